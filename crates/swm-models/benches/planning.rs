@@ -1,5 +1,5 @@
 //! Times one iteration of the cross-entropy method in a LeWM of the published size (300 candidates of 5 model steps,
-//! one environment): the CPU rollout of planning against the model's own rollout, on the same threads. Prints
+//! one environment): the CPU rollout that planning uses, compared with `Lewm::rollout` on the same threads. Prints
 //! milliseconds and the ratio.
 #![allow(clippy::print_stdout, reason = "a benchmark prints its result")]
 

@@ -1,10 +1,11 @@
-//! [`Checkpoint`]: a folder with a trained model and the state for its use and for continued training.
+//! [`Checkpoint`]: a folder with a trained model, the statistics of its dataset, and the state from which training
+//! continues.
 //!
 //! | file | content |
 //! | --- | --- |
 //! | `config.json` | family, configuration, statistics of the dataset |
 //! | `weights.safetensors` | weights under their published names |
-//! | `optimizer.safetensors`, `state.json` | the state of the optimizer and the run, to continue it exactly |
+//! | `optimizer.safetensors`, `state.json` | the state of the optimizer and of the run, from which training continues |
 //! | `raw.safetensors` | the trained weights, where `weights.safetensors` holds their moving average |
 //! | `manifest.json` | provenance, and the hashes of the files above |
 //!
@@ -81,7 +82,7 @@ impl<M: Trainable> Checkpoint<M> {
         self.config.data.frameskip * self.dataset_info.action.dim()
     }
 
-    /// Saves the checkpoint in the run folder `run`, replacing the one that is there. Returns the hash of the weights.
+    /// Saves the checkpoint in the run folder `run`, replacing an earlier checkpoint. Returns the weights' hash.
     ///
     /// # Errors
     /// When writing fails; an earlier checkpoint is kept.
@@ -90,7 +91,7 @@ impl<M: Trainable> Checkpoint<M> {
         self.save(run, None)
     }
 
-    /// Saves as [`Checkpoint::save_to`] does, with the state to continue from.
+    /// Saves the checkpoint as [`Checkpoint::save_to`] does, and the state from which training continues.
     pub(crate) fn save(&mut self, run: &Path, state: Option<&TrainState<M>>) -> Result<String> {
         let config = ConfigFile {
             family: M::FAMILY.to_owned(),
@@ -100,25 +101,26 @@ impl<M: Trainable> Checkpoint<M> {
             dataset_info: self.dataset_info.clone(),
             config: json(&self.config)?,
         };
-        let mut more = vec![];
+        let mut additional = vec![];
         if let Some(state) = state {
             let optimizer = pack(&state.moments)?;
             self.manifest.hashes.insert("optimizer".to_owned(), manifest::hash(&optimizer));
-            more.push((OPTIMIZER, optimizer));
-            more.push((STATE, text(&state.state)?.into_bytes()));
+            additional.push((OPTIMIZER, optimizer));
+            additional.push((STATE, text(&state.state)?.into_bytes()));
             if let Some(raw) = &state.raw {
                 let raw = pack(&parameters::values(raw))?;
                 self.manifest.hashes.insert("raw".to_owned(), manifest::hash(&raw));
-                more.push((RAW, raw));
+                additional.push((RAW, raw));
             }
         }
-        write(run, &config, &mut self.manifest, &parameters::values(&self.model), &more)
+        write(run, &config, &mut self.manifest, &parameters::values(&self.model), &additional)
     }
 
     /// Loads the checkpoint of a run folder (or the checkpoint folder itself).
     ///
     /// # Errors
-    /// When there is none, it is of another family, it is damaged, or its weights do not fit its configuration.
+    /// When the folder holds no checkpoint, or the checkpoint is of another family, is damaged, or has weights that
+    /// do not fit its configuration.
     pub fn load(run: &Path, device: &Device) -> Result<Self> {
         Ok(Self::read(run, device)?.0)
     }
@@ -135,10 +137,10 @@ impl<M: Trainable> Checkpoint<M> {
         Ok((Self { model, config, dataset_info, manifest }, folder))
     }
 
-    /// Loads the checkpoint and the state to continue from.
+    /// Loads the checkpoint and the state from which training continues.
     ///
     /// # Errors
-    /// As [`Checkpoint::load`], and when the checkpoint was saved without that state.
+    /// As [`Checkpoint::load`], and when the checkpoint was saved without the state.
     pub(crate) fn load_to_resume(run: &Path, device: &Device) -> Result<(Self, TrainState<M>)> {
         let (checkpoint, folder) = Self::read(run, device)?;
         let path = folder.join(STATE);
@@ -154,7 +156,7 @@ impl<M: Trainable> Checkpoint<M> {
     }
 }
 
-/// The family of the model in a run folder; `None` where there is no checkpoint.
+/// The family of the model in a run folder; `None` if the folder holds no checkpoint.
 pub fn family(run: &Path) -> Option<String> {
     let file: serde_json::Value = serde_json::from_slice(&read(&locate(run)?.join(CONFIG)).ok()?).ok()?;
     Some(file.get("family")?.as_str()?.to_owned())
@@ -166,7 +168,7 @@ pub(crate) struct StoredCheckpoint<C> {
     pub folder: PathBuf,
     /// The whole `config.json`.
     pub file: serde_json::Value,
-    /// Its field `config`.
+    /// The field `config` of `config.json`.
     pub config: C,
     /// The provenance of the checkpoint.
     pub manifest: Manifest,
@@ -176,7 +178,7 @@ impl<C: serde::de::DeserializeOwned> StoredCheckpoint<C> {
     /// Reads the checkpoint of a run folder (or the checkpoint folder itself).
     ///
     /// # Errors
-    /// When there is none, it is of another family, or it is damaged.
+    /// When the folder holds no checkpoint, or the checkpoint is of another family or is damaged.
     pub fn read(run: &Path, family: &str) -> Result<Self> {
         let folder = locate(run).ok_or_else(|| {
             Error::corrupt(run, "there is no checkpoint", "give the folder that `swm train` wrote to")
@@ -247,10 +249,10 @@ fn replace(run: &Path, new: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Loads a checkpoint's file of weights into a model, after checking the hash, where there is one.
+/// Loads the weights file of a checkpoint into a model, after checking the hash of the file if `hash` is given.
 ///
 /// # Errors
-/// When the file is damaged, or its weights are not those of the model.
+/// When the file is damaged, or the names or shapes of the weights differ from the model's.
 pub(crate) fn load_weights<M: burn::module::Module>(model: M, path: &Path, hash: Option<&String>) -> Result<M> {
     let weights = unpack(path, hash)?;
     match weights::mismatch(&parameters::shapes(&model), &weights, CONFIG) {
@@ -263,8 +265,8 @@ fn broken(path: &Path, problem: String) -> Error {
     Error::corrupt(path, problem, "train again, or copy the checkpoint again from where it came")
 }
 
-/// The folder of a run's checkpoint: the folder itself, its checkpoint, or the old checkpoint that a killed process had
-/// not yet replaced.
+/// Returns the folder of a run's checkpoint: `run` itself, its checkpoint folder, or the old checkpoint that a killed
+/// process did not replace.
 fn locate(run: &Path) -> Option<PathBuf> {
     [run.to_owned(), run.join(FOLDER), run.join(format!("{FOLDER}.old"))]
         .into_iter()
@@ -297,7 +299,7 @@ fn pack(tensors: &Named<HostTensor>) -> Result<Vec<u8>> {
     safetensors::serialize(views?, None).map_err(failed)
 }
 
-/// Reads the tensors of a safetensors file, after checking its hash, where there is one.
+/// Reads the tensors of a safetensors file, after checking the hash of the file if `hash` is given.
 fn unpack(path: &Path, hash: Option<&String>) -> Result<Named<HostTensor>> {
     let bytes = read(path)?;
     let broken = |problem: String| broken(path, problem);

@@ -8,7 +8,7 @@ use swm_core::{Candidates, Error, Result, Schema};
 /// Checks that dropout rates are at least 0 and below 1.
 ///
 /// # Errors
-/// Names the first rate that is not.
+/// When a rate is out of range; the error names the first such rate.
 pub(crate) fn dropout_rates(rates: &[(&str, f32)]) -> Result<()> {
     match rates.iter().find(|(_, rate)| !(0.0..1.0).contains(rate)) {
         Some((name, rate)) => Err(Error::config(*name, rate.to_string(), "give a probability below 1")),
@@ -19,7 +19,7 @@ pub(crate) fn dropout_rates(rates: &[(&str, f32)]) -> Result<()> {
 /// Checks that the standard deviations of pixels are positive.
 ///
 /// # Errors
-/// When one is not.
+/// When a standard deviation is not positive.
 pub(crate) fn pixel_std(std: [f32; 3]) -> Result<()> {
     if std.iter().any(|std| *std <= 0.0) {
         return Err(Error::config("model.pixel_std", format!("{std:?}"), "give three positive numbers"));
@@ -30,7 +30,7 @@ pub(crate) fn pixel_std(std: [f32; 3]) -> Result<()> {
 /// Checks that clips of `num_steps` frames contain a window of `history` frames and the frame after it.
 ///
 /// # Errors
-/// When they are shorter.
+/// When the clips are shorter.
 pub(crate) fn clip_covers_history(num_steps: usize, history: usize) -> Result<()> {
     at_least(&[("data.num_steps", num_steps, 2)])?;
     if num_steps - 1 < history {
@@ -78,10 +78,11 @@ pub(crate) fn column_shape(schema: &Schema, name: &str, expected: &[usize]) -> R
     ))
 }
 
-/// Checks that candidates and costs are for `envs` observed environments and actions of `action_dim` elements.
+/// Checks that candidates and costs have the sizes for `envs` observed environments and actions of `action_dim`
+/// elements.
 ///
 /// # Errors
-/// When they are not.
+/// When a size differs.
 pub(crate) fn candidate_sizes(
     what: &str,
     candidates: &Candidates<'_>,

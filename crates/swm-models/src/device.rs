@@ -3,7 +3,7 @@
 use burn::tensor::Device;
 use swm_core::{Error, Result};
 
-/// The backends by name, and whether this build has them.
+/// The backends: the name, and whether this build contains the backend.
 const BACKENDS: [(&str, bool); 3] =
     [("cpu", true), ("vulkan", cfg!(feature = "vulkan")), ("cuda", cfg!(feature = "cuda"))];
 
@@ -66,8 +66,8 @@ mod tests {
 
     #[test]
     fn cpu_is_always_available_and_errors_name_the_fix() {
-        assert_eq!(name(&parse("cpu").expect("always")), "cpu (flex)");
-        let message = |name: &str| parse(name).expect_err("invalid").to_string();
+        assert_eq!(name(&parse("cpu").expect("the CPU")), "cpu (flex)");
+        let message = |name: &str| parse(name).expect_err("an error").to_string();
         assert!(message("cdua").contains("did you mean cuda"), "{}", message("cdua"));
         assert!(message("cpu:x").contains("not a GPU index"), "{}", message("cpu:x"));
         if !cfg!(feature = "cuda") {

@@ -42,7 +42,7 @@ impl ImageNormalization {
 /// Checks that a column holds square images with a side of `side` pixels.
 ///
 /// # Errors
-/// When there is no such column, or it holds something else.
+/// When the column is missing, or has another type or shape.
 pub fn check(side: usize, schema: &Schema, column: &str) -> Result<()> {
     let spec = schema.column(column)?;
     if spec.dtype == DType::U8 && spec.shape == [side, side, 3] {
@@ -61,7 +61,7 @@ pub fn check(side: usize, schema: &Schema, column: &str) -> Result<()> {
 /// column.
 ///
 /// # Shapes
-/// `[frames, side, side, 3]` bytes to `[frames, patches, 3 * patch * patch]`.
+/// Maps `[frames, side, side, 3]` bytes to `[frames, patches, 3 * patch * patch]`.
 ///
 /// # Errors
 /// When the bytes are not whole images of that side.
@@ -87,10 +87,10 @@ pub fn patches(images: &ImageNormalization, patch: usize, rgb: &[u8], device: &D
     Ok(Tensor::from_data(TensorData::new(values, [frames, grid * grid, width]), device))
 }
 
-/// Normalised images with the channels first.
+/// Converts images to normalised colour planes, channels first.
 ///
 /// # Shapes
-/// `[frames, side, side, 3]` bytes to `[frames, 3, side, side]`.
+/// Maps `[frames, side, side, 3]` bytes to `[frames, 3, side, side]`.
 ///
 /// # Errors
 /// When the bytes are not whole images of that side.

@@ -35,7 +35,8 @@ pub fn dataset_requirements() -> Result<Vec<DatasetRequirements>> {
 /// Loads the checkpoint of a run folder, of any family in [`FAMILIES`].
 ///
 /// # Errors
-/// When there is none, its family is unknown, it is damaged, or its weights do not fit its configuration.
+/// When the folder holds no checkpoint, or the checkpoint is of an unknown family, is damaged, or has weights that do
+/// not fit its configuration.
 pub fn load(run: &Path, device: &Device) -> Result<Box<dyn LoadedModel>> {
     load_from(FAMILIES.rows, run, device)
 }

@@ -40,14 +40,14 @@ pub struct DinoWmConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ColumnConfig {
-    /// Its name in the dataset, such as `action` or `proprio`.
+    /// The name of the column in the dataset, such as `action` or `proprio`.
     pub name: String,
-    /// Number of its features.
+    /// Number of features of the encoded column.
     pub dim: usize,
 }
 
 impl DinoWmConfig {
-    /// Returns the number of features of a patch: those of the encoder, then those of the columns.
+    /// Returns the number of features of a patch: the features of the encoder, then the features of the columns.
     pub fn dim(&self) -> usize {
         self.encoder.dim() + self.columns.iter().map(|column| column.dim).sum::<usize>()
     }
@@ -72,7 +72,7 @@ impl DinoWmConfig {
     /// Checks that the sizes are consistent.
     ///
     /// # Errors
-    /// Names the first size that is not.
+    /// When a size is invalid; the error names the first such size.
     pub fn check(&self) -> Result<()> {
         self.encoder.check("model.encoder", self.image)?;
         let predictor = &self.predictor;

@@ -1,9 +1,9 @@
 //! [`DinoWmCost`]: the planning cost of a DINO-WM, the mean squared distance between the last predicted patches of a
-//! candidate and the patches of the goal image. If the goal of a column is given (`goal_proprio` for `proprio`), the mean
-//! squared distance between the column's features is added.
+//! candidate and the patches of the goal image. If the goal of a column is given (`goal_proprio` for `proprio`), the
+//! mean squared distance between the column's features is added.
 //!
-//! As for a LeWM, every environment is evaluated in calls whose shapes do not depend on the other environments, so the bytes
-//! of its plan depend neither on them nor on the number of threads.
+//! As for a LeWM, every environment is evaluated in calls whose shapes do not depend on the other environments, so the
+//! bytes of an environment's plan depend neither on the other environments nor on the number of threads.
 
 use super::config::{ACTION, DinoWmConfig};
 use super::model::DinoWm;
@@ -23,15 +23,15 @@ pub struct DinoWmCost {
     model: DinoWm,
     config: DinoWmConfig,
     dataset_info: DatasetInfo,
-    actions: usize,
+    action_dim: usize,
     contexts: Vec<PlanContext>,
 }
 
-/// The frames of one environment that its plan starts from and ends at.
+/// The start frames and the goal of one environment's plan.
 struct PlanContext {
     /// The last frames, oldest first: `[1, frames, patches, dim]`.
     start: Tensor<4>,
-    /// The actions taken between them, in model units: `[frames - 1, actions]`.
+    /// The actions taken between the start frames, in model units: `[frames - 1, action_dim]`.
     past: Vec<f32>,
     /// The features of the goal's patches, `[1, patches, features]`.
     goal: Tensor<3>,
@@ -39,45 +39,45 @@ struct PlanContext {
     columns: Vec<(std::ops::Range<usize>, Tensor<2>)>,
 }
 
-/// Candidates that are predicted at once. A frame has many tokens, so a few candidates fill a core's cache.
+/// Candidates of one rollout call. A frame has many tokens, so a few candidates fill a core's cache.
 const PART: usize = 16;
 
 impl DinoWmCost {
-    /// The planning cost of a trained model.
+    /// Creates the planning cost of a trained model.
     pub fn new(checkpoint: &Checkpoint<DinoWm>) -> Self {
         Self {
             model: checkpoint.model.clone(),
             config: checkpoint.config.model.clone(),
             dataset_info: checkpoint.dataset_info.clone(),
-            actions: checkpoint.actions(),
+            action_dim: checkpoint.actions(),
             contexts: vec![],
         }
     }
 
     fn check_columns(&self, schema: &Schema) -> Result<()> {
-        checks::planning_images(schema, self.config.image, self.actions)?;
+        checks::planning_images(schema, self.config.image, self.action_dim)?;
         let columns = self.config.columns.iter().filter(|column| column.name != ACTION);
         columns
             .map(|column| &column.name)
             .try_for_each(|name| checks::column_shape(schema, name, &self.dataset_info.column(name)?.shape))
     }
 
-    /// Checks that candidates and costs are for the observed environments.
+    /// Checks that candidates and costs have the sizes for the observed environments.
     fn check_sizes(&self, candidates: &Candidates<'_>, costs: &[f32]) -> Result<()> {
-        checks::candidate_sizes("costs of a DINO-WM", candidates, costs, [self.contexts.len(), self.actions])
+        checks::candidate_sizes("costs of a DINO-WM", candidates, costs, [self.contexts.len(), self.action_dim])
     }
 
-    /// Encodes present, recent frames and goal of one environment.
+    /// Encodes the current frame, the recorded history and the goal of one environment.
     fn context(&self, infos: &Batch, env: usize) -> Result<PlanContext> {
         let (row, device) = (infos.row(env), Device::flex());
         // One image per call: features must not depend on the number of images in a call.
         let encode = |rgb: &[u8]| Ok::<_, Error>(self.model.backbone.patches(self.config.image_patches(rgb, &device)?));
         let column = |name: &str, values: &[f32]| normalised(&self.dataset_info, name, values, [1, 1], &device);
-        // The recorded history has no other columns; a model that reads some starts from the present frame alone.
-        let others: Vec<&str> =
+        // The recorded history has images and actions only: with further columns, a plan starts from the current frame.
+        let further_columns: Vec<&str> =
             self.config.columns.iter().map(|column| column.name.as_str()).filter(|name| *name != ACTION).collect();
         let (mut frames, mut past) = (vec![encode(row.get::<u8>(PIXELS)?)?], vec![]);
-        if others.is_empty() && infos.schema().find("history.length").is_some() {
+        if further_columns.is_empty() && infos.schema().find("history.length").is_some() {
             let recorded = infos.schema().column("history.action")?.shape[0];
             let length = usize::try_from(row.get::<i32>("history.length")?[0]).unwrap_or(0);
             let length = length.min(self.config.predictor.history - 1).min(recorded);
@@ -86,7 +86,7 @@ impl DinoWmCost {
             for frame in images[images.len() - length * bytes..].rchunks_exact(bytes) {
                 frames.insert(0, encode(frame)?);
             }
-            past = actions[actions.len() - length * self.actions..].to_vec();
+            past = actions[actions.len() - length * self.action_dim..].to_vec();
         }
         let count = frames.len();
         let features: Tensor<4> = Tensor::cat(frames, 0).unsqueeze_dim(0);
@@ -95,7 +95,7 @@ impl DinoWmCost {
             .columns
             .iter()
             .map(|spec| match spec.name.as_str() {
-                ACTION => Ok(Tensor::zeros([1, count, self.actions], &device)),
+                ACTION => Ok(Tensor::zeros([1, count, self.action_dim], &device)),
                 name => column(name, row.get::<f32>(name)?),
             })
             .collect();
@@ -121,7 +121,7 @@ impl PlanContext {
     /// Returns the costs of candidates, with autodiff if the candidates have it.
     ///
     /// # Shapes
-    /// `candidates` is `[samples, horizon, actions]`; returns `[samples]`.
+    /// `candidates` is `[samples, horizon, action_dim]`; returns `[samples]`.
     fn cost(&self, model: &DinoWm, candidates: Tensor<3>) -> Tensor<1> {
         // If the candidates are differentiated, all operands must be in their graph.
         let differentiated = candidates.is_autodiff();
@@ -196,10 +196,10 @@ impl DifferentiableCost for DinoWmCost {
                 let parts = costs.par_chunks_mut(PART).zip(gradient.par_chunks_mut(PART * per));
                 parts.zip(actions.par_chunks(PART * per)).for_each(|((costs, gradient), actions)| {
                     let data = TensorData::new(actions.to_vec(), [costs.len(), horizon, dim]);
-                    let free = Tensor::<3>::from_data(data, &Device::flex()).autodiff().require_grad();
-                    let found = context.cost(&model, free.clone());
+                    let leaf = Tensor::<3>::from_data(data, &Device::flex()).autodiff().require_grad();
+                    let found = context.cost(&model, leaf.clone());
                     costs.copy_from_slice(&found.clone().inner().into_data().into_f32_vec());
-                    match free.grad(&found.sum().backward()) {
+                    match leaf.grad(&found.sum().backward()) {
                         Some(found) => gradient.copy_from_slice(&found.into_data().into_f32_vec()),
                         None => gradient.fill(0.0),
                     }

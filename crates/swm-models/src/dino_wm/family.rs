@@ -1,4 +1,4 @@
-//! The uses of a trained DINO-WM.
+//! [`ModelFamily`] for DINO-WM.
 
 use super::{DinoWm, DinoWmCost, import};
 use crate::checkpoint::Checkpoint;

@@ -20,11 +20,13 @@ use swm_core::{Error, Key, Manifest, Result};
 const MODULES: &str = "stable_worldmodel.wm.prejepa.module";
 const CLASS: &str = "stable_worldmodel.wm.PreJEPA";
 
-/// Converts a DINO-WM of the reference implementation: a folder with `weights.pt` and `config.json`, or that file. The
-/// files do not store how columns were normalised, so `dataset_info` must describe the dataset it was trained on.
+/// Converts a DINO-WM of the reference implementation: a folder with `weights.pt` and `config.json`, or the path of the
+/// weights. The files do not store how columns were normalised, so `dataset_info` must describe the model's training
+/// dataset.
 ///
 /// # Errors
-/// When it is another model, its encoder is not DINOv2, it is damaged, or its columns are not those of `dataset_info`.
+/// When a file is damaged or holds another model, the encoder is not DINOv2, or the columns are not those of
+/// `dataset_info`.
 pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<DinoWm>> {
     let mut reference = Reference::open(from, "PreJEPA")?;
     // The wrapper of the frozen encoder adds a prefix.

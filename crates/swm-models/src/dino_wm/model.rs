@@ -13,13 +13,13 @@ use swm_core::columns::PIXELS;
 /// A DINO-WM: predicts the patches of the next frame from the patches of frames and the actions between them.
 #[derive(Module, Debug)]
 pub struct DinoWm {
-    /// From images to features of patches; frozen.
+    /// Maps images to features of patches; frozen.
     pub backbone: Backbone,
-    /// From a window of frames to the next frame.
+    /// Maps a window of frames to the next frame.
     pub predictor: FramePredictor,
-    /// From columns to the features that are appended to every patch.
+    /// Maps columns to the features that are appended to every patch.
     pub extra_encoders: ModuleDict<ColumnEncoder>,
-    /// From features of patches to their pixels.
+    /// Maps features of patches to their pixels.
     pub decoder: Option<PatchDecoder>,
 }
 
@@ -30,13 +30,13 @@ pub struct ColumnEncoder {
     pub patch_embed: PointwiseConv,
 }
 
-/// The image decoder, from the features of a patch to its pixels: linear, GELU, and a transposed convolution whose stride
-/// is its kernel size, which is one matrix product.
+/// The image decoder, from the features of a patch to its pixels: linear, GELU, and a transposed convolution whose
+/// stride is its kernel size, which is one matrix product.
 #[derive(Module, Debug)]
 pub struct PatchDecoder {
-    /// Into the hidden features.
+    /// The layer to the hidden features.
     pub hidden: Linear,
-    /// From the hidden features.
+    /// The layer from the hidden features.
     pub pixels: Linear,
 }
 
@@ -71,8 +71,8 @@ impl PatchDecoder {
 }
 
 impl DinoWm {
-    /// A model with random weights. `widths` are the element counts of the columns per frame, in the order of the
-    /// configuration.
+    /// Creates a model with random weights. `widths` are the element counts of the columns per frame, in the order of
+    /// the configuration.
     pub fn init(config: &DinoWmConfig, widths: &[usize], key: Key, device: &Device) -> Self {
         let init = Init::new(key, device);
         let columns = config.columns.iter().zip(widths).map(|(column, width)| {
@@ -121,7 +121,8 @@ impl DinoWm {
     /// Replaces the action features of frames.
     ///
     /// # Shapes
-    /// `frames` is `[clips, frames, patches, dim]`, `actions` is `[clips, frames, actions]`; returns the shape of `frames`.
+    /// `frames` is `[clips, frames, patches, dim]`, `actions` is `[clips, frames, action_dim]`; returns the shape of
+    /// `frames`.
     pub fn with_actions(&self, frames: Tensor<4>, actions: Tensor<3>) -> Tensor<4> {
         let mut columns = self.extra_encoders.iter().zip(self.columns());
         let Some(((_, encoder), (_, span))) = columns.find(|((name, _), _)| *name == ACTION) else { return frames };
@@ -143,12 +144,12 @@ impl DinoWm {
         self.predictor.forward(frames.reshape([clips, steps * patches, dim]), rng).reshape([clips, steps, patches, dim])
     }
 
-    /// Rolls the model out: returns the given frames, then one predicted frame after each further action. The action features
-    /// of `given` are replaced; those of the last frame have no meaning.
+    /// Rolls the model out: returns the given frames, then one predicted frame after each further action. The action
+    /// features of `given` are replaced; the action features of the last frame have no meaning.
     ///
     /// # Shapes
-    /// `given` is `[clips, given, patches, dim]`, `actions` is `[clips, steps, actions]` with `steps >= given`; returns
-    /// `[clips, steps + 1, patches, dim]`.
+    /// `given` is `[clips, given, patches, dim]`, `actions` is `[clips, steps, action_dim]` with `steps >= given`;
+    /// returns `[clips, steps + 1, patches, dim]`.
     pub fn rollout(&self, given: Tensor<4>, actions: Tensor<3>) -> Tensor<4> {
         let ([clips, count, patches, dim], [_, steps, elements]) = (given.dims(), actions.dims());
         let history = self.predictor.config().history;

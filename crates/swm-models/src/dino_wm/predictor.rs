@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FramePredictorConfig {
-    /// Input frames: the present one and those before it.
+    /// Number of input frames, including the current one.
     pub history: usize,
     /// Number of layers.
     pub depth: usize,
@@ -61,7 +61,7 @@ pub struct Layer {
 const EPSILON: f64 = 1e-5;
 
 impl FramePredictorConfig {
-    /// A predictor of frames with `patches` patches of `dim` features.
+    /// Creates a predictor of frames with `patches` patches of `dim` features.
     pub fn init(&self, init: &Init, patches: usize, dim: usize) -> FramePredictor {
         let layer = |index| {
             let init = init.of("layer").at(index);
@@ -96,7 +96,7 @@ impl FramePredictor {
     /// Predicts the patches of the frame after each frame of a window.
     ///
     /// # Shapes
-    /// `[windows, frames * patches, dim]`, `frames` at most the history, to the same.
+    /// Maps `[windows, frames * patches, dim]`, with `frames` at most the history, to the same shape.
     pub fn forward(&self, x: Tensor<3>, rng: &mut DropoutRng<'_>) -> Tensor<3> {
         let [_, tokens, dim] = x.dims();
         let x = x + self.pos_embedding.val().slice([0..1, 0..tokens, 0..dim]);

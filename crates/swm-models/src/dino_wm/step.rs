@@ -54,12 +54,12 @@ pub fn step(model: &DinoWm, batch: &TrainBatch, noise: Option<&mut Rng>) -> Dino
     let pixels = errors(0..width);
     let mut parts = vec![pixels.clone()];
     parts.extend(learner.columns().into_iter().filter(|(name, _)| *name != ACTION).map(|(_, span)| errors(span)));
-    let others = (parts.len() > 1).then(|| Tensor::cat(parts[1..].to_vec(), 3).mean());
+    let column_error = (parts.len() > 1).then(|| Tensor::cat(parts[1..].to_vec(), 3).mean());
     let prediction = Tensor::cat(parts, 3).mean();
 
     let value = |loss: &Tensor<1>| f64::from(loss.clone().inner().into_scalar::<f32>());
     let mut losses = vec![("prediction", value(&prediction)), (PIXELS, value(&pixels.mean()))];
-    losses.extend(others.as_ref().map(|others| ("columns", value(others))));
+    losses.extend(column_error.as_ref().map(|error| ("columns", value(error))));
     let mut loss = prediction;
     if let Some(decoder) = &learner.decoder {
         let images = batch.patches.clone().autodiff();

@@ -1,4 +1,4 @@
-//! [`Trainable`] for DINO-WM: the training loop's view of [`super::step`].
+//! [`Trainable`] for DINO-WM, which connects [`super::step`] to the training loop.
 
 use super::config::{ACTION, DinoWmConfig};
 use super::model::DinoWm;

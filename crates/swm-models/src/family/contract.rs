@@ -1,4 +1,4 @@
-//! [`ModelFamily`]: the uses of a trained model.
+//! [`ModelFamily`]: the operations on the trained models of a family.
 
 use crate::checkpoint::Checkpoint;
 use crate::online::OnlineSummary;
@@ -11,7 +11,8 @@ use swm_core::run::Control;
 use swm_core::{CostModel, EnvPool, EnvSpec, Policy, Predictor, Result};
 use swm_data::Reader;
 
-/// A trainable model and its uses. A method that returns `None` by default is a use that the family does not offer.
+/// A trainable model and the operations on its checkpoints. A method returns `None` if the family does not support the
+/// operation.
 pub trait ModelFamily: Trainable {
     /// Whether a trained model acts without a solver.
     const ACTS: bool = false;
@@ -80,7 +81,7 @@ pub trait ModelFamily: Trainable {
 pub struct TrainRun<'a> {
     /// The dataset.
     pub reader: Arc<dyn Reader>,
-    /// The checkpoint whose encoder is used, for families that borrow one.
+    /// The checkpoint whose encoder is used, for families that train on the encoder of another model.
     pub encoder: Option<&'a Path>,
     /// The folder of the checkpoint and the logs.
     pub out: &'a Path,

@@ -32,14 +32,14 @@ pub struct FamilyEntry {
     pub requirements: fn() -> Result<Option<DatasetRequirements>>,
     /// Loads the checkpoint of a run folder.
     pub load: fn(&Path, &Device) -> Result<Box<dyn LoadedModel>>,
-    /// Converts a checkpoint of the reference implementation (`weights.pt` and `config.json` in the first folder), which
-    /// was trained on the given dataset, into a checkpoint in the last folder; returns the hash of its weights. `None` if
-    /// the reference implementation has no such family.
+    /// Converts a checkpoint of the reference implementation (`weights.pt` and `config.json` in the first folder),
+    /// which was trained on the given dataset, into a checkpoint in the last folder; returns the hash of its weights.
+    /// `None` if the reference implementation has no such family.
     pub import: fn(&Path, &dyn Reader, &Path) -> Option<Result<String>>,
 }
 
 impl FamilyEntry {
-    /// The row of a family.
+    /// Creates the row of a family.
     pub const fn of<M: ModelFamily>() -> Self {
         Self {
             id: M::FAMILY,

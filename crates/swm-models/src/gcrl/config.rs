@@ -18,7 +18,7 @@ pub struct GcrlConfig {
     pub pixel_mean: [f32; 3],
     /// Standard deviation of each colour channel for pixel values in 0 ..= 1.
     pub pixel_std: [f32; 3],
-    /// Input frames: the present one and earlier ones.
+    /// Number of input frames, including the current one.
     pub history: usize,
     /// Whether the encoder is not trained.
     pub frozen: bool,
@@ -53,7 +53,7 @@ impl GcrlConfig {
     /// Checks that the sizes are consistent.
     ///
     /// # Errors
-    /// Names the first size that is not.
+    /// When a size is invalid; the error names the first such size.
     pub fn check(&self) -> Result<()> {
         self.encoder.check("model.encoder", self.image)?;
         let TransformerConfig { depth, heads, dim_head, mlp, dropout, emb_dropout } = self.head;

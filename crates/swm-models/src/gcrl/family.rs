@@ -1,4 +1,4 @@
-//! The uses of trained goal-conditioned models: they act without planning, and their encoders can be probed.
+//! [`ModelFamily`] for goal-conditioned models, which act without planning and whose encoders can be probed.
 
 use super::{Gcbc, Gciql, Gcivl, GoalConditioned, import};
 use crate::checkpoint::Checkpoint;

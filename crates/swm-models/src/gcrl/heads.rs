@@ -15,7 +15,7 @@ pub struct Head {
     pub pos_embedding_goal: Param<Tensor<3>>,
     /// The transformer over frames and goal.
     pub transformer: Transformer,
-    /// To the outputs.
+    /// The output layer.
     pub out_proj: Linear,
     emb_dropout: f32,
 }
@@ -29,7 +29,7 @@ pub struct Critic {
     pub pos_embedding_goal: Param<Tensor<3>>,
     /// The transformer over frames and goal.
     pub transformer: Transformer,
-    /// From the transformer's output and the action to the value.
+    /// Maps the transformer's output and the action to the value.
     pub q_head: CriticHead,
     emb_dropout: f32,
 }
@@ -37,16 +37,16 @@ pub struct Critic {
 /// Two hidden layers with ReLU. A field `_2` is element 2 of a sequence.
 #[derive(Module, Debug)]
 pub struct CriticHead {
-    /// Into hidden features.
+    /// The layer to the hidden features.
     pub _0: Linear,
-    /// Between the hidden features.
+    /// The layer between the hidden features.
     pub _2: Linear,
-    /// To the value.
+    /// The output layer.
     pub _4: Linear,
 }
 
 impl Head {
-    /// A head with `outputs` outputs and random weights.
+    /// Creates a head with `outputs` outputs and random weights.
     pub fn new(init: &Init, size: &TransformerConfig, grid: PatchGrid, pool: Pool, outputs: usize) -> Self {
         let [pos_embedding, pos_embedding_goal] = positions(init, grid);
         Self {
@@ -71,13 +71,14 @@ impl Head {
 }
 
 impl Critic {
-    /// A critic for actions of `actions` elements, with `hidden` features after the transformer and random weights.
+    /// Creates a critic for actions of `action_dim` elements, with `hidden` features after the transformer and random
+    /// weights.
     pub fn new(
         init: &Init,
         size: &TransformerConfig,
         grid: PatchGrid,
         pool: Pool,
-        actions: usize,
+        action_dim: usize,
         hidden: usize,
     ) -> Self {
         let [pos_embedding, pos_embedding_goal] = positions(init, grid);
@@ -86,7 +87,7 @@ impl Critic {
             pos_embedding_goal,
             transformer: size.init(&init.of("transformer"), grid, pool),
             q_head: CriticHead {
-                _0: Linear::new(&init.of("0"), grid.dim + actions, hidden),
+                _0: Linear::new(&init.of("0"), grid.dim + action_dim, hidden),
                 _2: Linear::new(&init.of("2"), hidden, hidden),
                 _4: Linear::new(&init.of("4"), hidden, 1),
             },
@@ -97,7 +98,7 @@ impl Critic {
     /// Computes the value of the actions at every frame.
     ///
     /// # Shapes
-    /// As [`Head::forward`]; `actions` is `[rows, frames, actions]`; returns `[rows, frames, 1]`.
+    /// As [`Head::forward`]; `actions` is `[rows, frames, action_dim]`; returns `[rows, frames, 1]`.
     pub fn forward(
         &self,
         frames: &Tensor<3>,
@@ -114,8 +115,9 @@ impl Critic {
     }
 }
 
-/// The standard deviation of initial position embeddings. The reference implementation uses 1, that of DINOv2's features;
-/// a trained encoder begins with features a tenth of that size, which such positions would dominate.
+/// The standard deviation of initial position embeddings. The reference implementation uses 1, the standard
+/// deviation of DINOv2's features. An encoder that is trained from random weights begins with features of a tenth of
+/// that size, which position embeddings with a standard deviation of 1 would dominate.
 const POSITION_STD: f32 = 0.02;
 
 /// Draws the position embeddings of frames and goal.

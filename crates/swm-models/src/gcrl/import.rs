@@ -1,7 +1,7 @@
 //! Import and export of goal-conditioned checkpoints of the reference implementation (its class `GCRL`).
 //!
-//! Its training scripts store their own settings as `config.json`, while `load_pretrained` requires a class tree. So sizes
-//! are read from the weights, and only the number of attention heads is read from the file.
+//! The published training scripts store their own settings as `config.json`, while `load_pretrained` requires a class
+//! tree. So sizes are read from the weights, and only the number of attention heads is read from the file.
 
 use super::config::GcrlConfig;
 use super::loss::LOG_STD;
@@ -23,15 +23,15 @@ use swm_core::{Error, Key, Manifest, Result};
 const CLASS: &str = "stable_worldmodel.wm.gcrl.GCRL";
 const MODULE: &str = "stable_worldmodel.wm.gcrl.module";
 
-/// Converts a model of the reference implementation: a folder with `weights.pt` and `config.json`, or a weights file next to
-/// such a file. The files do not store how actions were normalised, so `dataset_info` must describe the dataset it was
-/// trained on.
+/// Converts a model of the reference implementation: a folder with `weights.pt` and `config.json`, or a weights file
+/// next to such a file. The files do not store how actions were normalised, so `dataset_info` must describe the model's
+/// training dataset.
 ///
 /// A policy's checkpoint has no target networks; they are initialised with the values' weights.
 ///
 /// # Errors
-/// When a network of the family is missing (policies of GCIQL are stored without the critic: import them as `gcivl`), the
-/// model has inputs other than images, it is damaged, or its actions are not those of `dataset_info`.
+/// When a network of the family is missing (policies of GCIQL are stored without the critic: import them as `gcivl`),
+/// the model has inputs other than images, a file is damaged, or the actions are not those of `dataset_info`.
 pub fn import<M>(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<M>>
 where
     M: GoalConditioned<Config = GcrlConfig>,
@@ -60,10 +60,10 @@ where
     config.data.num_steps = config.data.num_steps - config.model.history + sizes.history;
     config.model = GcrlConfig { weights: path.display().to_string(), ..sizes };
     config.check()?;
-    let drawn = model(&config)?;
-    let expected = parameters::shapes(&drawn);
+    let initial = model(&config)?;
+    let expected = parameters::shapes(&initial);
     found.weights.retain(|name, _| expected.contains_key(name) || !is_optional(name));
-    let model = weights::fill(drawn, &found.weights, &path, &format!("a {}", M::FAMILY))?;
+    let model = weights::fill(initial, &found.weights, &path, &format!("a {}", M::FAMILY))?;
     let manifest = Manifest::new("import", 0, json!({ "from": from.display().to_string() }));
     Ok(Checkpoint { model, config, dataset_info, manifest })
 }
@@ -73,7 +73,7 @@ fn is_optional(name: &str) -> bool {
     ["value_predictor.", "critic_predictor."].iter().any(|part| name.starts_with(part))
 }
 
-/// Removes wrappers and masks from names, and duplicates values and critics as their target networks.
+/// Removes wrapper prefixes and attention masks, and copies value networks and critics to their target networks.
 fn plain(weights: Named<HostTensor>) -> Named<HostTensor> {
     let mut plain = Named::new();
     for (name, weight) in weights {
@@ -181,7 +181,7 @@ impl StoredWeights<'_> {
     }
 }
 
-/// A model that the reference implementation has.
+/// A model for which the reference implementation has a class.
 pub trait Exportable: GoalConditioned {
     /// The networks other than encoder and policy, with their classes.
     const PARTS: &'static [(&'static str, &'static str)];
@@ -200,8 +200,8 @@ impl Exportable for Gciql {
         &[("value_predictor", "Predictor"), ("critic_predictor", "QPredictor")];
 }
 
-/// Writes the `weights.pt` and `config.json` that `load_pretrained` of the reference implementation reads, without target
-/// networks.
+/// Writes the `weights.pt` and `config.json` that `load_pretrained` of the reference implementation reads, without
+/// target networks.
 ///
 /// # Errors
 /// When the reference implementation has no such encoder, or a file cannot be written.
@@ -259,8 +259,8 @@ where
     write(folder, &tree, &state(&checkpoint.model, sizes, naming))
 }
 
-/// Returns the state dict of a model in the layout of the reference implementation: with attention masks, without target
-/// networks.
+/// Returns the state dict of a model in the layout of the reference implementation: with attention masks, without
+/// target networks.
 fn state<M: GoalConditioned>(model: &M, sizes: &GcrlConfig, naming: Naming) -> Named<HostTensor> {
     let grid = sizes.patch_grid();
     let keys = grid.frames * grid.patches;

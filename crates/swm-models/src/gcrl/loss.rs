@@ -16,7 +16,7 @@ pub const LOG_STD: [f32; 2] = [-5.0, 2.0];
 pub struct ValueLoss {
     /// Discount per model step, γ.
     pub discount: f32,
-    /// Expectile, τ: 0.5 estimates the mean of the outcomes, values towards 1 the best outcome.
+    /// Expectile, τ: 0.5 estimates the mean outcome, and values close to 1 estimate the best outcome.
     pub expectile: f32,
     /// Inverse temperature of the advantage weights, α.
     pub temperature: f32,
@@ -62,8 +62,8 @@ pub fn weights<const D: usize>(advantage: Tensor<D>, temperature: f32) -> Tensor
 /// over all elements.
 ///
 /// # Shapes
-/// `means` and `actions` are `[rows, frames, actions]`, `log_stds` is `[actions]`, `weights` is `[rows, frames, 1]`; returns
-/// `[1]`.
+/// `means` and `actions` are `[rows, frames, action_dim]`, `log_stds` is `[action_dim]`, `weights` is
+/// `[rows, frames, 1]`; returns `[1]`.
 pub fn regression(means: Tensor<3>, log_stds: Tensor<1>, actions: Tensor<3>, weights: Tensor<3>) -> Tensor<1> {
     let log_stds = log_stds.clamp(LOG_STD[0], LOG_STD[1]).unsqueeze::<3>();
     let precision = (log_stds.clone() * -2.0).exp();
@@ -81,7 +81,7 @@ mod tests {
 
     #[test]
     fn expectile_weights_positive_residuals_by_tau() {
-        // Residuals 1 and -3: 0.9 * 1 + 0.1 * 9 over two.
+        // Residuals 1 and -3: the loss is (0.9 * 1 + 0.1 * 9) / 2.
         let loss: f32 = expectile(tensor(&[0.0, 0.0]), tensor(&[1.0, -3.0]), 0.9).into_scalar();
         assert!((loss - 0.9).abs() < 1e-6, "{loss}");
     }

@@ -12,7 +12,7 @@ use swm_core::Key;
 /// Goal-conditioned behavioural cloning.
 #[derive(Module, Debug)]
 pub struct Gcbc {
-    /// From images to patches.
+    /// Maps images to patches.
     pub encoder: Backbone,
     /// The mean action.
     pub action_predictor: Head,
@@ -25,7 +25,7 @@ pub struct Gcbc {
 /// Goal-conditioned implicit value learning.
 #[derive(Module, Debug)]
 pub struct Gcivl {
-    /// From images to patches.
+    /// Maps images to patches.
     pub encoder: Backbone,
     /// The mean action.
     pub action_predictor: Head,
@@ -40,7 +40,7 @@ pub struct Gcivl {
 /// Goal-conditioned implicit Q-learning.
 #[derive(Module, Debug)]
 pub struct Gciql {
-    /// From images to patches.
+    /// Maps images to patches.
     pub encoder: Backbone,
     /// The mean action.
     pub action_predictor: Head,
@@ -78,13 +78,13 @@ impl<N: Module> WithTarget<N> {
 /// Creates the networks of a model with random weights.
 struct Builder<'a> {
     config: &'a GcrlConfig,
-    actions: usize,
+    action_dim: usize,
     init: Init,
 }
 
 impl<'a> Builder<'a> {
-    fn new(config: &'a GcrlConfig, actions: usize, key: Key, device: &Device) -> Self {
-        Self { config, actions, init: Init::new(key, device) }
+    fn new(config: &'a GcrlConfig, action_dim: usize, key: Key, device: &Device) -> Self {
+        Self { config, action_dim, init: Init::new(key, device) }
     }
 
     fn encoder(&self) -> Backbone {
@@ -94,11 +94,11 @@ impl<'a> Builder<'a> {
 
     fn policy(&self) -> Head {
         let init = self.init.of("action_predictor");
-        Head::new(&init, &self.config.head, self.config.patch_grid(), Pool::Attention, self.actions)
+        Head::new(&init, &self.config.head, self.config.patch_grid(), Pool::Attention, self.action_dim)
     }
 
     fn log_stds(&self) -> Param<Tensor<1>> {
-        self.init.constant([self.actions], 0.0)
+        self.init.constant([self.action_dim], 0.0)
     }
 
     fn value(&self) -> WithTarget<Head> {
@@ -109,14 +109,14 @@ impl<'a> Builder<'a> {
     fn critic(&self) -> WithTarget<Critic> {
         let GcrlConfig { head, critic, .. } = self.config;
         let init = self.init.of("critic_predictor");
-        WithTarget::new(Critic::new(&init, head, self.config.patch_grid(), Pool::Mean, self.actions, *critic))
+        WithTarget::new(Critic::new(&init, head, self.config.patch_grid(), Pool::Mean, self.action_dim, *critic))
     }
 }
 
 impl Gcbc {
-    /// A model with random weights for actions of `actions` elements per model step.
-    pub fn init(config: &GcrlConfig, actions: usize, key: Key, device: &Device) -> Self {
-        let parts = Builder::new(config, actions, key, device);
+    /// Creates a model with random weights for actions of `action_dim` elements per model step.
+    pub fn init(config: &GcrlConfig, action_dim: usize, key: Key, device: &Device) -> Self {
+        let parts = Builder::new(config, action_dim, key, device);
         Self {
             encoder: parts.encoder(),
             action_predictor: parts.policy(),
@@ -127,9 +127,9 @@ impl Gcbc {
 }
 
 impl Gcivl {
-    /// A model with random weights, as [`Gcbc::init`].
-    pub fn init(config: &GcrlConfig, actions: usize, key: Key, device: &Device) -> Self {
-        let parts = Builder::new(config, actions, key, device);
+    /// Creates a model with random weights, as [`Gcbc::init`].
+    pub fn init(config: &GcrlConfig, action_dim: usize, key: Key, device: &Device) -> Self {
+        let parts = Builder::new(config, action_dim, key, device);
         Self {
             encoder: parts.encoder(),
             action_predictor: parts.policy(),
@@ -141,9 +141,9 @@ impl Gcivl {
 }
 
 impl Gciql {
-    /// A model with random weights, as [`Gcbc::init`].
-    pub fn init(config: &GcrlConfig, actions: usize, key: Key, device: &Device) -> Self {
-        let parts = Builder::new(config, actions, key, device);
+    /// Creates a model with random weights, as [`Gcbc::init`].
+    pub fn init(config: &GcrlConfig, action_dim: usize, key: Key, device: &Device) -> Self {
+        let parts = Builder::new(config, action_dim, key, device);
         Self {
             encoder: parts.encoder(),
             action_predictor: parts.policy(),

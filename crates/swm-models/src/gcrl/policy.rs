@@ -34,7 +34,7 @@ pub struct EpisodePatches {
 }
 
 impl Actor {
-    /// A policy for `slots` environments of `spec`.
+    /// Creates a policy for `slots` environments of `spec`.
     ///
     /// # Errors
     /// When the model was trained for other actions.

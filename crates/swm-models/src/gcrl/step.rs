@@ -1,7 +1,7 @@
 //! Losses and gradients of clips.
 //!
-//! Values and policy are trained together, as by Kostrikov et al. (2021): the policy's loss has no gradient with respect to
-//! values and encoder, so the gradients are those of the two phases of the published algorithms.
+//! Values and policy are trained together, as by Kostrikov et al. (2021): the policy's loss has no gradient with
+//! respect to values and encoder, so the gradients are those of the two phases of the published algorithms.
 
 use super::heads::{Critic, Head};
 use super::loss::{self, ValueLoss};
@@ -14,11 +14,12 @@ use burn::tensor::Tensor;
 /// Normalised clips; the tensors have no autodiff.
 #[derive(Clone, Debug)]
 pub struct Clips {
-    /// Image patches, `[clips * steps, patches, 3 * patch * patch]`: the history, and for value learning the next frame.
+    /// Image patches, `[clips * steps, patches, 3 * patch * patch]`: the history, and for value learning the next
+    /// frame.
     pub frames: Tensor<3>,
     /// Goals of the values (for GCBC, of the policy), `[clips, patches, 3 * patch * patch]`.
     pub goal: Tensor<3>,
-    /// Actions taken at the frames of the history, `[clips, history, actions]`.
+    /// Actions taken at the frames of the history, `[clips, history, action_dim]`.
     pub actions: Tensor<3>,
 }
 
@@ -37,7 +38,7 @@ struct HeadInputs {
     now: Tensor<3>,
     /// The goal, in the same graph.
     goal: Tensor<3>,
-    /// The frames after those of the history, outside the graph.
+    /// The frames that follow each frame of the history, outside the graph.
     next: Tensor<3>,
     /// The goal of the policy, outside the graph.
     policy_goal: Tensor<3>,
@@ -62,26 +63,26 @@ impl Gcbc {
 }
 
 impl Gcivl {
-    /// Computes the losses of implicit value learning: values by expectile regression on bootstrapped targets, the policy by
-    /// advantage-weighted regression.
+    /// Computes the losses of implicit value learning: values by expectile regression on bootstrapped targets, the
+    /// policy by advantage-weighted regression.
     pub fn losses(
         &self,
         clips: &Clips,
-        more: &Relabelled,
+        relabelled: &Relabelled,
         settings: &ValueLoss,
         rng: &mut DropoutRng<'_>,
         training: bool,
     ) -> StepOutput {
         let model = self.clone().train();
-        let inputs = head_inputs(&self.encoder, &model.encoder, self.config.frozen, clips, more);
+        let inputs = head_inputs(&self.encoder, &model.encoder, self.config.frozen, clips, relabelled);
         let HeadInputs { now, goal, next, policy_goal } = &inputs;
-        let target = bootstrap(&self.value_predictor.teacher, &inputs, more, settings);
+        let target = bootstrap(&self.value_predictor.teacher, &inputs, relabelled, settings);
         let value = model.value_predictor.student.forward(now, goal, rng);
         let value_loss = loss::expectile(value.clone(), target.autodiff(), settings.expectile);
 
-        let worth =
+        let state_value =
             |frames: &Tensor<3>| self.value_predictor.student.forward(frames, policy_goal, &mut DropoutRng::disabled());
-        let advantage = worth(next) - worth(&now.clone().inner());
+        let advantage = state_value(next) - state_value(&now.clone().inner());
         let Policy { loss: policy_loss, weights } =
             policy(&model.action_predictor, model.log_stds.val(), &inputs, clips, advantage, settings, rng);
         let total = value_loss.clone() + policy_loss.clone();
@@ -91,32 +92,32 @@ impl Gcivl {
             ("policy_loss", scalar(&policy_loss)),
             ("value", scalar(&value.mean())),
             ("weight", scalar(&weights.mean())),
-            ("reached", scalar(&more.reached.clone().mean())),
+            ("reached", scalar(&relabelled.reached.clone().mean())),
         ];
         finish(&model, &total, metrics, training)
     }
 }
 
 impl Gciql {
-    /// Computes the losses of implicit Q-learning: values by expectile regression on a critic, the critic by regression on
-    /// bootstrapped targets, the policy by advantage-weighted regression.
+    /// Computes the losses of implicit Q-learning: values by expectile regression on a critic, the critic by regression
+    /// on bootstrapped targets, the policy by advantage-weighted regression.
     pub fn losses(
         &self,
         clips: &Clips,
-        more: &Relabelled,
+        relabelled: &Relabelled,
         settings: &ValueLoss,
         rng: &mut DropoutRng<'_>,
         training: bool,
     ) -> StepOutput {
         let model = self.clone().train();
-        let inputs = head_inputs(&self.encoder, &model.encoder, self.config.frozen, clips, more);
+        let inputs = head_inputs(&self.encoder, &model.encoder, self.config.frozen, clips, relabelled);
         let HeadInputs { now, goal, policy_goal, .. } = &inputs;
         let (actions, frames) = (clips.actions.clone(), now.clone().inner());
         let evaluate = |critic: &Critic, goal: &Tensor<3>| {
             critic.forward(&frames, actions.clone(), goal, &mut DropoutRng::disabled())
         };
 
-        let target = bootstrap(&self.value_predictor.teacher, &inputs, more, settings);
+        let target = bootstrap(&self.value_predictor.teacher, &inputs, relabelled, settings);
         let critic = model.critic_predictor.student.forward(now, actions.clone().autodiff(), goal, rng);
         let critic_loss = (critic - target.autodiff()).square().mean();
 
@@ -124,8 +125,8 @@ impl Gciql {
         let value = model.value_predictor.student.forward(now, goal, rng);
         let value_loss = loss::expectile(value.clone(), target.autodiff(), settings.expectile);
 
-        let worth = self.value_predictor.student.forward(&frames, policy_goal, &mut DropoutRng::disabled());
-        let advantage = evaluate(&self.critic_predictor.student, policy_goal) - worth;
+        let state_value = self.value_predictor.student.forward(&frames, policy_goal, &mut DropoutRng::disabled());
+        let advantage = evaluate(&self.critic_predictor.student, policy_goal) - state_value;
         let Policy { loss: policy_loss, weights } =
             policy(&model.action_predictor, model.log_stds.val(), &inputs, clips, advantage, settings, rng);
         let total = value_loss.clone() + critic_loss.clone() + policy_loss.clone();
@@ -136,7 +137,7 @@ impl Gciql {
             ("policy_loss", scalar(&policy_loss)),
             ("value", scalar(&value.mean())),
             ("weight", scalar(&weights.mean())),
-            ("reached", scalar(&more.reached.clone().mean())),
+            ("reached", scalar(&relabelled.reached.clone().mean())),
         ];
         finish(&model, &total, metrics, training)
     }
@@ -153,7 +154,13 @@ fn embed(encoder: &Backbone, images: Tensor<3>, clips: usize) -> Tensor<3> {
 }
 
 /// Encodes the inputs of the heads; only history and goal of the values are encoded in an autodiff graph.
-fn head_inputs(plain: &Backbone, trained: &Backbone, frozen: bool, clips: &Clips, more: &Relabelled) -> HeadInputs {
+fn head_inputs(
+    plain: &Backbone,
+    trained: &Backbone,
+    frozen: bool,
+    clips: &Clips,
+    relabelled: &Relabelled,
+) -> HeadInputs {
     let [count, history, _] = clips.actions.dims();
     let [frames, patches, elements] = clips.frames.dims();
     let steps = frames / count;
@@ -173,18 +180,18 @@ fn head_inputs(plain: &Backbone, trained: &Backbone, frozen: bool, clips: &Clips
         now,
         goal: encode(clips.goal.clone()),
         next: if history > 1 { Tensor::cat(vec![rest, last], 1) } else { last },
-        policy_goal: embed(plain, more.policy_goal.clone(), count),
+        policy_goal: embed(plain, relabelled.policy_goal.clone(), count),
     }
 }
 
-/// Returns the bootstrapped targets `r + γ m V(s', g)`: the reward is -1 and `m` is 1 until the goal is reached, then both
-/// are 0.
+/// Returns the bootstrapped targets `r + γ m V(s', g)`: the reward is -1 and `m` is 1 until the goal is reached, then
+/// both are 0.
 ///
 /// # Shapes
 /// Returns `[clips, history, 1]`.
-fn bootstrap(teacher: &Head, inputs: &HeadInputs, more: &Relabelled, settings: &ValueLoss) -> Tensor<3> {
+fn bootstrap(teacher: &Head, inputs: &HeadInputs, relabelled: &Relabelled, settings: &ValueLoss) -> Tensor<3> {
     let next = teacher.forward(&inputs.next, &inputs.goal.clone().inner(), &mut DropoutRng::disabled());
-    let not_reached = -more.reached.clone() + 1.0;
+    let not_reached = -relabelled.reached.clone() + 1.0;
     (next * settings.discount - 1.0) * not_reached
 }
 

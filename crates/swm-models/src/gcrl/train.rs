@@ -1,4 +1,4 @@
-//! [`Trainable`] for goal-conditioned models: the training loop's view of [`super::step`].
+//! [`Trainable`] for goal-conditioned models, which connects [`super::step`] to the training loop.
 
 use super::config::GcrlConfig;
 use super::loss::{CloningLoss, ValueLoss};
@@ -16,7 +16,7 @@ use swm_core::columns::{ACTION, PIXELS};
 use swm_core::{Batch, Error, Key, Result, Schema};
 use swm_data::{ClipSpec, GoalMixture, GoalSpec, LoaderConfig};
 
-/// Names of goals, which prefix the columns of a batch.
+/// Names of goals, which are prefixes of column names in a batch.
 const GOAL: &str = "goal";
 const POLICY_GOAL: &str = "policy_goal";
 
@@ -38,7 +38,7 @@ macro_rules! presets {
 
 /// A trained goal-conditioned model of any family.
 pub trait GoalConditioned: Trainable {
-    /// Returns the encoder and policy head, which act.
+    /// Returns the encoder and the policy head, which compute actions.
     fn actor(checkpoint: &Checkpoint<Self>) -> Actor;
 }
 
@@ -113,7 +113,7 @@ impl Trainable for Gcbc {
 }
 
 macro_rules! value_learner {
-    ($model:ty, $family:literal, $summary:literal, [$($slow:ident),*]) => {
+    ($model:ty, $family:literal, $summary:literal, [$($target:ident),*]) => {
         impl Trainable for $model {
             const FAMILY: &'static str = $family;
             const SUMMARY: &'static str = $summary;
@@ -162,14 +162,14 @@ macro_rules! value_learner {
                 shards::mean(batch.rows(), config.shards, |range| {
                     let mut rng = key.with("dropout").at(range.start as u64).rng();
                     let mut noise = DropoutRng(training.then_some(&mut rng));
-                    let (clips, more) = (read.clips(range.clone())?, read.relabelled(range)?);
-                    Ok(self.losses(&clips, &more, &config.loss, &mut noise, *training))
+                    let (clips, relabelled) = (read.clips(range.clone())?, read.relabelled(range)?);
+                    Ok(self.losses(&clips, &relabelled, &config.loss, &mut noise, *training))
                 })
             }
 
             fn after_step(mut self, context: &StepContext<'_, Self>, _: Named<Tensor<1>>) -> Self {
                 let keep = f64::from(context.config.loss.target);
-                $(self.$slow = self.$slow.update_target(keep);)*
+                $(self.$target = self.$target.update_target(keep);)*
                 self
             }
 
@@ -192,8 +192,8 @@ value_learner!(
     [value_predictor, critic_predictor]
 );
 
-/// Returns the encoder with the weights that `from` names, of an encoder or of a model with one; unchanged if `from` is
-/// empty.
+/// Returns the encoder with the weights in the file or repository `from`, which holds an encoder or a model with an
+/// encoder. Returns the encoder unchanged if `from` is empty.
 fn with_weights(encoder: Backbone, from: &str, cache: &Path) -> Result<Backbone> {
     if from.is_empty() {
         return Ok(encoder);
@@ -284,7 +284,7 @@ impl<'a> BatchReader<'a> {
         Ok(Self { config, device, steps, frames: batch.get(PIXELS)?, batch, actions })
     }
 
-    /// Returns the images of some clips from a column with `per_clip` images per clip.
+    /// Returns the images of a range of clips from a column with `per_clip` images per clip.
     fn part<'b>(&self, images: &'b [u8], per_clip: usize, clips: &Range<usize>) -> &'b [u8] {
         let bytes = per_clip * self.config.image * self.config.image * 3;
         &images[clips.start * bytes..clips.end * bytes]

@@ -1,8 +1,8 @@
 //! [`Transformer`]: a transformer over the patches of a few frames and of a goal image, with one output per frame.
 //!
 //! Layers alternate between causal attention among the patches of the frames and attention to the patches of the goal.
-//! The output of a frame is pooled at the end: by a last layer in which one learnt token per frame attends to the patches
-//! up to that frame, or as the mean of the frame's patches.
+//! The output of a frame is pooled at the end: by a last layer in which one learnt token per frame attends to the
+//! patches up to that frame, or as the mean of the frame's patches.
 
 use crate::nn::attention::{AttentionOutput, attend, causal_mask};
 use crate::nn::{DropoutRng, FeedForward, Init, LayerNorm, Linear};
@@ -31,9 +31,9 @@ pub struct TransformerConfig {
 /// How the patches of a frame are pooled.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pool {
-    /// A learnt token per frame attends to them in the last layer, as published for policies.
+    /// In the last layer, a learnt token per frame attends to the patches, as published for policies.
     Attention,
-    /// Their mean, as published for values.
+    /// The mean of the patches, as published for values.
     Mean,
 }
 
@@ -110,7 +110,7 @@ const EPSILON: f64 = 1e-5;
 const TOKEN_STD: f32 = 0.02;
 
 impl TransformerConfig {
-    /// A transformer for inputs of the given sizes.
+    /// Creates a transformer for inputs of the given sizes.
     pub fn init(&self, init: &Init, grid: PatchGrid, pool: Pool) -> Transformer {
         let layer = |index| {
             let init = init.of("layer").at(index);

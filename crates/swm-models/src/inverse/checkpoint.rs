@@ -19,8 +19,8 @@ pub struct InverseCheckpoint {
     pub model: Mlp,
     /// The training configuration.
     pub config: InverseConfig,
-    /// The origin of the checkpoint; `hashes["weights"]` is the hash of the network, `hashes["encoder"]` that of the
-    /// world model.
+    /// The origin of the checkpoint; `hashes["weights"]` is the hash of the network, `hashes["encoder"]` is the hash of
+    /// the world model.
     pub manifest: Manifest,
 }
 
@@ -48,7 +48,8 @@ impl InverseCheckpoint {
     /// Loads the checkpoint of a run folder.
     ///
     /// # Errors
-    /// When there is none, it is of another family, it is damaged, or its weights do not fit its configuration.
+    /// When the folder holds no checkpoint, or the checkpoint is of another family, is damaged, or has weights that
+    /// do not fit its configuration.
     pub fn load(run: &Path, device: &Device) -> Result<Self> {
         let stored = checkpoint::StoredCheckpoint::<InverseConfig>::read(run, FAMILY)?;
         let world_model = Checkpoint::<Lewm>::load(&run.join(WORLD_MODEL), device)?;

@@ -1,5 +1,5 @@
-//! The uses of an inverse-dynamics policy. It has a training loop and a checkpoint of its own, because it is trained on
-//! the latents of another checkpoint.
+//! [`TrainableConfig`] and [`LoadedModel`] for inverse dynamics, which has its own training loop and checkpoint format
+//! because its network is trained on the latents of another checkpoint.
 
 use super::checkpoint::FAMILY;
 use super::{InverseCheckpoint, InverseConfig, InversePolicy, train};

@@ -2,9 +2,9 @@
 //!
 //! In training, the network reads the latents of a frame and of a frame up to `offset` model steps later, and predicts
 //! the actions between the first frame and the next (mean squared error of normalised actions). The policy reads the
-//! goal's latent as the later one, so a decision costs one encoding and no search. It is the cheap baseline for planners
-//! that use the same latents. Sources: Jordan and Rumelhart 1992 ("distal teacher"); Pathak et al. 2018 (zero-shot visual
-//! imitation). PLDM uses inverse dynamics as a term of its loss.
+//! latent of the goal in place of the later frame's latent, so a decision costs one encoding and no search. The policy
+//! is a cheap baseline for planners that use the same latents. Sources: Jordan and Rumelhart 1992 ("distal teacher");
+//! Pathak et al. 2018 (zero-shot visual imitation). PLDM uses inverse dynamics as a term of its loss.
 
 mod checkpoint;
 mod family;

@@ -195,16 +195,16 @@ fn loader(config: &InverseConfig, frameskip: usize, reader: Arc<dyn Reader>) -> 
 struct Pairs {
     /// `[pairs, 2 * latent]`.
     latents: Vec<f32>,
-    /// `[pairs, actions]`.
+    /// `[pairs, action_dim]`.
     actions: Vec<f32>,
     count: usize,
 }
 
-/// Frames that are encoded at once: a constant, so that latents do not depend on the number of threads.
+/// Frames that are encoded in one call: a constant, so that latents do not depend on the number of threads.
 const FRAMES: usize = 64;
 
 impl Pairs {
-    /// Draws one pair for every frame of every clip except the last: the goal is a random later frame.
+    /// Draws one pair for every frame of a clip except the last frame. The goal is a random later frame of the clip.
     fn draw(world_model: &Checkpoint<Lewm>, offset: usize, batch: &swm_core::Batch, key: Key) -> Result<Self> {
         let (config, dim) = (&world_model.config.model, world_model.dataset_info.action.dim());
         let (latent, actions) = (config.latent, world_model.config.data.frameskip * dim);
@@ -240,8 +240,8 @@ impl Pairs {
     }
 }
 
-/// Takes one optimizer step with the learning rate times `factor`; returns the new network, the loss before the step and
-/// the norm of the gradient.
+/// Takes one optimizer step with the learning rate times `factor`; returns the new network, the loss before the step
+/// and the norm of the gradient.
 fn optimizer_step(model: Mlp, optimizer: &mut AdamW, factor: f64, pairs: Pairs) -> Result<(Mlp, f64, f64)> {
     let tensor = |values: Vec<f32>| {
         let width = values.len() / pairs.count;

@@ -19,7 +19,7 @@ pub struct LewmConfig {
     pub pixel_std: [f32; 3],
     /// Latent dimension.
     pub latent: usize,
-    /// Output features of the first layer of the action encoder; 0 for as many as an action has elements.
+    /// Output features of the first layer of the action encoder; 0 for the action dimension.
     #[serde(default)]
     pub smoothed: usize,
     /// Hidden features of the projectors after the encoder and the predictor.
@@ -34,7 +34,7 @@ impl LewmConfig {
     /// Checks that the sizes are consistent.
     ///
     /// # Errors
-    /// Names the first size that is not.
+    /// When a size is invalid; the error names the first such size.
     pub fn check(&self) -> Result<()> {
         let predictor = &self.predictor;
         at_least(&[

@@ -1,9 +1,9 @@
 //! [`LewmCost`]: the planning cost of a LeWM, the squared distance between the last predicted latent of a candidate and
 //! the latent of the goal image.
 //!
-//! Every environment is evaluated in calls whose shapes do not depend on the other environments, each on one thread of the
-//! current rayon pool. So the bytes of an environment's plan depend neither on the other environments nor on the number of
-//! threads.
+//! Every environment is evaluated in calls whose shapes do not depend on the other environments, each on one thread of
+//! the current rayon pool. So the bytes of an environment's plan depend neither on the other environments nor on the
+//! number of threads.
 
 use super::config::LewmConfig;
 use super::host_encoder::HostEncoder;
@@ -23,43 +23,43 @@ pub struct LewmCost {
     pub(super) model: Lewm,
     host: Option<Host>,
     pub(super) config: LewmConfig,
-    pub(super) actions: usize,
+    pub(super) action_dim: usize,
     pub(super) contexts: Vec<PlanContext>,
 }
 
-/// The model laid out for the CPU. Other devices use the tensors of the model.
+/// The weights laid out for the CPU kernels. On other devices, the cost uses the tensors of the model.
 struct Host {
     rollout: Rollout,
     encoder: Option<HostEncoder>,
 }
 
-/// The latents of one environment that its plan starts from and ends at.
+/// The start latents and the goal latent of one environment's plan.
 #[derive(Clone)]
 pub(super) struct PlanContext {
     /// The latents of the last frames, oldest first: `[frames, latent]`.
     pub start: Vec<f32>,
-    /// The actions taken between them, in model units: `[frames - 1, actions]`.
+    /// The actions taken between the start frames, in model units: `[frames - 1, action_dim]`.
     pub past: Vec<f32>,
     /// The latent of the goal image, `[latent]`.
     pub goal: Vec<f32>,
 }
 
 impl LewmCost {
-    /// The planning cost of a trained model.
+    /// Creates the planning cost of a trained model.
     pub fn new(checkpoint: &Checkpoint<Lewm>) -> Self {
         Self::of(&checkpoint.model, &checkpoint.config.model, checkpoint.actions())
     }
 
-    /// The planning cost of a model with these sizes, whose actions have `actions` elements.
-    pub fn of(model: &Lewm, config: &LewmConfig, actions: usize) -> Self {
+    /// Creates the planning cost of a model with the configuration `config` and actions of `action_dim` elements.
+    pub fn of(model: &Lewm, config: &LewmConfig, action_dim: usize) -> Self {
         let on_host = model.device() == Device::flex();
         let host = on_host.then(|| Host { rollout: Rollout::new(model), encoder: HostEncoder::new(model, config) });
-        Self { model: model.clone(), host, config: config.clone(), actions, contexts: vec![] }
+        Self { model: model.clone(), host, config: config.clone(), action_dim, contexts: vec![] }
     }
 
-    /// Checks that candidates and costs are for the observed environments.
+    /// Checks that candidates and costs have the sizes for the observed environments.
     pub(super) fn check_sizes(&self, candidates: &Candidates<'_>, costs: &[f32]) -> Result<()> {
-        checks::candidate_sizes("costs of a LeWM", candidates, costs, [self.contexts.len(), self.actions])
+        checks::candidate_sizes("costs of a LeWM", candidates, costs, [self.contexts.len(), self.action_dim])
     }
 
     /// Returns the latent of one image.
@@ -77,7 +77,7 @@ impl LewmCost {
         })
     }
 
-    /// Encodes present, recent frames and goal of one environment.
+    /// Encodes the current frame, the recorded history and the goal of one environment.
     fn context(&self, infos: &Batch, env: usize) -> Result<PlanContext> {
         let row = infos.row(env);
         // One image per call: a latent must not depend on the number of images in a call.
@@ -93,7 +93,7 @@ impl LewmCost {
             for frame in frames[frames.len() - length * bytes..].rchunks_exact(bytes) {
                 start.insert(0, self.latent_of(frame)?);
             }
-            past = actions[actions.len() - length * self.actions..].to_vec();
+            past = actions[actions.len() - length * self.action_dim..].to_vec();
         }
         Ok(PlanContext { start: start.concat(), past, goal: self.latent_of(row.get::<u8>(GOAL)?)? })
     }
@@ -103,7 +103,7 @@ impl PlanContext {
     /// Writes the costs of candidates.
     ///
     /// # Shapes
-    /// `candidates` is `[samples, horizon, actions]`, `costs` is `[samples]`.
+    /// `candidates` is `[samples, horizon, action_dim]`, `costs` is `[samples]`.
     fn cost(&self, predictor: &RolloutModel<'_>, candidates: &[f32], horizon: usize, costs: &mut [f32]) {
         let (samples, latent) = (costs.len(), self.goal.len());
         let steps = self.start.len() / latent - 1 + horizon;
@@ -129,7 +129,7 @@ impl RolloutModel<'_> {
     /// Returns the last latents of a rollout.
     ///
     /// # Shapes
-    /// `start` is `[frames, latent]`, `actions` is `[samples, steps, actions]`; returns `[samples, latent]`.
+    /// `start` is `[frames, latent]`, `actions` is `[samples, steps, action_dim]`; returns `[samples, latent]`.
     fn last(&self, start: &[f32], actions: Vec<f32>, samples: usize, steps: usize) -> Vec<f32> {
         match self {
             Self::Host(rollout) => rollout.run(start, &actions, samples, steps).pop().unwrap_or_default(),
@@ -145,8 +145,8 @@ impl RolloutModel<'_> {
         }
     }
 
-    /// Returns how many of `samples` candidates are rolled out in one call.
-    fn part(&self, samples: usize) -> usize {
+    /// Returns the number of candidates that are rolled out in one call, given `samples` candidates.
+    fn chunk_size(&self, samples: usize) -> usize {
         match self {
             Self::Host(_) => Rollout::part(samples),
             Self::Device(_) => samples,
@@ -156,7 +156,7 @@ impl RolloutModel<'_> {
 
 impl CostModel for LewmCost {
     fn observe(&mut self, infos: &Batch, envs: &[usize]) -> Result<()> {
-        checks::planning_images(infos.schema(), self.config.image, self.actions)?;
+        checks::planning_images(infos.schema(), self.config.image, self.action_dim)?;
         let contexts: Result<Vec<PlanContext>> = envs.par_iter().map(|&env| self.context(infos, env)).collect();
         self.contexts = contexts?;
         Ok(())
@@ -169,12 +169,12 @@ impl CostModel for LewmCost {
             Some(host) => RolloutModel::Host(&host.rollout),
             None => RolloutModel::Device(&self.model),
         };
-        // Each environment's candidates are split into parts on their own.
-        let (contexts, part) = (&self.contexts, predictor.part(samples));
+        // The candidates of each environment are split separately, so that no chunk spans two environments.
+        let (contexts, chunk_size) = (&self.contexts, predictor.chunk_size(samples));
         costs.par_chunks_mut(samples).zip(actions.par_chunks(samples * horizon * dim)).zip(contexts).for_each(
             |((costs, actions), context)| {
-                let parts = costs.par_chunks_mut(part).zip(actions.par_chunks(part * horizon * dim));
-                parts.for_each(|(costs, actions)| context.cost(&predictor, actions, horizon, costs));
+                let chunks = costs.par_chunks_mut(chunk_size).zip(actions.par_chunks(chunk_size * horizon * dim));
+                chunks.for_each(|(costs, actions)| context.cost(&predictor, actions, horizon, costs));
             },
         );
         Ok(())
@@ -217,16 +217,16 @@ mod tests {
         let costs = |on_host: bool| {
             let mut cost = LewmCost::of(&model, &config.model, dim);
             cost.host = cost.host.filter(|_| on_host);
-            cost.observe(&infos, &[0]).expect("observed");
+            cost.observe(&infos, &[0]).expect("observed environments");
             let mut costs = vec![0.0; samples];
             let candidates = Candidates { actions: &actions, envs: 1, samples, horizon, dim };
             cost.cost(candidates, &mut costs).expect("costs");
             costs
         };
-        let (host, other) = (costs(true), costs(false));
+        let (host, device) = (costs(true), costs(false));
         assert!(host.windows(2).all(|pair| pair[0] != pair[1]), "actions have no effect: {host:?}");
-        for (host, other) in host.iter().zip(&other) {
-            assert!((host - other).abs() < 1e-4 * other.abs(), "{host} for {other}");
+        for (host, device) in host.iter().zip(&device) {
+            assert!((host - device).abs() < 1e-4 * device.abs(), "the CPU cost is {host}, the device cost is {device}");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The uses of a trained LeWM.
+//! [`ModelFamily`] for LeWM.
 
 use super::predictor::LewmPredictor;
 use super::{Lewm, LewmConfig, LewmCost, import, pixels};

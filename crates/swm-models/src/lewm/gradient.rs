@@ -1,11 +1,11 @@
-//! Gradients of [`LewmCost`] with respect to actions, and latent dynamics with vector-Jacobian products, by Burn's autodiff
-//! of [`Lewm::rollout`].
+//! Gradients of [`LewmCost`] with respect to actions, and latent dynamics with vector-Jacobian products, by Burn's
+//! autodiff of [`Lewm::rollout`].
 //!
-//! The latent state of a solver is that of one frame: [`LatentDynamics::predict`] uses a window of one latent, which the
-//! predictor is trained on at the first frame of every clip. The cost and its gradient use the whole window.
+//! The state of a solver is the latent of one frame: [`LatentDynamics::predict`] uses a window of one latent, as
+//! training does at the first frame of every clip. The cost and its gradient use the whole window.
 //!
-//! The rows of each environment are split into parts on their own, so that its results do not depend on the other
-//! environments.
+//! The rows of each environment are split into chunks separately, so that the results of an environment do not depend
+//! on the other environments.
 
 use super::cost::{LewmCost, PlanContext};
 use super::model::Lewm;
@@ -20,9 +20,9 @@ fn tensor<const D: usize>(model: &Lewm, values: Vec<f32>, shape: [usize; D]) -> 
     Tensor::from_data(TensorData::new(values, shape), &model.device().inner())
 }
 
-/// Returns how many of `rows` are differentiated at once: equal parts of at most 80. The rounding of Burn's products depends
-/// on this number, so it must not depend on the machine.
-fn part(rows: usize) -> usize {
+/// Returns the number of rows that are differentiated in one call, given `rows` rows: equal chunks of at most 80 rows.
+/// The rounding of Burn's products depends on the chunk size, so the chunk size must not depend on the machine.
+fn chunk_size(rows: usize) -> usize {
     rows.div_ceil(rows.div_ceil(80).max(1)).max(1)
 }
 
@@ -31,7 +31,7 @@ fn differentiable(model: &Lewm) -> Lewm {
     model.clone().train().no_grad()
 }
 
-/// Writes costs of candidates of one environment and their gradients.
+/// Writes the costs of one environment's candidates, and the gradients of the costs.
 ///
 /// # Shapes
 /// `actions` and `gradient` are `[samples, horizon, dim]`, `costs` is `[samples]`.
@@ -46,11 +46,11 @@ fn cost_and_gradient(
     let (latent, past) = (context.goal.len(), context.past.len() / dim);
     let frames = context.start.len() / latent;
     let start = tensor(model, context.start.repeat(samples), [samples, frames, latent]).autodiff();
-    let free = tensor(model, actions.to_vec(), [samples, horizon, dim]).autodiff().require_grad();
+    let leaf = tensor(model, actions.to_vec(), [samples, horizon, dim]).autodiff().require_grad();
     let taken = match past {
-        0 => free.clone(),
+        0 => leaf.clone(),
         _ => Tensor::cat(
-            vec![tensor(model, context.past.repeat(samples), [samples, past, dim]).autodiff(), free.clone()],
+            vec![tensor(model, context.past.repeat(samples), [samples, past, dim]).autodiff(), leaf.clone()],
             1,
         ),
     };
@@ -60,10 +60,10 @@ fn cost_and_gradient(
     let cost = (end - goal).square().sum_dim(2);
     costs.copy_from_slice(&cost.clone().inner().into_data().into_f32_vec());
     let all = cost.sum().backward();
-    copy_gradient(free.grad(&all), gradient);
+    copy_gradient(leaf.grad(&all), gradient);
 }
 
-/// Copies the gradient of a leaf; zeros if nothing depends on it.
+/// Copies the gradient of a leaf; writes zeros if the leaf has no gradient.
 fn copy_gradient<const D: usize>(gradient: Option<Tensor<D>>, to: &mut [f32]) {
     match gradient {
         Some(gradient) => to.copy_from_slice(&gradient.into_data().into_f32_vec()),
@@ -80,12 +80,12 @@ impl DifferentiableCost for LewmCost {
             return Err(Error::mismatch("the number of elements in the gradient of a LeWM's cost", given, expected));
         }
         let model = differentiable(&self.model);
-        let (width, part) = (horizon * dim, part(samples));
+        let (width, chunk_size) = (horizon * dim, chunk_size(samples));
         let rows = costs.par_chunks_mut(samples).zip(gradient.par_chunks_mut(samples * width));
         rows.zip(actions.par_chunks(samples * width)).zip(&self.contexts).for_each(
             |(((costs, gradient), actions), context)| {
-                let parts = costs.par_chunks_mut(part).zip(gradient.par_chunks_mut(part * width));
-                parts.zip(actions.par_chunks(part * width)).for_each(|((costs, gradient), actions)| {
+                let parts = costs.par_chunks_mut(chunk_size).zip(gradient.par_chunks_mut(chunk_size * width));
+                parts.zip(actions.par_chunks(chunk_size * width)).for_each(|((costs, gradient), actions)| {
                     cost_and_gradient(&model, context, [costs.len(), horizon, dim], actions, costs, gradient);
                 });
             },
@@ -95,12 +95,13 @@ impl DifferentiableCost for LewmCost {
 }
 
 impl LewmCost {
-    /// Checks the lengths of latents, actions and other arrays (name, length, width); returns the rows per environment.
-    fn pairs(&self, latents: &[f32], actions: &[f32], others: &[(&str, usize, usize)]) -> Result<usize> {
+    /// Checks the lengths of latents, actions and additional arrays, each given as (name, length, width). Returns the
+    /// number of rows per environment.
+    fn pairs(&self, latents: &[f32], actions: &[f32], additional: &[(&str, usize, usize)]) -> Result<usize> {
         let (latent, envs) = (self.config.latent, self.contexts.len().max(1));
         let n = latents.len() / latent;
-        let given = [("latents", latents.len(), latent), ("actions", actions.len(), self.actions)];
-        for &(what, length, width) in given.iter().chain(others) {
+        let given = [("latents", latents.len(), latent), ("actions", actions.len(), self.action_dim)];
+        for &(what, length, width) in given.iter().chain(additional) {
             if length != n * width || !n.is_multiple_of(envs) {
                 return Err(Error::mismatch(
                     format!("one step of a LeWM: {what}"),
@@ -140,10 +141,10 @@ impl LatentDynamics for LewmCost {
     fn predict(&mut self, latents: &[f32], actions: &[f32], next: &mut [f32]) -> Result<()> {
         let latent = self.config.latent;
         let rows = self.pairs(latents, actions, &[("next latents", next.len(), latent)])?;
-        let parts = chunks(latents, rows, latent).zip(chunks(actions, rows, self.actions));
+        let parts = chunks(latents, rows, latent).zip(chunks(actions, rows, self.action_dim));
         let mut work: Vec<_> = parts.zip(chunks_mut(next, rows, latent)).collect();
         work.par_iter_mut().for_each(|((latents, actions), next)| {
-            let (n, dim) = (latents.len() / latent, self.actions);
+            let (n, dim) = (latents.len() / latent, self.action_dim);
             let window = tensor(&self.model, latents.to_vec(), [n, 1, latent]);
             let conditions = self.model.embed_actions(tensor(&self.model, actions.to_vec(), [n, 1, dim]));
             next.copy_from_slice(&self.model.predict(window, conditions).into_data().into_f32_vec());
@@ -159,13 +160,13 @@ impl LatentDynamics for LewmCost {
         latent_gradient: &mut [f32],
         action_gradient: &mut [f32],
     ) -> Result<()> {
-        let (latent, dim) = (self.config.latent, self.actions);
-        let others = [
+        let (latent, dim) = (self.config.latent, self.action_dim);
+        let additional = [
             ("gradients of next latents", next_gradient.len(), latent),
             ("gradients of latents", latent_gradient.len(), latent),
             ("gradients of actions", action_gradient.len(), dim),
         ];
-        let rows = self.pairs(latents, actions, &others)?;
+        let rows = self.pairs(latents, actions, &additional)?;
         let model = differentiable(&self.model);
         let given =
             chunks(latents, rows, latent).zip(chunks(actions, rows, dim)).zip(chunks(next_gradient, rows, latent));
@@ -184,14 +185,14 @@ impl LatentDynamics for LewmCost {
     }
 }
 
-/// Splits rows of `width` elements into the parts that are computed together; no part spans two environments.
+/// Splits rows of `width` elements into chunks; no chunk spans two environments.
 fn chunks(values: &[f32], rows: usize, width: usize) -> impl Iterator<Item = &[f32]> {
-    let part = part(rows);
-    values.chunks(rows.max(1) * width).flat_map(move |env| env.chunks(part * width))
+    let chunk_size = chunk_size(rows);
+    values.chunks(rows.max(1) * width).flat_map(move |env| env.chunks(chunk_size * width))
 }
 
 /// Splits mutable rows as [`chunks`] does.
 fn chunks_mut(values: &mut [f32], rows: usize, width: usize) -> impl Iterator<Item = &mut [f32]> {
-    let part = part(rows);
-    values.chunks_mut(rows.max(1) * width).flat_map(move |env| env.chunks_mut(part * width))
+    let chunk_size = chunk_size(rows);
+    values.chunks_mut(rows.max(1) * width).flat_map(move |env| env.chunks_mut(chunk_size * width))
 }

@@ -18,12 +18,13 @@ use swm_core::{Error, Key, Manifest, Result};
 const MODULES: &str = "stable_worldmodel.wm.lewm.module";
 const CLASS: &str = "stable_worldmodel.wm.lewm.LeWM";
 
-/// Converts a LeWM of the reference implementation: a folder with `weights.pt` and `config.json`, or that file. The files
-/// do not store how actions were normalised, so `dataset_info` must describe the dataset it was trained on.
+/// Converts a LeWM of the reference implementation: a folder with `weights.pt` and `config.json`, or the path of the
+/// weights. The files do not store how actions were normalised, so `dataset_info` must describe the model's training
+/// dataset.
 ///
 /// # Errors
-/// When it is another model or an unsupported variant, it is damaged, or its action size is no multiple of that in
-/// `dataset_info`.
+/// When a file is damaged or holds another model or an unsupported variant, or the model's action dimension is not a
+/// multiple of the action dimension in `dataset_info`.
 pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<Lewm>> {
     let (model, sizes, frameskip) = world_model(Reference::open(from, "LeWM")?, &dataset_info)?;
     let mut config = TrainConfig::<Lewm>::load("paper", &[])?;

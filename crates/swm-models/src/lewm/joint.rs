@@ -20,14 +20,14 @@ pub(crate) struct JointStep {
     pub prediction: f64,
     /// Gradients by parameter of the model, flat.
     pub gradients: Named<Tensor<1>>,
-    /// All gradients, which include those of the regulariser's own parameters.
+    /// All gradients, including the gradients of the regulariser's own parameters.
     pub all: Gradients,
     /// Batch statistics of the projectors after the encoder and after the predictor.
     pub statistics: [BatchStatistics; 2],
 }
 
-/// Returns every window of `history` steps that is followed by a step, shifted by `offset` steps: one window per clip if
-/// clips are one step longer than the history, as published.
+/// Returns every window of `history` steps that is followed by a step, shifted by `offset` steps: one window per clip
+/// if clips are one step longer than the history, as published.
 ///
 /// # Shapes
 /// `x` is `[clips, steps, width]`; returns `[(steps - history) * clips, history, width]`.
@@ -37,8 +37,8 @@ fn windows(x: &Tensor<3>, history: usize, offset: usize) -> Tensor<3> {
     Tensor::cat(starts.map(|s| x.clone().slice([0..clips, s + offset..s + offset + history, 0..width])).collect(), 0)
 }
 
-/// Computes prediction error and gradients of a batch. The loss is the prediction error plus `regularise(latents)`, where
-/// the latents are `[clips, steps, latent]`. `model` has no autodiff; `shards` is at least 1.
+/// Computes prediction error and gradients of a batch. The loss is the prediction error plus `regularise(latents)`,
+/// where the latents are `[clips, steps, latent]`. `model` has no autodiff; `shards` is at least 1.
 pub(crate) fn step(
     model: &Lewm,
     batch: &TrainBatch,

@@ -1,5 +1,5 @@
-//! SIGReg, the regulariser that keeps latents from collapsing (LeJEPA, arXiv 2511.08544; published settings: 17 knots up
-//! to 3).
+//! SIGReg, the regulariser that keeps latents from collapsing (LeJEPA, arXiv 2511.08544; published settings: 17 knots
+//! up to 3).
 //!
 //! The latents of a batch are projected on random directions, and the empirical characteristic function of each
 //! projection is compared with that of a standard normal distribution by the Epps-Pulley statistic, integrated by the
@@ -30,11 +30,11 @@ pub fn directions(key: Key, dim: usize, count: usize) -> Vec<f32> {
 
 /// The trapezoidal rule over the arguments (knots) of the characteristic functions, from 0 to [`LAST_KNOT`].
 struct Quadrature {
-    /// The distance of neighbouring knots.
+    /// The distance between neighbouring knots.
     spacing: f32,
     /// The characteristic function of the standard normal distribution at each knot.
     target: Vec<f32>,
-    /// The weight of each knot, which counts its negative too.
+    /// The weight of each knot, which includes the weight of the knot's negative.
     weights: Vec<f32>,
 }
 
@@ -89,8 +89,8 @@ impl Quadrature {
     }
 }
 
-/// Computes the Epps-Pulley statistic, `n ∫ |φ_n(t) - exp(-t²/2)|² exp(-t²/2) dt` averaged over steps and directions, and its
-/// gradient with respect to the latents.
+/// Computes the Epps-Pulley statistic, `n ∫ |φ_n(t) - exp(-t²/2)|² exp(-t²/2) dt` averaged over steps and directions,
+/// and its gradient with respect to the latents.
 ///
 /// # Shapes
 /// `latents` is `[batch, steps, dim]`, `directions` is `[count, dim]`; the gradient has the shape of the latents.

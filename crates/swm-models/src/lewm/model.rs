@@ -10,29 +10,29 @@ use swm_core::Key;
 /// A LeWM: encodes images to latents, and predicts the next latents from latents and actions.
 #[derive(Module, Debug)]
 pub struct Lewm {
-    /// From images to features.
+    /// Maps images to features.
     pub encoder: Encoder,
-    /// From features to latents.
+    /// Maps features to latents.
     pub projector: Projector,
-    /// From actions to conditions.
+    /// Maps actions to conditions.
     pub action_encoder: Embedder,
-    /// From latents and conditions to features of the next latents.
+    /// Maps latents and conditions to features of the next latents.
     pub predictor: Predictor,
-    /// From features of the predictor to latents.
+    /// Maps features of the predictor to latents.
     pub pred_proj: Projector,
 }
 
 impl Lewm {
-    /// A model with random weights for actions of `actions` elements per model step.
-    pub fn init(config: &LewmConfig, actions: usize, key: Key, device: &Device) -> Self {
+    /// Creates a model with random weights for actions of `action_dim` elements per model step.
+    pub fn init(config: &LewmConfig, action_dim: usize, key: Key, device: &Device) -> Self {
         let init = Init::new(key, device);
         let features = config.encoder.dim();
         let project = |name| Projector::new(&init.of(name), features, config.projector, config.latent);
-        let smoothed = if config.smoothed == 0 { actions } else { config.smoothed };
+        let smoothed = if config.smoothed == 0 { action_dim } else { config.smoothed };
         Self {
             encoder: config.encoder.init(&init.of("encoder"), config.image),
             projector: project("projector"),
-            action_encoder: Embedder::new(&init.of("action_encoder"), actions, smoothed, config.latent),
+            action_encoder: Embedder::new(&init.of("action_encoder"), action_dim, smoothed, config.latent),
             predictor: config.predictor.init(&init.of("predictor"), config.latent),
             pred_proj: Projector::new(&init.of("pred_proj"), config.latent, config.projector, config.latent),
         }
@@ -52,7 +52,7 @@ impl Lewm {
     /// Encodes images.
     ///
     /// # Shapes
-    /// `[frames, patches, 3 * patch * patch]` to `[frames, latent]`.
+    /// Maps `[frames, patches, 3 * patch * patch]` to `[frames, latent]`.
     pub fn encode(&self, patches: Tensor<3>) -> Tensor<2> {
         self.projector.forward(self.encoder.forward(patches))
     }
@@ -60,7 +60,7 @@ impl Lewm {
     /// Embeds actions as conditions of the predictor.
     ///
     /// # Shapes
-    /// `[windows, steps, actions]` to `[windows, steps, latent]`.
+    /// Maps `[windows, steps, action_dim]` to `[windows, steps, latent]`.
     pub fn embed_actions(&self, actions: Tensor<3>) -> Tensor<3> {
         let [windows, steps, elements] = actions.dims();
         let embedded = self.action_encoder.forward(actions.reshape([windows * steps, elements]));
@@ -97,8 +97,8 @@ impl Lewm {
     /// Rolls the model out: returns the given latents, then one predicted latent after each further action.
     ///
     /// # Shapes
-    /// `latents` is `[windows, given, latent]`, `actions` is `[windows, steps, actions]` with `steps >= given`; returns
-    /// `[windows, steps + 1, latent]`.
+    /// `latents` is `[windows, given, latent]`, `actions` is `[windows, steps, action_dim]` with `steps >= given`;
+    /// returns `[windows, steps + 1, latent]`.
     pub fn rollout(&self, latents: Tensor<3>, actions: Tensor<3>) -> Tensor<3> {
         let [windows, given, latent] = latents.dims();
         let [_, steps, _] = actions.dims();

@@ -16,7 +16,7 @@ pub fn check(config: &LewmConfig, schema: &Schema, column: &str) -> Result<()> {
 /// Converts images to normalised patches.
 ///
 /// # Shapes
-/// `[frames, image, image, 3]` bytes to `[frames, patches, 3 * patch * patch]`.
+/// Maps `[frames, image, image, 3]` bytes to `[frames, patches, 3 * patch * patch]`.
 ///
 /// # Errors
 /// When the bytes are not a whole number of images.
@@ -27,7 +27,7 @@ pub fn patches(config: &LewmConfig, rgb: &[u8], device: &Device) -> Result<Tenso
 /// Converts images to normalised colour planes.
 ///
 /// # Shapes
-/// `[frames, image, image, 3]` bytes to `[frames, 3, image, image]`.
+/// Maps `[frames, image, image, 3]` bytes to `[frames, 3, image, image]`.
 ///
 /// # Errors
 /// As [`patches`].

@@ -8,7 +8,7 @@ use swm_core::columns::PIXELS;
 use swm_core::{Batch, Error, Predictor, Result};
 use swm_plan::ActionScale;
 
-/// Encodes rows and predicts trajectories, each on its own, so that a latent does not depend on the other rows.
+/// Encodes rows and predicts trajectories one at a time, so that a latent does not depend on the other rows.
 pub struct LewmPredictor {
     model: Lewm,
     config: LewmConfig,
@@ -18,7 +18,7 @@ pub struct LewmPredictor {
 }
 
 impl LewmPredictor {
-    /// The predictor of a trained model, whose model step is `frameskip` environment steps.
+    /// Creates the predictor of a trained model whose model step is `frameskip` environment steps.
     pub fn new(model: &Lewm, config: &LewmConfig, scale: ActionScale, frameskip: usize) -> Self {
         Self { rollout: Rollout::new(model), model: model.clone(), config: config.clone(), scale, frameskip }
     }

@@ -1,20 +1,21 @@
-//! [`Rollout`]: rollouts of many action sequences from one present, with the CPU kernels of `swm-kernels`.
+//! [`Rollout`]: rollouts of many action sequences from one start state, with the CPU kernels of `swm-kernels`.
 //!
 //! The result equals [`Lewm::rollout`] up to rounding, with less work:
 //!
 //! - actions are embedded and converted to modulations once for the whole sequence;
 //! - the normalised tokens of a layer are cached while the window of latents grows, and recomputed only when the window
-//!   slides, because the positions of its tokens change then;
+//!   slides, because the positions of the tokens change when it slides;
 //! - the last layer and the modules after it compute only the last token;
-//! - keys and values are never computed. A window holds a few tokens of `dim` features, and the heads together have many
-//!   more features. So a query is multiplied by the transposed key matrix, `(W_k y)ᵀq = yᵀ(W_kᵀ q)`, and compared with the
-//!   tokens themselves; the weighted mean of the tokens is multiplied by the value matrix, `Σ a_j W_v y_j = W_v Σ a_j y_j`.
-//!   This costs as much per query as keys and values cost per token, and there are fewer queries. The first token attends
-//!   to itself alone, so its value and output projections are one matrix;
+//! - keys and values are never computed. A window holds a few tokens of `dim` features, and the heads together have
+//!   many more features. So a query is multiplied by the transposed key matrix, `(W_k y)ᵀq = yᵀ(W_kᵀ q)`, and compared
+//!   with the tokens themselves; the weighted mean of the tokens is multiplied by the value matrix,
+//!   `Σ a_j W_v y_j = W_v Σ a_j y_j`. A query costs as much in this form as the key and value of a token cost in the
+//!   usual form, and there are fewer queries than tokens. The first token attends to itself alone, so its value and
+//!   output projections are one matrix;
 //! - batch normalisation is folded into the linear layer before it.
 //!
-//! Rows are ordered by token, then by sample, so that tokens are contiguous. Every row is computed on its own, so costs do
-//! not depend on the other candidates.
+//! Rows are ordered by token, then by sample, so that tokens are contiguous. Every row is computed separately, so costs
+//! do not depend on the other candidates.
 
 use super::model::Lewm;
 use crate::nn::Linear;
@@ -25,8 +26,8 @@ use burn::module::Param;
 use swm_kernels::functions::{gelu, silu};
 use swm_kernels::{Modulation, Norm, Panels, ScratchPool, add_gated, causal_attention, grown};
 
-/// Rows that a layer processes together: few enough that their activations fit into a core's cache, and many, because each
-/// block reads all weights.
+/// Rows that a layer processes together: few enough that the activations fit into a core's cache, and as many as
+/// possible, because each block reads all weights.
 const BLOCK: usize = 80;
 /// Parts of a modulation: shift, scale and gate of the attention, then of the feed-forward block.
 const PARTS: usize = 6;
@@ -54,9 +55,9 @@ struct Layer {
     alone: Panels,
     /// `[dim, heads * width]`.
     query: Panels,
-    /// For each head, from its query to the space of tokens, `[width, dim]`, scaled.
+    /// For each head, the scaled map from queries to the space of tokens, `[width, dim]`.
     key: Vec<Panels>,
-    /// For each head, from the weighted mean of the tokens to its values, `[dim, width]`.
+    /// For each head, the map from the weighted mean of the tokens to values, `[dim, width]`.
     value: Vec<Panels>,
     /// `[heads * width, dim]`; absent for a single head of the tokens' size.
     out: Option<Panels>,
@@ -152,17 +153,18 @@ impl Rollout {
         }
     }
 
-    /// Returns how many of `samples` candidates a thread rolls out at once: an equal part, within limits that keep the matrix
-    /// products efficient. The result of a candidate does not depend on it.
+    /// Returns how many of `samples` candidates a thread rolls out at once: an equal part, within limits that keep the
+    /// matrix products efficient. The result of a candidate does not depend on this number.
     pub fn part(samples: usize) -> usize {
         samples.div_ceil(rayon::current_num_threads()).clamp(24, 160)
     }
 
-    /// Returns the latents of a rollout from one present: the given ones, then one predicted after each further action.
+    /// Returns the latents of a rollout from one start state: the given latents, then one predicted latent after each
+    /// further action.
     ///
     /// # Shapes
-    /// `start` is `[frames, latent]`, `actions` is `[samples, steps, actions]` with `steps >= frames`; returns `steps + 1`
-    /// arrays `[samples, latent]`.
+    /// `start` is `[frames, latent]`, `actions` is `[samples, steps, action_dim]` with `steps >= frames`; returns
+    /// `steps + 1` arrays `[samples, latent]`.
     pub fn run(&self, start: &[f32], actions: &[f32], samples: usize, steps: usize) -> Vec<Vec<f32>> {
         self.scratch.with(|scratch| self.run_with(scratch, start, actions, samples, steps))
     }
@@ -188,10 +190,10 @@ impl Rollout {
                 cached.iter_mut().for_each(Vec::clear);
                 tokens = 0;
             }
-            let fresh = tokens..end - first;
-            tokens = fresh.end;
+            let new_tokens = tokens..end - first;
+            tokens = new_tokens.end;
             x.clear();
-            for token in fresh.clone() {
+            for token in new_tokens.clone() {
                 let position = &self.positions[token * self.latent..][..self.latent];
                 for row in latents[first + token].chunks_exact(self.latent) {
                     x.extend(row.iter().zip(position).map(|(x, p)| x + p));
@@ -200,7 +202,7 @@ impl Rollout {
             through(self.input.as_ref(), x, hidden);
             for (index, layer) in self.layers.iter().enumerate() {
                 let per_step = samples * PARTS * self.dim;
-                let modulation = &modulations[index][(first + fresh.start) * per_step..end * per_step];
+                let modulation = &modulations[index][(first + new_tokens.start) * per_step..end * per_step];
                 let last = index + 1 == self.layers.len();
                 self.layer(layer, x, modulation, &mut cached[index], [samples, tokens], last, block);
             }
@@ -257,7 +259,8 @@ impl Rollout {
         }
     }
 
-    /// Computes one layer for the new tokens of a window of `tokens`; after the last layer, `x` holds the last token only.
+    /// Computes one layer for the new tokens of a window of `tokens`; after the last layer, `x` holds the last token
+    /// only.
     #[allow(clippy::too_many_arguments, reason = "the scratch buffers are borrowed separately")]
     fn layer(
         &self,
@@ -270,9 +273,9 @@ impl Rollout {
         scratch: &mut BlockScratch,
     ) {
         let (dim, token) = (self.dim, samples * self.dim);
-        let known = cached.len();
-        cached.resize(known + x.len(), 0.0);
-        layer.norm.apply_modulated(shifted(modulation, 0), x, &mut cached[known..]);
+        let cached_length = cached.len();
+        cached.resize(cached_length + x.len(), 0.0);
+        layer.norm.apply_modulated(shifted(modulation, 0), x, &mut cached[cached_length..]);
         if last {
             // Only the last token is needed from here on.
             let unused = x.len() - token;
@@ -286,17 +289,17 @@ impl Rollout {
             // The first token attends to itself alone.
             let alone = rows.start.min(samples)..rows.end.min(samples);
             let mixed = grown(&mut scratch.mixed, x.len());
-            let (first_token, others) = mixed.split_at_mut(alone.len() * dim);
+            let (first_token, later_tokens) = mixed.split_at_mut(alone.len() * dim);
             if !alone.is_empty() {
                 layer.alone.apply(&cached[alone.start * dim..alone.end * dim], first_token);
             }
-            if !others.is_empty() {
-                let rows = rows.end - others.len() / dim..rows.end;
+            if !later_tokens.is_empty() {
+                let rows = rows.end - later_tokens.len() / dim..rows.end;
                 layer.attend(
                     cached,
                     rows,
                     samples,
-                    others,
+                    later_tokens,
                     &mut scratch.narrow,
                     &mut scratch.wide,
                     &mut scratch.scores,
@@ -316,7 +319,8 @@ impl Rollout {
 }
 
 impl Layer {
-    /// Computes the attention output of some rows of a window, each of which attends to its own token and earlier ones.
+    /// Computes the attention output of a range of rows of a window; each row attends to its own token and earlier
+    /// tokens.
     #[allow(clippy::too_many_arguments, reason = "the scratch buffers are borrowed separately")]
     fn attend(
         &self,
@@ -349,12 +353,12 @@ impl Layer {
     }
 }
 
-/// Returns the shift and scale that begin at part `shift`.
+/// Returns the modulation whose shift is part `shift` and whose scale is the next part.
 fn shifted(values: &[f32], shift: usize) -> Modulation<'_> {
     Modulation { values, parts: PARTS, shift, epsilon: MODULATED_EPSILON as f32 }
 }
 
-/// Applies a layer to rows, if there is one; `spare` is scratch memory.
+/// Applies a layer to rows if the layer is present; `spare` is scratch memory.
 fn through(layer: Option<&Panels>, x: &mut Vec<f32>, spare: &mut Vec<f32>) {
     if let Some(layer) = layer {
         spare.resize(x.len() / layer.inputs() * layer.outputs(), 0.0);

@@ -1,4 +1,4 @@
-//! [`Shard`]: forward and backward pass of the encoder for some images of a batch.
+//! [`Shard`]: forward and backward pass of the encoder for one part of the images of a batch.
 //!
 //! On the CPU, [`VitGradient`] differentiates vision transformers; Burn differentiates all other encoders.
 

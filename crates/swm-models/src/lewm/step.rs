@@ -25,7 +25,7 @@ pub struct SigregConfig {
 pub struct TrainBatch {
     /// `[clips * steps, patches, 3 * patch * patch]`.
     pub patches: Tensor<3>,
-    /// `[clips, steps, actions]`; the actions of the last step are not used.
+    /// `[clips, steps, action_dim]`; the actions of the last step are not used.
     pub actions: Tensor<3>,
 }
 

@@ -1,4 +1,4 @@
-//! [`Trainable`] for LeWM: the training loop's view of [`super::step`].
+//! [`Trainable`] for LeWM, which connects [`super::step`] to the training loop.
 
 use super::step::{self, LewmStep, SigregConfig, TrainBatch};
 use super::{Lewm, LewmConfig, loss, pixels};
@@ -95,7 +95,7 @@ pub(crate) fn prepare(
 /// The modules with running batch statistics.
 const TRACKED: [&str; 2] = ["projector", "pred_proj"];
 
-/// Names batch statistics for the training loop.
+/// Stores batch statistics under the names of their modules, for [`Trainable::after_step`].
 pub(crate) fn stored(statistics: [BatchStatistics; 2]) -> Named<Tensor<1>> {
     let mut buffers = Named::new();
     for (name, statistics) in TRACKED.into_iter().zip(statistics) {

@@ -24,7 +24,7 @@ impl Activation {
     /// Applies the function to every element.
     ///
     /// # Shapes
-    /// `[…]` to the same.
+    /// Maps `[…]` to the same shape.
     pub fn forward<const D: usize>(self, x: Tensor<D>) -> Tensor<D> {
         match self {
             Self::Relu => activation::relu(x),
@@ -34,8 +34,8 @@ impl Activation {
     }
 }
 
-/// `x Φ(x)`. The CPU uses the vectorised kernel of `swm-kernels`: Burn computes the error function one element at a time, twice in
-/// training.
+/// `x Φ(x)`. The CPU uses the vectorised kernel of `swm-kernels`: Burn computes the error function one element at a
+/// time, and twice in training.
 fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     let device = x.device();
     if device.clone().inner() != Device::flex() || x.dtype() != DType::F32 {
@@ -48,8 +48,8 @@ fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
         functions::gelu(&mut values);
         return tensor(values);
     }
-    // The tangent at every element has the value and the derivative of the function there, which is all that the
-    // backward pass needs.
+    // The tangent at an element has the function's value and derivative at that element, so the backward pass through
+    // the tangent is exact.
     let mut offsets = host(x.clone().inner());
     let mut slopes = vec![0.0; offsets.len()];
     functions::gelu_tangent(&mut offsets, &mut slopes);
@@ -65,11 +65,11 @@ impl DropoutRng<'_> {
         DropoutRng(None)
     }
 
-    /// Sets elements to zero with probability `rate` and scales the others by `1 / (1 - rate)` (Srivastava et al.
-    /// 2014).
+    /// Sets elements to zero with probability `rate` and scales the remaining elements by `1 / (1 - rate)` (Srivastava
+    /// et al. 2014).
     ///
     /// # Shapes
-    /// `[…]` to the same.
+    /// Maps `[…]` to the same shape.
     pub fn dropout<const D: usize>(&mut self, x: Tensor<D>, rate: f32) -> Tensor<D> {
         let Some(rng) = self.0.as_deref_mut().filter(|_| rate > 0.0) else { return x };
         let scale = 1.0 / (1.0 - rate);

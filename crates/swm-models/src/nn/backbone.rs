@@ -64,7 +64,7 @@ impl BackboneConfig {
     /// Checks that the sizes fit each other and images with a side of `image` pixels. `at` is the path of the settings.
     ///
     /// # Errors
-    /// Names the first size that does not fit.
+    /// When a size does not fit; the error names the first such size.
     pub fn check(&self, at: &str, image: usize) -> Result<()> {
         let invalid = |what: &str, problem: String, fix: &str| Err(Error::config(format!("{at}.{what}"), problem, fix));
         let transformer = |name: &str, sizes: [(&str, usize); 5], dim: usize, heads: usize| {
@@ -126,7 +126,7 @@ impl Backbone {
     /// Computes the features of images: the class token of a transformer.
     ///
     /// # Shapes
-    /// `[frames, patches, 3 * patch * patch]` to `[frames, dim]`.
+    /// Maps `[frames, patches, 3 * patch * patch]` to `[frames, dim]`.
     pub fn forward(&self, patches: Tensor<3>) -> Tensor<2> {
         match self {
             Self::Vit(vit) => vit.forward(patches),
@@ -135,10 +135,10 @@ impl Backbone {
         }
     }
 
-    /// Computes the features of every patch; a [`PatchCnn`] returns those of the image as one patch.
+    /// Computes the features of every patch; a [`PatchCnn`] returns the features of the image as one patch.
     ///
     /// # Shapes
-    /// `[frames, patches, 3 * patch * patch]` to `[frames, patches, dim]`.
+    /// Maps `[frames, patches, 3 * patch * patch]` to `[frames, patches, dim]`.
     pub fn patches(&self, patches: Tensor<3>) -> Tensor<3> {
         match self {
             Self::Vit(vit) => {

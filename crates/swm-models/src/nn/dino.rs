@@ -151,7 +151,7 @@ impl Dino {
     /// Computes the class token.
     ///
     /// # Shapes
-    /// `[frames, patches, 3 * patch * patch]` to `[frames, dim]`.
+    /// Maps `[frames, patches, 3 * patch * patch]` to `[frames, dim]`.
     pub fn forward(&self, patches: Tensor<3>) -> Tensor<2> {
         let class = self.run(patches, Some(1));
         let [frames, _, dim] = class.dims();
@@ -161,7 +161,7 @@ impl Dino {
     /// Computes all tokens: the class token, the registers, one for every patch.
     ///
     /// # Shapes
-    /// `[frames, patches, 3 * patch * patch]` to `[frames, 1 + registers + patches, dim]`.
+    /// Maps `[frames, patches, 3 * patch * patch]` to `[frames, 1 + registers + patches, dim]`.
     pub fn tokens(&self, patches: Tensor<3>) -> Tensor<3> {
         self.run(patches, None)
     }
@@ -169,7 +169,7 @@ impl Dino {
     /// Computes one token for every patch.
     ///
     /// # Shapes
-    /// `[frames, patches, 3 * patch * patch]` to `[frames, patches, dim]`.
+    /// Maps `[frames, patches, 3 * patch * patch]` to `[frames, patches, dim]`.
     pub fn patches(&self, patches: Tensor<3>) -> Tensor<3> {
         let [frames, count, _] = patches.dims();
         let tokens = self.tokens(patches);
@@ -206,7 +206,7 @@ impl Layer {
     /// Computes all tokens, or the first `outputs`.
     ///
     /// # Shapes
-    /// `[frames, tokens, dim]` to `[frames, outputs, dim]`.
+    /// Maps `[frames, tokens, dim]` to `[frames, outputs, dim]`.
     fn forward(&self, x: Tensor<3>, outputs: Option<usize>) -> Tensor<3> {
         let attended = self.attention.forward(self.norm1.forward(x.clone()), outputs);
         let x = match outputs {

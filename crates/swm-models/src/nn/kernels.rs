@@ -49,8 +49,8 @@ pub(crate) fn vit_encoder(vit: &Vit, patches: usize) -> Option<VitEncoder> {
     Some(VitEncoder::new(&vit_parameters(vit, patches), heads, vit.layernorm.epsilon() as f32))
 }
 
-/// Lays out a vision transformer for training on images of `patches` patches; returns `None` if its learnt positions
-/// are for another number of patches.
+/// Lays out a vision transformer for training on images of `patches` patches; returns `None` if the learnt
+/// positions are for another number of patches.
 pub(crate) fn vit_gradient(vit: &Vit, patches: usize) -> Option<VitGradient> {
     let [_, learnt, _] = vit.embeddings.position_embeddings.dims();
     let heads = vit.encoder.layer.first()?.attention.heads();
@@ -134,7 +134,7 @@ mod tests {
     #[test]
     fn vit_encoder_matches_module_on_any_number_of_threads() {
         let sizes = VitConfig { patch: 2, dim: 24, depth: 2, heads: 3, mlp: 40 };
-        // 50 tokens, in two blocks; more positions than were learnt, so that they are resampled.
+        // The 50 tokens fill two blocks. There are more patches than learnt positions, so the positions are resampled.
         let (patches, elements) = (49, 12);
         let vit = sizes.init(&Init::new(Key::new(1), &Device::flex()), 12);
         let encoder = vit_encoder(&vit, patches).expect("a transformer with layers");
@@ -144,7 +144,7 @@ mod tests {
         assert_eq!(class, on(3));
         let input = Tensor::from_data(TensorData::new(image.clone(), [1, patches, elements]), &Device::flex());
         for (actual, expected) in class.iter().zip(host(vit.forward(input))) {
-            assert!((actual - expected).abs() < 1e-4, "{actual} for {expected}");
+            assert!((actual - expected).abs() < 1e-4, "{actual}, expected {expected}");
         }
     }
 }

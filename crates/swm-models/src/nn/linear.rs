@@ -41,7 +41,7 @@ impl Linear {
     /// Applies the layer; all leading axes are rows of one matrix product.
     ///
     /// # Shapes
-    /// `[…, inputs]` to `[…, outputs]`.
+    /// Maps `[…, inputs]` to `[…, outputs]`.
     pub fn forward<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
         let [outputs, inputs] = self.weight.dims();
         let mut shape = x.dims();

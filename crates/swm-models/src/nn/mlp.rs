@@ -4,7 +4,7 @@ use super::{Activation, BatchNorm, BatchStatistics, Init, Linear};
 use burn::module::Module;
 use burn::tensor::Tensor;
 
-/// Linear, batch normalisation, GELU, linear. Its layers have the published names `net.0`, `net.1`, `net.3`: a field
+/// Linear, batch normalisation, GELU, linear. The layers have the published names `net.0`, `net.1`, `net.3`: a field
 /// `_3` is element 3 of a sequence.
 #[derive(Module, Debug)]
 pub struct Projector {
@@ -17,7 +17,7 @@ pub struct Projector {
 pub struct ProjectorNet {
     /// The layer to the hidden features.
     pub _0: Linear,
-    /// Their normalisation.
+    /// The normalisation of the hidden features.
     pub _1: BatchNorm,
     /// The layer from the hidden features.
     pub _3: Linear,
@@ -38,7 +38,7 @@ impl Projector {
     /// Normalises with the running statistics, for evaluation.
     ///
     /// # Shapes
-    /// `[rows, inputs]` to `[rows, outputs]`.
+    /// Maps `[rows, inputs]` to `[rows, outputs]`.
     pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
         let hidden = self.net._1.forward(self.net._0.forward(x));
         self.net._3.forward(Activation::Gelu.forward(hidden))
@@ -47,7 +47,7 @@ impl Projector {
     /// Normalises with the statistics of the batch, which it also returns, for training.
     ///
     /// # Shapes
-    /// `[rows, inputs]` to `[rows, outputs]`.
+    /// Maps `[rows, inputs]` to `[rows, outputs]`.
     pub fn forward_train(&self, x: Tensor<2>) -> (Tensor<2>, BatchStatistics) {
         let (hidden, statistics) = self.net._1.forward_train(self.net._0.forward(x));
         (self.net._3.forward(Activation::Gelu.forward(hidden)), statistics)
@@ -106,7 +106,7 @@ impl Embedder {
     /// Embeds actions.
     ///
     /// # Shapes
-    /// `[rows, inputs]` to `[rows, outputs]`.
+    /// Maps `[rows, inputs]` to `[rows, outputs]`.
     pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
         let weight: Tensor<2> = self.patch_embed.weight.val().squeeze_dim(2);
         let x = x.matmul(weight.transpose()) + self.patch_embed.bias.val().unsqueeze();
@@ -117,7 +117,7 @@ impl Embedder {
 /// Two hidden layers with GELU. A field `_2` is element 2 of a sequence, as in PyTorch.
 #[derive(Module, Debug)]
 pub struct Mlp {
-    /// Into hidden features.
+    /// The layer to the hidden features.
     pub _0: Linear,
     /// The layer between the hidden features.
     pub _2: Linear,
@@ -138,7 +138,7 @@ impl Mlp {
     /// Applies the network.
     ///
     /// # Shapes
-    /// `[rows, inputs]` to `[rows, outputs]`.
+    /// Maps `[rows, inputs]` to `[rows, outputs]`.
     pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
         let hidden = Activation::Gelu.forward(self._0.forward(x));
         self._4.forward(Activation::Gelu.forward(self._2.forward(hidden)))

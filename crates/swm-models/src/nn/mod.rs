@@ -1,5 +1,6 @@
 //! Building blocks with the parameter names and layouts of PyTorch checkpoints, so that weights are exchanged without
-//! renaming. A [`Key`] and the name of a parameter determine its initial values; there is no global generator.
+//! renaming. A [`Key`] and the name of a parameter determine the initial values; no global generator is
+//! used.
 
 pub mod activation;
 pub mod attention;
@@ -53,13 +54,13 @@ impl Init {
         Self { key, device: device.clone() }
     }
 
-    /// The source for the part of that name.
+    /// Returns the source for the part named `part`.
     #[must_use]
     pub fn of(&self, part: &str) -> Self {
         Self { key: self.key.with(part), device: self.device.clone() }
     }
 
-    /// The source for the part of that index.
+    /// Returns the source for the part with the index `index`.
     #[must_use]
     pub fn at(&self, index: usize) -> Self {
         Self { key: self.key.at(index as u64), device: self.device.clone() }
@@ -101,7 +102,7 @@ impl Init {
     }
 }
 
-/// Draws standard normal values, each row with its key.
+/// Draws one row of standard normal values per key.
 ///
 /// # Shapes
 /// `[keys, width]`.

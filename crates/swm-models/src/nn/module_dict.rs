@@ -1,4 +1,4 @@
-//! [`ModuleDict`]: modules under names that are data, such as the names of columns.
+//! [`ModuleDict`]: modules under names that are known at run time only, such as the names of columns.
 
 use burn::module::{Content, Devices, Module, ModuleDisplay, ModuleDisplayDefault, ModuleMapper, ModuleVisitor};
 use burn::tensor::Device;

@@ -28,7 +28,7 @@ impl LayerNorm {
     /// Applies the layer.
     ///
     /// # Shapes
-    /// `[…, features]` to the same.
+    /// Maps `[…, features]` to the same shape.
     pub fn forward<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
         module::layer_norm(x, self.weight.val(), Some(self.bias.val()), self.epsilon)
     }
@@ -37,7 +37,7 @@ impl LayerNorm {
 /// Normalises the last axis to mean 0 and variance 1, without scale and shift.
 ///
 /// # Shapes
-/// `[…, features]` to the same.
+/// Maps `[…, features]` to the same shape.
 pub fn standardize<const D: usize>(x: Tensor<D>, epsilon: f64) -> Tensor<D> {
     let mean = x.clone().mean_dim(D - 1);
     let centred = x - mean;
@@ -66,7 +66,7 @@ pub struct BatchStatistics {
 }
 
 impl BatchStatistics {
-    /// Inserts the statistics into other tensors, under `name`.
+    /// Inserts the statistics into `tensors` under `name`.
     pub fn store(self, name: &str, tensors: &mut Named<Tensor<1>>) {
         tensors.insert(format!("{name}.mean"), self.mean);
         tensors.insert(format!("{name}.variance"), self.variance);
@@ -98,7 +98,7 @@ impl BatchNorm {
     /// Normalises with the running statistics.
     ///
     /// # Shapes
-    /// `[rows, features]` to the same.
+    /// Maps `[rows, features]` to the same shape.
     pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
         let scale = self.weight.val() / (self.running_var.val() + Self::EPSILON).sqrt();
         let shift = self.bias.val() - self.running_mean.val() * scale.clone();
@@ -108,7 +108,7 @@ impl BatchNorm {
     /// Normalises with the statistics of the batch, which it returns for [`BatchNorm::track`].
     ///
     /// # Shapes
-    /// `[rows, features]` to the same.
+    /// Maps `[rows, features]` to the same shape.
     pub fn forward_train(&self, x: Tensor<2>) -> (Tensor<2>, BatchStatistics) {
         let [rows, _] = x.dims();
         let mean = x.clone().mean_dim(0);

@@ -8,7 +8,7 @@ use burn::tensor::{Tensor, activation};
 
 /// Added to the variance by the normalisations.
 const EPSILON: f64 = 1e-5;
-/// The standard deviation of initial weights, which are truncated at twice that.
+/// The standard deviation of initial weights, which are truncated at twice the standard deviation.
 const STD: f32 = 0.02;
 
 /// A linear layer followed by layer normalisation.
@@ -35,7 +35,7 @@ impl NormalizedLinear {
     /// Computes the input of the activation function.
     ///
     /// # Shapes
-    /// `[rows, inputs]` to `[rows, outputs]`.
+    /// Maps `[rows, inputs]` to `[rows, outputs]`.
     pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
         self.ln.forward(x.matmul(self.weight.val().transpose()) + self.bias.val().unsqueeze())
     }
@@ -72,7 +72,7 @@ impl Head {
     /// Applies the network.
     ///
     /// # Shapes
-    /// `[rows, inputs]` to `[rows, outputs]`.
+    /// Maps `[rows, inputs]` to `[rows, outputs]`.
     pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
         self._2.forward(mish(self._1.forward(mish(self._0.forward(x)))))
     }
@@ -102,7 +102,7 @@ impl Dynamics {
     /// Computes latents, every `simplex` elements of which add up to 1.
     ///
     /// # Shapes
-    /// `[rows, inputs]` to `[rows, latent]`.
+    /// Maps `[rows, inputs]` to `[rows, latent]`.
     pub fn forward(&self, x: Tensor<2>, simplex: usize) -> Tensor<2> {
         let hidden = mish(self._1.forward(mish(self._0.forward(x))));
         sim_norm(self._2.forward(hidden), simplex)
@@ -153,7 +153,7 @@ impl Ensemble {
     /// Applies all heads; `dropout` is the rate after the first matrix product.
     ///
     /// # Shapes
-    /// `[rows, inputs]` to `[heads, rows, outputs]`.
+    /// Maps `[rows, inputs]` to `[heads, rows, outputs]`.
     pub fn forward(&self, x: Tensor<2>, dropout: f32, noise: &mut DropoutRng<'_>) -> Tensor<3> {
         let [first, second, last] = &self.layers;
         let [heads, _, _] = first.weight.dims();
@@ -169,7 +169,7 @@ impl Ensemble {
 /// Stacks the matrices of several heads.
 ///
 /// # Shapes
-/// `[outputs, inputs]` each, to `[heads, inputs, outputs]`.
+/// Maps matrices `[outputs, inputs]` to `[heads, inputs, outputs]`.
 fn matrices<'a>(parameters: impl Iterator<Item = &'a Param<Tensor<2>>>) -> Tensor<3> {
     Tensor::stack::<3>(parameters.map(Param::val).collect(), 0).swap_dims(1, 2)
 }
@@ -177,7 +177,7 @@ fn matrices<'a>(parameters: impl Iterator<Item = &'a Param<Tensor<2>>>) -> Tenso
 /// Stacks the vectors of several heads, or returns `None` if one is missing.
 ///
 /// # Shapes
-/// `[outputs]` each, to `[heads, 1, outputs]`.
+/// Maps vectors `[outputs]` to `[heads, 1, outputs]`.
 fn rows<'a>(parameters: impl Iterator<Item = Option<&'a Param<Tensor<1>>>>) -> Option<Tensor<3>> {
     let all: Option<Vec<Tensor<1>>> = parameters.map(|parameter| parameter.map(Param::val)).collect();
     Some(Tensor::stack::<2>(all?, 0).unsqueeze_dim(1))
@@ -201,10 +201,10 @@ impl Layer {
 }
 
 /// Mish (Misra 2019), `x tanh(ln(1 + exp x))`, with one exponential: for `n = exp x (exp x + 2)` it is `x n / (n + 2)`.
-/// Its derivative is explicit, so that a graph holds one product and not six functions.
+/// The derivative is computed explicitly, so that an autodiff graph holds one product instead of six functions.
 ///
 /// # Shapes
-/// `[…]` to the same.
+/// Maps `[…]` to the same shape.
 pub fn mish<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     let inner = x.clone().inner();
     // Above 20 the function equals x in single precision; the bound keeps the square of the exponential finite.
@@ -223,7 +223,7 @@ pub fn mish<const D: usize>(x: Tensor<D>) -> Tensor<D> {
 /// SimNorm (Lavoie et al. 2023): a softmax over every `simplex` elements of a row.
 ///
 /// # Shapes
-/// `[rows, width]` to the same.
+/// Maps `[rows, width]` to the same shape.
 pub fn sim_norm(x: Tensor<2>, simplex: usize) -> Tensor<2> {
     let [rows, width] = x.dims();
     activation::softmax(x.reshape([rows, width / simplex, simplex]), 2).reshape([rows, width])

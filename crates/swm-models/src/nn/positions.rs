@@ -1,8 +1,8 @@
-//! Resampling of position embeddings from the grid of patches they were trained for to another.
+//! Resampling of position embeddings from the patch grid of their training to another grid.
 
 use burn::tensor::{Tensor, TensorData};
 
-/// How a grid of position embeddings is resampled, as PyTorch does it.
+/// The method that resamples a grid of position embeddings; the results equal PyTorch's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Resampling {
     /// Bicubic with the four nearest neighbours per axis, as in ViT and DINOv2.
@@ -89,7 +89,7 @@ mod tests {
                     let reach = 2.0 * (from as f32 / to as f32).max(1.0);
                     if centre > reach && centre + reach < from as f32 - 1.0 && to > from {
                         let value: f32 = row.iter().enumerate().map(|(index, weight)| index as f32 * weight).sum();
-                        assert!((value - centre).abs() < 1e-4, "{resampling:?} {from} to {to}: {value} for {centre}");
+                        assert!((value - centre).abs() < 1e-4, "{resampling:?} {from} to {to}: {value}, not {centre}");
                     }
                 }
             }

@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PredictorConfig {
-    /// The number of latents in a window: the present one and those before it.
+    /// The number of latents in a window, including the current one.
     pub history: usize,
     /// The number of features of a token.
     pub dim: usize,
@@ -43,7 +43,7 @@ pub struct Predictor {
     config: PredictorConfig,
 }
 
-/// The layers of a [`Predictor`]; it has projections only where sizes differ.
+/// The layers of a [`Predictor`]. A projection is absent if its input and output sizes are equal.
 #[derive(Module, Debug)]
 pub struct Transformer {
     /// The last normalisation.
@@ -79,7 +79,7 @@ pub struct Modulation {
 
 /// Added to the variance by the normalisations before a modulation.
 pub(crate) const MODULATED_EPSILON: f64 = 1e-6;
-/// Added to the variance by the other normalisations.
+/// Added to the variance by the normalisation after the last layer.
 const EPSILON: f64 = 1e-5;
 
 impl PredictorConfig {
@@ -150,7 +150,7 @@ impl Block {
     ) -> Tensor<3> {
         let modulation = self.adaLN_modulation._1.forward(condition).chunk(6, 2);
         let [shift_attn, scale_attn, gate_attn, shift_mlp, scale_mlp, gate_mlp] =
-            <[Tensor<3>; 6]>::try_from(modulation).expect("six equal parts of a width that is six times another");
+            <[Tensor<3>; 6]>::try_from(modulation).expect("a modulation has six equal parts");
         let modulate = |x: Tensor<3>, shift: Tensor<3>, scale: Tensor<3>| {
             standardize(x, MODULATED_EPSILON) * (scale + 1.0) + shift
         };

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 /// Computes `sign(x) ln(1 + |x|)`.
 ///
 /// # Shapes
-/// `[…]` to the same.
+/// Maps `[…]` to the same shape.
 pub fn symlog<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     x.clone().sign() * (x.abs() + 1.0).log()
 }
@@ -16,7 +16,7 @@ pub fn symlog<const D: usize>(x: Tensor<D>) -> Tensor<D> {
 /// Computes the inverse of [`symlog`], `sign(x) (exp |x| - 1)`.
 ///
 /// # Shapes
-/// `[…]` to the same.
+/// Maps `[…]` to the same shape.
 pub fn symexp<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     x.clone().sign() * (x.abs().exp() - 1.0)
 }
@@ -44,10 +44,11 @@ impl Bins {
         Tensor::from_data(TensorData::new(centres, [self.count]), device)
     }
 
-    /// Encodes scalars: the weight of a bin falls linearly to 0 at its neighbours.
+    /// Encodes scalars: the weight of a bin falls linearly from 1 at the bin's centre to 0 at the neighbouring
+    /// centres.
     ///
     /// # Shapes
-    /// `[rows]` to `[rows, bins]`.
+    /// Maps `[rows]` to `[rows, bins]`.
     pub fn two_hot(&self, x: Tensor<1>) -> Tensor<2> {
         let position = (symlog(x).clamp(self.low, self.high) - self.low) / self.width();
         let indices: Vec<f32> = (0..self.count).map(|i| i as f32).collect();
@@ -59,7 +60,7 @@ impl Bins {
     /// Decodes distributions: `symexp` of the mean of the centres, weighted by the softmax of the logits.
     ///
     /// # Shapes
-    /// `[rows, bins]` to `[rows]`.
+    /// Maps `[rows, bins]` to `[rows]`.
     pub fn expectation(&self, logits: Tensor<2>) -> Tensor<1> {
         let centres = if logits.is_autodiff() {
             self.centres(&logits.clone().inner().device()).autodiff()
@@ -70,7 +71,8 @@ impl Bins {
     }
 }
 
-/// Computes the cross-entropy `-Σ target log softmax(logits)`. Its gradient, `softmax(logits) - target`, is explicit.
+/// Computes the cross-entropy `-Σ target log softmax(logits)`. The gradient,
+/// `softmax(logits) - target`, is computed explicitly.
 ///
 /// # Shapes
 /// `logits` and `target` are `[rows, bins]`; returns `[rows]`.

@@ -71,7 +71,7 @@ impl Projection {
     /// Projects patches.
     ///
     /// # Shapes
-    /// `[rows, channels * patch * patch]` (channel, then row, then column) to `[rows, dim]`.
+    /// Maps `[rows, channels * patch * patch]` (channel, then row, then column) to `[rows, dim]`.
     pub fn forward(&self, patches: Tensor<2>) -> Tensor<2> {
         let [dim, channels, height, width] = self.weight.dims();
         let weight = self.weight.val().reshape([dim, channels * height * width]);
@@ -196,7 +196,7 @@ impl Vit {
     /// Computes the class token.
     ///
     /// # Shapes
-    /// `[frames, patches, 3 * patch * patch]` to `[frames, dim]`.
+    /// Maps `[frames, patches, 3 * patch * patch]` to `[frames, dim]`.
     pub fn forward(&self, patches: Tensor<3>) -> Tensor<2> {
         let class = self.run(patches, Some(1));
         let [frames, _, dim] = class.dims();
@@ -206,15 +206,15 @@ impl Vit {
     /// Computes all tokens: the class token, then one for every patch.
     ///
     /// # Shapes
-    /// `[frames, patches, 3 * patch * patch]` to `[frames, 1 + patches, dim]`.
+    /// Maps `[frames, patches, 3 * patch * patch]` to `[frames, 1 + patches, dim]`.
     pub fn tokens(&self, patches: Tensor<3>) -> Tensor<3> {
         self.run(patches, None)
     }
 
-    /// Computes the first `outputs` tokens, or all of them. The last layer skips the others.
+    /// Computes the first `outputs` tokens, or all of them. The last layer does not compute the remaining tokens.
     ///
     /// # Shapes
-    /// `[frames, patches, 3 * patch * patch]` to `[frames, outputs, dim]`.
+    /// Maps `[frames, patches, 3 * patch * patch]` to `[frames, outputs, dim]`.
     fn run(&self, patches: Tensor<3>, outputs: Option<usize>) -> Tensor<3> {
         let Embeddings { cls_token, position_embeddings, patch_embeddings } = &self.embeddings;
         let projection = &patch_embeddings.projection;
@@ -232,7 +232,7 @@ impl Vit {
 /// Returns the first `count` tokens.
 ///
 /// # Shapes
-/// `[frames, tokens, dim]` to `[frames, count, dim]`.
+/// Maps `[frames, tokens, dim]` to `[frames, count, dim]`.
 pub(super) fn leading(tokens: Tensor<3>, count: usize) -> Tensor<3> {
     let [frames, _, dim] = tokens.dims();
     tokens.slice([0..frames, 0..count, 0..dim])
@@ -242,7 +242,7 @@ pub(super) fn leading(tokens: Tensor<3>, count: usize) -> Tensor<3> {
 /// to the grid of the patches.
 ///
 /// # Shapes
-/// `[frames, patches, 3 * patch * patch]` to `[frames, 1 + patches, dim]`.
+/// Maps `[frames, patches, 3 * patch * patch]` to `[frames, 1 + patches, dim]`.
 pub(super) fn embed(
     patches: Tensor<3>,
     projection: &Projection,
@@ -260,7 +260,7 @@ impl Layer {
     /// Computes all tokens, or the first `outputs`.
     ///
     /// # Shapes
-    /// `[frames, tokens, dim]` to `[frames, outputs, dim]`.
+    /// Maps `[frames, tokens, dim]` to `[frames, outputs, dim]`.
     fn forward(&self, x: Tensor<3>, outputs: Option<usize>) -> Tensor<3> {
         let mixed = self.attention.forward(self.layernorm_before.forward(x.clone()), outputs);
         let x = match outputs {
@@ -291,7 +291,7 @@ impl Attention {
     /// Computes the attention of all tokens, or of the first `outputs`, to all tokens.
     ///
     /// # Shapes
-    /// `[frames, tokens, dim]` to `[frames, outputs, dim]`.
+    /// Maps `[frames, tokens, dim]` to `[frames, outputs, dim]`.
     pub(super) fn forward(&self, x: Tensor<3>, outputs: Option<usize>) -> Tensor<3> {
         let [_, tokens, _] = x.dims();
         let parts = &self.attention;

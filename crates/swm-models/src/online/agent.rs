@@ -35,7 +35,7 @@ pub fn policy<M: Agent>(checkpoint: &Checkpoint<M>, spec: &EnvSpec, slots: usize
 /// Checks that a dataset has rewards to learn from.
 ///
 /// # Errors
-/// Names the column that is missing.
+/// When a column is missing; the error names the column.
 pub(crate) fn check_rewards(schema: &Schema) -> Result<()> {
     match [REWARD, TERMINATED].into_iter().find(|name| schema.find(name).is_none()) {
         None => Ok(()),

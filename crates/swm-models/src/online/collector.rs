@@ -1,7 +1,7 @@
 //! [`Collector`]: steps environments with a policy and adds their transitions to the replay buffer, segment by segment.
 //!
-//! A segment ends with the observation that the next one begins with, so that no transition is lost; only clips of
-//! several steps across the border of two segments are.
+//! The last observation of a segment is the first observation of the next segment, so that no transition is lost. Clips
+//! of several steps that would span two segments are lost.
 
 use serde::{Deserialize, Serialize};
 use swm_core::columns::{ACTION, REWARD, TERMINATED, TRUNCATED};
@@ -15,7 +15,7 @@ pub(super) struct Collector {
     replay: ReplayBuffer,
     /// For every recorded column that is an observation: its index in the infos, and in a recorded row.
     observed: Vec<(usize, usize)>,
-    /// Indices of the other columns in a recorded row.
+    /// Index of the action column in a recorded row.
     action: usize,
     reward: usize,
     terminated: usize,
@@ -30,7 +30,7 @@ pub(super) struct Collector {
     next: u64,
     /// Environment steps done.
     pub steps: usize,
-    /// Undiscounted returns of the episodes that ended since they were last taken.
+    /// Undiscounted returns of the episodes that ended since the returns were last taken.
     pub returns: Vec<f64>,
 }
 
@@ -165,7 +165,7 @@ impl Collector {
         Ok(ended)
     }
 
-    /// Starts the next episodes in these slots.
+    /// Starts the next episodes in the slots `slots`.
     fn begin(&mut self, slots: &[usize]) -> Result<()> {
         for &slot in slots {
             self.running[slot].number = self.next;
@@ -174,7 +174,7 @@ impl Collector {
         self.reset(slots)
     }
 
-    /// Resets the environments of these slots to the start of their episodes.
+    /// Resets the environments of the slots `slots` to the start of their episodes.
     fn reset(&mut self, slots: &[usize]) -> Result<()> {
         if slots.is_empty() {
             return Ok(());
@@ -190,13 +190,13 @@ impl Collector {
         self.pool.reset(&resets)
     }
 
-    /// The state to continue from.
+    /// Returns the state from which a collector can continue.
     pub fn state(&self) -> CollectorState {
         let running = self.running.iter().map(|running| (running.number, running.actions.clone()));
         CollectorState { steps: self.steps, next: self.next, running: running.collect() }
     }
 
-    /// Restores a state of a collector with the same key, by repeating the actions of its running episodes.
+    /// Restores the state of a collector with the same key: repeats the actions of the running episodes.
     ///
     /// # Errors
     /// When the number of environments differs, or an episode now ends earlier than it did.

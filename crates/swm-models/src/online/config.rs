@@ -10,7 +10,7 @@ use swm_core::Result;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OnlineConfig {
-    /// Environments that run at the same time. A round is one step of each.
+    /// Environments that run at the same time. A round is one step of every environment.
     pub envs: usize,
     /// Optimizer steps after each round.
     pub updates: usize,
@@ -24,7 +24,7 @@ pub struct OnlineConfig {
     pub segment: usize,
     /// Optimizer steps between two evaluations; 0 for none.
     pub evaluate_every: usize,
-    /// Episodes of an evaluation, always the same ones.
+    /// Episodes of an evaluation, always the same episodes.
     pub evaluate_episodes: usize,
     /// The planner that selects actions; without it, the policy network's actions are executed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -35,7 +35,7 @@ impl OnlineConfig {
     /// Checks the ranges of the settings.
     ///
     /// # Errors
-    /// Names the first that is out of range.
+    /// When a setting is out of range; the error names the first such setting.
     pub fn check(&self) -> Result<()> {
         at_least(&[
             ("online.envs", self.envs, 1),

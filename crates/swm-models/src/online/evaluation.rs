@@ -1,10 +1,11 @@
-//! Evaluation during online training: whole episodes without exploration, always the same ones.
+//! Evaluation during online training: whole episodes without exploration, always the same episodes.
 
 use swm_core::columns::{REWARD, TERMINATED, TRUNCATED};
 use swm_core::pool::Reset;
 use swm_core::{Batch, EnvPool, Key, Policy, ResetOptions, Result, Schema};
 
-/// Runs `episodes` episodes and returns their undiscounted returns in order. `key` and the index of an episode determine it.
+/// Runs `episodes` episodes and returns their undiscounted returns in order. `key` and the index of an episode
+/// determine the episode.
 pub(super) fn returns(pool: &mut EnvPool, policy: &mut dyn Policy, episodes: usize, key: Key) -> Result<Vec<f64>> {
     let slots = pool.len();
     let mut actions = Batch::zeros(&Schema::new(vec![pool.spec().action_column()])?, slots);
@@ -17,7 +18,7 @@ pub(super) fn returns(pool: &mut EnvPool, policy: &mut dyn Policy, episodes: usi
         for (slot, running) in running.iter_mut().enumerate() {
             if running.is_none() && next < episodes {
                 let key = key.at(next as u64);
-                // Without the highest bit, as all reset seeds.
+                // Reset seeds do not use the highest bit.
                 resets.push(Reset { slot, seed: key.seed() >> 1, options: ResetOptions::default() });
                 policy.begin(slot, key);
                 *running = Some(next);

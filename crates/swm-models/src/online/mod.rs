@@ -6,7 +6,8 @@
 //! the buffer.
 //! Results depend neither on the number of threads nor on the speed of the machine.
 //!
-//! An episode that its time limit truncates does not end a value target: only `terminated` does.
+//! Value targets bootstrap from the next state unless `terminated` is set, also if the time limit truncates the
+//! episode.
 
 mod agent;
 mod collector;

@@ -14,7 +14,7 @@ pub struct PlannerConfig {
     pub samples: usize,
     /// Iterations.
     pub iterations: usize,
-    /// Candidates that are weighted in the next mean and standard deviation.
+    /// Candidates of which the next mean and standard deviation are weighted averages.
     pub elites: usize,
     /// Candidates that are rollouts of the policy.
     pub proposals: usize,
@@ -30,7 +30,7 @@ impl PlannerConfig {
     /// Checks the ranges of the settings.
     ///
     /// # Errors
-    /// Names the first that is out of range.
+    /// When a setting is out of range; the error names the first such setting.
     pub fn check(&self) -> Result<()> {
         at_least(&[
             ("online.planner.horizon", self.horizon, 1),

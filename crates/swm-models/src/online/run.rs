@@ -76,13 +76,13 @@ pub fn train_online<M: Agent>(
     let pool = make_pool(online.envs)?;
     let evaluation_pool = make_pool(online.envs.min(online.evaluate_episodes))?;
     let threads = swm_core::pool::threads(options.threads)?;
-    // A pool is not shared between threads, but may move to those that compute.
+    // A pool of environments cannot be shared between threads, but can be moved to a compute thread.
     threads.install(|| start(config, online, pool, evaluation_pool, out, options)?(control))
 }
 
 type Loop<'a> = Box<dyn FnOnce(&mut Control<'_>) -> Result<OnlineSummary> + 'a>;
 
-/// Prepares a run, or the continuation of the one in `out`.
+/// Prepares a new run, or continues the run in `out`.
 fn start<'a, M: Agent>(
     config: &'a TrainConfig<M>,
     online: &'a OnlineConfig,
@@ -180,7 +180,7 @@ struct Run<'a> {
     key: Key,
 }
 
-/// Measurements of a run between its steps.
+/// Measurements of a run.
 struct Meter {
     start: Instant,
     /// The optimizer step at which the run began or continued.
@@ -200,7 +200,7 @@ const COLLECTOR: &str = "place.json";
 const PLAYED: &str = "played-";
 
 impl Data {
-    /// The data of a new run, or those that an earlier one saved in the folder `saved`.
+    /// Creates the data of a new run, or restores the data that an earlier run saved in the folder `saved`.
     fn new(
         config: &LoopConfig,
         online: &OnlineConfig,
@@ -262,7 +262,7 @@ impl Run<'_> {
             }
             self.learner.publish();
             let (done, save_every) = (self.step(), self.config.save_every);
-            // Saved between rounds only: a round that was interrupted could not be continued.
+            // Runs are saved between rounds only, because an interrupted round cannot be continued.
             let before = done - self.online.updates.min(done);
             if save_every > 0 && done / save_every > before / save_every && done < steps {
                 self.save()?;
@@ -287,7 +287,7 @@ impl Run<'_> {
         self.learner.learner().state().step
     }
 
-    /// Makes one optimizer step, evaluates where it is due, and reports both.
+    /// Makes one optimizer step, evaluates if an evaluation is due, and reports the metrics.
     fn train_step(&mut self, meter: &mut Meter, control: &mut Control<'_>) -> Result<()> {
         let Update { metrics, lr, gradient_norm } = self.update()?;
         meter.window.add(&metrics, gradient_norm);
@@ -317,7 +317,7 @@ impl Run<'_> {
         Ok(())
     }
 
-    /// Draws a batch from the replay buffer and makes one optimizer step, checked to be finite.
+    /// Draws a batch from the replay buffer, makes one optimizer step, and checks that loss and gradient are finite.
     fn update(&mut self) -> Result<Update> {
         let step = self.step() as u64;
         let batch = self.data.loader.sample(self.key.with("batch").at(step))?;
@@ -351,12 +351,12 @@ impl Run<'_> {
             ("env_steps", self.data.collector.steps as f64),
         ];
         self.log.write(self.step(), &line)?;
-        // The state of a run stores a loss, of which lower is better.
+        // The run state stores a loss, for which lower is better, so the return is negated.
         self.learner.learner_mut().save_if_best(-mean, self.out)?;
         Ok(mean)
     }
 
-    /// Saves the replay buffer and the collector, then the checkpoint, so that a checkpoint always has its data.
+    /// Saves the replay buffer and the collector, then the checkpoint, so that every checkpoint has its data.
     /// Returns the hash of the weights.
     fn save(&mut self) -> Result<String> {
         let folder = saved_data(self.out, self.step());

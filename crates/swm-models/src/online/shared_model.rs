@@ -1,4 +1,4 @@
-//! [`SharedModel`]: weights that a policy acts with while they are trained.
+//! [`SharedModel`]: weights that training updates while policies use them.
 
 use std::sync::{Arc, Mutex, PoisonError};
 

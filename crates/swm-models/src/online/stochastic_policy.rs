@@ -10,8 +10,8 @@ use swm_plan::ActionScale;
 
 /// A model with a distribution over actions.
 pub trait StochasticActor: Trainable {
-    /// Returns an action for the observation in a row, in model units from -1 to 1: drawn with `key`, or without one
-    /// the most likely action.
+    /// Returns an action for the observation in a row, in model units from -1 to 1: drawn with `key`, or the most
+    /// likely action if `key` is `None`.
     ///
     /// # Shapes
     /// `[action_dim]`.
@@ -21,7 +21,8 @@ pub trait StochasticActor: Trainable {
     fn act(&self, config: &TrainConfig<Self>, row: RowRef<'_>, key: Option<Key>) -> Result<Vec<f32>>;
 }
 
-/// Executes the actions of a network. Every slot is computed separately, so its actions do not depend on the others.
+/// Executes the actions of a network. Every slot is computed separately, so the actions of a slot do not depend on the
+/// other slots.
 pub struct StochasticPolicy<M: StochasticActor> {
     config: TrainConfig<M>,
     scale: ActionScale,
@@ -31,7 +32,7 @@ pub struct StochasticPolicy<M: StochasticActor> {
     explore: bool,
     /// The key of each slot's episode.
     keys: Vec<Key>,
-    /// Seconds per decision since they were last taken.
+    /// Seconds per decision since the latencies were last taken.
     latencies: Vec<f64>,
 }
 
@@ -79,8 +80,8 @@ impl<M: StochasticActor> Policy for StochasticPolicy<M> {
 
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
         let column = actions.schema().index(ACTION)?;
-        // Keyed by the step of the episode, not of the policy, so that a policy that takes over in mid-episode draws
-        // the same.
+        // The key depends on the step of the episode, so that a policy that starts in mid-episode draws the same
+        // actions.
         let steps = infos.get::<i32>(STEP_IDX)?;
         let model = self.model.get();
         let mut env_action = vec![0.0; self.bounds.len()];

@@ -1,4 +1,4 @@
-//! The uses of a trained PLDM: its world model is used as a LeWM is.
+//! [`ModelFamily`] for PLDM, whose world model has the networks of a LeWM.
 
 use super::{Pldm, import};
 use crate::checkpoint::Checkpoint;

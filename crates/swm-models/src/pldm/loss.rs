@@ -1,6 +1,6 @@
-//! The regularisation terms of PLDM (Sobal et al. 2025, arXiv 2502.14819): variance and covariance as in VICReg (Bardes et
-//! al. 2022), over the batch and over time, temporal alignment, and optionally straight latent paths (arXiv 2603.12231).
-//! The inverse-dynamics term is computed with [`super::Idm`].
+//! The regularisation terms of PLDM (Sobal et al. 2025, arXiv 2502.14819): variance and covariance as in VICReg (Bardes
+//! et al. 2022), over the batch and over time, temporal alignment, and optionally straight latent paths (arXiv
+//! 2603.12231). The inverse-dynamics term is computed with [`super::Idm`].
 
 use burn::tensor::{Tensor, activation};
 use serde::{Deserialize, Serialize};
@@ -31,11 +31,12 @@ pub struct PldmLoss {
 pub struct Terms {
     /// Mean of `max(0, 1 - std)` over latent elements, with the standard deviation over the batch.
     pub std: Tensor<1>,
-    /// The same over time, of latents minus the batch's mean at each time.
+    /// Mean of `max(0, 1 - std)` over latent elements, with the standard deviation over time of the latents minus their
+    /// mean over the batch.
     pub std_t: Tensor<1>,
     /// Mean square of the covariances of two latent elements over the batch.
     pub cov: Tensor<1>,
-    /// The same over time.
+    /// Mean square of the covariances of two latent elements over time.
     pub cov_t: Tensor<1>,
     /// Mean square of the difference between consecutive latents.
     pub temp_align: Tensor<1>,
@@ -45,7 +46,7 @@ pub struct Terms {
 
 /// Added to a variance before the square root.
 const VARIANCE_EPSILON: f64 = 1e-4;
-/// The smallest length of a difference with a direction.
+/// The lower bound of the length of a latent difference in the cosine.
 const LENGTH_EPSILON: f64 = 1e-8;
 
 impl Terms {

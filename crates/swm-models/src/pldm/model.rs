@@ -37,23 +37,23 @@ pub struct IdmNet {
 const EPSILON: f64 = 1e-5;
 
 impl Pldm {
-    /// Creates a model with random weights. A model step has an action of dimension `actions`; the inverse dynamics
+    /// Creates a model with random weights. A model step has an action of dimension `action_dim`; the inverse dynamics
     /// have `hidden` hidden features.
-    pub fn init(config: &LewmConfig, actions: usize, hidden: usize, key: Key, device: &Device) -> Self {
+    pub fn init(config: &LewmConfig, action_dim: usize, hidden: usize, key: Key, device: &Device) -> Self {
         let init = Init::new(key, device).of("idm");
-        let model = Lewm::init(config, actions, key, device);
-        Self { model, idm: Idm::new(&init, config.latent, hidden, actions) }
+        let model = Lewm::init(config, action_dim, key, device);
+        Self { model, idm: Idm::new(&init, config.latent, hidden, action_dim) }
     }
 }
 
 impl Idm {
     /// Creates inverse dynamics with random weights for latents of dimension `latent`.
-    pub fn new(init: &Init, latent: usize, hidden: usize, actions: usize) -> Self {
+    pub fn new(init: &Init, latent: usize, hidden: usize, action_dim: usize) -> Self {
         Self {
             net: IdmNet {
                 _0: Linear::new(&init.of("0"), 2 * latent, hidden),
                 _1: LayerNorm::new(init, hidden, EPSILON),
-                _3: Linear::new(&init.of("3"), hidden, actions),
+                _3: Linear::new(&init.of("3"), hidden, action_dim),
             },
         }
     }
@@ -61,7 +61,7 @@ impl Idm {
     /// Predicts the action between each latent and the next.
     ///
     /// # Shapes
-    /// `latents` is `[clips, steps, latent]`; returns `[clips, steps - 1, actions]`.
+    /// `latents` is `[clips, steps, latent]`; returns `[clips, steps - 1, action_dim]`.
     pub fn forward(&self, latents: Tensor<3>) -> Tensor<3> {
         let [clips, steps, latent] = latents.dims();
         let range = |from: usize, to: usize| latents.clone().slice([0..clips, from..to, 0..latent]);

@@ -1,4 +1,4 @@
-//! [`Trainable`] for PLDM: the training loop's view of [`super::step`].
+//! [`Trainable`] for PLDM, which connects [`super::step`] to the training loop.
 
 use super::loss::PldmLoss;
 use super::model::Pldm;

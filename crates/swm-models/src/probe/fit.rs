@@ -63,7 +63,7 @@ pub(super) fn fit<M: Module>(
 /// Gathers rows of a table as a tensor.
 ///
 /// # Shapes
-/// `[rows, width]` to `[indices, width]`.
+/// Maps `[rows, width]` to `[indices, width]`.
 pub(super) fn rows(table: &[f32], width: usize, indices: &[usize]) -> Tensor<2> {
     let values: Vec<f32> =
         indices.iter().flat_map(|&index| &table[index * width..(index + 1) * width]).copied().collect();

@@ -4,8 +4,8 @@
 //!   held-out episodes.
 //! - [`reconstruction`]: the images, reconstructed from latents.
 //!
-//! A state that a linear map reads is represented linearly; one that only the network reads, nonlinearly. A planner
-//! cannot use what neither reads.
+//! If the linear map predicts a state, the latents represent the state linearly; if only the network predicts the
+//! state, the representation is nonlinear. A planner cannot use a state that neither regression predicts.
 
 mod fit;
 pub mod reconstruction;
@@ -21,16 +21,16 @@ use swm_core::Result;
 
 /// An encoder of images.
 pub trait ImageEncoder: Send + Sync {
-    /// The side of its square images, in pixels.
+    /// The side of the encoder's square images, in pixels.
     fn image_size(&self) -> usize;
 
-    /// The dimension of a latent; for an encoder of patches, that of all patches together.
+    /// The dimension of a latent; for an encoder of patches, the dimension of all patches together.
     fn latent_dim(&self) -> usize;
 
     /// Encodes images.
     ///
     /// # Shapes
-    /// `[frames, image_size, image_size, 3]` bytes to `[frames, latent_dim]`.
+    /// Maps `[frames, image_size, image_size, 3]` bytes to `[frames, latent_dim]`.
     ///
     /// # Errors
     /// When the bytes are not whole images.

@@ -1,4 +1,4 @@
-//! Reconstruction of images from latents, which show the information that an encoder preserves.
+//! Reconstruction of images from latents, which shows the information that an encoder preserves.
 
 use super::fit::{FitConfig, fit, rows};
 use super::scale::Scale;
@@ -54,7 +54,7 @@ pub struct ReconstructionReport {
     pub held_out: usize,
     /// The root mean squared error of a pixel on held-out episodes, of values from 0 to 255.
     pub rmse: f64,
-    /// The same error of the mean image, which needs no latent.
+    /// The same error for the mean of the training images, a baseline without latents.
     pub rmse_of_mean: f64,
     /// The fraction of the pixels' variance that the reconstruction explains.
     pub explained: f64,
@@ -104,7 +104,7 @@ impl Decoder {
     /// Decodes latents.
     ///
     /// # Shapes
-    /// `[frames, latent]` to `[frames, image * image * 3]`, the elements of `[image, image, 3]`.
+    /// Maps `[frames, latent]` to `[frames, image * image * 3]`, the elements of `[image, image, 3]`.
     fn forward(&self, latents: Tensor<2>) -> Tensor<2> {
         let [frames, _] = latents.dims();
         let relu = |x: Tensor<2>| Activation::Relu.forward(x);
@@ -131,8 +131,8 @@ impl Decoder {
 /// their reconstructions.
 ///
 /// # Errors
-/// When the images have another size than the encoder's or one that the blocks do not fill, no episode is held out, or
-/// a setting is out of range.
+/// When the images do not have the encoder's image size, the side is not divisible into the decoder's blocks, no
+/// episode is held out, or a setting is out of range.
 pub fn reconstruct_images(
     encoder: &dyn ImageEncoder,
     reader: &dyn Reader,
@@ -195,7 +195,7 @@ pub fn reconstruct_images(
 /// The mean image, with values from 0 to 1.
 ///
 /// # Shapes
-/// `[count, bytes]` to `[bytes]`.
+/// Maps `[count, bytes]` to `[bytes]`.
 fn mean_image(images: &[u8], bytes: usize) -> Vec<f32> {
     let mut sums = vec![0u32; bytes];
     for image in images.chunks_exact(bytes) {
@@ -208,7 +208,7 @@ fn mean_image(images: &[u8], bytes: usize) -> Vec<f32> {
 /// Decodes latents to images with values from 0 to 1.
 ///
 /// # Shapes
-/// `[count, latent]` to `[count, image, image, 3]`.
+/// Maps `[count, latent]` to `[count, image, image, 3]`.
 fn decode(decoder: &Decoder, latents: &[f32], latent: usize, mean: &[f32]) -> Vec<f32> {
     let parts: Vec<Vec<f32>> = latents
         .par_chunks(64 * latent)
@@ -246,7 +246,7 @@ fn sheet(images: &[u8], decoded: &[f32], image: usize, shown: usize) -> Result<R
                 .iter()
                 .map(|i| decoded[i * bytes..(i + 1) * bytes].iter().map(|v| (v * 255.0).round() as u8).collect()),
         );
-        // An incomplete last row is padded, so that it stays above its reconstructions.
+        // Padding aligns the images of an incomplete last row with their reconstructions.
         if indices.len() < COLUMNS && shown > COLUMNS {
             let blank = vec![u8::MAX; bytes];
             let at = frames.len() - indices.len();

@@ -70,7 +70,7 @@ impl Ridge {
     /// Predicts targets.
     ///
     /// # Shapes
-    /// `[rows, features]` to `[rows, targets]`.
+    /// Maps `[rows, features]` to `[rows, targets]`.
     pub fn predict(&self, x: &[f32]) -> Vec<f32> {
         x.par_chunks_exact(self.features)
             .flat_map_iter(|x| {
@@ -103,7 +103,7 @@ pub(super) fn mean_and_std(x: &[f32], rows: usize) -> (Vec<f64>, Vec<f64>) {
 /// Transposes a matrix.
 ///
 /// # Shapes
-/// `[rows, columns]` to `[columns, rows]`.
+/// Maps `[rows, columns]` to `[columns, rows]`.
 fn transpose(x: &[f64], rows: usize, columns: usize) -> Vec<f64> {
     (0..rows * columns).map(|i| x[i % rows * columns + i / rows]).collect()
 }
@@ -182,21 +182,21 @@ mod tests {
             .chunks(features)
             .flat_map(|x| [0, 1].map(|t| 3.0 + x.iter().zip(&truth[t * features..]).map(|(x, w)| x * w).sum::<f32>()))
             .collect();
-        let found = Ridge::fit(&x, &y, rows, 1e-9).expect("fitted").predict(&x);
+        let found = Ridge::fit(&x, &y, rows, 1e-9).expect("a fit").predict(&x);
         let worst = found.iter().zip(&y).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()));
         assert!(worst < 1e-4, "{worst}");
     }
 
     #[test]
     fn primal_and_dual_solutions_agree() {
-        // The same problem with more rows than features, then with every feature twice, so that there are more
-        // features.
+        // The first fit has more rows than features. The second fit has every feature twice, and so more features than
+        // rows.
         let (rows, features) = (12, 9);
         let (x, y) = (noise(rows * features, "x"), noise(rows * 3, "y"));
-        let primal = Ridge::fit(&x, &y, rows, 0.1).expect("fitted").predict(&x);
+        let primal = Ridge::fit(&x, &y, rows, 0.1).expect("a fit").predict(&x);
         let twice: Vec<f32> = x.chunks(features).flat_map(|x| [x, x].concat()).collect();
         // Every feature twice with twice the penalty gives the same map, with each weight split in two.
-        let dual = Ridge::fit(&twice, &y, rows, 0.2).expect("fitted").predict(&twice);
+        let dual = Ridge::fit(&twice, &y, rows, 0.2).expect("a fit").predict(&twice);
         let worst = primal.iter().zip(&dual).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()));
         assert!(worst < 1e-5, "{worst}");
     }

@@ -48,7 +48,7 @@ pub(super) fn sample(
     let rows = choose(rows, count.min(MAX_ELEMENTS / encoder.latent_dim()), key.with(&part.to_string()));
     let names: Vec<&str> = std::iter::once(PIXELS).chain(columns.iter().map(String::as_str)).collect();
     let mut samples = Samples { count: 0, latents: vec![], images: vec![], targets: vec![] };
-    // Some blocks at a time, encoded in parallel.
+    // Several blocks are read and encoded in parallel.
     for blocks in rows.chunks(FRAMES * 16) {
         let parts: Result<Vec<(Vec<f32>, Batch)>> = blocks
             .par_chunks(FRAMES)

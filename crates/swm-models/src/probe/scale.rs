@@ -9,7 +9,7 @@ pub(super) struct Scale {
 }
 
 impl Scale {
-    /// Computes the scale of a table `[rows, width]`; a constant column keeps its unit.
+    /// Computes the scale of a table `[rows, width]`; a constant column is centred only.
     pub fn of(table: &[f32], rows: usize) -> Self {
         let (mean, std) = mean_and_std(table, rows);
         Self { mean, std: std.into_iter().map(|s| if s > 1e-12 { s } else { 1.0 }).collect() }
@@ -23,17 +23,17 @@ impl Scale {
     /// Standardises a table.
     ///
     /// # Shapes
-    /// `[rows, width]` to the same.
+    /// Maps `[rows, width]` to the same shape.
     pub fn apply(&self, table: &[f32]) -> Vec<f32> {
         let width = self.width();
         let scaled = |(i, &v): (usize, &f32)| ((f64::from(v) - self.mean[i % width]) / self.std[i % width]) as f32;
         table.iter().enumerate().map(scaled).collect()
     }
 
-    /// Converts a standardised table back to its units.
+    /// Converts a standardised table back to the units of the columns.
     ///
     /// # Shapes
-    /// `[rows, width]` to the same.
+    /// Maps `[rows, width]` to the same shape.
     pub fn undo(&self, table: &mut [f32]) {
         let width = self.width();
         for (i, v) in table.iter_mut().enumerate() {

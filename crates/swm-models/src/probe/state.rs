@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use swm_core::{Error, Key, Result};
 use swm_data::{Part, Reader};
 
-/// The columns to predict, and how.
+/// The settings of a state probe: the columns to predict and the settings of both regressions.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StateConfig {
@@ -49,14 +49,14 @@ pub struct Score {
     pub column: String,
     /// The index of the element in a row of the column.
     pub index: usize,
-    /// The standard deviation of the element, in its units.
+    /// The standard deviation of the element, in the units of the column.
     pub spread: f64,
-    /// The coefficient of determination: 1 for perfect predictions, 0 for those of the mean. `None` for a constant
-    /// element.
+    /// The coefficient of determination: 1 for perfect predictions, 0 for predictions of the mean. `None` for a
+    /// constant element.
     pub r2: Option<f64>,
-    /// The root mean squared error, in its units.
+    /// The root mean squared error, in the units of the column.
     pub rmse: f64,
-    /// The mean absolute error, in its units.
+    /// The mean absolute error, in the units of the column.
     pub mae: f64,
 }
 
@@ -185,7 +185,7 @@ mod tests {
         let scores = scores(&names, &predictions, &targets);
         assert!((scores[0].mae - 2.0 / 3.0).abs() < 1e-9 && (scores[0].rmse - (2.0f64 / 3.0).sqrt()).abs() < 1e-9);
         // The variance of 0, 3, 6 is 6.
-        assert!((scores[0].r2.expect("it changes") - (1.0 - 2.0 / 3.0 / 6.0)).abs() < 1e-9);
+        assert!((scores[0].r2.expect("a score") - (1.0 - 2.0 / 3.0 / 6.0)).abs() < 1e-9);
         assert!(scores[1].r2.is_none() && scores[1].mae == 0.0);
     }
 }

@@ -19,7 +19,7 @@ impl SacConfig {
     /// Checks the sizes.
     ///
     /// # Errors
-    /// Names the first invalid size or column.
+    /// When a size or column is invalid; the error names the first one.
     pub fn check(&self) -> Result<()> {
         at_least(&[("model.hidden", self.hidden, 1)])?;
         if self.columns.is_empty() {
@@ -54,7 +54,7 @@ impl SacLoss {
     /// Checks the settings.
     ///
     /// # Errors
-    /// Names the first invalid setting.
+    /// When a setting is invalid; the error names the first such setting.
     pub fn check(&self) -> Result<()> {
         let positive = [("loss.discount", self.discount, 1.0), ("loss.tau", self.tau, 1.0)];
         let positive = positive.into_iter().chain([("loss.temperature", self.temperature, f64::MAX)]);

@@ -1,4 +1,4 @@
-//! The uses of a trained SAC.
+//! [`ModelFamily`] for SAC.
 
 use super::Sac;
 use crate::checkpoint::Checkpoint;

@@ -6,8 +6,8 @@ use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor};
 use swm_core::Key;
 
-/// A policy, two Q functions, their target networks, and the temperature. A field `_2` is element 2 of a sequence, as in
-/// PyTorch.
+/// A policy, two Q functions, their target networks, and the temperature. A field `_2` is element 2 of a sequence, as
+/// in PyTorch.
 #[derive(Module, Debug)]
 pub struct Sac {
     /// The policy.
@@ -34,9 +34,9 @@ pub struct Actor {
 /// Two hidden layers with ReLU.
 #[derive(Module, Debug)]
 pub struct Hidden {
-    /// The first.
+    /// The first hidden layer.
     pub _0: Linear,
-    /// The second.
+    /// The second hidden layer.
     pub _2: Linear,
 }
 
@@ -54,7 +54,7 @@ pub struct Critics {
 pub struct Critic {
     /// The first hidden layer.
     pub _0: Linear,
-    /// The second.
+    /// The second hidden layer.
     pub _2: Linear,
     /// The output layer.
     pub _4: Linear,
@@ -62,22 +62,29 @@ pub struct Critic {
 
 /// Sampled actions and the logarithm of their density.
 pub struct ActionSample {
-    /// The actions after `tanh`, `[rows, actions]`.
+    /// The actions after `tanh`, `[rows, action_dim]`.
     pub actions: Tensor<2>,
     /// The logarithm of their density, `[rows]`.
     pub log_density: Tensor<1>,
 }
 
 impl Sac {
-    /// Networks with random weights for observations of `inputs` elements and actions of `actions` elements.
-    pub fn init(config: &SacConfig, loss: &SacLoss, inputs: usize, actions: usize, key: Key, device: &Device) -> Self {
+    /// Creates networks with random weights for observations of `inputs` elements and actions of `action_dim` elements.
+    pub fn init(
+        config: &SacConfig,
+        loss: &SacLoss,
+        inputs: usize,
+        action_dim: usize,
+        key: Key,
+        device: &Device,
+    ) -> Self {
         let init = Init::new(key, device);
         let hidden = config.hidden;
         let actor = init.of("actor");
         let critic = |name: &str| {
             let init = init.of(name);
             Critic {
-                _0: Linear::new(&init.of("0"), inputs + actions, hidden),
+                _0: Linear::new(&init.of("0"), inputs + action_dim, hidden),
                 _2: Linear::new(&init.of("2"), hidden, hidden),
                 _4: Linear::new(&init.of("4"), hidden, 1),
             }
@@ -89,8 +96,8 @@ impl Sac {
                     _0: Linear::new(&actor.of("0"), inputs, hidden),
                     _2: Linear::new(&actor.of("2"), hidden, hidden),
                 },
-                mu: Linear::new(&actor.of("mu"), hidden, actions),
-                log_std: Linear::new(&actor.of("log_std"), hidden, actions),
+                mu: Linear::new(&actor.of("mu"), hidden, action_dim),
+                log_std: Linear::new(&actor.of("log_std"), hidden, action_dim),
             },
             critic_target: critic.clone().no_grad(),
             critic,
@@ -108,7 +115,7 @@ impl Actor {
     /// Returns mean and logarithm of the standard deviation, which is clamped to -20 ..= 2.
     ///
     /// # Shapes
-    /// `observations` is `[rows, inputs]`; returns `[rows, actions]` twice.
+    /// `observations` is `[rows, inputs]`; returns `[rows, action_dim]` twice.
     pub fn forward(&self, observations: Tensor<2>) -> (Tensor<2>, Tensor<2>) {
         let relu = |x| Activation::Relu.forward(x);
         let hidden = relu(self.latent_pi._2.forward(relu(self.latent_pi._0.forward(observations))));
@@ -118,7 +125,7 @@ impl Actor {
     /// Samples actions with standard normal `noise`.
     ///
     /// # Shapes
-    /// `observations` is `[rows, inputs]`, `noise` is `[rows, actions]`.
+    /// `observations` is `[rows, inputs]`, `noise` is `[rows, action_dim]`.
     pub fn sample(&self, observations: Tensor<2>, noise: Tensor<2>) -> ActionSample {
         let (mean, log_std) = self.forward(observations);
         let raw = mean + log_std.clone().exp() * noise.clone();
@@ -134,7 +141,7 @@ impl Critics {
     /// Returns the values of both Q functions.
     ///
     /// # Shapes
-    /// `x` is `[rows, inputs + actions]`; returns `[rows]` twice.
+    /// `x` is `[rows, inputs + action_dim]`; returns `[rows]` twice.
     pub fn forward(&self, x: Tensor<2>) -> [Tensor<1>; 2] {
         [self.qf0.forward(x.clone()), self.qf1.forward(x)]
     }

@@ -1,7 +1,7 @@
 //! One training step (Haarnoja et al. 2018, equations 5, 7 and 18): losses and gradients of a batch of transitions.
 //!
-//! The losses of Q functions, policy and temperature have separate graphs. All gradients are computed at the same weights;
-//! the publication updates the Q functions before it computes the policy's loss.
+//! The losses of Q functions, policy and temperature have separate graphs. All gradients are computed at the same
+//! weights; the publication updates the Q functions before it computes the policy's loss.
 
 use super::config::SacLoss;
 use super::model::{Critics, Sac};
@@ -14,7 +14,7 @@ use burn::tensor::Tensor;
 pub struct Transitions {
     /// `[rows, inputs]`.
     pub observations: Tensor<2>,
-    /// `[rows, actions]`, in model units.
+    /// `[rows, action_dim]`, in model units.
     pub actions: Tensor<2>,
     /// `[rows]`.
     pub rewards: Tensor<1>,
@@ -22,7 +22,8 @@ pub struct Transitions {
     pub terminated: Tensor<1>,
     /// `[rows, inputs]`.
     pub next: Tensor<2>,
-    /// Standard normal, `[rows, actions]` each: for the actions at the next observations, and for those of the policy's loss.
+    /// Standard normal, `[rows, action_dim]` each: for the actions at the next observations, and for the actions of the
+    /// policy's loss.
     pub noise: [Tensor<2>; 2],
 }
 

@@ -1,4 +1,4 @@
-//! [`Trainable`] for SAC: the training loop's view of [`super::step`].
+//! [`Trainable`] for SAC, which connects [`super::step`] to the training loop.
 
 use super::config::{SacConfig, SacLoss};
 use super::model::Sac;

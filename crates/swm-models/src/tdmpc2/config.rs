@@ -36,7 +36,7 @@ pub struct Tdmpc2Config {
 pub struct Encoding {
     /// The column: `pixels`, or a numeric column.
     pub column: String,
-    /// Latent elements it is encoded to.
+    /// Number of latent elements that encode the column.
     pub latent: usize,
 }
 
@@ -46,12 +46,12 @@ impl Tdmpc2Config {
         self.encoding.iter().map(|part| part.latent).sum()
     }
 
-    /// Returns the encoding of images, if there is one.
+    /// Returns the encoding of images, if images are observed.
     pub fn image_encoding(&self) -> Option<&Encoding> {
         self.encoding.iter().find(|part| part.column == PIXELS)
     }
 
-    /// Returns the encodings of the other columns.
+    /// Returns the encodings of the columns other than images.
     pub fn column_encodings(&self) -> impl Iterator<Item = &Encoding> {
         self.encoding.iter().filter(|part| part.column != PIXELS)
     }
@@ -64,7 +64,7 @@ impl Tdmpc2Config {
     /// Checks that the sizes are consistent.
     ///
     /// # Errors
-    /// Names the first size that is not.
+    /// When a size is invalid; the error names the first such size.
     pub fn check(&self) -> Result<()> {
         let Some(first) = self.encoding.first() else {
             let fix = "name a column, such as [{ column = \"state\", latent = 64 }]";
@@ -132,10 +132,10 @@ impl LossConfig {
     /// Checks the settings.
     ///
     /// # Errors
-    /// Names the first invalid setting.
+    /// When a setting is invalid; the error names the first such setting.
     pub fn check(&self) -> Result<()> {
-        let shares = [("loss.discount", self.discount), ("loss.rho", self.rho), ("loss.tau", self.tau)];
-        for (what, value) in shares {
+        let fractions = [("loss.discount", self.discount), ("loss.rho", self.rho), ("loss.tau", self.tau)];
+        for (what, value) in fractions {
             if !(value > 0.0 && value <= 1.0) {
                 return Err(Error::config(what, value.to_string(), "choose a number above 0, at most 1"));
             }

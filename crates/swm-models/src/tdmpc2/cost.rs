@@ -1,5 +1,5 @@
 //! [`Tdmpc2Cost`]: the planning cost of a TD-MPC2 for any solver, the negated sum of predicted rewards and the final
-//! value. It reads no goal: the rewards it was trained with define the task.
+//! value. The cost reads no goal: the rewards of the training data define the task.
 
 use super::config::Tdmpc2Config;
 use super::model::Tdmpc2;
@@ -19,7 +19,7 @@ pub struct Tdmpc2Cost {
 }
 
 impl Tdmpc2Cost {
-    /// The planning cost of a trained model.
+    /// Creates the planning cost of a trained model.
     pub fn new(checkpoint: &Checkpoint<Tdmpc2>) -> Self {
         let loss = &checkpoint.config.loss;
         Self {

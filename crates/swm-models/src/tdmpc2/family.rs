@@ -1,4 +1,4 @@
-//! The uses of a trained TD-MPC2.
+//! [`ModelFamily`] for TD-MPC2.
 
 use super::{Tdmpc2, Tdmpc2Cost, export, import};
 use crate::checkpoint::Checkpoint;

@@ -48,7 +48,7 @@ pub struct ImageCnn {
 }
 
 impl ImageCnn {
-    /// Convolutions with random weights.
+    /// Creates convolutions with random weights.
     pub fn new(init: &Init) -> Self {
         let layer = |name: &str, inputs, kernel: usize| Convolution::new(&init.of(name), inputs, KERNELS[kernel][0]);
         Self {
@@ -83,7 +83,7 @@ fn side(image: usize) -> Option<usize> {
 /// Checks the side of the input images.
 ///
 /// # Errors
-/// When it is too small.
+/// When the side is too small.
 pub fn check(image: usize) -> Result<()> {
     match side(image) {
         Some(_) => Ok(()),

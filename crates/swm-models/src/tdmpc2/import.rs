@@ -19,11 +19,12 @@ use swm_core::{Error, Key, Manifest, Result};
 
 const CLASS: &str = "stable_worldmodel.wm.tdmpc2.TDMPC2";
 
-/// Converts a TD-MPC2 of the reference implementation: a folder with `weights.pt` and `config.json`, or that file. The
-/// files do not store how actions were scaled to -1 ..= 1, so `dataset_info` must describe its environment or dataset.
+/// Converts a TD-MPC2 of the reference implementation: a folder with `weights.pt` and `config.json`, or the path of the
+/// weights. The files do not store how actions were scaled to -1 ..= 1, so `dataset_info` must describe the environment
+/// or the dataset.
 ///
 /// # Errors
-/// When it is another model, it is damaged, or its actions are not those of `dataset_info`.
+/// When a file is damaged or holds another model, or the model's actions are not those of `dataset_info`.
 pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<Tdmpc2>> {
     let reference = Reference::open(from, "TDMPC2")?;
     let folder = if from.is_dir() { from } else { from.parent().unwrap_or(Path::new("")) };
@@ -195,7 +196,7 @@ impl Published {
         })
     }
 
-    /// Returns the sizes.
+    /// Returns the sizes of the model.
     pub fn model(&self) -> Tdmpc2Config {
         let WorldModel { encoding, enc_dim, mlp_dim, num_bins, vmin, vmax, num_q, simnorm_dim, .. } = &self.wm;
         // Images come first in a latent, wherever the file lists them.

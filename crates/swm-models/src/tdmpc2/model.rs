@@ -14,11 +14,11 @@ pub struct Tdmpc2 {
     pub scale: RunningScale,
     /// The convolutions of images; absent in a state-only model.
     pub cnn: Option<ImageCnn>,
-    /// From convolution features to a latent; absent in a state-only model.
+    /// Maps convolution features to a latent; absent in a state-only model.
     pub pixel_encoder: Option<Linear>,
-    /// The encoders of the other columns.
+    /// The encoders of the columns other than images.
     pub extra_encoders: ModuleDict<ColumnEncoder>,
-    /// From a latent and an action to the next latent.
+    /// Maps a latent and an action to the next latent.
     pub dynamics: Dynamics,
     /// Rewards of actions, as logits of bins.
     pub reward: Head,
@@ -57,7 +57,7 @@ pub struct ColumnEncoder {
 pub struct Observation {
     /// `[rows, 3, image, image]`; `None` for a state-only model.
     pub pixels: Option<Tensor<4>>,
-    /// `[rows, features]` of every other column, in the order of the configuration.
+    /// `[rows, features]` of every column other than images, in the order of the configuration.
     pub columns: Vec<Tensor<2>>,
 }
 
@@ -90,7 +90,7 @@ impl Observation {
     }
 }
 
-/// A Gaussian policy before `tanh`: mean and logarithm of the standard deviation, `[rows, actions]` each.
+/// A Gaussian policy before `tanh`: mean and logarithm of the standard deviation, `[rows, action_dim]` each.
 pub struct Gaussian {
     /// The mean.
     pub mean: Tensor<2>,
@@ -99,7 +99,7 @@ pub struct Gaussian {
 }
 
 impl Gaussian {
-    /// Splits a network's output `[rows, 2 * actions]`; the logarithm is mapped to -10 ..= 2.
+    /// Splits a network's output `[rows, 2 * action_dim]`; the logarithm is mapped to -10 ..= 2.
     pub fn of(raw: Tensor<2>) -> Self {
         let [rows, both] = raw.dims();
         let half = both / 2;
@@ -110,16 +110,16 @@ impl Gaussian {
     /// Returns `tanh(mean + std * noise)` for standard normal `noise`.
     ///
     /// # Shapes
-    /// `noise` is `[rows, actions]`; returns the same shape.
+    /// `noise` is `[rows, action_dim]`; returns the same shape.
     pub fn sample(&self, noise: Tensor<2>) -> Tensor<2> {
         (self.mean.clone() + self.log_std.clone().exp() * noise).tanh()
     }
 }
 
 impl Tdmpc2 {
-    /// A model with random weights for actions of `actions` elements. `widths` are the element counts of the observed columns
-    /// other than images, in the order of the configuration.
-    pub fn init(config: &Tdmpc2Config, widths: &[usize], actions: usize, key: Key, device: &Device) -> Self {
+    /// Creates a model with random weights for actions of `action_dim` elements. `widths` are the element counts of the
+    /// observed columns other than images, in the order of the configuration.
+    pub fn init(config: &Tdmpc2Config, widths: &[usize], action_dim: usize, key: Key, device: &Device) -> Self {
         let init = Init::new(key, device);
         let (latent, hidden, bins) = (config.latent(), config.hidden, config.bins.count);
         let encoder = |(part, &width): (&super::Encoding, &usize)| {
@@ -131,7 +131,7 @@ impl Tdmpc2 {
             };
             (part.column.clone(), encoder)
         };
-        let critic = |i| Head::zero_initialized(&init.of("qs").at(i), latent + actions, hidden, bins);
+        let critic = |i| Head::zero_initialized(&init.of("qs").at(i), latent + action_dim, hidden, bins);
         let qs: Vec<Head> = (0..config.critics).map(critic).collect();
         let images = config.image_encoding();
         Self {
@@ -140,9 +140,9 @@ impl Tdmpc2 {
             pixel_encoder: images
                 .map(|part| image_encoder::projection(&init.of("pixel_encoder"), config.image, part.latent)),
             extra_encoders: ModuleDict(config.column_encodings().zip(widths).map(encoder).collect()),
-            dynamics: Dynamics::new(&init.of("dynamics"), latent + actions, hidden, latent),
-            reward: Head::zero_initialized(&init.of("reward"), latent + actions, hidden, bins),
-            pi: Head::new(&init.of("pi"), latent, hidden, 2 * actions),
+            dynamics: Dynamics::new(&init.of("dynamics"), latent + action_dim, hidden, latent),
+            reward: Head::zero_initialized(&init.of("reward"), latent + action_dim, hidden, bins),
+            pi: Head::new(&init.of("pi"), latent, hidden, 2 * action_dim),
             target_qs: qs.clone().into_iter().map(Module::no_grad).collect(),
             qs,
             termination: config.termination.then(|| Head::zero_initialized(&init.of("termination"), latent, hidden, 1)),
@@ -180,7 +180,7 @@ impl Tdmpc2 {
     /// Predicts the next latents.
     ///
     /// # Shapes
-    /// `latents_actions` is `[rows, latent + actions]`; returns `[rows, latent]`.
+    /// `latents_actions` is `[rows, latent + action_dim]`; returns `[rows, latent]`.
     pub fn next(&self, latents_actions: Tensor<2>) -> Tensor<2> {
         self.dynamics.forward(latents_actions, self.config.simplex)
     }

@@ -1,11 +1,11 @@
 //! [`Tdmpc2Policy`]: planning as published (section 3.2 and appendix H), by model-predictive path integral control in
 //! latent space.
 //!
-//! Every iteration evaluates `proposals` rollouts of the policy and samples of a Gaussian. The `elites` with the lowest cost
-//! get the weights `exp(-temperature (cost - lowest cost))` in the next mean and standard deviation. A search begins at
-//! the previous plan's mean, shifted by one step. The policy takes the first action of an elite drawn by weight; exploring,
-//! it adds noise with the last standard deviation. (The mean itself is not used: between two equally good actions it may
-//! be a bad one.)
+//! Every iteration evaluates `proposals` rollouts of the policy and samples of a Gaussian. The `elites` with the lowest
+//! cost get the weights `exp(-temperature (cost - lowest cost))` in the next mean and standard deviation. A search
+//! begins at the previous plan's mean, shifted by one step. The policy takes the first action of an elite drawn by
+//! weight; with exploration, the policy adds noise with the last standard deviation. (The mean is not executed, because
+//! the mean of two equally good actions can be a bad action.)
 
 use super::config::Tdmpc2Config;
 use super::model::Tdmpc2;
@@ -25,11 +25,11 @@ use swm_plan::ActionScale;
 
 /// The result of a search.
 pub struct SearchResult {
-    /// The weighted mean of the elites, `[horizon, actions]`.
+    /// The weighted mean of the elites, `[horizon, action_dim]`.
     pub mean: Vec<f32>,
-    /// The weighted standard deviation of the elites, `[horizon, actions]`.
+    /// The weighted standard deviation of the elites, `[horizon, action_dim]`.
     pub std: Vec<f32>,
-    /// The elites in order of cost, `[elites, horizon, actions]`.
+    /// The elites in order of cost, `[elites, horizon, action_dim]`.
     pub elites: Vec<f32>,
     /// The weights of the elites, which sum to 1: `[elites]`.
     pub weights: Vec<f32>,
@@ -39,7 +39,7 @@ impl PlannerConfig {
     /// Searches for a plan from a latent. `key` determines the samples.
     ///
     /// # Shapes
-    /// `latent` is `[latent]`, `mean`, the initial mean, is `[horizon, actions]`.
+    /// `latent` is `[latent]`, `mean`, the initial mean, is `[horizon, action_dim]`.
     pub fn search(&self, rollouts: &Rollouts, latent: &[f32], mean: &[f32], key: Key) -> SearchResult {
         let len = mean.len();
         let mut candidates = vec![0.0; self.samples * len];
@@ -108,14 +108,14 @@ pub struct Tdmpc2Policy {
 /// The plan of one environment.
 struct Slot {
     key: Key,
-    /// The initial mean of the next search, `[horizon, actions]`.
+    /// The initial mean of the next search, `[horizon, action_dim]`.
     mean: Vec<f32>,
     action: Vec<f32>,
     failed: Option<Error>,
 }
 
 impl Tdmpc2Policy {
-    /// A policy for `slots` environments of `spec` with the current weights of a shared model.
+    /// Creates a policy for `slots` environments of `spec` with the current weights of a shared model.
     ///
     /// # Errors
     /// When the model was trained for other actions, or a setting is invalid.
@@ -146,7 +146,7 @@ impl Tdmpc2Policy {
         })
     }
 
-    /// The policy of a checkpoint.
+    /// Creates the policy of a checkpoint.
     ///
     /// # Errors
     /// As [`Tdmpc2Policy::new`].
@@ -190,7 +190,8 @@ impl Policy for Tdmpc2Policy {
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
         let column = actions.schema().index(ACTION)?;
         let begun = Instant::now();
-        // Keyed by the step of the episode, so that a policy attached later draws the same samples.
+        // The key depends on the step of the episode, so that a policy that starts in mid-episode draws the same
+        // samples.
         let steps = infos.get::<i32>(STEP_IDX)?;
         let rollouts = Rollouts::new(&self.shared_model.get(), self.discount, self.uncertainty);
         let (planner, model, explore) = (&self.planner, &self.model, self.explore);
@@ -217,7 +218,7 @@ impl Policy for Tdmpc2Policy {
         Ok(())
     }
 
-    /// Returns the seconds of each plan: the time of a call is divided equally among its environments.
+    /// Returns the seconds of each plan: the time of a call is divided equally among the environments.
     fn take_latencies(&mut self) -> Vec<f64> {
         std::mem::take(&mut self.latencies)
     }

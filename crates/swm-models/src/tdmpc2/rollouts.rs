@@ -20,7 +20,8 @@ pub struct Rollouts {
 }
 
 impl Rollouts {
-    /// Rollouts with a `discount` per step; `uncertainty` is the cost of the Q functions' disagreement per unit of value.
+    /// Creates rollouts with a `discount` per step; `uncertainty` is the cost of the Q functions' disagreement per unit
+    /// of value.
     pub fn new(model: &Tdmpc2, discount: f64, uncertainty: f64) -> Self {
         let critics = Ensemble::of(&model.qs.iter().collect::<Vec<_>>());
         Self { model: model.clone(), critics, discount, uncertainty }
@@ -31,11 +32,11 @@ impl Rollouts {
         &self.model
     }
 
-    /// Writes the costs of candidates that start at one latent: the negated sum of the discounted rewards and of the value
-    /// of the policy's action after the last step.
+    /// Writes the costs of candidates that start at one latent: the negated sum of the discounted rewards and of the
+    /// value of the policy's action after the last step.
     ///
     /// # Shapes
-    /// `latent` is `[latent]`, `candidates` is `[samples, horizon, actions]`, `costs` is `[samples]`.
+    /// `latent` is `[latent]`, `candidates` is `[samples, horizon, action_dim]`, `costs` is `[samples]`.
     pub fn cost(&self, latent: &[f32], candidates: &[f32], horizon: usize, costs: &mut [f32]) {
         let width = horizon * self.model.actions();
         let parts = costs.par_chunks_mut(PART).zip(candidates.par_chunks(PART * width));
@@ -51,7 +52,7 @@ impl Rollouts {
         let start = Tensor::<2>::from_data(TensorData::new(latent.to_vec(), [1, latent.len()]), &device);
         let mut latents = start.expand([samples, latent.len()]);
         let mut inputs = vec![];
-        // Whether the episode continues, 1 or 0, and the weight of each reward.
+        // `alive` is 1 while the episode continues, else 0; `weights` has the weight of each reward.
         let mut alive = Tensor::<1>::ones([samples], &device);
         let mut weights = vec![];
         for step in 0..horizon {
@@ -84,7 +85,7 @@ impl Rollouts {
     /// Returns the policy's actions: the mean, or samples drawn with one key per row.
     ///
     /// # Shapes
-    /// `latents` is `[rows, latent]`; returns `[rows, actions]`.
+    /// `latents` is `[rows, latent]`; returns `[rows, action_dim]`.
     pub fn act(&self, latents: Tensor<2>, keys: Option<&[Key]>) -> Tensor<2> {
         let gaussian = self.model.policy(latents);
         match keys {
@@ -97,11 +98,11 @@ impl Rollouts {
         }
     }
 
-    /// Writes action sequences that begin with the actions `prefix` and continue with samples of the policy. `key` and the
-    /// index of a sequence determine its samples.
+    /// Writes action sequences that begin with the actions `prefix` and continue with samples of the policy. `key` and
+    /// the index of a sequence determine its samples.
     ///
     /// # Shapes
-    /// `latent` is `[latent]`, `prefix` is `[steps, actions]`, `proposals` is `[samples, horizon, actions]`.
+    /// `latent` is `[latent]`, `prefix` is `[steps, action_dim]`, `proposals` is `[samples, horizon, action_dim]`.
     pub fn propose(&self, latent: &[f32], prefix: &[f32], horizon: usize, key: Key, proposals: &mut [f32]) {
         let (device, width) = (self.model.device(), self.model.actions());
         let samples = proposals.len() / (horizon * width);

@@ -1,8 +1,8 @@
 //! One training step (Hansen et al. 2024, equations 3 to 6): losses and gradients of a batch of clips.
 //!
-//! World model (encoder, dynamics, rewards, values) and policy have separate autodiff graphs: latents and Q functions are
-//! constants for the policy. Everything except the dynamics is computed for all steps of a clip at once; the Q functions are
-//! one batched product.
+//! World model (encoder, dynamics, rewards, values) and policy have separate autodiff graphs: latents and Q functions
+//! are constants for the policy. Everything except the dynamics is computed for all steps of a clip at once; the Q
+//! functions are one batched product.
 //!
 //! A batch is split into shards of clips that run in parallel. Their gradients are added in order; only the spread of
 //! values, which scales the policy's loss, is computed over all shards.
@@ -22,19 +22,19 @@ use swm_core::Key;
 pub struct TrainBatch {
     /// `[(horizon + 1) * clips]` observations.
     pub observations: Observation,
-    /// `[horizon, clips, actions]`, in model units.
+    /// `[horizon, clips, action_dim]`, in model units.
     pub actions: Tensor<3>,
     /// `[horizon, clips]`.
     pub rewards: Tensor<2>,
-    /// `[horizon, clips]`: 1 where the episode terminated by that action.
+    /// `[horizon, clips]`: 1 where the action terminated the episode.
     pub terminated: Tensor<2>,
 }
 
 /// The random draws of a step.
 pub struct Draws {
-    /// Standard normal, `[horizon, clips, actions]`, for the actions at the next frames.
+    /// Standard normal, `[horizon, clips, action_dim]`, for the actions at the next frames.
     pub target: Tensor<3>,
-    /// Standard normal, `[horizon, clips, actions]`, for the actions of the policy's loss.
+    /// Standard normal, `[horizon, clips, action_dim]`, for the actions of the policy's loss.
     pub policy: Tensor<3>,
     /// The two target Q functions of each step whose minimum is the target.
     pub target_critics: Vec<[usize; 2]>,
@@ -160,7 +160,7 @@ pub fn step(model: &Tdmpc2, batch: &TrainBatch, config: &LossConfig, draws: &Dra
     step
 }
 
-/// Some clips of a batch. Rows are ordered by step, then by clip.
+/// One part of the clips of a batch. Rows are ordered by step, then by clip.
 struct Part {
     index: usize,
     clips: usize,
@@ -272,8 +272,8 @@ fn world_model_loss(model: &Tdmpc2, part: &Part, config: &LossConfig, draws: &Dr
     WorldModelLoss { losses, gradients, latents }
 }
 
-/// Returns the targets of the Q functions, `[rows]`: `r + γ min(Q_i, Q_j)` at the next frames, and `r` where the episode
-/// terminates.
+/// Returns the targets of the Q functions, `[rows]`: `r + γ min(Q_i, Q_j)` at the next frames, and `r` where the
+/// episode terminates.
 fn targets(model: &Tdmpc2, part: &Part, next_latents: &Tensor<2>, config: &LossConfig, draws: &Draws) -> Tensor<1> {
     let next = model.policy(next_latents.clone()).sample(part.target_noise.clone());
     let input = Tensor::cat(vec![next_latents.clone(), next], 1);
@@ -292,7 +292,7 @@ fn targets(model: &Tdmpc2, part: &Part, next_latents: &Tensor<2>, config: &LossC
 /// Values and entropies of the policy's actions.
 struct PolicyEvaluation {
     policy: Head,
-    /// Values of its actions, `[rows]`.
+    /// Values of the policy's actions, `[rows]`.
     q: Tensor<1>,
     /// The negative log-density of the actions times the number of action elements, `[rows]`.
     entropy: Tensor<1>,

@@ -1,4 +1,4 @@
-//! [`Trainable`] for TD-MPC2: the training loop's view of [`super::step`].
+//! [`Trainable`] for TD-MPC2, which connects [`super::step`] to the training loop.
 
 use super::config::{LossConfig, Tdmpc2Config};
 use super::model::{Observation, Tdmpc2};

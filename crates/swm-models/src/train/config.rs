@@ -17,7 +17,7 @@ pub struct TrainConfig<M: Trainable> {
     pub seed: u64,
     /// The sizes of the model.
     pub model: M::Config,
-    /// The settings of its loss.
+    /// The settings of the loss.
     pub loss: M::Loss,
     /// The data.
     pub data: DataConfig,
@@ -64,7 +64,7 @@ impl<M: Trainable> std::fmt::Debug for TrainConfig<M> {
     }
 }
 
-/// The data a model is trained on.
+/// The data on which a model is trained.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DataConfig {
@@ -87,9 +87,9 @@ pub struct DataConfig {
 pub struct ValidationConfig {
     /// Steps between two validations; 0 for none.
     pub every: usize,
-    /// Batches of a validation, always the same ones.
+    /// Batches of a validation, always the same batches.
     pub batches: usize,
-    /// Validations without a lower loss after which training stops; 0 trains to the end.
+    /// Number of validations without a lower loss after which training stops; 0 trains to the end.
     pub patience: usize,
 }
 
@@ -115,11 +115,11 @@ pub(crate) struct LoopConfig {
 const OPTIONAL: &str = "optim.accumulate = 1\noptim.ema = 0.0\nvalidation = { every = 0, batches = 8, patience = 0 }\n";
 
 impl<M: Trainable> TrainConfig<M> {
-    /// Loads a preset (its name, or the path of a TOML file), overridden by `key=value` settings with dotted keys, such as
-    /// `optim.lr=3e-4`.
+    /// Loads a preset (its name, or the path of a TOML file), overridden by `key=value` settings with dotted keys, such
+    /// as `optim.lr=3e-4`.
     ///
     /// # Errors
-    /// When there is no such preset or key (naming the nearest), or a value does not fit.
+    /// When there is no such preset or key (the error names the nearest), or a value does not fit.
     pub fn load(preset: &str, settings: &[String]) -> Result<Self> {
         let text = preset_text(M::PRESETS, preset)?;
         let presets: Vec<&str> = M::PRESETS.iter().map(|preset| preset.toml).chain([OPTIONAL]).collect();
@@ -139,7 +139,7 @@ impl<M: Trainable> TrainConfig<M> {
     /// Checks that the settings fit each other.
     ///
     /// # Errors
-    /// Names the first that does not.
+    /// When a setting does not fit; the error names the first such setting.
     pub fn check(&self) -> Result<()> {
         at_least(&[
             ("data.num_steps", self.data.num_steps, 1),

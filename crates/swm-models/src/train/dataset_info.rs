@@ -40,7 +40,7 @@ impl ColumnInfo {
         self.mean.len()
     }
 
-    /// The standard deviation, replaced by 1 for elements that are constant, so that it can be divided by.
+    /// The standard deviation, replaced by 1 for elements that are constant, so that it can be a divisor.
     pub fn spread(&self) -> Vec<f64> {
         self.std.iter().map(|&std| if std > 1e-6 { std } else { 1.0 }).collect()
     }
@@ -50,7 +50,7 @@ impl ColumnInfo {
         Ok(Self { shape: spec.shape.clone(), mean: stats.mean, std: stats.std, min: stats.min, max: stats.max })
     }
 
-    /// Statistics that leave a column of that shape as it is.
+    /// Returns statistics with which scaling does not change the column.
     fn identity(spec: &ColumnSpec) -> Self {
         let all = |value: f64| vec![value; spec.len()];
         Self { shape: spec.shape.clone(), mean: all(0.0), std: all(1.0), min: all(0.0), max: all(0.0) }
@@ -86,8 +86,8 @@ impl DatasetInfo {
         Ok(Self { action, columns: observed, env })
     }
 
-    /// The info of an environment without data: the shapes of `columns`, whose values are not scaled, and actions whose
-    /// bounds are mapped to -1 and 1.
+    /// Returns the info of an environment, without a dataset: the shapes of `columns`, whose values are not scaled, and
+    /// actions whose bounds are mapped to -1 and 1.
     ///
     /// # Errors
     /// When the action space is not continuous with finite bounds, or the environment does not observe a column.
@@ -100,7 +100,7 @@ impl DatasetInfo {
             })?;
             Ok((name.clone(), ColumnInfo::identity(column)))
         };
-        // Images are not scaled, and the other three are no observations.
+        // Images are not scaled; action, reward and termination are not observations.
         let skipped = [PIXELS, ACTION, REWARD, TERMINATED];
         let columns = columns.iter().filter(|name| !skipped.contains(&name.as_str())).map(info);
         Ok(Self { action, columns: columns.collect::<Result<Named<_>>>()?, env: Some(spec.id.clone()) })
@@ -109,7 +109,7 @@ impl DatasetInfo {
     /// The statistics of a column.
     ///
     /// # Errors
-    /// When the model was trained without it.
+    /// When the model was trained without the column.
     pub fn column(&self, name: &str) -> Result<&ColumnInfo> {
         self.columns.get(name).ok_or_else(|| {
             let known = self.columns.keys().map(String::as_str);
@@ -124,7 +124,7 @@ impl DatasetInfo {
     /// `[clips, steps, frameskip * action_dim]`.
     ///
     /// # Errors
-    /// When there is no column of actions, or it is of another type.
+    /// When there is no column of actions, or the column is of another type.
     pub fn actions(&self, batch: &Batch, steps: usize, frameskip: usize, device: &Device) -> Result<Tensor<3>> {
         let dim = self.action.dim();
         let mut actions = batch.get::<f32>(ACTION)?.to_vec();
@@ -145,7 +145,7 @@ fn standard_scale(action: &ColumnInfo) -> ActionScale {
     ActionScale { mean: single(&action.mean), std: single(&action.spread()) }
 }
 
-/// Maps the range of the actions in the data to -1 ..= 1; an element that is constant keeps its unit.
+/// Maps the range of the actions in the data to -1 ..= 1; a constant element is mapped to 0.
 fn range_scale(action: &ColumnInfo) -> ActionScale {
     let range = |(&low, &high): (&f64, &f64)| match high > low {
         true => (((high + low) / 2.0) as f32, ((high - low) / 2.0) as f32),

@@ -1,6 +1,7 @@
 //! [`Learner`]: a model, its optimizer and their progress, which both training loops update.
 //!
-//! The loops access a model through the object-safe trait [`DynLearner`], so they are compiled once and not once per family.
+//! The loops access a model through the object-safe trait [`DynLearner`], so they are compiled once and not once per
+//! family.
 
 use super::config::TrainConfig;
 use super::dataset_info::DatasetInfo;
@@ -30,7 +31,7 @@ pub(crate) trait DynLearner {
     /// When writing fails.
     fn save_if_best(&mut self, loss: f64, out: &Path) -> Result<bool>;
 
-    /// Loss and gradients of a batch; without `training`, of the averaged weights, where an average is kept.
+    /// Computes loss and gradients of a batch; without `training`, with the averaged weights if an average is kept.
     ///
     /// # Errors
     /// When the batch does not fit the model.
@@ -39,7 +40,7 @@ pub(crate) trait DynLearner {
     /// Makes one optimizer step, then [`Trainable::after_step`] with `key`.
     fn update(&mut self, output: StepOutput, key: Key) -> Update;
 
-    /// Saves the checkpoint with the state to continue from, and returns the hash of its weights.
+    /// Saves the checkpoint and the state from which training continues, and returns the hash of the weights.
     ///
     /// # Errors
     /// When writing fails.
@@ -59,7 +60,7 @@ pub(crate) struct Update {
     pub gradient_norm: f64,
 }
 
-/// The folder, inside a run's, of the checkpoint with the lowest validation loss or the highest mean return.
+/// The folder, inside a run folder, of the checkpoint with the lowest validation loss or the highest mean return.
 const BEST: &str = "best";
 
 /// A model in training.
@@ -77,10 +78,10 @@ pub(crate) struct Learner<'a, M: Trainable> {
 }
 
 impl<'a, M: Trainable> Learner<'a, M> {
-    /// Resumes the run in the folder `out`, or returns `None` where there is none.
+    /// Resumes the run in the folder `out`, or returns `None` if the folder holds no run.
     ///
     /// # Errors
-    /// When there is a run that may not be continued: `options` do not ask for it, or its configuration or data differ.
+    /// When the run cannot be continued: `options.resume` is not set, or the configuration or the data differ.
     pub fn resume(
         config: &'a TrainConfig<M>,
         dataset_info: &DatasetInfo,
@@ -107,7 +108,7 @@ impl<'a, M: Trainable> Learner<'a, M> {
         Ok(Some(Self { config, device, model, average, dataset_info, manifest, optimizer, state: stored.state }))
     }
 
-    /// A model with initial weights, in a folder that is created.
+    /// Creates a model with initial weights, and the folder `out`.
     ///
     /// # Errors
     /// When the data do not fit the configuration, or writing fails.
@@ -124,7 +125,7 @@ impl<'a, M: Trainable> Learner<'a, M> {
         Ok(Self { config, device, model, average: None, dataset_info, manifest, optimizer, state })
     }
 
-    /// Loads pretrained weights, and keeps an average of the weights where the configuration asks for one.
+    /// Loads pretrained weights, and starts the average of the weights if the configuration sets one.
     ///
     /// # Errors
     /// When the weights cannot be fetched or do not fit.
@@ -148,7 +149,7 @@ impl<'a, M: Trainable> Learner<'a, M> {
         StepContext { config: self.config, dataset_info: &self.dataset_info, key, device: self.device, training }
     }
 
-    /// The weights to use: the average, where one is kept.
+    /// Returns the checkpoint, with the averaged weights if an average is kept.
     fn checkpoint(&self) -> Checkpoint<M> {
         Checkpoint {
             model: self.average.as_ref().unwrap_or(&self.model).clone(),

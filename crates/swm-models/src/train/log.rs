@@ -110,7 +110,7 @@ struct Value {
     simple_value: Option<f32>,
 }
 
-/// A record of a TFRecord file: the length, its checksum, the data, their checksum.
+/// A record of a TFRecord file: the length, the checksum of the length, the data, the checksum of the data.
 fn record(data: &[u8]) -> Vec<u8> {
     let length = (data.len() as u64).to_le_bytes();
     let mut out = length.to_vec();
@@ -133,7 +133,7 @@ mod tests {
     fn events_round_trip_with_valid_checksums() {
         let folder = tempfile::tempdir().expect("a folder");
         let mut log = Log::new(folder.path(), false).expect("a log");
-        log.write(7, &[("loss", 0.5), ("lr", 1e-3)]).expect("written");
+        log.write(7, &[("loss", 0.5), ("lr", 1e-3)]).expect("a written file");
         let line = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("lines");
         assert_eq!(line, "{\"loss\":0.5,\"lr\":0.001,\"step\":7}\n");
         let events = std::fs::read(&log.events.path).expect("events");
@@ -155,7 +155,8 @@ mod tests {
 
     #[test]
     fn checksum_matches_tensorflow() {
-        // The first twelve bytes of every event file that TensorFlow writes: a length of 24, then its checksum.
+        // The first twelve bytes of every event file that TensorFlow writes: a length of 24, then the checksum of the
+        // length.
         assert_eq!(masked_crc(&24u64.to_le_bytes()), 0x224b_7fa3);
     }
 }

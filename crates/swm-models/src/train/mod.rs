@@ -1,9 +1,10 @@
 //! Training on datasets: one loop for every [`Trainable`] model, its configuration and its logs.
 //!
-//! The configuration and the data determine a run. The step number alone decides which batches come next and which
-//! random numbers they use, so a run that was interrupted continues as if it had not been.
+//! The configuration and the data determine a run. The step number determines the next batches and their random
+//! numbers, so an interrupted and resumed run gives the same results as an uninterrupted run.
 //!
-//! Training by interaction with an environment is in [`crate::online`]; both loops drive a model through one learner.
+//! Training by interaction with an environment is in [`crate::online`]; both loops update a model through the same
+//! learner.
 
 pub mod checks;
 pub mod config;

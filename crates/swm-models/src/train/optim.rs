@@ -1,7 +1,7 @@
 //! AdamW (Loshchilov and Hutter 2019, algorithm 2) with clipping of the global gradient norm, as PyTorch computes both.
 //!
-//! Burn's optimizer clips every tensor separately and keys its state by ids that change from run to run. This one clips
-//! the whole gradient and keys its state by parameter name, so that the state can be stored beside the weights.
+//! Burn's optimizer clips every tensor separately and keys its state by ids that change from run to run. This optimizer
+//! clips the whole gradient and keys its state by parameter name, so that the state can be stored beside the weights.
 
 use crate::nn::parameters::{self, HostTensor, IntoF32, Named};
 use burn::module::Module;
@@ -99,7 +99,7 @@ impl AdamW {
     }
 
     /// Makes one step at `lr_factor` times the peak learning rate. Returns the module and the gradient norm before
-    /// clipping. `group` returns the group of the parameter of a name.
+    /// clipping. `group` maps a parameter name to the group of the parameter.
     ///
     /// # Shapes
     /// `gradients` are flattened to one axis, by parameter name.
@@ -121,7 +121,7 @@ impl AdamW {
             let Some(gradient) = gradients.remove(name) else { return value };
             let group = group(name);
             let lr = config.lr * lr_factor * group.lr;
-            // PyTorch adds 1e-6 to the norm, so that a zero gradient divides by more than 0.
+            // PyTorch adds 1e-6 to the norm, so that the divisor of a zero gradient is not 0.
             let scale = config.clip / (squared_norms[&group.clip].sqrt() + 1e-6);
             let gradient = if scale < 1.0 { gradient * scale } else { gradient };
             let (first, second) = match moments.remove(name) {

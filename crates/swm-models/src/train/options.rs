@@ -12,7 +12,7 @@ pub struct TrainOptions {
     pub resume: bool,
     /// The device that holds the tensors.
     pub device: Device,
-    /// Threads that compute; 0 for all.
+    /// Number of compute threads; 0 for all cores.
     pub threads: usize,
     /// Number of threads that load data.
     pub loader_threads: usize,

@@ -11,16 +11,16 @@ use swm_core::{Error, Result};
 pub struct Preset {
     /// The name on the command line.
     pub id: &'static str,
-    /// One-sentence description of its purpose.
+    /// One-sentence description of the configuration.
     pub summary: &'static str,
     /// The configuration.
     pub toml: &'static str,
 }
 
-/// Reads the TOML of a preset, or of the file of that path.
+/// Returns the TOML of the preset named `preset`, or of the file at the path `preset`.
 ///
 /// # Errors
-/// When there is neither.
+/// When there is no such preset or file.
 pub(crate) fn preset_text(presets: &[Preset], preset: &str) -> Result<String> {
     match presets.iter().find(|row| row.id == preset) {
         Some(row) => Ok(row.toml.to_owned()),
@@ -38,7 +38,7 @@ pub(crate) fn preset_text(presets: &[Preset], preset: &str) -> Result<String> {
 /// `presets`.
 ///
 /// # Errors
-/// When there is no such key (naming the nearest), or a value does not fit.
+/// When there is no such key (the error names the nearest), or a value does not fit.
 pub(crate) fn parse<C: DeserializeOwned>(text: &str, settings: &[String], presets: &[&str]) -> Result<C> {
     merge(text, settings, presets)?.extract().map_err(|error| {
         let key = if error.path.is_empty() { "configuration".to_owned() } else { error.path.join(".") };
@@ -68,7 +68,7 @@ fn merge(text: &str, settings: &[String], presets: &[&str]) -> Result<Figment> {
             return Err(Error::config(setting, "is not a setting", "write key=value, such as optim.lr=3e-4"));
         };
         check(key)?;
-        // A setting that is no TOML value is a string.
+        // A value that is not valid TOML is a string.
         let value = toml::from_str::<toml::Table>(&format!("value = {value}"))
             .ok()
             .and_then(|mut table| table.remove("value"))

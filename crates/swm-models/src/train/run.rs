@@ -96,7 +96,7 @@ impl<'a> Run<'a> {
         let loader = |part| {
             let config = LoaderConfig {
                 batch_size: config.data.batch_size,
-                // Validation is shuffled, too: in stored order, its first batches would come from one or two episodes.
+                // Validation is shuffled, too: in stored order, the first batches would come from one or two episodes.
                 shuffle: true,
                 seed: config.seed,
                 threads: options.loader_threads,
@@ -136,7 +136,7 @@ impl<'a> Run<'a> {
             if is_due(self.config.validation.every, done, steps) {
                 let loss = self.validate()?;
                 validation = Some(loss);
-                stopped_early = self.is_stalled(loss)?;
+                stopped_early = self.record_validation(loss)?;
             }
             let rates = self.clock.rates(elapsed);
             let mut shown = metrics;
@@ -184,7 +184,7 @@ impl<'a> Run<'a> {
         Ok(self.learner.update(mean, key))
     }
 
-    /// Loss and gradients of the batch of that number, checked to be finite.
+    /// Computes loss and gradients of the batch with the index `number`, and checks that they are finite.
     fn loss_and_gradients(&self, batch: &Batch, number: usize) -> Result<StepOutput> {
         let key = Key::new(self.config.seed).with("step").at(number as u64);
         let output = self.learner.loss_and_gradients(batch, key, true)?;
@@ -223,7 +223,7 @@ impl<'a> Run<'a> {
     }
 
     /// Saves the weights if `loss` is the lowest so far; returns whether training is to stop early.
-    fn is_stalled(&mut self, loss: f64) -> Result<bool> {
+    fn record_validation(&mut self, loss: f64) -> Result<bool> {
         let is_best = self.learner.save_if_best(loss, self.out)?;
         let since_best = &mut self.learner.state_mut().validations_since_best;
         *since_best = if is_best { 0 } else { *since_best + 1 };
@@ -266,14 +266,14 @@ impl<'a> Run<'a> {
 }
 
 impl Batches {
-    /// The batches after the first `taken`.
+    /// Creates the batches that follow the first `taken` batches.
     fn new(loader: Loader, taken: usize) -> Self {
         let per_epoch = loader.batches_per_epoch();
         let epoch = loader.epoch((taken / per_epoch) as u64, taken % per_epoch);
         Self { loader, epoch, taken }
     }
 
-    /// The next batch, of the next epoch after the last one of an epoch.
+    /// Returns the next batch; the first batch of the next epoch follows the last batch of an epoch.
     fn next(&mut self) -> Result<swm_data::LoadedBatch> {
         loop {
             match self.epoch.next() {

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-/// The progress of a run: together with the tensors, all that its continuation depends on.
+/// The progress of a run. With the tensors of the checkpoint, it determines how the run continues.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub(crate) struct RunState {
     /// Optimizer steps done.

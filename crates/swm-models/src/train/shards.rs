@@ -1,16 +1,16 @@
 //! Losses that are means over clips, computed in parallel.
 //!
-//! Burn computes on one thread, so shards of a batch run on several threads. The configuration, not the machine, sets the number of shards a
-//! batch is cut into. Each shard differentiates its own copy of the model, and the results are added in the order of
-//! the shards, so they do not depend on the number of threads.
+//! Burn computes on one thread, so shards of a batch run on several threads. The configuration, not the machine, sets
+//! the number of shards a batch is cut into. Each shard differentiates its own copy of the model, and the results are
+//! added in the order of the shards, so they do not depend on the number of threads.
 
 use super::step_output::StepOutput;
 use rayon::prelude::*;
 use std::ops::Range;
 use swm_core::Result;
 
-/// Returns the mean of a step over shards of `rows`, each weighted by its rows. `shard(range)` computes the mean over
-/// the rows of its range.
+/// Returns the mean of a step over shards of `rows` rows, each weighted by its number of rows. `shard(range)` computes
+/// the mean over the rows of `range`.
 ///
 /// # Errors
 /// The first error of a shard.

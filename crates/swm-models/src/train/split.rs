@@ -3,7 +3,8 @@
 use swm_core::{Error, Result};
 use swm_data::{Part, Reader, Split};
 
-/// Returns the indices of the episodes of a part of the dataset, or `None` for all episodes where none are held out.
+/// Returns the indices of the episodes of a part of the dataset, or `None` (all episodes) if none are held
+/// out.
 ///
 /// # Errors
 /// When no episode is left for the part.

@@ -33,10 +33,10 @@ pub trait Trainable: Module + Sync + 'static {
     /// Weights and settings of the loss: the table `loss`.
     type Loss: Serialize + DeserializeOwned + Clone + Debug + PartialEq + Send + Sync;
 
-    /// Checks the settings of the family; the training loop checks the common ones.
+    /// Checks the settings of the family; the training loop checks the settings of all families.
     ///
     /// # Errors
-    /// Names the first setting that does not fit the others.
+    /// When two settings contradict each other; the error names the first such setting.
     fn check(config: &TrainConfig<Self>) -> Result<()>;
 
     /// The side of the square images that the model takes, in pixels; `None` for a state-only model.
@@ -68,14 +68,14 @@ pub trait Trainable: Module + Sync + 'static {
     /// When the batch does not fit the model.
     fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput>;
 
-    /// Updates running statistics and target networks after the optimizer's step. `buffers` are those of the step's
-    /// output.
+    /// Updates running statistics and target networks after the optimizer's step. The buffers are those
+    /// that [`Trainable::step`] returned.
     #[must_use]
     fn after_step(self, _context: &StepContext<'_, Self>, _buffers: Named<Tensor<1>>) -> Self {
         self
     }
 
-    /// How the optimizer treats the parameter of that name.
+    /// Returns the group of a parameter, given the parameter's name.
     fn parameter_group(_name: &str) -> ParameterGroup {
         ParameterGroup::default()
     }

@@ -14,7 +14,7 @@ use swm_data::objects::ObjectFile;
 /// The size of a download request, in bytes.
 const CHUNK: u64 = 32 << 20;
 
-/// The hub and the caches of its files.
+/// A client of the hub with file caches.
 pub struct Hub {
     endpoint: String,
     cache: PathBuf,
@@ -101,7 +101,7 @@ pub fn fetch(repo: &str, file: &str, cache: &Path) -> Result<PathBuf> {
 /// files are cached in the folder `cache`.
 ///
 /// # Errors
-/// When `from` is neither, or the hub cannot be reached.
+/// When `from` is neither a file nor a repository, or the hub cannot be reached.
 pub fn locate(from: &str, cache: &Path) -> Result<PathBuf> {
     let path = PathBuf::from(from);
     if path.is_file() {

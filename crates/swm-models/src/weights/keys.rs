@@ -1,5 +1,5 @@
-//! The keys of JSON objects in the order of the file, which parsed objects lose. The reference applies its modules in
-//! that order.
+//! The keys of JSON objects in the order of the file, which parsed objects do not preserve. The reference
+//! implementation applies modules in that order.
 
 use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, SeqAccess, Visitor};
 use serde::ser::{Serialize, SerializeMap as _, Serializer};
@@ -59,7 +59,7 @@ impl<'de> Deserialize<'de> for Keys {
     }
 }
 
-/// An object that is serialised with its keys in this order.
+/// An object that is serialised with its keys in the order of the vector.
 pub(crate) struct InOrder<T>(pub Vec<(String, T)>);
 
 impl<T: Serialize> Serialize for InOrder<T> {
@@ -82,7 +82,7 @@ mod tests {
         let keys: Keys = serde_json::from_str(text).expect("JSON");
         let names = |keys: &Keys| keys.0.iter().map(|(name, _)| name.clone()).collect::<Vec<_>>();
         assert_eq!(names(&keys), ["z", "a"]);
-        assert_eq!(names(keys.at("z").expect("there")), ["second", "first", "null"]);
+        assert_eq!(names(keys.at("z").expect("the key z")), ["second", "first", "null"]);
         assert!(keys.at("z.third").is_none());
         let written = serde_json::to_string(&InOrder(vec![("b".to_owned(), 1), ("a".to_owned(), 2)])).expect("JSON");
         assert_eq!(written, r#"{"b":1,"a":2}"#);

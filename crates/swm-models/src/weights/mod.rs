@@ -28,7 +28,7 @@ use swm_core::{Error, Result};
 
 /// Reads the tensors of a file in single precision; half precision is widened, integers and doubles are converted.
 ///
-/// Of a training checkpoint with weights under `state_dict`, only those are returned.
+/// For a training checkpoint with weights under `state_dict`, returns those weights only.
 ///
 /// # Errors
 /// When the file cannot be read, has another format, is damaged, or holds anything but tensors of real values.
@@ -115,11 +115,12 @@ fn damaged(path: &Path, problem: String) -> Error {
     Error::corrupt(path, problem, "save the state dict again, as safetensors or with torch.save")
 }
 
-/// Replaces the weights of a module: `weights` must hold each of its parameters and buffers in its shape, and nothing
-/// else. `what` names the module in errors, such as "the model of config.json".
+/// Replaces the weights of a module: `weights` must hold every parameter and buffer of the module, with the same
+/// shapes, and nothing else. `what` names the module in errors, such as "the model of config.json".
 ///
 /// # Errors
-/// Names the first weight that is missing, of another shape, or not one of the module.
+/// When a weight is missing, has another shape, or is not a weight of the module; the error names the first such
+/// weight.
 pub fn fill<M: Module>(module: M, weights: &Named<HostTensor>, path: &Path, what: &str) -> Result<M> {
     match mismatch(&parameters::shapes(&module), weights, what) {
         Some(problem) => Err(Error::corrupt(path, problem, format!("give the weights of {what}"))),

@@ -1,7 +1,7 @@
 //! The names of the weights of a vision transformer.
 //!
-//! Published files and `transformers` up to version 4 use the names of our modules. Version 5 renames weights when it
-//! loads a file, so a state dict that it saved has the newer names.
+//! Published files and `transformers` up to version 4 use the parameter names of this crate. Version 5 renames weights
+//! when it loads a file, so a state dict that version 5 saved has the newer names.
 
 use crate::nn::parameters::Named;
 
@@ -34,14 +34,14 @@ const DINO: &[(&str, &str)] = &[
     (".attention.output.dense.", ".attention.o_proj."),
 ];
 
-/// The table of a transformer; only a DINOv2 has weights of LayerScale.
+/// Returns the table of the transformer below `prefix`; a transformer with LayerScale weights is a DINOv2.
 fn table<T>(weights: &Named<T>, prefix: &str) -> &'static [(&'static str, &'static str)] {
     let scaled = weights.keys().any(|name| name.starts_with(prefix) && name.contains(".layer_scale1."));
     if scaled { DINO } else { VIT }
 }
 
-/// Renames the weights of the transformer below `prefix` (such as `encoder.`) to their published names, whichever they
-/// have.
+/// Renames the weights of the transformer below `prefix` (such as `encoder.`) to their published names; published names
+/// are unchanged.
 pub fn to_published<T>(weights: Named<T>, prefix: &str) -> Named<T> {
     let table = table(&weights, prefix);
     let is_newer = |name: &String| name.starts_with(prefix) && name.contains(".attention.q_proj.");

@@ -10,7 +10,7 @@ use serde_json::Value;
 use std::path::{Path, PathBuf};
 use swm_core::{Error, Result};
 
-/// A checkpoint of the reference.
+/// A checkpoint of the reference implementation.
 pub(crate) struct Reference {
     /// The file of weights.
     pub path: PathBuf,
@@ -30,7 +30,7 @@ impl Reference {
     /// that file.
     ///
     /// # Errors
-    /// When a file is missing or damaged, there are several files of weights, or the class is another one.
+    /// When a file is missing or damaged, there are several files of weights, or the checkpoint is of another class.
     pub fn open(from: &Path, class: &str) -> Result<Self> {
         if !from.exists() {
             let fix = "give the folder of a checkpoint, or its file of weights";
@@ -63,21 +63,21 @@ impl Reference {
     /// Returns the size at a dotted path, such as `predictor.depth`.
     ///
     /// # Errors
-    /// When there is none.
+    /// When there is no size at the path.
     pub fn size(&self, at: &str) -> Result<usize> {
         self.size_or(at, None)
     }
 
-    /// Returns the size at a dotted path, or `default` where there is none.
+    /// Returns the size at a dotted path, or `default` if there is no size at the path.
     ///
     /// # Errors
-    /// When there is neither.
+    /// When there is neither a size at the path nor a default.
     pub fn size_or(&self, at: &str, default: Option<usize>) -> Result<usize> {
         let found = self.at(at).and_then(Value::as_u64).and_then(|size| usize::try_from(size).ok());
         found.or(default).ok_or_else(|| self.wrong(format!("{CONFIG} has no number at {at}")))
     }
 
-    /// Returns the rate at a dotted path, or 0 where there is none.
+    /// Returns the rate at a dotted path, or 0 if there is no rate at the path.
     pub fn rate(&self, at: &str) -> f32 {
         self.at(at).and_then(Value::as_f64).unwrap_or(0.0) as f32
     }
@@ -93,7 +93,7 @@ impl Reference {
         target.rsplit('.').next().unwrap_or_default()
     }
 
-    /// The error for a checkpoint that this program cannot use.
+    /// Returns the error for a checkpoint that this program cannot use.
     pub fn wrong(&self, problem: String) -> Error {
         Error::corrupt(&self.path, problem, "give a checkpoint that the reference's own training wrote")
     }
@@ -101,7 +101,7 @@ impl Reference {
     /// Returns the shape of a weight.
     ///
     /// # Errors
-    /// When it is missing.
+    /// When the weight is missing.
     pub fn shape(&self, name: &str) -> Result<&[usize]> {
         let found = self.weights.get(name).map(|weight| weight.shape.as_slice());
         found.ok_or_else(|| self.wrong(format!("'{name}' is missing")))
@@ -111,7 +111,7 @@ impl Reference {
     /// their published names.
     ///
     /// # Errors
-    /// When there is another encoder, or its size is unknown.
+    /// When the encoder is not a vision transformer, or its size is unknown.
     pub fn vit(&mut self, at: &str) -> Result<(VitConfig, usize)> {
         if self.class(at) != "vit_hf" {
             return Err(self.wrong(format!("its encoder is '{}', not the vision transformer 'vit_hf'", self.class(at))));
@@ -137,7 +137,7 @@ impl Reference {
         let prefix = format!("{at}.");
         let weights = std::mem::take(&mut self.weights);
         self.weights = names::to_published(weights, &prefix);
-        // Used in pretraining with masked images only.
+        // The mask token is used in pretraining with masked images only.
         self.weights.remove(&format!("{prefix}embeddings.mask_token"));
         Ok((config, image))
     }

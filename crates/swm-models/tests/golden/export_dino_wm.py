@@ -54,7 +54,7 @@ def main(path):
 
     clips, steps = 3, c["history"] + 1
     pixels = torch.randn(clips, steps, 3, c["image"], c["image"])
-    columns = {name: torch.randn(clips, steps, numbers) for name, numbers, _ in c["columns"]}
+    columns = {name: torch.randn(clips, steps, elements) for name, elements, _ in c["columns"]}
     out |= {"i.pixels": pixels} | {f"i.{name}": value for name, value in columns.items()}
 
     info = model.encode(dict(pixels=pixels, **columns))

@@ -1,15 +1,15 @@
-"""Writes gcbc-small.safetensors, gcivl-small.safetensors and gciql-small.safetensors: numerics of goal-conditioned models at
-a very small size; and reference/gcivl, a checkpoint in the form of the published training script.
+"""Writes gcbc-small.safetensors, gcivl-small.safetensors and gciql-small.safetensors: numerics of goal-conditioned
+models at a very small size; and reference/gcivl, a checkpoint in the form of the published training script.
 
 Run with an interpreter that has torch and the reference package (`pip install stable-worldmodel torch`):
 
     python export_gcrl.py FOLDER
 
 Model, heads and expectile loss are the reference's (`wm/gcrl`). The package holds no training code, so the losses are
-transcribed here from the algorithms of the paper's appendix (GCBC, GCIVL and GCIQL training), with what the published
-training scripts add: the weight of an action is at most 100, the policy is a normal distribution with one trained standard
-deviation per element, values are pooled by the mean. Values and policy are trained together: the policy's loss has no
-gradient to encoder and values, so the gradients are those of the paper's two phases.
+transcribed here from the algorithms of the paper's appendix (GCBC, GCIVL and GCIQL training), with the additions of the
+published training scripts: the weight of an action is at most 100, the policy is a normal distribution with one trained
+standard deviation per element, values are pooled by the mean. Values and policy are trained together: the policy's
+loss has no gradient to encoder and values, so the gradients equal those of the paper's two phases.
 """
 
 import json
@@ -99,29 +99,29 @@ def main(family, path):
         loss = nn.functional.mse_loss(means, taken)
         out["o.loss"] = loss[None]
     else:
-        now, then, towards = flat(embed[:, :history]), flat(embed[:, 1:]), flat(goal_embed)
+        now, later, goals = flat(embed[:, :history]), flat(embed[:, 1:]), flat(goal_embed)
         reached = (pixels[:, :history] == goal).all((2, 3, 4)).float().unsqueeze(-1)
-        open_ = 1 - reached
-        value = model.value_predictor.student(now, towards)
+        not_reached = 1 - reached
+        value = model.value_predictor.student(now, goals)
         with torch.no_grad():
-            target = c["discount"] * open_ * model.value_predictor.teacher(then, towards) - open_
+            target = c["discount"] * not_reached * model.value_predictor.teacher(later, goals) - not_reached
         critic_loss = torch.zeros(())
         if family == "gciql":
-            critic = model.critic_predictor.student(now, taken, towards)
+            critic = model.critic_predictor.student(now, taken, goals)
             critic_loss = (critic - target).square().mean()
             with torch.no_grad():
-                target = model.critic_predictor.teacher(now, taken, towards)
+                target = model.critic_predictor.teacher(now, taken, goals)
             out["o.critic_loss"] = critic_loss[None]
         value_loss = ExpectileLoss(c["expectile"])(value, target)
 
         with torch.no_grad():
             actor_embed = encode(actor_goal)
-            towards = flat(actor_embed)
+            goals = flat(actor_embed)
             if family == "gciql":
-                after = model.critic_predictor.student(now, taken, towards)
+                after = model.critic_predictor.student(now, taken, goals)
             else:
-                after = model.value_predictor.student(then, towards)
-            advantage = after - model.value_predictor.student(now, towards)
+                after = model.value_predictor.student(later, goals)
+            advantage = after - model.value_predictor.student(now, goals)
             weight = (c["temperature"] * advantage).exp().clamp(max=100)
         means, stds = model.predict_actions(embed[:, :history].detach(), actor_embed)
         policy_loss = (weight * (stds.log() + (taken - means).square() / stds.square() / 2)).mean()

@@ -1,12 +1,12 @@
-"""Writes reference/{lewm,pldm,prejepa}, checkpoints that the reference wrote, and reference-*.safetensors, their outputs.
+"""Writes checkpoints of the reference to reference/{lewm,pldm,prejepa}, and their outputs to reference-*.safetensors.
 
 Run with an interpreter that has the reference package, stable-pretraining, hydra, torch and transformers:
 
     python export_reference.py FOLDER/reference
 
-Hydra builds the models from the `config.json` that is stored with them; the reference's `save_pretrained` saves them. The state
-dict of `lewm` has the names of transformers 5, that of `pldm` those of version 4 and of published files, and that of
-`prejepa` the prefix of a wrapped encoder.
+Hydra builds the models from the `config.json` that is stored with them; the reference's `save_pretrained` saves them.
+The state dict of `lewm` has the names of transformers 5, the state dict of `pldm` the names of version 4 and of
+published files, and the state dict of `prejepa` the prefix of a wrapped encoder.
 """
 
 import json
@@ -25,7 +25,7 @@ from stable_worldmodel.wm.utils import save_pretrained
 from transformers import Dinov2Config, Dinov2Model
 
 
-def world(family, cls):
+def world_model(family, cls):
     module = f"stable_worldmodel.wm.{family}.module"
     norm = dict(_target_="torch.nn.BatchNorm1d", _partial_=True)
     project = lambda inputs: dict(
@@ -50,7 +50,7 @@ def world(family, cls):
 
 def prejepa():
     module = "stable_worldmodel.wm.prejepa.module"
-    embedder = lambda numbers, dim: dict(_target_=f"{module}.Embedder", in_chans=numbers, emb_dim=dim)
+    embedder = lambda elements, dim: dict(_target_=f"{module}.Embedder", in_chans=elements, emb_dim=dim)
     return dict(
         _target_="stable_worldmodel.wm.PreJEPA", history_size=2, num_pred=1, interpolate_pos_encoding=False,
         encoder=dict(_target_=f"{module}.create_backbone", name="dinov2_small"),
@@ -62,7 +62,7 @@ def prejepa():
     )  # fmt: skip
 
 
-def shake(model):
+def perturb(model):
     with torch.no_grad():
         for name, value in model.state_dict().items():
             if name.endswith("running_var"):
@@ -92,13 +92,13 @@ def tensors(path, all):
 def main(folder):
     torch.manual_seed(0)
     for family, cls in [("lewm", "stable_worldmodel.wm.lewm.LeWM"), ("pldm", "stable_worldmodel.wm.pldm.pldm.PLDM")]:
-        config = world(family, cls)
+        config = world_model(family, cls)
         model = instantiate(config)
-        shake(model)
-        old = lambda name: (
+        perturb(model)
+        rename = lambda name: (
             "encoder." + published(name.removeprefix("encoder."), dino=False) if name.startswith("encoder.") else name
         )
-        save(model, config, folder / family, old if family == "pldm" else None)
+        save(model, config, folder / family, rename if family == "pldm" else None)
         pixels, action = torch.randn(2, 3, 3, 8, 8), torch.randn(2, 3, 4)
         info = model.encode(dict(pixels=pixels, action=action))
         predicted = model.predict(info["emb"], info["act_emb"])
@@ -110,7 +110,7 @@ def main(folder):
         hidden_size=64, num_hidden_layers=1, num_attention_heads=1, mlp_ratio=1, patch_size=4, image_size=12
     )
     model = instantiate(config, encoder=EvalOnly(Dinov2Model(encoder)))
-    shake(model)
+    perturb(model)
     save(model, config, folder / "prejepa")
     pixels = torch.randn(2, 2, 3, 8, 8)
     columns = dict(proprio=torch.randn(2, 2, 3), action=torch.randn(2, 2, 4))

@@ -4,9 +4,10 @@ Run with an interpreter that has torch and the reference package (`pip install s
 
     python export_tdmpc2.py tdmpc2-train.safetensors
 
-Model and loss are the reference's (`wm/tdmpc2`). Its random draws, noise and pairs of Q functions, are recorded; dropout is
-off. The reference bootstraps after terminations, so `o.terminated.*` additionally has the loss of a batch with terminations:
-there the value of the next frame is multiplied by 0, as in the publication of SAC and the later official TD-MPC2.
+Model and loss are the reference's (`wm/tdmpc2`). The reference's random draws (noise and pairs of Q functions) are
+recorded; dropout is off. The reference bootstraps after terminations, so `o.terminated.*` additionally has the loss of
+a batch with terminations, in which the value of the next frame is multiplied by 0, as in the publication of SAC and the
+later official TD-MPC2.
 """
 
 import json
@@ -48,7 +49,7 @@ def record(model, config, batch, out, prefix):
     loss = reference.tdmpc2_forward(context, batch, "validate", config)["loss"]
     loss.backward()
     reference.torch.randn_like, reference.random.sample = draw, choose
-    # For every step, the draws of the target, then those of the policy.
+    # For every step, the draws of the target, then the draws of the policy.
     pairs = torch.tensor(pairs, dtype=torch.float32)
     out[f"{prefix}.target_noise"], out[f"{prefix}.policy_noise"] = torch.stack(noise[::2]), torch.stack(noise[1::2])
     out[f"{prefix}.target_critics"], out[f"{prefix}.policy_critics"] = pairs[::2], pairs[1::2]
@@ -60,15 +61,15 @@ def terminated(model, config, batch, done, out):
     """The value loss where some steps terminate: the reference's targets with the next value masked."""
     original = reference.two_hot_inv
     step = SimpleNamespace(call=0)
-    # Every step calls two values of the next frame, which are masked, then every Q function once.
+    # In every step, the reference decodes two values of the next frame (masked), then one value per Q function.
     per_step = 2 + config.wm.num_q
 
     def masked(logits, cfg):
-        numbers = original(logits, cfg)
+        values = original(logits, cfg)
         call, step.call = step.call, step.call + 1
         if call % per_step < 2:
-            numbers = numbers * (1 - done[:, call // per_step]).unsqueeze(1)
-        return numbers
+            values = values * (1 - done[:, call // per_step]).unsqueeze(1)
+        return values
 
     reference.two_hot_inv = masked
     record(model, config, batch, out, "o.terminated")

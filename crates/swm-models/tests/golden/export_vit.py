@@ -5,8 +5,8 @@ Run with an interpreter that has torch and transformers:
     python export_vit.py FOLDER
 
 Weights are written under the names of published checkpoints (transformers 4; version 5 renames them when it loads).
-Each file has images of the model's size (`i.pixels`) and of another size (`i.other`), the tokens of both, and the gradients
-of the mean square of the tokens of the latter.
+Each file has images of the model's size (`i.pixels`) and of another size (`i.other`), the tokens of both,
+and the gradients of the mean square of the tokens of `i.other`.
 """
 
 import json

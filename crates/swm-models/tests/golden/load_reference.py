@@ -22,8 +22,8 @@ def main(checkpoint, recorded):
     recorded = load_file(recorded)
     info = model.encode(dict(pixels=recorded["i.pixels"], action=recorded["i.action"]))
     predicted = model.predict(info["emb"], info["act_emb"])
-    for ours, theirs in [(info["emb"], recorded["o.emb"]), (predicted, recorded["o.pred"])]:
-        error = (ours - theirs).abs().max() / theirs.abs().max()
+    for actual, expected in [(info["emb"], recorded["o.emb"]), (predicted, recorded["o.pred"])]:
+        error = (actual - expected).abs().max() / expected.abs().max()
         assert error < 1e-5, f"differs by {error:.1e}"
 
 

@@ -1,4 +1,4 @@
-//! Errors of checkpoints name what is wrong.
+//! Errors of damaged and unsuitable checkpoints name the problem.
 
 use crate::training::{config, run};
 use burn::tensor::Device;
@@ -7,9 +7,9 @@ use swm_models::lewm::Lewm;
 use swm_models::{Checkpoint, TrainOptions};
 
 fn edit(path: &Path, change: impl FnOnce(&mut serde_json::Value)) {
-    let mut value = serde_json::from_slice(&std::fs::read(path).expect("readable")).expect("JSON");
+    let mut value = serde_json::from_slice(&std::fs::read(path).expect("a readable file")).expect("JSON");
     change(&mut value);
-    std::fs::write(path, value.to_string()).expect("written");
+    std::fs::write(path, value.to_string()).expect("a written file");
 }
 
 #[test]
@@ -17,48 +17,48 @@ fn damaged_checkpoints_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     let trained = folder.path().join("run");
     let load = |path: &Path| Checkpoint::<Lewm>::load(path, &Device::flex());
-    let message = |path: &Path| load(path).expect_err("invalid").to_string();
+    let message = |path: &Path| load(path).expect_err("an error").to_string();
     assert!(message(&trained).contains("no checkpoint"));
 
-    run(&config(&["schedule.steps=1"]), &trained, &TrainOptions::default(), 0).expect("trained");
-    let checkpoint = load(&trained).expect("whole");
+    run(&config(&["schedule.steps=1"]), &trained, &TrainOptions::default(), 0).expect("a trained model");
+    let checkpoint = load(&trained).expect("an undamaged checkpoint");
     assert_eq!(checkpoint.dataset_info.env.as_deref(), Some("test/Dots-v0"));
     assert_eq!(checkpoint.hash().len(), 64);
 
     let inner = trained.join("checkpoint");
     let weights = inner.join("weights.safetensors");
-    let whole = std::fs::read(&weights).expect("readable");
-    std::fs::write(&weights, &whole[..whole.len() / 2]).expect("written");
+    let whole = std::fs::read(&weights).expect("a readable file");
+    std::fs::write(&weights, &whole[..whole.len() / 2]).expect("a written file");
     assert!(message(&trained).contains("is damaged"), "{}", message(&trained));
     let mut flipped = whole.clone();
     *flipped.last_mut().expect("bytes") ^= 1;
-    std::fs::write(&weights, flipped).expect("written");
+    std::fs::write(&weights, flipped).expect("a written file");
     assert!(message(&trained).contains("its hash differs"), "{}", message(&trained));
-    std::fs::write(&weights, &whole).expect("written");
+    std::fs::write(&weights, &whole).expect("a written file");
 
     let config_file = inner.join("config.json");
-    let original = std::fs::read(&config_file).expect("readable");
+    let original = std::fs::read(&config_file).expect("a readable file");
     edit(&config_file, |file| file["config"]["model"]["latent"] = 8.into());
     assert!(message(&trained).contains("config.json makes it"), "{}", message(&trained));
-    std::fs::write(&config_file, &original).expect("written");
+    std::fs::write(&config_file, &original).expect("a written file");
     edit(&config_file, |file| file["config"]["model"]["predictor"]["depth"] = 1.into());
     assert!(message(&trained).contains("is not a weight of config.json"), "{}", message(&trained));
-    std::fs::write(&config_file, &original).expect("written");
+    std::fs::write(&config_file, &original).expect("a written file");
     edit(&config_file, |file| file["family"] = "pldm".into());
     assert!(message(&trained).contains("family 'pldm'"), "{}", message(&trained));
-    std::fs::write(&config_file, &original).expect("written");
+    std::fs::write(&config_file, &original).expect("a written file");
 
-    // A process that was killed between the two renames leaves the old checkpoint.
-    std::fs::rename(&inner, trained.join("checkpoint.old")).expect("renamed");
-    load(&trained).expect("the old one");
+    // If a process is killed between the two renames, the old checkpoint remains.
+    std::fs::rename(&inner, trained.join("checkpoint.old")).expect("a renamed folder");
+    load(&trained).expect("the old checkpoint");
 }
 
 #[test]
 fn resuming_with_another_configuration_is_refused() {
     let folder = tempfile::tempdir().expect("a folder");
-    run(&config(&["schedule.steps=1"]), folder.path(), &TrainOptions::default(), 0).expect("trained");
+    run(&config(&["schedule.steps=1"]), folder.path(), &TrainOptions::default(), 0).expect("a trained model");
     let resume = TrainOptions { resume: true, ..TrainOptions::default() };
     let error = run(&config(&["schedule.steps=1", "optim.lr=2e-3"]), folder.path(), &resume, 0);
-    let message = error.expect_err("another run").to_string();
+    let message = error.expect_err("another configuration").to_string();
     assert!(message.contains("optim.lr: 0.001 there, 0.002 here"), "{message}");
 }

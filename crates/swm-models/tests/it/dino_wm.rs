@@ -23,7 +23,7 @@ const POSITIONS: &str = "model.columns=[{ name = \"position\", dim = 3 }, { name
 const IMAGES: &str = "model.columns=[{ name = \"action\", dim = 5 }]";
 
 /// A model of a few thousand parameters.
-fn config(words: &[&str]) -> Result<TrainConfig<DinoWm>> {
+fn config(overrides: &[&str]) -> Result<TrainConfig<DinoWm>> {
     let small = [
         "model.image=16",
         "model.encoder.vit.patch=8",
@@ -41,8 +41,8 @@ fn config(words: &[&str]) -> Result<TrainConfig<DinoWm>> {
         "schedule.warmup=2",
         "log_every=5",
     ];
-    let words: Vec<String> = small.iter().chain(words).map(|&word| word.to_owned()).collect();
-    TrainConfig::load("tiny", &words)
+    let overrides: Vec<String> = small.iter().chain(overrides).map(|&setting| setting.to_owned()).collect();
+    TrainConfig::load("tiny", &overrides)
 }
 
 fn run(config: &TrainConfig<DinoWm>, out: &Path, threads: usize) -> Result<TrainSummary> {
@@ -52,17 +52,17 @@ fn run(config: &TrainConfig<DinoWm>, out: &Path, threads: usize) -> Result<Train
 
 fn dataset_info(config: &TrainConfig<DinoWm>) -> DatasetInfo {
     let columns: Vec<String> = config.model.columns.iter().map(|column| column.name.clone()).collect();
-    DatasetInfo::from_reader(&Dots::new(2, 0), &columns, false).expect("statistics")
+    DatasetInfo::from_reader(&Dots::new(2, 0), &columns, false).expect("dataset statistics")
 }
 
 #[test]
 fn results_do_not_depend_on_threads_and_the_encoder_is_frozen() {
     let folder = tempfile::tempdir().expect("a folder");
     let config = config(&[POSITIONS, "model.decoder=16"]).expect("a configuration");
-    let one = run(&config, &folder.path().join("1"), 1).expect("trained");
-    let two = run(&config, &folder.path().join("2"), 2).expect("trained");
+    let one = run(&config, &folder.path().join("1"), 1).expect("a trained model");
+    let two = run(&config, &folder.path().join("2"), 2).expect("a trained model");
     assert_eq!(one.weights, two.weights);
-    let loaded = Checkpoint::<DinoWm>::load(&folder.path().join("1"), &Device::flex()).expect("it loads");
+    let loaded = Checkpoint::<DinoWm>::load(&folder.path().join("1"), &Device::flex()).expect("a checkpoint");
     let key = Key::new(config.seed).with("init");
     let fresh = DinoWm::new(&config, &loaded.dataset_info, key, &Device::flex()).expect("a model");
     let (before, after) = (parameters::values(&fresh), parameters::values(&loaded.model));
@@ -74,7 +74,7 @@ fn results_do_not_depend_on_threads_and_the_encoder_is_frozen() {
 #[test]
 fn training_reduces_every_loss() {
     let folder = tempfile::tempdir().expect("a folder");
-    let words = [
+    let overrides = [
         POSITIONS,
         "model.decoder=16",
         "schedule.steps=200",
@@ -82,7 +82,7 @@ fn training_reduces_every_loss() {
         "model.predictor.dropout=0",
         "optim.lr=3e-3",
     ];
-    run(&config(&words).expect("a configuration"), folder.path(), 2).expect("trained");
+    run(&config(&overrides).expect("a configuration"), folder.path(), 2).expect("a trained model");
     let lines = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("lines");
     let value = |line: Option<&str>, name: &str| {
         let line: serde_json::Value = serde_json::from_str(line.expect("a line")).expect("JSON");
@@ -96,13 +96,13 @@ fn training_reduces_every_loss() {
 
 #[test]
 fn invalid_settings_and_data_are_refused() {
-    let message = |words: &[&str]| config(words).expect_err("invalid").to_string();
+    let message = |overrides: &[&str]| config(overrides).expect_err("an error").to_string();
     assert!(message(&["model.columns=[]"]).contains("name = \"action\""));
     assert!(message(&[IMAGES, "model.encoder.vit.patch=7"]).contains("model.encoder"));
     let folder = tempfile::tempdir().expect("a folder");
-    let trained = |words: &[&str]| {
-        let config = config(words).expect("a configuration");
-        run(&config, &folder.path().join("none"), 1).expect_err("invalid").to_string()
+    let trained = |overrides: &[&str]| {
+        let config = config(overrides).expect("a configuration");
+        run(&config, &folder.path().join("none"), 1).expect_err("an error").to_string()
     };
     let missing = "model.columns=[{ name = \"velocity\", dim = 3 }, { name = \"action\", dim = 5 }]";
     assert!(trained(&[missing]).contains("velocity"), "{}", trained(&[missing]));
@@ -111,8 +111,8 @@ fn invalid_settings_and_data_are_refused() {
     assert!(weights.contains("nowhere.pt") && weights.contains("facebook/dinov2-small"), "{weights}");
 }
 
-fn checkpoint(words: &[&str]) -> Checkpoint<DinoWm> {
-    let config = config(words).expect("a configuration");
+fn checkpoint(overrides: &[&str]) -> Checkpoint<DinoWm> {
+    let config = config(overrides).expect("a configuration");
     let dataset_info = dataset_info(&config);
     let model = DinoWm::new(&config, &dataset_info, Key::new(3), &Device::flex()).expect("a model");
     Checkpoint { model, config, dataset_info, manifest: Manifest::new("train", 0, serde_json::Value::Null) }
@@ -151,18 +151,18 @@ fn candidates() -> Vec<f32> {
 }
 
 /// Costs `[envs * samples]` and their gradients `[envs * samples, horizon, dim]`.
-fn costs(words: &[&str], infos: &Batch, envs: &[usize], threads: usize) -> (Vec<f32>, Vec<f32>) {
+fn costs(overrides: &[&str], infos: &Batch, envs: &[usize], threads: usize) -> (Vec<f32>, Vec<f32>) {
     let (per_env, all) = (SAMPLES * HORIZON * DIM, candidates());
     let actions: Vec<f32> = envs.iter().flat_map(|&env| all[env * per_env..][..per_env].to_vec()).collect();
-    let mut model = DinoWmCost::new(&checkpoint(words));
+    let mut model = DinoWmCost::new(&checkpoint(overrides));
     let (mut plain, mut costs) = (vec![f32::NAN; envs.len() * SAMPLES], vec![f32::NAN; envs.len() * SAMPLES]);
     let mut slopes = vec![f32::NAN; actions.len()];
     swm_core::pool::threads(threads).expect("threads").install(|| {
-        model.observe(infos, envs).expect("observed");
+        model.observe(infos, envs).expect("observed environments");
         let candidates =
             Candidates { actions: &actions, envs: envs.len(), samples: SAMPLES, horizon: HORIZON, dim: DIM };
         model.cost(candidates, &mut plain).expect("costs");
-        let differentiable = model.differentiable().expect("it has a gradient");
+        let differentiable = model.differentiable().expect("a differentiable cost");
         differentiable.cost_and_gradient(candidates, &mut costs, &mut slopes).expect("gradients");
     });
     for (cost, plain) in costs.iter().zip(&plain) {
@@ -174,13 +174,13 @@ fn costs(words: &[&str], infos: &Batch, envs: &[usize], threads: usize) -> (Vec<
 #[test]
 fn costs_do_not_depend_on_other_environments_or_threads() {
     let history = ["history.length", "history.action", "history.pixels"];
-    for (words, more) in [(IMAGES, &[][..]), (IMAGES, &history), (POSITIONS, &["position", "goal_position"])] {
+    for (overrides, more) in [(IMAGES, &[][..]), (IMAGES, &history), (POSITIONS, &["position", "goal_position"])] {
         let infos = infos(more);
-        let together = costs(&[words], &infos, &[0, 1, 2], 2);
+        let together = costs(&[overrides], &infos, &[0, 1, 2], 2);
         assert!(together.0.windows(2).any(|pair| pair[0] != pair[1]), "actions have no effect");
-        assert_eq!(together, costs(&[words], &infos, &[0, 1, 2], 1));
+        assert_eq!(together, costs(&[overrides], &infos, &[0, 1, 2], 1));
         for env in 0..ENVS {
-            let (alone, slopes) = costs(&[words], &infos, &[env], 2);
+            let (alone, slopes) = costs(&[overrides], &infos, &[env], 2);
             assert_eq!(together.0[env * SAMPLES..][..SAMPLES], alone[..]);
             let per_env = SAMPLES * HORIZON * DIM;
             assert_eq!(together.1[env * per_env..][..per_env], slopes[..]);
@@ -193,7 +193,7 @@ fn gradients_match_finite_differences() {
     let (infos, all) = (infos(&["position", "goal_position"]), candidates());
     let width = HORIZON * DIM;
     let mut model = DinoWmCost::new(&checkpoint(&[POSITIONS]));
-    model.observe(&infos, &[1]).expect("observed");
+    model.observe(&infos, &[1]).expect("observed environments");
     let slopes = costs(&[POSITIONS], &infos, &[1], 1).1;
     let mut cost_at = |i: usize, by: f32| {
         let mut actions = all[SAMPLES * width..][..width].to_vec();

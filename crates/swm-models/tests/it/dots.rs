@@ -1,4 +1,4 @@
-//! A dataset in memory: a dot that its actions move, on images of 16 pixels.
+//! A dataset in memory: images of 16 x 16 pixels with a dot that the actions move.
 
 use swm_core::{Batch, ColumnSpec, DType, Error, Key, Manifest, Result, Schema};
 use swm_data::{Episode, Reader, StepRange};

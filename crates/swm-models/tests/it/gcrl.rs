@@ -27,9 +27,9 @@ const SMALL: &[&str] = &[
     "log_every=4",
 ];
 
-fn config<M: GoalConditioned<Config = GcrlConfig>>(words: &[&str]) -> TrainConfig<M> {
-    let words: Vec<String> = SMALL.iter().chain(words).map(|&word| word.to_owned()).collect();
-    TrainConfig::load("tiny", &words).expect("a configuration")
+fn config<M: GoalConditioned<Config = GcrlConfig>>(overrides: &[&str]) -> TrainConfig<M> {
+    let overrides: Vec<String> = SMALL.iter().chain(overrides).map(|&setting| setting.to_owned()).collect();
+    TrainConfig::load("tiny", &overrides).expect("a configuration")
 }
 
 fn run<M: Trainable>(config: &TrainConfig<M>, out: &Path, options: &TrainOptions) -> Result<TrainSummary> {
@@ -37,11 +37,11 @@ fn run<M: Trainable>(config: &TrainConfig<M>, out: &Path, options: &TrainOptions
 }
 
 fn trained<M: Trainable>(config: &TrainConfig<M>, out: &Path) -> Checkpoint<M> {
-    run(config, out, &TrainOptions::default()).expect("trained");
+    run(config, out, &TrainOptions::default()).expect("a trained model");
     Checkpoint::load(out, &Device::flex()).expect("a checkpoint")
 }
 
-/// An environment with a dot, which is never stepped.
+/// The specification of an environment with a dot; the tests do not step the environment.
 fn spec(action_space: Space) -> EnvSpec {
     EnvSpec {
         id: "test/Dots-v0".to_owned(),
@@ -54,11 +54,11 @@ fn spec(action_space: Space) -> EnvSpec {
     }
 }
 
-fn plane() -> Space {
+fn box_actions() -> Space {
     Space::uniform_box([2], DType::Float32, -1.0, 1.0)
 }
 
-/// Frames of the dots at their positions and at their goals.
+/// Observations and goal images: `positions` lists the positions of the dot in both.
 fn infos(positions: &[([f32; 2], [f32; 2])]) -> Batch {
     let schema = Schema::new([ColumnSpec::image("pixels", SIDE, SIDE), ColumnSpec::image("goal", SIDE, SIDE)]);
     let mut infos = Batch::zeros(&schema.expect("columns"), positions.len());
@@ -91,12 +91,12 @@ fn presets_load() {
 
 #[test]
 fn results_do_not_depend_on_threads() {
-    fn check<M: GoalConditioned<Config = GcrlConfig>>(words: &[&str]) {
+    fn check<M: GoalConditioned<Config = GcrlConfig>>(overrides: &[&str]) {
         let folder = tempfile::tempdir().expect("a folder");
-        let config = config::<M>(words);
+        let config = config::<M>(overrides);
         let weights = [("one", 1), ("three", 3)].map(|(name, threads)| {
             let out = folder.path().join(name);
-            run(&config, &out, &TrainOptions { threads, ..TrainOptions::default() }).expect("trained");
+            run(&config, &out, &TrainOptions { threads, ..TrainOptions::default() }).expect("a trained model");
             std::fs::read(out.join("checkpoint/weights.safetensors")).expect("weights")
         });
         assert_eq!(weights[0], weights[1], "{}", M::FAMILY);
@@ -105,7 +105,7 @@ fn results_do_not_depend_on_threads() {
     check::<Gciql>(&["model.history=2", "data.num_steps=3", "model.head.dropout=0.1"]);
 }
 
-/// A value in the first and the last line of a run's log.
+/// Returns a value in the first and the last line of a run's log.
 fn first_and_last(run: &Path, name: &str) -> (f64, f64) {
     let lines = std::fs::read_to_string(run.join("train.jsonl")).expect("lines");
     let value =
@@ -116,20 +116,20 @@ fn first_and_last(run: &Path, name: &str) -> (f64, f64) {
 #[test]
 fn cloning_reduces_the_loss() {
     let folder = tempfile::tempdir().expect("a folder");
-    let words = ["schedule.steps=240", "log_every=40", "model.history=2", "data.num_steps=2"];
-    trained(&config::<Gcbc>(&words), folder.path());
+    let overrides = ["schedule.steps=240", "log_every=40", "model.history=2", "data.num_steps=2"];
+    trained(&config::<Gcbc>(&overrides), folder.path());
     let (first, last) = first_and_last(folder.path(), "loss");
     assert!(last < 0.95 * first, "{first} to {last}");
 }
 
 #[test]
-fn values_fall_below_their_start() {
+fn training_lowers_the_values() {
     fn check<M: GoalConditioned<Config = GcrlConfig>>() {
         let folder = tempfile::tempdir().expect("a folder");
-        let words = ["schedule.steps=240", "log_every=20", "loss.target=0.9"];
-        trained(&config::<M>(&words), folder.path());
+        let overrides = ["schedule.steps=240", "log_every=20", "loss.target=0.9"];
+        trained(&config::<M>(&overrides), folder.path());
         let (first, last) = first_and_last(folder.path(), "value");
-        // Every step to the goal has reward -1, so values are negative and several steps large.
+        // Every step before the goal has the reward -1, so a value is about minus the number of steps to the goal.
         assert!(last < first - 0.3 && last > -20.0, "{}: {first} to {last}", M::FAMILY);
     }
     check::<Gcivl>();
@@ -137,7 +137,7 @@ fn values_fall_below_their_start() {
 }
 
 #[test]
-fn target_networks_follow_and_frozen_encoders_do_not_change() {
+fn target_networks_lag_and_frozen_encoders_do_not_change() {
     let folder = tempfile::tempdir().expect("a folder");
     let config = config::<Gcivl>(&["loss.target=0.5"]);
     let dataset_info = DatasetInfo { action: ActionScale::identity(2), columns: Default::default(), env: None };
@@ -153,15 +153,15 @@ fn target_networks_follow_and_frozen_encoders_do_not_change() {
         a.values.iter().zip(&b.values).map(|(a, b)| (a - b).abs()).sum::<f32>()
     };
     let lag = distance(student, teacher);
-    assert!(lag > 0.0 && lag < distance(student, initial), "the target follows with a lag");
+    assert!(lag > 0.0 && lag < distance(student, initial), "the target network follows the trained network with a lag");
 
-    // The trained encoder, frozen.
+    // A second model uses the trained encoder and freezes it.
     let weights = folder.path().join("checkpoint/weights.safetensors");
-    let words = [format!("model.weights={}", weights.display()), "model.frozen=true".to_owned()];
-    let words: Vec<&str> = words.iter().map(String::as_str).collect();
-    let again = trained(&self::config::<Gcbc>(&words), &folder.path().join("frozen")).model;
-    let again = parameters::values(&again);
-    let encoders: Vec<_> = again.iter().filter(|(name, _)| name.starts_with("encoder.")).collect();
+    let overrides = [format!("model.weights={}", weights.display()), "model.frozen=true".to_owned()];
+    let overrides: Vec<&str> = overrides.iter().map(String::as_str).collect();
+    let second = trained(&self::config::<Gcbc>(&overrides), &folder.path().join("frozen")).model;
+    let second = parameters::values(&second);
+    let encoders: Vec<_> = second.iter().filter(|(name, _)| name.starts_with("encoder.")).collect();
     assert!(!encoders.is_empty() && encoders.iter().all(|(name, tensor)| &last[*name] == *tensor));
     let mut untrained = config.clone();
     untrained.model.frozen = true;
@@ -174,10 +174,10 @@ fn policy_acts_in_chunks_within_bounds_independent_of_other_environments() {
     let folder = tempfile::tempdir().expect("a folder");
     let checkpoint = trained(&config::<Gcbc>(&["model.history=2", "data.num_steps=2"]), folder.path());
     let policy = |slots: usize| -> FeedForwardPolicy<Actor> {
-        Gcbc::actor(&checkpoint).policy(&spec(plane()), slots).expect("a policy")
+        Gcbc::actor(&checkpoint).policy(&spec(box_actions()), slots).expect("a policy")
     };
     let scene = ([4.0, 5.0], [11.0, 9.0]);
-    // Five steps alone, and together with another environment that begins later.
+    // The environment takes five steps alone, and five steps together with an environment that begins later.
     let observed = |step: usize| ([4.0 + step as f32, 5.0], scene.1);
     let (mut alone, mut together) = (policy(1), policy(2));
     alone.begin(0, Key::new(0));
@@ -185,24 +185,26 @@ fn policy_acts_in_chunks_within_bounds_independent_of_other_environments() {
     let mut taken: Vec<Vec<f32>> = vec![];
     for step in 0..5 {
         let (mut one, mut two) = (actions(1), actions(2));
-        alone.act(&infos(&[observed(step)]), &[true], &mut one).expect("acts");
-        together.act(&infos(&[([9.0, 9.0], [2.0, 2.0]), observed(step)]), &[step > 1, true], &mut two).expect("acts");
+        alone.act(&infos(&[observed(step)]), &[true], &mut one).expect("an action");
+        together
+            .act(&infos(&[([9.0, 9.0], [2.0, 2.0]), observed(step)]), &[step > 1, true], &mut two)
+            .expect("an action");
         let action = one.row(0).at::<f32>(0).to_vec();
         assert_eq!(action, two.row(1).at::<f32>(0));
         assert!(action.iter().all(|v| (-1.0..=1.0).contains(v)), "{action:?}");
         taken.push(action);
     }
-    // With a frameskip of 2, there is a decision every other step.
+    // With a frameskip of 2, the policy makes a decision at every second step.
     assert_eq!(alone.take_latencies().len(), 3);
-    assert_ne!(taken[0], taken[2], "another image, another action");
+    assert_ne!(taken[0], taken[2], "actions do not depend on the image");
 }
 
 #[test]
 fn invalid_settings_data_and_environments_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
-    let message = |words: &[&str]| {
-        let words: Vec<String> = SMALL.iter().chain(words).map(|&word| word.to_owned()).collect();
-        TrainConfig::<Gcivl>::load("tiny", &words).expect_err("wrong").to_string()
+    let message = |overrides: &[&str]| {
+        let overrides: Vec<String> = SMALL.iter().chain(overrides).map(|&setting| setting.to_owned()).collect();
+        TrainConfig::<Gcivl>::load("tiny", &overrides).expect_err("an error").to_string()
     };
     assert!(message(&["data.num_steps=1"]).contains("model.history"), "{}", message(&["data.num_steps=1"]));
     assert!(message(&["model.head.depth=2"]).contains("attends to the goal"));
@@ -213,20 +215,21 @@ fn invalid_settings_data_and_environments_are_refused() {
     // Images of another size than the model's.
     let mut large = config::<Gcbc>(&[]);
     large.model.image = 32;
-    let error = run(&large, &folder.path().join("large"), &TrainOptions::default()).expect_err("invalid").to_string();
+    let error = run(&large, &folder.path().join("large"), &TrainOptions::default()).expect_err("an error").to_string();
     assert!(error.contains("[16, 16, 3]") && error.contains("model.image"), "{error}");
 
     let checkpoint = trained(&config::<Gcbc>(&[]), &folder.path().join("run"));
     let discrete = Gcbc::actor(&checkpoint).policy(&spec(Space::Discrete { n: 3, start: 0 }), 1);
     let error = discrete.err().expect("discrete actions").to_string();
     assert!(error.contains("2 means"), "{error}");
-    let mut policy = Gcbc::actor(&checkpoint).policy(&spec(plane()), 1).expect("a policy");
+    let mut policy = Gcbc::actor(&checkpoint).policy(&spec(box_actions()), 1).expect("a policy");
     policy.begin(0, Key::new(0));
     let without_goal = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", SIDE, SIDE)]).expect("a column"), 1);
     let error = policy.act(&without_goal, &[true], &mut actions(1)).expect_err("no goal").to_string();
     assert!(error.contains("'goal'"), "{error}");
     // A checkpoint of another family.
-    let error = Checkpoint::<Gciql>::load(&folder.path().join("run"), &Device::flex()).expect_err("gcbc").to_string();
+    let error =
+        Checkpoint::<Gciql>::load(&folder.path().join("run"), &Device::flex()).expect_err("another family").to_string();
     assert!(error.contains("gcbc") && error.contains("gciql"), "{error}");
 }
 
@@ -260,29 +263,29 @@ fn probes_read_the_position_and_reconstruct_the_image() {
     let data = Dots::new(40, 1);
     let mut settings = StateConfig::new(vec!["position".to_owned()]);
     settings.fit.steps = 300;
-    let report = probe::read_state(&Profiles, &data, &settings).expect("read");
+    let report = probe::read_state(&Profiles, &data, &settings).expect("a report");
     assert_eq!((report.latent, report.linear.len(), report.network.len()), (2 * SIDE, 2, 2));
     for score in report.linear.iter().chain(&report.network) {
-        let r2 = score.r2.expect("the dot moves");
+        let r2 = score.r2.expect("a score of a moving dot");
         assert!(r2 > 0.95, "{score:?}");
         assert!((r2 - (1.0 - (score.rmse / score.spread).powi(2))).abs() < 1e-9);
     }
-    assert_eq!(probe::read_state(&Profiles, &data, &settings).expect("read"), report, "deterministic");
-    // Actions cannot be read from images. The missing action of the last row of an episode is skipped.
+    assert_eq!(probe::read_state(&Profiles, &data, &settings).expect("a report"), report, "deterministic");
+    // Images do not determine the actions. The probe skips the last row of an episode, which has no action.
     let actions = StateConfig { columns: vec!["action".to_owned()], ..settings };
-    let report = probe::read_state(&Profiles, &data, &actions).expect("read");
-    assert!(report.linear.iter().all(|score| score.r2.expect("it changes") < 0.1), "{report:?}");
+    let report = probe::read_state(&Profiles, &data, &actions).expect("a report");
+    assert!(report.linear.iter().all(|score| score.r2.expect("a score of actions that differ") < 0.1), "{report:?}");
 
     let mut settings = ReconstructionConfig { channels: vec![16, 8], shown: 6, ..ReconstructionConfig::default() };
     (settings.fit.steps, settings.fit.lr) = (1000, 5e-3);
-    let (report, sheet) = probe::reconstruct_images(&Profiles, &data, &settings).expect("fitted");
+    let (report, sheet) = probe::reconstruct_images(&Profiles, &data, &settings).expect("a fit");
     assert!(report.explained > 0.2 && report.rmse < report.rmse_of_mean, "{report:?}");
     let cell = SIDE * 8 + 2;
     assert_eq!((sheet.width, sheet.height), (6 * cell + 2, 2 * cell + 2));
 
     let error = |columns: &[&str]| {
         let columns = columns.iter().map(|&name| name.to_owned()).collect();
-        probe::read_state(&Profiles, &data, &StateConfig::new(columns)).expect_err("wrong").to_string()
+        probe::read_state(&Profiles, &data, &StateConfig::new(columns)).expect_err("an error").to_string()
     };
     assert!(error(&["positoin"]).contains("did you mean position"), "{}", error(&["positoin"]));
     assert!(error(&["pixels"]).contains("holds images"));

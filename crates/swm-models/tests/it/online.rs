@@ -94,7 +94,7 @@ fn check_threads<M: Agent>() {
     let out = |name: &str| folder.path().join(name);
     for (name, threads) in [("one", 1), ("three", 3)] {
         let options = TrainOptions { threads, ..TrainOptions::default() };
-        let summary = run(&config, &out(name), &options, 0).expect("trained");
+        let summary = run(&config, &out(name), &options, 0).expect("a trained model");
         assert_eq!((summary.steps, summary.interrupted), (24, false));
         // 60 steps of warm-up, then 12 rounds of 3 environments.
         assert_eq!(summary.env_steps, 60 + 12 * 3);
@@ -103,7 +103,7 @@ fn check_threads<M: Agent>() {
     assert_eq!(files(&out("one")), files(&out("three")));
     assert_eq!(lines(&out("one")), lines(&out("three")));
     let other = self::config::<M>(&["seed=1"]);
-    run(&other, &out("other"), &TrainOptions::default(), 0).expect("trained");
+    run(&other, &out("other"), &TrainOptions::default(), 0).expect("a trained model");
     assert_ne!(files(&out("other"))[1], files(&out("one"))[1]);
 }
 
@@ -116,19 +116,21 @@ fn online_results_do_not_depend_on_threads() {
 #[test]
 fn resumed_online_run_gives_the_same_bytes() {
     let folder = tempfile::tempdir().expect("a folder");
-    let (whole, halved) = (folder.path().join("whole"), folder.path().join("halved"));
+    let (complete, resumed) = (folder.path().join("complete"), folder.path().join("resumed"));
     let config = config::<Sac>(&[]);
     let options = TrainOptions::default();
-    run(&config, &whole, &options, 0).expect("trained");
-    let first = run(&config, &halved, &options, 10).expect("trained");
+    run(&config, &complete, &options, 0).expect("a trained model");
+    let first = run(&config, &resumed, &options, 10).expect("a trained model");
     assert_eq!((first.steps, first.interrupted), (10, true));
-    let again = run(&config, &halved, &options, 0).expect_err("a run is there").to_string();
-    assert!(again.contains("resume"), "{again}");
+    let refused = run(&config, &resumed, &options, 0).expect_err("a run is there").to_string();
+    assert!(refused.contains("resume"), "{refused}");
     let resume = TrainOptions { resume: true, ..options };
-    let second = run(&config, &halved, &resume, 0).expect("trained");
+    let second = run(&config, &resumed, &resume, 0).expect("a trained model");
     assert_eq!((second.steps, second.interrupted), (24, false));
-    assert_eq!(files(&whole), files(&halved));
-    let other = run(&self::config::<Sac>(&["optim.lr=1e-4"]), &halved, &resume, 0).expect_err("another").to_string();
+    assert_eq!(files(&complete), files(&resumed));
+    let other = run(&self::config::<Sac>(&["optim.lr=1e-4"]), &resumed, &resume, 0)
+        .expect_err("another configuration")
+        .to_string();
     assert!(other.contains("optim.lr"), "{other}");
 }
 
@@ -138,7 +140,7 @@ fn invalid_settings_and_data_are_refused() {
     let refused = |config: &TrainConfig<Sac>, id: &'static str| {
         let out = folder.path().join("refused");
         let error = train_online(config, &pools(id, None), &out, &TrainOptions::default(), &mut Control::new());
-        error.expect_err("refused").to_string()
+        error.expect_err("an error").to_string()
     };
     let discrete = refused(&config(&[]), "swm/CartPoleControl-v1");
     assert!(discrete.contains("continuous actions"), "{discrete}");
@@ -150,7 +152,7 @@ fn invalid_settings_and_data_are_refused() {
     assert!(missing.contains("online") && missing.contains("--data"), "{missing}");
 
     let message =
-        |setting: &str| TrainConfig::<Tdmpc2>::load("tiny", &[setting.to_owned()]).expect_err("invalid").to_string();
+        |setting: &str| TrainConfig::<Tdmpc2>::load("tiny", &[setting.to_owned()]).expect_err("an error").to_string();
     assert!(message("model.simplex=7").contains("multiple"), "{}", message("model.simplex=7"));
     assert!(message("data.frameskip=5").contains("rewards"), "{}", message("data.frameskip=5"));
     assert!(message("loss.discount=1.5").contains("loss.discount"));

@@ -66,7 +66,7 @@ fn costs(infos: &Batch, envs: &[usize], threads: usize) -> Vec<f32> {
     let mut cost = LewmCost::new(&checkpoint());
     let mut costs = vec![f32::NAN; envs.len() * SAMPLES];
     swm_core::pool::threads(threads).expect("threads").install(|| {
-        cost.observe(infos, envs).expect("observed");
+        cost.observe(infos, envs).expect("observed environments");
         let candidates =
             Candidates { actions: &actions, envs: envs.len(), samples: SAMPLES, horizon: HORIZON, dim: DIM };
         cost.cost(candidates, &mut costs).expect("costs");
@@ -99,7 +99,7 @@ fn history_changes_the_cost() {
 #[test]
 fn invalid_candidates_and_observations_are_refused() {
     let mut cost = LewmCost::new(&checkpoint());
-    cost.observe(&infos(false), &[0]).expect("observed");
+    cost.observe(&infos(false), &[0]).expect("observed environments");
     let actions = vec![0.0; 6];
     let wrong = Candidates { actions: &actions, envs: 1, samples: 1, horizon: 2, dim: 3 };
     let message = cost.cost(wrong, &mut [0.0]).expect_err("three elements").to_string();
@@ -113,10 +113,10 @@ fn invalid_candidates_and_observations_are_refused() {
     assert!(message.contains("[16, 16, 3]"), "{message}");
 }
 
-/// A model after observing environments 0 and 1 with their histories.
+/// Returns a cost that has observed environments 0 and 1 with their histories.
 fn observed() -> LewmCost {
     let mut cost = LewmCost::new(&checkpoint());
-    cost.observe(&infos(true), &[0, 1]).expect("observed");
+    cost.observe(&infos(true), &[0, 1]).expect("observed environments");
     cost
 }
 
@@ -162,7 +162,7 @@ fn gradients_do_not_depend_on_other_environments_or_threads() {
         let mut model = LewmCost::new(&checkpoint());
         let (mut costs, mut slopes) = (vec![0.0; envs.len() * samples], vec![0.0; actions.len()]);
         swm_core::pool::threads(threads).expect("threads").install(|| {
-            model.observe(&infos(true), envs).expect("observed");
+            model.observe(&infos(true), envs).expect("observed environments");
             let candidates = Candidates { actions: &actions, envs: envs.len(), samples, horizon: HORIZON, dim: DIM };
             let model = model.differentiable().expect("a LeWM has a gradient");
             model.cost_and_gradient(candidates, &mut costs, &mut slopes).expect("gradients");

@@ -10,7 +10,7 @@ use swm_models::pldm::Pldm;
 use swm_models::{Checkpoint, TrainConfig, TrainOptions, TrainSummary, train};
 
 /// A model of a few thousand parameters.
-fn config(words: &[&str]) -> Result<TrainConfig<Pldm>> {
+fn config(overrides: &[&str]) -> Result<TrainConfig<Pldm>> {
     let small = [
         "model.image=16",
         "model.latent=4",
@@ -33,13 +33,13 @@ fn config(words: &[&str]) -> Result<TrainConfig<Pldm>> {
         "schedule.warmup=2",
         "log_every=5",
     ];
-    let words: Vec<String> = small.iter().chain(words).map(|&word| word.to_owned()).collect();
-    TrainConfig::load("tiny", &words)
+    let overrides: Vec<String> = small.iter().chain(overrides).map(|&setting| setting.to_owned()).collect();
+    TrainConfig::load("tiny", &overrides)
 }
 
 fn run(config: &TrainConfig<Pldm>, out: &Path, threads: usize) -> TrainSummary {
     let options = TrainOptions { threads, ..TrainOptions::default() };
-    train(config, Arc::new(Dots::new(6, 0)), out, &options, &mut Control::new()).expect("trained")
+    train(config, Arc::new(Dots::new(6, 0)), out, &options, &mut Control::new()).expect("a trained model")
 }
 
 #[test]
@@ -48,15 +48,15 @@ fn results_do_not_depend_on_threads() {
     let config = config(&[]).expect("a configuration");
     let (one, two) = (run(&config, &folder.path().join("1"), 1), run(&config, &folder.path().join("2"), 2));
     assert_eq!(one.weights, two.weights);
-    let loaded = Checkpoint::<Pldm>::load(&folder.path().join("1"), &Device::flex()).expect("it loads");
+    let loaded = Checkpoint::<Pldm>::load(&folder.path().join("1"), &Device::flex()).expect("a checkpoint");
     assert_eq!((loaded.hash(), loaded.config.loss.idm_hidden), (one.weights.as_str(), 16));
 }
 
 #[test]
-fn every_term_is_logged_and_trained_terms_fall() {
+fn every_term_is_logged_and_the_loss_decreases() {
     let folder = tempfile::tempdir().expect("a folder");
-    let words = ["schedule.steps=300", "log_every=20", "model.predictor.dropout=0", "optim.lr=3e-3", "loss.idm=10"];
-    run(&config(&words).expect("a configuration"), folder.path(), 2);
+    let overrides = ["schedule.steps=300", "log_every=20", "model.predictor.dropout=0", "optim.lr=3e-3", "loss.idm=10"];
+    run(&config(&overrides).expect("a configuration"), folder.path(), 2);
     let lines = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("lines");
     let line = |line: Option<&str>| serde_json::from_str::<serde_json::Value>(line.expect("a line")).expect("JSON");
     let (first, last) = (line(lines.lines().next()), line(lines.lines().last()));
@@ -74,7 +74,7 @@ fn every_term_is_logged_and_trained_terms_fall() {
 
 #[test]
 fn invalid_settings_are_refused() {
-    let message = |words: &[&str]| config(words).expect_err("invalid").to_string();
+    let message = |overrides: &[&str]| config(overrides).expect_err("an error").to_string();
     assert!(message(&["model.latent=1"]).contains("model.latent"), "{}", message(&["model.latent=1"]));
     let short = message(&["data.num_steps=2", "model.predictor.history=1"]);
     assert!(short.contains("loss.temp_straight") && short.contains("data.num_steps of at least 3"), "{short}");

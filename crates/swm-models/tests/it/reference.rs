@@ -43,21 +43,21 @@ fn check_world_model(golden: &Golden, model: &Lewm) {
 
 #[test]
 fn lewm_checkpoints_load() {
-    let checkpoint = lewm::import::import(&folder("lewm"), dataset_info(2)).expect("it loads");
+    let checkpoint = lewm::import::import(&folder("lewm"), dataset_info(2)).expect("a checkpoint");
     assert_eq!((checkpoint.config.data.frameskip, checkpoint.config.model.image), (2, 8));
     check_world_model(&recorded("lewm"), &checkpoint.model);
 }
 
 #[test]
 fn pldm_checkpoints_load() {
-    // The path may also be that of the file.
-    let checkpoint = pldm::import::import(&folder("pldm").join("weights.pt"), dataset_info(4)).expect("it loads");
+    // The path can also be the path of the weights file.
+    let checkpoint = pldm::import::import(&folder("pldm").join("weights.pt"), dataset_info(4)).expect("a checkpoint");
     assert_eq!((checkpoint.config.data.frameskip, checkpoint.config.model.predictor.history), (1, 3));
     check_world_model(&recorded("pldm"), &checkpoint.model.model);
 }
 
 fn dino_wm_checkpoint() -> swm_models::Checkpoint<DinoWm> {
-    dino_wm::import::import(&folder("prejepa"), dataset_info(2)).expect("it loads")
+    dino_wm::import::import(&folder("prejepa"), dataset_info(2)).expect("a checkpoint")
 }
 
 #[test]
@@ -78,20 +78,20 @@ fn dino_wm_checkpoints_load() {
 fn exported_checkpoints_load_again() {
     let out = tempfile::tempdir().expect("a folder");
     for naming in [Naming::Published, Naming::Transformers5] {
-        let there = out.path().join(format!("lewm-{naming:?}"));
-        let lewm = lewm::import::import(&folder("lewm"), dataset_info(2)).expect("it loads");
-        lewm::import::export(&lewm, &there, naming).expect("it is written");
-        let again = lewm::import::import(&there, dataset_info(2)).expect("it loads");
+        let exported_folder = out.path().join(format!("lewm-{naming:?}"));
+        let lewm = lewm::import::import(&folder("lewm"), dataset_info(2)).expect("a checkpoint");
+        lewm::import::export(&lewm, &exported_folder, naming).expect("an exported checkpoint");
+        let again = lewm::import::import(&exported_folder, dataset_info(2)).expect("a checkpoint");
         assert_eq!(again.config.model, lewm.config.model);
         assert_eq!(parameters::values(&again.model), parameters::values(&lewm.model));
 
-        let there = out.path().join(format!("pldm-{naming:?}"));
-        let pldm = pldm::import::import(&folder("pldm"), dataset_info(2)).expect("it loads");
-        pldm::import::export(&pldm, &there, naming).expect("it is written");
-        let again = pldm::import::import(&there, dataset_info(2)).expect("it loads");
+        let exported_folder = out.path().join(format!("pldm-{naming:?}"));
+        let pldm = pldm::import::import(&folder("pldm"), dataset_info(2)).expect("a checkpoint");
+        pldm::import::export(&pldm, &exported_folder, naming).expect("an exported checkpoint");
+        let again = pldm::import::import(&exported_folder, dataset_info(2)).expect("a checkpoint");
         assert_eq!(parameters::values(&again.model), parameters::values(&pldm.model));
     }
-    // Weights that were published under old names are exported unchanged, except for counters.
+    // Weights with published names are exported unchanged, except for counters.
     let mut reference = weights::read(&folder("pldm").join("weights.pt")).expect("the reference");
     let mut exported = weights::read(&out.path().join("pldm-Published/weights.pt")).expect("exported");
     for state in [&mut reference, &mut exported] {
@@ -115,7 +115,7 @@ fn exported_checkpoints_load_again() {
 
 #[test]
 fn unsuitable_checkpoints_are_refused() {
-    let message = |found: swm_core::Result<swm_models::Checkpoint<Lewm>>| found.expect_err("invalid").to_string();
+    let message = |found: swm_core::Result<swm_models::Checkpoint<Lewm>>| found.expect_err("an error").to_string();
     let other = message(lewm::import::import(&folder("pldm"), dataset_info(2)));
     assert!(other.contains("PLDM") && other.contains("class LeWM"), "{other}");
     let actions = message(lewm::import::import(&folder("lewm"), dataset_info(3)));
@@ -124,9 +124,10 @@ fn unsuitable_checkpoints_are_refused() {
     assert!(none.contains("nowhere"), "{none}");
     // Weights of another size than in config.json.
     let out = tempfile::tempdir().expect("a folder");
-    let text = std::fs::read_to_string(folder("lewm").join("config.json")).expect("there");
-    std::fs::write(out.path().join("config.json"), text.replace("\"depth\": 2", "\"depth\": 1")).expect("written");
-    std::fs::copy(folder("lewm").join("weights.pt"), out.path().join("weights.pt")).expect("copied");
+    let text = std::fs::read_to_string(folder("lewm").join("config.json")).expect("a configuration file");
+    std::fs::write(out.path().join("config.json"), text.replace("\"depth\": 2", "\"depth\": 1"))
+        .expect("a written file");
+    std::fs::copy(folder("lewm").join("weights.pt"), out.path().join("weights.pt")).expect("a copied file");
     let mismatch = message(lewm::import::import(out.path(), dataset_info(2)));
     assert!(mismatch.contains("layers.1") && mismatch.contains("config.json"), "{mismatch}");
 }
@@ -144,12 +145,12 @@ fn exported_checkpoints_load_in_the_reference() {
             .arg(out.path().join(family))
             .arg(golden.join(format!("reference-{family}.safetensors")))
             .status();
-        assert!(status.expect("it runs").success(), "{family}");
+        assert!(status.expect("a finished process").success(), "{family}");
     };
-    let lewm = lewm::import::import(&folder("lewm"), dataset_info(2)).expect("it loads");
-    lewm::import::export(&lewm, &out.path().join("lewm"), Naming::Transformers5).expect("it is written");
+    let lewm = lewm::import::import(&folder("lewm"), dataset_info(2)).expect("a checkpoint");
+    lewm::import::export(&lewm, &out.path().join("lewm"), Naming::Transformers5).expect("an exported checkpoint");
     load("lewm");
-    let pldm = pldm::import::import(&folder("pldm"), dataset_info(2)).expect("it loads");
-    pldm::import::export(&pldm, &out.path().join("pldm"), Naming::Transformers5).expect("it is written");
+    let pldm = pldm::import::import(&folder("pldm"), dataset_info(2)).expect("a checkpoint");
+    pldm::import::export(&pldm, &out.path().join("pldm"), Naming::Transformers5).expect("an exported checkpoint");
     load("pldm");
 }

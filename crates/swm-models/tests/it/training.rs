@@ -10,7 +10,7 @@ use swm_models::lewm::Lewm;
 use swm_models::{TrainConfig, TrainOptions, TrainSummary, train};
 
 /// A model of a few thousand parameters.
-pub fn config(words: &[&str]) -> TrainConfig<Lewm> {
+pub fn config(overrides: &[&str]) -> TrainConfig<Lewm> {
     let small = [
         "model.image=16",
         "model.latent=4",
@@ -31,8 +31,8 @@ pub fn config(words: &[&str]) -> TrainConfig<Lewm> {
         "schedule.warmup=2",
         "log_every=5",
     ];
-    let words: Vec<String> = small.iter().chain(words).map(|&word| word.to_owned()).collect();
-    TrainConfig::load("tiny", &words).expect("a configuration")
+    let overrides: Vec<String> = small.iter().chain(overrides).map(|&setting| setting.to_owned()).collect();
+    TrainConfig::load("tiny", &overrides).expect("a configuration")
 }
 
 /// A control that interrupts the run after the step `stop_at`.
@@ -58,21 +58,21 @@ fn files(run: &Path) -> Vec<Vec<u8>> {
 #[test]
 fn resumed_run_gives_the_same_bytes() {
     let folder = tempfile::tempdir().expect("a folder");
-    let (whole, halved) = (folder.path().join("whole"), folder.path().join("halved"));
-    // 6 episodes of 17 clips: an epoch ends after the sixth step, so the second half crosses it.
+    let (complete, resumed) = (folder.path().join("complete"), folder.path().join("resumed"));
+    // 6 episodes of 17 clips: an epoch ends after the sixth step, so the resumed part crosses the end of the epoch.
     let config = config(&[]);
     let options = TrainOptions::default();
-    let summary = run(&config, &whole, &options, 0).expect("trained");
+    let summary = run(&config, &complete, &options, 0).expect("a trained model");
     assert!((summary.steps, summary.interrupted) == (10, false));
-    let first = run(&config, &halved, &options, 5).expect("trained");
+    let first = run(&config, &resumed, &options, 5).expect("a trained model");
     assert!((first.steps, first.interrupted) == (5, true));
-    let again = run(&config, &halved, &options, 0).expect_err("a run is there").to_string();
-    assert!(again.contains("resume"), "{again}");
+    let refused = run(&config, &resumed, &options, 0).expect_err("a run is there").to_string();
+    assert!(refused.contains("resume"), "{refused}");
     let resume = TrainOptions { resume: true, ..options };
-    let second = run(&config, &halved, &resume, 0).expect("trained");
+    let second = run(&config, &resumed, &resume, 0).expect("a trained model");
     assert_eq!((second.steps, &second.weights), (10, &summary.weights));
-    assert_eq!(files(&whole), files(&halved));
-    let lines = std::fs::read_to_string(halved.join("train.jsonl")).expect("lines");
+    assert_eq!(files(&complete), files(&resumed));
+    let lines = std::fs::read_to_string(resumed.join("train.jsonl")).expect("lines");
     let steps: Vec<u64> = lines
         .lines()
         .map(|line| serde_json::from_str::<serde_json::Value>(line).expect("JSON")["step"].as_u64().expect("a step"))
@@ -87,21 +87,21 @@ fn results_do_not_depend_on_threads() {
     let mut all = vec![];
     for (name, threads, loader_threads) in [("one", 1, 0), ("two", 2, 1), ("three", 3, 2)] {
         let options = TrainOptions { threads, loader_threads, ..TrainOptions::default() };
-        run(&config, &folder.path().join(name), &options, 0).expect("trained");
+        run(&config, &folder.path().join(name), &options, 0).expect("a trained model");
         all.push(files(&folder.path().join(name)));
     }
     assert_eq!(all[0], all[1]);
     assert_eq!(all[0], all[2]);
     let other = self::config(&["seed=1"]);
-    run(&other, &folder.path().join("other"), &TrainOptions::default(), 0).expect("trained");
+    run(&other, &folder.path().join("other"), &TrainOptions::default(), 0).expect("a trained model");
     assert_ne!(files(&folder.path().join("other"))[1], all[0][1]);
 }
 
 #[test]
 fn training_reduces_the_loss() {
     let folder = tempfile::tempdir().expect("a folder");
-    let words = ["schedule.steps=300", "log_every=20", "model.predictor.dropout=0", "optim.lr=3e-3"];
-    run(&config(&words), folder.path(), &TrainOptions::default(), 0).expect("trained");
+    let overrides = ["schedule.steps=300", "log_every=20", "model.predictor.dropout=0", "optim.lr=3e-3"];
+    run(&config(&overrides), folder.path(), &TrainOptions::default(), 0).expect("a trained model");
     let lines = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("lines");
     let value = |line: &str, name: &str| {
         serde_json::from_str::<serde_json::Value>(line).expect("JSON")[name].as_f64().expect(name)

@@ -98,16 +98,16 @@ impl Golden {
             let actual = values(output.gradients.get(name).unwrap_or_else(|| panic!("a gradient of {name}")).clone());
             // A softmax cancels the bias of the keys, so its gradient is zero up to rounding; its error is relative to
             // the largest gradient of all.
-            let idle = name.ends_with(".key.bias");
-            let error = error(&actual, &gradient.values, if idle { largest } else { 1e-6 });
+            let has_no_effect = name.ends_with(".key.bias");
+            let error = error(&actual, &gradient.values, if has_no_effect { largest } else { 1e-6 });
             if error > worst.0 {
                 worst = (error, name.clone());
             }
         }
         println!("worst gradient: {:.1e} ({})", worst.0, worst.1);
         assert!(worst.0 < TOLERANCE, "gradient of {} differs by {:.1e}", worst.1, worst.0);
-        let more: Vec<_> = output.gradients.keys().filter(|name| !expected.contains_key(*name)).collect();
-        assert!(more.is_empty(), "gradients that are not in the file: {more:?}");
+        let unexpected: Vec<_> = output.gradients.keys().filter(|name| !expected.contains_key(*name)).collect();
+        assert!(unexpected.is_empty(), "gradients that are not in the file: {unexpected:?}");
     }
 }
 
@@ -117,20 +117,20 @@ fn golden_gcrl_heads() {
         println!("{}", file.display());
         let golden = Golden::read(&file);
         let init = Init::new(Key::new(0), &Device::flex());
-        let sight = PatchGrid {
+        let grid = PatchGrid {
             frames: golden.size("num_frames"),
             patches: golden.size("num_patches"),
             dim: golden.size("dim"),
         };
         let (frames, goal) = (golden.tensor("i.x"), golden.tensor("i.goal"));
-        let policy = Head::new(&init, &golden.head(), sight, Pool::Attention, golden.size("out_dim"));
+        let policy = Head::new(&init, &golden.head(), grid, Pool::Attention, golden.size("out_dim"));
         let means = golden.fill("w.policy.", policy).forward(&frames, &goal, &mut DropoutRng::disabled());
         check(&golden, "o.policy", &values(means));
         let (actions, hidden) = (golden.size("action_dim"), golden.size("q_hidden_dim"));
-        let critic = Critic::new(&init, &golden.head(), sight, Pool::Attention, actions, hidden);
+        let critic = Critic::new(&init, &golden.head(), grid, Pool::Attention, actions, hidden);
         let critic = golden.fill("w.q.", critic);
-        let worth = critic.forward(&frames, golden.tensor("i.action"), &goal, &mut DropoutRng::disabled());
-        check(&golden, "o.q", &values(worth));
+        let action_values = critic.forward(&frames, golden.tensor("i.action"), &goal, &mut DropoutRng::disabled());
+        check(&golden, "o.q", &values(action_values));
         for name in golden.tensors.keys().filter(|name| name.starts_with("o.expectile_")) {
             let tau = name.trim_start_matches("o.expectile_").parse().expect("a number");
             let loss = loss::expectile::<1>(golden.tensor("i.preds"), golden.tensor("i.targets"), tau);
@@ -157,8 +157,8 @@ fn golden_gcivl() {
         let golden = Golden::read(&file);
         let model = Gcivl::init(&golden.gcrl(), golden.size("action_dim"), Key::new(0), &Device::flex());
         let model = golden.fill("w.", model);
-        let (clips, more, settings) = (golden.clips(), golden.relabelled(), golden.value_loss());
-        golden.compare(&model.losses(&clips, &more, &settings, &mut DropoutRng::disabled(), true));
+        let (clips, relabelled, settings) = (golden.clips(), golden.relabelled(), golden.value_loss());
+        golden.compare(&model.losses(&clips, &relabelled, &settings, &mut DropoutRng::disabled(), true));
     }
 }
 
@@ -169,8 +169,8 @@ fn golden_gciql() {
         let golden = Golden::read(&file);
         let model = Gciql::init(&golden.gcrl(), golden.size("action_dim"), Key::new(0), &Device::flex());
         let model = golden.fill("w.", model);
-        let (clips, more, settings) = (golden.clips(), golden.relabelled(), golden.value_loss());
-        golden.compare(&model.losses(&clips, &more, &settings, &mut DropoutRng::disabled(), true));
+        let (clips, relabelled, settings) = (golden.clips(), golden.relabelled(), golden.value_loss());
+        golden.compare(&model.losses(&clips, &relabelled, &settings, &mut DropoutRng::disabled(), true));
     }
 }
 
@@ -203,12 +203,12 @@ fn golden_gcrl_checkpoints_round_trip() {
         assert_eq!(weight, &actual[&name.replace(".teacher.", ".student.")], "{name}");
     }
 
-    // It contains a policy but no critic, and does not fit other actions.
+    // The checkpoint contains a policy but no critic, and does not fit another action dimension.
     let cloned = import::import::<Gcbc>(folder.path(), dataset_info.clone()).expect("the policy alone");
     assert_eq!(parameters::values(&cloned.model)["log_stds"], actual["log_stds"]);
-    let words = import::import::<Gciql>(folder.path(), dataset_info).expect_err("no critic").to_string();
-    assert!(words.contains("critic_predictor"), "{words}");
+    let message = import::import::<Gciql>(folder.path(), dataset_info).expect_err("no critic").to_string();
+    assert!(message.contains("critic_predictor"), "{message}");
     let dataset_info = DatasetInfo { action: ActionScale::identity(3), columns: Default::default(), env: None };
-    let words = import::import::<Gcivl>(folder.path(), dataset_info).expect_err("other actions").to_string();
-    assert!(words.contains("a divisor of 4"), "{words}");
+    let message = import::import::<Gcivl>(folder.path(), dataset_info).expect_err("other actions").to_string();
+    assert!(message.contains("a divisor of 4"), "{message}");
 }

@@ -1,6 +1,6 @@
 //! Parity with the published models: names of weights, outputs, losses and gradients of the reference implementation.
 //! Every test reads each `<model>-*.safetensors` of the folder named by `SWM_GOLDEN_MODELS`, or of `tests/golden`
-//! (written by the exporters beside them) and of the shared reference.
+//! (written by the exporters in that folder) and of the shared reference folder.
 
 mod dino_wm;
 mod gcrl;
@@ -64,16 +64,16 @@ impl Golden {
         self.tensors.iter().filter_map(strip).collect()
     }
 
-    /// Compares gradients with all recorded ones. Parameters whose names end in one of `idle` have no effect, because a
-    /// batch normalisation or a softmax cancels them: their gradients are zero up to rounding, so their errors are
-    /// relative to the largest gradient of all.
-    fn check_gradients(&self, actual: &Named<Tensor<1>>, idle: &[&str]) {
+    /// Compares gradients with all recorded ones. Parameters whose names end in one of `without_effect` have no effect,
+    /// because a batch normalisation or a softmax cancels them: their gradients are zero up to rounding, so their
+    /// errors are relative to the largest gradient of all.
+    fn check_gradients(&self, actual: &Named<Tensor<1>>, without_effect: &[&str]) {
         let expected = self.group("g.");
         let largest = expected.values().flat_map(|g| &g.values).fold(0.0f32, |m, v| m.max(v.abs()));
         let mut worst = (0.0, String::new());
         for (name, gradient) in &expected {
             let actual = values(actual.get(name).unwrap_or_else(|| panic!("a gradient of {name}")).clone());
-            let floor = if idle.iter().any(|end| name.ends_with(end)) { largest } else { 1e-12 };
+            let floor = if without_effect.iter().any(|end| name.ends_with(end)) { largest } else { 1e-12 };
             let error = error(&actual, &gradient.values, floor);
             if error > worst.0 {
                 worst = (error, name.clone());

@@ -74,8 +74,8 @@ fn golden_tdmpc2_checkpoints_round_trip() {
         let dataset_info = DatasetInfo { action, columns: Named::new(), env: None };
         let manifest = swm_core::Manifest::new("test", 0, serde_json::Value::Null);
         let checkpoint = Checkpoint { model, config, dataset_info: dataset_info.clone(), manifest };
-        export(&checkpoint, folder.path()).expect("written");
-        let again = import(folder.path(), dataset_info).expect("read");
+        export(&checkpoint, folder.path()).expect("an exported checkpoint");
+        let again = import(folder.path(), dataset_info).expect("a checkpoint");
         assert_eq!(parameters::values(&again.model), parameters::values(&checkpoint.model));
         assert_eq!((&again.config.model, &again.config.loss), (&checkpoint.config.model, &checkpoint.config.loss));
         let other = DatasetInfo { action: ActionScale::identity(1), columns: Named::new(), env: None };
@@ -122,7 +122,7 @@ fn golden_tdmpc2_training() {
 }
 
 impl Golden {
-    /// A training step on the recorded batch and draws.
+    /// Computes a training step on the recorded batch and random draws.
     fn train(
         &self,
         model: &Tdmpc2,
@@ -132,7 +132,7 @@ impl Golden {
         terminations: bool,
         shards: usize,
     ) -> Tdmpc2Step {
-        // From clip-major to step-major order.
+        // Reorders rows from clip-major to step-major.
         let step_major = |name: &str| {
             let [clips, steps, width] = self.tensor::<3>(name).dims();
             self.tensor::<3>(name).swap_dims(0, 1).reshape([steps * clips, width])

@@ -34,8 +34,8 @@ fn state_dicts_round_trip() {
     .into_iter()
     .map(|(name, tensor)| (name.to_owned(), tensor))
     .collect();
-    weights::torch::write(&path, &state).expect("the disk is fine");
-    assert_eq!(weights::read(&path).expect("ours"), state);
+    weights::torch::write(&path, &state).expect("a written file");
+    assert_eq!(weights::read(&path).expect("the written state dict"), state);
 }
 
 #[test]
@@ -43,7 +43,7 @@ fn invalid_files_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     let message = |name: &str, bytes: &[u8]| {
         let path = folder.path().join(name);
-        std::fs::write(&path, bytes).expect("the disk is fine");
+        std::fs::write(&path, bytes).expect("a written file");
         weights::read(&path).expect_err("no weights").to_string()
     };
     assert!(message("weights.txt", b"").contains(".safetensors, .pt"));

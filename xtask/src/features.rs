@@ -1,8 +1,8 @@
-//! Features of shared dependencies: all builds compile a library with the same features, and therefore once.
+//! Checks that all builds compile a library with the same features, so that each library is compiled only once.
 //!
 //! Cargo unifies features over the packages that one command builds. `workspace-hack` gives the large libraries equal
-//! features in all builds (the program, the Python extension, the tests); this check compares what Cargo resolves for
-//! each.
+//! features in all builds (the program, the Python extension, the tests). This check compares the features that Cargo
+//! resolves for each build.
 
 use anyhow::{Context as _, Result, bail};
 use std::collections::{BTreeMap, BTreeSet};

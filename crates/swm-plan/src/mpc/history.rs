@@ -88,7 +88,7 @@ impl History {
         slot.steps += 1;
     }
 
-    /// Returns the observed columns extended by the history, for these slots; other rows are stale.
+    /// Returns the observed columns extended by the history, for `slots`; the rows of other slots are stale.
     pub fn extend(&mut self, observed: &Batch, slots: &[usize]) -> Result<&Batch> {
         let infos = match &mut self.infos {
             Some(infos) => infos,

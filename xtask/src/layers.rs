@@ -157,7 +157,7 @@ mod tests {
 
     #[test]
     fn violations_name_the_dependency_path() {
-        for (from, need, says) in [
+        for (from, need, expected) in [
             ("swm-core", "burn", "swm-core → burn ("),
             ("swm-envs", "mujoco-rs", "swm-envs → mujoco-rs ("),
             ("swm-report", "swm-data", "swm-report → swm-data → lance-file ("),
@@ -181,7 +181,7 @@ mod tests {
             ),
         ] {
             let found = with(&[(from, need)]);
-            assert!(found.iter().any(|line| line.starts_with(says)), "{from} → {need}: {found:#?}");
+            assert!(found.iter().any(|line| line.starts_with(expected)), "{from} → {need}: {found:#?}");
         }
     }
 

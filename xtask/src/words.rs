@@ -129,7 +129,7 @@ impl Words {
     }
 }
 
-/// The words of a line in lower case, identifiers split into their parts.
+/// Returns the words of a line in lower case; identifiers are split into words.
 fn parts(line: &str) -> Vec<String> {
     let mut parts: Vec<String> = vec![];
     let mut word = String::new();

@@ -113,7 +113,7 @@ pub struct DataBenchRow {
     pub reference: Vec<f64>,
     /// The median of `ours`.
     pub rate: f64,
-    /// The median over measurement pairs of the rate of this implementation divided by that of the reference.
+    /// The median over measurement pairs of the rate of this implementation divided by the reference's rate.
     pub ratio: Option<f64>,
 }
 
@@ -192,11 +192,11 @@ pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBench
             Err(error) => report.reference = format!("not compared: {error}"),
         }
     }
-    let wanted = |layout: &&Layout| {
+    let selected = |layout: &&Layout| {
         let known = FORMATS.rows.iter().any(|format| format.id() == layout.format && format.is_available());
         known && (config.formats.is_empty() || config.formats.iter().any(|name| name == layout.format))
     };
-    for layout in LAYOUTS.iter().filter(wanted) {
+    for layout in LAYOUTS.iter().filter(selected) {
         let path = at(layout.file);
         write(&source, &path, layout)?;
         let mut reference_side = match &mut reference {
@@ -226,7 +226,7 @@ pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBench
     if config.convert {
         // This implementation and the reference convert the same dataset: the reference's, if there is a reference.
         let jpeg = [at("theirs.lance"), at("jpeg.lance")].into_iter().find(|path| path.exists());
-        for layout in LAYOUTS.iter().filter(wanted).filter(|layout| ["hdf5", "video"].contains(&layout.format)) {
+        for layout in LAYOUTS.iter().filter(selected).filter(|layout| ["hdf5", "video"].contains(&layout.format)) {
             for (what, verify) in [("", false), (", verified", true)] {
                 let what = format!("lance to {}{what}", layout.name);
                 let source = jpeg.as_deref().unwrap_or(&source);

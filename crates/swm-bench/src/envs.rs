@@ -89,7 +89,7 @@ pub struct BenchRow {
     pub reference: Vec<f64>,
     /// The median of `ours`.
     pub steps_per_second: f64,
-    /// The median over measurement pairs of the rate of this implementation divided by that of the reference.
+    /// The median over measurement pairs of the rate of this implementation divided by the reference's rate.
     pub ratio: Option<f64>,
 }
 
@@ -257,9 +257,9 @@ impl Ours {
 impl BenchReport {
     /// Starts the reference with a `World` of this size. If this fails, stores the reason and returns `None`.
     fn start_reference(&mut self, env: &EnvChoice, size: usize, config: &BenchConfig) -> Option<Reference> {
-        let wanted =
+        let world_size =
             Size { env: &env.id(), envs: config.envs, image: (size, size), episode_steps: config.episode_steps };
-        match Reference::start(config.python.as_ref()?, wanted) {
+        match Reference::start(config.python.as_ref()?, world_size) {
             Ok(started) => {
                 self.reference.clone_from(&started.version);
                 Some(started)

@@ -85,7 +85,7 @@ pub struct ModelBenchRow {
     pub reference: Vec<f64>,
     /// The median of `ours`.
     pub seconds: f64,
-    /// The median over measurement pairs of the time of this implementation divided by that of the reference.
+    /// The median over measurement pairs of the time of this implementation divided by the reference's time.
     pub share: Option<f64>,
     /// The largest difference between the outputs of this implementation and of the reference, relative to the largest
     /// output of the reference.

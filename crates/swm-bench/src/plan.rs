@@ -17,7 +17,7 @@ use swm_plan::Cem;
 /// Settings of the benchmark.
 #[derive(Clone, Debug)]
 pub struct PlanBenchConfig {
-    /// The counts of environments planned in one call; one row each.
+    /// The numbers of environments that one call plans for; the report has a row for each.
     pub envs: Vec<usize>,
     /// Candidates, iterations, elites.
     pub cem: Cem,
@@ -86,7 +86,7 @@ pub struct PlanBenchRow {
     pub reference: Vec<f64>,
     /// The median of `ours`.
     pub iterations_per_second: f64,
-    /// The median over measurement pairs of the rate of this implementation divided by that of the reference.
+    /// The median over measurement pairs of the rate of this implementation divided by the reference's rate.
     pub ratio: Option<f64>,
     /// The planner's time divided by [`PlanBenchConfig::model_seconds`].
     pub overhead: f64,

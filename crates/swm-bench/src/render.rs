@@ -1,7 +1,7 @@
 //! `bench render`: frames per second of one environment, by environment, size and renderer.
 //!
-//! Measurements of the renderers alternate within one run, and the report contains their median. The environment steps
-//! between two frames; the time of the step is not counted.
+//! Measurements of the renderers alternate within one run, and the report contains the median for each. The environment
+//! steps between two frames; the time of the step is not counted.
 
 use serde::Serialize;
 use std::time::{Duration, Instant};

@@ -78,9 +78,9 @@ pub fn predict(
     Ok(Prediction::new(predictor.frameskip(), variance, trajectories))
 }
 
-/// Predicts `n` trajectories of some episodes of a dataset, such as those of a held-out [`swm_data::Split`], chosen by
-/// [`Starts::choose_among`]. An episode succeeded if its column `success` is set in any row; without that column the
-/// outcome is unknown.
+/// Predicts `n` trajectories of some episodes of a dataset, such as the episodes of a held-out [`swm_data::Split`],
+/// chosen by [`Starts::choose_among`]. An episode succeeded if its column `success` is set in any row; without that
+/// column the outcome is unknown.
 ///
 /// # Errors
 /// As [`predict`], and when the episodes have fewer than `n` trajectories.

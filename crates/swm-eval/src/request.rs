@@ -167,7 +167,7 @@ impl EvalRequest {
     /// The request behind some results.
     ///
     /// # Errors
-    /// When the manifest is not that of an evaluation, or contains no request of this layout.
+    /// When the manifest is not an evaluation's manifest, or contains no request of this layout.
     pub fn of(manifest: &Manifest) -> Result<Self> {
         let again = "evaluate again with this version (`swm eval`)";
         let invalid = |problem: String| Error::config("the results' manifest", problem, again);

@@ -233,7 +233,7 @@ impl EvalRequest {
     /// Adds the provenance of a policy to the manifest.
     fn record_provenance(&self, manifest: &mut Manifest, policy: &PolicyRequest, resolved: &ResolvedPolicy) {
         if let Some(weights) = &resolved.weights {
-            // The floor and one other policy.
+            // Two policies are the random-policy floor and one other policy.
             let single = self.policies.len() <= 2;
             let key = if single { "weights".to_owned() } else { format!("weights of {}", policy.name) };
             manifest.hashes.insert(key, weights.clone());

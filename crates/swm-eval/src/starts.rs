@@ -113,7 +113,7 @@ impl Starts {
         Self::choose_among(reader, &all, n, goal_offset, seed)
     }
 
-    /// As [`Starts::choose`], among these episodes only, such as those of a held-out [`swm_data::Split`].
+    /// As [`Starts::choose`], among these episodes only, such as the episodes of a held-out [`swm_data::Split`].
     ///
     /// # Errors
     /// When the episodes have fewer than `n` starts, or an episode does not exist.

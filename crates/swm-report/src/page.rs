@@ -18,7 +18,7 @@ pub struct ReportOptions {
     pub title: Option<String>,
     /// A training log (`train.jsonl`) whose metrics are shown.
     pub metrics: Option<PathBuf>,
-    /// The command that reproduces the results; by default, the one in the manifest, if there is any.
+    /// The command that reproduces the results; by default, the command in the manifest, if there is one.
     pub command: Option<String>,
 }
 

@@ -23,7 +23,7 @@ struct Infos {
     batch: Batch,
     /// The index of the frames among the observed columns, if there are any.
     pixels: Option<usize>,
-    /// The number of observed columns; those of the history follow.
+    /// The number of observed columns; the columns of the history follow.
     observed: usize,
 }
 

@@ -8,7 +8,7 @@ use crate::search::UNWRITTEN;
 use swm_core::{Batch, Candidates, Constrained, CostModel, DifferentiableCost, Env, Error, LatentDynamics, Result};
 
 /// A model whose cost is an objective on a rollout of its [`LatentDynamics`] from the present latent, with constraints.
-/// The gradient is that of back-propagation through time.
+/// The gradient is computed by back-propagation through time.
 ///
 /// Only [`LatentDynamics`] is used. For a model that conditions on several past states, such as a LeWM, the latent
 /// dynamics are a one-step model, so a terminal goal term is close to that model's own cost but not equal to it.

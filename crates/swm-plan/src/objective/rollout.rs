@@ -73,7 +73,7 @@ impl Rollout {
     /// Propagates gradients from the latents back to the actions, from the last step to the first.
     ///
     /// # Shapes
-    /// `slopes` has the shape of the latents, `gradient` that of the actions.
+    /// `slopes` has the shape of the latents, `gradient` has the shape of the actions.
     pub fn back(
         &mut self,
         model: &mut dyn LatentDynamics,

@@ -55,7 +55,7 @@ pub fn candidates(update: &Update, gaussian: &Gaussian, bound: f32) -> Vec<f32> 
     candidates
 }
 
-/// Asserts that values equal those of the reference up to 1e-5.
+/// Asserts that the values equal the values of the reference up to 1e-5.
 pub fn assert_near(ours: &[f32], theirs: &[f32]) {
     assert_eq!(ours.len(), theirs.len());
     for (ours, theirs) in ours.iter().zip(theirs) {

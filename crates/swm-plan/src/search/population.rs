@@ -185,7 +185,7 @@ pub fn average(values: &[f32]) -> f32 {
     (values.iter().map(|&value| f64::from(value)).sum::<f64>() / values.len() as f64) as f32
 }
 
-/// The standard deviation over candidates `[samples, len]`, averaged over their values.
+/// The standard deviation over candidates `[samples, len]`, averaged over the values of a candidate.
 fn spread(candidates: &[f32], len: usize) -> f32 {
     let samples = (candidates.len() / len) as f64;
     let deviation = |j: usize| {

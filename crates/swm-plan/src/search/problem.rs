@@ -206,8 +206,8 @@ fn check_init(problem: &PlanProblem<'_>) -> Result<()> {
     let (envs, horizon, dim) = (problem.keys.len(), problem.horizon, problem.space.dim());
     let expected = envs * horizon * dim;
     if init.len() != expected {
-        let wanted = format!("{expected} ({envs} environments x {horizon} x {dim})");
-        return Err(Error::mismatch("the initial guess of a plan", format!("{} values", init.len()), wanted));
+        let expected_shape = format!("{expected} ({envs} environments x {horizon} x {dim})");
+        return Err(Error::mismatch("the initial guess of a plan", format!("{} values", init.len()), expected_shape));
     }
     let Some(i) = init.iter().position(|v| !v.is_finite()) else {
         return Ok(());

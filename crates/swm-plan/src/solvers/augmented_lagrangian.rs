@@ -25,7 +25,7 @@
 //!   candidate); values that are not finite are errors.
 //!
 //! As in the reference, the optimizer's memory is cleared whenever the multipliers change. The trace has an entry
-//! before every step and one for the plan: the cost and the violation of the candidate that would be the plan.
+//! before every step and one for the plan: the cost and the violation of the candidate that is the best at this step.
 
 use crate::entry::{ActionKind, Family, Need, SolverEntry, defaults, make};
 use crate::search::{Adam, Descent, Optimizer, Settings, Step, UNWRITTEN, constrained, continuous, misfit};

@@ -319,7 +319,8 @@ fn deadline_ends_the_search() {
         let stopped =
             solver.solve(&mut Model::new(toy, &[0]), problem(Some(Instant::now()))).expect("the solver returns a plan");
         let complete = solver.solve(&mut Model::new(toy, &[0]), problem(None)).expect("the solver returns a plan");
-        // The start and one step; for GRASP, whose steps are not rolled out, only the plan.
+        // The trace has entries for the start and one step. For GRASP, whose steps are not rolled out, it has only the
+        // plan.
         assert_eq!(stopped.trace[0].best.len(), if id == "grasp" { 1 } else { 2 }, "{id}");
         assert_eq!(stopped.trace[0].best.last(), Some(&stopped.costs[0]), "{id}");
         assert!(stopped.costs[0].is_finite() && stopped.actions.len() == complete.actions.len(), "{id}");

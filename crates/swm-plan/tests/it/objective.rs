@@ -410,8 +410,8 @@ fn unstable(growth: f32) -> ObjectiveCost {
 
 #[test]
 fn one_step_size_of_grasp_works_for_all_horizons() {
-    // The curvature of a rollout's cost grows with the horizon, that of the lifted problem does not. The test uses
-    // plain gradient steps, because Adam rescales every value and hides the difference.
+    // The curvature of a rollout's cost grows with the horizon; the curvature of the lifted problem does not. The test
+    // uses plain gradient steps, because Adam rescales every value and hides the difference.
     let plain = |step| Optimizer::Sgd(Sgd { step, momentum: 0.0 });
     let zero = LinearSchedule { from: 0.0, to: 0.0 };
     let mut grasp = Grasp {

@@ -1,4 +1,4 @@
-//! The simulator as a cost model: its costs are those of the actions that the policy executes.
+//! The simulator as a cost model: its costs are computed for the actions that the policy executes.
 
 use rand::Rng as _;
 use swm_core::pool::{Reset, threads};

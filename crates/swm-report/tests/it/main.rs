@@ -174,7 +174,7 @@ fn policies_are_compared_on_the_same_starts() {
         assert!(page.contains(words), "the page lacks: {words}");
     }
     assert!(!page.contains("agent.color shifted: cost") && !page.contains("pldm, in distribution: cost"));
-    // The shifted run counts one start fewer than its floor, so they are compared by their confidence intervals.
+    // The shifted run counts one start fewer than its floor, so the report compares their confidence intervals.
     assert!(page.contains("not significantly different from the random-policy floor of 5.0 %<"));
 }
 

@@ -110,7 +110,7 @@ impl Installable {
 }
 
 impl Names {
-    /// Returns the named assets; without names, those that `default` accepts.
+    /// Returns the named assets; without names, the assets that `default` accepts.
     fn chosen(&self, default: impl Fn(Installable) -> bool) -> Result<Vec<Installable>> {
         if self.names.is_empty() {
             return Ok(Installable::all().filter(|item| default(*item)).collect());

@@ -104,7 +104,7 @@ impl Drop for StageDisplay {
 
 /// Formats the model's first metrics, the validation metric, and the speed of the loader.
 fn training_message(progress: &Progress<'_>) -> String {
-    // The metrics of the training loop follow those of the model.
+    // The metrics of the model precede the metrics of the training loop.
     let is_of_loop = |name: &str| ["validation_loss", "evaluation_return", "lr"].contains(&name);
     let model = progress.metrics.iter().take_while(|(name, _)| !is_of_loop(name)).take(SHOWN_METRICS);
     let model: Vec<String> = model.map(|(name, value)| format!("{name} {value:.4}")).collect();

@@ -9,8 +9,8 @@ const REFERENCE: &str = include_str!("reference_envs.json");
 #[test]
 fn environments_have_the_spaces_of_the_reference() {
     let ours = Swm::new().json(&["envs"]);
-    let theirs: Value = serde_json::from_str(REFERENCE).expect("the fixture is JSON");
-    for (id, expected) in theirs.as_object().expect("a JSON object") {
+    let reference: Value = serde_json::from_str(REFERENCE).expect("the fixture is JSON");
+    for (id, expected) in reference.as_object().expect("a JSON object") {
         let found = &ours[id];
         assert!(same(&found["action_space"], &expected["action_space"]), "{id}");
         assert!(same(&found["observation_space"], &expected["observation_space"]), "{id}");

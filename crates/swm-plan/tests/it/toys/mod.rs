@@ -1,7 +1,7 @@
 //! Planning problems whose optimum is known in closed form or by exhaustive search, as models for any solver.
 //!
 //! Each environment of a toy has its own optimum, keyed by its index, so that using another environment's data gives a
-//! wrong plan. Arithmetic is in double precision, so errors are those of the solver.
+//! wrong plan. Arithmetic is in double precision, so errors are due to the solver.
 
 mod landscapes;
 mod model;

@@ -1,11 +1,11 @@
-//! Names of standard columns appear as string literals in `swm-core` only.
+//! Checks that the names of standard columns are string literals in `swm-core` only.
 
 use crate::source::File;
 
 /// The file that defines the names.
 const HOME: &str = "crates/swm-core/src/columns";
 
-/// Names that are used for columns only. (`action`, `goal` and others are also settings and JSON fields.)
+/// Names that are used for columns only. (`action` and `goal`, for example, are also settings and JSON fields.)
 const NAMES: &[&str] =
     &["\"pixels\"", "\"terminated\"", "\"truncated\"", "\"episode_idx\"", "\"step_idx\"", "\"variation."];
 

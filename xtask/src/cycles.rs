@@ -1,8 +1,8 @@
 //! Import cycles between the files of a crate.
 //!
 //! A file imports another when its code names a path of this crate (`crate::…`, `super::…`, `self::…`) that leads into
-//! the other file. Names that a module re-exports count for the file that defines them, so a crate root of re-exports
-//! is not part of a cycle. Unit tests are ignored.
+//! the other file. A re-exported name counts as an import of the file that defines the name, so a crate root of
+//! re-exports is not part of a cycle. Unit tests are ignored.
 
 use crate::source::{self, File};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
@@ -49,7 +49,7 @@ impl<'a> Imports<'a> {
         let index: HashMap<&[String], usize> = modules.iter().enumerate().map(|(i, m)| (m.as_slice(), i)).collect();
         let sources: Vec<String> = files.iter().map(|file| source::without_tests(&source::code(&file.text))).collect();
         let mut exports: HashMap<ModulePath, ModulePath> = HashMap::new();
-        let mut wanted: Vec<Vec<ModulePath>> = vec![];
+        let mut imported: Vec<Vec<ModulePath>> = vec![];
         for (module, source) in modules.iter().zip(&sources) {
             let mut paths = vec![];
             for (public, path) in imports(source, module, &index) {
@@ -61,9 +61,9 @@ impl<'a> Imports<'a> {
                     paths.push(path);
                 }
             }
-            wanted.push(paths);
+            imported.push(paths);
         }
-        let edges = wanted
+        let edges = imported
             .iter()
             .enumerate()
             .map(|(from, paths)| {
@@ -120,7 +120,7 @@ fn resolve(
     exports: &HashMap<ModulePath, ModulePath>,
 ) -> Option<usize> {
     let mut path = path.to_vec();
-    // More re-exports than this in a row are a cycle of re-exports.
+    // A longer chain of re-exports is a cycle.
     for _ in 0..8 {
         let next = (1..=path.len()).find_map(|n| {
             let target = exports.get(&path[..n])?;
@@ -129,12 +129,12 @@ fn resolve(
         let Some(next) = next else { break };
         path = next;
     }
-    // Naming a module itself, as `use crate::batch;` does, leads into it as well. The crate root itself defines no
+    // The path of a module, as in `use crate::batch;`, leads to the file of the module. The crate root defines no
     // items.
     (1..=path.len()).rev().find_map(|n| index.get(&path[..n]).copied())
 }
 
-/// The crate-local paths of a file, each with whether it is re-exported from there.
+/// The crate-local paths that a file names, each with whether the file re-exports it.
 fn imports(code: &str, module: &[String], index: &HashMap<&[String], usize>) -> Vec<(bool, ModulePath)> {
     let mut found = vec![];
     for statement in code.split_inclusive(';') {
@@ -159,7 +159,7 @@ fn imports(code: &str, module: &[String], index: &HashMap<&[String], usize>) -> 
             let path: ModulePath =
                 code[at..end].split("::").filter(|part| !part.is_empty()).map(str::to_owned).collect();
             if let Some(path) = absolute(&path, module, index).filter(|path| path.len() > 1) {
-                // A path of a `use` statement is found above, with its braces.
+                // The loop above has already found the paths of `use` statements, including those in braces.
                 let line = code[..at].rfind(['\n', ';', '{', '}']).map_or(0, |n| n + 1);
                 if !code[line..at].contains("use ") {
                     found.push((false, path));
@@ -196,7 +196,7 @@ fn expand(tree: &str) -> Vec<ModulePath> {
     }
     branches.push(&inner[start..]);
     for branch in branches.into_iter().filter(|branch| !branch.trim().is_empty()) {
-        // The closing braces that the outer trim took belong to the last branch.
+        // `trim_end_matches` above has removed the closing braces of the last branch.
         let missing = branch.matches('{').count().saturating_sub(branch.matches('}').count());
         let branch = format!("{branch}{}", "}".repeat(missing));
         for path in expand(&branch) {

@@ -1,8 +1,8 @@
-//! Features of shared dependencies: all builds compile a library with the same features, and therefore once.
+//! Checks that all builds compile a library with the same features, so that each library is compiled only once.
 //!
 //! Cargo unifies features over the packages that one command builds. `workspace-hack` gives the large libraries equal
-//! features in all builds (the program, the Python extension, the tests); this check compares what Cargo resolves for
-//! each.
+//! features in all builds (the program, the Python extension, the tests). This check compares the features that Cargo
+//! resolves for each build.
 
 use anyhow::{Context as _, Result, bail};
 use std::collections::{BTreeMap, BTreeSet};
@@ -27,7 +27,7 @@ pub fn violations(root: &Path) -> Result<Vec<String>> {
         .iter()
         .map(|(name, select, tests)| Ok((*name, features(root, select, *tests)?)))
         .collect::<Result<_>>()?;
-    let (whole, all) = &resolved[0];
+    let (tests, all) = &resolved[0];
     let mut found = vec![];
     for (name, features) in &resolved[1..] {
         for (library, sets) in features {
@@ -36,7 +36,7 @@ pub fn violations(root: &Path) -> Result<Vec<String>> {
             if let [set, ..] = missing[..] {
                 let sets: Vec<&str> = all.get(library).into_iter().flatten().map(String::as_str).collect();
                 found.push(format!(
-                    "{library} has the features [{set}] in {name}, [{}] in {whole}: name them in crates/workspace-hack/Cargo.toml",
+                    "{library} has the features [{set}] in {name}, [{}] in {tests}: name them in crates/workspace-hack/Cargo.toml",
                     sets.join("] or [")
                 ));
             }

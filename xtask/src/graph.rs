@@ -134,7 +134,7 @@ mod tests {
             ("z", &["burn"]),
             ("burn", &[]),
         ]);
-        let start = graph.member("swm-a").expect("there");
+        let start = graph.member("swm-a").expect("the graph has this package");
         assert_eq!(graph.shortest_path(start, |name| name == "burn"), Some(vec!["swm-a", "y", "burn"]));
         assert_eq!(graph.shortest_path(start, |name| name == "lance"), None);
         assert!(graph.member("x").is_none());

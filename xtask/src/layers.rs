@@ -1,5 +1,5 @@
-//! The layer rules: packages that a crate must not depend on, directly or indirectly. They keep the core, environment,
-//! planning and report crates fast to build and usable without a deep-learning framework or a database.
+//! The layer rules: packages that a crate must not depend on, directly or indirectly. The rules keep the core,
+//! environment, planning and report crates fast to build and usable without a deep-learning framework or a database.
 
 use crate::graph::Graph;
 
@@ -16,9 +16,9 @@ pub enum Rule {
     },
     /// Only `users` may depend directly on `crates`.
     Only {
-        /// The crates that may depend on them.
+        /// The crates that may depend on `crates`.
         users: &'static [&'static str],
-        /// The crates.
+        /// The crates with restricted users.
         crates: &'static [&'static str],
         /// The rule in words.
         words: &'static str,
@@ -43,7 +43,8 @@ pub const RULES: &[Rule] = &[
     },
     Rule::Never {
         crates: &[],
-        // `datafusion-common` holds the shared types that Lance's file crate uses; all others belong to the engine.
+        // Lance's file crate uses the types of `datafusion-common`. All other DataFusion crates are parts of the query
+        // engine.
         forbidden: |name| of_family(name, "datafusion") && name != "datafusion-common",
         words: "no crate depends on DataFusion's query engine",
     },
@@ -143,7 +144,7 @@ mod tests {
             ("mujoco-rs", vec![]),
         ];
         for (name, need) in more {
-            packages.iter_mut().find(|(other, _)| other == name).expect("a package").1.push(need);
+            packages.iter_mut().find(|(other, _)| other == name).expect("the list has this package").1.push(need);
         }
         let packages: Vec<(&str, &[&str])> = packages.iter().map(|(name, needs)| (*name, needs.as_slice())).collect();
         violations(&Graph::synthetic(&packages), RULES)
@@ -156,7 +157,7 @@ mod tests {
 
     #[test]
     fn violations_name_the_dependency_path() {
-        for (from, need, says) in [
+        for (from, need, expected) in [
             ("swm-core", "burn", "swm-core → burn ("),
             ("swm-envs", "mujoco-rs", "swm-envs → mujoco-rs ("),
             ("swm-report", "swm-data", "swm-report → swm-data → lance-file ("),
@@ -180,7 +181,7 @@ mod tests {
             ),
         ] {
             let found = with(&[(from, need)]);
-            assert!(found.iter().any(|line| line.starts_with(says)), "{from} → {need}: {found:#?}");
+            assert!(found.iter().any(|line| line.starts_with(expected)), "{from} → {need}: {found:#?}");
         }
     }
 

@@ -1,9 +1,9 @@
 //! Checks of the workspace.
 //!
-//! `cargo xtask check` runs everything a change must pass apart from the tests, cheapest first, and stops at the
-//! first failure. Every check is also a separate command.
+//! `cargo xtask check` runs all checks that a change must pass, except the tests. The cheapest check runs first, and
+//! the command stops at the first failure. Every check is also a separate command.
 
-// A command-line program; the lints guard the libraries.
+// The printing lints are for libraries; this is a command-line program.
 #![allow(clippy::print_stdout, clippy::print_stderr, reason = "a command-line program prints")]
 
 mod columns;
@@ -116,7 +116,7 @@ fn sources() -> Result<Vec<source::File>> {
     Ok(files)
 }
 
-/// All text files: code, documents, Python, presets; without the list of words itself.
+/// All text files: code, documents, Python, presets. The files of `xtask` are omitted, because they list refused words.
 fn prose() -> Result<Vec<source::File>> {
     let mut files = source::files(&root(), &[".rs", ".md", ".py", ".toml", "Makefile"])?;
     files.retain(|file| !file.path.starts_with("xtask/"));
@@ -140,8 +140,8 @@ fn cargo(arguments: &[&str], fix: &str) -> Result<()> {
     let program = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let words = arguments.join(" ");
     let mut command = Command::new(program);
-    // `cargo run` sets variables about this package. Build scripts that watch them (ring's) would run again in the
-    // inner cargo, and everything above them would be compiled again, so they are removed.
+    // `cargo run` sets environment variables about this package. In the inner cargo, they would cause build scripts
+    // that depend on these variables (such as ring's) to run again, and all dependent crates to be compiled again.
     let own = std::env::vars_os().map(|(name, _)| name).filter(|name| {
         let name = name.to_string_lossy();
         name == "OUT_DIR" || name.starts_with("CARGO_PKG_") || name.starts_with("CARGO_MANIFEST_")
@@ -157,8 +157,8 @@ fn cargo(arguments: &[&str], fix: &str) -> Result<()> {
     Ok(())
 }
 
-/// The workspace's folder: the one that cargo runs this in, which need not be the one it was compiled in when two
-/// checkouts share a target folder.
+/// The folder of the workspace in which cargo runs this program. If two checkouts share a target folder, the program
+/// may have been compiled in another folder.
 fn root() -> PathBuf {
     let here = std::env::var_os("CARGO_MANIFEST_DIR").unwrap_or_else(|| env!("CARGO_MANIFEST_DIR").into());
     let here = PathBuf::from(here);

@@ -1,4 +1,4 @@
-//! Registries: every `pub const ENTRY` is in a list of its crate.
+//! Checks that every `pub const ENTRY` is in a registry list of its crate.
 
 use crate::source::{self, File};
 

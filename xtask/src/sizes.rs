@@ -1,4 +1,4 @@
-//! The size of source files. (The length of functions is Clippy's `too_many_lines`.)
+//! Checks the length of source files. (Clippy's `too_many_lines` checks the length of functions.)
 
 use crate::source::File;
 

@@ -136,11 +136,11 @@ mod tests {
         let text = "let a = \"use crate::x; \\\" {\"; // use b\nlet c = 'x'; let d: &'a str = r#\"{\"#; /* { */ let e = '\\'';";
         let code = code(text);
         assert_eq!(code.len(), text.len());
-        for gone in ["use", "{", "b\n"] {
-            assert!(!code.contains(gone), "{gone} in {code}");
+        for removed in ["use", "{", "b\n"] {
+            assert!(!code.contains(removed), "{removed} in {code}");
         }
-        for stays in ["let a =", "let c =", "&'a str", "let e ="] {
-            assert!(code.contains(stays), "{stays} not in {code}");
+        for kept in ["let a =", "let c =", "&'a str", "let e ="] {
+            assert!(code.contains(kept), "{kept} not in {code}");
         }
     }
 

@@ -8,7 +8,7 @@ use anyhow::{Result, bail};
 pub struct Row {
     /// The crate.
     pub name: String,
-    /// The names in backticks of its last column.
+    /// The names in backticks in the last column.
     pub may: Vec<String>,
 }
 
@@ -20,7 +20,7 @@ pub fn parse(text: &str) -> Result<Vec<Row>> {
         bail!("ARCHITECTURE.md contains no table with the header | crate | responsibility | may depend on |");
     }
     let mut rows = vec![];
-    // The line under a header is its rule.
+    // The line below the header separates the header from the rows.
     for cells in lines.skip(1).take_while(|cells| !cells.is_empty()) {
         let [name, _, may] = cells[..] else { bail!("a row of the crate table does not have 3 columns: {cells:?}") };
         let [name] = &quoted(name)[..] else { bail!("the crate table does not name one crate in backticks: {name}") };
@@ -81,7 +81,7 @@ mod tests {
         | `swm` | all | `swm-core`, `swm-plan`, `clap` |\n\nMore text.\n";
 
     fn check(text: &str, packages: &[(&str, &[&str])]) -> Vec<String> {
-        violations(&Graph::synthetic(packages), &parse(text).expect("a table"))
+        violations(&Graph::synthetic(packages), &parse(text).expect("a valid table"))
     }
 
     const WORKSPACE: &[(&str, &[&str])] =
@@ -94,19 +94,23 @@ mod tests {
 
     #[test]
     fn every_difference_is_reported() {
-        let says = |text: &str, packages: &[(&str, &[&str])], words: &str| {
+        let reports = |text: &str, packages: &[(&str, &[&str])], words: &str| {
             let found = check(text, packages);
             assert!(found.len() == 1 && found[0].contains(words), "{words}: {found:?}");
         };
-        says(
+        reports(
             &TEXT.replace("| `swm-plan` | solvers | `swm-core` |", "| `swm-plan` | solvers | |"),
             WORKSPACE,
             "swm-plan depends on swm-core",
         );
-        says(&TEXT.replace("| `swm-plan` | solvers | `swm-core` |\n", ""), WORKSPACE, "the table lacks swm-plan");
-        says(&TEXT.replace("`clap`", "`swm-raster`"), WORKSPACE, "depend on swm-raster, which is no crate");
-        says(&TEXT.replace("| `swm` |", "| `swm-plan` | again | `swm-core` |\n| `swm` |"), WORKSPACE, "swm-plan twice");
-        says(TEXT, &[("swm-core", &[]), ("swm", &[]), ("swm-plan", &[]), ("xtask", &[])], "the table lacks xtask");
+        reports(&TEXT.replace("| `swm-plan` | solvers | `swm-core` |\n", ""), WORKSPACE, "the table lacks swm-plan");
+        reports(&TEXT.replace("`clap`", "`swm-raster`"), WORKSPACE, "depend on swm-raster, which is no crate");
+        reports(
+            &TEXT.replace("| `swm` |", "| `swm-plan` | again | `swm-core` |\n| `swm` |"),
+            WORKSPACE,
+            "swm-plan twice",
+        );
+        reports(TEXT, &[("swm-core", &[]), ("swm", &[]), ("swm-plan", &[]), ("xtask", &[])], "the table lacks xtask");
         let without = |name: &str| check(TEXT, &[("swm-core", &[]), (name, &[])]);
         assert!(without("swm").iter().any(|line| line.contains("lists swm-plan, which is no crate")));
     }

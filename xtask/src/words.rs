@@ -1,13 +1,14 @@
-//! The words of the project: `xtask/words.toml` lists words that have a better one, and where they are right after all.
+//! Checks the vocabulary: `xtask/words.toml` lists words to avoid, their replacements, and the lines that may contain
+//! them.
 //!
-//! Identifiers are split where their parts meet (`snake_case`, `CamelCase`), so a word is found in names, prose and
-//! strings alike.
+//! Identifiers are split into words (`snake_case`, `CamelCase`), so a refused word is found in identifiers, prose and
+//! strings.
 
 use crate::source::File;
 use anyhow::{Context as _, Result, bail};
 use toml::Table;
 
-/// The list.
+/// The content of `xtask/words.toml`.
 #[derive(Debug, Default)]
 pub struct Words {
     refused: Vec<Refused>,
@@ -15,12 +16,12 @@ pub struct Words {
     allowed: Vec<Allowed>,
 }
 
-/// A word that is not used.
+/// A word or a sequence of words to avoid.
 #[derive(Debug)]
 struct Refused {
-    /// Its parts, in lower case.
+    /// The words of the sequence, in lower case.
     parts: Vec<String>,
-    /// What is said instead.
+    /// The words to use instead.
     say: String,
 }
 
@@ -33,12 +34,12 @@ struct RefusedType {
     say: String,
 }
 
-/// Lines in which a refused word is right.
+/// Lines that may contain a refused word.
 #[derive(Debug)]
 struct Allowed {
-    /// How the file's path begins.
+    /// The beginning of the file's path.
     path: String,
-    /// What the line contains.
+    /// A part of the line.
     line: String,
 }
 
@@ -79,7 +80,8 @@ impl Words {
         Ok(words)
     }
 
-    /// Every refused word and type of these files, a sentence each; rows of the allow list that match nothing, too.
+    /// Returns a sentence for each refused word, for each reserved type name that another file defines, and for each
+    /// row of the allow list that matches no line.
     pub fn violations(&self, files: &[File]) -> Vec<String> {
         let mut found = vec![];
         let mut used = vec![false; self.allowed.len()];
@@ -127,7 +129,7 @@ impl Words {
     }
 }
 
-/// The words of a line in lower case, identifiers split into their parts.
+/// Returns the words of a line in lower case; identifiers are split into words.
 fn parts(line: &str) -> Vec<String> {
     let mut parts: Vec<String> = vec![];
     let mut word = String::new();
@@ -164,7 +166,7 @@ mod tests {
     fn check(path: &str, text: &str) -> Vec<String> {
         let used = File { path: "a/b.rs".to_owned(), text: "a column named picture".to_owned() };
         let file = File { path: path.to_owned(), text: text.to_owned() };
-        Words::parse(LIST).expect("a list").violations(&[used, file])
+        Words::parse(LIST).expect("a valid list").violations(&[used, file])
     }
 
     #[test]
@@ -187,7 +189,7 @@ mod tests {
 
     #[test]
     fn an_allowed_line_that_is_gone_is_named() {
-        let found = Words::parse(LIST).expect("a list").violations(&[]);
+        let found = Words::parse(LIST).expect("a valid list").violations(&[]);
         assert!(found[0].contains("delete the row"), "{found:?}");
     }
 }

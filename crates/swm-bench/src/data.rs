@@ -1,7 +1,8 @@
 //! `bench data`: clips loaded per second and datasets converted per second.
 //!
-//! All datasets have the same content, collected once; each side writes its own. The reference loads in its own process
-//! or with worker processes, whichever is faster in a first measurement.
+//! All datasets have the same content, collected once; this implementation and the reference each write their own
+//! files. The reference loads in one process or with worker processes, depending on which was faster in a first
+//! measurement.
 
 use crate::reference::{Reference, not_compared, reference_python};
 use serde::Serialize;
@@ -28,13 +29,13 @@ pub struct DataBenchConfig {
     pub steps: usize,
     /// The side length of the square frames, in pixels.
     pub size: usize,
-    /// The clips that are loaded.
+    /// The length, frameskip and columns of the loaded clips.
     pub clip: ClipSpec,
     /// Clips in a batch.
     pub batch_size: usize,
-    /// Threads of our loader.
+    /// Threads of this implementation's loader.
     pub threads: usize,
-    /// The counts of worker processes to try with the reference.
+    /// The numbers of worker processes with which the reference is tried.
     pub workers: Vec<usize>,
     /// The number of measurement pairs: one of this implementation and one of the reference.
     pub pairs: usize,
@@ -84,19 +85,19 @@ pub struct DataBenchReport {
     pub episodes: usize,
     /// Rows of all episodes.
     pub rows: usize,
-    /// Frames of a clip, rows between them, and clips of a batch.
+    /// The number of frames in a clip, the frameskip, and the number of clips in a batch.
     pub clip: [usize; 3],
-    /// Threads of our loader.
+    /// Threads of this implementation's loader.
     pub threads: usize,
     /// The version of the reference, or the reason why it is not compared.
     pub reference: String,
-    /// One entry for each measurement.
+    /// One entry for each kind of work, format and codec.
     pub rates: Vec<DataBenchRow>,
     /// Memory of this process after every epoch of loading from Lance, in bytes.
     pub resident: Vec<u64>,
 }
 
-/// One measurement.
+/// The rates of one kind of work with one format and codec.
 #[derive(Clone, Debug, Serialize)]
 pub struct DataBenchRow {
     /// The kind of work: `load` or `convert`.
@@ -108,11 +109,11 @@ pub struct DataBenchRow {
     pub reference_setup: String,
     /// Clips or conversions per second in each measurement of this implementation.
     pub ours: Vec<f64>,
-    /// The same for the reference; empty without a reference.
+    /// Clips or conversions per second in each measurement of the reference; empty without a reference.
     pub reference: Vec<f64>,
     /// The median of `ours`.
     pub rate: f64,
-    /// The median over measurement pairs of the rate of this implementation divided by that of the reference.
+    /// The median over measurement pairs of the rate of this implementation divided by the reference's rate.
     pub ratio: Option<f64>,
 }
 
@@ -121,11 +122,11 @@ struct Layout {
     name: &'static str,
     format: &'static str,
     codec: ImageCodec,
-    /// The name of its folder or file.
+    /// The name of the dataset's folder or file.
     file: &'static str,
     /// The format of the reference.
     reference_format: &'static str,
-    /// The name of the reference's folder or file.
+    /// The name of the folder or file of the reference's dataset.
     reference_file: &'static str,
 }
 
@@ -168,7 +169,7 @@ pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBench
     }
     let folder = tempfile::tempdir().map_err(|e| Error::io("a temporary folder", "creating it for datasets", e))?;
     let at = |name: &str| folder.path().join(name);
-    // Both sides read PNG without loss.
+    // This implementation and the reference both read PNG, and PNG is lossless.
     let source = at("source.lance");
     let rows = collect(env, config, &source)?;
     let mut report = DataBenchReport {
@@ -191,11 +192,11 @@ pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBench
             Err(error) => report.reference = format!("not compared: {error}"),
         }
     }
-    let wanted = |layout: &&Layout| {
+    let selected = |layout: &&Layout| {
         let known = FORMATS.rows.iter().any(|format| format.id() == layout.format && format.is_available());
         known && (config.formats.is_empty() || config.formats.iter().any(|name| name == layout.format))
     };
-    for layout in LAYOUTS.iter().filter(wanted) {
+    for layout in LAYOUTS.iter().filter(selected) {
         let path = at(layout.file);
         write(&source, &path, layout)?;
         let mut reference_side = match &mut reference {
@@ -223,9 +224,9 @@ pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBench
         }
     }
     if config.convert {
-        // Both sides read the same dataset: the one that the reference wrote, if any.
+        // This implementation and the reference convert the same dataset: the reference's, if there is a reference.
         let jpeg = [at("theirs.lance"), at("jpeg.lance")].into_iter().find(|path| path.exists());
-        for layout in LAYOUTS.iter().filter(wanted).filter(|layout| ["hdf5", "video"].contains(&layout.format)) {
+        for layout in LAYOUTS.iter().filter(selected).filter(|layout| ["hdf5", "video"].contains(&layout.format)) {
             for (what, verify) in [("", false), (", verified", true)] {
                 let what = format!("lance to {}{what}", layout.name);
                 let source = jpeg.as_deref().unwrap_or(&source);
@@ -321,7 +322,7 @@ fn loader(reader: &Arc<dyn Reader>, config: &DataBenchConfig, cache: CacheConfig
     Loader::new(Arc::clone(reader), config)
 }
 
-/// Alternates measurements of loading.
+/// Measures loading, alternately by this implementation and by the reference.
 fn load(
     what: &str,
     path: &Path,
@@ -349,7 +350,7 @@ fn load(
     Ok(DataBenchRow::new("load", what.to_owned(), reference_setup, ours, reference))
 }
 
-/// Alternates measurements of loading from the object store and from the local disk.
+/// Measures loading, alternately from the object store and from the local disk.
 fn remote(local: &Path, config: &DataBenchConfig) -> Result<Option<DataBenchRow>> {
     let Some(folder) = &config.remote else { return Ok(None) };
     let target = Location::parse(&format!("{}/bench.lance", folder.to_string().trim_end_matches('/')))?;
@@ -363,7 +364,7 @@ fn remote(local: &Path, config: &DataBenchConfig) -> Result<Option<DataBenchRow>
         remote.push(loaders[0].measure(config)?);
         local.push(loaders[1].measure(config)?);
     }
-    // The first measurement of each is a warm-up.
+    // The first measurement of each loader is a warm-up.
     let reference_setup = "the local disk".to_owned();
     let row = DataBenchRow::new(
         "load",
@@ -411,7 +412,7 @@ fn resident() -> Option<u64> {
     line.split_whitespace().next()?.parse::<u64>().ok().map(|kib| kib * 1024)
 }
 
-/// Alternates measurements of converting.
+/// Measures conversions, alternately by this implementation and by the reference.
 fn converting(
     what: &str,
     verify: bool,

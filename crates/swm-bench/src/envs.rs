@@ -21,9 +21,9 @@ pub struct BenchConfig {
     pub envs: usize,
     /// The side lengths of the square frames, in pixels.
     pub sizes: Vec<usize>,
-    /// Whether to measure stepping without frames, too.
+    /// Whether to measure stepping without frames in addition to stepping with frames.
     pub bare: bool,
-    /// Worker threads; as many as the machine has cores for 0. The reference steps on one thread.
+    /// Worker threads; 0 for the number of cores. The reference steps on one thread.
     pub threads: usize,
     /// The number of measurement pairs: one of this implementation and one of the reference.
     pub pairs: usize,
@@ -31,20 +31,20 @@ pub struct BenchConfig {
     pub seconds: f64,
     /// Steps of an episode.
     pub episode_steps: usize,
-    /// Episodes the reference collects in a measurement; 0 skips collecting. This implementation collects
-    /// `EPISODE_FACTOR` times as many, so that both measurements are long enough.
+    /// Episodes that the reference collects in a measurement; 0 skips collecting. This implementation collects
+    /// `EPISODE_FACTOR` times as many episodes, so that both measurements are long enough.
     pub episodes: usize,
     /// A Python with the reference implementation, if any.
     pub python: Option<PathBuf>,
 }
 
-/// The number of episodes that this implementation collects for each one of the reference, so that both measurements
-/// take about as long.
+/// The number of episodes that this implementation collects for each episode of the reference, so that both
+/// measurements take about the same time.
 const EPISODE_FACTOR: usize = 32;
 
 impl Default for BenchConfig {
-    /// The settings of the reference's published rates: 8 environments at 224 pixels. The reference is that of
-    /// [`REFERENCE_PYTHON`](crate::REFERENCE_PYTHON).
+    /// The settings of the reference's published rates: 8 environments at 224 pixels. The Python of the reference is
+    /// the one that [`REFERENCE_PYTHON`](crate::REFERENCE_PYTHON) names.
     fn default() -> Self {
         Self {
             envs: 8,
@@ -65,7 +65,7 @@ impl Default for BenchConfig {
 pub struct BenchReport {
     /// The number of environments that are stepped together.
     pub envs: usize,
-    /// Worker threads of our side.
+    /// Worker threads of this implementation.
     pub threads: usize,
     /// The version of the reference, or the reason why it is not compared.
     pub reference: String,
@@ -89,7 +89,7 @@ pub struct BenchRow {
     pub reference: Vec<f64>,
     /// The median of `ours`.
     pub steps_per_second: f64,
-    /// The median over measurement pairs of the rate of this implementation divided by that of the reference.
+    /// The median over measurement pairs of the rate of this implementation divided by the reference's rate.
     pub ratio: Option<f64>,
 }
 
@@ -136,7 +136,7 @@ pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchRe
         for &size in &config.sizes {
             let mut reference = report.start_reference(env, size, config);
             let mut ours = Ours::new(env, Some(size), config)?;
-            // The first measurement of each side is a warm-up and is not counted.
+            // The first measurements of this implementation and of the reference are warm-ups and are not counted.
             ours.step(config.seconds / 4.0)?;
             reference.as_mut().map(|reference| reference.step(config.seconds / 4.0)).transpose()?;
             report.rows.push(BenchRow::measure(
@@ -158,7 +158,7 @@ pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchRe
                 policy: "random".to_owned(),
                 ..CollectConfig::default()
             };
-            // The reference stores JPEG of quality 95; our default codec is lossless.
+            // The reference stores JPEG of quality 95; the default codec of this implementation is lossless.
             let codecs =
                 [("qoi", "collect, qoi", ImageCodec::Qoi), ("jpeg", "collect, jpeg", ImageCodec::Jpeg { quality: 95 })];
             for (name, what, codec) in codecs {
@@ -189,7 +189,7 @@ struct Ours {
     world: World,
     policy: RandomPolicy,
     active: Vec<bool>,
-    /// Episodes started so far.
+    /// The number of episodes started so far.
     episodes: usize,
     done: Vec<Reset>,
 }
@@ -248,18 +248,18 @@ impl Ours {
         let writer = create(path, &self.world.collect_schema(false)?, options)?;
         let collected = self.world.collect(&mut self.policy, writer, &config, &mut Control::default())?;
         let rate = collected.steps as f64 / begun.elapsed().as_secs_f64();
-        // The next measurement of stepping starts from running episodes.
+        // The next measurement of stepping requires that every slot has a running episode.
         self.world.reset(0, &VariationRequest::default())?;
         Ok(rate)
     }
 }
 
 impl BenchReport {
-    /// Starts the reference with a `World` of this size, if possible; otherwise stores the reason.
+    /// Starts the reference with a `World` of this size. If this fails, stores the reason and returns `None`.
     fn start_reference(&mut self, env: &EnvChoice, size: usize, config: &BenchConfig) -> Option<Reference> {
-        let wanted =
+        let world_size =
             Size { env: &env.id(), envs: config.envs, image: (size, size), episode_steps: config.episode_steps };
-        match Reference::start(config.python.as_ref()?, wanted) {
+        match Reference::start(config.python.as_ref()?, world_size) {
             Ok(started) => {
                 self.reference.clone_from(&started.version);
                 Some(started)
@@ -308,7 +308,8 @@ fn single(env: &EnvChoice, seed: u64, config: &BenchConfig) -> Result<f64> {
 }
 
 impl BenchRow {
-    /// Alternates measurements of both sides; `ours` and `reference` receive the index of the measurement.
+    /// Measures this implementation and the reference alternately; `ours` and `reference` receive the index of the
+    /// measurement pair.
     fn measure(
         env: &EnvChoice,
         size: Option<usize>,

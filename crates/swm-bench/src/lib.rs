@@ -3,9 +3,9 @@
 //! Every benchmark compares with the reference implementation where `SWM_REFERENCE_PYTHON` names a Python that has it
 //! ([`REFERENCE_PYTHON`]). The drivers of the reference are Python scripts in `reference/`, run as a process.
 //!
-//! Measurements of both sides alternate within one run, so that both are subject to the same load of the machine. The
-//! reported figure is the median over the ratios of successive measurements: ratios are reproducible on a shared
-//! machine, absolute rates are not.
+//! Measurements of this implementation and of the reference alternate within one run, so that the load of the machine
+//! affects both in the same way. The reported figure is the median over the ratios of successive measurements, because
+//! ratios are reproducible on a shared machine and absolute rates are not.
 
 mod data;
 mod envs;

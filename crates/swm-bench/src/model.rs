@@ -1,8 +1,8 @@
 //! `bench plan` and `bench train`: the time of a LeWM for planning, evaluating candidates, encoding, and a training
 //! step.
 //!
-//! The reference runs with the same weights. The reported ratio is our time divided by that of the reference. Outputs
-//! of both sides are compared where they are deterministic.
+//! The reference runs with the same weights. The reported ratio is the time of this implementation divided by the time
+//! of the reference. Deterministic outputs of this implementation and of the reference are compared.
 
 use crate::reference::{Reference, not_compared};
 use serde::Serialize;
@@ -37,7 +37,7 @@ impl Work {
         }
     }
 
-    /// Whether the outputs of both sides are compared.
+    /// Whether the outputs of this implementation and of the reference are compared.
     fn is_compared(self) -> bool {
         matches!(self, Self::Cost | Self::Encode)
     }
@@ -81,13 +81,14 @@ pub struct ModelBenchRow {
     pub work: Work,
     /// Seconds per repetition in each measurement of this implementation.
     pub ours: Vec<f64>,
-    /// The same for the reference; empty without a reference.
+    /// Seconds per repetition in each measurement of the reference; empty without a reference.
     pub reference: Vec<f64>,
     /// The median of `ours`.
     pub seconds: f64,
-    /// The median over measurement pairs of the time of this implementation divided by that of the reference.
+    /// The median over measurement pairs of the time of this implementation divided by the reference's time.
     pub share: Option<f64>,
-    /// The largest difference between the outputs of both sides, relative to the largest output.
+    /// The largest difference between the outputs of this implementation and of the reference, relative to the largest
+    /// output of the reference.
     pub difference: Option<f32>,
 }
 
@@ -201,26 +202,27 @@ mod tests {
 
     #[test]
     fn report_states_that_the_reference_is_missing() {
-        let report = bench_model(&config(None), Path::new("none"), &mut Constant).expect("a report");
+        let report = bench_model(&config(None), Path::new("none"), &mut Constant).expect("the benchmark succeeds");
         assert!(report.to_string().contains(REFERENCE_PYTHON));
         assert_eq!(report.rows.len(), 2);
         assert!(report.rows.iter().all(|row| row.ours.len() == 3 && row.share.is_none() && row.difference.is_none()));
-        let nothing = ModelBenchConfig { pairs: 0, ..config(None) };
-        assert!(bench_model(&nothing, Path::new("none"), &mut Constant).is_err());
+        let no_pairs = ModelBenchConfig { pairs: 0, ..config(None) };
+        assert!(bench_model(&no_pairs, Path::new("none"), &mut Constant).is_err());
     }
 
     #[cfg(unix)]
     #[test]
     fn times_and_outputs_are_compared() {
         use std::os::unix::fs::PermissionsExt as _;
-        let folder = tempfile::tempdir().expect("a folder");
+        let folder = tempfile::tempdir().expect("a temporary folder");
         let python = folder.path().join("python");
-        // A fake reference: two repetitions per second, and an output that differs by a fifth of the largest.
+        // A fake reference: two repetitions per second, and an output that differs by a fifth of the largest output.
         let script = "#!/bin/sh\necho SWM ready 1.2.3\nwhile read what rest; do\n\
             if [ $what = run ]; then echo SWM 2 1.0; else echo SWM 1.0 2.5; fi; done\n";
-        std::fs::write(&python, script).expect("a file");
-        std::fs::set_permissions(&python, std::fs::Permissions::from_mode(0o755)).expect("executable");
-        let report = bench_model(&config(Some(python)), Path::new("none"), &mut Constant).expect("a report");
+        std::fs::write(&python, script).expect("the file is written");
+        std::fs::set_permissions(&python, std::fs::Permissions::from_mode(0o755)).expect("the file is made executable");
+        let report =
+            bench_model(&config(Some(python)), Path::new("none"), &mut Constant).expect("the benchmark succeeds");
         assert_eq!(report.reference, "1.2.3");
         assert_eq!((report.rows[0].difference, report.rows[1].difference), (Some(0.2), None));
         for row in &report.rows {
@@ -233,7 +235,7 @@ mod tests {
 
     #[test]
     fn nan_is_a_difference() {
-        assert!(difference(&[f32::NAN, 1.0], &[1.0, 1.0]).expect("two").is_nan());
+        assert!(difference(&[f32::NAN, 1.0], &[1.0, 1.0]).expect("at least one result").is_nan());
         assert!(difference(&[1.0], &[1.0, 1.0]).is_err());
     }
 }

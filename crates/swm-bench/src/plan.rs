@@ -1,6 +1,7 @@
 //! `bench plan`: iterations of CEM per second, without the time of a model.
 //!
-//! The model of both sides returns precomputed random costs, so that only sampling and updates are measured.
+//! The models of this implementation and of the reference return precomputed random costs, so that only sampling and
+//! updates are measured.
 
 use crate::reference::{Reference, not_compared, reference_python};
 use rand::Rng as _;
@@ -16,7 +17,7 @@ use swm_plan::Cem;
 /// Settings of the benchmark.
 #[derive(Clone, Debug)]
 pub struct PlanBenchConfig {
-    /// The counts of environments planned in one call; one row each.
+    /// The numbers of environments that one call plans for; the report has a row for each.
     pub envs: Vec<usize>,
     /// Candidates, iterations, elites.
     pub cem: Cem,
@@ -24,10 +25,10 @@ pub struct PlanBenchConfig {
     pub horizon: usize,
     /// The dimension of a model step.
     pub dim: usize,
-    /// The time of a model for the candidates of one environment in one iteration, in seconds, which the planner's time
-    /// is compared with.
+    /// The time in seconds that a model takes for the candidates of one environment in one iteration. The planner's
+    /// time is reported relative to this time.
     pub model_seconds: f64,
-    /// Worker threads; as many as the machine has cores for 0. The reference uses torch's default.
+    /// Worker threads; 0 for the number of cores. The reference uses torch's default.
     pub threads: usize,
     /// The number of measurement pairs: one of this implementation and one of the reference.
     pub pairs: usize,
@@ -39,7 +40,7 @@ pub struct PlanBenchConfig {
 
 impl Default for PlanBenchConfig {
     /// The paper's settings: 300 candidates, 30 iterations, 5 model steps of 5 actions of dimension 2; for 1 and for 16
-    /// environments. The model time is that of the fastest LeWM we aim at, on two cores.
+    /// environments. The model time is the target for a LeWM on two cores.
     fn default() -> Self {
         Self {
             envs: vec![1, 16],
@@ -66,7 +67,7 @@ pub struct PlanBenchReport {
     pub horizon: usize,
     /// The dimension of a model step.
     pub dim: usize,
-    /// Worker threads of our side.
+    /// Worker threads of this implementation.
     pub threads: usize,
     /// The version of the reference, or the reason why it is not compared.
     pub reference: String,
@@ -85,7 +86,7 @@ pub struct PlanBenchRow {
     pub reference: Vec<f64>,
     /// The median of `ours`.
     pub iterations_per_second: f64,
-    /// The median over measurement pairs of the rate of this implementation divided by that of the reference.
+    /// The median over measurement pairs of the rate of this implementation divided by the reference's rate.
     pub ratio: Option<f64>,
     /// The planner's time divided by [`PlanBenchConfig::model_seconds`].
     pub overhead: f64,
@@ -132,7 +133,7 @@ pub fn bench_plan(config: &PlanBenchConfig) -> Result<PlanBenchReport> {
             }
         }
         let mut planning = Planning::new(config, envs);
-        // The first measurement of each side is a warm-up and is not counted.
+        // The first measurements of this implementation and of the reference are warm-ups and are not counted.
         workers.install(|| planning.solve(config.seconds / 4.0))?;
         reference.as_mut().map(|reference| reference.solve(config.seconds / 4.0)).transpose()?;
         let (mut ours, mut theirs) = (vec![], vec![]);
@@ -164,7 +165,7 @@ struct Planning<'a> {
     keys: Vec<Key>,
     low: Vec<f32>,
     high: Vec<f32>,
-    /// Plans made so far.
+    /// The number of plans made so far.
     plans: u64,
 }
 
@@ -174,7 +175,7 @@ impl<'a> Planning<'a> {
         let costs = (0..config.cem.iterations)
             .map(|_| (0..envs * config.cem.samples).map(|_| rng.random()).collect())
             .collect();
-        // Our side clips to bounds, because every environment has bounds; the reference does not clip.
+        // This implementation clips to bounds, because every environment has bounds; the reference does not clip.
         let (low, high) = (vec![-1.0; config.dim], vec![1.0; config.dim]);
         let keys = (0..envs).map(|env| Key::new(env as u64)).collect();
         Self { config, cem: config.cem.clone(), model: PrecomputedCosts { costs, calls: 0 }, keys, low, high, plans: 0 }
@@ -257,7 +258,7 @@ mod tests {
 
     #[test]
     fn report_states_that_the_reference_is_missing() {
-        let report = bench_plan(&config()).expect("a report");
+        let report = bench_plan(&config()).expect("the benchmark succeeds");
         assert!(report.reference.contains(REFERENCE_PYTHON));
         assert_eq!(report.rows.iter().map(|row| row.envs).collect::<Vec<_>>(), [1, 3]);
         for row in &report.rows {
@@ -265,7 +266,7 @@ mod tests {
             assert!(row.iterations_per_second > 0.0 && row.overhead > 0.0);
         }
         let missing = PlanBenchConfig { python: Some("/no/such/python".into()), ..config() };
-        let report = bench_plan(&missing).expect("a report");
+        let report = bench_plan(&missing).expect("the benchmark succeeds");
         assert!(report.reference.contains("/no/such/python"), "{}", report.reference);
     }
 
@@ -273,13 +274,13 @@ mod tests {
     #[test]
     fn ratio_is_the_median_over_measurement_pairs() {
         use std::os::unix::fs::PermissionsExt as _;
-        let folder = tempfile::tempdir().expect("a folder");
+        let folder = tempfile::tempdir().expect("a temporary folder");
         let python = folder.path().join("python");
         // A fake reference: prints other text, then answers every request with 10 iterations in 2 seconds.
         let script = "#!/bin/sh\necho hello\necho SWM ready 1.2.3\nwhile read line; do echo SWM 10 2.0; done\n";
-        std::fs::write(&python, script).expect("a file");
-        std::fs::set_permissions(&python, std::fs::Permissions::from_mode(0o755)).expect("executable");
-        let report = bench_plan(&PlanBenchConfig { python: Some(python), ..config() }).expect("a report");
+        std::fs::write(&python, script).expect("the file is written");
+        std::fs::set_permissions(&python, std::fs::Permissions::from_mode(0o755)).expect("the file is made executable");
+        let report = bench_plan(&PlanBenchConfig { python: Some(python), ..config() }).expect("the benchmark succeeds");
         assert_eq!(report.reference, "1.2.3");
         for row in &report.rows {
             assert_eq!(row.reference, [5.0; 3]);

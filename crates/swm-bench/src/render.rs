@@ -1,7 +1,7 @@
 //! `bench render`: frames per second of one environment, by environment, size and renderer.
 //!
-//! Measurements of the renderers alternate within one run, and the report contains their median. The environment steps
-//! between two frames; the time of the step is not counted.
+//! Measurements of the renderers alternate within one run, and the report contains the median for each. The environment
+//! steps between two frames; the time of the step is not counted.
 
 use serde::Serialize;
 use std::time::{Duration, Instant};
@@ -68,7 +68,7 @@ pub fn bench_render(
                     let seed = episode_key(0, measurement).seed() >> 1;
                     env.reset(seed, &ResetOptions::default())?;
                     let (mut spent, mut frames, mut step) = (Duration::ZERO, 0u32, 0);
-                    // The first frame, which fills caches, is not counted.
+                    // The first frame fills caches, so its time is not counted.
                     let mut render = |env: &mut dyn Env| {
                         let mut frame = || env.render(FrameMut::new(size, size, &mut rgb));
                         thread_budget::with(config.threads, || draw(&mut frame))
@@ -101,7 +101,7 @@ pub fn bench_render(
     Ok(rows)
 }
 
-/// Takes a random step, and resets at the end of an episode.
+/// Steps the environment with a random action, and resets it at the end of an episode.
 fn act(env: &mut dyn Env, space: &Space, step: u64) -> Result<()> {
     let drawn = space.sample(&mut Key::new(1).at(step).rng());
     let values: Vec<f32> = drawn.iter().map(|&x| x as f32).collect();

@@ -1,25 +1,25 @@
-//! Collecting: writes every episode that a policy plays to a dataset.
+//! Collection: writes every episode that a policy plays to a dataset.
 //!
-//! An episode is determined by its number: its reset seed is `Key::new(seed).with("episode").at(number).seed()` without the
-//! highest bit, and the policy draws from the same key. The writer receives episodes in the order of their numbers, whichever
-//! slot finishes first, so the dataset has the same bytes for any number of environments and threads, and after any
-//! interruption.
+//! An episode is determined by its number: its reset seed is `Key::new(seed).with("episode").at(number).seed()` without
+//! the highest bit, and the policy draws from the same key. The writer receives episodes in the order of their numbers,
+//! not in the order in which slots finish, so the dataset has the same bytes for any number of environments and
+//! threads, and after any interruption.
 //!
 //! # Rows
-//! Row `t` holds the observation at `t`, the action taken from it, and the reward and flags of that step. The last row holds
-//! the final observation: its action is NaN (-1 for integer actions), its reward and flags are 0. `success` states whether the
-//! observation of the same row satisfies the goal.
+//! Row `t` holds the observation at `t`, the action taken from it, and the reward and flags of that step. The last row
+//! holds the final observation: its action is NaN (-1 for integer actions), its reward and flags are 0. `success`
+//! states whether the observation of the same row satisfies the goal.
 //!
 //! | column | |
 //! | --- | --- |
-//! | those of the environment | the observation; a `/` in a name becomes `.`, because most formats cannot store it |
+//! | columns of the environment | the observation; a `/` in a name becomes `.`, because most formats cannot store `/` |
 //! | `pixels` (and `goal`, if requested) | frames, of environments that render |
 //! | `action`, `reward`, `terminated`, `truncated`, `success` | the step |
 //! | `variation.<key>` | every factor of variation, constant over the episode |
 //! | `episode_seed` | the reset seed, constant over the episode: three `int32` of 21 bits each, the lowest first |
 //!
-//! The seed is split because datasets store values as `float32`, which represents integers up to 2^24. It is not called `seed`,
-//! because the reference implementation resets environments with a column of that name.
+//! The seed is split because datasets store values as `float32`, which represents integers up to 2^24. It is not called
+//! `seed`, because the reference implementation resets environments with a column of that name.
 
 use crate::seeding::{episode_key, reset, reset_seed};
 use crate::world::{Play, World};
@@ -39,9 +39,9 @@ use swm_data::{Constants, Writer};
 /// Settings of a collection.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct CollectConfig {
-    /// The number of episodes the dataset has in the end; existing ones are not played again.
+    /// The number of episodes of the complete dataset; episodes that it already contains are not played again.
     pub episodes: usize,
-    /// The seed; together with its number, it determines every episode.
+    /// The seed; an episode is determined by this seed and its number.
     pub seed: u64,
     /// The factors that are sampled and pinned.
     pub variation: VariationRequest,
@@ -56,11 +56,11 @@ pub struct CollectConfig {
 /// The result of a collection.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Collected {
-    /// Episodes in the dataset.
+    /// The number of episodes in the dataset.
     pub episodes: usize,
-    /// Episodes added.
+    /// The number of added episodes.
     pub added: usize,
-    /// Environment steps in the added episodes.
+    /// The number of environment steps in the added episodes.
     pub steps: usize,
 }
 
@@ -99,8 +99,9 @@ impl World {
     /// [`World::collect_schema`]; its existing episodes are assumed to be the first ones of the same collection.
     ///
     /// # Errors
-    /// When the policy, an environment or the writer fails, or the run is stopped ([`Error::Interrupted`]). The episodes up
-    /// to the first unfinished one stay in the dataset; a resumed collection plays the rest again, to the same bytes.
+    /// When the policy, an environment or the writer fails, or the run is stopped ([`Error::Interrupted`]). The
+    /// episodes up to the first unfinished one stay in the dataset; a resumed collection plays the rest again, to the
+    /// same bytes.
     pub fn collect(
         &mut self,
         policy: &mut dyn Policy,
@@ -135,8 +136,8 @@ impl World {
     }
 }
 
-/// Checks that a collection may be continued: environment, policy, seed and settings must be the same; the number of episodes
-/// may differ.
+/// Checks that a collection may be continued: environment, policy, seed and settings must be the same; the number of
+/// episodes may differ.
 ///
 /// # Errors
 /// When something differs; the message names it.
@@ -160,8 +161,8 @@ pub fn check_continues(stored: &Manifest, wanted: &Manifest) -> Result<()> {
     Ok(())
 }
 
-/// Writes the episodes it receives and returns their batches. Encoding runs on the world's threads, so that one setting limits
-/// all threads.
+/// Writes the episodes it receives and returns their batches. Encoding runs on the world's threads, so that one setting
+/// limits all threads.
 fn write_all(
     mut writer: Box<dyn Writer>,
     episodes: &Receiver<Finished>,
@@ -170,7 +171,7 @@ fn write_all(
 ) -> Result<()> {
     for Finished { rows: episode, constants } in episodes {
         threads.install(|| writer.write_episode_with(&episode, &constants))?;
-        // The receiver is gone if the world failed; its finished episodes are stored all the same.
+        // The receiver is dropped if the world fails. The episodes that are already finished are stored nevertheless.
         let _ = back.send(episode);
     }
     writer.finish()
@@ -184,7 +185,7 @@ struct Layout {
     /// The indices of the standard columns in the episode.
     columns: ColumnIndices,
     action: usize,
-    /// The index of the first factor column; the other factors follow.
+    /// The index of the first factor column; the columns of all other factors follow.
     factors: usize,
     episode_seed: usize,
     /// The indices of the standard columns in the infos.
@@ -263,8 +264,8 @@ fn fill(batch: &mut Batch, column: usize, value: &[f64]) {
     }
 }
 
-/// An episode being played. Its batch may hold rows of an older episode, which are overwritten one by one: clearing them would
-/// cost as much as recording.
+/// An episode in progress. The batch may contain rows of an older episode, which are overwritten one by one, because
+/// clearing the batch would take as long as recording.
 struct Recording {
     number: usize,
     /// The number of recorded rows; the batch may have more until the episode is finished.
@@ -287,7 +288,7 @@ struct Collection<'a> {
     /// The number of the next episode to start.
     next: usize,
     recordings: Vec<Option<Recording>>,
-    /// The episodes from `sent` on; none for unfinished ones.
+    /// The episodes from number `sent` on; `None` for unfinished episodes.
     finished: VecDeque<Option<Finished>>,
     /// The number of episodes sent to the writer.
     sent: usize,
@@ -309,7 +310,8 @@ impl Collection<'_> {
         self.finished[index] = Some(Finished { rows, constants });
         while let Some(Some(_)) = self.finished.front() {
             let episode = self.finished.pop_front().flatten();
-            // The channel closes only if the writer failed; `close` then returns the writer's error instead of this one.
+            // The channel closes only if the writer failed; `close` then returns the writer's error instead of this
+            // one.
             let received = episode.is_none_or(|episode| self.to_writer.send(episode).is_ok());
             if !received {
                 return Err(Error::Interrupted);
@@ -331,7 +333,7 @@ impl Collection<'_> {
         });
     }
 
-    /// Waits for the writer. An error of the writer is returned first, because it causes the others.
+    /// Waits for the writer. An error of the writer is returned first, because it causes all other errors.
     fn close(mut self, writing: ScopedJoinHandle<'_, Result<()>>, control: &mut Control<'_>) -> Result<Collected> {
         let (closed, _) = sync_channel(0);
         drop(std::mem::replace(&mut self.to_writer, closed));

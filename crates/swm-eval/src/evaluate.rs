@@ -1,8 +1,8 @@
-//! Evaluation: the success rate of a policy from given starts, and its time to goal.
+//! Evaluation: the success rate and the time to goal of a policy from given starts.
 //!
-//! [`Counting`] defines the episodes that count and the success criterion. Strict counting, the default, does not play a start
-//! that is solved right after the reset and counts it separately from the success rate, which has a 95 % Wilson confidence
-//! interval.
+//! [`Counting`] defines the episodes that count and the success criterion. Strict counting, the default, does not play
+//! a start that is solved right after the reset and counts it separately from the success rate, which has a 95 % Wilson
+//! confidence interval.
 //!
 //! An evaluation under a shift is an evaluation whose starts sample or pin factors of variation.
 
@@ -23,7 +23,7 @@ pub struct EvalConfig {
     pub policy: String,
     /// The condition: `in distribution`, or a description of the shift.
     pub condition: String,
-    /// The time limit of an episode, in steps; that of the world for `None`.
+    /// The time limit of an episode, in steps; `None` for the world's time limit.
     pub budget: Option<usize>,
     /// The episodes that count, and the success criterion.
     pub counting: Counting,
@@ -33,15 +33,14 @@ pub struct EvalConfig {
 }
 
 impl World {
-    /// Plays every start once. Each slot takes the next start when it is free; the result of an episode depends on its start
-    /// alone.
+    /// Plays every start once. A free slot takes the next start; the result of an episode depends only on its start.
     ///
-    /// Compat counting of episodic starts continues beyond the last start until as many episodes as there are starts have
-    /// finished, like the reference implementation.
+    /// Compat counting of episodic starts continues beyond the last start until as many episodes as there are starts
+    /// have finished, like the reference implementation.
     ///
     /// # Errors
-    /// When the budget exceeds the world's time limit, the counting contradicts itself or the world, videos are requested of a
-    /// world without frames, the policy or an environment fails, or the run is stopped.
+    /// When the budget exceeds the world's time limit, the counting contradicts itself or the world, videos are
+    /// requested of a world without frames, the policy or an environment fails, or the run is stopped.
     pub fn evaluate(
         &mut self,
         policy: &mut dyn Policy,
@@ -110,7 +109,7 @@ fn check_counting(counting: Counting, budget: usize, slots: Option<usize>) -> Re
 /// An evaluation in progress.
 struct Evaluation<'a> {
     starts: &'a Starts,
-    /// Whether episodes start until enough have finished, instead of one for each start.
+    /// Whether episodes start until enough episodes have finished, instead of one episode for each start.
     first_to_finish: bool,
     columns: ColumnIndices,
     /// The episode of each slot, and its success criterion.
@@ -119,7 +118,7 @@ struct Evaluation<'a> {
     episodes: Vec<EpisodeResult>,
     /// The finished episodes, in the order in which they finished.
     finished: Vec<usize>,
-    /// The number of episodes that were not solved at the start and satisfied the goal at some step.
+    /// The number of episodes that were not solved at the start and whose goal was satisfied at some step.
     satisfied: usize,
     steps: usize,
     videos: Option<VideoRecording>,

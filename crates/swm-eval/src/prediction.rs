@@ -1,9 +1,9 @@
 //! Prediction errors of a model on recorded trajectories.
 //!
-//! From the latent of the first observation and the recorded actions, the model predicts open loop; each predicted latent is
-//! compared with that of the recorded observation. Trajectories are grouped by success, because a low prediction error does
-//! not imply success: those of an evaluation by whether the policy solved them, those of a dataset split by whether the
-//! recorded episode succeeded.
+//! The model predicts latents open loop from the latent of the first observation and the recorded actions. Each
+//! predicted latent is compared with the latent of the recorded observation. Trajectories are grouped by success,
+//! because a low prediction error does not imply success. Success is the outcome of the evaluated policy for the starts
+//! of an evaluation, and the outcome of the recorded episode for the episodes of a dataset.
 
 use crate::starts::Starts;
 use swm_core::columns::{ACTION, SUCCESS};
@@ -16,8 +16,8 @@ pub use swm_core::Predictor;
 /// The number of trajectories that are read and predicted at once.
 const CHUNK: usize = 16;
 
-/// Predicts `horizon` model steps from each pick `[episode, step]`. `success` returns the outcome of a pick, where it is
-/// known.
+/// Predicts `horizon` model steps from each pick `[episode, step]`. `success` returns the outcome of a pick; `None` if
+/// it is unknown.
 ///
 /// # Errors
 /// When there are no picks, a trajectory reaches beyond its episode, the dataset lacks a column the model encodes, a
@@ -78,9 +78,9 @@ pub fn predict(
     Ok(Prediction::new(predictor.frameskip(), variance, trajectories))
 }
 
-/// Predicts `n` trajectories of some episodes of a dataset, such as those of a held-out [`swm_data::Split`], chosen by
-/// [`Starts::choose_among`]. An episode succeeded if its column `success` is set in any row; without that column the outcome is
-/// unknown.
+/// Predicts `n` trajectories of some episodes of a dataset, such as the episodes of a held-out [`swm_data::Split`],
+/// chosen by [`Starts::choose_among`]. An episode succeeded if its column `success` is set in any row; without that
+/// column the outcome is unknown.
 ///
 /// # Errors
 /// As [`predict`], and when the episodes have fewer than `n` trajectories.
@@ -103,8 +103,8 @@ pub fn predict_recorded(
     predict(predictor, reader, &picks, horizon, |i| outcomes[i])
 }
 
-/// Predicts the recorded trajectories that a run's starts were taken from, grouped by the outcome of the run. Episodes that
-/// strict counting did not play have no outcome.
+/// Predicts the recorded trajectories that a run's starts were taken from, grouped by the outcome of the run. Episodes
+/// that strict counting did not play have no outcome.
 ///
 /// # Errors
 /// As [`predict`], and when the run's starts were not taken from a dataset.

@@ -19,7 +19,7 @@ use swm_data::Reader;
 pub struct Reproduction {
     /// The new results.
     pub results: Results,
-    /// The differences from the old results, times and videos aside.
+    /// The differences from the old results, except times and videos.
     pub differences: Vec<Difference>,
 }
 

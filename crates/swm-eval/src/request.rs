@@ -1,7 +1,7 @@
 //! [`EvalRequest`]: all settings that determine the results of an evaluation.
 //!
-//! The request is written to the manifest of the results and read again to reproduce them. It refers to environments, datasets
-//! and checkpoints by name; a [`Resolver`](crate::Resolver) loads them.
+//! The request is written to the manifest of the results and read again to reproduce them. It refers to environments,
+//! datasets and checkpoints by name; a [`Resolver`](crate::Resolver) loads them.
 
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -20,12 +20,12 @@ pub struct EvalRequest {
     pub version: u32,
     /// The environment's id.
     pub env: String,
-    /// The visual wrappers of its frames, in order.
+    /// The visual wrappers of the environment's frames, in order.
     pub wrappers: Vec<Choice>,
     /// Whether the wrappers apply to the frame of the goal, too.
     #[serde(default)]
     pub wrap_goal: bool,
-    /// The `[height, width]` of its frames, in pixels; none for no frames.
+    /// The `[height, width]` of frames, in pixels; `None` for no frames.
     pub image: Option<[usize; 2]>,
     /// The policies. The random-policy floor is always evaluated, even if it is not listed.
     pub policies: Vec<PolicyRequest>,
@@ -35,14 +35,14 @@ pub struct EvalRequest {
     pub episodes: usize,
     /// The seed of starts, goals, factors, and all draws of policies.
     pub seed: u64,
-    /// The time limit of an episode, in steps; that of the environment for `None`.
+    /// The time limit of an episode, in steps; `None` for the environment's time limit.
     pub budget: Option<usize>,
     /// The episodes that count, and the success criterion.
     pub counting: Counting,
     /// The conditions, one evaluation each.
     pub conditions: Vec<Condition>,
-    /// The horizon, in model steps, of prediction errors on the recorded trajectories that the starts are taken from; none to
-    /// omit them.
+    /// The horizon, in model steps, of prediction errors on the recorded trajectories that the starts are taken from;
+    /// none to omit them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub prediction: Option<usize>,
 }
@@ -62,7 +62,7 @@ pub struct Choice {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum StartsRequest {
-    /// The environment draws them.
+    /// The environment draws starts and goals.
     Episodic,
     /// Rows of a dataset.
     Dataset {
@@ -167,7 +167,7 @@ impl EvalRequest {
     /// The request behind some results.
     ///
     /// # Errors
-    /// When the manifest is not that of an evaluation, or contains no request of this layout.
+    /// When the manifest is not an evaluation's manifest, or contains no request of this layout.
     pub fn of(manifest: &Manifest) -> Result<Self> {
         let again = "evaluate again with this version (`swm eval`)";
         let invalid = |problem: String| Error::config("the results' manifest", problem, again);
@@ -188,8 +188,8 @@ impl EvalRequest {
     /// Checks the request before anything is loaded.
     ///
     /// # Errors
-    /// When there is no condition, two policies or conditions share a name, or prediction errors are requested without a
-    /// dataset.
+    /// When there is no condition, two policies or conditions share a name, or prediction errors are requested without
+    /// a dataset.
     pub fn check(&self) -> Result<()> {
         if self.conditions.is_empty() {
             return Err(Error::config("conditions of an evaluation", "there are none", "name at least one"));

@@ -41,7 +41,8 @@ pub trait Resolver {
     /// When a checkpoint, an expert or a solver does not exist or does not fit the world.
     fn policy(&self, request: &PolicyRequest, world: &World) -> Result<ResolvedPolicy>;
 
-    /// Returns the model of a policy for prediction errors; none where it has no model or offers no predictions.
+    /// Returns the model of a policy for prediction errors; `None` if the policy has no model or the model offers no
+    /// predictions.
     ///
     /// # Errors
     /// As [`Resolver::policy`].
@@ -78,7 +79,7 @@ impl From<Box<dyn Policy>> for ResolvedPolicy {
 pub struct RunOptions {
     /// Environments played and planned for at the same time. Compat counting of episodic starts overrides it.
     pub envs: usize,
-    /// Worker threads; as many as the machine has cores for 0.
+    /// Worker threads; 0 for the number of cores.
     pub threads: usize,
     /// Videos of the first episodes of every run: the folder of the results file, and the number of episodes.
     pub videos: Option<(PathBuf, usize)>,
@@ -87,8 +88,8 @@ pub struct RunOptions {
 impl EvalRequest {
     /// Evaluates every policy, and the random-policy floor, from the same starts under every condition.
     ///
-    /// Each policy and condition is a stage `evaluate` with the subject `[policy, condition]`; its metrics are `success_rate`,
-    /// `successes` and `episodes` (those that count).
+    /// Each policy and condition is a stage `evaluate` with the subject `[policy, condition]`; its metrics are
+    /// `success_rate`, `successes` and `episodes` (those that count).
     ///
     /// # Errors
     /// When the request contradicts itself or names something unknown, a policy or an environment fails, or the run is
@@ -232,7 +233,7 @@ impl EvalRequest {
     /// Adds the provenance of a policy to the manifest.
     fn record_provenance(&self, manifest: &mut Manifest, policy: &PolicyRequest, resolved: &ResolvedPolicy) {
         if let Some(weights) = &resolved.weights {
-            // The floor and one other policy.
+            // Two policies are the random-policy floor and one other policy.
             let single = self.policies.len() <= 2;
             let key = if single { "weights".to_owned() } else { format!("weights of {}", policy.name) };
             manifest.hashes.insert(key, weights.clone());

@@ -3,13 +3,13 @@
 use swm_core::pool::Reset;
 use swm_core::{Key, ResetOptions, VariationRequest};
 
-/// The key of an episode, from which all its randomness derives, that of the policy included.
+/// The key of an episode, from which all random values of the episode and of its policy derive.
 pub fn episode_key(seed: u64, episode: usize) -> Key {
     Key::new(seed).with("episode").at(episode as u64)
 }
 
-/// The seed an environment is reset with, at most 63 bits: results and datasets store it as a signed integer, and Gymnasium
-/// accepts no negative seeds.
+/// The seed an environment is reset with, at most 63 bits: results and datasets store it as a signed integer, and
+/// Gymnasium accepts no negative seeds.
 pub fn reset_seed(key: Key) -> u64 {
     key.seed() >> 1
 }

@@ -13,7 +13,7 @@ use swm_core::{
 };
 use swm_data::{Reader, StepRange};
 
-/// Initial states and goals, determined by the request alone.
+/// Initial states and goals, which depend only on the request.
 #[derive(Clone, Debug)]
 pub struct Starts {
     seed: u64,
@@ -32,13 +32,13 @@ struct Rows {
     goal_offset: usize,
     /// The start row and the goal row of every pick, alternating.
     rows: Batch,
-    /// The methods that put an environment into a state which it cannot restore from columns.
+    /// The methods that set a state of an environment which columns cannot restore.
     calls: Vec<Callable>,
 }
 
 impl Starts {
-    /// The episodic protocol: `n` episodes, whose start and goal the environment draws from the episode's seed. `variation`
-    /// samples or pins factors.
+    /// The episodic protocol: `n` episodes, whose start and goal the environment draws from the episode's seed.
+    /// `variation` samples or pins factors.
     ///
     /// # Errors
     /// When `n` is 0.
@@ -56,18 +56,18 @@ impl Starts {
         Ok(Self { sequential: true, ..Self::episodic(n, seed, variation)? })
     }
 
-    /// The dataset protocol (of DINO-WM and LeWM): each pick `[episode, step]` of a dataset is a start, and the observation
-    /// `goal_offset` steps later in the same episode is its goal, which is therefore reachable.
+    /// The dataset protocol (of DINO-WM and LeWM): each pick `[episode, step]` of a dataset is a start, and the
+    /// observation `goal_offset` steps later in the same episode is its goal, which is therefore reachable.
     ///
-    /// Factors are those of the recorded episode, except those that `variation` samples or pins, which applies a shift to
-    /// recorded starts.
+    /// Factors are those of the recorded episode, except those that `variation` samples or pins, which applies a shift
+    /// to recorded starts.
     ///
-    /// `env` is one of the environments to be played; `calls` are the methods that put it into a state which it cannot restore
-    /// from columns.
+    /// `env` is one of the environments to be played; `calls` are the methods that set a state of `env` which columns
+    /// cannot restore.
     ///
     /// # Errors
-    /// When there is no pick, a pick or its goal lies outside its episode, the dataset lacks columns that the environment
-    /// needs ([`dataset_start::required_columns`]), or `variation` names an unknown factor.
+    /// When there is no pick, a pick or its goal lies outside its episode, the dataset lacks columns that the
+    /// environment needs ([`dataset_start::required_columns`]), or `variation` names an unknown factor.
     pub fn from_dataset(
         reader: &dyn Reader,
         env: &dyn Env,
@@ -103,20 +103,20 @@ impl Starts {
         })
     }
 
-    /// Chooses `n` different starts of a dataset, uniformly among all whose goal lies in the same episode: `[n]` picks
-    /// `[episode, step]`.
+    /// Chooses `n` different starts of a dataset, uniformly among all starts whose goal lies in the same episode: `[n]`
+    /// picks `[episode, step]`.
     ///
     /// # Errors
-    /// When there are fewer than `n` of them.
+    /// When the dataset has fewer than `n` such starts.
     pub fn choose(reader: &dyn Reader, n: usize, goal_offset: usize, seed: u64) -> Result<Vec<[usize; 2]>> {
         let all: Vec<usize> = (0..reader.episodes().len()).collect();
         Self::choose_among(reader, &all, n, goal_offset, seed)
     }
 
-    /// As [`Starts::choose`], among these episodes only, such as those of a held-out [`swm_data::Split`].
+    /// As [`Starts::choose`], among these episodes only, such as the episodes of a held-out [`swm_data::Split`].
     ///
     /// # Errors
-    /// When they have fewer than `n` starts, or one of them does not exist.
+    /// When the episodes have fewer than `n` starts, or an episode does not exist.
     pub fn choose_among(
         reader: &dyn Reader,
         episodes: &[usize],
@@ -124,7 +124,8 @@ impl Starts {
         goal_offset: usize,
         seed: u64,
     ) -> Result<Vec<[usize; 2]>> {
-        // Candidate starts are numbered episode by episode; `ends[e]` is one past the last number of the `e`-th episode.
+        // Candidate starts are numbered episode by episode; `ends[e]` is one past the last number of the `e`-th
+        // episode.
         let mut total = 0;
         let mut ends = Vec::with_capacity(episodes.len());
         for &episode in episodes {

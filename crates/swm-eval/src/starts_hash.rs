@@ -1,7 +1,7 @@
 //! [`StartsHash`]: hashes of the initial states and goals of an evaluation.
 //!
-//! Seeds and dataset rows determine the starts as requested; these hashes cover the actual states, so that a changed reset of
-//! an environment is detected.
+//! Seeds and dataset rows identify the requested starts. The hashes cover the states after the reset, so they detect a
+//! changed reset of an environment.
 
 use crate::starts::Starts;
 use crate::world::World;
@@ -17,8 +17,8 @@ pub struct StartsHash {
 }
 
 impl StartsHash {
-    /// Resets the world to every start and adds its state: the column `state` and the factors of variation to the starts, the
-    /// columns whose name starts with `goal` to the goals.
+    /// Resets the world to every start and adds its state: the column `state` and the factors of variation to the
+    /// starts, the columns whose name starts with `goal` to the goals.
     ///
     /// # Errors
     /// When an environment rejects a start.

@@ -21,7 +21,7 @@ pub(crate) struct SuccessCriterion {
     counting: Counting,
     /// The time limit of an episode, in steps.
     budget: usize,
-    /// The number of consecutive steps, up to now, that satisfied the goal.
+    /// The number of consecutive steps that satisfied the goal, up to the last step.
     held: usize,
     /// Whether any step satisfied the goal.
     satisfied: bool,
@@ -43,8 +43,8 @@ impl SuccessCriterion {
         matches!(self.counting, Counting::Compat { .. }) || !solved_at_start
     }
 
-    /// Whether strict counting with a hold of 1 counts the episode as a success. Strict counting ends an episode no later than
-    /// compat counting, so one run gives both results.
+    /// Whether strict counting with a hold of 1 counts the episode as a success. Strict counting ends an episode no
+    /// later than compat counting, so one run gives both results.
     pub fn satisfied(&self) -> bool {
         self.satisfied
     }
@@ -77,8 +77,8 @@ impl SuccessCriterion {
 mod tests {
     use super::*;
 
-    /// Plays steps, one letter each: `.` nothing, `s` goal satisfied, `g` satisfied and terminated, `f` terminated without
-    /// success, `c` the time limit. Returns the success, the steps played, and the time to goal.
+    /// Plays steps, one letter each: `.` nothing, `s` goal satisfied, `g` satisfied and terminated, `f` terminated
+    /// without success, `c` the time limit. Returns the success, the steps played, and the time to goal.
     fn result_of(counting: Counting, budget: usize, steps: &str) -> (bool, usize, Option<usize>) {
         let mut criterion = SuccessCriterion::new(counting, budget);
         let mut episode = EpisodeResult::default();

@@ -63,9 +63,9 @@ impl VideoRecording {
         frames.push(pairs.flat_map(|(agent, goal)| agent.iter().chain(goal).copied()).collect());
     }
 
-    /// Writes the videos of the recorded ones of the `counted` episodes, numbered by their index among these. Returns the
-    /// paths relative to the root. A video that cannot be written (no encoder in this build, a full disk) only causes a
-    /// warning, because the results do not depend on it.
+    /// Writes a video of every episode in `counted` that was recorded. A video's number is the index of its episode in
+    /// `counted`. Returns the paths relative to the root. A video that cannot be written (no encoder in this build, a
+    /// full disk) only causes a warning, because the results do not depend on videos.
     pub fn write(self, counted: &[usize]) -> Vec<String> {
         let (height, width) = self.size;
         let scale = swm_data::integer_scale(width, height, MIN_SIDE);

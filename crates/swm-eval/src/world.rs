@@ -15,13 +15,13 @@ use swm_core::{
 pub struct WorldConfig {
     /// Environments played at the same time.
     pub envs: usize,
-    /// The `(height, width)` of frames, in pixels; none for no frames.
+    /// The `(height, width)` of frames, in pixels; `None` for no frames.
     pub image: Option<(usize, usize)>,
-    /// Camera views to render besides the default camera's colours, at the same size.
+    /// Camera views to render in addition to the RGB frames of the default camera, at the same size.
     pub views: Vec<CameraView>,
-    /// The time limit of an episode, in steps; that of the environment for `None`.
+    /// The time limit of an episode, in steps; `None` for the environment's time limit.
     pub max_episode_steps: Option<usize>,
-    /// Worker threads; as many as the machine has cores for 0.
+    /// Worker threads; 0 for the number of cores.
     pub threads: usize,
 }
 
@@ -49,10 +49,10 @@ impl World {
         Self::of(|| env.env(), config)
     }
 
-    /// As [`World::new`], with environments that `make` creates: wrapped ones, or ones that are not in the registry.
+    /// Creates a world of environments that `make` creates, such as wrapped or unregistered environments.
     ///
     /// # Errors
-    /// As [`World::new`], and what `make` returns.
+    /// As [`World::new`], or when `make` fails.
     pub fn of(make: impl FnMut() -> Result<Box<dyn Env>>, config: WorldConfig) -> Result<Self> {
         if let Some((height, width)) = config.image
             && (height == 0 || width == 0)
@@ -84,7 +84,7 @@ impl World {
         self.pool.spec()
     }
 
-    /// The versions of the libraries that determine results; the renderer's only where frames are rendered.
+    /// The versions of the libraries that determine results. The renderer is included only if frames are rendered.
     pub fn libraries(&self) -> BTreeMap<String, String> {
         let mut libraries = self.pool.env(0).libraries();
         if self.pool.image().is_none() && self.pool.views().is_empty() {
@@ -112,7 +112,7 @@ impl World {
         self.pool.step(&self.actions, active)
     }
 
-    /// The actions of all slots, for custom loops, which fill them before [`World::advance`].
+    /// The actions of all slots. A custom loop writes them before it calls [`World::advance`].
     pub fn actions_mut(&mut self) -> &mut Batch {
         &mut self.actions
     }
@@ -141,7 +141,7 @@ impl World {
     /// Modifies environments in place, then observes them as after a reset.
     ///
     /// # Errors
-    /// What `modify` returns.
+    /// When `modify` fails.
     pub fn modify(&mut self, slots: &[usize], modify: impl Fn(usize, &mut dyn Env) -> Result<()> + Sync) -> Result<()> {
         self.pool.restart(slots, modify)
     }
@@ -162,7 +162,7 @@ impl World {
         }
     }
 
-    /// Plays the episodes of `play`. Each slot starts the next episode when it is free.
+    /// Plays the episodes of `play`. A free slot starts the next episode.
     pub(crate) fn play(
         &mut self,
         policy: &mut dyn Policy,
@@ -216,7 +216,7 @@ impl World {
 
 /// Selects the episodes that a world plays and consumes their steps.
 pub(crate) trait Play {
-    /// Returns the next episode to start; none if there is none, or none yet.
+    /// Returns the next episode to start; `None` if no episode can start now.
     fn next(&mut self) -> Option<usize>;
 
     /// Whether [`Play::next`] would return an episode now.

@@ -12,15 +12,15 @@ use swm_core::{Error, PlanSpace, Result, Solver, Space};
 pub struct SolverEntry {
     /// The id, such as `cem`.
     pub id: &'static str,
-    /// One sentence on how it searches.
+    /// One sentence on the search method.
     pub summary: &'static str,
-    /// The family of algorithms it belongs to.
+    /// How the solver searches.
     pub family: Family,
-    /// The actions it plans.
+    /// The kind of actions that the solver plans.
     pub actions: ActionKind,
     /// The capabilities that it requires of a model in addition to a cost.
     pub needs: &'static [Need],
-    /// The publication it follows.
+    /// The publication of the algorithm.
     pub paper: &'static str,
     /// Returns the default settings, as JSON.
     pub defaults: fn() -> serde_json::Value,
@@ -32,9 +32,9 @@ pub struct SolverEntry {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Family {
-    /// It compares the costs of samples.
+    /// Compares the costs of samples.
     Sampling,
-    /// It follows the gradient of the cost.
+    /// Follows the gradient of the cost.
     Gradient,
 }
 
@@ -85,12 +85,12 @@ impl SolverEntry {
 }
 
 impl ActionKind {
-    /// The kind of the actions of an environment.
+    /// Returns the kind of the actions in an environment's action space.
     pub fn of(space: &Space) -> Self {
         if matches!(space, Space::Box { .. }) { Self::Continuous } else { Self::Discrete }
     }
 
-    /// The kind of the actions of a plan.
+    /// Returns the kind of the actions in a plan space.
     pub fn of_plan(space: PlanSpace<'_>) -> Self {
         match space {
             PlanSpace::Continuous { .. } => Self::Continuous,
@@ -100,7 +100,7 @@ impl ActionKind {
 }
 
 impl Need {
-    /// The obstacle for a solver that requires this of a model without it.
+    /// Returns the reason why a solver that needs this capability cannot use a model without it.
     pub fn obstacle(self) -> String {
         let needed = match self {
             Self::Gradient => "the gradient of the cost",

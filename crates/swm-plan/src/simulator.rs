@@ -1,12 +1,12 @@
 //! [`SimulatorCost`]: the true simulator as a cost model, so that any solver can be run with perfect dynamics.
 //!
-//! It gives an upper bound on performance and tests solvers without model errors: a failure is due to the search, its
-//! settings or the cost. The model reads the environment itself ([`CostModel::observe_env`]), so it requires a
-//! [`MpcPolicy`](crate::MpcPolicy) that receives the environments.
+//! Planning with the simulator gives an upper bound on performance and tests solvers without model errors: a failure is
+//! due to the search, its settings or the cost. The model reads the environments ([`CostModel::observe_env`]), so
+//! [`MpcPolicy`](crate::MpcPolicy) must receive them through `observe_envs`.
 //!
-//! Every candidate is played from a snapshot of the environment in a private simulator, with the actions that the policy would
-//! execute. Simulators are created when a thread first needs one, and reused. A cost depends on the snapshot and the
-//! candidate alone.
+//! Every candidate is played from a snapshot of the environment in a private simulator, with the actions that the
+//! policy would execute. A thread reuses an idle simulator, or creates one if none is idle. A cost depends only on the
+//! snapshot and the candidate.
 
 use crate::mpc::{ActionCodec, ActionScale, Decoded};
 use rayon::prelude::*;
@@ -52,11 +52,11 @@ struct Simulator {
 const GROUP: usize = 8;
 
 impl SimulatorCost {
-    /// A model of the environments that `make` creates, such as [`swm_core::EnvChoice::env`]. Scale and block are those of the
-    /// policy; [`ActionScale::unscaled`] fits any simulator.
+    /// A model of the environments that `make` creates, such as [`swm_core::EnvChoice::env`]. Scale and block are those
+    /// of the policy; [`ActionScale::unscaled`] fits any simulator.
     ///
     /// # Errors
-    /// When the scale does not fit the environment, or a model step has no action, and what `make` returns.
+    /// When the scale does not fit the environment, a model step has no action, or `make` fails.
     pub fn new(
         make: impl Fn() -> Result<Box<dyn Env>> + Send + Sync + 'static,
         scale: ActionScale,
@@ -120,7 +120,7 @@ impl CostModel for SimulatorCost {
     fn observe(&mut self, _: &Batch, envs: &[usize]) -> Result<()> {
         self.present.clear();
         for &slot in envs {
-            // Taken, not copied, so that an outdated snapshot is never planned from.
+            // The snapshot is removed, so that a later call cannot plan from an outdated snapshot.
             let Some(snapshot) = self.received.get_mut(slot).and_then(Option::take) else {
                 return Err(Error::config(
                     format!("planning in slot {slot} with a simulator"),

@@ -25,11 +25,11 @@ pub(crate) struct Condition<'a> {
 /// One run with its label and colour.
 pub(crate) struct Row<'a> {
     pub run: &'a Run,
-    /// The index of its results file.
+    /// The index of the run's results file.
     pub file: usize,
-    /// The name of the policy, with the number of its file if several runs have the same name.
+    /// The name of the policy, with the number of the results file if several runs have the same name.
     pub label: String,
-    /// The CSS class of its colour: `floor`, `expert`, or `c0` and so on.
+    /// The CSS class of the policy's colour: `floor`, `expert`, or `c0` and so on.
     pub class: String,
 }
 
@@ -106,13 +106,14 @@ impl<'a> Condition<'a> {
         self.rows.iter().find(|row| row.is_floor())
     }
 
-    /// The floor to compare a run with: that of its file, or else that of the condition.
+    /// The floor to compare a run with: the floor in the same file or, if there is none, the first floor of the
+    /// condition.
     pub(crate) fn floor_of(&self, run: &Row<'_>) -> Option<&Row<'a>> {
         self.rows.iter().find(|row| row.is_floor() && row.file == run.file).or_else(|| self.floor())
     }
 
-    /// Every pair of policies that played the same starts; the first of a pair is the later one, usually a model, the second
-    /// its floor.
+    /// Every pair of runs that played the same starts, the later run first: usually a model, then the random-policy
+    /// floor.
     pub(crate) fn pairs(&self, counting: Counting) -> Vec<(&Row<'a>, &Row<'a>, Paired)> {
         let later = self.rows.iter().enumerate();
         let pairs = later.flat_map(|(i, row)| self.rows[..i].iter().map(move |other| (row, other)));

@@ -14,16 +14,16 @@ const STYLE: &str = include_str!("style.css");
 /// Options of a page.
 #[derive(Clone, Debug, Default)]
 pub struct ReportOptions {
-    /// The title; by default, the environments are named.
+    /// The title; by default, it contains the environments' ids.
     pub title: Option<String>,
     /// A training log (`train.jsonl`) whose metrics are shown.
     pub metrics: Option<PathBuf>,
-    /// The command that reproduces the results; by default, the one in the manifest, if there is any.
+    /// The command that reproduces the results; by default, the command in the manifest, if there is one.
     pub command: Option<String>,
 }
 
-/// Writes the page of these result files to `out_dir/index.html` and returns its path. Paths of videos are relative to their
-/// results file.
+/// Writes the page of these result files to `out_dir/index.html` and returns its path. Paths of videos are relative to
+/// their results file.
 ///
 /// # Errors
 /// When there are no results, or the page cannot be written.
@@ -46,7 +46,7 @@ pub fn write_report_with(results: &[(PathBuf, Results)], options: &ReportOptions
     let partial = out_dir.join(format!(".index.html.{}.partial", std::process::id()));
     let written = std::fs::write(&partial, page).and_then(|()| std::fs::rename(&partial, &path));
     written.map_err(|source| {
-        // The first error is reported; a second one while cleaning up adds nothing.
+        // Only the first error is reported; an error during the clean-up is ignored.
         let _ = std::fs::remove_file(&partial);
         Error::io(&path, "writing the report", source)
     })?;

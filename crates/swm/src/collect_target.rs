@@ -7,7 +7,7 @@ use swm_data::{Location, WriteMode};
 use swm_eval::collect::check_continues;
 
 /// Checks, before any episode is played, that a collection with this manifest may be written to a location.
-/// `mix_renderers` permits frames of another renderer than those that are stored there.
+/// `mix_renderers` permits frames of another renderer than the renderer of the stored frames.
 ///
 /// # Errors
 /// When a dataset exists and `mode` is [`WriteMode::Create`], or when it cannot be continued with this manifest.

@@ -38,8 +38,8 @@ fn suffixes() -> impl Iterator<Item = &'static str> {
     FORMATS.rows.iter().flat_map(|format| format.suffixes).copied()
 }
 
-/// Returns the path of a dataset given as a path or as a name in [`datasets`]. If no such dataset exists, the path has the
-/// suffix of the default format.
+/// Returns the path of a dataset given as a path or as a name in [`datasets`]. If no such dataset exists, the path has
+/// the suffix of the default format.
 pub fn dataset(given: &str) -> PathBuf {
     let folder = datasets();
     let mut existing =
@@ -126,8 +126,8 @@ pub fn target(given: &str, format: Option<&str>) -> Result<Location> {
     }
 }
 
-/// Returns a path unchanged, and the entry of `folder` with this suffix for a name. A text with a folder or an extension,
-/// or that of an existing file, is a path.
+/// Returns `given` unchanged if it is a path, and the entry of `folder` with this suffix if it is a name. A text is a
+/// path if it contains a folder or an extension, or if a file of this name exists.
 fn named(given: &str, folder: &Path, suffix: &str) -> PathBuf {
     let path = Path::new(given);
     if path.components().count() > 1 || path.extension().is_some() || path.exists() {

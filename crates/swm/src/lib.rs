@@ -24,7 +24,7 @@ pub mod subject;
 use swm_core::registry::{Registry, concat};
 use swm_core::{EnvChoice, EnvEntry, Result};
 
-/// The built-in environments: first the 2-D ones, then those simulated by MuJoCo.
+/// The built-in environments: first the 2-D environments, then the MuJoCo environments.
 pub static ENVS: Registry<EnvEntry> = Registry { rows: &ROWS, ..swm_envs::ENVS };
 
 const ROWS: [EnvEntry; swm_envs::ENVS.rows.len() + swm_mujoco::ENVS.rows.len()] =

@@ -1,5 +1,6 @@
-//! [`HomeResolver`] loads what an evaluation request names: environments, wrappers and solvers of this build, and datasets
-//! and checkpoints of the [home folder](crate::home).
+//! [`HomeResolver`] loads the environments, wrappers, solvers, datasets and checkpoints that an evaluation request
+//! names. Environments, wrappers and solvers are those of this build; datasets and checkpoints are in the [home
+//! folder](crate::home).
 
 use crate::home;
 use serde::de::DeserializeOwned;
@@ -22,7 +23,7 @@ use swm_plan::{
 /// A [`Resolver`] of names in this build and in the home folder. It loads every checkpoint once.
 #[derive(Default)]
 pub struct HomeResolver {
-    /// The wrappers of the last request. All environments share them, and with them the files they read.
+    /// The wrappers of the last request. All environments share the wrappers and the files that the wrappers read.
     wrapping: RefCell<Option<Wrapping>>,
     /// The loaded checkpoints, by path.
     checkpoints: RefCell<BTreeMap<PathBuf, Rc<dyn LoadedModel>>>,
@@ -201,12 +202,12 @@ fn with_provenance(policy: ResolvedPolicy, info: CheckpointInfo) -> ResolvedPoli
     }
 }
 
-/// Returns the policy with this name for a world, and the hash of its weights if it is a checkpoint: a [`scripted`] policy,
-/// or a checkpoint that acts without a solver.
+/// Returns the policy with this name for a world, and the hash of its weights if it is a checkpoint: a [`scripted`]
+/// policy, or a checkpoint that acts without a solver.
 ///
 /// # Errors
-/// When neither an expert nor a checkpoint has the name, or the checkpoint was trained on another environment or requires
-/// a solver.
+/// When neither an expert nor a checkpoint has the name, or the checkpoint was trained on another environment or
+/// requires a solver.
 pub fn policy_by_name(entry: &EnvEntry, name: &str, world: &World) -> Result<(Box<dyn Policy>, Option<String>)> {
     let is_scripted = ["random", "expert"].contains(&name) || entry.experts.iter().any(|expert| expert.id == name);
     if is_scripted || !home::checkpoint(name).exists() {

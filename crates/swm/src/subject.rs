@@ -1,5 +1,5 @@
-//! [`LewmSubject`]: the LeWM that `swm bench plan` and `swm bench train` measure. It has the published size and random
-//! weights, on which its speed does not depend.
+//! [`LewmSubject`]: the LeWM that `swm bench plan` and `swm bench train` measure. The model has the published size. Its
+//! weights are random, because the speed of planning and training does not depend on the weights.
 
 use rand::Rng as _;
 use std::path::Path;
@@ -17,7 +17,7 @@ use swm_plan::{ActionScale, Cem};
 
 /// Model steps of a plan.
 const HORIZON: usize = 5;
-/// Elements of an environment's action.
+/// The dimension of an environment action.
 const ACTION_DIM: usize = 2;
 
 /// A LeWM with inputs for planning and training.
@@ -51,9 +51,9 @@ impl LewmSubject {
     pub fn new(iterations: usize, clips: usize, device: &Device) -> Result<Self> {
         let settings = [format!("data.batch_size={clips}"), format!("shards={}", rayon::current_num_threads())];
         let config = TrainConfig::<Lewm>::load("paper", &settings)?;
-        let actions = config.data.frameskip * ACTION_DIM;
-        let model = with_modulations(Lewm::init(&config.model, actions, Key::new(0), device));
-        let mut cost = LewmCost::of(&model, &config.model, actions);
+        let action_dim = config.data.frameskip * ACTION_DIM;
+        let model = with_modulations(Lewm::init(&config.model, action_dim, Key::new(0), device));
+        let mut cost = LewmCost::of(&model, &config.model, action_dim);
         let side = config.model.image;
         let columns = [ColumnSpec::image(PIXELS, side, side), ColumnSpec::image(GOAL, side, side)];
         let mut infos = Batch::zeros(&Schema::new(columns)?, 1);
@@ -63,18 +63,19 @@ impl LewmSubject {
         }
         cost.observe(&infos, &[0])?;
         let cem = Cem { iterations, ..Cem::default() };
-        let candidates = (0..cem.samples * HORIZON * actions).map(|_| rng.random_range(-1.0..1.0)).collect();
+        let candidates = (0..cem.samples * HORIZON * action_dim).map(|_| rng.random_range(-1.0..1.0)).collect();
         Ok(Self { config, device: device.clone(), model, cost, cem, infos, candidates, training: None })
     }
 
-    /// Returns the sizes as the process of the reference implementation reads them.
+    /// Returns the sizes of the model and of the benchmark as JSON, for the process that runs the reference
+    /// implementation.
     pub fn sizes(&self) -> serde_json::Value {
         let (model, predictor) = (&self.config.model, &self.config.model.predictor);
         let EncoderConfig::Vit(vit) = &model.encoder else { return serde_json::Value::Null };
         serde_json::json!({
             "device": if self.device == Device::flex() { "cpu" } else { "cuda" },
             "image": model.image, "patch": vit.patch, "dim": vit.dim, "vit_layers": vit.depth, "vit_heads": vit.heads,
-            "vit_mlp": vit.mlp, "latent": model.latent, "proj_hidden": model.projector, "actions": self.actions(),
+            "vit_mlp": vit.mlp, "latent": model.latent, "proj_hidden": model.projector, "actions": self.action_dim(),
             "history": predictor.history, "depth": predictor.depth, "heads": predictor.heads, "mlp": predictor.mlp,
             "predictor_dim": predictor.dim, "dim_head": predictor.dim_head, "dropout": predictor.dropout,
             "iterations": self.cem.iterations, "elites": self.cem.elites, "batch": self.config.data.batch_size,
@@ -82,7 +83,7 @@ impl LewmSubject {
         })
     }
 
-    /// Writes weights (`w.NAME`) and inputs (`i.NAME`, with normalised images) for the process of the reference
+    /// Writes weights (`w.NAME`) and inputs (`i.NAME`, with normalised images) for the process that runs the reference
     /// implementation.
     ///
     /// # Errors
@@ -96,18 +97,19 @@ impl LewmSubject {
             let values = planes.into_data().iter::<f32>().collect();
             tensors.insert(format!("i.{name}"), HostTensor { shape: vec![3, side, side], values });
         }
-        let shape = vec![self.cem.samples, HORIZON, self.actions()];
+        let shape = vec![self.cem.samples, HORIZON, self.action_dim()];
         tensors.insert("i.candidates".to_owned(), HostTensor { shape, values: self.candidates.clone() });
         weights::torch::write(path, &tensors)
     }
 
-    fn actions(&self) -> usize {
+    /// The action dimension of a model step.
+    fn action_dim(&self) -> usize {
         self.config.data.frameskip * ACTION_DIM
     }
 
     fn costs(&mut self) -> Result<Vec<f32>> {
         let mut costs = vec![0.0; self.cem.samples];
-        let (samples, dim) = (self.cem.samples, self.actions());
+        let (samples, dim) = (self.cem.samples, self.action_dim());
         let candidates = Candidates { actions: &self.candidates, envs: 1, samples, horizon: HORIZON, dim };
         self.cost.cost(candidates, &mut costs)?;
         Ok(costs)
@@ -115,7 +117,7 @@ impl LewmSubject {
 
     fn plan(&mut self) -> Result<()> {
         self.cost.observe(&self.infos, &[0])?;
-        let (low, high) = (vec![-1.0; self.actions()], vec![1.0; self.actions()]);
+        let (low, high) = (vec![-1.0; self.action_dim()], vec![1.0; self.action_dim()]);
         let space = PlanSpace::Continuous { low: &low, high: &high };
         let problem = PlanProblem { horizon: HORIZON, space, keys: &[Key::new(0)], init: None, deadline: None };
         self.cem.solve(&mut self.cost, problem).map(|_| ())
@@ -169,7 +171,7 @@ impl Subject for LewmSubject {
     }
 }
 
-/// Replaces the zero-initialised modulations by random ones; without them actions have no effect.
+/// Replaces the zero-initialised modulations by random values, because actions have no effect on zero modulations.
 fn with_modulations(model: Lewm) -> Lewm {
     let mut values = parameters::values(&model);
     let mut rng = Key::new(0).with("modulations").rng();

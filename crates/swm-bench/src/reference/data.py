@@ -1,7 +1,8 @@
 """Measures loading and converting of datasets by the reference implementation.
 
-Requests, one per line: `load FORMAT PATH WORKERS STEPS FRAMESKIP BATCH SECONDS` or `convert SOURCE FORMAT PATH`. Answers are
-lines that start with `SWM `: a count and seconds, or `error` and a message; other output of the reference is ignored.
+Requests, one per line: `load FORMAT PATH WORKERS STEPS FRAMESKIP BATCH SECONDS` or `convert SOURCE FORMAT PATH`.
+Answers are lines that start with `SWM `: a count and seconds, or `error` and a message. Other output of the reference is
+ignored.
 """
 
 import shutil
@@ -58,5 +59,5 @@ if __name__ == "__main__":
         command, *arguments = line.rstrip("\n").split("\t")
         try:
             answer(*(load if command == "load" else convert)(*arguments))
-        except Exception as error:  # every error is an answer
+        except Exception as error:  # The request is answered with the error.
             answer("error", f"{type(error).__name__}: {error}".replace("\n", " "))

@@ -1,6 +1,6 @@
 """Measures stepping and collecting of the reference implementation.
 
-Requests, one per line: `step SECONDS`, `bare SECONDS` (environments without frames and without a world) or
+Requests, one per line: `step SECONDS`, `bare SECONDS` (environments without frames and without a `World`) or
 `collect PATH EPISODES SEED`. Answers are lines that start with `SWM `; other output of the reference is ignored.
 """
 

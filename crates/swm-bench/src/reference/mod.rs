@@ -28,7 +28,7 @@ pub(crate) fn not_compared() -> String {
     format!("not compared: set {REFERENCE_PYTHON} to a Python that has stable-worldmodel")
 }
 
-/// A Python process that runs the reference: its `World`, a solver, a model, or its datasets.
+/// A Python process that runs a part of the reference: a `World`, a solver, a model, or datasets.
 pub(crate) struct Reference {
     process: Child,
     requests: ChildStdin,
@@ -51,8 +51,8 @@ impl Reference {
     /// Starts a process with a `World` and waits until it is ready.
     ///
     /// # Errors
-    /// When Python cannot be started, or the reference cannot be imported; the message contains the last line of its
-    /// output.
+    /// When Python cannot be started, or the reference cannot be imported; the message contains the last line that
+    /// Python wrote to standard error.
     pub fn start(python: &Path, size: Size<'_>) -> Result<Self> {
         let counts = [size.envs, size.image.0, size.image.1, size.episode_steps].map(|n| n.to_string());
         Self::spawn(python, SCRIPT, &[&[size.env.to_owned()][..], &counts].concat())
@@ -67,7 +67,7 @@ impl Reference {
         Self::spawn(python, PLAN_SCRIPT, &sizes.map(|n| n.to_string()))
     }
 
-    /// Starts a process with a LeWM; a file contains its weights and inputs.
+    /// Starts a process with a LeWM; the file `weights` contains the weights and the inputs of the model.
     ///
     /// # Errors
     /// As [`Reference::start`].
@@ -154,7 +154,7 @@ impl Reference {
         self.rate(&format!("convert\t{}\t{format}\t{}", source.display(), target.display()))
     }
 
-    /// Sends a request whose answer is a count and seconds; returns their quotient.
+    /// Sends a request whose answer is a count and seconds; returns the count per second.
     fn rate(&mut self, request: &str) -> Result<f64> {
         let words = self.request(request)?;
         if let Some(("error", why)) = words.split_first().map(|(first, why)| (first.as_str(), why)) {

@@ -1,4 +1,4 @@
-//! Tests of reports, with and without a fake reference. Times are not tested.
+//! Tests of benchmark reports, with and without a fake reference. The measured times are not tested.
 
 use std::io::Write as _;
 use swm_bench::{BenchConfig, bench_envs};
@@ -26,7 +26,7 @@ fn config() -> BenchConfig {
 
 #[test]
 fn report_states_that_the_reference_is_missing() {
-    let report = bench_envs(&[env()], &config()).expect("a report");
+    let report = bench_envs(&[env()], &config()).expect("the benchmark succeeds");
     assert!(report.reference.contains("SWM_REFERENCE_PYTHON"));
     let what: Vec<_> = report.rows.iter().map(|row| (row.what, row.size)).collect();
     assert_eq!(what, [("step", None), ("step, one thread", None), ("step + render", Some(8))]);
@@ -35,7 +35,7 @@ fn report_states_that_the_reference_is_missing() {
         assert!(row.steps_per_second > 0.0);
     }
     let missing = BenchConfig { python: Some("/no/such/python".into()), ..config() };
-    let report = bench_envs(&[env()], &missing).expect("a report");
+    let report = bench_envs(&[env()], &missing).expect("the benchmark succeeds");
     assert!(report.reference.contains("/no/such/python"), "{}", report.reference);
 }
 
@@ -43,15 +43,16 @@ fn report_states_that_the_reference_is_missing() {
 #[test]
 fn ratio_is_the_median_over_measurement_pairs() {
     use std::os::unix::fs::PermissionsExt as _;
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let python = folder.path().join("python");
     // A fake reference: prints other text, then answers every request with 10 steps in 2 seconds.
     let script = "#!/bin/sh\necho hello\necho SWM ready 1.2.3\nwhile read line; do echo SWM 10 2.0; done\n";
-    let mut file = std::fs::File::create(&python).expect("a file");
-    file.write_all(script.as_bytes()).expect("written");
-    file.set_permissions(std::fs::Permissions::from_mode(0o755)).expect("executable");
+    let mut file = std::fs::File::create(&python).expect("the file is written");
+    file.write_all(script.as_bytes()).expect("the file is written");
+    file.set_permissions(std::fs::Permissions::from_mode(0o755)).expect("the file is made executable");
     drop(file);
-    let report = bench_envs(&[env()], &BenchConfig { python: Some(python), ..config() }).expect("a report");
+    let report =
+        bench_envs(&[env()], &BenchConfig { python: Some(python), ..config() }).expect("the benchmark succeeds");
     assert_eq!(report.reference, "1.2.3");
     for row in &report.rows {
         assert_eq!(row.reference, [5.0; 3]);

@@ -11,7 +11,7 @@ use swm_eval::{CollectConfig, Collected, World, WorldConfig};
 
 fn world(envs: usize, threads: usize) -> World {
     let config = WorldConfig { envs, image: Some((2, 3)), views: vec![], max_episode_steps: None, threads };
-    World::new(&ENTRY, config).expect("a world")
+    World::new(&ENTRY, config).expect("a valid world")
 }
 
 fn config(episodes: usize) -> CollectConfig {
@@ -33,28 +33,28 @@ fn collect(envs: usize, threads: usize, episodes: usize, memory: &Memory) -> Res
 
 #[test]
 fn datasets_do_not_depend_on_environments_or_threads() {
-    let alone = Memory::default();
-    let collected = collect(1, 1, 23, &alone).expect("collected");
+    let single = Memory::default();
+    let collected = collect(1, 1, 23, &single).expect("the collection succeeds");
     assert_eq!((collected.episodes, collected.added), (23, 23));
-    let rows: usize = alone.episodes.lock().expect("lock").iter().map(Batch::rows).sum();
+    let rows: usize = single.episodes.lock().expect("no thread has panicked").iter().map(Batch::rows).sum();
     assert_eq!(collected.steps, rows - 23);
-    let lengths: Vec<usize> = alone.episodes.lock().expect("lock").iter().map(Batch::rows).collect();
+    let lengths: Vec<usize> = single.episodes.lock().expect("no thread has panicked").iter().map(Batch::rows).collect();
     assert!(lengths.iter().any(|&n| n < 13), "some episodes end early, so that slots finish out of order: {lengths:?}");
     for (envs, threads) in [(1, 2), (5, 1), (5, 2), (23, 2), (40, 3)] {
         let memory = Memory::default();
-        collect(envs, threads, 23, &memory).expect("collected");
-        assert!(memory.bytes() == alone.bytes(), "{envs} environments on {threads} threads");
+        collect(envs, threads, 23, &memory).expect("the collection succeeds");
+        assert!(memory.bytes() == single.bytes(), "{envs} environments on {threads} threads");
     }
 }
 
 #[test]
-fn rows_follow_the_time_convention() {
+fn row_holds_an_observation_and_the_following_step() {
     let memory = Memory::default();
     let mut world = world(3, 1);
-    let schema = world.collect_schema(false).expect("schema");
-    assert_eq!(world.collect_schema(true).expect("schema").columns().len(), schema.columns().len() + 1);
-    world.collect(&mut Walker, memory.writer(), &config(6), &mut Control::default()).expect("collected");
-    for (number, episode) in memory.episodes.lock().expect("lock").iter().enumerate() {
+    let schema = world.collect_schema(false).expect("a valid schema");
+    assert_eq!(world.collect_schema(true).expect("a valid schema").columns().len(), schema.columns().len() + 1);
+    world.collect(&mut Walker, memory.writer(), &config(6), &mut Control::default()).expect("the collection succeeds");
+    for (number, episode) in memory.episodes.lock().expect("no thread has panicked").iter().enumerate() {
         assert_eq!(*episode.schema(), schema);
         let last = episode.rows() - 1;
         let state = episode.get::<f64>("state").expect("state");
@@ -75,7 +75,10 @@ fn rows_follow_the_time_convention() {
         for elements in episode.get::<i32>("episode_seed").expect("seed").chunks_exact(3) {
             let together = elements.iter().rev().fold(0u64, |high, &element| high << 21 | element as u64);
             assert_eq!(together, seed);
-            assert!(elements.iter().all(|&element| element as f32 as i32 == element), "datasets store float32");
+            assert!(
+                elements.iter().all(|&element| element as f32 as i32 == element),
+                "float32 represents the element exactly"
+            );
         }
         let start = episode.get::<f32>("variation.agent.x").expect("factor");
         assert!(start.iter().all(|&x| f64::from(x) == state[0]), "constant, and equal to the initial position");
@@ -89,21 +92,21 @@ fn rows_follow_the_time_convention() {
 
 #[test]
 fn resumed_collection_equals_uninterrupted_one() {
-    let whole = Memory::default();
-    collect(4, 2, 15, &whole).expect("collected");
+    let complete = Memory::default();
+    collect(4, 2, 15, &complete).expect("the collection succeeds");
     let parts = Memory::default();
-    collect(3, 1, 4, &parts).expect("a first part");
-    let second = collect(2, 2, 15, &parts).expect("the rest");
+    collect(3, 1, 4, &parts).expect("the first collection succeeds");
+    let second = collect(2, 2, 15, &parts).expect("the second collection succeeds");
     assert_eq!((second.episodes, second.added), (15, 11));
-    assert!(parts.bytes() == whole.bytes());
+    assert!(parts.bytes() == complete.bytes());
     assert_eq!(collect(2, 2, 15, &parts).expect("no episodes to add").added, 0);
     assert_eq!(parts.len(), 15);
 }
 
 #[test]
 fn interruption_keeps_finished_episodes() {
-    let (whole, part) = (Memory::default(), Memory::default());
-    collect(4, 1, 30, &whole).expect("collected");
+    let (complete, part) = (Memory::default(), Memory::default());
+    collect(4, 1, 30, &complete).expect("the collection succeeds");
     let stop = Arc::new(AtomicBool::new(false));
     let mut world = world(4, 1);
     let mut policy = RandomPolicy::new(world.spec(), 4);
@@ -117,25 +120,25 @@ fn interruption_keeps_finished_episodes() {
     let outcome = world.collect(&mut policy, part.writer(), &config(30), &mut control);
     drop(control);
     assert!(matches!(outcome, Err(Error::Interrupted)), "{outcome:?}");
-    assert_eq!(*part.finished.lock().expect("lock"), 1, "`finish` was called");
+    assert_eq!(*part.finished.lock().expect("no thread has panicked"), 1, "`finish` was called");
     assert_eq!(reported, part.len(), "the reported episodes are stored");
     assert!((6..30).contains(&part.len()));
-    assert!(whole.bytes().starts_with(&part.bytes()));
-    collect(2, 1, 30, &part).expect("resumed");
-    assert!(part.bytes() == whole.bytes());
+    assert!(complete.bytes().starts_with(&part.bytes()));
+    collect(2, 1, 30, &part).expect("the resumed collection succeeds");
+    assert!(part.bytes() == complete.bytes());
 }
 
-/// A policy that fails after `left` steps.
+/// A policy that fails after `remaining` steps.
 struct Failing {
     walker: Walker,
-    left: usize,
+    remaining: usize,
 }
 
 impl Policy for Failing {
     fn begin(&mut self, _: usize, _: Key) {}
 
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
-        self.left = self.left.checked_sub(1).ok_or(Error::external("acting", "no more actions"))?;
+        self.remaining = self.remaining.checked_sub(1).ok_or(Error::external("acting", "no more actions"))?;
         self.walker.act(infos, active, actions)
     }
 }
@@ -143,11 +146,11 @@ impl Policy for Failing {
 #[test]
 fn failures_keep_finished_episodes() {
     let memory = Memory::default();
-    let mut failing = Failing { walker: Walker, left: 20 };
+    let mut failing = Failing { walker: Walker, remaining: 20 };
     let error = world(3, 1).collect(&mut failing, memory.writer(), &config(50), &mut Control::default());
     assert!(error.expect_err("the policy fails").to_string().contains("no more actions"));
     assert!(memory.len() > 0);
-    assert_eq!(*memory.finished.lock().expect("lock"), 1);
+    assert_eq!(*memory.finished.lock().expect("no thread has panicked"), 1);
 
     let full = Memory { full_at: Some(5), ..Memory::default() };
     let error = collect(3, 1, 500, &full).expect_err("the disk is full").to_string();
@@ -157,7 +160,7 @@ fn failures_keep_finished_episodes() {
 
 #[test]
 fn errors_name_invalid_requests() {
-    let made = |config| World::new(&ENTRY, config).err().expect("wrong").to_string();
+    let made = |config| World::new(&ENTRY, config).err().expect("invalid input").to_string();
     assert!(made(WorldConfig { envs: 0, ..WorldConfig::default() }).contains("at least 1"));
     assert!(made(WorldConfig { image: Some((0, 3)), ..WorldConfig::default() }).contains("0 x 3"));
     let unknown = VariationRequest { variation: Some(vec!["agent.colour".to_owned()]), ..Default::default() };
@@ -175,7 +178,7 @@ fn manifest_contains_settings_but_no_run_options() {
     assert_eq!(manifest.config["env"], "test/Line-v0");
     assert_eq!(manifest.config["image"], serde_json::json!([2, 3]));
     let other = |config: CollectConfig| check_continues(&manifest, &world(1, 1).collect_manifest(&config));
-    other(config(500)).expect("more of the same");
+    other(config(500)).expect("a larger number of episodes is compatible");
     let seed = other(CollectConfig { seed: 12, ..config(9) }).expect_err("another seed").to_string();
     assert!(seed.contains("seed 12") && seed.contains("11"), "{seed}");
     let policy = other(CollectConfig { policy: "expert".to_owned(), ..config(9) }).expect_err("another policy");

@@ -1,4 +1,4 @@
-//! Strict and compat counting, on a line where every outcome is known.
+//! Strict and compat counting, in an environment on a line whose outcomes are known.
 
 use crate::evaluating::{pinned, recorded, run_counted, world};
 use crate::line::Walker;
@@ -21,9 +21,9 @@ impl Policy for MoveRight {
 }
 
 #[test]
-fn passing_the_goal_is_not_holding_it() {
+fn hold_rejects_episodes_that_pass_the_goal() {
     // From -2 to 2 in steps of 1: at the goal after 4 steps, beyond it after 5.
-    let starts = Starts::episodic(2, 0, pinned(&[("agent.x", -2.0), ("goal.x", 2.0)])).expect("starts");
+    let starts = Starts::episodic(2, 0, pinned(&[("agent.x", -2.0), ("goal.x", 2.0)])).expect("valid starts");
     let play = |policy: &mut dyn Policy, hold| {
         let found = run_counted(&mut world(2, 1), policy, &starts, Counting::Strict { hold });
         let first = &found.episodes[0];
@@ -37,10 +37,11 @@ fn passing_the_goal_is_not_holding_it() {
 
 #[test]
 fn hold_beyond_the_budget_is_an_error() {
-    let starts = Starts::episodic(1, 0, VariationRequest::default()).expect("starts");
+    let starts = Starts::episodic(1, 0, VariationRequest::default()).expect("valid starts");
     for hold in [0, 13] {
         let config = EvalConfig { counting: Counting::Strict { hold }, ..EvalConfig::default() };
-        let error = world(1, 1).evaluate(&mut Walker, &starts, &config, &mut Control::default()).expect_err("wrong");
+        let error =
+            world(1, 1).evaluate(&mut Walker, &starts, &config, &mut Control::default()).expect_err("invalid input");
         assert!(error.to_string().contains(&format!("{hold} in a budget of 12")), "{error}");
     }
 }
@@ -49,10 +50,10 @@ fn hold_beyond_the_budget_is_an_error() {
 fn compat_counting_plays_solved_starts_and_reports_the_strict_rate() {
     let reader = recorded(12);
     let spec = world(1, 1).spec().clone();
-    let picks = Starts::choose(&reader, 40, 1, 3).expect("picks");
+    let picks = Starts::choose(&reader, 40, 1, 3).expect("the dataset has enough starts");
     let starts =
         Starts::from_dataset(&reader, world(1, 1).pool().env(0), picks, 1, 3, VariationRequest::default(), &[])
-            .expect("starts");
+            .expect("valid starts");
     let mut random = RandomPolicy::new(&spec, 5);
     let strict = run_counted(&mut world(5, 1), &mut random, &starts, Counting::Strict { hold: 1 });
     let compat = run_counted(&mut world(5, 2), &mut random, &starts, Counting::Compat { envs: 40 });
@@ -74,7 +75,7 @@ fn compat_counting_plays_solved_starts_and_reports_the_strict_rate() {
 fn episodic_compat_counting_counts_the_first_to_finish() {
     let all = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
     let play = |envs, threads| -> Run {
-        let starts = Starts::sequential(20, 100, all.clone()).expect("starts");
+        let starts = Starts::sequential(20, 100, all.clone()).expect("valid starts");
         run_counted(&mut world(envs, threads), &mut MoveRight, &starts, Counting::Compat { envs })
     };
     // The expected values were computed by `World.evaluate(episodes=20, seed=100)` of stable-worldmodel 0.1.1, for
@@ -88,8 +89,10 @@ fn episodic_compat_counting_counts_the_first_to_finish() {
         assert_eq!(found.episodes, play(envs, 1).episodes, "independent of threads");
         assert_eq!(found.strict, None, "strict counting selects other episodes");
     }
-    let starts = Starts::sequential(2, 0, all).expect("starts");
+    let starts = Starts::sequential(2, 0, all).expect("valid starts");
     let config = EvalConfig { counting: Counting::Compat { envs: 2 }, ..EvalConfig::default() };
-    let error = world(3, 1).evaluate(&mut MoveRight, &starts, &config, &mut Control::default()).expect_err("rejected");
+    let error = world(3, 1)
+        .evaluate(&mut MoveRight, &starts, &config, &mut Control::default())
+        .expect_err("the request is rejected");
     assert!(error.to_string().contains("among 2 environments, and the world has 3"), "{error}");
 }

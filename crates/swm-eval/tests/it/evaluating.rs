@@ -11,7 +11,7 @@ use swm_plan::{ActionScale, Cem, MpcConfig, MpcPolicy};
 
 pub fn world(envs: usize, threads: usize) -> World {
     let config = WorldConfig { envs, image: Some((4, 4)), views: vec![], max_episode_steps: Some(12), threads };
-    World::new(&ENTRY, config).expect("a world")
+    World::new(&ENTRY, config).expect("a valid world")
 }
 
 pub fn pinned(values: &[(&str, f64)]) -> VariationRequest {
@@ -22,24 +22,24 @@ pub fn pinned(values: &[(&str, f64)]) -> VariationRequest {
 fn run(world: &mut World, policy: &mut dyn Policy, starts: &Starts, budget: Option<usize>) -> Run {
     let config =
         EvalConfig { policy: "walker".to_owned(), condition: "test".to_owned(), budget, ..EvalConfig::default() };
-    world.evaluate(policy, starts, &config, &mut Control::default()).expect("a run")
+    world.evaluate(policy, starts, &config, &mut Control::default()).expect("the evaluation succeeds")
 }
 
 pub fn run_counted(world: &mut World, policy: &mut dyn Policy, starts: &Starts, counting: Counting) -> Run {
     let config = EvalConfig { counting, ..EvalConfig::default() };
-    world.evaluate(policy, starts, &config, &mut Control::default()).expect("a run")
+    world.evaluate(policy, starts, &config, &mut Control::default()).expect("the evaluation succeeds")
 }
 
 /// The run without its timing, as JSON.
-fn timeless(run: &Run) -> String {
-    serde_json::to_string(&Run { timing: Default::default(), ..run.clone() }).expect("JSON")
+fn without_timing(run: &Run) -> String {
+    serde_json::to_string(&Run { timing: Default::default(), ..run.clone() }).expect("valid JSON")
 }
 
 #[test]
 fn solved_starts_are_counted_separately() {
     // Some episodes are solved at the start: the goal is at 2, the start anywhere in -4 ..= 4.
     let variation = VariationRequest { variation: Some(vec!["agent.x".to_owned()]), ..pinned(&[("goal.x", 2.0)]) };
-    let starts = Starts::episodic(200, 3, variation).expect("starts");
+    let starts = Starts::episodic(200, 3, variation).expect("valid starts");
     let found = run(&mut world(16, 2), &mut Walker, &starts, None);
     assert!(found.solved_at_start > 0, "some starts are solved");
     assert_eq!(found.success.n + found.solved_at_start, 200);
@@ -54,7 +54,7 @@ fn solved_starts_are_counted_separately() {
 
 #[test]
 fn budget_ends_an_episode() {
-    let starts = Starts::episodic(3, 0, pinned(&[("agent.x", -3.0), ("goal.x", 3.0)])).expect("starts");
+    let starts = Starts::episodic(3, 0, pinned(&[("agent.x", -3.0), ("goal.x", 3.0)])).expect("valid starts");
     let steps = |budget| {
         let found = run(&mut world(2, 1), &mut Walker, &starts, budget);
         (found.success.successes, found.episodes[0].steps)
@@ -62,7 +62,7 @@ fn budget_ends_an_episode() {
     assert_eq!((steps(None), steps(Some(6)), steps(Some(5))), ((3, 6), (3, 6), (0, 5)));
     let config = EvalConfig { budget: Some(13), ..EvalConfig::default() };
     let error = world(1, 1).evaluate(&mut Walker, &starts, &config, &mut Control::default());
-    assert!(error.expect_err("too long").to_string().contains("truncates episodes after 12"));
+    assert!(error.expect_err("the budget is too large").to_string().contains("truncates episodes after 12"));
 }
 
 /// A perfect model: the cost is the distance to the goal after the last action.
@@ -96,25 +96,33 @@ fn planner(world: &World) -> MpcPolicy {
     let config = MpcConfig { horizon: 3, receding_horizon: 2, action_block: 2, ..MpcConfig::default() };
     let (scale, slots) = (ActionScale::identity(1), world.pool().len());
     MpcPolicy::new(Box::new(cem), Box::new(PerfectModel::default()), config, scale, world.spec(), slots)
-        .expect("a policy")
+        .expect("a valid policy")
 }
 
 #[test]
 fn results_do_not_depend_on_environments_or_threads() {
-    let starts = Starts::episodic(20, 5, VariationRequest::default()).expect("starts");
-    let mut alone = world(1, 1);
-    let mut policy = planner(&alone);
-    let planned = run(&mut alone, &mut policy, &starts, None);
-    let mut policy = RandomPolicy::new(alone.spec(), 1);
-    let random = run(&mut alone, &mut policy, &starts, None);
+    let starts = Starts::episodic(20, 5, VariationRequest::default()).expect("valid starts");
+    let mut single = world(1, 1);
+    let mut policy = planner(&single);
+    let planned = run(&mut single, &mut policy, &starts, None);
+    let mut policy = RandomPolicy::new(single.spec(), 1);
+    let random = run(&mut single, &mut policy, &starts, None);
     assert!(planned.success.low > random.success.high, "{:?} and {:?}", planned.success, random.success);
     assert!(planned.timing.plan_seconds.is_some_and(|plans| plans.n >= 20) && random.timing.plan_seconds.is_none());
     for (envs, threads) in [(7, 1), (20, 1), (20, 2), (32, 2)] {
         let mut world = world(envs, threads);
         let mut policy = planner(&world);
-        assert_eq!(timeless(&run(&mut world, &mut policy, &starts, None)), timeless(&planned), "{envs} planned");
+        assert_eq!(
+            without_timing(&run(&mut world, &mut policy, &starts, None)),
+            without_timing(&planned),
+            "{envs} planned"
+        );
         let mut policy = RandomPolicy::new(world.spec(), envs);
-        assert_eq!(timeless(&run(&mut world, &mut policy, &starts, None)), timeless(&random), "{envs} random");
+        assert_eq!(
+            without_timing(&run(&mut world, &mut policy, &starts, None)),
+            without_timing(&random),
+            "{envs} random"
+        );
     }
 }
 
@@ -124,7 +132,7 @@ pub fn recorded(episodes: usize) -> MemoryReader {
     let mut policy = RandomPolicy::new(world.spec(), 4);
     let variation = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
     let config = CollectConfig { episodes, seed: 1, variation, ..CollectConfig::default() };
-    world.collect(&mut policy, memory.writer(), &config, &mut Control::default()).expect("collected");
+    world.collect(&mut policy, memory.writer(), &config, &mut Control::default()).expect("the collection succeeds");
     memory.reader()
 }
 
@@ -157,26 +165,30 @@ impl Policy for Replay<'_> {
 #[test]
 fn replaying_actions_reaches_the_recorded_goal() {
     let reader = recorded(12);
-    let picks = Starts::choose(&reader, 30, 4, 8).expect("picks");
-    assert_eq!(picks, Starts::choose(&reader, 30, 4, 8).expect("picks"), "determined by the seed");
-    assert_ne!(picks, Starts::choose(&reader, 30, 4, 9).expect("picks"));
+    let picks = Starts::choose(&reader, 30, 4, 8).expect("the dataset has enough starts");
+    assert_eq!(
+        picks,
+        Starts::choose(&reader, 30, 4, 8).expect("the dataset has enough starts"),
+        "determined by the seed"
+    );
+    assert_ne!(picks, Starts::choose(&reader, 30, 4, 9).expect("the dataset has enough starts"));
     let starts =
         Starts::from_dataset(&reader, world(1, 1).pool().env(0), picks, 4, 8, VariationRequest::default(), &[])
-            .expect("starts");
+            .expect("valid starts");
     let keys = (0..30).map(|i| (Key::new(8).with("episode").at(i as u64), i)).collect();
     let mut replay = Replay { reader: &reader, starts: &starts, keys, playing: vec![[0; 2]; 5] };
     let found = run(&mut world(5, 2), &mut replay, &starts, Some(4));
     assert!(found.success.n > 0);
     assert_eq!(found.success.rate, 1.0, "{found:?}");
     assert!(found.episodes.iter().all(|episode| episode.start.is_some() && episode.steps <= 4));
-    let still = run(&mut world(5, 1), &mut Still, &starts, Some(4));
-    assert_eq!((still.success.successes, still.solved_at_start), (0, found.solved_at_start));
+    let stationary = run(&mut world(5, 1), &mut Stationary, &starts, Some(4));
+    assert_eq!((stationary.success.successes, stationary.solved_at_start), (0, found.solved_at_start));
 }
 
 /// A policy whose actions are zero.
-struct Still;
+struct Stationary;
 
-impl Policy for Still {
+impl Policy for Stationary {
     fn begin(&mut self, _: usize, _: Key) {}
 
     fn act(&mut self, _: &Batch, _: &[bool], actions: &mut Batch) -> Result<()> {
@@ -198,17 +210,17 @@ impl Policy for FirstColor {
         if self.color.is_empty() {
             self.color = infos.row(0).get::<u8>("pixels")?[..2].to_vec();
         }
-        Still.act(infos, &[], actions)
+        Stationary.act(infos, &[], actions)
     }
 }
 
 #[test]
 fn recorded_factors_apply_unless_they_are_shifted() {
     let reader = recorded(12);
-    let picks = Starts::choose(&reader, 1, 6, 0).expect("picks");
+    let picks = Starts::choose(&reader, 1, 6, 0).expect("the dataset has enough starts");
     let color = |variation: VariationRequest| {
         let starts = Starts::from_dataset(&reader, world(1, 1).pool().env(0), picks.clone(), 6, 0, variation, &[])
-            .expect("starts");
+            .expect("valid starts");
         let mut policy = FirstColor::default();
         run(&mut world(1, 1), &mut policy, &starts, None);
         policy.color
@@ -228,31 +240,32 @@ fn errors_name_invalid_requests() {
     let reader = recorded(3);
     let starts = |picks, offset, variation| {
         Starts::from_dataset(&reader, world(1, 1).pool().env(0), picks, offset, 0, variation, &[])
-            .expect_err("wrong")
+            .expect_err("invalid input")
             .to_string()
     };
     assert!(starts(vec![], 1, VariationRequest::default()).contains("at least 1"));
     assert!(starts(vec![[3, 0]], 1, VariationRequest::default()).contains("3 episodes, counted from 0"));
     assert!(starts(vec![[0, 5]], 50, VariationRequest::default()).contains("50 steps later"));
     assert!(starts(vec![[0, 0]], 1, pinned(&[("agent.y", 1.0)])).contains("agent.x"));
-    let error = Starts::choose(&reader, 1000, 2, 0).expect_err("too many").to_string();
+    let error = Starts::choose(&reader, 1000, 2, 0).expect_err("too many starts").to_string();
     assert!(error.contains("1000") && error.contains("collect more"), "{error}");
     let no_frames = WorldConfig { envs: 1, image: None, views: vec![], max_episode_steps: None, threads: 1 };
     let videos = Videos { root: "nowhere".into(), prefix: "v".to_owned(), count: 1, fps: 10 };
     let config = EvalConfig { videos: Some(videos), ..EvalConfig::default() };
-    let starts = Starts::episodic(1, 0, VariationRequest::default()).expect("starts");
-    let mut world = World::new(&ENTRY, no_frames).expect("a world");
+    let starts = Starts::episodic(1, 0, VariationRequest::default()).expect("valid starts");
+    let mut world = World::new(&ENTRY, no_frames).expect("a valid world");
     let error = world.evaluate(&mut Walker, &starts, &config, &mut Control::default()).expect_err("no frames");
     assert!(matches!(error, Error::Config { .. }), "{error}");
 }
 
 #[test]
 fn videos_of_the_first_episodes_are_written() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let videos = Videos { root: folder.path().to_owned(), prefix: "videos/walker".to_owned(), count: 2, fps: 10 };
     let config = EvalConfig { videos: Some(videos), ..EvalConfig::default() };
-    let starts = Starts::episodic(4, 2, VariationRequest::default()).expect("starts");
-    let found = world(3, 1).evaluate(&mut Walker, &starts, &config, &mut Control::default()).expect("a run");
+    let starts = Starts::episodic(4, 2, VariationRequest::default()).expect("valid starts");
+    let found =
+        world(3, 1).evaluate(&mut Walker, &starts, &config, &mut Control::default()).expect("the evaluation succeeds");
     assert_eq!(found.videos, ["videos/walker-0.mp4", "videos/walker-1.mp4"]);
     assert!(found.videos.iter().all(|video| folder.path().join(video).metadata().is_ok_and(|file| file.len() > 500)));
 }

@@ -23,7 +23,7 @@ pub struct Line {
     factors: FactorValues,
     x: f64,
     goal: f64,
-    /// A random value drawn at every step, to test that randomness depends on the episode alone.
+    /// A random value drawn at every step, to test that random values depend only on the episode.
     noise: f64,
     rng: Rng,
 }

@@ -1,4 +1,4 @@
-//! A dataset in memory, for comparisons byte by byte.
+//! A dataset in memory, whose content tests compare byte by byte.
 
 use std::sync::{Arc, Mutex};
 use swm_core::{Batch, ColumnSpec, DType, Error, Manifest, Result, Schema};
@@ -18,13 +18,13 @@ impl Memory {
     }
 
     pub fn len(&self) -> usize {
-        self.episodes.lock().expect("no panic").len()
+        self.episodes.lock().expect("no thread has panicked").len()
     }
 
     /// The content of all episodes.
     pub fn bytes(&self) -> Vec<u8> {
         let mut all = vec![];
-        for episode in self.episodes.lock().expect("no panic").iter() {
+        for episode in self.episodes.lock().expect("no thread has panicked").iter() {
             all.extend((episode.rows() as u64).to_le_bytes());
             (0..episode.schema().columns().len()).for_each(|column| all.extend(episode.bytes(column)));
         }
@@ -32,17 +32,17 @@ impl Memory {
     }
 
     pub fn reader(&self) -> MemoryReader {
-        let batches = self.episodes.lock().expect("no panic").clone();
+        let batches = self.episodes.lock().expect("no thread has panicked").clone();
         let episodes = batches.iter().enumerate().map(|(i, b)| Episode { index: i as i64, length: b.rows() }).collect();
         let mut columns = vec![ColumnSpec::new("episode_idx", DType::Int64, [])];
         columns.extend(batches[0].schema().columns().iter().cloned());
-        MemoryReader { schema: Schema::new(columns).expect("schema"), batches, episodes }
+        MemoryReader { schema: Schema::new(columns).expect("a valid schema"), batches, episodes }
     }
 }
 
 impl Writer for Memory {
     fn write_episode_with(&mut self, episode: &Batch, _constants: &Constants) -> Result<()> {
-        let mut episodes = self.episodes.lock().expect("no panic");
+        let mut episodes = self.episodes.lock().expect("no thread has panicked");
         if self.full_at == Some(episodes.len()) {
             let full = std::io::Error::from(std::io::ErrorKind::StorageFull);
             return Err(Error::io("memory", "writing an episode", full));
@@ -56,7 +56,7 @@ impl Writer for Memory {
     }
 
     fn finish(self: Box<Self>) -> Result<()> {
-        *self.finished.lock().expect("no panic") += 1;
+        *self.finished.lock().expect("no thread has panicked") += 1;
         Ok(())
     }
 }

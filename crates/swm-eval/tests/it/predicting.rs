@@ -53,8 +53,8 @@ fn recorded_positions(reader: &MemoryReader, picks: &[[usize; 2]], horizon: usiz
         .iter()
         .flat_map(|&[episode, start]| (1..=horizon).map(move |k| StepRange::new(episode, start + 2 * k, 1)))
         .collect();
-    let rows = reader.read(&["state"], &ranges).expect("rows");
-    let x = rows.get::<f64>("state").expect("states").to_vec();
+    let rows = reader.read(&["state"], &ranges).expect("the dataset is readable");
+    let x = rows.get::<f64>("state").expect("the dataset has states").to_vec();
     let mean = x.iter().sum::<f64>() / x.len() as f64;
     let variance = x.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / x.len() as f64;
     (x, variance)
@@ -63,9 +63,10 @@ fn recorded_positions(reader: &MemoryReader, picks: &[[usize; 2]], horizon: usiz
 #[test]
 fn errors_equal_the_closed_form() {
     let reader = recorded(40);
-    let picks = Starts::choose(&reader, 50, 6, 2).expect("picks");
+    let picks = Starts::choose(&reader, 50, 6, 2).expect("the dataset has enough starts");
     let (_, variance) = recorded_positions(&reader, &picks, 3);
-    let found = predict(&mut Drifting { drift: 0.5 }, &reader, &picks, 3, |i| Some(i % 3 == 0)).expect("errors");
+    let found = predict(&mut Drifting { drift: 0.5 }, &reader, &picks, 3, |i| Some(i % 3 == 0))
+        .expect("the prediction succeeds");
     // One of two latent dimensions has the error 0.5 k; the other is constant.
     assert!((found.variance - variance / 2.0).abs() < 1e-5 * variance, "{} {variance}", found.variance);
     for (trajectory, pick) in found.trajectories.iter().zip(&picks) {
@@ -77,9 +78,9 @@ fn errors_equal_the_closed_form() {
     }
     let sizes: Vec<(Option<bool>, usize)> = found.groups.iter().map(|g| (g.success, g.trajectory.n)).collect();
     assert_eq!(sizes, [(None, 50), (Some(true), 17), (Some(false), 33)]);
-    let exact = predict(&mut Drifting { drift: 0.0 }, &reader, &picks, 3, |_| None).expect("errors");
+    let exact = predict(&mut Drifting { drift: 0.0 }, &reader, &picks, 3, |_| None).expect("the prediction succeeds");
     assert!(exact.groups[0].trajectory.p95 < 1e-12, "{:?}", exact.groups[0]);
-    assert_eq!(exact.groups.len(), 1, "their outcomes are unknown");
+    assert_eq!(exact.groups.len(), 1, "trajectories without an outcome have no groups by success");
 }
 
 /// A model with a constant prediction.
@@ -111,10 +112,10 @@ impl Predictor for Constant {
 #[test]
 fn predicting_the_mean_has_the_error_one() {
     let reader = recorded(40);
-    let picks = Starts::choose(&reader, 33, 4, 0).expect("picks");
+    let picks = Starts::choose(&reader, 33, 4, 0).expect("the dataset has enough starts");
     let (x, _) = recorded_positions(&reader, &picks, 2);
     let mean = x.iter().sum::<f64>() / x.len() as f64;
-    let found = predict(&mut Constant(mean as f32), &reader, &picks, 2, |_| None).expect("errors");
+    let found = predict(&mut Constant(mean as f32), &reader, &picks, 2, |_| None).expect("the prediction succeeds");
     assert!((found.groups[0].trajectory.mean - 1.0).abs() < 1e-6, "{:?}", found.groups[0]);
 }
 
@@ -123,32 +124,32 @@ fn trajectories_are_grouped_by_recorded_success() {
     let reader = recorded(60);
     let episodes: Vec<usize> = (10..60).collect();
     let predict = || -> Prediction {
-        predict_recorded(&mut Drifting { drift: 0.1 }, &reader, &episodes, 40, 2, 9).expect("errors")
+        predict_recorded(&mut Drifting { drift: 0.1 }, &reader, &episodes, 40, 2, 9).expect("the prediction succeeds")
     };
     let found = predict();
     assert_eq!(found, predict(), "determined by the seed");
     let succeeded = |episode: usize| {
         let length = reader.episodes()[episode].length;
-        let rows = reader.read(&["success"], &[StepRange::new(episode, 0, length)]).expect("rows");
+        let rows = reader.read(&["success"], &[StepRange::new(episode, 0, length)]).expect("the dataset is readable");
         rows.bytes(0).contains(&1)
     };
     for trajectory in &found.trajectories {
-        assert!(trajectory.start[0] >= 10, "of the chosen episodes");
+        assert!(trajectory.start[0] >= 10, "the trajectory is in one of the chosen episodes");
         assert_eq!(trajectory.success, Some(succeeded(trajectory.start[0])));
     }
     assert_eq!(found.groups.len(), 3, "all, successful and failed trajectories");
 }
 
 #[test]
-fn errors_name_what_cannot_be_predicted() {
+fn errors_name_the_invalid_trajectory() {
     let reader = recorded(10);
     let rejected = |drift: f32, picks: &[[usize; 2]], horizon| -> Error {
-        predict(&mut Drifting { drift }, &reader, picks, horizon, |_| None).expect_err("rejected")
+        predict(&mut Drifting { drift }, &reader, picks, horizon, |_| None).expect_err("the request is rejected")
     };
     let [none, far] = [rejected(0.0, &[], 2), rejected(0.0, &[[3, 4]], 50)].map(|error| error.to_string());
     assert!(none.contains("0 trajectories of 2 model steps"), "{none}");
     assert!(far.contains("50 model steps of 2 from step 4 of episode 3") && far.contains("more than 104"), "{far}");
-    let picks = Starts::choose(&reader, 5, 4, 0).expect("picks");
+    let picks = Starts::choose(&reader, 5, 4, 0).expect("the dataset has enough starts");
     let error = rejected(f32::NAN, &picks, 2).to_string();
     assert!(error.contains(&format!("model step 1 from step {} of episode {}", picks[0][1], picks[0][0])), "{error}");
     let error = rejected(0.0, &picks[..1], 1).to_string();

@@ -88,7 +88,7 @@ fn held_out(part: Part) -> StartsRequest {
 
 fn run(request: &EvalRequest, envs: usize, threads: usize) -> Results {
     let options = RunOptions { envs, threads, ..RunOptions::default() };
-    request.run(&TestResolver::new(), &options, &mut Control::new()).expect("results")
+    request.run(&TestResolver::new(), &options, &mut Control::new()).expect("the evaluation succeeds")
 }
 
 fn again(old: &Results, known: &TestResolver) -> Result<swm_eval::Reproduction> {
@@ -97,12 +97,12 @@ fn again(old: &Results, known: &TestResolver) -> Result<swm_eval::Reproduction> 
 
 /// Serialises results to JSON and back.
 fn round_trip(results: &Results) -> Results {
-    serde_json::from_str(&serde_json::to_string_pretty(results).expect("JSON")).expect("results")
+    serde_json::from_str(&serde_json::to_string_pretty(results).expect("valid JSON")).expect("results")
 }
 
-fn timeless(mut results: Results) -> String {
+fn without_timing(mut results: Results) -> String {
     results.runs.iter_mut().for_each(|run: &mut Run| run.timing = Default::default());
-    serde_json::to_string(&results).expect("JSON")
+    serde_json::to_string(&results).expect("valid JSON")
 }
 
 #[test]
@@ -144,7 +144,7 @@ fn every_policy_and_condition_is_a_stage() {
         _ => {}
     });
     let options = RunOptions { envs: 4, threads: 1, ..RunOptions::default() };
-    request().run(&TestResolver::new(), &options, &mut control).expect("results");
+    request().run(&TestResolver::new(), &options, &mut control).expect("the evaluation succeeds");
     drop(control);
     assert_eq!(
         stages[..4],
@@ -161,9 +161,9 @@ fn results_do_not_depend_on_run_options() {
     requests[2].starts = held_out(Part::Validation);
     requests[2].counting = Counting::Compat { envs: 9 };
     for request in requests {
-        let alone = timeless(run(&request, 1, 1));
+        let single = without_timing(run(&request, 1, 1));
         for (envs, threads) in [(7, 1), (24, 2), (50, 2)] {
-            assert_eq!(timeless(run(&request, envs, threads)), alone, "{envs} environments, {threads} threads");
+            assert_eq!(without_timing(run(&request, envs, threads)), single, "{envs} environments, {threads} threads");
         }
     }
 }
@@ -187,10 +187,11 @@ fn held_out_starts_come_from_held_out_episodes() {
     hashes.sort();
     hashes.dedup();
     assert_eq!(hashes.len(), 3);
-    let nothing = HeldOut { part: Part::Test, split: Split { test: 0.0, ..Split::default() } };
-    let starts = StartsRequest::Dataset { dataset: "line".to_owned(), goal_offset: 3, held_out: Some(nothing) };
-    let error =
-        EvalRequest { starts, ..request() }.run(&known, &RunOptions::default(), &mut Control::new()).expect_err("none");
+    let empty = HeldOut { part: Part::Test, split: Split { test: 0.0, ..Split::default() } };
+    let starts = StartsRequest::Dataset { dataset: "line".to_owned(), goal_offset: 3, held_out: Some(empty) };
+    let error = EvalRequest { starts, ..request() }
+        .run(&known, &RunOptions::default(), &mut Control::new())
+        .expect_err("the split has no episodes");
     assert!(error.to_string().contains("the test split") && error.to_string().contains("60 episodes"), "{error}");
 }
 
@@ -204,8 +205,8 @@ fn results_can_be_reproduced() {
         let first = round_trip(&run(&request, 4, 1));
         let mut expected = request.clone();
         expected.policies.insert(0, PolicyRequest { name: "random".to_owned(), kind: PolicyKind::Random });
-        assert_eq!(EvalRequest::of(&first.manifest).expect("a request"), expected, "the request with the floor");
-        let second = again(&first, &known).expect("again");
+        assert_eq!(EvalRequest::of(&first.manifest).expect("a valid request"), expected, "the request with the floor");
+        let second = again(&first, &known).expect("the reproduction succeeds");
         assert_eq!(second.differences, []);
         assert!(second.holds());
     }
@@ -226,7 +227,7 @@ fn prediction_errors_are_grouped_by_the_outcome_of_the_episode() {
         let grouped: usize = prediction.groups[1..].iter().map(|group| group.trajectory.n).sum();
         assert_eq!((prediction.groups[0].trajectory.n, grouped), (24, run.success.n));
     }
-    assert_eq!(again(&round_trip(&found), &TestResolver::new()).expect("again").differences, []);
+    assert_eq!(again(&round_trip(&found), &TestResolver::new()).expect("the reproduction succeeds").differences, []);
     let error = EvalRequest { prediction: Some(2), ..request() }.run(
         &TestResolver::new(),
         &RunOptions::default(),
@@ -242,7 +243,7 @@ fn differences_are_listed() {
     first.runs[3].episodes[7].steps += 1;
     first.manifest.swm_version = "0.0.9".to_owned();
     first.manifest.hashes.insert("goals".to_owned(), "other".to_owned());
-    let second = again(&first, &known).expect("again");
+    let second = again(&first, &known).expect("the reproduction succeeds");
     let listed: Vec<(Kind, &str)> = second.differences.iter().map(|d| (d.kind, d.what.as_str())).collect();
     let expected = [
         (Kind::Version, "stable-worldmodel"),
@@ -283,7 +284,7 @@ fn malformed_requests_are_errors() {
     let rejected = |change: &dyn Fn(&mut Results)| {
         let mut old = first.clone();
         change(&mut old);
-        again(&old, &known).map(|_| ()).expect_err("rejected").to_string()
+        again(&old, &known).map(|_| ()).expect_err("the request is rejected").to_string()
     };
     let message = rejected(&|old| old.manifest.config["version"] = json!(99));
     assert!(message.contains("layout 99; this version reads 1"), "{message}");

@@ -1,4 +1,4 @@
-//! An environment, a format, a solver and a family from outside, in one run: collect, store, train, load, plan, evaluate.
+//! Uses the extensions of this test in one run: collect, store, train, load, plan, evaluate.
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 mod env;
@@ -15,7 +15,7 @@ use swm::eval::{CollectConfig, EvalConfig, Starts, World, WorldConfig};
 use swm::models::{Device, FamilyEntry, TrainOptions, TrainRun, load_from};
 use swm::plan::{MpcConfig, MpcPolicy, SolverEntry};
 
-/// The environments of the facade and the one of this test, in one registry.
+/// The built-in environments and the environment of this test, in one registry.
 static ENVS: Registry<EnvEntry> = Registry { rows: &ENV_ROWS, ..swm::envs::ENVS };
 const ENV_ROWS: [EnvEntry; swm::envs::ENVS.rows.len() + 1] = concat(swm::envs::ENVS.rows, &[env::ENTRY]);
 static FORMATS: Registry<FormatEntry> = Registry { kind: "dataset format", hint: "", rows: &[format::ENTRY] };

@@ -1,4 +1,5 @@
-//! Success rates of planners with perfect dynamics: an upper bound for every model, and a measure of the search alone.
+//! Success rates of planners with perfect dynamics: an upper bound for every model, and a measure of the search without
+//! model errors.
 //!
 //!     cargo run --release -p swm-plan --example simulator [PART OF AN ENVIRONMENT ID] [SOLVER] [STARTS] [SETTINGS]
 //!

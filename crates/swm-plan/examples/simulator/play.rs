@@ -38,13 +38,13 @@ pub struct Planner {
 
 /// The result of playing.
 pub struct Outcome {
-    /// Starts that were already solved.
+    /// The number of starts that were already solved.
     pub solved_at_start: usize,
-    /// The success rate of the other starts.
+    /// The success rate of the starts that were not already solved.
     pub success: Proportion,
     /// Steps to the goal in successful episodes.
     pub steps: Option<Summary>,
-    /// Seconds per plan, while others are planned on the same cores.
+    /// Seconds per plan, while the plans of other environments are computed on the same cores.
     pub plan: Option<Summary>,
     /// Seconds in total.
     pub seconds: f64,
@@ -75,7 +75,7 @@ pub fn starts(entry: &EnvEntry, protocol: Protocol, n: usize) -> Result<Vec<Star
 
 /// The rows of one episode of the first expert.
 fn demonstrate(entry: &EnvEntry, seed: u64) -> Result<Batch> {
-    let mut env = entry.env().expect("an environment");
+    let mut env = entry.env().expect("a valid environment");
     let mut expert = (entry.experts[0].make)();
     env.reset(seed, &ResetOptions::default())?;
     expert.begin(Key::new(seed).with("expert"));
@@ -104,7 +104,7 @@ pub fn play(entry: &EnvEntry, starts: &[Start], planner: &Planner, budget: usize
     let begun = Instant::now();
     let (mut solved_at_start, mut played, mut successes, mut latencies) = (0, 0, vec![], vec![]);
     for starts in starts.chunks(SLOTS) {
-        let envs = starts.iter().map(|_| entry.env().expect("an environment")).collect();
+        let envs = starts.iter().map(|_| entry.env().expect("a valid environment")).collect();
         let mut pool = EnvPool::new(envs, None, Some(budget), threads(0)?)?;
         let slots: Vec<usize> = (0..starts.len()).collect();
         pool.restart(&slots, |slot, env| {

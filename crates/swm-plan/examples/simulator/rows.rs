@@ -28,9 +28,10 @@ fn two_room(_: &str) -> Value {
 
 /// The horizon is the paper's 25 steps, planned individually, so that noise can be coloured along them.
 ///
-/// The search is hard because most candidates do not touch the block, and those that do rarely push it in the right direction.
-/// Frequent replanning helps every solver more than a long search, because the spread of CEM collapses around the first push
-/// with a lower cost. MPPI keeps its spread, and the coloured noise of iCEM moves in straighter lines than white noise.
+/// The search is hard because most candidates do not touch the block, and those that do rarely push it in the right
+/// direction. Frequent replanning helps every solver more than a long search, because the spread of CEM collapses
+/// around the first push with a lower cost. MPPI keeps its spread, and the coloured noise of iCEM moves in straighter
+/// lines than white noise.
 fn push_t(solver: &str) -> Value {
     let (solver, receding_horizon) = match solver {
         "cem" => (json!({ "samples": 300, "iterations": 5, "elites": 20, "sigma": 0.7 }), 1),
@@ -41,7 +42,7 @@ fn push_t(solver: &str) -> Value {
     json!({ "score": "reach", "solver": solver, "mpc": mpc })
 }
 
-/// The planner of a row, with `changes` merged into its settings.
+/// The planner of a task and a solver, with `changes` merged into the settings.
 pub fn planner(task: &Task, solver: &'static str, changes: &Value) -> Result<Planner> {
     let mut settings = (task.settings)(solver);
     merge(&mut settings, changes);

@@ -38,7 +38,7 @@ impl ActionCodec {
     /// The codec of an environment, with `block` actions in a model step.
     ///
     /// # Errors
-    /// When the scale does not fit the action space, or nothing can be planned in it.
+    /// When the scale does not fit the action space, or actions of this space cannot be planned.
     pub fn new(spec: &EnvSpec, scale: ActionScale, block: usize) -> Result<Self> {
         scale.check(spec)?;
         let space = &spec.action_space;
@@ -80,8 +80,8 @@ impl ActionCodec {
         }
     }
 
-    /// Decodes one action from `planned`, `[width]`: a point clipped to its box, or for every integer the option with the
-    /// largest value, the first of equals.
+    /// Decodes one action from `planned`, `[width]`: a point clipped to its box, or for every integer the option with
+    /// the largest value, the first of equals.
     pub fn decode<'a>(&self, planned: &[f32], decoded: &'a mut Decoded) -> Action<'a> {
         match self {
             Self::Continuous { scale, bounds, .. } => {

@@ -13,8 +13,8 @@ pub struct MpcConfig {
     pub horizon: usize,
     /// Model steps to execute before planning again; the whole horizon is open loop.
     pub receding_horizon: usize,
-    /// Environment steps in one model step (the frameskip the model was trained with). Their actions are concatenated
-    /// in a model step's action.
+    /// Environment steps in one model step (the frameskip the model was trained with). The actions of these steps are
+    /// concatenated in a model step's action.
     pub action_block: usize,
     /// Whether a plan starts from the part of the last plan that was not executed, moved forward and filled with zeros
     /// (the mean action in model units; no preference among choices).

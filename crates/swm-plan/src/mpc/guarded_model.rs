@@ -9,7 +9,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::Instant;
 use swm_core::{Batch, Candidates, Constrained, CostModel, DifferentiableCost, Env, Error, LatentDynamics, Result};
 
-/// A model with a timer, whose panics are errors.
+/// Measures the time of a model's methods and converts panics to errors.
 pub(crate) struct GuardedModel<'m> {
     /// In a cell, because [`LatentDynamics`] and [`Constrained`] return their sizes through shared references, and the
     /// model gives access to these traits through exclusive references only.
@@ -18,9 +18,9 @@ pub(crate) struct GuardedModel<'m> {
     pub seconds: f64,
 }
 
-/// Runs `work`; a panic in it becomes an error that names `who`.
+/// Runs `work`; converts a panic in `work` to an error that names `who`.
 pub(crate) fn catch_panic<T>(who: &str, doing: &str, work: impl FnOnce() -> Result<T>) -> Result<T> {
-    // Values that were being changed may be inconsistent, but the error ends the run, and they are not used again.
+    // A panic may leave values inconsistent, but the error ends the run, so these values are not used again.
     catch_unwind(AssertUnwindSafe(work))
         .unwrap_or_else(|panic| Err(Error::external(format!("{who} panicked while {doing}"), message(&*panic))))
 }
@@ -30,7 +30,7 @@ fn message(panic: &(dyn Any + Send)) -> &str {
     text.or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("it left no message")
 }
 
-fn withdrawn(what: &str) -> Error {
+fn not_offered(what: &str) -> Error {
     Error::external("calling the model", format!("it returned {what} earlier and returns none now"))
 }
 
@@ -77,7 +77,7 @@ impl CostModel for GuardedModel<'_> {
 impl DifferentiableCost for GuardedModel<'_> {
     fn cost_and_gradient(&mut self, candidates: Candidates<'_>, costs: &mut [f32], gradient: &mut [f32]) -> Result<()> {
         self.call("differentiating its cost", |model| {
-            let model = model.differentiable().ok_or_else(|| withdrawn("a gradient"))?;
+            let model = model.differentiable().ok_or_else(|| not_offered("a gradient"))?;
             model.cost_and_gradient(candidates, costs, gradient)
         })
     }
@@ -90,13 +90,13 @@ impl LatentDynamics for GuardedModel<'_> {
 
     fn encode(&mut self, start: &mut [f32], goal: &mut [f32]) -> Result<()> {
         self.call("encoding start and goal", |model| {
-            model.latent().ok_or_else(|| withdrawn("a latent state"))?.encode(start, goal)
+            model.latent().ok_or_else(|| not_offered("a latent state"))?.encode(start, goal)
         })
     }
 
     fn predict(&mut self, latents: &[f32], actions: &[f32], next: &mut [f32]) -> Result<()> {
         self.call("predicting", |model| {
-            model.latent().ok_or_else(|| withdrawn("a latent state"))?.predict(latents, actions, next)
+            model.latent().ok_or_else(|| not_offered("a latent state"))?.predict(latents, actions, next)
         })
     }
 
@@ -109,7 +109,7 @@ impl LatentDynamics for GuardedModel<'_> {
         action_gradient: &mut [f32],
     ) -> Result<()> {
         self.call("differentiating its prediction", |model| {
-            let model = model.latent().ok_or_else(|| withdrawn("a latent state"))?;
+            let model = model.latent().ok_or_else(|| not_offered("a latent state"))?;
             model.predict_vjp(latents, actions, next_gradient, latent_gradient, action_gradient)
         })
     }
@@ -122,13 +122,13 @@ impl Constrained for GuardedModel<'_> {
 
     fn constrain(&mut self, candidates: Candidates<'_>, values: &mut [f32]) -> Result<()> {
         self.call("checking constraints", |model| {
-            model.constrained().ok_or_else(|| withdrawn("constraints"))?.constrain(candidates, values)
+            model.constrained().ok_or_else(|| not_offered("constraints"))?.constrain(candidates, values)
         })
     }
 
     fn constrain_vjp(&mut self, candidates: Candidates<'_>, weights: &[f32], gradient: &mut [f32]) -> Result<()> {
         self.call("differentiating constraints", |model| {
-            model.constrained().ok_or_else(|| withdrawn("constraints"))?.constrain_vjp(candidates, weights, gradient)
+            model.constrained().ok_or_else(|| not_offered("constraints"))?.constrain_vjp(candidates, weights, gradient)
         })
     }
 }

@@ -23,7 +23,7 @@ struct Infos {
     batch: Batch,
     /// The index of the frames among the observed columns, if there are any.
     pixels: Option<usize>,
-    /// The number of observed columns; those of the history follow.
+    /// The number of observed columns; the columns of the history follow.
     observed: usize,
 }
 
@@ -88,7 +88,7 @@ impl History {
         slot.steps += 1;
     }
 
-    /// Returns the observed columns extended by the history, for these slots; other rows are stale.
+    /// Returns the observed columns extended by the history, for `slots`; the rows of other slots are stale.
     pub fn extend(&mut self, observed: &Batch, slots: &[usize]) -> Result<&Batch> {
         let infos = match &mut self.infos {
             Some(infos) => infos,

@@ -1,7 +1,7 @@
 //! Model-predictive control: plan some steps ahead, execute the first of them, plan again.
 //!
-//! [`MpcPolicy`] is the policy; [`ActionScale`] relates a model's action units to an environment's; [`TraceLog`] collects how
-//! searches went.
+//! [`MpcPolicy`] is the policy; [`ActionScale`] converts between a model's and an environment's action units;
+//! [`TraceLog`] records every plan and its search.
 
 mod action_codec;
 mod action_scale;

@@ -1,8 +1,8 @@
 //! [`MpcPolicy`]: a policy that plans with a solver and a model.
 //!
-//! Slots that have executed their part of a plan replan together, in one [`Solver::solve`] call; the others keep
-//! executing. A plan is keyed by (episode, replan), so an episode is the same in any slot and together with any other
-//! episodes it is played.
+//! Slots that have executed their part of a plan replan together, in one [`Solver::solve`] call; other slots continue
+//! their plans. A plan is keyed by (episode, replan), so the plans of an episode do not depend on its slot or on other
+//! episodes.
 //!
 //! # Actions
 //! Points of a box are planned in model units ([`ActionScale`]) and clipped to the box when they are executed. Integers
@@ -52,7 +52,7 @@ struct Slot {
     plans: u64,
     /// The part of the plan to execute, `[receding horizon, dim]`.
     plan: Vec<f32>,
-    /// The number of its values that are executed.
+    /// The number of values of `plan` that are executed.
     done: usize,
     /// The initial guess of the next plan, `[horizon, dim]`.
     warm: Vec<f32>,
@@ -77,7 +77,7 @@ struct Scratch {
 }
 
 impl MpcPolicy {
-    /// A planning policy for `slots` environments of `spec`. `scale` is that of the model ([`ActionScale::unscaled`]
+    /// Creates a policy for `slots` environments of `spec`. `scale` is the model's scale ([`ActionScale::unscaled`]
     /// for a model that uses the environment's own units).
     ///
     /// # Errors
@@ -268,8 +268,8 @@ impl Policy for MpcPolicy {
         Ok(())
     }
 
-    /// Seconds each plan took, encoding the present included; the time of a call is divided equally among its
-    /// environments.
+    /// Returns the seconds that each plan took, including the encoding of the present observation. The time of a call
+    /// is divided equally among its environments.
     fn take_latencies(&mut self) -> Vec<f64> {
         std::mem::take(&mut self.latencies)
     }

@@ -4,20 +4,20 @@ use serde::Serialize;
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::PlanTrace;
 
-/// One plan.
+/// The record of one plan.
 #[derive(Clone, Debug, Serialize)]
 pub struct PlanRecord {
-    /// The episode, by the number that results call its seed.
+    /// The seed of the episode, as in evaluation results.
     pub episode: u64,
     /// The slot in which the episode was played.
     pub slot: usize,
     /// The number of earlier plans in the episode.
     pub replan: u64,
-    /// Environments planned in the same call; its time is divided equally among them.
+    /// The number of environments planned in the same call; the time of the call is divided equally among them.
     pub together: usize,
-    /// Seconds the plan took, encoding the present included.
+    /// Seconds the plan took, including the encoding of the present observation.
     pub seconds: f64,
-    /// The part of these seconds spent in the model.
+    /// The part of `seconds` that was spent in the model.
     pub model_seconds: f64,
     /// The cost of the best candidate.
     pub cost: f32,

@@ -10,8 +10,8 @@ use swm_core::{CostModel, Result};
 
 /// The terms and constraints of a plan.
 ///
-/// Without a goal term, the terms are added to the model's own cost. With one, the terms are the whole cost, computed on a
-/// rollout of the model's latent dynamics; only then can latents be constrained.
+/// Without a goal term, the terms are added to the model's own cost. With one, the terms are the whole cost, computed
+/// on a rollout of the model's latent dynamics; only then can latents be constrained.
 ///
 /// ```
 /// use swm_plan::objective::ObjectiveConfig;
@@ -26,7 +26,7 @@ use swm_core::{CostModel, Result};
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ObjectiveConfig {
-    /// The terms, which are added up.
+    /// The terms; their costs are added.
     pub terms: Vec<Term>,
     /// The constraints.
     pub constraints: Vec<Limit>,
@@ -38,7 +38,7 @@ pub struct ObjectiveConfig {
 pub enum Term {
     /// The squared distance to the goal.
     Goal(Goal),
-    /// The squared size of the actions.
+    /// The squared norm of the actions.
     Control(Control),
     /// The squared differences of neighbouring actions.
     Change(Change),
@@ -100,8 +100,8 @@ impl ObjectiveConfig {
     /// Applies the terms and constraints to a model.
     ///
     /// # Errors
-    /// When a term or constraint uses latents and the model has none, a constraint uses latents without a goal term, or the
-    /// model has constraints of its own.
+    /// When a term or constraint uses latents and the model has none, a constraint uses latents without a goal term, or
+    /// the model has constraints of its own.
     pub fn apply(&self, model: Box<dyn CostModel>) -> Result<Box<dyn CostModel>> {
         if self.is_empty() {
             return Ok(model);

@@ -12,7 +12,7 @@ use swm_core::{Error, Result};
 pub struct ActionNorm {
     /// The largest norm of an action.
     pub limit: f32,
-    /// Environment actions in a model step; each has its own norm.
+    /// Environment actions in a model step; the limit holds for each of them.
     #[serde(default = "one")]
     pub block: usize,
 }
@@ -115,8 +115,8 @@ impl Constraint for LatentBox {
     }
 }
 
-/// A constraint made of two functions: `values` writes `count` values, and `gradient` adds the gradient of their weighted
-/// sum.
+/// A constraint made of two functions: `values` writes `count` values, and `gradient` adds the gradient of their
+/// weighted sum.
 pub struct CustomConstraint<V, G> {
     /// The number of values, independent of the horizon.
     pub count: usize,

@@ -2,7 +2,7 @@
 
 use swm_core::{Error, Result};
 
-/// One candidate and the latents it leads to.
+/// One candidate and its predicted latents.
 #[derive(Clone, Copy, Debug)]
 pub struct Trajectory<'a> {
     /// The latents, the present first, `[horizon + 1, latent]`; empty where the model has none.
@@ -11,14 +11,15 @@ pub struct Trajectory<'a> {
     pub goal: &'a [f32],
     /// The actions, `[horizon, dim]`.
     pub actions: &'a [f32],
-    /// The dimension of one model step.
+    /// The action dimension of one model step.
     pub dim: usize,
 }
 
 /// The gradient of a cost with respect to a trajectory, to which terms add.
 #[derive(Debug)]
 pub struct Slope<'a> {
-    /// With respect to the latents, `[horizon + 1, latent]`; that of the present is discarded.
+    /// With respect to the latents, `[horizon + 1, latent]`; the gradient with respect to the present latent is
+    /// discarded.
     pub latents: &'a mut [f32],
     /// With respect to the actions, `[horizon, dim]`.
     pub actions: &'a mut [f32],
@@ -31,19 +32,19 @@ pub struct Shape {
     pub horizon: usize,
     /// The dimension of a latent; 0 where the model has none.
     pub latent: usize,
-    /// The dimension of one model step.
+    /// The action dimension of one model step.
     pub dim: usize,
 }
 
 /// A differentiable cost of trajectories.
 pub trait Objective: Send + Sync {
-    /// Whether it uses latents.
+    /// Whether the cost or the constraint uses latents.
     fn needs_latents(&self) -> bool;
 
     /// Checks the settings for trajectories of this shape.
     ///
     /// # Errors
-    /// When they contradict each other or the shape.
+    /// When the settings contradict each other or the shape.
     fn check(&self, shape: Shape) -> Result<()>;
 
     /// The cost.
@@ -55,13 +56,13 @@ pub trait Objective: Send + Sync {
 
 /// Differentiable inequalities; each is satisfied when its value is at most 0.
 pub trait Constraint: Send + Sync {
-    /// Whether it uses latents.
+    /// Whether the cost or the constraint uses latents.
     fn needs_latents(&self) -> bool;
 
     /// Checks the settings for trajectories of this shape.
     ///
     /// # Errors
-    /// When they contradict each other or the shape.
+    /// When the settings contradict each other or the shape.
     fn check(&self, shape: Shape) -> Result<()>;
 
     /// The number of values for `horizon` model steps and a latent dimension.
@@ -92,7 +93,7 @@ impl<O: Objective + ?Sized> Objective for Box<O> {
     }
 }
 
-/// A list of objectives is their sum.
+/// The cost of a list of objectives is the sum of their costs.
 impl<O: Objective> Objective for Vec<O> {
     fn needs_latents(&self) -> bool {
         self.iter().any(Objective::needs_latents)

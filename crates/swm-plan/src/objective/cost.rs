@@ -7,18 +7,18 @@ use super::trajectories::{Trajectories, check_all, check_len};
 use crate::search::UNWRITTEN;
 use swm_core::{Batch, Candidates, Constrained, CostModel, DifferentiableCost, Env, Error, LatentDynamics, Result};
 
-/// A model whose cost is an objective on a rollout of its [`LatentDynamics`] from the present latent, with constraints. The
-/// gradient is that of back-propagation through time.
+/// A model whose cost is an objective on a rollout of its [`LatentDynamics`] from the present latent, with constraints.
+/// The gradient is computed by back-propagation through time.
 ///
-/// Only [`LatentDynamics`] is used. Of a model that conditions on several past states, such as a LeWM, this is the one-step
-/// model, so a terminal goal term is close to that model's own cost but not equal to it.
+/// Only [`LatentDynamics`] is used. For a model that conditions on several past states, such as a LeWM, the latent
+/// dynamics are a one-step model, so a terminal goal term is close to that model's own cost but not equal to it.
 pub struct ObjectiveCost {
     model: Box<dyn CostModel>,
     objective: Box<dyn Objective>,
     constraints: Vec<Box<dyn Constraint>>,
     /// The present latents of the observed environments, `[envs, latent]`.
     start: Vec<f32>,
-    /// The latents of their goals, `[envs, latent]`.
+    /// The goal latents of the observed environments, `[envs, latent]`.
     goals: Vec<f32>,
     latent: usize,
     rollout: Rollout,
@@ -70,7 +70,7 @@ impl ObjectiveCost {
         slopes
     }
 
-    /// Adds the gradient with respect to the actions, given that with respect to the latents.
+    /// Adds the gradient with respect to the actions, computed from the gradient with respect to the latents.
     fn back_propagate(&mut self, candidates: Candidates<'_>, slopes: Vec<f32>, gradient: &mut [f32]) -> Result<()> {
         self.slopes = slopes;
         self.rollout.back(dynamics(&mut *self.model)?, self.latent, candidates, &mut self.slopes, gradient)

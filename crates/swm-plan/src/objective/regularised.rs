@@ -4,8 +4,8 @@ use super::contracts::{Constraint, Objective, Shape};
 use super::trajectories::{Trajectories, check_all, check_len};
 use swm_core::{Batch, Candidates, Constrained, CostModel, DifferentiableCost, Env, Error, LatentDynamics, Result};
 
-/// A model with terms on actions added to its cost, and with constraints on actions. It is differentiable if the model is,
-/// and gives access to the model's latents.
+/// A model with terms on actions added to its cost, and with constraints on actions. It is differentiable if the model
+/// is, and gives access to the model's latents.
 pub struct Regularised {
     model: Box<dyn CostModel>,
     objective: Box<dyn Objective>,
@@ -16,7 +16,7 @@ impl Regularised {
     /// Adds an objective and constraints to a model.
     ///
     /// # Errors
-    /// When one of them uses latents, or the model has constraints of its own.
+    /// When the objective or a constraint uses latents, or the model has constraints of its own.
     pub fn new(
         mut model: Box<dyn CostModel>,
         objective: Box<dyn Objective>,
@@ -40,7 +40,7 @@ impl Regularised {
     }
 }
 
-/// Rejects models that already have constraints: a candidate has one list of them.
+/// Rejects models that already have constraints: constraints of a model and of an objective are not combined.
 pub(super) fn reject_constraints(model: &mut dyn CostModel) -> Result<()> {
     if model.constrained().is_none() {
         return Ok(());

@@ -1,4 +1,4 @@
-//! [`Rollout`]: the latents that candidates lead to, and back-propagation through them.
+//! [`Rollout`]: the predicted latents of candidates, and back-propagation through the predictions.
 
 use crate::search::UNWRITTEN;
 use swm_core::{Candidates, LatentDynamics, Result};
@@ -12,11 +12,11 @@ pub(super) struct Rollout {
     shape: [usize; 4],
     /// The present and the predicted latents, `[envs, samples, horizon + 1, latent]`.
     pub latents: Vec<f32>,
-    /// One step of all candidates: the latents before it.
+    /// The latents of all candidates before the current step.
     before: Vec<f32>,
-    /// The actions of the step.
+    /// The actions of all candidates in the current step.
     action: Vec<f32>,
-    /// The latents after the step.
+    /// The latents of all candidates after the current step.
     after: Vec<f32>,
     /// The gradient with respect to `before`.
     before_gradient: Vec<f32>,
@@ -30,7 +30,8 @@ impl Rollout {
         self.shape = [0; 4];
     }
 
-    /// Predicts all candidates, step by step, unless they are the cached ones.
+    /// Predicts the latents of all candidates, step by step, unless the cached latents are those of the same
+    /// candidates.
     ///
     /// # Shapes
     /// `start` is `[envs, latent]`.
@@ -72,7 +73,7 @@ impl Rollout {
     /// Propagates gradients from the latents back to the actions, from the last step to the first.
     ///
     /// # Shapes
-    /// `slopes` has the shape of the latents, `gradient` that of the actions.
+    /// `slopes` has the shape of the latents, `gradient` has the shape of the actions.
     pub fn back(
         &mut self,
         model: &mut dyn LatentDynamics,
@@ -85,7 +86,7 @@ impl Rollout {
         let (all, len) = ((horizon + 1) * latent, horizon * dim);
         for t in (0..horizon).rev() {
             gather(slopes, all, (t + 1) * latent, latent, &mut self.after);
-            // No cost depends on these latents, as when only actions have costs or constraints.
+            // No cost depends on these latents, for example because only actions have costs or constraints.
             if self.after.iter().all(|&slope| slope == 0.0) {
                 continue;
             }
@@ -109,13 +110,13 @@ impl Rollout {
     }
 }
 
-/// Copies the `width` values from `at` on of every row.
+/// Copies `width` values of every row, from index `at` on.
 fn gather(rows: &[f32], row: usize, at: usize, width: usize, to: &mut Vec<f32>) {
     to.clear();
     rows.chunks_exact(row).for_each(|values| to.extend_from_slice(&values[at..at + width]));
 }
 
-/// Adds to the `width` values from `at` on of every row.
+/// Adds `what` to `width` values of every row, from index `at` on.
 fn add(rows: &mut [f32], row: usize, at: usize, width: usize, what: &[f32]) {
     for (values, what) in rows.chunks_exact_mut(row).zip(what.chunks_exact(width)) {
         values[at..at + width].iter_mut().zip(what).for_each(|(value, what)| *value += what);

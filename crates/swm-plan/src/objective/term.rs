@@ -16,8 +16,8 @@ pub enum When {
     Running,
 }
 
-/// The squared distance of latents to the goal's latent: `w Σ_t γ^(t-1) Σ_i (z_t,i - g_i)²`, over the last latent or over all
-/// predicted ones. The defaults give the cost of the reference's models.
+/// The squared distance of latents to the goal's latent: `w Σ_t γ^(t-1) Σ_i (z_t,i - g_i)²`, over the last latent or
+/// over all predicted ones. The defaults give the cost of the reference's models.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Goal {
@@ -90,7 +90,7 @@ impl Objective for Goal {
     }
 }
 
-/// The squared size of the actions: `w Σ_t ‖a_t‖²`.
+/// The squared norm of the actions: `w Σ_t ‖a_t‖²`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Control {
@@ -128,7 +128,7 @@ impl Objective for Control {
 pub struct Change {
     /// The weight, w.
     pub weight: f32,
-    /// Environment actions in a model step; each is compared with the one before.
+    /// Environment actions in a model step; each action is compared with the preceding one.
     pub block: usize,
 }
 

@@ -3,7 +3,7 @@
 use super::contracts::{Constraint, Objective, Shape, Slope, Trajectory};
 use swm_core::{Candidates, Error, Result};
 
-/// Candidates and the latents they lead to.
+/// Candidates and their predicted latents.
 ///
 /// # Shapes
 /// `latents` is `[envs, samples, horizon + 1, latent]`, `goals` is `[envs, latent]`.
@@ -17,7 +17,7 @@ pub(super) struct Trajectories<'a> {
 }
 
 impl<'a> Trajectories<'a> {
-    /// The sizes of the latents and of the actions of one candidate.
+    /// The number of latent values and of action values of one candidate.
     fn sizes(&self) -> (usize, usize) {
         let Candidates { horizon, dim, .. } = self.candidates;
         ((horizon + 1) * self.latent, horizon * dim)
@@ -39,8 +39,8 @@ impl<'a> Trajectories<'a> {
         self.iter().zip(costs).for_each(|(trajectory, cost)| *cost += objective.cost(trajectory));
     }
 
-    /// Adds the gradients of the costs to `latents`, `[envs, samples, horizon + 1, latent]`, and `actions`, `[envs, samples,
-    /// horizon, dim]`.
+    /// Adds the gradients of the costs to `latents`, `[envs, samples, horizon + 1, latent]`, and `actions`,
+    /// `[envs, samples, horizon, dim]`.
     pub fn add_gradients(self, objective: &dyn Objective, latents: &mut [f32], actions: &mut [f32]) {
         let (all, len) = self.sizes();
         for (i, trajectory) in self.iter().enumerate() {

@@ -17,7 +17,7 @@ pub struct Step<'a> {
     pub action_noise: f32,
 }
 
-/// Moves actions to the nearest allowed ones.
+/// Moves actions to the nearest allowed actions.
 type Projection<'p> = Box<dyn Fn(&mut [f32]) + 'p>;
 
 /// Candidates that descend the gradient of their cost.
@@ -26,9 +26,9 @@ pub struct Descent<'p> {
     pub population: Population,
     /// The gradient of each candidate's cost, `[envs, samples, horizon, dim]`.
     pub gradient: Vec<f32>,
-    /// The search of every environment, `[envs]`.
+    /// The trace of the search of every environment, `[envs]`.
     pub trace: Vec<PlanTrace>,
-    /// Steps done so far.
+    /// The number of steps done so far.
     pub steps: usize,
     solver: &'static str,
     memory: Memory,
@@ -37,8 +37,9 @@ pub struct Descent<'p> {
 }
 
 impl<'p> Descent<'p> {
-    /// Starts at `samples` candidates for each environment: the initial guess, and others around it with the standard
-    /// deviation `sigma`. `project` moves actions to the nearest allowed ones, here and after every step.
+    /// Creates `samples` candidates for each environment: the initial guess, and random candidates around the guess
+    /// with the standard deviation `sigma`. `project` moves actions to the nearest allowed actions, now and after every
+    /// step.
     pub fn new(
         solver: &'static str,
         problem: &PlanProblem<'p>,
@@ -62,10 +63,10 @@ impl<'p> Descent<'p> {
 
     /// Takes up to `steps` steps; returns whether time is left before the deadline.
     ///
-    /// `prepare` runs once costs and gradients are known: it records the trace and adjusts the gradient.
+    /// `prepare` runs after costs and gradients are computed; it records the trace and adjusts the gradient.
     ///
     /// # Errors
-    /// When the model fails, a cost or a gradient is missing or not finite, and what `prepare` returns.
+    /// When the model fails, a cost or a gradient is missing or not finite, or `prepare` fails.
     pub fn run(
         &mut self,
         cost: &mut dyn CostModel,
@@ -97,7 +98,7 @@ impl<'p> Descent<'p> {
     /// Checks that the gradient is finite.
     ///
     /// # Errors
-    /// When it is not; the message names the step and the candidate.
+    /// When a value of the gradient is not finite; the message names the step and the candidate.
     pub fn check_gradient(&self) -> Result<()> {
         let Some(i) = self.gradient.iter().position(|g| !g.is_finite()) else {
             return Ok(());
@@ -138,7 +139,7 @@ impl<'p> Descent<'p> {
         best
     }
 
-    /// Evaluates the candidates where they are now and returns the cheapest as plans.
+    /// Evaluates the current candidates and returns the cheapest of every environment as its plan.
     ///
     /// # Errors
     /// When the model fails, or a cost is missing or not finite.

@@ -8,7 +8,7 @@ use swm_core::PlanTrace;
 /// The cheapest candidates of one environment, cheapest first.
 #[derive(Clone, Copy)]
 pub struct Elites<'a> {
-    /// Values of one candidate.
+    /// The number of values of one candidate.
     len: usize,
     /// All candidates, `[samples, horizon, dim]`.
     actions: &'a [f32],
@@ -18,7 +18,8 @@ pub struct Elites<'a> {
     chosen: &'a [usize],
 }
 
-/// Values of a plan that [`Elites::sum`] adds up together: one running sum alone would wait for every addition.
+/// The number of plan values that [`Elites::sum`] accumulates at once. With one accumulator, every addition would have
+/// to wait for the result of the previous one.
 const LANES: usize = 8;
 
 impl<'a> Elites<'a> {
@@ -53,8 +54,8 @@ impl<'a> Elites<'a> {
         &self.actions[self.chosen[0] * self.len..][..self.len]
     }
 
-    /// Moves a diagonal Gaussian to the mean and the unbiased standard deviation of the elites. The old moments keep the
-    /// weight `momentum`.
+    /// Moves a diagonal Gaussian to the mean and the unbiased standard deviation of the elites. The old moments keep
+    /// the weight `momentum`.
     ///
     /// # Shapes
     /// `mean` and `std` are `[horizon, dim]`.
@@ -81,8 +82,8 @@ impl<'a> Elites<'a> {
         }
     }
 
-    /// Sums `term(elite, lane, action)` over the elites, for every value of one block of a plan. The order is always from
-    /// the cheapest elite to the most expensive, so that the rounding is the same everywhere.
+    /// Sums `term(elite, lane, action)` over the elites, for every value of one block of a plan. The order is always
+    /// from the cheapest elite to the most expensive, so that the rounding is the same everywhere.
     fn sum(self, block: usize, term: impl Fn(usize, usize, f64) -> f64) -> [f64; LANES] {
         let mut sums = [0.0; LANES];
         for (elite, actions) in self.actions().enumerate() {
@@ -93,7 +94,7 @@ impl<'a> Elites<'a> {
         sums
     }
 
-    /// Appends an iteration to the trace; `spread` is that of the distribution after the iteration.
+    /// Appends an iteration to the trace; `spread` is the spread of the distribution after the iteration.
     pub fn record(self, trace: &mut PlanTrace, spread: f32) {
         let sum: f64 = (0..self.count()).map(|elite| f64::from(self.cost(elite))).sum();
         trace.best.push(self.cost(0));

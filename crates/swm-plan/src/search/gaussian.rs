@@ -13,7 +13,7 @@ pub struct Gaussian {
     pub mean: Vec<f32>,
     /// The standard deviation, `[horizon, dim]`.
     pub std: Vec<f32>,
-    /// The search so far, one entry for each iteration.
+    /// The trace of the search, one entry for each iteration.
     pub trace: PlanTrace,
     /// Scratch memory for the selection of elites.
     pub order: Vec<usize>,
@@ -32,11 +32,11 @@ impl Gaussian {
         (0..problem.keys.len()).map(initial).collect()
     }
 
-    /// Draws the population of an iteration: `clip(mean + std ξ)` with standard normal ξ, coloured where a colour is given.
-    /// The first candidate of every environment is the mean.
+    /// Draws the population of an iteration: `clip(mean + std ξ)` with standard normal ξ, coloured where a colour is
+    /// given. The first candidate of every environment is the mean.
     ///
-    /// The noise of an environment and an iteration is one keyed sequence, in which every candidate has a fixed position:
-    /// it does not depend on threads or on other environments.
+    /// The noise of an environment and an iteration is one keyed sequence, in which every candidate has a fixed
+    /// position: it does not depend on threads or on other environments.
     pub fn draw(
         distributions: &[Self],
         iteration: usize,
@@ -48,7 +48,7 @@ impl Gaussian {
         let Population { actions, keys, .. } = population;
         actions.par_chunks_exact_mut(all).zip(distributions).enumerate().for_each(|(env, (candidates, gaussian))| {
             let key = keys[env].at(iteration as u64);
-            // `RUN` candidates make a whole number of runs, so every task begins at a run.
+            // The noise of `RUN` candidates is a whole number of runs, so the noise of every task begins at a run.
             let tasks = candidates.par_chunks_mut(RUN * len).enumerate();
             tasks.for_each_init(Vec::new, |scratch, (task, candidates)| {
                 normal_noise::fill(key, task * len, candidates);

@@ -1,6 +1,6 @@
 //! Recorded iterations of the reference's sampling solvers, for tests of single updates.
 //!
-//! `tests/golden/export_updates.py` wrote them to `tests/golden/updates.json`.
+//! The recordings are in `tests/golden/updates.json`; `tests/golden/export_updates.py` writes this file.
 
 use super::{Bounds, Elites, Gaussian};
 use serde::Deserialize;
@@ -11,7 +11,7 @@ pub const HORIZON: usize = 4;
 pub const DIM: usize = 2;
 pub const ELITES: usize = 5;
 
-/// One iteration of the reference, of 16 samples.
+/// One iteration of a reference solver with 16 samples.
 #[derive(Default, Deserialize)]
 #[serde(default)]
 pub struct Update {
@@ -34,8 +34,8 @@ impl Update {
 /// The recorded iterations of a solver.
 pub fn updates(solver: &str) -> Vec<Update> {
     let text = include_str!("../../tests/golden/updates.json");
-    let mut all: BTreeMap<String, Vec<Update>> = serde_json::from_str(text).expect("updates");
-    all.remove(solver).expect("a solver")
+    let mut all: BTreeMap<String, Vec<Update>> = serde_json::from_str(text).expect("updates.json is valid");
+    all.remove(solver).expect("updates.json has an entry for this solver")
 }
 
 /// The initial distribution of the reference's Gaussian solvers.
@@ -44,7 +44,7 @@ pub fn initial() -> Gaussian {
     Gaussian { mean, std, trace: PlanTrace::default(), order: vec![] }
 }
 
-/// The candidates that our solvers compute from the recorded noise.
+/// Returns the candidates that the solvers of this crate compute from the recorded noise.
 pub fn candidates(update: &Update, gaussian: &Gaussian, bound: f32) -> Vec<f32> {
     let mut candidates = update.noise.clone();
     for candidate in candidates.chunks_exact_mut(HORIZON * DIM) {
@@ -55,7 +55,7 @@ pub fn candidates(update: &Update, gaussian: &Gaussian, bound: f32) -> Vec<f32> 
     candidates
 }
 
-/// Asserts that values equal those of the reference up to 1e-5.
+/// Asserts that the values equal the values of the reference up to 1e-5.
 pub fn assert_near(ours: &[f32], theirs: &[f32]) {
     assert_eq!(ours.len(), theirs.len());
     for (ours, theirs) in ours.iter().zip(theirs) {

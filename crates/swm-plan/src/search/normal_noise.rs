@@ -1,10 +1,10 @@
 //! Standard normal noise for the sampling solvers, identical on every platform.
 //!
-//! The Box–Muller transform turns two uniform values into two independent normal values, `√(-2 ln u) (cos 2πv, sin 2πv)`. The
-//! uniform values are the words of a key's ChaCha stream, in order, so any part of the noise can be generated without the
-//! rest. `ln`, `cos` and `sin` are polynomials (minimax fits, relative error below 3e-7) because the system's functions differ
-//! between platforms, while additions, multiplications and square roots are defined to the last bit. The polynomials are also
-//! vectorised.
+//! The Box–Muller transform turns two uniform values into two independent normal values,
+//! `√(-2 ln u) (cos 2πv, sin 2πv)`. The uniform values are the words of a key's ChaCha stream, in order, so any part of
+//! the noise can be generated without the rest. `ln`, `cos` and `sin` are polynomials (minimax fits, relative error
+//! below 3e-7) because the system's functions differ between platforms, while additions, multiplications and square
+//! roots are defined to the last bit. The polynomials are also vectorised.
 
 use rand::RngCore as _;
 use swm_core::{Key, Rng};
@@ -31,8 +31,8 @@ fn fill_runs(rng: &mut Rng, runs: &mut [[f32; RUN]]) {
     dispatch(Transform(runs));
 }
 
-/// [`transform`], compiled for the vector instructions of the CPU. The compiler neither contracts nor reorders its arithmetic,
-/// so the values are the same at every level.
+/// [`transform`], compiled for the vector instructions of the CPU. The compiler neither contracts nor reorders its
+/// arithmetic, so the values are the same at every level.
 struct Transform<'a>(&'a mut [[f32; RUN]]);
 
 impl Kernel for Transform<'_> {
@@ -55,13 +55,15 @@ fn transform(runs: &mut [[f32; RUN]]) {
     }
 }
 
-/// Two normal values from two random words: the first determines their distance from the origin, the second the direction.
+/// Two normal values from two random words: the first determines their distance from the origin, the second the
+/// direction.
 #[inline(always)]
 fn normal_pair(distance: u32, direction: u32) -> (f32, f32) {
-    // Uniform between 2⁻³² and 1; 31 bits, because processors convert signed integers only.
+    // Uniform between 2⁻³² and 1. Only 31 bits are used, because many vector units convert signed integers only.
     let u = ((distance >> 1) as i32 as f32 + 0.5) * 2f32.powi(-31);
     let r = (-2.0 * ln(u)).sqrt();
-    // Two bits select the quadrant; the others are the angle from its middle, in quarter turns between -1/2 and 1/2.
+    // Two bits select the quadrant. The other 30 bits are the angle from the middle of the quadrant, in quarter turns
+    // between -1/2 and 1/2.
     let angle = ((direction << 2) as i32 as f32) * 2f32.powi(-32);
     let square = angle * angle;
     let (cos, sin) = (r * cos(square), r * angle * sin_over_angle(square));
@@ -135,7 +137,7 @@ mod tests {
         let noise = noise(1 << 20);
         let n = noise.len() as f64;
         let mean = |f: &dyn Fn(f64) -> f64| noise.iter().map(|&v| f(f64::from(v))).sum::<f64>() / n;
-        // Each within five standard errors.
+        // Every statistic is within five standard errors of its expected value.
         for (moment, expected, variance) in [(1, 0.0, 1.0), (2, 1.0, 2.0), (3, 0.0, 15.0), (4, 3.0, 96.0)] {
             let error = mean(&|v| v.powi(moment)) - expected;
             assert!(error.abs() < 5.0 * (variance / n).sqrt(), "moment {moment}: off by {error}");

@@ -1,8 +1,9 @@
 //! [`Optimizer`]: turns gradients into steps, on plain arrays.
 //!
-//! Gradient descent with momentum, Adam (Kingma and Ba, *Adam: A Method for Stochastic Optimization*, 2015) and `RMSProp`
-//! (Tieleman and Hinton, 2012), with the formulas and the defaults of `torch.optim`, which the reference implementation uses.
-//! Every value moves by its own gradient and memory alone, so a step does not depend on the other values in the array.
+//! Gradient descent with momentum, Adam (Kingma and Ba, *Adam: A Method for Stochastic Optimization*, 2015) and
+//! `RMSProp` (Tieleman and Hinton, 2012), with the formulas and the defaults of `torch.optim`, which the reference
+//! implementation uses. Every value is updated from its own gradient and memory only, so a step does not depend on
+//! other values in the array.
 
 use super::settings::Settings;
 use serde::{Deserialize, Serialize};
@@ -90,7 +91,7 @@ impl Memory {
         Self { steps: 0, first: vec![0.0; len], second: vec![0.0; len] }
     }
 
-    /// Returns to the state before the first step.
+    /// Resets the memory to the state before the first step.
     pub fn clear(&mut self) {
         self.steps = 0;
         self.first.fill(0.0);
@@ -171,12 +172,12 @@ mod tests {
     #[test]
     fn errors_name_the_setting() {
         let read = |json: &str| serde_json::from_str::<Optimizer>(json);
-        let adam = read(r#"{"kind": "adam", "step": 0.2}"#).expect("an optimizer");
+        let adam = read(r#"{"kind": "adam", "step": 0.2}"#).expect("a valid optimizer");
         assert_eq!(adam, Optimizer::Adam(Adam { step: 0.2, ..Adam::default() }));
-        assert_eq!(read(r#"{"kind": "rmsprop"}"#).expect("an optimizer"), Optimizer::RmsProp(RmsProp::default()));
+        assert_eq!(read(r#"{"kind": "rmsprop"}"#).expect("a valid optimizer"), Optimizer::RmsProp(RmsProp::default()));
         let unknown = read(r#"{"kind": "adam", "momentum": 0.9}"#).expect_err("Adam has no momentum").to_string();
         assert!(unknown.contains("momentum"), "{unknown}");
-        let message = |optimizer: Optimizer| optimizer.check("gd").expect_err("wrong").to_string();
+        let message = |optimizer: Optimizer| optimizer.check("gd").expect_err("invalid settings").to_string();
         let sgd = message(Optimizer::Sgd(Sgd { momentum: 1.0, ..Sgd::default() }));
         assert_eq!(sgd, "gd optimizer, momentum: 1; choose a number of at least 0 and below 1");
         assert!(message(Optimizer::RmsProp(RmsProp { step: 0.0, ..RmsProp::default() })).contains("step: 0"));

@@ -12,7 +12,7 @@ use swm_core::{Candidates, CostModel, Key, Plan, PlanProblem, PlanTrace, Result}
 pub struct Population {
     /// The candidates, `[envs, samples, horizon, dim]`.
     pub actions: Vec<f32>,
-    /// The cost of each, `[envs, samples]`.
+    /// The cost of every candidate, `[envs, samples]`.
     pub costs: Vec<f32>,
     /// A key for each environment, from which all draws of the solver derive.
     pub(super) keys: Vec<Key>,
@@ -22,16 +22,16 @@ pub struct Population {
 }
 
 impl Population {
-    /// A population of zeros with `samples` candidates for each environment. `solver` separates the draws from those of
-    /// other solvers.
+    /// Creates a population of zeros with `samples` candidates for each environment. Draws are keyed by `solver`, so
+    /// they differ from the draws of other solvers.
     pub fn new(solver: &str, problem: &PlanProblem<'_>, samples: usize) -> Self {
         let keys: Vec<Key> = problem.keys.iter().map(|key| key.with(solver)).collect();
         let (horizon, dim, count) = (problem.horizon, problem.space.dim(), keys.len() * samples);
         Self { keys, samples, horizon, dim, actions: vec![0.0; count * horizon * dim], costs: vec![0.0; count] }
     }
 
-    /// As [`Population::new`], with candidates around the initial guess: the first is the guess itself, the others are
-    /// drawn with the standard deviation `sigma`, each from its own key.
+    /// Creates a population around the initial guess: the first candidate is the guess, and every other candidate is
+    /// drawn around the guess with the standard deviation `sigma` and its own key.
     pub fn around(solver: &str, problem: &PlanProblem<'_>, samples: usize, sigma: f32) -> Self {
         let mut population = Self::new(solver, problem, samples);
         let (len, keys) = (population.len(), &population.keys);
@@ -47,18 +47,18 @@ impl Population {
         population
     }
 
-    /// The size of one candidate, `horizon * dim`.
+    /// The number of values of one candidate, `horizon * dim`.
     #[allow(clippy::len_without_is_empty, reason = "the length of a candidate, which is never empty")]
     pub fn len(&self) -> usize {
         self.horizon * self.dim
     }
 
-    /// Candidates of each environment.
+    /// The number of candidates of each environment.
     pub fn samples(&self) -> usize {
         self.samples
     }
 
-    /// Values of one model step.
+    /// The number of values of one model step.
     pub fn dim(&self) -> usize {
         self.dim
     }
@@ -84,8 +84,8 @@ impl Population {
         evaluate(cost, candidates, iteration, costs)
     }
 
-    /// Calls `write(env, sample, key, candidate)` for every candidate, in parallel. `key` is that of the environment
-    /// and the iteration.
+    /// Calls `write(env, sample, key, candidate)` for every candidate, in parallel. `key` is derived from the
+    /// environment's key and the iteration.
     pub fn write(&mut self, iteration: usize, write: impl Fn(usize, usize, Key, &mut [f32]) + Sync) {
         let (len, all) = (self.len(), self.samples * self.len());
         let keys = &self.keys;
@@ -96,7 +96,7 @@ impl Population {
         });
     }
 
-    /// Replaces the second and following candidates of every environment by given ones, `[n, horizon, dim]` for each
+    /// Replaces the candidates after the first one of every environment by `candidates`, `[n, horizon, dim]` for each
     /// environment.
     pub fn replace(&mut self, candidates: &[Vec<f32>]) {
         let (len, all) = (self.len(), self.samples * self.len());
@@ -122,7 +122,7 @@ impl Population {
         Elites::select(&self.actions[env * n * len..][..n * len], &self.costs[env * n..][..n], k, order)
     }
 
-    /// The index of the cheapest candidate of every environment; the first of equals.
+    /// The index of the cheapest candidate of every environment; the first of several with the same cost.
     pub fn cheapest(&self) -> Vec<usize> {
         let lowest = |costs: &[f32]| (1..costs.len()).fold(0, |best, i| if costs[i] < costs[best] { i } else { best });
         self.costs.chunks_exact(self.samples).map(lowest).collect()
@@ -150,10 +150,11 @@ impl Population {
 
 /// Calls `iteration` for 0, 1, … until all iterations are done or the deadline has passed, but at least once.
 ///
-/// The thread pool is entered here, once for each plan: entering it from outside costs as much as drawing a population.
+/// The function enters the thread pool once for each plan, because every entry from outside the pool takes as long as
+/// drawing a population.
 ///
 /// # Errors
-/// Those of an iteration.
+/// When an iteration fails.
 pub fn iterate(
     iterations: usize,
     problem: &PlanProblem<'_>,
@@ -184,7 +185,7 @@ pub fn average(values: &[f32]) -> f32 {
     (values.iter().map(|&value| f64::from(value)).sum::<f64>() / values.len() as f64) as f32
 }
 
-/// The standard deviation over candidates `[samples, len]`, averaged over their values.
+/// The standard deviation over candidates `[samples, len]`, averaged over the values of a candidate.
 fn spread(candidates: &[f32], len: usize) -> f32 {
     let samples = (candidates.len() / len) as f64;
     let deviation = |j: usize| {

@@ -1,4 +1,4 @@
-//! Checks of a planning problem and of a model's answers, shared by all solvers.
+//! Checks of a planning problem and of the values that a model returns, shared by all solvers.
 //!
 //! A solver starts with [`continuous`] or [`discrete`], which reject a problem it cannot solve, and gets its costs from
 //! [`evaluate`], which rejects costs that are missing or not finite.
@@ -21,7 +21,7 @@ impl Bounds<'_> {
     pub fn clip(&self, actions: &mut [f32]) {
         for step in actions.chunks_exact_mut(self.low.len()) {
             for ((action, &low), &high) in step.iter_mut().zip(self.low).zip(self.high) {
-                // Not `clamp`, whose check of the bounds would cost more than the rest.
+                // `clamp` would be slower: it checks its bounds in every call.
                 let above = if *action < low { low } else { *action };
                 *action = if above > high { high } else { above };
             }
@@ -32,8 +32,8 @@ impl Bounds<'_> {
 /// Checks a problem with continuous actions; returns its bounds.
 ///
 /// # Errors
-/// When the solver cannot solve such a problem with such a model, the horizon is 0, or the bounds or the initial guess are
-/// invalid.
+/// When the solver cannot solve such a problem with such a model, the horizon is 0, or the bounds or the initial guess
+/// are invalid.
 pub fn continuous<'a>(solver: &SolverEntry, cost: &mut dyn CostModel, problem: &PlanProblem<'a>) -> Result<Bounds<'a>> {
     check_fit(solver, cost, problem)?;
     let PlanSpace::Continuous { low, high } = problem.space else {
@@ -62,8 +62,8 @@ pub fn continuous<'a>(solver: &SolverEntry, cost: &mut dyn CostModel, problem: &
 /// preference.
 ///
 /// # Errors
-/// When the solver cannot solve such a problem with such a model, the horizon is 0, or the choices or the initial guess are
-/// invalid.
+/// When the solver cannot solve such a problem with such a model, the horizon is 0, or the choices or the initial guess
+/// are invalid.
 pub fn discrete<'a>(solver: &SolverEntry, cost: &mut dyn CostModel, problem: &PlanProblem<'a>) -> Result<&'a [usize]> {
     check_fit(solver, cost, problem)?;
     let PlanSpace::Discrete { choices } = problem.space else {
@@ -88,7 +88,7 @@ pub fn discrete<'a>(solver: &SolverEntry, cost: &mut dyn CostModel, problem: &Pl
     Ok(choices)
 }
 
-/// The gradient of a model's cost.
+/// Returns a model's cost with its gradient.
 ///
 /// # Errors
 /// When the model has none.
@@ -96,7 +96,7 @@ pub fn differentiable<'m>(solver: &str, cost: &'m mut dyn CostModel) -> Result<&
     cost.differentiable().ok_or_else(|| misfit(solver, &Need::Gradient.obstacle(), OTHER_SOLVER))
 }
 
-/// The latent dynamics of a model.
+/// Returns the latent dynamics of a model.
 ///
 /// # Errors
 /// When the model has none.
@@ -104,7 +104,7 @@ pub fn latent<'m>(solver: &str, cost: &'m mut dyn CostModel) -> Result<&'m mut d
     cost.latent().ok_or_else(|| misfit(solver, &Need::Latent.obstacle(), OTHER_SOLVER))
 }
 
-/// The constraints of a model.
+/// Returns the constraints of a model.
 ///
 /// # Errors
 /// When the model has none.
@@ -112,7 +112,7 @@ pub fn constrained<'m>(solver: &str, cost: &'m mut dyn CostModel) -> Result<&'m 
     cost.constrained().ok_or_else(|| misfit(solver, &Need::Constraints.obstacle(), OTHER_SOLVER))
 }
 
-/// The capabilities of a model beyond a cost.
+/// Returns the capabilities of a model beyond a cost.
 pub fn offers(cost: &mut dyn CostModel) -> Vec<Need> {
     let offered = [
         (Need::Gradient, cost.differentiable().is_some()),
@@ -127,7 +127,7 @@ pub fn misfit(solver: &str, obstacle: &str, fix: &str) -> Error {
     Error::config(format!("solver {solver}"), obstacle, fix)
 }
 
-/// The fix where the solvers that fit are not at hand; [`pairing`](crate::pairing) names them.
+/// The suggestion of errors that do not list suitable solvers; [`pairing`](crate::pairing) lists them.
 const OTHER_SOLVER: &str = "choose another solver; `swm solvers` lists what each one needs";
 
 /// Checks that a solver can plan the actions of a problem with a model.
@@ -151,7 +151,7 @@ pub fn evaluate(
     iteration: usize,
     costs: &mut [f32],
 ) -> Result<()> {
-    // A cost that the model does not write must not be mistaken for that of the last iteration.
+    // A cost that the model does not write must not be mistaken for the cost of the previous iteration.
     costs.fill(UNWRITTEN);
     cost.cost(candidates, costs)?;
     check_costs(costs, candidates.samples, iteration)
@@ -166,7 +166,7 @@ pub const UNWRITTEN: f32 = f32::from_bits(0x7fc5_eeee);
 /// `costs` is `[envs, samples]`.
 ///
 /// # Errors
-/// When one is not; the message names the candidate.
+/// When a cost is not finite; the message names the candidate.
 pub(super) fn check_costs(costs: &[f32], samples: usize, iteration: usize) -> Result<()> {
     let Some(i) = costs.iter().position(|cost| !cost.is_finite()) else {
         return Ok(());
@@ -206,8 +206,8 @@ fn check_init(problem: &PlanProblem<'_>) -> Result<()> {
     let (envs, horizon, dim) = (problem.keys.len(), problem.horizon, problem.space.dim());
     let expected = envs * horizon * dim;
     if init.len() != expected {
-        let wanted = format!("{expected} ({envs} environments x {horizon} x {dim})");
-        return Err(Error::mismatch("the initial guess of a plan", format!("{} values", init.len()), wanted));
+        let expected_shape = format!("{expected} ({envs} environments x {horizon} x {dim})");
+        return Err(Error::mismatch("the initial guess of a plan", format!("{} values", init.len()), expected_shape));
     }
     let Some(i) = init.iter().position(|v| !v.is_finite()) else {
         return Ok(());

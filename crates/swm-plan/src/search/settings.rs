@@ -2,7 +2,7 @@
 
 use swm_core::{Error, Result};
 
-/// Checks the settings of one owner (a solver, a term, the policy), whose name error messages begin with.
+/// Checks the settings of one owner (a solver, a term, the policy). Error messages begin with the owner's name.
 #[derive(Clone, Copy)]
 pub struct Settings<'a>(pub &'a str);
 

@@ -1,30 +1,31 @@
 //! [`AugmentedLagrangian`]: gradient descent under differentiable inequality constraints `g_j(A) ≤ 0`.
 //!
-//! Algorithm "Lagrangian Solver" of the stable-worldmodel paper. Several candidates, the first at the initial guess and the
-//! others at random around it, descend `J(A) + λ·g(A) + ρ ‖[g(A)]₊‖²` for K steps with fixed multipliers λ and penalty ρ.
-//! Then `λ ← [λ + ρ ḡ]₊`, with ḡ the mean over the candidates, and ρ grows up to a limit. This is repeated L times.
-//! Candidates are `[envs, samples, horizon, dim]`, values of constraints `[envs, samples, constraints]`, and every environment
-//! has its own multipliers, `[envs, constraints]`.
+//! Algorithm "Lagrangian Solver" of the stable-worldmodel paper. Several candidates, the first at the initial guess and
+//! the others at random around it, descend `J(A) + λ·g(A) + ρ ‖[g(A)]₊‖²` for K steps with fixed multipliers λ and
+//! penalty ρ. Then `λ ← [λ + ρ ḡ]₊`, with ḡ the mean over the candidates, and ρ grows up to a limit. This is repeated L
+//! times. Candidates are `[envs, samples, horizon, dim]`, values of constraints `[envs, samples, constraints]`, and
+//! every environment has its own multipliers, `[envs, constraints]`.
 //!
-//! Outer iterations, penalties, standard deviation and noise are those of the reference (`solver/lagrangian.py`). The number
-//! of candidates and Adam's step size (1 in the reference) are those of gradient descent. The reference leaves the number of
-//! steps open; 50 bring the constrained problem of the tests within 0.003 of its lowest cost. The penalty term has the
-//! gradient 2ρ[g]₊, so an update of the multipliers halves the violation at best. A penalty that grows beyond what the step
-//! size can follow makes plans worse, not more exact.
+//! Outer iterations, penalties, standard deviation and noise are those of the reference (`solver/lagrangian.py`). The
+//! number of candidates and Adam's step size (1 in the reference) are those of gradient descent. The reference leaves
+//! the number of steps open; with 50 steps, the cost of the tests' constrained problem is within 0.003 of the lowest.
+//! The penalty term has the gradient 2ρ[g]₊, so an update of the multipliers halves the violation at best. A penalty
+//! that is too large for the step size makes plans worse.
 //!
 //! Intended differences from the paper and the reference:
-//! - The plan is the cheapest candidate among those whose constraints all hold within `tolerance`. If there is none, it is
-//!   the candidate with the smallest largest violation, and the last entry of
-//!   [`PlanTrace::violation`](swm_core::PlanTrace::violation) exceeds the tolerance. The paper and the reference return the
-//!   cheapest candidate, feasible or not.
-//! - Candidates are clipped to the bounds of the problem after every step; infinite bounds give their algorithm.
-//! - Multipliers start at zero for every plan. The reference can carry them to the next plan; here a plan depends on its
-//!   problem and its key only.
-//! - Every candidate draws from its own stream, keyed by (plan key, candidate), and noise by (plan key, step, candidate);
-//!   values that are not finite are errors.
+//! - The plan is the cheapest candidate among those whose constraints all hold within `tolerance`. If there is none, it
+//!   is the candidate with the smallest largest violation, and the last entry of
+//!   [`PlanTrace::violation`](swm_core::PlanTrace::violation) exceeds the tolerance. The paper and the reference return
+//!   the cheapest candidate, feasible or not.
+//! - Candidates are clipped to the bounds of the problem after every step; with infinite bounds, the algorithm is that
+//!   of the paper.
+//! - Multipliers start at zero for every plan. The reference can carry them to the next plan; here a plan depends on
+//!   its problem and its key only.
+//! - Every candidate draws from its own stream, keyed by (plan key, candidate), and noise by (plan key, step,
+//!   candidate); values that are not finite are errors.
 //!
-//! As in the reference, the optimizer's memory is cleared whenever the multipliers change. The trace has an entry before
-//! every step and one for the plan: the cost and the violation of the candidate that would be the plan.
+//! As in the reference, the optimizer's memory is cleared whenever the multipliers change. The trace has an entry
+//! before every step and one for the plan: the cost and the violation of the candidate that is the best at this step.
 
 use crate::entry::{ActionKind, Family, Need, SolverEntry, defaults, make};
 use crate::search::{Adam, Descent, Optimizer, Settings, Step, UNWRITTEN, constrained, continuous, misfit};
@@ -53,9 +54,9 @@ pub struct AugmentedLagrangian {
     pub samples: usize,
     /// Updates of the multipliers, L.
     pub outer_iterations: usize,
-    /// Steps between them, K.
+    /// Steps between two updates of the multipliers, K.
     pub iterations: usize,
-    /// The standard deviation of the first candidates around the initial guess, σ₀, in model action units.
+    /// The standard deviation of the initial candidates around the initial guess, σ₀, in model action units.
     pub sigma: f32,
     /// Turns a gradient into a step.
     pub optimizer: Optimizer,
@@ -167,7 +168,7 @@ impl Duals {
         })
     }
 
-    /// Adds the gradient of `λ·g + ρ ‖[g]₊‖²` to that of the cost.
+    /// Adds the gradient of `λ·g + ρ ‖[g]₊‖²` to the gradient of the cost.
     fn add_gradient(&mut self, cost: &mut dyn CostModel, descent: &mut Descent<'_>, rho: f32) -> Result<()> {
         let values = self.values.chunks_exact(self.constraints).enumerate();
         for ((i, values), slopes) in values.zip(self.slopes.chunks_exact_mut(self.constraints)) {
@@ -180,7 +181,7 @@ impl Duals {
         constrained(ID, cost)?.constrain_vjp(population.candidates(), &self.slopes, gradient)
     }
 
-    /// Raises the multipliers of constraints that are violated on average, and lowers the others.
+    /// Increases the multipliers of constraints that are violated on average, and decreases all other multipliers.
     fn ascend(&mut self, rho: f32) {
         for (i, lambda) in self.multipliers.iter_mut().enumerate() {
             let (env, constraint) = (i / self.constraints, i % self.constraints);
@@ -191,8 +192,8 @@ impl Duals {
         }
     }
 
-    /// Appends to the trace; returns the best candidate of every environment: the cheapest that satisfies the constraints,
-    /// or the one with the smallest violation.
+    /// Appends to the trace; returns the best candidate of every environment: the cheapest that satisfies the
+    /// constraints, or the one with the smallest violation.
     fn record(&self, descent: &mut Descent<'_>, tolerance: f32) -> Vec<usize> {
         let Descent { population, trace, .. } = descent;
         let violation = |i: usize| {

@@ -1,23 +1,23 @@
 //! [`CategoricalCem`]: the cross-entropy method for discrete actions.
 //!
-//! Rubinstein and Kroese, *The Cross-Entropy Method* (2004), as algorithm "Categorical Cross-Entropy Method Solver" of the
-//! stable-worldmodel paper. Every choice of a plan has a categorical distribution over its options. Each iteration draws
-//! candidates and sets the probability of an option to its frequency among the elites. The first candidate of every iteration
-//! is the mode (the most probable option of every choice); the last mode is the plan.
+//! Rubinstein and Kroese, *The Cross-Entropy Method* (2004), as algorithm "Categorical Cross-Entropy Method Solver" of
+//! the stable-worldmodel paper. Every choice of a plan has a categorical distribution over its options. Each iteration
+//! draws candidates and sets the probability of an option to its frequency among the elites. The first candidate of
+//! every iteration is the mode (the most probable option of every choice); the last mode is the plan.
 //!
-//! A model step makes several choices, one after another: the actions of an action block, or the parts of a multi-discrete
-//! action. Candidates and the plan are `[envs, samples, horizon, dim]` with a one-hot vector for each choice, where `dim` is
-//! the number of options of all choices. The defaults are those of the reference (`solver/categorical_cem.py`); the paper
-//! gives none.
+//! A model step makes several choices, one after another: the actions of an action block, or the parts of a
+//! multi-discrete action. Candidates and the plan are `[envs, samples, horizon, dim]` with a one-hot vector for each
+//! choice, where `dim` is the number of options of all choices. The defaults are those of the reference
+//! (`solver/categorical_cem.py`); the paper gives none.
 //!
 //! Intended differences from the paper and the reference:
 //! - An option is drawn by inverting the distribution function, with one random number per choice instead of one Gumbel
 //!   number per option. The distribution of the draws is the same.
 //! - An option of probability 0 is never drawn again; the reference leaves it a probability of 10⁻¹⁰.
-//! - An initial guess, which the paper does not have and the reference ignores, gets half of the probability; the other half
-//!   is uniform.
-//! - As in [`Cem`](crate::Cem): draws are keyed, equal costs are ordered by index (equal probabilities too), costs that are
-//!   not finite are errors, and [`Plan::costs`] is the lowest cost of the last iteration.
+//! - An initial guess, which the paper does not have and the reference ignores, gets half of the probability; the other
+//!   half is uniform.
+//! - As in [`Cem`](crate::Cem): draws are keyed, equal costs are ordered by index (equal probabilities too), costs that
+//!   are not finite are errors, and [`Plan::costs`] is the lowest cost of the last iteration.
 //!
 //! The spread in the trace is the probability that two draws of a choice differ, `1 - Σ π²`, averaged over the choices.
 
@@ -31,7 +31,7 @@ use swm_core::{CostModel, Key, Plan, PlanProblem, PlanTrace, Result, Solver};
 
 const ID: &str = "categorical_cem";
 
-/// The probability of the initial guess.
+/// The part of an initial distribution's probability that is given to the initial guess.
 const GUESS: f32 = 0.5;
 
 /// The row of this solver in the registry.

@@ -1,21 +1,22 @@
 //! [`GradientDescent`]: gradient descent on the cost.
 //!
-//! Algorithm "Gradient Descent Solver" of the stable-worldmodel paper. Several candidates, the first at the initial guess and
-//! the others at random around it, each take K steps against the gradient of their own cost; the cheapest after the last step
-//! is the plan. Candidates and gradients are `[envs, samples, horizon, dim]`.
+//! Algorithm "Gradient Descent Solver" of the stable-worldmodel paper. Several candidates, the first at the initial
+//! guess and the others at random around it, each take K steps against the gradient of their own cost; the cheapest
+//! after the last step is the plan. Candidates and gradients are `[envs, samples, horizon, dim]`.
 //!
-//! The paper gives no settings. The defaults are those of the reference's scripts (`scripts/eval` and `scripts/plan`): 30
-//! steps, 100 candidates, Adam with the step size 0.1. (The default of its class, plain gradient descent with the step size
-//! 1, only suits costs of one scale.)
+//! The paper gives no settings. The defaults are those of the reference's scripts (`scripts/eval` and `scripts/plan`):
+//! 30 steps, 100 candidates, Adam with the step size 0.1. (The default of the reference's class, gradient descent with
+//! the step size 1, only suits costs of one scale.)
 //!
 //! Intended differences from the paper and the reference:
-//! - Candidates are clipped to the bounds of the problem before the first step and after every step. The paper's table of
-//!   solvers states this, but neither its algorithm nor the reference does it. Infinite bounds give their algorithm.
+//! - Candidates are clipped to the bounds of the problem before the first step and after every step. The paper's table
+//!   of solvers states this; the paper's algorithm and the reference omit the clipping.
 //! - The plan is the candidate that is cheapest after its last step, as in the paper; the reference compares the costs
 //!   from before that step.
 //! - The norm of gradients is clipped for each candidate. The reference clips by the norm over all candidates of all
 //!   environments, so its plans depend on the other environments.
-//! - Every candidate draws from its own stream, keyed by (plan key, candidate), and noise by (plan key, step, candidate).
+//! - Every candidate draws from its own stream, keyed by (plan key, candidate), and noise by (plan key, step,
+//!   candidate).
 //! - Costs and gradients that are not finite are errors.
 //!
 //! Entry k of the trace is recorded after k steps, so there is one entry more than there are steps.
@@ -47,7 +48,7 @@ pub struct GradientDescent {
     pub samples: usize,
     /// Steps, K.
     pub iterations: usize,
-    /// The standard deviation of the first candidates around the initial guess, in model action units.
+    /// The standard deviation of the initial candidates around the initial guess, in model action units.
     pub sigma: f32,
     /// Turns a gradient into a step.
     pub optimizer: Optimizer,

@@ -1,22 +1,23 @@
 //! [`ICem`]: the improved cross-entropy method.
 //!
 //! Pinneri et al., *Sample-efficient Cross-Entropy Method for Real-time Planning* (CoRL 2020), as algorithm "Improved
-//! Cross-Entropy Method Solver" of the stable-worldmodel paper. It extends [`Cem`](crate::Cem) by noise that is coloured along
-//! the model steps ([`ColouredNoise`]), by elites that stay among the candidates of the next iteration, and by momentum on both
-//! moments. Candidates are `[envs, samples, horizon, dim]` and clipped to the bounds. The defaults are those of the
-//! reference (`solver/icem.py`); the paper gives none.
+//! Cross-Entropy Method Solver" of the stable-worldmodel paper. It extends [`Cem`](crate::Cem) by noise that is
+//! coloured along the model steps ([`ColouredNoise`]), by elites that stay among the candidates of the next iteration,
+//! and by momentum on both moments. Candidates are `[envs, samples, horizon, dim]` and clipped to the bounds. The
+//! defaults are those of the reference (`solver/icem.py`); the paper gives none.
 //!
-//! The noise is coloured along the model steps. The actions of an action block are dimensions of one step, with independent
-//! noise, as in the reference.
+//! The noise is coloured along the model steps. The actions of an action block are dimensions of one step, with
+//! independent noise, as in the reference.
 //!
-//! The stable-worldmodel paper omits three features of the original publication, and so does this solver: a population that
-//! shrinks from iteration to iteration, elites that are reused after a replan, and executing the best action ever found.
+//! The stable-worldmodel paper omits three features of the original publication, and so does this solver: a population
+//! that shrinks from iteration to iteration, elites that are reused after a replan, and executing the best action ever
+//! found.
 //!
 //! Intended differences from the paper and the reference:
-//! - Coloured noise has the variance 1, as in the original publication. The reference divides the noise of every candidate
-//!   by its own standard deviation along the steps, which makes nearly constant candidates larger.
-//! - As in CEM: the standard deviation of the elites is unbiased, draws are keyed, equal costs are ordered by index, costs
-//!   that are not finite are errors, and [`Plan::costs`] is the lowest cost of the last iteration.
+//! - Coloured noise has the variance 1, as in the original publication. The reference divides the noise of every
+//!   candidate by its own standard deviation along the steps, which makes nearly constant candidates larger.
+//! - As in CEM: the standard deviation of the elites is unbiased, draws are keyed, equal costs are ordered by index,
+//!   costs that are not finite are errors, and [`Plan::costs`] is the lowest cost of the last iteration.
 
 use crate::entry::{ActionKind, Family, SolverEntry, defaults, make};
 use crate::search::{ColouredNoise, Gaussian, Population, Settings, average, continuous, iterate};
@@ -54,7 +55,7 @@ pub struct ICem {
     pub beta: f32,
     /// The weight of the previous distribution, α.
     pub momentum: f32,
-    /// Elites that are candidates of the next iteration too.
+    /// The number of elites that are also candidates of the next iteration.
     pub keep: usize,
 }
 
@@ -119,7 +120,8 @@ mod tests {
         let (momentum, keep, len) = (0.25, 2, HORIZON * DIM);
         let (mut gaussian, mut kept) = (golden::initial(), Vec::<f32>::new());
         for update in golden::updates(ID) {
-            // The reference divides the noise of a candidate by its deviation along the steps; the recorded noise is white.
+            // The reference divides the noise of a candidate by its deviation along the steps; the recorded noise is
+            // white.
             let mut ours = update.noise.clone();
             let colour = ColouredNoise::new(2.0, HORIZON);
             ours.chunks_exact_mut(len).for_each(|noise| {

@@ -2,25 +2,26 @@
 //!
 //! Algorithm "Projected Gradient Descent Solver" of the stable-worldmodel paper, after Henaff, Whitney and `LeCun`,
 //! *Model-Based Planning with Discrete and Continuous Actions* (2017). A choice among n options is relaxed to n
-//! probabilities. Several candidates, the first at the initial guess and the others at random around it, take K steps against
-//! the gradient of their cost. After each step, every choice is projected onto its simplex (Duchi et al., *Efficient
-//! Projections onto the ℓ₁-Ball for Learning in High Dimensions*, 2008, figure 1). In the end the most probable options are
-//! chosen. Candidates are `[envs, samples, horizon, dim]`, where `dim` is the number of options of all choices of a step.
+//! probabilities. Several candidates, the first at the initial guess and the others at random around it, take K steps
+//! against the gradient of their cost. After each step, every choice is projected onto its simplex (Duchi et al.,
+//! *Efficient Projections onto the ℓ₁-Ball for Learning in High Dimensions*, 2008, figure 1). In the end the most
+//! probable options are chosen. Candidates are `[envs, samples, horizon, dim]`, where `dim` is the number of options of
+//! all choices of a step.
 //!
-//! The paper gives no settings. Step size, standard deviation and noise are those of the reference (`solver/pgd.py`: 1, 1
-//! and 0); the numbers of steps and candidates are those of gradient descent.
+//! The paper gives no settings. Step size, standard deviation and noise are those of the reference (`solver/pgd.py`: 1,
+//! 1 and 0); the numbers of steps and candidates are those of gradient descent.
 //!
 //! Intended differences from the paper and the reference:
-//! - All candidates are turned into choices and evaluated as such, and the cheapest is the plan, so [`Plan::costs`] is the
-//!   cost of the plan. The paper selects a candidate by its relaxed cost, and the reference by the relaxed cost before the
-//!   last step; no plan has such a cost.
+//! - All candidates are rounded to choices, these choices are evaluated, and the cheapest is the plan, so
+//!   [`Plan::costs`] is the cost of the plan. The paper selects a candidate by its relaxed cost, and the reference by
+//!   the relaxed cost before the last step; a relaxed cost is not the cost of a plan.
 //! - Initial candidates are projected, as in the paper; the reference starts outside the simplex, at zeros.
 //! - A model step may hold several choices of different sizes, each with its own simplex.
-//! - Every candidate draws from its own stream, keyed by (plan key, candidate), and noise by (plan key, step, candidate);
-//!   equally probable options are ordered by index; values that are not finite are errors.
+//! - Every candidate draws from its own stream, keyed by (plan key, candidate), and noise by (plan key, step,
+//!   candidate); equally probable options are ordered by index; values that are not finite are errors.
 //!
-//! Entry k of the trace is that of the relaxed candidates after k steps. The last entry is that of the final choices, which
-//! may cost more.
+//! Entry k of the trace describes the relaxed candidates after k steps. The last entry describes the final choices,
+//! which may cost more.
 
 use crate::entry::{ActionKind, Family, Need, SolverEntry, defaults, make};
 use crate::search::{Descent, Optimizer, Settings, Sgd, Step, discrete};
@@ -51,7 +52,7 @@ pub struct Pgd {
     pub iterations: usize,
     /// The step size, η.
     pub step: f32,
-    /// The standard deviation of the first candidates around the initial guess, σ₀, before projection.
+    /// The standard deviation of the initial candidates around the initial guess, σ₀, before projection.
     pub sigma: f32,
     /// The standard deviation of the noise added in every step, before projection, `σ_act`.
     pub action_noise: f32,
@@ -140,8 +141,8 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// The nearest point of the simplex, found by trying every support: on each, the nearest point is the given one with a
-    /// constant added to all coordinates.
+    /// Finds the nearest point of the simplex by trying every support. For one support, the nearest point is `v` plus a
+    /// constant on the supported coordinates and zero elsewhere.
     fn brute_force(v: &[f32]) -> Vec<f64> {
         let n = v.len();
         let candidates = (1..1u32 << n).filter_map(|support| {
@@ -152,7 +153,7 @@ mod tests {
             point.iter().all(|&p| p >= 0.0).then_some(point)
         });
         let distance = |p: &[f64]| p.iter().zip(v).map(|(p, &v)| (p - f64::from(v)).powi(2)).sum::<f64>();
-        candidates.min_by(|a, b| distance(a).total_cmp(&distance(b))).expect("a point")
+        candidates.min_by(|a, b| distance(a).total_cmp(&distance(b))).expect("the simplex is not empty")
     }
 
     proptest! {

@@ -1,8 +1,8 @@
-"""Writes gradient_solvers.json: what torch's optimizers and the reference's gradient solvers do on small problems.
+"""Writes gradient_solvers.json: iterates and plans of torch's optimizers and of the reference's gradient solvers.
 
     python export_gradient_solvers.py      # with the package stable-worldmodel 0.1.1 and torch installed
 
-The problems are written out again in ../it/gradient.rs; nothing is drawn at random.
+The same problems are defined in ../it/gradient.rs. No value is random.
 """
 
 import json
@@ -19,7 +19,7 @@ TARGET = torch.tensor([[1.0, -2.0], [0.5, 3.0], [-1.5, 0.25]])
 
 
 class Bowl(torch.nn.Module):
-    """Half the scaled squared distance to a target; the sum of the numbers of a step is at most a half."""
+    """Half the scaled squared distance to a target; the sum of the values of a step is at most a half."""
 
     def get_cost(self, info, actions):
         return (0.5 * SCALE * (actions - TARGET) ** 2).sum(dim=(-1, -2))
@@ -29,7 +29,7 @@ class Bowl(torch.nn.Module):
 
 
 class Choice(torch.nn.Module):
-    """A bowl over two choices among three, each step."""
+    """A scaled squared distance for two steps with one choice among three options each."""
 
     scale = torch.tensor([[0.6, 0.2, 0.3], [0.1, 0.5, 0.4]])
     target = torch.tensor([[0.9, 0.4, -0.2], [0.2, 0.3, 1.1]])

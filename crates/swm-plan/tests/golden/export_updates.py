@@ -1,11 +1,11 @@
-"""Writes updates.json: what the reference's sampling solvers do with given noise, iteration by iteration.
+"""Writes updates.json: every iteration of the reference's sampling solvers, with the noise of that iteration.
 
 Run with the Python package `stable-worldmodel` 0.1.1 (and torch) installed:
 
     python export_updates.py > updates.json
 
-Every draw of the reference is recorded on its way in, every population and its costs where the model is asked, and the
-distribution after each update. The solvers are unchanged; the toy cost has its minimum where no bound is and where one is.
+The script records every random draw, every population with its costs, and the distribution after each update. It does not
+change the solvers. The minimum of the toy cost is within the bounds in some dimensions and outside the bounds in others.
 """
 
 import contextlib
@@ -23,17 +23,17 @@ OPTIONS, BLOCK = 3, 2
 
 
 class Toy:
-    """A bowl; notes every population it is shown and what it answered."""
+    """A quadratic cost that records every population and its costs."""
 
-    def __init__(self, numbers):
-        self.target = torch.linspace(-1.5, 1.2, numbers)
-        self.weight = torch.linspace(1.0, 2.0, numbers)
-        self.seen = []
+    def __init__(self, size):
+        self.target = torch.linspace(-1.5, 1.2, size)
+        self.weight = torch.linspace(1.0, 2.0, size)
+        self.recorded = []
 
     def get_cost(self, _, candidates):
         plans = candidates[0].reshape(candidates.shape[1], -1)
         costs = (self.weight * (plans - self.target) ** 2).sum(-1)
-        self.seen.append((plans.clone(), costs.clone()))
+        self.recorded.append((plans.clone(), costs.clone()))
         return costs[None]
 
 
@@ -54,8 +54,8 @@ class Record:
     def end_solve(self): ...
 
 
-def run(make, space, numbers, block):
-    toy, record, noise = Toy(numbers), Record(), []
+def run(make, space, size, block):
+    toy, record, noise = Toy(size), Record(), []
     randn = torch.randn
 
     def recorded(*shape, **options):
@@ -72,7 +72,7 @@ def run(make, space, numbers, block):
             plan = solver.solve({"x": torch.zeros(1, 1)})["actions"][0]
     finally:
         torch.randn = randn
-    return toy.seen, record.history, noise, plan
+    return toy.recorded, record.history, noise, plan
 
 
 def flat(tensor):
@@ -98,15 +98,15 @@ def main():
     out = {}
     for name, arguments in solvers.items():
         torch.manual_seed(0)
-        seen, states, noise, plan = run(*arguments)
-        if name == "mppi":  # It has no callbacks: its mean is the first candidate of the next iteration, and the plan.
-            states = [{"mean": plans[0]} for plans, _ in seen[1:]] + [{"mean": plan}]
+        recorded, states, noise, plan = run(*arguments)
+        if name == "mppi":  # MPPI has no callbacks. Its mean is the first candidate of the next iteration, and the plan.
+            states = [{"mean": plans[0]} for plans, _ in recorded[1:]] + [{"mean": plan}]
         out[name] = [
             {"candidates": flat(plans), "costs": flat(costs)}
             | {key: flat(value) for key, value in state.items()}
             # iCEM draws its noise with the steps last.
             | ({"noise": flat(noise[i][0].transpose(-1, -2) if name == "icem" else noise[i][0])} if noise else {})
-            for i, ((plans, costs), state) in enumerate(zip(seen, states, strict=True))
+            for i, ((plans, costs), state) in enumerate(zip(recorded, states, strict=True))
         ]
     print(json.dumps(out))
 

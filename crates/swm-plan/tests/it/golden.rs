@@ -1,7 +1,7 @@
 //! Golden test: every iteration of a short search by every solver equals `tests/golden/plans.json`.
 //!
-//! Published results depend on these values, so changing them is a breaking change. After an intended change, `BLESS=1 cargo
-//! test --release -p swm-plan golden` rewrites the file.
+//! Published results depend on these values, so changing them is a breaking change. After an intended change,
+//! `BLESS=1 cargo test --release -p swm-plan golden` rewrites the file.
 
 use crate::solvers::{solves, trial};
 use crate::toys::{Model, TOYS, solve};
@@ -21,17 +21,17 @@ struct Golden {
     spread: Vec<f64>,
 }
 
-/// The toys to use, the first that a solver can solve.
+/// The toys in order of preference: the test of a solver uses the first toy that the solver can solve.
 const PREFERRED: [&str; 4] = ["multi-modal", "discrete", "constrained", "reach-bounded"];
 
 const ENV: usize = 4;
 
 fn short_search(row: &SolverEntry) -> Golden {
     let toys = PREFERRED.iter().flat_map(|name| TOYS.iter().filter(move |toy| toy.name == *name));
-    let toy = toys.into_iter().find(|toy| solves(row, toy)).expect("a toy");
-    let settings = serde_json::from_str(trial(row.id).short).expect("settings");
-    let mut solver = (row.make)(&settings).expect("a solver");
-    let plan = solve(&mut *solver, &mut Model::new(toy, &[ENV]), toy, &[ENV]).expect("a plan");
+    let toy = toys.into_iter().find(|toy| solves(row, toy)).expect("a toy for this solver");
+    let settings = serde_json::from_str(trial(row.id).short).expect("valid settings");
+    let mut solver = (row.make)(&settings).expect("valid settings");
+    let plan = solve(&mut *solver, &mut Model::new(toy, &[ENV]), toy, &[ENV]).expect("the solver returns a plan");
     let Plan { actions, trace, .. } = plan;
     let round = |values: &[f32]| values.iter().map(|v| format!("{v:.5e}").parse().expect("a number")).collect();
     Golden {
@@ -48,7 +48,8 @@ fn iterations_equal_golden_plans() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/plans.json");
     let ours: BTreeMap<&str, Golden> = SOLVERS.rows.iter().map(|row| (row.id, short_search(row))).collect();
     if std::env::var_os("BLESS").is_some() {
-        std::fs::write(&path, serde_json::to_string_pretty(&ours).expect("json") + "\n").expect("written");
+        std::fs::write(&path, serde_json::to_string_pretty(&ours).expect("valid JSON") + "\n")
+            .expect("the file is written");
     }
     let text = std::fs::read_to_string(&path).expect("golden plans");
     let published: BTreeMap<String, Golden> = serde_json::from_str(&text).expect("golden plans");

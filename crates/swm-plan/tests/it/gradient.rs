@@ -10,7 +10,7 @@ use swm_core::{
 use swm_plan::search::{Adam, Memory, Optimizer, RmsProp, Sgd};
 use swm_plan::{AugmentedLagrangian, GradientDescent, Pgd, SOLVERS};
 
-/// The file that `export_gradient_solvers.py` writes.
+/// The content of the file that `export_gradient_solvers.py` writes.
 #[derive(Deserialize)]
 struct Golden {
     optimizers: Paths,
@@ -158,7 +158,7 @@ fn gradient_descent_equals_the_reference() {
     let optimizer = Optimizer::Sgd(Sgd { step: 0.5, momentum: 0.9 });
     let mut gd =
         GradientDescent { samples: 1, iterations: 4, optimizer, clip: Some(1.0), ..GradientDescent::default() };
-    let plan = solve(&mut gd, &mut { BOWL }, &[Key::new(0)]).expect("a plan");
+    let plan = solve(&mut gd, &mut { BOWL }, &[Key::new(0)]).expect("the solver returns a plan");
     assert_near(&plan.actions, &golden.actions, 1e-5);
     assert_near(&plan.trace[0].best[..4], &golden.costs, 1e-5);
     assert_eq!(plan.trace[0].best[4..], plan.costs, "the last entry is that of the plan");
@@ -171,7 +171,7 @@ fn projected_gradient_descent_equals_the_reference() {
     let start = [0.0, 0.0, 1.0, 1.0, 0.0, 0.0];
     let space = PlanSpace::Discrete { choices: &[3] };
     let problem = PlanProblem { horizon: 2, space, keys: &[Key::new(0)], init: Some(&start), deadline: None };
-    let plan = pgd.solve(&mut { CHOICE }, problem).expect("a plan");
+    let plan = pgd.solve(&mut { CHOICE }, problem).expect("the solver returns a plan");
     assert_near(&plan.trace[0].best[..4], &golden.costs, 1e-6);
     let chosen: Vec<f32> =
         golden.choices.iter().flat_map(|&c| (0..3).map(move |i| f32::from(u8::from(i == c)))).collect();
@@ -179,7 +179,7 @@ fn projected_gradient_descent_equals_the_reference() {
     let mut cost = [0.0];
     { CHOICE }
         .cost(Candidates { actions: &chosen, envs: 1, samples: 1, horizon: 2, dim: 3 }, &mut cost)
-        .expect("a cost");
+        .expect("the model computes a cost");
     assert_eq!(plan.costs, cost, "the cost is that of the choices, not of probabilities");
 }
 
@@ -193,7 +193,8 @@ fn augmented_lagrangian_equals_the_reference() {
         penalty_limit: 3.0,
         ..AugmentedLagrangian::default()
     };
-    let plan = solve(&mut solver, &mut Bowl { limited: true, ..BOWL }, &[Key::new(0)]).expect("a plan");
+    let plan =
+        solve(&mut solver, &mut Bowl { limited: true, ..BOWL }, &[Key::new(0)]).expect("the solver returns a plan");
     // Nine steps of Adam, which agree only if the multipliers and penalties agree.
     assert_near(&plan.actions, &golden.actions, 1e-5);
     let trace = &plan.trace[0];
@@ -209,11 +210,12 @@ fn trace_records_the_violation_of_the_plan() {
     let space = PlanSpace::Continuous { low: &[0.3, 0.4], high: &[9.0, 9.0] };
     let problem = PlanProblem { horizon: 3, space, keys: &[Key::new(0)], init: None, deadline: None };
     let mut solver = AugmentedLagrangian { samples: 8, ..AugmentedLagrangian::default() };
-    let plan = solver.solve(&mut Bowl { limited: true, ..BOWL }, problem).expect("a plan");
-    let violation = plan.trace[0].violation.last().expect("a violation");
+    let plan = solver.solve(&mut Bowl { limited: true, ..BOWL }, problem).expect("the solver returns a plan");
+    let violation = plan.trace[0].violation.last().expect("the trace has violations");
     assert!((violation - 0.2).abs() < 1e-2, "the smallest possible violation, not {violation}");
     // A feasible candidate is preferred to a cheaper infeasible one.
-    let plan = solve(&mut solver, &mut Bowl { limited: true, ..BOWL }, &[Key::new(0)]).expect("a plan");
+    let plan =
+        solve(&mut solver, &mut Bowl { limited: true, ..BOWL }, &[Key::new(0)]).expect("the solver returns a plan");
     let steps = plan.actions.chunks_exact(2).map(|step| step.iter().sum::<f32>() - 0.5);
     let violation = steps.fold(f32::NEG_INFINITY, f32::max);
     assert_eq!(plan.trace[0].violation.last(), Some(&violation));
@@ -232,14 +234,14 @@ const NOISY: &[(&str, &str, &str)] = &[
 fn noisy_plans_do_not_depend_on_batches_or_threads() {
     for &(solver, name, settings) in NOISY {
         let toy = toy(name);
-        let settings = serde_json::from_str(settings).expect("settings");
-        let mut solver = (SOLVERS.get(solver).expect("a solver").make)(&settings).expect("a solver");
+        let settings = serde_json::from_str(settings).expect("valid settings");
+        let mut solver = (SOLVERS.get(solver).expect("a registered solver").make)(&settings).expect("valid settings");
         let mut run = |threads: usize, size: usize| -> Vec<u32> {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a thread pool");
             let all: Vec<usize> = (0..50).collect();
             let mut plan = |envs: &[usize]| {
                 let plan = pool.install(|| crate::toys::solve(&mut *solver, &mut Model::new(toy, envs), toy, envs));
-                let plan = plan.expect("a plan");
+                let plan = plan.expect("the solver returns a plan");
                 plan.actions.into_iter().chain(plan.costs).map(f32::to_bits).collect::<Vec<_>>()
             };
             // Actions and costs, environment by environment.
@@ -263,13 +265,14 @@ fn noisy_plans_do_not_depend_on_batches_or_threads() {
 
 #[test]
 fn noisy_searches_are_pinned() {
-    // Published results depend on these values: changing them is a breaking change. They are rounded, because `exp` and `ln`
-    // may differ in the last bit between platforms.
+    // Published results depend on these values: changing them is a breaking change. They are rounded, because `exp` and
+    // `ln` may differ in the last bit between platforms.
     for (&(solver, name, settings), expected) in NOISY.iter().zip(PINNED) {
         let toy = toy(name);
-        let settings = serde_json::from_str(settings).expect("settings");
-        let mut solver = (SOLVERS.get(solver).expect("a solver").make)(&settings).expect("a solver");
-        let plan = crate::toys::solve(&mut *solver, &mut Model::new(toy, &[0]), toy, &[0]).expect("a plan");
+        let settings = serde_json::from_str(settings).expect("valid settings");
+        let mut solver = (SOLVERS.get(solver).expect("a registered solver").make)(&settings).expect("valid settings");
+        let plan =
+            crate::toys::solve(&mut *solver, &mut Model::new(toy, &[0]), toy, &[0]).expect("the solver returns a plan");
         let rounded: Vec<f32> = plan.trace[0].mean.iter().map(|cost| (cost * 1e3).round() / 1e3).collect();
         assert_eq!(rounded, *expected, "{name}");
     }
@@ -289,9 +292,9 @@ fn errors_locate_gradients_that_are_not_finite() {
         // Value 3 of candidate 1 of environment 1, of two environments with two candidates each.
         let mut bowl = Bowl { wrong: Some((3 * 6 + 3, wrong)), ..BOWL };
         let mut gd = GradientDescent { samples: 2, ..GradientDescent::default() };
-        let message = solve(&mut gd, &mut bowl, &[Key::new(0), Key::new(1)]).expect_err("wrong").to_string();
-        let place = format!("{wrong} at step 1 for candidate 1 of planned environment 1 in iteration 0");
-        assert!(message.contains(&place), "{message}");
+        let message = solve(&mut gd, &mut bowl, &[Key::new(0), Key::new(1)]).expect_err("invalid input").to_string();
+        let location = format!("{wrong} at step 1 for candidate 1 of planned environment 1 in iteration 0");
+        assert!(message.contains(&location), "{message}");
     }
 }
 
@@ -311,20 +314,27 @@ fn deadline_ends_the_search() {
         let (toy, keys) = (toy(name), [Key::new(0)]);
         let problem =
             |deadline| PlanProblem { horizon: toy.horizon, space: toy.space, keys: &keys, init: None, deadline };
-        let mut solver = (SOLVERS.get(id).expect("a solver").make)(&serde_json::json!({})).expect("a solver");
-        let late = solver.solve(&mut Model::new(toy, &[0]), problem(Some(Instant::now()))).expect("a plan");
-        let whole = solver.solve(&mut Model::new(toy, &[0]), problem(None)).expect("a plan");
-        // The start and one step; for GRASP, whose steps are not rolled out, only the plan.
-        assert_eq!(late.trace[0].best.len(), if id == "grasp" { 1 } else { 2 }, "{id}");
-        assert_eq!(late.trace[0].best.last(), Some(&late.costs[0]), "{id}");
-        assert!(late.costs[0].is_finite() && late.actions.len() == whole.actions.len(), "{id}");
-        assert!(late.trace[0].best.len() < whole.trace[0].best.len(), "{id}: the search without a deadline is longer");
+        let mut solver =
+            (SOLVERS.get(id).expect("a registered solver").make)(&serde_json::json!({})).expect("a solver");
+        let stopped =
+            solver.solve(&mut Model::new(toy, &[0]), problem(Some(Instant::now()))).expect("the solver returns a plan");
+        let complete = solver.solve(&mut Model::new(toy, &[0]), problem(None)).expect("the solver returns a plan");
+        // The trace has entries for the start and one step. For GRASP, whose steps are not rolled out, it has only the
+        // plan.
+        assert_eq!(stopped.trace[0].best.len(), if id == "grasp" { 1 } else { 2 }, "{id}");
+        assert_eq!(stopped.trace[0].best.last(), Some(&stopped.costs[0]), "{id}");
+        assert!(stopped.costs[0].is_finite() && stopped.actions.len() == complete.actions.len(), "{id}");
+        assert!(
+            stopped.trace[0].best.len() < complete.trace[0].best.len(),
+            "{id}: the search without a deadline is longer"
+        );
     }
 }
 
 #[test]
 fn errors_name_invalid_settings() {
-    let message = |gd: GradientDescent| solve(&mut gd.clone(), &mut { BOWL }, &[]).expect_err("wrong").to_string();
+    let message =
+        |gd: GradientDescent| solve(&mut gd.clone(), &mut { BOWL }, &[]).expect_err("invalid input").to_string();
     let default = GradientDescent::default;
     assert!(message(GradientDescent { samples: 0, ..default() }).contains("gd samples: 0; ask for at least 1"));
     assert!(message(GradientDescent { iterations: 0, ..default() }).contains("gd iterations"));
@@ -332,13 +342,13 @@ fn errors_name_invalid_settings() {
     assert!(message(GradientDescent { action_noise: -1.0, ..default() }).contains("gd action_noise: -1"));
     assert!(message(GradientDescent { clip: Some(0.0), ..default() }).contains("gd clip: 0"));
 
-    // The settings of the other solvers.
+    // Invalid settings of PGD, the augmented Lagrangian method and GRASP.
     let message = |id: &str, settings: serde_json::Value| {
-        let mut solver = match (SOLVERS.get(id).expect("a solver").make)(&settings) {
+        let mut solver = match (SOLVERS.get(id).expect("a registered solver").make)(&settings) {
             Ok(solver) => solver,
             Err(error) => return error.to_string(),
         };
-        solve(&mut *solver, &mut { BOWL }, &[]).expect_err("wrong").to_string()
+        solve(&mut *solver, &mut { BOWL }, &[]).expect_err("invalid input").to_string()
     };
     let table = [
         ("pgd", r#"{"step": 0}"#, "pgd optimizer, step: 0"),
@@ -357,7 +367,7 @@ fn errors_name_invalid_settings() {
         ("grasp", r#"{"state_optimizer": {"kind": "sgd", "momentum": 2}}"#, "grasp optimizer, momentum: 2"),
     ];
     for (id, settings, expected) in table {
-        let message = message(id, serde_json::from_str(settings).expect("settings"));
+        let message = message(id, serde_json::from_str(settings).expect("valid settings"));
         assert!(message.contains(expected), "{message}");
     }
 }

@@ -1,5 +1,5 @@
-//! Every draw has a key: the plan of an environment has the same bytes for any other environments that are planned in
-//! the same call, and on any number of threads.
+//! Every random draw is keyed, so the plan of an environment has the same bytes on any number of threads and for any
+//! set of environments planned in the same call.
 
 use crate::solvers::{solves, trial};
 use crate::toys::{Model, TOYS, Toy, solve};
@@ -16,14 +16,14 @@ fn bits(plan: &Plan, envs: usize) -> Vec<Vec<u32>> {
 }
 
 fn plan(row: &SolverEntry, toy: &'static Toy, envs: &[usize]) -> Vec<Vec<u32>> {
-    let settings = serde_json::from_str(trial(row.id).short).expect("settings");
-    let mut solver = (row.make)(&settings).expect("a solver");
-    bits(&solve(&mut *solver, &mut Model::new(toy, envs), toy, envs).expect("a plan"), envs.len())
+    let settings = serde_json::from_str(trial(row.id).short).expect("valid settings");
+    let mut solver = (row.make)(&settings).expect("valid settings");
+    bits(&solve(&mut *solver, &mut Model::new(toy, envs), toy, envs).expect("the solver returns a plan"), envs.len())
 }
 
 /// The first toy a solver can solve.
 fn toy_for(row: &SolverEntry) -> &'static Toy {
-    TOYS.iter().find(|toy| solves(row, toy)).expect("a toy")
+    TOYS.iter().find(|toy| solves(row, toy)).expect("a toy for this solver")
 }
 
 #[test]
@@ -31,7 +31,7 @@ fn plans_do_not_depend_on_batches_or_threads() {
     let envs: Vec<usize> = (0..50).collect();
     for row in SOLVERS.rows {
         let run = |threads, size| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a thread pool");
             pool.install(|| envs.chunks(size).flat_map(|envs| plan(row, toy_for(row), envs)).collect::<Vec<_>>())
         };
         let alone = run(1, 1);

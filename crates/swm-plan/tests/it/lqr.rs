@@ -2,7 +2,7 @@
 //!
 //! A force accelerates a cart on a line, `s = (position, speed)`: `s' = A s + B a`. The plan minimises
 //! `Σ_t (sᵗᵀ Q sᵗ + R aᵗ²) + sᴴᵀ Q_H sᴴ`. Bellman's recursion (Riccati's equation) gives the best feedback, and the
-//! best plan is the sequence of its actions from the start.
+//! best plan is the sequence of actions of this feedback from the initial state.
 
 use crate::toys::{Landscape, draw};
 

@@ -18,7 +18,7 @@ struct RecordingSolver {
 
 impl Solver for RecordingSolver {
     fn solve(&mut self, _: &mut dyn CostModel, problem: PlanProblem<'_>) -> Result<Plan> {
-        let mut calls = self.calls.lock().expect("one thread");
+        let mut calls = self.calls.lock().expect("no thread has panicked");
         calls.push((problem.keys.to_vec(), problem.init.expect("an initial guess").to_vec()));
         let base = 100.0 * calls.len() as f32;
         let len = problem.horizon * problem.space.dim();
@@ -44,10 +44,10 @@ struct Past {
 
 impl CostModel for RecordingModel {
     fn observe(&mut self, infos: &Batch, envs: &[usize]) -> Result<()> {
-        self.observed.lock().expect("one thread").push(envs.to_vec());
+        self.observed.lock().expect("no thread has panicked").push(envs.to_vec());
         if infos.schema().find("history.length").is_some() {
             let row = infos.row(envs[0]);
-            self.past.lock().expect("one thread").push(Past {
+            self.past.lock().expect("no thread has panicked").push(Past {
                 length: row.get::<i32>("history.length")?[0],
                 pixels: row.get::<u8>("history.pixels")?.to_vec(),
                 actions: row.get::<f32>("history.action")?.to_vec(),
@@ -73,7 +73,8 @@ fn spec(high: f64) -> EnvSpec {
     }
 }
 
-struct Rig {
+/// A policy with a recording solver and a recording model, and their records.
+struct Fixture {
     policy: MpcPolicy,
     calls: Arc<Mutex<Vec<Call>>>,
     observed: Arc<Mutex<Vec<Vec<usize>>>>,
@@ -82,16 +83,16 @@ struct Rig {
     actions: Batch,
 }
 
-impl Rig {
+impl Fixture {
     fn new(config: MpcConfig, high: f64, slots: usize) -> Self {
         let calls = Arc::default();
         let cost = RecordingModel::default();
         let (observed, past) = (Arc::clone(&cost.observed), Arc::clone(&cost.past));
         let scale = ActionScale { mean: vec![1.0], std: vec![2.0] };
         let solver = Box::new(RecordingSolver { calls: Arc::clone(&calls) });
-        let policy = MpcPolicy::new(solver, Box::new(cost), config, scale, &spec(high), slots).expect("a policy");
-        let infos = Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("schema");
-        let actions = Schema::new([spec(high).action_column()]).expect("schema");
+        let policy = MpcPolicy::new(solver, Box::new(cost), config, scale, &spec(high), slots).expect("a valid policy");
+        let infos = Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("a valid schema");
+        let actions = Schema::new([spec(high).action_column()]).expect("a valid schema");
         Self {
             policy,
             calls,
@@ -108,51 +109,54 @@ impl Rig {
     }
 
     fn observed(&self) -> Vec<Vec<usize>> {
-        self.observed.lock().expect("one thread").clone()
+        self.observed.lock().expect("no thread has panicked").clone()
     }
 }
 
 #[test]
 fn replans_due_slots_in_one_call_with_warm_starts() {
     let config = MpcConfig { horizon: 3, receding_horizon: 2, action_block: 2, ..MpcConfig::default() };
-    let mut rig = Rig::new(config, 1e6, 3);
+    let mut fixture = Fixture::new(config, 1e6, 3);
     for slot in 0..3 {
-        rig.policy.begin(slot, Key::new(slot as u64));
+        fixture.policy.begin(slot, Key::new(slot as u64));
     }
     // Two model steps of two environment steps are executed: the first four values of the plan, times 2 plus 1.
     for value in 0..4 {
-        assert_eq!(rig.act(&[true, true, false])[..2], [201.0 + 2.0 * value as f32; 2]);
+        assert_eq!(fixture.act(&[true, true, false])[..2], [201.0 + 2.0 * value as f32; 2]);
     }
-    assert_eq!(rig.observed(), [[0, 1]]);
-    // A new episode in slot 1; slot 2 joins. All are due: one call.
-    rig.policy.begin(1, Key::new(7));
-    rig.act(&[true, true, true]);
-    assert_eq!(rig.observed(), [vec![0, 1], vec![0, 1, 2]]);
-    let calls = rig.calls.lock().expect("one thread");
+    assert_eq!(fixture.observed(), [[0, 1]]);
+    // Slot 1 begins a new episode and slot 2 becomes active: one call plans for all three slots.
+    fixture.policy.begin(1, Key::new(7));
+    fixture.act(&[true, true, true]);
+    assert_eq!(fixture.observed(), [vec![0, 1], vec![0, 1, 2]]);
+    let calls = fixture.calls.lock().expect("no thread has panicked");
     let (keys, init) = &calls[1];
     let key = |seed, plan| Key::new(seed).with("plan").at(plan);
     assert_eq!(keys[..], [key(0, 1), key(7, 0), key(2, 0)]);
     assert_eq!(init[..6], [104.0, 105.0, 0.0, 0.0, 0.0, 0.0], "the part that was not executed, moved forward");
     assert_eq!(init[6..], [0.0; 12], "new episodes start from zeros");
-    assert_eq!(rig.policy.take_latencies().len(), 5);
-    assert!(rig.policy.take_latencies().is_empty());
+    assert_eq!(fixture.policy.take_latencies().len(), 5);
+    assert!(fixture.policy.take_latencies().is_empty());
 }
 
 #[test]
 fn cold_starts_are_zero_and_open_loop_executes_whole_plans() {
     let config = MpcConfig { horizon: 2, receding_horizon: 2, action_block: 1, ..MpcConfig::default() };
-    let mut open = Rig::new(config.clone(), 1e6, 1);
+    let mut open = Fixture::new(config.clone(), 1e6, 1);
     (0..3).for_each(|_| drop(open.act(&[true])));
-    assert_eq!(open.calls.lock().expect("one thread").iter().map(|c| c.1.clone()).collect::<Vec<_>>(), [[0.0; 2]; 2]);
-    let mut cold = Rig::new(MpcConfig { receding_horizon: 1, warm_start: false, ..config }, 1e6, 1);
+    assert_eq!(
+        open.calls.lock().expect("no thread has panicked").iter().map(|c| c.1.clone()).collect::<Vec<_>>(),
+        [[0.0; 2]; 2]
+    );
+    let mut cold = Fixture::new(MpcConfig { receding_horizon: 1, warm_start: false, ..config }, 1e6, 1);
     (0..2).for_each(|_| drop(cold.act(&[true])));
-    assert_eq!(cold.calls.lock().expect("one thread")[1].1, [0.0; 2]);
+    assert_eq!(cold.calls.lock().expect("no thread has panicked")[1].1, [0.0; 2]);
 }
 
 #[test]
 fn executed_actions_are_clipped_to_the_action_space() {
     let config = MpcConfig { horizon: 1, receding_horizon: 1, action_block: 1, ..MpcConfig::default() };
-    assert_eq!(Rig::new(config, 5.0, 1).act(&[true]), [5.0]);
+    assert_eq!(Fixture::new(config, 5.0, 1).act(&[true]), [5.0]);
 }
 
 #[test]
@@ -165,13 +169,13 @@ fn history_contains_past_frames_and_actions() {
         history: 3,
         ..MpcConfig::default()
     };
-    let mut rig = Rig::new(config, 1e6, 2);
-    rig.policy.begin(1, Key::new(0));
+    let mut fixture = Fixture::new(config, 1e6, 2);
+    fixture.policy.begin(1, Key::new(0));
     for step in 0..7u8 {
-        rig.infos.get_mut::<u8>("pixels").expect("pixels").fill(10 + step);
-        rig.act(&[false, true]);
+        fixture.infos.get_mut::<u8>("pixels").expect("pixels").fill(10 + step);
+        fixture.act(&[false, true]);
     }
-    let past = rig.past.lock().expect("one thread");
+    let past = fixture.past.lock().expect("no thread has panicked");
     let pixel = |values: [u8; 2]| values.iter().flat_map(|&v| [v; 3]).collect::<Vec<_>>();
     let at = |length, pixels, actions: [f32; 4]| Past { length, pixels: pixel(pixels), actions: actions.to_vec() };
     assert_eq!(past[0], at(0, [0, 0], [0.0; 4]));
@@ -179,9 +183,9 @@ fn history_contains_past_frames_and_actions() {
     assert_eq!(past[2], at(2, [10, 12], [100.0, 101.0, 200.0, 201.0]));
     assert_eq!(past[3], at(2, [12, 14], [200.0, 201.0, 300.0, 301.0]));
     drop(past);
-    rig.policy.begin(1, Key::new(1));
-    rig.act(&[false, true]);
-    assert_eq!(rig.past.lock().expect("one thread")[4], at(0, [0, 0], [0.0; 4]));
+    fixture.policy.begin(1, Key::new(1));
+    fixture.act(&[false, true]);
+    assert_eq!(fixture.past.lock().expect("no thread has panicked")[4], at(0, [0, 0], [0.0; 4]));
 }
 
 #[test]
@@ -189,7 +193,7 @@ fn errors_name_invalid_settings() {
     let make = |config: MpcConfig, scale: ActionScale, spec: &EnvSpec| {
         let solver = Box::new(RecordingSolver { calls: Arc::default() });
         let made = MpcPolicy::new(solver, Box::new(RecordingModel::default()), config, scale, spec, 1);
-        made.err().expect("wrong").to_string()
+        made.err().expect("invalid input").to_string()
     };
     let scale = ActionScale::identity(1);
     let far = MpcConfig { receding_horizon: 6, ..MpcConfig::default() };
@@ -218,9 +222,9 @@ fn integers_are_planned_as_one_hot_vectors() {
             assert_eq!(choices, [3, 2, 3, 2]);
             let mut options = self.0.iter();
             let mut actions = vec![];
-            for &options_here in choices.iter().cycle().take(choices.len() * problem.horizon) {
+            for &option_count in choices.iter().cycle().take(choices.len() * problem.horizon) {
                 let chosen = options.next().expect("enough options");
-                actions.extend((0..options_here).map(|option| f32::from(u8::from(option == *chosen))));
+                actions.extend((0..option_count).map(|option| f32::from(u8::from(option == *chosen))));
             }
             Ok(Plan { actions, costs: vec![0.0], ..Plan::default() })
         }
@@ -231,19 +235,21 @@ fn integers_are_planned_as_one_hot_vectors() {
     let config = MpcConfig { horizon: 2, receding_horizon: 1, action_block: 2, history: 2, ..MpcConfig::default() };
     let (model, scale) = (RecordingModel::default(), ActionScale::unscaled(&spec));
     let (past, solver) = (Arc::clone(&model.past), Options(vec![2, 0, 1, 1, 0, 0, 0, 0]));
-    let mut policy = MpcPolicy::new(Box::new(solver), Box::new(model), config, scale, &spec, 1).expect("a policy");
-    let infos = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("schema"), 1);
-    let mut actions = Batch::zeros(&Schema::new([spec.action_column()]).expect("schema"), 1);
-    for wanted in [[2, 5], [1, 6], [2, 5]] {
+    let mut policy =
+        MpcPolicy::new(Box::new(solver), Box::new(model), config, scale, &spec, 1).expect("a valid policy");
+    let infos = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("a valid schema"), 1);
+    let mut actions = Batch::zeros(&Schema::new([spec.action_column()]).expect("a valid schema"), 1);
+    for expected in [[2, 5], [1, 6], [2, 5]] {
         policy.act(&infos, &[true], &mut actions).expect("actions");
-        assert_eq!(actions.get::<i64>("action").expect("integers"), wanted);
+        assert_eq!(actions.get::<i64>("action").expect("integers"), expected);
     }
-    let past = past.lock().expect("one thread");
+    let past = past.lock().expect("no thread has panicked");
     assert_eq!(past[1].actions, [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0]);
 
     // An action column of another type is an error.
-    let mut floats = Batch::zeros(&Schema::new([ColumnSpec::new("action", DType::Float32, [2])]).expect("schema"), 1);
-    let error = policy.act(&infos, &[true], &mut floats).expect_err("floats");
+    let mut floats =
+        Batch::zeros(&Schema::new([ColumnSpec::new("action", DType::Float32, [2])]).expect("a valid schema"), 1);
+    let error = policy.act(&infos, &[true], &mut floats).expect_err("float actions");
     assert!(error.to_string().contains("Int64"), "{error}");
 }
 
@@ -254,7 +260,7 @@ fn latency_budget_sets_the_deadline() {
 
     impl Solver for DeadlineSolver {
         fn solve(&mut self, _: &mut dyn CostModel, problem: PlanProblem<'_>) -> Result<Plan> {
-            *self.0.lock().expect("one thread") = problem.deadline;
+            *self.0.lock().expect("no thread has panicked") = problem.deadline;
             Ok(Plan { actions: vec![0.0; 25], costs: vec![0.0], ..Plan::default() })
         }
     }
@@ -264,10 +270,10 @@ fn latency_budget_sets_the_deadline() {
         let (solver, model) = (DeadlineSolver(Arc::clone(&deadline)), RecordingModel::default());
         let config = MpcConfig { latency_budget, ..MpcConfig::default() };
         let policy = MpcPolicy::new(Box::new(solver), Box::new(model), config, ActionScale::identity(1), &spec(1.0), 1);
-        let infos = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("schema"), 1);
-        let mut actions = Batch::zeros(&Schema::new([spec(1.0).action_column()]).expect("schema"), 1);
-        policy.expect("a policy").act(&infos, &[true], &mut actions).expect("actions");
-        *deadline.lock().expect("one thread")
+        let infos = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("a valid schema"), 1);
+        let mut actions = Batch::zeros(&Schema::new([spec(1.0).action_column()]).expect("a valid schema"), 1);
+        policy.expect("a valid policy").act(&infos, &[true], &mut actions).expect("actions");
+        *deadline.lock().expect("no thread has panicked")
     };
     let (before, budget) = (Instant::now(), Duration::from_secs(5));
     let end = deadline(Some(5.0)).expect("a deadline");
@@ -279,13 +285,13 @@ fn latency_budget_sets_the_deadline() {
 #[test]
 fn trace_log_records_plans() {
     let config = MpcConfig { horizon: 2, receding_horizon: 1, action_block: 1, ..MpcConfig::default() };
-    let mut rig = Rig::new(config, 1e6, 2);
+    let mut fixture = Fixture::new(config, 1e6, 2);
     let log = TraceLog::default();
-    rig.policy = rig.policy.traced(log.clone());
+    fixture.policy = fixture.policy.traced(log.clone());
     let keys = [Key::new(4), Key::new(5)];
-    (0..2).for_each(|slot| rig.policy.begin(slot, keys[slot]));
-    rig.act(&[true, false]);
-    rig.act(&[true, true]);
+    (0..2).for_each(|slot| fixture.policy.begin(slot, keys[slot]));
+    fixture.act(&[true, false]);
+    fixture.act(&[true, true]);
     let plans = log.take();
     let recorded: Vec<_> =
         plans.iter().map(|p| (p.episode, p.slot, p.replan, p.together, p.cost, p.search.best.clone())).collect();
@@ -295,7 +301,7 @@ fn trace_log_records_plans() {
     assert_eq!(recorded[1..], [(first, 0, 1, 2, 200.0, two.clone()), (second, 1, 0, 2, 200.0, two)]);
     assert!(plans.iter().all(|plan| plan.seconds >= plan.model_seconds && plan.model_seconds >= 0.0));
     assert!(log.take().is_empty(), "each plan is returned once");
-    let json = serde_json::to_value(&plans[0]).expect("JSON");
+    let json = serde_json::to_value(&plans[0]).expect("valid JSON");
     assert_eq!((&json["episode"], &json["best"]), (&first.into(), &serde_json::json!([100.0])));
 }
 
@@ -326,9 +332,9 @@ fn errors_name_the_source_of_invalid_plans() {
     let message = |solver: Box<dyn Solver>| {
         let scale = ActionScale::identity(1);
         let policy = MpcPolicy::new(solver, Box::new(Panicking), MpcConfig::default(), scale, &spec(1.0), 1);
-        let infos = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("schema"), 1);
-        let mut actions = Batch::zeros(&Schema::new([spec(1.0).action_column()]).expect("schema"), 1);
-        policy.expect("a policy").act(&infos, &[true], &mut actions).expect_err("wrong").to_string()
+        let infos = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("a valid schema"), 1);
+        let mut actions = Batch::zeros(&Schema::new([spec(1.0).action_column()]).expect("a valid schema"), 1);
+        policy.expect("a valid policy").act(&infos, &[true], &mut actions).expect_err("invalid input").to_string()
     };
     let wrong = |plan| message(Box::new(Wrong(plan)));
     assert!(wrong(|_, len| Plan { actions: vec![0.0; len - 1], ..Plan::default() }).contains("24 values"));

@@ -14,8 +14,8 @@ use swm_plan::objective::{
 use swm_plan::search::{Adam, Optimizer, Sgd};
 use swm_plan::solvers::{AugmentedLagrangian, GradientDescent, Grasp, LinearSchedule};
 
-/// Latent dynamics `z' = f(M z + B a)`, where the matrices M and B are lists of rows. The cost is the squared distance to the
-/// goal after the last step.
+/// Latent dynamics `z' = f(M z + B a)`, where the matrices M and B are lists of rows. The cost is the squared distance
+/// to the goal after the last step.
 struct System {
     mix: Vec<Vec<f32>>,
     push: Vec<Vec<f32>>,
@@ -119,7 +119,7 @@ impl LatentDynamics for System {
     }
 }
 
-/// Lets a model observe environments, which it knows by their indices.
+/// Calls `observe` with the indices of environments and a batch without columns.
 fn observe(model: &mut dyn CostModel, envs: &[usize]) {
     model.observe(&Batch::zeros(&Schema::new([]).expect("no columns"), 0), envs).expect("no columns are read");
 }
@@ -191,16 +191,18 @@ fn total(values: &[f32]) -> f64 {
 
 #[test]
 fn gradients_through_time_equal_finite_differences() {
-    let mut model = ObjectiveCost::new(Box::new(nonlinear()), Box::new(all_terms()), limits()).expect("a model");
+    let mut model = ObjectiveCost::new(Box::new(nonlinear()), Box::new(all_terms()), limits()).expect("a valid model");
     observe(&mut model, &ENVS);
     let actions = random(ENVS.len() * SAMPLES * HORIZON * 4);
     let (mut costs, mut again) = ([f32::NAN; 6], [f32::NAN; 6]);
     let mut gradient = vec![f32::NAN; actions.len()];
-    model.cost(candidates(&actions, HORIZON), &mut costs).expect("costs");
-    model.cost_and_gradient(candidates(&actions, HORIZON), &mut again, &mut gradient).expect("gradients");
+    model.cost(candidates(&actions, HORIZON), &mut costs).expect("the model computes costs");
+    model
+        .cost_and_gradient(candidates(&actions, HORIZON), &mut again, &mut gradient)
+        .expect("the model computes gradients");
     assert_eq!(costs, again);
     assert_gradient(&actions, &gradient, |moved| {
-        model.cost(candidates(moved, HORIZON), &mut costs).expect("costs");
+        model.cost(candidates(moved, HORIZON), &mut costs).expect("the model computes costs");
         total(&costs)
     });
 
@@ -210,10 +212,10 @@ fn gradients_through_time_equal_finite_differences() {
     let mut values = vec![0.0; 6 * count];
     // Gradients of constraints are added to the existing values.
     let mut gradient = vec![0.5; actions.len()];
-    model.constrain_vjp(candidates(&actions, HORIZON), &weights, &mut gradient).expect("gradients");
+    model.constrain_vjp(candidates(&actions, HORIZON), &weights, &mut gradient).expect("the model computes gradients");
     gradient.iter_mut().for_each(|g| *g -= 0.5);
     assert_gradient(&actions, &gradient, |moved| {
-        model.constrain(candidates(moved, HORIZON), &mut values).expect("values");
+        model.constrain(candidates(moved, HORIZON), &mut values).expect("the model computes constraints");
         values.iter().zip(&weights).map(|(value, weight)| f64::from(value * weight)).sum()
     });
 }
@@ -244,8 +246,8 @@ fn values_of_terms_and_constraints_follow_their_formulas() {
     assert_eq!(values(&LatentBox { high: Some(1.5), ..LatentBox::default() }), [0.5, -0.5, 2.5, -1.5]);
     let one = LatentBox { latents: vec![Pick::Range([0, 1])], low: Some(3.0), high: Some(5.0) };
     assert_eq!(values(&one), [1.0, -3.0, -1.0, -1.0]);
-    let none = Control::default().cost(Trajectory { latents: &[], goal: &[], ..trajectory });
-    assert_eq!(none, 32.0, "terms on actions need no latents");
+    let control_cost = Control::default().cost(Trajectory { latents: &[], goal: &[], ..trajectory });
+    assert_eq!(control_cost, 32.0, "terms on actions need no latents");
 }
 
 #[test]
@@ -254,15 +256,16 @@ fn terminal_goal_equals_the_cost_of_the_model() {
     let (mut own, mut priced) = ([0.0; 6], [1.0; 6]);
     let mut model = nonlinear();
     observe(&mut model, &ENVS);
-    model.cost(candidates(&actions, HORIZON), &mut own).expect("costs");
-    let mut model = ObjectiveCost::new(Box::new(nonlinear()), Box::new(Goal::default()), vec![]).expect("a model");
+    model.cost(candidates(&actions, HORIZON), &mut own).expect("the model computes costs");
+    let mut model =
+        ObjectiveCost::new(Box::new(nonlinear()), Box::new(Goal::default()), vec![]).expect("a valid model");
     observe(&mut model, &ENVS);
-    model.cost(candidates(&actions, HORIZON), &mut priced).expect("costs");
+    model.cost(candidates(&actions, HORIZON), &mut priced).expect("the model computes costs");
     assert_eq!(own, priced);
     assert!(model.constrained().is_none());
     // The same candidates are predicted again after a new observation.
     observe(&mut model, &[4, 5]);
-    model.cost(candidates(&actions, HORIZON), &mut priced).expect("costs");
+    model.cost(candidates(&actions, HORIZON), &mut priced).expect("the model computes costs");
     assert!(own.iter().zip(priced).all(|(own, other)| *own != other));
 }
 
@@ -274,41 +277,43 @@ fn regularised_model_adds_costs_gradients_and_constraints() {
         "terms": [{"term": "control", "weight": 0.25}, {"term": "change", "weight": 0.5}],
         "constraints": [{"constraint": "action_norm", "limit": 0.5}]
     }"#;
-    let config: ObjectiveConfig = serde_json::from_str(config).expect("an objective");
+    let config: ObjectiveConfig = serde_json::from_str(config).expect("a valid objective");
     let mut own = [0.0; 6];
-    Model::new(quadratic, &ENVS).cost(candidates(&actions, 3), &mut own).expect("costs");
+    Model::new(quadratic, &ENVS).cost(candidates(&actions, 3), &mut own).expect("the model computes costs");
 
-    let mut model = config.apply(Box::new(Model::new(quadratic, &ENVS))).expect("a model");
+    let mut model = config.apply(Box::new(Model::new(quadratic, &ENVS))).expect("a valid model");
     let (mut costs, mut gradient) = ([0.0; 6], vec![0.0; actions.len()]);
-    model.cost(candidates(&actions, 3), &mut costs).expect("costs");
+    model.cost(candidates(&actions, 3), &mut costs).expect("the model computes costs");
     for ((cost, own), a) in costs.iter().zip(own).zip(actions.chunks_exact(6)) {
         let change: f32 = (2..6).map(|j| (a[j] - a[j - 2]).powi(2)).sum();
         let expected = own + 0.25 * a.iter().map(|a| a * a).sum::<f32>() + 0.5 * change;
         assert!((cost - expected).abs() < 1e-5, "{cost} {expected}");
     }
     let differentiable = model.differentiable().expect("the toy has a gradient");
-    differentiable.cost_and_gradient(candidates(&actions, 3), &mut costs, &mut gradient).expect("gradients");
+    differentiable
+        .cost_and_gradient(candidates(&actions, 3), &mut costs, &mut gradient)
+        .expect("the model computes gradients");
     assert_gradient(&actions, &gradient, |moved| {
-        model.cost(candidates(moved, 3), &mut costs).expect("costs");
+        model.cost(candidates(moved, 3), &mut costs).expect("the model computes costs");
         total(&costs)
     });
     let limits = model.constrained().expect("a constraint");
     let (weights, mut values) = (random(18), vec![0.0; 18]);
     gradient.fill(0.0);
-    limits.constrain_vjp(candidates(&actions, 3), &weights, &mut gradient).expect("gradients");
+    limits.constrain_vjp(candidates(&actions, 3), &weights, &mut gradient).expect("the model computes gradients");
     assert_gradient(&actions, &gradient, |moved| {
-        limits.constrain(candidates(moved, 3), &mut values).expect("values");
+        limits.constrain(candidates(moved, 3), &mut values).expect("the model computes constraints");
         values.iter().zip(&weights).map(|(value, weight)| f64::from(value * weight)).sum()
     });
 
-    let mut opaque = config.apply(Box::new(Model::new(quadratic, &ENVS).opaque())).expect("a model");
+    let mut opaque = config.apply(Box::new(Model::new(quadratic, &ENVS).opaque())).expect("a valid model");
     assert!(opaque.differentiable().is_none() && opaque.latent().is_none() && opaque.constrained().is_some());
-    let mut shown = config.apply(Box::new(Model::new(toy("reach"), &ENVS))).expect("a model");
-    assert!(shown.latent().is_some());
+    let mut with_latents = config.apply(Box::new(Model::new(toy("reach"), &ENVS))).expect("a valid model");
+    assert!(with_latents.latent().is_some());
 }
 
 fn solve(solver: &mut dyn Solver, model: &mut dyn CostModel, horizon: usize, dim: usize, envs: &[usize]) -> Plan {
-    try_solve(solver, model, horizon, dim, envs).expect("a plan")
+    try_solve(solver, model, horizon, dim, envs).expect("the solver returns a plan")
 }
 
 fn try_solve(
@@ -327,12 +332,13 @@ fn try_solve(
 
 #[test]
 fn plans_satisfy_an_action_norm_constraint() {
-    // The goal is farther away than three actions of norm 0.1 reach, so the best plan is a straight line of maximal actions.
+    // The goal is farther away than three actions of norm 0.1 reach, so the best plan is a straight line of maximal
+    // actions.
     const LIMIT: f32 = 0.1;
     let limit: Vec<Box<dyn Constraint>> = vec![Box::new(ActionNorm { limit: LIMIT, block: 1 })];
     let envs = [0, 1, 2];
     let model = Box::new(Model::new(toy("reach"), &envs));
-    let mut model = Regularised::new(model, Box::new(Vec::<Control>::new()), limit).expect("a model");
+    let mut model = Regularised::new(model, Box::new(Vec::<Control>::new()), limit).expect("a valid model");
     let mut solver = AugmentedLagrangian {
         samples: 4,
         outer_iterations: 25,
@@ -345,7 +351,7 @@ fn plans_satisfy_an_action_norm_constraint() {
     for (env, actions) in envs.into_iter().zip(plan.actions.chunks_exact(6)) {
         let goal = draw(env, 2, 1.0);
         let norm = goal.iter().map(|g| g * g).sum::<f64>().sqrt();
-        assert!(norm > 0.35, "environment {env}: its goal is near");
+        assert!(norm > 0.35, "environment {env}: the goal is too near");
         for (j, action) in actions.iter().enumerate() {
             let best = f64::from(LIMIT) * goal[j % 2] / norm;
             assert!((f64::from(*action) - best).abs() < 2e-3, "environment {env}: {actions:?}, goal {goal:?}");
@@ -367,7 +373,7 @@ fn cart() -> ObjectiveCost {
         terms.push(Box::new(Goal { weight: each, when: When::Running, latents: latents.clone(), ..Goal::default() }));
         terms.push(Box::new(Goal { weight: last - each, latents, ..Goal::default() }));
     }
-    ObjectiveCost::new(Box::new(system), Box::new(terms), vec![]).expect("a model")
+    ObjectiveCost::new(Box::new(system), Box::new(terms), vec![]).expect("a valid model")
 }
 
 #[test]
@@ -399,13 +405,13 @@ fn unstable(growth: f32) -> ObjectiveCost {
     let mix = vec![vec![growth, 0.2], vec![-0.2, growth]];
     let push = vec![vec![1.0, 0.0], vec![0.0, 1.0]];
     let system = System { mix, push, nonlinear: false, start_and_goal, envs: vec![] };
-    ObjectiveCost::new(Box::new(system), Box::new(Goal::default()), vec![]).expect("a model")
+    ObjectiveCost::new(Box::new(system), Box::new(Goal::default()), vec![]).expect("a valid model")
 }
 
 #[test]
 fn one_step_size_of_grasp_works_for_all_horizons() {
-    // The curvature of a rollout's cost grows with the horizon, that of the lifted problem does not. The test uses plain
-    // gradient steps, because Adam rescales every value and hides the difference.
+    // The curvature of a rollout's cost grows with the horizon; the curvature of the lifted problem does not. The test
+    // uses plain gradient steps, because Adam rescales every value and hides the difference.
     let plain = |step| Optimizer::Sgd(Sgd { step, momentum: 0.0 });
     let zero = LinearSchedule { from: 0.0, to: 0.0 };
     let mut grasp = Grasp {
@@ -425,22 +431,31 @@ fn one_step_size_of_grasp_works_for_all_horizons() {
         Ok(plan.costs.into_iter().fold(0.0, f32::max))
     };
     for (growth, horizon) in [(1.1, 20), (1.1, 40), (1.3, 20)] {
-        let cost = worst(&mut grasp, growth, horizon).expect("a plan");
+        let cost = worst(&mut grasp, growth, horizon).expect("the solver returns a plan");
         assert!(cost < 1e-6, "growth {growth}, horizon {horizon}: {cost}");
     }
     let gd =
         |step| GradientDescent { samples: 1, iterations: 100, optimizer: plain(step), ..GradientDescent::default() };
-    assert!(worst(&mut gd(1e-3), 1.1, 20).expect("a plan") < 1e-6, "a suitable step size for horizon 20");
+    assert!(
+        worst(&mut gd(1e-3), 1.1, 20).expect("the solver returns a plan") < 1e-6,
+        "a suitable step size for horizon 20"
+    );
     let message = worst(&mut gd(1e-3), 1.1, 40).expect_err("too large a step size for horizon 40").to_string();
     assert!(message.contains("not finite"), "{message}");
-    assert!(worst(&mut gd(1e-5), 1.1, 40).expect("a plan") < 1e-6, "a suitable step size for horizon 40");
-    assert!(worst(&mut gd(1e-5), 1.1, 20).expect("a plan") > 1.0, "too small a step size for horizon 20");
+    assert!(
+        worst(&mut gd(1e-5), 1.1, 40).expect("the solver returns a plan") < 1e-6,
+        "a suitable step size for horizon 40"
+    );
+    assert!(
+        worst(&mut gd(1e-5), 1.1, 20).expect("the solver returns a plan") > 1.0,
+        "too small a step size for horizon 20"
+    );
 }
 
 #[test]
-fn errors_name_what_does_not_fit() {
+fn errors_name_the_mismatch() {
     let shape = Shape { horizon: 2, latent: 3, dim: 4 };
-    let message = |objective: &dyn Objective| objective.check(shape).expect_err("wrong").to_string();
+    let message = |objective: &dyn Objective| objective.check(shape).expect_err("invalid input").to_string();
     let goal = Goal::default;
     let past = message(&Goal { latents: vec![Pick::Range([2, 4])], ..goal() });
     assert_eq!(past, "goal term latents = 2..4 is outside its space: expected latent dimensions within 0..3");
@@ -449,7 +464,7 @@ fn errors_name_what_does_not_fit() {
     assert!(message(&Goal { weight: f32::NAN, ..goal() }).contains("goal term weight: NaN"));
     assert!(message(&Control { weight: -1.0 }).contains("control term weight: -1"));
     assert!(message(&Change { weight: 1.0, block: 3 }).contains("3 actions in a model step of dimension 4"));
-    let message = |constraint: &dyn Constraint| constraint.check(shape).expect_err("wrong").to_string();
+    let message = |constraint: &dyn Constraint| constraint.check(shape).expect_err("invalid input").to_string();
     assert!(message(&ActionNorm { limit: -1.0, block: 1 }).contains("action norm limit: -1"));
     assert!(message(&LatentBox::default()).contains("give a finite lower bound"));
     assert!(message(&LatentBox { low: Some(1.0), high: Some(0.0), ..LatentBox::default() }).contains("Some(1.0)"));
@@ -460,8 +475,9 @@ fn errors_name_what_does_not_fit() {
     assert!(read(r#"{"terms": [{"term": "goal", "wieght": 1}]}"#).expect_err("a typo").to_string().contains("wieght"));
     assert!(read(r#"{"terms": [{"term": "joy"}]}"#).expect_err("unknown").to_string().contains("joy"));
     let model = |name| Box::new(Model::new(toy(name), &ENVS));
-    let reject =
-        |json: &str, name| read(json).expect("an objective").apply(model(name)).err().expect("wrong").to_string();
+    let reject = |json: &str, name| {
+        read(json).expect("a valid objective").apply(model(name)).err().expect("invalid input").to_string()
+    };
     let message = reject(r#"{"terms": [{"term": "goal"}]}"#, "quadratic");
     assert!(message.contains("it uses latents, and this model has none"), "{message}");
     let message = reject(r#"{"constraints": [{"constraint": "latent_box", "low": 0}]}"#, "reach");
@@ -471,7 +487,7 @@ fn errors_name_what_does_not_fit() {
     assert!(ObjectiveConfig::default().is_empty());
     assert!(ObjectiveConfig::default().apply(model("constrained")).is_ok(), "an empty objective");
 
-    let mut cost = ObjectiveCost::new(Box::new(nonlinear()), Box::new(goal()), vec![]).expect("a model");
+    let mut cost = ObjectiveCost::new(Box::new(nonlinear()), Box::new(goal()), vec![]).expect("a valid model");
     let actions = random(ENVS.len() * SAMPLES * HORIZON * 4);
     let message = cost.cost(candidates(&actions, HORIZON), &mut [0.0; 6]).expect_err("nothing observed").to_string();
     assert!(message.contains("got 2, expected 0, the number of observed ones"), "{message}");

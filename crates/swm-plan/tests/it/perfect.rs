@@ -11,9 +11,9 @@ use rows::Task;
 use serde_json::Value;
 
 fn run(task: &Task, solver: &'static str, n: usize) -> Outcome {
-    let starts = starts(task.entry, task.protocol, n).expect("starts");
-    let planner = rows::planner(task, solver, &Value::Null).expect("settings");
-    play(task.entry, &starts, &planner, task.budget).expect("an outcome")
+    let starts = starts(task.entry, task.protocol, n).expect("valid starts");
+    let planner = rows::planner(task, solver, &Value::Null).expect("valid settings");
+    play(task.entry, &starts, &planner, task.budget).expect("the planner plays the starts")
 }
 
 #[test]

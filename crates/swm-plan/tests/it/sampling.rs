@@ -6,23 +6,23 @@ use std::time::Instant;
 use swm_core::{Key, Plan, PlanProblem, PlanSpace, Solver};
 use swm_plan::{ActionKind, Family, SOLVERS, SolverEntry};
 
-fn samplers() -> impl Iterator<Item = (&'static SolverEntry, &'static Toy)> {
+fn sampling_solvers() -> impl Iterator<Item = (&'static SolverEntry, &'static Toy)> {
     let toy_for = |row: &SolverEntry| toy(if row.actions == ActionKind::Discrete { "discrete" } else { "quadratic" });
     SOLVERS.rows.iter().filter(|row| row.family == Family::Sampling).map(move |row| (row, toy_for(row)))
 }
 
 fn make(id: &str, settings: &Value) -> Box<dyn Solver> {
-    (SOLVERS.get(id).expect("a solver").make)(settings).expect("settings")
+    (SOLVERS.get(id).expect("a registered solver").make)(settings).expect("valid settings")
 }
 
 fn plan(id: &str, toy: &'static Toy, init: Option<&[f32]>, deadline: Option<Instant>) -> Plan {
     let problem = PlanProblem { horizon: toy.horizon, space: toy.space, keys: &[Key::new(1)], init, deadline };
-    make(id, &json!({})).solve(&mut Model::new(toy, &[0]), problem).expect("a plan")
+    make(id, &json!({})).solve(&mut Model::new(toy, &[0]), problem).expect("the solver returns a plan")
 }
 
 #[test]
 fn initial_guess_is_the_first_candidate() {
-    for (row, toy) in samplers() {
+    for (row, toy) in sampling_solvers() {
         let landscape = (toy.landscape)(0);
         let optimum = landscape.optimum();
         let init: Vec<f32> = optimum.iter().map(|&v| v as f32).collect();
@@ -36,18 +36,18 @@ fn initial_guess_is_the_first_candidate() {
 
 #[test]
 fn deadline_ends_the_search() {
-    for (row, toy) in samplers() {
-        let (late, whole) = (plan(row.id, toy, None, Some(Instant::now())), plan(row.id, toy, None, None));
-        assert_eq!(late.trace[0].best.len(), 1, "{}", row.id);
-        assert_eq!(late.trace[0].best[0], whole.trace[0].best[0], "{}", row.id);
-        assert_eq!(late.costs, late.trace[0].best, "{}", row.id);
-        assert_eq!(whole.trace[0].best.len(), if row.id == "predictive_sampling" { 1 } else { 30 }, "{}", row.id);
+    for (row, toy) in sampling_solvers() {
+        let (stopped, complete) = (plan(row.id, toy, None, Some(Instant::now())), plan(row.id, toy, None, None));
+        assert_eq!(stopped.trace[0].best.len(), 1, "{}", row.id);
+        assert_eq!(stopped.trace[0].best[0], complete.trace[0].best[0], "{}", row.id);
+        assert_eq!(stopped.costs, stopped.trace[0].best, "{}", row.id);
+        assert_eq!(complete.trace[0].best.len(), if row.id == "predictive_sampling" { 1 } else { 30 }, "{}", row.id);
     }
 }
 
 #[test]
 fn traces_are_consistent() {
-    for (row, toy) in samplers() {
+    for (row, toy) in sampling_solvers() {
         let trace = &plan(row.id, toy, None, None).trace[0];
         let n = trace.best.len();
         assert!(trace.mean.len() == n && trace.spread.len() == n && trace.violation.is_empty(), "{}", row.id);
@@ -72,13 +72,13 @@ fn candidates_stay_within_bounds() {
             Ok(())
         }
     }
-    for (row, _) in samplers().filter(|(row, _)| row.actions == ActionKind::Continuous) {
+    for (row, _) in sampling_solvers().filter(|(row, _)| row.actions == ActionKind::Continuous) {
         let mut model = LargestAction(0.0);
         let space = PlanSpace::Continuous { low: &[-0.3, -0.5], high: &[0.25, 0.5] };
         let problem = PlanProblem { horizon: 3, space, keys: &[Key::new(0)], init: Some(&[9.0; 6]), deadline: None };
-        let plan = make(row.id, &json!({})).solve(&mut model, problem).expect("a plan");
+        let plan = make(row.id, &json!({})).solve(&mut model, problem).expect("the solver returns a plan");
         assert_eq!(model.0, 0.5, "{}", row.id);
-        // All costs are equal; the plan must be within the bounds all the same.
+        // The plan must be within the bounds even though all costs are equal.
         for step in plan.actions.chunks_exact(2) {
             assert!((-0.3..=0.25).contains(&step[0]) && (-0.5..=0.5).contains(&step[1]), "{}: {step:?}", row.id);
         }
@@ -87,8 +87,8 @@ fn candidates_stay_within_bounds() {
 
 #[test]
 fn no_environments_give_no_plans() {
-    for (row, toy) in samplers() {
-        let plan = solve(&mut *make(row.id, &json!({})), &mut Model::new(toy, &[]), toy, &[]).expect("nothing");
+    for (row, toy) in sampling_solvers() {
+        let plan = solve(&mut *make(row.id, &json!({})), &mut Model::new(toy, &[]), toy, &[]).expect("an empty plan");
         assert!(plan.actions.is_empty() && plan.costs.is_empty() && plan.trace.is_empty());
     }
 }
@@ -116,11 +116,11 @@ fn errors_name_invalid_settings() {
         ("categorical_cem", json!({"elites": 0}), "categorical_cem elites"),
     ];
     for (id, settings, expected) in wrong {
-        let toy = samplers().find(|(row, _)| row.id == id).expect("a sampler").1;
+        let toy = sampling_solvers().find(|(row, _)| row.id == id).expect("a sampling solver").1;
         let error = solve(&mut *make(id, &settings), &mut Model::new(toy, &[0]), toy, &[0]).expect_err(expected);
         assert!(error.is_usage() && error.to_string().contains(expected), "{error}");
     }
-    for (row, _) in samplers() {
+    for (row, _) in sampling_solvers() {
         let error = (row.make)(&json!({"sampels": 3})).err().expect("a typo").to_string();
         assert!(error.contains("sampels"), "{error}");
     }
@@ -132,7 +132,7 @@ fn errors_name_invalid_problems() {
     let message = |id: &str, horizon, space, init: Option<&[f32]>| {
         let keys = [Key::new(0), Key::new(1)];
         let problem = PlanProblem { horizon, space, keys: &keys, init, deadline: None };
-        make(id, &json!({})).solve(&mut Model::new(quadratic, &[0, 1]), problem).expect_err("wrong").to_string()
+        make(id, &json!({})).solve(&mut Model::new(quadratic, &[0, 1]), problem).expect_err("invalid input").to_string()
     };
     let space = quadratic.space;
     assert!(message("cem", 0, space, None).contains("planning horizon: 0 model steps"));

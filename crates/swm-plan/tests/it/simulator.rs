@@ -1,4 +1,4 @@
-//! The simulator as a cost model: its costs are those of the actions that the policy executes.
+//! The simulator as a cost model: its costs are computed for the actions that the policy executes.
 
 use rand::Rng as _;
 use swm_core::pool::{Reset, threads};
@@ -10,10 +10,10 @@ const HORIZON: usize = 3;
 const BLOCK: usize = 2;
 
 fn pool(entry: &EnvEntry, envs: usize) -> EnvPool {
-    let envs = (0..envs).map(|_| entry.env().expect("an environment")).collect();
+    let envs = (0..envs).map(|_| entry.env().expect("a valid environment")).collect();
     let mut pool = EnvPool::new(envs, None, None, threads(1).expect("a thread")).expect("a pool");
     let resets = (0..pool.len()).map(|slot| Reset { slot, seed: slot as u64, options: ResetOptions::default() });
-    pool.reset(&resets.collect::<Vec<_>>()).expect("a reset");
+    pool.reset(&resets.collect::<Vec<_>>()).expect("the reset succeeds");
     pool
 }
 
@@ -37,7 +37,9 @@ fn simulator(entry: &EnvEntry, pool: &EnvPool, slots: &[usize], score: Score) ->
 fn costs(simulator: &mut SimulatorCost, actions: &[f32], envs: usize, samples: usize) -> Vec<f32> {
     let mut costs = vec![f32::NAN; envs * samples];
     let dim = actions.len() / (envs * samples * HORIZON);
-    simulator.cost(Candidates { actions, envs, samples, horizon: HORIZON, dim }, &mut costs).expect("costs");
+    simulator
+        .cost(Candidates { actions, envs, samples, horizon: HORIZON, dim }, &mut costs)
+        .expect("the model computes costs");
     costs
 }
 
@@ -54,21 +56,21 @@ fn costs_equal_distances_in_the_environment() {
         for score in [Score::Terminal, Score::Running] {
             let costs = costs(&mut simulator(entry, &pool, &[1], score), &actions, 1, samples);
             for (candidate, cost) in actions.chunks_exact(HORIZON * BLOCK * 2).zip(costs) {
-                let mut environment = entry.env().expect("an environment");
-                environment.restore(&pool.env(1).snapshot()).expect("a snapshot");
+                let mut environment = entry.env().expect("a valid environment");
+                environment.restore(&pool.env(1).snapshot()).expect("the environment restores the snapshot");
                 let distances: Vec<f64> = candidate
                     .chunks_exact(2)
                     .map(|action| {
                         let action = [action[0].clamp(-1.0, 1.0), action[1].clamp(-1.0, 1.0)];
-                        environment.step(Action::Continuous(&action)).expect("a step");
+                        environment.step(Action::Continuous(&action)).expect("the environment steps");
                         environment.goal_distance()
                     })
                     .collect();
-                let wanted = match score {
+                let expected = match score {
                     Score::Running => distances.iter().sum(),
                     _ => distances[distances.len() - 1],
                 };
-                assert_eq!(cost.to_bits(), (wanted as f32).to_bits(), "{}, {score:?}", entry.id);
+                assert_eq!(cost.to_bits(), (expected as f32).to_bits(), "{}, {score:?}", entry.id);
             }
         }
     }
@@ -87,7 +89,7 @@ fn reaching_the_goal_early_is_cheapest() {
         };
         env.reset(0, &options)
     })
-    .expect("a reset");
+    .expect("the reset succeeds");
     let walk = |steps: usize| (0..6).flat_map(move |t| [if t < steps { 1.0 } else { 0.0 }, 0.0]);
     let actions: Vec<f32> = walk(3).chain(walk(2)).chain(walk(6)).collect();
     let costs = costs(&mut simulator(entry, &pool, &[0], Score::Reach), &actions, 1, 3);
@@ -112,14 +114,18 @@ fn costs_do_not_depend_on_other_environments_or_threads() {
         let own = samples * HORIZON * BLOCK * width;
         let all = actions(&mut Key::new(2).rng(), envs * own);
         let run = |threads: usize, slots: &[usize]| {
-            let workers = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
+            let workers = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a thread pool");
             let actions: Vec<f32> = slots.iter().flat_map(|&slot| &all[slot * own..][..own]).copied().collect();
             let mut simulator = simulator(entry, &pool, slots, Score::Terminal);
             let costs = workers.install(|| costs(&mut simulator, &actions, slots.len(), samples));
             costs.chunks(samples).map(<[f32]>::to_vec).collect::<Vec<_>>()
         };
         let together = run(1, &[0, 1, 2]);
-        assert!(together.iter().all(|costs| costs.iter().any(|&cost| cost != costs[0])), "{}: all alike", entry.id);
+        assert!(
+            together.iter().all(|costs| costs.iter().any(|&cost| cost != costs[0])),
+            "{}: all candidates have the same cost",
+            entry.id
+        );
         assert_eq!(run(2, &[0, 1, 2]), together, "{}: two threads", entry.id);
         assert_eq!(
             run(2, &[2, 0]),
@@ -132,14 +138,14 @@ fn costs_do_not_depend_on_other_environments_or_threads() {
 
 #[test]
 fn rejects_other_environments_and_wrong_shapes() {
-    let (room, table) = (pool(&two_room::ENTRY, 1), pool(&push_t::ENTRY, 1));
-    let mut simulator = simulator(&two_room::ENTRY, &room, &[0], Score::Terminal);
-    let foreign = simulator.observe_env(0, table.env(0)).expect_err("another environment").to_string();
-    assert!(foreign.contains(push_t::ENTRY.id) && foreign.contains(two_room::ENTRY.id), "{foreign}");
-    let again = simulator.observe(room.infos(), &[0]).expect_err("passed once, observed twice").to_string();
+    let (two_room_pool, push_t_pool) = (pool(&two_room::ENTRY, 1), pool(&push_t::ENTRY, 1));
+    let mut simulator = simulator(&two_room::ENTRY, &two_room_pool, &[0], Score::Terminal);
+    let message = simulator.observe_env(0, push_t_pool.env(0)).expect_err("another environment").to_string();
+    assert!(message.contains(push_t::ENTRY.id) && message.contains(two_room::ENTRY.id), "{message}");
+    let again = simulator.observe(two_room_pool.infos(), &[0]).expect_err("passed once, observed twice").to_string();
     assert!(again.contains("was not passed to the policy"), "{again}");
     let wide = Candidates { actions: &[0.0; 6], envs: 1, samples: 1, horizon: 1, dim: 6 };
-    assert!(simulator.cost(wide, &mut [0.0]).expect_err("too wide").to_string().contains("6 values"));
+    assert!(simulator.cost(wide, &mut [0.0]).expect_err("too many action values").to_string().contains("6 values"));
     let none = SimulatorCost::new(|| two_room::ENTRY.env(), ActionScale::identity(2), 0, Score::Terminal);
     assert!(none.err().expect("no actions").to_string().contains("action block"));
 }

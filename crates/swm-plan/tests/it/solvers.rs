@@ -1,19 +1,19 @@
-//! Every solver on every toy: it finds the optimum to the accuracy of its trial, or rejects the toy.
+//! Every solver on every toy: the solver finds the optimum to the accuracy of its trial, or rejects the toy.
 
 use crate::toys::{Model, TOYS, Toy, solve, toy};
 use swm_core::PlanSpace;
 use swm_core::registry::Named;
 use swm_plan::{ActionKind, Need, Penalised, SOLVERS, SolverEntry, pairing};
 
-/// The settings to try a solver with, and the required accuracy.
+/// The settings with which a solver is tested, and the required accuracy.
 pub struct Trial {
     pub solver: &'static str,
     /// The settings, as JSON.
     pub settings: &'static str,
     /// The settings of the short search that golden files record.
     pub short: &'static str,
-    /// For each toy it can solve: the allowed excess of the cost over the lowest one, and the allowed distance of any value of
-    /// the plan from the best plan.
+    /// For each toy it can solve: the allowed excess of the cost over the lowest one, and the allowed distance of any
+    /// value of the plan from the best plan.
     pub near: &'static [(&'static str, f64, f64)],
 }
 
@@ -114,21 +114,21 @@ pub const TRIALS: &[Trial] = &[
     },
 ];
 
-/// Pairs that are not tried, with the reason.
+/// Pairs of solver and toy that are not tested, with the reason.
 const SKIPPED: &[(&str, &str, &str)] = &[];
 
 /// The environments that every toy is solved for in one call.
 const ENVS: [usize; 3] = [0, 1, 2];
 
-/// Above the multipliers of the constrained toy, which are below 2.
+/// The weight of the penalty. It exceeds the multipliers of the constrained toy, which are below 2.
 const PENALTY: f32 = 4.0;
 
 pub fn trial(solver: &str) -> &'static Trial {
     let trial = TRIALS.iter().find(|trial| trial.solver == solver);
-    trial.unwrap_or_else(|| panic!("give {solver} a trial"))
+    trial.unwrap_or_else(|| panic!("TRIALS has no entry for {solver}"))
 }
 
-/// Whether a solver can plan for a toy, constraints aside.
+/// Whether a solver can plan for a toy if the toy's constraints are ignored.
 fn fits(row: &SolverEntry, toy: &Toy) -> bool {
     let actions = match toy.space {
         PlanSpace::Continuous { .. } => ActionKind::Continuous,
@@ -151,7 +151,7 @@ pub fn solves(row: &SolverEntry, toy: &Toy) -> bool {
 fn solvers_find_the_optima_of_toys() {
     for row in SOLVERS.rows {
         let trial = trial(row.id);
-        let settings = serde_json::from_str(trial.settings).expect("settings");
+        let settings = serde_json::from_str(trial.settings).expect("valid settings");
         for toy in TOYS {
             // A sampling solver receives constraints as a penalty.
             let penalised = toy.constrained && fits(row, toy) && row.needs.is_empty();
@@ -161,7 +161,7 @@ fn solvers_find_the_optima_of_toys() {
             assert_eq!(near.is_some(), tried, "the trial of {} on {}", row.id, toy.name);
             let Some(&(_, excess, distance)) = near else { continue };
 
-            let mut solver = (row.make)(&settings).expect("a solver");
+            let mut solver = (row.make)(&settings).expect("valid settings");
             let mut model = Model::new(toy, &ENVS);
             let plan = if penalised {
                 let mut model = Penalised::new(Box::new(model), PENALTY).expect("constraints");
@@ -216,8 +216,8 @@ fn pairing_names_the_solvers_that_fit() {
         let toy = toy(if row.actions == ActionKind::Discrete { "discrete" } else { "quadratic" });
         let message = message(row, toy, &mut Model::new(toy, &ENVS).opaque());
         for other in SOLVERS.rows.iter().filter(|other| other.id() != row.id()) {
-            let able = other.actions == row.actions && other.needs.is_empty();
-            assert_eq!(named(&message, other.id), able, "{message}");
+            let fits_actions = other.actions == row.actions && other.needs.is_empty();
+            assert_eq!(named(&message, other.id), fits_actions, "{message}");
         }
     }
 }
@@ -236,7 +236,7 @@ fn skipped_trials_exist_and_have_reasons() {
 #[test]
 fn errors_name_costs_that_are_missing_or_not_finite() {
     for row in SOLVERS.rows {
-        let toy = TOYS.iter().find(|toy| solves(row, toy)).expect("a toy");
+        let toy = TOYS.iter().find(|toy| solves(row, toy)).expect("a toy for this solver");
         let message = |cost| {
             let mut solver = (row.make)(&serde_json::json!({})).expect("a solver");
             let model = Model::new(toy, &ENVS).with_wrong_cost(1, 0, cost);

@@ -4,7 +4,7 @@ use super::svg::{LABELS, NAME, Svg, WIDE};
 use crate::group::Group;
 use crate::text::{outcome, shorten};
 
-/// Every episode as a square, in order, so that runs on the same starts can be compared start by start.
+/// Draws every episode as a square, in order, so that runs on the same starts can be compared start by start.
 pub(crate) fn chart(group: &Group<'_>) -> String {
     const CELL: f64 = 12.0;
     const COLUMNS: usize = 60;

@@ -4,7 +4,7 @@ use super::svg::{LABELS, NAME, Scale, Svg, WIDE};
 use crate::group::Group;
 use crate::text::{duration, shorten};
 
-/// The time of a plan: a bar to the median, a whisker to the 95th percentile; none if no policy plans.
+/// Draws the time of a plan as a bar to the median and a whisker to the 95th percentile; `None` if no policy plans.
 pub(crate) fn chart(group: &Group<'_>) -> Option<String> {
     let planned: Vec<_> = group
         .conditions
@@ -16,7 +16,7 @@ pub(crate) fn chart(group: &Group<'_>) -> Option<String> {
     if planned.is_empty() || !longest.is_finite() {
         return None;
     }
-    // In milliseconds.
+    // The axis is in milliseconds.
     let right = WIDE - 170.0;
     let (scale, ticks) = Scale::nice(0.0, longest * 1e3, LABELS, right, 5);
     let bottom = 6.0 + planned.len() as f64 * 40.0;

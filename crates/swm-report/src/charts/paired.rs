@@ -9,8 +9,8 @@ use swm_core::results::Paired;
 /// The left edge of the plot area, right of the names, in pixels.
 const LABELS: f64 = 340.0;
 
-/// Differences of success rates with their confidence intervals, one row for each pair; none if no policies played the same
-/// starts.
+/// Draws differences of success rates with their confidence intervals, one row for each pair; `None` if no two policies
+/// played the same starts.
 pub(crate) fn chart(group: &Group<'_>) -> Option<String> {
     let pairs = all(group);
     let rows: usize = pairs.iter().map(|(_, pairs)| pairs.len()).sum();

@@ -24,7 +24,7 @@ pub(crate) fn charts(condition: &Condition<'_>) -> String {
         .collect()
 }
 
-/// Medians as lines, with a band from the tenth to the ninetieth percentile, over iterations.
+/// Draws medians over iterations as lines, with a band from the tenth to the ninetieth percentile.
 fn bands(row: &Row<'_>, title: &str, curves: &[(&str, &Vec<Band>)], searches: &Searches) -> String {
     let [left, top, bottom] = [56.0, 46.0, 200.0];
     let right = HALF - 12.0;
@@ -35,7 +35,7 @@ fn bands(row: &Row<'_>, title: &str, curves: &[(&str, &Vec<Band>)], searches: &S
         return String::new();
     }
     let longest = curves.iter().map(|(_, bands)| bands.len()).max().unwrap_or(1);
-    // The axis of positive costs starts at zero, to show their relative decrease.
+    // The axis of positive costs starts at zero, to show the relative decrease of the costs.
     let (y, levels) = Scale::nice(low.min(0.0), high, bottom, top, 4);
     let (nice, ticks) = Scale::nice(1.0, longest.max(2) as f64, left, right, 5);
     let x = Scale { low: 1.0, high: longest.max(2) as f64, ..nice };

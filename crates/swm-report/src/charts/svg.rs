@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 
 /// The width of charts that fill the page, in pixels.
 pub(crate) const WIDE: f64 = 920.0;
-/// The width of charts that stand in pairs, in pixels.
+/// The width of charts that are arranged in pairs, in pixels.
 pub(crate) const HALF: f64 = 440.0;
 /// The left edge of the plot area in charts with labelled rows, in pixels.
 pub(crate) const LABELS: f64 = 200.0;

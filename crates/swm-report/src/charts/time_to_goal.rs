@@ -11,7 +11,7 @@ pub(crate) fn chart(condition: &Condition<'_>, counting: Counting, longest: usiz
     let right = HALF - 12.0;
     let mut svg = Svg::new(HALF, bottom + 42.0);
     let (nice, ticks) = Scale::nice(0.0, longest as f64, left, right, 5);
-    // Curves end at the longest episode, and so does the axis.
+    // Curves and axis end at the longest episode.
     let x = Scale { high: longest.max(1) as f64, ..nice };
     let ticks: Vec<f64> = ticks.into_iter().filter(|&tick| tick <= x.high).collect();
     let y = Scale { low: 0.0, high: 100.0, from: bottom, to: top };

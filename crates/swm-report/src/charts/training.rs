@@ -4,7 +4,7 @@ use super::svg::{HALF, Scale, Svg};
 use crate::read::{Metrics, Series};
 use crate::text::{number, shorten};
 
-/// The curve of one metric of a training log; none for fewer than two points.
+/// Draws the curve of one metric of a training log; `None` for fewer than two points.
 pub(crate) fn chart(metrics: &Metrics, series: &Series) -> Option<String> {
     let [left, top, bottom] = [56.0, 30.0, 150.0];
     let right = HALF - 12.0;

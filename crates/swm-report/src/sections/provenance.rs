@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use swm_core::{Manifest, Results};
 
-/// Writes the section; `command` replaces those of the manifests.
+/// Writes the section; `command` replaces the commands in the manifests.
 pub(crate) fn write(html: &mut String, results: &[(PathBuf, Results)], command: Option<&str>) {
     html.push_str("<section>\n<h2>Provenance</h2>\n");
     if let Some(command) = command {

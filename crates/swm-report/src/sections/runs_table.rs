@@ -30,7 +30,7 @@ pub(super) fn write(html: &mut String, group: &Group<'_>) {
     html.push_str("</table>\n</div>\n");
 }
 
-/// Writes the cells of a run after that of its condition.
+/// Writes the cells of a run that follow the cell of the condition.
 fn cells(html: &mut String, row: &Row<'_>) {
     let (run, p) = (row.run, row.run.success);
     const NONE: &str = "<span class=\"quiet\">–</span>";

@@ -7,7 +7,7 @@ use crate::read::Metrics;
 /// The largest number of metrics that are shown; losses come first.
 const CURVES: usize = 8;
 
-/// Metrics of speed, which are left out.
+/// Metrics of speed, which are not shown.
 const TIMES: [&str; 3] = ["seconds", "clips_per_second", "data_wait"];
 
 /// Writes the section.

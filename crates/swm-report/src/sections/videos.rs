@@ -24,8 +24,8 @@ pub(super) fn write(html: &mut String, group: &Group<'_>, results: &[(PathBuf, R
     }
 }
 
-/// The videos of a run as figures; `folder` is that of its results file. Videos that are missing, too large or of an unknown
-/// format are named instead.
+/// Returns the videos of a run as figures; `folder` is the folder of the run's results file. If a video is missing, too
+/// large or of an unknown format, the figure contains the name of the video and the reason.
 fn figures(run: &Run, folder: &Path) -> String {
     let mut html = String::new();
     for video in &run.videos {
@@ -67,7 +67,8 @@ fn embed(path: &Path) -> Result<String, String> {
     Ok(format!("data:{kind};base64,{}", base64::engine::general_purpose::STANDARD.encode(bytes)))
 }
 
-/// The episode of a video whose name ends in the index of the episode: `in-distribution/lewm-003.mp4`.
+/// Describes the episode of a video. The name of the video ends in the index of the episode:
+/// `in-distribution/lewm-003.mp4`.
 fn caption(run: &Run, video: &str) -> String {
     let stem = Path::new(video).file_stem().and_then(|stem| stem.to_str()).unwrap_or_default();
     let digits = stem.len() - stem.chars().rev().take_while(char::is_ascii_digit).count();

@@ -5,7 +5,7 @@ use swm_core::results::{Comparison, Counting, EpisodeResult, Prediction, Run, Se
 use swm_core::{Manifest, PlanTrace, Results};
 use swm_report::{ReportOptions, read_metrics, read_results, write_report, write_report_with};
 
-/// A run of `n` episodes of which the first `solved` reach the goal, each a step later than the one before.
+/// A run of `n` episodes. The first `solved` episodes reach the goal, each one step later than the preceding episode.
 fn run(condition: &str, policy: &str, n: usize, solved: usize, plans: Option<f64>) -> Run {
     let episodes: Vec<EpisodeResult> = (0..n)
         .map(|i| EpisodeResult {
@@ -48,14 +48,14 @@ fn results() -> Results {
     }
 }
 
-/// Results of a dataset's test split with all that an evaluation can tell: two models on starts that are solved
-/// differently, a goal to be held, traced searches, and prediction errors.
-fn everything() -> Results {
+/// Results from a dataset with all optional parts: two models that solve different starts, a goal that must be held,
+/// traced searches, and prediction errors.
+fn results_with_all_parts() -> Results {
     let mut found = results();
     found.manifest.config = serde_json::json!({"version": 1, "env": "swm/TwoRoom-v1"});
     (found.protocol, found.counting) = ("dataset".to_owned(), Counting::Strict { hold: 5 });
     let mut other = run("in distribution", "pldm", 40, 25, Some(0.0512));
-    // Of the 37 starts that the first model solves, 3 to 36, this one solves 10 to 34.
+    // `pldm` solves starts 10 to 34, which `lewm-tiny` solves too.
     other.episodes.rotate_right(10);
     for (i, episode) in other.episodes.iter_mut().enumerate() {
         episode.seed = 1000 + i as u64;
@@ -85,14 +85,14 @@ fn everything() -> Results {
 }
 
 fn page(results: &[(PathBuf, Results)], folder: &Path) -> String {
-    let path = write_report(results, folder).expect("report");
-    let page = std::fs::read_to_string(path).expect("page");
+    let path = write_report(results, folder).expect("the report is written");
+    let page = std::fs::read_to_string(path).expect("the page is readable");
     well_formed(&page);
     page.replace('\u{a0}', " ")
 }
 
-/// Checks that elements nest, attributes are quoted, and ampersands start entities, so that the page is valid XML apart from its
-/// doctype.
+/// Checks that elements nest, attributes are quoted, and ampersands start entities, so that the page is valid XML apart
+/// from its doctype.
 fn well_formed(page: &str) {
     let mut open: Vec<&str> = vec![];
     let mut rest = page.strip_prefix("<!DOCTYPE html>").expect("a doctype");
@@ -107,7 +107,7 @@ fn well_formed(page: &str) {
         let tag = &rest[start + 1..end];
         assert!(tag.matches('"').count().is_multiple_of(2) && !tag.contains('<'), "quotes of <{tag}>");
         let name = |tag: &'_ str| tag.trim_start_matches('/').split([' ', '\n', '/']).next().map(str::len);
-        let length = name(tag).expect("a name");
+        let length = name(tag).expect("the name is a string");
         if let Some(closed) = tag.strip_prefix('/') {
             assert_eq!(open.pop(), Some(closed));
         } else if !tag.ends_with('/') {
@@ -120,7 +120,7 @@ fn well_formed(page: &str) {
 
 #[test]
 fn page_contains_the_results() {
-    let folder = tempfile::tempdir().expect("folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let results = [(PathBuf::from("runs/demo/results.json"), results())];
     let page = page(&results, folder.path());
     // 37 of 40: Wilson 80.1 to 97.4 % (z = 1.96); 2 of 40: 1.4 to 16.5 %; 3 of 39: 2.7 to 20.3 %.
@@ -151,10 +151,10 @@ fn page_contains_the_results() {
 
 #[test]
 fn policies_are_compared_on_the_same_starts() {
-    let folder = tempfile::tempdir().expect("folder");
-    let page = page(&[(PathBuf::from("runs/all/results.json"), everything())], folder.path());
-    // 37 of 40 against 2 of 40, none solved by the floor alone: p = 2 × 0.5^35. 25 of 40 against 37 of 40: 25 both, 12 only
-    // one policy, 0 only the other.
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let page = page(&[(PathBuf::from("runs/all/results.json"), results_with_all_parts())], folder.path());
+    // 37 of 40 against 2 of 40, none solved by the floor alone: p = 2 × 0.5^35. 25 of 40 against 37 of 40: 25 both, 12
+    // only one policy, 0 only the other.
     for words in [
         "dataset protocol · counting: strict, held for 5 steps",
         "once the goal was satisfied for 5 steps in a row",
@@ -174,13 +174,13 @@ fn policies_are_compared_on_the_same_starts() {
         assert!(page.contains(words), "the page lacks: {words}");
     }
     assert!(!page.contains("agent.color shifted: cost") && !page.contains("pldm, in distribution: cost"));
-    // The shifted run counts one start fewer than its floor, so they are compared by their confidence intervals.
+    // The shifted run counts one start fewer than its floor, so the report compares their confidence intervals.
     assert!(page.contains("not significantly different from the random-policy floor of 5.0 %<"));
 }
 
 #[test]
 fn compat_counting_is_described_with_the_strict_rate() {
-    let folder = tempfile::tempdir().expect("folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let mut results = results();
     results.counting = Counting::Compat { envs: 8 };
     results.runs.truncate(3);
@@ -191,7 +191,7 @@ fn compat_counting_is_described_with_the_strict_rate() {
     results.runs[2].strict = Some(Counting::default().rate(&results.runs[2].episodes));
     results.comparisons = Comparison::all(&results.runs, results.counting);
     let file = folder.path().join("results.json");
-    std::fs::write(&file, serde_json::to_string(&results).expect("JSON")).expect("file");
+    std::fs::write(&file, serde_json::to_string(&results).expect("valid JSON")).expect("the file is written");
     let results = read_results(&file).expect("consistent results");
     let page = page(&[(file, results)], &folder.path().join("report"));
     for words in [
@@ -207,7 +207,7 @@ fn compat_counting_is_described_with_the_strict_rate() {
 
 #[test]
 fn equal_results_give_equal_bytes() {
-    let folder = tempfile::tempdir().expect("folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let results = [(PathBuf::from("a/results.json"), results())];
     let pages = ["x", "y"].map(|name| page(&results, &folder.path().join(name)));
     assert!(pages[0] == pages[1]);
@@ -215,26 +215,27 @@ fn equal_results_give_equal_bytes() {
 
 #[test]
 fn external_text_is_escaped() {
-    let folder = tempfile::tempdir().expect("folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let mut results = results();
-    let evil = "<img src=x onerror=\"alert('1')\">&";
-    (results.env, results.protocol) = (evil.to_owned(), evil.to_owned());
-    (results.manifest.device, results.manifest.kind) = (evil.to_owned(), evil.to_owned());
-    results.manifest.hashes.insert(evil.to_owned(), evil.to_owned());
+    let markup = "<img src=x onerror=\"alert('1')\">&";
+    (results.env, results.protocol) = (markup.to_owned(), markup.to_owned());
+    (results.manifest.device, results.manifest.kind) = (markup.to_owned(), markup.to_owned());
+    results.manifest.hashes.insert(markup.to_owned(), markup.to_owned());
     for run in &mut results.runs {
-        (run.condition, run.policy) = (evil.to_owned(), evil.to_owned());
-        run.videos = vec![evil.to_owned()];
+        (run.condition, run.policy) = (markup.to_owned(), markup.to_owned());
+        run.videos = vec![markup.to_owned()];
     }
-    let options = ReportOptions { title: Some(evil.to_owned()), command: Some(evil.to_owned()), metrics: None };
-    let path = write_report_with(&[(PathBuf::from(evil), results)], &options, folder.path()).expect("report");
-    let page = std::fs::read_to_string(path).expect("page");
+    let options = ReportOptions { title: Some(markup.to_owned()), command: Some(markup.to_owned()), metrics: None };
+    let path =
+        write_report_with(&[(PathBuf::from(markup), results)], &options, folder.path()).expect("the report is written");
+    let page = std::fs::read_to_string(path).expect("the page is readable");
     well_formed(&page);
     assert!(!page.contains("<img"));
 }
 
 #[test]
 fn empty_results_are_described() {
-    let folder = tempfile::tempdir().expect("folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let mut empty = results();
     empty.runs.clear();
     let mut unsolved = results();
@@ -246,13 +247,13 @@ fn empty_results_are_described() {
         page.contains("These results contain no runs.") && page.contains("the random-policy floor was not measured")
     );
     assert!(!page.contains("NaN"));
-    let none = write_report(&[], folder.path()).expect_err("nothing to report");
-    assert!(none.is_usage() && none.to_string().contains("at least one results.json"));
+    let error = write_report(&[], folder.path()).expect_err("there are no results");
+    assert!(error.is_usage() && error.to_string().contains("at least one results.json"));
 }
 
 #[test]
 fn files_of_one_environment_share_a_section() {
-    let folder = tempfile::tempdir().expect("folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let files = ["a.json", "b.json"].map(|name| (PathBuf::from(name), results()));
     let page = page(&files, folder.path());
     assert_eq!(page.matches("<h2>Success</h2>").count(), 1);
@@ -271,7 +272,7 @@ fn files_of_one_environment_share_a_section() {
 
 #[test]
 fn environments_and_countings_have_separate_sections() {
-    let folder = tempfile::tempdir().expect("folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let (first, other) = (results(), Results { env: "swm/PushT-v1".to_owned(), ..results() });
     let compat = Results { counting: Counting::Compat { envs: 8 }, ..results() };
     let files = [first, other, compat].map(|results| (PathBuf::from("results.json"), results));
@@ -283,12 +284,12 @@ fn environments_and_countings_have_separate_sections() {
 }
 
 #[test]
-fn videos_are_embedded_and_missing_ones_named() {
-    let folder = tempfile::tempdir().expect("folder");
-    std::fs::create_dir_all(folder.path().join("videos")).expect("folder");
-    std::fs::write(folder.path().join("videos/lewm-2.mp4"), b"not really a video").expect("file");
-    let large = std::fs::File::create(folder.path().join("videos/lewm-39.mp4")).expect("file");
-    large.set_len((8 << 20) + 1).expect("length");
+fn videos_are_embedded_or_listed_with_a_reason() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    std::fs::create_dir_all(folder.path().join("videos")).expect("the folder is created");
+    std::fs::write(folder.path().join("videos/lewm-2.mp4"), b"not really a video").expect("the file is written");
+    let large = std::fs::File::create(folder.path().join("videos/lewm-39.mp4")).expect("the file is written");
+    large.set_len((8 << 20) + 1).expect("the file is enlarged");
     let mut results = results();
     results.runs[2].videos =
         ["videos/lewm-2.mp4", "videos/lewm-39.mp4", "videos/lost.mp4", "videos/a.avi"].map(str::to_owned).to_vec();
@@ -303,7 +304,7 @@ fn videos_are_embedded_and_missing_ones_named() {
 
 #[test]
 fn training_metrics_become_charts() {
-    let folder = tempfile::tempdir().expect("folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let log = folder.path().join("train.jsonl");
     let lines: String = (0..900)
         .map(|i| {
@@ -313,57 +314,60 @@ fn training_metrics_become_charts() {
             )
         })
         .collect();
-    std::fs::write(&log, format!("{lines}{{\"step\": 900, \"lo")).expect("log");
+    std::fs::write(&log, format!("{lines}{{\"step\": 900, \"lo")).expect("the log is written");
     let metrics = read_metrics(&log).expect("an incomplete last line is ignored");
     assert_eq!(metrics.over, "step");
     assert_eq!(metrics.series.iter().map(|s| s.name.as_str()).collect::<Vec<_>>(), ["loss", "optimizer/lr", "seconds"]);
     assert_eq!(metrics.series[0].points[1], (1.0, 0.5));
     let options = ReportOptions { metrics: Some(log.clone()), ..ReportOptions::default() };
     let results = [(PathBuf::from("results.json"), results())];
-    let path = write_report_with(&results, &options, &folder.path().join("report")).expect("report");
-    let page = std::fs::read_to_string(path).expect("page");
+    let path = write_report_with(&results, &options, &folder.path().join("report")).expect("the report is written");
+    let page = std::fs::read_to_string(path).expect("the page is readable");
     well_formed(&page);
     assert!(page.contains("loss over step, ending at 0.001111") && page.contains("optimizer/lr"));
     assert!(!page.contains("seconds over step"), "metrics of speed are left out");
 
-    std::fs::write(&log, "{\"step\": 1}\nloss = 3\n{\"step\": 2}\n").expect("log");
+    std::fs::write(&log, "{\"step\": 1}\nloss = 3\n{\"step\": 2}\n").expect("the log is written");
     assert!(read_metrics(&log).expect_err("no JSON").to_string().contains("line 2 is not a JSON object"));
 }
 
 #[test]
 fn results_are_read_and_errors_name_the_problem() {
-    let folder = tempfile::tempdir().expect("folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("results.json");
-    let good = serde_json::to_value(results()).expect("json");
-    std::fs::write(&path, good.to_string()).expect("file");
-    assert_eq!(read_results(&path).expect("readable"), results());
+    let good = serde_json::to_value(results()).expect("valid JSON");
+    std::fs::write(&path, good.to_string()).expect("the file is written");
+    assert_eq!(read_results(&path).expect("valid results"), results());
 
     let wrong = |change: &dyn Fn(&mut serde_json::Value)| {
         let mut value = good.clone();
         change(&mut value);
-        std::fs::write(&path, value.to_string()).expect("file");
-        read_results(&path).expect_err("unreadable").to_string()
+        std::fs::write(&path, value.to_string()).expect("the file is written");
+        read_results(&path).expect_err("an invalid file").to_string()
     };
     let newer = wrong(&|v| v["manifest"]["swm_version"] = "0.9.2".into());
     assert!(newer.contains("written by stable-worldmodel 0.9.2") && newer.contains("swm eval"), "{newer}");
     let lacking = wrong(&|v| v["runs"][0].as_object_mut().map(|run| run.remove("success")).map_or((), drop));
     assert!(lacking.contains("a layout that this version does not read") && lacking.contains("success"), "{lacking}");
-    let doctored = wrong(&|v| v["runs"][0]["success"]["successes"] = 39.into());
-    assert!(doctored.contains("states 39 successes in 40, its episodes have 2 in 40"), "{doctored}");
-    let doctored = wrong(&|v| v["comparisons"][1]["only_a"] = 36.into());
-    assert!(doctored.contains("the comparison of lewm-tiny and random does not match the episodes"), "{doctored}");
+    let inconsistent = wrong(&|v| v["runs"][0]["success"]["successes"] = 39.into());
+    assert!(inconsistent.contains("states 39 successes in 40, its episodes have 2 in 40"), "{inconsistent}");
+    let inconsistent = wrong(&|v| v["comparisons"][1]["only_a"] = 36.into());
+    assert!(
+        inconsistent.contains("the comparison of lewm-tiny and random does not match the episodes"),
+        "{inconsistent}"
+    );
     assert!(wrong(&|v| *v = serde_json::json!({"loss": 1})).contains("not a results file"));
 
-    // Files from before countings and comparisons existed are read with their defaults.
+    // Older versions wrote no counting and no comparisons; such files are read with the defaults.
     let mut older = good.clone();
-    let fields = older.as_object_mut().expect("an object");
-    fields.remove("counting").and(fields.remove("comparisons")).expect("both were there");
-    std::fs::write(&path, older.to_string()).expect("file");
-    let older = read_results(&path).expect("readable");
+    let fields = older.as_object_mut().expect("a JSON object");
+    fields.remove("counting").and(fields.remove("comparisons")).expect("the results have both fields");
+    std::fs::write(&path, older.to_string()).expect("the file is written");
+    let older = read_results(&path).expect("valid results");
     assert_eq!((older.counting, older.runs, older.comparisons), (Counting::default(), results().runs, vec![]));
 
-    std::fs::write(&path, "{\"manifest\": ").expect("file");
+    std::fs::write(&path, "{\"manifest\": ").expect("the file is written");
     assert!(read_results(&path).expect_err("incomplete").to_string().contains("not a JSON document"));
-    let missing = read_results(&folder.path().join("lost.json")).expect_err("missing").to_string();
+    let missing = read_results(&folder.path().join("lost.json")).expect_err("a missing file").to_string();
     assert!(missing.contains("reading results"), "{missing}");
 }

@@ -110,7 +110,7 @@ impl Installable {
 }
 
 impl Names {
-    /// Returns the named assets; without names, those that `default` accepts.
+    /// Returns the named assets; without names, the assets that `default` accepts.
     fn chosen(&self, default: impl Fn(Installable) -> bool) -> Result<Vec<Installable>> {
         if self.names.is_empty() {
             return Ok(Installable::all().filter(|item| default(*item)).collect());
@@ -145,7 +145,7 @@ pub fn assets(args: &AssetsArgs, as_json: bool) -> anyhow::Result<()> {
                 return emit_json(&json!({"sound": names}));
             }
             emit(&match &names[..] {
-                [] => "noitem is installed\n".to_owned(),
+                [] => "nothing is installed\n".to_owned(),
                 names => format!("sound: {}\n", names.join(", ")),
             });
             Ok(())

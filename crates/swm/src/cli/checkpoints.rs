@@ -211,7 +211,7 @@ fn export(given: &str, folder: &Path, as_json: bool) -> anyhow::Result<()> {
 
 fn remove(given: &str, as_json: bool) -> anyhow::Result<()> {
     let path = home::find_checkpoint(given)?;
-    // A mistyped path must not remove anything but a checkpoint.
+    // Only a checkpoint is removed, so that a mistyped path cannot remove another folder.
     if checkpoint::family(&path).is_none() {
         anyhow::bail!(Error::corrupt(&path, "it is not a checkpoint", "give the folder that `swm train` wrote to"));
     }

@@ -96,9 +96,9 @@ pub struct Collection<'a> {
     pub shard: Option<Shard>,
     /// The name of the policy.
     pub policy: &'a str,
-    /// Environments, frames, threads.
+    /// The number of environments, the frames, and the number of threads.
     pub world: WorldConfig,
-    /// Episodes, seed, factors.
+    /// The episodes, the seed, and the factors of variation.
     pub config: CollectConfig,
     /// Whether to create, continue or replace the dataset.
     pub mode: WriteMode,

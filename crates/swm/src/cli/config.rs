@@ -52,7 +52,7 @@ pub struct VariationArgs {
 }
 
 impl VariationArgs {
-    /// Returns the request that environments get at every reset.
+    /// Returns the factors of variation for every reset.
     ///
     /// # Errors
     /// When a pinned value is not `KEY=NUMBER[,NUMBER…]`.
@@ -108,11 +108,11 @@ mod tests {
             variation: Some(vec!["agent".to_owned()]),
             pin: vec!["background.color=1, 2,3".to_owned()],
         };
-        let request = args.request().expect("a request");
+        let request = args.request().expect("a valid request");
         assert_eq!(request.variation_values["background.color"], [1.0, 2.0, 3.0]);
         assert_eq!(args.describe(), "agent sampled, background.color=1, 2,3");
         let none = VariationArgs { variation: Some(vec!["none".to_owned()]), pin: vec![] };
-        assert_eq!(none.request().expect("a request").variation, Some(vec![]));
+        assert_eq!(none.request().expect("a valid request").variation, Some(vec![]));
         let wrong = VariationArgs { variation: None, pin: vec!["background.color".to_owned()] };
         assert!(wrong.request().expect_err("no value").to_string().contains("background.color=200"));
         assert_eq!(image_size("64x96"), Ok((64, 96)));

@@ -117,7 +117,7 @@ pub fn formats(as_json: bool) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Returns the environment, and the counts of episodes, steps and bytes, which need no reading of rows.
+/// Returns the environment and the counts of episodes, steps and bytes, without reading rows.
 pub fn summary(reader: &dyn Reader) -> Result<Value> {
     let manifest = reader.manifest();
     Ok(json!({

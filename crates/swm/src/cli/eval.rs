@@ -101,7 +101,7 @@ enum Protocol {
     Compat,
 }
 
-/// The time limit of episodes that start from a dataset, in steps: that of the paper's evaluations.
+/// The time limit of episodes that start from a dataset, in steps, as in the paper's evaluations.
 const DATASET_TIME_LIMIT: usize = 50;
 
 /// The name of the condition without any shift.
@@ -197,7 +197,8 @@ pub fn run(
     Ok((results, file))
 }
 
-/// Returns the options that do not change results; `videos` is a folder, and the number of recorded episodes of each run.
+/// Returns the options that do not change results; `videos` is a folder, and the number of recorded episodes of each
+/// run.
 pub fn run_options(envs: usize, videos: Option<(PathBuf, usize)>, context: &Context) -> RunOptions {
     RunOptions { envs, threads: context.threads, videos }
 }

@@ -136,7 +136,7 @@ impl Cli {
     /// Runs the command. Returns the exit code: 0 for success, 1 for a failure, 2 for wrong usage, 130 for an
     /// interrupted run.
     pub fn run(self) -> u8 {
-        // An embedding program may have set up logging; its setup is kept.
+        // If an embedding program has already set up logging, `try_init` fails and that setup stays in place.
         let _ = tracing_subscriber::fmt()
             .with_writer(std::io::stderr)
             .with_env_filter(
@@ -148,7 +148,7 @@ impl Cli {
         match self.dispatch() {
             Ok(()) => 0,
             Err(error) => {
-                // Errors of this engine are complete in one line; third-party errors are printed with their causes.
+                // An error of this engine is one complete line; other errors are printed with their causes.
                 let own = error.downcast_ref::<swm_core::Error>();
                 eprint(&own.map_or_else(|| format!("error: {error:#}\n"), |own| format!("error: {own}\n")));
                 match own {
@@ -192,7 +192,7 @@ impl Cli {
 
 impl Context {
     fn new(json: bool, threads: usize) -> Self {
-        // Burn's matrix products run in rayon's global pool; it gets the same number of threads.
+        // Burn's matrix products run in rayon's global pool, so the pool gets the same number of threads.
         rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().ok();
         let interrupt = Arc::new(AtomicBool::new(false));
         let flag = Arc::clone(&interrupt);

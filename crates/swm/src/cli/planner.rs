@@ -37,7 +37,8 @@ pub struct PlannerArgs {
     pub latency_budget: Option<f64>,
     /// Term of the objective: goal, control or change; may be repeated
     ///
-    /// With settings, such as control,weight=0.01. Without a goal term, the model's own cost is kept and terms are added.
+    /// With settings, such as control,weight=0.01. Without a goal term, the model's own cost is kept and terms are
+    /// added.
     #[arg(long = "term", value_name = "NAME[,KEY=VALUE…]")]
     pub terms: Vec<String>,
     /// Constraint, such as action_norm,limit=2 or latent_box
@@ -49,8 +50,8 @@ pub struct PlannerArgs {
 }
 
 impl PlannerArgs {
-    /// Returns the solvers with complete settings. Without --solver, it is the first one for the environment's actions that
-    /// requires only a cost.
+    /// Returns the solvers with complete settings. Without --solver, this is the first solver for the environment's
+    /// actions that requires only a cost.
     ///
     /// # Errors
     /// When a solver or a setting is unknown.
@@ -74,8 +75,8 @@ impl PlannerArgs {
         Ok(vec![Choice { id: first.id.to_owned(), settings: (first.defaults)() }])
     }
 
-    /// Returns the policy that plans in a model with a solver. `block` is the model's count of environment steps per model
-    /// step, `history` its count of observations.
+    /// Returns the policy that plans in a model with a solver. `block` is the model's count of environment steps per
+    /// model step, `history` its count of observations.
     ///
     /// # Errors
     /// When a setting of planning or of the objective is invalid.

@@ -15,7 +15,7 @@ const PLAIN_INTERVAL: Duration = Duration::from_secs(10);
 /// How many metrics of a model are shown.
 const SHOWN_METRICS: usize = 4;
 
-/// Returns a control that shows the stages of a run and stops it at Ctrl-C.
+/// Returns a control that shows the stages of a run and stops the run at Ctrl-C.
 pub fn control(context: &Context) -> Control<'static> {
     let mut shown: Option<StageDisplay> = None;
     Control::new().with_interrupt(Arc::clone(&context.interrupt)).with_events(move |event| match event {
@@ -38,7 +38,7 @@ pub fn control(context: &Context) -> Control<'static> {
     })
 }
 
-/// Prints the line that remains when a stage is over.
+/// Prints the summary of a finished stage.
 pub fn print_summary(stage: &str, message: &str) {
     eprint(&format!("{stage:>9}: {message}\n"));
 }
@@ -104,7 +104,7 @@ impl Drop for StageDisplay {
 
 /// Formats the model's first metrics, the validation metric, and the speed of the loader.
 fn training_message(progress: &Progress<'_>) -> String {
-    // The metrics of the training loop follow those of the model.
+    // The metrics of the model precede the metrics of the training loop.
     let is_of_loop = |name: &str| ["validation_loss", "evaluation_return", "lr"].contains(&name);
     let model = progress.metrics.iter().take_while(|(name, _)| !is_of_loop(name)).take(SHOWN_METRICS);
     let model: Vec<String> = model.map(|(name, value)| format!("{name} {value:.4}")).collect();

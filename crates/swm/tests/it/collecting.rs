@@ -13,7 +13,7 @@ fn with<'a>(args: &[&'a str], more: &[&'a str]) -> Vec<&'a str> {
 /// Returns the content hash and the number of episodes of a dataset.
 fn content(swm: &Swm, name: &str) -> (String, usize) {
     let found = swm.json(&["inspect", name]);
-    let hash = found["content_hash"].as_str().expect("a hash").to_owned();
+    let hash = found["content_hash"].as_str().expect("the hash is a string").to_owned();
     (hash, usize::try_from(found["episodes"].as_u64().expect("an integer")).expect("it fits usize"))
 }
 
@@ -42,7 +42,7 @@ fn killed_collection_keeps_committed_episodes_and_resumes() {
         std::thread::sleep(Duration::from_millis(50));
         let output = swm.run(&["inspect", "rooms", "--json"]);
         if output.status.success() {
-            let found: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+            let found: serde_json::Value = serde_json::from_slice(&output.stdout).expect("valid JSON");
             if found["episodes"].as_u64() > Some(0) {
                 break found["episodes"].as_u64();
             }
@@ -51,7 +51,10 @@ fn killed_collection_keeps_committed_episodes_and_resumes() {
     child.kill().expect("SIGKILL");
     child.wait().expect("the process ends");
     let (_, kept) = content(&swm, "rooms");
-    assert!(kept as u64 >= partial.expect("some"), "{kept} episodes, {partial:?} were committed");
+    assert!(
+        kept as u64 >= partial.expect("the loop has read the number of episodes"),
+        "{kept} episodes, {partial:?} were committed"
+    );
     assert!(kept < 100_000, "the collection ended before it was killed");
     let target = (kept + 5).to_string();
     swm.json(&with(ROOMS, &["--episodes", &target, "--resume"]));
@@ -105,11 +108,11 @@ fn truncated_dataset_is_an_error() {
     let swm = Swm::new();
     swm.json(&with(ROOMS, &["--episodes", "3"]));
     let data = swm.path("datasets/rooms.lance/data");
-    let file = std::fs::read_dir(data).expect("data files").flatten().next().expect("one").path();
-    let bytes = std::fs::read(&file).expect("readable");
-    std::fs::write(&file, &bytes[..bytes.len() / 2]).expect("writable");
+    let file = std::fs::read_dir(data).expect("data files").flatten().next().expect("the folder has a file").path();
+    let bytes = std::fs::read(&file).expect("the file is readable");
+    std::fs::write(&file, &bytes[..bytes.len() / 2]).expect("the file is writable");
     swm.fails(&["inspect", "rooms"], 1, &["rooms.lance"]);
-    std::fs::remove_file(&file).expect("removable");
+    std::fs::remove_file(&file).expect("the file is removable");
     swm.fails(&["inspect", "rooms"], 1, &["rooms.lance"]);
 }
 
@@ -137,11 +140,14 @@ fn shards_of_two_renderers_require_mix_renderers() {
         swm.json(&with(&collect(shard), &["--episodes", "2", "--renderer", "cpu"]));
     }
     let logs = swm.path("datasets/swings.lance/_shards");
-    let second =
-        std::fs::read_dir(logs).expect("shards").map(|entry| entry.expect("a shard").path()).max().expect("two");
+    let second = std::fs::read_dir(logs)
+        .expect("shards")
+        .map(|entry| entry.expect("a shard").path())
+        .max()
+        .expect("at least one result");
     let log = second.join("begun.json");
     let changed = std::fs::read_to_string(&log).expect("a log").replace(r#""renderer":"cpu"#, r#""renderer":"egl"#);
-    std::fs::write(&log, changed).expect("writable");
+    std::fs::write(&log, changed).expect("the file is writable");
     swm.fails(&["datasets", "commit", "swings"], 2, &["egl", "--mix-renderers"]);
     assert_eq!(swm.json(&["datasets", "commit", "swings", "--mix-renderers"])["added"], 2);
 }

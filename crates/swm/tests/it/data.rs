@@ -66,8 +66,8 @@ fn doctor_finds_truncated_files() {
 
     // Reading the truncated file fails; opening the dataset may fail, too.
     let file = largest(&swm.path("datasets/rooms.lance/data"));
-    let bytes = std::fs::read(&file).expect("readable");
-    std::fs::write(&file, &bytes[..bytes.len() / 2]).expect("writable");
+    let bytes = std::fs::read(&file).expect("the file is readable");
+    std::fs::write(&file, &bytes[..bytes.len() / 2]).expect("the file is writable");
     let output = swm.run(&["doctor", "rooms"]);
     assert!(text(&output.stdout).contains("problem") || text(&output.stderr).contains("rooms"));
     assert_eq!(output.status.code(), Some(1), "{}", text(&output.stderr));
@@ -76,8 +76,11 @@ fn doctor_finds_truncated_files() {
 }
 
 fn largest(folder: &Path) -> std::path::PathBuf {
-    let entries = std::fs::read_dir(folder).expect("a folder").flatten();
-    entries.map(|entry| entry.path()).max_by_key(|path| path.metadata().map_or(0, |m| m.len())).expect("a file")
+    let entries = std::fs::read_dir(folder).expect("a readable folder").flatten();
+    entries
+        .map(|entry| entry.path())
+        .max_by_key(|path| path.metadata().map_or(0, |m| m.len()))
+        .expect("the folder has a file")
 }
 
 #[test]
@@ -86,10 +89,10 @@ fn bench_data_measures_loading() {
     let small =
         ["--episodes", "14", "--steps", "24", "--size", "32", "--pairs", "1", "--seconds", "0.05", "--epochs", "2"];
     let found = swm.json(&[&["bench", "data", "swm/TwoRoom-v1"][..], &small].concat());
-    let rates = found["rates"].as_array().expect("rates");
+    let rates = found["rates"].as_array().expect("an array of rates");
     let named = |name: &str| rates.iter().find(|row| row["what"] == name).unwrap_or_else(|| panic!("{name}: {found}"));
-    assert!(named("lance, lossless")["rate"].as_f64().expect("a rate") > 0.0);
-    assert!(named("lance, jpeg, all cached on disk")["ours"][0].as_f64().expect("a rate") > 0.0);
+    assert!(named("lance, lossless")["rate"].as_f64().expect("the rate is a number") > 0.0);
+    assert!(named("lance, jpeg, all cached on disk")["ours"][0].as_f64().expect("the rate is a number") > 0.0);
     assert_eq!(found["resident"].as_array().map(Vec::len), Some(2));
     swm.fails(&["bench", "data", "--pairs", "0"], 2, &["at least 1 pair"]);
 }

@@ -1,4 +1,5 @@
-//! Tests of Gymnasium environments on the command line. They require a Python with Gymnasium, which `$SWM_PYTHON` names.
+//! Tests of Gymnasium environments on the command line. They require a Python with Gymnasium, which `$SWM_PYTHON`
+//! names.
 
 use crate::{Swm, text};
 
@@ -46,8 +47,8 @@ fn gymnasium_environments_are_collected_and_evaluated() {
     assert!(text(&output.stderr).contains("/no/such/python (named by $SWM_PYTHON)"), "{}", text(&output.stderr));
 }
 
-/// An environment whose state grows by a constant speed, which depends on the seed, whatever the action. Every recorded
-/// state is reached again.
+/// An environment whose state grows by a constant speed that depends on the seed and not on the action. An episode that
+/// starts from a recorded state therefore reaches all later recorded states.
 const TRAIN: &str = "
 import gymnasium, numpy as np
 from gymnasium import spaces
@@ -113,7 +114,7 @@ fn wrappers_change_atari_frames() {
         swm.json(&args);
         let found = swm.json(&["inspect", name]);
         assert!(found["manifest"]["libraries"]["ale-py"].is_string(), "{}", found["manifest"]);
-        found["content_hash"].as_str().expect("a hash").to_owned()
+        found["content_hash"].as_str().expect("the hash is a string").to_owned()
     });
     for (i, hash) in hashes.iter().enumerate() {
         assert!(!hashes[..i].contains(hash), "{:?} has no effect", sweep[i]);

@@ -9,19 +9,19 @@ const REFERENCE: &str = include_str!("reference_envs.json");
 #[test]
 fn environments_have_the_spaces_of_the_reference() {
     let ours = Swm::new().json(&["envs"]);
-    let theirs: Value = serde_json::from_str(REFERENCE).expect("the fixture is JSON");
-    for (id, expected) in theirs.as_object().expect("an object") {
+    let reference: Value = serde_json::from_str(REFERENCE).expect("the fixture is JSON");
+    for (id, expected) in reference.as_object().expect("a JSON object") {
         let found = &ours[id];
         assert!(same(&found["action_space"], &expected["action_space"]), "{id}");
         assert!(same(&found["observation_space"], &expected["observation_space"]), "{id}");
         assert_eq!(found["sampling_order"], expected["sampling_order"], "{id}");
         assert_eq!(found["default_variations"], expected["default_variations"], "{id}");
         let names = |value: &Value| -> Vec<String> {
-            value["variation"].as_object().expect("an object").keys().cloned().collect()
+            value["variation"].as_object().expect("a JSON object").keys().cloned().collect()
         };
         assert_eq!(names(found), names(expected), "{id}");
-        for (key, factor) in expected["variation"].as_object().expect("an object") {
-            for (field, value) in factor.as_object().expect("an object") {
+        for (key, factor) in expected["variation"].as_object().expect("a JSON object") {
+            for (field, value) in factor.as_object().expect("a JSON object") {
                 let ours = &found["variation"][key][field];
                 assert!(same(ours, value), "{id} {key}.{field}: {ours}, the reference has {value}");
             }

@@ -3,7 +3,8 @@
 use crate::{Swm, text};
 use serde_json::Value;
 
-/// A demo that is small enough for a test. Its model is useless, but it writes all files.
+/// A demo that is small enough for a test. Its model is not trained long enough to be useful, but all files are
+/// written.
 const DEMO: &[&str] =
     &["demo", "-o", "demo", "--episodes", "6", "--eval-episodes", "5", "schedule.steps=8", "schedule.warmup=2"];
 
@@ -11,7 +12,7 @@ const DEMO: &[&str] =
 fn demo(swm: &Swm, more: &[&str]) -> (Value, Value) {
     let args: Vec<&str> = DEMO.iter().chain(more).copied().collect();
     let mut found = swm.json(&args);
-    for run in found["results"]["runs"].as_array_mut().expect("runs") {
+    for run in found["results"]["runs"].as_array_mut().expect("an array of runs") {
         run["timing"] = Value::Null;
     }
     let dataset = swm.json(&["inspect", "demo/rooms.lance"]);
@@ -63,13 +64,13 @@ fn trains_evaluates_and_reports() {
 
     // An unknown model family, and truncated weights.
     let file = find(&swm.path("checkpoints/small"), "config.json");
-    let config = std::fs::read_to_string(&file).expect("readable");
-    std::fs::write(&file, config.replace("\"lewm\"", "\"dreamer\"")).expect("writable");
+    let config = std::fs::read_to_string(&file).expect("the file is readable");
+    std::fs::write(&file, config.replace("\"lewm\"", "\"dreamer\"")).expect("the file is writable");
     swm.fails(&["eval", "small"], 1, &["dreamer", "does not support"]);
-    std::fs::write(&file, config).expect("writable");
+    std::fs::write(&file, config).expect("the file is writable");
     let weights = find(&swm.path("checkpoints/small"), "weights.safetensors");
-    let bytes = std::fs::read(&weights).expect("readable");
-    std::fs::write(&weights, &bytes[..bytes.len() / 2]).expect("writable");
+    let bytes = std::fs::read(&weights).expect("the file is readable");
+    std::fs::write(&weights, &bytes[..bytes.len() / 2]).expect("the file is writable");
     swm.fails(&["eval", "small"], 1, &["small"]);
 }
 
@@ -77,7 +78,7 @@ fn trains_evaluates_and_reports() {
 fn find(folder: &std::path::Path, name: &str) -> std::path::PathBuf {
     let mut folders = vec![folder.to_owned()];
     while let Some(folder) = folders.pop() {
-        for entry in std::fs::read_dir(&folder).expect("a folder").flatten() {
+        for entry in std::fs::read_dir(&folder).expect("a readable folder").flatten() {
             let path = entry.path();
             if path.is_dir() && !path.is_symlink() {
                 folders.push(path);
@@ -108,8 +109,8 @@ fn compares_policies_from_the_same_starts_and_reproduces_results() {
     let eval = ["eval", "small", "direct", "simulator", "expert", "--episodes", "4", "--budget", "60", "--trace"];
     let solver = ["--solver", "icem,samples=32,iterations=2,elites=8,keep=2", "--receding-horizon", "2"];
     let found = swm.json(&[&eval[..], &solver, &noise, &["--wrap-goal", "-o", "found"]].concat());
-    let runs = found["runs"].as_array().expect("runs");
-    let names: Vec<_> = runs.iter().map(|run| run["policy"].as_str().expect("a name")).collect();
+    let runs = found["runs"].as_array().expect("an array of runs");
+    let names: Vec<_> = runs.iter().map(|run| run["policy"].as_str().expect("the name is a string")).collect();
     assert_eq!(names, ["random", "small", "direct", "simulator", "expert"]);
     assert_eq!(runs[0]["condition"], "noise,std=4, grayscale");
     assert_eq!(found["comparisons"].as_array().map(Vec::len), Some(10));
@@ -119,7 +120,7 @@ fn compares_policies_from_the_same_starts_and_reproduces_results() {
         "planning with the true dynamics beats the floor"
     );
     let traces: Value =
-        serde_json::from_slice(&std::fs::read(swm.path("found/traces.json")).expect("traces")).expect("JSON");
+        serde_json::from_slice(&std::fs::read(swm.path("found/traces.json")).expect("traces")).expect("valid JSON");
     assert!(traces[0]["policy"] == "small" && traces[0]["best"].as_array().map(Vec::len) == Some(2), "{}", traces[0]);
 
     // Solvers that require gradients, latents, terms or constraints get them.
@@ -140,7 +141,7 @@ fn compares_policies_from_the_same_starts_and_reproduces_results() {
     let again = swm.json(&["reproduce", "found", "--threads", "1", "--envs", "3"]);
     assert_eq!((&again["holds"], &again["differences"]), (&Value::Bool(true), &Value::Array(vec![])));
     // Other weights under the same name are an error before any episode is played.
-    std::fs::remove_dir_all(swm.path("checkpoints/small")).expect("removable");
+    std::fs::remove_dir_all(swm.path("checkpoints/small")).expect("the file is removable");
     let other = ["train", "lewm", "--data", "rooms", "-o", "small", "schedule.steps=7", "data.batch_size=32"];
     swm.json(&other);
     swm.fails(&["reproduce", "found"], 2, &["weights of small", "hash"]);

@@ -1,40 +1,41 @@
 //! [`Grasp`]: optimises states and actions together, every model step independently.
 //!
-//! Psenka, Rabbat, Krishnapriyan, `LeCun` and Bar, *Parallel Stochastic Gradient-Based Planning for World Models* (2026),
-//! as algorithm "GRASP Solver" of the stable-worldmodel paper. Besides the actions `a_0 … a_{H-1}`, the states between start
-//! and goal are variables, `z_1 … z_{H-1}`, initially on the straight line. All predictions `ẑ_{t+1} = P(sg(z_t), a_t)` are
-//! computed at once, and both kinds of variables descend
+//! Psenka, Rabbat, Krishnapriyan, `LeCun` and Bar, *Parallel Stochastic Gradient-Based Planning for World Models*
+//! (2026), as algorithm "GRASP Solver" of the stable-worldmodel paper. In addition to the actions `a_0 … a_{H-1}`, the
+//! states between start and goal are variables, `z_1 … z_{H-1}`, initially on a straight line. All predictions
+//! `ẑ_{t+1} = P(sg(z_t), a_t)` are computed at once, and both kinds of variables descend
 //!
 //! `Σ_t ‖ẑ_{t+1} - z_{t+1}‖² + γ_k ‖ẑ_{t+1} - s_g‖²`
 //!
-//! where the gradient stops at `z_t` as an input of the predictor. Noise with the standard deviation σ_k is added to the
-//! states. Every few iterations, the synchronisation moves the actions some steps against the gradient of the rollout's cost;
-//! nowhere else does a gradient pass through more than one prediction. States are `[envs, horizon + 1, latent]`, start and
-//! goal included; actions are `[envs, horizon, dim]`, one candidate for each environment.
+//! where the gradient stops at `z_t` as an input of the predictor. Noise with the standard deviation σ_k is added to
+//! the states. Every few iterations, the synchronisation moves the actions some steps against the gradient of the
+//! rollout's cost; no other gradient passes through more than one prediction. States are `[envs, horizon + 1, latent]`,
+//! start and goal included; actions are `[envs, horizon, dim]`, one candidate for each environment.
 //!
-//! The solver is not in the published package. What the paper leaves open is taken from the reference's later source
-//! (`solver/grasp.py`): 200 iterations, Adam, the step size 0.1 for states, a synchronisation of 10 steps of 0.01 every 50
-//! iterations, and goal weight and noise that fall linearly from 2 and 0.1 to 0 between synchronisations. Only the step size
-//! of actions is ten times larger here: with the reference's 0.001, Adam moves no value by more than 0.2 in 200 iterations,
-//! which is less than plans in normalised units need.
+//! The solver is not in the published package. Values that the paper does not give are those of a later reference
+//! version (`solver/grasp.py`): 200 iterations, Adam, the step size 0.1 for states, a synchronisation of 10 steps of
+//! 0.01 every 50 iterations, and goal weight and noise that fall linearly from 2 and 0.1 to 0 between synchronisations.
+//! Only the step size of actions is ten times larger here: with the reference's 0.001, Adam moves no value by more than
+//! 0.2 in 200 iterations, which is less than plans in normalised units need.
 //!
 //! Intended differences from the paper:
-//! - Actions are clipped to the bounds of the problem after every step. The paper's table of solvers states this, but its
-//!   algorithm omits it.
-//! - Steps are those of an [`Optimizer`] (plain gradient descent is one), whose memory is cleared at a synchronisation, as in
-//!   the reference.
+//! - Actions are clipped to the bounds of the problem after every step. The paper's table of solvers states this, but
+//!   its algorithm omits it.
+//! - Steps are those of an [`Optimizer`] (plain gradient descent is one), whose memory is cleared at a synchronisation,
+//!   as in the reference.
 //! - Noise is keyed by (plan key, iteration); values that are not finite are errors.
 //!
-//! The one-step model is [`LatentDynamics::predict`](swm_core::LatentDynamics::predict). Of a model that conditions on several
-//! past states, it receives one; only the synchronisation uses the cost as the model computes it.
+//! The one-step model is [`LatentDynamics::predict`](swm_core::LatentDynamics::predict). If the model conditions on
+//! several past states, `predict` receives only one of them; only the synchronisation uses the model's own cost.
 //!
-//! Because the gradient stops at `z_t`, an action only receives a gradient for its effect within one step. Where an effect
-//! takes two steps, as from a force to a position, the lifted loss has no gradient, and only the synchronisation finds the
-//! plan. With plain gradient steps, one step size works for horizons at which gradient descent on the rollout requires a
-//! different one each (`tests/it/objective.rs`); with Adam on linear systems, gradient descent is as good or better.
+//! Because the gradient stops at `z_t`, an action only receives a gradient for its effect within one step. Where an
+//! effect takes two steps, as from a force to a position, the lifted loss has no gradient, and only the synchronisation
+//! finds the plan. With plain gradient steps, one step size works for horizons at which gradient descent on the rollout
+//! requires a different one each (`tests/it/objective.rs`); with Adam on linear systems, gradient descent is as good or
+//! better.
 //!
-//! The cost of a plan is only known after a rollout. So the trace has an entry before every step of a synchronisation, and
-//! one for the plan.
+//! The cost of a plan is only known after a rollout. So the trace has an entry before every step of a synchronisation,
+//! and one for the plan.
 
 mod virtual_states;
 
@@ -64,9 +65,9 @@ pub const ENTRY: SolverEntry = SolverEntry {
 pub struct Grasp {
     /// Iterations, K.
     pub iterations: usize,
-    /// Moves the actions.
+    /// The optimizer of the actions.
     pub action_optimizer: Optimizer,
-    /// Moves the virtual states.
+    /// The optimizer of the virtual states.
     pub state_optimizer: Optimizer,
     /// The weight of the distance of every predicted state to the goal, γ.
     pub goal_weight: LinearSchedule,
@@ -76,11 +77,11 @@ pub struct Grasp {
     pub sync_every: usize,
     /// Steps of a synchronisation.
     pub sync_iterations: usize,
-    /// Moves the actions in a synchronisation.
+    /// The optimizer of the actions in a synchronisation.
     pub sync_optimizer: Optimizer,
 }
 
-/// A value that changes linearly between synchronisations, or over all iterations where there are none.
+/// A value that changes linearly between synchronisations, or over all iterations if there are no synchronisations.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LinearSchedule {

@@ -7,8 +7,8 @@ use swm_core::{CostModel, Error, PlanProblem, Result};
 /// States on the way from start to goal, and their gradient.
 ///
 /// # Shapes
-/// `values` and `gradient` are `[envs, horizon + 1, latent]`; the first and the last state, start and goal, do not move.
-/// The private buffers are `[envs, horizon, latent]`.
+/// `values` and `gradient` are `[envs, horizon + 1, latent]`; the first and the last state, start and goal, do not
+/// move. The private buffers are `[envs, horizon, latent]`.
 pub struct VirtualStates {
     pub values: Vec<f32>,
     pub gradient: Vec<f32>,
@@ -75,7 +75,7 @@ impl VirtualStates {
         let predicted = self.next.chunks_exact(steps).zip(self.next_gradient.chunks_exact_mut(steps));
         for ((states, gradient), (next, next_gradient)) in envs.zip(predicted) {
             let goal = &states[steps..];
-            // Prediction i belongs to the state one latent further on.
+            // The prediction at `i` is compared with the state of the next step, at `i + latent`.
             for (i, &next) in next.iter().enumerate() {
                 let error = 2.0 * (next - states[i + self.latent]);
                 next_gradient[i] = error + gamma * 2.0 * (next - goal[i % self.latent]);

@@ -137,7 +137,7 @@ impl Landscape for Chain {
             }
             plan
         });
-        plans.min_by(|a, b| self.cost(a).total_cmp(&self.cost(b))).expect("some plan")
+        plans.min_by(|a, b| self.cost(a).total_cmp(&self.cost(b))).expect("there is at least one plan")
     }
 }
 

@@ -1,7 +1,7 @@
 //! Planning problems whose optimum is known in closed form or by exhaustive search, as models for any solver.
 //!
-//! Each environment of a toy has its own optimum, keyed by its index, so that using another environment's data gives a wrong
-//! plan. Arithmetic is in double precision, so errors are those of the solver.
+//! Each environment of a toy has its own optimum, keyed by its index, so that using another environment's data gives a
+//! wrong plan. Arithmetic is in double precision, so errors are due to the solver.
 
 mod landscapes;
 mod model;
@@ -18,9 +18,9 @@ pub struct Toy {
     pub name: &'static str,
     pub horizon: usize,
     pub space: PlanSpace<'static>,
-    /// Whether it has latent dynamics; its cost is then the squared distance of the last latent to the goal.
+    /// Whether the toy has latent dynamics; the cost is then the squared distance of the last latent to the goal.
     pub latent: bool,
-    /// Whether it has constraints.
+    /// Whether the toy has constraints.
     pub constrained: bool,
     /// The cost function of an environment.
     pub landscape: fn(env: usize) -> Box<dyn Landscape>,

@@ -8,7 +8,7 @@ use swm_core::{Batch, Candidates, Constrained, CostModel, DifferentiableCost, La
 pub struct Model {
     toy: &'static Toy,
     landscapes: Vec<Box<dyn Landscape>>,
-    /// Whether it offers its gradient and its latent dynamics.
+    /// Whether the model offers a gradient and latent dynamics.
     gradient: bool,
     /// Replaces the cost of one candidate: environment, sample, and the cost; `None` leaves it unwritten.
     wrong: Option<(usize, usize, Option<f32>)>,

@@ -10,7 +10,7 @@ use swm_core::{Action, Batch, Key, ResetOptions, Schema};
 use swm_mujoco::physics::{Physics, compile_file};
 use swm_mujoco::{ENVS, assets};
 
-/// Rounds; the fastest of each side counts, because other load only slows them.
+/// The number of rounds. The fastest round of each side counts, because other load on the machine only slows rounds.
 const ROUNDS: usize = 15;
 
 /// The CPU time of this thread, which does not include time spent waiting for other processes.

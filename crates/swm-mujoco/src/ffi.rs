@@ -1,7 +1,7 @@
 //! Declarations of the MuJoCo functions that may fail while an environment runs, so that [`crate::link::guard`] can
 //! catch the error.
 //!
-//! MuJoCo calls the log handler on an error; ours unwinds from it. `mujoco-rs` declares the same functions
+//! MuJoCo calls the log handler on an error; the handler of this crate unwinds. `mujoco-rs` declares the same functions
 //! `extern "C"`, through which unwinding aborts the process. Names, arguments and requirements are those of MuJoCo's
 //! API reference: model and data must be valid and belong together.
 #![allow(unsafe_code, reason = "declarations of foreign functions")]

@@ -23,7 +23,7 @@ pub enum Target<'a> {
 /// Draws scenes. One canvas serves any scenes and sizes; after the first frames of a kind, it does not allocate.
 ///
 /// A sample takes 8 bytes in each layer that a frame needs (main, mirrored, transparent), and 8 bytes for each of at
-/// most 4 views with cached static geometry. A texel of a shadow map takes as much.
+/// most 4 views with cached static geometry. A texel of a shadow map takes 8 bytes as well.
 #[derive(Default)]
 pub struct Canvas {
     threads: usize,
@@ -138,8 +138,7 @@ impl Canvas {
 /// The lights of a scene.
 #[derive(Default)]
 struct LightSet {
-    /// Lights without shadows.
-    /// Lights with shadows are in `shadowed`, in the order of `casting`.
+    /// Lights without shadows. Lights with shadows are in `shadowed`, in the order of `casting`.
     plain: Vec<ShadingLight>,
     shadowed: Vec<ShadingLight>,
     /// The scene's lights that cast shadows.

@@ -16,7 +16,7 @@ use std::sync::Arc;
 /// turn, each with its own view.
 const VIEWS: usize = 4;
 
-/// Consecutive frames that share more geoms than are cached, before these are cached instead.
+/// The number of consecutive frames that must share more geoms than are cached before the cache grows.
 const FRAMES_BEFORE_GROWTH: usize = 4;
 
 /// All inputs of the depth buffer except the geoms, as bits.
@@ -57,7 +57,7 @@ pub(crate) struct DrawSettings<'a> {
     pub view: &'a View,
     /// The far plane.
     pub far: f32,
-    /// Whether a shadow map is drawn, not a frame.
+    /// Whether the drawing is a shadow map instead of a frame.
     pub casting: bool,
 }
 
@@ -148,8 +148,8 @@ impl CachedView {
         same.unwrap_or(count)
     }
 
-    /// Returns how many of the first geoms to cache when `same` of them did not change: fewer than before at once,
-    /// more only after some frames.
+    /// Returns how many of the first geoms to cache when `same` of them did not change: the cache shrinks at once and
+    /// grows only after [`FRAMES_BEFORE_GROWTH`] frames.
     fn cacheable(&mut self, same: usize) -> usize {
         if same <= self.count || self.count == 0 {
             self.waiting = 0;

@@ -94,7 +94,7 @@ impl Mesh {
         let mut cells = FINEST;
         while cells >= COARSEST && side > 0.0 {
             let coarser = levels[0].merged(low, side / cells);
-            // Only levels that save work are stored.
+            // A level is stored only if it has less than 4/5 of the triangles of the previous level.
             if levels.last().is_some_and(|last| coarser.faces.len() * 5 < last.faces.len() * 4) {
                 levels.push(coarser);
             }

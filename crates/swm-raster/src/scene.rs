@@ -21,7 +21,7 @@ pub struct Assets {
 pub struct Scene {
     /// The camera.
     pub camera: Camera,
-    /// The geoms. The later one is visible where two have the same depth.
+    /// The geoms. Of two geoms at the same depth, the later one is visible.
     pub geoms: Vec<Geom>,
     /// The lights. A scene without lights is lit evenly and dimly.
     pub lights: Vec<Light>,

@@ -28,12 +28,11 @@ pub(crate) fn depth(radius: f32, direction: V3) -> f32 {
 /// until the camera turns.
 #[derive(Default)]
 pub(crate) struct SkyCache {
-    /// The texture, and the rays it was looked up along.
-    seen: Option<(Arc<Texture>, V3, [V3; 2])>,
+    /// The texture, and the rays along which it was looked up for `colours`.
+    source: Option<(Arc<Texture>, V3, [V3; 2])>,
     width: usize,
     rows: Range<usize>,
-    /// Red, green and blue of pixels.
-    /// `known` is set for the rows that were looked up.
+    /// Red, green and blue of pixels. `known` is set for the rows that were looked up.
     colours: [Vec<f32>; 3],
     known: Vec<bool>,
     sampler: Sampler,
@@ -57,11 +56,11 @@ impl SkyCache {
             return;
         };
         let rays = view.rays();
-        let known = self.seen.as_ref().is_some_and(|(seen, direction, directions)| {
-            Arc::ptr_eq(seen, texture) && *direction == rays.direction && *directions == rays.directions
+        let known = self.source.as_ref().is_some_and(|(cached, direction, directions)| {
+            Arc::ptr_eq(cached, texture) && *direction == rays.direction && *directions == rays.directions
         });
         if !known || (self.width, &self.rows) != (view.width, &main.rows) {
-            self.seen = Some((Arc::clone(texture), rays.direction, rays.directions));
+            self.source = Some((Arc::clone(texture), rays.direction, rays.directions));
             (self.width, self.rows) = (view.width, main.rows.clone());
             self.colours.iter_mut().for_each(|colours| colours.resize(view.width * main.rows.len(), 0.0));
             self.known.clear();

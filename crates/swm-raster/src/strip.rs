@@ -94,7 +94,7 @@ impl Strip {
         let Self { main, painter, colours, .. } = self;
         let context = ShadingContext { scene, assets, view, lights, dimmed: 1.0 };
         let whole = [0, 0, view.width, view.height];
-        painter.paint(main, &context, whole, |pixels, part, seen| add_part(colours, pixels, part, seen));
+        painter.paint(main, &context, whole, |pixels, part, light| add_part(colours, pixels, part, light));
         draw_haze(scene, view, main, colours);
         self.draw_transparent(frame, unshaded);
         let [r, g, b] = &self.colours;
@@ -125,17 +125,17 @@ impl Strip {
         // Only the pixels of the mirror, and only what lies in front of it.
         let own = u32::try_from(index).unwrap_or(NOTHING);
         select_mirror(own, scene.camera.far, &main.ids, &mut mirror.depths);
-        let mut seen = [usize::MAX, usize::MAX, 0, 0];
+        let mut visible = [usize::MAX, usize::MAX, 0, 0];
         for (other, geom) in (0u32..).zip(&scene.geoms) {
             if other != own && !is_transparent(scene, other as usize, view) {
                 let touched = mirror.draw(other, geom, (assets, &mirrored), Some(&main.depths), false);
-                seen = touched.map_or(seen, |touched| union(seen, touched));
+                visible = touched.map_or(visible, |touched| union(visible, touched));
             }
         }
-        let seen = intersection(seen, region);
+        let visible = intersection(visible, region);
         // Mirrored lights on mirrored geoms give the same light as the originals.
         let context = ShadingContext { scene, assets, view: &mirrored, lights, dimmed: geom.reflectance };
-        painter.paint(mirror, &context, seen, |pixels, part, seen| add_part(colours, pixels, part, seen));
+        painter.paint(mirror, &context, visible, |pixels, part, light| add_part(colours, pixels, part, light));
     }
 
     /// Draws transparent geoms from near to far, and again from far to near as MuJoCo does, without shadows.
@@ -174,11 +174,11 @@ impl Strip {
                 Shape::Plane(..) if is_seen_from_behind(scene, index, view) => BACK_OPACITY * geom.rgba[3],
                 _ => geom.rgba[3],
             };
-            painter.paint(transparent, &context, region, |pixels, part, seen| {
+            painter.paint(transparent, &context, region, |pixels, part, light| {
                 let opacity = (part * opacity).clamp(0.0, 1.0);
-                for (colours, seen) in colours.iter_mut().zip(seen) {
-                    for (colour, seen) in colours[pixels.clone()].iter_mut().zip(seen) {
-                        *colour = sky::over(*seen, opacity, *colour);
+                for (colours, light) in colours.iter_mut().zip(light) {
+                    for (colour, light) in colours[pixels.clone()].iter_mut().zip(light) {
+                        *colour = sky::over(*light, opacity, *colour);
                     }
                 }
             });
@@ -187,10 +187,10 @@ impl Strip {
 }
 
 /// Adds colours to pixels, weighted by the covered part.
-fn add_part(colours: &mut [Vec<f32>; 3], pixels: Range<usize>, part: f32, seen: [&[f32]; 3]) {
-    for (colours, seen) in colours.iter_mut().zip(seen) {
-        for (colour, seen) in colours[pixels.clone()].iter_mut().zip(seen) {
-            *colour += part * seen;
+fn add_part(colours: &mut [Vec<f32>; 3], pixels: Range<usize>, part: f32, light: [&[f32]; 3]) {
+    for (colours, light) in colours.iter_mut().zip(light) {
+        for (colour, light) in colours[pixels.clone()].iter_mut().zip(light) {
+            *colour += part * light;
         }
     }
 }
@@ -241,7 +241,7 @@ fn draw_haze(scene: &Scene, view: &View, main: &Layers, colours: &mut [Vec<f32>;
 }
 
 vectorize! {
-    /// Sets depths to the far plane where the mirror is visible, and closes all other samples.
+    /// Sets depths to the far plane where the mirror is visible, and excludes all other samples.
     fn select_mirror(own: u32, far: f32, ids: &[u32], depths: &mut [f32]) {
         for (depth, id) in depths.iter_mut().zip(ids) {
             *depth = if *id == own { far } else { f32::NEG_INFINITY };

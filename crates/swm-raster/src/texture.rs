@@ -69,8 +69,8 @@ impl MipLevel {
     fn halved(&self) -> Self {
         let (width, height) = ((self.width / 2).max(1), (self.height / 2).max(1));
         let at = |x: usize, y: usize| self.texels[y.min(self.height - 1) * self.width + x.min(self.width - 1)];
-        let texels = (0..width * height).map(|place| {
-            let (x, y) = (2 * (place % width), 2 * (place / width));
+        let texels = (0..width * height).map(|index| {
+            let (x, y) = (2 * (index % width), 2 * (index / width));
             weighted([at(x, y), at(x + 1, y), at(x, y + 1), at(x + 1, y + 1)], [64; 4])
         });
         Self { width, height, texels: texels.collect() }

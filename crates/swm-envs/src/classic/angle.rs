@@ -57,13 +57,17 @@ mod tests {
             let observed = |angle: f64| [angle.cos() as f32, angle.sin() as f32];
             let [cos, sin] = observed(angle).map(f64::from);
             let back = from_cos_sin(cos, sin);
-            assert!(between(angle, back).abs() < 1e-7, "{angle} came back as {back}");
+            assert!(between(angle, back).abs() < 1e-7, "{angle} was restored as {back}");
             assert_eq!(observed(back), observed(angle), "{angle}");
             assert!(check("angle", cos, sin).is_ok());
         }
         assert!(check("angle", 0.5, 0.5).is_err());
         let exact = 2.0f64;
         assert!((from_cos_sin(exact.cos(), exact.sin()) - exact).abs() < 1e-15, "double precision is not rounded");
-        assert_eq!(from_cos_sin(0.625, 0.75), 0.75f64.atan2(0.625), "values that no angle has");
+        assert_eq!(
+            from_cos_sin(0.625, 0.75),
+            0.75f64.atan2(0.625),
+            "a cosine and a sine whose squares do not sum to 1"
+        );
     }
 }

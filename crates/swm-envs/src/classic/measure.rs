@@ -14,7 +14,7 @@ pub struct Tally {
 }
 
 /// Plays 200 episodes with the first expert until they terminate or are truncated: with the default factors or with
-/// `all` varied, towards the goal of the reset or one that `sample_goal` draws.
+/// `all` varied, towards a goal that `sample_goal` draws if `sampled` is set, otherwise towards the goal of the reset.
 pub fn tally(entry: &EnvEntry, all: bool, sampled: bool) -> Tally {
     let variation = VariationRequest { variation: all.then(|| vec!["all".to_owned()]), ..VariationRequest::default() };
     let options = ResetOptions { variation, ..ResetOptions::default() };

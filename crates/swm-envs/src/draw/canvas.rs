@@ -56,7 +56,7 @@ impl Area {
         Self { low: Point::new(0, 0), high: Point::new(side as i32, side as i32) }
     }
 
-    /// Returns whether two areas opacity a pixel.
+    /// Returns whether two areas have a pixel in common.
     pub fn touches(self, other: Self) -> bool {
         self.low.x < other.high.x && other.low.x < self.high.x && self.low.y < other.high.y && other.low.y < self.high.y
     }

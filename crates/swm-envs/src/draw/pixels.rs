@@ -101,7 +101,7 @@ impl<'a> Pixels<'a> {
         };
         let columns = bound(0, f64::min) as usize..bound(0, f64::max).ceil() as usize;
         let rows = bound(1, f64::min) as usize..bound(1, f64::max).ceil() as usize;
-        // For each pixel, what the edges add to its own coverage and to that of all pixels right of it.
+        // For each pixel, the coverage that the edges add to the pixel itself and to every pixel right of it.
         let mut added = vec![[0.0; 2]; columns.len()];
         for y in rows {
             added.fill([0.0; 2]);

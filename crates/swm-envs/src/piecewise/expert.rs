@@ -103,13 +103,13 @@ mod tests {
     #[test]
     fn expert_reaches_the_target() {
         let reached = reached_of_200(&ENTRY, 100, 400);
-        // The other targets lie behind a drift that is stronger than the agent, or nearly so.
+        // The remaining 10 targets lie behind a drift that is stronger than the agent or nearly as strong.
         assert_eq!(reached, 190, "all factors varied, targets of the reset");
     }
 
     #[test]
     fn explorer_visits_the_whole_room() {
-        // A target in the corner does not end episodes early.
+        // The target is in a corner, so that the walk does not end the episode early by reaching the target.
         let far_goal = ResetOptions { goal_state: Some(vec![0.0, 0.0]), ..ResetOptions::default() };
         let mut visited = std::collections::BTreeSet::new();
         for seed in 0..50 {

@@ -28,7 +28,7 @@ const DRIFT_FACTORS: [&str; ZONES] = ["zones.bias_0", "zones.bias_1", "zones.bia
 /// The factors with the colour of each zone.
 const COLOR_FACTORS: [&str; ZONES] = ["zones.color_0", "zones.color_1", "zones.color_2", "zones.color_3"];
 
-/// One room in four zones with a drift each.
+/// One room divided into four zones, each with its own drift.
 struct Piecewise {
     dynamics: Dynamics,
     agent_color: Rgb,
@@ -53,12 +53,12 @@ impl PointTask for Piecewise {
             speed: factors.scalar("agent.speed"),
             drift: DRIFT_FACTORS.map(|key| factors.get(key)).map(|value| [value[0], value[1]]),
         };
-        let shown = |key| factors.integer(key) == 1;
+        let is_rendered = |key| factors.integer(key) == 1;
         let appearance = ZonesAppearance {
             background: factors.rgb("background.color"),
             border: factors.rgb("border.color"),
-            zones: shown("rendering.render_zones").then(|| COLOR_FACTORS.map(|key| factors.rgb(key))),
-            drift: shown("rendering.render_bias_field").then_some(dynamics.drift),
+            zones: is_rendered("rendering.render_zones").then(|| COLOR_FACTORS.map(|key| factors.rgb(key))),
+            drift: is_rendered("rendering.render_bias_field").then_some(dynamics.drift),
             target: room::target_disc(factors),
         };
         Self { dynamics, agent_color: factors.rgb("agent.color"), appearance }
@@ -100,7 +100,8 @@ impl PointTask for Piecewise {
             let mut goal = position(&space.sample(rng));
             let (end, mut steps) = paths::steer_to(&self.dynamics, agent, goal);
             if steps.is_none() {
-                // Out of reach: the position where the drift stops the agent on its way there may qualify.
+                // The goal is out of reach. The next candidate is the position at which the drift stops the agent on
+                // the way.
                 goal = end;
                 steps = paths::steer_to(&self.dynamics, agent, goal).1;
             }
@@ -164,7 +165,7 @@ mod tests {
             let (_, steps) = paths::steer_to(&env.task.dynamics, env.agent, env.goal);
             assert!(steps.is_some(), "seed {seed}: steering leads to {:?}", env.goal);
         }
-        // In these two, a drift stronger than the agent holds it in its corner.
+        // In the episodes of these two seeds, a drift stronger than the agent holds the agent in a corner.
         assert_eq!(trapped, [7732, 9434]);
     }
 }

@@ -4,7 +4,7 @@ use super::physics::Dynamics;
 use crate::point_agent::Position;
 use crate::point_agent::room::{GOAL_RADIUS, distance};
 
-/// Steps within which steering straight must reach its end.
+/// The maximal number of steps of a straight path.
 const MAX_STEPS: usize = 400;
 
 /// Steers straight towards `to`. Returns the last position and the number of steps to the target, if it is reached.
@@ -27,14 +27,14 @@ pub fn steer_to(dynamics: &Dynamics, from: Position, to: Position) -> (Position,
 const SIDE: usize = 256;
 /// The step count of a node from which the target is unreachable.
 const UNREACHABLE: u16 = u16::MAX;
-/// Margin left to rounding, in pixels.
+/// Margin against rounding errors, in pixels.
 const SPARE: f64 = 1e-3;
 
 /// The fewest steps to a target from every node of a grid.
 ///
-/// A step can end anywhere in a rectangle of twice the speed, moved by the drift and cut by the border. So the agent
-/// can go from node to node exactly, and a breadth-first search backwards from the target finds every path over the
-/// grid.
+/// A step can end anywhere in a square whose side is twice the speed, shifted by the drift and clipped at the border.
+/// So the agent can go from node to node exactly, and a breadth-first search backwards from the target finds every path
+/// over the grid.
 pub struct Detours {
     dynamics: Dynamics,
     to: Position,
@@ -51,8 +51,8 @@ impl Detours {
                 detours.steps[i] = 0;
             }
         }
-        // A summed-area table of the nodes from which the target is reachable, which counts those of a rectangle at
-        // once.
+        // A summed-area table of the nodes from which the target is reachable, to count such nodes in a rectangle in
+        // constant time.
         let mut counts = vec![0_u32; (SIDE + 1) * (SIDE + 1)];
         for step in 1..UNREACHABLE {
             for (y, row) in detours.steps.chunks_exact(SIDE).enumerate() {

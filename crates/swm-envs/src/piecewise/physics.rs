@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn border_holds_and_actions_are_clipped() {
+    fn agent_stays_within_the_border_and_actions_are_clipped() {
         assert_eq!(dynamics().advance([22.0, 200.0], [-9.0, 9.0]), [21.0, 203.0]);
     }
 

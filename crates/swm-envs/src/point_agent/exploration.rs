@@ -43,7 +43,7 @@ pub trait RandomWalk: Default + Send + 'static {
     /// Draws the next leg.
     fn draw_leg(rng: &mut Rng) -> Leg;
 
-    /// Returns whether a leg ends before its steps are used up, because the agent is near its end.
+    /// Returns whether a leg ends before its steps are used up, because the agent is near the end of the leg.
     fn has_arrived(observed: &Self::Observed, leg: &Leg) -> bool;
 
     /// Returns the action along a leg before noise, as shares of the largest action, `[x, y]`.

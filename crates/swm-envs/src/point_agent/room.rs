@@ -30,7 +30,7 @@ mod index {
 }
 
 /// Describes an environment in the room: an `observation` of `observation_len` values, and a column `privileged`, given
-/// as name and length, with what its experts read.
+/// as name and length, with the values that its experts read.
 pub fn spec(id: &str, observation_len: usize, privileged: (&str, usize), variation_space: VariationSpace) -> EnvSpec {
     let column = |name: &str, len: usize| ColumnSpec::new(name, DType::Float32, [len]);
     EnvSpec {

@@ -134,7 +134,7 @@ mod tests {
     #[test]
     fn expert_reaches_the_goal() {
         let reached = reached_of_200(&ENTRY, 100, 1000);
-        // Walls cut the other goals off from everywhere the agent can walk.
+        // Walls separate the remaining 9 goals from every position that the agent can reach.
         assert_eq!(reached, 191, "all factors varied, goals of the reset");
     }
 
@@ -142,7 +142,7 @@ mod tests {
     fn explorer_visits_the_whole_maze() {
         let mut visited = std::collections::BTreeSet::new();
         let mut stopped = 0;
-        // A goal in the corner does not end episodes early.
+        // The goal is in a corner, so that the walk does not end the episode early by reaching the goal.
         let far_goal = ResetOptions { goal_state: Some(vec![0.0, 0.0]), ..ResetOptions::default() };
         for seed in 0..50 {
             let (positions, _) = play(&ENTRY, &EXPERTS[1], seed, &far_goal, false, 100);

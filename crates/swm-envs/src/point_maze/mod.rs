@@ -29,9 +29,9 @@ pub const ENTRY: EnvEntry = EnvEntry {
 
 /// Goal candidates per clearance that [`PointTask::find_goal`] tries.
 const TRIES_PER_CLEARANCE: usize = 4096;
-/// Length of the path to a sampled goal that is aimed for, in full steps.
+/// Desired length of the path to a sampled goal, in steps at full speed.
 const GOAL_STEPS: f64 = 10.0;
-/// Factor draws at a reset before it fails.
+/// The maximal number of times that a reset draws the factors.
 const RESOLVE_TRIES: usize = 1000;
 
 /// Indices of the columns of [`PointTask::spec`].
@@ -46,7 +46,7 @@ mod index {
 struct PointMaze {
     layout: Layout,
     appearance: MazeAppearance,
-    /// The agent at its start; its position is not used.
+    /// The agent's disc at the start of the episode; its position is not used.
     agent: Disc,
     /// The visibility graph of the walls, built at the first use.
     graph: OnceCell<VisibilityGraph>,
@@ -112,7 +112,8 @@ impl PointTask for PointMaze {
     }
 
     fn resolve_factors(space: &VariationSpace, request: &VariationRequest, seed: u64) -> Result<FactorValues> {
-        // Factors sampled after a position, such as a radius, may make it touch a wall. Then all are drawn again.
+        // A factor sampled after a position, such as a radius, may make the disc touch a wall. All factors are then
+        // drawn again.
         let key = |tried: u64| if tried == 0 { Key::new(seed) } else { Key::new(seed).with("another world").at(tried) };
         let mut draws = (0..RESOLVE_TRIES as u64).map(|tried| space.resolve(request, key(tried)));
         let fitting =
@@ -159,10 +160,11 @@ impl PointTask for PointMaze {
     fn find_goal(&self, _factors: &FactorValues, agent: Position, rng: &mut Rng) -> Option<Position> {
         let space = Space::uniform_box([2], DType::Float32, 0.0, Self::SIZE);
         let wanted = GOAL_STEPS * f64::from(MAX_ACTION * self.layout.speed);
-        // Paths are as long in either direction, so paths to the agent serve for all candidates.
+        // A path has the same length in both directions, so the paths to the agent give the lengths for all candidates.
         let graph = self.graph();
         let paths = graph.shortest_paths(widen(agent));
-        // The goal touches no wall, as at a reset; only where no such position exists, it suffices that the agent fits.
+        // As at a reset, the goal disc must not touch a wall. If no such position is found, positions at which only the
+        // agent fits are accepted.
         [self.layout.radius.max(self.appearance.goal.radius), self.layout.radius].into_iter().find_map(|clearance| {
             farthest_goal(TRIES_PER_CLEARANCE, wanted, || {
                 let goal = position(&space.sample(rng));
@@ -208,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn agent_and_goal_touch_no_wall_whatever_varies() {
+    fn agent_and_goal_touch_no_wall_for_any_factors() {
         let mut env = PointAgentEnv::<PointMaze>::new();
         let keys = ["agent", "goal", "walls", "agent.radius", "walls.shape", "walls.number"];
         for (i, seed) in (0..1200).enumerate() {
@@ -242,8 +244,11 @@ mod tests {
                 let walked = f64::from(distance(before, env.agent));
                 let now = env.goal_distance();
                 // The polygons around round corners are a little longer than what the agent can walk.
-                assert!(now < left - walked + 1e-5, "seed {seed}: {left}, {walked} walked, {now} left");
-                assert!(walked > 0.0 && left - walked - now < 0.02, "seed {seed}: {left}, {walked} walked, {now} left");
+                assert!(now < left - walked + 1e-5, "seed {seed}: from {left} to {now} by walking {walked}");
+                assert!(
+                    walked > 0.0 && left - walked - now < 0.02,
+                    "seed {seed}: from {left} to {now} by walking {walked}"
+                );
                 left = now;
             }
         }

@@ -7,7 +7,8 @@
 use super::physics::{Layout, SIZE, Wall};
 use crate::point_agent::{Position64, distance64};
 
-/// Margin that a path keeps from walls beyond the agent's radius, in maze units. Half of it is left to rounding.
+/// Margin that a path keeps from walls beyond the agent's radius, in maze units. Half of the margin allows for rounding
+/// errors.
 const SPARE: f64 = 1e-3;
 /// Corners of the polygon around a round corner.
 const NODES_PER_CORNER: u8 = 3;
@@ -69,8 +70,8 @@ impl VisibilityGraph {
         self.layout.walls().iter().map(|wall| point_to_wall(at, wall)).fold(f64::INFINITY, f64::min)
     }
 
-    /// Returns the length of the straight path, or `None` if it comes nearer to a wall than the agent may be and than
-    /// both its ends are.
+    /// Returns the length of the straight path, or `None` if the path comes nearer to a wall than the agent may and
+    /// than both ends of the path are.
     fn straight(&self, from: Position64, to: Position64) -> Option<f64> {
         let clear = f64::from(self.layout.radius) + SPARE / 2.0;
         let free = self.layout.walls().iter().all(|wall| {
@@ -112,7 +113,7 @@ impl VisibilityGraph {
         best.filter(|(_, length)| length.is_finite())
     }
 
-    /// Returns a position near `goal` at which the agent fits, or nearly so, by moving `goal` away from the walls.
+    /// Returns a position near `goal` at which the agent fits or nearly fits, by moving `goal` away from the walls.
     pub fn nearest_free(&self, goal: Position64) -> Position64 {
         let clear = f64::from(self.layout.radius) + SPARE;
         let mut at = goal;
@@ -149,8 +150,8 @@ fn point_to_wall(at: Position64, wall: &Wall) -> f64 {
     distance64(at, nearest_in_wall(at, wall))
 }
 
-/// Returns the distance between a segment and a wall. Where it exceeds `enough`, the result is only a lower bound that
-/// exceeds `enough`, too.
+/// Returns the distance between a segment and a wall. If the distance exceeds `enough`, the result is a lower bound
+/// that exceeds `enough` as well.
 fn segment_to_wall(from: Position64, to: Position64, wall: &Wall, enough: f64) -> f64 {
     let (low, high) = (wall.low.map(f64::from), wall.high.map(f64::from));
     let gap = |i: usize| (from[i].min(to[i]) - high[i]).max(low[i] - from[i].max(to[i]));

@@ -2,8 +2,9 @@
 //! square.
 //!
 //! Constants and the order of the checks are those of the reference (`simple_point_maze.py`), and so is single
-//! precision. Only the end of a step is checked, and before it is clipped to the square: a step may jump over a corner,
-//! and one that ends outside the square may be clipped into a wall at the border. Lengths are in maze units, y up.
+//! precision. Only the end of a step is checked, and this happens before the end is clipped to the square: a step may
+//! jump over a corner, and a step that ends outside the square may be clipped into a wall at the border. Lengths are in
+//! maze units, y up.
 
 use crate::point_agent::Position;
 
@@ -107,13 +108,17 @@ mod tests {
     }
 
     #[test]
-    fn walls_stop_the_disc_and_the_border_holds_it() {
+    fn walls_stop_the_disc_and_positions_are_clipped_to_the_square() {
         let layout = layout();
-        assert_eq!(layout.advance([1.8, 2.5], [0.05, 0.05]), [1.8499999, 2.55], "free");
-        assert_eq!(layout.advance([1.8, 2.5], [0.15, 0.0]), [1.8, 2.5], "its rim would touch");
+        assert_eq!(layout.advance([1.8, 2.5], [0.05, 0.05]), [1.8499999, 2.55], "no wall is near");
+        assert_eq!(layout.advance([1.8, 2.5], [0.15, 0.0]), [1.8, 2.5], "the rim of the disc would touch the wall");
         assert_eq!(layout.advance([1.8, 1.8], [0.12, 0.12]), [1.92, 1.92], "a round disc fits beside the corner");
-        assert_eq!(layout.advance([1.8, 1.8], [0.14, 0.14]), [1.8, 1.8], "but no closer");
-        assert_eq!(layout.advance([0.1, 0.1], [-0.2, 0.9]), [0.0, 0.3], "held, and the action is clipped");
+        assert_eq!(
+            layout.advance([1.8, 1.8], [0.14, 0.14]),
+            [1.8, 1.8],
+            "nearer to the corner, the disc would touch it"
+        );
+        assert_eq!(layout.advance([0.1, 0.1], [-0.2, 0.9]), [0.0, 0.3], "position and action are clipped");
     }
 
     #[test]

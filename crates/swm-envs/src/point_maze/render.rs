@@ -116,7 +116,7 @@ fn draw_agent(agent: &Disc, pixels: &mut Pixels<'_>) -> Area {
     let (center, radius) = agent.in_pixels();
     let bounds = Pixels::circle_bounds(center, radius);
     let [first, last] = PARTLY_COVERED;
-    // Each band with how often the line covers it in part.
+    // Each band with the number of times that the line covers it in part.
     let bands = [(first, 1), ((first.1, last.0), 0), (last, 1)];
     for ((left, right), covered_x) in bands {
         for ((top, bottom), covered_y) in bands {

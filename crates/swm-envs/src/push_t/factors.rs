@@ -68,7 +68,7 @@ pub fn columns() -> Vec<ColumnSpec> {
     ]
 }
 
-/// The observation columns with the reference's bounds. Agents may leave the bounds, as there.
+/// The observation columns with the reference's bounds. As in the reference, agents may leave the bounds.
 pub fn observation_space() -> Vec<(&'static str, Space)> {
     let (side, speed) = (512.0, 512.0);
     let space = |low: &[f64], high: &[f64]| Space::Box {

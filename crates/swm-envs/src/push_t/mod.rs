@@ -223,7 +223,7 @@ impl Env for PushT {
             self.begin(factors.unwrap_or_else(|| self.factors.clone()), goal);
         }
         if self.simulation.load(&mut bytes).is_none() || !bytes.is_empty() {
-            // A partly read state is invalid: the episode starts anew at its goal.
+            // A partly read state is invalid, so the episode starts again at its goal.
             self.begin(self.factors.clone(), goal);
             return Err(wrong_snapshot(&self.spec.id, "bytes of another length"));
         }

@@ -2,7 +2,7 @@
 //!
 //! Dimensions, centres of gravity and moments of inertia are those of the reference (`env.py`). The centre of gravity
 //! is the mean of the rectangles' centres, whatever their size, and some shapes count the moment of their first
-//! rectangle several times, as there.
+//! rectangle several times; both follow the reference.
 
 use super::physics::{Body, Shape, Vec2};
 use std::f64::consts::{PI, TAU};

@@ -8,9 +8,9 @@ use swm_core::{Error, FactorValues, Result};
 /// Agent x y, block x y (pixels), block angle (radians), agent velocity x y (pixels per second).
 pub type State = [f64; 7];
 
-/// The goal is reached when the positions of agent and block together are nearer than this, in pixels,
+/// The largest distance at which the goal is reached: the norm over the positions of agent and block, in pixels.
 pub const REACH: f64 = 20.0;
-/// and the block's angle is nearer than this, in radians.
+/// The largest rotation of the block at which the goal is reached, in radians.
 pub const REACH_ANGLE: f64 = PI / 9.0;
 /// Weight of the agent's distance in [`goal_distance`], relative to the block's. It is small, because the agent has to
 /// leave its goal to push the block: a plan that minimised both equally would leave the agent at its goal and not push
@@ -67,8 +67,8 @@ pub fn state_distance(a: &State, b: &State) -> f64 {
     a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt()
 }
 
-/// Returns whether a state counts as the goal: agent and block in position, and the block at an angle at which it looks
-/// the same.
+/// Returns whether a goal is reached: both positions are near those of the goal, and the angle of the block is near
+/// that of the goal up to the symmetry of the block.
 pub fn is_reached(factors: &FactorValues, goal: &State, state: &State) -> bool {
     let distance = goal[..4].iter().zip(state).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt();
     distance < REACH && angle_between(factors.integer("block.shape"), goal[4], state[4]) < REACH_ANGLE

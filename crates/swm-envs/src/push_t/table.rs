@@ -7,7 +7,7 @@ use swm_core::FactorValues;
 
 /// Side of the table, in pixels.
 pub const TABLE: f64 = 512.0;
-/// Distance that an action component of 1 asks the agent to move, in pixels.
+/// Distance from the agent to the target position for an action component of 1, in pixels.
 pub const ACTION_SCALE: f32 = 100.0;
 /// Physics steps per step of the environment (10 Hz control).
 pub const SUBSTEPS: usize = 10;

@@ -92,13 +92,13 @@ mod tests {
     #[test]
     fn expert_reaches_the_target() {
         let reached = reached_of_200(&ENTRY, 100, 400);
-        // The other eight targets lie deep in the wall, or behind doors too near the border for the agent.
+        // The remaining eight targets lie deep in the wall, or behind doors too near the border for the agent.
         assert_eq!(reached, 192, "all factors varied, targets of the reset");
     }
 
     #[test]
     fn explorer_visits_both_rooms() {
-        // A target in the corner does not end episodes early.
+        // The target is in a corner, so that the walk does not end the episode early by reaching the target.
         let far_goal = ResetOptions { goal_state: Some(vec![0.0, 0.0]), ..ResetOptions::default() };
         let mut visited = std::collections::BTreeSet::new();
         let (mut crossings, mut touches) = (0, 0);

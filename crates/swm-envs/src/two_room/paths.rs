@@ -8,7 +8,7 @@ use crate::point_agent::{Position64, distance64};
 
 /// Distance that a path keeps from the edges of a door, where the door is wide enough, in pixels.
 const CLEARANCE: f64 = 3.0;
-/// Distance from touching the wall at which a path turns into a door, in pixels.
+/// Gap between the agent and the wall at which a path turns into a door, in pixels.
 const STAND_OFF: f64 = 1.0;
 /// A target counts as reached within this distance, which is a little less than the environment requires, in pixels.
 const NEAR: f64 = GOAL_RADIUS as f64 - SPARE;
@@ -64,8 +64,8 @@ fn openings(layout: &Layout) -> impl Iterator<Item = [f64; 2]> + use<> {
 }
 
 /// Returns the position to walk to in order to reach `to`. This is `to` itself unless it lies inside the wall; then it
-/// is the position, among those at the wall's faces and in the doors, that reaches `to` by the shortest path. Where
-/// none is near enough, it is the nearest one.
+/// is the position, among those at the wall's faces and in the doors, that reaches `to` by the shortest path. If none
+/// of them is near enough, it is the nearest of them.
 fn reachable_end(layout: &Layout, from: Position64, to: Position64) -> Position64 {
     let (across, along) = (layout.across, 1 - layout.across);
     let beyond = layout.contact_depth() + SPARE;

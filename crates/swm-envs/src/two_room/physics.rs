@@ -9,9 +9,9 @@ use crate::point_agent::room;
 
 /// Coordinate of the centre line of the wall, on the axis across it, in pixels.
 pub const WALL_CENTER: f64 = 112.0;
-/// How far beyond the edge of a door the agent's centre may be and still pass, in pixels.
+/// Distance beyond the edge of a door within which the agent's centre can still pass, in pixels.
 const DOOR_MARGIN: f64 = 1.75;
-/// How far from touching the wall the agent is put back, in pixels.
+/// Gap between the agent and the wall after the agent was pushed back, in pixels.
 const PUSH_BACK: f64 = 0.5;
 /// The maximal number of doors.
 pub const MAX_DOORS: usize = 3;
@@ -85,7 +85,8 @@ impl Layout {
         let (across, along) = (f64::from(to[self.across]), f64::from(to[1 - self.across]));
         let in_door = self.doors.iter().any(|&[first, last]| (first..=last).contains(&along));
         if !in_door {
-            // The side is that of the step's start, so that a fast agent is put back to its own room.
+            // The agent's side of the wall is that at the start of the step, so that a fast agent is put back into its
+            // own room.
             let (low, high) = (WALL_CENTER - self.contact_depth(), WALL_CENTER + self.contact_depth());
             if f64::from(from[self.across]) < WALL_CENTER {
                 if across > low {
@@ -114,7 +115,7 @@ mod tests {
             let at = |x: f32, y: f32| if flip { [y, x] } else { [x, y] };
             let layout = layout(across);
             assert_eq!(layout.advance(at(98.0, 150.0), at(1.0, 0.0)), at(99.5, 150.0), "pushed back from the left");
-            assert_eq!(layout.advance(at(126.0, 150.0), at(-1.0, 0.0)), at(124.5, 150.0), "and from the right");
+            assert_eq!(layout.advance(at(126.0, 150.0), at(-1.0, 0.0)), at(124.5, 150.0), "pushed back from the right");
             assert_eq!(layout.advance(at(98.0, 49.0), at(1.0, 0.0)), at(103.0, 49.0), "through the door");
             assert_eq!(layout.advance(at(22.0, 150.0), at(-1.0, 0.0)), at(21.0, 150.0), "held by the border");
         }

@@ -2,8 +2,8 @@
 //! target and agent over them.
 //!
 //! Everything but the agent is static during an episode, so it is drawn once per frame size. At 224 pixels this
-//! background equals the reference's bit for bit (apart from the line in `border_color`), and the discs are within a
-//! rounding of it.
+//! background equals the reference's bit for bit (apart from the line in `border_color`), and the discs differ from the
+//! reference's by rounding only.
 
 use super::physics::WALL_CENTER;
 use crate::draw::{Brush, BySize, Rgb, SoftDisc};

@@ -66,7 +66,7 @@ pub(super) struct ChromaKey {
 impl ChromaKey {
     pub fn new(keys: &[u8], media: Media, tolerance: f64) -> Self {
         let keys = keys.as_chunks::<3>().0.iter().map(|key| key.map(i32::from)).collect();
-        // The margin keeps a distance equal to the tolerance despite rounding.
+        // The margin includes distances equal to the tolerance in spite of rounding errors.
         let max_distance_squared = (tolerance * tolerance + 1e-6) as i32;
         Self { keys, max_distance_squared, media: Arc::new(media), sized: None }
     }

@@ -81,13 +81,13 @@ static STANDARD: LazyLock<Vec<f64>> = LazyLock::new(|| {
 struct Noise {
     settings: Settings,
     episode: Key,
-    /// The value that each interval adds to a channel, for one standard deviation.
+    /// The change of a channel for each interval of the normal distribution, at the standard deviation `table_std`.
     table: Vec<i16>,
-    /// The standard deviation of the table.
+    /// The standard deviation for which `table` was computed.
     table_std: f64,
 }
 
-/// The SplitMix64 generator; it is fast, because a frame needs tens of thousands of draws.
+/// The SplitMix64 generator. A frame needs tens of thousands of draws, so the generator must be fast.
 struct SplitMix64(u64);
 
 impl SplitMix64 {

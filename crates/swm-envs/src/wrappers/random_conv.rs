@@ -8,7 +8,7 @@
 //! | `kernel_size` | pixels; even values mean the next odd one | 3 | 1 to 15 |
 //!
 //! Source: `RandomConvWrapper` of the reference (Lee et al. 2020, "Network Randomization"). The result is not
-//! normalised, so about half of the channels are clipped to 0 in some areas, as there.
+//! normalised, so about half of the channels are clipped to 0 in some areas, as in the reference.
 
 use super::border::mirror;
 use super::settings::{Domain, Parameter};

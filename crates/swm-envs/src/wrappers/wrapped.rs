@@ -14,7 +14,7 @@ pub enum GoalFrame {
     /// default, so that results are comparable with the reference's.
     #[default]
     Clean,
-    /// The goal frame is wrapped like all others, so that start and goal differ only by the state.
+    /// The goal frame is changed like every other frame, so that start and goal differ only by the state.
     Wrapped,
 }
 

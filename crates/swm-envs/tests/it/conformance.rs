@@ -3,7 +3,7 @@
 use swm_conformance::Suite;
 use swm_envs::ENVS;
 
-/// Why `goal.scale` changes nothing.
+/// The reason why `goal.scale` has no effect.
 const GOAL_SCALE: &str = "the reference samples it and draws the goal pose as large as the block";
 
 static SUITE: Suite = Suite {

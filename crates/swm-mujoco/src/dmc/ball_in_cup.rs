@@ -22,7 +22,7 @@ const CUP: [usize; 2] = [0, 1];
 const BALL: [usize; 2] = [2, 3];
 /// Half the width, depth and height of the inside of the cup, in metres.
 const CUP_INSIDE: [f64; 3] = [0.05, 0.006, 0.05];
-/// The ball's slides, in metres, when it is in the middle of a cup at its origin.
+/// Positions of the ball's slides at which the ball is in the middle of a cup at its origin, in metres.
 const CAUGHT: [f64; 2] = [0.0, 0.35];
 
 /// The indices of the domain's elements.

@@ -47,7 +47,7 @@ impl Cheetah {
         (5.0 * up + Tolerance::within(0.0, 0.0).of(self.speed(physics))) / 6.0
     }
 
-    /// Both stands at once.
+    /// The mean of both stands.
     fn jump(&self, physics: &Physics) -> f64 {
         f64::midpoint(self.stand(physics, self.back_foot), self.stand(physics, self.front_foot))
     }

@@ -116,7 +116,7 @@ pub trait Domain: Send + Sized + 'static {
     /// The reward of one control step.
     fn reward(&self, physics: &Physics) -> f64;
 
-    /// Writes the configuration that the task leads to, if there is exactly one, and returns whether there is.
+    /// Writes the goal configuration of the task and returns true, if the task has exactly one.
     fn goal_qpos(&self, _physics: &Physics, _qpos: &mut [f64]) -> bool {
         false
     }

@@ -68,13 +68,14 @@ impl<D: Domain> Replay<D> {
         self.row.row(0).to_f64(name).expect("a column")
     }
 
-    /// The difference of MuJoCo's image from a recorded one, of 255, and whether the CPU renderer's is close to it.
+    /// The mean difference between MuJoCo's frame and a recorded image, from 0 to 255, and whether the frame of the CPU
+    /// renderer is close to the recorded image.
     fn compare_image(&mut self, file: &Path, golden: &mut Golden, name: &str) -> (f64, bool) {
         if !golden.has(name) {
             return (0.0, true);
         }
-        let (height, width, wanted) = golden.image(name);
-        let mut rgb = vec![0; wanted.len()];
+        let (height, width, expected) = golden.image(name);
+        let mut rgb = vec![0; expected.len()];
         let camera = self.task.camera();
         let mut draw = |choice| {
             let buffer = FrameBuffer::Rgb(&mut rgb);
@@ -85,8 +86,8 @@ impl<D: Domain> Replay<D> {
         let (cpu, egl) = (draw(Choice::Cpu), draw(Choice::Egl));
         let name = format!("{}-{name}", file.file_stem().unwrap_or_default().to_string_lossy());
         (
-            ImageSimilarity::of(&egl, &wanted, width).difference,
-            ImageSimilarity::report(&name, &cpu, &wanted, width).is_close(),
+            ImageSimilarity::of(&egl, &expected, width).difference,
+            ImageSimilarity::report(&name, &cpu, &expected, width).is_close(),
         )
     }
 }
@@ -128,32 +129,34 @@ fn replay_one<D: Domain>(file: &Path) -> Worst {
     physics.set_state(&state).expect("a state");
     physics.forward_passive();
 
-    // The columns as in an environment: two of its own, then the task's.
-    let own = [ColumnSpec::new("state", DType::Float64, [1]), ColumnSpec::new("unstable", DType::Bool, [])];
-    let specs: Vec<ColumnSpec> = own.into_iter().chain(spec.columns.clone()).collect();
+    // The columns as in an environment: `state` and `unstable`, then those of the task.
+    let common_columns = [ColumnSpec::new("state", DType::Float64, [1]), ColumnSpec::new("unstable", DType::Bool, [])];
+    let specs: Vec<ColumnSpec> = common_columns.into_iter().chain(spec.columns.clone()).collect();
     let row = Batch::zeros(&Schema::new(specs).expect("columns"), 1);
     let mut replay = Replay { physics, task, scene: None, row };
 
-    let (actions, rewards, ends) =
+    let (actions, rewards, terminations) =
         (golden.values("action"), golden.values("reward"), golden.values(columns::TERMINATED));
     let (states, observations) = (golden.values("qpos_qvel"), golden.values("obs"));
     let infos: Vec<(&str, Vec<f64>)> =
         D::INFO.iter().map(|info| (info.name, golden.values(&format!("info.{}", info.name)))).collect();
     let mut worst = Worst::default();
     worst.images[0] = replay.compare_image(file, &mut golden, "frame_first");
-    let n = spec.action_space.len();
+    let action_dim = spec.action_space.len();
     for t in 0..=rewards.len() {
         if t > 0 {
-            let step = replay.task.apply_action(&mut replay.physics, actions[(t - 1) * n..t * n].iter().copied());
+            let step = replay
+                .task
+                .apply_action(&mut replay.physics, actions[(t - 1) * action_dim..t * action_dim].iter().copied());
             worst.reward = worst.reward.max((step.reward - rewards[t - 1]).abs());
-            assert_eq!(step.terminated, ends[t - 1] > 0.0, "{}, terminated {t}", file.display());
+            assert_eq!(step.terminated, terminations[t - 1] > 0.0, "{}, terminated {t}", file.display());
         }
         let mut now = replay.column("qpos");
         now.extend(replay.column("qvel"));
         worst.state = worst.state.max(apart(&now, &states[t * now.len()..][..now.len()]));
         let observation = replay.column("observation");
-        let wanted = &observations[t * observation.len()..][..observation.len()];
-        worst.observation = worst.observation.max(apart(&observation, wanted));
+        let expected = &observations[t * observation.len()..][..observation.len()];
+        worst.observation = worst.observation.max(apart(&observation, expected));
         for (name, recorded) in &infos {
             let info = replay.column(name);
             worst.info = worst.info.max(apart(&info, &recorded[t * info.len()..][..info.len()]));

@@ -24,9 +24,9 @@ const ARM: [&str; 8] =
     ["arm_root", "arm_shoulder", "arm_elbow", "arm_wrist", "finger", "fingertip", "thumb", "thumbtip"];
 /// The touch sensors of the hand.
 const TOUCH: [&str; 5] = ["palm_touch", "finger_touch", "thumb_touch", "fingertip_touch", "thumbtip_touch"];
-/// The bodies that exist only in some tasks; a task removes the others.
+/// The bodies that only some tasks use; the model of a task contains only those that the task uses.
 const PROPS: [&str; 6] = ["ball", "target_ball", "cup", "peg", "target_peg", "slot"];
-/// Distance of two sites, in metres (`_CLOSE` of the suite).
+/// Reward for the closeness of two sites, as a function of their distance in metres (`_CLOSE` of the suite).
 const CLOSE: Tolerance = Tolerance::within(0.0, 0.01).gaussian(0.02);
 /// Radius of the ball's target, in metres.
 const TARGET_RADIUS: f64 = 0.015;
@@ -47,7 +47,7 @@ pub struct Task {
 const BALL: Task = Task { object: "ball", target: "target_ball", receptacle: None };
 const PEG: Task = Task { object: "peg", target: "target_peg", receptacle: None };
 
-/// Pairs of sites whose distances reward the handling of the peg.
+/// Pairs of sites whose closeness is the reward of tasks with a peg.
 struct Peg {
     grasp: [usize; 2],
     pinch: [usize; 2],
@@ -73,7 +73,7 @@ pub struct Manipulator {
 }
 
 impl Manipulator {
-    /// 1 where two sites are close, less with their distance.
+    /// The closeness of two sites: 1 up to a distance of 1 cm, falling towards 0 as the distance grows.
     fn close(&self, physics: &Physics, [a, b]: [usize; 2]) -> f64 {
         let sites = physics.data().site_xpos();
         CLOSE.of(distance(sites[a], sites[b]))

@@ -14,7 +14,7 @@ pub struct ModelEdit<'a> {
 
 /// The error for an element that the model lacks.
 fn missing(what: &str, name: &str) -> Error {
-    Error::mismatch("editing a model of the suite", format!("no {what} '{name}'"), "the pinned files")
+    Error::mismatch("editing a dm_control suite model", format!("no {what} '{name}'"), "the pinned files")
 }
 
 /// A colour in MuJoCo's form.

@@ -11,7 +11,7 @@ impl ModelIndex<'_> {
     fn id(&self, kind: MjtObjBase, what: &str, name: &str) -> Result<usize> {
         self.0.name_to_id(kind, name).ok_or_else(|| {
             Error::mismatch(
-                "reading a model of the suite",
+                "loading a dm_control suite model",
                 format!("no {what} '{name}'"),
                 format!("a {what} '{name}': `swm assets verify dm_control` checks the files"),
             )

@@ -58,7 +58,7 @@ impl ModelSource {
 /// When there is no such element.
 pub fn without_element(text: &str, tag: &str, name: &str) -> Result<String> {
     let missing =
-        || Error::mismatch("preparing a model of the suite", format!("no {tag} '{name}'"), "the pinned files");
+        || Error::mismatch("preparing a dm_control suite model", format!("no {tag} '{name}'"), "the pinned files");
     let begin = text.find(&format!("<{tag} name=\"{name}\"")).ok_or_else(missing)?;
     let (open, close) = (format!("<{tag} "), format!("</{tag}>"));
     let head = begin + text[begin..].find('>').ok_or_else(missing)?;

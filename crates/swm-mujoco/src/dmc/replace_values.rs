@@ -1,7 +1,7 @@
 //! Replaces the values of a compiled model by those of another compilation, except for large textures.
 //!
 //! Masses, inertias and more are computed when a model is compiled, so other factors of variation require a
-//! compilation. Nearly all of its time goes into generating the sky texture. [`replace_values`] therefore takes the
+//! compilation. The compiler spends nearly all of its time on the sky texture. [`replace_values`] therefore takes the
 //! values of a model that was compiled with a tiny sky: 0.5 ms instead of 100 ms.
 #![allow(unsafe_code, reason = "a model's arrays are consecutive in one buffer, which is copied in two parts")]
 

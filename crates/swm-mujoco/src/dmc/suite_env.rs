@@ -24,9 +24,9 @@ use swm_core::{
 const ACTION_REPEAT: usize = 2;
 /// The maximal number of elements of an observation.
 const MAX_OBSERVATION: usize = 256;
-/// Starts tried until one is stable.
+/// The maximal number of starts that are tried to find a stable one.
 const START_TRIES: u64 = 10;
-/// Random walks tried until one leads to a new goal.
+/// The maximal number of random walks that are tried to find a goal.
 const GOAL_TRIES: u64 = 32;
 /// Actions of a random walk.
 const GOAL_STEPS: RangeInclusive<usize> = 5..=25;
@@ -162,7 +162,7 @@ impl<D: Domain> SuiteTask<D> {
         let from = physics.data().qpos().to_vec();
         let (min_steps, mut hold) = (rng.random_range(GOAL_STEPS), 0);
         for step in 1..=*GOAL_STEPS.end() {
-            // An action is held for some steps: the effects of independent actions would cancel out.
+            // Each action is repeated for several steps, because the effects of independent actions would cancel out.
             if hold == 0 {
                 hold = rng.random_range(1..=5);
                 for (control, &[low, high]) in physics.data_mut().ctrl_mut().iter_mut().zip(&self.control_ranges) {

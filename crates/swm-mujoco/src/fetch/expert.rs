@@ -90,7 +90,7 @@ fn gripper_offset([x, y]: [f64; 2], inputs: &Inputs) -> (f64, f64) {
 }
 
 /// Moves the gripper behind the object, `back` metres from its centre, and over the object where that is in the way.
-/// `None` when the gripper is there.
+/// `None` when the gripper is behind the object.
 fn move_behind(inputs: &Inputs, direction: [f64; 2], back: f64, height: f64) -> Option<[f64; 4]> {
     let (ahead, left) = gripper_offset(direction, inputs);
     let [x, y] = [0, 1].map(|i| inputs.object[i] - back * direction[i]);

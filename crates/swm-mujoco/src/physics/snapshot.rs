@@ -71,8 +71,8 @@ impl Physics {
         self.source_state.len() + 2
     }
 
-    /// Appends the state and how the derived quantities were computed, so that [`Physics::load`] restores both bit for
-    /// bit.
+    /// Appends the state and the kind of call that computed the derived quantities, so that [`Physics::load`] restores
+    /// both bit for bit.
     pub fn save(&self, into: &mut Vec<f64>) {
         into.push(f64::from(u8::from(self.unstable)));
         into.push(f64::from(self.derivation as u8));
@@ -85,7 +85,7 @@ impl Physics {
         saved.get(2..).unwrap_or_default()
     }
 
-    /// Restores what [`Physics::save`] wrote, on the same model with the same edits.
+    /// Restores the values that [`Physics::save`] wrote, on the same model with the same edits.
     ///
     /// # Errors
     /// When the values were not written by [`Physics::save`].

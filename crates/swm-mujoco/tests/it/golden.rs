@@ -111,9 +111,9 @@ fn table_goal(golden: &mut Golden, state: &mut [f64]) {
     }
 }
 
-/// All rows; for Slide, those before the puck is struck or the simulation becomes chaotic. A puck is a cylinder:
-/// contacts with a finger are computed iteratively, with last digits that differ between versions, and contacts with
-/// the table jump along its rim.
+/// The number of rows to compare: all rows; for Slide, the rows before the puck is struck or the simulation becomes
+/// chaotic. A puck is a cylinder: contacts with a finger are computed iteratively, with last digits that differ between
+/// versions, and contacts with the table jump along its rim.
 fn fetch_rows(file: &str, golden: &mut Golden) -> usize {
     if !file.contains("FetchSlide") {
         return usize::MAX;
@@ -185,19 +185,19 @@ fn column(env: &dyn Env, name: &str) -> Vec<f64> {
     row.row(0).to_f64(name).expect("a column")
 }
 
-/// All rows before the simulation becomes chaotic: where the gripper's mesh touches a button, the contacts that MuJoCo
-/// finds jump with the last digit of a pose, and the reference does not reproduce its own recording.
+/// The number of rows before the simulation becomes chaotic: where the gripper's mesh touches a button, the contacts
+/// that MuJoCo finds jump with the last digit of a pose, and the reference does not reproduce its own recording.
 fn table_rows(name: &str, golden: &mut Golden) -> usize {
     rows_before_chaos(&FAMILIES[1], name, golden)
 }
 
-/// All rows before perturbations of the last digits change the trajectory.
+/// The number of rows before perturbations of the last digits change the trajectory.
 fn rows_before_chaos(family: &Family, name: &str, golden: &mut Golden) -> usize {
     let variation = (family.factors)(name, golden.variation());
     let options = ResetOptions { variation, ..ResetOptions::default() };
     let actions: Vec<f32> = golden.values("action").iter().map(|&a| a as f32).collect();
-    let width = actions.len() / golden.values("reward").len();
-    let pose = golden.values("start.qpos").len();
+    let action_dim = actions.len() / golden.values("reward").len();
+    let qpos_len = golden.values("start.qpos").len();
     let mut play = |perturbation: f64| -> Vec<Vec<f64>> {
         let mut env = recorded_env(Path::new(name)).expect("an environment");
         env.reset(0, &options).expect("a reset");
@@ -206,9 +206,9 @@ fn rows_before_chaos(family: &Family, name: &str, golden: &mut Golden) -> usize 
         env.reset(0, &ResetOptions { state: Some(state), ..options.clone() }).expect("a reset");
         let mut step = |action| {
             env.step(Action::Continuous(action)).expect("a step");
-            column(&*env, "state")[1..=pose].to_vec()
+            column(&*env, "state")[1..=qpos_len].to_vec()
         };
-        actions.chunks_exact(width).map(&mut step).collect()
+        actions.chunks_exact(action_dim).map(&mut step).collect()
     };
     let unperturbed = play(0.0);
     let diverged = [1e-13, -1e-13, 1e-14].into_iter().filter_map(|perturbation| {
@@ -273,16 +273,16 @@ impl<'a> Comparison<'a> {
             .collect();
         let positions = self.golden.values("qpos_qvel");
         let (rewards, endings) = (self.golden.values("reward"), self.golden.values("terminated"));
-        let n = self.env.spec().action_dim();
+        let action_dim = self.env.spec().action_dim();
         let actions: Vec<f32> = self.golden.values("action").iter().map(|&a| a as f32).collect();
 
-        let pose = positions.len() / (rewards.len() + 1);
-        let until = (self.family.comparable_rows)(&self.name, &mut self.golden);
+        let pose_len = positions.len() / (rewards.len() + 1);
+        let row_count = (self.family.comparable_rows)(&self.name, &mut self.golden);
         self.compare_image("frame_first", &names);
         for step in 0..=rewards.len() {
             self.env.observe(&mut self.row.row_mut(0));
-            if step < until {
-                self.compare_pose(step, &positions[step * pose..(step + 1) * pose]);
+            if step < row_count {
+                self.compare_pose(step, &positions[step * pose_len..(step + 1) * pose_len]);
                 self.compare_infos(step, &infos, rewards.len());
                 for (array, recorded) in &observations {
                     let ours = self.observation(array.strip_prefix("obs."));
@@ -290,16 +290,16 @@ impl<'a> Comparison<'a> {
                 }
             }
             let Some(&reward) = rewards.get(step) else { break };
-            let action = Action::Continuous(&actions[step * n..(step + 1) * n]);
+            let action = Action::Continuous(&actions[step * action_dim..(step + 1) * action_dim]);
             let transition = self.env.step(action).unwrap_or_else(|error| panic!("{}: {error}", self.name));
-            if step + 1 < until {
+            if step + 1 < row_count {
                 self.note_difference("reward", step, (transition.reward - reward).abs() / reward.abs().max(1.0));
                 let ended = (f64::from(u8::from(transition.terminated)) - endings[step]).abs();
                 self.note_difference("terminated", step, ended);
             }
         }
         self.compare_image("frame_last", &names);
-        self.report(until.min(rewards.len() + 1))
+        self.report(row_count.min(rewards.len() + 1))
     }
 
     /// Compares the infos of a step; the reference's mazes have none at a reset.
@@ -369,9 +369,9 @@ impl<'a> Comparison<'a> {
     }
 
     fn note_difference(&mut self, array: &str, step: usize, value: f64) {
-        let known = self.differences.entry(array.to_owned()).or_insert(Difference { value, step });
-        if value.is_nan() || value > known.value {
-            *known = Difference { value, step };
+        let largest = self.differences.entry(array.to_owned()).or_insert(Difference { value, step });
+        if value.is_nan() || value > largest.value {
+            *largest = Difference { value, step };
         }
     }
 

@@ -1,4 +1,4 @@
-//! A linear read-out of the state learned from the frames of one renderer works for those of the other.
+//! A linear read-out of the state that is trained on the frames of one renderer works on the frames of the other.
 
 use rand::Rng;
 use swm_core::{Action, Batch, FrameMut, Key, ResetOptions, Schema};
@@ -11,7 +11,7 @@ const SIDE: usize = 64;
 const POOL: usize = 4;
 const EPISODES: u64 = 25;
 const STEPS: usize = 12;
-/// One of so many of the [`EPISODES`] is held out for testing.
+/// One in this many episodes is held out for testing.
 const HELD_OUT: usize = 4;
 /// The ridge penalty on the weights.
 const RIDGE: f64 = 1.0;
@@ -80,16 +80,16 @@ fn read_out_trained_on_one_renderer_works_on_the_other() {
     let held_out = |i: &usize| (i / STEPS).is_multiple_of(HELD_OUT);
     let train: Vec<usize> = (0..poses.len()).filter(|i| !held_out(i)).collect();
     let test: Vec<usize> = (0..poses.len()).filter(held_out).collect();
-    let error = |learned: &[Vec<f64>], shown: &[Vec<f64>]| -> f64 {
+    let error = |trained: &[Vec<f64>], tested: &[Vec<f64>]| -> f64 {
         // The dual form: one weight per frame instead of one per feature.
         let mut kernel: Vec<Vec<f64>> =
-            train.iter().map(|&i| train.iter().map(|&j| dot(&learned[i], &learned[j])).collect()).collect();
+            train.iter().map(|&i| train.iter().map(|&j| dot(&trained[i], &trained[j])).collect()).collect();
         kernel.iter_mut().enumerate().for_each(|(i, row)| row[i] += RIDGE);
         let weights = solve(kernel, train.iter().map(|&i| poses[i].clone()).collect());
         let squares: f64 = test
             .iter()
             .map(|&i| {
-                let similarities: Vec<f64> = train.iter().map(|&j| dot(&learned[j], &shown[i])).collect();
+                let similarities: Vec<f64> = train.iter().map(|&j| dot(&trained[j], &tested[i])).collect();
                 let read =
                     (0..poses[i].len()).map(|k| weights.iter().zip(&similarities).map(|(w, s)| w[k] * s).sum::<f64>());
                 read.zip(&poses[i]).map(|(a, b)| (a - b).powi(2)).sum::<f64>()
@@ -98,8 +98,8 @@ fn read_out_trained_on_one_renderer_works_on_the_other() {
         (squares / test.len() as f64).sqrt()
     };
     let [egl, cpu] = &frames;
-    for (name, learned, other) in [("egl", egl, cpu), ("cpu", cpu, egl)] {
-        let (own, foreign) = (error(learned, learned), error(learned, other));
+    for (name, trained, other) in [("egl", egl, cpu), ("cpu", cpu, egl)] {
+        let (own, foreign) = (error(trained, trained), error(trained, other));
         let mean: Vec<f64> =
             (0..poses[0].len()).map(|k| train.iter().map(|&i| poses[i][k]).sum::<f64>() / train.len() as f64).collect();
         let mean_error =

@@ -12,7 +12,7 @@ const FRAME_CELL: f32 = 0.6;
 /// Largest side of a merged mesh cell in shadow maps, in texels.
 const SHADOW_MAP_CELL: f32 = 2.0;
 
-/// Returns the largest side of a merged mesh cell, in local units, that is not visible.
+/// Returns the largest side of a mesh cell, in local units, at which merging its vertices is not visible.
 pub(crate) fn mesh_cell(mesh: &Mesh, geom: &Geom, view: &View, caster: bool) -> f32 {
     let (low, high) = mesh.bounds();
     let reach = 0.5 * length([high[0] - low[0], high[1] - low[1], high[2] - low[2]]);

@@ -36,8 +36,8 @@ pub(crate) fn pattern(samples: usize) -> &'static [[f32; 2]] {
     }
 }
 
-/// Returns the mean position of covered samples, a bit each. It lies inside a convex shape even at the shape's edge.
-/// For a fully covered pixel it is the pixel's centre.
+/// Returns the mean position of covered samples; `covered` has a bit per sample. It lies inside a convex shape even at
+/// the shape's edge. For a fully covered pixel it is the pixel's centre.
 fn centre_of(pattern: &[[f32; 2]], covered: usize) -> [f32; 2] {
     let count = covered.count_ones() as usize;
     if count == 0 || count >= pattern.len() {
@@ -62,7 +62,7 @@ pub(crate) struct Layers {
     stride: usize,
     /// Positions of samples within a pixel.
     pub pattern: &'static [[f32; 2]],
-    /// Their smallest and largest coordinates.
+    /// The smallest and largest coordinates in `pattern`.
     reach: [[f32; 2]; 2],
     /// Depths; the far plane where nothing was drawn.
     pub depths: Vec<f32>,
@@ -78,7 +78,7 @@ pub(crate) struct Layers {
     lanes: [[f32; LANES]; 2],
     /// By mask of covered samples: their mean position within the pixel.
     pub centres: [[f32; 2]; 16],
-    /// For every sample of a row, a floor in front of all geoms, which hides none of them.
+    /// For every sample of a row, a floor depth in front of all geoms, which excludes none of them.
     free: Vec<f32>,
     /// Scratch: how far a shape reaches to the left and right in each row.
     outline: [Vec<f32>; 2],

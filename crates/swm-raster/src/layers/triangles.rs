@@ -24,7 +24,7 @@ pub(crate) struct Triangle {
     base: [f32; 2],
     /// `[by x, by y, constant]` of each barycentric weight, divided by `w`.
     shares: [[f32; 3]; 3],
-    /// The same for the depth, divided by `w`.
+    /// The equation of the depth divided by `w`, in the same form.
     depth: [f32; 3],
 }
 

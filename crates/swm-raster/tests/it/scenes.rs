@@ -67,9 +67,9 @@ fn paint() -> impl Strategy<Value = Option<Paint>> {
 
 /// A random geom.
 pub fn geom() -> impl Strategy<Value = Geom> {
-    let looks = (prop::array::uniform4(number()), number(), number(), number(), number(), paint());
-    (shape(), vector(), rotation(), looks, any::<bool>()).prop_map(|(shape, position, rotation, looks, casts)| {
-        let (rgba, emission, specular, shininess, reflectance, paint) = looks;
+    let material = (prop::array::uniform4(number()), number(), number(), number(), number(), paint());
+    (shape(), vector(), rotation(), material, any::<bool>()).prop_map(|(shape, position, rotation, material, casts)| {
+        let (rgba, emission, specular, shininess, reflectance, paint) = material;
         let label = Some(1);
         Geom { shape, position, rotation, rgba, emission, specular, shininess, reflectance, paint, label, casts }
     })

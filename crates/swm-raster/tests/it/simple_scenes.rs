@@ -66,15 +66,15 @@ fn depths_of_shapes_are_exact() {
         (Shape::Box([1.0, 3.0, 1.0]), 7.0),
     ] {
         let scene = Scene { camera: CAMERA, geoms: vec![geom(shape, [0.0, 10.0, 0.0])], ..Scene::default() };
-        let seen = middle(&depths(&scene, &Assets::default()));
-        assert!((seen - nearest).abs() < 0.05, "{shape:?}: {seen}");
+        let depth = middle(&depths(&scene, &Assets::default()));
+        assert!((depth - nearest).abs() < 0.05, "{shape:?}: {depth}");
         // Far away and small: rounding must not lose it.
         let mut far = scene.clone();
         far.camera.far = 2e4;
         far.geoms[0].position[1] += 1e4;
         far.camera.frustum = [-2e-5, 2e-5, -2e-5, 2e-5];
-        let seen = middle(&depths(&far, &Assets::default()));
-        assert!((seen - nearest - 1e4).abs() < 0.05, "{shape:?}: {seen}");
+        let depth = middle(&depths(&far, &Assets::default()));
+        assert!((depth - nearest - 1e4).abs() < 0.05, "{shape:?}: {depth}");
     }
     // A rotated geom.
     let mut lying = geom(Shape::Capsule(0.5, 2.0), [0.0, 10.0, 0.0]);

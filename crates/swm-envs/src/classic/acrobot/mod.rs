@@ -26,9 +26,9 @@ pub const ENTRY: EnvEntry = EnvEntry {
 /// Two links with a motor in the joint between them.
 struct Acrobot(Physics);
 
-/// Half-width of the uniform distribution of the start around hanging at rest, for every value of the state.
+/// Half-width of the uniform distribution around 0 (hanging at rest) from which every value of the start is drawn.
 const START: f64 = 0.1;
-/// A goal below the line is reached when both angles are nearer than this, in radians.
+/// Tolerance of both angles for a goal below the line, in radians.
 const NEAR: f64 = 0.2;
 
 impl ControlTask for Acrobot {

@@ -10,7 +10,7 @@ use swm_core::Transition;
 const STEP: f64 = 0.2;
 /// Gravitational acceleration, in m/s².
 const GRAVITY: f64 = 9.8;
-/// The maximal angular speeds of link and joint, in rad/s.
+/// The maximal angular speeds of the first link and of the joint, in rad/s.
 pub const MAX_SPEED: [f64; 2] = [4.0 * PI, 9.0 * PI];
 
 /// The angle of the first link from hanging down, the angle of the joint (radians), and both angular velocities
@@ -20,7 +20,7 @@ pub type State = [f64; 4];
 /// The physical factors of an episode, in SI units, for both links.
 #[derive(Clone, Copy, Debug)]
 pub struct Physics {
-    /// Distance of the centre of mass along each link, in m.
+    /// Distance of the centre of mass of each link from its upper joint, in m.
     pub centre: [f64; 2],
     /// Length of each link, in m.
     pub length: [f64; 2],

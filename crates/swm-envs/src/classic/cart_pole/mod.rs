@@ -25,11 +25,11 @@ pub const ENTRY: EnvEntry = EnvEntry {
 /// A cart with a pole on it.
 struct CartPole(Physics);
 
-/// Half-width of the uniform distribution of the start around 0, for every value of the state.
+/// Half-width of the uniform distribution around 0 from which every value of the start state is drawn.
 const START: f64 = 0.05;
 /// Least and greatest distance of the goal from the centre of the track, in metres.
 const GOAL: [f64; 2] = [0.5, 1.5];
-/// The goal is reached when cart (metres) and pole (radians) are both nearer than this.
+/// Tolerances of the goal for the position of the cart (metres) and the angle of the pole (radians).
 const NEAR: [f64; 2] = [0.1, 0.1];
 /// Twice the angle at which an episode ends, in radians: the bound of the observation in the reference.
 const MAX_ANGLE: f64 = 24.0 * std::f64::consts::PI / 180.0;

@@ -34,8 +34,8 @@ impl Physics {
         Self { force, gravity, length, pole, total: pole + cart, tau }
     }
 
-    /// Advances the state by one step with a push to the right or to the left. The reward is 1, including the step in
-    /// which the pole falls, and 0 while it stays down.
+    /// Advances the state by one step with a push to the right or to the left. The reward is 1 up to and including the
+    /// step in which the pole falls, and 0 afterwards.
     pub fn step(&self, state: &mut [f64; 5], right: bool) -> Transition {
         let [x, v, angle, angular_velocity, fell] = *state;
         let Self { gravity, length, pole, total, tau, .. } = *self;

@@ -1,4 +1,4 @@
-//! [`FrameRenderer`]: renders frames in the steps of the reference: shapes of SDL_gfx on a surface of fixed size,
+//! [`FrameRenderer`]: renders frames by the same steps as the reference: shapes of SDL_gfx on a surface of fixed size,
 //! replacement of some colours, and Pillow's bilinear resize.
 
 mod resize;

@@ -175,9 +175,9 @@ mod tests {
         if (x / 3 + y / 2) % 2 == 1 { ((x * 37 + y * y * 11) % 256) as u8 } else { 200 }
     }
 
-    fn surface(shown: impl Fn(usize, usize) -> bool) -> Surface {
+    fn surface(is_drawn: impl Fn(usize, usize) -> bool) -> Surface {
         let mut surface = Surface::new(9, 6, Color::new([77; 3]));
-        for (x, y) in (0..54).map(|i| (i % 9, i / 9)).filter(|&(x, y)| shown(x, y)) {
+        for (x, y) in (0..54).map(|i| (i % 9, i / 9)).filter(|&(x, y)| is_drawn(x, y)) {
             surface.horizontal_line(5 - y as i32, x as i32, x as i32, Color::new([grey(x, y); 3]));
         }
         surface
@@ -192,7 +192,7 @@ mod tests {
             (13, 6, &[200, 200, 200, 200, 145, 122, 148, 174, 191, 200, 200, 200, 200]),
         ];
         for (width, height, expected) in expected {
-            // Some pixels belong to the background, the others are drawn in front of it.
+            // Some pixels belong to the background; all other pixels are drawn in front of it.
             for part in 0..4 {
                 let mut resize = Resize::new((9, 6), width, height);
                 let mut background = surface(|x, y| (x + y) % 4 < part);

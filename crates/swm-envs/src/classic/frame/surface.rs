@@ -22,7 +22,8 @@ impl Color {
         [r, g, b]
     }
 
-    /// Blends this colour over another one with `weight` / 256; a weight of 255 covers it.
+    /// Blends this colour over another one with `weight` / 256; a weight of 255 leaves almost nothing of the other
+    /// colour.
     fn over(self, below: Self, weight: i32) -> Self {
         // SDL_gfx scales the weight by the opacity, which is 255 of 256 for an opaque colour.
         let share = (255 * weight) >> 8;

@@ -129,7 +129,7 @@ struct MountainCar<V>(Hill, PhantomData<V>);
 
 /// Bounds of the start position, in track units; the car starts at rest.
 const START: [f64; 2] = [-0.6, -0.4];
-/// A goal below the flag is reached when the car is nearer than this, in track units.
+/// Tolerance of the position for a goal below the flag, in track units.
 const NEAR: f64 = 0.05;
 /// Weight of a unit of missing height in the goal distance, relative to a unit of distance.
 const HEIGHT_WEIGHT: f64 = 10.0;

@@ -26,11 +26,11 @@ pub const ENTRY: EnvEntry = EnvEntry {
 /// A rod that rotates about its end.
 struct Pendulum(Physics);
 
-/// Bound of the actions, whatever torque the motor can exert, in N m.
+/// Bound of the actions in N m, independent of the maximal torque of the motor.
 const MAX_ACTION: f64 = 2.0;
 /// Half-widths of the uniform distributions of the start around 0: angle (rad) and angular velocity (rad/s).
 const START: [f64; 2] = [PI, 1.0];
-/// The goal is reached when angle (rad) and angular velocity (rad/s) are both nearer than this.
+/// Tolerances of the goal for the angle (rad) and the angular velocity (rad/s).
 const NEAR: [f64; 2] = [0.2, 1.0];
 
 impl ControlTask for Pendulum {

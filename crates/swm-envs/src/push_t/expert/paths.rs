@@ -96,7 +96,8 @@ mod tests {
             at = next;
         }
         assert!((walked - length).abs() < 1e-9);
-        // Straight where nothing is between, away from the block where the agent touches it, and not through it.
+        // A path is straight if nothing is between its ends, leads away from a block that the agent touches, and never
+        // leads through the block.
         let (_, node) = paths.to(Vec2::new(150.0, 50.0)).expect("a path");
         assert_eq!(node, 0);
         let touching = ShortestPaths::from(&space, Vec2::new(186.0, 250.0));

@@ -65,7 +65,7 @@ pub struct Candidates<'a> {
 pub struct PushModel {
     /// The `shapes` column: agent shape and scale, block shape and scale.
     pub shapes: [f64; 4],
-    /// Rounds an action to one that the environment has.
+    /// Rounds an action to one of the action space.
     round_action: fn([f64; 2]) -> [f64; 2],
     body_shapes: [BodyShape; 2],
     /// The simulation before any step.
@@ -171,7 +171,7 @@ impl PushModel {
         best.map(|(push, from, node)| Push { waypoints: paths.waypoints(from, node), ..push })
     }
 
-    /// Returns the best of `samples` random pushes, each judged by the error after the best push that follows it. Its
+    /// Returns the best of `samples` random pushes, rated by the error after the best push that follows. The returned
     /// error and rate are those after both pushes.
     pub fn best_detour(
         &mut self,

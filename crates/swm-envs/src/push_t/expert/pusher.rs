@@ -2,8 +2,8 @@
 //!
 //! A plan is a path around the block to a point beside it, and a push from there: a direction, a strength and a number
 //! of steps. Pushes from all around the block are tried in the model, and the expert chooses the one that reduces the
-//! error fastest. Where none does, it searches for a push that makes a good one possible. When the block is at its
-//! goal, the agent walks to its own goal.
+//! error fastest. If no push reduces the error enough, the expert searches for a push after which a good push is
+//! possible. When the block is at its goal, the agent walks to its own goal.
 
 use super::paths::ShortestPaths;
 use super::push_model::{Candidates, Observation, Push, PushModel};
@@ -35,7 +35,7 @@ const PATIENCE: usize = 60;
 
 /// The expert.
 pub struct Pusher {
-    /// Rounds an action to one that the environment has.
+    /// Rounds an action to one of the action space.
     round_action: fn([f64; 2]) -> [f64; 2],
     rng: Rng,
     model: Option<PushModel>,
@@ -138,7 +138,7 @@ fn next_plan(model: &mut PushModel, now: &Observation, goal: &State, rng: &mut R
     }
     match model.best_detour(now, goal, DETOURS, &COARSE, rng) {
         Some(push) => push.into(),
-        // No starting point is reachable. From the centre of the table one may be.
+        // No starting point is reachable. A starting point may be reachable from the centre of the table.
         None => Plan::walk(vec![Vec2::new(TABLE / 2.0, TABLE / 2.0)]),
     }
 }

@@ -94,9 +94,9 @@ impl Simulation {
 #[derive(Clone, Copy, Default)]
 struct Neighbour {
     shape: u32,
-    /// Whether the two become a new pair.
+    /// Whether the queried shape and the neighbour become a new pair.
     becomes_pair: bool,
-    /// Whether it comes second in the pair, so that contacts are found when it is updated itself.
+    /// Whether the neighbour is the second shape of the pair: contacts of the pair are then found when it is updated.
     comes_second: bool,
 }
 

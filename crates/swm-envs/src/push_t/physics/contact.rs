@@ -38,9 +38,9 @@ pub struct Arbiter {
     pub bodies: [u32; 2],
     /// The last step in which they touched.
     pub stamp: u32,
-    /// 1 if they did not touch in the step before, so that there are no impulses to start from.
+    /// 1 if they did not touch in the last step, so that there are no impulses to start from.
     pub is_new: u32,
-    /// 1 if they touched once and do not any more.
+    /// 1 if they touched in an earlier step and no longer touch.
     pub separated: u32,
 }
 

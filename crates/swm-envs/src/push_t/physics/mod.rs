@@ -2,7 +2,7 @@
 //! checkpoints depend on its trajectories, so the order of operations is the same.
 //!
 //! There are two bodies (the agent and the block) between four walls, without gravity, friction and restitution, and
-//! with a damping that stops everything between two steps. [`Simulation::step`] moves the bodies with the velocities of
+//! with a damping that stops every body between two steps. [`Simulation::step`] moves the bodies with the velocities of
 //! the last step, finds contacts ([`bounds_tree`] finds the pairs, [`collide`] their contacts), and solves for the
 //! velocities that separate overlapping shapes by sequential impulses, warm-started from those of the step before.
 

@@ -65,7 +65,7 @@ fn background_replaces_the_key_colours_and_follows_the_steps() {
     for media in backgrounds {
         let text = format!("chroma-key,key_color=1/2/3/9/9/9,tolerance=2,media={}", media.display());
         let mut wrapper = make(&text);
-        let mut seen = |step| {
+        let mut level_at = |step| {
             // The key colour, one at distance 2, one just beyond, the other key colour, an unrelated colour.
             let mut rgb = [[1, 2, 3], [1, 4, 3], [2, 4, 3], [9, 9, 8], [200, 0, 0]].concat();
             wrapper.apply(&mut FrameMut::new(5, 1, &mut rgb), EpisodeFrame::Step(step));
@@ -74,7 +74,7 @@ fn background_replaces_the_key_colours_and_follows_the_steps() {
             rgb[0]
         };
         for (step, level) in (0..).zip(levels.iter().cycle().take(10)) {
-            assert!(seen(step).abs_diff(*level) <= 2, "{text}: step {step} shows {}, not {level}", seen(step));
+            assert!(level_at(step).abs_diff(*level) <= 2, "{text}: step {step} shows {}, not {level}", level_at(step));
         }
     }
 }
@@ -82,10 +82,10 @@ fn background_replaces_the_key_colours_and_follows_the_steps() {
 #[test]
 fn gaussian_noise_has_the_moments_and_tails_of_a_normal_distribution() {
     for std in [1.0, 10.0, 30.0] {
-        let looks = applied_to_grey(&format!("noise,std={std}"), 128, [224, 224], 0..7).concat();
-        let n = looks.len() as f64;
+        let bytes = applied_to_grey(&format!("noise,std={std}"), 128, [224, 224], 0..7).concat();
+        let n = bytes.len() as f64;
         // Rounding down moves the mean by half a level and adds 1/12 to the variance.
-        let noise = looks.iter().map(|&v| f64::from(v) - 127.5);
+        let noise = bytes.iter().map(|&v| f64::from(v) - 127.5);
         let variance = mean(noise.clone().map(|v| v * v));
         assert!(mean(noise.clone()).abs() < 5.0 * std / n.sqrt(), "std {std}: the mean is {}", mean(noise));
         let expected = std * std + 1.0 / 12.0;
@@ -105,7 +105,7 @@ fn gaussian_noise_has_the_moments_and_tails_of_a_normal_distribution() {
         }
         // Neighbours, channels, rows and steps are uncorrelated.
         for lag in [1, 3, 4, 3 * 224, 3 * 224 * 224] {
-            let pairs = looks.iter().zip(&looks[lag..]);
+            let pairs = bytes.iter().zip(&bytes[lag..]);
             let correlation = mean(pairs.map(|(&a, &b)| (f64::from(a) - 127.5) * (f64::from(b) - 127.5))) / variance;
             assert!(correlation.abs() < 5.0 / n.sqrt(), "std {std}: correlation {correlation} over {lag}");
         }
@@ -114,24 +114,24 @@ fn gaussian_noise_has_the_moments_and_tails_of_a_normal_distribution() {
     let untouched = mean(white.iter().map(|&v| f64::from(u8::from(v == 255))));
     assert!((untouched - 0.5).abs() < 0.01, "half of the noise is clipped, not {untouched}");
     let schedule = applied_to_grey("noise,std=linear/0/20/2", 128, [64, 64], 0..4);
-    let spread = |look: &[u8]| mean(look.iter().map(|&v| (f64::from(v) - 127.5).powi(2))).sqrt();
-    assert!(schedule[0].iter().all(|&v| v == 128), "without noise nothing changes");
-    for (look, std) in schedule.iter().zip([0.5, 10.0, 20.0, 20.0]) {
-        assert!((spread(look) - std).abs() < 0.5, "{} is not {std}", spread(look));
+    let spread = |frame: &[u8]| mean(frame.iter().map(|&v| (f64::from(v) - 127.5).powi(2))).sqrt();
+    assert!(schedule[0].iter().all(|&v| v == 128), "a standard deviation of 0 changes nothing");
+    for (frame, std) in schedule.iter().zip([0.5, 10.0, 20.0, 20.0]) {
+        assert!((spread(frame) - std).abs() < 0.5, "{} is not {std}", spread(frame));
     }
 }
 
 #[test]
 fn salt_and_pepper_replace_whole_pixels_with_equal_probability() {
     for amount in [0.0, 0.05, 0.5, 1.0] {
-        let looks = applied_to_grey(&format!("noise,kind=salt-pepper,amount={amount}"), 128, [201, 224], 0..3).concat();
-        let pixels = looks.as_chunks::<3>().0;
+        let bytes = applied_to_grey(&format!("noise,kind=salt-pepper,amount={amount}"), 128, [201, 224], 0..3).concat();
+        let pixels = bytes.as_chunks::<3>().0;
         let share = |level: u8| mean(pixels.iter().map(|&pixel| f64::from(u8::from(pixel == [level; 3]))));
         let slack = 5.0 * (0.25 / pixels.len() as f64).sqrt();
         for (level, expected) in [(0, amount / 2.0), (255, amount / 2.0), (128, 1.0 - amount)] {
             assert!((share(level) - expected).abs() < slack, "amount {amount}: {} show {level}", share(level));
         }
-        assert!((share(0) + share(255) + share(128) - 1.0).abs() < 1e-9, "pixels stay grey");
+        assert!((share(0) + share(255) + share(128) - 1.0).abs() < 1e-9, "every pixel is black, white or unchanged");
     }
 }
 
@@ -195,13 +195,13 @@ fn moving_patches_move_straight_and_stay_inside() {
                 bounds(&rgb, 100).expect("a rectangle")
             })
             .collect();
-        assert!(rectangles.iter().all(|rectangle| rectangle[2..] == [20, 12]), "the size stays");
+        assert!(rectangles.iter().all(|rectangle| rectangle[2..] == [20, 12]), "the size does not change");
         for pair in rectangles.windows(2) {
             let away = [0, 1].map(|axis| pair[1][axis] as f64 - pair[0][axis] as f64);
             assert!(away[0].hypot(away[1]) < 3.0 + 1.5, "seed {seed}: from {:?} to {:?}", pair[0], pair[1]);
         }
         let moved: BTreeSet<_> = rectangles.iter().collect();
-        assert!(moved.len() > 50, "seed {seed}: it moves");
+        assert!(moved.len() > 50, "seed {seed}: the patch moves");
     }
 }
 
@@ -241,23 +241,23 @@ fn random_convolutions_have_weights_of_the_documented_variance() {
     for side in [1, 3, 5] {
         let mut wrapper = make(&format!("random-conv,kernel_size={side}"));
         let (n, deviation) = (21, 80.0 / f64::from(3 * side * side).sqrt());
-        let mut seen = vec![];
+        let mut responses = vec![];
         for seed in 0..400 {
-            // The response to a single dim pixel is the positive weights.
+            // The response to a single dim pixel consists of the positive weights.
             let mut rgb = vec![0; 3 * n * n];
             rgb[3 * (n * (n / 2) + n / 2)] = 80;
             wrapper.reset(Key::new(seed));
             wrapper.apply(&mut FrameMut::new(n, n, &mut rgb), EpisodeFrame::Step(0));
             let radius = (side / 2) as usize;
             for y in n / 2 - radius..=n / 2 + radius {
-                seen.extend_from_slice(&rgb[3 * (n * y + n / 2 - radius)..][..3 * side as usize]);
+                responses.extend_from_slice(&rgb[3 * (n * y + n / 2 - radius)..][..3 * side as usize]);
             }
             let touched = rgb.iter().filter(|v| **v > 0).count();
-            assert!(touched <= seen.len() / (seed as usize + 1), "only the window is touched");
+            assert!(touched <= responses.len() / (seed as usize + 1), "pixels outside the window change");
         }
-        // Rounding down loses half a level of positive weights on average.
-        let square = mean(seen.iter().filter(|v| **v > 0).map(|&v| (f64::from(v) + 0.5).powi(2)));
-        let positive = mean(seen.iter().map(|&v| f64::from(u8::from(v > 0))));
+        // Rounding down lowers a positive response by half a level on average.
+        let square = mean(responses.iter().filter(|v| **v > 0).map(|&v| (f64::from(v) + 0.5).powi(2)));
+        let positive = mean(responses.iter().map(|&v| f64::from(u8::from(v > 0))));
         // Weights up to 1 are rounded to level 0.
         let hidden = 0.4 / deviation;
         assert!((positive + hidden - 0.5).abs() < 0.03, "side {side}: {positive} of the weights are positive");

@@ -15,13 +15,13 @@ const SIZE: [usize; 2] = [48, 40];
 /// The inputs that change a wrapper's result on one image.
 #[derive(Clone, Copy, PartialEq)]
 enum Varies {
-    /// On nothing.
+    /// The result does not change.
     Never,
-    /// On the seed.
+    /// The result changes with the seed.
     PerEpisode,
-    /// On seed and step.
+    /// The result changes with the seed and with the step.
     PerStep,
-    /// On the step only.
+    /// The result changes with the step only.
     WithStep,
 }
 

@@ -121,19 +121,20 @@ fn everything_but_the_frames_is_unchanged() {
             (stack.wrap(entry.env().expect("an environment"), GoalFrame::Clean), entry.env().expect("an environment"));
         assert_eq!(env.spec().id, bare.spec().id);
         let schema = Schema::new(bare.spec().columns.clone()).expect("a schema");
-        let [mut mine, mut other] = [Batch::zeros(&schema, 1), Batch::zeros(&schema, 1)];
+        let [mut wrapped_row, mut bare_row] = [Batch::zeros(&schema, 1), Batch::zeros(&schema, 1)];
         env.reset(4, &ResetOptions::default()).expect("a reset");
         bare.reset(4, &ResetOptions::default()).expect("a reset");
         for goal in 0..3 {
             let key = Key::new(goal);
             assert_eq!(env.sample_goal(key).is_ok(), bare.sample_goal(key).is_ok());
-            env.observe(&mut mine.row_mut(0));
-            bare.observe(&mut other.row_mut(0));
-            (0..schema.columns().len()).for_each(|c| assert_eq!(mine.bytes(c), other.bytes(c), "{}", entry.id));
+            env.observe(&mut wrapped_row.row_mut(0));
+            bare.observe(&mut bare_row.row_mut(0));
+            (0..schema.columns().len())
+                .for_each(|c| assert_eq!(wrapped_row.bytes(c), bare_row.bytes(c), "{}", entry.id));
             assert_eq!(env.factors().iter().collect::<Vec<_>>(), bare.factors().iter().collect::<Vec<_>>());
             assert_eq!((env.is_success(), env.goal_distance()), (bare.is_success(), bare.goal_distance()));
-            assert_eq!(goal_frame(&mut *env), goal_frame(&mut *bare), "{}: the goal is clean", entry.id);
-            assert_ne!(frame(&mut *env), frame(&mut *bare), "{}: the frame is wrapped", entry.id);
+            assert_eq!(goal_frame(&mut *env), goal_frame(&mut *bare), "{}: the goal frame is unchanged", entry.id);
+            assert_ne!(frame(&mut *env), frame(&mut *bare), "{}: the frame of the step is changed", entry.id);
         }
         let refused = ResetOptions { state: Some(vec![f64::NAN]), ..ResetOptions::default() };
         let before = frame(&mut *env);

@@ -11,14 +11,14 @@ fn every_row_and_parameter_is_tested_and_documented() {
     let docs = include_str!("../../../../../docs/wrappers.md");
     assert_eq!(WRAPPERS.rows.len(), 11);
     for entry in WRAPPERS.rows {
-        let mine: Vec<&str> =
+        let texts: Vec<&str> =
             variants.iter().map(|(text, _)| &text[..]).filter(|text| make(text).id() == entry.id).collect();
-        assert!(!mine.is_empty(), "{} is tried", entry.id);
+        assert!(!texts.is_empty(), "{} is tested", entry.id);
         assert!(!entry.summary.is_empty() && docs.contains(&format!("`{}`", entry.id)), "{} is in the docs", entry.id);
         let described = entry.describe();
         for parameter in entry.parameters {
             let name = parameter.name;
-            assert!(mine.iter().any(|text| text.contains(&format!(",{name}="))), "{}: {name} is tried", entry.id);
+            assert!(texts.iter().any(|text| text.contains(&format!(",{name}="))), "{}: {name} is tested", entry.id);
             let row = format!(
                 "| `{name}` | {} | {} | {} |",
                 parameter.summary,

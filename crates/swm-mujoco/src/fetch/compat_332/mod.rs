@@ -55,8 +55,8 @@ impl Compat332 {
     }
 }
 
-fn to_index(number: i32) -> usize {
-    usize::try_from(number).unwrap_or(0)
+fn to_index(value: i32) -> usize {
+    usize::try_from(value).unwrap_or(0)
 }
 
 /// Whether two geoms belong to different bodies that the model does not exclude from colliding.

@@ -9,7 +9,7 @@ use super::pose::{Pose, Vec3, about, cross, inverse, log, mul, norm, normalized,
 pub const JOINTS: usize = 6;
 
 const MAX_ITERATIONS: usize = 20;
-/// In metres and radians.
+/// Tolerance of position and orientation, in metres and radians.
 const TOLERANCE: f64 = 1e-4;
 const DAMPING: f64 = 1e-12;
 /// The maximal rotation of a joint in one iteration, in radians.

@@ -34,8 +34,7 @@ const CLOSED_CONTROL: f64 = 255.0;
 /// The norm of force (N) and torque (N m) on a finger's pad that counts as full contact.
 const FULL_CONTACT: f64 = 50.0;
 
-/// The links of the arm and their joints.
-/// The links of the arm and the joint that each turns about.
+/// The links of the arm, each with the joint about which it turns.
 const LINKS: [(&str, &str); JOINTS] = [
     ("ur5e/shoulder_link", "ur5e/shoulder_pan_joint"),
     ("ur5e/upper_arm_link", "ur5e/shoulder_lift_joint"),

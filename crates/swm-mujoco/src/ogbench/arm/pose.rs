@@ -114,8 +114,7 @@ pub struct Pose {
 }
 
 impl Pose {
-    /// The composition of transforms: the pose `inner`, given in the frame of `self`, in the frame that `self` is given
-    /// in.
+    /// Composes transforms: converts the pose `inner` from the frame of `self` to the parent frame of `self`.
     pub fn then(self, inner: Self) -> Self {
         Self {
             position: add(self.position, rotate(self.rotation, inner.position)),

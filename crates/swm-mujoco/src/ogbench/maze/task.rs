@@ -21,7 +21,7 @@ pub const POINT_STEP: f32 = 0.2;
 const NOISE: f64 = UNIT / 4.0;
 /// Half range of the uniform noise on initial positions, and standard deviation of initial velocities.
 const START_NOISE: f64 = 0.1;
-/// Random actions before the pose at the goal is taken.
+/// The number of random actions at the goal before the goal pose is stored.
 const SETTLE_STEPS: usize = 5;
 /// Distance from the centre of an entrance within which the agent is teleported, in metres.
 const TELEPORT_DISTANCE: f64 = 1.5 * TELEPORT_RADIUS;
@@ -36,7 +36,7 @@ pub struct Settings {
     pub agent: Agent,
     /// The map.
     pub map: &'static Map,
-    /// The only task, if there is only one; its reward is -1 until the goal is reached, then 0.
+    /// The task of all episodes, if it is fixed; the reward is then -1 until the goal is reached, and 0 afterwards.
     pub fixed_task: Option<usize>,
     /// Whether an episode terminates at its goal.
     pub terminate: bool,
@@ -66,7 +66,8 @@ fn xy(physics: &Physics) -> Xy {
     [physics.data().qpos()[0], physics.data().qpos()[1]]
 }
 
-/// Draws a teleport seed of 24 bits, which single precision represents exactly: datasets may store states so.
+/// Draws a teleport seed of 24 bits, which single precision represents exactly, because datasets may store states in
+/// single precision.
 fn draw_seed(rng: &mut Rng) -> u32 {
     rng.random_range(0..1 << 24)
 }
@@ -183,7 +184,7 @@ impl Task for Maze {
         let start = near(start, NOISE);
         let goal = near(goal, if self.settings.goal_noise { NOISE } else { 0.0 });
         self.teleport_seed = draw_seed(rng);
-        // The pose at the goal first: the state there is overwritten by the start.
+        // The goal pose comes first, because the start overwrites the state of the goal.
         self.add_start_noise(physics, rng);
         physics.forward();
         for _ in 0..SETTLE_STEPS {

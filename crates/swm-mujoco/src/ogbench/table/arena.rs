@@ -16,7 +16,7 @@ use std::ffi::CStr;
 use std::path::PathBuf;
 use swm_core::{Error, Result};
 
-/// Half the initial distance of two adjacent cubes, in metres; episodes move them.
+/// Half the distance of two adjacent cubes in the model, in metres; every episode sets new positions.
 const SPACING: f64 = 0.05;
 
 /// Stiffness (N m/rad) and damping (N m s/rad) of the arm's position actuators.

@@ -1,9 +1,9 @@
 //! The scripted expert of tables: performs one job after another, planning every action from the present columns, so
 //! that it recovers from errors.
 //!
-//! As OGBench's oracles, a job consists of moves above an object, down, grasp, up, over the target, down, release. The
-//! order of jobs is planned here, because a goal may include several: lower cubes before those on top, obstacles first,
-//! unlocking before sliding, and locks last.
+//! As in OGBench's oracles, a job is a sequence of moves: above an object, down, grasp, up, over the target, down,
+//! release. The order of jobs is planned here, because a goal may include several: lower cubes before those on top,
+//! obstacles first, unlocking before sliding, and locks last.
 
 use super::config::OPEN;
 use super::goal::{GOAL_TOLERANCE, Subject};
@@ -41,9 +41,9 @@ const CLEARANCE: f64 = 0.06;
 const OBSTACLE_DISTANCE: f64 = 0.06;
 /// Depth of a button press below the top, in metres.
 const PRESS_DEPTH: f64 = 0.035;
-/// Where a cube is released to fall into the open drawer, in metres.
+/// The position at which a cube is released to fall into the open drawer, in metres.
 const OVER_DRAWER: Vec3 = [0.33, -0.24, 0.09];
-/// Objects below this y coordinate are in the drawer, in metres.
+/// The y coordinate below which objects are in the drawer, in metres.
 const DRAWER_EDGE: f64 = -0.16;
 /// Steps after which a job is planned again.
 const MAX_JOB_STEPS: usize = 120;
@@ -65,7 +65,7 @@ struct TableExpert {
     job: Option<Job>,
     /// Steps since the job started.
     steps: usize,
-    /// The locks when the job started.
+    /// The states of the locks when the job started.
     locks: [i64; 2],
     /// Whether the gripper must still move away from the object of the last job.
     retreating: bool,
@@ -136,8 +136,8 @@ impl Inputs {
     }
 
     /// Whether the goal includes a subject.
-    fn includes(&self, one: Subject) -> bool {
-        self.subject == Subject::All || self.subject == one
+    fn includes(&self, subject: Subject) -> bool {
+        self.subject == Subject::All || self.subject == subject
     }
 
     /// Whether a cube is at its goal, with a margin to the tolerance.
@@ -154,7 +154,7 @@ impl Inputs {
         })
     }
 
-    /// The cube that occupies a position.
+    /// The cube, other than `cube`, that occupies a position.
     fn obstacle(&self, cube: usize, position: Vec3) -> Option<usize> {
         (0..self.cubes.len()).find(|&other| {
             let at = self.cubes[other].0;

@@ -6,7 +6,7 @@ use crate::ogbench::arm::pose::{Quat, Vec3, distance};
 
 /// The distance within which cubes and openings are at their goal, in metres.
 pub const GOAL_TOLERANCE: f64 = 0.04;
-/// The distance that a wrong lock counts, in metres.
+/// The distance that a lock in the wrong state adds, in metres.
 const WRONG_LOCK_DISTANCE: f64 = 0.1;
 
 /// The objects that a goal includes.

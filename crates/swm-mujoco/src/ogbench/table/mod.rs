@@ -26,7 +26,7 @@ use swm_core::registry::EnvOption;
 use swm_core::{DType, Env, EnvChoice, EnvSpec, Result, Space};
 use task::{Mode, Table};
 
-/// The options of both tables, after those given.
+/// The options of both tables, preceded by the given options.
 macro_rules! options {
     ($($own:expr,)*) => {
         &[

@@ -131,9 +131,9 @@ impl Parts {
     }
 }
 
-/// Converts an index of MuJoCo's.
-fn index(number: i32) -> Result<usize> {
-    usize::try_from(number).map_err(|error| Error::external("searching OGBench's model", error))
+/// Converts an index that MuJoCo stores as a signed integer.
+fn index(value: i32) -> Result<usize> {
+    usize::try_from(value).map_err(|error| Error::external("searching OGBench's model", error))
 }
 
 impl Cube {

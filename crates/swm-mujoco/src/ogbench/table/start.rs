@@ -31,7 +31,7 @@ const LOCKED_WEIGHT: f64 = 0.25;
 const P_GOAL_STACK: f64 = 0.3;
 /// Distance of two cubes side by side at a sampled goal, in metres: the gripper fits between them.
 const MIN_DISTANCE: f64 = 0.08;
-/// Goals drawn before sampling fails, and positions drawn for each cube.
+/// The maximal number of goals drawn before sampling fails, and of positions drawn for each cube.
 const TRIES: usize = 256;
 
 /// Draws a point within bounds.
@@ -59,7 +59,7 @@ impl Table {
         physics.forward();
     }
 
-    /// Starts a task. The goal is simulated first, for the observation there; then the start is set.
+    /// Starts a task. The goal is simulated first, for its observation; then the start is set.
     fn begin_task(&mut self, physics: &mut Physics, task: usize, factors: &FactorValues, rng: &mut Rng) {
         let task = &self.config.tasks[task];
         let mut order: Vec<usize> = (0..self.config.cubes).collect();

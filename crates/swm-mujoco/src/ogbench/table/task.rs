@@ -70,7 +70,7 @@ pub struct Goal {
     pub contact: f64,
     /// The observation in that pose.
     pub observation: Vec<f64>,
-    /// Whether `observation` is that of `pose`.
+    /// Whether `observation` was computed in `pose`.
     observed: bool,
 }
 
@@ -187,8 +187,8 @@ impl Table {
         }
     }
 
-    /// Moves the mocap bodies of the cubes' markers, which are part of the state, to the goal. For the start of an
-    /// episode.
+    /// Moves the mocap bodies of the cubes' markers, which are part of the state, to the goal. Called at the start of
+    /// an episode.
     pub(super) fn move_marker_bodies(&self, physics: &mut Physics) {
         for (cube, &(position, rotation)) in self.parts.cubes.iter().zip(&self.goal.cubes) {
             let at = Pose { position, rotation };
@@ -198,8 +198,8 @@ impl Table {
         }
     }
 
-    /// Computes the observation at the goal; the physics is in the goal pose afterwards. The reference has none in data
-    /// collection.
+    /// Computes the observation at the goal; the physics is in the goal pose afterwards. The reference computes no such
+    /// observation in data collection.
     pub(super) fn observe_goal(&mut self, physics: &mut Physics) {
         self.goal.observed = true;
         if self.mode == Mode::DataCollection {

@@ -54,16 +54,16 @@ pub(super) fn fill(assets: &mut Assets, model: &MjModel, appearance: &Appearance
 }
 
 /// A count or address of MuJoCo as an index; 0 for negative values.
-fn index(number: impl TryInto<usize>) -> usize {
-    number.try_into().unwrap_or(0)
+fn index(value: impl TryInto<usize>) -> usize {
+    value.try_into().unwrap_or(0)
 }
 
 /// Converts a mesh, with the vertex normals that MuJoCo shades with.
-fn mesh(model: &MjModel, number: usize) -> Mesh {
-    let first = |starts: &[i32]| index(starts[number]);
+fn mesh(model: &MjModel, asset: usize) -> Mesh {
+    let first = |starts: &[i32]| index(starts[asset]);
     let (vertices, normals) = (first(model.mesh_vertadr()), first(model.mesh_normaladr()));
-    let coordinates = usize::try_from(model.mesh_texcoordadr()[number]).ok();
-    let faces = first(model.mesh_faceadr())..first(model.mesh_faceadr()) + index(model.mesh_facenum()[number]);
+    let coordinates = usize::try_from(model.mesh_texcoordadr()[asset]).ok();
+    let faces = first(model.mesh_faceadr())..first(model.mesh_faceadr()) + index(model.mesh_facenum()[asset]);
     Mesh::new(faces.map(|face| {
         let positions = model.mesh_face()[face].map(|i| model.mesh_vert()[vertices + index(i)]);
         let flat = face_normal(positions);
@@ -89,10 +89,10 @@ fn face_normal([a, b, c]: [V3; 3]) -> V3 {
 }
 
 /// Converts a height field: surface, four side walls and bottom.
-fn height_field(model: &MjModel, number: usize) -> Mesh {
-    let (rows, columns) = (index(model.hfield_nrow()[number]), index(model.hfield_ncol()[number]));
-    let [x, y, above, below] = model.hfield_size()[number].map(|size| size as f32);
-    let heights = &model.hfield_data()[index(model.hfield_adr()[number])..];
+fn height_field(model: &MjModel, asset: usize) -> Mesh {
+    let (rows, columns) = (index(model.hfield_nrow()[asset]), index(model.hfield_ncol()[asset]));
+    let [x, y, above, below] = model.hfield_size()[asset].map(|size| size as f32);
+    let heights = &model.hfield_data()[index(model.hfield_adr()[asset])..];
     let along = |i: usize, n: usize, half: f32| half * (2.0 * i as f32 / (n.max(2) - 1) as f32 - 1.0);
     let at = |r: usize, c: usize| [along(c, columns, x), along(r, rows, y), above * heights[r * columns + c]];
     let foot = |r: usize, c: usize| [along(c, columns, x), along(r, rows, y), -below];
@@ -126,12 +126,12 @@ fn height_field(model: &MjModel, number: usize) -> Mesh {
 }
 
 /// Converts a texture; white if its type is not rendered.
-fn texture(model: &MjModel, number: usize) -> Texture {
-    let (width, height) = (index(model.tex_width()[number]), index(model.tex_height()[number]));
-    let channels = index(model.tex_nchannel()[number]);
-    let first = index(model.tex_adr()[number]);
+fn texture(model: &MjModel, asset: usize) -> Texture {
+    let (width, height) = (index(model.tex_width()[asset]), index(model.tex_height()[asset]));
+    let channels = index(model.tex_nchannel()[asset]);
+    let first = index(model.tex_adr()[asset]);
     let bytes = model.tex_data().get(first..first + width * height * channels).unwrap_or_default();
-    let texture = match model.tex_type()[number] {
+    let texture = match model.tex_type()[asset] {
         mjtTexture::mjTEXTURE_2D => Texture::flat(width, height, channels, bytes),
         // Six square faces stacked vertically, or one face for all sides.
         _ => Texture::cube(width, channels, bytes),

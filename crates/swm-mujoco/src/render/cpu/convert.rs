@@ -16,7 +16,7 @@ const MAX_CELLS: usize = 200;
 /// Cells along each axis of a plane that is not a geom of the model.
 const DECOR_CELLS: usize = 4;
 
-/// Fills a scene from MuJoCo's.
+/// Fills a scene from MuJoCo's abstract scene.
 pub(super) fn fill(scene: &mut Scene, from: &mjvScene, model: &MjModel, (width, height): (usize, usize)) {
     let flag = |flag: mjtRndFlag| from.flags[flag as usize] != 0;
     let (vis, extent) = (model.vis(), model.stat().extent as f32);

@@ -12,12 +12,12 @@ use std::ffi::c_int;
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::{Error, Result};
 
-/// Contexts that a thread caches; the least recently used one is dropped first. Each holds a shadow map of 64 MB, and
-/// more.
+/// Contexts that a thread caches; the least recently used one is dropped first. Each context holds a shadow map of 64
+/// MB, a frame buffer, meshes and textures.
 const MAX_CONTEXTS: usize = 4;
 
 /// Serialises the creation and destruction of contexts: MuJoCo counts them in an unguarded variable.
-static CONTEXT_COUNT: Mutex<()> = Mutex::new(());
+static CONTEXT_LOCK: Mutex<()> = Mutex::new(());
 
 /// The contexts of one thread, the most recently used one last.
 pub struct RenderContexts {
@@ -114,7 +114,7 @@ impl RenderContext {
     fn make(model: &MjModel) -> Result<Box<mjrContext>> {
         let mut inner = Box::new_uninit();
         let model: *const mjModel = model.ffi();
-        let lock = CONTEXT_COUNT.lock().unwrap_or_else(PoisonError::into_inner);
+        let lock = CONTEXT_LOCK.lock().unwrap_or_else(PoisonError::into_inner);
         // SAFETY: the first call initialises the context, the second fills it for a valid model.
         let inner = unsafe {
             mjr_defaultContext(inner.as_mut_ptr());
@@ -187,7 +187,7 @@ impl RenderContext {
 
 impl Drop for RenderContext {
     fn drop(&mut self) {
-        let _lock = CONTEXT_COUNT.lock().unwrap_or_else(PoisonError::into_inner);
+        let _lock = CONTEXT_LOCK.lock().unwrap_or_else(PoisonError::into_inner);
         let context = &raw mut *self.inner;
         if self.library.bind(&self.gl).is_ok() {
             // An error here cannot be handled, and the context is not used again.

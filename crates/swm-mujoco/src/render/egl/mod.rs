@@ -23,7 +23,7 @@ use swm_core::{Error, Result};
 /// The maximal number of render threads: each holds contexts and their device memory.
 const MAX_THREADS: usize = 8;
 
-/// The maximal number of render threads on a graphics card; more do not increase its load.
+/// The maximal number of render threads on a graphics card; more threads do not increase the utilisation of the card.
 const MAX_HARDWARE_THREADS: usize = 4;
 
 /// Whether there is a usable graphics card. EGL is loaded only if the system has a device file of a card; otherwise it

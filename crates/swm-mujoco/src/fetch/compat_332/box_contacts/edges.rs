@@ -25,26 +25,26 @@ pub fn edge_contacts(a: &OrientedBox, b: &OrientedBox, edges: &Edges, margin: f6
     // From here on, the first box's face is the plane z = 0, and its rectangle is centred at the origin.
     let [lx, ly, height] = view(a.half).map(f64::abs);
     let size = [lx, ly];
-    let normal_seen = view(normal);
-    if normal_seen[2].abs() < TINY {
+    let viewed_normal = view(normal);
+    if viewed_normal[2].abs() < TINY {
         return None;
     }
-    let along_normal = sign(!inward) / normal_seen[2];
-    let seen: [Vector; 3] = axes.map(view);
+    let along_normal = sign(!inward) / viewed_normal[2];
+    let viewed: [Vector; 3] = axes.map(view);
     let mut middle = view(a.local_direction(add(b.center, a.center, -1.0)));
     middle[2] -= height;
     let corner = |across: bool, end: f64| {
-        let at = add(middle, seen[wide], b.half[wide] * sign(across));
-        add(add(at, seen[up], b.half[up] * sign(sides[1][up])), seen[j], b.half[j] * end)
+        let at = add(middle, viewed[wide], b.half[wide] * sign(across));
+        add(add(at, viewed[up], b.half[up] * sign(sides[1][up])), viewed[j], b.half[j] * end)
     };
     let near = sides[1][wide];
     let solid = [corner(near, 1.0), corner(near, -1.0), corner(!near, 1.0), corner(!near, -1.0)];
     // The second face, projected along the normal onto the plane of the first.
-    let shadow = solid.map(|at| add(at, normal_seen, -at[2] / normal_seen[2]));
+    let shadow = solid.map(|at| add(at, viewed_normal, -at[2] / viewed_normal[2]));
     let [along, across] = [1, 2].map(|k| add(shadow[k], shadow[0], -1.0));
     let [solid_along, solid_across] = [1, 2].map(|k| add(solid[k], solid[0], -1.0));
 
-    let toward = a.world_direction(from_face_frame(face, outward, normal_seen));
+    let toward = a.world_direction(from_face_frame(face, outward, viewed_normal));
     let mut contacts = BoxContacts::new(toward.map(|x| x * sign(!inward)));
     let put = |contacts: &mut BoxContacts, mut at: Vector, distance: f64| {
         at[2] += height;

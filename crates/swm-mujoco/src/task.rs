@@ -19,8 +19,7 @@ pub(crate) struct StepOutcome {
 /// The part of an environment that differs between families: start, step, observation, reward and goal.
 ///
 /// The *task state* contains the values of a task that are not part of the physics, such as a score; it is part of the
-/// `state` column. The *goal
-/// values* are stored in snapshots only, because a state is the same for every goal.
+/// `state` column. The *goal values* are stored in snapshots only, because a state is the same for every goal.
 pub(crate) trait Task: Send {
     /// Edits the model for these factors of variation. The model is the compiled one, unless
     /// [`Task::overwrites_edits`]. The method is called only when the factors change.

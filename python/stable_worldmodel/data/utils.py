@@ -229,7 +229,7 @@ def doctor(
 
     Args:
         dataset: A path, a URI or a name.
-        repair: Where to write the sound episodes to, if at all.
+        repair: Where to write the intact episodes to, if at all.
         format: The format of what is written.
         progress: Whether to show a progress bar.
         codec: How images are stored there, as in :func:`convert`.
@@ -237,7 +237,7 @@ def doctor(
 
     Returns:
         `episodes`, `rows`, `problems` (how many), `findings` (each with `severity`, `what`, `episodes`), `sound` (the
-        positions of sound episodes), `models`, and `repaired` (as :func:`convert` returns it, or `None`).
+        positions of intact episodes), `models`, and `repaired` (as :func:`convert` returns it, or `None`).
     """
     options = _options(format, "resume", codec, jpeg_quality, True, 25.0)
     target = None if repair is None else os.fspath(repair)

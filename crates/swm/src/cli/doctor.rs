@@ -1,4 +1,4 @@
-//! `swm doctor`: finds the defects of a dataset and the models it can train, and writes the sound episodes to a new one.
+//! `swm doctor`: finds the defects of a dataset and the models it can train, and writes the intact episodes to a new one.
 
 use super::convert::{self, TargetArgs};
 use super::progress::{control, print_summary};
@@ -61,7 +61,7 @@ pub fn doctor(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
         emit_json(&found)?;
     }
     if problems > 0 && repaired.is_none() {
-        anyhow::bail!("{name} has problems; `swm doctor {name} --repair TARGET` writes the sound episodes");
+        anyhow::bail!("{name} has problems; `swm doctor {name} --repair TARGET` writes the intact episodes");
     }
     Ok(())
 }

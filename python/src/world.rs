@@ -186,8 +186,8 @@ impl World {
     }
 
     /// Plays `steps` steps with a policy. A slot whose episode is over starts the next episode of `seed` instead of a
-    /// step. `next` is the index of the first episode to start. Returns the `(slot, episode)` pairs of the started episodes
-    /// and the index of the next episode.
+    /// step. `next` is the index of the first episode to start. Returns the `(slot, episode)` pairs of the started
+    /// episodes and the index of the next episode.
     #[allow(clippy::too_many_arguments, reason = "one argument for each option in Python")]
     fn play(
         &self,

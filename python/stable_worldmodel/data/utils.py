@@ -179,7 +179,7 @@ def convert(
         **kwargs: Further arguments of the writer of a user-defined format.
 
     Returns:
-        A dict with `episodes`, `kept` (episodes that existed before), `rows`, `last_actions` (left out, because no
+        A dict with `episodes`, `kept` (episodes that existed before), `rows`, `last_actions` (number of actions left out, because no
         observation follows them), `checksum`, and the comparison of the `columns`. For a user-defined format, `episodes` and
         `rows`.
     """

@@ -179,9 +179,9 @@ def convert(
         **kwargs: Further arguments of the writer of a user-defined format.
 
     Returns:
-        A dict with `episodes`, `kept` (episodes that existed before), `rows`, `last_actions` (number of actions left out, because no
-        observation follows them), `checksum`, and the comparison of the `columns`. For a user-defined format, `episodes` and
-        `rows`.
+        A dict with `episodes`, `kept` (episodes that existed before), `rows`, `last_actions` (the number of actions left
+        out, because no observation follows them), `checksum`, and the comparison of the `columns`. For a user-defined
+        format, `episodes` and `rows`.
     """
     if isinstance(source, (str, os.PathLike)):
         source = load_dataset(source, cache_dir, source_format)

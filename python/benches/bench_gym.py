@@ -1,9 +1,9 @@
-"""Steps a second of Gymnasium environments in worker processes, beside Gymnasium's own vector environment of processes.
+"""Steps per second of Gymnasium environments in worker processes, compared with Gymnasium's `AsyncVectorEnv`.
 
     python benches/bench_gym.py [--pairs 5] [--seconds 3]
 
-Both sides step with random actions and draw nothing, alternating; shown are the medians, the lowest and highest, and the
-processor time (all processes, by the kernel's count) that a step takes.
+Both sides step in turns, with random actions and without rendering. The output has the median, lowest and highest rates,
+and the processor time per step (of all processes, as the kernel counts it).
 """
 
 import argparse
@@ -23,8 +23,8 @@ IDS = ["CartPole-v1", "ALE/Pong-v5"]
 
 
 def processor() -> float:
-    """Seconds of processor time of this process and its children that live."""
-    ticks, own, kin = os.sysconf("SC_CLK_TCK"), str(os.getpid()), 0
+    """Seconds of processor time of this process and its running children."""
+    ticks, own, ticks_used = os.sysconf("SC_CLK_TCK"), str(os.getpid()), 0
     for process in filter(str.isdigit, os.listdir("/proc")):
         try:
             with open(f"/proc/{process}/stat") as file:
@@ -32,12 +32,12 @@ def processor() -> float:
         except OSError:
             continue
         if own in (process, words[1]):
-            kin += int(words[11]) + int(words[12])
-    return kin / ticks
+            ticks_used += int(words[11]) + int(words[12])
+    return ticks_used / ticks
 
 
 def turn(step: Callable[[], object], envs: int, seconds: float) -> tuple[float, float]:
-    """Steps a second, and microseconds of processor time a step."""
+    """Steps per second, and microseconds of processor time per step."""
     steps, used, begun = 0, processor(), time.perf_counter()
     while time.perf_counter() - begun < seconds:
         for _ in range(10):

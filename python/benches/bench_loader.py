@@ -1,12 +1,13 @@
-"""How fast a torch training loop gets its batches: our loader, our dataset in torch's DataLoader, and the reference's.
+"""Clips per second of a torch training loop: our loader, our dataset in torch's DataLoader, and the reference's dataset.
 
     python benches/bench_loader.py --reference /path/to/python
 
 The loop is LeRobot's: shuffled batches of 64 clips of 4 frames, 5 rows apart, at 224 pixels, each of which goes through a
-trivial model, whose step all sides take. Our loader runs twice: without a cache, and with its default cache of decoded
-frames. All datasets have the content of one collection; the reference's are written by its own writers. The reference runs
-in the Python that `--reference` (or `$SWM_REFERENCE_PYTHON`) names, in turns with ours; the result is the median of the
-ratios of neighbouring turns. The reference runs with every number of workers, and ours is compared with the fastest.
+training step of a trivial model, the same on all sides. Our loader runs twice: without a cache, and with its default cache
+of decoded frames. All datasets have the content of one collection; the reference's are written by its own writers. The
+reference runs in the Python that `--reference` (or `$SWM_REFERENCE_PYTHON`) names, in turns with ours; the result is the
+median of the ratios of neighbouring turns. The reference runs with every number of workers, and ours is compared with the
+fastest.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ COLUMNS = ["pixels", "action"]
 CLIP = {"num_steps": 4, "frameskip": 5}
 BATCH = 64
 
-#: Name, our file, the writer's settings, the reference's format beside it.
+#: Name, our file, the writer's settings, the format of the reference's file.
 LAYOUTS = [
     ("lance, jpeg", "jpeg.lance", {"codec": "jpeg"}, "lance"),
     ("lance, lossless", "lossless.lance", {}, "lance"),
@@ -36,26 +37,26 @@ LAYOUTS = [
 
 
 def trainer() -> Callable[[dict[str, Any]], int]:
-    """A step of training that takes next to no time: how many clips it was."""
+    """Creates a training step of negligible cost that returns the number of clips of its batch."""
     import torch
 
     model = torch.nn.Linear(CLIP["frameskip"] * 2 + 3, 1)
     optimizer = torch.optim.SGD(model.parameters(), 1e-6)
 
     def step(batch: dict[str, Any]) -> int:
-        # What a model does first: it looks at every frame, here at one place of each.
-        seen = batch["pixels"][..., ::56, ::56].float().mean(dim=(-1, -2)) / 255
-        loss = model(torch.cat([seen, batch["action"].nan_to_num().float()], dim=-1)).square().mean()
+        # Like the first layer of a model, this reads every frame, here only a few of its pixels.
+        features = batch["pixels"][..., ::56, ::56].float().mean(dim=(-1, -2)) / 255
+        loss = model(torch.cat([features, batch["action"].nan_to_num().float()], dim=-1)).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        return len(seen)
+        return len(features)
 
     return step
 
 
 def turn(batches: Iterator[dict[str, Any]], step: Callable[[dict[str, Any]], int], seconds: float) -> float:
-    """Trains for about so long: clips a second."""
+    """Trains for about `seconds` and returns the clips per second."""
     begun, clips = time.perf_counter(), 0
     while (elapsed := time.perf_counter() - begun) < seconds:
         clips += step(next(batches))
@@ -110,7 +111,7 @@ def serve() -> None:
 
 
 class Reference:
-    """The reference in a process of its own."""
+    """The reference implementation in a separate process."""
 
     def __init__(self, python: str) -> None:
         environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
@@ -134,7 +135,7 @@ class Reference:
 
 
 def collect(folder: Path, episodes: int, steps: int, size: int) -> Path:
-    """Plays Push-T at random: the content of all datasets."""
+    """Collects the content of all datasets: Push-T episodes of the random policy."""
     import numpy as np
 
     import stable_worldmodel as swm

@@ -1,8 +1,8 @@
-"""Steps a second of a World seen from Python, beside the same engine from the command line (`swm bench envs`).
+"""Steps per second of a `World` in Python, compared with the engine's command line (`swm bench envs`).
 
     python benches/bench_pool.py [--swm PATH] [--pairs 3]
 
-Both sides step with random actions, alternating; the ratio is the median of the pairs'.
+Both sides step with random actions, in turns; the ratio is the median over the pairs of turns.
 """
 
 import argparse
@@ -13,7 +13,7 @@ import time
 
 import stable_worldmodel as swm
 
-#: Steps of an episode on both sides: resets cost time, too.
+#: Steps of an episode, equal on both sides because resets cost time.
 EPISODE = 500
 
 CASES = [("swm/PushT-v1", 8, 224), ("swm/PushT-v1", 8, 64), ("swm/TwoRoom-v1", 8, 64), ("swm/PushT-v1", 8, None)]

@@ -21,7 +21,7 @@ macro_rules! with_dtype {
     };
 }
 
-/// Copies some rows of a column into an array `[rows, ..]`.
+/// Copies the given rows of a column into a new array `[rows, ..]`.
 pub fn copy_rows<'py>(py: Python<'py>, batch: &Batch, column: usize, rows: &[usize]) -> PyResult<Bound<'py, PyAny>> {
     let spec = &batch.schema().columns()[column];
     let n = spec.row_bytes();
@@ -32,15 +32,15 @@ pub fn copy_rows<'py>(py: Python<'py>, batch: &Batch, column: usize, rows: &[usi
     array(py, spec.dtype, &with_rows(&[rows.len()], spec), &bytes)
 }
 
-/// Copies bytes, which need not be aligned, into an array of this type and shape.
+/// Copies bytes into a new array of the given type and shape. The bytes need not be aligned.
 ///
 /// # Panics
 /// If the number of bytes does not match the shape.
 pub fn array<'py>(py: Python<'py>, dtype: DType, shape: &[usize], bytes: &[u8]) -> PyResult<Bound<'py, PyAny>> {
     fn make<'py, T: Element + Copy>(py: Python<'py>, shape: &[usize], bytes: &[u8]) -> PyResult<Bound<'py, PyAny>> {
         let array = PyArrayDyn::<T>::zeros(py, IxDyn(shape), false);
-        // SAFETY: the new array is contiguous and has no other reference. It has as many bytes as are given (asserted), and
-        // they are valid values of `T`: batches store booleans as 0 and 1.
+        // SAFETY: the new array is contiguous and has no other reference. It has the size of `bytes` (asserted), and
+        // `bytes` holds valid values of `T`: batches store booleans as 0 and 1.
         #[allow(unsafe_code, reason = "numpy arrays share memory with the engine")]
         unsafe {
             assert_eq!(array.len() * size_of::<T>(), bytes.len(), "the bytes must fill the shape");
@@ -51,10 +51,10 @@ pub fn array<'py>(py: Python<'py>, dtype: DType, shape: &[usize], bytes: &[u8]) 
     with_dtype!(dtype, make(py, shape, bytes))
 }
 
-/// An array that shares the memory of a column, so it shows later writes to the batch.
+/// Returns an array that shares the memory of a column, so later writes to the batch change the array.
 ///
 /// # Shapes
-/// `[rows, 1, ..]` with `time`, else `[rows, ..]`.
+/// `[rows, 1, ..]` if `time` is set, else `[rows, ..]`.
 ///
 /// # Safety
 /// The batch must neither move nor be resized while `owner` lives.
@@ -71,7 +71,6 @@ pub unsafe fn view<'py>(
         owner: &Bound<'py, PyAny>,
     ) -> PyResult<Bound<'py, PyAny>> {
         // SAFETY: columns are aligned to 64 bytes and hold values of this type; the caller guarantees their lifetime.
-
         let view = unsafe { ArrayView::from_shape_ptr(IxDyn(shape), bytes.as_ptr().cast::<T>()) };
         // SAFETY: `owner` keeps the memory alive, as the caller guarantees.
         Ok(unsafe { PyArrayDyn::borrow_from_array(&view, owner.clone()) }.into_any())
@@ -80,7 +79,7 @@ pub unsafe fn view<'py>(
     let rows = [batch.rows(), 1];
     let shape = with_rows(if time { &rows } else { &rows[..1] }, spec);
     let bytes = batch.bytes(column);
-    // SAFETY: the caller's guarantee is passed on.
+    // SAFETY: the caller guarantees what `make` requires.
     unsafe { with_dtype!(spec.dtype, make(bytes, &shape, owner)) }
 }
 
@@ -91,7 +90,8 @@ fn with_rows(rows: &[usize], spec: &ColumnSpec) -> Vec<usize> {
 /// Copies the elements of an array, in row-major order, into a column of the same type.
 ///
 /// # Errors
-/// `TypeError` for another type, `ValueError` for another number of elements or an array that is not contiguous.
+/// `TypeError` if the array and the column differ in type; `ValueError` if they differ in their number of elements, or
+/// if the array is not contiguous.
 pub fn fill(batch: &mut Batch, column: usize, given: &Bound<'_, PyAny>) -> PyResult<()> {
     fn go<T: Element + Copy>(to: &mut [u8], given: &Bound<'_, PyAny>, what: &str) -> PyResult<()> {
         let Ok(array) = given.extract::<PyReadonlyArrayDyn<'_, T>>() else {
@@ -107,7 +107,7 @@ pub fn fill(batch: &mut Batch, column: usize, given: &Bound<'_, PyAny>) -> PyRes
             let problem = format!("{what}: got {n} values (shape {:?}), expected {expected}", array.shape());
             return Err(PyValueError::new_err(problem));
         }
-        // SAFETY: elements of these types are plain data, and both sides have the same number of bytes (checked above).
+        // SAFETY: elements of these types are plain data, and both slices have the same size (checked above).
         #[allow(unsafe_code, reason = "numpy arrays share memory with the engine")]
         unsafe {
             std::ptr::copy_nonoverlapping(slice.as_ptr().cast::<u8>(), to.as_mut_ptr(), to.len());
@@ -119,7 +119,7 @@ pub fn fill(batch: &mut Batch, column: usize, given: &Bound<'_, PyAny>) -> PyRes
     with_dtype!(spec.dtype, go(to, given, &spec.name))
 }
 
-/// A batch with a column for every array `[rows, ..]` of `infos`.
+/// Creates a batch with one column for every array `[rows, ..]` in `infos`.
 ///
 /// # Errors
 /// `TypeError` for a type that batches cannot hold, `ValueError` if the arrays differ in their number of rows.
@@ -159,7 +159,7 @@ fn dtype_and_shape(value: &Bound<'_, PyAny>) -> Option<(DType, Vec<usize>)> {
     Some((dtype, array.shape().to_vec()))
 }
 
-/// The elements of a `float32` array, after a check of its shape. `what` names the array in errors.
+/// Copies the elements of a `float32` array, which must have the given shape. `what` names the array in errors.
 pub fn f32_values(what: &str, given: &Bound<'_, PyAny>, shape: &[usize]) -> PyResult<Vec<f32>> {
     let Ok(array) = given.extract::<PyReadonlyArrayDyn<'_, f32>>() else {
         return Err(PyTypeError::new_err(format!(
@@ -173,7 +173,7 @@ pub fn f32_values(what: &str, given: &Bound<'_, PyAny>, shape: &[usize]) -> PyRe
     Ok(array.as_array().iter().copied().collect())
 }
 
-/// A `float32` array of this shape with these elements.
+/// Creates a `float32` array of the given shape from its elements.
 pub fn f32_array<'py>(py: Python<'py>, values: &[f32], shape: &[usize]) -> PyResult<Bound<'py, PyAny>> {
     Ok(PyArray1::from_slice(py, values).reshape(IxDyn(shape))?.into_any())
 }

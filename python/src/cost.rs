@@ -1,4 +1,5 @@
-//! [`PythonCost`]: a [`CostModel`] implemented in Python, called through the adapter class of `stable_worldmodel.planning`.
+//! [`PythonCost`]: a [`CostModel`] implemented in Python, called through the adapter class of
+//! `stable_worldmodel.planning`.
 
 use crate::arrays;
 use crate::errors::{from_py_err, to_py_err};
@@ -11,21 +12,22 @@ use swm::core::{
 };
 use swm::plan::{ActionScale, Score, SimulatorCost};
 
-/// A model to plan with.
+/// A cost model for planning, with its action scale and origin.
 pub struct PlanningModel {
     pub cost: Box<dyn CostModel>,
     /// The scale of the model's actions; `None` if the model does not define one.
     pub scale: Option<ActionScale>,
-    /// The hash of the model's weights, for checkpoints.
+    /// The hash of the model's weights; `None` unless the model is a checkpoint.
     pub weights: Option<String>,
     /// Whether the model is implemented in Python.
     pub python: bool,
 }
 
-/// The model that Python passes: a checkpoint of the engine, an adapter of a Python model, or `None` for the simulator.
+/// Converts the model that Python passes: a checkpoint of the engine, an adapter of a Python model, or `None` for the
+/// simulator.
 ///
 /// # Errors
-/// If the simulator cannot be made, the checkpoint cannot be loaded or the adapter lacks an attribute.
+/// If the simulator cannot be created, the checkpoint cannot be loaded, or the adapter lacks an attribute.
 pub fn planning_model(
     given: Option<&Bound<'_, PyAny>>,
     spec: &EnvSpec,
@@ -53,16 +55,16 @@ pub fn planning_model(
 
 /// A cost model implemented in Python.
 pub struct PythonCost {
-    /// Has the methods `observe(infos)` and `cost(candidates)`, and depending on its flags `cost_and_gradient`, `encode`,
-    /// `predict`, `predict_vjp`, `constrain` and `constrain_vjp`. All of them take and return numpy arrays.
+    /// Has the methods `observe(infos)` and `cost(candidates)`, and depending on its flags `cost_and_gradient`,
+    /// `encode`, `predict`, `predict_vjp`, `constrain` and `constrain_vjp`. All methods take and return numpy arrays.
     adapter: Py<PyAny>,
     gradient: bool,
-    /// The latent dimension, if the model has latent dynamics.
+    /// The latent dimension; `None` if the model has no latent dynamics.
     latent: Option<usize>,
     constrained: bool,
     /// The number of environments in the last observation.
     envs: usize,
-    /// The error of a trait method that cannot return one; the next call returns it.
+    /// The error of a call in a trait method that cannot return errors; the next call returns this error.
     failed: RefCell<Option<Error>>,
 }
 
@@ -87,7 +89,7 @@ impl PythonCost {
         self.envs = envs;
     }
 
-    /// Calls a method of the adapter.
+    /// Runs `work` with the adapter. If `failed` holds an error, returns this error instead.
     fn call<T>(&self, work: impl FnOnce(&Bound<'_, PyAny>) -> PyResult<T>) -> Result<T> {
         if let Some(error) = self.failed.take() {
             return Err(error);
@@ -96,7 +98,7 @@ impl PythonCost {
     }
 }
 
-/// The candidates as an array `[envs, samples, horizon, dim]`.
+/// Copies the candidates into an array `[envs, samples, horizon, dim]`.
 fn candidates<'py>(py: Python<'py>, given: Candidates<'_>) -> PyResult<Bound<'py, PyAny>> {
     arrays::f32_array(py, given.actions, &[given.envs, given.samples, given.horizon, given.dim])
 }
@@ -141,9 +143,9 @@ impl DifferentiableCost for PythonCost {
         self.call(|adapter| {
             let shape = [given.envs, given.samples, given.horizon, given.dim];
             let returned = adapter.call_method1("cost_and_gradient", (candidates(adapter.py(), given)?,))?;
-            let (cost, slope): (Bound<'_, PyAny>, Bound<'_, PyAny>) = returned.extract()?;
-            costs.copy_from_slice(&arrays::f32_values("the costs of the model", &cost, &shape[..2])?);
-            gradient.copy_from_slice(&arrays::f32_values("the gradient of the model's costs", &slope, &shape)?);
+            let (values, gradients): (Bound<'_, PyAny>, Bound<'_, PyAny>) = returned.extract()?;
+            costs.copy_from_slice(&arrays::f32_values("the costs of the model", &values, &shape[..2])?);
+            gradient.copy_from_slice(&arrays::f32_values("the gradient of the model's costs", &gradients, &shape)?);
             Ok(())
         })
     }
@@ -157,9 +159,9 @@ impl LatentDynamics for PythonCost {
     fn encode(&mut self, start: &mut [f32], goal: &mut [f32]) -> Result<()> {
         let shape = [self.envs, self.latent_dim()];
         self.call(|adapter| {
-            let (from, to): (Bound<'_, PyAny>, Bound<'_, PyAny>) = adapter.call_method0("encode")?.extract()?;
-            start.copy_from_slice(&arrays::f32_values("the latents of the current observation", &from, &shape)?);
-            goal.copy_from_slice(&arrays::f32_values("the latents of the goal", &to, &shape)?);
+            let (current, target): (Bound<'_, PyAny>, Bound<'_, PyAny>) = adapter.call_method0("encode")?.extract()?;
+            start.copy_from_slice(&arrays::f32_values("the latents of the current observation", &current, &shape)?);
+            goal.copy_from_slice(&arrays::f32_values("the latents of the goal", &target, &shape)?);
             Ok(())
         })
     }
@@ -187,16 +189,17 @@ impl LatentDynamics for PythonCost {
         let dim = self.latent_dim();
         self.call(|adapter| {
             let (py, n) = (adapter.py(), latents.len() / dim);
-            let width = actions.len() / n;
+            let action_dim = actions.len() / n;
             let given = (
                 arrays::f32_array(py, latents, &[n, dim])?,
-                arrays::f32_array(py, actions, &[n, width])?,
+                arrays::f32_array(py, actions, &[n, action_dim])?,
                 arrays::f32_array(py, next_gradient, &[n, dim])?,
             );
             let returned = adapter.call_method1("predict_vjp", given)?;
-            let (states, acts): (Bound<'_, PyAny>, Bound<'_, PyAny>) = returned.extract()?;
-            latent_gradient.copy_from_slice(&arrays::f32_values("the gradient of a prediction", &states, &[n, dim])?);
-            action_gradient.copy_from_slice(&arrays::f32_values("the gradient of a prediction", &acts, &[n, width])?);
+            let (latent, action): (Bound<'_, PyAny>, Bound<'_, PyAny>) = returned.extract()?;
+            let what = "the gradient of a prediction";
+            latent_gradient.copy_from_slice(&arrays::f32_values(what, &latent, &[n, dim])?);
+            action_gradient.copy_from_slice(&arrays::f32_values(what, &action, &[n, action_dim])?);
             Ok(())
         })
     }

@@ -1,11 +1,11 @@
-//! Bindings for datasets: reading, loading, writing, converting and examining datasets.
+//! Bindings that read, load, write, convert and examine datasets.
 //!
-//! - [`dataset`]: [`Dataset`](dataset::Dataset), the rows of episodes, usable after a fork.
+//! - [`dataset`]: [`Dataset`](dataset::Dataset) reads the rows of episodes, also in forked processes.
 //! - [`loader`]: shuffled batches that threads prefetch.
 //! - [`writer`]: writes episodes in one of the engine's formats.
 //! - [`replay`]: the latest episodes of a running collection.
 //! - [`foreign`]: readers and writers implemented in Python.
-//! - [`work`]: converts, examines and describes datasets.
+//! - [`tools`]: converts, examines and describes datasets.
 //! - [`process`]: support for forked processes.
 
 pub mod dataset;
@@ -25,7 +25,7 @@ use std::ops::Deref;
 use swm::core::{Batch, ColumnSpec, DType, Schema};
 use swm::data::{Constants, ImageCodec, LoadedBatch, WriteMode};
 
-/// A batch whose memory numpy arrays share; it is dropped with the last of them.
+/// A batch that shares its memory with numpy arrays and is dropped after the last of these arrays.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
 struct SharedBatch(BatchMemory);
 
@@ -47,28 +47,28 @@ impl Deref for SharedBatch {
     }
 }
 
-/// The columns of a batch as arrays `[rows, ..]`, without a copy.
+/// Returns the columns of a batch as arrays `[rows, ..]`, without a copy.
 fn columns(py: Python<'_>, batch: BatchMemory) -> PyResult<Bound<'_, PyDict>> {
-    let held = Bound::new(py, SharedBatch(batch))?;
+    let shared = Bound::new(py, SharedBatch(batch))?;
     let dict = PyDict::new(py);
-    for (i, column) in held.get().schema().columns().iter().enumerate() {
+    for (i, column) in shared.get().schema().columns().iter().enumerate() {
         // SAFETY: a `SharedBatch` is immutable, and every array keeps it alive.
         #[allow(unsafe_code, reason = "numpy arrays share memory with the engine")]
-        dict.set_item(&column.name, unsafe { arrays::view(held.get(), i, false, held.as_any()) }?)?;
+        dict.set_item(&column.name, unsafe { arrays::view(shared.get(), i, false, shared.as_any()) }?)?;
     }
     Ok(dict)
 }
 
-/// A column as Python describes it: its name, the numpy name of its type, the shape of a row.
+/// The description of a column in Python: its name, the numpy name of its type, the shape of a row.
 type Column = (String, String, Vec<usize>);
 
-/// The columns of a schema, for Python.
+/// Returns the descriptions of a schema's columns.
 fn described(schema: &Schema) -> Vec<Column> {
     let column = |column: &ColumnSpec| (column.name.clone(), column.dtype.name().to_owned(), column.shape.clone());
     schema.columns().iter().map(column).collect()
 }
 
-/// The schema of these columns.
+/// Builds a schema from the descriptions of its columns.
 ///
 /// # Errors
 /// `TypeError` for a type that datasets cannot store.
@@ -87,7 +87,7 @@ fn schema(columns: Vec<Column>) -> PyResult<Schema> {
     Schema::new(specs?).map_err(to_py_err)
 }
 
-/// The constants of an episode, text or bytes, from Python.
+/// Converts the constants of an episode, text or bytes, from Python.
 fn constants(given: &Bound<'_, PyDict>) -> PyResult<Constants> {
     let mut constants = Constants::new();
     for (name, value) in given {
@@ -100,7 +100,8 @@ fn constants(given: &Bound<'_, PyDict>) -> PyResult<Constants> {
     Ok(constants)
 }
 
-/// The write mode of this name; any other name creates a dataset and fails if one exists.
+/// Returns the write mode for `"append"` or `"overwrite"`. Any other name selects `Create`, which fails if the dataset
+/// exists.
 fn write_mode(mode: &str) -> WriteMode {
     match mode {
         "append" => WriteMode::Append,
@@ -109,7 +110,7 @@ fn write_mode(mode: &str) -> WriteMode {
     }
 }
 
-/// The codec of stored images, from JSON; the default codec for `None`.
+/// Parses the codec of stored images from JSON; `None` selects the default codec.
 fn image_codec(codec: Option<&str>) -> PyResult<ImageCodec> {
     codec.map_or(Ok(ImageCodec::default()), |text| crate::errors::json("codec", text))
 }

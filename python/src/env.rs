@@ -92,7 +92,7 @@ impl NativeEnv {
         Ok((state.observe(py)?, transition.reward, transition.terminated, transition.truncated, success))
     }
 
-    /// Renders the environment, or its goal with `goal`, into an array `[height, width, 3]` of `uint8`.
+    /// Renders the environment, or its goal if `goal` is set, into an array `[height, width, 3]` of `uint8`.
     fn render<'py>(&self, py: Python<'py>, height: usize, width: usize, goal: bool) -> PyResult<Bound<'py, PyAny>> {
         let mut state = self.lock();
         let state = &mut *state;
@@ -141,7 +141,7 @@ impl NativeEnv {
         self.lock().env.sample_goal(Key::new(seed).with("goal")).map_err(to_py_err)
     }
 
-    /// The full state, randomness included.
+    /// Returns the full state, including the environment's random state.
     fn snapshot<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
         PyBytes::new(py, &self.lock().env.snapshot().0)
     }

@@ -5,7 +5,7 @@ use pyo3::prelude::*;
 use std::time::{Duration, Instant};
 use swm::core::Error;
 
-/// The Python exception of an engine error. An exception that passed through the engine is returned unchanged.
+/// Converts an engine error to a Python exception. Returns an exception that passed through the engine unchanged.
 pub fn to_py_err(error: Error) -> PyErr {
     let message = error.to_string();
     match error {
@@ -30,8 +30,8 @@ pub fn from_py_err(error: PyErr) -> Error {
     Error::Embedder(Box::new(error))
 }
 
-/// A poll function for long loops: runs Python's signal handlers, so that Ctrl-C raises `KeyboardInterrupt`, at most every
-/// 20 ms.
+/// Creates a poll function for long loops. The function runs Python's signal handlers at most every 20 ms, so that
+/// Ctrl-C raises `KeyboardInterrupt`.
 pub fn signal_poll() -> impl FnMut() -> swm::core::Result<()> {
     let mut last = Instant::now();
     move || {

@@ -1,4 +1,4 @@
-//! [`VisualWrappers`]: visual wrappers applied to frames that Python holds.
+//! [`VisualWrappers`]: visual wrappers for frames given as numpy arrays.
 
 use crate::arrays;
 use crate::errors::{json, to_py_err};
@@ -31,7 +31,7 @@ impl VisualWrappers {
         }
     }
 
-    /// Returns a changed copy of the frame of an episode's step.
+    /// Applies the wrappers to a copy of the frame at step `step` of the episode.
     ///
     /// # Shapes
     /// `frame` and the result: `[height, width, 3]`, `uint8`.
@@ -49,7 +49,7 @@ impl VisualWrappers {
     }
 }
 
-/// The value of a schedule, given as JSON, at a step of the episode.
+/// Returns the value of a schedule, given as JSON, at a step of the episode.
 #[pyfunction]
 pub fn schedule(text: &str, step: u64) -> PyResult<f64> {
     Ok(json::<swm::envs::wrappers::Schedule>("schedule", text)?.at(step))

@@ -7,21 +7,21 @@ use swm::gym::{BRIDGE, CRAFTAX, Description, Failure, Request, Transport};
 
 /// A [`Transport`] to an environment in this interpreter.
 pub struct InProcess {
-    /// A callable without arguments that makes the environment and returns a `Bridge`.
+    /// A callable without arguments that creates the environment and returns its `Bridge`.
     make: Py<PyAny>,
     bridge: Option<Py<PyAny>>,
-    /// The memory that the bridge reads and writes. The views of the bridge prevent a resize.
+    /// The memory that the bridge reads and writes. The bridge's memory views prevent a resize.
     memory: Option<Py<PyByteArray>>,
 }
 
 impl InProcess {
-    /// A transport to the environment that `make` makes.
+    /// Creates a transport to the environment that `make` creates.
     pub fn new(make: Py<PyAny>) -> Self {
         Self { make, bridge: None, memory: None }
     }
 }
 
-/// A Python exception as a failure that is not retried: another attempt would raise it again.
+/// Converts a Python exception to a failure that is not retried, because a retry would raise the exception again.
 fn refused(error: PyErr) -> Failure {
     Failure::Refused(from_py_err(error))
 }
@@ -57,9 +57,9 @@ impl Transport for InProcess {
 
     fn memory(&self) -> &[u8] {
         let Some(memory) = &self.memory else { return &[] };
-        // SAFETY: only this object and the bridge hold the array, and the views of the bridge prevent a resize. The bridge
-        // writes only during `call`, which borrows `self` exclusively.
-        #[allow(unsafe_code, reason = "numpy arrays share memory with the engine")]
+        // SAFETY: only this object and the bridge hold the byte array, and the bridge's memory views prevent a resize.
+        // The bridge writes only during `call`, which borrows `self` exclusively.
+        #[allow(unsafe_code, reason = "the bridge shares its memory with the engine")]
         Python::attach(|py| unsafe {
             let memory = memory.bind(py);
             std::slice::from_raw_parts(memory.data(), memory.len())
@@ -69,7 +69,7 @@ impl Transport for InProcess {
     fn memory_mut(&mut self) -> &mut [u8] {
         let Some(memory) = &self.memory else { return &mut [] };
         // SAFETY: as in `memory`; `self` is borrowed exclusively.
-        #[allow(unsafe_code, reason = "numpy arrays share memory with the engine")]
+        #[allow(unsafe_code, reason = "the bridge shares its memory with the engine")]
         Python::attach(|py| unsafe {
             let memory = memory.bind(py);
             std::slice::from_raw_parts_mut(memory.data(), memory.len())
@@ -77,7 +77,8 @@ impl Transport for InProcess {
     }
 }
 
-/// The Python module with the class `Bridge`, loaded once. With `craftax`, also loads `swm_craftax`, which needs JAX.
+/// Returns the Python module with the class `Bridge`, which is loaded once. If `craftax` is set, also loads
+/// `swm_craftax`, which needs JAX.
 #[pyfunction]
 pub fn bridge(py: Python<'_>, craftax: bool) -> PyResult<Bound<'_, PyModule>> {
     let modules = py.import("sys")?.getattr("modules")?;

@@ -44,7 +44,7 @@ pub fn formats() -> Vec<&'static str> {
     swm::data::FORMATS.rows.iter().map(|row| row.id).collect()
 }
 
-/// The home folder: datasets and checkpoints given by name are in it.
+/// The home folder, which holds the datasets and checkpoints that are given by name.
 #[pyfunction]
 pub fn home() -> String {
     swm::home::home().display().to_string()
@@ -56,7 +56,7 @@ pub fn command(py: Python<'_>, arguments: Vec<String>) -> u8 {
     py.detach(|| match swm::cli::Cli::try_parse_from(arguments) {
         Ok(cli) => cli.run(),
         Err(error) => {
-            // Prints help and versions to stdout and wrong arguments to stderr. A failure to print cannot be reported anywhere.
+            // Prints help and versions to stdout, and errors to stderr. A failure to print cannot be reported anywhere.
             let _ = error.print();
             u8::try_from(error.exit_code()).unwrap_or(2)
         }

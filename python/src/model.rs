@@ -1,4 +1,4 @@
-//! [`Model`]: a checkpoint of the engine, to plan with or to act with.
+//! [`Model`]: a checkpoint of the engine, for planning or acting.
 
 use crate::arrays;
 use crate::errors::{json, to_py_err};
@@ -13,27 +13,27 @@ use swm::models::{CheckpointInfo, load};
 use swm::plan::ActionScale;
 use swm::plan::objective::ObjectiveConfig;
 
-/// A checkpoint.
+/// A checkpoint, which is loaded when a cost or an action is first needed.
 #[pyclass(frozen, subclass, module = "stable_worldmodel._engine")]
 pub struct Model {
     path: PathBuf,
     device: Device,
     objective: Value,
     scale: ActionScale,
-    /// The hash of its weights.
+    /// The hash of the checkpoint's weights.
     pub weights: String,
     /// The checkpoint info as JSON.
     info: String,
-    /// The cost model of [`Model::cost`], made by the first call.
+    /// The cost model of [`Model::cost`], created by the first call.
     cost: Mutex<Option<Box<dyn CostModel>>>,
-    /// The policy of [`Model::act`] and its number of environments, made by the first call.
+    /// The policy of [`Model::act`] and its number of environments, created by the first call.
     policy: Mutex<Option<(Box<dyn Policy>, usize)>>,
-    /// The id of the environment it was trained on.
+    /// The id of the training environment; `None` if the manifest does not name one.
     env: Option<String>,
 }
 
 impl Model {
-    /// A new cost model and the scale of its actions.
+    /// Creates a cost model and returns it with the scale of its actions.
     ///
     /// # Errors
     /// If the checkpoint cannot be loaded, holds a policy without a cost, or the objective is not valid.
@@ -101,7 +101,7 @@ impl Model {
         self.path.display().to_string()
     }
 
-    /// The actions of a checkpoint with a policy, in the environment's units.
+    /// Computes the actions of a checkpoint with a policy, in the environment's units.
     ///
     /// # Shapes
     /// `infos`: `[envs, ..]`; result: `[envs, dim]`.
@@ -132,7 +132,7 @@ impl Model {
         arrays::copy_rows(py, &actions.map_err(to_py_err)?, 0, &(0..rows).collect::<Vec<_>>())
     }
 
-    /// The costs of candidate action sequences.
+    /// Computes the costs of candidate action sequences.
     ///
     /// # Shapes
     /// `infos`: `[envs, ..]`; `candidates`: `[envs, samples, horizon, dim]`; result: `[envs, samples]`.

@@ -16,7 +16,7 @@ use swm::plan::{ActionScale, MpcConfig, MpcPolicy, TraceLog};
 pub struct Actor {
     policy: Mutex<Box<dyn Policy>>,
     log: Option<TraceLog>,
-    /// The hash of the policy's weights, for checkpoints.
+    /// The hash of the policy's weights; `None` unless the policy or its model is a checkpoint.
     pub weights: Option<String>,
 }
 
@@ -37,14 +37,14 @@ impl Actor {
 
 #[pymethods]
 impl Actor {
-    /// The policy that samples actions uniformly.
+    /// Creates the policy that samples actions uniformly.
     #[staticmethod]
     fn random(world: &World, seed: Option<u64>) -> PyResult<Self> {
         let world = world.lock()?;
         Ok(Self::new(Box::new(RandomPolicy::new(world.spec(), world.pool().len())), seed))
     }
 
-    /// An expert of the environment by name.
+    /// Creates the environment's expert with this name.
     #[staticmethod]
     fn expert(world: &World, name: &str, seed: Option<u64>) -> PyResult<Self> {
         let world = world.lock()?;
@@ -52,7 +52,7 @@ impl Actor {
         Ok(Self::new(swm::resolver::scripted(&entry, name, &world).map_err(to_py_err)?, seed))
     }
 
-    /// The policy of a checkpoint.
+    /// Creates the policy of a checkpoint.
     #[staticmethod]
     fn checkpoint(py: Python<'_>, world: &World, name: &str) -> PyResult<Self> {
         let world = world.lock()?;
@@ -61,8 +61,8 @@ impl Actor {
         Ok(Self { weights: Some(info.weights), ..Self::new(policy, None) })
     }
 
-    /// A policy implemented in Python: `call(infos, active, fresh)` returns an array of actions. `infos` are those of
-    /// [`World::infos`]; `active` marks the slots that act, `fresh` those that begin an episode.
+    /// Creates a policy implemented in Python: `call(infos, active, fresh)` returns an array of actions. `infos` is a
+    /// copy of the dict of [`World::infos`]; `active` marks the slots that act, `fresh` those that begin an episode.
     #[staticmethod]
     fn python(world: &Bound<'_, World>, call: Py<PyAny>) -> PyResult<Self> {
         let infos = World::infos(world)?.unbind();
@@ -70,8 +70,8 @@ impl Actor {
         Ok(Self::new(Box::new(PythonPolicy { call, infos, fresh }), None))
     }
 
-    /// A planning policy. `model` is a [`crate::model::Model`], an adapter of `stable_worldmodel.planning`, or `None` for the
-    /// simulator.
+    /// Creates a planning policy. `model` is a [`crate::model::Model`], an adapter of `stable_worldmodel.planning`, or
+    /// `None` for the simulator.
     #[staticmethod]
     #[allow(clippy::too_many_arguments, reason = "one argument for each option in Python")]
     fn planning(
@@ -142,7 +142,7 @@ impl Policy for Seeded {
     }
 }
 
-/// A planning policy with a Python model, which it calls on the current thread, where Python handles Ctrl-C.
+/// A planning policy that calls a Python model on the current thread: see [`solver::on_this_thread`].
 struct OnThisThread(MpcPolicy);
 
 impl Policy for OnThisThread {

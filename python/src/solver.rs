@@ -1,4 +1,4 @@
-//! Planning outside of a world: [`solve`] plans once for every row of some infos.
+//! Planning without a world: [`solve`] plans once for every row of a batch of infos.
 
 use crate::arrays;
 use crate::cost::PythonCost;
@@ -12,11 +12,13 @@ use serde_json::Value;
 use swm::core::{Error, Key, PlanProblem, PlanSpace, Solver};
 use swm::plan::SOLVERS;
 
-/// Runs `work` in a thread pool that consists of the current thread. Solvers call the model from any thread of their pool,
-/// and Python handles signals only in the main thread, so a Python model must be called there for Ctrl-C to work.
+/// Runs `work` in a thread pool that consists of the current thread.
+///
+/// Solvers call the model from any thread of their pool, and Python handles signals only in the main thread. Ctrl-C
+/// therefore interrupts a Python model only if the pool is the main thread.
 pub fn on_this_thread<T: Send>(work: impl FnOnce() -> T + Send) -> T {
     thread_local! {
-        // Leaked, because a pool that a thread belongs to cannot be dropped before the thread ends.
+        // The pool is leaked, because it cannot be dropped before its thread ends.
         static POOL: Option<&'static ThreadPool> =
             ThreadPoolBuilder::new().use_current_thread().build().ok().map(|pool| &*Box::leak(Box::new(pool)));
     }
@@ -26,7 +28,7 @@ pub fn on_this_thread<T: Send>(work: impl FnOnce() -> T + Send) -> T {
     }
 }
 
-/// A solver by id, with settings in JSON.
+/// Creates a solver by id, with settings in JSON.
 ///
 /// # Errors
 /// For an unknown solver or setting.
@@ -35,8 +37,11 @@ pub fn make(solver: &str, settings: &str) -> PyResult<Box<dyn Solver>> {
     (SOLVERS.get(solver).map_err(to_py_err)?.make)(&settings).map_err(to_py_err)
 }
 
-/// Plans for every row of `infos`, with the random key `(seed, call, row)`. `low` and `high` bound the elements of a model
-/// step, or `choices` are the sizes of its discrete choices. Returns the actions, their costs, and the search traces as JSON.
+/// Plans for every row of `infos`, with the random key `(seed, call, row)`. Returns the actions, their costs, and the
+/// search traces as JSON.
+///
+/// `low` and `high` are the bounds of the elements of a model step with continuous actions; `choices` holds the number
+/// of options of each discrete choice.
 ///
 /// # Shapes
 /// `infos`: `[envs, ..]`; `init` and actions: `[envs, horizon, dim]`; costs: `[envs]`.

@@ -49,7 +49,7 @@ impl World {
     pub fn lock(&self) -> PyResult<MutexGuard<'_, swm::eval::World>> {
         match self.world.try_lock() {
             Ok(world) => Ok(world),
-            // A panic leaves the environments in a state that a reset replaces.
+            // A reset replaces the state that a panic left in the environments.
             Err(TryLockError::Poisoned(poisoned)) => Ok(poisoned.into_inner()),
             Err(TryLockError::WouldBlock) => Err(to_py_err(Error::config(
                 "world",
@@ -86,7 +86,8 @@ impl World {
         Ok(Self { world: Mutex::new(world.map_err(to_py_err)?), envs })
     }
 
-    /// A world of Gymnasium environments in this interpreter: `make()` returns a `Bridge`.
+    /// Creates a world of Gymnasium environments in this interpreter. `make()` creates one environment and returns its
+    /// `Bridge`.
     #[staticmethod]
     #[allow(clippy::too_many_arguments, reason = "one argument for each option in Python")]
     fn gymnasium(
@@ -122,8 +123,8 @@ impl World {
         Ok(self.lock()?.pool().max_episode_steps())
     }
 
-    /// The infos of the last reset or step as arrays `[envs, 1, ..]` that share the engine's memory, so later steps update
-    /// them.
+    /// Returns the infos of the last reset or step as arrays `[envs, 1, ..]`. The arrays share the engine's memory, so
+    /// later steps change the arrays.
     pub fn infos<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyDict>> {
         let infos = PyDict::new(slf.py());
         let world = slf.get().lock()?;
@@ -136,7 +137,7 @@ impl World {
         Ok(infos)
     }
 
-    /// The actions `[envs, ..]` of the next [`World::advance`], for the caller to write.
+    /// Returns the actions `[envs, ..]` of the next [`World::advance`], which the caller writes.
     fn actions<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
         let mut world = slf.get().lock()?;
         let batch = world.actions_mut();
@@ -147,8 +148,8 @@ impl World {
         }
     }
 
-    /// Starts an episode in every given `(slot, seed)`. `options` is a JSON object with a variation request, a state and a
-    /// goal state.
+    /// Starts an episode for every `(slot, seed)` of `starts`. `options` is a JSON object with a variation request, a
+    /// state and a goal state.
     fn reset(&self, py: Python<'_>, starts: Vec<(usize, u64)>, options: &str) -> PyResult<()> {
         let options = reset_options(options)?;
         if let Some((slot, _)) = starts.iter().find(|(slot, _)| *slot >= self.envs) {
@@ -164,7 +165,7 @@ impl World {
         py.detach(|| world.restart(&resets)).map_err(to_py_err)
     }
 
-    /// Begins the episode `episode` of `seed` in a slot of the policy.
+    /// Begins episode `episode` of `seed` in a slot of the policy. The environment is not reset.
     fn begin(&self, actor: &Actor, slot: usize, seed: u64, episode: usize) -> PyResult<()> {
         actor.lock()?.begin(slot, episode_key(seed, episode));
         Ok(())
@@ -184,8 +185,9 @@ impl World {
         py.detach(|| world.advance(&active)).map_err(to_py_err)
     }
 
-    /// Plays `steps` steps with a policy. A slot whose episode is over starts the next episode of `seed` instead of stepping;
-    /// `next` is the index of that episode. Returns `(slot, episode)` of the started episodes and the next index.
+    /// Plays `steps` steps with a policy. A slot whose episode is over starts the next episode of `seed` instead of a
+    /// step. `next` is the index of the first episode to start. Returns the `(slot, episode)` pairs of the started
+    /// episodes and the index of the next episode.
     #[allow(clippy::too_many_arguments, reason = "one argument for each option in Python")]
     fn play(
         &self,
@@ -218,7 +220,7 @@ impl World {
                     let over = (0..active.len()).filter(|&slot| !active[slot]);
                     let starting: Vec<(usize, usize)> = over.zip(next..).collect();
                     next += starting.len();
-                    // Parsed here because most calls start no episode.
+                    // The options are parsed here because most calls start no episode.
                     let options = reset_options(options).map_err(from_py_err)?;
                     let reset = |&(slot, episode)| {
                         let seed = reset_seed(episode_key(seed, episode));
@@ -409,7 +411,8 @@ struct Evaluation {
     videos: Option<(PathBuf, String, usize)>,
 }
 
-/// A run control that runs Python's signal handlers and calls `progress(done, total, steps)` at most ten times a second.
+/// Creates a run control that runs Python's signal handlers and calls `progress(done, total, steps)` at most ten times
+/// a second. An exception from either stops the run.
 fn control<'a>(progress: Option<Py<PyAny>>) -> Control<'a> {
     let failed = Arc::new(Mutex::new(None));
     let callback_error = Arc::clone(&failed);
@@ -436,7 +439,7 @@ fn control<'a>(progress: Option<Py<PyAny>>) -> Control<'a> {
     })
 }
 
-/// The options of a reset, from JSON.
+/// Parses the options of a reset from JSON.
 ///
 /// # Errors
 /// `ValueError` if the JSON is not valid.
@@ -451,7 +454,7 @@ pub fn reset_options(text: &str) -> PyResult<ResetOptions> {
     Ok(ResetOptions { variation, state, goal_state })
 }
 
-/// The factors of the current episode, by key, each a list of floats.
+/// Returns the factors of the current episode by key, each as a list of floats.
 pub fn factors<'py>(py: Python<'py>, env: &dyn Env) -> PyResult<Bound<'py, PyDict>> {
     let dict = PyDict::new(py);
     for (key, value) in env.factors().iter() {

@@ -21,13 +21,13 @@ def open_world(
     threads: int,
     wrap_goal: bool,
 ) -> tuple[Any, list[Any], list[Any]]:
-    """Makes a world of Gymnasium environments.
+    """Creates a world of Gymnasium environments.
 
     If all wrappers are visual wrappers of this package, they run in the engine. Otherwise all wrappers run in Python.
 
     Returns:
-        The engine's world, the Gymnasium environments (filled as the world makes them), and the ids and settings of the
-        wrappers that run in the engine.
+        The engine's world, the list of its Gymnasium environments (the world appends each one that it creates), and the
+        ids and settings of the wrappers that run in the engine.
     """
     in_engine = engine_wrappers(wrappers)
     in_python = [] if in_engine is not None else list(wrappers)
@@ -36,7 +36,7 @@ def open_world(
     except ModuleNotFoundError as error:
         raise _missing("craftax", error) from error
     envs: list[Any] = []
-    # Native environments render at any size, which is better than resizing.
+    # Native environments render at any size, so their frames need no resizing.
     sized = {"image_shape": image} if image is not None and env_name in _engine.envs() else {}
 
     def make() -> Any:

@@ -1,4 +1,4 @@
-"""Progress of long runs: a tqdm bar if tqdm is installed, else lines; only in terminals and notebooks."""
+"""Progress of long runs in terminals and notebooks: a tqdm bar, or lines in a terminal if tqdm is not installed."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Registers the native environments with Gymnasium: now if it is imported, else right after its import.
+"""Registers the native environments with Gymnasium: at once if Gymnasium is imported, else right after its import.
 
-`import stable_worldmodel` is therefore enough for `gymnasium.make("swm/PushT-v1")`, in any order of the two imports, and
-does not import Gymnasium itself.
+After `import stable_worldmodel`, `gymnasium.make("swm/PushT-v1")` works for any order of the two imports.
+`stable_worldmodel` does not import Gymnasium at that time.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 
 def install() -> None:
-    """Registers the environments, or installs an import hook that does."""
+    """Registers the environments, or installs an import hook that registers them."""
     if "gymnasium" in sys.modules:
         register()
     elif not any(isinstance(finder, _AfterGymnasium) for finder in sys.meta_path):

@@ -1,11 +1,11 @@
 """Interfaces of models for planning, and a cost evaluator for latent dynamics.
 
-A model is anything with `get_cost(info_dict, action_candidates) -> (B, S)`: `Costable`. A model that can encode
-and predict (`Dynamics`) becomes one with `ShootingCostEvaluator`, which rolls out candidates and sums objectives of the
+A model is any object with `get_cost(info_dict, action_candidates) -> (B, S)`: `Costable`. `ShootingCostEvaluator` makes a
+`Costable` of an object that encodes and predicts (`Dynamics`): it rolls out candidates and sums the objectives of the
 trajectories. The gradient solvers differentiate `get_cost` with torch's autograd; GRASP requires `Dynamics`.
 
-Shapes: B environments, S candidates for each, H model steps, A the dimension of a model step (action dimension times action
-block), D the latent dimension.
+Shapes: B environments, S candidates for each environment, H model steps, A the dimension of a model step (action dimension
+times action block), D the latent dimension.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ __all__ = [
 
 @runtime_checkable
 class Costable(Protocol):
-    """A model with a cost of action candidates."""
+    """A model that computes costs of action candidates."""
 
     def get_cost(self, info_dict: dict[str, Any], action_candidates: Any) -> Any:
         """The costs `(B, S)` of candidates.
 
         Args:
             info_dict: The infos, each `(B, S, T, ..)` with T steps of history (`history_len` of the plan config): `pixels`,
-                `goal` and the other columns. Entries that the model adds stay for the rest of the search, so an encoding
-                can be cached there.
+                `goal` and the other columns. Entries that the model adds remain for the rest of the search, so the
+                model can cache an encoding in `info_dict`.
             action_candidates: The candidates `(B, S, H, A)`.
         """
         ...
@@ -58,7 +58,7 @@ class Dynamics(Protocol):
         ...
 
     def predict(self, latents: Any, actions: Any) -> Any:
-        """The latents `(N, D)` one model step after `latents` `(N, D)`, by `actions` `(N, A)`."""
+        """The latents `(N, D)` one model step after `latents` `(N, D)`, with `actions` `(N, A)`."""
         ...
 
 
@@ -88,12 +88,12 @@ class Objective(Protocol):
     """A cost term of trajectories."""
 
     def __call__(self, latents: Any, goal: Any, actions: Any) -> Any:
-        """The costs `(N,)` of latents `(N, H + 1, D)` (the current one first), goals `(N, D)` and actions `(N, H, A)`."""
+        """The costs `(N,)` of latents `(N, H + 1, D)` (the current latent first), goals `(N, D)` and actions `(N, H, A)`."""
         ...
 
 
 class GoalDistance:
-    """The squared distance to the goal latent: of the last latent, or with `running` of all predicted latents."""
+    """The squared distance of the last latent from the goal latent; with `running`, summed over all predicted latents."""
 
     def __init__(self, weight: float = 1.0, running: bool = False) -> None:
         self.weight, self.running = float(weight), bool(running)
@@ -126,12 +126,12 @@ class ShootingCostEvaluator:
     def get_cost(self, info_dict: dict[str, Any], action_candidates: Any) -> Any:
         """See `Costable`."""
         envs, samples, horizon, dim = action_candidates.shape
-        known = info_dict.setdefault("_latents", {})
-        if not known:
-            present = {key: value[:, 0] for key, value in info_dict.items() if not key.startswith("_")}
-            known["start"], known["goal"] = self.dynamics.encode(present), self.dynamics.encode_goal(present)
-        latent = _repeat(known["start"], samples)
-        goal = _repeat(known["goal"], samples)
+        cached = info_dict.setdefault("_latents", {})
+        if not cached:
+            infos = {key: value[:, 0] for key, value in info_dict.items() if not key.startswith("_")}
+            cached["start"], cached["goal"] = self.dynamics.encode(infos), self.dynamics.encode_goal(infos)
+        latent = _repeat(cached["start"], samples)
+        goal = _repeat(cached["goal"], samples)
         actions = action_candidates.reshape(envs * samples, horizon, dim)
         latents = [latent]
         for step in range(horizon):
@@ -143,6 +143,7 @@ class ShootingCostEvaluator:
 
 
 def _repeat(rows: Any, times: int) -> Any:
+    """Every row `times` times in succession."""
     return np.repeat(rows, times, 0) if isinstance(rows, np.ndarray) else rows.repeat_interleave(times, 0)
 
 
@@ -197,7 +198,7 @@ class Adapter:
         batch_size: The number of environments in one call of the model; all of them for `None`. It does not affect the
             result.
         process, transform: As for `stable_worldmodel.policy.MPCPolicy`.
-        history: Frames the model gets, the current one included.
+        history: The number of frames that the model gets, including the current frame.
         dim: The dimension of one model step.
     """
 
@@ -269,14 +270,14 @@ class Adapter:
     # Called by the engine while it plans.
 
     def observe(self, infos: Mapping[str, np.ndarray]) -> None:
-        """Sets the infos of one step, `(B, ..)`, and of the history."""
+        """Sets the infos of the current step, `(B, ..)`, and the history that the infos contain."""
         timed = {key: value[:, None] for key, value in infos.items() if not key.startswith("history.")}
         if self.history > 1 and "history.pixels" in infos and "pixels" in timed:
             past = infos["history.pixels"]
             # Before the first step, the history repeats the first frame.
-            real = infos["history.length"].reshape(-1)
+            lengths = infos["history.length"].reshape(-1)
             steps = past.shape[1]
-            for row, length in enumerate(real):
+            for row, length in enumerate(lengths):
                 missing = steps - min(int(length), steps)
                 if missing:
                     past[row, :missing] = past[row, missing] if missing < steps else timed["pixels"][row, 0]
@@ -301,7 +302,7 @@ class Adapter:
     def cost_and_gradient(self, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The costs `(B, S)` of candidates `(B, S, H, A)` and their gradients `(B, S, H, A)`."""
         torch = _torch()
-        costs, slopes = [], []
+        costs, gradients = [], []
         with torch.enable_grad():
             for infos, part in self._parts(candidates, "gradient"):
                 part = part.requires_grad_()
@@ -311,16 +312,16 @@ class Adapter:
                     raise ValueError(f"{name}.get_cost is not differentiable: its result does not depend on its actions")
                 # The cost of a candidate depends on its own actions only, so the gradient of the sum holds all gradients.
                 # Values that the model cached in its infos may belong to an older graph, so graphs are retained.
-                (slope,) = torch.autograd.grad(cost.sum(), part, retain_graph=True)
+                (gradient,) = torch.autograd.grad(cost.sum(), part, retain_graph=True)
                 costs.append(cost.detach())
-                slopes.append(slope)
-        return self._numpy(costs), self._numpy(slopes)
+                gradients.append(gradient)
+        return self._numpy(costs), self._numpy(gradients)
 
     def encode(self) -> tuple[np.ndarray, np.ndarray]:
         """The latents `(B, D)` of the current observation and of the goal."""
         dynamics = self.dynamics
         with _torch().inference_mode():
-            infos = {key: self._placed(value) for key, value in self._infos.items()}
+            infos = {key: self._on_device(value) for key, value in self._infos.items()}
             return self._numpy([dynamics.encode(infos)]), self._numpy([dynamics.encode_goal(infos)])
 
     def predict(self, latents: np.ndarray, actions: np.ndarray) -> np.ndarray:
@@ -328,14 +329,14 @@ class Adapter:
         with _torch().inference_mode():
             return self._numpy([self.dynamics.predict(self._tensor(latents), self._tensor(actions))])
 
-    def predict_vjp(self, latents: np.ndarray, actions: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The vector-Jacobian products of a prediction, `(N, D)` and `(N, A)`, for the output gradient `slope` `(N, D)`."""
+    def predict_vjp(self, latents: np.ndarray, actions: np.ndarray, gradient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The vector-Jacobian products of a prediction, `(N, D)` and `(N, A)`, for the output gradient `gradient` `(N, D)`."""
         torch = _torch()
         with torch.enable_grad():
             given = self._tensor(latents).requires_grad_(), self._tensor(actions).requires_grad_()
             predicted = self.dynamics.predict(*given)
-            slopes = torch.autograd.grad(predicted, given, self._tensor(slope), allow_unused=True)
-        filled = [torch.zeros_like(x) if g is None else g for g, x in zip(slopes, given, strict=True)]
+            gradients = torch.autograd.grad(predicted, given, self._tensor(gradient), allow_unused=True)
+        filled = [torch.zeros_like(x) if g is None else g for g, x in zip(gradients, given, strict=True)]
         return self._numpy(filled[:1]), self._numpy(filled[1:])
 
     def constraints(self, horizon: int) -> int:
@@ -354,16 +355,16 @@ class Adapter:
     def constrain_vjp(self, candidates: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """The gradient of the constraints with respect to the candidates, weighted by `weights` `(B, S, C)`."""
         torch = _torch()
-        slopes, at = [], 0
+        gradients, at = [], 0
         with torch.enable_grad():
             for infos, part in self._parts(candidates, "constrain gradient"):
                 part = part.requires_grad_()
                 values = self.model.get_constraints(infos, part)
                 weight = self._tensor(weights[at : at + len(part)])
                 at += len(part)
-                (slope,) = torch.autograd.grad(values, part, weight, retain_graph=True, allow_unused=True)
-                slopes.append(torch.zeros_like(part) if slope is None else slope)
-        return self._numpy(slopes)
+                (gradient,) = torch.autograd.grad(values, part, weight, retain_graph=True, allow_unused=True)
+                gradients.append(torch.zeros_like(part) if gradient is None else gradient)
+        return self._numpy(gradients)
 
     # Between numpy and torch.
 
@@ -377,7 +378,7 @@ class Adapter:
         return cost if not isinstance(cost, np.ndarray) else _torch().from_numpy(cost)
 
     def _parts(self, candidates: np.ndarray, what: str) -> Any:
-        """Yields infos, repeated for every candidate, and candidates, for `batch_size` environments at a time."""
+        """Yields pairs of infos, repeated for every candidate, and candidates, for `batch_size` environments at a time."""
         envs, samples = candidates.shape[:2]
         size = self.batch_size or envs
         for begin in range(0, envs, size):
@@ -396,7 +397,7 @@ class Adapter:
                 some = value[rows][:, None]
                 infos[key] = np.broadcast_to(some, (some.shape[0], samples, *some.shape[2:]))
             elif hasattr(value, "expand"):
-                some = self._placed(value[rows]).unsqueeze(1)
+                some = self._on_device(value[rows]).unsqueeze(1)
                 infos[key] = some.expand(-1, samples, *some.shape[2:])
             else:
                 infos[key] = value[rows] if isinstance(value, list) else value
@@ -404,7 +405,8 @@ class Adapter:
             infos["action"] = self._tensor(np.zeros((part.shape[0], samples, 1, dim), dtype=np.float32))
         return infos
 
-    def _placed(self, value: Any) -> Any:
+    def _on_device(self, value: Any) -> Any:
+        """A tensor on the device, in the model's type if it is floating point; other values unchanged."""
         if not hasattr(value, "is_floating_point"):
             return value
         return value.to(device=self.device, dtype=self.dtype if value.is_floating_point() else None)

@@ -1,8 +1,8 @@
 """Policies.
 
-A policy is any object with `get_action(infos)` that returns one action for each environment; `BasePolicy` provides the
-rest. The policies of the engine (random, experts, checkpoints, planning) run inside of it. There an episode depends only on
-its seed, not on the slot that plays it or on other episodes.
+A policy is any object whose method `get_action(infos)` returns one action for each environment; `BasePolicy` provides the
+other methods. The engine's policies (random, experts, checkpoints, planning) run in the engine. An episode that one of these
+policies plays depends only on its seed, not on its slot or on other episodes.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class PlanConfig:
     Attributes:
         horizon: Model steps to plan.
         receding_horizon: Model steps to execute before planning again; the whole horizon is open loop.
-        history_len: Frames the model gets, the current one included.
-        action_block: Environment steps in one model step (the frameskip the model was trained with).
+        history_len: The number of frames that the model gets, including the current frame.
+        action_block: Environment steps in one model step (the frameskip that the model was trained with).
         warm_start: Whether a search starts from the part of the last plan that was not executed.
         latency_budget: Seconds after which a search stops with its best plan; results then depend on the machine.
     """
@@ -90,7 +90,7 @@ class BasePolicy:
         raise NotImplementedError(f"{type(self).__name__} has no get_action(infos)")
 
     def _actor(self, world: World) -> Any:
-        """The policy of the engine that implements this one; `None` if it runs in Python."""
+        """The engine's actor that implements this policy; `None` if the policy runs in Python."""
         return None
 
 
@@ -130,7 +130,7 @@ class ExpertPolicy(_EnginePolicy):
     """A scripted expert of the environment.
 
     Args:
-        name: One of `swm.envs.experts(ID)`; the first for `"expert"`.
+        name: One of `swm.envs.experts(ID)`; `"expert"` selects the first one.
         seed: Combined with the seed of each episode.
     """
 
@@ -149,7 +149,7 @@ class FeedForwardPolicy(BasePolicy):
     """Acts with one forward pass of a model: an `Actionable`, or a checkpoint with a policy.
 
     Args:
-        model: Something with `get_action(info)`, or a checkpoint's name or path.
+        model: An object with `get_action(info)`, or a checkpoint's name or path.
         process: Scalers by column; the scaler of `action` converts actions back (`inverse_transform`).
         transform: Transforms of frames by column, called with one frame `(C, H, W)` at a time.
     """
@@ -200,9 +200,9 @@ class MPCPolicy(BasePolicy):
     """Model predictive control: plans with a solver, executes the first steps of the plan, and plans again.
 
     Args:
-        solver: One of `swm.solver`, or an object with `configure` and `solve`.
-        config: The planning config; by default 5 model steps, all of them executed, with the model's `action_block` (1 if it
-            has none).
+        solver: A solver of `swm.solver`, or an object with `configure` and `solve`.
+        config: The planning config; by default 5 model steps, all of them executed, with the model's `action_block` (1 if the
+            model has none).
         process: Scalers by column, applied before the model (`transform`); the scaler of `action` converts planned actions
             back (`inverse_transform`).
         transform: Transforms by frame column (`pixels`, `goal`), called with one frame `(C, H, W)` at a time.
@@ -337,7 +337,7 @@ def _executed(step: np.ndarray, space: Any) -> np.ndarray:
 
 
 def _scale(scaler: Any) -> tuple[list[float], list[float]] | None:
-    """The mean and standard deviation of a scaler; `None` if it has none."""
+    """The mean and standard deviation of a scaler; `None` if the scaler has neither."""
     if scaler is None:
         return None
     for mean, std in (("mean", "std"), ("mean_", "scale_")):

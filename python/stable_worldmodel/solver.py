@@ -1,11 +1,11 @@
-"""Solvers: searches for action sequences of low cost.
+"""Solvers, which search for action sequences of low cost.
 
     solver = swm.solver.CEMSolver(model, num_samples=300, n_steps=30, topk=30)
     policy = swm.policy.MPCPolicy(solver, config=swm.PlanConfig(horizon=5, receding_horizon=5))
 
-`model` is any object with `get_cost` (a PyTorch module, a model of `swm.wm`, …), or `"simulator"`: the environment itself as
-a perfect model. The search runs in the engine for all environments together; the plan of an environment depends on the seed
-and the infos of that environment, not on the others. A user-defined solver is any object with
+`model` is any object with `get_cost` (a PyTorch module, a model of `swm.wm`, …), or `"simulator"`, which plans with the
+environment itself. The search runs in the engine for all environments together; the plan of an environment depends on the
+seed and the infos of that environment, not on other environments. A user-defined solver is any object with
 `configure(action_space, n_envs, config)` and `solve(info_dict, init_action)`.
 """
 
@@ -50,7 +50,7 @@ class Solver(Protocol):
 
 
 class EngineSolver:
-    """Base class of the engine's solvers. Settings have the names of `swm solvers`, or the field's names in `_names`."""
+    """Base class of the engine's solvers. Settings have the names that `swm solvers` lists, or the keys of `_names`."""
 
     #: The id of the solver in the engine.
     id: str
@@ -123,15 +123,15 @@ class EngineSolver:
     def solve(self, info_dict: dict[str, Any], init_action: Any = None) -> dict[str, Any]:
         """Plans for every row of `info_dict` `(B, T, ..)`.
 
-        Each call uses new random numbers; the same sequence of calls with the same seed uses the same ones.
+        Each call uses new random numbers. The same sequence of calls with the same seed returns the same plans.
 
         Args:
             info_dict: Infos `(B, T, ..)`.
-            init_action: Where the search starts, `(B, at most horizon, action_dim)`; zeros fill the rest.
+            init_action: The actions at which the search starts, `(B, at most horizon, action_dim)`, padded with zeros.
 
         Returns:
-            A dict with `actions` `(B, horizon, action_dim)`, `costs` (for each environment, of the cheapest candidate of the
-            last iteration) and `trace` (the record of each search).
+            A dict with `actions` `(B, horizon, action_dim)`, `costs` (for each environment, the cost of the cheapest
+            candidate of the last iteration) and `trace` (the record of each search).
         """
         config, space = self._configured(), self._space()
         block, horizon, dim = config.action_block, config.horizon, self.action_dim
@@ -184,7 +184,7 @@ class EngineSolver:
 
 
 class _Observed:
-    """An adapter whose infos are set already, so that it ignores `observe`."""
+    """An adapter whose infos are set already, so `observe` does nothing."""
 
     def __init__(self, adapter: Adapter) -> None:
         self._adapter = adapter
@@ -211,7 +211,7 @@ def single(space: Any, envs: int) -> Any:
 
 
 def last_step(value: Any) -> np.ndarray:
-    """The last step `(B, ..)` of an info column `(B, T, ..)`, in a type of the engine."""
+    """The last step `(B, ..)` of an info column `(B, T, ..)`, in a type that the engine supports."""
     if hasattr(value, "detach"):
         value = value.detach().cpu().numpy()
     value = np.asarray(value)
@@ -221,6 +221,7 @@ def last_step(value: Any) -> np.ndarray:
 
 
 def _dim(space: spaces.Space, block: int) -> int:
+    """The dimension of a model step of `block` actions, with one-hot vectors for discrete choices."""
     if isinstance(space, spaces.Discrete):
         return int(space.n) * block
     if isinstance(space, spaces.MultiDiscrete):
@@ -244,6 +245,7 @@ def _bounds(space: Any, block: int, model: Any) -> tuple[list[float], list[float
 
 
 def _padded(init: Any, envs: int, horizon: int, dim: int) -> np.ndarray:
+    """The initial actions, padded with zeros to `(envs, horizon, dim)`."""
     init = np.asarray(init.detach().cpu() if hasattr(init, "detach") else init, dtype=np.float32)
     if init.ndim != 3 or init.shape[0] != envs or init.shape[1] > horizon or init.shape[2] != dim:
         raise ValueError(f"init_action: got shape {init.shape}, expected ({envs}, at most {horizon}, {dim})")
@@ -254,7 +256,7 @@ _SAMPLING = {"num_samples": "samples", "n_steps": "iterations", "topk": "elites"
 
 
 class PredictiveSamplingSolver(EngineSolver):
-    """Predictive sampling: samples candidates once and takes the cheapest."""
+    """Predictive sampling: samples candidates once and returns the cheapest one."""
 
     id = "predictive_sampling"
     _names = {"num_samples": "samples", "noise_scale": "sigma"}

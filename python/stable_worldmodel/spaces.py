@@ -14,12 +14,12 @@ from gymnasium import spaces
 
 __all__ = ["Box", "Dict", "Discrete", "MultiDiscrete", "RGBBox", "reset_variation_space"]
 
-#: The number of samples after which a condition is taken to be impossible.
+#: The number of samples after which a condition is considered impossible.
 TRIES = 1000
 
 
 class _Factor:
-    """A mixin that makes a factor of a Gymnasium space."""
+    """A mixin that turns a Gymnasium space into a factor."""
 
     constrain_fn: Callable[[Any], bool] | None
     _init_value: Any
@@ -59,9 +59,9 @@ class _Factor:
         return self.contains(self._value)
 
     def sample(self, mask: Any = None, probability: Any = None, *, max_tries: int = TRIES, set_value: bool = True) -> Any:
-        """Samples until the condition holds, at most `max_tries` times; the sample becomes the value."""
+        """Samples until the condition holds, at most `max_tries` times; with `set_value`, the sample becomes the value."""
         for _ in range(max_tries):
-            # Passed only if given, because Gymnasium has the argument `probability` since 1.1.
+            # `probability` is passed only if given, because Gymnasium supports it since 1.1.
             given = {} if probability is None else {"probability": probability}
             value = super().sample(mask=mask, **given)  # type: ignore[misc]
             if self.contains(value):
@@ -114,7 +114,7 @@ class RGBBox(Box):
 
 
 class Discrete(_Factor, spaces.Discrete):
-    """One of `n` integers from `start`."""
+    """An integer from `start` to `start + n - 1`."""
 
     def __init__(
         self,
@@ -131,7 +131,7 @@ class Discrete(_Factor, spaces.Discrete):
 
 
 class MultiDiscrete(_Factor, spaces.MultiDiscrete):
-    """Several integers, the `i`-th one of `nvec[i]`."""
+    """Several integers; the `i`-th one has `nvec[i]` possible values."""
 
     def __init__(
         self,
@@ -251,7 +251,7 @@ class Dict(spaces.Dict):
         raise RuntimeError(f"the factors' common constrain_fn did not hold in {max_tries} tries")
 
     def update(self, keys: Iterable[str]) -> None:
-        """Samples these factors and groups, in order; `all` means every one."""
+        """Samples these factors and groups in sampling order; `all` selects every factor."""
         wanted = set(keys)
         if "all" in wanted:
             self.sample()
@@ -319,7 +319,7 @@ def reset_variation_space(
 
 
 def from_description(described: Mapping[str, Any]) -> spaces.Space:
-    """The space of a description by the engine."""
+    """Builds a space from its description by the engine."""
     kind = described["type"]
     if kind == "Dict":
         return spaces.Dict({key: from_description(inner) for key, inner in described["spaces"].items()})
@@ -343,15 +343,15 @@ def from_description(described: Mapping[str, Any]) -> spaces.Space:
     return (Box if factor else spaces.Box)(low, high, shape=shape, dtype=dtype.type, **more)
 
 
-def _unbounded(numbers: Any, bound: float) -> Any:
+def _unbounded(bounds: Any, bound: float) -> Any:
     """The bounds, with `None` (infinity in the engine's JSON) replaced by `bound`."""
-    if isinstance(numbers, list):
-        return [_unbounded(number, bound) for number in numbers]
-    return bound if numbers is None else numbers
+    if isinstance(bounds, list):
+        return [_unbounded(inner, bound) for inner in bounds]
+    return bound if bounds is None else bounds
 
 
 def variation_space(factors: Mapping[str, Mapping[str, Any]], order: Sequence[str]) -> Dict:
-    """The factors of an environment, described by dot key, as nested spaces in their sampling order."""
+    """Builds the nested spaces of an environment's factors from descriptions by dot key, in sampling order."""
     tree: dict[str, Any] = {}
     for key in order:
         if key in factors:

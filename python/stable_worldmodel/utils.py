@@ -1,4 +1,4 @@
-"""Small helpers."""
+"""The home folder, and descriptions of environments and visual wrappers."""
 
 from __future__ import annotations
 

@@ -25,18 +25,19 @@ __all__ = ["Model", "load", "load_pretrained", "train"]
 
 
 class Model:
-    """A checkpoint, to plan with (`get_cost`) or to act with (`swm.policy.FeedForwardPolicy`).
+    """A checkpoint, for planning (`get_cost`) or for acting (`swm.policy.FeedForwardPolicy`).
 
     Args:
         name: A name under `$STABLEWM_HOME/checkpoints`, or a path.
-        device: `cpu`, or a GPU if the engine was built with support for one.
+        device: `cpu`, or a GPU if the engine was built with GPU support.
         objective: Terms of the planning objective, a dict in the form of `swm eval --objective`; `None` for the
             model's own cost.
     """
 
     def __init__(self, name: str, device: str = "cpu", objective: dict[str, Any] | None = None) -> None:
         self._engine_model = _engine.Model(str(name), device, json.dumps(objective))
-        #: The checkpoint info: `family`, `env`, `image`, `action_block`, `history`, `config`, `weights` and more.
+        #: The checkpoint info: `family`, `env`, `image`, `action_block`, `history`, `config`, `weights`, `action_mean` and
+        #: `action_std`.
         self.card: dict[str, Any] = json.loads(self._engine_model.info)
 
     @property
@@ -57,8 +58,8 @@ class Model:
         """The costs of candidate action sequences.
 
         Args:
-            info_dict: Infos `(B, T, ..)`, or `(B, S, T, ..)` if they are repeated for every candidate. The dimensions of
-                `pixels` and `goal` (frames `(height, width, 3)` of `uint8`) tell the two apart.
+            info_dict: Infos `(B, T, ..)`, or `(B, S, T, ..)` if they are repeated for every candidate. The number of
+                dimensions of `pixels` and `goal` (frames `(height, width, 3)` of `uint8`) decides between the two.
             action_candidates: Candidates `(B, S, H, A)` in the model's units, a tensor or an array.
 
         Returns:
@@ -75,7 +76,7 @@ class Model:
             if not isinstance(value, (list, str, Mapping)) and not key.startswith("_")
         }
         frame_dims = [value.ndim for key, value in given.items() if key in ("pixels", "goal")]
-        # The repetitions of an info are equal: take the first.
+        # The repetitions of an info are equal, so the first one is used.
         repeated = bool(frame_dims) and max(frame_dims) == 6
         infos = {key: last_step(value[:, 0] if repeated else value) for key, value in given.items()}
         costs = self._engine_model.cost(infos, candidates)
@@ -86,7 +87,7 @@ class Model:
         return costs
 
     def get_action(self, info: dict[str, Any], **kwargs: Any) -> Any:
-        """The actions `(B, A)` for infos `(B, T, ..)`, in the environment's units; a tensor if an info is one."""
+        """The actions `(B, A)` for infos `(B, T, ..)`, in the environment's units; a tensor if an info is a tensor."""
         given = {key: value for key, value in info.items() if not isinstance(value, (list, str, Mapping)) and key[0] != "_"}
         actions = self._engine_model.act({key: last_step(value) for key, value in given.items()})
         if has_torch() and any(hasattr(value, "detach") for value in given.values()):
@@ -125,7 +126,7 @@ def train(
         env: The environment to train in, for families that learn online.
         out: The checkpoint's name or path.
         preset: The name of a configuration; the first one of the family for `None`.
-        device: `cpu`, or a GPU if the engine was built with support for one.
+        device: `cpu`, or a GPU if the engine was built with GPU support.
         **overrides: Settings that replace those of the preset, with `__` for dots: `train__steps=1000`.
 
     Returns:
@@ -148,12 +149,12 @@ sys.path.insert(0, sys.argv[1])
 from stable_worldmodel import _engine
 
 
-def follow():
+def interrupt_at_end_of_input():
     os.read(0, 1)
     os.kill(os.getpid(), signal.SIGINT)
 
 
-threading.Thread(target=follow, daemon=True).start()
+threading.Thread(target=interrupt_at_end_of_input, daemon=True).start()
 sys.exit(_engine.command(sys.argv[2:]))
 """
 
@@ -190,9 +191,9 @@ def _command(arguments: list[str]) -> None:
         for stream in (child.stdin, child.stdout):
             if stream is not None:
                 stream.close()
-    why = last_line.removeprefix("error: ").strip() or "see its output"
+    reason = last_line.removeprefix("error: ").strip() or "see its output"
     if child.returncode == 130:
         raise KeyboardInterrupt
     if child.returncode:
         kind = ValueError if child.returncode == 2 else RuntimeError
-        raise kind(f"swm {arguments[1]} ended with code {child.returncode}: {why}")
+        raise kind(f"swm {arguments[1]} ended with code {child.returncode}: {reason}")

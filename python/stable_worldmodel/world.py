@@ -23,17 +23,17 @@ from .wrapper.visual import engine_wrappers
 
 __all__ = ["EnvPool", "Metrics", "World"]
 
-#: Formats by the suffix of a path.
-_ENDINGS = {".lance": "lance", ".h5": "hdf5", ".hdf5": "hdf5", ".mp4": "video", ".lerobot": "lerobot"}
+#: The dataset format of each path suffix.
+_FORMAT_OF_SUFFIX = {".lance": "lance", ".h5": "hdf5", ".hdf5": "hdf5", ".mp4": "video", ".lerobot": "lerobot"}
 
 
 class World:
     """A batch of environments of one kind, stepped and rendered in parallel.
 
     Args:
-        env_name: An environment's id, such as `swm/PushT-v1`, with options as `ID,option=value`; or any id that Gymnasium
-            knows.
-        num_envs: The number of environments. Episodes do not depend on it.
+        env_name: An environment's id, such as `swm/PushT-v1`, with options as `ID,option=value`; or any id that is
+            registered with Gymnasium.
+        num_envs: The number of environments. Episodes do not depend on this number.
         image_shape: `(height, width)` of frames.
         max_episode_steps: Steps after which episodes are truncated; the environment's time limit for `None`.
         goal_conditioned: Whether the infos contain `goal`, the frame of the goal.
@@ -43,15 +43,15 @@ class World:
         add_pixels: Whether frames are rendered.
         views: Additional camera views: cameras, `depth`, `segmentation`, or `CAMERA:MODALITY`.
         wrap_goal: Whether visual wrappers also change the frame of the goal.
-        threads: Worker threads; one for each core for 0. The number does not affect results.
-        workers: Whether each third-party environment gets a process of its own instead of this interpreter. The processes
-            step in parallel and are restarted after a crash; the environment must be importable there.
+        threads: The number of worker threads, which does not affect results; 0 uses one for each core.
+        workers: Whether each third-party environment runs in a worker process instead of this interpreter. The processes
+            step in parallel and are restarted after a crash. They must be able to import the environment.
         image_resample: How frames of third-party environments are resized: `"bilinear"`, or `"nearest"` for pixel art.
         **kwargs: Options of the environment.
 
     Attributes:
         infos: The info columns by name: arrays `(num_envs, 1, ..)` in the engine's memory, which every reset and step
-            overwrites. Use `infos[name].copy()` for values that must stay.
+            overwrites. `infos[name].copy()` keeps the values of a step.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class World:
         wrappers = [*(pre_wrappers or []), *(extra_wrappers or [])]
         in_engine = engine_wrappers(wrappers)
         self._native = in_engine is not None and self._is_native(env_name)
-        #: The Gymnasium environments of this world that are in this interpreter.
+        #: The Gymnasium environments of this world that run in this interpreter.
         self.gym_envs: list[Any] = []
         if in_engine is None and workers:
             raise ValueError("workers: user-defined wrappers cannot run in worker processes; use workers=False")
@@ -137,7 +137,7 @@ class World:
             return True
         import gymnasium
 
-        # An id of this namespace that is not registered is a misspelt native one: the engine reports close names.
+        # An unregistered id in this namespace is a misspelt native id. The engine's error suggests similar ids.
         return name.startswith("swm/") and not name.startswith("swm/Craftax") and name not in gymnasium.registry
 
     # Properties.
@@ -229,11 +229,11 @@ class World:
             options: `variation`: factors to sample; `variation_values`: factors to pin; `state`, `goal_state`: start and goal.
         """
         self._reset_text = text = _options.reset(options, self.spec["variation"])
-        one = seed is None or isinstance(seed, (int, np.integer))
-        self.seed = _seed(seed if one else None)  # type: ignore[arg-type]
+        single = seed is None or isinstance(seed, (int, np.integer))
+        self.seed = _seed(seed if single else None)  # type: ignore[arg-type]
         self._episodes = list(range(self.num_envs))
         self._next_episode = self.num_envs
-        if not one:
+        if not single:
             seeds = [_seed(given) for given in seed]  # type: ignore[union-attr]
             if len(seeds) != self.num_envs:
                 raise ValueError(f"seed: expected {self.num_envs} seeds, one for each environment, got {len(seeds)}")
@@ -244,10 +244,10 @@ class World:
         self._actions[:] = np.nan if self._actions.dtype.kind == "f" else -1
 
     def step(self, steps: int = 1) -> None:
-        """Steps the environments with the policy and refreshes `infos`. Environments whose episode is over are reset instead.
+        """Steps the environments with the policy and refreshes `infos`. Environments whose episode is over are reset.
 
         Args:
-            steps: The number of steps. The engine's policies make all of them in one call, without Python in between.
+            steps: The number of steps. With a policy of the engine, all steps run in one call of the engine.
         """
         if self.policy is None:
             raise RuntimeError("World.step: no policy; call set_policy first")
@@ -278,11 +278,11 @@ class World:
                 self._begin(slots)
 
     def snapshot(self, index: int = 0) -> bytes:
-        """The full state of an environment, randomness included."""
+        """The full state of an environment, including its random state."""
         return self._world.snapshot(index)
 
     def restore(self, state: bytes, index: int = 0) -> None:
-        """Restores a snapshot. Later steps equal those after the snapshot bit for bit."""
+        """Restores a snapshot. The steps that follow repeat those after the snapshot bit for bit."""
         self._world.restore(index, state)
 
     def _begin(self, slots: Sequence[int]) -> None:
@@ -334,7 +334,7 @@ class World:
         self._actors.pop(id(policy), None)
 
     def _playing(self, policy: Any) -> Any:
-        """The actor of a policy for collection and evaluation; a policy in Python is called back by the engine."""
+        """The actor of a policy for collection and evaluation. The actor of a policy implemented in Python calls back."""
         actor = self._actor(policy)
         if actor is not None:
             return actor
@@ -372,13 +372,13 @@ class World:
             episodes: The number of episodes.
             seed: The seed, which is combined with the index of each episode; random for `None`.
             options: Factors to sample (`variation`) and to pin (`variation_values`).
-            format: One of `swm.data.list_formats()`; for `None` that of the path's suffix, else Lance.
+            format: One of `swm.data.list_formats()`. `None` selects the format by the path's suffix, or Lance.
             writer: Instead of a path: an object with `write_episode(dict of arrays)`, such as `swm.data.ReplayBuffer`.
             progress: Whether to show progress.
             dataset_path: Another name for `path`.
-            policy: The policy, instead of that of `set_policy`.
-            mode: If there is a dataset already: `"error"` refuses, `"overwrite"` replaces it, `"append"` adds `episodes`
-                more, `"resume"` continues until it has `episodes`.
+            policy: The policy to set first; `None` keeps the policy of `set_policy`.
+            mode: What to do if the dataset exists: `"error"` raises, `"overwrite"` replaces it, `"append"` adds `episodes`
+                more, `"resume"` continues until the dataset has `episodes`.
             codec: How frames are stored: `"qoi"` (lossless), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
             goal: Whether to store the frame of the goal in every row.
 
@@ -395,7 +395,7 @@ class World:
             raise ValueError(f"episodes: {episodes}; expected at least 1")
         policy = self._chosen(policy)
         if writer is None and format is None:
-            format = _ENDINGS.get(Path(str(path)).suffix)
+            format = _FORMAT_OF_SUFFIX.get(Path(str(path)).suffix)
         if path is not None and writer is None and format not in _engine.formats():
             from .data.format import foreign_writer
 
@@ -403,7 +403,7 @@ class World:
         config: dict[str, Any] = {
             "episodes": int(episodes),
             "seed": _seed(seed),
-            "variation": _options.variation(_varied(options), self.spec["variation"]),
+            "variation": _options.variation(_without_states(options), self.spec["variation"]),
             "policy": _name(policy),
             "goal": bool(goal),
             "first": 0,
@@ -469,13 +469,13 @@ class World:
             dataset: The dataset of starts and goals: a `swm.data.Dataset`, its path, URI or name.
             episodes_idx, start_steps: The episodes and steps of the dataset to start from; chosen by the seed for `None`.
             goal_offset: The number of steps from a start to its goal; 25 for `None`.
-            eval_budget: The time limit of an episode in steps; for `None` that of the world, or 50 with a dataset.
+            eval_budget: The time limit of an episode in steps. `None` uses the world's time limit, or 50 with a dataset.
             callables: The methods that put an environment into a recorded state, called in this order after its reset:
-                `{"method": NAME, "args": {KEYWORD: {"value": COLUMN}}}`, where `goal_` before a column's name takes it from
-                the goal's row, and `{"value": ANYTHING, "in_dataset": False}` is the value itself. The default is
+                `{"method": NAME, "args": {KEYWORD: {"value": COLUMN}}}`. A column name with the prefix `goal_` reads the
+                row of the goal. `{"value": ANYTHING, "in_dataset": False}` passes the value itself. The default is
                 `set_state(state)` and `set_goal_state(goal_state)`, with or without a leading `_`. Native environments
-                restore recorded states themselves.
-            policy: The policy, instead of that of `set_policy`.
+                restore recorded states without callables.
+            policy: The policy to set first; `None` keeps the policy of `set_policy`.
             protocol: `"strict"` leaves out episodes that are solved at start and requires a satisfied goal;
                 `"compat"` counts as the Python package stable-worldmodel 0.1.1 does.
             hold: Consecutive steps that must satisfy the goal (with `"strict"`).
@@ -505,7 +505,7 @@ class World:
         elif episodes_idx is not None or start_steps is not None or goal_offset is not None:
             raise ValueError("episodes_idx, start_steps, goal_offset: they select rows of a dataset; pass dataset=…")
         episodes = 50 if episodes is None else int(episodes)
-        variation = _options.variation(_varied(options), self.spec["variation"])
+        variation = _options.variation(_without_states(options), self.spec["variation"])
         config = {
             "episodes": episodes,
             "seed": _seed(seed),
@@ -536,13 +536,13 @@ class World:
         return Metrics._of(self, config, runs, dataset)
 
     def _callables(self, callables: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        """The callables that the engine calls; none for native environments."""
+        """The callables for the engine; an empty list for native environments, which do not need them."""
         if not self._native:
             return callables
-        others = sorted({call["method"] for call in callables} - {"_set_state", "_set_goal_state", "set_state"})
-        if others:
+        ignored = sorted({call["method"] for call in callables} - {"_set_state", "_set_goal_state", "set_state"})
+        if ignored:
             name = self.env_name.partition(",")[0]
-            warnings.warn(f"callables: {name} restores recorded states itself; {others} are not called", stacklevel=3)
+            warnings.warn(f"callables: {name} restores recorded states itself; {ignored} are not called", stacklevel=3)
         return []
 
     def _chosen(self, policy: Any) -> Any:
@@ -559,7 +559,7 @@ class World:
 
 
 class EnvPool:
-    """The environments of a world as policies get them in `set_env`: their number and spaces."""
+    """The interface of a world that `set_env` passes to policies: the number of environments and their spaces."""
 
     def __init__(self, world: World) -> None:
         self._world = world
@@ -610,7 +610,7 @@ class Metrics(dict):
     """The metrics of an evaluation.
 
     Keys: `success_rate` in percent; `interval`, its 95 % Wilson interval; `random_success_rate` and `random_interval`,
-    those of the random-policy floor; `episode_successes`, `seeds` and `steps`, one entry for each episode;
+    the same two metrics of the random-policy floor; `episode_successes`, `seeds` and `steps`, one entry for each episode;
     `solved_at_start`, the number of starts that satisfy the goal; `time_to_goal`, the steps of successful episodes;
     `plan_seconds`, the planning times; `videos`.
     """
@@ -665,26 +665,26 @@ class Metrics(dict):
 
     def __str__(self) -> str:
         low, high = self["interval"]
-        words = f"{self['success_rate']:.1f} % [{low:.0f}, {high:.0f}] of {len(self['seeds'])} episodes"
+        text = f"{self['success_rate']:.1f} % [{low:.0f}, {high:.0f}] of {len(self['seeds'])} episodes"
         if "random_success_rate" in self:
             low, high = self["random_interval"]
-            words += f", at random {self['random_success_rate']:.1f} % [{low:.0f}, {high:.0f}]"
-        return words
+            text += f", at random {self['random_success_rate']:.1f} % [{low:.0f}, {high:.0f}]"
+        return text
 
 
 def _percent(rate: float | None) -> float:
     return math.nan if rate is None else 100.0 * rate
 
 
-def _drawn() -> int:
-    """A random seed."""
+def _random_seed() -> int:
+    """A random seed of 32 bits."""
     return secrets.randbits(32)
 
 
 def _seed(seed: int | None) -> int:
     """The seed, or a random one for `None`."""
     if seed is None:
-        return _drawn()
+        return _random_seed()
     if int(seed) != seed or not 0 <= seed < 2**63:
         raise ValueError(f"seed: {seed}; expected a whole number from 0 to 2^63 - 1")
     return int(seed)
@@ -694,7 +694,8 @@ def _name(policy: Any) -> str:
     return str(getattr(policy, "type", None) or type(policy).__name__)
 
 
-def _varied(options: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+def _without_states(options: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+    """The options of many episodes, checked to contain no fixed state or goal state."""
     fixed = [name for name in ("state", "goal_state") if (options or {}).get(name) is not None]
     if fixed:
         raise ValueError(f"options: {fixed} would apply to every episode; pass them to World.reset")

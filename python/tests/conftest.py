@@ -1,4 +1,4 @@
-"""Every test has a home folder of its own, so that it finds no datasets and checkpoints of the user."""
+"""Gives every test its own home folder, so that tests do not find the datasets and checkpoints of the user."""
 
 import os
 import signal

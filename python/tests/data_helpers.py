@@ -8,7 +8,7 @@ LENGTHS = (12, 20, 9, 30)
 
 
 def episode(number, length, side=16):
-    """An episode whose pixels and values identify it."""
+    """An episode with pixels and values that depend on `number`."""
     random = np.random.default_rng(number)
     action = random.normal(size=(length, 2)).astype(np.float32)
     action[-1] = np.nan
@@ -36,7 +36,7 @@ def write(path, lengths=LENGTHS, **kwargs):
 
 
 def clips(written, num_steps, frameskip):
-    """All clips of some episodes, cut by hand: pixels channels first, actions a step one after another."""
+    """The expected clips of episodes: pixels channels first, the actions of each step joined."""
     span = num_steps * frameskip
     found = []
     for content in written:

@@ -1,4 +1,4 @@
-"""Reading: what was written comes back, as clips, chunks, columns and rows."""
+"""Reading: clips, chunks, columns and rows equal the written episodes."""
 
 import pickle
 import subprocess
@@ -78,7 +78,7 @@ def test_cached_and_merged_columns(stored):
     assert dataset.get_dim("both") == 6
 
 
-def test_transforms_see_rows_before_actions_are_grouped(stored):
+def test_transform_gets_rows_before_actions_are_grouped(stored):
     path, _, _ = stored
     seen = []
 
@@ -187,7 +187,7 @@ def test_goals_follow_the_clip(tmp_path):
     def drawn(chances, **kwargs):
         goals = data.GoalDataset(dataset, chances, goal_keys=keys, seed=3, **kwargs)
         samples = goals.__getitems__(range(len(goals)))
-        # The reward counts rows: what is ahead of the last step of the clip, in rows.
+        # The reward counts rows, so the difference is the distance from the clip's last step to the goal in rows.
         return goals, np.array([sample["goal"][0, 0] - sample["reward"][-1, 0] for sample in samples])
 
     goals, ahead = drawn((0, 0, 0, 1))
@@ -201,7 +201,7 @@ def test_goals_follow_the_clip(tmp_path):
     later = np.array([sample["goal"][0, 0] - sample["reward"][-1, 0] for sample in goals.__getitems__(range(len(goals)))])
     assert (later != ahead).any()
     _, ahead = drawn((1, 0, 0, 0))
-    assert (abs(ahead) > 30).any(), "of other episodes, too"
+    assert (abs(ahead) > 30).any(), "some goals are in other episodes"
     assert goals.clip_indices[0] == (0, 0)
     with pytest.raises(ValueError, match="add up to 1"):
         data.GoalDataset(dataset, (1, 1, 0, 0))

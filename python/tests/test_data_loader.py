@@ -1,4 +1,4 @@
-"""The loader: every clip once an epoch, the same order for the same seed, resumed, interrupted."""
+"""The loader: epochs, order, saved positions, goals, interrupts and errors."""
 
 import signal
 import subprocess
@@ -23,7 +23,7 @@ def loader(path, **kwargs):
 
 
 def identities(batches):
-    """What clips are in the batches: their first rewards, which are all different."""
+    """Identifies the clips of batches by their first rewards, which are all different."""
     return [batch["reward"][:, 0].ravel().tolist() for batch in batches]
 
 
@@ -67,7 +67,7 @@ def test_saved_position_continues_with_the_same_batches(stored):
         assert identities(resumed) == (epochs[0][stop:] if stop < 7 else epochs[1])
         if stop < 7:
             assert identities(resumed) == epochs[1]
-    # Who ends early gets the next epoch, not the same again.
+    # After an iteration that ended early, the next iteration yields the next epoch.
     next(iter(stopped := loader(path, seed=5)))
     assert identities(stopped) == epochs[1]
     with pytest.raises(ValueError, match="seed was 5 and is 6"):
@@ -89,7 +89,7 @@ def test_goals(stored):
         loader(path, goals=data.Goals(random=1.0))
 
 
-def test_transforms_see_rows(stored):
+def test_transform_gets_rows(stored):
     path, _ = stored
     plain = next(iter(loader(path)))
     transform = data.ColumnTransform(data.ZScoreScaler(mean=[0.0, 0.0], std=[2.0, 4.0]), "action", "action")

@@ -33,10 +33,10 @@ with open(sys.argv[2], "wb") as file:
 
 @pytest.mark.skipif(not REFERENCE, reason="SWM_REFERENCE_PYTHON names no Python with the reference")
 @pytest.mark.parametrize("name", ["a.lance", "a.h5"])
-def test_the_reference_reads_the_same(tmp_path, name):
+def test_reference_reads_the_same_samples(tmp_path, name):
     path, answer = tmp_path / name, tmp_path / "answer"
     write(path, codec="png" if name == "a.lance" else None)
-    # Not this package, which `PYTHONPATH` may name.
+    # `PYTHONPATH` may name this package instead of the reference.
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     subprocess.run([REFERENCE, "-c", READ, path, answer], check=True, env=environment, cwd=tmp_path, capture_output=True)
     theirs = np.load(answer, allow_pickle=True)
@@ -48,6 +48,6 @@ def test_the_reference_reads_the_same(tmp_path, name):
         assert set(found) == set(expected)
         for column, array in expected.items():
             assert found[column].shape == array.shape, column
-            # It stores some columns in single precision.
+            # The reference returns some columns in single precision.
             np.testing.assert_allclose(found[column], array, rtol=1e-6, err_msg=column)
     np.testing.assert_allclose(theirs["state"], ours.get_col_data("state"), rtol=1e-6)

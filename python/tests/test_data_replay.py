@@ -56,7 +56,7 @@ def test_user_defined_sampler():
         buffer.sample(3)
 
 
-def test_filters_loaders_dumps(tmp_path):
+def test_key_filter_loader_and_dump(tmp_path):
     buffer = data.ReplayBuffer(100, history_len=2, key_filter=data.classic_filter)
     buffer.write_episodes(episodes())
     assert buffer.column_names == ["pixels", "action", "reward", "terminated"]

@@ -16,10 +16,10 @@ def stored(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("workers", "context"), [(0, None), (2, "fork"), (2, "spawn")])
-def test_a_data_loader_gives_every_clip(stored, workers, context):
+def test_data_loader_yields_every_clip(stored, workers, context):
     path, written = stored
     dataset = data.load_dataset(path, num_steps=3, frameskip=2)
-    # The engine has threads here that a forked worker has not.
+    # Reading starts engine threads here, which a forked worker does not have.
     dataset.get_col_data("pixels")
     loader = torch.utils.data.DataLoader(dataset, 8, num_workers=workers, multiprocessing_context=context)
     expected = clips(written, 3, 2)

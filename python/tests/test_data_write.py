@@ -1,4 +1,4 @@
-"""Writing, formats of our own and of users, converting, examining."""
+"""Writing episodes, native and user-defined formats, conversion and examination."""
 
 import json
 import signal
@@ -43,7 +43,7 @@ def test_episodes_of_lists_and_other_types(tmp_path):
     sample = dataset[0]
     assert np.isnan(sample["action"][3]).all() and (sample["action"][:3] == [0, 1]).all()
     assert sample["half"].dtype == np.float32 and sample["small"].dtype == np.int32
-    assert dataset.get_col_data("step_idx").tolist() == [0, 1, 2, 3], "numbered by the writer"
+    assert dataset.get_col_data("step_idx").tolist() == [0, 1, 2, 3], "the writer computes the indices"
 
 
 def test_discrete_actions_that_are_missing(tmp_path):
@@ -100,7 +100,7 @@ def test_codecs(tmp_path):
 
 @pytest.fixture
 def numpy_format():
-    """A format that keeps a `.npz` file an episode."""
+    """A format that stores each episode in a `.npz` file."""
 
     class Reader(data.Dataset):
         def __init__(self, path, **kwargs):
@@ -165,18 +165,18 @@ def test_user_defined_format(tmp_path, numpy_format):
     written = write(tmp_path / "a.npzs")
     dataset = data.load_dataset(tmp_path / "a.npzs", num_steps=3, frameskip=2)
     assert dataset[0]["pixels"].shape == (3, 3, 16, 16) and dataset[0]["action"].shape == (3, 4)
-    # To ours and back.
+    # Conversion to Lance and back.
     report = data.convert(tmp_path / "a.npzs", tmp_path / "b.lance", progress=False)
     assert report["episodes"] == 4 and all(column["exact"] for column in report["columns"])
     report = data.convert(tmp_path / "b.lance", tmp_path / "c", dest_format="npz", progress=False)
     assert report == {"episodes": 4, "rows": 71}
     back = data.load_dataset(tmp_path / "c", format="npz")
-    for number, content in enumerate(written):
-        found = back.load_episode(number)
+    for index, content in enumerate(written):
+        found = back.load_episode(index)
         same({**found, "pixels": found["pixels"].transpose(0, 2, 3, 1)}, content)
     with pytest.raises(FileExistsError):
         data.convert(tmp_path / "b.lance", tmp_path / "c", dest_format="npz", progress=False)
-    # Our loader reads it, and what it gives is what ours gives.
+    # The loader returns the same batches from both formats.
     theirs = data.Loader(dataset, 8, backend="numpy")
     ours = data.Loader(tmp_path / "b.lance", 8, num_steps=3, frameskip=2, columns=dataset.column_names, backend="numpy")
     for a, b in zip(theirs, ours, strict=True):
@@ -193,7 +193,7 @@ def test_registering(numpy_format):
         data.register_format(type("Lance", (data.Format,), {"name": "lance"}))
     with pytest.raises(ValueError, match="needs a `name`"):
         data.register_format(type("Nameless", (data.Format,), {}))
-    assert data.register_format(numpy_format) is numpy_format, "again, as notebooks do"
+    assert data.register_format(numpy_format) is numpy_format, "the same class can be registered again"
     reads = type("Reads", (data.Format,), {"name": "reads"})
     with pytest.raises(NotImplementedError, match="'reads' cannot be written"):
         reads.open_writer("x")

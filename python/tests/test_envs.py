@@ -1,4 +1,4 @@
-"""Our environments as Gymnasium environments."""
+"""The native environments as Gymnasium environments."""
 
 import copy
 import pickle
@@ -13,12 +13,12 @@ from gymnasium.utils.env_checker import check_env
 
 import stable_worldmodel as swm
 
-#: What Gymnasium advises against, and an environment that other libraries know by these spaces keeps.
+#: Accepted warnings of Gymnasium's checker: the environments keep the spaces that other libraries define for them.
 ADVICE = ("we recommend using a symmetric and normalized space", "probably too low", "probably too high")
 
 
 def make(name, **options):
-    """An environment, or a skip where its assets are not installed."""
+    """Creates an environment; skips the test if its assets are not installed."""
     try:
         return gymnasium.make(name, **options)
     except ValueError as error:
@@ -64,7 +64,7 @@ def test_episode_depends_only_on_its_seed(name):
     assert image.shape == (40, 48, 3) and image.dtype == np.uint8 and image.std() > 0
     assert np.array_equal(image, other.render())
     assert one.unwrapped.render_goal().shape == (40, 48, 3)
-    # Without a seed, the next episode is another one, and follows from the last seed.
+    # Without a seed, the next episode differs, and the last seed determines it.
     (first, _), (second, _) = one.reset(), one.reset()
     same(first, other.reset()[0])
     with pytest.raises(AssertionError):

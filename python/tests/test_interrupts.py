@@ -53,14 +53,14 @@ def world():
     gymnasium.registry.pop("Fragile-v0")
 
 
-def test_an_environment_that_raises_in_step(world):
+def test_error_of_an_environment_step_is_raised(world):
     world.reset(seed=0)
     fragile = world.gym_envs[1].unwrapped
     fragile.breaks = (fragile.episodes, 3)
     with pytest.raises(Broken, match="step 3") as caught:
         for _ in range(5):
             world.step()
-    # Where it was raised is in the traceback.
+    # The traceback contains the environment's `step`.
     assert any(entry.name == "step" and "test_interrupts" in str(entry.path) for entry in caught.traceback)
     fragile.breaks = None
     world.reset(seed=1)
@@ -70,7 +70,7 @@ def test_an_environment_that_raises_in_step(world):
     assert world.truncateds.all() and (world.infos["observation"] == 5).all()
 
 
-def test_finished_episodes_outlive_an_error(world, tmp_path):
+def test_finished_episodes_are_stored_after_an_error(world, tmp_path):
     fragile = world.gym_envs[0].unwrapped
     fragile.breaks = (fragile.episodes + 4, 3)
     with pytest.raises(Broken):
@@ -78,13 +78,13 @@ def test_finished_episodes_outlive_an_error(world, tmp_path):
     data = swm.data.load_dataset(str(tmp_path / "d.lance"), backend="numpy")
     begun = data.num_episodes
     assert begun >= 4 and set(np.asarray(data.lengths).tolist()) == {6}
-    # And collecting goes on from there.
+    # Collection resumes after the stored episodes.
     fragile.breaks = None
     outcome = world.collect(tmp_path / "d.lance", episodes=10, seed=0, mode="resume", progress=False)
     assert outcome == {"episodes": 10, "added": 10 - begun, "steps": 5 * (10 - begun)}
 
 
-def test_an_evaluation_that_breaks_leaves_the_world_usable(world):
+def test_world_is_usable_after_a_failed_evaluation(world):
     fragile = world.gym_envs[0].unwrapped
     fragile.breaks = (fragile.episodes + 1, 2)
     with pytest.raises(Broken):
@@ -121,7 +121,7 @@ def test_ctrl_c_stops_an_evaluation(whose):
         child.kill()
 
 
-# Environments in processes of their own.
+# Environments in worker processes.
 
 
 def children(pid):
@@ -133,7 +133,7 @@ def children(pid):
 
 
 def gone(pids, seconds=10):
-    """Whether processes end in time."""
+    """Whether the processes end within `seconds`."""
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         if not any(os.path.exists(f"/proc/{pid}") for pid in pids):
@@ -155,7 +155,7 @@ def carts(**more):
     return world
 
 
-def test_a_killed_worker_is_replaced_in_mid_episode(unrendered):
+def test_killed_worker_is_replaced_during_an_episode(unrendered):
     before = set(children(os.getpid()))
     alone, apart = carts(), carts(workers=True)
     workers = set(children(os.getpid())) - before
@@ -186,7 +186,7 @@ world.evaluate(episodes=1_000_000, progress=False)
 
 
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_no_worker_outlives_the_program(unrendered, end):
+def test_workers_end_with_the_program(unrendered, end):
     child = subprocess.Popen([sys.executable, "-c", ABANDONED], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     assert child.stdout.readline().strip() == "ready"
     workers = children(child.pid)

@@ -57,11 +57,11 @@ def test_listing_of_the_full_loop(tmp_path, monkeypatch):
     print(metrics["success_rate"])
     assert 0 <= metrics["success_rate"] <= 100 and len(metrics["episode_successes"]) == 3
     assert len(list((tmp_path / "videos").glob("*.mp4"))) == 3
-    # Every environment is planned for as often as its plans, 5 steps each, run out.
+    # Every environment replans after the 5 steps of its plan.
     assert wm_policy.plans and {plan["slot"] for plan in wm_policy.plans} <= set(range(8))
 
 
-def test_a_world_of_any_id():
+def test_world_with_several_environments():
     world = swm.World("swm/PushT-v1", num_envs=8, image_shape=(64, 64))
     world.reset(seed=0)
     assert world.infos["pixels"].shape == (8, 1, 64, 64, 3)
@@ -110,7 +110,7 @@ def test_robustness_sweep_on_atari():
             one.step()
     assert world.infos["pixels"].shape == (2, 1, 84, 84, 3)
     assert not np.array_equal(world.infos["pixels"], plain.infos["pixels"])
-    # The game itself goes on as it would without them.
+    # The wrappers do not change the game.
     assert np.array_equal(world.infos["observation"], plain.infos["observation"])
     metrics = world.evaluate(episodes=2, eval_budget=5, seed=0)
     assert len(metrics["steps"]) == 2
@@ -154,7 +154,7 @@ def test_user_defined_solver():
     for _ in range(5):
         world.step()
         assert (world.infos["action"] == 1).all()
-    # The second plan starts from what the first one left.
+    # The second plan starts from the unexecuted part of the first plan.
     assert [envs for envs, _ in solver.calls] == [3, 3]
     assert solver.calls[0][1] is None and solver.calls[1][1].shape == (3, 2, 4)
     metrics = world.evaluate(episodes=4, seed=1, progress=False)
@@ -163,7 +163,7 @@ def test_user_defined_solver():
 
 def test_user_defined_format(tmp_path):
     class Npz:
-        """One file an episode."""
+        """Writes one file for each episode."""
 
         def __init__(self, folder):
             self.folder, self.count = folder, 0
@@ -231,7 +231,7 @@ def test_user_defined_format(tmp_path):
 
 
 class Corridor(gymnasium.Env):
-    """A dot on a line, of which the colour and the speed vary."""
+    """A dot on a line; its colour and speed are factors of variation."""
 
     metadata = {"render_modes": ["rgb_array"]}
 

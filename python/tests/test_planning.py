@@ -1,4 +1,4 @@
-"""Models of Python's in the engine's solvers."""
+"""The engine's solvers with models implemented in Python."""
 
 import json
 import os
@@ -20,7 +20,7 @@ from stable_worldmodel import solver as solvers  # noqa: E402
 
 BOX = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
 CHOICES = gymnasium.spaces.Discrete(3)
-#: Where the cheapest actions are, an environment each.
+#: The cheapest action of each environment.
 TARGETS = np.array([[0.5, -0.3], [-0.6, 0.2], [0.1, 0.8]], np.float32)
 
 
@@ -33,14 +33,14 @@ class Quadratic(torch.nn.Module):
 
 
 class Constrained(Quadratic):
-    """The first number of an action may be 0.2 at most."""
+    """Constrains the first element of an action to at most 0.2."""
 
     def get_constraints(self, info_dict, action_candidates):
         return action_candidates[..., 0] - 0.2
 
 
 class Prices(torch.nn.Module):
-    """Has a price for every choice: the one of the environment's target is free."""
+    """Every choice costs 1, except the environment's `choice`, which costs nothing."""
 
     def get_cost(self, info_dict, action_candidates):
         free = info_dict["choice"][:, :, -1, None, 0]
@@ -49,7 +49,7 @@ class Prices(torch.nn.Module):
 
 
 class Linear(torch.nn.Module):
-    """A point that every action moves: a `Dynamics`."""
+    """A `Dynamics` that adds the action to the latent."""
 
     latent_dim = 2
 
@@ -106,7 +106,7 @@ DISCRETE = [
 
 
 @pytest.mark.parametrize(("solver", "settings", "tolerance"), CONTINUOUS, ids=CONTINUOUS_IDS)
-def test_the_optimum_is_found(solver, settings, tolerance):
+def test_continuous_solvers_find_the_optimum(solver, settings, tolerance):
     found = configured(solver(Quadratic(), seed=3, **settings)).solve(infos())
     actions = found["actions"].numpy()
     assert actions.shape == (3, 3, 2) and actions.dtype == np.float32 and len(found["trace"]) == 3
@@ -116,19 +116,19 @@ def test_the_optimum_is_found(solver, settings, tolerance):
 
 
 @pytest.mark.parametrize(("solver", "settings"), DISCRETE, ids=["categorical-cem", "pgd"])
-def test_the_best_choices_are_found(solver, settings):
+def test_discrete_solvers_find_the_best_choices(solver, settings):
     actions = plan(solver(Prices(), **settings), space=CHOICES)
     assert actions.shape == (3, 3, 3)
     assert (actions.argmax(-1) == np.arange(3)[:, None]).all()
     # Two choices in one step of the model.
-    blocks = plan(solver(Prices2(), **settings), space=CHOICES, action_block=2).reshape(3, 3, 2, 3)
+    blocks = plan(solver(BlockPrices(), **settings), space=CHOICES, action_block=2).reshape(3, 3, 2, 3)
     assert (blocks.argmax(-1) == np.arange(3)[:, None, None]).all()
 
 
-class Prices2(Prices):
+class BlockPrices(Prices):
     def get_cost(self, info_dict, action_candidates):
         each = action_candidates.unflatten(-1, (2, 3)).movedim(3, 0)
-        return sum(super(Prices2, self).get_cost(info_dict, part) for part in each)
+        return sum(super(BlockPrices, self).get_cost(info_dict, part) for part in each)
 
 
 def test_constraints_hold():
@@ -139,15 +139,15 @@ def test_constraints_hold():
 
 
 def test_grasp_reaches_the_goal():
-    # A search that ends with a synchronisation: with actions that were fitted to a whole rollout.
+    # The search ends with a synchronisation, which fits the actions to a whole rollout.
     actions = plan(solvers.GRASPSolver(Linear(), n_steps=100, sync_every=50, sync_iterations=40))
     assert np.abs(actions.sum(1) - TARGETS).max() < 0.05
     with pytest.raises(AttributeError, match="latent_dim"):
 
-        class Untold(Linear):
+        class WithoutLatentDim(Linear):
             latent_dim = None
 
-        plan(solvers.GRASPSolver(Untold()))
+        plan(solvers.GRASPSolver(WithoutLatentDim()))
 
 
 def test_dynamics_are_rolled_out_by_an_evaluator():
@@ -158,7 +158,7 @@ def test_dynamics_are_rolled_out_by_an_evaluator():
         assert isinstance(evaluator, swm.planning.Costable) and isinstance(Linear(), swm.planning.Dynamics)
         actions = plan(solvers.CEMSolver(model, **settings))
         assert np.abs(actions.sum(1) - TARGETS).max() < 0.05
-    # By the gradient, through the rollout.
+    # The gradient passes through the rollout.
     actions = plan(solvers.GradientSolver(evaluator, num_samples=2, n_steps=60))
     assert np.abs(actions.sum(1) - TARGETS).max() < 0.05
     running = swm.planning.GoalDistance(2.0, running=True)
@@ -179,7 +179,7 @@ FEW = {"num_samples": 20, "n_steps": 3, "topk": 5}
 
 
 def few(solver, model, **more):
-    """A short search, by those of the settings that the solver has."""
+    """A solver with a short search: those settings of `FEW` that the solver has."""
     known = json.loads(_engine.solvers())[solver.id]
     settings = {name: value for name, value in FEW.items() if solver._names.get(name, name) in known}
     return solver(model, **settings, **more)
@@ -188,21 +188,21 @@ def few(solver, model, **more):
 @pytest.mark.parametrize(
     ("solver", "model", "space"), ALL, ids=[*CONTINUOUS_IDS, "lagrangian", "categorical-cem", "pgd", "grasp"]
 )
-def test_a_plan_depends_on_the_seed_and_on_its_own_infos_only(solver, model, space):
+def test_plan_depends_only_on_the_seed_and_the_infos_of_its_environment(solver, model, space):
     together = plan(few(solver, model, seed=8), space=space)
     for size in (1, 2):
         assert np.array_equal(plan(few(solver, model, seed=8, batch_size=size), space=space), together)
     # Environments planned alone and together get the same plans.
     assert np.array_equal(plan(few(solver, model, seed=8), slice(0, 1), space=space), together[:1])
     assert np.array_equal(plan(few(solver, model, seed=8), slice(0, 2), space=space), together[:2])
-    # Every call draws other numbers, the same ones in the same order.
+    # Every call uses new random numbers; the same sequence of calls returns the same plans.
     one, other = (configured(few(solver, model, seed=8), space) for _ in range(2))
     calls = [[solver.solve(infos())["actions"] for _ in range(2)] for solver in (one, other)]
     assert all(torch.equal(*pair) for pair in zip(*calls, strict=True))
     assert np.array_equal(calls[0][0], together)
 
 
-def test_a_numpy_model_sees_no_torch():
+def test_numpy_model_gets_numpy_candidates():
     actions = plan(solvers.CEMSolver(NumpyQuadratic(), num_samples=200, n_steps=15, topk=20))
     assert np.abs(actions - TARGETS[:, None]).max() < 0.02
     with pytest.raises(ValueError, match="gradient"):
@@ -213,46 +213,46 @@ def test_search_starts_from_the_initial_actions():
     solver = configured(solvers.CEMSolver(Quadratic(), num_samples=30, n_steps=1, topk=3, var_scale=1e-4))
     init = np.full((3, 3, 2), 0.25, np.float32)
     assert np.allclose(solver.solve(infos(), init_action=init)["actions"], 0.25, atol=1e-2)
-    # A shorter one is filled with zeros.
+    # Shorter initial actions are padded with zeros.
     short = solver.solve(infos(), init_action=torch.from_numpy(init[:, :1]))["actions"]
     assert np.allclose(short[:, 0], 0.25, atol=1e-2) and np.allclose(short[:, 1:], 0, atol=1e-2)
     with pytest.raises(ValueError, match="init_action"):
         solver.solve(infos(), init_action=np.zeros((3, 4, 2)))
 
 
-def test_a_model_is_in_inference_mode_but_for_gradients():
+def test_model_runs_in_inference_mode_except_for_gradients():
     seen = []
 
-    class Watching(Quadratic):
+    class Recording(Quadratic):
         def get_cost(self, info_dict, action_candidates):
             seen.append((torch.is_inference_mode_enabled(), self.training, action_candidates.requires_grad))
             return super().get_cost(info_dict, action_candidates)
 
-    plan(few(solvers.CEMSolver, Watching()))
+    plan(few(solvers.CEMSolver, Recording()))
     assert set(seen) == {(True, False, False)}
     seen.clear()
-    plan(few(solvers.GradientSolver, Watching()))
+    plan(few(solvers.GradientSolver, Recording()))
     assert (False, False, True) in seen
 
 
 def test_infos_cached_by_a_model_stay_for_the_search():
     computed = []
 
-    class Keeping(Quadratic):
+    class Caching(Quadratic):
         def get_cost(self, info_dict, action_candidates):
             if "encoded" not in info_dict:
                 computed.append(len(action_candidates))
                 info_dict["encoded"] = info_dict["target"] * 1.0
             return super().get_cost({"target": info_dict["encoded"]}, action_candidates)
 
-    solver = configured(few(solvers.CEMSolver, Keeping()))
+    solver = configured(few(solvers.CEMSolver, Caching()))
     solver.solve(infos())
     assert computed == [3]
     solver.solve(infos())
     assert computed == [3, 3]
 
 
-# What goes wrong.
+# Errors.
 
 
 class MyError(Exception):
@@ -290,18 +290,18 @@ WRONG = [
 
 @pytest.mark.parametrize(("how", "error", "words"), WRONG, ids=[how for how, _, _ in WRONG])
 @pytest.mark.parametrize("solver", [solvers.CEMSolver, solvers.MPPISolver, solvers.GradientSolver])
-def test_a_wrong_model_gets_a_clear_error(solver, how, error, words):
+def test_wrong_model_raises_a_clear_error(solver, how, error, words):
     with pytest.raises(error, match=words):
         plan(few(solver, Wrong(how)))
 
 
 @pytest.mark.parametrize(("how", "error", "words"), WRONG, ids=[how for how, _, _ in WRONG])
-def test_a_wrong_model_stops_an_evaluation(how, error, words):
+def test_wrong_model_stops_an_evaluation(how, error, words):
     world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(16, 16), max_episode_steps=8)
     world.set_policy(swm.policy.MPCPolicy(few(solvers.CEMSolver, Wrong(how))))
     with pytest.raises(error, match=words):
         world.evaluate(episodes=2, seed=0, progress=False)
-    # The world is as good as before.
+    # The world remains usable.
     world.set_policy(swm.policy.RandomPolicy(seed=0))
     assert len(world.evaluate(episodes=2, seed=0, progress=False)["steps"]) == 2
 
@@ -336,7 +336,7 @@ def test_wrong_arguments_raise_clear_errors(make, error, words):
 
 
 class ToGoal(torch.nn.Module):
-    """Walks to the goal of a two-room world, in a straight line."""
+    """A cost that is least for an action along the straight line to the goal state."""
 
     def __init__(self, dtype=torch.float32):
         super().__init__()
@@ -349,8 +349,8 @@ class ToGoal(torch.nn.Module):
         return ((action_candidates.unflatten(-1, (-1, 2)).sum((2, 3)) - way) ** 2).sum(-1)
 
 
-class Followed:
-    """A solver of the engine that looks like one of Python's."""
+class Wrapped:
+    """A user-defined solver that calls a solver of the engine."""
 
     def __init__(self, solver):
         self.solver = solver
@@ -380,21 +380,21 @@ def played(policy, steps=18, envs=2):
 @pytest.mark.parametrize("warm", [True, False])
 @pytest.mark.parametrize("process", [False, True])
 def test_the_engine_executes_plans_as_python_does(warm, process):
-    # Without noise, a search depends on where it starts alone: on warm starts, and on where an episode begins.
+    # Without noise, a search depends only on its initial actions: on warm starts and on the start of an episode.
     config = swm.PlanConfig(horizon=3, receding_horizon=2, action_block=2, warm_start=warm)
     scaler = swm.data.ZScoreScaler(np.array([0.1, -0.1], np.float32), np.array([0.5, 0.8], np.float32))
     settings = {"num_samples": 1, "n_steps": 3, "var_scale": 0.0}
     given = {"config": config, "process": {"action": scaler} if process else None}
-    # Bounds of model units are the engine's to know; Python's solvers are told the action space.
+    # The engine converts bounds to the model's units; user-defined solvers get the action space. Small actions meet both.
     small = ToGoal()
     small.weight.data *= 0.02
     ours = played(swm.policy.MPCPolicy(solvers.GradientSolver(small, **settings), **given))
-    python = played(swm.policy.MPCPolicy(Followed(solvers.GradientSolver(small, **settings)), **given))
+    python = played(swm.policy.MPCPolicy(Wrapped(solvers.GradientSolver(small, **settings)), **given))
     for one, other in zip(ours, python, strict=True):
         assert np.allclose(one, other, atol=1e-6, equal_nan=True)
     if not process:
         assert np.array_equal(ours[0], python[0], equal_nan=True)
-    # They move, and episodes end on the way.
+    # The actions vary, and some episodes end.
     assert np.nanstd(ours[0]) > 1e-4 and (np.diff(ours[2], axis=0) < 0).any()
 
 
@@ -408,7 +408,7 @@ def test_plans_do_not_depend_on_the_slot():
 
 
 def test_planning_reaches_goals():
-    # The way to the goal within a room: every step moves the agent by what the action says, times a speed.
+    # Within a room, every step moves the agent by the action times a speed.
     model = ToGoal()
     model.weight.data *= 5
     policy = swm.policy.MPCPolicy(solvers.CEMSolver(model, num_samples=60, n_steps=4, topk=8), swm.PlanConfig(2, 1))
@@ -441,7 +441,7 @@ def test_model_gets_scaled_infos():
     image = torch.from_numpy(begun).movedim(-1, 1)[:, :, ::2, ::2].double() / 255
     for frame in range(3):
         assert torch.allclose(first["pixels"][:, 0, frame], image)
-    # Frames are a model step of two environment steps apart: the third plan sees all three.
+    # Frames are one model step (two environment steps) apart, so the third plan has three different frames.
     assert torch.allclose(last["pixels"][:, 0, 0], image) and not torch.equal(last["pixels"][:, 0, 2], image)
     assert last["history_action"].shape == (3, 20, 2, 4)
     assert np.allclose(last["state"][:, 0], (states[4] - [100, 50]) / [10, 20])
@@ -449,12 +449,12 @@ def test_model_gets_scaled_infos():
 
 
 def test_history_requires_an_engine_solver():
-    policy = swm.policy.MPCPolicy(Followed(few(solvers.CEMSolver, ToGoal())), swm.PlanConfig(history_len=2))
+    policy = swm.policy.MPCPolicy(Wrapped(few(solvers.CEMSolver, ToGoal())), swm.PlanConfig(history_len=2))
     with pytest.raises(ValueError, match="history_len: 2"):
         rooms().evaluate(policy=policy, episodes=1, progress=False)
 
 
-def test_a_scaler_that_is_not_linear_scales_plans_back():
+def test_nonlinear_scaler_converts_plans_back():
     class Cubic:
         def transform(self, x):
             return np.cbrt(x)
@@ -482,7 +482,7 @@ def test_discrete_actions_are_planned_and_executed():
 
     config = swm.PlanConfig(horizon=3, receding_horizon=2, action_block=2)
     engine = solvers.CategoricalCEMSolver(Right(), num_samples=60, n_steps=4, topk=8)
-    for solver in (engine, Followed(solvers.PGDSolver(Right()))):
+    for solver in (engine, Wrapped(solvers.PGDSolver(Right()))):
         world = swm.World("swm/CartPoleControl-v1", num_envs=2, image_shape=(16, 16))
         world.set_policy(swm.policy.MPCPolicy(solver, config))
         world.reset(seed=0)
@@ -528,7 +528,7 @@ def test_ctrl_c_interrupts_a_slow_model_at_once(where):
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
-def test_a_model_on_a_gpu_plans_as_on_the_cpu():
+def test_plans_on_gpu_and_cpu_agree():
     kinds = [(solvers.CEMSolver, Quadratic()), (solvers.GradientSolver, Quadratic()), (solvers.GRASPSolver, Linear())]
     for solver, model in kinds:
         on = [plan(few(solver, model.to(device), device=device)) for device in ("cpu", "cuda")]

@@ -1,4 +1,4 @@
-"""Gymnasium environments that start at recorded states, in this interpreter and in processes of their own."""
+"""Evaluations of Gymnasium environments from recorded states, in this interpreter and in worker processes."""
 
 import os
 import signal
@@ -12,7 +12,7 @@ from test_interrupts import children
 
 import stable_worldmodel as swm
 
-#: A module that worker processes import, too.
+#: The source of a module that the tests and the worker processes import.
 MODULE = '''
 import os
 import signal
@@ -23,7 +23,7 @@ from gymnasium import spaces
 
 
 class Field(gymnasium.Env):
-    """A point that looks for another, in a wind that the seed decides."""
+    """A point with a goal position, in a wind that the seed determines."""
 
     metadata = {"render_modes": ["rgb_array"]}
 
@@ -64,7 +64,7 @@ class Field(gymnasium.Env):
 
 
 class Quiet(Field):
-    """The same without names that say what they do."""
+    """A `Field` whose setters do not have the default names."""
 
     _set_state = _set_goal_state = None
 
@@ -90,7 +90,7 @@ OWN = [
 
 
 class Seeking(swm.policy.BasePolicy):
-    """Goes to the goal that the infos show; notes what it saw."""
+    """Moves to the goal state of the infos; records the infos of the first step of every episode."""
 
     def __init__(self):
         super().__init__()
@@ -106,7 +106,7 @@ class Seeking(swm.policy.BasePolicy):
 
 @pytest.fixture
 def fields(tmp_path, monkeypatch):
-    """The module, importable here and in workers; it gives the name of an environment in it."""
+    """Makes the module importable here and in workers; yields a function from a class name to an environment id."""
     (tmp_path / "fields_of_mine.py").write_text(MODULE)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
@@ -133,7 +133,7 @@ def evaluate(world, dataset, policy=None, **more):
 
 
 @pytest.mark.parametrize(("name", "callables"), [("Field", CALLABLES), ("Field", None), ("Quiet", OWN)])
-def test_episodes_start_where_they_were_recorded(fields, recorded, name, callables):
+def test_episodes_start_at_recorded_states(fields, recorded, name, callables):
     found = []
     for envs, workers in ((2, False), (3, True), (5, False)):
         world, policy = swm.World(fields(name), num_envs=envs, image_shape=(32, 32), workers=workers), Seeking()
@@ -154,7 +154,7 @@ def test_episodes_start_where_they_were_recorded(fields, recorded, name, callabl
     assert found[0] == found[1] == found[2]
 
 
-def test_a_worker_that_dies_starts_there_again(fields, recorded, tmp_path):
+def test_restarted_worker_starts_at_the_recorded_state(fields, recorded, tmp_path):
     wanted = evaluate(
         swm.World(fields("Field"), num_envs=2, image_shape=None, add_pixels=False), recorded, floor=False, policy=Blind()
     )
@@ -166,13 +166,13 @@ def test_a_worker_that_dies_starts_there_again(fields, recorded, tmp_path):
 
 
 class Blind(Seeking):
-    """An environment without frames."""
+    """A policy for an environment without frames."""
 
     def get_action(self, infos, **kwargs):
         return super().get_action({**infos, "goal": infos["state"]})
 
 
-def test_a_worker_killed_between_steps_is_replaced(fields, recorded):
+def test_worker_killed_between_steps_is_replaced(fields, recorded):
     class Killing(Seeking):
         killed = False
 

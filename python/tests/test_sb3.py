@@ -1,4 +1,4 @@
-"""Stable-Baselines3 trains on our environments as they are."""
+"""Stable-Baselines3 trains on the native environments without adapters."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def test_ppo_learns_to_balance_a_pole():
     def reward():
         return evaluate_policy(model, envs("swm/CartPoleControl-v1", 4), n_eval_episodes=12, deterministic=False)[0]
 
-    # Nobody has learned yet: it acts nearly at random.
+    # The untrained model acts nearly at random.
     before = reward()
     model.learn(4096)
     after = reward()
@@ -49,7 +49,7 @@ def test_sac_runs_on_continuous_actions():
 
 
 @pytest.mark.parametrize("name", ["swm/PushT-v1", "swm/PushT-Discrete-v1"])
-def test_dictionaries_of_observations(name):
+def test_dict_observations(name):
     model = sb3.PPO("MultiInputPolicy", envs(name, 2), n_steps=8, batch_size=16, n_epochs=1, seed=0)
     model.learn(32)
     observation = model.env.reset()

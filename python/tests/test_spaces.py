@@ -19,7 +19,7 @@ def factors():
     )
 
 
-def test_a_space_has_a_default_a_value_and_a_condition():
+def test_space_has_a_default_a_value_and_a_condition():
     space = factors()
     assert space.names() == ["agent.color", "agent.x", "shape"]
     assert space.sampling_order == ["agent", "agent.color", "agent.x", "shape"]

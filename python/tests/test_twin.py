@@ -1,8 +1,8 @@
-"""A torch model and its Burn twin give the same plan for one seed.
+"""A torch model and a Burn model with the same weights give the same plan for the same seed.
 
-The Burn model is a small LeWM that the engine trains here; the torch model loads the same weights under their published
-names, and computes what the engine's documentation says a LeWM computes. The two sum in another order, so their costs differ in
-the last bits of single precision, and no more.
+The engine trains the Burn model, a small LeWM. The torch model loads its weights under their published names and implements
+LeWM as the engine documents it. The two models sum in different orders, so their costs differ only in the last bits of
+single precision.
 """
 
 import json
@@ -71,7 +71,7 @@ class Attention(nn.Module):
         self.to_out = nn.Sequential(nn.Linear(inner, dim))
 
     def forward(self, x):
-        # A history of one: a token attends to itself alone, and gets its value.
+        # With a history of 1, a token attends only to itself, so the result is its value.
         return self.to_out(self.to_qkv(self.norm(x)).chunk(3, -1)[2])
 
 
@@ -163,7 +163,7 @@ class TorchLewm(nn.Module):
 
 
 def tensors(path):
-    """What a safetensors file holds."""
+    """The tensors of a safetensors file, by name."""
     data = Path(path).read_bytes()
     (length,) = struct.unpack("<Q", data[:8])
     header = json.loads(data[8 : 8 + length])
@@ -182,7 +182,7 @@ def rooms(**more):
 
 @pytest.fixture(scope="module")
 def twins(tmp_path_factory):
-    """The engine's model and torch's."""
+    """The engine's model and the torch model."""
     folder = tmp_path_factory.mktemp("twin")
     world = rooms()
     world.set_policy(swm.policy.RandomPolicy(seed=0))
@@ -214,7 +214,7 @@ def infos():
 
 
 def in_model_units(card):
-    """The action space of the world, as both models mean it."""
+    """The action space of the world in the models' units."""
     mean, std = (np.asarray(card[name], np.float32) for name in ("action_mean", "action_std"))
     return gymnasium.spaces.Box((-1 - mean) / std, (1 - mean) / std, dtype=np.float32)
 
@@ -228,13 +228,13 @@ def test_costs_are_the_same(twins, infos):
         repeated = {key: torch.from_numpy(value)[:, None].expand(-1, 20, *value.shape[1:]) for key, value in infos.items()}
         cost = twin.get_cost(repeated, torch.from_numpy(candidates)).numpy()
     assert np.allclose(cost, expected, rtol=1e-4, atol=1e-5 * expected.max())
-    # They say something: candidates and environments differ.
+    # The comparison is not trivial: the costs of candidates differ.
     assert expected.std(1).min() > 1e-3 * expected.mean()
 
 
-#: How far plans may be apart, as a share of their largest number; a few millionths have been seen. Few iterations, because
-#: searches amplify last bits: where two samples at the edge of CEM's elites cost nearly the same, the models may disagree
-#: about which one is in; and Adam begins with the signs of gradients, however small these are.
+#: The maximum difference of plans, relative to their largest element; measured differences are a few millionths. Searches
+#: run few iterations, because they amplify rounding errors: with two samples of nearly equal cost, CEM may choose different
+#: elites, and the first steps of Adam follow the signs of gradients, even of tiny ones.
 TOLERANCE = 1e-4
 
 SOLVERS = [
@@ -255,11 +255,11 @@ def test_plans_are_the_same(twins, infos, solver, settings):
         planner = solver(model, seed=5, **settings)
         planner.configure(action_space=space, n_envs=3, config=config)
         plans.append(planner.solve(infos))
-    ours, torchs = (plan["actions"].numpy() for plan in plans)
+    ours, theirs = (plan["actions"].numpy() for plan in plans)
     assert ours.shape == (3, 4, 10)
-    assert np.abs(ours - torchs).max() < TOLERANCE * np.abs(ours).max()
+    assert np.abs(ours - theirs).max() < TOLERANCE * np.abs(ours).max()
     assert np.allclose(plans[0]["costs"], plans[1]["costs"], rtol=1e-4)
-    # Not because the plans are nothing: they differ between environments and between seeds.
+    # The comparison is not trivial: plans differ between environments and between seeds.
     other = solver(burn, seed=6, **settings)
     other.configure(action_space=gymnasium.spaces.Box(-1, 1, (2,), np.float32), n_envs=3, config=config)
     assert np.abs(other.solve(infos)["actions"].numpy() - ours).max() > 10 * TOLERANCE * np.abs(ours).max()
@@ -297,9 +297,9 @@ def test_engine_model_accepts_numpy_and_torch(twins, infos):
         repeated = {key: torch.from_numpy(value)[:, None].expand(-1, samples, *value.shape[1:]) for key, value in infos.items()}
         cost = burn.get_cost(repeated, asked.expand(-1, samples, -1, -1))
         assert torch.is_tensor(cost) and np.array_equal(cost.numpy(), np.repeat(expected, samples, 1))
-    # Several moments, of which the last one counts, as many as candidates.
-    moments = {key: np.concatenate([np.zeros_like(value), value], 1) for key, value in infos.items()}
-    assert np.array_equal(burn.get_cost(moments, np.repeat(candidates, 2, 1)), np.repeat(expected, 2, 1))
+    # Infos of several steps (as many as candidates), of which the last step counts.
+    steps = {key: np.concatenate([np.zeros_like(value), value], 1) for key, value in infos.items()}
+    assert np.array_equal(burn.get_cost(steps, np.repeat(candidates, 2, 1)), np.repeat(expected, 2, 1))
 
 
 def test_engine_model_reports_wrong_inputs(twins, infos):

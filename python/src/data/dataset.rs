@@ -14,7 +14,7 @@ use swm::core::{Batch, ColumnSpec, Error, Result, Schema};
 use swm::data::{CacheConfig, FORMATS, Reader, StepRange, views};
 use swm::home;
 
-/// Opens a reader; called again in a forked process.
+/// A function that opens a reader. A forked process calls the function again.
 type Open = Arc<dyn Fn() -> Result<Arc<dyn Reader>> + Send + Sync>;
 
 /// A dataset, or a view of one or several datasets.
@@ -31,7 +31,7 @@ struct Opened {
 }
 
 impl Dataset {
-    /// A dataset that `open` opens, now and again after a fork.
+    /// Opens a dataset with `open`, which forked processes call again.
     ///
     /// # Errors
     /// The error of `open`.
@@ -40,16 +40,16 @@ impl Dataset {
         Ok(Self { open, opened: Mutex::new(Opened { process: std::process::id(), reader }) })
     }
 
-    /// The reader for this process.
+    /// Returns the reader of this process. A forked process opens a new reader.
     ///
     /// # Errors
-    /// If the reader must be opened again in a forked process and that fails.
+    /// If a forked process cannot open its reader.
     pub fn reader(&self) -> Result<Arc<dyn Reader>> {
         let mut opened = self.opened.lock().unwrap_or_else(PoisonError::into_inner);
         let process = std::process::id();
         if opened.process != process {
             let reader = (self.open)()?;
-            // Dropping the parent's reader could wait for threads that this process does not have.
+            // Dropping the parent's reader could wait for threads that the forked process does not have.
             std::mem::forget(std::mem::replace(&mut opened.reader, reader));
             opened.process = process;
         }
@@ -152,8 +152,9 @@ impl Dataset {
         Ok(dict)
     }
 
-    /// Reads the rows `starts[i] .. starts[i] + lengths[i]` of `episodes[i]`, for all `i` in one pass, concatenated. The
-    /// `action` column has all rows, other columns the first row of each run and every `frameskip`-th row after it.
+    /// Reads the rows `starts[i] .. starts[i] + lengths[i]` of `episodes[i]` for all `i` (runs) in one pass, and
+    /// concatenates them. The `action` column has all rows of a run; other columns have every `frameskip`-th row, from
+    /// the first row of the run on.
     ///
     /// # Shapes
     /// `episodes`, `starts`, `lengths`: `[runs]`; each column: `[rows, ..]`.
@@ -184,7 +185,7 @@ impl Dataset {
             runs.push(StepRange::new(episode, start, length));
         }
         let batch = detached(py, || read(&*self.reader()?, &names, &runs, frameskip)).map_err(to_py_err)?;
-        // The columns differ in their number of rows, so each is a batch of its own.
+        // The columns differ in their number of rows, so each column is a separate batch.
         let dict = PyDict::new(py);
         for column in batch {
             dict.update(columns(py, BatchMemory::Owned(column))?.as_mapping())?;
@@ -193,20 +194,21 @@ impl Dataset {
     }
 }
 
+/// Reads each column as one batch: all rows of `action`, every `frameskip`-th row of other columns.
 fn read(reader: &dyn Reader, names: &[String], runs: &[StepRange], frameskip: usize) -> Result<Vec<Batch>> {
-    let frames: Vec<StepRange> = match frameskip {
+    let skipped: Vec<StepRange> = match frameskip {
         1 => vec![],
         _ => runs
             .iter()
             .flat_map(|run| (0..run.length).step_by(frameskip).map(|at| StepRange::new(run.episode, run.start + at, 1)))
             .collect(),
     };
-    let one = |name: &String| {
-        let runs = if name == ACTION || frameskip == 1 { runs } else { &frames };
+    let read_one = |name: &String| {
+        let runs = if name == ACTION || frameskip == 1 { runs } else { &skipped };
         let spec: ColumnSpec = reader.schema().column(name)?.clone();
         let mut batch = Batch::zeros(&Schema::new([spec])?, runs.iter().map(|run| run.length).sum());
         reader.read_column(name, runs, batch.bytes_mut(0))?;
         Ok(batch)
     };
-    names.iter().map(one).collect()
+    names.iter().map(read_one).collect()
 }

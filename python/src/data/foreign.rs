@@ -9,11 +9,12 @@ use swm::core::columns::{EPISODE_IDX, STEP_IDX};
 use swm::core::{Batch, Error, Manifest, Result, Schema};
 use swm::data::{Constants, Episode, Reader, StepRange, Writer, checksum};
 
-/// The columns with the indices of episodes and steps, which the engine computes.
-const NUMBERING: [&str; 2] = [EPISODE_IDX, STEP_IDX];
+/// The columns with the indices of episodes and steps. The engine computes their values.
+const INDEX_COLUMNS: [&str; 2] = [EPISODE_IDX, STEP_IDX];
 
-/// A reader implemented by a Python object. The object has `schema()`, a list of `(name, type, shape)`; `lengths()`, the
-/// rows of every episode; and `rows(column, episode, start, length)`, an array `[length, ..]` of the column's type.
+/// A reader implemented by a Python object with three methods: `schema()` returns a list of `(name, type, shape)`;
+/// `lengths()` returns the number of rows of every episode; `rows(column, episode, start, length)` returns an array
+/// `[length, ..]` of the column's type.
 pub struct ForeignReader {
     object: Py<PyAny>,
     schema: Schema,
@@ -27,8 +28,8 @@ impl ForeignReader {
     /// If the object raises, or a column has a type that cannot be stored.
     pub fn new(py: Python<'_>, object: Py<PyAny>) -> PyResult<Self> {
         let given: Vec<Column> = object.call_method0(py, "schema")?.extract(py)?;
-        let indices = NUMBERING.map(|name| (name.to_owned(), "int64".to_owned(), vec![]));
-        let data = given.into_iter().filter(|(name, ..)| !NUMBERING.contains(&name.as_str()));
+        let indices = INDEX_COLUMNS.map(|name| (name.to_owned(), "int64".to_owned(), vec![]));
+        let data = given.into_iter().filter(|(name, ..)| !INDEX_COLUMNS.contains(&name.as_str()));
         let schema = schema(indices.into_iter().chain(data).collect())?;
         let lengths: Vec<usize> = object.call_method0(py, "lengths")?.extract(py)?;
         let episodes = lengths.into_iter().enumerate().map(|(i, length)| Episode { index: i as i64, length }).collect();
@@ -78,11 +79,11 @@ impl Reader for ForeignReader {
                 let given = format!("{} rows from row {} of episode {}", range.length, range.start, range.episode);
                 return Err(Error::mismatch("reading rows", given, "rows inside the episode"));
             }
-            let Some((target, others)) = rest.split_at_mut_checked(range.length * n) else {
+            let Some((target, remaining)) = rest.split_at_mut_checked(range.length * n) else {
                 return Err(Error::mismatch("reading rows", "a buffer that is too small", "room for every row"));
             };
-            rest = others;
-            if let Some(which) = NUMBERING.iter().position(|&name| name == column) {
+            rest = remaining;
+            if let Some(which) = INDEX_COLUMNS.iter().position(|&name| name == column) {
                 for (row, target) in target.chunks_exact_mut(n).enumerate() {
                     let index = if which == 0 { range.episode } else { range.start + row } as i64;
                     target.copy_from_slice(&index.to_ne_bytes());
@@ -98,7 +99,7 @@ impl Reader for ForeignReader {
         None
     }
 
-    /// The size on disk is unknown to the engine.
+    /// Returns no sizes, because the engine does not know the files of a Python reader.
     fn footprint(&self) -> Result<Vec<(String, u64)>> {
         Ok(vec![])
     }
@@ -108,8 +109,8 @@ impl Reader for ForeignReader {
     }
 }
 
-/// A writer that passes episodes to a Python object: `write_episode({column: array [rows, ..]})`. The constants of an episode
-/// are not passed on.
+/// A writer that passes episodes to a Python object: `write_episode({column: array [rows, ..]})`. The object does not
+/// get the constants of an episode.
 pub struct ForeignWriter {
     object: Py<PyAny>,
     episodes: usize,
@@ -127,7 +128,7 @@ impl Writer for ForeignWriter {
         let write = |py: Python<'_>| {
             let dict = PyDict::new(py);
             for (i, column) in episode.schema().columns().iter().enumerate() {
-                if !NUMBERING.contains(&column.name.as_str()) {
+                if !INDEX_COLUMNS.contains(&column.name.as_str()) {
                     let shape: Vec<usize> =
                         std::iter::once(episode.rows()).chain(column.shape.iter().copied()).collect();
                     dict.set_item(&column.name, arrays::array(py, column.dtype, &shape, episode.bytes(i))?)?;

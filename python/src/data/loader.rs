@@ -30,7 +30,7 @@ struct Options {
     episodes: Option<Vec<usize>>,
     /// Size of the cache of decoded rows in bytes; 0 disables it.
     cache: usize,
-    /// The folder of the cache; in memory if `None`.
+    /// The folder of a cache on disk; `None` selects a cache in memory.
     cache_dir: Option<PathBuf>,
 }
 
@@ -58,8 +58,8 @@ impl Options {
     }
 }
 
-/// An object that owns threads. Dropping it ends them without the GIL, which they may wait for; in a process forked
-/// later it is leaked, because that process does not have the threads.
+/// An object that owns threads. Dropping the object releases the GIL, because the threads may wait for it, and ends the
+/// threads. A forked process leaks the object, because that process does not have the threads.
 struct Threaded<T: Send + 'static> {
     inner: Arc<Mutex<Option<T>>>,
     process: u32,
@@ -78,7 +78,7 @@ impl<T: Send> Threaded<T> {
     /// Calls `work` with the inner object.
     ///
     /// # Errors
-    /// The error of `work`, or if the object belongs to another process or was ended with the interpreter.
+    /// The error of `work`; an error if the object belongs to another process, or if its threads have ended.
     fn with<R>(&self, work: impl FnOnce(&mut T) -> Result<R>) -> Result<R> {
         if self.process != std::process::id() {
             let problem = "it was made in the process that this one was forked from";
@@ -124,8 +124,8 @@ fn lock<T: ?Sized>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Ends the threads of all loaders. Call it before the interpreter shuts down: a thread that takes the GIL of an interpreter
-/// in shutdown crashes the process.
+/// Ends the threads of all loaders. Python calls this function before the interpreter shuts down, because a thread that
+/// takes the GIL during the shutdown crashes the process.
 #[pyfunction]
 pub fn end_loaders(py: Python<'_>) {
     if !is_forked() {

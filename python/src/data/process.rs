@@ -1,21 +1,24 @@
-//! Support for forked processes, such as the workers of a torch `DataLoader`. A forked process has the memory of its parent
-//! and none of its threads, so waiting for a thread of the parent never returns. Forked processes therefore open datasets
-//! again and run the engine on one thread of their own (one, because there are usually several such processes).
+//! Support for forked processes, such as the workers of a torch `DataLoader`.
+//!
+//! A forked process has the memory of its parent but not the parent's threads, so waiting for one of them never ends.
+//! Forked processes therefore open datasets again, and run the engine on one new thread each (one, because there are
+//! usually several forked processes).
 
 use pyo3::prelude::*;
 use std::sync::{Mutex, OnceLock, PoisonError};
 use swm::core::{Error, Result};
 
-static FIRST: OnceLock<u32> = OnceLock::new();
+/// The id of the process that loaded the engine.
+static LOADING_PROCESS: OnceLock<u32> = OnceLock::new();
 
 /// Records the id of the process that loads the engine and owns its threads.
 pub fn record_process() {
-    FIRST.get_or_init(std::process::id);
+    LOADING_PROCESS.get_or_init(std::process::id);
 }
 
 /// Whether this process was forked from the process that loaded the engine.
 pub fn is_forked() -> bool {
-    *FIRST.get_or_init(std::process::id) != std::process::id()
+    *LOADING_PROCESS.get_or_init(std::process::id) != std::process::id()
 }
 
 /// Runs `work` without the GIL; in a forked process, on the thread pool of that process.
@@ -28,17 +31,17 @@ pub fn detached<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T> + Send
 
 /// The thread pool of this forked process, leaked because it lives until the process ends.
 fn forked_pool() -> Result<&'static rayon::ThreadPool> {
-    static THREADS: Mutex<Option<(u32, &'static rayon::ThreadPool)>> = Mutex::new(None);
-    let mut made = THREADS.lock().unwrap_or_else(PoisonError::into_inner);
+    static POOL: Mutex<Option<(u32, &'static rayon::ThreadPool)>> = Mutex::new(None);
+    let mut made = POOL.lock().unwrap_or_else(PoisonError::into_inner);
     let process = std::process::id();
-    if let Some((owner, threads)) = *made
+    if let Some((owner, pool)) = *made
         && owner == process
     {
-        return Ok(threads);
+        return Ok(pool);
     }
-    let threads = rayon::ThreadPoolBuilder::new().num_threads(1).build();
-    let threads = threads.map_err(|error| Error::external("starting the thread of a forked process", error))?;
-    let threads = &*Box::leak(Box::new(threads));
-    *made = Some((process, threads));
-    Ok(threads)
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build();
+    let pool = pool.map_err(|error| Error::external("starting the thread of a forked process", error))?;
+    let pool = &*Box::leak(Box::new(pool));
+    *made = Some((process, pool));
+    Ok(pool)
 }

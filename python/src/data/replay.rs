@@ -11,7 +11,7 @@ use std::sync::Arc;
 use swm::core::Key;
 use swm::data::{ClipSpec, GoalSpec, ReplayConfig, ReplayLoader};
 
-/// The latest episodes, with at most `capacity` rows in all.
+/// The latest episodes, with at most `capacity` rows in total.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
 pub struct ReplayBuffer(swm::data::ReplayBuffer);
 
@@ -40,8 +40,8 @@ impl ReplayBuffer {
         swm::data::ReplayBuffer::new(&schema(columns)?, capacity).map(Self).map_err(to_py_err)
     }
 
-    /// Adds an episode (arrays `[rows, ..]` with the schema's columns in order) and its constants, and removes the oldest
-    /// episodes until it fits.
+    /// Adds an episode (arrays `[rows, ..]` with the schema's columns in order) and its constants. Removes the oldest
+    /// episodes until the new one fits.
     fn add(&self, py: Python<'_>, episode: &Bound<'_, PyDict>, constants: &Bound<'_, PyDict>) -> PyResult<()> {
         let (episode, constants) = (arrays::batch(episode)?, super::constants(constants)?);
         py.detach(|| self.0.add(&episode, &constants)).map_err(to_py_err)
@@ -57,7 +57,7 @@ impl ReplayBuffer {
         self.0.episodes()
     }
 
-    /// The number of episodes added since the buffer was made.
+    /// The number of episodes added since the buffer was created.
     fn added(&self) -> u64 {
         self.0.added()
     }
@@ -68,7 +68,7 @@ impl ReplayBuffer {
         Dataset::of(py, Arc::new(move || Ok(Arc::clone(&reader))))
     }
 
-    /// A sampler with settings in JSON.
+    /// Creates a sampler with settings in JSON.
     fn sampler(&self, config: &str, seed: u64) -> PyResult<ReplaySampler> {
         let Options { num_steps, frameskip, columns, goals, batch_size, recent } = json("sampler", config)?;
         let clip = ClipSpec { num_steps, frameskip, columns };

@@ -53,8 +53,8 @@ impl Options {
     }
 }
 
-/// A run control that calls Python's `progress(stage, done, total)` and runs Python's signal handlers. An exception from
-/// either stops the run.
+/// Creates a run control that calls Python's `progress(stage, done, total)` and runs Python's signal handlers. An
+/// exception from either stops the run.
 fn control<'a>(progress: Option<Py<PyAny>>) -> Control<'a> {
     let failed = Arc::new(Mutex::new(None));
     let callback_error = Arc::clone(&failed);
@@ -74,9 +74,9 @@ fn control<'a>(progress: Option<Py<PyAny>>) -> Control<'a> {
     })
 }
 
-/// The value as JSON text.
-fn to_json(found: &impl serde::Serialize) -> PyResult<String> {
-    serde_json::to_string(found).map_err(|error| to_py_err(Error::external("writing JSON", error)))
+/// Writes a value as JSON text.
+fn to_json(value: &impl serde::Serialize) -> PyResult<String> {
+    serde_json::to_string(value).map_err(|error| to_py_err(Error::external("writing JSON", error)))
 }
 
 /// Copies a dataset to `target` and returns the outcome as JSON. Calls `progress(stage, done, total)`.
@@ -97,7 +97,7 @@ pub fn convert(
     to_json(&converted.map_err(to_py_err)?)
 }
 
-/// Examines a dataset, and writes its sound episodes to `target` if given. Returns the diagnosis as JSON.
+/// Examines a dataset, and writes its sound episodes to `target` if one is given. Returns the diagnosis as JSON.
 #[pyfunction]
 pub fn doctor(
     py: Python<'_>,

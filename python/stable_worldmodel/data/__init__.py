@@ -1,9 +1,9 @@
 """Datasets: reading, loading, writing, converting and examining episodes.
 
-- `load_dataset` opens a dataset of any format for a torch `DataLoader`; `Loader` gives shuffled batches by itself.
+- `load_dataset` opens a dataset of any format for a torch `DataLoader`; `Loader` yields shuffled batches directly.
 - `open_writer` stores episodes; `convert`, `doctor` and `inspect` convert, examine and describe datasets.
 - `register_format` adds a user-defined format to all of these.
-- `MergeDataset`, `ConcatDataset`, `GoalDataset`, `ReplayBuffer`: datasets derived from others, and from a running collection.
+- `MergeDataset`, `ConcatDataset`, `GoalDataset`, `ReplayBuffer`: datasets derived from other datasets or a collection.
 """
 
 from .buffer import ReplayBuffer, classic_filter

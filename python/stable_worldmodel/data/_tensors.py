@@ -16,7 +16,7 @@ Backend = Literal["torch", "numpy"]
 #: The columns with the indices of episodes and steps. Readers compute them, writers ignore them.
 NUMBERING = ("episode_idx", "step_idx")
 
-#: The stored types of types that cannot be stored.
+#: The type in which values are stored, for each type that datasets do not support.
 _WIDER = {
     "float16": "float32",
     "int8": "int32",
@@ -77,7 +77,7 @@ def _from_torch(tensor: Any) -> Array:
 def rows(episode: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, str | bytes]]:
     """Splits an episode into arrays `(T, ...)` of types that can be stored, and text constants.
 
-    Images `(T, C, H, W)` become `(T, H, W, C)`. Text is stored once per episode. `action` may have one row less than the
+    Images `(T, C, H, W)` become `(T, H, W, C)`. Text is stored once per episode. `action` may have one row fewer than the
     other columns, because no action follows the final observation.
     """
     arrays: dict[str, Array] = {}
@@ -100,8 +100,8 @@ def rows(episode: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, str | 
             raise TypeError(
                 f"column {name!r}: {array.dtype} cannot be stored; expected numeric values, or one text per episode"
             )
-        first = array.ndim == 4 and array.shape[1] in (1, 3) and array.shape[-1] not in (1, 3)
-        if first and array.dtype == np.uint8:
+        channels_lead = array.ndim == 4 and array.shape[1] in (1, 3) and array.shape[-1] not in (1, 3)
+        if channels_lead and array.dtype == np.uint8:
             array = np.moveaxis(array, 1, -1)
         arrays[name] = np.ascontiguousarray(array, dtype=dtype)
     _equal_lengths(arrays)

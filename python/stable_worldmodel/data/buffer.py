@@ -33,14 +33,14 @@ class ReplayBuffer(Dataset):
     of the buffer.
 
     Args:
-        max_steps: The maximum number of rows. An episode of `n` steps has `n + 1`.
-        history_len: Steps of a clip.
-        frameskip: Rows from one step to the next.
-        sampler: Chooses clips: `(step, buffer, batch_size, history_len)` to indices below `num_valid_ends(history_len)`.
-            Without it all clips are equally likely.
-        transform: Called with the dict of every sample of `buffer[i]`; not with those of `sample`.
-        key_filter: Called with every episode that comes: the columns to keep.
-        seed: Decides what is drawn, together with the step.
+        max_steps: The maximum number of rows. An episode of `n` steps has `n + 1` rows.
+        history_len: The number of steps of a clip.
+        frameskip: The number of rows from one step to the next.
+        sampler: A function `(step, buffer, batch_size, history_len) -> indices` that chooses clips by indices below
+            `num_valid_ends(history_len)`. With `None`, all clips are equally likely.
+        transform: Called with the dict of every sample of `buffer[i]`, but not with the batches of `sample`.
+        key_filter: A function from the dict of a new episode to a dict of the columns to keep.
+        seed: Determines the samples, together with the step.
     """
 
     def __init__(
@@ -53,9 +53,9 @@ class ReplayBuffer(Dataset):
         key_filter: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
         seed: int = 0,
     ) -> None:
-        for name, number in (("max_steps", max_steps), ("history_len", history_len), ("frameskip", frameskip)):
-            if number < 1:
-                raise ValueError(f"{name}: expected at least 1, got {number}")
+        for name, value in (("max_steps", max_steps), ("history_len", history_len), ("frameskip", frameskip)):
+            if value < 1:
+                raise ValueError(f"{name}: expected at least 1, got {value}")
         super().__init__([], [], frameskip, history_len, transform)
         self.max_steps = int(max_steps)
         self.history_len = int(history_len)
@@ -76,7 +76,7 @@ class ReplayBuffer(Dataset):
         return None
 
     def write_episode(self, ep_data: Mapping[str, Any]) -> None:
-        """Adds an episode: a list of steps a column, or an array `(T, ...)`, as :class:`EpisodeWriter` takes it."""
+        """Adds an episode: a list of steps or an array `(T, ...)` for each column, as in :class:`EpisodeWriter`."""
         if self.key_filter is not None:
             ep_data = self.key_filter(dict(ep_data))
         arrays, constants = _tensors.rows(ep_data)
@@ -93,12 +93,12 @@ class ReplayBuffer(Dataset):
         self._refresh()
 
     def write_episodes(self, episodes: Iterable[Mapping[str, Any]]) -> None:
-        """Adds episodes as they come."""
+        """Adds several episodes."""
         for episode in episodes:
             self.write_episode(episode)
 
     def clear(self) -> None:
-        """Drops all episodes."""
+        """Removes all episodes."""
         if self._buffer is not None:
             self._buffer = _engine.ReplayBuffer(self._columns, self.max_steps)
             self._samplers.clear()
@@ -141,8 +141,8 @@ class ReplayBuffer(Dataset):
 
         Args:
             batch_size: The number of clips.
-            history_len: Steps of a clip; the buffer's without it.
-            step: The number of the draw; without it they are counted.
+            history_len: The number of steps of a clip; `None` uses the value of the buffer.
+            step: The index of the batch, which determines the sampled clips; `None` counts the calls.
 
         Returns:
             Arrays `(batch_size, history_len, ...)`; `action` is `(batch_size, history_len, frameskip * dim)`, images
@@ -193,7 +193,7 @@ class ReplayBuffer(Dataset):
     def _load_slice(self, ep_idx: int, start: int, end: int) -> dict[str, Any]:
         if not 0 <= ep_idx < self.num_episodes or not 0 <= start <= end <= self.lengths[ep_idx]:
             raise IndexError(f"rows {start} .. {end} of episode {ep_idx} of {self.num_episodes}")
-        episodes, starts, lengths = (np.asarray([number]) for number in (ep_idx, start, end - start))
+        episodes, starts, lengths = (np.asarray([value]) for value in (ep_idx, start, end - start))
         sample: dict[str, Any] = self._read(episodes, starts, lengths, self.frameskip)
         return self.transform(sample) if self.transform else sample
 

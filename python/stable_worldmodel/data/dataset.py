@@ -1,4 +1,4 @@
-"""Datasets of episodes as sequences of clips, and datasets derived from others."""
+"""Datasets that split episodes into clips, and datasets derived from other datasets."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from . import _collate, _tensors
 from ._tensors import NUMBERING, Array
 
 Transform = Callable[[dict[str, Any]], dict[str, Any]]
-#: One row, or several.
+#: The index of a row, or the indices of several rows.
 Rows = int | Sequence[int] | Array
 
 __all__ = ["ConcatDataset", "Dataset", "GoalDataset", "MergeDataset", "StoredDataset"]
 
 
 class Dataset:
-    """The clips of `num_steps` steps inside of the episodes.
+    """A dataset whose samples are the clips of `num_steps` steps in its episodes.
 
-    A clip covers `num_steps * frameskip` rows. Its step `k` has the columns of row `k * frameskip` and carries the `frameskip`
-    actions from there on: `action` has the shape `(num_steps, frameskip * dim)`, every other column
+    A clip covers `num_steps * frameskip` rows. Step `k` of a clip has the columns of row `k * frameskip` and the actions of
+    the `frameskip` rows from that row on: `action` has the shape `(num_steps, frameskip * dim)`, every other column
     `(num_steps, ...)`, images `(T, C, H, W)` with `T = num_steps`.
 
-    Readers of user-defined formats derive from it and implement `column_names` and `_load_slice`.
+    Readers of user-defined formats derive from this class and implement `column_names` and `_load_slice`.
 
     Args:
-        lengths: Rows of every episode.
-        offsets: The first row of every episode in the whole dataset.
-        frameskip: Rows from one step to the next.
-        num_steps: Steps of a clip.
-        transform: Called with the dict of every sample; what it returns is the sample.
+        lengths: The number of rows of every episode.
+        offsets: The index of every episode's first row in the whole dataset.
+        frameskip: The number of rows from one step to the next.
+        num_steps: The number of steps of a clip.
+        transform: A function from the dict of a sample to the sample that the dataset returns.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class Dataset:
         self.span = self.num_steps * self.frameskip
         self.transform = transform
         clips = np.maximum(self.lengths - self.span + 1, 0)
-        #: Clips before every episode, and all of them.
+        #: The number of clips before every episode, and at the end the number of all clips.
         self._clips_before = np.concatenate([[0], np.cumsum(clips)]).astype(np.int64)
 
     @property
@@ -65,23 +65,25 @@ class Dataset:
         raise NotImplementedError(f"{type(self).__name__}.column_names")
 
     def _load_slice(self, ep_idx: int, start: int, end: int) -> dict[str, Any]:
-        """The rows `start .. end` of an episode: of actions all, of other columns every `frameskip`-th. With `transform`
-        applied."""
+        """The rows `start .. end` of an episode: all rows of `action`, every `frameskip`-th row of other columns.
+
+        The result is the output of `transform`, if there is one.
+        """
         raise NotImplementedError(f"{type(self).__name__}._load_slice")
 
     @property
     def num_episodes(self) -> int:
-        """How many episodes there are."""
+        """The number of episodes."""
         return len(self.lengths)
 
     @property
     def clip_indices(self) -> list[tuple[int, int]]:
-        """The episode and the first row of every clip. Long: one entry a sample."""
+        """The episode and the first row of every clip; the list has one entry for each sample."""
         episodes, starts = self._clips(np.arange(len(self)))
         return list(zip(episodes.tolist(), starts.tolist(), strict=True))
 
     def _clips(self, indices: Array) -> tuple[Array, Array]:
-        """The episodes and first rows of clips."""
+        """The episodes and the first rows of the clips with these indices."""
         total = int(self._clips_before[-1])
         wrong = (indices < -total) | (indices >= total)
         if wrong.any():
@@ -100,7 +102,7 @@ class Dataset:
 
     @staticmethod
     def _grouped(sample: dict[str, Any], steps: int) -> dict[str, Any]:
-        """A sample with the actions of a step one after another."""
+        """The sample, with the actions of each step joined into one row of `action`."""
         if "action" in sample:
             sample["action"] = sample["action"].reshape(steps, -1)
         return sample
@@ -108,12 +110,12 @@ class Dataset:
     def load_chunk(
         self, episodes_idx: Sequence[int] | Array, start: Sequence[int] | Array, end: Sequence[int] | Array
     ) -> list[dict[str, Any]]:
-        """The rows `start .. end` of some episodes, a dict each, in the form of clips."""
+        """The rows `start[i] .. end[i]` of each episode `episodes_idx[i]`, as a list of dicts in the form of clips."""
         runs = zip(*(np.asarray(part).tolist() for part in (episodes_idx, start, end)), strict=True)
         return [self._grouped(self._load_slice(e, s, t), (t - s) // self.frameskip) for e, s, t in runs]
 
     def load_episode(self, episode_idx: int) -> dict[str, Any]:
-        """A whole episode: of actions all rows, of other columns every `frameskip`-th."""
+        """A whole episode: all rows of `action`, every `frameskip`-th row of other columns."""
         return self._load_slice(episode_idx, 0, int(self.lengths[episode_idx]))
 
     def get_col_data(self, col: str) -> Array:
@@ -121,7 +123,7 @@ class Dataset:
         raise NotImplementedError(f"{type(self).__name__}.get_col_data")
 
     def get_row_data(self, row_idx: Rows) -> dict[str, Array]:
-        """Rows of the whole dataset, counted through all episodes: `(...)` for one, `(rows, ...)` for several."""
+        """The rows with these indices in the whole dataset: `(...)` for one index, `(rows, ...)` for several."""
         raise NotImplementedError(f"{type(self).__name__}.get_row_data")
 
     def get_dim(self, col: str) -> int:
@@ -130,31 +132,35 @@ class Dataset:
         return int(np.prod(data.shape[1:]))
 
     def merge_col(self, source: list[str] | str, target: str, dim: int = -1) -> None:
-        """Adds a column that concatenates others, given by names or a regular expression, along `dim`."""
+        """Adds the column `target`, which concatenates columns along `dim`.
+
+        `source` is a list of column names, or a regular expression that the names match.
+        """
         raise NotImplementedError(f"{type(self).__name__}.merge_col")
 
 
 class StoredDataset(Dataset):
-    """A dataset that the engine reads, of any of its formats.
+    """A dataset in one of the engine's formats.
 
-    A batch is read in one call, which decodes each row once, on all cores, without the GIL. The dataset can be pickled (the
-    other process opens it again) and used after a fork.
+    A batch is read in one call, which decodes each row once, on all cores, without the GIL. The dataset can be pickled
+    (the process that unpickles it opens the files again) and used after a fork.
 
     Args:
         path: A path, a URI (`s3://`, `gs://`, `az://`, `http(s)://`), or a name under `$STABLEWM_HOME/datasets`.
-        frameskip: Rows from one step to the next.
-        num_steps: Steps of a clip.
-        transform: Called with the dict of every sample.
-        keys_to_load: The columns of a sample; all without it.
+        frameskip: The number of rows from one step to the next.
+        num_steps: The number of steps of a clip.
+        transform: A function from the dict of a sample to the sample that the dataset returns.
+        keys_to_load: The columns of a sample; all columns for `None`.
         keys_to_cache: Columns whose decoded rows stay in memory.
         keys_to_merge: Columns to add: see :meth:`merge_col`.
-        format: The format, where the path does not say it.
-        backend: `"torch"` or `"numpy"`; torch where it is installed.
+        format: The format; `None` detects it from the path.
+        backend: `"torch"` or `"numpy"`; `None` selects torch if it is installed.
     """
 
     #: The format of this class's datasets; any for `None`.
     format: str | None = None
-    #: Formats whose samples have scalar columns as `(num_steps, 1)`, as other readers return Lance's lists of one element.
+    #: Formats with scalar columns of shape `(num_steps, 1)`, because other packages read them from Lance as lists of one
+    #: element.
     _LISTS = ("lance", "lance-video")
 
     def __init__(
@@ -184,7 +190,7 @@ class StoredDataset(Dataset):
             name: (np.dtype(dtype), tuple(shape) or (() if name in NUMBERING else scalar))
             for name, dtype, shape in self._handle.schema()
         }
-        #: Columns merged from others.
+        #: The columns that `merge_col` added.
         self._merged: dict[str, Array] = {}
         self._keys = [name for name in self.schema if name not in NUMBERING] if keys_to_load is None else [*keys_to_load]
         self._cached = [*(keys_to_cache or [])]
@@ -258,7 +264,7 @@ class StoredDataset(Dataset):
                 raise IndexError(f"rows {start} .. {end} of episode {episode}, which has {self.lengths[episode]}")
 
     def _slices(self, episodes: Array, starts: Array, ends: Array) -> list[dict[str, Any]]:
-        """A dict for every run, in one call of the engine."""
+        """One dict for each run of rows, read in one call of the engine."""
         episodes, starts, ends = (np.asarray(part, dtype=np.int64) for part in (episodes, starts, ends))
         episodes = np.where(episodes < 0, episodes + self.num_episodes, episodes)
         self._check_runs(episodes, starts, ends)
@@ -319,7 +325,7 @@ class StoredDataset(Dataset):
             raise IndexError(f"rows {rows.tolist()} of a dataset of {total}")
         rows = np.where(rows < 0, rows + total, rows)
         episodes = np.searchsorted(self.offsets, rows, side="right") - 1
-        # Episodes without rows begin where the next one does.
+        # An episode without rows has the offset of the next episode; `side="right"` selects the later of the two.
         found = self._read(self._keys, episodes, rows - self.offsets[episodes], np.ones_like(rows), 1)
         return {name: array[0] for name, array in found.items()} if np.ndim(row_idx) == 0 else found
 
@@ -343,7 +349,8 @@ class MergeDataset:
 
     Args:
         datasets: The datasets.
-        keys_from_dataset: The columns that each contributes; without it, those that none before it has.
+        keys_from_dataset: The columns to take from each dataset. `None` takes from each dataset the columns that no earlier
+            dataset has.
     """
 
     def __init__(self, datasets: Sequence[Any], keys_from_dataset: Sequence[Sequence[str]] | None = None) -> None:
@@ -371,7 +378,7 @@ class MergeDataset:
 
     @property
     def lengths(self) -> Array:
-        """Rows of every episode."""
+        """The number of rows of every episode."""
         return np.asarray(self.datasets[0].lengths)
 
     @property
@@ -438,32 +445,32 @@ class ConcatDataset:
 
     @property
     def column_names(self) -> list[str]:
-        """The columns of any of them."""
+        """The columns that at least one of the datasets has."""
         return list(dict.fromkeys(name for dataset in self.datasets for name in dataset.column_names))
 
     @property
     def lengths(self) -> Array:
-        """Rows of every episode."""
+        """The number of rows of every episode."""
         return np.concatenate([np.asarray(dataset.lengths) for dataset in self.datasets])
 
     @property
     def offsets(self) -> Array:
-        """The first row of every episode in the whole dataset."""
+        """The index of every episode's first row in the whole dataset."""
         return np.cumsum(self.lengths) - self.lengths
 
     @property
     def num_episodes(self) -> int:
-        """How many episodes there are."""
+        """The number of episodes."""
         return int(self._episodes_before[-1])
 
     @property
     def num_steps(self) -> int:
-        """Steps of a clip."""
+        """The number of steps of a clip."""
         return int(self.datasets[0].num_steps)
 
     @property
     def frameskip(self) -> int:
-        """Rows from one step to the next."""
+        """The number of rows from one step to the next."""
         return int(self.datasets[0].frameskip)
 
     @property
@@ -541,17 +548,17 @@ def _items(dataset: Any, indices: Sequence[int]) -> list[dict[str, Any]]:
 class GoalDataset:
     """A dataset whose samples have a goal: a row of the dataset, `(1, ...)`.
 
-    The goal is a random row of the dataset, a later step of the episode (nearer ones more likely, or all equally
+    The goal is a random row of the dataset, a later step of the episode (nearer steps more likely, or all steps equally
     likely), or the current step. Clips without a later step are left out if the goal can be a later step.
 
     Args:
         dataset: The dataset.
-        goal_probabilities: The chances of a random row, a later step with geometric chances, a later step, the current
-            step.
-        gamma: The discount of the geometric law: the goal is `k` steps ahead with probability
-            `(1 - gamma) * gamma**(k - 1)`, and the last step at most.
-        current_goal_offset: Which step of the clip, counted from 1, is the current one; the last one without it.
-        goal_keys: The columns of goals to load and their names in the sample; `pixels` and `proprio` for `None`.
+        goal_probabilities: The probabilities of a random row, a later step at a geometrically distributed distance, a
+            uniformly distributed later step, and the current step.
+        gamma: The discount of the geometric distribution: the goal is `k` steps ahead with probability
+            `(1 - gamma) * gamma**(k - 1)`. A distance beyond the episode selects the last step.
+        current_goal_offset: The current step of the clip, counted from 1; the last step for `None`.
+        goal_keys: The columns to load from the goal row, and their names in the sample; `pixels` and `proprio` for `None`.
         seed: The seed of goals, combined with the epoch and the sample's index. Goals are random for `None`.
     """
 
@@ -594,7 +601,7 @@ class GoalDataset:
         self._clips = clips[later]
 
     def set_epoch(self, epoch: int) -> None:
-        """Sets the epoch, which changes the goals that a seed determines."""
+        """Sets the epoch, which determines the goals together with the seed."""
         self.epoch = int(epoch)
 
     @property
@@ -604,12 +611,12 @@ class GoalDataset:
 
     @property
     def column_names(self) -> list[str]:
-        """The columns of the dataset, without the goals'."""
+        """The columns of the dataset, without the columns of the goals."""
         return list(self.dataset.column_names)
 
     @property
     def lengths(self) -> Array:
-        """Rows of every episode."""
+        """The number of rows of every episode."""
         return np.asarray(self.dataset.lengths)
 
     def __len__(self) -> int:
@@ -624,9 +631,9 @@ class GoalDataset:
         return self._fresh[1]
 
     def _draw(self, idx: int) -> tuple[int, int]:
-        """The episode and row of a goal."""
+        """Samples the episode and the row of a goal."""
         random = self._random(idx)
-        episode, start = (int(number) for number in self._clips[idx])
+        episode, start = (int(index) for index in self._clips[idx])
         now, skip = start + self._now, self.dataset.frameskip
         later = (int(self.dataset.lengths[episode]) - 1 - now) // skip
         kind = random.choice(4, p=self.goal_probabilities)

@@ -1,4 +1,4 @@
-"""Readers implemented in Python, as datasets of the engine for loading and conversion."""
+"""Converts readers implemented in Python to datasets of the engine, for loading and conversion."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _CACHED = 4
 
 
 class _Rows:
-    """The interface that the engine requires of a reader: its columns, the lengths of its episodes, and rows."""
+    """Adapts a reader to the methods that the engine calls: `schema`, `lengths` and `rows`."""
 
     def __init__(self, reader: Any) -> None:
         # Read stored rows, without frameskip, clips and transform.
@@ -54,7 +54,7 @@ class _Rows:
         else:
             whole = self._reader.load_episode(episode)
             found = {name: value if isinstance(value, str) else value[start:end] for name, value in whole.items()}
-        # A slice has as many actions as rows, the last one of an episode included.
+        # A slice has one action for each row, also for the last row of an episode.
         arrays, _ = _tensors.rows(found)
         with self._lock:
             self._cache[key] = arrays
@@ -64,7 +64,7 @@ class _Rows:
 
 
 def engine_of(dataset: Any) -> Any:
-    """The engine's dataset of any dataset.
+    """The engine's dataset for a dataset of any class.
 
     Readers of user-defined formats need `lengths`, and `_load_slice(episode, start, end)` or `load_episode(episode)`.
     """

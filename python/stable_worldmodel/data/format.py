@@ -88,7 +88,7 @@ FORMATS: dict[str, type[Format]] = {}
 
 
 def register_format(cls: F) -> F:
-    """Registers a format; a decorator. A class of the same name and module replaces the old one, as in notebooks."""
+    """Registers a format; a decorator. A class with the name and module of a registered one replaces it."""
     name = getattr(cls, "name", None)
     if not name:
         raise ValueError(f"{cls.__name__}: a format needs a `name`")
@@ -112,7 +112,7 @@ def get_format(name: str) -> type[Format]:
 
 
 def detect_format(path: str | os.PathLike[str]) -> type[Format] | None:
-    """The format of a path; user-defined formats come first."""
+    """The format of a path; user-defined formats take precedence."""
     ordered = sorted(FORMATS.values(), key=lambda kind: kind.native)
     return next((kind for kind in ordered if kind.detect(path)), None)
 
@@ -133,8 +133,8 @@ def open_writer(path: str | os.PathLike[str], *, format: str | None = None, mode
     Args:
         path: A path, a URI, or a name under `$STABLEWM_HOME/datasets`.
         format: The format's name; detected from the path, else Lance, for `None`.
-        mode: `"append"` continues an existing dataset, `"overwrite"` replaces it, `"error"` refuses.
-        **kwargs: Arguments of the format's writer; native ones take `codec`.
+        mode: `"append"` continues an existing dataset, `"overwrite"` replaces it, `"error"` raises.
+        **kwargs: Arguments of the format's writer; writers of native formats take `codec`.
     """
     validate_write_mode(mode)
     kind = get_format(format) if format is not None else detect_format(path)

@@ -26,18 +26,20 @@ atexit.register(_engine.end_loaders)
 
 @dataclass(frozen=True)
 class Goals:
-    """A goal row for every clip, as the columns `NAME_COLUMN` `(B, 1, ...)`. `NAME_offset` `(B,)` is the number of rows from
-    the anchor to the goal, or -1 if the goal is not a later row of the same episode.
+    """The distribution of a goal row for every clip.
+
+    A batch has the goal's columns as `NAME_COLUMN` `(B, 1, ...)`. `NAME_offset` `(B,)` is the number of rows from the anchor
+    to the goal, or -1 if the goal is not a later row of the same episode.
 
     Attributes:
-        columns: The columns of goals to load.
+        columns: The columns to load from the goal row.
         random: The probability of any row of any episode.
-        geometric: The chance of a later step, `k` steps ahead with probability `(1 - discount) * discount**(k - 1)`.
-        future: The chance of a later step, all equally likely.
-        last: The chance of the episode's last row.
-        current: The chance of the anchor itself.
+        geometric: The probability of a later step, `k` steps ahead with probability `(1 - discount) * discount**(k - 1)`.
+        future: The probability of a later step, all later steps equally likely.
+        last: The probability of the episode's last row.
+        current: The probability of the anchor itself.
         discount: The discount of the geometric distribution.
-        anchor: The step of the clip that counts as the current one; the last one for `None`.
+        anchor: The index of the current step in the clip; the last step for `None`.
         name: The prefix of the column names.
     """
 
@@ -82,31 +84,31 @@ class Loader:
             batch["action"]  # (64, 4, 10)
 
     Each iteration is the next epoch, in an order that depends on the seed and the epoch. The tensors share the engine's
-    memory, which is reused after the last of them is released. Images are `(B, T, C, H, W)` in torch's memory format
+    memory, which is reused after the last tensor is released. Images are `(B, T, C, H, W)` in torch's memory format
     `channels_last`.
 
     Args:
         dataset: A path, a URI, a name, or an open dataset of any format.
-        batch_size: Clips of a batch.
-        num_steps: Steps of a clip; the open dataset's without it, or 1.
-        frameskip: Rows from one step to the next; the open dataset's without it, or 1.
-        columns: The columns; those of the open dataset without it, or all.
+        batch_size: The number of clips of a batch.
+        num_steps: The number of steps of a clip; `None` uses the value of the open dataset, or 1.
+        frameskip: The number of rows from one step to the next; `None` uses the value of the open dataset, or 1.
+        columns: The columns to load; `None` loads the columns of the open dataset, or all columns.
         shuffle: Whether clips come in random order, over the whole dataset.
-        seed: Decides the order and the goals, together with the epoch.
+        seed: Determines the order and the goals, together with the epoch.
         drop_last: Whether a last batch with fewer clips is left out.
-        episodes: Positions of the episodes to use; all without it.
-        goals: Goals to draw for every clip, several kinds if need be.
-        transform: Called with the dict of every batch, in which `action` is `(batch, num_steps * frameskip, numbers)`, as in
-            a dataset's `transform`.
-        device: Where tensors go.
-        threads: Prefetch threads, which decode on the engine's threads; 0 loads batches on demand.
+        episodes: The indices of the episodes to use; all episodes for `None`.
+        goals: The goals to sample for every clip: one `Goals`, or several with different names.
+        transform: Called with the dict of every batch, in which `action` is `(batch, num_steps * frameskip, action_dim)`, as
+            in a dataset's `transform`.
+        device: The device to which tensors are moved; the CPU for `None`.
+        threads: The number of prefetch threads, which decode on the engine's threads; 0 loads batches on demand.
         prefetch: The maximum number of prefetched batches.
         prefetch_bytes: The maximum size of prefetched batches.
         cache: The size of the cache of decoded rows for later epochs, such as `"8GB"`; 0 disables it. The default is
             512 MiB for datasets that the engine reads.
         cache_dir: A folder for a cache on disk that several runs share, instead of memory.
-        backend: `"torch"` or `"numpy"`; torch where it is installed.
-        format: The dataset's format, where it cannot be told from the path.
+        backend: `"torch"` or `"numpy"`; `None` selects torch if it is installed.
+        format: The dataset's format; `None` detects it from the path.
     """
 
     def __init__(
@@ -178,25 +180,25 @@ class Loader:
             negative = {name: value for name, value in wanted.items() if isinstance(value, int) and value < 0}
             raise ValueError(f"expected no negative numbers, got {negative}")
         self._loader = _engine.Loader(engine, json.dumps(wanted))
-        #: The shape of a row of every column of a batch: what follows the batch and the steps.
+        #: The shape of a row of every column: the axes after the batch and the steps.
         self._shapes = {name: tuple(shape[1:]) for name, _, shape in self._loader.schema()}
-        # Columns that the dataset returns as lists of one element.
+        # The dataset returns some scalar columns as lists of one element, so the loader does the same.
         for name, (_, shape) in getattr(dataset, "schema", {}).items():
             for column in (name, *(f"{goal.name}_{name}" for goal in given)):
                 if name != "action" and self._shapes.get(column) == () and shape == (1,):
                     self._shapes[column] = shape
         self._action = stored.get("action")
-        #: Epoch and batch where the next iteration starts, and where the latest one is.
+        #: The epoch and batch at which the next iteration starts, and those of the latest iteration.
         self._next = (0, 0)
         self._at = (0, 0)
 
     def __len__(self) -> int:
-        """Batches of an epoch."""
+        """The number of batches in an epoch."""
         return int(self._loader.batches())
 
     @property
     def num_clips(self) -> int:
-        """Clips of an epoch."""
+        """The number of clips in an epoch."""
         return int(self._loader.clips())
 
     @property
@@ -205,7 +207,7 @@ class Loader:
         return list(self._shapes)
 
     def set_epoch(self, epoch: int) -> None:
-        """Starts the next iteration with this epoch; keeps the position inside of the epoch if it is the same."""
+        """Starts the next iteration with this epoch; keeps the position in the epoch if the epoch does not change."""
         if epoch != self._next[0]:
             self._next = (int(epoch), 0)
 
@@ -216,16 +218,16 @@ class Loader:
         return {"epoch": epoch, "batch": batch, "seed": self.seed, "batch_size": self.batch_size, "clips": clips}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Continues at a saved position, with the same batches that would have followed it."""
-        here = self.state_dict()
-        other = {name: (state[name], here[name]) for name in ("seed", "batch_size", "clips") if state[name] != here[name]}
-        if other:
-            told = ", ".join(f"{name} was {was} and is {now}" for name, (was, now) in other.items())
-            raise ValueError(f"the state is of another loader: {told}")
+        """Continues at a saved position: the next batches equal those that followed the position."""
+        own = self.state_dict()
+        changed = {name: (state[name], own[name]) for name in ("seed", "batch_size", "clips") if state[name] != own[name]}
+        if changed:
+            changes = ", ".join(f"{name} was {was} and is {now}" for name, (was, now) in changed.items())
+            raise ValueError(f"the state is of another loader: {changes}")
         self._next = self._at = (int(state["epoch"]), int(state["batch"]))
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        """The batches of an epoch. Ended early, the next iteration begins the epoch after it."""
+        """Yields the batches of an epoch. The next iteration yields the next epoch, also if this iteration ends early."""
         epoch, batch = self._next
         self._next = (epoch + 1, 0)
         self._at = (epoch, batch)

@@ -21,7 +21,7 @@ def _is_tensor(value: Any) -> bool:
 
 
 def _like(value: Any, *bounds: Array | None) -> list[Any]:
-    """The bounds as arrays or tensors, like `value`."""
+    """The bounds as arrays, or as tensors with the type and device of `value`."""
     if any(bound is None for bound in bounds):
         raise ValueError("the scaler is not fitted: call fit first, or give it its bounds")
     if not _is_tensor(value):
@@ -32,7 +32,7 @@ def _like(value: Any, *bounds: Array | None) -> list[Any]:
 
 
 def _finite_rows(values: Any) -> Array:
-    """All rows `(n, d)` without a NaN, such as the missing action of an episode's last row."""
+    """The rows `(n, d)` without NaN. The missing action of an episode's last row is NaN."""
     array = _tensors.to_numpy(values)
     array = array.reshape(-1, array.shape[-1] if array.ndim > 1 else 1)
     array = array[~np.isnan(array).any(axis=1)]
@@ -42,22 +42,22 @@ def _finite_rows(values: Any) -> Array:
 
 
 class IdentityScaler:
-    """Leaves values as they are."""
+    """A scaler that does not change values."""
 
     def fit(self, values: Any) -> IdentityScaler:
         """Does nothing."""
         return self
 
     def transform(self, values: X) -> X:
-        """The values."""
+        """Returns the values unchanged."""
         return values
 
     def inverse_transform(self, values: X) -> X:
-        """The values."""
+        """Returns the values unchanged."""
         return values
 
     def fit_transform(self, values: X) -> X:
-        """The values."""
+        """Returns the values unchanged."""
         return values
 
     def __call__(self, values: X) -> X:
@@ -81,7 +81,7 @@ class _Affine:
         return (values - centre) / scale
 
     def inverse_transform(self, values: Any) -> Any:
-        """The values that were scaled, `(..., d)`."""
+        """The original values of scaled values, `(..., d)`."""
         centre, scale = _like(values, *self._bounds())
         return values * scale + centre
 
@@ -95,7 +95,7 @@ class _Affine:
 
 
 class ZScoreScaler(_Affine):
-    """Mean 0 and standard deviation 1 in every dimension; deviations below `eps` count as `eps`."""
+    """Scales to mean 0 and standard deviation 1 in every dimension; deviations below `eps` count as `eps`."""
 
     def __init__(self, mean: Any = None, std: Any = None, eps: float = 1e-8) -> None:
         self.mean = None if mean is None else np.asarray(mean)
@@ -164,12 +164,12 @@ class ColumnTransform:
 
 
 def column_normalizer(dataset: Any, source: str, target: str, method: str = "zscore") -> ColumnTransform:
-    """A transform that scales a column by what the dataset has of it.
+    """A transform that scales a column with a scaler fitted to the dataset's values of that column.
 
     Args:
-        dataset: Anything with `get_col_data`.
+        dataset: An object with `get_col_data`.
         source: The column to read.
-        target: The column to write; may be the same.
+        target: The column to write; may equal `source`.
         method: `"zscore"`, `"percentile"` or `"none"`.
     """
     scaler = get_scaler(method)

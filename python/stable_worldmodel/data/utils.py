@@ -1,4 +1,4 @@
-"""Finding, opening, converting, examining and describing datasets."""
+"""Functions that find, open, convert, examine and describe datasets."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ def ensure_dir_exists(path: str | Path) -> None:
 
 
 def resolve(given: str | os.PathLike[str], cache_dir: str | os.PathLike[str] | None = None) -> str:
-    """The location of an existing dataset: a path, a URI, or a name below `datasets` of the home folder or `cache_dir`."""
+    """The location of an existing dataset, given by path, URI, or name under `datasets` of the home folder or `cache_dir`."""
     text = os.fspath(given)
     if "://" in text:
         return text
     datasets = Path(_engine.home() if cache_dir is None else cache_dir) / "datasets"
-    # Datasets of a hub are stored under their name.
+    # The dataset `OWNER/NAME` of a hub is stored as `OWNER--NAME`.
     candidates = [Path(text), datasets / text, datasets / text.replace("/", "--")]
     if cache_dir is not None:
         candidates = [*candidates[1:], *sorted(datasets.glob(f"{text}.*")), candidates[0]]
@@ -72,14 +72,14 @@ def load_dataset(
     Args:
         name: A path, a URI (`s3://`, `gs://`, `az://`, `http(s)://`), or a name under `$STABLEWM_HOME/datasets`.
         cache_dir: A folder in place of `$STABLEWM_HOME`.
-        format: The format's name, where it cannot be told from the path.
-        num_steps: Steps of a clip.
-        frameskip: Rows from one step to the next.
-        keys_to_load: The columns of a sample; all without it.
+        format: The format's name; `None` detects it from the path.
+        num_steps: The number of steps of a clip.
+        frameskip: The number of rows from one step to the next.
+        keys_to_load: The columns of a sample; all columns for `None`.
         keys_to_cache: Columns whose decoded rows stay in memory.
-        transform: Called with the dict of every sample.
-        **kwargs: Further arguments of the format's reader; native ones take `backend` (`"torch"` or `"numpy"`) and
-            `keys_to_merge`.
+        transform: A function from the dict of a sample to the sample that the dataset returns.
+        **kwargs: Further arguments of the format's reader; readers of native formats take `backend` (`"torch"` or `"numpy"`)
+            and `keys_to_merge`.
 
     Returns:
         A :class:`~stable_worldmodel.data.Dataset`.
@@ -163,25 +163,25 @@ def convert(
         convert("pusht.lance", "pusht-video", dest_format="video")
 
     Args:
-        source: A path, a URI, a name, or a dataset that is open.
+        source: A path, a URI, a name, or an open dataset.
         dest: The target. Its name determines the format unless `dest_format` is given; Lance otherwise.
-        source_format: The source's format, where it cannot be told from the path.
+        source_format: The source's format; `None` detects it from the path.
         dest_format: The format to write.
         format: Another name for `dest_format`.
-        cache_dir: A folder in place of `$STABLEWM_HOME` to find the source in.
+        cache_dir: A folder in place of `$STABLEWM_HOME` that contains the source.
         progress: Whether to show a progress bar (with tqdm, if it is installed).
         mode: What to do with an existing target: `"resume"` continues after its last episode if its content is the
-            beginning of the source, `"append"` adds to it, `"overwrite"` replaces it, `"error"` refuses.
+            beginning of the source, `"append"` adds to it, `"overwrite"` replaces it, `"error"` raises.
         codec: How images are stored: `"qoi"` (lossless, the default), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
-        jpeg_quality: Another way to say `codec="jpeg-QUALITY"`.
-        verify: Whether the target is read again and compared.
-        least_psnr: The least signal-to-noise ratio of lossy images, in dB; less is an error.
+        jpeg_quality: The quality of the codec `"jpeg"`, as in `codec="jpeg-QUALITY"`.
+        verify: Whether to read the target and compare its content with the source.
+        least_psnr: The minimum peak signal-to-noise ratio of lossy images, in dB; a lower ratio is an error.
         **kwargs: Further arguments of the writer of a user-defined format.
 
     Returns:
-        A dict with `episodes`, `kept` (episodes that existed before), `rows`, `last_actions` (left out, because no
-        observation follows them), `checksum`, and the comparison of the `columns`. For a user-defined format, `episodes` and
-        `rows`.
+        A dict with `episodes`, `kept` (episodes that existed before), `rows`, `last_actions` (the number of actions left
+        out, because no observation follows them), `checksum`, and the comparison of the `columns`. For a user-defined
+        format, `episodes` and `rows`.
     """
     if isinstance(source, (str, os.PathLike)):
         source = load_dataset(source, cache_dir, source_format)
@@ -209,7 +209,7 @@ def hand_over(source: Any, writer: Any, report: Callable[[str, int, int], None] 
     names = [name for name, _, _ in engine.schema() if name not in _tensors.NUMBERING]
     with writer:
         for episode, length in enumerate(lengths):
-            run = (np.asarray([number], dtype=np.int64) for number in (episode, 0, length))
+            run = (np.asarray([value], dtype=np.int64) for value in (episode, 0, length))
             writer.write_episode(dict(engine.read(names, *run, 1)))
             if report is not None:
                 report("convert", episode + 1, len(lengths))
@@ -225,19 +225,19 @@ def doctor(
     codec: str | None = None,
     jpeg_quality: int | None = None,
 ) -> dict[str, Any]:
-    """Reads a dataset as training does, and reports problems and the models that it can train.
+    """Reads a dataset as training does, and reports its problems and the models that can train on it.
 
     Args:
         dataset: A path, a URI or a name.
-        repair: Where to write the intact episodes to, if at all.
-        format: The format of what is written.
+        repair: The location of a repaired copy with only the intact episodes; `None` writes no copy.
+        format: The format of the copy.
         progress: Whether to show a progress bar.
-        codec: How images are stored there, as in :func:`convert`.
-        jpeg_quality: Another way to say `codec="jpeg-QUALITY"`.
+        codec: How images are stored in the copy, as in :func:`convert`.
+        jpeg_quality: The quality of the codec `"jpeg"`, as in `codec="jpeg-QUALITY"`.
 
     Returns:
-        `episodes`, `rows`, `problems` (how many), `findings` (each with `severity`, `what`, `episodes`), `sound` (the
-        positions of intact episodes), `models`, and `repaired` (as :func:`convert` returns it, or `None`).
+        `episodes`, `rows`, `problems` (their number), `findings` (each with `severity`, `what`, `episodes`), `sound` (the
+        indices of intact episodes), `models`, and `repaired` (as :func:`convert` returns it, or `None`).
     """
     options = _options(format, "resume", codec, jpeg_quality, True, 25.0)
     target = None if repair is None else os.fspath(repair)
@@ -248,8 +248,8 @@ def inspect(dataset: Any, *, checksum: bool = False) -> dict[str, Any]:
     """Describes a dataset.
 
     Args:
-        dataset: A path, a URI, a name, or a dataset that is open.
-        checksum: Whether to read everything for the hash of the decoded content, which does not depend on the format.
+        dataset: A path, a URI, a name, or an open dataset.
+        checksum: Whether to read all rows and hash the decoded content; the hash does not depend on the format.
 
     Returns:
         `episodes`, `steps`, `lengths`, `columns` (each with `name`, `dtype`, `shape`), `bytes`, `footprint` (bytes by

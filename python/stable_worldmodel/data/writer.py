@@ -1,4 +1,4 @@
-"""Writing episodes into datasets of the engine's formats."""
+"""A writer of episodes into datasets of the engine's formats."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ def codec_json(codec: str | None, quality: int | None = None) -> str | None:
 class EpisodeWriter:
     """Writes episodes into a dataset: a :class:`~stable_worldmodel.data.Writer`.
 
-    The first episode defines the columns. Episodes survive a killed process once they are committed, which
-    happens at least every two seconds and when the writer is closed.
+    The first episode defines the columns. The writer commits episodes at least every two seconds and when it is closed.
+    Committed episodes remain if the process is killed.
 
     Args:
         path: A path, a URI, or a name under `$STABLEWM_HOME/datasets`.
-        format: The format, where the path does not say it; Lance without either.
-        mode: `"append"` continues a dataset that is there, `"overwrite"` replaces it, `"error"` refuses.
+        format: The format; `None` detects it from the path, or selects Lance.
+        mode: `"append"` continues an existing dataset, `"overwrite"` replaces it, `"error"` raises.
         codec: How images are stored: `"qoi"` (lossless, the default), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
-        jpeg_quality: Another way to say `codec="jpeg-QUALITY"`.
+        jpeg_quality: The quality of the codec `"jpeg"`, as in `codec="jpeg-QUALITY"`.
         manifest: The provenance of the data, stored in the dataset's manifest under the key `config`.
     """
 
@@ -96,14 +96,14 @@ class EpisodeWriter:
 
     @property
     def num_episodes(self) -> int:
-        """Episodes in the dataset, those to be committed included; 0 before the first one is written."""
+        """The number of episodes in the dataset, including uncommitted ones; 0 before the first episode is written."""
         return 0 if self._writer is None else int(self._writer.episodes() or 0)
 
     def write_episode(self, ep_data: Mapping[str, Any]) -> None:
-        """Adds an episode: a list of steps a column, or an array `(T, ...)`.
+        """Adds an episode: a list of steps or an array `(T, ...)` for each column.
 
-        Row `t` holds the observation at `t` and the action taken from it; the last row's action is missing, NaN (or -1 of
-        integers), or left out.
+        Row `t` holds the observation at `t` and the action taken from it. The action of the last row is missing: NaN, -1 for
+        integers, or left out.
         """
         if self._closed:
             raise ValueError(f"{self.path}: the writer is closed; open another one with mode='append'")
@@ -127,7 +127,7 @@ class EpisodeWriter:
         fitted = {}
         for name, (dtype, shape) in self._columns.items():
             array = arrays[name]
-            # Some sources have scalar columns as lists of one element.
+            # Some sources store scalar columns as lists of one element.
             if array.shape[1:] != shape and array[:1].size == int(np.prod(shape)) and max(array.ndim - 1, len(shape)) <= 1:
                 array = array.reshape(len(array), *shape)
             if array.shape[1:] != shape:

@@ -1,6 +1,6 @@
 """The native environments as Gymnasium environments.
 
-`gymnasium.make("swm/PushT-v1")` makes one; options of an environment are keyword arguments
+`gymnasium.make("swm/PushT-v1")` creates an environment; options of an environment are keyword arguments
 (`gymnasium.make("swm/OGBCube-v0", env_type="double")`). Factors of variation, a start and a goal are options of
 `reset`: `env.reset(seed=0, options={"variation": ["agent.color"], "variation_values": {"block.scale": 40}})`.
 """
@@ -80,7 +80,7 @@ class NativeEnv(gymnasium.Env):
 
     @property
     def max_episode_steps(self) -> int:
-        """Steps after which an episode is truncated, by `swm.World` (else use `gymnasium.make(…, max_episode_steps=…)`)."""
+        """Steps after which `swm.World` truncates an episode (elsewhere: `gymnasium.make(…, max_episode_steps=…)`)."""
         return int(self._described["max_episode_steps"])
 
     @cached_property
@@ -127,7 +127,7 @@ class NativeEnv(gymnasium.Env):
         return self._env.render_view(view, *self.image_shape)
 
     def sample_goal(self, seed: int) -> None:
-        """Samples a new reachable goal, without a change of the state."""
+        """Samples a new reachable goal and keeps the state."""
         self._env.sample_goal(seed)
 
     def goal_distance(self) -> float:
@@ -135,11 +135,11 @@ class NativeEnv(gymnasium.Env):
         return self._env.goal_distance()
 
     def snapshot(self) -> bytes:
-        """The full state, randomness included."""
+        """The full state, including the random state."""
         return self._env.snapshot()
 
     def restore(self, state: bytes) -> tuple[Any, dict[str, Any]]:
-        """Restores a snapshot. Later steps equal those after the snapshot bit for bit."""
+        """Restores a snapshot. The steps that follow repeat those after the snapshot bit for bit."""
         columns = self._env.restore(state)
         return self._observation(columns), self._info(columns, self._env.is_success())
 
@@ -149,7 +149,7 @@ class NativeEnv(gymnasium.Env):
         columns = self._env.restore_from(*rows)
         return self._observation(columns), self._info(columns, self._env.is_success())
 
-    # Called by evaluations from a dataset if the environment is inside of Gymnasium wrappers.
+    # Evaluations from a dataset call these methods if Gymnasium wrappers contain the environment.
 
     def _set_state(self, state: Any) -> None:
         self._start = np.asarray(state)

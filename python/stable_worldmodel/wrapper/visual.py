@@ -5,9 +5,9 @@
         partial(ColorJitterWrapper, brightness=0.3, hue=0.1),
     ])
 
-In a `World` they run in the engine. Around a Gymnasium environment they change `render()` and the `pixels` of its infos.
-Random values depend on the episode's seed, so an episode always looks the same. `swm wrappers` lists the settings and
-their ranges.
+A `World` runs visual wrappers in the engine. Around a Gymnasium environment, a visual wrapper changes `render()` and the
+`pixels` of the infos. Random values depend only on the episode's seed, so frames are reproducible. `swm wrappers` lists the
+settings and their ranges.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ __all__ = [
 class Schedule:
     """A value that changes with the steps of an episode."""
 
-    def __init__(self, kind: str, *numbers: float) -> None:
-        self.kind, self.numbers = kind, tuple(float(number) for number in numbers)
+    def __init__(self, kind: str, *parameters: float) -> None:
+        self.kind, self.parameters = kind, tuple(float(parameter) for parameter in parameters)
 
     def __call__(self, step: int) -> float:
         """The value at a step."""
@@ -56,10 +56,10 @@ class Schedule:
 
     def setting(self) -> Any:
         """The schedule as a setting of the engine."""
-        return self.numbers[0] if self.kind == "constant" else [self.kind, *self.numbers]
+        return self.parameters[0] if self.kind == "constant" else [self.kind, *self.parameters]
 
     def __repr__(self) -> str:
-        return f"{self.kind}({', '.join(f'{number:g}' for number in self.numbers)})"
+        return f"{self.kind}({', '.join(f'{parameter:g}' for parameter in self.parameters)})"
 
 
 def constant(value: float) -> Schedule:
@@ -168,19 +168,19 @@ def _to_json(cls: type, name: str, value: Any) -> Any:
     return value
 
 
-#: The number of steps for which a user's schedule function is tabulated; its last value holds after them.
+#: The number of steps for which a user's schedule function is tabulated; later steps have the last value.
 _STEPS = 10_000
 
 
 def _tabulated(cls: type, name: str, schedule: Callable[[int], Any]) -> list[float]:
     """The values of a schedule function at the steps of an episode, because the engine does not call Python."""
     try:
-        numbers = [float(schedule(step)) for step in range(_STEPS)]
+        values = [float(schedule(step)) for step in range(_STEPS)]
     except (TypeError, ValueError) as error:
         raise TypeError(f"{cls.__name__}: {name} is no function from a step of the episode to a number: {error}") from error
-    while len(numbers) > 1 and numbers[-1] == numbers[-2]:
-        numbers.pop()
-    return numbers
+    while len(values) > 1 and values[-1] == values[-2]:
+        values.pop()
+    return values
 
 
 class ChromaKeyWrapper(VisualWrapper):
@@ -198,7 +198,7 @@ class NoiseWrapper(VisualWrapper):
 
 
 class ColorJitterWrapper(VisualWrapper):
-    """Changes brightness, contrast, saturation and hue, by the same amounts during an episode."""
+    """Changes brightness, contrast, saturation and hue by amounts that are constant during an episode."""
 
     id = "color-jitter"
     positional = ("brightness", "contrast", "saturation", "hue")
@@ -212,14 +212,14 @@ class BlurWrapper(VisualWrapper):
 
 
 class OcclusionWrapper(VisualWrapper):
-    """Covers parts of the frame by rectangles, at the same positions during an episode."""
+    """Covers parts of the frame with rectangles at positions that are constant during an episode."""
 
     id = "occlusion"
     positional = ("num_patches", "size", "color")
 
 
 class MovingPatchWrapper(VisualWrapper):
-    """Covers parts of the frame by rectangles that move and bounce off its edges."""
+    """Covers parts of the frame with rectangles that move and bounce off the frame's edges."""
 
     id = "moving-patch"
     positional = ("num_patches", "size", "color", "speed")
@@ -233,14 +233,14 @@ class RandomShiftWrapper(VisualWrapper):
 
 
 class CutoutWrapper(VisualWrapper):
-    """Masks rectangles, at other positions in every frame."""
+    """Masks rectangles at new positions in every frame."""
 
     id = "cutout"
     positional = ("num", "size", "color")
 
 
 class RandomConvWrapper(VisualWrapper):
-    """Applies a random convolution to the frame, the same during an episode."""
+    """Applies a random convolution to the frame, constant during an episode."""
 
     id = "random-conv"
     positional = ("kernel_size",)

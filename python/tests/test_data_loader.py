@@ -89,7 +89,7 @@ def test_goals(stored):
         loader(path, goals=data.Goals(random=1.0))
 
 
-def test_transform_gets_rows(stored):
+def test_transform_is_applied_before_frameskip_joins_actions(stored):
     path, _ = stored
     plain = next(iter(loader(path)))
     transform = data.ColumnTransform(data.ZScoreScaler(mean=[0.0, 0.0], std=[2.0, 4.0]), "action", "action")

@@ -48,7 +48,7 @@ pub fn choose(text: &str) -> Result<EnvChoice> {
     Ok(entry.into())
 }
 
-/// Makes the environment of a text in a worker process.
+/// Starts a worker process and makes the environment that `text` (`ID` or `ID,key=value,…`) names.
 ///
 /// # Errors
 /// When the environment cannot be made: Python or a package is missing, the id is unknown, or Python raises an

@@ -88,7 +88,7 @@ FORMATS: dict[str, type[Format]] = {}
 
 
 def register_format(cls: F) -> F:
-    """Registers a format; a decorator. A class with the name and module of a registered one replaces it."""
+    """Registers a format; a decorator. Defining the same class again (module and qualified name) replaces it."""
     name = getattr(cls, "name", None)
     if not name:
         raise ValueError(f"{cls.__name__}: a format needs a `name`")
@@ -132,7 +132,7 @@ def open_writer(path: str | os.PathLike[str], *, format: str | None = None, mode
 
     Args:
         path: A path, a URI, or a name under `$STABLEWM_HOME/datasets`.
-        format: The format's name; detected from the path, else Lance, for `None`.
+        format: The format's name. `None` detects it from the path, and uses Lance if no format matches.
         mode: `"append"` continues an existing dataset, `"overwrite"` replaces it, `"error"` raises.
         **kwargs: Arguments of the format's writer; writers of native formats take `codec`.
     """

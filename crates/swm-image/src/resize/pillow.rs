@@ -7,7 +7,7 @@ use super::axis::{FilterAxis, WEIGHT_HALF, weighted_byte};
 /// Pillow's filters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PillowFilter {
-    /// `BILINEAR`: a triangle that averages when it shrinks.
+    /// `BILINEAR`: a triangle filter. When downscaling, its support grows with the scale (antialiasing).
     Triangle,
     /// `NEAREST`, for pixel art.
     Nearest,

@@ -19,7 +19,7 @@ pub(crate) fn chart(condition: &Condition<'_>, counting: Counting, longest: usiz
     svg.y_axis(y, &[0.0, 25.0, 50.0, 75.0, 100.0], [left, right], " %");
     svg.x_axis(x, &ticks, [top, bottom], "");
     svg.text("tick middle", [(left + right) / 2.0, bottom + 36.0], "steps");
-    // The floor is drawn first, below the other curves.
+    // The curve of the random-policy floor is drawn first, so that the other curves cover it.
     let (floors, others): (Vec<_>, Vec<_>) = condition.rows.iter().partition(|row| row.is_floor());
     for row in floors.into_iter().chain(others) {
         let counted = || row.run.episodes.iter().filter(|episode| counting.counts(episode));

@@ -1,4 +1,5 @@
-//! The meshes and textures of a model group, converted for `swm-raster` at its first rendering.
+//! Converts the meshes and textures of a compiled model for `swm-raster` at the first rendering, and caches them. All
+//! copies of one compiled model (one `Appearance::group`) share them.
 
 use crate::physics::Appearance;
 use mujoco_rs::mujoco_c::mjtTexture;
@@ -125,7 +126,7 @@ fn height_field(model: &MjModel, asset: usize) -> Mesh {
     Mesh::new(triangles)
 }
 
-/// Converts a texture; white if its type is not rendered.
+/// Converts a texture. Returns a white one if its data do not match its size or its channels are not supported.
 fn texture(model: &MjModel, asset: usize) -> Texture {
     let (width, height) = (index(model.tex_width()[asset]), index(model.tex_height()[asset]));
     let channels = index(model.tex_nchannel()[asset]);

@@ -11,7 +11,7 @@
 //! 5. [`plan`]: costs of candidate action sequences, and the solvers that minimise them. [`predictor`]: models that
 //!    predict latents. [`requirements`]: columns that a model family requires of a dataset.
 //! 6. [`run`]: progress and interruption of long commands. [`registry`], [`manifest`], [`results`], [`error`]: names,
-//!    provenance, evaluation results and errors.
+//!    provenance, evaluation results and errors. [`files`]: reading, replacing and deleting files.
 
 pub mod batch;
 pub mod camera_view;
@@ -21,6 +21,7 @@ pub mod dispatch;
 pub mod env;
 pub mod error;
 pub mod factors;
+pub mod files;
 pub mod key;
 pub mod manifest;
 mod parallelism;

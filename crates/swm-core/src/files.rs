@@ -1,0 +1,178 @@
+//! Reading, writing and deleting files: the only module of the program that deletes, so that nothing a user owns is
+//! deleted, and the way to read a file that a stranger may have written.
+//!
+//! - [`open`] and [`read`] accept regular files only. A pipe or a device could block forever or never end.
+//! - [`write`] replaces a file whole: readers and killed processes see the old content or the new.
+//! - [`delete`] removes the regular files of a folder that match the program's own names, and nothing else.
+
+use crate::{Error, Result};
+use std::fs::File;
+use std::io::{Read as _, Write as _};
+use std::path::{Path, PathBuf};
+
+/// Opens a regular file for reading.
+///
+/// # Errors
+/// When the file does not exist, cannot be read, or is a folder, a pipe, a socket or a device.
+pub fn open(path: &Path) -> Result<File> {
+    let io = |error| Error::io(path, "opening the file", error);
+    let kind = std::fs::metadata(path).map_err(io)?.file_type();
+    if !kind.is_file() {
+        let problem = if kind.is_dir() { "is a folder" } else { "is not a regular file" };
+        return Err(Error::corrupt(path, problem, "give a regular file"));
+    }
+    File::open(path).map_err(io)
+}
+
+/// Reads a regular file of at most `limit` bytes.
+///
+/// # Errors
+/// As [`open`], and when the file is longer.
+pub fn read(path: &Path, limit: u64) -> Result<Vec<u8>> {
+    let file = open(path)?;
+    let io = |error| Error::io(path, "reading the file", error);
+    let length = file.metadata().map_err(io)?.len();
+    let too_long =
+        || Error::corrupt(path, format!("is longer than {limit} bytes"), "give the file that this program wrote");
+    if length > limit {
+        return Err(too_long());
+    }
+    let mut bytes = Vec::new();
+    bytes.try_reserve_exact(length as usize).map_err(|_| {
+        Error::corrupt(path, format!("has {length} bytes, more than the free memory"), "use a machine with more memory")
+    })?;
+    file.take(limit.saturating_add(1)).read_to_end(&mut bytes).map_err(io)?;
+    if bytes.len() as u64 > limit {
+        return Err(too_long());
+    }
+    Ok(bytes)
+}
+
+/// Replaces a file by `bytes`: writes a temporary file in the same folder and renames it.
+///
+/// # Errors
+/// When writing fails; the old file is unchanged and the temporary file is removed.
+pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
+    let io = |error| Error::io(path, "writing the file", error);
+    let name =
+        path.file_name().ok_or_else(|| Error::config(path.display().to_string(), "has no file name", "give one"))?;
+    let temporary = path.with_file_name(format!(".{}.{}.tmp", name.to_string_lossy(), std::process::id()));
+    let written = File::create(&temporary)
+        .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_data()))
+        .and_then(|()| std::fs::rename(&temporary, path));
+    if written.is_err() {
+        let _ = unlink(&temporary);
+    }
+    written.map_err(io)
+}
+
+/// The fate of the folder in [`delete`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Folder {
+    /// Keep the folder.
+    Keep,
+    /// Remove the folder if it is empty after the deletion.
+    RemoveIfEmpty,
+}
+
+/// Deletes the regular files directly in `folder` for whose names `owned` returns true. Folders, symbolic links and files
+/// with other names stay. Returns the entries that remain.
+///
+/// # Errors
+/// When `folder` is a symbolic link or not a folder, or a file cannot be removed. A missing folder is not an error.
+pub fn delete(folder: &Path, owned: &dyn Fn(&str) -> bool, after: Folder) -> Result<Vec<PathBuf>> {
+    let io = |error| Error::io(folder, "deleting files", error);
+    match std::fs::symlink_metadata(folder) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(vec![]),
+        Err(error) => return Err(io(error)),
+        Ok(found) if !found.is_dir() => {
+            return Err(Error::corrupt(folder, "is a file or a symbolic link", "give the folder itself"));
+        }
+        Ok(_) => {}
+    }
+    let mut remaining = vec![];
+    for entry in std::fs::read_dir(folder).map_err(io)? {
+        let entry = entry.map_err(io)?;
+        let (name, path) = (entry.file_name(), entry.path());
+        // The type of a directory entry is that of the link, not of its target.
+        let regular = entry.file_type().map_err(io)?.is_file();
+        if regular && name.to_str().is_some_and(owned) {
+            unlink(&path).map_err(|error| Error::io(&path, "deleting the file", error))?;
+        } else {
+            remaining.push(path);
+        }
+    }
+    remaining.sort();
+    if after == Folder::RemoveIfEmpty && remaining.is_empty() {
+        std::fs::remove_dir(folder).map_err(io)?;
+    }
+    Ok(remaining)
+}
+
+/// Deletes one regular file of the program, such as a temporary file. A missing file is not an error.
+///
+/// # Errors
+/// When `path` is a folder, a symbolic link or a device, or the file cannot be removed.
+pub fn delete_file(path: &Path) -> Result<()> {
+    let io = |error| Error::io(path, "deleting the file", error);
+    match std::fs::symlink_metadata(path) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(()),
+        Err(error) => Err(io(error)),
+        Ok(found) if !found.is_file() => Err(Error::corrupt(path, "is not a regular file", "remove it yourself")),
+        Ok(_) => unlink(path).map_err(io),
+    }
+}
+
+fn unlink(path: &Path) -> std::io::Result<()> {
+    std::fs::remove_file(path)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs;
+
+    /// A new folder below the system's folder of temporary files.
+    fn folder(name: &str) -> PathBuf {
+        let path = std::env::temp_dir().join(format!("swm-files-{name}-{}", std::process::id()));
+        fs::create_dir_all(&path).expect("creating the folder");
+        path
+    }
+
+    #[test]
+    fn delete_keeps_links_folders_and_other_names() {
+        let root = folder("delete");
+        let (run, outside) = (root.join("run"), root.join("outside.txt"));
+        fs::create_dir_all(run.join("weights.bin.d")).expect("creating a folder");
+        fs::write(&outside, "thesis").expect("writing a file");
+        for name in ["config.json", "thesis.tex"] {
+            fs::write(run.join(name), name).expect("writing a file");
+        }
+        std::os::unix::fs::symlink(&outside, run.join("weights.bin")).expect("making a link");
+        let owned = |name: &str| ["config.json", "weights.bin", "weights.bin.d"].contains(&name);
+
+        let remaining = delete(&run, &owned, Folder::RemoveIfEmpty).expect("deleting");
+        assert_eq!(remaining, ["thesis.tex", "weights.bin", "weights.bin.d"].map(|name| run.join(name)));
+        assert!(!run.join("config.json").exists());
+        assert_eq!(fs::read_to_string(&outside).expect("the file outside"), "thesis");
+
+        std::os::unix::fs::symlink(&run, root.join("link")).expect("making a link");
+        assert!(delete(&root.join("link"), &|_| true, Folder::Keep).is_err());
+        assert!(run.join("thesis.tex").exists());
+        fs::remove_dir_all(&root).expect("removing the folder of the test");
+    }
+
+    #[test]
+    fn reads_regular_files_up_to_the_limit() {
+        let root = folder("read");
+        let path = root.join("file");
+        write(&path, b"four").expect("writing");
+        assert_eq!(read(&path, 4).expect("reading"), b"four");
+        assert!(read(&path, 3).expect_err("a longer file").to_string().contains("longer than 3 bytes"));
+        assert!(read(Path::new("/dev/zero"), 10).expect_err("a device").to_string().contains("not a regular file"));
+        assert!(read(&root, 10).expect_err("a folder").to_string().contains("is a folder"));
+        delete_file(&path).expect("deleting");
+        assert!(delete(&root, &|_| false, Folder::RemoveIfEmpty).expect("deleting").is_empty());
+        assert!(!root.exists());
+    }
+}

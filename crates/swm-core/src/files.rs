@@ -3,7 +3,7 @@
 //!
 //! - [`open`] and [`read`] accept regular files only. A pipe or a device could block forever or never end.
 //! - [`write`] replaces a file whole: readers and killed processes see the old content or the new.
-//! - [`delete`] removes the regular files of a folder that match the program's own names, and nothing else.
+//! - [`delete`] removes the regular files of a folder whose names are the program's own, and nothing else.
 
 use crate::{Error, Result};
 use std::fs::File;
@@ -66,47 +66,63 @@ pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
     written.map_err(io)
 }
 
-/// The fate of the folder in [`delete`].
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Folder {
-    /// Keep the folder.
-    Keep,
-    /// Remove the folder if it is empty after the deletion.
-    RemoveIfEmpty,
-}
-
-/// Deletes the regular files directly in `folder` for whose names `owned` returns true. Folders, symbolic links and files
-/// with other names stay. Returns the entries that remain.
+/// Deletes the files of the program in `folder`. `patterns` are relative paths such as `checkpoint/config.json` or
+/// `events.*.swm`; a `*` stands for any text within one name. Only regular files are deleted; symbolic links are neither
+/// followed nor deleted. A folder in which files were deleted is removed if it is empty then. Returns the remaining
+/// entries of `folder`, sorted.
 ///
 /// # Errors
 /// When `folder` is a symbolic link or not a folder, or a file cannot be removed. A missing folder is not an error.
-pub fn delete(folder: &Path, owned: &dyn Fn(&str) -> bool, after: Folder) -> Result<Vec<PathBuf>> {
-    let io = |error| Error::io(folder, "deleting files", error);
+pub fn delete(folder: &Path, patterns: &[&str]) -> Result<Vec<PathBuf>> {
     match std::fs::symlink_metadata(folder) {
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(vec![]),
-        Err(error) => return Err(io(error)),
+        Err(error) => return Err(Error::io(folder, "deleting files", error)),
         Ok(found) if !found.is_dir() => {
             return Err(Error::corrupt(folder, "is a file or a symbolic link", "give the folder itself"));
         }
         Ok(_) => {}
     }
-    let mut remaining = vec![];
+    delete_in(folder, patterns).map(|(_, remaining)| remaining)
+}
+
+/// As [`delete`], for an existing folder; also returns whether a file was deleted.
+fn delete_in(folder: &Path, patterns: &[&str]) -> Result<(bool, Vec<PathBuf>)> {
+    let io = |error| Error::io(folder, "deleting files", error);
+    let (mut deleted, mut remaining) = (false, vec![]);
     for entry in std::fs::read_dir(folder).map_err(io)? {
         let entry = entry.map_err(io)?;
         let (name, path) = (entry.file_name(), entry.path());
-        // The type of a directory entry is that of the link, not of its target.
-        let regular = entry.file_type().map_err(io)?.is_file();
-        if regular && name.to_str().is_some_and(owned) {
+        // The type of a directory entry is that of a link, not of the link's target.
+        let kind = entry.file_type().map_err(io)?;
+        let below: Vec<&str> = patterns.iter().filter_map(|pattern| after_name(pattern, name.to_str()?)).collect();
+        if kind.is_file() && below.contains(&"") {
             unlink(&path).map_err(|error| Error::io(&path, "deleting the file", error))?;
+            deleted = true;
+        } else if kind.is_dir() && below.iter().any(|pattern| !pattern.is_empty()) {
+            let (inside, rest) = delete_in(&path, &below)?;
+            deleted |= inside;
+            if !inside || !rest.is_empty() {
+                remaining.push(path);
+            }
         } else {
             remaining.push(path);
         }
     }
     remaining.sort();
-    if after == Folder::RemoveIfEmpty && remaining.is_empty() {
+    if deleted && remaining.is_empty() {
         std::fs::remove_dir(folder).map_err(io)?;
     }
-    Ok(remaining)
+    Ok((deleted, remaining))
+}
+
+/// Returns the part of a pattern below its first component, or `None` if `name` does not match that component.
+fn after_name<'a>(pattern: &'a str, name: &str) -> Option<&'a str> {
+    let (first, below) = pattern.split_once('/').unwrap_or((pattern, ""));
+    let matches = match first.split_once('*') {
+        Some((start, end)) => name.len() >= start.len() + end.len() && name.starts_with(start) && name.ends_with(end),
+        None => name == first,
+    };
+    matches.then_some(below)
 }
 
 /// Deletes one regular file of the program, such as a temporary file. A missing file is not an error.
@@ -120,6 +136,19 @@ pub fn delete_file(path: &Path) -> Result<()> {
         Err(error) => Err(io(error)),
         Ok(found) if !found.is_file() => Err(Error::corrupt(path, "is not a regular file", "remove it yourself")),
         Ok(_) => unlink(path).map_err(io),
+    }
+}
+
+/// Removes a folder if it is empty.
+///
+/// # Errors
+/// When the folder cannot be removed for another reason than its contents.
+pub fn remove_empty_folder(folder: &Path) -> Result<()> {
+    match std::fs::remove_dir(folder) {
+        Err(error) if error.kind() != std::io::ErrorKind::DirectoryNotEmpty => {
+            Err(Error::io(folder, "removing an empty folder", error))
+        }
+        _ => Ok(()),
     }
 }
 
@@ -149,17 +178,30 @@ mod tests {
             fs::write(run.join(name), name).expect("writing a file");
         }
         std::os::unix::fs::symlink(&outside, run.join("weights.bin")).expect("making a link");
-        let owned = |name: &str| ["config.json", "weights.bin", "weights.bin.d"].contains(&name);
+        fs::create_dir_all(run.join("logs/old")).expect("creating a folder");
+        fs::write(run.join("logs/run-1.log"), "").expect("writing a file");
+        let patterns = ["config.json", "weights.bin", "weights.bin.d", "logs/run-*.log", "outside/*"];
 
-        let remaining = delete(&run, &owned, Folder::RemoveIfEmpty).expect("deleting");
-        assert_eq!(remaining, ["thesis.tex", "weights.bin", "weights.bin.d"].map(|name| run.join(name)));
-        assert!(!run.join("config.json").exists());
+        let remaining = delete(&run, &patterns).expect("deleting");
+        assert_eq!(remaining, ["logs", "thesis.tex", "weights.bin", "weights.bin.d"].map(|name| run.join(name)));
+        assert!(!run.join("config.json").exists() && !run.join("logs/run-1.log").exists());
+        assert!(run.join("logs/old").is_dir(), "a folder without a deleted file stays");
         assert_eq!(fs::read_to_string(&outside).expect("the file outside"), "thesis");
 
         std::os::unix::fs::symlink(&run, root.join("link")).expect("making a link");
-        assert!(delete(&root.join("link"), &|_| true, Folder::Keep).is_err());
+        assert!(delete(&root.join("link"), &["*"]).is_err());
         assert!(run.join("thesis.tex").exists());
         fs::remove_dir_all(&root).expect("removing the folder of the test");
+    }
+
+    #[test]
+    fn delete_removes_folders_that_it_empties() {
+        let root = folder("empty");
+        fs::create_dir_all(root.join("a/b")).expect("creating folders");
+        fs::write(root.join("a/b/c.txt"), "").expect("writing a file");
+        assert!(delete(&root, &["a/*/c.txt"]).expect("deleting").is_empty());
+        assert!(!root.exists());
+        assert!(delete(&root, &["a"]).expect("a missing folder").is_empty());
     }
 
     #[test]
@@ -172,7 +214,6 @@ mod tests {
         assert!(read(Path::new("/dev/zero"), 10).expect_err("a device").to_string().contains("not a regular file"));
         assert!(read(&root, 10).expect_err("a folder").to_string().contains("is a folder"));
         delete_file(&path).expect("deleting");
-        assert!(delete(&root, &|_| false, Folder::RemoveIfEmpty).expect("deleting").is_empty());
-        assert!(!root.exists());
+        fs::remove_dir(&root).expect("an empty folder");
     }
 }

@@ -13,6 +13,7 @@
 //! process leaves a complete checkpoint.
 
 use crate::nn::parameters::{self, HostTensor, Named};
+use crate::run_folder::{CHECKPOINT_FILES, CONFIG, FOLDER, MANIFEST, OPTIMIZER, RAW, STATE, WEIGHTS};
 use crate::train::run_state::RunState;
 use crate::train::{DatasetInfo, TrainConfig, Trainable};
 use crate::weights;
@@ -20,7 +21,7 @@ use burn::tensor::Device;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
-use swm_core::{Error, Key, Manifest, Result, manifest};
+use swm_core::{Error, Key, Manifest, Result, files, manifest};
 
 /// A trained model, its configuration and its provenance.
 #[derive(Clone, Debug)]
@@ -57,14 +58,6 @@ struct ConfigFile {
     dataset_info: DatasetInfo,
     config: serde_json::Value,
 }
-
-const FOLDER: &str = "checkpoint";
-const CONFIG: &str = "config.json";
-const MANIFEST: &str = "manifest.json";
-const WEIGHTS: &str = "weights.safetensors";
-const RAW: &str = "raw.safetensors";
-const OPTIMIZER: &str = "optimizer.safetensors";
-const STATE: &str = "state.json";
 
 impl<M: Trainable> Checkpoint<M> {
     /// Returns whether a folder holds a checkpoint.
@@ -211,9 +204,7 @@ pub(crate) fn write(
     additional: &[(&str, Vec<u8>)],
 ) -> Result<String> {
     let new = run.join(format!("{FOLDER}.new"));
-    if new.exists() {
-        std::fs::remove_dir_all(&new).map_err(|error| Error::io(&new, "removing an unfinished checkpoint", error))?;
-    }
+    files::delete(&new, CHECKPOINT_FILES)?;
     std::fs::create_dir_all(&new).map_err(|error| Error::io(&new, "creating a checkpoint", error))?;
     let write_file = |name: &str, bytes: &[u8]| {
         let path = new.join(name);
@@ -230,23 +221,32 @@ pub(crate) fn write(
     Ok(hash)
 }
 
-/// Renames the folder `new` to that of the checkpoint and removes the old checkpoint.
+/// Renames the folder `new` to that of the checkpoint and deletes the old checkpoint. Other files in the folder of the
+/// old checkpoint move to the new one.
 fn replace(run: &Path, new: &Path) -> Result<()> {
     let (current, old) = (run.join(FOLDER), run.join(format!("{FOLDER}.old")));
     let rename = |from: &Path, to: &Path| {
         std::fs::rename(from, to).map_err(|error| Error::io(to, "replacing a checkpoint", error))
     };
-    if old.exists() && current.exists() {
-        std::fs::remove_dir_all(&old).map_err(|error| Error::io(&old, "removing an old checkpoint", error))?;
-    }
     if current.exists() {
+        move_other_files(&old, &current)?;
         rename(&current, &old)?;
     }
     rename(new, &current)?;
-    if old.exists() {
-        std::fs::remove_dir_all(&old).map_err(|error| Error::io(&old, "removing an old checkpoint", error))?;
+    move_other_files(&old, &current)
+}
+
+/// Deletes the checkpoint in the folder `old`, moves the remaining entries to the folder `current`, and removes `old`
+/// if it is empty then. An entry whose name exists in `current` stays.
+fn move_other_files(old: &Path, current: &Path) -> Result<()> {
+    let remaining = files::delete(old, CHECKPOINT_FILES)?;
+    for path in &remaining {
+        let target = current.join(path.file_name().unwrap_or_default());
+        if !target.exists() {
+            std::fs::rename(path, &target).map_err(|error| Error::io(&target, "moving a file", error))?;
+        }
     }
-    Ok(())
+    if old.exists() { files::remove_empty_folder(old) } else { Ok(()) }
 }
 
 /// Loads the weights file of a checkpoint into a model, after checking the hash of the file if `hash` is given.

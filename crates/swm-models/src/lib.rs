@@ -5,7 +5,7 @@
 //! - [`family`]: [`ModelFamily`], the contract of a model family; [`registry`]: the families of this build.
 //! - [`online`]: training by acting in environments; [`feed_forward`]: policies without planning.
 //! - [`probe`]: regression of the environment state from frozen latents.
-//! - [`checkpoint`]: trained models on disk; [`weights`]: pretrained weights, and files for PyTorch.
+//! - [`checkpoint`]: trained models on disk; [`run_folder`]: the files of a training run; [`weights`]: pretrained weights, and files for PyTorch.
 //!
 //! Building blocks: [`nn`], with PyTorch's parameter names; [`pixels`], the normalisation of images; [`device`].
 //!
@@ -31,6 +31,7 @@ pub mod pixels;
 pub mod pldm;
 pub mod probe;
 pub mod registry;
+pub mod run_folder;
 pub mod sac;
 pub mod tdmpc2;
 pub mod train;

@@ -50,14 +50,24 @@ pub fn dataset(given: &str) -> PathBuf {
 /// Returns the location of a dataset given as a path, as a URI, or as a name in [`datasets`].
 ///
 /// # Errors
-/// When the text is a URI of an unknown scheme.
+/// When the text is empty, or a URI of an unknown scheme.
 pub fn location(given: &str) -> Result<Location> {
+    check_name("dataset", given)?;
     if given.contains("://") { Location::parse(given) } else { Ok(dataset(given).into()) }
 }
 
 /// Returns the path of a checkpoint given as a path or as a name in [`checkpoints`].
 pub fn checkpoint(given: &str) -> PathBuf {
     named(given, &checkpoints(), "")
+}
+
+/// Returns the path of a checkpoint to write, given as a path or as a name in [`checkpoints`].
+///
+/// # Errors
+/// When the text is empty.
+pub fn new_checkpoint(given: &str) -> Result<PathBuf> {
+    check_name("checkpoint", given)?;
+    Ok(checkpoint(given))
 }
 
 /// Opens a dataset given as a path, as a URI, or as a name in [`datasets`].
@@ -85,8 +95,21 @@ pub fn find_dataset(given: &str) -> Result<Location> {
 /// # Errors
 /// When it does not exist; the message names the closest name.
 pub fn find_checkpoint(given: &str) -> Result<PathBuf> {
+    check_name("checkpoint", given)?;
     let path = checkpoint(given);
     if path.exists() { Ok(path) } else { Err(unknown("checkpoint", given, &path, &checkpoints())) }
+}
+
+/// Returns an error for an empty name: the path that it stands for is the folder of all names.
+fn check_name(kind: &str, given: &str) -> Result<()> {
+    if given.trim().is_empty() {
+        return Err(Error::config(
+            format!("the name of a {kind}"),
+            "is empty",
+            format!("`swm {kind}s` lists the names"),
+        ));
+    }
+    Ok(())
 }
 
 /// Returns the error for a name that does not exist, with the closest name in `folder`.
@@ -119,6 +142,7 @@ pub fn names_in(folder: &Path) -> Vec<String> {
 pub fn target(given: &str, format: Option<&str>) -> Result<Location> {
     match format {
         Some(format) if !given.contains("://") => {
+            check_name("dataset", given)?;
             let suffix = FORMATS.get(format)?.suffixes.first().copied().unwrap_or(format);
             Ok(named(given, &datasets(), suffix).into())
         }

@@ -5,6 +5,7 @@ use super::collector::{Collector, CollectorState};
 use super::config::OnlineConfig;
 use super::evaluation;
 use super::shared_model::SharedModel;
+use crate::run_folder::{COLLECTOR, PLAYED, REPLAY, SAVED_DATA_FILES};
 use crate::train::config::LoopConfig;
 use crate::train::learner::{self, DynLearner, Learner, Update};
 use crate::train::metrics::{MetricWindow, Metrics};
@@ -16,7 +17,7 @@ use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 use swm_core::run::{Control, Event, Progress, Stage};
-use swm_core::{ColumnSpec, EnvPool, Error, Key, Policy, RandomPolicy, Result, Schema};
+use swm_core::{ColumnSpec, EnvPool, Error, Key, Policy, RandomPolicy, Result, Schema, files};
 use swm_data::{LoaderConfig, ReplayBuffer, ReplayConfig, ReplayLoader, WriteOptions};
 
 /// The result of an online run.
@@ -195,10 +196,6 @@ struct Meter {
     evaluated_return: Option<f64>,
 }
 
-const REPLAY: &str = "replay.lance";
-const COLLECTOR: &str = "place.json";
-const PLAYED: &str = "played-";
-
 impl Data {
     /// Creates the data of a new run, or restores the data that an earlier run saved in the folder `saved`.
     fn new(
@@ -360,9 +357,7 @@ impl Run<'_> {
     /// Returns the hash of the weights.
     fn save(&mut self) -> Result<String> {
         let folder = saved_data(self.out, self.step());
-        if folder.exists() {
-            std::fs::remove_dir_all(&folder).map_err(|error| Error::io(&folder, "removing an older save", error))?;
-        }
+        files::delete(&folder, SAVED_DATA_FILES)?;
         std::fs::create_dir_all(&folder).map_err(|error| Error::io(&folder, "creating a folder", error))?;
         self.data.replay.save(folder.join(REPLAY), WriteOptions::default())?;
         let path = folder.join(COLLECTOR);
@@ -373,7 +368,7 @@ impl Run<'_> {
         for path in entries.filter_map(|entry| Some(entry.ok()?.path())) {
             let name = path.file_name().unwrap_or_default().to_string_lossy();
             if name.starts_with(PLAYED) && path != folder {
-                std::fs::remove_dir_all(&path).map_err(|error| Error::io(&path, "removing an older save", error))?;
+                files::delete(&path, SAVED_DATA_FILES)?;
             }
         }
         Ok(weights)

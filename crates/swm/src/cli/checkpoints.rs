@@ -1,12 +1,13 @@
 //! `swm checkpoints`: lists, shows, verifies, imports, exports and removes checkpoints.
 
-use super::{emit, emit_json, table};
+use super::{emit, emit_json, eprint, table};
 use crate::home::{self, names_in};
 use clap::{Args, Subcommand};
 use serde_json::{Value, json};
+use std::io::IsTerminal as _;
 use std::path::{Path, PathBuf};
 use swm_core::{Error, Result};
-use swm_models::{CheckpointInfo, Device, FAMILIES, checkpoint};
+use swm_models::{CheckpointInfo, Device, FAMILIES, checkpoint, run_folder};
 
 /// Arguments of `swm checkpoints`.
 #[derive(Args)]
@@ -58,11 +59,14 @@ enum CheckpointsCommand {
         /// The folder to write weights.pt and config.json to
         folder: PathBuf,
     },
-    /// Remove a checkpoint and its logs
+    /// Remove a checkpoint and its logs; other files in its folder stay
     #[command(after_help = "Example: swm checkpoints remove lewm-rooms")]
     Remove {
         /// A path or a name
         checkpoint: String,
+        /// Remove without asking
+        #[arg(short, long)]
+        yes: bool,
     },
 }
 
@@ -76,7 +80,7 @@ pub fn checkpoints(args: &CheckpointsArgs, as_json: bool) -> anyhow::Result<()> 
             import(folder, model, data, output, as_json)
         }
         (Some(CheckpointsCommand::Export { checkpoint, folder }), _) => export(checkpoint, folder, as_json),
-        (Some(CheckpointsCommand::Remove { checkpoint }), _) => remove(checkpoint, as_json),
+        (Some(CheckpointsCommand::Remove { checkpoint, yes }), _) => remove(checkpoint, *yes, as_json),
     }
 }
 
@@ -177,7 +181,7 @@ fn verify(given: &[String], as_json: bool) -> anyhow::Result<()> {
 }
 
 fn import(folder: &Path, model: &str, data: &str, output: &str, as_json: bool) -> anyhow::Result<()> {
-    let (family, out) = (FAMILIES.get(model)?, home::checkpoint(output));
+    let (family, out) = (FAMILIES.get(model)?, home::new_checkpoint(output)?);
     if checkpoint::family(&out).is_some() {
         let fix = "choose another --output, or `swm checkpoints remove` it";
         anyhow::bail!(Error::config(out.display().to_string(), "holds a checkpoint already", fix));
@@ -209,16 +213,35 @@ fn export(given: &str, folder: &Path, as_json: bool) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn remove(given: &str, as_json: bool) -> anyhow::Result<()> {
+fn remove(given: &str, yes: bool, as_json: bool) -> anyhow::Result<()> {
     let path = home::find_checkpoint(given)?;
-    // Only a checkpoint is removed, so that a mistyped path cannot remove another folder.
     if checkpoint::family(&path).is_none() {
         anyhow::bail!(Error::corrupt(&path, "it is not a checkpoint", "give the folder that `swm train` wrote to"));
     }
-    std::fs::remove_dir_all(&path).map_err(|error| Error::io(&path, "removing a checkpoint", error))?;
-    if as_json {
-        return emit_json(&json!({"removed": path}));
+    if !yes && !confirm(&format!("remove the checkpoint and the logs in {}?", path.display()))? {
+        anyhow::bail!(Error::config("swm checkpoints remove", "not confirmed", "answer y, or give --yes"));
     }
-    emit(&format!("removed {}\n", path.display()));
+    let remaining = run_folder::remove(&path)?;
+    if as_json {
+        return emit_json(&json!({"removed": path, "remaining": remaining}));
+    }
+    emit(&format!("removed the checkpoint {}\n", path.display()));
+    if !remaining.is_empty() {
+        let names: Vec<String> = remaining.iter().map(|path| path.display().to_string()).collect();
+        emit(&format!("kept {}: not written by `swm train`\n", names.join(", ")));
+    }
     Ok(())
+}
+
+/// Asks a question on the terminal. Returns whether the answer is yes; without a terminal the answer is no.
+fn confirm(question: &str) -> Result<bool> {
+    if !std::io::stdin().is_terminal() {
+        return Ok(false);
+    }
+    eprint(&format!("{question} [y/N] "));
+    let mut answer = String::new();
+    std::io::stdin()
+        .read_line(&mut answer)
+        .map_err(|error| Error::io("standard input", "reading the answer", error))?;
+    Ok(matches!(answer.trim(), "y" | "Y" | "yes"))
 }

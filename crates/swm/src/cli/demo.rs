@@ -1,6 +1,6 @@
 //! `swm demo`: collects, trains, plans, evaluates and reports within minutes on a laptop CPU.
 
-use super::collect::{self, Collection};
+use super::collect::{self, Collection, create_folder};
 use super::results_tables::summary;
 use super::wrappers::WrapperArgs;
 use super::{Context, emit, emit_json, eprint, eval, train};
@@ -11,13 +11,13 @@ use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 use swm_core::results::Counting;
-use swm_core::{Result, VariationRequest};
+use swm_core::{Error, Result, VariationRequest, files};
 use swm_data::{ImageCodec, Location, WriteMode};
 use swm_eval::{
     Choice, CollectConfig, Condition, EvalRequest, Model, PolicyKind, PolicyRequest, StartsRequest, WorldConfig,
 };
 use swm_models::lewm::Lewm;
-use swm_models::{TrainConfig, TrainOptions};
+use swm_models::{TrainConfig, TrainOptions, run_folder};
 use swm_plan::{Cem, MpcConfig};
 use swm_report::ReportOptions;
 
@@ -68,11 +68,9 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
     let mut config = TrainConfig::<Lewm>::load("tiny", &args.settings)?;
     config.seed = args.seed;
     let side = config.model.image;
-    for old in [&model, &results] {
-        if old.exists() {
-            std::fs::remove_dir_all(old).map_err(|e| swm_core::Error::io(old, "removing the last demo", e))?;
-        }
-    }
+    claim(&output)?;
+    // The other steps replace the files of an earlier demo themselves; training refuses the folder of another run.
+    let _ = run_folder::remove(&model)?;
     eprint("1/4 collect: an exploring policy moves through two rooms\n");
     collect_rooms(args, &data, side, context)?;
 
@@ -102,6 +100,26 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
     emit(&summary(&found));
     emit(&format!("{seconds:.0} s in total; the report: {}\n", page.display()));
     Ok(())
+}
+
+/// The file that marks the folder of a demo, and its text.
+const MARK: &str = ".swm-demo";
+const MARK_TEXT: &str =
+    "`swm demo` made this folder, and replaces rooms.lance, lewm-rooms, results and index.html in it.\n";
+
+/// Creates the folder of the demo and marks it.
+///
+/// # Errors
+/// When the folder has contents and no mark: its files may be the user's.
+fn claim(folder: &Path) -> Result<()> {
+    create_folder(folder)?;
+    let mark = folder.join(MARK);
+    let io = |error| Error::io(folder, "listing the folder", error);
+    if !mark.is_file() && std::fs::read_dir(folder).map_err(io)?.next().is_some() {
+        let fix = "give an empty folder with --output, or move its contents away";
+        return Err(Error::config(folder.display().to_string(), "has files that `swm demo` did not write", fix));
+    }
+    files::write(&mark, MARK_TEXT.as_bytes())
 }
 
 /// Collects the dataset of the demo.

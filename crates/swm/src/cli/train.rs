@@ -102,7 +102,7 @@ fn train_online(
         let env = env.rsplit('/').next().unwrap_or(env).split(',').next().unwrap_or(env);
         format!("{}-{env}", args.model)
     });
-    let out = home::checkpoint(&name);
+    let out = home::new_checkpoint(&name)?;
     let setup = OnlineRun { environments: &environments, out: &out, options };
     let Some(summary) = config.train_online(setup, &mut control(context)) else {
         let problem = format!("{} trains on datasets only", args.model);
@@ -141,7 +141,7 @@ impl TrainArgs {
             let stem = Path::new(data).file_stem().unwrap_or_default().to_string_lossy();
             format!("{}-{stem}", self.model)
         });
-        Ok((home::open_dataset(data)?, home::checkpoint(&name)))
+        Ok((home::open_dataset(data)?, home::new_checkpoint(&name)?))
     }
 }
 

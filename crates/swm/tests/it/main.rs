@@ -3,6 +3,7 @@
 
 mod collecting;
 mod data;
+mod deletion;
 mod gym;
 mod listing;
 mod pipeline;

@@ -1,0 +1,70 @@
+//! Tests that commands delete only files that the program wrote (docs/security.md).
+
+use crate::Swm;
+use std::fs;
+use std::path::Path;
+
+/// A demo of a few seconds in the folder `demo`.
+const DEMO: &[&str] =
+    &["demo", "-o", "demo", "--episodes", "2", "--eval-episodes", "2", "schedule.steps=2", "schedule.warmup=1"];
+
+/// Writes a file of the user, and its folders.
+fn user_file(path: &Path) {
+    fs::create_dir_all(path.parent().expect("a folder")).expect("creating folders");
+    fs::write(path, "thesis").expect("writing a file");
+}
+
+fn assert_untouched(path: &Path) {
+    assert_eq!(fs::read_to_string(path).expect("the user's file"), "thesis", "{}", path.display());
+}
+
+#[test]
+fn demo_refuses_a_folder_that_it_did_not_make() {
+    let swm = Swm::new();
+    let files = ["demo/results/thesis.txt", "demo/lewm-rooms/thesis.txt"].map(|name| swm.path(name));
+    files.iter().for_each(|path| user_file(path));
+    swm.fails(DEMO, 2, &["demo", "did not write", "--output"]);
+    files.iter().for_each(|path| assert_untouched(path));
+}
+
+#[test]
+fn second_demo_keeps_files_of_the_user() {
+    let swm = Swm::new();
+    swm.json(DEMO);
+    let files = ["demo/results/thesis.txt", "demo/lewm-rooms/thesis.txt", "demo/lewm-rooms/checkpoint/thesis.txt"]
+        .map(|name| swm.path(name));
+    files.iter().for_each(|path| user_file(path));
+    swm.json(DEMO);
+    files.iter().for_each(|path| assert_untouched(path));
+}
+
+#[test]
+fn checkpoint_removal_keeps_files_of_the_user() {
+    let swm = Swm::new();
+    swm.json(DEMO);
+    let run = swm.path("demo/lewm-rooms");
+    let outside = swm.path("outside/config.json");
+    let files = [run.join("thesis.txt"), run.join("checkpoint/notes/config.json"), outside.clone()];
+    files.iter().for_each(|path| user_file(path));
+    std::os::unix::fs::symlink(&outside, run.join("raw.safetensors")).expect("making a link");
+    std::os::unix::fs::symlink(swm.path("outside"), run.join("best")).expect("making a link");
+
+    swm.fails(&["checkpoints", "remove", "demo/lewm-rooms"], 2, &["not confirmed", "--yes"]);
+    assert!(run.join("checkpoint/weights.safetensors").exists());
+    let removed = swm.json(&["checkpoints", "remove", "demo/lewm-rooms", "--yes"]);
+    assert_eq!(removed["remaining"].as_array().map(Vec::len), Some(4), "{removed}");
+    assert!(!run.join("checkpoint/weights.safetensors").exists() && !run.join("train.jsonl").exists());
+    files.iter().for_each(|path| assert_untouched(path));
+}
+
+#[test]
+fn empty_names_are_refused() {
+    let swm = Swm::new();
+    let file = swm.path("checkpoints/thesis.txt");
+    user_file(&file);
+    fs::write(swm.path("checkpoints/config.json"), r#"{"family": "lewm"}"#).expect("writing a file");
+    swm.fails(&["checkpoints", "remove", "", "--yes"], 2, &["name of a checkpoint", "is empty"]);
+    swm.fails(&["train", "lewm", "--data", "", "-o", "x"], 2, &["name of a dataset", "is empty"]);
+    assert_untouched(&file);
+    assert!(swm.path("checkpoints/config.json").exists());
+}

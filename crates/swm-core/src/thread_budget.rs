@@ -41,13 +41,13 @@ mod tests {
     fn budget_is_restored_after_the_work() {
         let budgets = with(3, || (threads(), with(2, threads), threads()));
         assert_eq!((budgets, threads()), ((3, 2, 3), 1));
-        assert!(std::panic::catch_unwind(|| with(5, || panic!("as a test"))).is_err());
+        assert!(std::panic::catch_unwind(|| with(5, || panic!("the work fails"))).is_err());
         assert_eq!(threads(), 1);
     }
 
     #[test]
     fn all_sets_the_thread_count_of_the_pool() {
-        let pool = crate::pool::threads(3).expect("a thread pool");
+        let pool = crate::pool::threads(3).expect("starting three threads");
         assert_eq!(pool.install(|| all(threads)), 3);
     }
 }

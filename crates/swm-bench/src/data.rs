@@ -233,15 +233,7 @@ pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBench
                 let what = format!("lance to {}{what}", layout.name);
                 let source = jpeg.as_deref().unwrap_or(&source);
                 let folder = at("converted");
-                report.rates.push(measure_conversion(
-                    &what,
-                    verify,
-                    source,
-                    layout,
-                    &folder,
-                    config,
-                    reference.as_mut(),
-                )?);
+                report.rates.push(conversion(&what, verify, source, layout, &folder, config, reference.as_mut())?);
             }
         }
     }
@@ -423,7 +415,7 @@ fn resident() -> Option<u64> {
 }
 
 /// Measures conversions, alternately by this implementation and by the reference.
-fn measure_conversion(
+fn conversion(
     what: &str,
     verify: bool,
     source: &Path,

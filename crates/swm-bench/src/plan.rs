@@ -39,8 +39,8 @@ pub struct PlanBenchConfig {
 }
 
 impl Default for PlanBenchConfig {
-    /// The settings of the LeWM paper: 300 candidates, 30 iterations, 5 model steps of 5 actions of dimension 2; for 1
-    /// and for 16 environments. `model_seconds` is the target for a LeWM on two cores.
+    /// The settings of the stable-worldmodel paper: 300 candidates, 30 iterations, 5 model steps of 5 actions of
+    /// dimension 2; for 1 and for 16 environments. `model_seconds` is the target for a LeWM on two cores.
     fn default() -> Self {
         Self {
             envs: vec![1, 16],

@@ -22,7 +22,7 @@ pub enum Error {
         given: String,
         /// The most similar valid names, best first.
         nearest: Vec<String>,
-        /// Where the valid names are listed.
+        /// A hint that names the list of valid names.
         hint: String,
     },
     /// A value outside its space.

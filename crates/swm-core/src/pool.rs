@@ -24,7 +24,7 @@ pub struct Reset {
     pub options: ResetOptions,
 }
 
-/// The columns that the pool adds after the environment's own.
+/// The columns that the pool adds after the columns of the environment.
 struct PoolColumns {
     standard: ColumnIndices,
     step_idx: usize,

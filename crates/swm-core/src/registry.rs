@@ -15,7 +15,7 @@ pub trait Named {
 pub struct Registry<T: 'static> {
     /// The kind of the rows, for errors: "environment".
     pub kind: &'static str,
-    /// Where users find the ids, for errors: "`swm envs` lists them".
+    /// A hint for errors, which names the command that lists the ids: "`swm envs` lists them".
     pub hint: &'static str,
     /// The rows.
     pub rows: &'static [T],

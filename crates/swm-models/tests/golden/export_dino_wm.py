@@ -63,7 +63,7 @@ def main(path):
     predicted = model.predict(embedding)
     target = info["emb"][:, 1:].detach()
     out |= {"o.emb": info["emb"], "o.pred": predicted}
-    # Actions are the last column.
+    # The action embedding is the last part of a frame's embedding and is not predicted.
     free = info["emb"].shape[-1] - c["columns"][-1][2]
     loss = (predicted - target)[..., :free].square().mean()
     loss.backward()

@@ -260,8 +260,8 @@ pub trait Env: Send {
         None
     }
 
-    /// Returns the environment's own interface for starting at dataset rows; `None` if it starts by
-    /// [`Env::restore_from`]. Callers use the functions of [`crate::dataset_start`] instead of this method.
+    /// Returns the environment's own interface for starting at dataset rows; `None` if the environment
+    /// starts by [`Env::restore_from`]. Callers use the functions of [`crate::dataset_start`] instead of this method.
     fn dataset_start(&self) -> Option<&dyn DatasetStartEnv> {
         None
     }

@@ -59,7 +59,7 @@ pub enum Error {
     },
 
     // ---- data ----
-    /// Two shapes, sizes or types that must be equal, but differ.
+    /// Two shapes, sizes or types that do not fit each other.
     #[error("{operation}: got {given}, expected {expected}")]
     Mismatch {
         /// The operation that failed.

@@ -183,7 +183,8 @@ pub struct PlanProblem<'a> {
     pub space: PlanSpace<'a>,
     /// The key of each environment's plan, `[envs]`: `(seed, episode, replan)`.
     pub keys: &'a [Key],
-    /// The initial action sequences, `[envs, horizon, dim]`; `None` for zeros, or for uniform choices.
+    /// The initial action sequences, `[envs, horizon, dim]`; `None` for zeros (continuous) or uniform choices
+    /// (discrete).
     pub init: Option<&'a [f32]>,
     /// The time at which the solver stops and returns the best plan found. Solvers check the deadline after every
     /// iteration. The plan of a search that stopped early depends on the machine's speed.

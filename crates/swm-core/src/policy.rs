@@ -28,7 +28,7 @@ pub trait Policy: Send {
         Ok(())
     }
 
-    /// Whether [`Policy::act`] uses several threads. If not, it runs on the calling thread.
+    /// Whether [`Policy::act`] uses several threads. If not, `act` runs on the calling thread.
     fn uses_threads(&self) -> bool {
         true
     }

@@ -132,7 +132,7 @@ impl EnvPool {
         threads: Arc<rayon::ThreadPool>,
     ) -> Result<Self> {
         if image.is_none() && !views.is_empty() {
-            return Err(Error::config("camera views", "camera views need a frame size", "set the frame size"));
+            return Err(Error::config("camera views", "no frame size is set", "set the frame size"));
         }
         let Some(first) = envs.first() else {
             return Err(Error::config("number of environments", "it is 0", "choose at least 1"));

@@ -158,7 +158,7 @@ impl Registry<EnvEntry> {
             let options = chosen.entry.options;
             let keys = || options.iter().map(|option| option.key);
             let index = keys().position(|known| known == key).ok_or_else(|| {
-                let hint = if options.is_empty() { "it has no options" } else { "write ID,option=value" };
+                let hint = if options.is_empty() { "this environment has no options" } else { "write ID,option=value" };
                 Error::unknown("option of the environment", key, keys(), format!("{}: {hint}", chosen.entry.id))
             })?;
             let values = options[index].values;

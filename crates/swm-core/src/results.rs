@@ -62,7 +62,7 @@ pub struct Run {
     /// Prediction errors of the model on the trajectories that the starts come from, if requested.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub prediction: Option<Prediction>,
-    /// Durations. Only these differ between runs with equal manifests.
+    /// Durations. All other fields are equal for equal manifests.
     pub timing: Timing,
     /// Paths of videos, relative to the results file.
     #[serde(default)]

@@ -2,8 +2,8 @@
 //! environments than threads.
 //!
 //! The pool distributes environments over threads first ([`crate::EnvPool`]). A renderer reads [`threads`] and may draw
-//! parts of one frame on as many threads of the current rayon pool. The output of a
-//! renderer must not depend on the budget.
+//! parts of one frame on as many threads of the current rayon pool. The output of a renderer
+//! must not depend on the budget.
 
 use std::cell::Cell;
 

@@ -138,7 +138,7 @@ pub(crate) fn mismatch(shapes: &Named<Vec<usize>>, weights: &Named<HostTensor>, 
             Some(tensor) => {
                 return Some(format!("'{name}' has the shape {:?}, but {what} requires {shape:?}", tensor.shape));
             }
-            None => return Some(format!("'{name}' is missing, but {what} requires it")),
+            None => return Some(format!("'{name}' is missing from the weights of {what}")),
         }
     }
     let unknown = weights.keys().find(|name| !shapes.contains_key(*name))?;

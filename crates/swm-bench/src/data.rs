@@ -37,7 +37,7 @@ pub struct DataBenchConfig {
     pub threads: usize,
     /// Worker counts of the reference's loader; the fastest count is used.
     pub workers: Vec<usize>,
-    /// The number of measurement pairs: one of this implementation and one of the reference.
+    /// The number of measurement pairs. A pair is one measurement of this implementation and one of the reference.
     pub pairs: usize,
     /// The duration of a measurement of loading, in seconds.
     pub seconds: f64,

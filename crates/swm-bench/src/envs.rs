@@ -23,9 +23,9 @@ pub struct BenchConfig {
     pub sizes: Vec<usize>,
     /// Whether to measure stepping without frames in addition to stepping with frames.
     pub bare: bool,
-    /// Worker threads; 0 for the number of cores. The reference steps on one thread.
+    /// The number of worker threads; 0 for the number of cores. The reference steps on one thread.
     pub threads: usize,
-    /// The number of measurement pairs: one of this implementation and one of the reference.
+    /// The number of measurement pairs. A pair is one measurement of this implementation and one of the reference.
     pub pairs: usize,
     /// The duration of a measurement of stepping, in seconds.
     pub seconds: f64,
@@ -65,7 +65,7 @@ impl Default for BenchConfig {
 pub struct BenchReport {
     /// The number of environments that are stepped together.
     pub envs: usize,
-    /// Worker threads of this implementation.
+    /// The number of worker threads of this implementation.
     pub threads: usize,
     /// The version of the reference, or the reason why it is not compared.
     pub reference: String,

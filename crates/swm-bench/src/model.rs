@@ -16,7 +16,7 @@ use swm_core::{Error, Result};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Work {
-    /// A whole plan: encoding start and goal, then all iterations.
+    /// A plan: encoding start and goal, then all iterations.
     Plan,
     /// The costs of the candidates of one iteration.
     Cost,
@@ -57,7 +57,7 @@ pub trait Subject {
 pub struct ModelBenchConfig {
     /// The workloads, each with the number of repetitions in a measurement.
     pub works: Vec<(Work, usize)>,
-    /// The number of measurement pairs: one of this implementation and one of the reference.
+    /// The number of measurement pairs. A pair is one measurement of this implementation and one of the reference.
     pub pairs: usize,
     /// The sizes of the model: the first argument of the script `reference/model.py`.
     pub sizes: serde_json::Value,

@@ -28,9 +28,9 @@ pub struct PlanBenchConfig {
     /// The time in seconds that a model takes for the candidates of one environment in one iteration. The planner's
     /// time is reported relative to this time.
     pub model_seconds: f64,
-    /// Worker threads; 0 for the number of cores. The reference uses torch's default.
+    /// The number of worker threads; 0 for the number of cores. The reference uses torch's default.
     pub threads: usize,
-    /// The number of measurement pairs: one of this implementation and one of the reference.
+    /// The number of measurement pairs. A pair is one measurement of this implementation and one of the reference.
     pub pairs: usize,
     /// The duration of a measurement, in seconds.
     pub seconds: f64,
@@ -67,7 +67,7 @@ pub struct PlanBenchReport {
     pub horizon: usize,
     /// The dimension of a model step.
     pub dim: usize,
-    /// Worker threads of this implementation.
+    /// The number of worker threads of this implementation.
     pub threads: usize,
     /// The version of the reference, or the reason why it is not compared.
     pub reference: String,

@@ -104,7 +104,7 @@ fn flatten(key: &str, value: &serde_json::Value, into: &mut BTreeMap<String, Vec
     fn flatten_values(value: &serde_json::Value, into: &mut Vec<f64>) {
         match value {
             serde_json::Value::Array(values) => values.iter().for_each(|value| flatten_values(value, into)),
-            value => into.push(value.as_f64().expect("a number")),
+            value => into.push(value.as_f64().expect("a numeric factor value")),
         }
     }
     match value {

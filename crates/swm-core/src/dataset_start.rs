@@ -69,8 +69,8 @@ pub trait DatasetStartEnv {
     fn reset_from(&mut self, seed: u64, options: &ResetOptions, from: DatasetStart<'_>) -> Result<()>;
 }
 
-/// The columns of a dataset that [`reset`] reads: those of [`DatasetStartEnv::required_columns`] if the environment
-/// implements it, otherwise all columns except images.
+/// The columns of a dataset that [`reset`] reads: the columns of [`DatasetStartEnv::required_columns`] if the
+/// environment implements it, otherwise all columns except images.
 ///
 /// # Errors
 /// When the dataset lacks a required column: by default, a `state` of the environment's shape.

@@ -203,7 +203,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn unknown_names_suggest_similar_ones() {
+    fn unknown_names_suggest_similar_names() {
         let known = ["swm/PushT-v1", "swm/TwoRoom-v1"];
         assert_eq!(nearest("pusht", known), ["swm/PushT-v1"]);
         assert_eq!(nearest("swm/TowRoom-v1", known)[0], "swm/TwoRoom-v1");

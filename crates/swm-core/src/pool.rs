@@ -45,7 +45,7 @@ struct FrameColumns {
 }
 
 impl PoolColumns {
-    /// Appends the pool's columns to those of an environment.
+    /// Appends the pool's columns to the columns of an environment.
     fn add(
         mut columns: Vec<ColumnSpec>,
         image: Option<(usize, usize)>,
@@ -135,7 +135,7 @@ impl EnvPool {
             return Err(Error::config("camera views", "no frame size is set", "set the frame size"));
         }
         let Some(first) = envs.first() else {
-            return Err(Error::config("number of environments", "it is 0", "choose at least 1"));
+            return Err(Error::config("number of environments", "0", "choose at least 1"));
         };
         let spec = first.spec();
         let (schema, columns) = PoolColumns::add(spec.columns.clone(), image, views)?;

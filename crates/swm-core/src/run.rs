@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 /// An event that a run reports to its caller.
 ///
-/// A run is a sequence of stages: [`Event::Started`], any number of the other events, [`Event::Finished`]. A stage that
+/// A run is a sequence of stages: [`Event::Started`], any number of other events, [`Event::Finished`]. A stage that
 /// fails or is interrupted does not emit [`Event::Finished`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[non_exhaustive]

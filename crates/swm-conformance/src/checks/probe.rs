@@ -85,7 +85,7 @@ impl Probe {
         self.env.step(action).expect("an action of the action space")
     }
 
-    /// The observation, both frames and the success flag, as bytes.
+    /// The observation, the frame, the goal frame and the success flag, as bytes.
     pub fn all_outputs(&mut self) -> Vec<u8> {
         let mut bytes = bytes_of(self.observed());
         bytes.extend(self.frame());

@@ -68,7 +68,7 @@ fn dataset_row(probe: &mut Probe, dtype: DType) -> Batch {
     row
 }
 
-/// Checks that restoring a dataset row restores the state, the factors and both frames.
+/// Checks that restoring a dataset row restores the state, the factors, the frame and the goal frame.
 pub fn dataset_rows_restore_state_and_factors(suite: &Suite) {
     for entry in suite.rows {
         for seed in 0..suite.restored_rows {

@@ -1,5 +1,5 @@
-//! [`Learner`]: a model, its optimizer and the progress of the run. The training loop on
-//! datasets and the online training loop both update a learner.
+//! [`Learner`]: a model, its optimizer and the progress of the run. The training loop on datasets and the
+//! online training loop both update a learner.
 //!
 //! The loops access a model through the object-safe trait [`DynLearner`], so they are compiled once and not once per
 //! family.

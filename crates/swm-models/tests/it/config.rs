@@ -6,7 +6,7 @@ use swm_models::{TrainConfig, Trainable as _};
 type Config = TrainConfig<Lewm>;
 
 #[test]
-fn presets_round_trip_and_settings_override_them() {
+fn presets_round_trip_and_settings_override_presets() {
     for preset in Lewm::PRESETS {
         let config = Config::load(preset.id, &[]).expect(preset.id);
         let text = config.to_toml().expect("TOML");
@@ -19,7 +19,7 @@ fn presets_round_trip_and_settings_override_them() {
 }
 
 #[test]
-fn invalid_settings_are_named() {
+fn errors_name_invalid_settings() {
     let message =
         |setting: &str| Config::load("tiny", &[setting.to_owned()]).expect_err("an invalid setting").to_string();
     assert!(message("optim.rl=1").contains("did you mean optim.lr"), "{}", message("optim.rl=1"));

@@ -234,7 +234,7 @@ fn finds_each_defect_in_its_episode() {
     let mut broken = Broken::new(4, |_, _| {});
     broken.episodes[3].index = 1;
     let (what, episodes) = problem(&diagnose(&broken));
-    assert!(what.contains("the index 1 is also that of another episode") && episodes == [3], "{what}");
+    assert!(what.contains("the index 1 is also the index of another episode") && episodes == [3], "{what}");
     let mut broken = Broken::new(4, |_, _| {});
     broken.irregular = vec![Irregularity { episode: None, what: "3 rows belong to no episode".to_owned() }];
     let diagnosis = diagnose(&broken);

@@ -43,7 +43,7 @@ fn detect(location: &Location) -> bool {
     ENTRY.has_suffix(location)
 }
 
-/// The file of an image.
+/// Path of the image file of a step.
 fn image_path(folder: &Path, column: &str, episode: usize, step: usize, suffix: &str) -> PathBuf {
     folder.join(column).join(format!("ep_{episode}_step_{step}.{suffix}"))
 }

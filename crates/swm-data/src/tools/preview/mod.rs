@@ -1,5 +1,5 @@
-//! Previews of datasets: videos of sampled episodes and a contact sheet of them, with all cameras side by side and
-//! labelled; and functions to write such videos and sheets.
+//! Previews of datasets: one video per selected episode, and a contact sheet of all selected episodes. Every frame
+//! shows the labelled images of all cameras side by side.
 
 mod label;
 mod sheet;
@@ -17,11 +17,11 @@ use swm_image::write_png;
 /// Settings of a preview.
 #[derive(Clone, Debug)]
 pub struct PreviewOptions {
-    /// Number of episodes, spread over the dataset.
+    /// Number of episodes, which are spread evenly over the dataset.
     pub episodes: usize,
     /// The image columns to show; all if empty.
     pub columns: Vec<String>,
-    /// Frames per second.
+    /// Frame rate of the videos, in frames per second.
     pub fps: u32,
 }
 
@@ -31,20 +31,20 @@ impl Default for PreviewOptions {
     }
 }
 
-/// Frames of an episode on the contact sheet.
+/// Number of frames per episode on the contact sheet.
 const SHEET_COLUMNS: usize = 8;
 
 /// Target side of enlarged images, in pixels.
 const ENLARGED_SIDE: usize = 256;
 
-/// Rows decoded at once, which bounds the memory.
+/// Number of rows decoded at once. Limits the memory.
 const ROWS: usize = 32;
 
-/// Writes `episode_N.mp4` for some episodes and `contact_sheet.png` of all of them into a folder, and returns the
-/// paths. Calls `progress` with the number of finished episodes.
+/// Writes `episode_N.mp4` for each selected episode and one `contact_sheet.png` into a folder. Returns the paths. Calls
+/// `progress` with the number of finished episodes.
 ///
 /// # Errors
-/// If the dataset has no images or no such column, is damaged, or the folder cannot be written.
+/// If the dataset has no images, lacks one of the columns or is damaged, or the folder cannot be written.
 pub fn preview(
     reader: &dyn Reader,
     folder: &Path,
@@ -95,12 +95,12 @@ fn chosen(reader: &dyn Reader, count: usize) -> Result<Vec<usize>> {
     Ok((0..count).map(|i| all[i * all.len() / count]).collect())
 }
 
-/// Layout of a row: cameras side by side below their labels.
+/// Layout of a preview frame: the images of all cameras side by side below their labels.
 struct Strip {
     cameras: Vec<ColumnSpec>,
     width: usize,
     height: usize,
-    /// Size of a letter's point in pixels.
+    /// Side of a letter's point in pixels.
     point: usize,
 }
 

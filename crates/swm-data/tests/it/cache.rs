@@ -15,7 +15,7 @@ struct Counting {
 
 impl Counting {
     fn open(path: &Path) -> Arc<Self> {
-        Arc::new(Self { inner: open(path).expect("opens"), rows: AtomicUsize::new(0) })
+        Arc::new(Self { inner: open(path).expect("opening the dataset"), rows: AtomicUsize::new(0) })
     }
 
     fn decoded(&self) -> usize {
@@ -63,7 +63,7 @@ fn read_all(reader: &dyn Reader) -> (Vec<u8>, Vec<u8>) {
     let rows = |e: usize| (0..reader.episodes()[e].length).map(move |t| StepRange::new(e, t, 1));
     let mut ranges: Vec<StepRange> = (0..reader.episodes().len()).rev().flat_map(rows).collect();
     ranges.push(StepRange::new(2, 1, 3));
-    let batch = reader.read(&["pixels", "state"], &ranges).expect("reads");
+    let batch = reader.read(&["pixels", "state"], &ranges).expect("reading rows");
     (batch.bytes(0).to_vec(), batch.bytes(1).to_vec())
 }
 
@@ -75,7 +75,7 @@ fn dataset(folder: &Path) -> (PathBuf, usize) {
 
 #[test]
 fn decodes_cached_rows_once_within_the_limit() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let (path, rows) = dataset(folder.path());
     let reader = Counting::open(&path);
     let expected = read_all(&*reader);
@@ -94,7 +94,8 @@ fn decodes_cached_rows_once_within_the_limit() {
             let decoded = reader.decoded();
             let again = if cached_rows == rows { 0..=0 } else { rows - cached_rows..=rows + 3 - cached_rows };
             assert!(again.contains(&decoded), "{decoded} of {rows} with {cache:?}");
-            let wrong = cached.read(&["pixels"], &[StepRange::new(0, 3, 4)]).expect_err("no such rows").to_string();
+            let wrong =
+                cached.read(&["pixels"], &[StepRange::new(0, 3, 4)]).expect_err("rows beyond the episode").to_string();
             assert!(wrong.contains("rows below 5"), "{wrong}");
             reader.decoded();
         }
@@ -103,7 +104,7 @@ fn decodes_cached_rows_once_within_the_limit() {
 
 #[test]
 fn disk_cache_serves_later_runs_and_other_processes() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let (path, _) = dataset(folder.path());
     let cache = CacheConfig::Disk { folder: folder.path().join("cache"), bytes: 1 << 30 };
     let reader = Counting::open(&path);
@@ -126,7 +127,7 @@ fn disk_cache_serves_later_runs_and_other_processes() {
 
 #[test]
 fn damaged_cache_is_decoded_again() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let (path, rows) = dataset(folder.path());
     let cache = CacheConfig::Disk { folder: folder.path().join("cache"), bytes: 1 << 30 };
     let reader = Counting::open(&path);
@@ -134,16 +135,18 @@ fn damaged_cache_is_decoded_again() {
     reader.decoded();
     let files = || -> Vec<PathBuf> {
         let mut found = vec![];
-        for dataset in std::fs::read_dir(folder.path().join("cache")).expect("the cache").flatten() {
-            found.extend(std::fs::read_dir(dataset.path()).expect("its files").flatten().map(|entry| entry.path()));
+        for dataset in std::fs::read_dir(folder.path().join("cache")).expect("listing the cache").flatten() {
+            found.extend(
+                std::fs::read_dir(dataset.path()).expect("listing a cache folder").flatten().map(|entry| entry.path()),
+            );
         }
         found
     };
     let rows_file = files().into_iter().find(|file| file.extension().is_some_and(|end| end == "rows")).expect("rows");
     // A bit of the third row flips.
-    let mut bytes = std::fs::read(&rows_file).expect("reads");
+    let mut bytes = std::fs::read(&rows_file).expect("reading a file");
     bytes[2 * IMAGE + 7] ^= 1;
-    std::fs::write(&rows_file, &bytes).expect("writes");
+    std::fs::write(&rows_file, &bytes).expect("writing a file");
     assert!(read_all(&*with_cache(&reader, &cache)) == expected);
     assert_eq!(reader.decoded(), 1);
     assert!(
@@ -152,7 +155,7 @@ fn damaged_cache_is_decoded_again() {
     );
     // Both files are truncated.
     for file in files() {
-        std::fs::write(&file, b"").expect("writes");
+        std::fs::write(&file, b"").expect("writing a file");
     }
     assert!(read_all(&*with_cache(&reader, &cache)) == expected);
     assert_eq!(reader.decoded(), rows + 3);

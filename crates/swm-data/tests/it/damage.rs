@@ -10,7 +10,7 @@ use swm_data::{ImageCodec, WriteMode, image, open};
 
 /// Damages each kind of file of a Lance dataset (manifests, data).
 fn damaged_datasets(cases: u64) {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 2, 0..4);
     let report = fuzz::dataset("lance", &path, cases, fuzz::read_everything);
@@ -34,11 +34,11 @@ fn rejects_ten_thousand_damaged_datasets() {
 
 #[test]
 fn missing_data_files_are_reported() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 2, 0..4);
     for file in fuzz::files(&path.join("data")) {
-        std::fs::remove_file(file).expect("removes");
+        std::fs::remove_file(file).expect("removing a file");
     }
     let reader = open(&path as &Path);
     assert!(reader.is_err_and(|e| e.to_string().contains("damaged or missing")));
@@ -56,7 +56,7 @@ fn damaged_images(cases: u64) {
         [("qoi", ImageCodec::Qoi), ("png", ImageCodec::Png), ("jpeg", ImageCodec::Jpeg { quality: 95 })]
     {
         let mut bytes = vec![];
-        codec.encode(&image(), 30, 40, &mut bytes).expect("encodes");
+        codec.encode(&image(), 30, 40, &mut bytes).expect("encoding an image");
         let report = fuzz::bytes(name, &bytes, cases, |bytes| {
             image::image_size(bytes)?;
             let mut out = vec![0; 30 * 40 * 3];

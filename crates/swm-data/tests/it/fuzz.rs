@@ -47,41 +47,41 @@ fn only() -> Option<u64> {
 /// Damages one file of a copy of a dataset (a file or a folder) per case. Every kind of file (by folder and suffix)
 /// gets an equal number of cases. `read` opens a dataset and returns its content, as [`read_everything`] does.
 pub fn dataset<T: PartialEq>(name: &str, intact: &Path, cases: u64, read: impl Fn(&Path) -> Result<T>) -> Report {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let copy = folder.path().join(intact.file_name().expect("a name"));
     copy_all(intact, &copy);
     let kinds = kinds(&copy);
     let all: Vec<&PathBuf> = kinds.iter().flatten().collect();
-    let expected = read(&copy).expect("the intact dataset is read");
+    let expected = read(&copy).expect("reading the intact dataset");
     run(name, cases, &expected, |case, rng| {
         let kind = &kinds[case as usize % kinds.len()];
         let file = &kind[rng.random_range(0..kind.len())];
-        let bytes = std::fs::read(file).expect("reads");
+        let bytes = std::fs::read(file).expect("reading a file");
         let other = all[rng.random_range(0..all.len())];
         let change = match rng.random_range(0..16) {
             0 => {
-                std::fs::remove_file(file).expect("removes");
+                std::fs::remove_file(file).expect("removing a file");
                 "removed".to_owned()
             }
             1 if other != file => {
-                std::fs::copy(other, file).expect("copies");
+                std::fs::copy(other, file).expect("copying a file");
                 format!("replaced by {}", other.display())
             }
             _ => {
                 let (damaged, change) = damage(rng, &bytes);
-                std::fs::write(file, damaged).expect("writes");
+                std::fs::write(file, damaged).expect("writing a file");
                 change
             }
         };
         let change = format!("{} {change}", file.strip_prefix(folder.path()).unwrap_or(file).display());
-        let restore = move || std::fs::write(file, &bytes).expect("writes");
+        let restore = move || std::fs::write(file, &bytes).expect("writing a file");
         (change, || read(&copy), restore)
     })
 }
 
 /// Damages copies of a byte string, such as an encoded image.
 pub fn bytes<T: PartialEq>(name: &str, intact: &[u8], cases: u64, read: impl Fn(&[u8]) -> Result<T>) -> Report {
-    let expected = read(intact).expect("the intact bytes are read");
+    let expected = read(intact).expect("reading the intact bytes");
     run(name, cases, &expected, |_, rng| {
         let (damaged, change) = damage(rng, intact);
         let read = &read;
@@ -202,7 +202,7 @@ fn run<T: PartialEq, R: FnOnce() -> Result<T>, C: FnOnce()>(
         restore();
     }
     drop(progress);
-    watchdog.join().expect("the watchdog ends");
+    watchdog.join().expect("joining the watchdog");
     report
 }
 
@@ -236,7 +236,7 @@ pub fn files(path: &Path) -> Vec<PathBuf> {
     if path.is_file() {
         return vec![path.to_owned()];
     }
-    let entries = std::fs::read_dir(path).expect("a folder");
+    let entries = std::fs::read_dir(path).expect("listing a folder");
     let mut found: Vec<PathBuf> = entries.flat_map(|entry| files(&entry.expect("an entry").path())).collect();
     found.sort();
     found
@@ -249,8 +249,8 @@ pub fn copy_all(from: &Path, to: &Path) {
             Ok(rest) if !rest.as_os_str().is_empty() => to.join(rest),
             _ => to.to_owned(),
         };
-        std::fs::create_dir_all(target.parent().expect("a folder")).expect("a folder");
-        std::fs::copy(&file, &target).expect("copies");
+        std::fs::create_dir_all(target.parent().expect("a folder")).expect("creating a folder");
+        std::fs::copy(&file, &target).expect("copying a file");
     }
 }
 

@@ -28,10 +28,10 @@ fn config(goals: &[(&str, GoalMixture)]) -> LoaderConfig {
 
 #[test]
 fn goals_are_rows_of_the_dataset_with_offsets() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..9);
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     let goals = [("goal", GoalMixture::default()), ("end", GoalMixture::LAST), ("later", GoalMixture::FUTURE)];
     let batches = load(&reader, config(&goals), 0, 0);
     // A clip has two steps of two rows; a goal after the second step requires one more row.
@@ -66,10 +66,10 @@ fn goals_are_rows_of_the_dataset_with_offsets() {
 
 #[test]
 fn goals_are_reproducible_and_differ_between_epochs() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..9);
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     let goals = [("goal", GoalMixture::default())];
     let states = |config: LoaderConfig, epoch, first| -> Vec<f64> {
         let batches = load(&reader, config, epoch, first);

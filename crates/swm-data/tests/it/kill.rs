@@ -27,8 +27,8 @@ struct Running {
 fn start(test: &str, path: &Path) -> Running {
     let mut command = Command::new(std::env::current_exe().expect("the test executable"));
     command.args(["--exact", &format!("kill::{test}"), "--nocapture"]).env(TARGET, path);
-    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().expect("starts");
-    let mut output = BufReader::new(child.stdout.take().expect("a pipe")).lines();
+    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().expect("starting the child process");
+    let mut output = BufReader::new(child.stdout.take().expect("the output of the child process")).lines();
     let begun = output.any(|line| line.is_ok_and(|line| line.contains("begun")));
     assert!(begun, "the child ended before it began");
     Running { child, _output: output }
@@ -41,7 +41,7 @@ fn kill(mut running: Running, key: Key, longest: Duration) -> bool {
     while Instant::now() < end {
         std::hint::spin_loop();
     }
-    running.child.kill().expect("kills the child");
+    running.child.kill().expect("killing the child process");
     !running.child.wait().expect("an exit status").success()
 }
 
@@ -57,9 +57,9 @@ fn write_until(mut writer: Box<dyn Writer>, until: usize) {
     println!("begun");
     for e in writer.episodes()..until {
         let constants = Constants::from([("number".to_owned(), e.to_string().into_bytes())]);
-        writer.write_episode_with(&episode(e), &constants).expect("writes");
+        writer.write_episode_with(&episode(e), &constants).expect("writing an episode");
     }
-    writer.finish().expect("finishes");
+    writer.finish().expect("finishing the dataset");
 }
 
 /// A child process: creates or continues a dataset forever.
@@ -67,7 +67,7 @@ fn write_until(mut writer: Box<dyn Writer>, until: usize) {
 fn child_that_appends() {
     let Some(path) = target() else { return };
     let options = WriteOptions { commit: frequent_commits(), ..options(WriteMode::Append) };
-    write_until(create(&path, &schema(), options).expect("continues"), 1_000_000);
+    write_until(create(&path, &schema(), options).expect("continuing the dataset"), 1_000_000);
 }
 
 /// A child process: replaces a dataset with ten episodes, again and again.
@@ -76,7 +76,7 @@ fn child_that_replaces() {
     let Some(path) = target() else { return };
     loop {
         let options = WriteOptions { commit: frequent_commits(), ..options(WriteMode::Overwrite) };
-        write_until(create(&path, &schema(), options).expect("replaces"), 10);
+        write_until(create(&path, &schema(), options).expect("replacing the dataset"), 10);
     }
 }
 
@@ -88,31 +88,31 @@ fn child_that_writes_parts() {
     for index in 0..2 {
         let options = WriteOptions { commit: frequent_commits(), ..options(WriteMode::Append) };
         let shard = Shard { index, count: 2 };
-        let mut writer = create_shard(&Location::from(&path), &schema(), options, shard).expect("continues");
+        let mut writer = create_shard(&Location::from(&path), &schema(), options, shard).expect("continuing the shard");
         for e in writer.episodes()..6 {
-            writer.write_episode(&episode(6 * index + e)).expect("writes");
+            writer.write_episode(&episode(6 * index + e)).expect("writing an episode");
         }
-        writer.finish().expect("finishes");
+        writer.finish().expect("finishing the dataset");
     }
-    commit_shards(&Location::from(&path)).expect("commits");
+    commit_shards(&Location::from(&path)).expect("committing the shards");
 }
 
 /// Checks that everything is readable and that episode indices have no gap.
 fn check_all(path: &Path, constants: bool) -> usize {
-    let reader = open(path).expect("opens");
+    let reader = open(path).expect("opening the dataset");
     check(&*reader, 0);
     for (at, stored) in reader.episodes().iter().enumerate() {
         assert_eq!(stored.index, at as i64);
         if constants {
-            assert_eq!(reader.constants(at).expect("reads")["number"], at.to_string().into_bytes());
+            assert_eq!(reader.constants(at).expect("reading constants")["number"], at.to_string().into_bytes());
         }
     }
-    reader.content_hash().expect("a hash");
+    reader.content_hash().expect("hashing the content");
     reader.episodes().len()
 }
 
 fn killed_appends(moments: u64) {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     let mut stored = 0;
     for moment in 0..moments {
@@ -127,15 +127,15 @@ fn killed_appends(moments: u64) {
     }
     assert!(stored > 0);
     // The next writer continues and ignores leftovers.
-    let mut writer = create(&path, &schema(), options(WriteMode::Append)).expect("continues");
+    let mut writer = create(&path, &schema(), options(WriteMode::Append)).expect("continuing the dataset");
     let constants = Constants::from([("number".to_owned(), stored.to_string().into_bytes())]);
-    writer.write_episode_with(&episode(stored), &constants).expect("writes");
-    writer.finish().expect("finishes");
+    writer.write_episode_with(&episode(stored), &constants).expect("writing an episode");
+    writer.finish().expect("finishing the dataset");
     assert_eq!(check_all(&path, true), stored + 1);
 }
 
 fn killed_replacements(moments: u64) {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     for moment in 0..moments {
         let child = start("child_that_replaces", &path);
@@ -148,7 +148,7 @@ fn killed_replacements(moments: u64) {
 }
 
 fn killed_parts(moments: u64) {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     for moment in 0..moments {
         let path = folder.path().join(format!("{moment}.lance"));
         let child = start("child_that_writes_parts", &path);
@@ -159,7 +159,8 @@ fn killed_parts(moments: u64) {
                 assert_eq!(check_all(&path, false), 12, "both shards are committed together");
                 let _ = commit_shards(&Location::from(&path));
             } else {
-                let status = start("child_that_writes_parts", &path).child.wait().expect("ends");
+                let status =
+                    start("child_that_writes_parts", &path).child.wait().expect("waiting for the child process");
                 assert!(status.success(), "moment {moment}");
             }
         }

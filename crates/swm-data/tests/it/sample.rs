@@ -18,7 +18,7 @@ pub fn schema() -> Schema {
         ColumnSpec::new("variation.agent.color", DType::Int64, [3]),
         ColumnSpec::image("goal", 16, 24),
     ])
-    .expect("schema")
+    .expect("a valid schema")
 }
 
 /// Number of rows of episode `e`.
@@ -58,18 +58,18 @@ pub fn options(mode: WriteMode) -> WriteOptions {
 /// Writes episodes with a commit after every `group` of them.
 pub fn write(path: &Path, mode: WriteMode, group: usize, episodes: std::ops::Range<usize>) {
     let commit = CommitPolicy { episodes: group, ..CommitPolicy::default() };
-    let mut writer = create(path, &schema(), WriteOptions { commit, ..options(mode) }).expect("creates");
+    let mut writer = create(path, &schema(), WriteOptions { commit, ..options(mode) }).expect("creating the dataset");
     for e in episodes {
-        writer.write_episode(&episode(e)).expect("writes");
+        writer.write_episode(&episode(e)).expect("writing an episode");
     }
-    writer.finish().expect("finishes");
+    writer.finish().expect("finishing the dataset");
 }
 
 /// Checks that position `p` holds episode `first + p`, for all positions.
 pub fn check(reader: &dyn Reader, first: usize) {
     let all: Vec<StepRange> =
         reader.episodes().iter().enumerate().map(|(p, episode)| StepRange::new(p, 0, episode.length)).collect();
-    let read = reader.read(&COLUMNS, &all).expect("reads");
+    let read = reader.read(&COLUMNS, &all).expect("reading rows");
     let mut at = 0;
     for (p, stored) in reader.episodes().iter().enumerate() {
         let expected = episode(first + p);

@@ -58,7 +58,7 @@ fn with_cache(reader: &Arc<Counting>, cache: &CacheConfig) -> Arc<dyn Reader> {
     cache.over(Arc::clone(reader) as Arc<dyn Reader>, &["pixels", "state"]).expect("a cache")
 }
 
-/// Every image and state, as single rows in a mixed order.
+/// Reads every image and state row by row, the last episode first, and then three rows of episode 2 again.
 fn read_all(reader: &dyn Reader) -> (Vec<u8>, Vec<u8>) {
     let rows = |e: usize| (0..reader.episodes()[e].length).map(move |t| StepRange::new(e, t, 1));
     let mut ranges: Vec<StepRange> = (0..reader.episodes().len()).rev().flat_map(rows).collect();
@@ -90,7 +90,7 @@ fn decodes_cached_rows_once_within_the_limit() {
             assert!(read_all(&*cached) == expected, "{cache:?}");
             assert_eq!(reader.decoded(), rows + 3, "first read with {cache:?}");
             assert!(read_all(&*cached) == expected, "{cache:?}");
-            // The three rows that are read twice are cached only if all rows are.
+            // A cached row saves two decodes if it is one of the three rows that are read twice.
             let decoded = reader.decoded();
             let again = if cached_rows == rows { 0..=0 } else { rows - cached_rows..=rows + 3 - cached_rows };
             assert!(again.contains(&decoded), "{decoded} of {rows} with {cache:?}");
@@ -112,7 +112,7 @@ fn disk_cache_serves_later_runs_and_other_processes() {
     reader.decoded();
     let first = with_cache(&reader, &cache);
     assert!(read_all(&*first) == expected && reader.decoded() == 0, "a new run reads the cached rows");
-    // A second cache at the same time has no lock, but reads the existing rows.
+    // A second cache does not get the lock while the first cache exists, but reads the existing rows.
     let second = with_cache(&reader, &cache);
     assert!(read_all(&*second) == expected && reader.decoded() == 0);
     drop((first, second));
@@ -143,7 +143,7 @@ fn damaged_cache_is_decoded_again() {
         found
     };
     let rows_file = files().into_iter().find(|file| file.extension().is_some_and(|end| end == "rows")).expect("rows");
-    // A bit of the third row flips.
+    // Flips a bit of the third row.
     let mut bytes = std::fs::read(&rows_file).expect("reading a file");
     bytes[2 * IMAGE + 7] ^= 1;
     std::fs::write(&rows_file, &bytes).expect("writing a file");
@@ -153,7 +153,7 @@ fn damaged_cache_is_decoded_again() {
         read_all(&*with_cache(&reader, &cache)) == expected && reader.decoded() == 0,
         "the damaged row is stored again"
     );
-    // Both files are truncated.
+    // Empties both files.
     for file in files() {
         std::fs::write(&file, b"").expect("writing a file");
     }

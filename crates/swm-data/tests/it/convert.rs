@@ -1,4 +1,5 @@
-//! Conversion between all formats: resumed, verified, and rejected if the target holds other data.
+//! Conversions between all formats are verified, resumed after an interruption, and rejected if the target holds other
+//! data.
 
 use crate::sample::{check, episode, options, schema, write};
 use rand::Rng as _;
@@ -22,7 +23,7 @@ fn lossless(mode: ConvertMode) -> ConvertOptions {
     ConvertOptions { mode, codec: ImageCodec::Png, ..ConvertOptions::default() }
 }
 
-/// The episodes `0..9` with lossless images.
+/// Writes the episodes `0..9` with lossless images.
 fn source(folder: &Path) -> PathBuf {
     let path = folder.join("source.lance");
     let mut writer = create(&path, &schema(), WriteOptions { codec: ImageCodec::Png, ..options(WriteMode::Create) })
@@ -63,7 +64,7 @@ fn every_format_preserves_the_content() {
         if report.columns.iter().all(|column| column.exact) {
             assert_eq!(checksum(&*to).expect("a checksum"), sum, "{}", format.id);
         }
-        // Back to the source's format.
+        // Converts back to the source's format.
         let back = folder.path().join(format!("back-{}.lance", format.id));
         run(&target, &back, &lossless(ConvertMode::Create)).unwrap_or_else(|error| panic!("{}: {error}", format.id));
         check(&*open(&back).expect("opening the dataset"), 0);

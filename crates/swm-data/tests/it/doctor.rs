@@ -99,7 +99,7 @@ fn diagnose(reader: &dyn Reader) -> Diagnosis {
     examine(reader, &MODELS, &mut Control::new()).expect("examining the dataset")
 }
 
-/// The only problem: its description and episodes.
+/// Returns the description and the episodes of the only problem.
 fn problem(diagnosis: &Diagnosis) -> (String, Vec<usize>) {
     let problems: Vec<_> = diagnosis.findings.iter().filter(|found| found.severity == Severity::Problem).collect();
     assert_eq!(problems.len(), 1, "{problems:?}");
@@ -182,7 +182,7 @@ fn repairs_the_readable_part_of_a_table() {
 
 #[test]
 #[allow(clippy::too_many_lines, reason = "a table of defects")]
-fn finds_each_defect_in_its_episode() {
+fn reports_the_episodes_of_each_defect() {
     type Breaking = fn(usize, &mut Batch);
     let breaks: [(&str, Breaking); 7] = [
         ("'reward' has a value that is not finite", |e, rows| {
@@ -292,7 +292,7 @@ fn repair_writes_the_intact_episodes() {
             rows.get_mut::<f32>("reward").expect("rewards").fill(f32::NAN);
         }
         if e == 4 {
-            // Repeated step indices, as after two writers used the same episode index.
+            // Repeated step indices, as if two writers had used the same episode index.
             rows.get_mut::<i64>("step_idx").expect("steps").fill(0);
         }
     });

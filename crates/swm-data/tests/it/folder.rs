@@ -22,7 +22,7 @@ fn killed_writer_keeps_committed_episodes() {
 }
 
 #[test]
-#[ignore = "a minute"]
+#[ignore = "takes a minute"]
 fn writer_killed_50_times_keeps_committed_episodes() {
     format_suite::killed("d.folder", 50);
 }
@@ -44,21 +44,20 @@ fn rejects_damaged_folders() {
 }
 
 #[test]
-#[ignore = "minutes"]
+#[ignore = "takes minutes"]
 fn rejects_folders_damaged_in_10000_ways() {
     damaged(10_000);
 }
 
 #[test]
-fn rejects_damaged_leftovers_of_an_interrupted_writer() {
-    // The folder holds a journal, and column files without rows.
+fn rejects_damaged_journals() {
+    // The unfinished writer leaves a journal, and column files without rows.
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.folder");
     let mut writer = format_suite::writer(&path, WriteMode::Create).expect("creating the dataset");
     (0..4).for_each(|e| writer.write_episode(&sample::episode(e)).expect("writing an episode"));
     let journal = std::fs::read(path.join("ep_len.journal")).expect("a journal");
-    let whole = open(&path).expect("opening the dataset").episodes().len();
-    assert_eq!(whole, 4);
+    assert_eq!(open(&path).expect("opening the dataset").episodes().len(), 4);
     let copy = folder.path().join("copy.folder");
     fuzz::copy_all(&path, &copy);
     let read = |bytes: &[u8]| {
@@ -68,8 +67,8 @@ fn rejects_damaged_leftovers_of_an_interrupted_writer() {
     };
     let report = fuzz::bytes("journal", &journal, 300, read);
     assert!(report.refused > 30, "{report:?}");
-    for cut in (0..journal.len()).step_by(journal.len() / 40) {
-        std::fs::write(copy.join("ep_len.journal"), &journal[..cut]).expect("writing a file");
+    for length in (0..journal.len()).step_by(journal.len() / 40) {
+        std::fs::write(copy.join("ep_len.journal"), &journal[..length]).expect("writing a file");
         let reader = open(&copy).expect("the complete records");
         assert!(reader.episodes().len() < 4);
         format_suite::check(&*reader, 0);
@@ -151,7 +150,7 @@ fn reference_reads_folders_written_here() {
     let mut names: Vec<String> = sample::schema().columns().iter().map(|column| column.name.clone()).collect();
     names.sort();
     assert_eq!(seen["columns"], serde_json::json!(names));
-    // The last clip: rows of the last episode.
+    // The last clip consists of rows of the last episode.
     let first = sample::rows(7) - 4;
     assert_eq!(seen["state"], serde_json::json!([[7.0, first as f64, -0.5], [7.0, first as f64 + 2.0, -0.5]]));
     let last = sample::episode(7);

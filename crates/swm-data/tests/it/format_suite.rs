@@ -20,7 +20,7 @@ pub fn writer(location: impl Into<Location>, mode: WriteMode) -> Result<Box<dyn 
     create(location, &schema(), WriteOptions { mode, codec: ImageCodec::Png, manifest: Some(manifest(3)), commit })
 }
 
-/// A scene that every third episode shares, and a unique note.
+/// The constants of episode `e`: a scene that every third episode shares, and a unique note.
 fn constants(e: usize) -> Constants {
     let scene = format!("<mujoco model='{}'/>", e % 3);
     Constants::from([("scene.xml".to_owned(), scene.into_bytes()), ("note".to_owned(), vec![e as u8; e])])
@@ -53,7 +53,7 @@ fn check_constants(reader: &dyn Reader, first: usize) {
     }
 }
 
-/// Runs all tests except those that kill processes.
+/// Runs all tests except the tests that kill processes.
 pub fn all(name: &str) {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join(name);
@@ -72,7 +72,7 @@ fn check_write_modes(path: &Path) {
     let reader = open(path).expect("opening the dataset");
     assert_eq!(reader.episodes().len(), 5);
     assert_eq!(reader.schema().columns()[0], ColumnSpec::new("episode_idx", DType::Int32, []));
-    assert_eq!(reader.schema().column("step_idx").expect("a column").dtype, DType::Int64, "as it was declared");
+    assert_eq!(reader.schema().column("step_idx").expect("a column").dtype, DType::Int64, "the declared type");
     let data_columns = |columns: &[ColumnSpec]| -> Vec<ColumnSpec> {
         columns.iter().filter(|column| !column.name.ends_with("_idx")).cloned().collect()
     };
@@ -82,7 +82,7 @@ fn check_write_modes(path: &Path) {
     assert_eq!(reader.manifest(), Some(manifest(3)));
     let parts = reader.footprint().expect("listing the files");
     assert!(parts.iter().any(|(part, size)| part == "pixels" && *size > 0), "{parts:?}");
-    let five = reader.content_hash().expect("hashing the content");
+    let hash = reader.content_hash().expect("hashing the content");
 
     let error = writer(path, WriteMode::Create).err().expect("an existing dataset").to_string();
     assert!(error.contains("exists already") && error.contains("append"), "{error}");
@@ -91,7 +91,7 @@ fn check_write_modes(path: &Path) {
     assert_eq!(reader.episodes().len(), 9);
     check(&*reader, 0);
     check_constants(&*reader, 0);
-    assert_ne!(reader.content_hash().expect("hashing the content"), five);
+    assert_ne!(reader.content_hash().expect("hashing the content"), hash);
 
     let few = Schema::new(schema().columns()[..3].to_vec()).expect("a valid schema");
     let options = WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() };
@@ -106,7 +106,7 @@ fn check_write_modes(path: &Path) {
     write(path, WriteMode::Overwrite, 0..5);
     assert_eq!(
         open(path).expect("opening the dataset").content_hash().expect("hashing the content"),
-        five,
+        hash,
         "equal content has equal hashes"
     );
 }
@@ -215,14 +215,14 @@ fn numeric_types_round_trip(path: &Path) {
     (0..names.len()).for_each(|column| assert!(read.bytes(column) == batch.bytes(column), "{}", names[column]));
 }
 
-/// Kills a writer at random times, drawn with a fixed key. All committed episodes must be readable, and the next writer
-/// continues.
-pub fn killed(name: &str, moments: u64) {
+/// Kills `kills` writers at random times, drawn with a fixed key. All committed episodes must be readable, and the next
+/// writer continues.
+pub fn killed(name: &str, kills: u64) {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join(name);
     let mut stored = 0;
-    for moment in 0..moments {
-        let mut rng = Key::new(5).with(name).at(moment).rng();
+    for kill in 0..kills {
+        let mut rng = Key::new(5).with(name).at(kill).rng();
         let mut child = child(&path).spawn().expect("starting the child process");
         let mut lines = BufReader::new(child.stdout.take().expect("the output of the child process")).lines();
         let mut last = None;
@@ -239,12 +239,12 @@ pub fn killed(name: &str, moments: u64) {
         child.wait().expect("an exit status");
         let now = match open(&path) {
             Ok(reader) => {
-                // With a tolerance, because the child stores JPEG in formats that encode images.
+                // Compares with a tolerance, because the child stores JPEG in formats that encode images.
                 sample::check(&*reader, 0);
                 reader.episodes().len()
             }
             Err(error) => {
-                assert!(stored == 0 && last.is_none(), "moment {moment}: {error}");
+                assert!(stored == 0 && last.is_none(), "kill {kill}: {error}");
                 0
             }
         };
@@ -252,7 +252,7 @@ pub fn killed(name: &str, moments: u64) {
         let reported = last.map_or(0, |last| last + 1);
         assert!(
             now >= stored && now + 3 > reported,
-            "moment {moment}: {now} episodes after {stored}; {reported} were written"
+            "kill {kill}: {now} episodes after {stored}; {reported} were written"
         );
         stored = now;
     }
@@ -265,7 +265,7 @@ pub fn killed(name: &str, moments: u64) {
     sample::check(&*reader, 0);
 }
 
-/// A process that writes episodes until it is killed.
+/// The command of a child process that writes episodes until it is killed.
 fn child(path: &Path) -> Command {
     let program: PathBuf = std::env::current_exe().expect("the test executable");
     let mut command = Command::new(program);

@@ -170,7 +170,7 @@ fn random_offset(rng: &mut Rng, len: usize) -> usize {
 }
 
 /// Runs the cases that `prepare` returns: a description, a function that reads the damaged copy, and a function that
-/// restores it.
+/// restores the copy.
 fn run<T: PartialEq, R: FnOnce() -> Result<T>, C: FnOnce()>(
     name: &str,
     cases: u64,
@@ -178,8 +178,8 @@ fn run<T: PartialEq, R: FnOnce() -> Result<T>, C: FnOnce()>(
     prepare: impl Fn(u64, &mut Rng) -> (String, R, C),
 ) -> Report {
     // Only one fuzz test runs at a time, because allocations are recorded for all threads.
-    static ONE: Mutex<()> = Mutex::new(());
-    let _one = ONE.lock().unwrap_or_else(PoisonError::into_inner);
+    static LOCK: Mutex<()> = Mutex::new(());
+    let _lock = LOCK.lock().unwrap_or_else(PoisonError::into_inner);
     let mut report = Report::default();
     let (progress, watched) = channel();
     let watchdog = std::thread::spawn(move || watch(&watched));
@@ -206,7 +206,7 @@ fn run<T: PartialEq, R: FnOnce() -> Result<T>, C: FnOnce()>(
     report
 }
 
-/// Aborts the process and names the case if it takes too long, because a hanging thread cannot be stopped.
+/// Aborts the process and names the case if the case takes too long, because a hanging thread cannot be stopped.
 fn watch(cases: &Receiver<String>) {
     let mut current = String::new();
     loop {
@@ -254,7 +254,7 @@ pub fn copy_all(from: &Path, to: &Path) {
     }
 }
 
-/// Size of the largest allocation since this was last 0, on any thread, because readers use threads of their own. No
+/// Size in bytes of the largest allocation since the last reset to 0, on any thread, because readers start threads. No
 /// other test of this program allocates as much.
 static LARGEST: AtomicUsize = AtomicUsize::new(0);
 
@@ -266,24 +266,24 @@ struct RecordingAllocator;
 unsafe impl GlobalAlloc for RecordingAllocator {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         LARGEST.fetch_max(layout.size(), Ordering::Relaxed);
-        // SAFETY: the caller upholds the contract of this function, which is that of the system allocator.
+        // SAFETY: the caller upholds the contract of this function, which equals the contract of the system allocator.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
         LARGEST.fetch_max(layout.size(), Ordering::Relaxed);
-        // SAFETY: the caller upholds the contract of this function, which is that of the system allocator.
+        // SAFETY: the caller upholds the contract of this function, which equals the contract of the system allocator.
         unsafe { System.alloc_zeroed(layout) }
     }
 
     unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
         LARGEST.fetch_max(size, Ordering::Relaxed);
-        // SAFETY: the caller upholds the contract of this function, which is that of the system allocator.
+        // SAFETY: the caller upholds the contract of this function, which equals the contract of the system allocator.
         unsafe { System.realloc(pointer, layout, size) }
     }
 
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller upholds the contract of this function, which is that of the system allocator.
+        // SAFETY: the caller upholds the contract of this function, which equals the contract of the system allocator.
         unsafe { System.dealloc(pointer, layout) }
     }
 }

@@ -22,7 +22,7 @@ fn killed_writer_keeps_committed_episodes() {
 }
 
 #[test]
-#[ignore = "a minute"]
+#[ignore = "takes a minute"]
 fn writer_killed_50_times_keeps_committed_episodes() {
     format_suite::killed("d.h5", 50);
 }
@@ -46,14 +46,15 @@ fn rejects_damaged_files() {
 }
 
 #[test]
-#[ignore = "minutes"]
+#[ignore = "takes minutes"]
 fn rejects_files_damaged_in_10000_ways() {
     damaged(10_000);
 }
 
 #[test]
 fn many_chunks_form_b_trees_of_several_levels() {
-    // 64 chunks per leaf, 4096 per node of the second level: three levels, with commits at any position.
+    // A leaf holds 64 chunks and a node of the second level 4096, so the tree has three levels. Each commit ends at
+    // another position in the tree.
     let schema = Schema::new([ColumnSpec::new("large", DType::U8, [2048]), ColumnSpec::new("small", DType::Int64, [])]);
     let schema = schema.expect("a valid schema");
     let folder = tempfile::tempdir().expect("a temporary folder");
@@ -94,10 +95,10 @@ fn interop(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop").join(name)
 }
 
-/// Lengths of the episodes in the files that `hdf5_export.py` writes. [`image`] and [`values`] return the content of
-/// row `t` of a file.
+/// Lengths of the episodes in the files that `hdf5_export.py` writes.
 const LENGTHS: [usize; 3] = [6, 7, 8];
 
+/// The image in row `t` of these files.
 fn image(t: usize) -> Vec<u8> {
     let mut rgb = vec![];
     for y in 0..6 {
@@ -109,23 +110,24 @@ fn image(t: usize) -> Vec<u8> {
     rgb
 }
 
+/// The numeric values in row `t` of these files.
 fn values(t: usize) -> [i64; 5] {
     std::array::from_fn(|k| (t * 100 + k * k) as i64)
 }
 
-/// Reads a whole column, and checks that reading single rows in any order gives the same.
+/// Reads all rows of a column, and checks that reading single rows in reverse order gives the same values.
 fn column(reader: &dyn Reader, name: &str) -> Batch {
     let all: Vec<StepRange> = LENGTHS.iter().enumerate().map(|(e, &length)| StepRange::new(e, 0, length)).collect();
-    let whole = reader.read(&[name], &all).unwrap_or_else(|e| panic!("{name}: {e}"));
+    let all_rows = reader.read(&[name], &all).unwrap_or_else(|e| panic!("{name}: {e}"));
     let mut rows: Vec<StepRange> = (0..3).flat_map(|e| (0..LENGTHS[e]).map(move |t| StepRange::new(e, t, 1))).collect();
     rows.reverse();
     let single = reader.read(&[name], &rows).expect("reading rows");
     for t in 0..21 {
         let row =
             |batch: &Batch, t: usize| batch.bytes(0).chunks_exact(batch.bytes(0).len() / 21).nth(t).map(<[u8]>::to_vec);
-        assert_eq!(row(&whole, t), row(&single, 20 - t), "{name}");
+        assert_eq!(row(&all_rows, t), row(&single, 20 - t), "{name}");
     }
-    whole
+    all_rows
 }
 
 fn has_images(reader: &dyn Reader, name: &str) {
@@ -200,7 +202,7 @@ fn reads_every_layout() {
     (0..21)
         .for_each(|t| assert_eq!(read.row(t).get::<i32>("numbers i1").expect("values")[3], values(t)[3] as i32 % 100));
     let read = column(&*reader, "numbers f2");
-    // Half precision has 11 bits, so values above 2048 must be even.
+    // Half precision represents integers up to 2048 exactly.
     (0..20).for_each(|t| assert_eq!(read.row(t).get::<f32>("numbers f2").expect("values")[0], (t * 100) as f32));
     let read = column(&*reader, "truth");
     (0..21).for_each(|t| assert_eq!(read.row(t).get::<u8>("truth").expect("a boolean"), [u8::from(t % 3 == 0)]));
@@ -226,7 +228,7 @@ fn rejects_or_reads_damaged_third_party_files() {
 }
 
 #[test]
-#[ignore = "minutes"]
+#[ignore = "takes minutes"]
 fn rejects_or_reads_third_party_files_damaged_in_10000_ways() {
     for name in ["hdf5-reference.h5", "hdf5-filters.h5", "hdf5-layouts.h5", "hdf5-trees.h5"] {
         let report = fuzz::dataset(name, &interop(name), 2500, fuzz::read_everything);
@@ -235,7 +237,7 @@ fn rejects_or_reads_third_party_files_damaged_in_10000_ways() {
     }
 }
 
-/// One episode of `hdf5-reference.h5`.
+/// The second episode of `hdf5-reference.h5`.
 fn reference_episode() -> Batch {
     let reader = open(interop("hdf5-reference.h5")).expect("opening the dataset");
     let columns: Vec<ColumnSpec> = reader.schema().columns()[1..].to_vec();
@@ -280,7 +282,7 @@ fn check(mode: &str, path: &Path) -> Option<Value> {
     Some(serde_json::from_slice(&output.stdout).expect("JSON"))
 }
 
-/// Compares the columns that h5py reads with those that this crate reads.
+/// Compares the columns that h5py reads with the columns that this crate reads.
 fn check_columns(path: &Path, seen: &Value) {
     let reader = open(path).expect("opening the dataset");
     let all: Vec<StepRange> =

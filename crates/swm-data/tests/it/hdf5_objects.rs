@@ -15,15 +15,15 @@ fn reads_files_in_a_bucket_and_on_a_web_server() {
     let reader = open(&location).expect("opening the dataset");
     assert_eq!(reader.episodes().len(), 30);
     format_suite::check(&*reader, 0);
-    let here = open(&path).expect("opening the dataset");
-    assert_eq!(reader.content_hash().expect("hashing the content"), here.content_hash().expect("hashing the content"));
-    assert_eq!(reader.constants(7).expect("reading constants"), here.constants(7).expect("reading constants"));
+    let local = open(&path).expect("opening the dataset");
+    assert_eq!(reader.content_hash().expect("hashing the content"), local.content_hash().expect("hashing the content"));
+    assert_eq!(reader.constants(7).expect("reading constants"), local.constants(7).expect("reading constants"));
     // A batch in random order, with some rows twice.
     let ranges: Vec<StepRange> = (0..60).map(|i| StepRange::new(i * 7 % 30, i % 4, 2)).collect();
     let names = ["pixels", "action", "state"];
-    let (near, far) =
-        (here.read(&names, &ranges).expect("reading rows"), reader.read(&names, &ranges).expect("reading rows"));
-    (0..3).for_each(|column| assert!(near.bytes(column) == far.bytes(column), "{}", names[column]));
+    let (local_rows, remote_rows) =
+        (local.read(&names, &ranges).expect("reading rows"), reader.read(&names, &ranges).expect("reading rows"));
+    (0..3).for_each(|column| assert!(local_rows.bytes(column) == remote_rows.bytes(column), "{}", names[column]));
 
     let bucket = objects::serve(folder.path(), true);
     let output =

@@ -1,4 +1,4 @@
-//! Writers that are killed or run out of disk space keep committed episodes and leave no partial ones.
+//! Writers that are killed or run out of disk space keep committed episodes and leave no partial episodes.
 
 use crate::sample::{check, episode, options, schema, write};
 use std::io::{BufRead as _, BufReader};
@@ -28,7 +28,7 @@ fn child_that_writes() {
     }
 }
 
-/// The command that runs a child test after `shell` has set its limits.
+/// The command that runs a child test after `shell` has set the limits of the process.
 fn run_child(test: &str, path: &Path, shell: &str) -> Command {
     let mut command = Command::new("sh");
     let program = std::env::current_exe().expect("the test executable");

@@ -26,7 +26,7 @@ fn written_episodes_round_trip() {
     let mut expected = vec![ColumnSpec::new("episode_idx", DType::Int32, []), schema().columns()[5].clone()];
     expected.extend(schema().columns().iter().filter(|c| c.name != "step_idx").cloned());
     assert_eq!(reader.schema().columns(), expected);
-    // A folder that contains one table can be opened, too.
+    // A folder that contains one table can also be opened.
     assert_eq!(open(folder.path()).expect("opening the dataset").episodes(), reader.episodes());
     let on_disk: u64 = reader.footprint().expect("listing the files").iter().map(|(_, bytes)| bytes).sum();
     assert!(on_disk > 5_000, "{on_disk}");
@@ -94,7 +94,8 @@ fn follows_the_write_mode() {
     assert_eq!(writer.episodes(), 3);
     writer.write_episode(&episode(3)).expect("writing an episode");
     assert_eq!(writer.episodes(), 4);
-    drop(writer); // commits as `finish` does, but cannot report errors
+    // Dropping the writer commits as `finish` does, but cannot report errors.
+    drop(writer);
     let reader = open(&path).expect("opening the dataset");
     check(&*reader, 0);
     assert_eq!(reader.episodes().iter().map(|e| e.index).collect::<Vec<_>>(), [0, 1, 2, 3]);
@@ -243,7 +244,7 @@ fn concurrent_writers_both_append() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     let threads = 4;
-    let each = 25;
+    let episodes_per_thread = 25;
     std::thread::scope(|scope| {
         for thread in 0..threads {
             let path = &path;
@@ -251,8 +252,8 @@ fn concurrent_writers_both_append() {
                 let commit = CommitPolicy { episodes: 1, ..CommitPolicy::default() };
                 let options = WriteOptions { commit, ..options(WriteMode::Append) };
                 let mut writer = create(path, &schema(), options).expect("continuing the dataset");
-                for e in 0..each {
-                    writer.write_episode(&episode(thread * each + e)).expect("writing an episode");
+                for e in 0..episodes_per_thread {
+                    writer.write_episode(&episode(thread * episodes_per_thread + e)).expect("writing an episode");
                 }
                 writer.finish().expect("finishing the dataset");
             });
@@ -260,20 +261,20 @@ fn concurrent_writers_both_append() {
     });
     let reader = open(&path).expect("opening the dataset");
     let indices: Vec<i64> = reader.episodes().iter().map(|episode| episode.index).collect();
-    assert_eq!(indices, (0..(threads * each) as i64).collect::<Vec<_>>());
+    assert_eq!(indices, (0..(threads * episodes_per_thread) as i64).collect::<Vec<_>>());
     // The state identifies the episode.
-    let firsts: Vec<StepRange> = (0..threads * each).map(|at| StepRange::new(at, 0, 1)).collect();
+    let firsts: Vec<StepRange> = (0..threads * episodes_per_thread).map(|at| StepRange::new(at, 0, 1)).collect();
     let read = reader.read(&["state"], &firsts).expect("reading rows");
     let mut found: Vec<usize> = read.get::<f64>("state").expect("states").chunks(3).map(|s| s[0] as usize).collect();
     for thread in 0..threads {
-        let own: Vec<usize> = found.iter().copied().filter(|e| e / each == thread).collect();
+        let own: Vec<usize> = found.iter().copied().filter(|e| e / episodes_per_thread == thread).collect();
         assert!(own.is_sorted(), "episodes of one writer keep their order");
     }
     found.sort_unstable();
-    assert_eq!(found, (0..threads * each).collect::<Vec<_>>());
+    assert_eq!(found, (0..threads * episodes_per_thread).collect::<Vec<_>>());
     assert_eq!(
         std::fs::read_dir(path.join("data")).expect("listing a folder").count(),
-        threads * each,
+        threads * episodes_per_thread,
         "no file is left over"
     );
 }
@@ -311,7 +312,7 @@ fn stores_doubles_exactly_but_keeps_the_precision_of_older_tables() {
         read.get::<f64>("state").expect("states").iter().map(|v| v.to_bits()).collect()
     };
     assert_eq!(bits(&*open(&path).expect("opening the dataset")), values.map(f64::to_bits));
-    // A table of the first version stored all numeric columns in single precision; appending keeps it.
+    // A table of the first version stored all numeric columns in single precision; appending keeps this precision.
     let old = folder.path().join("old.lance");
     crate::fuzz::copy_all(&Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop/single.lance"), &old);
     let existing = open(&old).expect("opening the dataset").episodes().len();
@@ -370,7 +371,7 @@ fn unwritable_locations_are_explained() {
     let error = failure(&file.join("d.lance"), &schema(), WriteMode::Create);
     assert!(error.contains("Not a directory"), "{error}");
     assert!(failure(&folder.path().join("name"), &schema(), WriteMode::Create).contains("end it in .lance"));
-    // Not even root can create a folder in `/proc`.
+    // No user can create a folder in `/proc`, not even root.
     let error = create(Path::new("/proc/d.lance"), &schema(), options(WriteMode::Create)).err().expect("an error");
     assert!(matches!(error, Error::Io { .. }), "{error}");
     // A folder with other files is left unchanged.

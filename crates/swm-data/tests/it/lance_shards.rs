@@ -29,13 +29,13 @@ fn commits_all_shards_as_one_version() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     assert!(failure(&path).contains("no shards to commit"));
-    // Shards are written in any order; threads stand for machines.
+    // Two threads, in place of two machines, write shards in any order.
     std::thread::scope(|scope| {
         scope.spawn(|| write_shard(&path, 2, 3, 7..12));
         scope.spawn(|| write_shard(&path, 0, 3, 0..5));
     });
     assert!(failure(&path).contains("shard 1 of 3 is missing"));
-    assert!(open(&path).is_err(), "readers see no dataset before the commit");
+    assert!(open(&path).is_err(), "no dataset exists before the commit");
     write_shard(&path, 1, 3, 5..7);
     assert_eq!(commit_shards(&Location::from(&path)).expect("committing the shards"), 12);
 
@@ -45,15 +45,16 @@ fn commits_all_shards_as_one_version() {
     for e in [0, 4, 5, 11] {
         assert_eq!(reader.constants(e).expect("reading constants")["number"], e.to_string().into_bytes());
     }
-    assert!(failure(&path).contains("no shards to commit"), "the log is removed");
-    // The content equals that of a single writer.
-    let whole = folder.path().join("whole.lance");
-    write(&whole, WriteMode::Create, 100, 0..12);
+    assert!(failure(&path).contains("no shards to commit"), "the logs of the shards are removed");
+    // The content equals the dataset of a single writer.
+    let single_writer_path = folder.path().join("whole.lance");
+    write(&single_writer_path, WriteMode::Create, 100, 0..12);
     let columns = ["pixels", "state", "episode_idx", "step_idx"];
     let all: Vec<_> = (0..12).map(|e| swm_data::StepRange::new(e, 0, reader.episodes()[e].length)).collect();
     let read = |reader: &dyn swm_data::Reader| reader.read(&columns, &all).expect("reading rows");
-    let (parts, one) = (read(&*reader), read(&*open(&whole).expect("opening the dataset")));
-    assert!((0..columns.len()).all(|column| parts.bytes(column) == one.bytes(column)));
+    let (from_shards, from_one_writer) =
+        (read(&*reader), read(&*open(&single_writer_path).expect("opening the dataset")));
+    assert!((0..columns.len()).all(|column| from_shards.bytes(column) == from_one_writer.bytes(column)));
 
     // Appends two more shards, then episodes of an ordinary writer.
     write_shard(&path, 0, 2, 12..14);

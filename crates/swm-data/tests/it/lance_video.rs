@@ -64,19 +64,19 @@ fn reads_episodes_with_their_images() {
 }
 
 /// Kills a writer after some episodes. Committed episodes must be readable, and the next writer continues.
-fn killed(moments: usize) {
+fn killed(kills: usize) {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance-video");
     write(&path, WriteMode::Create, ImageCodec::Jpeg { quality: 95 }, 0..2);
     let mut stored = 2;
-    for moment in 0..moments {
+    for kill in 0..kills {
         let mut command = Command::new(std::env::current_exe().expect("the test executable"));
         command.args(["--exact", "interruption::child_that_writes", "--nocapture"]);
         command.env("SWM_TEST_CHILD_TARGET", &path).stdout(Stdio::piped()).stderr(Stdio::null());
         let mut child = command.spawn().expect("starting the child process");
         let mut lines = BufReader::new(child.stdout.take().expect("the output of the child process")).lines();
         let mut seen = 0;
-        while seen < 3 + 5 * moment % 11 {
+        while seen < 3 + 5 * kill % 11 {
             seen += usize::from(lines.next().expect("another line").expect("a line of text").contains("episode "));
         }
         child.kill().expect("killing the child process");
@@ -100,7 +100,7 @@ fn killed_writer_keeps_committed_episodes() {
 }
 
 #[test]
-#[ignore = "a minute"]
+#[ignore = "takes a minute"]
 fn writer_killed_50_times_keeps_committed_episodes() {
     killed(50);
 }
@@ -119,7 +119,7 @@ fn reads_or_rejects_damaged_tables() {
 }
 
 #[test]
-#[ignore = "minutes"]
+#[ignore = "takes minutes"]
 fn reads_or_rejects_tables_damaged_in_10000_ways() {
     damaged(10_000);
 }

@@ -1,11 +1,11 @@
 //! The format `lerobot`: reads datasets that LeRobot's own package wrote (`tests/interop/lerobot_export.py`), and lets
-//! this package read datasets written here. Run the long tests with:
+//! LeRobot read datasets written here. Run the long tests with:
 //!
 //! ```text
 //! cargo test --release --workspace --test it -- --ignored lerobot::
 //! ```
 
-use crate::video::{THEIR_LENGTHS, check_frames, interop};
+use crate::video::{THIRD_PARTY_LENGTHS, check_frames, interop};
 use crate::{format_suite, fuzz, sample};
 use std::process::Command;
 use swm_core::{ColumnSpec, DType};
@@ -22,7 +22,7 @@ fn killed_writer_keeps_committed_episodes() {
 }
 
 #[test]
-#[ignore = "a minute"]
+#[ignore = "takes a minute"]
 fn writer_killed_50_times_keeps_committed_episodes() {
     format_suite::killed("d.lerobot", 50);
 }
@@ -31,7 +31,7 @@ fn writer_killed_50_times_keeps_committed_episodes() {
 fn reads_datasets_of_lerobot() {
     for name in ["lerobot-v30-h264", "lerobot-v30-av1", "lerobot-v21"] {
         let reader = open(interop().join(name)).expect("opening the dataset");
-        assert_eq!(reader.episodes().iter().map(|e| e.length).collect::<Vec<_>>(), THEIR_LENGTHS, "{name}");
+        assert_eq!(reader.episodes().iter().map(|e| e.length).collect::<Vec<_>>(), THIRD_PARTY_LENGTHS, "{name}");
         check_frames(&*reader, "pixels", &format!("{name}-top.png"), 0);
         check_frames(&*reader, "observation.images.wrist", &format!("{name}-wrist.png"), 0);
         let schema = reader.schema();
@@ -39,7 +39,7 @@ fn reads_datasets_of_lerobot() {
         assert_eq!(schema.column("proprio").expect("the state"), &ColumnSpec::new("proprio", DType::Float32, [3]));
         assert_eq!(schema.column("next.done").expect("a flag"), &ColumnSpec::new("next.done", DType::Bool, []));
         let tasks = ["push the block", "open the drawer", "push the block"];
-        for (e, &length) in THEIR_LENGTHS.iter().enumerate() {
+        for (e, &length) in THIRD_PARTY_LENGTHS.iter().enumerate() {
             let names = ["observation.state", "action", "next.reward", "next.done", "task_index", "frame_index"];
             let read = reader.read(&names, &[StepRange::new(e, 0, length)]).expect("reading rows");
             for t in 0..length {
@@ -98,7 +98,7 @@ fn reads_or_rejects_damaged_datasets() {
 }
 
 #[test]
-#[ignore = "minutes"]
+#[ignore = "takes minutes"]
 fn reads_or_rejects_datasets_damaged_in_10000_ways() {
     ["lerobot-v30-h264", "lerobot-v30-av1", "lerobot-v21"].iter().for_each(|name| damaged(name, 4000));
 }
@@ -137,8 +137,8 @@ fn lerobot_reads_datasets_written_here() {
             for t in 0..episode.rows() {
                 let row = &rows[next];
                 assert_eq!(row["state"], serde_json::json!([e as f64, t as f64, -0.5]));
-                let acted = t.min(episode.rows() - 2);
-                assert_eq!(row["action"], serde_json::json!([e as f64, acted as f64 / 4.0]));
+                let action_row = t.min(episode.rows() - 2);
+                assert_eq!(row["action"], serde_json::json!([e as f64, action_row as f64 / 4.0]));
                 assert_eq!(row["task"], format!("task {}", e % 2));
                 assert_eq!((&row["episode_index"], &row["frame_index"]), (&e.into(), &t.into()));
                 for column in ["pixels", "goal"] {

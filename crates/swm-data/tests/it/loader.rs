@@ -126,7 +126,7 @@ fn follows_the_configuration_of_episodes_batches_and_cache() {
     assert_eq!(episodes, [2, 7]);
     let full = load(&reader, LoaderConfig { drop_last: true, ..some }, 0, 0);
     assert!(full.iter().all(|batch| batch.rows() == 4));
-    // An epoch may be dropped early, and an epoch that starts after its end is empty.
+    // An epoch may be dropped early. An epoch that starts after the last batch is empty.
     let loader = Loader::new(Arc::clone(&reader), config(1, 1)).expect("a loader");
     assert_eq!(loader.epoch(0, 0).take(2).count(), 2);
     assert_eq!(loader.epoch(0, loader.batches_per_epoch()).count(), 0);

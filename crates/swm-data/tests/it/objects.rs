@@ -14,6 +14,7 @@ use swm_data::{CommitPolicy, Constants, Location, StepRange, WriteMode, WriteOpt
 
 /// Environment variable of child processes: the location of the dataset.
 const TARGET: &str = "SWM_TEST_OBJECTS";
+/// The access key and the secret key of the server.
 const KEYS: [&str; 2] = ["AKEXAMPLE", "secret/example"];
 
 /// Serves the subfolders of `root` as buckets until the process ends; if `keys` is set, only to clients with [`KEYS`].
@@ -200,7 +201,7 @@ fn reads_from_but_does_not_write_to_a_web_server() {
     let reader = open(&location).expect("opening the dataset");
     assert_eq!(reader.episodes().len(), 5);
     check(&*reader, 0);
-    assert!(reader.footprint().is_ok_and(|parts| !parts.is_empty()), "without a list of files");
+    assert!(reader.footprint().is_ok_and(|parts| !parts.is_empty()), "a web server lists no files");
     let error = create(&location, &schema(), options(WriteMode::Append)).err().expect("an error").to_string();
     assert!(error.contains("cannot be written"), "{error}");
     let missing = Location::parse(&format!("{endpoint}/bucket/none.lance")).expect("a location");

@@ -23,9 +23,9 @@ fn previews_show_every_camera() {
         assert_eq!(fuzz::files(&out).len(), 4, "no other file remains");
         let png = std::io::BufReader::new(std::fs::File::open(&written[3]).expect("opening a file"));
         let png = png::Decoder::new(png).read_info().expect("an image");
-        // Eight strips of two 24-pixel cameras (or of a wider line of text), below two lines of text.
-        let strip = (22 * 4 + 1, 16 + 2 * 7);
-        assert_eq!((png.info().width, png.info().height), (8 * (strip.0 + 2) + 2, 3 * (strip.1 + 2) + 2));
+        // Each of the eight frames in a row has two lines of text above two images. The title is wider than the images.
+        let frame = (22 * 4 + 1, 16 + 2 * 7);
+        assert_eq!((png.info().width, png.info().height), (8 * (frame.0 + 2) + 2, 3 * (frame.1 + 2) + 2));
         let one = PreviewOptions { columns: vec!["goal".to_owned()], ..options };
         assert_eq!(preview(&*reader, &out, &one, |_| ()).expect("writing the preview").len(), 4);
         let wrong = PreviewOptions { columns: vec!["state".to_owned()], ..PreviewOptions::default() };

@@ -1,5 +1,5 @@
-//! Interoperability with the published `stable-worldmodel`. `tests/interop` holds a dataset that its writer wrote, the
-//! script `export.py` that wrote the dataset, and the script `check.py` that reads datasets written here.
+//! Interoperability with the published Python package `stable-worldmodel`. In `tests/interop`, the script `export.py`
+//! wrote `reference.lance` with this package, and the script `check.py` reads datasets written here with it.
 
 use crate::sample::{episode, options, rows, schema, write};
 use serde_json::Value;
@@ -54,7 +54,7 @@ fn check_reference(path: &Path, episodes: usize) {
             .expect("reading rows");
         assert_eq!(read.rows(), expected.rows());
         for column in 1..4 {
-            // Compared as text, so that NaN equals NaN.
+            // Compares the values as text, so that NaN equals NaN.
             let text = |b: &Batch| format!("{:?}", floats(b.bytes(column)));
             assert_eq!(text(&read), text(&expected), "column {column} of episode {e}");
         }
@@ -128,10 +128,10 @@ fn reference_reads_datasets_written_here() {
         path
     });
     // Two shards, committed together.
-    let parts = folder.path().join("parts.lance");
+    let sharded = folder.path().join("parts.lance");
     for index in 0..2 {
         let shard = Shard { index, count: 2 };
-        let location = Location::from(&parts);
+        let location = Location::from(&sharded);
         let mut writer =
             create_shard(&location, &schema(), options(WriteMode::Create), shard).expect("creating the shard");
         for e in 4 * index..4 * (index + 1) {
@@ -139,9 +139,9 @@ fn reference_reads_datasets_written_here() {
         }
         writer.finish().expect("finishing the dataset");
     }
-    assert_eq!(commit_shards(&Location::from(&parts)).expect("committing the shards"), 8);
+    assert_eq!(commit_shards(&Location::from(&sharded)).expect("committing the shards"), 8);
     let mut command = Command::new(python);
-    command.arg("-B").arg(interop().join("check.py")).args([&ours, &appended, &lossless[0], &lossless[1], &parts]);
+    command.arg("-B").arg(interop().join("check.py")).args([&ours, &appended, &lossless[0], &lossless[1], &sharded]);
     let output = command.output().expect("running Python");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let text = String::from_utf8(output.stdout).expect("text");
@@ -181,7 +181,7 @@ fn reference_reads_datasets_written_here() {
             assert!((mean.expect("a mean") - means[i]).abs() < 1e-9, "lossless");
         }
     }
-    assert_eq!(seen[4], seen[0], "shards read like a dataset of one writer");
+    assert_eq!(seen[4], seen[0], "committed shards equal the dataset of one writer");
     // Both readers define the same clips: 2 steps with frameskip 2 take 4 rows.
     let clips: usize = (0..8).map(|e| rows(e) - 3).sum();
     assert_eq!(seen[0]["clips"], clips);

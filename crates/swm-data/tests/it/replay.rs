@@ -20,7 +20,7 @@ fn filled(episodes: std::ops::Range<usize>, capacity: usize) -> ReplayBuffer {
     buffer
 }
 
-/// Episode and row of every first step.
+/// The episode and the row of the first step of every clip.
 fn first_rows(batch: &Batch) -> Vec<(usize, usize)> {
     let state = |row| batch.row(row).get::<f64>("state").expect("states").to_vec();
     (0..batch.rows()).map(|row| (state(row)[0] as usize, state(row)[1] as usize)).collect()
@@ -69,11 +69,11 @@ fn samples_windows_uniformly_and_reproducibly() {
         assert!(start + 3 <= rows(e), "a window extends beyond its episode");
         count[e][start] += 1;
     }
-    // 33 windows: five standard deviations of 9000 draws with probability 1/33.
+    // The tolerance is five standard deviations of the count of one of 33 windows in 9000 draws.
     let counts = count.iter().flatten().filter(|&&n| n > 0);
     assert_eq!(counts.clone().count(), 33);
     assert!(counts.clone().all(|n| n.abs_diff(273) < 82), "{count:?}");
-    // The latest twelve rows are those of the last two episodes.
+    // The latest twelve rows belong to the last two episodes.
     let recent = buffer.loader(ReplayConfig { recent: Some(12), ..config(1) }).expect("a loader");
     assert!(first_rows(&recent.sample(Key::new(2)).expect("sampling a batch")).iter().all(|&(e, _)| e >= 4));
     let goal =
@@ -134,14 +134,14 @@ fn saves_and_restores() {
     let options = WriteOptions { mode: WriteMode::Create, ..WriteOptions::default() };
     plain.save(&path, options).expect("saving the buffer");
     let reader = open(&path).expect("opening the dataset");
-    let again = ReplayBuffer::restore(&*reader, 30).expect("restoring the buffer");
-    assert_eq!(state(&again), state(&plain));
-    assert_eq!(again.snapshot().episodes(), plain.snapshot().episodes());
+    let restored = ReplayBuffer::restore(&*reader, 30).expect("restoring the buffer");
+    assert_eq!(state(&restored), state(&plain));
+    assert_eq!(restored.snapshot().episodes(), plain.snapshot().episodes());
     let drawn = |buffer: &ReplayBuffer| {
         let batch = buffer.loader(config(2)).expect("a loader").sample(Key::new(5)).expect("sampling a batch");
         (batch.bytes(0).to_vec(), batch.bytes(1).to_vec(), batch.bytes(2).to_vec())
     };
-    assert!(drawn(&again) == drawn(&plain), "the restored buffer draws the same samples");
-    let less = ReplayBuffer::restore(&*reader, 20).expect("restoring the buffer");
-    assert_eq!(state(&less), (19, 2, 6), "the latest episodes that fit");
+    assert!(drawn(&restored) == drawn(&plain), "the restored buffer draws the same samples");
+    let smaller = ReplayBuffer::restore(&*reader, 20).expect("restoring the buffer");
+    assert_eq!(state(&smaller), (19, 2, 6), "the latest episodes that fit");
 }

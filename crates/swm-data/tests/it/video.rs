@@ -20,7 +20,7 @@ fn killed_writer_keeps_committed_episodes() {
 }
 
 #[test]
-#[ignore = "a minute"]
+#[ignore = "takes a minute"]
 fn writer_killed_50_times_keeps_committed_episodes() {
     format_suite::killed("d.video", 50);
 }
@@ -42,7 +42,7 @@ fn rejects_damaged_folders() {
 }
 
 #[test]
-#[ignore = "minutes"]
+#[ignore = "takes minutes"]
 fn rejects_folders_damaged_in_10000_ways() {
     damaged(10_000);
 }
@@ -59,13 +59,13 @@ fn reads_or_rejects_damaged_third_party_videos() {
 }
 
 #[test]
-#[ignore = "minutes"]
+#[ignore = "takes minutes"]
 fn reads_or_rejects_third_party_videos_damaged_in_10000_ways() {
     damaged_third_party(10_000);
 }
 
 #[test]
-fn reports_videos_of_other_lengths() {
+fn reports_videos_with_wrong_frame_counts() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.video");
     format_suite::write(&path, WriteMode::Create, 0..4);
@@ -89,16 +89,16 @@ pub fn interop() -> PathBuf {
 }
 
 /// Lengths of the episodes in the datasets of other programs.
-pub const THEIR_LENGTHS: [usize; 3] = [11, 14, 9];
+pub const THIRD_PARTY_LENGTHS: [usize; 3] = [11, 14, 9];
 
-/// Compares the first, third and last frame of every episode with those that another program decoded, stored below each
-/// other in a PNG.
+/// Compares the first, third and last frame of every episode with the frames that another program decoded. The PNG file
+/// holds these frames one below the other.
 pub fn check_frames(reader: &dyn Reader, column: &str, png: &str, tolerance: u8) {
     let file = std::io::BufReader::new(std::fs::File::open(interop().join(png)).expect("opening a file"));
     let mut decoder = png::Decoder::new(file).read_info().expect("a PNG");
     let mut expected = vec![0; decoder.output_buffer_size().expect("a size")];
     decoder.next_frame(&mut expected).expect("an image");
-    let ranges: Vec<StepRange> = THEIR_LENGTHS
+    let ranges: Vec<StepRange> = THIRD_PARTY_LENGTHS
         .iter()
         .enumerate()
         .flat_map(|(e, length)| [0, 2, length - 1].map(|t| StepRange::new(e, t, 1)))
@@ -120,9 +120,9 @@ pub fn check_frames(reader: &dyn Reader, column: &str, png: &str, tolerance: u8)
 #[test]
 fn reads_videos_of_the_reference() {
     let reader = open(interop().join("reference-video")).expect("opening the dataset");
-    assert_eq!(reader.episodes().iter().map(|e| e.length).collect::<Vec<_>>(), THEIR_LENGTHS);
+    assert_eq!(reader.episodes().iter().map(|e| e.length).collect::<Vec<_>>(), THIRD_PARTY_LENGTHS);
     check_frames(&*reader, "pixels", "reference-video-pixels.png", 0);
-    for (e, &length) in THEIR_LENGTHS.iter().enumerate() {
+    for (e, &length) in THIRD_PARTY_LENGTHS.iter().enumerate() {
         let read = reader.read(&["state", "action", "success"], &[StepRange::new(e, 0, length)]).expect("reading rows");
         for t in 0..length {
             assert_eq!(read.row(t).get::<f64>("state").expect("values"), [e as f64, t as f64, -0.5]);
@@ -141,7 +141,7 @@ fn appends_to_a_dataset_of_the_reference() {
     let theirs = open(&path).expect("opening the dataset");
     let schema = swm_core::Schema::new(theirs.schema().columns()[2..].to_vec()).expect("a valid schema");
     let names: Vec<&str> = schema.columns().iter().map(|column| &*column.name).collect();
-    let episode = theirs.read(&names, &[StepRange::new(1, 0, THEIR_LENGTHS[1])]).expect("reading rows");
+    let episode = theirs.read(&names, &[StepRange::new(1, 0, THIRD_PARTY_LENGTHS[1])]).expect("reading rows");
     let options = WriteOptions { mode: WriteMode::Append, codec: ImageCodec::Png, ..WriteOptions::default() };
     let mut writer = create(&path, &schema, options).expect("continuing the dataset");
     writer.write_episode(&episode).expect("writing an episode");
@@ -149,7 +149,7 @@ fn appends_to_a_dataset_of_the_reference() {
     let reader = open(&path).expect("opening the dataset");
     assert_eq!(reader.episodes().len(), 4);
     check_frames(&*reader, "pixels", "reference-video-pixels.png", 0);
-    let again = reader.read(&names, &[StepRange::new(3, 0, THEIR_LENGTHS[1])]).expect("reading rows");
+    let again = reader.read(&names, &[StepRange::new(3, 0, THIRD_PARTY_LENGTHS[1])]).expect("reading rows");
     (0..names.len()).for_each(|column| assert!(again.bytes(column) == episode.bytes(column), "{}", names[column]));
 }
 
@@ -170,7 +170,7 @@ fn reference_reads_videos_written_here() {
         let mut writer =
             create(&path, &schema, WriteOptions { codec, ..WriteOptions::default() }).expect("creating the dataset");
         let episodes: Vec<_> = (0..3)
-            .map(|e| theirs.read(&names, &[StepRange::new(e, 0, THEIR_LENGTHS[e])]).expect("reading rows"))
+            .map(|e| theirs.read(&names, &[StepRange::new(e, 0, THIRD_PARTY_LENGTHS[e])]).expect("reading rows"))
             .collect();
         episodes.iter().for_each(|episode| writer.write_episode(episode).expect("writing an episode"));
         writer.finish().expect("finishing the dataset");

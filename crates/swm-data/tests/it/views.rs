@@ -1,4 +1,4 @@
-//! Views of datasets.
+//! Views of datasets: concatenated, merged, selected and split.
 
 use crate::sample::{COLUMNS, check, episode, rows, schema, write};
 use std::path::Path;
@@ -19,7 +19,7 @@ fn concatenation_reads_like_one_dataset() {
         [(0, 3), (3, 4), (4, 9)].map(|(from, to)| dataset(&folder.path().join(format!("{from}.lance")), from..to));
     let all = concat(parts.to_vec()).expect("concatenating the datasets");
     check(&*all, 0);
-    // Rows of all parts in any order, in one call.
+    // One call reads rows of all parts in any order.
     let ranges = [(7, 1, 2), (0, 0, 3), (3, 2, 1), (7, 1, 2), (5, 0, 1)].map(|(e, s, n)| StepRange::new(e, s, n));
     let read = all.read(&["state", "episode_idx", "pixels"], &ranges).expect("reading rows");
     let expected: Vec<[f64; 2]> =
@@ -79,12 +79,12 @@ fn splits_keep_episode_indices() {
     let mut indices: Vec<i64> = parts.iter().flat_map(|part| part.episodes().iter().map(|e| e.index)).collect();
     indices.sort_unstable();
     assert_eq!(indices, (0..40).collect::<Vec<_>>());
-    // A view of views: validation and test together, of two columns.
-    let held = concat(vec![Arc::clone(&parts[1]), Arc::clone(&parts[2])]).expect("concatenating the datasets");
-    let held = select(held, &["state", "action"]).expect("selecting columns");
-    assert_eq!(held.schema().columns().len(), 4);
-    for (position, stored) in held.episodes().iter().enumerate() {
-        let read = held.read(&["state"], &[StepRange::new(position, 0, stored.length)]).expect("reading rows");
+    // A view of views: two columns of the concatenated validation and test episodes.
+    let held_out = concat(vec![Arc::clone(&parts[1]), Arc::clone(&parts[2])]).expect("concatenating the datasets");
+    let held_out = select(held_out, &["state", "action"]).expect("selecting columns");
+    assert_eq!(held_out.schema().columns().len(), 4);
+    for (position, stored) in held_out.episodes().iter().enumerate() {
+        let read = held_out.read(&["state"], &[StepRange::new(position, 0, stored.length)]).expect("reading rows");
         let e = read.row(0).get::<f64>("state").expect("states")[0] as usize;
         assert_eq!(
             (stored.length, Split::default().part(e as i64)),
@@ -92,7 +92,7 @@ fn splits_keep_episode_indices() {
         );
         assert_eq!(read.bytes(0), episode(e).bytes(2));
     }
-    assert!(held.read(&["pixels"], &[StepRange::new(0, 0, 1)]).is_err(), "an unselected column");
+    assert!(held_out.read(&["pixels"], &[StepRange::new(0, 0, 1)]).is_err(), "an unselected column");
     for (positions, words) in [(vec![], "at least one"), (vec![40], "below 40"), (vec![1, 1], "twice")] {
         assert!(subset(Arc::clone(&all), positions).err().expect("an error").to_string().contains(words));
     }

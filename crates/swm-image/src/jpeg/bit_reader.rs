@@ -114,8 +114,8 @@ impl<'a> BitReader<'a> {
         value
     }
 
-    /// Reads the AC coefficients of a block, times their quantisation steps, into `to`. Returns whether the block has AC
-    /// coefficients, or `None` when it has more than 63.
+    /// Reads the AC coefficients of a block, times their quantisation steps, into `to`. Returns whether the block has
+    /// AC coefficients, or `None` when it has more than 63 or a code is invalid.
     #[inline(always)]
     pub fn ac_coefficients(&mut self, table: &HuffmanTable, steps: &[Step; 64], to: &mut Block) -> Option<bool> {
         let mut k = 0;

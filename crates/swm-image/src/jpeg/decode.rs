@@ -141,8 +141,8 @@ fn decode_planes<L: Level>(header: &Header, scan: &[u8], tables: &Tables, planes
     bits.is_at_end_of_image().then_some(())
 }
 
-/// Returns the code of an MCU that repeats the last MCU, as `(bits, number of bits)`. Every block of such an MCU has a DC
-/// difference of 0 and no AC coefficients. Returns `None` if the code has more than 32 bits.
+/// Returns the code of an MCU that repeats the last MCU, as `(bits, number of bits)`. Every block of such an MCU has a
+/// DC difference of 0 and no AC coefficients. Returns `None` if the code has more than 32 bits.
 fn repeated_mcu(tables: &PlaneTables<'_>, luma_blocks: usize) -> Option<(u64, u32)> {
     let code = |table: &HuffmanTable, run: u32| {
         let matches = |entry: &Entry| (1..=INDEX_BITS).any(|length| *entry == Entry::new(length, 0, run, 0));

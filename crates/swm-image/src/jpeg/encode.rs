@@ -1,10 +1,10 @@
 //! A baseline JPEG encoder for frames of simulations.
 //!
-//! Frames of simulations have large areas of one colour. An MCU (minimum coded unit, 16 × 16 pixels) of one colour needs
-//! no transform, only a few bits for the difference between its value and the value of the last MCU. The encoder finds
-//! these MCUs first, which makes it several times faster than general encoders, which transform every block. The output
-//! is ITU-T T.81 baseline, JFIF, with chroma at half resolution (4:2:0) and the example tables of Annex K, scaled by
-//! quality as in libjpeg.
+//! Frames of simulations have large areas of one colour. An MCU (minimum coded unit, 16 × 16 pixels) of one colour
+//! needs no transform, only a few bits for the difference between its value and the value of the last MCU. The encoder
+//! finds these MCUs first, which makes it several times faster than general encoders, which transform every block. The
+//! output is ITU-T T.81 baseline, JFIF, with chroma at half resolution (4:2:0) and the example tables of Annex K,
+//! scaled by quality as in libjpeg.
 
 use super::ZIGZAG;
 use super::annex_k::{AC_CHROMA, AC_LUMA, CHROMA, CODES, DC_CHROMA, DC_LUMA, LUMA};
@@ -149,7 +149,7 @@ impl Scan<'_> {
     /// Writes a block whose samples are all equal.
     fn flat_block(&mut self, component: usize, value: f32) {
         let kind = usize::from(component > 0);
-        // The DC coefficient is 8 times the value. `forward_dct` would keep another factor of 8.
+        // The DC coefficient is 8 times the value. `forward_dct` keeps another factor of 8.
         self.dc(component, round(64.0 * value * self.reciprocals[kind][0]));
         self.symbol(kind, 1, 0);
     }

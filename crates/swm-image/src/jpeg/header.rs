@@ -40,8 +40,8 @@ impl Header {
                     return (body == [3, 1, 0x00, 2, 0x11, 3, 0x11, 0, 63, 0]).then_some((header, rest));
                 }
                 0xdb => header.read_quantisation(body)?,
-                // Skips JFIF, other application segments and comments. Adobe's segment is unsupported, because it may change
-                // the colour space.
+                // Skips JFIF, other application segments and comments. Adobe's segment is unsupported, because it may
+                // change the colour space.
                 0xe0..=0xed | 0xef | 0xfe => {}
                 _ => return None,
             }

@@ -9,9 +9,9 @@ pub const END_OF_BLOCK: u32 = 64;
 /// The meaning of the next bits of a scan, packed into one register.
 ///
 /// Fields from the lowest bit:
-/// - 5 bits: the length of the code, plus the length of the coefficient if both fit into the index; 0 for a code that is
-///   longer than [`INDEX_BITS`].
-/// - 4 bits: the number of bits of the coefficient that follow.
+/// - 5 bits: the length of the code, plus the length of the coefficient if both fit into the index; 0 for a code that
+///   is longer than [`INDEX_BITS`].
+/// - 4 bits: the number of bits of the coefficient that follow the code.
 /// - 7 bits: the number of zeros before the coefficient, or [`END_OF_BLOCK`].
 /// - 16 bits: the coefficient.
 #[derive(Clone, Copy, Default, PartialEq, Eq)]

@@ -48,7 +48,8 @@ impl PillowResizer {
         self.sizes = [from, to];
     }
 
-    /// Resizes an image of `from = (height, width)` to `to = (height, width)`. If the sizes are equal, copies the image.
+    /// Resizes an image of `from = (height, width)` to `to = (height, width)`. If the sizes are equal, copies the
+    /// image.
     pub fn resize(&mut self, source: &[u8], from: (usize, usize), result: &mut [u8], to: (usize, usize)) {
         if from == to {
             result.copy_from_slice(source);

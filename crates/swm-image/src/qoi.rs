@@ -1,9 +1,9 @@
 //! The QOI image format (specification 1.0, qoiformat.org): lossless, and the fastest to decode of the lossless
 //! formats that other programs read as well.
 //!
-//! An image is a sequence of operations on the last pixel: repeat it, take one of 64 earlier pixels, change it a
-//! little, or replace it. Frames of simulations consist mostly of runs of equal pixels. The encoder finds runs, and the
-//! decoder fills them, many bytes at a time.
+//! An image is a sequence of operations. Each operation repeats the last pixel, takes one of 64 earlier pixels, changes
+//! the last pixel a little, or gives a new pixel. Frames of simulations consist mostly of runs of equal pixels. The
+//! encoder finds runs, and the decoder fills runs, many bytes at a time.
 
 use swm_core::{Error, Result};
 
@@ -28,7 +28,7 @@ const LONGEST_RUN: u8 = RUN | (LONGEST as u8 - 1);
 /// A pixel: red, green, blue, opacity.
 type Pixel = [u8; 4];
 
-/// The pixel before the first one.
+/// The pixel before the first pixel.
 const START: Pixel = [0, 0, 0, 255];
 
 /// Returns the slot of a pixel in the table of earlier pixels: (3 r + 5 g + 7 b + 11 a) mod 64.

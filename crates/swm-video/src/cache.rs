@@ -31,7 +31,7 @@ impl<K> Default for VideoCache<K> {
 }
 
 impl<K: Clone + Eq + Hash + Send + Sync> VideoCache<K> {
-    /// Returns a video, opening it unless it is cached.
+    /// Returns a cached video, or opens and caches the video.
     ///
     /// # Errors
     /// When the video cannot be opened.

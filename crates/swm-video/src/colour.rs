@@ -67,7 +67,7 @@ enum Planes {
     Gbr,
 }
 
-/// Returns the layout of the 8-bit formats that are converted directly, and whether they use the full range. Frames of
+/// Returns the layout of the 8-bit formats that are converted directly, and whether samples use the full range. Frames of
 /// other formats are converted to [`Pixel::YUV444P`] first.
 fn planes(format: Pixel) -> Option<(Planes, bool)> {
     Some(match format {
@@ -204,7 +204,7 @@ fn times(a: i16, b: i16) -> i16 {
     ((i32::from(a) * i32::from(b)) >> 16) as i16
 }
 
-/// Converts a sum of products to a byte, rounded where it has a fraction.
+/// Converts a sum of products to a byte, rounded if products have fraction bits.
 #[inline(always)]
 fn clamp(value: i16, fraction: u32) -> u8 {
     let half = if fraction > 0 { 1 << (fraction - 1) } else { 0 };

@@ -125,7 +125,7 @@ impl Video {
         Ok(())
     }
 
-    /// Returns the error for this video if it is damaged.
+    /// Returns the error for a defect of this video.
     pub fn damaged(&self, problem: &str) -> Error {
         damaged(self.source.label(), problem)
     }
@@ -171,7 +171,7 @@ struct Job<'a> {
 /// many files.
 #[derive(Default)]
 pub struct DecoderPool {
-    /// Idle decoders, the most recently used one last.
+    /// Idle decoders, sorted by the time of last use.
     idle: Mutex<Vec<Decoder>>,
 }
 
@@ -179,7 +179,7 @@ impl DecoderPool {
     /// Decodes frames of any videos, on the threads of the current rayon pool.
     ///
     /// # Errors
-    /// When a frame does not exist or its `out` has another size, or a video is damaged.
+    /// When a frame does not exist, an `out` has another size, or a video is damaged.
     pub fn read(&self, wanted: Vec<FrameRequest<'_>>) -> Result<()> {
         let mut jobs = Vec::with_capacity(wanted.len());
         for FrameRequest { video, frame, out } in wanted {
@@ -207,7 +207,7 @@ impl DecoderPool {
             let Some(Job { video, .. }) = run.first() else { return Ok(()) };
             let video = *video;
             let mut decoder = self.take(video)?;
-            // After a failure the state of the decoder is unknown, so it is dropped.
+            // After a failure the state of the decoder is unknown, so the decoder is dropped.
             decoder.run(video, run).map_err(|problem| damaged(video.source.label(), &problem))?;
             self.give_back(decoder);
             Ok(())
@@ -406,14 +406,13 @@ impl Decoder {
 }
 
 /// Passes the codec parameters from the file's header to the decoder.
-#[allow(unsafe_code, reason = "sets a field of FFmpeg's context that its wrapper does not offer")]
+#[allow(unsafe_code, reason = "sets a field of FFmpeg's context that `ffmpeg-next` does not offer")]
 fn set_extradata(context: &mut codec::Context, bytes: &[u8]) {
     if bytes.is_empty() {
         return;
     }
     let Ok(length) = i32::try_from(bytes.len()) else { return };
-    // The wrapper sets the codec parameters only by opening a file with libavformat, whose parsers must not read damaged
-    // files.
+    // `ffmpeg-next` sets `extradata` only when it opens a file with libavformat, whose parsers must not read damaged files.
     // SAFETY: the memory comes from FFmpeg's allocator, has the zeroed padding that decoders read, is filled within its
     // length, and then belongs to the context, which frees it. The context is not open yet and has no extradata.
     unsafe {

@@ -39,13 +39,13 @@ pub struct Report {
     pub changed: Vec<String>,
 }
 
-/// The only case to run, if `SWM_FUZZ_CASE` names one.
+/// The case that the environment variable `SWM_FUZZ_CASE` selects, if set.
 fn only() -> Option<u64> {
     std::env::var("SWM_FUZZ_CASE").ok().map(|case| case.parse().expect("SWM_FUZZ_CASE is the number of a case"))
 }
 
 /// Damages one file of a copy of a dataset (a file or a folder) per case. Every kind of file (by folder and suffix)
-/// gets an equal number of cases. `read` opens a dataset and returns its content, as [`read_everything`] does.
+/// gets an equal number of cases. `read` opens a dataset and returns the content, as [`read_everything`] does.
 pub fn dataset<T: PartialEq>(name: &str, intact: &Path, cases: u64, read: impl Fn(&Path) -> Result<T>) -> Report {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let copy = folder.path().join(intact.file_name().expect("a name"));

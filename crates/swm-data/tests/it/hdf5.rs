@@ -98,7 +98,7 @@ fn interop(name: &str) -> PathBuf {
 /// Lengths of the episodes in the files that `hdf5_export.py` writes.
 const LENGTHS: [usize; 3] = [6, 7, 8];
 
-/// The image in row `t` of these files.
+/// The image in row `t` of the files that `hdf5_export.py` writes.
 fn image(t: usize) -> Vec<u8> {
     let mut rgb = vec![];
     for y in 0..6 {
@@ -110,7 +110,7 @@ fn image(t: usize) -> Vec<u8> {
     rgb
 }
 
-/// The numeric values in row `t` of these files.
+/// The numeric values in row `t` of the files that `hdf5_export.py` writes.
 fn values(t: usize) -> [i64; 5] {
     std::array::from_fn(|k| (t * 100 + k * k) as i64)
 }
@@ -319,7 +319,7 @@ fn files_round_trip_through_h5py() {
     let Some(seen) = check("append", &path) else { return };
     assert_eq!(open(&path).expect("opening the dataset").episodes().len(), 78);
     check_columns(&path, &seen);
-    // Appends an episode after the one that h5py appended.
+    // Appends an episode after the episode that h5py appended.
     let mut writer = format_suite::writer(&path, WriteMode::Append).expect("continuing the dataset");
     writer.write_episode(&crate::sample::episode(0)).expect("writing an episode");
     writer.finish().expect("finishing the dataset");

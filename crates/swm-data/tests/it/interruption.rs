@@ -84,7 +84,7 @@ fn killed_writer_keeps_committed_episodes() {
     check(&*reader, 0);
 }
 
-/// Runs the child until it fails, and checks its error and the dataset.
+/// Runs the child until writing fails, and checks the error and the dataset.
 fn write_until_failure(path: &Path, shell: &str, expected: &str) {
     let output = run_child("child_that_writes", path, shell).output().expect("running the child process");
     let text = String::from_utf8_lossy(&output.stdout);

@@ -34,7 +34,7 @@ fn start(test: &str, path: &Path) -> Running {
     Running { child, _output: output }
 }
 
-/// Kills a child after a keyed random time; returns whether it was still running.
+/// Kills a child after a keyed random time; returns whether the child was still running.
 fn kill(mut running: Running, key: Key, longest: Duration) -> bool {
     // Busy waiting, because the scheduler may extend a sleep.
     let end = Instant::now() + longest.mul_f64(key.rng().random());

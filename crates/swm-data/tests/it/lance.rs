@@ -100,7 +100,7 @@ fn follows_the_write_mode() {
     check(&*reader, 0);
     assert_eq!(reader.episodes().iter().map(|e| e.index).collect::<Vec<_>>(), [0, 1, 2, 3]);
 
-    // A newer manifest replaces the older one.
+    // A newer manifest replaces the older manifest.
     let newer = WriteOptions { manifest: Some(manifest(4)), ..options(WriteMode::Append) };
     create(&path, &schema(), newer).expect("continuing the dataset").finish().expect("finishing the dataset");
     assert_eq!(open(&path).expect("opening the dataset").manifest(), Some(manifest(4)));

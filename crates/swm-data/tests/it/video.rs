@@ -107,7 +107,7 @@ pub fn check_frames(reader: &dyn Reader, column: &str, png: &str, tolerance: u8)
     assert_eq!(read.bytes(0).len(), expected.len());
     let worst = read.bytes(0).iter().zip(&expected).map(|(a, b)| a.abs_diff(*b)).max().expect("pixels");
     assert!(worst <= tolerance, "{column}: off by {worst}");
-    // Reads the frames backwards, and two of them twice, so that the decoder must seek.
+    // Reads the frames backwards, and two frames twice, so that the decoder must seek.
     let back: Vec<StepRange> = ranges.iter().rev().chain(&ranges[..2]).copied().collect();
     let again = reader.read(&[column], &back).expect("reading rows");
     let size = read.bytes(0).len() / ranges.len();

@@ -48,7 +48,7 @@ fn decodes_bit_for_bit_as_pillow() {
             assert!(decode_at_baseline(&bytes, height, width, &mut out), "{name}");
             assert!(out == expected, "{name} without AVX2");
         }
-        // The general decoder also reads the kinds that the fast decoder does not support. It rounds differently.
+        // The general decoder also reads the kinds that the fast decoder does not support, and rounds differently.
         crate::decode(&bytes, height, width, &mut out).expect("an image");
         let off: u32 = out.iter().zip(&expected).map(|(a, b)| u32::from(a.abs_diff(*b))).sum();
         assert!(f64::from(off) / (expected.len() as f64) < 3.0, "{name}: {off}");

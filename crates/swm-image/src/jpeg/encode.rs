@@ -269,7 +269,7 @@ fn write_headers(height: u16, width: u16, tables: &[[u8; 64]; 2], out: &mut Vec<
         segment(out, 0xdb, &[&[i], &ZIGZAG.map(|position| table[usize::from(position)])]);
     }
     let ([h1, h0], [w1, w0]) = (height.to_be_bytes(), width.to_be_bytes());
-    // 8 bits, 3 components: luma at twice the rate in both directions.
+    // Declares 8 bits and 3 components, with luma at twice the chroma rate in both directions.
     segment(out, 0xc0, &[&[8, h1, h0, w1, w0, 3, 1, 0x22, 0, 2, 0x11, 1, 3, 0x11, 1]]);
     for (id, table) in [(0x00, DC_LUMA), (0x10, AC_LUMA), (0x01, DC_CHROMA), (0x11, AC_CHROMA)] {
         segment(out, 0xc4, &[&[id], &table.counts, table.symbols]);

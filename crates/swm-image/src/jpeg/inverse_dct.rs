@@ -1,5 +1,5 @@
-//! The inverse cosine transform of 8 × 8 blocks: the algorithm of Loeffler, Ligtenberg and Moschytz (1989) in integers,
-//! bit for bit as libjpeg's accurate method (`islow`) rounds it.
+//! The inverse cosine transform of 8 × 8 blocks: the algorithm of Loeffler, Ligtenberg and Moschytz (1989) in integers.
+//! The results equal the results of libjpeg's accurate method (`islow`), bit for bit.
 
 use swm_simd::{CpuLevel, Level};
 
@@ -102,7 +102,7 @@ mod avx2 {
 
     type Rows = [__m128i; 8];
 
-    /// Computes the same as [`super::portable`].
+    /// Computes the same result as [`super::portable`].
     #[target_feature(enable = "avx2")]
     pub fn inverse_dct(block: &Block, to: &mut [u8], stride: usize) {
         let mut rows = [_mm_setzero_si128(); 8];
@@ -195,7 +195,7 @@ mod tests {
         for round in 0..3000 {
             let block = std::array::from_fn(|_| {
                 seed = seed.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-                // Most values are 0. The other values range from small values to values that exceed those of images.
+                // Most values are 0. The other values range from small values to values that exceed the values of images.
                 if seed >> 30 == 0 { (seed as i32 >> 15 >> (round % 16)) as i16 } else { 0 }
             });
             let (mut plain, mut fast) = ([0; 80], [0; 80]);

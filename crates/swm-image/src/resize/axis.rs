@@ -4,7 +4,7 @@ use std::ops::Range;
 
 /// Fraction bits of integer weights, as in Pillow.
 pub const WEIGHT_BITS: u32 = 22;
-/// One half. Callers add it to a sum of weighted bytes, so that [`weighted_byte`] rounds to the nearest byte.
+/// The weight 1/2. Callers add it to a sum of weighted bytes, so that [`weighted_byte`] rounds to the nearest byte.
 pub const WEIGHT_HALF: i32 = 1 << (WEIGHT_BITS - 1);
 
 /// Returns a sum of bytes with integer weights as a byte. Weights may sum to slightly more than 1.
@@ -26,7 +26,7 @@ pub struct FilterAxis<W> {
 }
 
 impl FilterAxis<i32> {
-    /// Pillow's triangle filter with weights of [`WEIGHT_BITS`] fraction bits. It averages when it shrinks and
+    /// Pillow's triangle filter with weights of [`WEIGHT_BITS`] fraction bits. The filter averages when it shrinks and
     /// interpolates linearly when it enlarges.
     pub fn triangle(from: usize, to: usize) -> Self {
         Self::from_triangle(from, to, |weight| (weight * f64::from(1 << WEIGHT_BITS) + 0.5) as i32)

@@ -22,7 +22,7 @@ pub struct PillowResizer {
     rows: FilterAxis<i32>,
     /// A row of the result before it is resized along x, as weighted sums.
     sums: Vec<i32>,
-    /// The same row as bytes.
+    /// A row of the result before it is resized along x, as bytes.
     line: Vec<u8>,
 }
 
@@ -83,7 +83,7 @@ mod tests {
     fn red(width: usize, height: usize, filter: PillowFilter) -> Vec<u8> {
         let old: Vec<u8> = (0..54).flat_map(|i| [((i % 9 * 37 + (i / 9) * (i / 9) * 11) % 256) as u8, 1, 2]).collect();
         let mut resizer = PillowResizer::new(filter);
-        // The first resize has another size, so the second one must compute new weights.
+        // The first resize has another size, so the second resize must compute new weights.
         for (width, height) in [(5, 4), (width, height)] {
             let mut new = vec![7; width * height * 3];
             resizer.resize(&old, (6, 9), &mut new, (height, width));

@@ -120,7 +120,7 @@ impl Journal {
         Ok(Self { path, file, length: 0 })
     }
 
-    /// Appends records and syncs them to disk. If this fails, truncates the journal to its previous length.
+    /// Appends records and syncs them to disk. If writing fails, truncates the journal to its previous length.
     ///
     /// # Errors
     /// If writing fails.

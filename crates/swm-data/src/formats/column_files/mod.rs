@@ -7,7 +7,7 @@
 //!   ep_len.npz, ep_offset.npz    length and first row of every episode
 //!   COLUMN.npz                   [rows, shape…], all episodes one after another
 //!   COLUMN/                      images
-//!   ep_len.journal               only while a writer is active, or after it was killed
+//!   ep_len.journal               only while a writer is active, or after a writer was killed
 //! ```
 //!
 //! The reference treats every file as a column unless its name starts with `ep_len` or `ep_offset`. Therefore schema,

@@ -31,7 +31,7 @@ pub(crate) struct ColumnFilesWriter {
     recorded: Metadata,
     policy: CommitPolicy,
     last_commit: Instant,
-    /// All episodes, including uncommitted ones.
+    /// The rows of all episodes, including uncommitted episodes.
     rows: EpisodeRows,
     /// Records of uncommitted episodes.
     group: Vec<u8>,
@@ -159,7 +159,7 @@ impl ColumnFilesWriter {
         Ok(())
     }
 
-    /// Number of episodes, including uncommitted ones.
+    /// Number of episodes, including uncommitted episodes.
     pub fn episodes(&self) -> usize {
         self.rows.episodes().len()
     }

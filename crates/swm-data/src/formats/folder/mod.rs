@@ -3,7 +3,7 @@
 //! ```text
 //! NAME.folder/
 //!   ep_len.npz, ep_offset.npz, action.npz, …    see `column_files`
-//!   pixels/ep_0_step_0.jpeg, …                  one image each
+//!   pixels/ep_0_step_0.jpeg, …                  one image per file
 //! ```
 //!
 //! This is the layout of the reference's `FolderDataset`, which accepts only names ending in `.jpeg` or `.jpg`, but

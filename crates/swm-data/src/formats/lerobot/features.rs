@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{DType, Error, Result, Schema};
 
-/// Frame rate of videos and timestamps, in frames per second. It is arbitrary, because simulated environments have no
+/// Frame rate of videos and timestamps, in frames per second. The rate is arbitrary, because simulated environments have no
 /// common rate.
 pub const FRAMES_PER_SECOND: u32 = 25;
 

@@ -315,7 +315,7 @@ impl Reader for LerobotReader {
         let spec = |name: &&str| -> Result<ColumnSpec> {
             let index = self.index(name)?;
             let known = &self.specs[index];
-            // Reads the files before memory for the batch is allocated, because they may be shorter than declared.
+            // Reads the files before memory for the batch is allocated, because files may be shorter than declared.
             if let Some(index) = index.checked_sub(2).filter(|&index| self.columns[index].kind == Kind::Values) {
                 self.data(index)?;
             }

@@ -1,5 +1,5 @@
 //! `meta/stats.json`: minimum, maximum, mean and standard deviation of every feature, which LeRobot's policies use for
-//! normalisation. Statistics of new episodes are merged with the stored ones. Quantiles are not written.
+//! normalisation. Statistics of new episodes are merged with the stored statistics. Quantiles are not written.
 
 use serde_json::{Value, json};
 use swm_core::{ColumnSpec, Result};
@@ -86,7 +86,7 @@ impl Stats {
         })
     }
 
-    /// Merges stored statistics. Returns `None` if their number of elements differs.
+    /// Merges stored statistics. Returns `None` if the number of elements differs.
     pub fn continue_from(&mut self, stored: &Value) -> Option<()> {
         let scale = if self.camera { 255.0 } else { 1.0 };
         let list = |name: &str| -> Option<Vec<f64>> {

@@ -54,7 +54,7 @@ pub fn read(path: &Path, columns: &[&str], rows: Option<Vec<Range<usize>>>) -> R
 /// The values of an integer column.
 ///
 /// # Errors
-/// If there is no such column, or it has another type.
+/// If there is no such column, or the column has another type.
 pub fn integers(path: &Path, batches: &[RecordBatch], column: &str) -> Result<Vec<i64>> {
     let mut integers = vec![];
     for batch in batches {

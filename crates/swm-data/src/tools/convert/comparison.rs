@@ -20,7 +20,7 @@ pub struct ColumnComparison {
     pub exact: bool,
     /// The largest absolute difference between a value of the source and the value of the target.
     pub max_error: f64,
-    /// Peak signal-to-noise ratio of images in decibels, if they differ.
+    /// Peak signal-to-noise ratio of images in decibels, if the images differ.
     pub psnr: Option<f64>,
     /// Sum of squared differences.
     #[serde(skip)]

@@ -1,4 +1,4 @@
-//! Examines a dataset for defects, and reports the models that it can train. A repair writes the intact episodes to a
+//! Examines a dataset for defects, and reports the models that the dataset can train. A repair writes the intact episodes to a
 //! new dataset.
 //!
 //! The examination reads every row of every column as training does, so a loader reads an intact dataset without

@@ -67,8 +67,8 @@ enum Planes {
     Gbr,
 }
 
-/// Returns the layout of the 8-bit formats that are converted directly, and whether samples use the full range. Frames of
-/// other formats are converted to [`Pixel::YUV444P`] first.
+/// Returns the layout of the 8-bit formats that are converted directly, and whether samples use the full range. Frames
+/// of other formats are converted to [`Pixel::YUV444P`] first.
 fn planes(format: Pixel) -> Option<(Planes, bool)> {
     Some(match format {
         Pixel::YUV420P => (Planes::Yuv(1, 1), false),

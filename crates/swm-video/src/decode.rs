@@ -412,7 +412,7 @@ fn set_extradata(context: &mut codec::Context, bytes: &[u8]) {
         return;
     }
     let Ok(length) = i32::try_from(bytes.len()) else { return };
-    // `ffmpeg-next` sets `extradata` only when it opens a file with libavformat, whose parsers must not read damaged files.
+    // `ffmpeg-next` sets `extradata` only when libavformat, whose parsers must not read damaged files, opens the file.
     // SAFETY: the memory comes from FFmpeg's allocator, has the zeroed padding that decoders read, is filled within its
     // length, and then belongs to the context, which frees it. The context is not open yet and has no extradata.
     unsafe {

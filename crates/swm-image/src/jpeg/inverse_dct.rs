@@ -195,7 +195,7 @@ mod tests {
         for round in 0..3000 {
             let block = std::array::from_fn(|_| {
                 seed = seed.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-                // Most values are 0. The other values range from small values to values that exceed the values of images.
+                // Most values are 0. The largest values exceed the values of images.
                 if seed >> 30 == 0 { (seed as i32 >> 15 >> (round % 16)) as i16 } else { 0 }
             });
             let (mut plain, mut fast) = ([0; 80], [0; 80]);

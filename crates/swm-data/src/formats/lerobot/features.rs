@@ -7,8 +7,8 @@ use std::collections::BTreeMap;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{DType, Error, Result, Schema};
 
-/// Frame rate of videos and timestamps, in frames per second. The rate is arbitrary, because simulated environments have no
-/// common rate.
+/// Frame rate of videos and timestamps, in frames per second. The rate is arbitrary, because simulated environments
+/// have no common rate.
 pub const FRAMES_PER_SECOND: u32 = 25;
 
 /// Indices of the columns to store, with the names of their features.
@@ -46,7 +46,8 @@ pub fn new_info(schema: &Schema, columns: &[(usize, String)], options: &WriteOpt
                 let names = json!(["height", "width", "channels"]);
                 let details = json!({
                     "video.height": column.shape[0], "video.width": column.shape[1], "video.codec": "h264",
-                    "video.fps": FRAMES_PER_SECOND, "video.channels": 3, "video.is_depth_map": false, "has_audio": false,
+                    "video.fps": FRAMES_PER_SECOND, "video.channels": 3, "video.is_depth_map": false,
+                    "has_audio": false,
                 });
                 Feature { dtype: "video".to_owned(), shape: column.shape.clone(), names, info: Some(details) }
             } else {

@@ -229,7 +229,7 @@ impl<'a> Source<'a> {
         Ok(cut_last_action(rows))
     }
 
-    /// Copies episodes while a thread reads ahead of the writer. Stores the hashes of the episodes in `hashes`, if given.
+    /// Copies episodes while a thread reads ahead of the writer. Stores the episode hashes in `hashes`, if given.
     #[allow(clippy::too_many_arguments, reason = "a part of `convert` that uses the state of `convert`")]
     fn copy(
         &self,

@@ -1,5 +1,5 @@
-//! Examines a dataset for defects, and reports the models that the dataset can train. A repair writes the intact episodes to a
-//! new dataset.
+//! Examines a dataset for defects, and reports the models that the dataset can train. A repair writes the intact
+//! episodes to a new dataset.
 //!
 //! The examination reads every row of every column as training does, so a loader reads an intact dataset without
 //! errors. Defects that only the format can detect come from [`Reader::irregularities`].

@@ -286,7 +286,7 @@ impl Decoder {
         // not concealed.
         context.set_threading(threading::Config::count(1));
         context.compliance(Compliance::Strict);
-        // Without this flag the decoder withholds frames after the key frame of an open GOP. `Index::key_before` chooses
+        // Without this flag the decoder withholds frames after the key frame of an open GOP. `Index::key_before` picks
         // a key frame from which the requested frame can be decoded.
         context.set_flags(Flags::OUTPUT_CORRUPT);
         let mut decoder = context.decoder();

@@ -40,7 +40,7 @@ pub struct Report {
 }
 
 /// The case that the environment variable `SWM_FUZZ_CASE` selects, if set.
-fn only() -> Option<u64> {
+fn selected_case() -> Option<u64> {
     std::env::var("SWM_FUZZ_CASE").ok().map(|case| case.parse().expect("SWM_FUZZ_CASE is the number of a case"))
 }
 
@@ -183,7 +183,7 @@ fn run<T: PartialEq, R: FnOnce() -> Result<T>, C: FnOnce()>(
     let mut report = Report::default();
     let (progress, watched) = channel();
     let watchdog = std::thread::spawn(move || watch(&watched));
-    for case in only().map_or(0..cases, |case| case..case + 1) {
+    for case in selected_case().map_or(0..cases, |case| case..case + 1) {
         let (change, read, restore) = prepare(case, &mut Key::new(0).with(name).at(case).rng());
         let change = format!("{name}, SWM_FUZZ_CASE={case}: {change}");
         progress.send(change.clone()).expect("a running watchdog");

@@ -1,6 +1,6 @@
 //! The features of new datasets: the names and descriptions of the columns in `meta/info.json`.
 
-use super::info::{DATA_PATH, Feature, Features, Info, Recorded, VERSION, VIDEO_PATH, native_name};
+use super::info::{DATA_PATH, Feature, Features, Info, VERSION, VIDEO_PATH, WriterMetadata, native_name};
 use crate::dataset::WriteOptions;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
@@ -79,7 +79,7 @@ pub fn new_info(schema: &Schema, columns: &[(usize, String)], options: &WriteOpt
         data_path: DATA_PATH.to_owned(),
         video_path: cameras.then(|| VIDEO_PATH.to_owned()),
         features: Features(features),
-        stable_worldmodel: Some(Recorded {
+        stable_worldmodel: Some(WriterMetadata {
             schema: schema.clone(),
             manifest: options.manifest.clone(),
             last_action_repeats: true,

@@ -29,11 +29,11 @@ pub struct Info {
     pub total_frames: usize,
     #[serde(default)]
     pub total_tasks: usize,
-    #[serde(default = "thousand")]
+    #[serde(default = "default_chunks_size")]
     pub chunks_size: usize,
-    #[serde(default = "hundred")]
+    #[serde(default = "default_file_size_in_mb")]
     pub data_files_size_in_mb: usize,
-    #[serde(default = "hundred")]
+    #[serde(default = "default_file_size_in_mb")]
     pub video_files_size_in_mb: usize,
     pub fps: serde_json::Number,
     #[serde(default)]
@@ -44,20 +44,20 @@ pub struct Info {
     pub features: Features,
     /// Metadata that only this project's writer adds.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub stable_worldmodel: Option<Recorded>,
+    pub stable_worldmodel: Option<WriterMetadata>,
 }
 
-fn thousand() -> usize {
+fn default_chunks_size() -> usize {
     1000
 }
 
-fn hundred() -> usize {
+fn default_file_size_in_mb() -> usize {
     100
 }
 
 /// Metadata that only this project's writer adds to `meta/info.json`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-pub struct Recorded {
+pub struct WriterMetadata {
     pub schema: Schema,
     pub manifest: Option<Manifest>,
     /// Whether the last action of an episode is a copy of the previous action and stands for a missing action.

@@ -61,7 +61,7 @@ impl LerobotReader {
         files_of_episodes.iter().for_each(|files| rows.push(files.length));
         if info.total_episodes != files_of_episodes.len() || rows.total() != info.total_frames as u64 {
             let problem = format!(
-                "meta/info.json declares {} episodes with {} rows in total, but {} with {} are listed",
+                "meta/info.json declares {} episodes and {} rows, but the list of episodes has {} episodes and {} rows",
                 info.total_episodes,
                 info.total_frames,
                 files_of_episodes.len(),
@@ -340,7 +340,7 @@ impl Reader for LerobotReader {
         };
         let mut constants = Constants::new();
         if let Some(stored) = &files.constants {
-            let stored: BTreeMap<String, Stored> = serde_json::from_str(stored)
+            let stored: BTreeMap<String, StoredConstant> = serde_json::from_str(stored)
                 .map_err(|e| damaged(&self.root, format!("the constants of episode {episode} are unreadable: {e}")))?;
             constants.extend(stored.into_iter().map(|(name, value)| (name, value.into_bytes())));
         } else if !files.tasks.is_empty() {
@@ -423,12 +423,12 @@ impl Reader for LerobotReader {
 /// A constant in JSON: a string, or bytes that are not UTF-8.
 #[derive(Deserialize, serde::Serialize)]
 #[serde(untagged)]
-pub(super) enum Stored {
+pub(super) enum StoredConstant {
     Text(String),
     Bytes(Vec<u8>),
 }
 
-impl Stored {
+impl StoredConstant {
     fn into_bytes(self) -> Vec<u8> {
         match self {
             Self::Text(text) => text.into_bytes(),

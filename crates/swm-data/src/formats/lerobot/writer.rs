@@ -3,8 +3,8 @@
 //! then replaces `meta/info.json`, which declares the number of committed episodes.
 
 use super::features::{FRAMES_PER_SECOND, new_info, stored_columns};
-use super::info::{DATA_PATH, EPISODES_PATH, Info, Recorded, VIDEO_PATH, damaged, fill};
-use super::reader::{LerobotReader, Stored};
+use super::info::{DATA_PATH, EPISODES_PATH, Info, VIDEO_PATH, WriterMetadata, damaged, fill};
+use super::reader::{LerobotReader, StoredConstant};
 use super::stats::{self, Stats};
 use super::table::{self, write_atomically};
 use super::{CONSTANTS, NO_TASK, TASK, values};
@@ -120,7 +120,7 @@ impl LerobotWriter {
         episodes::check_appendable(&self.root.display(), &self.schema, old.schema())?;
         self.file = old.files_of_episodes.last().map_or(0, |files| files.file + 1);
         let manifest = self.options.manifest.clone().or(recorded.manifest);
-        self.info = Info { stable_worldmodel: Some(Recorded { manifest, ..recorded }), ..old.info };
+        self.info = Info { stable_worldmodel: Some(WriterMetadata { manifest, ..recorded }), ..old.info };
         let path = self.root.join("meta").join("stats.json");
         let read = |path: &Path| std::fs::read(path).map_err(|e| Error::io(path, "reading the statistics", e));
         if self.info.total_episodes > 0 {
@@ -205,9 +205,11 @@ impl LerobotWriter {
         })?;
         let text = |bytes: &Vec<u8>| String::from_utf8(bytes.clone()).ok();
         let task = constants.get(TASK).and_then(text).unwrap_or_else(|| NO_TASK.to_owned());
-        let as_json: BTreeMap<&String, Stored> = constants
+        let as_json: BTreeMap<&String, StoredConstant> = constants
             .iter()
-            .map(|(name, bytes)| (name, text(bytes).map_or_else(|| Stored::Bytes(bytes.clone()), Stored::Text)))
+            .map(|(name, bytes)| {
+                (name, text(bytes).map_or_else(|| StoredConstant::Bytes(bytes.clone()), StoredConstant::Text))
+            })
             .collect();
         let constants = serde_json::to_string(&as_json).map_err(|e| Error::external("describing an episode", e))?;
         if !self.tasks.contains(&task) {

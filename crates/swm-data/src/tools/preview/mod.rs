@@ -51,23 +51,23 @@ pub fn preview(
     options: &PreviewOptions,
     mut progress: impl FnMut(usize),
 ) -> Result<Vec<PathBuf>> {
-    let strip = Strip::new(reader, &options.columns)?;
+    let layout = FrameLayout::new(reader, &options.columns)?;
     std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, "creating the folder", e))?;
     let chosen = chosen(reader, options.episodes)?;
     let (mut written, mut sheet) = (vec![], vec![]);
-    let scale = integer_scale(strip.width, strip.height, ENLARGED_SIDE);
+    let scale = integer_scale(layout.width, layout.height, ENLARGED_SIDE);
     for (done, &episode) in chosen.iter().enumerate() {
         let index = reader.episodes()[episode].index;
         let path = folder.join(format!("episode_{index}.mp4"));
         let length = reader.episodes()[episode].length;
         let last = length - 1;
-        let mut video = VideoFile::begin(&path, strip.width, strip.height, options.fps, scale)?;
+        let mut video = VideoFile::begin(&path, layout.width, layout.height, options.fps, scale)?;
         let on_sheet: Vec<usize> = (0..SHEET_COLUMNS).map(|i| i * last / (SHEET_COLUMNS - 1)).collect();
         for start in (0..length).step_by(ROWS) {
             let rows = ROWS.min(length - start);
-            let batch = reader.read(&strip.names(), &[StepRange::new(episode, start, rows)])?;
+            let batch = reader.read(&layout.names(), &[StepRange::new(episode, start, rows)])?;
             for row in 0..rows {
-                let image = strip.draw(&batch, row, &format!("episode {index} step {}", start + row));
+                let image = layout.draw(&batch, row, &format!("episode {index} step {}", start + row));
                 video.add(&image)?;
                 // Short episodes repeat frames on the sheet.
                 let times = on_sheet.iter().filter(|&&step| step == start + row).count();
@@ -78,7 +78,7 @@ pub fn preview(
         written.push(path);
         progress(done + 1);
     }
-    let image = contact_sheet(strip.width, strip.height, &sheet, SHEET_COLUMNS, 1)?;
+    let image = contact_sheet(layout.width, layout.height, &sheet, SHEET_COLUMNS, 1)?;
     let path = folder.join("contact_sheet.png");
     write_png(&path, image.width, image.height, &image.rgb)?;
     written.push(path);
@@ -96,7 +96,7 @@ fn chosen(reader: &dyn Reader, count: usize) -> Result<Vec<usize>> {
 }
 
 /// Layout of a preview frame: the images of all cameras side by side below their labels.
-struct Strip {
+struct FrameLayout {
     cameras: Vec<ColumnSpec>,
     width: usize,
     height: usize,
@@ -107,7 +107,7 @@ struct Strip {
 /// Pixels between two cameras.
 const GAP: usize = 2;
 
-impl Strip {
+impl FrameLayout {
     fn new(reader: &dyn Reader, names: &[String]) -> Result<Self> {
         let schema = reader.schema();
         let cameras: Vec<ColumnSpec> = if names.is_empty() {

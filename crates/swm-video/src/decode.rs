@@ -286,8 +286,8 @@ impl Decoder {
         // not concealed.
         context.set_threading(threading::Config::count(1));
         context.compliance(Compliance::Strict);
-        // Without this flag the decoder withholds frames after the key frame of an open GOP. `Index::key_before` picks
-        // a key frame from which the requested frame can be decoded.
+        // Without this flag the decoder withholds frames after the key frame of an open GOP. `Index::key_before`
+        // chooses a key frame from which the requested frame can be decoded.
         context.set_flags(Flags::OUTPUT_CORRUPT);
         let mut decoder = context.decoder();
         decoder.check(Check::CRC | Check::BITSTREAM | Check::BUFFER | Check::EXPLODE);

@@ -16,9 +16,9 @@
 //! `episode_idx` and `step_idx`. `timestamp`, `index` and `task_index` can be read by name but are not columns, because
 //! writers compute them. Text features are not read, except the task, which becomes the episode's constant `task`.
 //!
-//! **Time.** In LeRobot, the last row of an episode has an action; in this project, the last row holds NaN (or -1 for
-//! integers) instead. Third-party datasets are read unchanged. Datasets written here repeat the previous action in the
-//! last row, so that other programs get no NaN; the reader restores NaN (or -1).
+//! **Time.** In LeRobot, the last row of an episode has an action. In this project, the action of the last row is NaN
+//! (or -1 for integers). Third-party datasets are read unchanged. Datasets written here repeat the previous action in
+//! the last row, so that other programs get no NaN; the reader restores NaN (or -1).
 //!
 //! **Frames** are located by time: the start time of the episode in the file plus the timestamp of the row. Reading
 //! fails if the time of the nearest frame differs by more than a quarter of a frame interval.

@@ -32,7 +32,7 @@ impl Stats {
         Self { count: 0.0, dims: vec![EMPTY; if camera { 3 } else { column.len() }], camera }
     }
 
-    /// Adds values, row-major `[rows, elements]`; for a camera, pixels `[rows, height, dim_count, 3]`.
+    /// Adds values, row-major `[rows, elements]`; for a camera, pixels `[rows, height, width, 3]`.
     pub fn add(&mut self, values: impl Iterator<Item = f64> + Clone, rows: usize) {
         let dim_count = self.dims.len();
         let mut added = vec![EMPTY; dim_count];

@@ -37,7 +37,7 @@ const SHEET_COLUMNS: usize = 8;
 /// Target side of enlarged images, in pixels.
 const ENLARGED_SIDE: usize = 256;
 
-/// Number of rows decoded at once. Limits the memory.
+/// Number of rows decoded at once, which limits the memory.
 const ROWS: usize = 32;
 
 /// Writes `episode_N.mp4` for each selected episode and one `contact_sheet.png` into a folder. Returns the paths. Calls

@@ -1,8 +1,8 @@
 //! `bench data`: clips loaded per second and datasets converted per second.
 //!
-//! All datasets have the same content, collected once; this implementation and the reference each write their own
-//! files. The reference loads in one process or with worker processes, depending on which was faster in a first
-//! measurement.
+//! All datasets have the same content, which the benchmark collects once. This implementation and the reference convert
+//! the content to files of their own. The reference loads in one process or with worker processes, depending on which
+//! was faster in a first measurement.
 
 use crate::reference::{Reference, not_compared, reference_python};
 use serde::Serialize;
@@ -23,33 +23,33 @@ use swm_eval::{CollectConfig, World, WorldConfig};
 /// Settings of the benchmark.
 #[derive(Clone, Debug)]
 pub struct DataBenchConfig {
-    /// Episodes of the datasets.
+    /// The number of episodes of the datasets.
     pub episodes: usize,
-    /// Steps of an episode.
+    /// The number of steps of an episode.
     pub steps: usize,
     /// The side length of the square frames, in pixels.
     pub size: usize,
     /// The length, frameskip and columns of the loaded clips.
     pub clip: ClipSpec,
-    /// Clips in a batch.
+    /// The number of clips in a batch.
     pub batch_size: usize,
-    /// Threads of this implementation's loader.
+    /// The number of threads of this implementation's loader.
     pub threads: usize,
-    /// The numbers of worker processes with which the reference is tried.
+    /// Worker counts of the reference's loader; the fastest count is used.
     pub workers: Vec<usize>,
-    /// The number of measurement pairs: one of this implementation and one of the reference.
+    /// The number of measurement pairs. A pair is one measurement of this implementation and one of the reference.
     pub pairs: usize,
     /// The duration of a measurement of loading, in seconds.
     pub seconds: f64,
-    /// The names of the formats to load from; empty for all.
+    /// The names of the formats to load from; empty for all formats.
     pub formats: Vec<String>,
     /// Whether conversions are measured.
     pub convert: bool,
-    /// Epochs over which memory use is measured; 0 to skip.
+    /// The number of epochs over which memory use is measured; 0 skips this measurement.
     pub epochs: usize,
     /// A folder of an object store to compare with the local disk, if any.
     pub remote: Option<Location>,
-    /// A Python with the reference implementation, if any.
+    /// The Python interpreter of the reference implementation, if any.
     pub python: Option<PathBuf>,
 }
 
@@ -81,13 +81,13 @@ impl Default for DataBenchConfig {
 pub struct DataBenchReport {
     /// The environment whose frames are loaded.
     pub env: String,
-    /// Episodes of the datasets.
+    /// The number of episodes of the datasets.
     pub episodes: usize,
-    /// Rows of all episodes.
+    /// The number of rows of all episodes.
     pub rows: usize,
     /// The number of frames in a clip, the frameskip, and the number of clips in a batch.
     pub clip: [usize; 3],
-    /// Threads of this implementation's loader.
+    /// The number of threads of this implementation's loader.
     pub threads: usize,
     /// The version of the reference, or the reason why it is not compared.
     pub reference: String,
@@ -132,7 +132,8 @@ struct Layout {
 
 const JPEG: ImageCodec = ImageCodec::Jpeg { quality: 95 };
 
-/// Every format. Formats that the reference lacks are compared with its Lance format, which always stores JPEG.
+/// Every format. Formats that the reference lacks are compared with the reference's Lance format, which always stores
+/// JPEG.
 const LAYOUTS: [Layout; 6] = [
     layout("lance, jpeg", "lance", JPEG, "jpeg.lance", "lance", "theirs.lance"),
     layout("lance, lossless", "lance", LOSSLESS, "lossless.lance", "lance", "theirs.lance"),
@@ -156,7 +157,7 @@ const fn layout(
     Layout { name, format, codec, file, reference_format, reference_file }
 }
 
-/// Measures loading from every format, converting, and memory use over some epochs.
+/// Measures loading from every format, converting, and memory use over several epochs.
 ///
 /// # Errors
 /// When a setting is invalid, an environment or a writer fails, or the reference stops answering. Work that the
@@ -165,11 +166,11 @@ const fn layout(
 pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBenchReport> {
     if config.pairs == 0 || !(config.seconds > 0.0 && config.seconds.is_finite()) {
         let given = format!("{} pairs of measurements of {} seconds", config.pairs, config.seconds);
-        return Err(Error::config("benchmark", given, "ask for at least 1 pair of more than 0 seconds"));
+        return Err(Error::config("benchmark", given, "choose at least 1 pair of more than 0 seconds"));
     }
-    let folder = tempfile::tempdir().map_err(|e| Error::io("a temporary folder", "creating it for datasets", e))?;
+    let folder = tempfile::tempdir().map_err(|e| Error::io("a temporary folder", "creating the folder", e))?;
     let at = |name: &str| folder.path().join(name);
-    // This implementation and the reference both read PNG, and PNG is lossless.
+    // The source stores PNG, which is lossless and readable for this implementation and for the reference.
     let source = at("source.lance");
     let rows = collect(env, config, &source)?;
     let mut report = DataBenchReport {
@@ -206,7 +207,7 @@ pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBench
         report.rates.push(load(layout.name, &path, config, CacheConfig::Off, reference_side.as_mut())?);
         if layout.name == "lance, jpeg" {
             let decoded = rows * config.size * config.size * 3;
-            // The labels are part of the JSON report.
+            // The JSON report contains these labels.
             let caches = [
                 ("all cached in memory", CacheConfig::Memory { bytes: 2 * decoded }),
                 ("a tenth cached in memory", CacheConfig::Memory { bytes: decoded / 10 }),
@@ -224,21 +225,22 @@ pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBench
         }
     }
     if config.convert {
-        // This implementation and the reference convert the same dataset: the reference's, if there is a reference.
+        // This implementation and the reference convert the same dataset: the Lance dataset of the reference, if it
+        // exists.
         let jpeg = [at("theirs.lance"), at("jpeg.lance")].into_iter().find(|path| path.exists());
         for layout in LAYOUTS.iter().filter(selected).filter(|layout| ["hdf5", "video"].contains(&layout.format)) {
             for (what, verify) in [("", false), (", verified", true)] {
                 let what = format!("lance to {}{what}", layout.name);
                 let source = jpeg.as_deref().unwrap_or(&source);
                 let folder = at("converted");
-                report.rates.push(converting(&what, verify, source, layout, &folder, config, reference.as_mut())?);
+                report.rates.push(conversion(&what, verify, source, layout, &folder, config, reference.as_mut())?);
             }
         }
     }
     Ok(report)
 }
 
-/// Collects the content of all datasets; returns its number of rows.
+/// Collects the content of all datasets; returns the number of rows.
 fn collect(env: &EnvChoice, config: &DataBenchConfig, path: &Path) -> Result<usize> {
     let image = Some((config.size, config.size));
     let world = WorldConfig { image, max_episode_steps: Some(config.steps), ..WorldConfig::default() };
@@ -256,7 +258,7 @@ fn collect(env: &EnvChoice, config: &DataBenchConfig, path: &Path) -> Result<usi
     Ok(open(path)?.episodes().iter().map(|episode| episode.length).sum())
 }
 
-/// Writes the content in the format of a layout.
+/// Converts the dataset `source` to the format of a layout.
 fn write(source: &Path, path: &Path, layout: &Layout) -> Result<()> {
     let options = ConvertOptions {
         format: Some(layout.format.to_owned()),
@@ -331,7 +333,7 @@ fn load(
     dataset: std::result::Result<&mut ReferenceDataset<'_>, &mut String>,
 ) -> Result<DataBenchRow> {
     let mut endless = Endless { loader: loader(&open(path)?, config, cache)?, epoch: 0 };
-    // One epoch as a warm-up, which fills caches and buffers.
+    // The first epoch is a warm-up, which fills caches and buffers.
     for batch in endless.loader.epoch(0, 0) {
         batch?;
     }
@@ -413,7 +415,7 @@ fn resident() -> Option<u64> {
 }
 
 /// Measures conversions, alternately by this implementation and by the reference.
-fn converting(
+fn conversion(
     what: &str,
     verify: bool,
     source: &Path,

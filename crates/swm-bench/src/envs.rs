@@ -1,4 +1,4 @@
-//! `bench envs`: environment steps per second, with and without rendering, and while collecting.
+//! `bench envs`: environment steps per second of stepping, of stepping with rendering, and of collecting.
 
 use crate::reference::{Reference, Size, not_compared, reference_python};
 use serde::Serialize;
@@ -23,18 +23,18 @@ pub struct BenchConfig {
     pub sizes: Vec<usize>,
     /// Whether to measure stepping without frames in addition to stepping with frames.
     pub bare: bool,
-    /// Worker threads; 0 for the number of cores. The reference steps on one thread.
+    /// The number of worker threads; 0 for the number of cores. The reference steps on one thread.
     pub threads: usize,
-    /// The number of measurement pairs: one of this implementation and one of the reference.
+    /// The number of measurement pairs. A pair is one measurement of this implementation and one of the reference.
     pub pairs: usize,
     /// The duration of a measurement of stepping, in seconds.
     pub seconds: f64,
-    /// Steps of an episode.
+    /// The number of steps of an episode.
     pub episode_steps: usize,
-    /// Episodes that the reference collects in a measurement; 0 skips collecting. This implementation collects
-    /// `EPISODE_FACTOR` times as many episodes, so that both measurements are long enough.
+    /// The number of episodes that the reference collects in a measurement; 0 skips collecting. This implementation
+    /// collects `EPISODE_FACTOR` times as many episodes, so that both measurements are long enough.
     pub episodes: usize,
-    /// A Python with the reference implementation, if any.
+    /// The Python interpreter of the reference implementation, if any.
     pub python: Option<PathBuf>,
 }
 
@@ -44,7 +44,7 @@ const EPISODE_FACTOR: usize = 32;
 
 impl Default for BenchConfig {
     /// The settings of the reference's published rates: 8 environments at 224 pixels. The Python of the reference is
-    /// the one that [`REFERENCE_PYTHON`](crate::REFERENCE_PYTHON) names.
+    /// the value of the environment variable [`REFERENCE_PYTHON`](crate::REFERENCE_PYTHON).
     fn default() -> Self {
         Self {
             envs: 8,
@@ -65,7 +65,7 @@ impl Default for BenchConfig {
 pub struct BenchReport {
     /// The number of environments that are stepped together.
     pub envs: usize,
-    /// Worker threads of this implementation.
+    /// The number of worker threads of this implementation.
     pub threads: usize,
     /// The version of the reference, or the reason why it is not compared.
     pub reference: String,
@@ -78,10 +78,10 @@ pub struct BenchReport {
 pub struct BenchRow {
     /// The environment.
     pub env: String,
-    /// The kind of work: `step + render`, `collect` to Lance with a codec, `step` without frames, or `step` of a single
-    /// environment on one thread.
+    /// The kind of work: `step` (without frames), `step, one thread` (a single environment), `step + render`, or
+    /// `collect, CODEC` (to a Lance dataset).
     pub what: &'static str,
-    /// The side length of the frames, in pixels; none without frames.
+    /// The side length of the frames, in pixels; `None` without frames.
     pub size: Option<usize>,
     /// Environment steps per second in each measurement of this implementation.
     pub ours: Vec<f64>,
@@ -103,7 +103,7 @@ pub struct BenchRow {
 pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchReport> {
     if config.pairs == 0 || !(config.seconds > 0.0 && config.seconds.is_finite()) {
         let given = format!("{} pairs of measurements of {} seconds", config.pairs, config.seconds);
-        return Err(Error::config("benchmark", given, "ask for at least 1 pair of more than 0 seconds"));
+        return Err(Error::config("benchmark", given, "choose at least 1 pair of more than 0 seconds"));
     }
     let mut report = BenchReport {
         envs: config.envs,
@@ -150,8 +150,7 @@ pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchRe
             if config.episodes == 0 {
                 continue;
             }
-            let folder =
-                tempfile::tempdir().map_err(|e| Error::io("a temporary folder", "creating it for datasets", e))?;
+            let folder = tempfile::tempdir().map_err(|e| Error::io("a temporary folder", "creating the folder", e))?;
             let path = |side: &str, pair: usize| folder.path().join(format!("{side}-{pair}.lance"));
             let collect = CollectConfig {
                 episodes: config.episodes * EPISODE_FACTOR,
@@ -255,7 +254,8 @@ impl Ours {
 }
 
 impl BenchReport {
-    /// Starts the reference with a `World` of this size. If this fails, stores the reason and returns `None`.
+    /// Starts the reference with a `World` of frames of `size` pixels. On failure, stores the reason and returns
+    /// `None`.
     fn start_reference(&mut self, env: &EnvChoice, size: usize, config: &BenchConfig) -> Option<Reference> {
         let world_size =
             Size { env: &env.id(), envs: config.envs, image: (size, size), episode_steps: config.episode_steps };

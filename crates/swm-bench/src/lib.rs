@@ -1,11 +1,12 @@
 //! Benchmarks: steps, frames, clips, plans and training steps per second.
 //!
-//! Every benchmark compares with the reference implementation where `SWM_REFERENCE_PYTHON` names a Python that has it
-//! ([`REFERENCE_PYTHON`]). The drivers of the reference are Python scripts in `reference/`, run as a process.
+//! Every benchmark except [`bench_render`] compares with the reference implementation if the environment variable
+//! `SWM_REFERENCE_PYTHON` ([`REFERENCE_PYTHON`]) names a Python interpreter that has the reference. The Python scripts
+//! in `reference/` run the reference in a process.
 //!
 //! Measurements of this implementation and of the reference alternate within one run, so that the load of the machine
-//! affects both in the same way. The reported figure is the median over the ratios of successive measurements, because
-//! ratios are reproducible on a shared machine and absolute rates are not.
+//! affects both measurements in the same way. The reported figure is the median over the ratios of successive
+//! measurements, because ratios are reproducible on a shared machine and absolute rates are not.
 
 mod data;
 mod envs;

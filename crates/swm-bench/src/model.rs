@@ -16,7 +16,7 @@ use swm_core::{Error, Result};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Work {
-    /// A whole plan: encoding start and goal, then all iterations.
+    /// A plan: encoding start and goal, then all iterations.
     Plan,
     /// The costs of the candidates of one iteration.
     Cost,
@@ -45,7 +45,7 @@ impl Work {
 
 /// A model to measure.
 pub trait Subject {
-    /// Executes a workload once; returns its outputs, or an empty list if they are random.
+    /// Executes a workload once; returns the outputs of the workload, or an empty list if the outputs are random.
     ///
     /// # Errors
     /// When the model fails.
@@ -57,11 +57,11 @@ pub trait Subject {
 pub struct ModelBenchConfig {
     /// The workloads, each with the number of repetitions in a measurement.
     pub works: Vec<(Work, usize)>,
-    /// The number of measurement pairs: one of this implementation and one of the reference.
+    /// The number of measurement pairs. A pair is one measurement of this implementation and one of the reference.
     pub pairs: usize,
-    /// The sizes of the model, in the form that the reference's process reads.
+    /// The sizes of the model: the first argument of the script `reference/model.py`.
     pub sizes: serde_json::Value,
-    /// A Python with the reference implementation, if any.
+    /// The Python interpreter of the reference implementation, if any.
     pub python: Option<PathBuf>,
 }
 
@@ -92,14 +92,14 @@ pub struct ModelBenchRow {
     pub difference: Option<f32>,
 }
 
-/// Measures a model; `weights` is a file with its weights and inputs for the reference's process.
+/// Measures a model; `weights` is the file from which the reference reads the weights and the inputs of the model.
 ///
 /// # Errors
 /// When there are no measurements, a workload fails, or the reference fails after its start. A reference that does not
 /// start is not an error: [`ModelBenchReport::reference`] contains the reason.
 pub fn bench_model(config: &ModelBenchConfig, weights: &Path, subject: &mut dyn Subject) -> Result<ModelBenchReport> {
     if config.pairs == 0 || config.works.iter().any(|(_, count)| *count == 0) {
-        return Err(Error::config("measurements of a benchmark", "0", "ask for at least 1"));
+        return Err(Error::config("measurements of a benchmark", "0", "choose at least 1"));
     }
     let mut report = ModelBenchReport { reference: not_compared(), rows: vec![] };
     let mut reference = None;
@@ -154,9 +154,9 @@ fn difference(ours: &[f32], theirs: &[f32]) -> Result<f32> {
         return Err(Error::mismatch("comparing with the reference", given, expected));
     }
     let largest = theirs.iter().fold(f32::MIN_POSITIVE, |most, value| value.abs().max(most));
-    // `max` would discard NaN.
-    let apart = ours.iter().zip(theirs).map(|(a, b)| (a - b).abs());
-    Ok(apart.fold(0.0, |most, apart| if apart > most || apart.is_nan() { apart } else { most }) / largest)
+    // `f32::max` would discard NaN.
+    let differences = ours.iter().zip(theirs).map(|(a, b)| (a - b).abs());
+    Ok(differences.fold(0.0, |most, one| if one > most || one.is_nan() { one } else { most }) / largest)
 }
 
 impl fmt::Display for ModelBenchReport {
@@ -235,7 +235,7 @@ mod tests {
 
     #[test]
     fn nan_is_a_difference() {
-        assert!(difference(&[f32::NAN, 1.0], &[1.0, 1.0]).expect("at least one result").is_nan());
+        assert!(difference(&[f32::NAN, 1.0], &[1.0, 1.0]).expect("two outputs of equal length").is_nan());
         assert!(difference(&[1.0], &[1.0, 1.0]).is_err());
     }
 }

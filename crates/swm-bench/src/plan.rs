@@ -17,30 +17,30 @@ use swm_plan::Cem;
 /// Settings of the benchmark.
 #[derive(Clone, Debug)]
 pub struct PlanBenchConfig {
-    /// The numbers of environments that one call plans for; the report has a row for each.
+    /// The numbers of environments that one call plans for; the report has a row for each number.
     pub envs: Vec<usize>,
-    /// Candidates, iterations, elites.
+    /// The settings of CEM (the cross-entropy method): candidates, iterations, elites.
     pub cem: Cem,
-    /// Model steps of a plan.
+    /// The number of model steps of a plan.
     pub horizon: usize,
     /// The dimension of a model step.
     pub dim: usize,
     /// The time in seconds that a model takes for the candidates of one environment in one iteration. The planner's
     /// time is reported relative to this time.
     pub model_seconds: f64,
-    /// Worker threads; 0 for the number of cores. The reference uses torch's default.
+    /// The number of worker threads; 0 for the number of cores. The reference uses torch's default.
     pub threads: usize,
-    /// The number of measurement pairs: one of this implementation and one of the reference.
+    /// The number of measurement pairs. A pair is one measurement of this implementation and one of the reference.
     pub pairs: usize,
     /// The duration of a measurement, in seconds.
     pub seconds: f64,
-    /// A Python with the reference implementation, if any.
+    /// The Python interpreter of the reference implementation, if any.
     pub python: Option<PathBuf>,
 }
 
 impl Default for PlanBenchConfig {
-    /// The paper's settings: 300 candidates, 30 iterations, 5 model steps of 5 actions of dimension 2; for 1 and for 16
-    /// environments. The model time is the target for a LeWM on two cores.
+    /// The settings of the stable-worldmodel paper: 300 candidates, 30 iterations, 5 model steps of 5 actions of
+    /// dimension 2; for 1 and for 16 environments. `model_seconds` is the target for a LeWM on two cores.
     fn default() -> Self {
         Self {
             envs: vec![1, 16],
@@ -59,15 +59,15 @@ impl Default for PlanBenchConfig {
 /// The result of the benchmark.
 #[derive(Clone, Debug, Serialize)]
 pub struct PlanBenchReport {
-    /// Candidates per iteration.
+    /// The number of candidates per iteration.
     pub samples: usize,
-    /// Iterations of a plan.
+    /// The number of iterations of a plan.
     pub iterations: usize,
-    /// Model steps of a plan.
+    /// The number of model steps of a plan.
     pub horizon: usize,
     /// The dimension of a model step.
     pub dim: usize,
-    /// Worker threads of this implementation.
+    /// The number of worker threads of this implementation.
     pub threads: usize,
     /// The version of the reference, or the reason why it is not compared.
     pub reference: String,
@@ -78,7 +78,7 @@ pub struct PlanBenchReport {
 /// The rate of planning for a number of environments in one call.
 #[derive(Clone, Debug, Serialize)]
 pub struct PlanBenchRow {
-    /// Environments planned in one call.
+    /// The number of environments planned in one call.
     pub envs: usize,
     /// Iterations per second in each measurement of this implementation.
     pub ours: Vec<f64>,
@@ -104,10 +104,10 @@ pub fn bench_plan(config: &PlanBenchConfig) -> Result<PlanBenchReport> {
             "{} pairs of measurements of {} seconds, a model that takes {} seconds",
             config.pairs, config.seconds, config.model_seconds
         );
-        return Err(Error::config("benchmark", given, "ask for at least 1 pair, and for times above 0"));
+        return Err(Error::config("benchmark", given, "choose at least 1 pair and times above 0"));
     }
     if config.envs.contains(&0) {
-        return Err(Error::config("environments to plan for", "0", "ask for at least 1"));
+        return Err(Error::config("environments to plan for", "0", "choose at least 1"));
     }
     let workers = threads(config.threads)?;
     let Cem { samples, iterations, elites, .. } = config.cem;

@@ -1,7 +1,7 @@
 //! `bench render`: frames per second of one environment, by environment, size and renderer.
 //!
-//! Measurements of the renderers alternate within one run, and the report contains the median for each. The environment
-//! steps between two frames; the time of the step is not counted.
+//! Measurements of the renderers alternate within one run, and the report contains the median for each renderer. The
+//! environment steps between two frames; the time of the step is not counted.
 
 use serde::Serialize;
 use std::time::{Duration, Instant};
@@ -18,7 +18,7 @@ pub struct RenderBenchConfig {
     pub turns: usize,
     /// The duration of a measurement, in seconds.
     pub seconds: f64,
-    /// Threads that may render a frame together.
+    /// The number of threads that may render one frame together.
     pub threads: usize,
 }
 
@@ -28,10 +28,10 @@ impl Default for RenderBenchConfig {
     }
 }
 
-/// A renderer: calls its argument so that frames are rendered with it.
+/// A renderer: a function that calls the given closure, whose frames are rendered by this renderer.
 pub type Drawing<'a> = dyn Fn(&mut dyn FnMut() -> Result<()>) -> Result<()> + 'a;
 
-/// The rate of one renderer.
+/// The rate of one renderer in one environment at one frame size.
 #[derive(Clone, Debug, Serialize)]
 pub struct RenderRow {
     /// The environment.
@@ -40,9 +40,9 @@ pub struct RenderRow {
     pub size: usize,
     /// The renderer.
     pub renderer: String,
-    /// Threads that may render a frame together.
+    /// The number of threads that may render one frame together.
     pub threads: usize,
-    /// The median over measurements.
+    /// Frames per second, the median over measurements.
     #[serde(rename = "pictures_per_second")]
     pub frames_per_second: f64,
 }

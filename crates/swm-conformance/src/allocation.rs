@@ -12,19 +12,19 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use swm_core::{Action, Batch, EnvEntry, FrameMut, Key, ResetOptions, Schema, Space, VariationRequest};
 
-/// Steps before counting starts, and steps counted.
+/// The number of steps before counting starts, and the number of counted steps.
 const WARM_UP: usize = 30;
 
 /// The system's allocator with a count per thread.
 pub struct Counting;
 
 thread_local! {
-    /// Allocations of this thread, while it counts them.
+    /// The number of allocations of this thread; `None` while the thread does not count.
     static ALLOCATIONS: Cell<Option<usize>> = const { Cell::new(None) };
 }
 
-/// Counts an allocation. The counter is `const` and has no destructor, so it can be read in every state of a thread and
-/// reading it allocates nothing.
+/// Counts an allocation. The counter is `const` and has no destructor, so every state of a thread can read it
+/// without an allocation.
 fn count() {
     ALLOCATIONS.with(|count| count.set(count.get().map(|n| n + 1)));
 }
@@ -66,14 +66,14 @@ pub fn allocations(work: impl FnOnce()) -> usize {
 /// Checks that the program uses [`Counting`] as its allocator.
 ///
 /// # Panics
-/// When it uses another one.
+/// When the program uses another allocator.
 pub fn counting_allocator_is_active() {
     assert_eq!(allocations(|| drop(std::hint::black_box(vec![1u8; 100]))), 1, "the program uses another allocator");
     assert_eq!(allocations(|| _ = std::hint::black_box([1u8; 100])), 0);
 }
 
-/// Steps every environment, with default factors and with all factors varied, and renders it and its goal as square
-/// frames of `sides` pixels per side.
+/// Steps every environment, with default factors and with all factors varied, and renders the state and the goal as
+/// square frames of `sides` pixels per side.
 ///
 /// # Panics
 /// When a step, an observation or a frame allocates memory or fails.

@@ -10,8 +10,9 @@ use swm_core::VariationRequest;
 
 /// Returns the golden files whose names start with `prefix`, sorted by name.
 ///
-/// They are read from `tests/golden` in the crate's folder and from the folder that `SWM_GOLDEN` names (default:
-/// `shared/reference/golden` next to the workspace). Of two files with the same name, the latter is used.
+/// The files are in `tests/golden` in the crate's folder and in the folder that the environment variable `SWM_GOLDEN`
+/// names (default: `shared/reference/golden` next to the workspace). Of two files with the same name, the file in the
+/// folder of `SWM_GOLDEN` is used.
 pub fn files(crate_folder: &str, prefix: &str) -> Vec<PathBuf> {
     let root = Path::new(crate_folder);
     let shared =
@@ -28,7 +29,7 @@ pub fn files(crate_folder: &str, prefix: &str) -> Vec<PathBuf> {
     found.into_values().collect()
 }
 
-/// A golden file. For use in tests: its methods panic when an array is missing or has another type.
+/// A golden file. The methods are for tests: they panic when an array is missing or has another type.
 pub struct Golden(NpzArchive<BufReader<File>>);
 
 impl Golden {
@@ -42,7 +43,7 @@ impl Golden {
         self.0.array_names().map(str::to_owned).collect()
     }
 
-    /// Returns whether there is an array of that name.
+    /// Returns whether the file contains the array `name`.
     pub fn has(&self, name: &str) -> bool {
         self.names().iter().any(|known| known == name)
     }
@@ -76,7 +77,7 @@ impl Golden {
     pub fn image(&mut self, name: &str) -> (usize, usize, Vec<u8>) {
         let array = self.array(name);
         let &[height, width, 3] = array.shape() else { panic!("{name} is not an RGB image") };
-        let side = |n| usize::try_from(n).expect("a size");
+        let side = |n| usize::try_from(n).expect("an image size that fits usize");
         (side(height), side(width), array.into_vec().unwrap_or_else(|error| panic!("{name}: {error}")))
     }
 
@@ -89,7 +90,11 @@ impl Golden {
     pub fn variation(&mut self) -> VariationRequest {
         let mut request = VariationRequest { variation: Some(vec![]), ..VariationRequest::default() };
         let text = self.text("variation");
-        flatten("", &serde_json::from_str(&text).expect("JSON"), &mut request.variation_values);
+        flatten(
+            "",
+            &serde_json::from_str(&text).expect("parsing the factors of variation"),
+            &mut request.variation_values,
+        );
         request
     }
 }
@@ -99,7 +104,7 @@ fn flatten(key: &str, value: &serde_json::Value, into: &mut BTreeMap<String, Vec
     fn flatten_values(value: &serde_json::Value, into: &mut Vec<f64>) {
         match value {
             serde_json::Value::Array(values) => values.iter().for_each(|value| flatten_values(value, into)),
-            value => into.push(value.as_f64().expect("a number")),
+            value => into.push(value.as_f64().expect("a numeric factor value")),
         }
     }
     match value {

@@ -5,7 +5,7 @@
 //! static SUITE: Suite = Suite::of(my_crate::ENVS.rows);
 //! swm_conformance::tests!(SUITE);
 //! ```
-//! This makes one test of each of the [`checks`].
+//! The macro makes one test of each function of [`checks`].
 
 pub mod allocation;
 pub mod checks;
@@ -24,19 +24,19 @@ pub struct Suite {
     pub frame_size: (usize, usize),
     /// Frame sizes at which every pixel must be written.
     pub frame_sizes: &'static [(usize, usize)],
-    /// Steps over which episodes are compared, frame by frame.
+    /// Environment steps over which episodes are compared, frame by frame.
     pub steps: u64,
     /// Goals sampled per environment.
     pub goals: u64,
     /// Dataset rows restored per environment.
     pub restored_rows: u64,
-    /// Values tried per factor, with the other factors at their defaults and in each of the contexts.
+    /// Values tried per factor in each context. A context is an assignment of values to all other factors.
     pub values: usize,
-    /// Random samples of the other factors in which a factor is tried.
+    /// The number of contexts with random values, besides the context of all defaults.
     pub contexts: u64,
-    /// Requests per factor and group.
+    /// Resets per factor and group that request the factor or group.
     pub requests: usize,
-    /// Resets with all factors varied.
+    /// The number of resets with all factors varied.
     pub resets: u64,
     /// Factors without effect: environment, factor, reason.
     pub inert_factors: &'static [(&'static str, &'static str, &'static str)],
@@ -62,7 +62,7 @@ impl Suite {
     }
 }
 
-/// Makes a test of each of the [`checks`], or of those named.
+/// Makes a test of each function of [`checks`], or of the named functions only.
 #[macro_export]
 macro_rules! tests {
     ($suite:expr) => {

@@ -11,7 +11,8 @@ pub enum Modality {
     Rgb,
     /// Distance from the camera plane: `[height, width]` of `Float32`, in metres.
     Depth,
-    /// The index of the visible geometry in the simulator's model: `[height, width]` of `Int32`, -1 for none.
+    /// The index of the visible geometry in the simulator's model: `[height, width]` of `Int32`, -1 for the
+    /// background.
     Segmentation,
 }
 
@@ -103,7 +104,7 @@ mod tests {
         let both = CameraView::parse("top:segmentation")?;
         assert_eq!((both.to_string().as_str(), both.modality), ("segmentation.top", Modality::Segmentation));
         assert_eq!(both.column(4, 6), ColumnSpec::new("segmentation.top", DType::Int32, [4, 6]));
-        let error = CameraView::parse("top:dept").expect_err("no modality").to_string();
+        let error = CameraView::parse("top:dept").expect_err("an unknown modality").to_string();
         assert!(error.contains("depth"), "{error}");
         Ok(())
     }

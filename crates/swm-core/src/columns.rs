@@ -33,11 +33,11 @@ pub const TRUNCATED: &str = "truncated";
 pub const SUCCESS: &str = "success";
 /// Steps since the start of the episode.
 pub const STEP_IDX: &str = "step_idx";
-/// The number of the episode in its dataset.
+/// The index of the episode in the dataset.
 pub const EPISODE_IDX: &str = "episode_idx";
 /// The reset seed of the episode, as [`split_seed`] stores it.
 pub const EPISODE_SEED: &str = "episode_seed";
-/// The reset seed of the episode as one integer, which is how other programs store it.
+/// The reset seed of the episode as one integer, the form in which other programs store it.
 pub const SEED: &str = "seed";
 
 /// The prefix of factor columns under their full names.
@@ -62,9 +62,9 @@ pub struct ColumnIndices {
     pub action: Option<usize>,
     /// The index of [`STEP_IDX`]; absent from collected episodes.
     pub step_idx: Option<usize>,
-    /// The index of [`PIXELS`], where frames are rendered.
+    /// The index of [`PIXELS`]; present if frames are rendered.
     pub pixels: Option<usize>,
-    /// The index of [`GOAL`], where frames of the goal are rendered.
+    /// The index of [`GOAL`]; present if frames of the goal are rendered.
     pub goal: Option<usize>,
 }
 
@@ -89,8 +89,8 @@ impl ColumnIndices {
 
 /// The flat form of a column name: `variation_agent_color` for `variation.agent.color`.
 ///
-/// Formats that read a dot as a path into a structure store flat names, and environments read dataset rows under flat
-/// names, whatever format the rows come from.
+/// Formats that read a dot as a path into a structure store flat names, and environments read dataset rows of every
+/// format under flat names.
 pub fn flat(name: &str) -> String {
     name.replace('.', "_")
 }
@@ -116,7 +116,7 @@ pub fn flat_factor(key: &str) -> String {
     flat(&factor(key))
 }
 
-/// Whether a [`flat`] name is that of a factor column.
+/// Whether `name` is the [`flat`] name of a factor column.
 pub fn is_flat_factor(name: &str) -> bool {
     name.starts_with(FLAT_FACTOR)
 }
@@ -134,8 +134,7 @@ pub fn of_goal(name: &str) -> String {
     if name == PIXELS { GOAL.to_owned() } else { format!("{OF_GOAL}{name}") }
 }
 
-/// The column whose value at the goal column `name` holds, or `None` if `name` is not a goal column: `state` for
-/// `goal_state`, `pixels` for `goal`.
+/// The inverse of [`of_goal`]: `state` for `goal_state`, `pixels` for `goal`; `None` if `name` is not a goal column.
 pub fn goal_source(name: &str) -> Option<&str> {
     if name == GOAL { Some(PIXELS) } else { name.strip_prefix(OF_GOAL) }
 }
@@ -148,7 +147,7 @@ pub fn split_seed(seed: u64) -> [i32; 3] {
     [0, SEED_BITS, 2 * SEED_BITS].map(|shift| (seed >> shift & ((1 << SEED_BITS) - 1)) as i32)
 }
 
-/// Joins the elements of [`EPISODE_SEED`] to the seed that [`split_seed`] was given.
+/// Joins the elements of [`EPISODE_SEED`] to a seed: the inverse of [`split_seed`].
 pub fn join_seed(elements: [f64; 3]) -> u64 {
     elements.iter().rev().fold(0, |seed, &element| seed << SEED_BITS | element as u64)
 }
@@ -165,7 +164,7 @@ mod tests {
         let found = ColumnIndices::of(&schema)?;
         assert_eq!([found.reward, found.terminated, found.truncated, found.success], [1, 2, 3, 4]);
         assert_eq!([found.action, found.step_idx, found.pixels, found.goal], [None, Some(5), Some(6), None]);
-        let error = ColumnIndices::of(&Schema::new(vec![])?).expect_err("no reward").to_string();
+        let error = ColumnIndices::of(&Schema::new(vec![])?).expect_err("a schema without a reward column").to_string();
         assert!(error.contains("reward"), "{error}");
         Ok(())
     }

@@ -1,7 +1,8 @@
 //! Starting an episode at a recorded row of a dataset, towards the state of another row.
 //!
-//! [`reset`] starts any environment in this way, and [`required_columns`] lists the columns that it reads. Both use
-//! [`DatasetStartEnv`] if the environment implements it, otherwise [`Env::reset`] and [`Env::restore_from`].
+//! [`reset`] starts any environment in this way, and [`required_columns`] lists the columns that it reads. Both
+//! functions use [`DatasetStartEnv`] if the environment implements it, otherwise [`Env::reset`] and
+//! [`Env::restore_from`].
 
 use crate::batch::{RowRef, Schema};
 use crate::{Env, Error, ResetOptions, Result, columns};
@@ -22,13 +23,14 @@ pub struct DatasetStart<'a> {
 
 /// A method of a third-party environment, called by name after a reset.
 ///
-/// The layout is that of the argument `callables` of `World.evaluate` in the Python package `stable-worldmodel` 0.1.1.
+/// The layout equals that of the argument `callables` of `World.evaluate` in the Python package `stable-worldmodel`
+/// 0.1.1.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Callable {
     /// The method's name.
     pub method: String,
-    /// Its keyword arguments.
+    /// The method's keyword arguments.
     #[serde(default)]
     pub args: BTreeMap<String, CallableArgument>,
 }
@@ -67,8 +69,8 @@ pub trait DatasetStartEnv {
     fn reset_from(&mut self, seed: u64, options: &ResetOptions, from: DatasetStart<'_>) -> Result<()>;
 }
 
-/// The columns of a dataset that [`reset`] reads: those of [`DatasetStartEnv::required_columns`] if the environment
-/// implements it, otherwise all except images.
+/// The columns of a dataset that [`reset`] reads: the columns of [`DatasetStartEnv::required_columns`] if the
+/// environment implements it, otherwise all columns except images.
 ///
 /// # Errors
 /// When the dataset lacks a required column: by default, a `state` of the environment's shape.
@@ -94,7 +96,7 @@ pub fn required_columns(env: &dyn Env, stored: &Schema, callables: &[Callable]) 
 /// otherwise by [`Env::reset`], which sets everything that the rows do not contain, followed by [`Env::restore_from`].
 ///
 /// # Errors
-/// As these methods.
+/// As [`DatasetStartEnv::reset_from`], [`Env::reset`] and [`Env::restore_from`].
 pub fn reset(env: &mut dyn Env, seed: u64, options: &ResetOptions, from: DatasetStart<'_>) -> Result<()> {
     if let Some(env) = env.dataset_start_mut() {
         return env.reset_from(seed, options, from);

@@ -1,9 +1,9 @@
 //! [`Env`]: one environment, with its actions, observations, goals and frames.
 //!
 //! An environment declares its observation columns up front ([`EnvSpec`]) and writes them into a [`crate::Batch`] row
-//! in place. It owns all its randomness: the same seed and the same actions give the same bytes. Its full state can be
-//! saved and restored ([`Env::snapshot`]), it can start from a row of a dataset ([`Env::restore_from`]), and it can
-//! always sample a reachable goal ([`Env::sample_goal`]).
+//! in place. An environment owns all its randomness: the same seed and the same actions give the same bytes. Its full
+//! state can be saved and restored ([`Env::snapshot`]), it can start from a row of a dataset ([`Env::restore_from`]),
+//! and it can always sample a reachable goal ([`Env::sample_goal`]).
 
 use crate::batch::{ColumnSpec, RowMut, RowRef};
 use crate::camera_view::CameraView;
@@ -16,7 +16,7 @@ use std::collections::BTreeMap;
 /// The constant properties of an environment.
 #[derive(Clone)]
 pub struct EnvSpec {
-    /// Its registered id with the options that differ from their defaults, such as `swm/PushT-v1` or
+    /// The registered id with the options that differ from their defaults, such as `swm/PushT-v1` or
     /// `swm/OGBCube-v0,env_type=double` ([`crate::EnvChoice::id`]).
     pub id: String,
     /// The action space: a `Float32` box, a discrete space or a multi-discrete one.
@@ -30,7 +30,7 @@ pub struct EnvSpec {
     pub variation_space: VariationSpace,
     /// The default time limit: steps after which an episode is truncated.
     pub max_episode_steps: usize,
-    /// The names of its cameras, the default one first; empty for an environment with a single unnamed view.
+    /// The names of the cameras, the default camera first; empty for an environment with a single unnamed view.
     pub cameras: Vec<String>,
 }
 
@@ -67,7 +67,7 @@ pub struct ResetOptions {
 pub enum Action<'a> {
     /// A point of a box, `[dim]`.
     Continuous(&'a [f32]),
-    /// One integer of a discrete space, or one for each dimension of a multi-discrete space.
+    /// One integer of a discrete space, or one integer for each dimension of a multi-discrete space.
     Discrete(&'a [i64]),
 }
 
@@ -124,7 +124,7 @@ impl<'a> Action<'a> {
     }
 }
 
-/// The outcome of a step, apart from the observation.
+/// The outcome of a step, without the observation.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Transition {
     /// The reward.
@@ -155,7 +155,7 @@ impl<'a> FrameMut<'a> {
     /// # Panics
     /// When the size of `rgb` differs from `height * width * 3`.
     pub fn new(width: usize, height: usize, rgb: &'a mut [u8]) -> Self {
-        assert_eq!(rgb.len(), width * height * 3, "a {width} x {height} RGB frame");
+        assert_eq!(rgb.len(), width * height * 3, "the buffer has the size of a {width} x {height} RGB frame");
         Self { width, height, rgb }
     }
 }
@@ -215,7 +215,7 @@ pub trait Env: Send {
         BTreeMap::new()
     }
 
-    /// Data that is constant over the episode and not a column, such as the XML of its scene. Datasets store it once
+    /// Data that is constant over the episode and not a column, such as the XML of the scene. Datasets store it once
     /// per episode.
     fn constants(&self) -> BTreeMap<String, Vec<u8>> {
         BTreeMap::new()
@@ -260,8 +260,8 @@ pub trait Env: Send {
         None
     }
 
-    /// Returns the interface for starting at dataset rows, if the environment does not use [`Env::restore_from`] for
-    /// this. Callers use the functions of [`crate::dataset_start`] instead.
+    /// Returns the environment's own interface for starting at dataset rows; `None` if the environment
+    /// starts by [`Env::restore_from`]. Callers use the functions of [`crate::dataset_start`] instead of this method.
     fn dataset_start(&self) -> Option<&dyn DatasetStartEnv> {
         None
     }

@@ -1,7 +1,7 @@
 //! [`Error`]: the one error type, its variants grouped by cause: user input, data, or the run.
 //!
-//! Every message states what was given, what was expected, and what to do. The command line maps variants to exit codes
-//! in one place, the Python package to exceptions in another.
+//! Every message states what was given, what was expected, and what to do. The command line maps variants to exit
+//! codes, and the Python package maps them to exceptions.
 
 use std::path::PathBuf;
 
@@ -22,7 +22,7 @@ pub enum Error {
         given: String,
         /// The most similar valid names, best first.
         nearest: Vec<String>,
-        /// Where the valid names are listed.
+        /// A hint that names the list of valid names.
         hint: String,
     },
     /// A value outside its space.
@@ -40,14 +40,14 @@ pub enum Error {
     Config {
         /// The setting.
         what: String,
-        /// Why it is invalid.
+        /// The reason that the setting is invalid.
         problem: String,
-        /// How to fix it.
+        /// The recommended fix.
         fix: String,
     },
     /// No sample satisfied a constraint within the bounded number of tries.
     #[error(
-        "no value of '{factor}' satisfied its constraint ({constraint}) in {tries} tries; pin the factors it depends on to compatible values, or vary fewer of them"
+        "no value of '{factor}' satisfied its constraint ({constraint}) in {tries} tries; pin the factors that the constraint reads to compatible values, or vary fewer factors"
     )]
     Unsatisfiable {
         /// The factor that was being sampled.
@@ -59,7 +59,7 @@ pub enum Error {
     },
 
     // ---- data ----
-    /// Two shapes, sizes or types that must agree and do not.
+    /// Two shapes, sizes or types that do not fit each other.
     #[error("{operation}: got {given}, expected {expected}")]
     Mismatch {
         /// The operation that failed.
@@ -69,14 +69,14 @@ pub enum Error {
         /// The expected value.
         expected: String,
     },
-    /// A file, dataset or checkpoint that is damaged or of another format.
+    /// A file, dataset or checkpoint that is damaged or does not have the expected format.
     #[error("{}: {problem}; {fix}", .path.display())]
     Corrupt {
         /// The file or folder.
         path: PathBuf,
         /// The damage.
         problem: String,
-        /// How to fix it.
+        /// The recommended fix.
         fix: String,
     },
     /// A file operation failed.
@@ -86,17 +86,17 @@ pub enum Error {
         path: PathBuf,
         /// The operation, such as "creating the folder".
         action: String,
-        /// The system's reason.
+        /// The error of the operating system.
         source: std::io::Error,
     },
-    /// A value that must be finite is not.
+    /// A value that must be finite is infinite or NaN.
     #[error("{what} is not finite: {given}; {fix}")]
     NotFinite {
         /// The value's name.
         what: String,
         /// The value and its position.
         given: String,
-        /// How to fix it.
+        /// The recommended fix.
         fix: String,
     },
 
@@ -112,8 +112,8 @@ pub enum Error {
         /// The library's message.
         message: String,
     },
-    /// An error of the embedding program, such as a Python exception: raised by a policy, model or environment that
-    /// this program defines, and returned to it unchanged.
+    /// An error of the embedding program, such as a Python exception. A policy, model or environment that the embedding
+    /// program defines raised the error, and the embedding program receives it unchanged.
     #[error("{0}")]
     Embedder(Box<dyn std::error::Error + Send + Sync>),
 }
@@ -203,7 +203,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn unknown_names_suggest_similar_ones() {
+    fn unknown_names_suggest_similar_names() {
         let known = ["swm/PushT-v1", "swm/TwoRoom-v1"];
         assert_eq!(nearest("pusht", known), ["swm/PushT-v1"]);
         assert_eq!(nearest("swm/TowRoom-v1", known)[0], "swm/TwoRoom-v1");

@@ -3,7 +3,7 @@
 
 use crate::{Error, FactorValues, Key, Result, RowRef, Snapshot, VariationRequest, VariationSpace, columns};
 
-/// A request that resolves to exactly these values.
+/// Returns the request that resolves to exactly `values`.
 ///
 /// Only values that differ from their defaults are pinned, because [`VariationSpace::resolve`] checks constraints on
 /// pinned factors and does not check defaults.
@@ -15,7 +15,7 @@ pub fn pin(values: &FactorValues) -> VariationRequest {
     }
 }
 
-/// The factor values of a dataset row. A factor without a column has its value of `current`.
+/// The factor values of a dataset row. A factor without a column keeps its value in `current`.
 ///
 /// # Errors
 /// When a column holds a value outside its factor's space.
@@ -83,7 +83,7 @@ pub fn wrong_snapshot(id: &str, given: impl Into<String>) -> Error {
     Error::mismatch("restoring a snapshot", given, format!("one of {id}"))
 }
 
-/// As [`read`], but returns `None` if the values equal `current`. A planner in a simulator restores states of one
+/// As [`read`], but returns `None` if the values equal `current`. A planner that simulates restores states of one
 /// episode thousands of times, and comparing bytes is much faster than resolving the factors again.
 ///
 /// # Errors
@@ -103,10 +103,10 @@ fn read_changed<'a>(
     }
 }
 
-/// Parses the values that [`write`] wrote; also returns the bytes after them.
+/// Parses the values that [`write`] wrote, and returns the values and the bytes after the values.
 ///
 /// # Errors
-/// When there are too few bytes or they hold invalid values.
+/// When there are too few bytes, or a value is outside its factor's space.
 fn read<'a>(space: &VariationSpace, bytes: &'a [u8]) -> Result<(FactorValues, &'a [u8])> {
     let Some((mut head, rest)) = bytes.split_at_checked(byte_len(space)) else {
         let (given, expected) = (format!("{} bytes", bytes.len()), format!("at least {}", byte_len(space)));

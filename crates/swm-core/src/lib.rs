@@ -2,9 +2,10 @@
 //!
 //! Read the modules in this order:
 //!
-//! 1. [`batch`] and [`columns`]: named typed arrays, which all parts of the system exchange, and the names of their columns.
-//! 2. [`space`], [`variation`], [`factors`]: spaces of actions and observations, factors of variation and their values in
-//!    dataset rows.
+//! 1. [`batch`] and [`columns`]: named typed arrays, which all parts of the system exchange, and the names of their
+//!    columns.
+//! 2. [`space`], [`variation`], [`factors`]: spaces of actions and observations, factors of variation, and the values
+//!    of factors in dataset rows.
 //! 3. [`key`]: keyed random streams, the only source of randomness.
 //! 4. [`env`], [`camera_view`], [`dispatch`], [`dataset_start`]: one environment. [`pool`], [`thread_budget`]: many
 //!    environments on a fixed set of threads. [`policy`]: policies and experts.

@@ -12,7 +12,7 @@ pub struct Manifest {
     pub swm_version: String,
     /// Versions of the libraries that affect the content of the artifact.
     pub libraries: BTreeMap<String, String>,
-    /// The seed.
+    /// The seed of the command.
     pub seed: u64,
     /// The complete configuration.
     pub config: serde_json::Value,

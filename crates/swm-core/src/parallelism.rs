@@ -3,16 +3,16 @@
 
 use std::time::{Duration, Instant};
 
-/// The approximate cost of distributing work over threads and waiting for them. Work that takes less time runs on one
+/// The approximate cost of distributing work over threads and waiting for these threads. Shorter work runs on one
 /// thread.
 const OVERHEAD: Duration = Duration::from_micros(20);
 
-/// The duration of one slot's work, measured at the last call.
+/// The duration of one slot's work, measured at the last call of [`Parallelism::record`].
 #[derive(Debug)]
 pub(crate) struct Parallelism(Duration);
 
 impl Default for Parallelism {
-    /// The duration is unknown before the first call, whose work is therefore distributed.
+    /// An unknown duration counts as the longest duration, so the first work is distributed over threads.
     fn default() -> Self {
         Self(Duration::MAX)
     }

@@ -25,16 +25,16 @@ pub struct Candidates<'a> {
     pub dim: usize,
 }
 
-/// Scores candidate action sequences from the present observation of each environment.
+/// A model that scores candidate action sequences from the present observation of each environment.
 pub trait CostModel: Send {
     /// Reads the present observation and the goal of each environment: rows `envs` of `infos`. Work that a plan needs
-    /// only once, such as encoding both, happens here.
+    /// only once, such as encoding the observation and the goal, belongs in this method.
     ///
     /// # Errors
     /// When `infos` lacks a column that the model reads.
     fn observe(&mut self, infos: &Batch, envs: &[usize]) -> Result<()>;
 
-    /// Writes the cost of every candidate, environments in the order of the last [`CostModel::observe`].
+    /// Writes the cost of every candidate. Environments have the order of the last [`CostModel::observe`].
     ///
     /// # Shapes
     /// `costs` is `[envs, samples]`.
@@ -94,14 +94,14 @@ pub trait LatentDynamics: CostModel {
     /// Before the first [`CostModel::observe`].
     fn encode(&mut self, start: &mut [f32], goal: &mut [f32]) -> Result<()>;
 
-    /// Predicts one model step for `n` pairs of latent state and action. The pairs are grouped by observed environment,
-    /// the same number for each.
+    /// Predicts one model step for `n` pairs of latent state and action. The pairs are grouped by observed
+    /// environment, with the same number of pairs for each environment.
     ///
     /// # Shapes
     /// `latents` and `next` are `[n, latent]`, `actions` is `[n, dim]`.
     ///
     /// # Errors
-    /// When shapes do not fit the model.
+    /// When the shapes do not fit the model.
     fn predict(&mut self, latents: &[f32], actions: &[f32], next: &mut [f32]) -> Result<()>;
 
     /// The vector-Jacobian product of [`LatentDynamics::predict`]: writes the gradients with respect to latents and
@@ -183,10 +183,11 @@ pub struct PlanProblem<'a> {
     pub space: PlanSpace<'a>,
     /// The key of each environment's plan, `[envs]`: `(seed, episode, replan)`.
     pub keys: &'a [Key],
-    /// The initial action sequences, `[envs, horizon, dim]`; `None` for zeros, or for uniform choices.
+    /// The initial action sequences, `[envs, horizon, dim]`; `None` for zeros (continuous) or uniform choices
+    /// (discrete).
     pub init: Option<&'a [f32]>,
-    /// When to stop and return the best plan so far. Solvers check it between iterations, after the first. A plan that
-    /// stopped early depends on the machine's speed.
+    /// The time at which the solver stops and returns the best plan found. Solvers check the deadline after every
+    /// iteration. The plan of a search that stopped early depends on the machine's speed.
     pub deadline: Option<Instant>,
 }
 
@@ -215,7 +216,8 @@ pub struct PlanTrace {
     pub best: Vec<f32>,
     /// The mean cost of the elites, or of all candidates if the solver has no elites.
     pub mean: Vec<f32>,
-    /// The mean spread of the sampling distribution after the iteration, or of the candidates if the solver has none.
+    /// The mean spread of the sampling distribution after the iteration, or of the candidates if the solver has no
+    /// distribution.
     pub spread: Vec<f32>,
     /// The largest constraint value of the best candidate, if the model has constraints and the solver enforces them.
     /// The value is at most 0, or at most the solver's tolerance, when all constraints are satisfied.
@@ -223,7 +225,7 @@ pub struct PlanTrace {
     pub violation: Vec<f32>,
 }
 
-/// Searches for action sequences of low cost.
+/// A search for action sequences of low cost.
 pub trait Solver: Send {
     /// Solves one problem for every environment that `cost` observed.
     ///

@@ -10,7 +10,7 @@ use std::time::Instant;
 
 /// Chooses the actions of the environments of a pool.
 pub trait Policy: Send {
-    /// Starts an episode in `slot`; `key` is that of the episode.
+    /// Starts an episode in `slot`; `key` is the key of the episode.
     fn begin(&mut self, slot: usize, key: Key);
 
     /// Fills the `action` rows of the active slots.
@@ -20,7 +20,7 @@ pub trait Policy: Send {
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()>;
 
     /// Reads the environments directly, before [`Policy::act`]. Only policies with privileged information, such as
-    /// those that plan in a simulator, override this method.
+    /// policies that plan in a simulator, override this method.
     ///
     /// # Errors
     /// When the policy does not support an environment.
@@ -28,7 +28,7 @@ pub trait Policy: Send {
         Ok(())
     }
 
-    /// Whether [`Policy::act`] uses several threads. If not, it runs on the thread of the caller.
+    /// Whether [`Policy::act`] uses several threads. If not, `act` runs on the calling thread.
     fn uses_threads(&self) -> bool {
         true
     }
@@ -71,7 +71,7 @@ impl Policy for RandomPolicy {
     }
 }
 
-/// A scripted policy of one environment: reads its infos row, writes its action.
+/// A scripted policy of one environment: reads the infos row of the environment and writes the action.
 pub trait Expert: Send {
     /// Starts an episode.
     fn begin(&mut self, key: Key);

@@ -24,7 +24,7 @@ pub struct Reset {
     pub options: ResetOptions,
 }
 
-/// The columns that the pool adds after the environment's own.
+/// The columns that the pool adds after the columns of the environment.
 struct PoolColumns {
     standard: ColumnIndices,
     step_idx: usize,
@@ -45,7 +45,7 @@ struct FrameColumns {
 }
 
 impl PoolColumns {
-    /// Appends the pool's columns to those of an environment.
+    /// Appends the pool's columns to the columns of an environment.
     fn add(
         mut columns: Vec<ColumnSpec>,
         image: Option<(usize, usize)>,
@@ -99,14 +99,14 @@ struct Slot {
 /// Starts a pool of `n` worker threads; 0 means one per core.
 ///
 /// # Errors
-/// When the operating system cannot start them.
+/// When the operating system cannot start the threads.
 pub fn threads(n: usize) -> Result<Arc<rayon::ThreadPool>> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(n).thread_name(|i| format!("swm-{i}")).build();
     pool.map(Arc::new).map_err(|error| Error::external("starting worker threads", error))
 }
 
 impl EnvPool {
-    /// Creates a pool of `envs`. `image` is the `(height, width)` of frames; without it, the pool renders nothing.
+    /// Creates a pool of `envs`. `image` is the `(height, width)` of frames; with `None`, the pool does not render.
     /// `max_episode_steps` replaces the environment's own time limit.
     ///
     /// # Errors
@@ -132,10 +132,10 @@ impl EnvPool {
         threads: Arc<rayon::ThreadPool>,
     ) -> Result<Self> {
         if image.is_none() && !views.is_empty() {
-            return Err(Error::config("camera views", "they need a frame size", "set the frame size"));
+            return Err(Error::config("camera views", "no frame size is set", "set the frame size"));
         }
         let Some(first) = envs.first() else {
-            return Err(Error::config("number of environments", "it is 0", "choose at least 1"));
+            return Err(Error::config("number of environments", "0", "choose at least 1"));
         };
         let spec = first.spec();
         let (schema, columns) = PoolColumns::add(spec.columns.clone(), image, views)?;
@@ -216,10 +216,11 @@ impl EnvPool {
         })
     }
 
-    /// Changes environments in place (a restore, a new goal), then observes and renders them as after a reset.
+    /// Changes environments in place by `change`, such as a restore or a new goal, then observes and renders them as
+    /// after a reset.
     ///
     /// # Errors
-    /// Those of `change`, and as [`Env::render`].
+    /// The errors of `change` and of [`Env::render`].
     pub fn restart(
         &mut self,
         slots: &[usize],
@@ -238,14 +239,14 @@ impl EnvPool {
     /// [`EnvSpec::action_column`]; the infos of the other slots do not change.
     ///
     /// # Errors
-    /// When `actions` has another column type or another number of rows than the pool, and as [`Env::step`] and
-    /// [`Env::render`].
+    /// When the action column of `actions` has another type or shape, or `actions` does not have one row per slot; and
+    /// as [`Env::step`] and [`Env::render`].
     pub fn step(&mut self, actions: &Batch, active: &[bool]) -> Result<()> {
         if actions.rows() != self.len() || active.len() != self.len() {
             return Err(Error::mismatch(
                 "stepping a pool",
                 format!("{} actions, {} flags", actions.rows(), active.len()),
-                format!("{} of each", self.len()),
+                format!("{0} actions, {0} flags", self.len()),
             ));
         }
         let column = actions.schema().index(columns::ACTION)?;
@@ -288,8 +289,9 @@ impl EnvPool {
         stepped
     }
 
-    /// Runs `work` on every slot and returns the error of the lowest slot that failed. `busy` is the number of slots
-    /// that have work; the threads are divided among these slots. `None` runs everything on the calling thread.
+    /// Runs `work` on every slot and returns the error of the failed slot with the lowest index. `busy` is the number
+    /// of slots that have work; the threads are divided among these slots. With `None`, `work` runs on the calling
+    /// thread.
     fn for_each_slot(
         &mut self,
         busy: Option<usize>,
@@ -322,7 +324,7 @@ impl EnvPool {
 }
 
 impl Slot {
-    /// Dispatches a call to the environment's process, if it has one, and returns whether the work started.
+    /// Dispatches a call to the environment's worker process, if there is one, and returns whether the work started.
     fn dispatch(&mut self, call: PendingCall<'_>) -> bool {
         self.env.as_dispatch().is_some_and(|env| env.dispatch(call))
     }
@@ -342,7 +344,7 @@ impl Slot {
         }
     }
 
-    /// Fills the columns of a row that follow from the present state.
+    /// Fills the observation, `success`, `step_idx` and the frames of a row.
     fn observe(&mut self, columns: &PoolColumns, row: &mut RowMut<'_>) -> Result<()> {
         self.env.observe(row);
         row.set(columns.standard.success, &[u8::from(self.env.is_success())]);

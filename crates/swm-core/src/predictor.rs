@@ -19,7 +19,7 @@ pub trait Predictor: Send {
     /// `latents` is `[rows, latent]`.
     ///
     /// # Errors
-    /// When the columns are not those the model was trained on.
+    /// When the columns differ from the columns of the training data.
     fn encode(&mut self, rows: &Batch, latents: &mut [f32]) -> Result<()>;
 
     /// Writes the predicted latents after each of `horizon` model steps. Actions are in the environment's units.

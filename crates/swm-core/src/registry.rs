@@ -15,7 +15,7 @@ pub trait Named {
 pub struct Registry<T: 'static> {
     /// The kind of the rows, for errors: "environment".
     pub kind: &'static str,
-    /// Where users find the ids, for errors: "`swm envs` lists them".
+    /// A hint for errors, which names the command that lists the ids: "`swm envs` lists them".
     pub hint: &'static str,
     /// The rows.
     pub rows: &'static [T],
@@ -39,7 +39,7 @@ impl<T: Named> Registry<T> {
 /// # Panics
 /// When `N` differs from the total length, or the first list is empty.
 pub const fn concat<T: Copy, const N: usize>(first: &[T], second: &[T]) -> [T; N] {
-    assert!(first.len() + second.len() == N && !first.is_empty(), "N is the length of both lists");
+    assert!(first.len() + second.len() == N && !first.is_empty(), "N is the total length of the two lists");
     let mut all = [first[0]; N];
     let mut i = 0;
     while i < N {
@@ -49,14 +49,14 @@ pub const fn concat<T: Copy, const N: usize>(first: &[T], second: &[T]) -> [T; N
     all
 }
 
-/// An option of an environment, such as its task. Its value is chosen when the environment is made.
+/// An option of an environment, such as its task. The option's value is chosen when the environment is made.
 #[derive(Clone, Copy, Debug)]
 pub struct EnvOption {
-    /// Its name, such as `task`.
+    /// The option's name, such as `task`.
     pub key: &'static str,
-    /// Its effect, in a sentence.
+    /// The option's effect, in a sentence.
     pub summary: &'static str,
-    /// Its possible values; the first is the default.
+    /// The possible values; the first is the default.
     pub values: &'static [&'static str],
 }
 
@@ -78,15 +78,15 @@ impl Choices {
 /// A row of the registry of environments.
 #[derive(Clone, Copy)]
 pub struct EnvEntry {
-    /// Its id, such as `swm/PushT-v1`.
+    /// The environment's id, such as `swm/PushT-v1`.
     pub id: &'static str,
-    /// Its task, in a sentence.
+    /// The environment's task, in a sentence.
     pub summary: &'static str,
-    /// Its options.
+    /// The environment's options.
     pub options: &'static [EnvOption],
     /// The constructor. The [`crate::EnvSpec::id`] of the environment is [`EnvChoice::id`].
     pub make: fn(&EnvChoice) -> Result<Box<dyn Env>>,
-    /// Its experts; the first is the default.
+    /// The environment's experts; the first is the default.
     pub experts: &'static [ExpertEntry],
 }
 
@@ -106,12 +106,12 @@ impl EnvEntry {
     }
 }
 
-/// A row of the registry of environments and the values of its options.
+/// A row of the registry of environments, with chosen values of the environment's options.
 #[derive(Clone)]
 pub struct EnvChoice {
     /// The row.
     pub entry: EnvEntry,
-    /// The values of its options.
+    /// The chosen values of the environment's options.
     pub choices: Choices,
 }
 
@@ -149,7 +149,7 @@ impl Registry<EnvEntry> {
     /// Parses `ID` or `ID,option=value,…`.
     ///
     /// # Errors
-    /// When there is no such environment, option or value; the error suggests similar ones.
+    /// When there is no such environment, option or value; the error suggests similar names.
     pub fn choose(&self, text: &str) -> Result<EnvChoice> {
         let mut parts = text.split(',');
         let mut chosen = EnvChoice::from(self.get(parts.next().unwrap_or_default())?);
@@ -158,7 +158,7 @@ impl Registry<EnvEntry> {
             let options = chosen.entry.options;
             let keys = || options.iter().map(|option| option.key);
             let index = keys().position(|known| known == key).ok_or_else(|| {
-                let hint = if options.is_empty() { "it has none" } else { "write ID,option=value" };
+                let hint = if options.is_empty() { "this environment has no options" } else { "write ID,option=value" };
                 Error::unknown("option of the environment", key, keys(), format!("{}: {hint}", chosen.entry.id))
             })?;
             let values = options[index].values;
@@ -179,9 +179,9 @@ impl Registry<EnvEntry> {
 /// A row of an environment's experts.
 #[derive(Clone, Copy)]
 pub struct ExpertEntry {
-    /// Its name, such as `expert` or `weak`.
+    /// The expert's name, such as `expert` or `weak`.
     pub id: &'static str,
-    /// Its behaviour, in a sentence.
+    /// The expert's behaviour, in a sentence.
     pub summary: &'static str,
     /// The constructor of an expert for one environment.
     pub make: fn() -> Box<dyn Expert>,

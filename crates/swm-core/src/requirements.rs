@@ -8,13 +8,13 @@ use serde::Serialize;
 /// The requirements of a model family on its training dataset. Every family requires continuous actions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct DatasetRequirements {
-    /// Name of the family, as in reports.
+    /// The name of the family in reports.
     pub model: &'static str,
     /// The required observations.
     pub observations: RequiredObservations,
     /// Whether rewards ([`REWARD`](crate::columns::REWARD)) are required.
     pub reward: bool,
-    /// Rows of a training clip, which is the minimum length of an episode.
+    /// The number of rows of a training clip, which is also the minimum length of an episode.
     pub clip_rows: usize,
 }
 

@@ -44,13 +44,13 @@ pub struct Run {
     pub condition: String,
     /// The policy: `random` (the random-policy floor), `expert`, or a checkpoint's name.
     pub policy: String,
-    /// Every episode, in order.
+    /// One result per episode.
     pub episodes: Vec<EpisodeResult>,
     /// The number of episodes that were solved at start.
     pub solved_at_start: usize,
     /// The success rate of the episodes that count.
     pub success: Proportion,
-    /// The success rate of the same episodes under [`Counting::Strict`]; present if [`Results::counting`] is not strict
+    /// The success rate of `episodes` under [`Counting::Strict`]; present if [`Results::counting`] is not strict
     /// and the episodes determine both rates.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub strict: Option<Proportion>,
@@ -62,7 +62,7 @@ pub struct Run {
     /// Prediction errors of the model on the trajectories that the starts come from, if requested.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub prediction: Option<Prediction>,
-    /// Durations, the only part that differs between equal runs.
+    /// Durations. All other fields are equal for equal manifests.
     pub timing: Timing,
     /// Paths of videos, relative to the results file.
     #[serde(default)]

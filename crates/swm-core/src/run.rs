@@ -10,8 +10,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 /// An event that a run reports to its caller.
 ///
-/// A run is a sequence of stages: [`Event::Started`], any number of the other events, [`Event::Finished`]. A stage that
-/// fails or is interrupted does not finish.
+/// A run is a sequence of stages: [`Event::Started`], any number of other events, [`Event::Finished`]. A stage that
+/// fails or is interrupted does not emit [`Event::Finished`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[non_exhaustive]
 pub enum Event<'a> {
@@ -86,12 +86,12 @@ pub struct Control<'a> {
 }
 
 impl<'a> Control<'a> {
-    /// A control that never stops the run and drops its events.
+    /// A control that never stops the run and drops all events.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Stops the run with [`Error::Interrupted`] once `flag` is set, as by a signal handler.
+    /// Stops the run with [`Error::Interrupted`] once `flag` is set, for example by a signal handler.
     #[must_use]
     pub fn with_interrupt(self, flag: Arc<AtomicBool>) -> Self {
         Self { interrupt: Some(flag), ..self }
@@ -104,7 +104,7 @@ impl<'a> Control<'a> {
         Self { poll: Some(Box::new(poll)), ..self }
     }
 
-    /// Sends events to `sink`. Every step may send one, so an expensive sink should drop some of them.
+    /// Sends events to `sink`. Every step may send an event, so an expensive sink should drop some events.
     #[must_use]
     pub fn with_events(self, sink: impl FnMut(Event<'_>) + Send + 'a) -> Self {
         Self { events: Some(Box::new(sink)), ..self }

@@ -1,7 +1,7 @@
 //! [`Space`]: the set of values of an action, an observation or a factor of variation.
 //!
-//! A value of any space is a slice of `f64` (exact for every type here). The space gives its shape, element type and
-//! bounds. [`Space`] serialises to the JSON that `swm fovs --json` prints.
+//! A value of any space is a slice of `f64`, which represents integers up to 2^53 exactly. The space gives the shape,
+//! element type and bounds of its values. [`Space`] serialises to the JSON that `swm fovs --json` prints.
 
 use crate::batch::DType;
 use crate::{Error, Result, Rng};
@@ -50,7 +50,7 @@ impl Space {
         Self::Box { shape, dtype, low: vec![low; n], high: vec![high; n] }
     }
 
-    /// Elements of one value.
+    /// The number of elements of one value.
     pub fn len(&self) -> usize {
         match self {
             Self::Box { low, .. } => low.len(),
@@ -75,7 +75,7 @@ impl Space {
         }
     }
 
-    /// The type of its elements.
+    /// The type of the elements.
     pub fn dtype(&self) -> DType {
         match self {
             Self::Box { dtype, .. } => *dtype,
@@ -118,8 +118,8 @@ impl Space {
     /// Checks that `value` is in the space.
     ///
     /// # Errors
-    /// When it has another number of elements, or an element is out of bounds, not finite, or not an integer where the
-    /// space holds integers.
+    /// When `value` has another number of elements, or an element is out of bounds, not finite, or not an integer where
+    /// the space holds integers.
     pub fn check(&self, name: &str, value: &[f64]) -> Result<()> {
         let integer = !matches!(self.dtype(), DType::Float32 | DType::Float64);
         let valid = value.len() == self.len()

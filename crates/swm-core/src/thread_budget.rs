@@ -2,7 +2,8 @@
 //! environments than threads.
 //!
 //! The pool distributes environments over threads first ([`crate::EnvPool`]). A renderer reads [`threads`] and may draw
-//! parts of one frame on as many threads of the current rayon pool. Its output must not depend on the budget.
+//! parts of one frame on as many threads of the current rayon pool. The output of a renderer
+//! must not depend on the budget.
 
 use std::cell::Cell;
 
@@ -41,13 +42,13 @@ mod tests {
     fn budget_is_restored_after_the_work() {
         let budgets = with(3, || (threads(), with(2, threads), threads()));
         assert_eq!((budgets, threads()), ((3, 2, 3), 1));
-        assert!(std::panic::catch_unwind(|| with(5, || panic!("as a test"))).is_err());
+        assert!(std::panic::catch_unwind(|| with(5, || panic!("the work fails"))).is_err());
         assert_eq!(threads(), 1);
     }
 
     #[test]
-    fn all_sets_the_thread_count_of_the_pool() {
-        let pool = crate::pool::threads(3).expect("a thread pool");
+    fn all_sets_the_budget_to_the_thread_count_of_the_pool() {
+        let pool = crate::pool::threads(3).expect("starting three threads");
         assert_eq!(pool.install(|| all(threads)), 3);
     }
 }

@@ -3,7 +3,7 @@
 //! A [`VariationSpace`] lists the factors of an environment, each with its space and default. A [`VariationRequest`]
 //! names the factors to sample (`"agent.color"`, a group such as `"agent"`, or `"all"`) and the values to pin.
 //! [`VariationSpace::resolve`] turns a request and a key into [`FactorValues`], constant over the episode. Every factor
-//! draws from its own stream, so varying one never changes the sample of another.
+//! draws from its own stream, so varying one factor never changes the sample of another factor.
 
 use crate::{Error, Key, Result, Space};
 use serde::{Deserialize, Serialize};
@@ -13,18 +13,18 @@ use std::sync::Arc;
 /// One factor of variation.
 #[derive(Clone, Debug, Serialize)]
 pub struct Factor {
-    /// Its key, such as `agent.color`.
+    /// The factor's key, such as `agent.color`.
     #[serde(skip)]
     pub key: String,
-    /// Its possible values.
+    /// The possible values.
     #[serde(flatten)]
     pub space: Space,
-    /// Its value unless it is sampled or pinned.
+    /// The factor's default: its value unless the factor is sampled or pinned.
     pub init_value: Vec<f64>,
 }
 
 impl Factor {
-    /// A factor of that key, space and default.
+    /// A factor with a key, a space and a default.
     pub fn new(key: &str, space: Space, init_value: impl Into<Vec<f64>>) -> Self {
         Self { key: key.to_owned(), space, init_value: init_value.into() }
     }
@@ -73,9 +73,9 @@ impl VariationSpace {
         space
     }
 
-    /// Adds a constraint: `factor` is sampled again until `holds` returns true. `holds` may read that factor's value,
-    /// those of factors earlier in the sampling order, and pinned values. `description` states the constraint in
-    /// errors.
+    /// Adds a constraint: `factor` is sampled again until `holds` returns true. `holds` may read the value of
+    /// `factor`, the values of factors earlier in the sampling order, and pinned values. `description` states the
+    /// constraint in errors.
     ///
     /// # Panics
     /// When there is no such factor.
@@ -101,7 +101,7 @@ impl VariationSpace {
         self.factors.iter().position(|factor| factor.key == key)
     }
 
-    /// The indices of all factors that a key names: one, a group, or all.
+    /// The indices of all factors that a key names: one factor, a group, or all factors.
     ///
     /// # Errors
     /// When the key names no factor.
@@ -125,7 +125,8 @@ impl VariationSpace {
         Ok(chosen)
     }
 
-    /// The factor values of an episode: defaults, replaced by pinned values, replaced by samples of the varied factors.
+    /// The factor values of an episode. A pinned factor has its pinned value, a varied factor a sample, any other
+    /// factor its default.
     ///
     /// # Errors
     /// When a key is unknown, a pinned value is out of bounds or violates a constraint, or no sample satisfies a

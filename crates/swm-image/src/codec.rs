@@ -13,16 +13,17 @@ pub enum ImageCodec {
     /// JPEG with chrominance at half resolution (4:2:0), as datasets of the reference implementation store frames (with
     /// quality 95).
     Jpeg {
-        /// 1 (smallest files) to 100 (most faithful).
+        /// The quality, from 1 (smallest files) to 100 (best quality).
         quality: u8,
     },
     /// PNG tuned for speed: lossless, and the lossless format that Python decodes fastest.
     Png,
     /// QOI: lossless, and nearly as fast as copying memory for frames with large areas of one colour. The default, so
     /// that a model trains on exactly the pixels that it observes when it acts. Pillow, and therefore the reference,
-    /// reads it too (5 to 60 ms per image).
+    /// reads QOI as well (5 to 60 ms per image).
     ///
-    /// Bytes per image of 224 × 224 × 3, and megabytes of pixels per second encoded and decoded on one core:
+    /// Each cell holds the bytes per image of 224 × 224 × 3, then the megabytes of pixels per second that one core
+    /// encodes and decodes:
     ///
     /// | environment | QOI | PNG |
     /// | --- | --- | --- |
@@ -118,11 +119,7 @@ pub fn decode(bytes: &[u8], height: usize, width: usize, out: &mut [u8]) -> Resu
         if given == (height, width) && length == height * width * 3 {
             return Ok(());
         }
-        Err(Error::mismatch(
-            "decoding an image",
-            format!("{} x {}", given.0, given.1),
-            format!("{height} x {width} like the first one"),
-        ))
+        Err(Error::mismatch("decoding an image", format!("{} x {}", given.0, given.1), format!("{height} x {width}")))
     };
     match FileFormat::of(bytes)? {
         FileFormat::Jpeg => {
@@ -130,7 +127,7 @@ pub fn decode(bytes: &[u8], height: usize, width: usize, out: &mut [u8]) -> Resu
                 return Ok(());
             }
             // The fast decoder returns false for unsupported kinds of JPEG, other sizes and damaged files. The general
-            // decoder decodes unsupported kinds and returns an error for the rest.
+            // decoder decodes unsupported kinds, and returns an error for other sizes and damaged files.
             let decoder = jpeg::Decoder::new(bytes)?;
             check(decoder.size())?;
             decoder.decode(out)
@@ -151,7 +148,7 @@ pub fn decode(bytes: &[u8], height: usize, width: usize, out: &mut [u8]) -> Resu
 mod tests {
     use super::*;
 
-    /// A gradient with a square of one colour in it.
+    /// Returns a gradient that contains a square of one colour.
     fn test_image(height: usize, width: usize) -> Vec<u8> {
         let mut rgb = vec![];
         for y in 0..height {

@@ -78,7 +78,7 @@ fn rgb_of(pixel: &[u8]) -> [u8; 3] {
 /// # Errors
 /// When the file cannot be opened, is damaged, or takes more than 1 GiB in memory.
 pub fn read_png(path: &Path) -> Result<RgbImage> {
-    let damaged = |problem: String| Error::corrupt(path, problem, "give a PNG file that opens");
+    let damaged = |problem: String| Error::corrupt(path, problem, "give a readable PNG file");
     let file = File::open(path).map_err(|source| Error::io(path, "opening an image", source))?;
     let mut decoder = png::Decoder::new(BufReader::new(file));
     decoder.set_transformations(Transformations::EXPAND | Transformations::STRIP_16);

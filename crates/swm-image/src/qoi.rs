@@ -1,13 +1,13 @@
 //! The QOI image format (specification 1.0, qoiformat.org): lossless, and the fastest to decode of the lossless
 //! formats that other programs read as well.
 //!
-//! An image is a sequence of operations on the last pixel: repeat it, take one of 64 earlier pixels, change it a
-//! little, or replace it. Frames of simulations consist mostly of runs of equal pixels. The encoder finds runs, and the
-//! decoder fills them, many bytes at a time.
+//! An image is a sequence of operations. Each operation repeats the last pixel, takes one of 64 earlier pixels, changes
+//! the last pixel a little, or gives a new pixel. Frames of simulations consist mostly of runs of equal pixels. The
+//! encoder finds runs, and the decoder fills runs, many bytes at a time.
 
 use swm_core::{Error, Result};
 
-/// Bytes of the header.
+/// Size of the header in bytes.
 const HEADER: usize = 14;
 /// The bytes after the last operation.
 const END: [u8; 8] = [0, 0, 0, 0, 0, 0, 0, 1];
@@ -21,14 +21,14 @@ const RUN: u8 = 0xc0;
 const RGB: u8 = 0xfe;
 const RGBA: u8 = 0xff;
 
-/// The longest run of one operation.
+/// The longest run of one operation, in pixels.
 const LONGEST: usize = 62;
 const LONGEST_RUN: u8 = RUN | (LONGEST as u8 - 1);
 
-/// Red, green, blue, opacity.
+/// A pixel: red, green, blue, opacity.
 type Pixel = [u8; 4];
 
-/// The pixel before the first one.
+/// The pixel before the first pixel.
 const START: Pixel = [0, 0, 0, 255];
 
 /// Returns the slot of a pixel in the table of earlier pixels: (3 r + 5 g + 7 b + 11 a) mod 64.
@@ -86,11 +86,11 @@ pub fn encode(rgb: &[u8], height: u16, width: u16, out: &mut Vec<u8>) {
     out.extend_from_slice(&END);
 }
 
-/// Returns how many pixels from byte `at` on equal the pixel before them.
+/// Returns the number of pixels from byte `at` on that equal the pixel before byte `at`.
 fn repeats(rgb: &[u8], at: usize) -> usize {
     const WIDE: usize = 32;
     let mut end = at;
-    // If bytes equal the bytes one pixel before them, all their pixels have one colour.
+    // If a chunk equals the bytes one pixel before the chunk, all pixels of the chunk have one colour.
     while let (Some(a), Some(b)) = (rgb[end - 3..].first_chunk::<WIDE>(), rgb[end..].first_chunk::<WIDE>()) {
         if a != b {
             break;
@@ -126,7 +126,7 @@ pub fn size(bytes: &[u8]) -> Result<(usize, usize)> {
 pub fn decode(bytes: &[u8], out: &mut [u8]) -> Result<()> {
     let damaged = |problem| Error::mismatch("decoding a QOI image", problem, "operations for every pixel, and an end");
     let Some(mut rest) = bytes.get(HEADER..).and_then(|rest| rest.strip_suffix(&END)) else {
-        return Err(damaged("one that is cut off"));
+        return Err(damaged("a file that is cut off"));
     };
     let mut seen = [[0; 4]; 64];
     let mut pixel = START;
@@ -157,7 +157,7 @@ pub fn decode(bytes: &[u8], out: &mut [u8]) -> Result<()> {
                 seen[slot(pixel)] = pixel;
             }
             RUN..RGB => {
-                // A long run is several operations, which are filled at once.
+                // A long run consists of several operations, which are filled at once.
                 let mut run = usize::from(op - RUN) + 1;
                 while let Some((&more @ RUN..RGB, after)) = rest.split_first() {
                     rest = after;
@@ -212,7 +212,7 @@ mod tests {
     fn round_trip(rgb: &[u8], height: u16, width: u16) -> Vec<u8> {
         let mut bytes = vec![7];
         encode(rgb, height, width, &mut bytes);
-        assert_eq!(bytes.remove(0), 7, "appends");
+        assert_eq!(bytes.remove(0), 7, "the encoder appends to the vector");
         assert_eq!(size(&bytes).expect("a header"), (height.into(), width.into()));
         let mut back = vec![0; rgb.len()];
         decode(&bytes, &mut back).expect("a decoded image");
@@ -222,8 +222,8 @@ mod tests {
 
     #[test]
     fn encodes_operations_of_the_specification() {
-        // Two pixels of the colour of `START`, one with a small difference, one with a larger difference, an unrelated
-        // one, an earlier one, and a run of 63.
+        // Two pixels of the colour of `START`, a pixel with a small difference, a pixel with a larger difference, an
+        // unrelated pixel, an earlier pixel, a new pixel, and 63 repetitions of the new pixel.
         let mut pixels = vec![[0, 0, 0], [0, 0, 0], [1, 255, 1], [11, 9, 9], [200, 0, 7], [1, 255, 1]];
         pixels.extend([[9, 9, 9]; 64]);
         let bytes = round_trip(pixels.as_flattened(), 7, 10);

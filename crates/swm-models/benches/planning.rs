@@ -1,6 +1,6 @@
-//! Times one iteration of the cross-entropy method in a LeWM of the published size (300 candidates of 5 model steps,
-//! one environment): the CPU rollout that planning uses, compared with `Lewm::rollout` on the same threads. Prints
-//! milliseconds and the ratio.
+//! Times one iteration of the cross-entropy method (CEM) in a LeWM of the published size: 300 candidates of 5 model
+//! steps, one environment. Compares the CPU rollout that planning uses ([`Rollout`]) with `Lewm::rollout` on the same
+//! threads. Prints milliseconds and the ratio.
 #![allow(clippy::print_stdout, reason = "a benchmark prints its result")]
 
 use burn::tensor::{Device, Tensor, TensorData};
@@ -27,7 +27,7 @@ fn median(mut times: Vec<f64>) -> f64 {
 }
 
 fn main() {
-    let config = TrainConfig::<Lewm>::load("paper", &[]).expect("a preset");
+    let config = TrainConfig::<Lewm>::load("paper", &[]).expect("loading the preset");
     let latent = config.model.latent;
     let model = Lewm::init(&config.model, ACTION_DIM, Key::new(0), &Device::flex());
     let rollout = Rollout::new(&model);

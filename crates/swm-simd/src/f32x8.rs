@@ -34,7 +34,7 @@ pub trait F32x8: Copy {
     fn and(self, a: Self::Mask, b: Self::Mask) -> Self::Mask;
     /// Returns a | b.
     fn or(self, a: Self::Mask, b: Self::Mask) -> Self::Mask;
-    /// Whether the mask is true in any lane.
+    /// Returns whether the mask is true in any lane.
     fn any(self, mask: Self::Mask) -> bool;
     /// Stores eight floats.
     fn store(self, values: Self::Vector, to: &mut [f32; LANES]);
@@ -44,7 +44,7 @@ pub trait F32x8: Copy {
     fn store_word_masked(self, mask: Self::Mask, word: u32, to: &mut [u32; LANES]);
 }
 
-/// Computes one lane after the other, on every CPU.
+/// Computes the lanes one after another, on every CPU.
 #[derive(Clone, Copy, Debug)]
 pub struct Portable;
 
@@ -141,7 +141,7 @@ mod avx2 {
         /// Returns the operations.
         ///
         /// # Safety
-        /// The CPU supports AVX2.
+        /// The CPU must support AVX2.
         #[inline(always)]
         pub const unsafe fn new() -> Self {
             Self(())

@@ -4,17 +4,17 @@ use crate::{CpuLevel, F32x8, Portable};
 
 /// The instruction set that a kernel is compiled for.
 ///
-/// Only the dispatch functions name the types that implement it, so a kernel that is generic over `Level` runs only on
-/// CPUs that support the level.
+/// Only the dispatch functions name the types that implement this trait, so a kernel that is generic over `Level` runs
+/// only on CPUs that support the level.
 pub trait Level {
-    /// The level.
+    /// The CPU level of the instruction set.
     const CPU: CpuLevel;
-    /// Whether [`Level::fma`] is one instruction.
+    /// Whether [`Level::fma`] is one instruction on this level.
     const FUSED: bool;
-    /// The implementation of eight floats at once.
+    /// The implementation of the operations on eight floats.
     type F32x8: F32x8;
 
-    /// Returns the operations on eight floats at once.
+    /// Returns the operations on eight floats.
     fn f32x8() -> Self::F32x8;
 
     /// Returns `a * b + c`, rounded once where [`Level::FUSED`] and twice elsewhere.
@@ -25,9 +25,9 @@ pub trait Level {
 }
 
 /// A computation that is compiled for every level. Every function that it calls must be `#[inline(always)]`, so that
-/// the function is compiled for the level, too.
+/// the compiler compiles the function for the level as well.
 pub trait Kernel {
-    /// The result.
+    /// The result of the computation.
     type Output;
 
     /// Runs the computation. Implementations are `#[inline(always)]`.

@@ -2,7 +2,7 @@
 
 use std::sync::atomic::{AtomicU8, Ordering};
 
-/// A set of vector instructions, from the smallest to the largest.
+/// A set of vector instructions. The variants are ordered from the smallest to the largest set.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u8)]
 pub enum CpuLevel {
@@ -10,7 +10,7 @@ pub enum CpuLevel {
     Baseline,
     /// x86-64-v3: AVX2, FMA, BMI1 and BMI2. 16 registers of 8 floats.
     Avx2,
-    /// x86-64-v4: AVX-512 F, BW, CD, DQ and VL as well. 32 registers of 16 floats.
+    /// x86-64-v4: also AVX-512 F, BW, CD, DQ and VL. 32 registers of 16 floats.
     Avx512,
 }
 

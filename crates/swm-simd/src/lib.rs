@@ -2,11 +2,11 @@
 //!
 //! - [`dispatch`] and [`dispatch_avx2`] run a [`Kernel`], plain loops that are compiled for several instruction sets,
 //!   at the best level that the CPU supports.
-//! - [`vectorize!`] does the same for single functions.
+//! - [`vectorize!`] compiles single functions for the baseline and for AVX2.
 //! - [`F32x8`] provides eight floats at once, for loops that are too short for the compiler to vectorise.
-//! - [`cpu_level`] returns the level for code that needs nothing else.
+//! - [`cpu_level`] returns the best level that the CPU supports.
 //!
-//! Rust never contracts `a * b + c` into a fused multiplication, so code that does not call [`Level::fma`] computes the
+//! Rust never contracts `a * b + c` into a fused multiply-add, so code that does not call [`Level::fma`] computes the
 //! same bytes at every level.
 
 mod f32x8;

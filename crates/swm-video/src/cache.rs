@@ -1,4 +1,4 @@
-//! The opened videos of a dataset: caches the tables of each video and pools decoders.
+//! A cache of the opened videos of a dataset, with a pool of decoders.
 
 use crate::decode::{DecoderPool, FrameRequest, Source, Video};
 use rayon::prelude::*;
@@ -31,10 +31,10 @@ impl<K> Default for VideoCache<K> {
 }
 
 impl<K: Clone + Eq + Hash + Send + Sync> VideoCache<K> {
-    /// Returns a video, opening it unless it is cached.
+    /// Returns a cached video, or opens and caches the video.
     ///
     /// # Errors
-    /// When it cannot be opened.
+    /// When the video cannot be opened.
     pub fn get(&self, key: &K, source: impl FnOnce() -> Result<Source>) -> Result<Arc<Video>> {
         if let Some(video) = self.lock().videos.get(key) {
             return Ok(Arc::clone(video));
@@ -54,7 +54,7 @@ impl<K: Clone + Eq + Hash + Send + Sync> VideoCache<K> {
         Ok(video)
     }
 
-    /// Returns the height and width of a video, after checking that its first frame has the size of its header.
+    /// Returns the height and width of a video, after checking that the first frame has the size in the header.
     ///
     /// # Errors
     /// When the sizes differ, or the video cannot be opened.
@@ -64,8 +64,8 @@ impl<K: Clone + Eq + Hash + Send + Sync> VideoCache<K> {
         Ok(video.size())
     }
 
-    /// Returns a description of what is wrong with the video of an episode's column: it cannot be opened, or its
-    /// frame count differs from the episode's rows.
+    /// Returns a description of the defect of an episode's video: the video cannot be opened, or its frame count
+    /// differs from the episode's row count. Returns `None` if the video has no defect.
     pub fn irregularity(
         &self,
         key: &K,
@@ -80,26 +80,26 @@ impl<K: Clone + Eq + Hash + Send + Sync> VideoCache<K> {
         }
     }
 
-    /// Decodes frames, each given as `(video key, frame description, memory)`; equal keys follow each other. `source`
-    /// opens a video, and `frame` returns the index of a description.
+    /// Decodes frames, each requested as `(video key, frame description, memory)`. Requests with equal keys must be
+    /// adjacent. `source` returns the source of a video, and `frame` the index of the described frame.
     ///
     /// # Errors
-    /// When a video cannot be opened, lacks the frame, or is damaged.
+    /// When a video cannot be opened, lacks a requested frame, or is damaged.
     pub fn read<F: Sync>(
         &self,
-        wanted: Vec<(K, F, &mut [u8])>,
+        requests: Vec<(K, F, &mut [u8])>,
         source: impl Fn(&K) -> Result<Source> + Sync,
         frame: impl Fn(&Video, &F) -> Result<usize>,
     ) -> Result<()> {
-        let mut keys: Vec<&K> = wanted.iter().map(|(key, ..)| key).collect();
+        let mut keys: Vec<&K> = requests.iter().map(|(key, ..)| key).collect();
         keys.dedup();
         let videos: Result<Vec<Arc<Video>>> =
             keys.into_par_iter().with_max_len(1).map(|key| self.get(key, || source(key))).collect();
         let videos = videos?;
-        let mut frames = Vec::with_capacity(wanted.len());
+        let mut frames = Vec::with_capacity(requests.len());
         let mut rest = videos.iter();
         let mut last: Option<(K, &Video)> = None;
-        for (key, which, out) in wanted {
+        for (key, description, out) in requests {
             let video = match &last {
                 Some((known, video)) if *known == key => *video,
                 _ => match rest.next() {
@@ -107,7 +107,7 @@ impl<K: Clone + Eq + Hash + Send + Sync> VideoCache<K> {
                     None => break,
                 },
             };
-            frames.push(FrameRequest { video, frame: frame(video, &which)?, out });
+            frames.push(FrameRequest { video, frame: frame(video, &description)?, out });
             last = Some((key, video));
         }
         self.decoders.read(frames)

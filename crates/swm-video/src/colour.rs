@@ -1,14 +1,14 @@
 //! Conversion of decoded planes to RGB and back.
 //!
-//! A chroma sample is repeated for the pixels that weight it, as FFmpeg's own converter does for frames that keep
-//! their size, so the frames equal those of PyAV, torchcodec and decord.
+//! Pixels that share a chroma sample use the sample unchanged, as in FFmpeg's own converter for frames that keep their
+//! size. The converted frames therefore equal the frames of PyAV, torchcodec and decord.
 
 use ffmpeg_next::color::{Range, Space};
 use ffmpeg_next::format::Pixel;
 use ffmpeg_next::frame;
 use swm_simd::vectorize;
 
-/// Fraction bits of the factors. All values have 16 bits, so that a register holds many.
+/// Fraction bits of the factors. All values have 16 bits, so that a vector register holds many of them.
 const FACTOR: u32 = 13;
 
 /// Fraction bits of products. Where pixels share chroma samples, products have no fraction bits and are truncated,
@@ -28,7 +28,7 @@ struct Matrix {
     bu: i16,
 }
 
-/// Returns the weights of red and blue in luma. Unspecified spaces are BT.601, as in FFmpeg.
+/// Returns the weights of red and blue in luma. An unspecified space is taken as BT.601, as in FFmpeg.
 fn luma_weights(space: Space) -> (f64, f64) {
     match space {
         Space::BT709 => (0.2126, 0.0722),
@@ -43,7 +43,7 @@ impl Matrix {
     fn new(space: Space, full_range: bool) -> Self {
         let (red, blue) = luma_weights(space);
         let green = 1.0 - red - blue;
-        // Luma has 219 steps and chroma 224, unless they use the full byte.
+        // Luma has 219 steps and chroma has 224 steps, unless the frame uses the full range.
         let (black, luma, difference) = if full_range { (0, 1.0, 1.0) } else { (16, 255.0 / 219.0, 255.0 / 224.0) };
         let fixed = |factor: f64| (factor * f64::from(1 << FACTOR)).round() as i16;
         Self {
@@ -67,8 +67,8 @@ enum Planes {
     Gbr,
 }
 
-/// Returns the layout of the 8-bit formats that are converted directly, and whether they use the full range. Frames of
-/// other formats are converted to [`Pixel::YUV444P`] first.
+/// Returns the layout of the 8-bit formats that are converted directly, and whether samples use the full range. Frames
+/// of other formats are converted to [`Pixel::YUV444P`] first.
 fn planes(format: Pixel) -> Option<(Planes, bool)> {
     Some(match format {
         Pixel::YUV420P => (Planes::Yuv(1, 1), false),
@@ -83,7 +83,7 @@ fn planes(format: Pixel) -> Option<(Planes, bool)> {
     })
 }
 
-/// Whether [`to_rgb`] supports frames of this format.
+/// Returns whether [`to_rgb`] supports frames of a format.
 pub fn is_native(format: Pixel) -> bool {
     planes(format).is_some()
 }
@@ -153,10 +153,10 @@ fn interleave(r: &[u8], g: &[u8], b: &[u8], out: &mut [u8]) {
     }
 }
 
-/// Pixels converted at a time: several registers, in first-level cache.
+/// Number of pixels converted at a time. They fill several registers and fit in the first-level cache.
 const PIECE: usize = 64;
 
-/// Converts one row, with one U and V for every pixel or for every two.
+/// Converts one row, with one U and one V sample for every pixel or, if `SHARED`, for every two pixels.
 #[inline(always)]
 fn yuv_row<const SHARED: bool>(matrix: &Matrix, y: &[u8], u: &[u8], v: &[u8], out: &mut [u8]) {
     // The upper half of a sample times a factor must have `fraction` bits.
@@ -204,7 +204,7 @@ fn times(a: i16, b: i16) -> i16 {
     ((i32::from(a) * i32::from(b)) >> 16) as i16
 }
 
-/// Converts a sum of products to a byte, rounded where it has a fraction.
+/// Converts a sum of products to a byte, rounded if products have fraction bits.
 #[inline(always)]
 fn clamp(value: i16, fraction: u32) -> u8 {
     let half = if fraction > 0 { 1 << (fraction - 1) } else { 0 };
@@ -212,7 +212,7 @@ fn clamp(value: i16, fraction: u32) -> u8 {
 }
 
 /// Converts RGB pixels to a frame of [`Pixel::YUV420P`] (BT.601, 16 to 235) or [`Pixel::YUV444P`], or copies them to
-/// one of [`Pixel::RGB24`]. Shared chroma is the mean of its pixels.
+/// a frame of [`Pixel::RGB24`]. A shared chroma sample is the mean over its pixels.
 pub fn from_rgb(rgb: &[u8], frame: &mut frame::Video) {
     let (width, height) = (frame.width() as usize, frame.height() as usize);
     let rows = rgb.chunks_exact(width * 3);

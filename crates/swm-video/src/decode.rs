@@ -1,5 +1,5 @@
-//! Decoding of frames by index. All frames of a batch are requested together; each run from a key frame is decoded
-//! once, and runs are decoded in parallel.
+//! Decoding of frames by index. The requested frames of a batch that depend on the same key frame form a run. Each run
+//! is decoded once, and runs are decoded in parallel.
 
 use crate::colour;
 use crate::mp4::{self, Codec, Index};
@@ -125,26 +125,26 @@ impl Video {
         Ok(())
     }
 
-    /// Returns the error of a damaged video.
+    /// Returns the error for a defect of this video.
     pub fn damaged(&self, problem: &str) -> Error {
         damaged(self.source.label(), problem)
     }
 
     fn lacks(&self, frame: usize) -> Error {
-        self.damaged(&format!("has {} frames, and frame {frame} was asked for", self.frames()))
+        self.damaged(&format!("has {} frames, but frame {frame} was requested", self.frames()))
     }
 
-    /// Returns the frame closest to a time, and its distance from the time, both in seconds. `None` where there are
-    /// no frames.
+    /// Returns the index of the frame closest to a time in seconds, and the frame's distance from the time in seconds.
+    /// Returns `None` if the video has no frames.
     pub fn frame_at(&self, seconds: f64) -> Option<(usize, f64)> {
         let frame = self.index.frame_at(seconds)?;
         Some((frame, (self.index.seconds(frame) - seconds).abs()))
     }
 }
 
-/// Returns the error of a damaged video.
+/// Returns the error for a damaged video.
 fn damaged(path: &Path, problem: &str) -> Error {
-    let fix = "restore it from a copy, or write it anew with `ffmpeg -i IN -c:v libx264 OUT.mp4`";
+    let fix = "restore it from a copy, or encode it again with `ffmpeg -i IN -c:v libx264 OUT.mp4`";
     Error::corrupt(path, format!("the video {problem}"), fix)
 }
 
@@ -154,11 +154,11 @@ pub struct FrameRequest<'a> {
     pub video: &'a Video,
     /// Index of the frame in presentation order.
     pub frame: usize,
-    /// The memory, `[height, width, 3]`.
+    /// The memory for the decoded frame, `[height, width, 3]`.
     pub out: &'a mut [u8],
 }
 
-/// A requested frame of a run, which is decoded from a key frame on.
+/// A requested frame of a run.
 struct Job<'a> {
     video: &'a Video,
     /// The sample at which decoding begins.
@@ -171,7 +171,7 @@ struct Job<'a> {
 /// many files.
 #[derive(Default)]
 pub struct DecoderPool {
-    /// Idle decoders, the most recently used one last.
+    /// Idle decoders, sorted by the time of last use.
     idle: Mutex<Vec<Decoder>>,
 }
 
@@ -179,7 +179,7 @@ impl DecoderPool {
     /// Decodes frames of any videos, on the threads of the current rayon pool.
     ///
     /// # Errors
-    /// When a frame does not exist or its `out` has another size, or a video is damaged.
+    /// When a frame does not exist, an `out` has another size, or a video is damaged.
     pub fn read(&self, wanted: Vec<FrameRequest<'_>>) -> Result<()> {
         let mut jobs = Vec::with_capacity(wanted.len());
         for FrameRequest { video, frame, out } in wanted {
@@ -189,7 +189,7 @@ impl DecoderPool {
             };
             if out.len() != index.width * index.height * 3 {
                 let problem = format!(
-                    "has {} x {} pixels, unlike the {} bytes a frame of its dataset takes",
+                    "has {} x {} pixels, but a frame of its dataset has {} bytes",
                     index.width,
                     index.height,
                     out.len()
@@ -207,15 +207,15 @@ impl DecoderPool {
             let Some(Job { video, .. }) = run.first() else { return Ok(()) };
             let video = *video;
             let mut decoder = self.take(video)?;
-            // After a failure the state of the decoder is unknown, so it is dropped.
+            // After a failure the state of the decoder is unknown, so the decoder is dropped.
             decoder.run(video, run).map_err(|problem| damaged(video.source.label(), &problem))?;
             self.give_back(decoder);
             Ok(())
         })
     }
 
-    /// Checks that the first frame has the size that the header states, before memory is allocated for frames of an
-    /// unknown file.
+    /// Checks that the first frame has the size that the header states. Callers check this before they allocate memory
+    /// for frames of an unknown file.
     ///
     /// # Errors
     /// When the sizes differ, or the frame cannot be decoded.
@@ -224,7 +224,7 @@ impl DecoderPool {
         let found = decoder.first_size(video).map_err(|problem| video.damaged(&problem))?;
         if found != video.size() {
             return Err(
-                video.damaged(&format!("has frames of {found:?} pixels, unlike the {:?} of its header", video.size()))
+                video.damaged(&format!("has frames of {found:?} pixels, but its header states {:?}", video.size()))
             );
         }
         self.give_back(decoder);
@@ -286,8 +286,8 @@ impl Decoder {
         // not concealed.
         context.set_threading(threading::Config::count(1));
         context.compliance(Compliance::Strict);
-        // Without this flag the decoder withholds frames after an open key frame. `Index::key_before` chooses a key
-        // frame from which the requested frame can be decoded.
+        // Without this flag the decoder withholds frames after the key frame of an open GOP. `Index::key_before`
+        // chooses a key frame from which the requested frame can be decoded.
         context.set_flags(Flags::OUTPUT_CORRUPT);
         let mut decoder = context.decoder();
         decoder.check(Check::CRC | Check::BITSTREAM | Check::BUFFER | Check::EXPLODE);
@@ -322,7 +322,7 @@ impl Decoder {
         let samples = &video.index.samples[first..=last];
         let mut missing = jobs.len();
         let mut reducer = Reducer::default();
-        // Neighbouring samples are read together.
+        // Samples that are adjacent in the file are read together.
         let mut at = first;
         for group in samples.chunk_by(|a, b| a.offset + u64::from(a.size) == b.offset) {
             let mut coded = std::mem::take(&mut self.coded);
@@ -371,7 +371,7 @@ impl Decoder {
         Ok((self.frame.height() as usize, self.frame.width() as usize))
     }
 
-    /// Receives the finished frames of the decoder and converts the requested ones.
+    /// Receives the finished frames of the decoder and converts the requested frames.
     fn receive(
         &mut self,
         video: &Video,
@@ -397,7 +397,7 @@ impl Decoder {
                 if colour::is_native(self.frame.format()) { &self.frame } else { reducer.reduce(&self.frame)? };
             if !colour::to_rgb(frame, width, height, out) {
                 let found = format!("{} x {}", frame.width(), frame.height());
-                return Err(format!("has a frame of {found} pixels, unlike the {width} x {height} its header says"));
+                return Err(format!("has a frame of {found} pixels, but its header states {width} x {height}"));
             }
             duplicates.iter_mut().for_each(|job| job.out.copy_from_slice(out));
             *missing = missing.saturating_sub(end - begin);
@@ -405,14 +405,14 @@ impl Decoder {
     }
 }
 
-/// Sets the codec parameters of the file's header.
-#[allow(unsafe_code, reason = "sets a field of FFmpeg's context that its wrapper does not offer")]
+/// Passes the codec parameters from the file's header to the decoder.
+#[allow(unsafe_code, reason = "sets a field of FFmpeg's context that `ffmpeg-next` does not offer")]
 fn set_extradata(context: &mut codec::Context, bytes: &[u8]) {
     if bytes.is_empty() {
         return;
     }
     let Ok(length) = i32::try_from(bytes.len()) else { return };
-    // The wrapper sets these only by opening a file with libavformat, whose parsers must not read damaged files.
+    // `ffmpeg-next` sets `extradata` only when libavformat, whose parsers must not read damaged files, opens the file.
     // SAFETY: the memory comes from FFmpeg's allocator, has the zeroed padding that decoders read, is filled within its
     // length, and then belongs to the context, which frees it. The context is not open yet and has no extradata.
     unsafe {
@@ -439,7 +439,7 @@ mod tests {
     }
 
     #[test]
-    fn every_frame_of_every_codec_decodes() {
+    fn decoded_frames_equal_the_frames_of_pyav() {
         let decoders = DecoderPool::default();
         // PyAV interpolates the chroma of 10-bit frames, so only the mean difference is small.
         for (name, tolerance) in [("times", 0), ("hevc", 0), ("deep", 4)] {
@@ -447,13 +447,13 @@ mod tests {
             assert_eq!((video.frames(), video.size()), (14, (32, 48)), "{name}");
             let size = 32 * 48 * 3;
             let bytes: Arc<[u8]> = std::fs::read(video.source.label()).expect("a readable file").into();
-            let same = Video::open(Source::Memory("a blob".into(), bytes)).expect("a readable video");
+            let in_memory = Video::open(Source::Memory("a blob".into(), bytes)).expect("a readable video");
             // Frames one by one from the file, then all frames in reverse order from memory, then frames with
             // repetitions.
             let orders: [Vec<usize>; 3] = [(0..14).collect(), (0..14).rev().collect(), vec![9, 3, 9, 13, 0, 3]];
             for (i, order) in orders.into_iter().enumerate() {
                 let mut out = vec![7; order.len() * size];
-                let video = if i == 1 { &same } else { &video };
+                let video = if i == 1 { &in_memory } else { &video };
                 let frames = order.iter().zip(out.chunks_exact_mut(size));
                 let wanted: Vec<FrameRequest<'_>> =
                     frames.map(|(&frame, out)| FrameRequest { video, frame, out }).collect();
@@ -465,7 +465,7 @@ mod tests {
                 for (&frame, found) in order.iter().zip(out.chunks_exact(size)) {
                     let off: usize =
                         found.iter().zip(&expected[frame * size..]).map(|(a, b)| usize::from(a.abs_diff(*b))).sum();
-                    assert!(off <= tolerance * size, "{name}, frame {frame}: off by {off}");
+                    assert!(off <= tolerance * size, "{name}, frame {frame}: the differences sum to {off}");
                 }
             }
         }
@@ -476,9 +476,9 @@ mod tests {
         let (_, video) = odd("times");
         for t in 0..14 {
             let time = f64::from(350 + 40 * t + 11 * t * t) / 1000.0;
-            let (frame, away) = video.frame_at(time + 0.004).expect("a frame");
+            let (frame, distance) = video.frame_at(time + 0.004).expect("a frame");
             assert_eq!(frame, t as usize);
-            assert!((away - 0.004).abs() < 1e-3, "{away}");
+            assert!((distance - 0.004).abs() < 1e-3, "{distance}");
         }
         assert_eq!(video.frame_at(-5.0).map(|(frame, _)| frame), Some(0));
         assert_eq!(video.frame_at(99.0).map(|(frame, _)| frame), Some(13));

@@ -55,7 +55,7 @@ impl Encoding {
     fn settings(self, even: bool) -> (&'static str, Pixel, Vec<(&'static str, String)>) {
         let pixels = if even { Pixel::YUV420P } else { Pixel::YUV444P };
         match self.quality {
-            // RGB without conversion.
+            // Encodes RGB without conversion to YUV.
             Quality::Lossless => {
                 ("libx264rgb", Pixel::RGB24, vec![("qp", "0".to_owned()), ("preset", "veryfast".to_owned())])
             }
@@ -80,14 +80,14 @@ fn instruction_set() -> Option<&'static str> {
     (swm_simd::cpu_level() == CpuLevel::Avx512).then_some("AVX2")
 }
 
-/// Frames from one key frame to the next in training data.
+/// Number of frames from one key frame to the next in training data.
 const TRAINING_GOP: u32 = 8;
 
 /// Encodes frames, `[height, width, 3]` RGB bytes each, as an MP4 file in memory with checksums. Equal frames give
 /// equal bytes with the same libraries.
 ///
 /// # Errors
-/// When there is no frame, a frame or a setting has a wrong size, or FFmpeg has no such encoder.
+/// When there is no frame, a frame has a wrong size, a setting is 0, or FFmpeg lacks the encoder.
 pub fn encode<I>(width: usize, height: usize, fps: u32, encoding: Encoding, frames: I) -> Result<Vec<u8>>
 where
     I: IntoIterator,
@@ -95,7 +95,7 @@ where
 {
     if width == 0 || height == 0 || fps == 0 || encoding.gop == 0 {
         let problem = format!("{width} x {height} pixels at {fps} frames a second, a key frame every {}", encoding.gop);
-        return Err(Error::config("video", problem, "give each of them at least 1"));
+        return Err(Error::config("video", problem, "make each value at least 1"));
     }
     let mut encoder = Encoder::new(width, height, fps, encoding)?;
     let mut count = 0;
@@ -139,7 +139,9 @@ impl Encoder {
             let problem = format!("this machine's FFmpeg has no encoder {name}; install one built with it");
             return Err(Error::external("encoding a video", problem));
         };
-        let side = |n: usize| u32::try_from(n).map_err(|_| Error::config("video", format!("{n} pixels"), "fewer"));
+        let side = |n: usize| {
+            u32::try_from(n).map_err(|_| Error::config("video", format!("a side of {n} pixels"), "use smaller frames"))
+        };
         let (wide, high) = (side(width)?, side(height)?);
         let file = Memory::default();
         let stream = format::context::StreamIo::from_write_seek(file.clone()).map_err(failed)?;

@@ -1,8 +1,8 @@
 //! MP4 videos with FFmpeg's libraries, in process: decodes frames by index and encodes frames.
 //!
-//! - [`Video`], [`DecoderPool`]: reads frames by index; each run from a key frame is decoded once, by pooled decoders.
-//! - [`VideoCache`]: the opened videos of a dataset.
-//! - [`encode`], [`Encoder`]: writes videos for training (a key frame every few frames) or for people.
+//! - [`Video`], [`DecoderPool`]: read frames by index with pooled decoders.
+//! - [`VideoCache`]: caches the opened videos of a dataset.
+//! - [`encode`], [`Encoder`]: write videos for training (a key frame every few frames) or for viewing.
 //!
 //! Safe code of this crate reads the tables of MP4 files, because files may be damaged; FFmpeg only decodes and encodes
 //! single frames. Frames are `[height, width, 3]` RGB bytes, row-major. Only `swm-data` depends on this crate.

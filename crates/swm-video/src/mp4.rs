@@ -6,7 +6,7 @@
 use std::ops::Range;
 use std::sync::Arc;
 
-/// Limit of a file's tables in bytes; an hour of video has less than a megabyte of them.
+/// Limit of the size of a file's tables in bytes. The tables of an hour of video take less than a megabyte.
 const LARGEST_TABLES: u64 = 256 << 20;
 
 /// Identifier of the box with checksums that [`seal`] appends.
@@ -23,7 +23,7 @@ pub enum Codec {
     Av1,
 }
 
-/// One encoded frame, in decoding order.
+/// An encoded frame, which MP4 calls a sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Sample {
     pub offset: u64,
@@ -38,13 +38,13 @@ pub struct Sample {
 #[derive(Clone, Debug)]
 pub struct Index {
     pub codec: Codec,
-    /// Parameters of the decoder: the record in the file's sample entry.
+    /// Parameters of the decoder, from the file's sample entry.
     pub extradata: Arc<[u8]>,
     pub width: usize,
     pub height: usize,
     /// The samples, in decoding order.
     pub samples: Vec<Sample>,
-    /// The sample of each frame, in presentation order, without those that the edit list hides.
+    /// Index of the sample of each frame, in presentation order. Samples that the edit list hides are left out.
     pub frames: Vec<u32>,
     /// Presentation time of each frame, in the track's units.
     pub times: Vec<i64>,
@@ -81,7 +81,7 @@ impl Index {
             }
             let mut body = |limit: u64| -> Result<Vec<u8>> {
                 if size - begin > limit {
-                    return Err(format!("its box '{}' is absurdly large", kind.escape_ascii()));
+                    return Err(format!("its box '{}' is larger than {limit} bytes", kind.escape_ascii()));
                 }
                 let mut bytes = vec![0; usize::try_from(size - begin).map_err(|e| e.to_string())?];
                 read(at + begin, &mut bytes)?;
@@ -158,7 +158,7 @@ impl Index {
         (0..=sample).rev().find(begins).unwrap_or(0)
     }
 
-    /// Checks the bytes of a sample.
+    /// Checks the bytes of a sample against the checksum, if the file has checksums.
     pub fn check(&self, sample: usize, bytes: &[u8]) -> Result<()> {
         if bytes.is_empty() {
             return Err(format!("is damaged: its encoded frame {sample} is empty"));
@@ -208,8 +208,8 @@ pub fn seal(file: &mut Vec<u8>) -> Result<()> {
     Ok(())
 }
 
-/// Returns a checksum against accidental damage. Every step is one-to-one, so the 64 bits differ whenever one word
-/// differs.
+/// Returns a checksum against accidental damage. Every step is one-to-one, so the 64-bit state differs whenever one
+/// word differs.
 pub fn sum(bytes: &[u8]) -> u32 {
     const ODD: u64 = 0x9e37_79b9_7f4a_7c15;
     let mut sum = ODD ^ bytes.len() as u64;
@@ -306,7 +306,7 @@ impl Integers<'_> {
     }
 }
 
-/// Reads a box that begins with a version and flags: the version, and the rest.
+/// Reads the version and the flags at the start of a box. Returns the version, and the integers after the flags.
 fn versioned(body: &[u8]) -> Result<(u8, Integers<'_>)> {
     let mut integers = Integers(body);
     let [version, ..] = integers.bytes::<4>()?;
@@ -316,7 +316,7 @@ fn versioned(body: &[u8]) -> Result<(u8, Integers<'_>)> {
 /// Returns the units per second in the header of a movie or a track.
 fn timescale(header: &[u8]) -> Result<u32> {
     let (version, mut integers) = versioned(header)?;
-    // Creation and modification time.
+    // Skips the creation time and the modification time.
     if version == 1 { integers.bytes::<16>().map(drop) } else { integers.bytes::<8>().map(drop) }?;
     match integers.u32()? {
         0 => Err("its time unit is 0".to_owned()),
@@ -326,8 +326,9 @@ fn timescale(header: &[u8]) -> Result<u32> {
 
 /// Returns the codec, its decoder record, width and height.
 fn description(stsd: &[u8]) -> Result<(Codec, Arc<[u8]>, usize, usize)> {
-    /// Bytes of a visual sample entry before its boxes, and the offset of its size.
+    /// Size in bytes of a visual sample entry before its boxes.
     const ENTRY: usize = 78;
+    /// Offset of the frame size in a visual sample entry.
     const SIZE: usize = 24;
     let (_, integers) = versioned(stsd)?;
     let entries = integers.0.get(4..).unwrap_or_default();
@@ -343,7 +344,7 @@ fn description(stsd: &[u8]) -> Result<(Codec, Arc<[u8]>, usize, usize)> {
     };
     let (fixed, boxes) = entry.split_at_checked(ENTRY).ok_or("the description of its codec is cut short")?;
     let size = |at: usize| usize::from(u16::from_be_bytes([fixed[at], fixed[at + 1]]));
-    // Boxes of other vendors may follow in unknown forms.
+    // Ignores malformed boxes, because vendors add boxes in unknown forms.
     let record = Boxes(boxes).flatten().find(|(kind, _)| kind == record).map_or(&[][..], |(_, body)| body);
     // A decoder needs no record for VP9.
     let extradata = if codec == Codec::Vp9 { &[] } else { record };
@@ -356,14 +357,14 @@ fn description(stsd: &[u8]) -> Result<(Codec, Arc<[u8]>, usize, usize)> {
 
 /// The part of a track that is presented.
 struct Edit {
-    /// The track's times that are presented.
+    /// Range of the track's times that are presented, in track units.
     shown: Range<i64>,
-    /// The presentation time minus the track's time.
+    /// The presentation time minus the track's time, in track units.
     shift: i64,
 }
 
-/// Reads the edit list. Encoders write one segment, possibly after an empty one, to hide their delay. Several segments
-/// are an error.
+/// Reads the edit list. Encoders write one segment, possibly after an empty segment, to hide their delay. Several
+/// segments are an error.
 fn edit(trak: &[u8], movie_scale: u32, timescale: u32) -> Result<Edit> {
     let mut edit = Edit { shown: i64::MIN..i64::MAX, shift: 0 };
     let Some(edts) = find(trak, b"edts")? else { return Ok(edit) };
@@ -376,7 +377,7 @@ fn edit(trak: &[u8], movie_scale: u32, timescale: u32) -> Result<Edit> {
         } else {
             (integers.u32()?.into(), integers.i32()?.into())
         };
-        integers.u32()?; // the playback rate
+        integers.u32()?; // Skips the playback rate.
         let units = u128::from(duration) * u128::from(timescale) / u128::from(movie_scale);
         let units = i64::try_from(units).unwrap_or(i64::MAX);
         if from >= 0 {
@@ -393,20 +394,20 @@ fn edit(trak: &[u8], movie_scale: u32, timescale: u32) -> Result<Edit> {
 #[allow(clippy::too_many_lines, reason = "reads the six tables of samples in sequence")]
 fn samples(stbl: &[u8], length: u64) -> Result<Vec<Sample>> {
     let table = |kind: &[u8; 4]| find(stbl, kind)?.ok_or(format!("its table '{}' is missing", kind.escape_ascii()));
-    // Sizes.
+    // Reads the sizes.
     let (_, mut sizes) = versioned(table(b"stsz")?)?;
-    let same = sizes.u32()?;
-    let count = if same == 0 { sizes.count(4)? } else { sizes.u32()? as usize };
-    if same != 0 && u64::from(same) * count as u64 > length {
+    let common_size = sizes.u32()?;
+    let count = if common_size == 0 { sizes.count(4)? } else { sizes.u32()? as usize };
+    if common_size != 0 && u64::from(common_size) * count as u64 > length {
         return Err("is shorter than its frames".to_owned());
     }
-    let mut samples = vec![Sample { offset: 0, size: same, time: 0, key: false }; count];
-    if same == 0 {
+    let mut samples = vec![Sample { offset: 0, size: common_size, time: 0, key: false }; count];
+    if common_size == 0 {
         for sample in &mut samples {
             sample.size = sizes.u32()?;
         }
     }
-    // Decoding times, and their offsets to presentation times.
+    // Reads the decoding times, and the offsets from decoding times to presentation times.
     let (_, mut durations) = versioned(table(b"stts")?)?;
     let (mut at, mut time) = (0, 0_i64);
     for _ in 0..durations.count(8)? {
@@ -434,7 +435,7 @@ fn samples(stbl: &[u8], length: u64) -> Result<Vec<Sample>> {
             at = at.saturating_add(n);
         }
     }
-    // Key frames: every sample, unless a table lists them.
+    // Marks the key frames that a table lists. Without this table, every sample is a key frame.
     match find(stbl, b"stss")? {
         None => samples.iter_mut().for_each(|sample| sample.key = true),
         Some(stss) => {
@@ -446,7 +447,7 @@ fn samples(stbl: &[u8], length: u64) -> Result<Vec<Sample>> {
             }
         }
     }
-    // Positions: samples follow each other within chunks, whose offsets are in a table.
+    // Reads the positions. Samples follow each other within a chunk; a table holds the offsets of the chunks.
     let (wide, chunks) = match find(stbl, b"stco")? {
         Some(stco) => (false, stco),
         None => (true, table(b"co64")?),
@@ -454,8 +455,8 @@ fn samples(stbl: &[u8], length: u64) -> Result<Vec<Sample>> {
     let (_, mut chunks) = versioned(chunks)?;
     let n = chunks.count(if wide { 8 } else { 4 })?;
     let (_, mut table) = versioned(table(b"stsc")?)?;
-    // Runs of chunks: the first chunk (from 1), its number of samples, and the index of the description, of which
-    // only the first is read.
+    // Runs of chunks: the first chunk (from 1), the number of samples per chunk, and the index of the description,
+    // which is ignored.
     let mut runs = vec![];
     for _ in 0..table.count(12)? {
         runs.push((table.u32()? as usize, table.u32()? as usize));

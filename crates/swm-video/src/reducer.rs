@@ -4,27 +4,29 @@ use ffmpeg_next::format::Pixel;
 use ffmpeg_next::frame;
 use ffmpeg_next::software::scaling;
 
-/// Converts frames of rare formats (10 bits, packed) to a format that is converted directly.
+/// Converts frames of rare formats (10 bits, packed) to `YUV444P`, which `colour::to_rgb` supports.
 #[derive(Default)]
 pub struct Reducer {
-    made: Option<(scaling::Context, frame::Video)>,
+    scaler_and_output: Option<(scaling::Context, frame::Video)>,
 }
 
 impl Reducer {
     /// Converts a frame to `YUV444P` of the same size.
     pub fn reduce(&mut self, frame: &frame::Video) -> Result<&frame::Video, String> {
         let (from, width, height) = (frame.format(), frame.width(), frame.height());
-        let same = |made: &(scaling::Context, frame::Video)| {
-            let input = made.0.input();
+        let same = |scaler_and_output: &(scaling::Context, frame::Video)| {
+            let input = scaler_and_output.0.input();
             (input.format, input.width, input.height) == (from, width, height)
         };
-        if !self.made.as_ref().is_some_and(same) {
+        if !self.scaler_and_output.as_ref().is_some_and(same) {
             let flags = scaling::Flags::BILINEAR | scaling::Flags::ACCURATE_RND;
             let scaler = scaling::Context::get(from, width, height, Pixel::YUV444P, width, height, flags);
-            let scaler = scaler.map_err(|e| format!("has pixels that nothing converts: {e}"))?;
-            self.made = Some((scaler, frame::Video::empty()));
+            let scaler = scaler.map_err(|e| format!("has a pixel format that FFmpeg cannot convert: {e}"))?;
+            self.scaler_and_output = Some((scaler, frame::Video::empty()));
         }
-        let Some((scaler, reduced)) = &mut self.made else { return Err("has pixels that nothing converts".to_owned()) };
+        let Some((scaler, reduced)) = &mut self.scaler_and_output else {
+            return Err("has a pixel format that FFmpeg cannot convert".to_owned());
+        };
         scaler.run(frame, reduced).map_err(|e| format!("has pixels that cannot be converted: {e}"))?;
         reduced.set_color_space(frame.color_space());
         reduced.set_color_range(frame.color_range());

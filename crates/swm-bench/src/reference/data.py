@@ -1,8 +1,8 @@
 """Measures loading and converting of datasets by the reference implementation.
 
 Requests, one per line: `load FORMAT PATH WORKERS STEPS FRAMESKIP BATCH SECONDS` or `convert SOURCE FORMAT PATH`.
-Answers are lines that start with `SWM `: a count and seconds, or `error` and a message. Other output of the reference is
-ignored.
+Answers are lines that start with `SWM `: a count and seconds, or `error` and a message. Other output of the reference
+is ignored.
 """
 
 import shutil
@@ -18,9 +18,9 @@ COLUMNS = ["pixels", "action"]
 
 
 def load(name, path, workers, steps, frameskip, batch, seconds):
-    more = {"video_keys": ["pixels"]} if name == "video" else {}
+    format_options = {"video_keys": ["pixels"]} if name == "video" else {}
     dataset = get_format(name).open_reader(
-        path, num_steps=int(steps), frameskip=int(frameskip), keys_to_load=list(COLUMNS), **more
+        path, num_steps=int(steps), frameskip=int(frameskip), keys_to_load=list(COLUMNS), **format_options
     )
     loader = torch.utils.data.DataLoader(
         dataset, batch_size=int(batch), shuffle=True, drop_last=True, num_workers=int(workers)
@@ -43,8 +43,7 @@ def load(name, path, workers, steps, frameskip, batch, seconds):
 def convert(source, name, path):
     shutil.rmtree(path, ignore_errors=True)
     begun = time.perf_counter()
-    more = {"mode": "overwrite"}
-    convert_dataset(source, path, dest_format=name, progress=False, **more)
+    convert_dataset(source, path, dest_format=name, progress=False, mode="overwrite")
     return 1, time.perf_counter() - begun
 
 
@@ -59,5 +58,5 @@ if __name__ == "__main__":
         command, *arguments = line.rstrip("\n").split("\t")
         try:
             answer(*(load if command == "load" else convert)(*arguments))
-        except Exception as error:  # The request is answered with the error.
+        except Exception as error:  # The script answers with the error and continues.
             answer("error", f"{type(error).__name__}: {error}".replace("\n", " "))

@@ -33,17 +33,17 @@ def step(seconds):
 
 
 def bare(seconds):
-    plain = [gymnasium.make(env, max_episode_steps=limit) for _ in range(envs)]
-    for seed, one in enumerate(plain):
-        one.reset(seed=seed)
-        one.action_space.seed(seed)
+    single_envs = [gymnasium.make(env, max_episode_steps=limit) for _ in range(envs)]
+    for seed, single in enumerate(single_envs):
+        single.reset(seed=seed)
+        single.action_space.seed(seed)
     steps = 0
     begun = time.perf_counter()
     while (elapsed := time.perf_counter() - begun) < seconds:
-        for one in plain:
-            _, _, terminated, truncated, _ = one.step(one.action_space.sample())
+        for single in single_envs:
+            _, _, terminated, truncated, _ = single.step(single.action_space.sample())
             if terminated or truncated:
-                one.reset()
+                single.reset()
         steps += envs
     return steps, elapsed
 

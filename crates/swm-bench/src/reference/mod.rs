@@ -10,15 +10,15 @@ use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use swm_core::{Error, Result};
 use swm_data::ClipSpec;
 
-const SCRIPT: &str = include_str!("envs.py");
+const ENVS_SCRIPT: &str = include_str!("envs.py");
 const PLAN_SCRIPT: &str = include_str!("plan.py");
 const MODEL_SCRIPT: &str = include_str!("model.py");
 const DATA_SCRIPT: &str = include_str!("data.py");
 
-/// The environment variable that names a Python with the reference implementation.
+/// The environment variable that names a Python interpreter with the reference implementation.
 pub const REFERENCE_PYTHON: &str = "SWM_REFERENCE_PYTHON";
 
-/// The Python that [`REFERENCE_PYTHON`] names, if any.
+/// The Python interpreter that [`REFERENCE_PYTHON`] names, if any.
 pub(crate) fn reference_python() -> Option<PathBuf> {
     std::env::var_os(REFERENCE_PYTHON).filter(|path| !path.is_empty()).map(PathBuf::from)
 }
@@ -38,7 +38,7 @@ pub(crate) struct Reference {
     pub version: String,
 }
 
-/// The sizes of a `World` of the reference.
+/// The environment and the sizes of a `World` of the reference; frames are `(height, width)` pixels.
 #[derive(Clone, Copy)]
 pub(crate) struct Size<'a> {
     pub env: &'a str,
@@ -55,7 +55,7 @@ impl Reference {
     /// Python wrote to standard error.
     pub fn start(python: &Path, size: Size<'_>) -> Result<Self> {
         let counts = [size.envs, size.image.0, size.image.1, size.episode_steps].map(|n| n.to_string());
-        Self::spawn(python, SCRIPT, &[&[size.env.to_owned()][..], &counts].concat())
+        Self::spawn(python, ENVS_SCRIPT, &[&[size.env.to_owned()][..], &counts].concat())
     }
 
     /// Starts a process with a CEM solver and a model of precomputed costs: environments, samples, iterations, elites,
@@ -84,8 +84,9 @@ impl Reference {
     }
 
     fn spawn(python: &Path, script: &str, arguments: &[String]) -> Result<Self> {
-        let log = tempfile::tempfile().map_err(|e| Error::io("a temporary file", "creating it", e))?;
-        let errors = log.try_clone().map_err(|e| Error::io("a temporary file", "sharing it", e))?;
+        let log =
+            tempfile::tempfile().map_err(|e| Error::io("a temporary file", "creating the log of the reference", e))?;
+        let errors = log.try_clone().map_err(|e| Error::io("a temporary file", "duplicating the handle", e))?;
         let mut process = Command::new(python)
             .args(["-u", "-c", script])
             .args(arguments)
@@ -95,7 +96,7 @@ impl Reference {
             .spawn()
             .map_err(|e| Error::io(python, "starting the reference's Python", e))?;
         let (Some(requests), Some(answers)) = (process.stdin.take(), process.stdout.take()) else {
-            return Err(Error::external("starting the reference", "its pipes are missing"));
+            return Err(Error::external("starting the reference", "the process has no pipes"));
         };
         let mut reference = Self { process, requests, answers: BufReader::new(answers), log, version: String::new() };
         reference.version = reference.answer()?.split_off(1).join(" ");
@@ -131,7 +132,9 @@ impl Reference {
     pub fn outputs(&mut self, work: &str) -> Result<Vec<f32>> {
         let words = self.request(&format!("outputs\t{work}"))?;
         let outputs = words.iter().map(|word| word.parse());
-        outputs.collect::<std::result::Result<_, _>>().map_err(|error| Error::external("reading the reference", error))
+        outputs
+            .collect::<std::result::Result<_, _>>()
+            .map_err(|error| Error::external("reading an output of the reference", error))
     }
 
     /// Loads shuffled batches of clips with the columns `pixels` and `action` for about `seconds`; returns clips per
@@ -163,11 +166,14 @@ impl Reference {
         let values: Vec<f64> = words.iter().filter_map(|word| word.parse().ok()).collect();
         match values[..] {
             [count, seconds] if seconds > 0.0 => Ok(count / seconds),
-            _ => Err(Error::external("a request to the reference", format!("it answered {words:?}"))),
+            _ => Err(Error::external(
+                "a request to the reference",
+                format!("the answer is {words:?}, expected a count and seconds"),
+            )),
         }
     }
 
-    /// Sends a request and returns the words of its answer.
+    /// Sends a request and returns the words of the answer.
     fn request(&mut self, request: &str) -> Result<Vec<String>> {
         let lost = |error| Error::external("sending a request to the reference", error);
         writeln!(self.requests, "{request}").and_then(|()| self.requests.flush()).map_err(lost)?;
@@ -179,7 +185,10 @@ impl Reference {
         let mut line = String::new();
         loop {
             line.clear();
-            let read = self.answers.read_line(&mut line).map_err(|e| Error::external("reading the reference", e))?;
+            let read = self
+                .answers
+                .read_line(&mut line)
+                .map_err(|e| Error::external("reading an answer of the reference", e))?;
             if read == 0 {
                 return Err(Error::external("running the reference", self.last_line()));
             }
@@ -196,7 +205,7 @@ impl Reference {
         let _ = self.log.rewind().and_then(|()| self.log.read_to_end(&mut log));
         let text = String::from_utf8_lossy(&log);
         let last = text.lines().map(str::trim).rfind(|line| !line.is_empty());
-        last.unwrap_or("it ended without output").to_owned()
+        last.unwrap_or("the process ended without output").to_owned()
     }
 }
 

@@ -1,9 +1,9 @@
 """Measures the LeWM of the reference implementation with given weights.
 
-Arguments: the sizes as JSON, and a file of weights and inputs. Requests, one per line: `run WORK COUNT` or `outputs WORK`.
-Works are `cost` (of the given candidates, with start and goal already encoded), `plan` (encoding, then CEM), `encode` (one
-frame) and `train` (one step, including the optimizer). Answers are lines that start with `SWM `; other output of the reference is
-ignored.
+Arguments: the sizes as JSON, and a file of weights and inputs. Requests, one per line: `run WORK COUNT` or
+`outputs WORK`. WORK is `cost` (of the given candidates, with start and goal already encoded), `plan` (encoding, then
+CEM), `encode` (one frame) or `train` (one step, including the optimizer). Answers are lines that start with `SWM `;
+other output of the reference is ignored.
 
 The encoder of the reference is from another package, so this file contains a vision transformer with fused attention.
 """
@@ -118,7 +118,7 @@ def encode():
 
 
 class Training:
-    """One training step as published: prediction error and SIGReg, clipped gradients, AdamW."""
+    """The published training step: prediction error and SIGReg, clipped gradients, AdamW."""
 
     def __init__(self):
         self.model = lewm().train()

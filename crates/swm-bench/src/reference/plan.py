@@ -1,6 +1,7 @@
 """Measures the CEM of the reference implementation with a model of precomputed costs.
 
-Requests, one per line: `solve SECONDS`. Answers are lines that start with `SWM `; other output of the reference is ignored.
+Requests, one per line: `solve SECONDS`. Answers are lines that start with `SWM `; other output of the reference is
+ignored.
 """
 
 import sys
@@ -30,7 +31,7 @@ class PrecomputedCosts:
 
 
 model = PrecomputedCosts()
-# All environments in one batch, which is the fastest setting of the reference.
+# One batch of all environments is the fastest setting of the reference.
 solver = CEMSolver(model, batch_size=envs, num_samples=samples, n_steps=iterations, topk=elites)
 actions = gym.spaces.Box(-1.0, 1.0, shape=(envs, dim), dtype=np.float32)
 solver.configure(action_space=actions, n_envs=envs, config=PlanConfig(horizon=horizon, receding_horizon=horizon))

@@ -4,7 +4,7 @@ use std::io::Write as _;
 use swm_bench::{BenchConfig, bench_envs};
 use swm_core::EnvChoice;
 
-/// The cheapest of the native environments.
+/// A native environment whose steps take little time.
 fn env() -> EnvChoice {
     EnvChoice::from(swm_envs::ENVS.get("swm/TwoRoom-v1").expect("an environment"))
 }
@@ -28,8 +28,8 @@ fn config() -> BenchConfig {
 fn report_states_that_the_reference_is_missing() {
     let report = bench_envs(&[env()], &config()).expect("the benchmark succeeds");
     assert!(report.reference.contains("SWM_REFERENCE_PYTHON"));
-    let what: Vec<_> = report.rows.iter().map(|row| (row.what, row.size)).collect();
-    assert_eq!(what, [("step", None), ("step, one thread", None), ("step + render", Some(8))]);
+    let works: Vec<_> = report.rows.iter().map(|row| (row.what, row.size)).collect();
+    assert_eq!(works, [("step", None), ("step, one thread", None), ("step + render", Some(8))]);
     for row in &report.rows {
         assert_eq!((row.ours.len(), row.reference.len(), row.ratio), (3, 0, None));
         assert!(row.steps_per_second > 0.0);
@@ -49,7 +49,7 @@ fn ratio_is_the_median_over_measurement_pairs() {
     let script = "#!/bin/sh\necho hello\necho SWM ready 1.2.3\nwhile read line; do echo SWM 10 2.0; done\n";
     let mut file = std::fs::File::create(&python).expect("the file is written");
     file.write_all(script.as_bytes()).expect("the file is written");
-    file.set_permissions(std::fs::Permissions::from_mode(0o755)).expect("the file is made executable");
+    file.set_permissions(std::fs::Permissions::from_mode(0o755)).expect("making the file executable");
     drop(file);
     let report =
         bench_envs(&[env()], &BenchConfig { python: Some(python), ..config() }).expect("the benchmark succeeds");

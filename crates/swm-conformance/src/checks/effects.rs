@@ -4,8 +4,8 @@ use super::probe::{Probe, bytes_of, vary};
 use crate::Suite;
 use swm_core::{EnvEntry, Factor, Key, ResetOptions, VariationRequest, VariationSpace};
 
-/// Requests the defaults of all factors, with the `rendering.*` factors at their upper bounds: at 0 they hide the
-/// effects of other factors.
+/// Requests the defaults of all factors, with the `rendering.*` factors at their upper bounds: at 0, the
+/// `rendering.*` factors hide the effects of other factors.
 fn all_visible(space: &VariationSpace) -> VariationRequest {
     let mut request = vary(&[]);
     for factor in space.factors().iter().filter(|factor| factor.key.starts_with("rendering.")) {
@@ -14,7 +14,7 @@ fn all_visible(space: &VariationSpace) -> VariationRequest {
     request
 }
 
-/// Resets with a request. Returns the frame, the observation, and the observation after some steps and a new goal.
+/// Resets with a request. Returns the frame, the observation, and the observation after four steps and a new goal.
 fn outcome(suite: &Suite, entry: &EnvEntry, variation: VariationRequest) -> Option<(Vec<u8>, Vec<u8>, Vec<u8>)> {
     let mut probe = Probe::new(suite, entry);
     probe.env.reset(5, &ResetOptions { variation, ..ResetOptions::default() }).ok()?;
@@ -27,7 +27,7 @@ fn outcome(suite: &Suite, entry: &EnvEntry, variation: VariationRequest) -> Opti
     Some((frame, row, later))
 }
 
-/// The number of tried values of a factor, and how many of them changed each output.
+/// The number of tried values of a factor, and the number of values that changed each output of [`outcome`].
 #[derive(Default)]
 struct Effects {
     tried: usize,
@@ -66,7 +66,7 @@ pub fn every_factor_has_an_effect(suite: &Suite) {
         let space = entry.env().expect("an environment").spec().variation_space.clone();
         let defaults = all_visible(&space);
         // Some factors have an effect only for certain values of another factor. For example, the angle of a shape
-        // changes nothing while the shape is round, which is its default.
+        // changes nothing while the shape has its default, a circle.
         let mut contexts = vec![defaults.clone()];
         for seed in 0..suite.contexts {
             let mut request = all_visible(&space);

@@ -1,4 +1,4 @@
-//! Checks of experts, and the episodes that other checks play with them.
+//! Checks of experts, and expert episodes for the checks of goals.
 
 use super::probe::{Probe, all_varied};
 use crate::Suite;
@@ -41,8 +41,8 @@ pub fn experts_are_valid_and_deterministic(suite: &Suite) {
                     policy.act(pool.infos(), &vec![true; slots], &mut actions).expect("an action");
                     for slot in 0..slots {
                         let action = actions.row(slot).to_f64(ACTION).expect("actions");
-                        let what = format!("{}, {}", entry.id, expert.id);
-                        spec.action_space.check(&what, &action).unwrap_or_else(|error| panic!("{error}"));
+                        let label = format!("{}, {}", entry.id, expert.id);
+                        spec.action_space.check(&label, &action).unwrap_or_else(|error| panic!("{error}"));
                     }
                     taken.push(actions.row(0).to_f64(ACTION).expect("actions"));
                     pool.step(&actions, &vec![true; slots]).expect("a step");

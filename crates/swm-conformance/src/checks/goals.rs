@@ -6,8 +6,8 @@ use crate::Suite;
 use swm_core::columns::{GOAL_STATE, STATE};
 use swm_core::{Batch, ColumnSpec, DType, Key, ResetOptions, Schema};
 
-/// Checks that a sampled goal is not reached yet, depends on its key only, matches its frame, and counts as success
-/// when reached.
+/// Checks that a sampled goal is not reached yet, depends on the key only, and matches the goal frame, and that the
+/// goal state is a success.
 pub fn sampled_goals_are_new_and_reachable(suite: &Suite) {
     for entry in suite.rows {
         let mut distinct = 0;
@@ -21,13 +21,13 @@ pub fn sampled_goals_are_new_and_reachable(suite: &Suite) {
             assert!(!probe.env.is_success(), "{id}, seed {seed}: the goal is reached at once");
             assert!(probe.env.snapshot() != snapshot, "{id}: the snapshot lacks the goal");
             let goal = probe.column(GOAL_STATE);
-            probe.env.sample_goal(key).expect("the same goal");
+            probe.env.sample_goal(key).expect("sampling a goal with the same key");
             assert_eq!(probe.column(GOAL_STATE), goal, "{id}: one key gives two goals");
             let goal_frame = probe.goal_frame();
-            probe.env.sample_goal(key.at(1)).expect("another goal");
+            probe.env.sample_goal(key.at(1)).expect("sampling a goal with another key");
             distinct += u64::from(probe.column(GOAL_STATE) != goal);
 
-            // The goal state succeeds, by reset and by restore, and its frame equals the goal frame.
+            // The goal state is a success after a reset and after a restore, and its frame equals the goal frame.
             let options = ResetOptions { state: Some(goal.clone()), goal_state: Some(goal.clone()), ..options };
             let mut at_goal = Probe::reset(suite, entry, seed, &options);
             assert!(at_goal.env.is_success(), "{id}, seed {seed}: a reset to the goal does not succeed");
@@ -44,8 +44,8 @@ pub fn sampled_goals_are_new_and_reachable(suite: &Suite) {
     }
 }
 
-/// Checks that the goal distance is positive at the start, near 0 at the goal, and smaller after an expert reached the
-/// goal.
+/// Checks that the goal distance is positive at the start, near 0 at the goal, and smaller than at the start after an
+/// expert reached the goal.
 pub fn goal_distance_decreases_to_the_goal(suite: &Suite) {
     for entry in suite.rows {
         let mut reached = 0;
@@ -61,17 +61,17 @@ pub fn goal_distance_decreases_to_the_goal(suite: &Suite) {
             let at_goal = Probe::reset(suite, entry, seed, &options).env.goal_distance();
             assert!(
                 (0.0..=0.05 * before).contains(&at_goal),
-                "{id}, seed {seed}: {at_goal} at the goal, {before} before"
+                "{id}, seed {seed}: distance {at_goal} at the goal, {before} at the start"
             );
             if !entry.experts.is_empty() && follow_expert(entry, &mut probe, seed) {
                 reached += 1;
                 let after = probe.env.goal_distance();
                 assert!(
                     after < before,
-                    "{id}, seed {seed}: {after} where the expert reached the goal, {before} before"
+                    "{id}, seed {seed}: distance {after} after the expert reached the goal, {before} at the start"
                 );
             }
         }
-        assert!(reached > 0 || entry.experts.is_empty(), "{}: its expert reaches no goal", entry.id);
+        assert!(reached > 0 || entry.experts.is_empty(), "{}: the expert reaches no goal", entry.id);
     }
 }

@@ -17,7 +17,7 @@ fn play(suite: &Suite, entry: &EnvEntry, episodes: &[u64], workers: usize, steps
         .enumerate()
         .map(|(slot, &episode)| {
             policy.begin(slot, Key::new(episode));
-            // Every other episode varies all factors.
+            // Episodes with odd numbers vary all factors.
             let options = if episode % 2 == 0 { ResetOptions::default() } else { all_varied() };
             Reset { slot, seed: episode, options }
         })
@@ -54,15 +54,16 @@ pub fn results_are_independent_of_threads_and_slots(suite: &Suite) {
         for (i, &episode) in episodes.iter().enumerate() {
             assert!(
                 one_thread[i] == play(suite, entry, &[episode], 1, steps)[0],
-                "{}: episode {episode} alone",
+                "{}: episode {episode} differs when played alone",
                 entry.id
             );
-            assert!(one_thread[i] == reversed[4 - i], "{}: episode {episode} in another slot", entry.id);
+            assert!(one_thread[i] == reversed[4 - i], "{}: episode {episode} differs in another slot", entry.id);
         }
     }
 }
 
-/// Checks that environments that are stepped alternately, after earlier episodes, give the same results as new ones.
+/// Checks that environments that are stepped alternately, after earlier episodes, give the same results as new
+/// environments.
 pub fn environments_are_independent(suite: &Suite) {
     for entry in suite.rows {
         let key = Key::new(7);

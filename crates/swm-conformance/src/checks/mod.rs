@@ -1,5 +1,5 @@
-//! The checks. Each runs over every entry of a [`crate::Suite`] and panics with the environment's id on the first
-//! failure.
+//! The conformance checks. Each check runs on every entry of a [`crate::Suite`] and panics with the environment's id on
+//! the first failure.
 
 mod effects;
 mod entries;

@@ -27,8 +27,12 @@ pub fn observations_and_frames_are_fully_written(suite: &Suite) {
                 }
                 rgb
             };
-            assert!(draw(0, false) == draw(255, false), "{}: {height} x {width} frame", entry.id);
-            assert!(draw(0, true) == draw(255, true), "{}: {height} x {width} goal frame", entry.id);
+            assert!(draw(0, false) == draw(255, false), "{}: {height} x {width} frame is not fully written", entry.id);
+            assert!(
+                draw(0, true) == draw(255, true),
+                "{}: {height} x {width} goal frame is not fully written",
+                entry.id
+            );
         }
     }
 }

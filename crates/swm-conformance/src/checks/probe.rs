@@ -22,7 +22,7 @@ pub(super) struct Probe {
     pub env: Box<dyn Env>,
     /// The last observation, a batch of one row.
     pub row: Batch,
-    /// Height and width of its frames, in pixels.
+    /// Height and width of the frames, in pixels.
     size: (usize, usize),
 }
 
@@ -85,7 +85,7 @@ impl Probe {
         self.env.step(action).expect("an action of the action space")
     }
 
-    /// The observation, both frames and the success flag, as bytes.
+    /// The observation, the frame, the goal frame and the success flag, as bytes.
     pub fn all_outputs(&mut self) -> Vec<u8> {
         let mut bytes = bytes_of(self.observed());
         bytes.extend(self.frame());
@@ -97,7 +97,7 @@ impl Probe {
 
 /// The mean absolute difference of two frames, in units of 1/255.
 pub(super) fn frame_difference(a: &[u8], b: &[u8]) -> f64 {
-    assert_eq!(a.len(), b.len(), "frames of equal size");
+    assert_eq!(a.len(), b.len(), "the frames have equal sizes");
     a.iter().zip(b).map(|(&a, &b)| f64::from(a.abs_diff(b))).sum::<f64>() / a.len() as f64
 }
 

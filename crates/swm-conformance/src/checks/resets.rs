@@ -21,22 +21,22 @@ pub fn any_requested_factors_can_be_sampled(suite: &Suite) {
             .chain(keys.iter().flat_map(|key| vec![key.as_str(); suite.requests]));
         for (seed, key) in (0..).zip(requests) {
             let options = ResetOptions { variation: vary(&[key]), ..ResetOptions::default() };
-            let what = format!("{}, '{key}', seed {seed}", entry.id);
-            probe.env.reset(seed, &options).unwrap_or_else(|error| panic!("{what}: {error}"));
+            let label = format!("{}, '{key}', seed {seed}", entry.id);
+            probe.env.reset(seed, &options).unwrap_or_else(|error| panic!("{label}: {error}"));
             let chosen = space.select(key).expect("a known key");
             for (i, (factor, (_, value))) in space.factors().iter().zip(probe.env.factors().iter()).enumerate() {
-                factor.space.check(&factor.key, value).unwrap_or_else(|error| panic!("{what}: {error}"));
+                factor.space.check(&factor.key, value).unwrap_or_else(|error| panic!("{label}: {error}"));
                 assert!(
                     chosen.contains(&i) || value == factor.init_value,
-                    "{what}: {} varies without being requested",
+                    "{label}: {} varies without being requested",
                     factor.key
                 );
             }
-            assert_finite(probe.observed(), &what);
+            assert_finite(probe.observed(), &label);
             (0..3).for_each(|t| {
                 probe.step(Key::new(seed), t);
             });
-            assert_finite(probe.observed(), &what);
+            assert_finite(probe.observed(), &label);
         }
     }
 }
@@ -85,14 +85,14 @@ pub fn groups_factors_and_pinned_values_combine(suite: &Suite) {
             request
                 .variation_values
                 .extend(pinned.map(|factor| (factor.key.clone(), sampled.get(&factor.key).to_vec())));
-            let what = format!("{}, {request:?}", entry.id);
+            let label = format!("{}, {request:?}", entry.id);
             let options = ResetOptions { variation: request.clone(), ..ResetOptions::default() };
-            probe.env.reset(seed, &options).unwrap_or_else(|error| panic!("{what}: {error}"));
+            probe.env.reset(seed, &options).unwrap_or_else(|error| panic!("{label}: {error}"));
             for (factor, (key, value)) in factors.iter().zip(probe.env.factors().iter()) {
                 if let Some(expected) = request.variation_values.get(key) {
-                    assert_eq!(value, expected, "{what}: {key} is pinned");
+                    assert_eq!(value, expected, "{label}: {key} is pinned");
                 } else if !inside(&factor) && other.is_none_or(|other| other.key != key) {
-                    assert_eq!(value, factor.init_value, "{what}: {key} varies without being requested");
+                    assert_eq!(value, factor.init_value, "{label}: {key} varies without being requested");
                 }
             }
         }

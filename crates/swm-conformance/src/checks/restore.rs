@@ -5,7 +5,7 @@ use crate::Suite;
 use swm_core::columns::{STATE, flat_factor};
 use swm_core::{Batch, ColumnSpec, DType, Key, ResetOptions, Schema, Snapshot, VariationRequest};
 
-/// Checks that every environment continues after a restore as after the snapshot, bit for bit.
+/// Checks that the steps after a restore equal the steps after the snapshot, bit for bit.
 pub fn restores_snapshot_bit_for_bit(suite: &Suite) {
     for entry in suite.rows {
         for (seed, options) in [(0, ResetOptions::default()), (1, all_varied()), (2, all_varied())] {
@@ -32,7 +32,11 @@ pub fn restores_snapshot_bit_for_bit(suite: &Suite) {
                 [(&mut probe, "the same"), (&mut other, "another"), (&mut Probe::new(suite, entry), "a new")]
             {
                 probe.env.restore(&snapshot).expect("a snapshot of this environment");
-                assert!(probe.env.snapshot() == snapshot, "{}: {name} environment", entry.id);
+                assert!(
+                    probe.env.snapshot() == snapshot,
+                    "{}: {name} environment has another snapshot after the restore",
+                    entry.id
+                );
                 assert!(follow(probe) == expected, "{}: {name} environment continues differently", entry.id);
             }
             let factors = |probe: &Probe| probe.env.factors().iter().map(|(_, v)| v.to_vec()).collect::<Vec<_>>();
@@ -64,7 +68,7 @@ fn dataset_row(probe: &mut Probe, dtype: DType) -> Batch {
     row
 }
 
-/// Checks that restoring a dataset row restores the state, the factors and both frames.
+/// Checks that restoring a dataset row restores the state, the factors, the frame and the goal frame.
 pub fn dataset_rows_restore_state_and_factors(suite: &Suite) {
     for entry in suite.rows {
         for seed in 0..suite.restored_rows {
@@ -76,7 +80,7 @@ pub fn dataset_rows_restore_state_and_factors(suite: &Suite) {
                 probe.step(key, t);
             });
             let goal = dataset_row(&mut probe, DType::Float64);
-            // A reset to the same state, with the same goal, because frames may show it.
+            // The expected environment also has the goal of the dataset row, because frames may show the goal.
             let factors = probe.env.factors().iter().map(|(key, value)| (key.to_owned(), value.to_vec()));
             let variation = VariationRequest { variation: Some(vec![]), variation_values: factors.collect() };
             let options = ResetOptions { variation, state: Some(start.clone()), goal_state: Some(probe.column(STATE)) };
@@ -99,7 +103,10 @@ pub fn dataset_rows_restore_state_and_factors(suite: &Suite) {
         }
         let no_state =
             Batch::zeros(&Schema::new([ColumnSpec::new("position", DType::Float64, [2])]).expect("a schema"), 1);
-        let error = Probe::new(suite, entry).env.restore_from(no_state.row(0), no_state.row(0)).expect_err("no state");
+        let error = Probe::new(suite, entry)
+            .env
+            .restore_from(no_state.row(0), no_state.row(0))
+            .expect_err("a row without a state");
         assert!(error.to_string().contains(STATE), "{}: {error}", entry.id);
     }
 }

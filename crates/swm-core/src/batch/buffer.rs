@@ -21,7 +21,7 @@ impl Buffer {
     /// Changes the number of bytes; new bytes are zero. Memory stays allocated.
     pub fn resize(&mut self, len: usize) {
         if len < self.len {
-            // A later resize to a larger size must read zeros here.
+            // The removed bytes must be zero after a later call that grows the buffer again.
             self.bytes_mut()[len..].fill(0);
         }
         self.lines.resize(len.div_ceil(64), Line([0; 64]));

@@ -139,7 +139,7 @@ impl Batch {
     /// current rayon pool.
     ///
     /// # Panics
-    /// Unless there is one item per row.
+    /// When the number of items differs from the number of rows.
     pub fn par_zip_mut<T: Send>(&mut self, items: &mut [T], f: impl Fn(usize, RowMut<'_>, &mut T) + Sync) {
         use rayon::prelude::*;
         assert_eq!(items.len(), self.rows, "one item per row");
@@ -147,7 +147,7 @@ impl Batch {
         items.par_iter_mut().with_max_len(1).enumerate().for_each(|(row, item)| f(row, shared.row(row), item));
     }
 
-    /// Copies a row of another batch of the same schema.
+    /// Copies row `row` of `from`, a batch of the same schema, to row `to`.
     ///
     /// # Errors
     /// When the schemas differ.
@@ -163,7 +163,7 @@ impl Batch {
         Ok(())
     }
 
-    /// Appends a row of another batch of the same schema.
+    /// Appends row `row` of `from`, a batch of the same schema.
     ///
     /// # Errors
     /// When the schemas differ.
@@ -173,7 +173,7 @@ impl Batch {
         self.copy_row(to, from, row)
     }
 
-    /// Checks that a column holds `T`.
+    /// Checks that a column holds elements of type `T`.
     fn check<T: Element>(&self, index: usize) -> Result<()> {
         let column = &self.schema.columns()[index];
         if T::is(column.dtype) {
@@ -205,7 +205,8 @@ mod tests {
     use super::*;
 
     fn schema() -> Schema {
-        Schema::new([ColumnSpec::new("state", DType::Float64, [3]), ColumnSpec::image("pixels", 2, 2)]).expect("schema")
+        Schema::new([ColumnSpec::new("state", DType::Float64, [3]), ColumnSpec::image("pixels", 2, 2)])
+            .expect("a valid schema")
     }
 
     #[test]
@@ -216,18 +217,18 @@ mod tests {
             row.at::<u8>(1).fill(i as u8);
         });
         assert_eq!(batch.row(7).at::<f64>(0), [7.0, 0.5, -1.0]);
-        assert_eq!(batch.row(99).get::<u8>("pixels").expect("pixels"), [99; 12]);
-        assert_eq!(batch.get::<f64>("state").expect("state").len(), 300);
+        assert_eq!(batch.row(99).get::<u8>("pixels").expect("the column `pixels`"), [99; 12]);
+        assert_eq!(batch.get::<f64>("state").expect("the column `state`").len(), 300);
         assert_eq!(batch.bytes(1).as_ptr() as usize % 64, 0);
     }
 
     #[test]
     fn rows_grown_after_shrinking_are_zero() {
         let mut batch = Batch::zeros(&schema(), 2);
-        batch.get_mut::<f64>("state").expect("state").fill(1.0);
+        batch.get_mut::<f64>("state").expect("the column `state`").fill(1.0);
         batch.resize(1);
         batch.resize(2);
-        assert_eq!(batch.get::<f64>("state").expect("state"), [1.0, 1.0, 1.0, 0.0, 0.0, 0.0]);
+        assert_eq!(batch.get::<f64>("state").expect("the column `state`"), [1.0, 1.0, 1.0, 0.0, 0.0, 0.0]);
     }
 
     #[test]

@@ -1,4 +1,5 @@
-//! Single rows of a batch: [`RowRef`] reads one, [`RowMut`] writes one. Several threads write disjoint rows at once.
+//! Single rows of a batch: [`RowRef`] reads a row, [`RowMut`] writes a row. Several threads write disjoint rows at
+//! once.
 
 use super::{Batch, DType, Element, Schema};
 use crate::Result;
@@ -19,7 +20,7 @@ impl<'a> RowRef<'a> {
     /// The elements of column `index`, `[shape…]`.
     ///
     /// # Panics
-    /// When the column holds another type: indices come from a schema, so that is a bug of the caller.
+    /// When the column holds another type: indices come from a schema, so another type is a bug of the caller.
     pub fn at<T: Element>(self, index: usize) -> &'a [T] {
         let column = &self.schema().columns()[index];
         assert!(T::is(column.dtype), "column '{}' holds {}", column.name, column.dtype.name());
@@ -82,7 +83,8 @@ mod shared {
         }
     }
 
-    // SAFETY: a `ColumnStart` is only read through `RowsMut`, which borrows the batch mutably and refreshes it.
+    // SAFETY: a `ColumnStart` is read only through `RowsMut`. `Batch::rows_mut` makes a `RowsMut`, borrows the batch
+    // mutably and updates every address.
     unsafe impl Send for ColumnStart {}
     // SAFETY: as for `Send`.
     unsafe impl Sync for ColumnStart {}
@@ -121,7 +123,7 @@ mod shared {
         /// The elements of column `index`, `[shape…]`, for writing.
         ///
         /// # Panics
-        /// When the column holds another type: indices come from a schema, so that is a bug of the caller.
+        /// When the column holds another type: indices come from a schema, so another type is a bug of the caller.
         pub fn at<T: Element>(&mut self, index: usize) -> &mut [T] {
             let column = &self.schema.columns()[index];
             assert!(T::is(column.dtype), "column '{}' holds {}", column.name, column.dtype.name());

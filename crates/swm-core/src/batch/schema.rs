@@ -10,20 +10,20 @@ use std::sync::Arc;
 pub enum DType {
     /// True or false, one byte (0 or 1).
     Bool,
-    /// Bytes; an RGB image is `U8` with shape `[height, width, 3]`.
+    /// 8-bit unsigned integers; an RGB image is `U8` with shape `[height, width, 3]`.
     U8,
     /// 32-bit signed integers.
     Int32,
     /// 64-bit signed integers.
     Int64,
-    /// Single precision.
+    /// 32-bit floating point.
     Float32,
-    /// Double precision.
+    /// 64-bit floating point.
     Float64,
 }
 
 impl DType {
-    /// Bytes of one element.
+    /// The number of bytes of one element.
     pub const fn size(self) -> usize {
         match self {
             Self::Bool | Self::U8 => 1,
@@ -90,7 +90,7 @@ impl ColumnSpec {
         Self::new(name, DType::U8, [height, width, 3])
     }
 
-    /// Elements of one row.
+    /// The number of elements of one row.
     pub fn len(&self) -> usize {
         self.shape.iter().product()
     }
@@ -100,7 +100,7 @@ impl ColumnSpec {
         self.len() == 0
     }
 
-    /// Bytes of one row.
+    /// The number of bytes of one row.
     pub fn row_bytes(&self) -> usize {
         self.len() * self.dtype.size()
     }
@@ -162,7 +162,7 @@ impl Schema {
     /// The index of a column.
     ///
     /// # Errors
-    /// When no column has that name; the error suggests the nearest ones.
+    /// When no column has that name; the error suggests similar names.
     pub fn index(&self, name: &str) -> Result<usize> {
         self.find(name).ok_or_else(|| {
             Error::unknown(
@@ -174,7 +174,7 @@ impl Schema {
         })
     }
 
-    /// The column of that name.
+    /// The column of a name.
     ///
     /// # Errors
     /// As [`Schema::index`].

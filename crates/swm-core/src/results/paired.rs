@@ -20,7 +20,7 @@ pub struct Comparison {
     pub table: Paired,
 }
 
-/// Counts of paired outcomes, a test and an interval of their difference.
+/// Counts of paired outcomes, and the test and the interval of the difference in success rate.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Paired {
     /// Starts that both policies solved.
@@ -34,7 +34,7 @@ pub struct Paired {
     /// The two-sided p-value of McNemar's exact test. The null hypothesis is that `only_a` and `only_b` are equally
     /// likely outcomes of the starts that exactly one policy solved.
     pub p: f64,
-    /// The success rate of the first policy minus that of the second.
+    /// The success rate of the first policy minus the success rate of the second.
     pub difference: f64,
     /// The lower end of the 95 % interval of the difference.
     pub low: f64,
@@ -171,7 +171,7 @@ mod tests {
             solved_at_start,
             ..EpisodeResult::new(seed)
         });
-        Run::new("here", policy, Counting::default(), episodes.collect(), Timing::default())
+        Run::new("in distribution", policy, Counting::default(), episodes.collect(), Timing::default())
     }
 
     #[test]
@@ -187,7 +187,7 @@ mod tests {
         let mut other = model.clone();
         other.episodes[3].seed = 5;
         assert!(Comparison::of(&other, &floor, Counting::default()).is_none(), "other starts");
-        other = Run { condition: "there".to_owned(), ..model };
+        other = Run { condition: "shifted colours".to_owned(), ..model };
         assert!(Comparison::of(&other, &floor, Counting::default()).is_none(), "another condition");
     }
 }

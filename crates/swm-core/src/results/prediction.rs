@@ -3,27 +3,27 @@
 use super::Summary;
 use serde::{Deserialize, Serialize};
 
-/// A model's open-loop prediction errors on recorded trajectories: it predicts from the latent of the first observation
-/// and the recorded actions.
+/// A model's open-loop prediction errors on recorded trajectories. The model predicts from the latent of the first
+/// observation and the recorded actions.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Prediction {
     /// Environment steps per model step.
     pub frameskip: usize,
-    /// The variance of the latents of all predicted observations, averaged over latent dimensions. It is the unit of
-    /// errors: always predicting the mean latent has an error of 1.
+    /// The variance of the latents of all predicted observations, averaged over latent dimensions. This variance is
+    /// the unit of errors: always predicting the mean latent has an error of 1.
     pub variance: f64,
     /// The errors of every trajectory.
     pub trajectories: Vec<Trajectory>,
-    /// All trajectories, then those of successes and those of failures, where known.
+    /// The group of all trajectories, then the group of successes and the group of failures.
     pub groups: Vec<Group>,
 }
 
 /// The prediction errors of one trajectory.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Trajectory {
-    /// The dataset row of its start: `[episode, step]`.
+    /// The dataset row at which the trajectory starts: `[episode, step]`.
     pub start: [usize; 2],
-    /// Whether its episode succeeded, if known.
+    /// Whether the trajectory's episode succeeded, if known.
     pub success: Option<bool>,
     /// The mean squared error of each model step's latent, in units of [`Prediction::variance`].
     pub errors: Vec<f64>,
@@ -32,11 +32,11 @@ pub struct Trajectory {
 /// The prediction errors of one group of trajectories.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Group {
-    /// Successes, failures, or all trajectories for `None`.
+    /// `true` for the group of successes, `false` for the group of failures, `None` for all trajectories.
     pub success: Option<bool>,
-    /// The mean errors of the trajectories, each over its own steps.
+    /// The summary of [`Trajectory::error`] over the trajectories.
     pub trajectory: Summary,
-    /// The errors of each model step.
+    /// The summary of the errors of each model step.
     pub steps: Vec<Summary>,
 }
 
@@ -50,7 +50,7 @@ impl Prediction {
 }
 
 impl Trajectory {
-    /// The mean error over its steps.
+    /// The mean error over the model steps.
     pub fn error(&self) -> f64 {
         self.errors.iter().sum::<f64>() / self.errors.len() as f64
     }

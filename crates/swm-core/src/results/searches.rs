@@ -63,7 +63,7 @@ mod tests {
     fn bands_do_not_depend_on_the_order_of_plans() {
         let mut traces: Vec<PlanTrace> = (0..10u8).map(|i| trace(&[f32::from(i), 0.5])).collect();
         traces.push(trace(&[10.0]));
-        let found = Searches::of(&traces).expect("traces");
+        let found = Searches::of(&traces).expect("aggregating eleven traces");
         assert_eq!(found.best[0], Band { low: 1.0, median: 5.0, high: 9.0 });
         assert_eq!(found.best[1], Band { low: 0.5, median: 0.5, high: 0.5 }, "ten plans have a second iteration");
         assert_eq!((found.plans, found.mean.len(), found.spread.len()), (11, 1, 0));

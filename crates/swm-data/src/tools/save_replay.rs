@@ -1,4 +1,4 @@
-//! Saving a replay buffer as a dataset.
+//! Saves a replay buffer as a dataset.
 
 use crate::dataset::{Location, ReplayBuffer, WriteOptions};
 use crate::formats::create;

@@ -17,15 +17,15 @@ def to_list(values):
 for path in sys.argv[1:]:
     table = lance.dataset(path)
     table.validate()
-    whole = table.to_table()
+    arrow_table = table.to_table()
     dataset = LanceDataset(path, num_steps=2, frameskip=2)
     rows = LanceDataset(path)
     episodes = [rows.load_episode(e) for e in range(len(rows.lengths))]
     clip = dataset[1]
     content = {
         "rows": table.count_rows(),
-        "episode_idx": whole["episode_idx"].to_pylist(),
-        "step_idx": whole["step_idx"].to_pylist(),
+        "episode_idx": arrow_table["episode_idx"].to_pylist(),
+        "step_idx": arrow_table["step_idx"].to_pylist(),
         "lengths": [int(n) for n in dataset.lengths],
         "clips": len(dataset),
         "clip_action": to_list(clip["action"]),

@@ -11,7 +11,7 @@ from reference import LanceWriter
 
 
 def episode(e, last_action):
-    """Rows 0..6+e; every value depends only on the episode and the row."""
+    """Returns the rows 0..6+e. Every value depends only on the episode and the row."""
     rows = range(6 + e)
     y, x = np.mgrid[:24, :32]
     return {

@@ -1,5 +1,5 @@
-"""Reads a folder dataset of this project with the reference's reader; prints its content as a line of JSON. Needs torch
-and Pillow."""
+"""Reads a folder dataset of this project with the reference's reader, and prints the content as a line of JSON. Needs
+torch and Pillow."""
 
 import json
 import sys

@@ -1,5 +1,5 @@
 """Reads HDF5 files of this project with h5py and prints a line of JSON for each file: the shape, type, sum and weighted
-sum of every column. With `append`, adds an episode (a copy of the first) as the reference's writer does."""
+sum of every column. With `append`, adds an episode (a copy of the first episode) as the reference's writer does."""
 
 import json
 import sys

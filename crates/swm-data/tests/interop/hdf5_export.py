@@ -1,8 +1,9 @@
-"""Writes the HDF5 files next to this script: one by the writer of the reference implementation, one by h5py with every
-filter, one with every layout. Needs numpy, h5py, hdf5plugin; for the first the published `stable-worldmodel`.
+"""Writes the HDF5 files next to this script. h5py writes every filter, every layout and chunks in B-trees; the writer
+of the reference implementation writes `hdf5-reference.h5`. Needs numpy, h5py, hdf5plugin, and for `reference` the
+published `stable-worldmodel`.
 
-    python hdf5_export.py            # hdf5-filters.h5, hdf5-layouts.h5
-    python hdf5_export.py reference  # hdf5-reference.h5 as well
+    python hdf5_export.py            # hdf5-filters.h5, hdf5-layouts.h5, hdf5-trees.h5
+    python hdf5_export.py reference  # also hdf5-reference.h5
 """
 
 import sys
@@ -89,7 +90,7 @@ def reference():
             action = values("f4")[part, :2].copy()
             action[-1] = np.nan
             columns = {"pixels": images()[part], "action": action, "reward": values("f8")[part, 0], "step_idx": np.arange(length)}
-            # Nine columns: HDF5 stores the names of more than eight in another way.
+            # Nine columns, because HDF5 stores more than eight names in another way.
             columns |= {f"variation.{k}": values("i8")[part, k] for k in range(5)}
             writer.write_episode({name: list(values) for name, values in columns.items()})
             first += length

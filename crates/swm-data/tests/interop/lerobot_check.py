@@ -1,5 +1,5 @@
 """Opens a dataset with LeRobot's own package and prints its rows as JSON. `tests/it/lerobot.rs` compares
-them with the written episodes."""
+the rows with the written episodes."""
 
 import json
 import os

@@ -1,5 +1,5 @@
 """Writes small datasets with LeRobot's own package, and the frames that the package reads back from them.
-`tests/it/lerobot.rs` compares the frames with those that this project reads.
+`tests/it/lerobot.rs` compares these frames with the frames that this project reads.
 
 python lerobot_export.py NAME CODEC    (lerobot 0.4.4 writes v3.0, lerobot 0.3.3 writes v2.1)
 """

@@ -1,5 +1,5 @@
 """Opens a folder of videos with the reader of the published `stable-worldmodel` (decord), and prints the frames and
-states of every episode as JSON. `tests/it/video.rs` compares them with the written episodes.
+states of every episode as JSON. `tests/it/video.rs` compares the output with the written episodes.
 """
 
 import json

@@ -1,5 +1,6 @@
 """Writes `reference-video` with the writer of the published `stable-worldmodel`, and the frames that its reader
-(decord) returns. `tests/it/video.rs` compares the frames with those that this project reads.
+(decord) returns. `tests/it/video.rs` compares these frames with the frames that this project
+reads.
 
 python video_export.py    (stable-worldmodel 0.1.1, imageio-ffmpeg, decord 0.6.0)
 """

@@ -15,7 +15,7 @@ struct Counting {
 
 impl Counting {
     fn open(path: &Path) -> Arc<Self> {
-        Arc::new(Self { inner: open(path).expect("opens"), rows: AtomicUsize::new(0) })
+        Arc::new(Self { inner: open(path).expect("opening the dataset"), rows: AtomicUsize::new(0) })
     }
 
     fn decoded(&self) -> usize {
@@ -58,12 +58,12 @@ fn with_cache(reader: &Arc<Counting>, cache: &CacheConfig) -> Arc<dyn Reader> {
     cache.over(Arc::clone(reader) as Arc<dyn Reader>, &["pixels", "state"]).expect("a cache")
 }
 
-/// Every image and state, as single rows in a mixed order.
+/// Reads every image and state row by row, the last episode first, and then three rows of episode 2 again.
 fn read_all(reader: &dyn Reader) -> (Vec<u8>, Vec<u8>) {
     let rows = |e: usize| (0..reader.episodes()[e].length).map(move |t| StepRange::new(e, t, 1));
     let mut ranges: Vec<StepRange> = (0..reader.episodes().len()).rev().flat_map(rows).collect();
     ranges.push(StepRange::new(2, 1, 3));
-    let batch = reader.read(&["pixels", "state"], &ranges).expect("reads");
+    let batch = reader.read(&["pixels", "state"], &ranges).expect("reading rows");
     (batch.bytes(0).to_vec(), batch.bytes(1).to_vec())
 }
 
@@ -75,7 +75,7 @@ fn dataset(folder: &Path) -> (PathBuf, usize) {
 
 #[test]
 fn decodes_cached_rows_once_within_the_limit() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let (path, rows) = dataset(folder.path());
     let reader = Counting::open(&path);
     let expected = read_all(&*reader);
@@ -90,11 +90,12 @@ fn decodes_cached_rows_once_within_the_limit() {
             assert!(read_all(&*cached) == expected, "{cache:?}");
             assert_eq!(reader.decoded(), rows + 3, "first read with {cache:?}");
             assert!(read_all(&*cached) == expected, "{cache:?}");
-            // The three rows that are read twice are cached only if all rows are.
+            // A cached row saves two decodes if it is one of the three rows that are read twice.
             let decoded = reader.decoded();
             let again = if cached_rows == rows { 0..=0 } else { rows - cached_rows..=rows + 3 - cached_rows };
             assert!(again.contains(&decoded), "{decoded} of {rows} with {cache:?}");
-            let wrong = cached.read(&["pixels"], &[StepRange::new(0, 3, 4)]).expect_err("no such rows").to_string();
+            let wrong =
+                cached.read(&["pixels"], &[StepRange::new(0, 3, 4)]).expect_err("rows beyond the episode").to_string();
             assert!(wrong.contains("rows below 5"), "{wrong}");
             reader.decoded();
         }
@@ -103,7 +104,7 @@ fn decodes_cached_rows_once_within_the_limit() {
 
 #[test]
 fn disk_cache_serves_later_runs_and_other_processes() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let (path, _) = dataset(folder.path());
     let cache = CacheConfig::Disk { folder: folder.path().join("cache"), bytes: 1 << 30 };
     let reader = Counting::open(&path);
@@ -111,7 +112,7 @@ fn disk_cache_serves_later_runs_and_other_processes() {
     reader.decoded();
     let first = with_cache(&reader, &cache);
     assert!(read_all(&*first) == expected && reader.decoded() == 0, "a new run reads the cached rows");
-    // A second cache at the same time has no lock, but reads the existing rows.
+    // A second cache does not get the lock while the first cache exists, but reads the existing rows.
     let second = with_cache(&reader, &cache);
     assert!(read_all(&*second) == expected && reader.decoded() == 0);
     drop((first, second));
@@ -126,7 +127,7 @@ fn disk_cache_serves_later_runs_and_other_processes() {
 
 #[test]
 fn damaged_cache_is_decoded_again() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let (path, rows) = dataset(folder.path());
     let cache = CacheConfig::Disk { folder: folder.path().join("cache"), bytes: 1 << 30 };
     let reader = Counting::open(&path);
@@ -134,25 +135,27 @@ fn damaged_cache_is_decoded_again() {
     reader.decoded();
     let files = || -> Vec<PathBuf> {
         let mut found = vec![];
-        for dataset in std::fs::read_dir(folder.path().join("cache")).expect("the cache").flatten() {
-            found.extend(std::fs::read_dir(dataset.path()).expect("its files").flatten().map(|entry| entry.path()));
+        for dataset in std::fs::read_dir(folder.path().join("cache")).expect("listing the cache").flatten() {
+            found.extend(
+                std::fs::read_dir(dataset.path()).expect("listing a cache folder").flatten().map(|entry| entry.path()),
+            );
         }
         found
     };
     let rows_file = files().into_iter().find(|file| file.extension().is_some_and(|end| end == "rows")).expect("rows");
-    // A bit of the third row flips.
-    let mut bytes = std::fs::read(&rows_file).expect("reads");
+    // Flips a bit of the third row.
+    let mut bytes = std::fs::read(&rows_file).expect("reading a file");
     bytes[2 * IMAGE + 7] ^= 1;
-    std::fs::write(&rows_file, &bytes).expect("writes");
+    std::fs::write(&rows_file, &bytes).expect("writing a file");
     assert!(read_all(&*with_cache(&reader, &cache)) == expected);
     assert_eq!(reader.decoded(), 1);
     assert!(
         read_all(&*with_cache(&reader, &cache)) == expected && reader.decoded() == 0,
         "the damaged row is stored again"
     );
-    // Both files are truncated.
+    // Empties both files.
     for file in files() {
-        std::fs::write(&file, b"").expect("writes");
+        std::fs::write(&file, b"").expect("writing a file");
     }
     assert!(read_all(&*with_cache(&reader, &cache)) == expected);
     assert_eq!(reader.decoded(), rows + 3);

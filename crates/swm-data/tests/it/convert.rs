@@ -1,4 +1,5 @@
-//! Conversion between all formats: resumed, verified, and rejected if the target holds other data.
+//! Conversions between all formats are verified, resumed after an interruption, and rejected if the target holds other
+//! data.
 
 use crate::sample::{check, episode, options, schema, write};
 use rand::Rng as _;
@@ -22,13 +23,13 @@ fn lossless(mode: ConvertMode) -> ConvertOptions {
     ConvertOptions { mode, codec: ImageCodec::Png, ..ConvertOptions::default() }
 }
 
-/// The episodes `0..9` with lossless images.
+/// Writes the episodes `0..9` with lossless images.
 fn source(folder: &Path) -> PathBuf {
     let path = folder.join("source.lance");
     let mut writer = create(&path, &schema(), WriteOptions { codec: ImageCodec::Png, ..options(WriteMode::Create) })
-        .expect("creates");
-    (0..9).for_each(|e| writer.write_episode(&episode(e)).expect("writes"));
-    writer.finish().expect("finishes");
+        .expect("creating the dataset");
+    (0..9).for_each(|e| writer.write_episode(&episode(e)).expect("writing an episode"));
+    writer.finish().expect("finishing the dataset");
     path
 }
 
@@ -42,9 +43,9 @@ fn target_path(folder: &Path, format: &str) -> PathBuf {
 
 #[test]
 fn every_format_preserves_the_content() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = source(folder.path());
-    let from = open(&path).expect("opens");
+    let from = open(&path).expect("opening the dataset");
     let sum = checksum(&*from).expect("a checksum");
     for format in FORMATS.rows.iter().filter(|format| format.is_available()) {
         let target = target_path(folder.path(), format.id);
@@ -52,7 +53,7 @@ fn every_format_preserves_the_content() {
         let report = run(&path, &target, &convert_options).unwrap_or_else(|error| panic!("{}: {error}", format.id));
         assert_eq!((report.episodes, report.existing, report.last_actions), (9, 0, 0), "{}", format.id);
         assert_eq!(report.checksum.as_deref(), Some(&sum[..]), "{}", format.id);
-        let to = format.open(&Location::from(&target)).expect("opens");
+        let to = format.open(&Location::from(&target)).expect("opening the dataset");
         check(&*to, 0);
         assert_eq!(to.manifest().map(|manifest| manifest.seed), from.manifest().map(|manifest| manifest.seed));
         for column in &report.columns {
@@ -63,16 +64,16 @@ fn every_format_preserves_the_content() {
         if report.columns.iter().all(|column| column.exact) {
             assert_eq!(checksum(&*to).expect("a checksum"), sum, "{}", format.id);
         }
-        // Back to the source's format.
+        // Converts back to the source's format.
         let back = folder.path().join(format!("back-{}.lance", format.id));
         run(&target, &back, &lossless(ConvertMode::Create)).unwrap_or_else(|error| panic!("{}: {error}", format.id));
-        check(&*open(&back).expect("opens"), 0);
+        check(&*open(&back).expect("opening the dataset"), 0);
     }
 }
 
 #[test]
 fn lossy_images_must_reach_the_minimum_psnr() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = source(folder.path());
     let jpeg = ConvertOptions { codec: ImageCodec::Jpeg { quality: 95 }, ..ConvertOptions::default() };
     let report = run(&path, &folder.path().join("fine.lance"), &jpeg).expect("a sufficient PSNR");
@@ -83,13 +84,13 @@ fn lossy_images_must_reach_the_minimum_psnr() {
     let error = run(&path, &folder.path().join("strict.lance"), &strict).expect_err("an insufficient PSNR").to_string();
     assert!(error.contains("dB") && error.contains("codec"), "{error}");
     let unverified = ConvertOptions { verify: false, ..strict };
-    let report = run(&path, &folder.path().join("unverified.lance"), &unverified).expect("converts");
+    let report = run(&path, &folder.path().join("unverified.lance"), &unverified).expect("converting the dataset");
     assert!(report.checksum.is_none() && report.columns.is_empty());
 }
 
 #[test]
 fn resumes_a_stopped_conversion_and_rejects_other_targets() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = source(folder.path());
     let target = folder.path().join("target.lance");
     for stop in [1, 4, 9] {
@@ -101,21 +102,23 @@ fn resumes_a_stopped_conversion_and_rejects_other_targets() {
                 flag.store(at.stage == "convert" && at.done >= stop, Ordering::Relaxed);
             }
         });
-        let reader = open(&path).expect("opens");
+        let reader = open(&path).expect("opening the dataset");
         let options = lossless(ConvertMode::Resume);
         let stopped = convert(&reader, &Location::from(&target), &options, &mut control);
         drop(control);
         assert!(matches!(stopped, Err(Error::Interrupted)), "{stopped:?}");
-        assert_eq!(open(&target).expect("opens").episodes().len(), stop, "written episodes remain");
+        assert_eq!(open(&target).expect("opening the dataset").episodes().len(), stop, "written episodes remain");
         assert_eq!(stages.contains(&"compare"), stop > 1);
     }
-    let report = run(&path, &target, &lossless(ConvertMode::Resume)).expect("compares");
+    let report = run(&path, &target, &lossless(ConvertMode::Resume)).expect("comparing the datasets");
     assert_eq!((report.episodes, report.existing, report.rows), (9, 9, 0));
     assert_eq!(
         report.checksum,
-        run(&path, &folder.path().join("whole.lance"), &lossless(ConvertMode::Create)).expect("converts").checksum
+        run(&path, &folder.path().join("whole.lance"), &lossless(ConvertMode::Create))
+            .expect("converting the dataset")
+            .checksum
     );
-    check(&*open(&target).expect("opens"), 0);
+    check(&*open(&target).expect("opening the dataset"), 0);
 
     let other = folder.path().join("other.lance");
     write(&other, WriteMode::Create, 2, 1..3);
@@ -126,10 +129,10 @@ fn resumes_a_stopped_conversion_and_rejects_other_targets() {
     write(&longer, WriteMode::Create, 20, 0..12);
     let error = run(&path, &longer, &lossless(ConvertMode::Resume)).expect_err("a longer target").to_string();
     assert!(error.contains("12 episodes, more than the source's 9"), "{error}");
-    let report = run(&path, &other, &lossless(ConvertMode::Append)).expect("appends");
-    assert_eq!((report.episodes, open(&other).expect("opens").episodes().len()), (11, 11));
-    assert_eq!(run(&path, &other, &lossless(ConvertMode::Overwrite)).expect("overwrites").episodes, 9);
-    check(&*open(&other).expect("opens"), 0);
+    let report = run(&path, &other, &lossless(ConvertMode::Append)).expect("appending to the target");
+    assert_eq!((report.episodes, open(&other).expect("opening the dataset").episodes().len()), (11, 11));
+    assert_eq!(run(&path, &other, &lossless(ConvertMode::Overwrite)).expect("overwriting the target").episodes, 9);
+    check(&*open(&other).expect("opening the dataset"), 0);
 }
 
 /// Environment variable of the child process: the target of the conversion. The source is in the same folder.
@@ -141,35 +144,36 @@ const TARGET: &str = "SWM_TEST_CONVERT_TARGET";
 fn child_that_converts() {
     let Some(target) = std::env::var_os(TARGET).map(PathBuf::from) else { return };
     let commit = CommitPolicy { episodes: 2, ..CommitPolicy::default() };
-    let source = open(target.with_file_name("source.lance")).expect("opens");
+    let source = open(target.with_file_name("source.lance")).expect("opening the dataset");
     let options = ConvertOptions { commit, ..lossless(ConvertMode::Resume) };
     let mut control = Control::new().with_events(|event| {
         if let Event::Progress(at) = event {
             println!("{} {}", at.stage, at.done);
         }
     });
-    let report = convert(&source, &Location::from(&target), &options, &mut control).expect("converts");
-    println!("done {}", report.checksum.expect("verified"));
+    let report = convert(&source, &Location::from(&target), &options, &mut control).expect("converting the dataset");
+    println!("done {}", report.checksum.expect("a checksum"));
 }
 
 #[test]
 fn resumes_a_killed_conversion() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("source.lance");
     write(&path, WriteMode::Create, 40, 0..40);
-    let expected = checksum(&*open(&path).expect("opens")).expect("a checksum");
+    let expected = checksum(&*open(&path).expect("opening the dataset")).expect("a checksum");
     let target = folder.path().join("target.lance");
     let mut rng = Key::new(7).rng();
     let (mut kills, mut finished, mut continued) = (0, 0, false);
     while kills < 50 || finished == 0 {
         let mut command = Command::new(std::env::current_exe().expect("the test executable"));
         command.args(["--exact", "convert::child_that_converts", "--nocapture"]).env(TARGET, &target);
-        let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().expect("starts");
-        let mut lines = BufReader::new(child.stdout.take().expect("a pipe")).lines();
+        let mut child =
+            command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().expect("starting the child process");
+        let mut lines = BufReader::new(child.stdout.take().expect("the output of the child process")).lines();
         // The child is killed after this many lines, unless it finishes earlier.
         let kill_after = if kills < 50 { rng.random_range(0..60) } else { usize::MAX };
         let mut done = None;
-        for line in lines.by_ref().map(|line| line.expect("text")).take(kill_after) {
+        for line in lines.by_ref().map(|line| line.expect("a line of text")).take(kill_after) {
             continued |= line.contains("compare");
             done = line.split_once("done ").map(|(_, checksum)| checksum.trim().to_owned()).or(done);
         }
@@ -178,12 +182,12 @@ fn resumes_a_killed_conversion() {
         kills += usize::from(done.is_none());
         if target.exists() {
             // The target always holds complete episodes, in order.
-            check(&*open(&target).expect("opens"), 0);
+            check(&*open(&target).expect("opening the dataset"), 0);
         }
         if let Some(checksum) = done {
             assert_eq!(checksum, expected);
-            assert_eq!(open(&target).expect("opens").episodes().len(), 40);
-            std::fs::remove_dir_all(&target).expect("removed");
+            assert_eq!(open(&target).expect("opening the dataset").episodes().len(), 40);
+            std::fs::remove_dir_all(&target).expect("removing a folder");
             finished += 1;
         }
     }
@@ -228,30 +232,30 @@ impl Reader for ThirdParty {
 
 #[test]
 fn omits_and_counts_actions_of_last_rows() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let target = folder.path().join("target.lance");
-    let schema = Schema::new([ColumnSpec::new("action", DType::Float32, [1])]).expect("schema");
+    let schema = Schema::new([ColumnSpec::new("action", DType::Float32, [1])]).expect("a valid schema");
     let reader: Arc<dyn Reader> = Arc::new(ThirdParty(schema));
-    let report =
-        convert(&reader, &Location::from(&target), &ConvertOptions::default(), &mut Control::new()).expect("converts");
+    let report = convert(&reader, &Location::from(&target), &ConvertOptions::default(), &mut Control::new())
+        .expect("converting the dataset");
     assert_eq!((report.episodes, report.last_actions), (2, 2));
-    let read = open(&target).expect("opens");
-    let batch: Batch = read.read(&["action"], &[swm_data::StepRange::new(0, 0, 3)]).expect("reads");
+    let read = open(&target).expect("opening the dataset");
+    let batch: Batch = read.read(&["action"], &[swm_data::StepRange::new(0, 0, 3)]).expect("reading rows");
     let actions = batch.get::<f32>("action").expect("actions");
     assert!(actions[..2] == [0.5, 1.5] && actions[2].is_nan());
 }
 
 #[test]
 fn preserves_doubles_or_reports_rounding() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("fine.lance");
-    let schema = Schema::new([ColumnSpec::new("state", DType::Float64, [1])]).expect("schema");
+    let schema = Schema::new([ColumnSpec::new("state", DType::Float64, [1])]).expect("a valid schema");
     let mut batch = Batch::zeros(&schema, 4);
     batch.get_mut::<f64>("state").expect("states").copy_from_slice(&[0.1, -1.0 / 3.0, 1e-9, 7.0]);
     let buffer = swm_data::ReplayBuffer::new(&schema, 10).expect("a buffer");
-    buffer.add(&batch, &swm_data::Constants::new()).expect("adds");
+    buffer.add(&batch, &swm_data::Constants::new()).expect("adding an episode");
     let report = convert(&buffer.snapshot(), &Location::from(&path), &ConvertOptions::default(), &mut Control::new())
-        .expect("converts");
+        .expect("converting the dataset");
     let state = &report.columns[0];
     assert!(state.exact || (state.max_error > 0.0 && state.max_error < 1e-7), "{state:?}");
 }

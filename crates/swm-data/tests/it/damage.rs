@@ -1,6 +1,6 @@
 //! Damaged Lance datasets and images.
 //!
-//! The suite tests several hundred damaged copies of each. Run the tests with many thousand copies with:
+//! The regular tests read several hundred damaged copies. The ignored tests read many thousand copies; run them with
 //! `cargo test --release -p swm-data --test it damage -- --ignored`.
 
 use crate::fuzz;
@@ -8,9 +8,9 @@ use crate::sample::write;
 use std::path::Path;
 use swm_data::{ImageCodec, WriteMode, image, open};
 
-/// Damages each kind of file of a Lance dataset (manifests, data).
+/// Damages copies of a Lance dataset: manifests and data files.
 fn damaged_datasets(cases: u64) {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 2, 0..4);
     let report = fuzz::dataset("lance", &path, cases, fuzz::read_everything);
@@ -34,17 +34,17 @@ fn rejects_ten_thousand_damaged_datasets() {
 
 #[test]
 fn missing_data_files_are_reported() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 2, 0..4);
     for file in fuzz::files(&path.join("data")) {
-        std::fs::remove_file(file).expect("removes");
+        std::fs::remove_file(file).expect("removing a file");
     }
     let reader = open(&path as &Path);
     assert!(reader.is_err_and(|e| e.to_string().contains("damaged or missing")));
 }
 
-/// An image with runs, gradients and noise.
+/// Returns an image of 30 x 40 pixels with runs of equal pixels, gradients and noise.
 fn image() -> Vec<u8> {
     (0..40_u32 * 30 * 3).map(|i| if i / 3 % 40 < 15 { 90 } else { (i * i % 251 % (1 + i / 360)) as u8 }).collect()
 }
@@ -56,7 +56,7 @@ fn damaged_images(cases: u64) {
         [("qoi", ImageCodec::Qoi), ("png", ImageCodec::Png), ("jpeg", ImageCodec::Jpeg { quality: 95 })]
     {
         let mut bytes = vec![];
-        codec.encode(&image(), 30, 40, &mut bytes).expect("encodes");
+        codec.encode(&image(), 30, 40, &mut bytes).expect("encoding an image");
         let report = fuzz::bytes(name, &bytes, cases, |bytes| {
             image::image_size(bytes)?;
             let mut out = vec![0; 30 * 40 * 3];

@@ -96,10 +96,10 @@ const MODELS: [DatasetRequirements; 2] = [
 ];
 
 fn diagnose(reader: &dyn Reader) -> Diagnosis {
-    examine(reader, &MODELS, &mut Control::new()).expect("examines")
+    examine(reader, &MODELS, &mut Control::new()).expect("examining the dataset")
 }
 
-/// The only problem: its description and episodes.
+/// Returns the description and the episodes of the only problem.
 fn problem(diagnosis: &Diagnosis) -> (String, Vec<usize>) {
     let problems: Vec<_> = diagnosis.findings.iter().filter(|found| found.severity == Severity::Problem).collect();
     assert_eq!(problems.len(), 1, "{problems:?}");
@@ -108,10 +108,10 @@ fn problem(diagnosis: &Diagnosis) -> (String, Vec<usize>) {
 
 #[test]
 fn collected_dataset_has_no_findings() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 2, 0..8);
-    let diagnosis = diagnose(&*open(&path).expect("opens"));
+    let diagnosis = diagnose(&*open(&path).expect("opening the dataset"));
     assert_eq!((diagnosis.problems(), diagnosis.findings.len(), diagnosis.intact.len()), (0, 0, 8), "{diagnosis:?}");
     assert_eq!(diagnosis.rows, (0..8).map(rows).sum::<usize>());
     // The longest episode, with eleven rows, is shorter than a clip of the world model.
@@ -123,7 +123,7 @@ fn collected_dataset_has_no_findings() {
 #[test]
 fn finds_a_repeated_episode_index_in_a_table() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop/broken.lance");
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     let diagnosis = diagnose(&*reader);
     let problems: Vec<_> = diagnosis.findings.iter().filter(|found| found.severity == Severity::Problem).collect();
     assert!(problems.iter().all(|found| found.episodes == [1]), "{problems:?}");
@@ -136,7 +136,7 @@ fn finds_a_repeated_episode_index_in_a_table() {
 #[cfg(feature = "hdf5")]
 fn finds_restarting_steps_and_shared_rows_in_an_hdf5_file() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop/broken.h5");
-    let diagnosis = diagnose(&*open(&path).expect("opens"));
+    let diagnosis = diagnose(&*open(&path).expect("opening the dataset"));
     let problems_of = |episode: usize| {
         let here = |found: &&Finding| found.severity == Severity::Problem && found.episodes.contains(&episode);
         diagnosis.findings.iter().filter(here).map(|found| found.what.clone()).collect::<Vec<_>>()
@@ -152,15 +152,15 @@ fn finds_restarting_steps_and_shared_rows_in_an_hdf5_file() {
 
 #[test]
 fn repairs_the_readable_part_of_a_table() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 2, 0..8);
     // One of the four data files is truncated, so the table does not open.
-    let data = std::fs::read_dir(path.join("data")).expect("a folder").flatten();
+    let data = std::fs::read_dir(path.join("data")).expect("listing a folder").flatten();
     let mut files: Vec<_> = data.map(|entry| entry.path()).collect();
     files.sort();
-    let bytes = std::fs::read(&files[1]).expect("reads");
-    std::fs::write(&files[1], &bytes[..bytes.len() / 2]).expect("writes");
+    let bytes = std::fs::read(&files[1]).expect("reading a file");
+    std::fs::write(&files[1], &bytes[..bytes.len() / 2]).expect("writing a file");
     let location = Location::from(&path);
     assert!(open(&location).is_err());
     let (reader, lost) = open_damaged(&location).expect("the readable part");
@@ -170,18 +170,19 @@ fn repairs_the_readable_part_of_a_table() {
     diagnosis.add_losses(lost);
     assert_eq!(diagnosis.problems(), 1);
     let target = Location::from(folder.path().join("repaired.lance"));
-    repair(&reader, &diagnosis, &target, &ConvertOptions::default(), &mut Control::new()).expect("repairs");
-    let repaired = open(&target).expect("opens");
+    repair(&reader, &diagnosis, &target, &ConvertOptions::default(), &mut Control::new())
+        .expect("repairing the dataset");
+    let repaired = open(&target).expect("opening the dataset");
     assert_eq!((diagnose(&*repaired).problems(), repaired.episodes().len()), (0, 6));
     // If no part can be opened, `open_damaged` returns the error of `open`.
-    files.iter().for_each(|file| std::fs::write(file, b"").expect("writes"));
+    files.iter().for_each(|file| std::fs::write(file, b"").expect("writing a file"));
     assert!(open_damaged(&location).map(|(reader, _)| reader.episodes().len()).unwrap_or(0) == 0);
     assert!(open_damaged(&Location::from(folder.path().join("nothing.lance"))).is_err());
 }
 
 #[test]
 #[allow(clippy::too_many_lines, reason = "a table of defects")]
-fn finds_each_defect_in_its_episode() {
+fn reports_the_episodes_of_each_defect() {
     type Breaking = fn(usize, &mut Batch);
     let breaks: [(&str, Breaking); 7] = [
         ("'reward' has a value that is not finite", |e, rows| {
@@ -234,7 +235,7 @@ fn finds_each_defect_in_its_episode() {
     let mut broken = Broken::new(4, |_, _| {});
     broken.episodes[3].index = 1;
     let (what, episodes) = problem(&diagnose(&broken));
-    assert!(what.contains("the index 1 is also that of another episode") && episodes == [3], "{what}");
+    assert!(what.contains("the index 1 is also the index of another episode") && episodes == [3], "{what}");
     let mut broken = Broken::new(4, |_, _| {});
     broken.irregular = vec![Irregularity { episode: None, what: "3 rows belong to no episode".to_owned() }];
     let diagnosis = diagnose(&broken);
@@ -264,7 +265,7 @@ fn unusual_but_intact_data_gives_a_note() {
     assert!(notes(single)[0].contains("no step"));
     let mut without = Broken::new(3, |_, _| {});
     let columns: Vec<ColumnSpec> = schema().columns().iter().filter(|c| c.name != "reward").cloned().collect();
-    let schema = Schema::new(columns).expect("schema");
+    let schema = Schema::new(columns).expect("a valid schema");
     without.rows = without.rows.iter().map(|rows| without_reward(&schema, rows)).collect();
     without.schema = Some(schema);
     let diagnosis = diagnose(&without);
@@ -284,14 +285,14 @@ fn without_reward(schema: &Schema, rows: &Batch) -> Batch {
 
 #[test]
 fn repair_writes_the_intact_episodes() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let target = folder.path().join("repaired.lance");
     let broken = Broken::new(6, |e, rows| {
         if e == 1 {
             rows.get_mut::<f32>("reward").expect("rewards").fill(f32::NAN);
         }
         if e == 4 {
-            // Repeated step indices, as after two writers used the same episode index.
+            // Repeated step indices, as if two writers had used the same episode index.
             rows.get_mut::<i64>("step_idx").expect("steps").fill(0);
         }
     });
@@ -301,12 +302,13 @@ fn repair_writes_the_intact_episodes() {
     let diagnosis = diagnose(&*reader);
     assert_eq!((diagnosis.problems(), &diagnosis.intact[..]), (3, &[0, 3, 5][..]));
     let to = Location::from(&target);
-    let report = repair(&reader, &diagnosis, &to, &ConvertOptions::default(), &mut Control::new()).expect("repairs");
+    let report = repair(&reader, &diagnosis, &to, &ConvertOptions::default(), &mut Control::new())
+        .expect("repairing the dataset");
     assert_eq!(report.episodes, 3);
-    let repaired = open(&target).expect("opens");
+    let repaired = open(&target).expect("opening the dataset");
     assert_eq!(diagnose(&*repaired).problems(), 0);
     for (position, e) in [0, 3, 5].into_iter().enumerate() {
-        let read = repaired.read(&["state"], &[StepRange::new(position, 0, rows(e))]).expect("reads");
+        let read = repaired.read(&["state"], &[StepRange::new(position, 0, rows(e))]).expect("reading rows");
         assert_eq!(read.bytes(0), episode(e).bytes(2));
     }
     let unrepairable: Arc<dyn Reader> = Arc::new(Broken::new(2, |_, rows| rows.resize(0)));

@@ -22,13 +22,13 @@ fn killed_writer_keeps_committed_episodes() {
 }
 
 #[test]
-#[ignore = "a minute"]
+#[ignore = "takes a minute"]
 fn writer_killed_50_times_keeps_committed_episodes() {
     format_suite::killed("d.folder", 50);
 }
 
 fn damaged(cases: u64) {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.folder");
     format_suite::write(&path, WriteMode::Create, 0..3);
     let report = fuzz::dataset("folder", &path, cases, fuzz::read_everything);
@@ -44,32 +44,31 @@ fn rejects_damaged_folders() {
 }
 
 #[test]
-#[ignore = "minutes"]
+#[ignore = "takes minutes"]
 fn rejects_folders_damaged_in_10000_ways() {
     damaged(10_000);
 }
 
 #[test]
-fn rejects_damaged_leftovers_of_an_interrupted_writer() {
-    // The folder holds a journal, and column files without rows.
-    let folder = tempfile::tempdir().expect("a folder");
+fn rejects_damaged_journals() {
+    // The unfinished writer leaves a journal, and column files without rows.
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.folder");
-    let mut writer = format_suite::writer(&path, WriteMode::Create).expect("creates");
-    (0..4).for_each(|e| writer.write_episode(&sample::episode(e)).expect("writes"));
+    let mut writer = format_suite::writer(&path, WriteMode::Create).expect("creating the dataset");
+    (0..4).for_each(|e| writer.write_episode(&sample::episode(e)).expect("writing an episode"));
     let journal = std::fs::read(path.join("ep_len.journal")).expect("a journal");
-    let whole = open(&path).expect("opens").episodes().len();
-    assert_eq!(whole, 4);
+    assert_eq!(open(&path).expect("opening the dataset").episodes().len(), 4);
     let copy = folder.path().join("copy.folder");
     fuzz::copy_all(&path, &copy);
     let read = |bytes: &[u8]| {
-        std::fs::write(copy.join("ep_len.journal"), bytes).expect("writes");
+        std::fs::write(copy.join("ep_len.journal"), bytes).expect("writing a file");
         open(&copy)?;
         fuzz::read_everything(&copy)
     };
     let report = fuzz::bytes("journal", &journal, 300, read);
     assert!(report.refused > 30, "{report:?}");
-    for cut in (0..journal.len()).step_by(journal.len() / 40) {
-        std::fs::write(copy.join("ep_len.journal"), &journal[..cut]).expect("writes");
+    for length in (0..journal.len()).step_by(journal.len() / 40) {
+        std::fs::write(copy.join("ep_len.journal"), &journal[..length]).expect("writing a file");
         let reader = open(&copy).expect("the complete records");
         assert!(reader.episodes().len() < 4);
         format_suite::check(&*reader, 0);
@@ -83,13 +82,13 @@ fn interop(name: &str) -> PathBuf {
 #[test]
 fn reads_but_does_not_append_to_a_folder_of_the_reference() {
     let path = interop("folder-reference");
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     let lengths: Vec<usize> = reader.episodes().iter().map(|episode| episode.length).collect();
     assert_eq!(lengths, [2, 3]);
     let names: Vec<&str> = reader.schema().columns()[2..].iter().map(|column| &*column.name).collect();
     assert_eq!(names, ["action", "pixels", "reward", "small", "variation.agent"], "text columns are skipped");
     let all = [StepRange::new(0, 0, 2), StepRange::new(1, 0, 3)];
-    let read = reader.read(&names, &all).expect("reads");
+    let read = reader.read(&names, &all).expect("reading rows");
     for t in 0..5 {
         let row = read.row(t);
         let values = |name: &str| row.to_f64(name).expect("values");
@@ -108,27 +107,27 @@ fn reads_but_does_not_append_to_a_folder_of_the_reference() {
     }
     assert!(reader.manifest().is_none() && reader.constants(1).expect("constants").is_empty());
 
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let copy = folder.path().join("copy.folder");
     fuzz::copy_all(&path, &copy);
-    let schema = Schema::new(reader.schema().columns()[2..].to_vec()).expect("schema");
+    let schema = Schema::new(reader.schema().columns()[2..].to_vec()).expect("a valid schema");
     let options = || WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() };
     let error = create(&copy, &schema, options()).err().expect("a text column").to_string();
     assert!(error.contains("'task'"), "{error}");
-    std::fs::remove_file(copy.join("task.npz")).expect("removes");
-    let mut writer = create(&copy, &schema, options()).expect("continues");
-    let mut episode = reader.read(&names, &[StepRange::new(1, 0, 3)]).expect("reads");
+    std::fs::remove_file(copy.join("task.npz")).expect("removing a file");
+    let mut writer = create(&copy, &schema, options()).expect("continuing the dataset");
+    let mut episode = reader.read(&names, &[StepRange::new(1, 0, 3)]).expect("reading rows");
     episode = {
         let mut batch = Batch::zeros(&schema, 3);
         (0..names.len()).for_each(|at| batch.bytes_mut(at).copy_from_slice(episode.bytes(at)));
         batch
     };
-    writer.write_episode(&episode).expect("writes");
-    writer.finish().expect("finishes");
-    let continued = open(&copy).expect("opens");
+    writer.write_episode(&episode).expect("writing an episode");
+    writer.finish().expect("finishing the dataset");
+    let continued = open(&copy).expect("opening the dataset");
     assert_eq!(continued.episodes().len(), 3);
-    let read = continued.read(&names, &[StepRange::new(2, 0, 3), StepRange::new(0, 0, 2)]).expect("reads");
-    let before = reader.read(&names, &[StepRange::new(1, 0, 3), StepRange::new(0, 0, 2)]).expect("reads");
+    let read = continued.read(&names, &[StepRange::new(2, 0, 3), StepRange::new(0, 0, 2)]).expect("reading rows");
+    let before = reader.read(&names, &[StepRange::new(1, 0, 3), StepRange::new(0, 0, 2)]).expect("reading rows");
     (0..names.len()).for_each(|at| assert!(read.bytes(at) == before.bytes(at), "{}", names[at]));
 }
 
@@ -138,12 +137,12 @@ fn reference_reads_folders_written_here() {
         println!("SKIPPED: set SWM_REFERENCE_PYTHON to a Python with stable-worldmodel");
         return;
     };
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("ours.folder");
     format_suite::write(&path, WriteMode::Create, 0..5);
     format_suite::write(&path, WriteMode::Append, 5..8);
     let output =
-        Command::new(python).arg("-B").arg(interop("folder_check.py")).arg(&path).output().expect("Python runs");
+        Command::new(python).arg("-B").arg(interop("folder_check.py")).arg(&path).output().expect("running Python");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let seen: Value = serde_json::from_slice(&output.stdout).expect("JSON");
     assert_eq!(seen["lengths"], serde_json::json!((0..8).map(sample::rows).collect::<Vec<_>>()));
@@ -151,7 +150,7 @@ fn reference_reads_folders_written_here() {
     let mut names: Vec<String> = sample::schema().columns().iter().map(|column| column.name.clone()).collect();
     names.sort();
     assert_eq!(seen["columns"], serde_json::json!(names));
-    // The last clip: rows of the last episode.
+    // The last clip consists of rows of the last episode.
     let first = sample::rows(7) - 4;
     assert_eq!(seen["state"], serde_json::json!([[7.0, first as f64, -0.5], [7.0, first as f64 + 2.0, -0.5]]));
     let last = sample::episode(7);

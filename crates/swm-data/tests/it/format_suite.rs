@@ -20,18 +20,18 @@ pub fn writer(location: impl Into<Location>, mode: WriteMode) -> Result<Box<dyn 
     create(location, &schema(), WriteOptions { mode, codec: ImageCodec::Png, manifest: Some(manifest(3)), commit })
 }
 
-/// A scene that every third episode shares, and a unique note.
+/// The constants of episode `e`: a scene that every third episode shares, and a unique note.
 fn constants(e: usize) -> Constants {
     let scene = format!("<mujoco model='{}'/>", e % 3);
     Constants::from([("scene.xml".to_owned(), scene.into_bytes()), ("note".to_owned(), vec![e as u8; e])])
 }
 
 pub fn write(path: &Path, mode: WriteMode, episodes: std::ops::Range<usize>) {
-    let mut writer = writer(path, mode).expect("creates");
+    let mut writer = writer(path, mode).expect("creating the dataset");
     for e in episodes {
-        writer.write_episode_with(&episode(e), &constants(e)).expect("writes");
+        writer.write_episode_with(&episode(e), &constants(e)).expect("writing an episode");
     }
-    writer.finish().expect("finishes");
+    writer.finish().expect("finishing the dataset");
 }
 
 /// Checks that the dataset holds exactly the episodes `first..`, bit for bit.
@@ -40,7 +40,7 @@ pub fn check(reader: &dyn Reader, first: usize) {
     for (position, stored) in reader.episodes().iter().enumerate() {
         let expected = episode(first + position);
         assert_eq!((stored.index, stored.length), (position as i64, expected.rows()));
-        let read = reader.read(&names, &[StepRange::new(position, 0, stored.length)]).expect("reads");
+        let read = reader.read(&names, &[StepRange::new(position, 0, stored.length)]).expect("reading rows");
         for (column, name) in names.iter().enumerate() {
             assert!(read.bytes(column) == expected.bytes(column), "{name} of episode {position}");
         }
@@ -49,13 +49,13 @@ pub fn check(reader: &dyn Reader, first: usize) {
 
 fn check_constants(reader: &dyn Reader, first: usize) {
     for position in 0..reader.episodes().len() {
-        assert_eq!(reader.constants(position).expect("reads"), constants(first + position));
+        assert_eq!(reader.constants(position).expect("reading constants"), constants(first + position));
     }
 }
 
-/// Runs all tests except those that kill processes.
+/// Runs all tests except the tests that kill processes.
 pub fn all(name: &str) {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join(name);
     check_write_modes(&path);
     reads_rows_in_any_order(&path);
@@ -69,10 +69,10 @@ pub fn all(name: &str) {
 
 fn check_write_modes(path: &Path) {
     write(path, WriteMode::Create, 0..5);
-    let reader = open(path).expect("opens");
+    let reader = open(path).expect("opening the dataset");
     assert_eq!(reader.episodes().len(), 5);
     assert_eq!(reader.schema().columns()[0], ColumnSpec::new("episode_idx", DType::Int32, []));
-    assert_eq!(reader.schema().column("step_idx").expect("a column").dtype, DType::Int64, "as it was declared");
+    assert_eq!(reader.schema().column("step_idx").expect("a column").dtype, DType::Int64, "the declared type");
     let data_columns = |columns: &[ColumnSpec]| -> Vec<ColumnSpec> {
         columns.iter().filter(|column| !column.name.ends_with("_idx")).cloned().collect()
     };
@@ -80,35 +80,39 @@ fn check_write_modes(path: &Path) {
     check(&*reader, 0);
     check_constants(&*reader, 0);
     assert_eq!(reader.manifest(), Some(manifest(3)));
-    let parts = reader.footprint().expect("lists");
+    let parts = reader.footprint().expect("listing the files");
     assert!(parts.iter().any(|(part, size)| part == "pixels" && *size > 0), "{parts:?}");
-    let five = reader.content_hash().expect("hashes");
+    let hash = reader.content_hash().expect("hashing the content");
 
     let error = writer(path, WriteMode::Create).err().expect("an existing dataset").to_string();
     assert!(error.contains("exists already") && error.contains("append"), "{error}");
     write(path, WriteMode::Append, 5..9);
-    let reader = open(path).expect("opens");
+    let reader = open(path).expect("opening the dataset");
     assert_eq!(reader.episodes().len(), 9);
     check(&*reader, 0);
     check_constants(&*reader, 0);
-    assert_ne!(reader.content_hash().expect("hashes"), five);
+    assert_ne!(reader.content_hash().expect("hashing the content"), hash);
 
-    let few = Schema::new(schema().columns()[..3].to_vec()).expect("schema");
+    let few = Schema::new(schema().columns()[..3].to_vec()).expect("a valid schema");
     let options = WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() };
     let error = create(path, &few, options).err().expect("other columns").to_string();
     assert!(error.contains("variation.agent.color") && error.contains("the columns it has"), "{error}");
 
     write(path, WriteMode::Overwrite, 3..5);
-    let reader = open(path).expect("opens");
+    let reader = open(path).expect("opening the dataset");
     assert_eq!(reader.episodes().len(), 2);
     check(&*reader, 3);
     check_constants(&*reader, 3);
     write(path, WriteMode::Overwrite, 0..5);
-    assert_eq!(open(path).expect("opens").content_hash().expect("hashes"), five, "equal content has equal hashes");
+    assert_eq!(
+        open(path).expect("opening the dataset").content_hash().expect("hashing the content"),
+        hash,
+        "equal content has equal hashes"
+    );
 }
 
 fn reads_rows_in_any_order(path: &Path) {
-    let reader = open(path).expect("opens");
+    let reader = open(path).expect("opening the dataset");
     let ranges = [
         StepRange::new(3, 2, 4),
         StepRange::new(0, 4, 1),
@@ -117,7 +121,7 @@ fn reads_rows_in_any_order(path: &Path) {
         StepRange::new(0, 0, 0),
     ];
     let names = ["pixels", "state", "episode_idx", "step_idx", "success"];
-    let read = reader.read(&names, &ranges).expect("reads");
+    let read = reader.read(&names, &ranges).expect("reading rows");
     let rows: Vec<(usize, usize)> =
         ranges.iter().flat_map(|range| (range.start..range.start + range.length).map(|t| (range.episode, t))).collect();
     assert_eq!(read.rows(), rows.len());
@@ -138,22 +142,28 @@ fn reads_rows_in_any_order(path: &Path) {
 }
 
 fn rejects_invalid_episodes(path: &Path) {
-    let mut writer = writer(path, WriteMode::Append).expect("continues");
+    let mut writer = writer(path, WriteMode::Append).expect("continuing the dataset");
     let mut missing = episode(0);
     let last = missing.rows() - 1;
     missing.row_mut(last).set(1, &[0.5_f32, 0.5]);
-    assert!(writer.write_episode(&missing).expect_err("an action").to_string().contains("final observation"));
+    assert!(
+        writer
+            .write_episode(&missing)
+            .expect_err("an action in the last row")
+            .to_string()
+            .contains("final observation")
+    );
     let empty = Batch::zeros(&schema(), 0);
-    assert!(writer.write_episode(&empty).expect_err("empty").to_string().contains("without rows"));
-    let few = Batch::zeros(&Schema::new(schema().columns()[1..].to_vec()).expect("schema"), 3);
-    assert!(writer.write_episode(&few).expect_err("no pixels").to_string().contains("pixels"));
+    assert!(writer.write_episode(&empty).expect_err("an episode without rows").to_string().contains("without rows"));
+    let few = Batch::zeros(&Schema::new(schema().columns()[1..].to_vec()).expect("a valid schema"), 3);
+    assert!(writer.write_episode(&few).expect_err("an episode without pixels").to_string().contains("pixels"));
     assert_eq!(writer.episodes(), 5, "the writer stores no invalid episode");
-    writer.finish().expect("finishes");
-    assert_eq!(open(path).expect("opens").episodes().len(), 5);
+    writer.finish().expect("finishing the dataset");
+    assert_eq!(open(path).expect("opening the dataset").episodes().len(), 5);
 }
 
 fn rejects_a_second_writer(path: &Path) {
-    let first = writer(path, WriteMode::Create).expect("creates");
+    let first = writer(path, WriteMode::Create).expect("creating the dataset");
     for mode in [WriteMode::Append, WriteMode::Overwrite] {
         let error = writer(path, mode).err().expect("another writer").to_string();
         assert!(error.contains("another process writes"), "{error}");
@@ -163,18 +173,18 @@ fn rejects_a_second_writer(path: &Path) {
 }
 
 fn reads_committed_episodes_during_writing(path: &Path) {
-    let mut writer = writer(path, WriteMode::Create).expect("creates");
-    assert_eq!(open(path).expect("opens").episodes().len(), 0);
+    let mut writer = writer(path, WriteMode::Create).expect("creating the dataset");
+    assert_eq!(open(path).expect("opening the dataset").episodes().len(), 0);
     for e in 0..7 {
-        writer.write_episode_with(&episode(e), &constants(e)).expect("writes");
-        let reader = open(path).expect("opens");
+        writer.write_episode_with(&episode(e), &constants(e)).expect("writing an episode");
+        let reader = open(path).expect("opening the dataset");
         let committed = (e + 1) / GROUP * GROUP;
         assert_eq!(reader.episodes().len(), committed);
         check(&*reader, 0);
         check_constants(&*reader, 0);
     }
     drop(writer);
-    let reader = open(path).expect("opens");
+    let reader = open(path).expect("opening the dataset");
     assert_eq!(reader.episodes().len(), 7, "dropping the writer commits the remaining episodes");
     check(&*reader, 0);
 }
@@ -188,36 +198,36 @@ fn numeric_types_round_trip(path: &Path) {
             shapes.map(|shape| ColumnSpec::new(format!("{}{}", dtype.name(), shape.len()), *dtype, shape))
         })
         .collect();
-    let schema = Schema::new(specs).expect("schema");
+    let schema = Schema::new(specs).expect("a valid schema");
     let mut batch = Batch::zeros(&schema, 300);
     for (index, column) in schema.columns().iter().enumerate() {
         let limit = if column.dtype == DType::Bool { 2 } else { 251 };
         batch.bytes_mut(index).iter_mut().enumerate().for_each(|(i, byte)| *byte = ((i * 7 + index) % limit) as u8);
     }
-    let mut writer = create(path, &schema, WriteOptions::default()).expect("creates");
-    writer.write_episode(&batch).expect("writes");
-    writer.write_episode(&batch).expect("writes");
-    writer.finish().expect("finishes");
-    let reader = open(path).expect("opens");
+    let mut writer = create(path, &schema, WriteOptions::default()).expect("creating the dataset");
+    writer.write_episode(&batch).expect("writing an episode");
+    writer.write_episode(&batch).expect("writing an episode");
+    writer.finish().expect("finishing the dataset");
+    let reader = open(path).expect("opening the dataset");
     assert_eq!(reader.schema().columns()[2..], *schema.columns());
     let names: Vec<&str> = schema.columns().iter().map(|column| &*column.name).collect();
-    let read = reader.read(&names, &[StepRange::new(1, 0, 300)]).expect("reads");
+    let read = reader.read(&names, &[StepRange::new(1, 0, 300)]).expect("reading rows");
     (0..names.len()).for_each(|column| assert!(read.bytes(column) == batch.bytes(column), "{}", names[column]));
 }
 
-/// Kills a writer at random times, drawn with a fixed key. All committed episodes must be readable, and the next writer
-/// continues.
-pub fn killed(name: &str, moments: u64) {
-    let folder = tempfile::tempdir().expect("a folder");
+/// Kills `kills` writers at random times, drawn with a fixed key. All committed episodes must be readable, and the next
+/// writer continues.
+pub fn killed(name: &str, kills: u64) {
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join(name);
     let mut stored = 0;
-    for moment in 0..moments {
-        let mut rng = Key::new(5).with(name).at(moment).rng();
-        let mut child = child(&path).spawn().expect("starts");
-        let mut lines = BufReader::new(child.stdout.take().expect("a pipe")).lines();
+    for kill in 0..kills {
+        let mut rng = Key::new(5).with(name).at(kill).rng();
+        let mut child = child(&path).spawn().expect("starting the child process");
+        let mut lines = BufReader::new(child.stdout.take().expect("the output of the child process")).lines();
         let mut last = None;
         for _ in 0..rng.random_range(0..12) {
-            let line = lines.next().expect("another line").expect("text");
+            let line = lines.next().expect("another line").expect("a line of text");
             last = line.rsplit_once("episode ").map(|(_, e)| e.parse::<usize>().expect("a number")).or(last);
         }
         // Waits for a random time.
@@ -225,16 +235,16 @@ pub fn killed(name: &str, moments: u64) {
         while Instant::now() < until {
             std::hint::spin_loop();
         }
-        child.kill().expect("kills the child");
+        child.kill().expect("killing the child process");
         child.wait().expect("an exit status");
         let now = match open(&path) {
             Ok(reader) => {
-                // With a tolerance, because the child stores JPEG in formats that encode images.
+                // Compares with a tolerance, because the child stores JPEG in formats that encode images.
                 sample::check(&*reader, 0);
                 reader.episodes().len()
             }
             Err(error) => {
-                assert!(stored == 0 && last.is_none(), "moment {moment}: {error}");
+                assert!(stored == 0 && last.is_none(), "kill {kill}: {error}");
                 0
             }
         };
@@ -242,20 +252,20 @@ pub fn killed(name: &str, moments: u64) {
         let reported = last.map_or(0, |last| last + 1);
         assert!(
             now >= stored && now + 3 > reported,
-            "moment {moment}: {now} episodes after {stored}; {reported} were written"
+            "kill {kill}: {now} episodes after {stored}; {reported} were written"
         );
         stored = now;
     }
     assert!(stored > 0, "no episode was committed");
-    let mut writer = writer(&path, WriteMode::Append).expect("continues");
-    writer.write_episode(&episode(stored)).expect("writes");
-    writer.finish().expect("finishes");
-    let reader = open(&path).expect("opens");
+    let mut writer = writer(&path, WriteMode::Append).expect("continuing the dataset");
+    writer.write_episode(&episode(stored)).expect("writing an episode");
+    writer.finish().expect("finishing the dataset");
+    let reader = open(&path).expect("opening the dataset");
     assert_eq!(reader.episodes().len(), stored + 1);
     sample::check(&*reader, 0);
 }
 
-/// A process that writes episodes until it is killed.
+/// The command of a child process that writes episodes until it is killed.
 fn child(path: &Path) -> Command {
     let program: PathBuf = std::env::current_exe().expect("the test executable");
     let mut command = Command::new(program);

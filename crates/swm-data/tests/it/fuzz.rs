@@ -39,49 +39,49 @@ pub struct Report {
     pub changed: Vec<String>,
 }
 
-/// The only case to run, if `SWM_FUZZ_CASE` names one.
-fn only() -> Option<u64> {
+/// The case that the environment variable `SWM_FUZZ_CASE` selects, if set.
+fn selected_case() -> Option<u64> {
     std::env::var("SWM_FUZZ_CASE").ok().map(|case| case.parse().expect("SWM_FUZZ_CASE is the number of a case"))
 }
 
 /// Damages one file of a copy of a dataset (a file or a folder) per case. Every kind of file (by folder and suffix)
-/// gets an equal number of cases. `read` opens a dataset and returns its content, as [`read_everything`] does.
+/// gets an equal number of cases. `read` opens a dataset and returns the content, as [`read_everything`] does.
 pub fn dataset<T: PartialEq>(name: &str, intact: &Path, cases: u64, read: impl Fn(&Path) -> Result<T>) -> Report {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let copy = folder.path().join(intact.file_name().expect("a name"));
     copy_all(intact, &copy);
     let kinds = kinds(&copy);
     let all: Vec<&PathBuf> = kinds.iter().flatten().collect();
-    let expected = read(&copy).expect("the intact dataset is read");
+    let expected = read(&copy).expect("reading the intact dataset");
     run(name, cases, &expected, |case, rng| {
         let kind = &kinds[case as usize % kinds.len()];
         let file = &kind[rng.random_range(0..kind.len())];
-        let bytes = std::fs::read(file).expect("reads");
+        let bytes = std::fs::read(file).expect("reading a file");
         let other = all[rng.random_range(0..all.len())];
         let change = match rng.random_range(0..16) {
             0 => {
-                std::fs::remove_file(file).expect("removes");
+                std::fs::remove_file(file).expect("removing a file");
                 "removed".to_owned()
             }
             1 if other != file => {
-                std::fs::copy(other, file).expect("copies");
+                std::fs::copy(other, file).expect("copying a file");
                 format!("replaced by {}", other.display())
             }
             _ => {
                 let (damaged, change) = damage(rng, &bytes);
-                std::fs::write(file, damaged).expect("writes");
+                std::fs::write(file, damaged).expect("writing a file");
                 change
             }
         };
         let change = format!("{} {change}", file.strip_prefix(folder.path()).unwrap_or(file).display());
-        let restore = move || std::fs::write(file, &bytes).expect("writes");
+        let restore = move || std::fs::write(file, &bytes).expect("writing a file");
         (change, || read(&copy), restore)
     })
 }
 
 /// Damages copies of a byte string, such as an encoded image.
 pub fn bytes<T: PartialEq>(name: &str, intact: &[u8], cases: u64, read: impl Fn(&[u8]) -> Result<T>) -> Report {
-    let expected = read(intact).expect("the intact bytes are read");
+    let expected = read(intact).expect("reading the intact bytes");
     run(name, cases, &expected, |_, rng| {
         let (damaged, change) = damage(rng, intact);
         let read = &read;
@@ -170,7 +170,7 @@ fn random_offset(rng: &mut Rng, len: usize) -> usize {
 }
 
 /// Runs the cases that `prepare` returns: a description, a function that reads the damaged copy, and a function that
-/// restores it.
+/// restores the copy.
 fn run<T: PartialEq, R: FnOnce() -> Result<T>, C: FnOnce()>(
     name: &str,
     cases: u64,
@@ -178,12 +178,12 @@ fn run<T: PartialEq, R: FnOnce() -> Result<T>, C: FnOnce()>(
     prepare: impl Fn(u64, &mut Rng) -> (String, R, C),
 ) -> Report {
     // Only one fuzz test runs at a time, because allocations are recorded for all threads.
-    static ONE: Mutex<()> = Mutex::new(());
-    let _one = ONE.lock().unwrap_or_else(PoisonError::into_inner);
+    static LOCK: Mutex<()> = Mutex::new(());
+    let _lock = LOCK.lock().unwrap_or_else(PoisonError::into_inner);
     let mut report = Report::default();
     let (progress, watched) = channel();
     let watchdog = std::thread::spawn(move || watch(&watched));
-    for case in only().map_or(0..cases, |case| case..case + 1) {
+    for case in selected_case().map_or(0..cases, |case| case..case + 1) {
         let (change, read, restore) = prepare(case, &mut Key::new(0).with(name).at(case).rng());
         let change = format!("{name}, SWM_FUZZ_CASE={case}: {change}");
         progress.send(change.clone()).expect("a running watchdog");
@@ -202,11 +202,11 @@ fn run<T: PartialEq, R: FnOnce() -> Result<T>, C: FnOnce()>(
         restore();
     }
     drop(progress);
-    watchdog.join().expect("the watchdog ends");
+    watchdog.join().expect("joining the watchdog");
     report
 }
 
-/// Aborts the process and names the case if it takes too long, because a hanging thread cannot be stopped.
+/// Aborts the process and names the case if the case takes too long, because a hanging thread cannot be stopped.
 fn watch(cases: &Receiver<String>) {
     let mut current = String::new();
     loop {
@@ -236,7 +236,7 @@ pub fn files(path: &Path) -> Vec<PathBuf> {
     if path.is_file() {
         return vec![path.to_owned()];
     }
-    let entries = std::fs::read_dir(path).expect("a folder");
+    let entries = std::fs::read_dir(path).expect("listing a folder");
     let mut found: Vec<PathBuf> = entries.flat_map(|entry| files(&entry.expect("an entry").path())).collect();
     found.sort();
     found
@@ -249,12 +249,12 @@ pub fn copy_all(from: &Path, to: &Path) {
             Ok(rest) if !rest.as_os_str().is_empty() => to.join(rest),
             _ => to.to_owned(),
         };
-        std::fs::create_dir_all(target.parent().expect("a folder")).expect("a folder");
-        std::fs::copy(&file, &target).expect("copies");
+        std::fs::create_dir_all(target.parent().expect("a folder")).expect("creating a folder");
+        std::fs::copy(&file, &target).expect("copying a file");
     }
 }
 
-/// Size of the largest allocation since this was last 0, on any thread, because readers use threads of their own. No
+/// Size in bytes of the largest allocation since the last reset to 0, on any thread, because readers start threads. No
 /// other test of this program allocates as much.
 static LARGEST: AtomicUsize = AtomicUsize::new(0);
 
@@ -266,24 +266,24 @@ struct RecordingAllocator;
 unsafe impl GlobalAlloc for RecordingAllocator {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         LARGEST.fetch_max(layout.size(), Ordering::Relaxed);
-        // SAFETY: the caller upholds the contract of this function, which is that of the system allocator.
+        // SAFETY: the caller upholds the contract of this function, which equals the contract of the system allocator.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
         LARGEST.fetch_max(layout.size(), Ordering::Relaxed);
-        // SAFETY: the caller upholds the contract of this function, which is that of the system allocator.
+        // SAFETY: the caller upholds the contract of this function, which equals the contract of the system allocator.
         unsafe { System.alloc_zeroed(layout) }
     }
 
     unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
         LARGEST.fetch_max(size, Ordering::Relaxed);
-        // SAFETY: the caller upholds the contract of this function, which is that of the system allocator.
+        // SAFETY: the caller upholds the contract of this function, which equals the contract of the system allocator.
         unsafe { System.realloc(pointer, layout, size) }
     }
 
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller upholds the contract of this function, which is that of the system allocator.
+        // SAFETY: the caller upholds the contract of this function, which equals the contract of the system allocator.
         unsafe { System.dealloc(pointer, layout) }
     }
 }

@@ -1,4 +1,4 @@
-//! Goals are drawn with every clip and are reproducible.
+//! The loader draws goals with every clip, reproducibly.
 
 use crate::sample::{rows, write};
 use std::sync::Arc;
@@ -28,10 +28,10 @@ fn config(goals: &[(&str, GoalMixture)]) -> LoaderConfig {
 
 #[test]
 fn goals_are_rows_of_the_dataset_with_offsets() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..9);
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     let goals = [("goal", GoalMixture::default()), ("end", GoalMixture::LAST), ("later", GoalMixture::FUTURE)];
     let batches = load(&reader, config(&goals), 0, 0);
     // A clip has two steps of two rows; a goal after the second step requires one more row.
@@ -53,7 +53,7 @@ fn goals_are_rows_of_the_dataset_with_offsets() {
                 }
                 let pixel = f64::from(row.get::<u8>(&format!("{name}_pixels")).expect("an image")[0]);
                 let drawn = (3.0 * goal[1] + 20.0 * goal[0]) % 256.0;
-                assert!((pixel - drawn).abs() < 40.0, "the goal image is that of another row: {pixel} {drawn}");
+                assert!((pixel - drawn).abs() < 40.0, "the goal image belongs to another row: {pixel} {drawn}");
                 match name {
                     "end" => assert_eq!(goal[1] as usize + 1, rows(e as usize)),
                     "later" => assert!(offset > 0 && offset % 2 == 0),
@@ -66,10 +66,10 @@ fn goals_are_rows_of_the_dataset_with_offsets() {
 
 #[test]
 fn goals_are_reproducible_and_differ_between_epochs() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..9);
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     let goals = [("goal", GoalMixture::default())];
     let states = |config: LoaderConfig, epoch, first| -> Vec<f64> {
         let batches = load(&reader, config, epoch, first);
@@ -80,9 +80,9 @@ fn goals_are_reproducible_and_differ_between_epochs() {
     assert_eq!(states(other, 4, 0), base, "goals depend neither on threads nor on the batch size");
     assert_eq!(states(config(&goals), 4, 2), base[2 * 5 * 3..], "resumed");
     assert_ne!(states(config(&goals), 5, 0), base);
-    // Goals drawn from one episode stay in it.
-    let held = LoaderConfig { episodes: Some(vec![6]), ..config(&[("goal", GoalMixture::RANDOM)]) };
-    assert!(states(held, 0, 0).chunks(3).all(|state| state[0] == 6.0));
+    // With one selected episode, all goals belong to the selected episode.
+    let selected = LoaderConfig { episodes: Some(vec![6]), ..config(&[("goal", GoalMixture::RANDOM)]) };
+    assert!(states(selected, 0, 0).chunks(3).all(|state| state[0] == 6.0));
     let refused = Loader::new(reader, config(&[("goal", GoalMixture { last: 0.5, ..GoalMixture::RANDOM })]));
     assert!(refused.err().expect("an error").to_string().contains("add up to 1"));
 }

@@ -22,13 +22,13 @@ fn killed_writer_keeps_committed_episodes() {
 }
 
 #[test]
-#[ignore = "a minute"]
+#[ignore = "takes a minute"]
 fn writer_killed_50_times_keeps_committed_episodes() {
     format_suite::killed("d.h5", 50);
 }
 
 fn damaged(cases: u64) {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.h5");
     format_suite::write(&path, WriteMode::Create, 0..3);
     let report = fuzz::dataset("hdf5", &path, cases, fuzz::read_everything);
@@ -46,23 +46,24 @@ fn rejects_damaged_files() {
 }
 
 #[test]
-#[ignore = "minutes"]
+#[ignore = "takes minutes"]
 fn rejects_files_damaged_in_10000_ways() {
     damaged(10_000);
 }
 
 #[test]
 fn many_chunks_form_b_trees_of_several_levels() {
-    // 64 chunks per leaf, 4096 per node of the second level: three levels, with commits at any position.
+    // A leaf holds 64 chunks and a node of the second level 4096, so the tree has three levels. Each commit ends at
+    // another position in the tree.
     let schema = Schema::new([ColumnSpec::new("large", DType::U8, [2048]), ColumnSpec::new("small", DType::Int64, [])]);
-    let schema = schema.expect("schema");
-    let folder = tempfile::tempdir().expect("a folder");
+    let schema = schema.expect("a valid schema");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.h5");
     let commit = CommitPolicy { episodes: 3, ..CommitPolicy::default() };
     let mut total = 0_usize;
     for part in 0..4 {
         let options = WriteOptions { mode: WriteMode::Append, commit, ..WriteOptions::default() };
-        let mut writer = create(&path, &schema, options).expect("creates");
+        let mut writer = create(&path, &schema, options).expect("creating the dataset");
         for e in 0..60 {
             let rows = (e * 7 + part) % 40;
             let mut batch = Batch::zeros(&schema, rows + 1);
@@ -71,15 +72,16 @@ fn many_chunks_form_b_trees_of_several_levels() {
                 batch.row_mut(t).set(1, &[total as i64]);
                 total += 1;
             }
-            writer.write_episode(&batch).expect("writes");
+            writer.write_episode(&batch).expect("writing an episode");
         }
-        writer.finish().expect("finishes");
+        writer.finish().expect("finishing the dataset");
     }
     assert!(total > 4096 + 64);
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     let mut row = 0;
     for (position, episode) in reader.episodes().iter().enumerate() {
-        let read = reader.read(&["large", "small"], &[StepRange::new(position, 0, episode.length)]).expect("reads");
+        let read =
+            reader.read(&["large", "small"], &[StepRange::new(position, 0, episode.length)]).expect("reading rows");
         for t in 0..episode.length {
             assert_eq!(read.row(t).get::<i64>("small").expect("a value"), [row as i64]);
             assert!(read.row(t).get::<u8>("large").expect("bytes").iter().all(|&byte| byte == (row % 251) as u8));
@@ -93,10 +95,10 @@ fn interop(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop").join(name)
 }
 
-/// Lengths of the episodes in the files that `hdf5_export.py` writes. [`image`] and [`values`] return the content of
-/// row `t` of a file.
+/// Lengths of the episodes in the files that `hdf5_export.py` writes.
 const LENGTHS: [usize; 3] = [6, 7, 8];
 
+/// The image in row `t` of the files that `hdf5_export.py` writes.
 fn image(t: usize) -> Vec<u8> {
     let mut rgb = vec![];
     for y in 0..6 {
@@ -108,23 +110,24 @@ fn image(t: usize) -> Vec<u8> {
     rgb
 }
 
+/// The numeric values in row `t` of the files that `hdf5_export.py` writes.
 fn values(t: usize) -> [i64; 5] {
     std::array::from_fn(|k| (t * 100 + k * k) as i64)
 }
 
-/// Reads a whole column, and checks that reading single rows in any order gives the same.
+/// Reads all rows of a column, and checks that reading single rows in reverse order gives the same values.
 fn column(reader: &dyn Reader, name: &str) -> Batch {
     let all: Vec<StepRange> = LENGTHS.iter().enumerate().map(|(e, &length)| StepRange::new(e, 0, length)).collect();
-    let whole = reader.read(&[name], &all).unwrap_or_else(|e| panic!("{name}: {e}"));
+    let all_rows = reader.read(&[name], &all).unwrap_or_else(|e| panic!("{name}: {e}"));
     let mut rows: Vec<StepRange> = (0..3).flat_map(|e| (0..LENGTHS[e]).map(move |t| StepRange::new(e, t, 1))).collect();
     rows.reverse();
-    let single = reader.read(&[name], &rows).expect("reads");
+    let single = reader.read(&[name], &rows).expect("reading rows");
     for t in 0..21 {
         let row =
             |batch: &Batch, t: usize| batch.bytes(0).chunks_exact(batch.bytes(0).len() / 21).nth(t).map(<[u8]>::to_vec);
-        assert_eq!(row(&whole, t), row(&single, 20 - t), "{name}");
+        assert_eq!(row(&all_rows, t), row(&single, 20 - t), "{name}");
     }
-    whole
+    all_rows
 }
 
 fn has_images(reader: &dyn Reader, name: &str) {
@@ -142,7 +145,7 @@ fn has_values(reader: &dyn Reader, name: &str) {
 
 #[test]
 fn reads_a_file_of_the_reference() {
-    let reader = open(interop("hdf5-reference.h5")).expect("opens");
+    let reader = open(interop("hdf5-reference.h5")).expect("opening the dataset");
     assert_eq!(reader.episodes().iter().map(|episode| episode.length).collect::<Vec<_>>(), LENGTHS);
     has_images(&*reader, "pixels");
     let types =
@@ -178,7 +181,7 @@ fn reads_a_file_of_the_reference() {
 
 #[test]
 fn decodes_every_filter_of_h5py_and_hdf5plugin() {
-    let reader = open(interop("hdf5-filters.h5")).expect("opens");
+    let reader = open(interop("hdf5-filters.h5")).expect("opening the dataset");
     let names: Vec<String> = reader.schema().columns()[2..].iter().map(|column| column.name.clone()).collect();
     assert_eq!(names.len(), 2 * 26);
     for name in names {
@@ -188,7 +191,7 @@ fn decodes_every_filter_of_h5py_and_hdf5plugin() {
 
 #[test]
 fn reads_every_layout() {
-    let reader = open(interop("hdf5-layouts.h5")).expect("opens");
+    let reader = open(interop("hdf5-layouts.h5")).expect("opening the dataset");
     for name in ["contiguous", "one chunk", "fixed", "growing", "growing blocks"] {
         has_images(&*reader, name);
     }
@@ -199,13 +202,13 @@ fn reads_every_layout() {
     (0..21)
         .for_each(|t| assert_eq!(read.row(t).get::<i32>("numbers i1").expect("values")[3], values(t)[3] as i32 % 100));
     let read = column(&*reader, "numbers f2");
-    // Half precision has 11 bits, so values above 2048 must be even.
+    // Half precision represents integers up to 2048 exactly.
     (0..20).for_each(|t| assert_eq!(read.row(t).get::<f32>("numbers f2").expect("values")[0], (t * 100) as f32));
     let read = column(&*reader, "truth");
     (0..21).for_each(|t| assert_eq!(read.row(t).get::<u8>("truth").expect("a boolean"), [u8::from(t % 3 == 0)]));
     assert!(reader.schema().column("text").is_err(), "text columns are skipped");
 
-    let reader = open(interop("hdf5-trees.h5")).expect("opens");
+    let reader = open(interop("hdf5-trees.h5")).expect("opening the dataset");
     has_images(&*reader, "growing");
     has_images(&*reader, "blocks");
     let read = column(&*reader, "partly written");
@@ -225,7 +228,7 @@ fn rejects_or_reads_damaged_third_party_files() {
 }
 
 #[test]
-#[ignore = "minutes"]
+#[ignore = "takes minutes"]
 fn rejects_or_reads_third_party_files_damaged_in_10000_ways() {
     for name in ["hdf5-reference.h5", "hdf5-filters.h5", "hdf5-layouts.h5", "hdf5-trees.h5"] {
         let report = fuzz::dataset(name, &interop(name), 2500, fuzz::read_everything);
@@ -234,30 +237,30 @@ fn rejects_or_reads_third_party_files_damaged_in_10000_ways() {
     }
 }
 
-/// One episode of `hdf5-reference.h5`.
+/// The second episode of `hdf5-reference.h5`.
 fn reference_episode() -> Batch {
-    let reader = open(interop("hdf5-reference.h5")).expect("opens");
+    let reader = open(interop("hdf5-reference.h5")).expect("opening the dataset");
     let columns: Vec<ColumnSpec> = reader.schema().columns()[1..].to_vec();
     let names: Vec<&str> = columns.iter().map(|column| &*column.name).collect();
-    reader.read(&names, &[StepRange::new(1, 0, LENGTHS[1])]).expect("reads")
+    reader.read(&names, &[StepRange::new(1, 0, LENGTHS[1])]).expect("reading rows")
 }
 
 #[test]
 fn appends_to_a_file_of_the_reference() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("continued.h5");
-    std::fs::copy(interop("hdf5-reference.h5"), &path).expect("copies");
+    std::fs::copy(interop("hdf5-reference.h5"), &path).expect("copying a file");
     let episode = reference_episode();
     for round in 1..3 {
         let options = WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() };
-        let mut writer = create(&path, episode.schema(), options).expect("continues");
-        writer.write_episode(&episode).expect("writes");
-        writer.finish().expect("finishes");
-        let reader = open(&path).expect("opens");
+        let mut writer = create(&path, episode.schema(), options).expect("continuing the dataset");
+        writer.write_episode(&episode).expect("writing an episode");
+        writer.finish().expect("finishing the dataset");
+        let reader = open(&path).expect("opening the dataset");
         assert_eq!(reader.episodes().len(), 3 + round);
         has_images(&*reader, "pixels");
         let names: Vec<&str> = episode.schema().columns().iter().map(|column| &*column.name).collect();
-        let read = reader.read(&names, &[StepRange::new(2 + round, 0, LENGTHS[1])]).expect("reads");
+        let read = reader.read(&names, &[StepRange::new(2 + round, 0, LENGTHS[1])]).expect("reading rows");
         (0..names.len()).for_each(|at| assert!(read.bytes(at) == episode.bytes(at), "{}", names[at]));
     }
 }
@@ -269,7 +272,7 @@ fn check(mode: &str, path: &Path) -> Option<Value> {
         return None;
     };
     let output = Command::new(python).arg("-B").arg(interop("hdf5_check.py")).arg(mode).arg(path).output();
-    let output = output.expect("Python runs");
+    let output = output.expect("running Python");
     let errors = String::from_utf8_lossy(&output.stderr);
     if errors.contains("ModuleNotFoundError") {
         println!("SKIPPED: {}", errors.lines().last().unwrap_or_default());
@@ -279,13 +282,13 @@ fn check(mode: &str, path: &Path) -> Option<Value> {
     Some(serde_json::from_slice(&output.stdout).expect("JSON"))
 }
 
-/// Compares the columns that h5py reads with those that this crate reads.
+/// Compares the columns that h5py reads with the columns that this crate reads.
 fn check_columns(path: &Path, seen: &Value) {
-    let reader = open(path).expect("opens");
+    let reader = open(path).expect("opening the dataset");
     let all: Vec<StepRange> =
         reader.episodes().iter().enumerate().map(|(at, episode)| StepRange::new(at, 0, episode.length)).collect();
     for column in &reader.schema().columns()[1..] {
-        let read = reader.read(&[&column.name], &all).expect("reads");
+        let read = reader.read(&[&column.name], &all).expect("reading rows");
         let seen = &seen["columns"][&column.name];
         let dtype = seen["dtype"].as_str().expect("a type");
         assert_eq!(dtype, column.dtype.name(), "{}", column.name);
@@ -306,7 +309,7 @@ fn check_columns(path: &Path, seen: &Value) {
 
 #[test]
 fn files_round_trip_through_h5py() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("ours.h5");
     format_suite::write(&path, WriteMode::Create, 0..40);
     format_suite::write(&path, WriteMode::Append, 40..77);
@@ -314,13 +317,13 @@ fn files_round_trip_through_h5py() {
     check_columns(&path, &seen);
     assert!(seen["record"].as_str().expect("text").contains("variation.agent.color"));
     let Some(seen) = check("append", &path) else { return };
-    assert_eq!(open(&path).expect("opens").episodes().len(), 78);
+    assert_eq!(open(&path).expect("opening the dataset").episodes().len(), 78);
     check_columns(&path, &seen);
-    // Appends an episode after the one that h5py appended.
-    let mut writer = format_suite::writer(&path, WriteMode::Append).expect("continues");
-    writer.write_episode(&crate::sample::episode(0)).expect("writes");
-    writer.finish().expect("finishes");
-    let seen = check("read", &path).expect("h5py is available");
+    // Appends an episode after the episode that h5py appended.
+    let mut writer = format_suite::writer(&path, WriteMode::Append).expect("continuing the dataset");
+    writer.write_episode(&crate::sample::episode(0)).expect("writing an episode");
+    writer.finish().expect("finishing the dataset");
+    let seen = check("read", &path).expect("running h5py");
     check_columns(&path, &seen);
-    assert_eq!(open(&path).expect("opens").episodes().len(), 79);
+    assert_eq!(open(&path).expect("opening the dataset").episodes().len(), 79);
 }

@@ -1,4 +1,4 @@
-//! Writers that are killed or run out of disk space keep committed episodes and leave no partial ones.
+//! Writers that are killed or run out of disk space keep committed episodes and leave no partial episodes.
 
 use crate::sample::{check, episode, options, schema, write};
 use std::io::{BufRead as _, BufReader};
@@ -16,7 +16,8 @@ const TARGET: &str = "SWM_TEST_CHILD_TARGET";
 fn child_that_writes() {
     let Some(path) = std::env::var_os(TARGET).map(PathBuf::from) else { return };
     let commit = CommitPolicy { episodes: 3, interval: Duration::from_millis(20), ..CommitPolicy::default() };
-    let mut writer = create(&path, &schema(), WriteOptions { commit, ..options(WriteMode::Append) }).expect("creates");
+    let mut writer =
+        create(&path, &schema(), WriteOptions { commit, ..options(WriteMode::Append) }).expect("creating the dataset");
     for e in writer.episodes()..100_000 {
         if let Err(error) = writer.write_episode(&episode(e)) {
             println!("failed: {error}");
@@ -27,7 +28,7 @@ fn child_that_writes() {
     }
 }
 
-/// The command that runs a child test after `shell` has set its limits.
+/// The command that runs a child test after `shell` has set the limits of the process.
 fn run_child(test: &str, path: &Path, shell: &str) -> Command {
     let mut command = Command::new("sh");
     let program = std::env::current_exe().expect("the test executable");
@@ -40,37 +41,37 @@ fn run_child(test: &str, path: &Path, shell: &str) -> Command {
 #[test]
 fn child_that_reads() {
     let Some(path) = std::env::var_os(TARGET).map(PathBuf::from) else { return };
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     check(&*reader, 0);
     println!("read {} episodes", reader.episodes().len());
 }
 
 #[test]
 fn opens_many_fragments_with_few_file_descriptors() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 1, 0..170);
-    let output = run_child("child_that_reads", &path, "ulimit -n 160;").output().expect("runs");
+    let output = run_child("child_that_reads", &path, "ulimit -n 160;").output().expect("running the child process");
     let text = String::from_utf8_lossy(&output.stdout);
     assert!(text.contains("read 170 episodes"), "{text}");
 }
 
 #[test]
 fn killed_writer_keeps_committed_episodes() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     let mut stored = 0;
     for written in [7, 20, 33] {
-        let mut child = run_child("child_that_writes", &path, "").spawn().expect("starts");
-        let mut lines = BufReader::new(child.stdout.take().expect("a pipe")).lines();
+        let mut child = run_child("child_that_writes", &path, "").spawn().expect("starting the child process");
+        let mut lines = BufReader::new(child.stdout.take().expect("the output of the child process")).lines();
         let mut seen = 0;
         while seen < written {
-            let line = lines.next().expect("another line").expect("text");
+            let line = lines.next().expect("another line").expect("a line of text");
             seen += usize::from(line.contains("episode "));
         }
-        child.kill().expect("kills the child");
+        child.kill().expect("killing the child process");
         child.wait().expect("an exit status");
-        let reader = open(&path).expect("still opens");
+        let reader = open(&path).expect("opening the dataset");
         // A commit has three episodes; two more may wait for the committing thread, and three may be in progress.
         let now = reader.episodes().len();
         assert!(now + 9 > stored + written, "{now} episodes of {}", stored + written);
@@ -78,36 +79,36 @@ fn killed_writer_keeps_committed_episodes() {
         stored = now;
     }
     write(&path, WriteMode::Append, 2, stored..stored + 2);
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     assert_eq!(reader.episodes().len(), stored + 2);
     check(&*reader, 0);
 }
 
-/// Runs the child until it fails, and checks its error and the dataset.
+/// Runs the child until writing fails, and checks the error and the dataset.
 fn write_until_failure(path: &Path, shell: &str, expected: &str) {
-    let output = run_child("child_that_writes", path, shell).output().expect("runs");
+    let output = run_child("child_that_writes", path, shell).output().expect("running the child process");
     let text = String::from_utf8_lossy(&output.stdout);
     let failure = text.lines().find(|line| line.starts_with("failed: ")).unwrap_or_else(|| panic!("{text}"));
     assert!(failure.contains(expected), "{failure}");
     let written = text.lines().filter(|line| line.starts_with("episode ")).count();
-    let reader = open(path).expect("still opens");
+    let reader = open(path).expect("opening the dataset");
     assert!(reader.episodes().len() + 9 > written, "{} of {written}", reader.episodes().len());
     check(&*reader, 0);
 }
 
 #[test]
 fn file_size_limit_keeps_committed_episodes() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 1, 0..4);
     // A fragment of three episodes is larger than 8 blocks; the existing manifests are smaller.
     write_until_failure(&path, "trap '' XFSZ; ulimit -f 8;", "File too large");
-    assert_eq!(open(&path).expect("opens").episodes().len(), 4);
+    assert_eq!(open(&path).expect("opening the dataset").episodes().len(), 4);
 }
 
 #[test]
 fn full_disk_keeps_committed_episodes() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let mount = Command::new("mount").args(["-t", "tmpfs", "-o", "size=1m", "tmpfs"]).arg(folder.path()).output();
     if !mount.is_ok_and(|output| output.status.success()) {
         println!("SKIPPED: mounting a small file system needs more rights than this test has");

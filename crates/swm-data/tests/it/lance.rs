@@ -15,10 +15,10 @@ fn failure(path: &Path, schema: &Schema, mode: WriteMode) -> String {
 
 #[test]
 fn written_episodes_round_trip() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("with space ü%20.lance");
     write(&path, WriteMode::Create, 2, 0..9);
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     assert_eq!(reader.episodes().len(), 9);
     check(&*reader, 0);
     assert_eq!(reader.manifest(), Some(manifest(3)));
@@ -26,18 +26,18 @@ fn written_episodes_round_trip() {
     let mut expected = vec![ColumnSpec::new("episode_idx", DType::Int32, []), schema().columns()[5].clone()];
     expected.extend(schema().columns().iter().filter(|c| c.name != "step_idx").cloned());
     assert_eq!(reader.schema().columns(), expected);
-    // A folder that contains one table can be opened, too.
-    assert_eq!(open(folder.path()).expect("opens").episodes(), reader.episodes());
-    let on_disk: u64 = reader.footprint().expect("a footprint").iter().map(|(_, bytes)| bytes).sum();
+    // A folder that contains one table can also be opened.
+    assert_eq!(open(folder.path()).expect("opening the dataset").episodes(), reader.episodes());
+    let on_disk: u64 = reader.footprint().expect("listing the files").iter().map(|(_, bytes)| bytes).sum();
     assert!(on_disk > 5_000, "{on_disk}");
 }
 
 #[test]
 fn reads_ranges_in_the_requested_order() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..12);
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     let mut rng = Key::new(1).rng();
     for _ in 0..20 {
         let ranges: Vec<StepRange> = (0..rng.random_range(1..12))
@@ -47,7 +47,7 @@ fn reads_ranges_in_the_requested_order() {
                 StepRange::new(e, start, rng.random_range(0..=rows(e) - start))
             })
             .collect();
-        let read = reader.read(&["goal", "state", "step_idx", "episode_idx", "pixels"], &ranges).expect("reads");
+        let read = reader.read(&["goal", "state", "step_idx", "episode_idx", "pixels"], &ranges).expect("reading rows");
         let mut row = 0;
         for range in &ranges {
             for t in range.start..range.start + range.length {
@@ -66,15 +66,16 @@ fn reads_ranges_in_the_requested_order() {
 
 #[test]
 fn invalid_columns_and_rows_are_explained() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..2);
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     let wrong = |column, range| reader.read(&[column], &[range]).expect_err("an invalid request").to_string();
     assert!(wrong("pixel", StepRange::new(0, 0, 1)).contains("did you mean pixels"));
     assert!(wrong("state", StepRange::new(2, 0, 1)).contains("positions below 2"));
     assert!(wrong("state", StepRange::new(0, 3, 3)).contains("rows below 5"));
-    let short = reader.read_column("state", &[StepRange::new(0, 0, 1)], &mut [0; 5]).expect_err("too small");
+    let short =
+        reader.read_column("state", &[StepRange::new(0, 0, 1)], &mut [0; 5]).expect_err("a buffer that is too small");
     assert!(short.to_string().contains("24 for 1 rows"), "{short}");
     let missing = open(folder.path().join("none.lance")).err().expect("no dataset").to_string();
     assert!(missing.contains("there is no such dataset"), "{missing}");
@@ -84,54 +85,55 @@ fn invalid_columns_and_rows_are_explained() {
 
 #[test]
 fn follows_the_write_mode() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Append, 100, 0..3);
     assert!(failure(&path, &schema(), WriteMode::Create).contains("exists already"));
 
-    let mut writer = create(&path, &schema(), options(WriteMode::Append)).expect("continues");
+    let mut writer = create(&path, &schema(), options(WriteMode::Append)).expect("continuing the dataset");
     assert_eq!(writer.episodes(), 3);
-    writer.write_episode(&episode(3)).expect("writes");
+    writer.write_episode(&episode(3)).expect("writing an episode");
     assert_eq!(writer.episodes(), 4);
-    drop(writer); // commits as `finish` does, but cannot report errors
-    let reader = open(&path).expect("opens");
+    // Dropping the writer commits as `finish` does, but cannot report errors.
+    drop(writer);
+    let reader = open(&path).expect("opening the dataset");
     check(&*reader, 0);
     assert_eq!(reader.episodes().iter().map(|e| e.index).collect::<Vec<_>>(), [0, 1, 2, 3]);
 
-    // A newer manifest replaces the older one.
+    // A newer manifest replaces the older manifest.
     let newer = WriteOptions { manifest: Some(manifest(4)), ..options(WriteMode::Append) };
-    create(&path, &schema(), newer).expect("continues").finish().expect("finishes");
-    assert_eq!(open(&path).expect("opens").manifest(), Some(manifest(4)));
+    create(&path, &schema(), newer).expect("continuing the dataset").finish().expect("finishing the dataset");
+    assert_eq!(open(&path).expect("opening the dataset").manifest(), Some(manifest(4)));
 
     write(&path, WriteMode::Overwrite, 100, 5..7);
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     assert_eq!(reader.episodes().len(), 2);
     check(&*reader, 5);
-    assert_eq!(std::fs::read_dir(path.join("data")).expect("a folder").count(), 1, "old files are removed");
+    assert_eq!(std::fs::read_dir(path.join("data")).expect("listing a folder").count(), 1, "old files are removed");
 }
 
 #[test]
 fn opens_an_empty_dataset() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 1, 0..0);
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     assert!(reader.episodes().is_empty());
     assert_eq!(reader.schema().columns().len(), 9);
-    assert_eq!(reader.read(&COLUMNS, &[]).expect("reads").rows(), 0);
+    assert_eq!(reader.read(&COLUMNS, &[]).expect("reading rows").rows(), 0);
     write(&path, WriteMode::Append, 1, 0..2);
-    check(&*open(&path).expect("opens"), 0);
+    check(&*open(&path).expect("opening the dataset"), 0);
 }
 
 #[test]
 fn does_not_append_another_schema() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 100, 0..2);
     let with = |change: &dyn Fn(&mut Vec<ColumnSpec>)| {
         let mut columns = schema().columns().to_vec();
         change(&mut columns);
-        failure(&path, &Schema::new(columns).expect("schema"), WriteMode::Append)
+        failure(&path, &Schema::new(columns).expect("a valid schema"), WriteMode::Append)
     };
     assert!(with(&|columns| columns[1].shape = vec![3]).contains("appending to"));
     assert!(with(&|columns| columns[0].shape = vec![16, 16, 3]).contains("[16, 24, 3]"));
@@ -141,12 +143,12 @@ fn does_not_append_another_schema() {
     // The order of columns does not matter.
     let mut columns = schema().columns().to_vec();
     columns.reverse();
-    let reordered = Schema::new(columns).expect("schema");
+    let reordered = Schema::new(columns).expect("a valid schema");
     let mut other = Batch::zeros(&reordered, rows(2));
     for (i, column) in reordered.columns().iter().enumerate() {
         other.bytes_mut(i).copy_from_slice(episode(2).bytes(schema().index(&column.name).expect("a column")));
     }
-    let mut writer = create(&path, &reordered, options(WriteMode::Append)).expect("continues");
+    let mut writer = create(&path, &reordered, options(WriteMode::Append)).expect("continuing the dataset");
     assert!(
         writer
             .write_episode(&episode(2))
@@ -154,15 +156,16 @@ fn does_not_append_another_schema() {
             .to_string()
             .contains("writing an episode")
     );
-    writer.write_episode(&other).expect("writes");
-    writer.finish().expect("finishes");
-    check(&*open(&path).expect("opens"), 0);
+    writer.write_episode(&other).expect("writing an episode");
+    writer.finish().expect("finishing the dataset");
+    check(&*open(&path).expect("opening the dataset"), 0);
 }
 
 #[test]
 fn rejects_episodes_that_break_the_time_convention() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let mut writer = create(folder.path().join("d.lance"), &schema(), options(WriteMode::Create)).expect("creates");
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let mut writer =
+        create(folder.path().join("d.lance"), &schema(), options(WriteMode::Create)).expect("creating the dataset");
     let mut refuse = |change: &dyn Fn(&mut Batch), expected: &str| {
         let mut bad = episode(2);
         change(&mut bad);
@@ -175,42 +178,43 @@ fn rejects_episodes_that_break_the_time_convention() {
     refuse(&|e| e.resize(0), "without rows");
     assert_eq!(writer.episodes(), 0);
     writer.write_episode(&episode(0)).expect("a valid episode");
-    writer.finish().expect("finishes");
+    writer.finish().expect("finishing the dataset");
 
-    let discrete = Schema::new([ColumnSpec::new("action", DType::Int64, [])]).expect("schema");
-    let mut writer = create(folder.path().join("i.lance"), &discrete, options(WriteMode::Create)).expect("creates");
+    let discrete = Schema::new([ColumnSpec::new("action", DType::Int64, [])]).expect("a valid schema");
+    let mut writer =
+        create(folder.path().join("i.lance"), &discrete, options(WriteMode::Create)).expect("creating the dataset");
     let mut batch = Batch::zeros(&discrete, 3);
     assert!(writer.write_episode(&batch).expect_err("an error").to_string().contains("-1"));
     batch.get_mut::<i64>("action").expect("actions")[2] = -1;
-    writer.write_episode(&batch).expect("writes");
+    writer.write_episode(&batch).expect("writing an episode");
     batch.get_mut::<i64>("action").expect("actions")[0] = -1;
     assert!(writer.write_episode(&batch).is_err());
 }
 
 #[test]
 fn content_hash_does_not_depend_on_files() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = |name: &str| folder.path().join(name);
     write(&path("a.lance"), WriteMode::Create, 1, 0..5);
     write(&path("b.lance"), WriteMode::Create, 100, 0..3);
     write(&path("b.lance"), WriteMode::Append, 100, 3..5);
     write(&path("c.lance"), WriteMode::Create, 1, 1..6);
-    let hash = |name: &str| open(path(name)).expect("opens").content_hash().expect("a hash");
+    let hash = |name: &str| open(path(name)).expect("opening the dataset").content_hash().expect("hashing the content");
     assert_eq!(hash("a.lance"), hash("b.lance"));
     assert_ne!(hash("a.lance"), hash("c.lance"));
 }
 
 #[test]
 fn stores_lossless_images() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     for (position, codec) in [ImageCodec::Png, ImageCodec::Qoi].into_iter().enumerate() {
         let lossless = WriteOptions { codec, ..options(WriteMode::Append) };
-        let mut writer = create(&path, &schema(), lossless).expect("creates");
-        writer.write_episode(&episode(1)).expect("writes");
-        writer.finish().expect("finishes");
-        let reader = open(&path).expect("opens");
-        let read = reader.read(&["pixels"], &[StepRange::new(position, 0, rows(1))]).expect("reads");
+        let mut writer = create(&path, &schema(), lossless).expect("creating the dataset");
+        writer.write_episode(&episode(1)).expect("writing an episode");
+        writer.finish().expect("finishing the dataset");
+        let reader = open(&path).expect("opening the dataset");
+        let read = reader.read(&["pixels"], &[StepRange::new(position, 0, rows(1))]).expect("reading rows");
         assert_eq!(read.bytes(0), episode(1).bytes(0));
     }
     let invalid = WriteOptions { codec: ImageCodec::Jpeg { quality: 0 }, ..options(WriteMode::Create) };
@@ -220,10 +224,10 @@ fn stores_lossless_images() {
 
 #[test]
 fn several_threads_read_at_once() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 2, 0..12);
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     std::thread::scope(|scope| {
         for _ in 0..8 {
             scope.spawn(|| {
@@ -237,135 +241,143 @@ fn several_threads_read_at_once() {
 
 #[test]
 fn concurrent_writers_both_append() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     let threads = 4;
-    let each = 25;
+    let episodes_per_thread = 25;
     std::thread::scope(|scope| {
         for thread in 0..threads {
             let path = &path;
             scope.spawn(move || {
                 let commit = CommitPolicy { episodes: 1, ..CommitPolicy::default() };
                 let options = WriteOptions { commit, ..options(WriteMode::Append) };
-                let mut writer = create(path, &schema(), options).expect("continues");
-                for e in 0..each {
-                    writer.write_episode(&episode(thread * each + e)).expect("writes");
+                let mut writer = create(path, &schema(), options).expect("continuing the dataset");
+                for e in 0..episodes_per_thread {
+                    writer.write_episode(&episode(thread * episodes_per_thread + e)).expect("writing an episode");
                 }
-                writer.finish().expect("finishes");
+                writer.finish().expect("finishing the dataset");
             });
         }
     });
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     let indices: Vec<i64> = reader.episodes().iter().map(|episode| episode.index).collect();
-    assert_eq!(indices, (0..(threads * each) as i64).collect::<Vec<_>>());
+    assert_eq!(indices, (0..(threads * episodes_per_thread) as i64).collect::<Vec<_>>());
     // The state identifies the episode.
-    let firsts: Vec<StepRange> = (0..threads * each).map(|at| StepRange::new(at, 0, 1)).collect();
-    let read = reader.read(&["state"], &firsts).expect("reads");
+    let firsts: Vec<StepRange> = (0..threads * episodes_per_thread).map(|at| StepRange::new(at, 0, 1)).collect();
+    let read = reader.read(&["state"], &firsts).expect("reading rows");
     let mut found: Vec<usize> = read.get::<f64>("state").expect("states").chunks(3).map(|s| s[0] as usize).collect();
     for thread in 0..threads {
-        let own: Vec<usize> = found.iter().copied().filter(|e| e / each == thread).collect();
+        let own: Vec<usize> = found.iter().copied().filter(|e| e / episodes_per_thread == thread).collect();
         assert!(own.is_sorted(), "episodes of one writer keep their order");
     }
     found.sort_unstable();
-    assert_eq!(found, (0..threads * each).collect::<Vec<_>>());
-    assert_eq!(std::fs::read_dir(path.join("data")).expect("a folder").count(), threads * each, "no file is left over");
+    assert_eq!(found, (0..threads * episodes_per_thread).collect::<Vec<_>>());
+    assert_eq!(
+        std::fs::read_dir(path.join("data")).expect("listing a folder").count(),
+        threads * episodes_per_thread,
+        "no file is left over"
+    );
 }
 
 #[test]
 fn writer_of_a_replaced_dataset_fails() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
-    let mut first = create(&path, &schema(), options(WriteMode::Append)).expect("creates");
-    let other = Schema::new([ColumnSpec::new("other", DType::Float32, [])]).expect("schema");
-    create(&path, &other, options(WriteMode::Overwrite)).expect("replaces").finish().expect("finishes");
-    first.write_episode(&episode(0)).expect("queues the episode");
+    let mut first = create(&path, &schema(), options(WriteMode::Append)).expect("creating the dataset");
+    let other = Schema::new([ColumnSpec::new("other", DType::Float32, [])]).expect("a valid schema");
+    create(&path, &other, options(WriteMode::Overwrite))
+        .expect("replacing the dataset")
+        .finish()
+        .expect("finishing the dataset");
+    first.write_episode(&episode(0)).expect("queueing an episode");
     let error = first.finish().expect_err("a replaced table").to_string();
     assert!(error.contains("another process replaced"), "{error}");
-    assert!(open(&path).expect("opens").episodes().is_empty());
+    assert!(open(&path).expect("opening the dataset").episodes().is_empty());
 }
 
 #[test]
 fn stores_doubles_exactly_but_keeps_the_precision_of_older_tables() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
-    let schema = Schema::new([ColumnSpec::new("state", DType::Float64, [2])]).expect("schema");
+    let schema = Schema::new([ColumnSpec::new("state", DType::Float64, [2])]).expect("a valid schema");
     let mut batch = Batch::zeros(&schema, 3);
     let values = [0.1, 1e300, f64::MIN_POSITIVE, -7.0, f64::NAN, 1.0 / 3.0];
     batch.get_mut::<f64>("state").expect("states").copy_from_slice(&values);
-    let mut writer = create(&path, &schema, options(WriteMode::Create)).expect("creates");
-    writer.write_episode(&batch).expect("writes");
-    writer.finish().expect("finishes");
+    let mut writer = create(&path, &schema, options(WriteMode::Create)).expect("creating the dataset");
+    writer.write_episode(&batch).expect("writing an episode");
+    writer.finish().expect("finishing the dataset");
     let all = [StepRange::new(0, 0, 3)];
     let bits = |reader: &dyn swm_data::Reader| -> Vec<u64> {
-        let read = reader.read(&["state"], &all).expect("reads");
+        let read = reader.read(&["state"], &all).expect("reading rows");
         read.get::<f64>("state").expect("states").iter().map(|v| v.to_bits()).collect()
     };
-    assert_eq!(bits(&*open(&path).expect("opens")), values.map(f64::to_bits));
-    // A table of the first version stored all numeric columns in single precision; appending keeps it.
+    assert_eq!(bits(&*open(&path).expect("opening the dataset")), values.map(f64::to_bits));
+    // A table of the first version stored all numeric columns in single precision; appending keeps this precision.
     let old = folder.path().join("old.lance");
     crate::fuzz::copy_all(&Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop/single.lance"), &old);
-    let existing = open(&old).expect("opens").episodes().len();
+    let existing = open(&old).expect("opening the dataset").episodes().len();
     write(&old, WriteMode::Append, 1, existing..existing + 2);
-    let reader = open(&old).expect("opens");
+    let reader = open(&old).expect("opening the dataset");
     assert_eq!(reader.episodes().len(), existing + 2);
     check(&*reader, 0);
 }
 
 #[test]
 fn reads_constants() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     let scene = |e: usize| {
         let xml = format!("<mujoco><body pos=\"{}\"/></mujoco>", e / 2).repeat(50).into_bytes();
         Constants::from([("scene.xml".to_owned(), xml), ("raw".to_owned(), vec![e as u8, 0, 255])])
     };
     let commit = CommitPolicy { episodes: 4, ..CommitPolicy::default() };
-    let mut writer = create(&path, &schema(), WriteOptions { commit, ..options(WriteMode::Create) }).expect("creates");
+    let mut writer =
+        create(&path, &schema(), WriteOptions { commit, ..options(WriteMode::Create) }).expect("creating the dataset");
     for e in 0..10 {
         let constants = if e == 5 { Constants::new() } else { scene(e) };
-        writer.write_episode_with(&episode(e), &constants).expect("writes");
+        writer.write_episode_with(&episode(e), &constants).expect("writing an episode");
     }
-    writer.finish().expect("finishes");
-    let reader = open(&path).expect("opens");
+    writer.finish().expect("finishing the dataset");
+    let reader = open(&path).expect("opening the dataset");
     check(&*reader, 0);
     for e in 0..10 {
         let expected = if e == 5 { Constants::new() } else { scene(e) };
-        assert_eq!(reader.constants(e).expect("reads"), expected, "episode {e}");
+        assert_eq!(reader.constants(e).expect("reading constants"), expected, "episode {e}");
     }
     assert!(reader.constants(10).is_err());
     // Constants are part of the content hash.
     let plain = folder.path().join("plain.lance");
     write(&plain, WriteMode::Create, 4, 0..10);
-    let plain = open(&plain).expect("opens");
-    assert_eq!(plain.constants(0).expect("reads"), Constants::new());
-    assert_ne!(plain.content_hash().expect("a hash"), reader.content_hash().expect("a hash"));
+    let plain = open(&plain).expect("opening the dataset");
+    assert_eq!(plain.constants(0).expect("reading constants"), Constants::new());
+    assert_ne!(plain.content_hash().expect("hashing the content"), reader.content_hash().expect("hashing the content"));
 }
 
 #[test]
 fn old_versions_are_removed() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 1, 0..30);
-    let versions = std::fs::read_dir(path.join("_versions")).expect("a folder").count();
+    let versions = std::fs::read_dir(path.join("_versions")).expect("listing a folder").count();
     assert!(versions <= 10, "{versions} files");
-    assert_eq!(open(&path).expect("opens").episodes().len(), 30);
+    assert_eq!(open(&path).expect("opening the dataset").episodes().len(), 30);
 }
 
 #[test]
 fn unwritable_locations_are_explained() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let file = folder.path().join("file");
-    std::fs::write(&file, "not a folder").expect("writes");
+    std::fs::write(&file, "not a folder").expect("writing a file");
     let error = failure(&file.join("d.lance"), &schema(), WriteMode::Create);
     assert!(error.contains("Not a directory"), "{error}");
     assert!(failure(&folder.path().join("name"), &schema(), WriteMode::Create).contains("end it in .lance"));
-    // Not even root can create a folder in `/proc`.
+    // No user can create a folder in `/proc`, not even root.
     let error = create(Path::new("/proc/d.lance"), &schema(), options(WriteMode::Create)).err().expect("an error");
     assert!(matches!(error, Error::Io { .. }), "{error}");
     // A folder with other files is left unchanged.
     let other = folder.path().join("other.lance");
-    std::fs::create_dir(&other).expect("a folder");
-    std::fs::write(other.join("notes.txt"), "notes").expect("writes");
+    std::fs::create_dir(&other).expect("creating a folder");
+    std::fs::write(other.join("notes.txt"), "notes").expect("writing a file");
     for mode in [WriteMode::Create, WriteMode::Append, WriteMode::Overwrite] {
         assert!(failure(&other, &schema(), mode).contains("notes.txt"));
     }
@@ -374,10 +386,10 @@ fn unwritable_locations_are_explained() {
 
 #[test]
 fn statistics_ignore_missing_values() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..4);
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     let stats = column_stats(&*reader, "action", Some(&[1, 3])).expect("statistics");
     let first: Vec<f64> = [1.0; 5].into_iter().chain([3.0; 7]).collect();
     let mean = first.iter().sum::<f64>() / 12.0;

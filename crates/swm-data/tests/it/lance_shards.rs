@@ -12,12 +12,12 @@ fn shard_writer(path: &Path, mode: WriteMode, index: usize, count: usize) -> swm
 }
 
 fn write_shard(path: &Path, index: usize, count: usize, episodes: std::ops::Range<usize>) {
-    let mut writer = shard_writer(path, WriteMode::Create, index, count).expect("begins");
+    let mut writer = shard_writer(path, WriteMode::Create, index, count).expect("creating the shard");
     for e in episodes {
         let constants = Constants::from([("number".to_owned(), e.to_string().into_bytes())]);
-        writer.write_episode_with(&episode(e), &constants).expect("writes");
+        writer.write_episode_with(&episode(e), &constants).expect("writing an episode");
     }
-    writer.finish().expect("finishes");
+    writer.finish().expect("finishing the dataset");
 }
 
 fn failure(path: &Path) -> String {
@@ -26,92 +26,93 @@ fn failure(path: &Path) -> String {
 
 #[test]
 fn commits_all_shards_as_one_version() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     assert!(failure(&path).contains("no shards to commit"));
-    // Shards are written in any order; threads stand for machines.
+    // Two threads, in place of two machines, write shards in any order.
     std::thread::scope(|scope| {
         scope.spawn(|| write_shard(&path, 2, 3, 7..12));
         scope.spawn(|| write_shard(&path, 0, 3, 0..5));
     });
     assert!(failure(&path).contains("shard 1 of 3 is missing"));
-    assert!(open(&path).is_err(), "readers see no dataset before the commit");
+    assert!(open(&path).is_err(), "no dataset exists before the commit");
     write_shard(&path, 1, 3, 5..7);
-    assert_eq!(commit_shards(&Location::from(&path)).expect("commits"), 12);
+    assert_eq!(commit_shards(&Location::from(&path)).expect("committing the shards"), 12);
 
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     check(&*reader, 0);
     assert_eq!(reader.episodes().iter().map(|e| e.index).collect::<Vec<_>>(), (0..12).collect::<Vec<_>>());
     for e in [0, 4, 5, 11] {
-        assert_eq!(reader.constants(e).expect("reads")["number"], e.to_string().into_bytes());
+        assert_eq!(reader.constants(e).expect("reading constants")["number"], e.to_string().into_bytes());
     }
-    assert!(failure(&path).contains("no shards to commit"), "the log is removed");
-    // The content equals that of a single writer.
-    let whole = folder.path().join("whole.lance");
-    write(&whole, WriteMode::Create, 100, 0..12);
+    assert!(failure(&path).contains("no shards to commit"), "the logs of the shards are removed");
+    // The content equals the dataset of a single writer.
+    let single_writer_path = folder.path().join("whole.lance");
+    write(&single_writer_path, WriteMode::Create, 100, 0..12);
     let columns = ["pixels", "state", "episode_idx", "step_idx"];
     let all: Vec<_> = (0..12).map(|e| swm_data::StepRange::new(e, 0, reader.episodes()[e].length)).collect();
-    let read = |reader: &dyn swm_data::Reader| reader.read(&columns, &all).expect("reads");
-    let (parts, one) = (read(&*reader), read(&*open(&whole).expect("opens")));
-    assert!((0..columns.len()).all(|column| parts.bytes(column) == one.bytes(column)));
+    let read = |reader: &dyn swm_data::Reader| reader.read(&columns, &all).expect("reading rows");
+    let (from_shards, from_one_writer) =
+        (read(&*reader), read(&*open(&single_writer_path).expect("opening the dataset")));
+    assert!((0..columns.len()).all(|column| from_shards.bytes(column) == from_one_writer.bytes(column)));
 
     // Appends two more shards, then episodes of an ordinary writer.
     write_shard(&path, 0, 2, 12..14);
     write_shard(&path, 1, 2, 14..16);
-    assert_eq!(commit_shards(&Location::from(&path)).expect("commits"), 4);
+    assert_eq!(commit_shards(&Location::from(&path)).expect("committing the shards"), 4);
     write(&path, WriteMode::Append, 1, 16..18);
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     assert_eq!(reader.episodes().len(), 18);
     check(&*reader, 0);
 }
 
 #[test]
 fn interrupted_shard_is_continued_or_restarted() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write_shard(&path, 1, 2, 4..6);
-    let mut writer = shard_writer(&path, WriteMode::Create, 0, 2).expect("begins");
+    let mut writer = shard_writer(&path, WriteMode::Create, 0, 2).expect("creating the shard");
     for e in 0..2 {
-        writer.write_episode(&episode(e)).expect("writes");
+        writer.write_episode(&episode(e)).expect("writing an episode");
     }
     drop(writer);
     assert!(failure(&path).contains("shard 0 of 2 is not finished"));
     assert!(
         shard_writer(&path, WriteMode::Create, 0, 2).err().expect("an error").to_string().contains("already exists")
     );
-    let mut writer = shard_writer(&path, WriteMode::Append, 0, 2).expect("continues");
+    let mut writer = shard_writer(&path, WriteMode::Append, 0, 2).expect("continuing the shard");
     assert_eq!(writer.episodes(), 2);
     for e in 2..4 {
-        writer.write_episode(&episode(e)).expect("writes");
+        writer.write_episode(&episode(e)).expect("writing an episode");
     }
-    writer.finish().expect("finishes");
-    commit_shards(&Location::from(&path)).expect("commits");
-    check(&*open(&path).expect("opens"), 0);
+    writer.finish().expect("finishing the dataset");
+    commit_shards(&Location::from(&path)).expect("committing the shards");
+    check(&*open(&path).expect("opening the dataset"), 0);
 
     write_shard(&path, 0, 1, 0..3);
-    let mut writer = shard_writer(&path, WriteMode::Overwrite, 0, 1).expect("begins again");
-    writer.write_episode(&episode(6)).expect("writes");
-    writer.finish().expect("finishes");
-    assert_eq!(commit_shards(&Location::from(&path)).expect("commits"), 1);
-    check(&*open(&path).expect("opens"), 0);
+    let mut writer = shard_writer(&path, WriteMode::Overwrite, 0, 1).expect("overwriting the shard");
+    writer.write_episode(&episode(6)).expect("writing an episode");
+    writer.finish().expect("finishing the dataset");
+    assert_eq!(commit_shards(&Location::from(&path)).expect("committing the shards"), 1);
+    check(&*open(&path).expect("opening the dataset"), 0);
 }
 
 #[test]
 fn commit_killed_before_cleanup_is_not_repeated() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write_shard(&path, 0, 1, 0..3);
     crate::fuzz::copy_all(&path.join("_shards"), &folder.path().join("kept"));
-    assert_eq!(commit_shards(&Location::from(&path)).expect("commits"), 3);
+    assert_eq!(commit_shards(&Location::from(&path)).expect("committing the shards"), 3);
     crate::fuzz::copy_all(&folder.path().join("kept"), &path.join("_shards"));
-    assert_eq!(commit_shards(&Location::from(&path)).expect("commits"), 0);
-    assert_eq!(open(&path).expect("opens").episodes().len(), 3);
+    assert_eq!(commit_shards(&Location::from(&path)).expect("committing the shards"), 0);
+    assert_eq!(open(&path).expect("opening the dataset").episodes().len(), 3);
     assert!(failure(&path).contains("no shards to commit"));
 }
 
 #[test]
 fn rejects_inconsistent_shards() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     let location = Location::from(&path);
     assert!(
@@ -120,10 +121,13 @@ fn rejects_inconsistent_shards() {
     write_shard(&path, 0, 2, 0..2);
     write_shard(&path, 0, 3, 0..2);
     assert!(failure(&path).contains("there are shards of"));
-    drop(shard_writer(&path, WriteMode::Overwrite, 0, 3).expect("begins again"));
-    std::fs::remove_dir_all(path.join("_shards/0-of-3")).expect("removes");
-    let other = Schema::new([ColumnSpec::new("other", DType::Float32, [])]).expect("schema");
+    drop(shard_writer(&path, WriteMode::Overwrite, 0, 3).expect("overwriting the shard"));
+    std::fs::remove_dir_all(path.join("_shards/0-of-3")).expect("removing a folder");
+    let other = Schema::new([ColumnSpec::new("other", DType::Float32, [])]).expect("a valid schema");
     let shard = Shard { index: 1, count: 2 };
-    create_shard(&location, &other, options(WriteMode::Create), shard).expect("begins").finish().expect("finishes");
+    create_shard(&location, &other, options(WriteMode::Create), shard)
+        .expect("creating the shard")
+        .finish()
+        .expect("finishing the dataset");
     assert!(failure(&path).contains("writing a shard of"));
 }

@@ -1,11 +1,11 @@
 //! The format `lerobot`: reads datasets that LeRobot's own package wrote (`tests/interop/lerobot_export.py`), and lets
-//! this package read datasets written here. Run the long tests with:
+//! LeRobot read datasets written here. Run the long tests with:
 //!
 //! ```text
 //! cargo test --release --workspace --test it -- --ignored lerobot::
 //! ```
 
-use crate::video::{THEIR_LENGTHS, check_frames, interop};
+use crate::video::{THIRD_PARTY_LENGTHS, check_frames, interop};
 use crate::{format_suite, fuzz, sample};
 use std::process::Command;
 use swm_core::{ColumnSpec, DType};
@@ -22,7 +22,7 @@ fn killed_writer_keeps_committed_episodes() {
 }
 
 #[test]
-#[ignore = "a minute"]
+#[ignore = "takes a minute"]
 fn writer_killed_50_times_keeps_committed_episodes() {
     format_suite::killed("d.lerobot", 50);
 }
@@ -30,8 +30,8 @@ fn writer_killed_50_times_keeps_committed_episodes() {
 #[test]
 fn reads_datasets_of_lerobot() {
     for name in ["lerobot-v30-h264", "lerobot-v30-av1", "lerobot-v21"] {
-        let reader = open(interop().join(name)).expect("opens");
-        assert_eq!(reader.episodes().iter().map(|e| e.length).collect::<Vec<_>>(), THEIR_LENGTHS, "{name}");
+        let reader = open(interop().join(name)).expect("opening the dataset");
+        assert_eq!(reader.episodes().iter().map(|e| e.length).collect::<Vec<_>>(), THIRD_PARTY_LENGTHS, "{name}");
         check_frames(&*reader, "pixels", &format!("{name}-top.png"), 0);
         check_frames(&*reader, "observation.images.wrist", &format!("{name}-wrist.png"), 0);
         let schema = reader.schema();
@@ -39,9 +39,9 @@ fn reads_datasets_of_lerobot() {
         assert_eq!(schema.column("proprio").expect("the state"), &ColumnSpec::new("proprio", DType::Float32, [3]));
         assert_eq!(schema.column("next.done").expect("a flag"), &ColumnSpec::new("next.done", DType::Bool, []));
         let tasks = ["push the block", "open the drawer", "push the block"];
-        for (e, &length) in THEIR_LENGTHS.iter().enumerate() {
+        for (e, &length) in THIRD_PARTY_LENGTHS.iter().enumerate() {
             let names = ["observation.state", "action", "next.reward", "next.done", "task_index", "frame_index"];
-            let read = reader.read(&names, &[StepRange::new(e, 0, length)]).expect("reads");
+            let read = reader.read(&names, &[StepRange::new(e, 0, length)]).expect("reading rows");
             for t in 0..length {
                 let (row, time) = (read.row(t), t as f32);
                 assert_eq!(row.get::<f32>("observation.state").expect("values"), [e as f32, time, -0.5]);
@@ -52,13 +52,16 @@ fn reads_datasets_of_lerobot() {
                 assert_eq!(row.get::<i32>("frame_index").expect("a value"), [t as i32]);
             }
             let task = Constants::from([("task".to_owned(), tasks[e].as_bytes().to_vec())]);
-            assert_eq!(reader.constants(e).expect("reads"), task);
+            assert_eq!(reader.constants(e).expect("reading constants"), task);
         }
-        let hash = reader.content_hash().expect("hashes");
-        assert_eq!(hash, open(interop().join(name)).expect("opens").content_hash().expect("hashes"));
+        let hash = reader.content_hash().expect("hashing the content");
+        assert_eq!(
+            hash,
+            open(interop().join(name)).expect("opening the dataset").content_hash().expect("hashing the content")
+        );
         let mut writer = create(
             interop().join(name),
-            &swm_core::Schema::new(schema.columns()[2..].to_vec()).expect("a schema"),
+            &swm_core::Schema::new(schema.columns()[2..].to_vec()).expect("a valid schema"),
             WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() },
         );
         assert!(writer.as_mut().err().expect("a third-party dataset").to_string().contains("convert it"), "{name}");
@@ -67,10 +70,10 @@ fn reads_datasets_of_lerobot() {
 
 #[test]
 fn reads_images_in_tables() {
-    let reader = open(interop().join("lerobot-v30-h264")).expect("opens");
+    let reader = open(interop().join("lerobot-v30-h264")).expect("opening the dataset");
     let name = "observation.images.still";
     let ranges = [StepRange::new(2, 3, 2), StepRange::new(0, 10, 1), StepRange::new(2, 3, 1)];
-    let read = reader.read(&[name], &ranges).expect("reads");
+    let read = reader.read(&[name], &ranges).expect("reading rows");
     for (row, (e, t)) in [(2, 3), (2, 4), (0, 10), (2, 3)].into_iter().enumerate() {
         let frame = read.row(row).get::<u8>(name).expect("an image").to_vec();
         for y in 0..24 {
@@ -95,7 +98,7 @@ fn reads_or_rejects_damaged_datasets() {
 }
 
 #[test]
-#[ignore = "minutes"]
+#[ignore = "takes minutes"]
 fn reads_or_rejects_datasets_damaged_in_10000_ways() {
     ["lerobot-v30-h264", "lerobot-v30-av1", "lerobot-v21"].iter().for_each(|name| damaged(name, 4000));
 }
@@ -106,7 +109,7 @@ fn lerobot_reads_datasets_written_here() {
         println!("SKIPPED: set SWM_LEROBOT_PYTHON to a Python with lerobot 0.4");
         return;
     };
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     for (name, codec, tolerance) in
         [("lossless.lerobot", ImageCodec::Png, 0.51), ("lossy.lerobot", ImageCodec::Jpeg { quality: 95 }, 5.0)]
     {
@@ -114,16 +117,16 @@ fn lerobot_reads_datasets_written_here() {
         for (mode, episodes) in [(WriteMode::Create, 0..3), (WriteMode::Append, 3..5)] {
             let commit = CommitPolicy { episodes: 2, ..CommitPolicy::default() };
             let options = WriteOptions { mode, codec, commit, ..WriteOptions::default() };
-            let mut writer = create(&path, &sample::schema(), options).expect("creates");
+            let mut writer = create(&path, &sample::schema(), options).expect("creating the dataset");
             for e in episodes {
                 let task = Constants::from([("task".to_owned(), format!("task {}", e % 2).into_bytes())]);
-                writer.write_episode_with(&sample::episode(e), &task).expect("writes");
+                writer.write_episode_with(&sample::episode(e), &task).expect("writing an episode");
             }
-            writer.finish().expect("finishes");
+            writer.finish().expect("finishing the dataset");
         }
         let mut command = Command::new(&python);
         let output =
-            command.arg("-B").arg(interop().join("lerobot_check.py")).arg(&path).output().expect("Python runs");
+            command.arg("-B").arg(interop().join("lerobot_check.py")).arg(&path).output().expect("running Python");
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         let seen: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
         assert_eq!(seen["episodes"], 5);
@@ -134,8 +137,8 @@ fn lerobot_reads_datasets_written_here() {
             for t in 0..episode.rows() {
                 let row = &rows[next];
                 assert_eq!(row["state"], serde_json::json!([e as f64, t as f64, -0.5]));
-                let acted = t.min(episode.rows() - 2);
-                assert_eq!(row["action"], serde_json::json!([e as f64, acted as f64 / 4.0]));
+                let action_row = t.min(episode.rows() - 2);
+                assert_eq!(row["action"], serde_json::json!([e as f64, action_row as f64 / 4.0]));
                 assert_eq!(row["task"], format!("task {}", e % 2));
                 assert_eq!((&row["episode_index"], &row["frame_index"]), (&e.into(), &t.into()));
                 for column in ["pixels", "goal"] {

@@ -9,7 +9,7 @@ use swm_data::{CacheConfig, ClipSpec, LoadedBatch, Loader, LoaderConfig, Reader,
 const EPISODES: usize = 9;
 
 fn dataset(group: usize) -> (tempfile::TempDir, PathBuf) {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, group, 0..EPISODES);
     (folder, path)
@@ -52,7 +52,7 @@ fn bytes(batches: &[Batch]) -> Vec<Vec<u8>> {
 #[test]
 fn yields_every_clip_once_with_its_rows() {
     let (_folder, path) = dataset(2);
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     let (steps, skip) = (2, 3);
     let batches = load(&reader, config(steps, skip), 0, 0);
     let mut expected: Vec<(usize, usize)> =
@@ -91,8 +91,8 @@ fn yields_every_clip_once_with_its_rows() {
 fn order_depends_only_on_seed_and_epoch() {
     let (_folder, path) = dataset(2);
     let (_other_folder, other_path) = dataset(100);
-    let reader = open(&path).expect("opens");
-    let other = open(&other_path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
+    let other = open(&other_path).expect("opening the dataset");
     let base = load(&reader, config(3, 1), 5, 0);
     for threads in [0, 1, 4] {
         for prefetch in [1, 3] {
@@ -115,7 +115,7 @@ fn order_depends_only_on_seed_and_epoch() {
 #[test]
 fn follows_the_configuration_of_episodes_batches_and_cache() {
     let (_folder, path) = dataset(2);
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     let cache = CacheConfig::Memory { bytes: 1 << 30 };
     let some = LoaderConfig { episodes: Some(vec![7, 2]), cache, ..config(2, 1) };
     let loader = Loader::new(Arc::clone(&reader), some.clone()).expect("a loader");
@@ -126,7 +126,7 @@ fn follows_the_configuration_of_episodes_batches_and_cache() {
     assert_eq!(episodes, [2, 7]);
     let full = load(&reader, LoaderConfig { drop_last: true, ..some }, 0, 0);
     assert!(full.iter().all(|batch| batch.rows() == 4));
-    // An epoch may be dropped early, and an epoch that starts after its end is empty.
+    // An epoch may be dropped early. An epoch that starts after the last batch is empty.
     let loader = Loader::new(Arc::clone(&reader), config(1, 1)).expect("a loader");
     assert_eq!(loader.epoch(0, 0).take(2).count(), 2);
     assert_eq!(loader.epoch(0, loader.batches_per_epoch()).count(), 0);
@@ -137,7 +137,7 @@ fn follows_the_configuration_of_episodes_batches_and_cache() {
 #[test]
 fn reuses_memory_and_reads_two_epochs_at_once() {
     let (_folder, path) = dataset(2);
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     let loader = Loader::new(Arc::clone(&reader), config(1, 1)).expect("a loader");
     let read = |epoch: u64| -> Vec<Batch> {
         loader.epoch(epoch, 0).map(|batch| batch.expect("a batch").into_batch()).collect()
@@ -165,7 +165,7 @@ fn reuses_memory_and_reads_two_epochs_at_once() {
 #[test]
 fn prefetching_respects_its_budget() {
     let (_folder, path) = dataset(2);
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     let ahead = |prefetch_bytes| {
         let config = LoaderConfig { prefetch: 8, prefetch_bytes, ..config(2, 1) };
         Loader::new(Arc::clone(&reader), config).expect("a loader").prefetch()
@@ -178,7 +178,7 @@ fn prefetching_respects_its_budget() {
 #[test]
 fn invalid_settings_are_explained() {
     let (_folder, path) = dataset(100);
-    let reader = open(&path).expect("opens");
+    let reader = open(&path).expect("opening the dataset");
     let wrong = |config| Loader::new(Arc::clone(&reader), config).err().expect("an error").to_string();
     let columns = |name: &str| ClipSpec { columns: vec![name.to_owned()], ..config(1, 1).clip };
     assert!(wrong(LoaderConfig { clip: columns("actions"), ..config(1, 1) }).contains("did you mean action"));
@@ -191,9 +191,9 @@ fn invalid_settings_are_explained() {
 #[test]
 fn damaged_dataset_ends_the_epoch_with_an_error() {
     let (_folder, path) = dataset(2);
-    let reader = open(&path).expect("opens");
-    for entry in std::fs::read_dir(path.join("data")).expect("a folder") {
-        std::fs::File::create(entry.expect("an entry").path()).expect("emptied");
+    let reader = open(&path).expect("opening the dataset");
+    for entry in std::fs::read_dir(path.join("data")).expect("listing a folder") {
+        std::fs::File::create(entry.expect("an entry").path()).expect("emptying a file");
     }
     for threads in [0, 2] {
         let loader = Loader::new(Arc::clone(&reader), LoaderConfig { threads, ..config(2, 1) }).expect("a loader");

@@ -1,6 +1,6 @@
 //! Tests of datasets on disk, in one test binary.
 
-// Tests print why they are skipped, and a child process prints its results, to standard output.
+// Skipped tests print the reason, and child processes print results, to standard output.
 #![allow(clippy::print_stdout, reason = "reports of skipped tests and of child processes")]
 
 mod cache;

@@ -14,6 +14,7 @@ use swm_data::{CommitPolicy, Constants, Location, StepRange, WriteMode, WriteOpt
 
 /// Environment variable of child processes: the location of the dataset.
 const TARGET: &str = "SWM_TEST_OBJECTS";
+/// The access key and the secret key of the server.
 const KEYS: [&str; 2] = ["AKEXAMPLE", "secret/example"];
 
 /// Serves the subfolders of `root` as buckets until the process ends; if `keys` is set, only to clients with [`KEYS`].
@@ -25,14 +26,14 @@ pub fn serve(root: &Path, keys: bool) -> String {
         service.set_auth(SimpleAuth::from_single(KEYS[0], KEYS[1]));
     }
     let service = service.build();
-    let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("binding a port");
     let address = listener.local_addr().expect("an address");
     listener.set_nonblocking(true).expect("a non-blocking listener");
     std::thread::spawn(move || {
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
         let writing = Arc::new(tokio::sync::Mutex::new(()));
         runtime.expect("a runtime").block_on(async move {
-            let listener = tokio::net::TcpListener::from_std(listener).expect("listens");
+            let listener = tokio::net::TcpListener::from_std(listener).expect("a TCP listener");
             while let Ok((socket, _)) = listener.accept().await {
                 let server = hyper_util::server::conn::auto::Builder::new(TokioExecutor::new());
                 let (service, writing) = (service.clone(), Arc::clone(&writing));
@@ -75,12 +76,13 @@ fn target() -> Option<Location> {
 
 fn write_to(location: &Location, mode: WriteMode, episodes: std::ops::Range<usize>) {
     let commit = CommitPolicy { episodes: 2, ..CommitPolicy::default() };
-    let mut writer = create(location, &schema(), WriteOptions { commit, ..options(mode) }).expect("creates");
+    let mut writer =
+        create(location, &schema(), WriteOptions { commit, ..options(mode) }).expect("creating the dataset");
     for e in episodes {
         let constants = Constants::from([("number".to_owned(), e.to_string().into_bytes())]);
-        writer.write_episode_with(&episode(e), &constants).expect("writes");
+        writer.write_episode_with(&episode(e), &constants).expect("writing an episode");
     }
-    writer.finish().expect("finishes");
+    writer.finish().expect("finishing the dataset");
 }
 
 /// A child process of other tests: writes, appends to, replaces and reads a dataset.
@@ -92,47 +94,52 @@ fn child_that_writes_and_reads() {
     let error = create(&location, &schema(), options(WriteMode::Create)).err().expect("an error").to_string();
     assert!(error.contains("exists already"), "{error}");
     write_to(&location, WriteMode::Append, 5..9);
-    let reader = open(&location).expect("opens");
+    let reader = open(&location).expect("opening the dataset");
     assert_eq!(reader.episodes().len(), 9);
     check(&*reader, 0);
-    assert_eq!(reader.constants(7).expect("reads")["number"], b"7");
-    assert!(reader.footprint().expect("a footprint").iter().map(|(_, bytes)| bytes).sum::<u64>() > 5_000);
+    assert_eq!(reader.constants(7).expect("reading constants")["number"], b"7");
+    assert!(reader.footprint().expect("listing the files").iter().map(|(_, bytes)| bytes).sum::<u64>() > 5_000);
 
     write_to(&location, WriteMode::Overwrite, 2..4);
-    let reader = open(&location).expect("opens");
+    let reader = open(&location).expect("opening the dataset");
     assert_eq!(reader.episodes().len(), 2);
     check(&*reader, 2);
 
     for index in 0..2 {
         let shard = Shard { index, count: 2 };
-        let mut writer = create_shard(&location, &schema(), options(WriteMode::Create), shard).expect("begins");
-        writer.write_episode(&episode(4 + index)).expect("writes");
-        writer.finish().expect("finishes");
+        let mut writer =
+            create_shard(&location, &schema(), options(WriteMode::Create), shard).expect("creating the shard");
+        writer.write_episode(&episode(4 + index)).expect("writing an episode");
+        writer.finish().expect("finishing the dataset");
     }
-    assert_eq!(commit_shards(&location).expect("commits"), 2);
-    let reader = open(&location).expect("opens");
+    assert_eq!(commit_shards(&location).expect("committing the shards"), 2);
+    let reader = open(&location).expect("opening the dataset");
     check(&*reader, 2);
-    println!("hash {}", reader.content_hash().expect("a hash"));
+    println!("hash {}", reader.content_hash().expect("hashing the content"));
 }
 
 #[test]
 fn stores_datasets_in_a_bucket() {
-    let folder = tempfile::tempdir().expect("a folder");
-    std::fs::create_dir(folder.path().join("bucket")).expect("a bucket");
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    std::fs::create_dir(folder.path().join("bucket")).expect("creating a bucket");
     let endpoint = serve(folder.path(), true);
-    let output = child("child_that_writes_and_reads", &endpoint, "s3://bucket/runs/d.lance").output().expect("runs");
+    let output = child("child_that_writes_and_reads", &endpoint, "s3://bucket/runs/d.lance")
+        .output()
+        .expect("running the child process");
     let text = finished(&output);
     // The objects in the bucket equal the files of a local dataset.
-    let reader = open(folder.path().join("bucket/runs/d.lance")).expect("opens");
+    let reader = open(folder.path().join("bucket/runs/d.lance")).expect("opening the dataset");
     check(&*reader, 2);
-    assert!(text.contains(&reader.content_hash().expect("a hash")), "{text}");
-    assert_eq!(std::fs::read_dir(folder.path().join("bucket/runs/d.lance/data")).expect("a folder").count(), 5);
+    assert!(text.contains(&reader.content_hash().expect("hashing the content")), "{text}");
+    assert_eq!(std::fs::read_dir(folder.path().join("bucket/runs/d.lance/data")).expect("listing a folder").count(), 5);
 
     let mut wrong = child("child_that_reads", &endpoint, "s3://bucket/runs/d.lance");
     wrong.env("AWS_SECRET_ACCESS_KEY", "no");
-    let text = finished(&wrong.output().expect("runs"));
+    let text = finished(&wrong.output().expect("running the child process"));
     assert!(text.contains("failed: s3://bucket/runs/d.lance"), "{text}");
-    let text = finished(&child("child_that_reads", &endpoint, "s3://bucket/none.lance").output().expect("runs"));
+    let text = finished(
+        &child("child_that_reads", &endpoint, "s3://bucket/none.lance").output().expect("running the child process"),
+    );
     assert!(text.contains("it holds no Lance table"), "{text}");
 }
 
@@ -155,29 +162,31 @@ fn child_that_appends() {
     let Some(location) = target() else { return };
     let commit = CommitPolicy { episodes: 1, ..CommitPolicy::default() };
     let options = WriteOptions { commit, ..options(WriteMode::Append) };
-    let mut writer = create(&location, &schema(), options).expect("continues");
+    let mut writer = create(&location, &schema(), options).expect("continuing the dataset");
     for e in 0..12 {
-        writer.write_episode(&episode(e)).expect("writes");
+        writer.write_episode(&episode(e)).expect("writing an episode");
     }
-    writer.finish().expect("finishes");
+    writer.finish().expect("finishing the dataset");
 }
 
 #[test]
 fn concurrent_processes_append_to_a_bucket() {
-    let folder = tempfile::tempdir().expect("a folder");
-    std::fs::create_dir(folder.path().join("bucket")).expect("a bucket");
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    std::fs::create_dir(folder.path().join("bucket")).expect("creating a bucket");
     let endpoint = serve(folder.path(), true);
     let children: Vec<_> = (0..3)
-        .map(|_| child("child_that_appends", &endpoint, "s3://bucket/d.lance").spawn().expect("starts"))
+        .map(|_| {
+            child("child_that_appends", &endpoint, "s3://bucket/d.lance").spawn().expect("starting the child process")
+        })
         .collect();
     for child in children {
-        finished(&child.wait_with_output().expect("ends"));
+        finished(&child.wait_with_output().expect("waiting for the child process"));
     }
-    let reader = open(folder.path().join("bucket/d.lance")).expect("opens");
+    let reader = open(folder.path().join("bucket/d.lance")).expect("opening the dataset");
     let indices: Vec<i64> = reader.episodes().iter().map(|episode| episode.index).collect();
     assert_eq!(indices, (0..36).collect::<Vec<_>>());
     let firsts: Vec<StepRange> = (0..36).map(|at| StepRange::new(at, 0, 1)).collect();
-    let states = reader.read(&["state"], &firsts).expect("reads");
+    let states = reader.read(&["state"], &firsts).expect("reading rows");
     let mut found: Vec<f64> = states.get::<f64>("state").expect("states").chunks(3).map(|s| s[0]).collect();
     found.sort_by(f64::total_cmp);
     assert_eq!(found, (0..36).map(|at| f64::from(at / 3)).collect::<Vec<_>>());
@@ -185,31 +194,32 @@ fn concurrent_processes_append_to_a_bucket() {
 
 #[test]
 fn reads_from_but_does_not_write_to_a_web_server() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     write(&folder.path().join("bucket/d.lance"), WriteMode::Create, 2, 0..5);
     let endpoint = serve(folder.path(), false);
     let location = Location::parse(&format!("{endpoint}/bucket/d.lance")).expect("a location");
-    let reader = open(&location).expect("opens");
+    let reader = open(&location).expect("opening the dataset");
     assert_eq!(reader.episodes().len(), 5);
     check(&*reader, 0);
-    assert!(reader.footprint().is_ok_and(|parts| !parts.is_empty()), "without a list of files");
+    assert!(reader.footprint().is_ok_and(|parts| !parts.is_empty()), "a web server lists no files");
     let error = create(&location, &schema(), options(WriteMode::Append)).err().expect("an error").to_string();
     assert!(error.contains("cannot be written"), "{error}");
     let missing = Location::parse(&format!("{endpoint}/bucket/none.lance")).expect("a location");
     assert!(open(&missing).is_err());
 
     let bytes: Vec<u8> = (0..400_000_u32).map(|i| ((i * i) >> 5) as u8).collect();
-    std::fs::write(folder.path().join("bucket/file.h5"), &bytes).expect("writes");
+    std::fs::write(folder.path().join("bucket/file.h5"), &bytes).expect("writing a file");
     let file = Location::parse(&format!("{endpoint}/bucket/file.h5")).expect("a location");
-    let file = ObjectFile::open(&file).expect("opens");
+    let file = ObjectFile::open(&file).expect("opening a file");
     assert_eq!(file.len(), 400_000);
-    let parts = file.read(&[300_000..400_000, 5..9]).expect("reads");
+    let parts = file.read(&[300_000..400_000, 5..9]).expect("reading byte ranges");
     assert!(parts[0] == bytes[300_000..] && parts[1] == bytes[5..9]);
 }
 
 #[test]
 fn unreachable_store_is_not_reported_as_damage() {
-    let unused_address = std::net::TcpListener::bind("127.0.0.1:0").expect("a port").local_addr().expect("an address");
+    let unused_address =
+        std::net::TcpListener::bind("127.0.0.1:0").expect("binding a port").local_addr().expect("an address");
     let location = Location::parse(&format!("http://{unused_address}/d.lance")).expect("a location");
     let error = open(&location).err().expect("no server").to_string();
     assert!(!error.contains("damaged") && error.contains(&unused_address.to_string()), "{error}");

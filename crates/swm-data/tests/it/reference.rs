@@ -1,5 +1,5 @@
-//! Interoperability with the published `stable-worldmodel`. `tests/interop` holds a dataset that its writer wrote, the
-//! script `export.py` that wrote the dataset, and the script `check.py` that reads datasets written here.
+//! Interoperability with the published Python package `stable-worldmodel`. In `tests/interop`, the script `export.py`
+//! wrote `reference.lance` with this package, and the script `check.py` reads datasets written here with it.
 
 use crate::sample::{episode, options, rows, schema, write};
 use serde_json::Value;
@@ -21,7 +21,7 @@ fn reference_schema() -> Schema {
         ColumnSpec::new("reward", DType::Float32, [1]),
         ColumnSpec::new("variation_agent_color", DType::Float32, [3]),
     ])
-    .expect("schema")
+    .expect("a valid schema")
 }
 
 /// Episode `e` of `export.py`. The third episode ends with action 0.
@@ -41,7 +41,7 @@ fn reference_episode(e: usize) -> Batch {
 }
 
 fn check_reference(path: &Path, episodes: usize) {
-    let reader = open(path).expect("opens");
+    let reader = open(path).expect("opening the dataset");
     assert_eq!(reader.schema().columns()[2..], *reference_schema().columns());
     assert_eq!(reader.episodes().len(), episodes);
     for e in 0..episodes {
@@ -51,10 +51,10 @@ fn check_reference(path: &Path, episodes: usize) {
                 &["pixels", "action", "reward", "variation_agent_color"],
                 &[StepRange::new(e, 0, reader.episodes()[e].length)],
             )
-            .expect("reads");
+            .expect("reading rows");
         assert_eq!(read.rows(), expected.rows());
         for column in 1..4 {
-            // Compared as text, so that NaN equals NaN.
+            // Compares the values as text, so that NaN equals NaN.
             let text = |b: &Batch| format!("{:?}", floats(b.bytes(column)));
             assert_eq!(text(&read), text(&expected), "column {column} of episode {e}");
         }
@@ -70,20 +70,20 @@ fn floats(bytes: &[u8]) -> Vec<f32> {
 #[test]
 fn reads_a_dataset_of_the_reference() {
     check_reference(&interop().join("reference.lance"), 3);
-    let text = open(interop().join("reference-text.lance")).expect("opens");
+    let text = open(interop().join("reference-text.lance")).expect("opening the dataset");
     let names: Vec<&str> = text.schema().columns().iter().map(|c| c.name.as_str()).collect();
     assert_eq!(names, ["episode_idx", "step_idx", "state"], "text columns are skipped");
 }
 
 fn copy(from: &Path, to: &Path) {
-    std::fs::create_dir_all(to).expect("a folder");
-    for entry in std::fs::read_dir(from).expect("a folder") {
+    std::fs::create_dir_all(to).expect("creating a folder");
+    for entry in std::fs::read_dir(from).expect("listing a folder") {
         let entry = entry.expect("an entry");
         let target = to.join(entry.file_name());
         if entry.path().is_dir() {
             copy(&entry.path(), &target);
         } else {
-            std::fs::copy(entry.path(), target).expect("copies");
+            std::fs::copy(entry.path(), target).expect("copying a file");
         }
     }
 }
@@ -92,17 +92,17 @@ fn copy(from: &Path, to: &Path) {
 fn append_to_reference(folder: &Path) -> PathBuf {
     let path = folder.join("continued.lance");
     copy(&interop().join("reference.lance"), &path);
-    let mut writer = create(&path, &reference_schema(), options(WriteMode::Append)).expect("continues");
+    let mut writer = create(&path, &reference_schema(), options(WriteMode::Append)).expect("continuing the dataset");
     assert_eq!(writer.episodes(), 3);
-    writer.write_episode(&reference_episode(3)).expect("writes");
-    writer.write_episode(&reference_episode(4)).expect("writes");
-    writer.finish().expect("finishes");
+    writer.write_episode(&reference_episode(3)).expect("writing an episode");
+    writer.write_episode(&reference_episode(4)).expect("writing an episode");
+    writer.finish().expect("finishing the dataset");
     path
 }
 
 #[test]
 fn appends_to_a_dataset_of_the_reference() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     check_reference(&append_to_reference(folder.path()), 5);
 }
 
@@ -113,35 +113,36 @@ fn reference_reads_datasets_written_here() {
         println!("SKIPPED: set SWM_REFERENCE_PYTHON to a Python with stable-worldmodel and pylance");
         return;
     };
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let ours = folder.path().join("ours.lance");
     write(&ours, WriteMode::Create, 2, 0..5);
     write(&ours, WriteMode::Append, 100, 5..8);
     let appended = append_to_reference(folder.path());
     let lossless = [("png", ImageCodec::Png), ("qoi", ImageCodec::Qoi)].map(|(name, codec)| {
         let path = folder.path().join(name).with_extension("lance");
-        let mut writer =
-            create(&path, &schema(), WriteOptions { codec, ..options(WriteMode::Create) }).expect("creates");
+        let mut writer = create(&path, &schema(), WriteOptions { codec, ..options(WriteMode::Create) })
+            .expect("creating the dataset");
         let constants = Constants::from([("scene.xml".to_owned(), b"<mujoco/>".to_vec())]);
-        writer.write_episode_with(&episode(0), &constants).expect("writes");
-        writer.finish().expect("finishes");
+        writer.write_episode_with(&episode(0), &constants).expect("writing an episode");
+        writer.finish().expect("finishing the dataset");
         path
     });
     // Two shards, committed together.
-    let parts = folder.path().join("parts.lance");
+    let sharded = folder.path().join("parts.lance");
     for index in 0..2 {
         let shard = Shard { index, count: 2 };
-        let location = Location::from(&parts);
-        let mut writer = create_shard(&location, &schema(), options(WriteMode::Create), shard).expect("begins");
+        let location = Location::from(&sharded);
+        let mut writer =
+            create_shard(&location, &schema(), options(WriteMode::Create), shard).expect("creating the shard");
         for e in 4 * index..4 * (index + 1) {
-            writer.write_episode(&episode(e)).expect("writes");
+            writer.write_episode(&episode(e)).expect("writing an episode");
         }
-        writer.finish().expect("finishes");
+        writer.finish().expect("finishing the dataset");
     }
-    assert_eq!(commit_shards(&Location::from(&parts)).expect("commits"), 8);
+    assert_eq!(commit_shards(&Location::from(&sharded)).expect("committing the shards"), 8);
     let mut command = Command::new(python);
-    command.arg("-B").arg(interop().join("check.py")).args([&ours, &appended, &lossless[0], &lossless[1], &parts]);
-    let output = command.output().expect("Python runs");
+    command.arg("-B").arg(interop().join("check.py")).args([&ours, &appended, &lossless[0], &lossless[1], &sharded]);
+    let output = command.output().expect("running Python");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let text = String::from_utf8(output.stdout).expect("text");
     let seen: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).expect("JSON")).collect();
@@ -180,7 +181,7 @@ fn reference_reads_datasets_written_here() {
             assert!((mean.expect("a mean") - means[i]).abs() < 1e-9, "lossless");
         }
     }
-    assert_eq!(seen[4], seen[0], "shards read like a dataset of one writer");
+    assert_eq!(seen[4], seen[0], "committed shards equal the dataset of one writer");
     // Both readers define the same clips: 2 steps with frameskip 2 take 4 rows.
     let clips: usize = (0..8).map(|e| rows(e) - 3).sum();
     assert_eq!(seen[0]["clips"], clips);

@@ -14,13 +14,13 @@ fn filled(episodes: std::ops::Range<usize>, capacity: usize) -> ReplayBuffer {
     let mut writer = buffer.writer();
     for e in episodes {
         let constants = Constants::from([("scene".to_owned(), vec![e as u8])]);
-        writer.write_episode_with(&episode(e), &constants).expect("writes");
+        writer.write_episode_with(&episode(e), &constants).expect("writing an episode");
     }
-    writer.finish().expect("finishes");
+    writer.finish().expect("finishing the dataset");
     buffer
 }
 
-/// Episode and row of every first step.
+/// The episode and the row of the first step of every clip.
 fn first_rows(batch: &Batch) -> Vec<(usize, usize)> {
     let state = |row| batch.row(row).get::<f64>("state").expect("states").to_vec();
     (0..batch.rows()).map(|row| (state(row)[0] as usize, state(row)[1] as usize)).collect()
@@ -35,14 +35,23 @@ fn evicts_the_oldest_episodes_but_keeps_snapshots() {
     check(&*before, 3);
     assert_eq!(before.episodes()[0].index, 3);
     assert_eq!(before.constants(1).expect("constants")["scene"], [4]);
-    buffer.add(&episode(6), &Constants::new()).expect("fits");
+    buffer.add(&episode(6), &Constants::new()).expect("adding an episode");
     assert_eq!((buffer.rows(), buffer.episodes(), buffer.snapshot().episodes()[0].index), (30, 3, 4));
     check(&*before, 3);
-    assert_ne!(before.content_hash().expect("a hash"), buffer.snapshot().content_hash().expect("a hash"));
+    assert_ne!(
+        before.content_hash().expect("hashing the content"),
+        buffer.snapshot().content_hash().expect("hashing the content")
+    );
     assert_eq!(buffer.writer().episodes(), 7, "a resumed collection continues after the evicted episodes");
 
     let small = ReplayBuffer::new(&schema(), 6).expect("a buffer");
-    assert!(small.add(&episode(2), &Constants::new()).expect_err("too long").to_string().contains("capacity"));
+    assert!(
+        small
+            .add(&episode(2), &Constants::new())
+            .expect_err("an episode beyond the capacity")
+            .to_string()
+            .contains("capacity")
+    );
     let mut broken = episode(0);
     broken.get_mut::<f32>("action").expect("actions").fill(0.5);
     assert!(small.add(&broken, &Constants::new()).expect_err("an action in the last row").to_string().contains("NaN"));
@@ -53,24 +62,24 @@ fn evicts_the_oldest_episodes_but_keeps_snapshots() {
 fn samples_windows_uniformly_and_reproducibly() {
     let buffer = filled(0..6, 100);
     let loader = buffer.loader(ReplayConfig { batch_size: 9000, ..config(3) }).expect("a loader");
-    let batch = loader.sample(Key::new(1)).expect("samples");
-    assert_eq!(first_rows(&batch), first_rows(&loader.sample(Key::new(1)).expect("samples")));
+    let batch = loader.sample(Key::new(1)).expect("sampling a batch");
+    assert_eq!(first_rows(&batch), first_rows(&loader.sample(Key::new(1)).expect("sampling a batch")));
     let mut count = vec![[0_i32; 10]; 6];
     for (e, start) in first_rows(&batch) {
         assert!(start + 3 <= rows(e), "a window extends beyond its episode");
         count[e][start] += 1;
     }
-    // 33 windows: five standard deviations of 9000 draws with probability 1/33.
+    // The tolerance is five standard deviations of the count of one of 33 windows in 9000 draws.
     let counts = count.iter().flatten().filter(|&&n| n > 0);
     assert_eq!(counts.clone().count(), 33);
     assert!(counts.clone().all(|n| n.abs_diff(273) < 82), "{count:?}");
-    // The latest twelve rows are those of the last two episodes.
+    // The latest twelve rows belong to the last two episodes.
     let recent = buffer.loader(ReplayConfig { recent: Some(12), ..config(1) }).expect("a loader");
-    assert!(first_rows(&recent.sample(Key::new(2)).expect("samples")).iter().all(|&(e, _)| e >= 4));
+    assert!(first_rows(&recent.sample(Key::new(2)).expect("sampling a batch")).iter().all(|&(e, _)| e >= 4));
     let goal =
         GoalSpec { name: "goal".into(), columns: vec!["state".into()], anchor: None, mixture: GoalMixture::LAST };
     let goals = buffer.loader(ReplayConfig { goals: vec![goal], ..config(1) }).expect("a loader");
-    let batch = goals.sample(Key::new(0)).expect("samples");
+    let batch = goals.sample(Key::new(0)).expect("sampling a batch");
     for (row, (e, _)) in first_rows(&batch).into_iter().enumerate() {
         let goal = batch.row(row).get::<f64>("goal_state").expect("goals");
         assert_eq!((goal[0] as usize, goal[1] as usize + 1), (e, rows(e)));
@@ -84,7 +93,7 @@ fn samples_while_the_buffer_grows() {
     let writer = buffer.clone();
     let writing = std::thread::spawn(move || {
         for e in 2..300 {
-            writer.add(&episode(e), &Constants::new()).expect("adds");
+            writer.add(&episode(e), &Constants::new()).expect("adding an episode");
         }
     });
     let mut latest = 0;
@@ -105,7 +114,7 @@ fn samples_while_the_buffer_grows() {
         }
     }
     assert!(latest > 250, "the loader samples added episodes");
-    writing.join().expect("the writer ends");
+    writing.join().expect("joining the writer");
     // Without a window, sampling fails and the stream ends.
     let empty = ReplayBuffer::new(&schema(), 10).expect("a buffer").loader(config(1)).expect("a loader");
     let mut batches = empty.batches(0);
@@ -114,25 +123,25 @@ fn samples_while_the_buffer_grows() {
 
 #[test]
 fn saves_and_restores() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("buffer.lance");
     let buffer = filled(0..6, 30);
     let state = |buffer: &ReplayBuffer| (buffer.rows(), buffer.episodes(), buffer.added());
     // The same episodes, without constants.
     let plain = ReplayBuffer::new(&schema(), 30).expect("a buffer");
-    (0..6).for_each(|e| plain.add(&episode(e), &Constants::new()).expect("adds"));
+    (0..6).for_each(|e| plain.add(&episode(e), &Constants::new()).expect("adding an episode"));
     assert_eq!(state(&plain), state(&buffer));
     let options = WriteOptions { mode: WriteMode::Create, ..WriteOptions::default() };
-    plain.save(&path, options).expect("saves");
-    let reader = open(&path).expect("opens");
-    let again = ReplayBuffer::restore(&*reader, 30).expect("restores");
-    assert_eq!(state(&again), state(&plain));
-    assert_eq!(again.snapshot().episodes(), plain.snapshot().episodes());
+    plain.save(&path, options).expect("saving the buffer");
+    let reader = open(&path).expect("opening the dataset");
+    let restored = ReplayBuffer::restore(&*reader, 30).expect("restoring the buffer");
+    assert_eq!(state(&restored), state(&plain));
+    assert_eq!(restored.snapshot().episodes(), plain.snapshot().episodes());
     let drawn = |buffer: &ReplayBuffer| {
-        let batch = buffer.loader(config(2)).expect("a loader").sample(Key::new(5)).expect("samples");
+        let batch = buffer.loader(config(2)).expect("a loader").sample(Key::new(5)).expect("sampling a batch");
         (batch.bytes(0).to_vec(), batch.bytes(1).to_vec(), batch.bytes(2).to_vec())
     };
-    assert!(drawn(&again) == drawn(&plain), "the restored buffer draws the same samples");
-    let less = ReplayBuffer::restore(&*reader, 20).expect("restores");
-    assert_eq!(state(&less), (19, 2, 6), "the latest episodes that fit");
+    assert!(drawn(&restored) == drawn(&plain), "the restored buffer draws the same samples");
+    let smaller = ReplayBuffer::restore(&*reader, 20).expect("restoring the buffer");
+    assert_eq!(state(&smaller), (19, 2, 6), "the latest episodes that fit");
 }

@@ -1,4 +1,4 @@
-//! Sample episodes in which every value depends on its episode and row.
+//! Sample episodes in which every value depends on the episode and the row.
 
 use std::path::Path;
 use swm_core::{Batch, ColumnSpec, DType, Manifest, Schema};
@@ -18,7 +18,7 @@ pub fn schema() -> Schema {
         ColumnSpec::new("variation.agent.color", DType::Int64, [3]),
         ColumnSpec::image("goal", 16, 24),
     ])
-    .expect("schema")
+    .expect("a valid schema")
 }
 
 /// Number of rows of episode `e`.
@@ -55,33 +55,38 @@ pub fn options(mode: WriteMode) -> WriteOptions {
     WriteOptions { mode, codec, manifest: Some(manifest(3)), ..WriteOptions::default() }
 }
 
-/// Writes episodes with a commit after every `group` of them.
+/// Writes episodes, with a commit after every `group` episodes.
 pub fn write(path: &Path, mode: WriteMode, group: usize, episodes: std::ops::Range<usize>) {
     let commit = CommitPolicy { episodes: group, ..CommitPolicy::default() };
-    let mut writer = create(path, &schema(), WriteOptions { commit, ..options(mode) }).expect("creates");
+    let mut writer = create(path, &schema(), WriteOptions { commit, ..options(mode) }).expect("creating the dataset");
     for e in episodes {
-        writer.write_episode(&episode(e)).expect("writes");
+        writer.write_episode(&episode(e)).expect("writing an episode");
     }
-    writer.finish().expect("finishes");
+    writer.finish().expect("finishing the dataset");
 }
 
 /// Checks that position `p` holds episode `first + p`, for all positions.
 pub fn check(reader: &dyn Reader, first: usize) {
     let all: Vec<StepRange> =
         reader.episodes().iter().enumerate().map(|(p, episode)| StepRange::new(p, 0, episode.length)).collect();
-    let read = reader.read(&COLUMNS, &all).expect("reads");
+    let read = reader.read(&COLUMNS, &all).expect("reading rows");
     let mut at = 0;
     for (p, stored) in reader.episodes().iter().enumerate() {
         let expected = episode(first + p);
         assert_eq!(stored.length, expected.rows(), "length of episode {p}");
         for (i, column) in schema().columns().iter().enumerate() {
             let n = column.row_bytes();
-            let got = &read.bytes(i)[at * n..(at + stored.length) * n];
+            let found = &read.bytes(i)[at * n..(at + stored.length) * n];
             if column.is_image() {
-                let off: f64 = got.iter().zip(expected.bytes(i)).map(|(&a, &b)| f64::from(a.abs_diff(b))).sum();
-                assert!(off / (got.len() as f64) < 6.0, "{} of episode {p}: {}", column.name, off / got.len() as f64);
+                let off: f64 = found.iter().zip(expected.bytes(i)).map(|(&a, &b)| f64::from(a.abs_diff(b))).sum();
+                assert!(
+                    off / (found.len() as f64) < 6.0,
+                    "{} of episode {p}: {}",
+                    column.name,
+                    off / found.len() as f64
+                );
             } else {
-                assert_eq!(got, expected.bytes(i), "{} of episode {p}", column.name);
+                assert_eq!(found, expected.bytes(i), "{} of episode {p}", column.name);
             }
         }
         at += stored.length;

@@ -1,4 +1,4 @@
-//! `ext/Line-v0`: a point on a line that an action moves, and a goal position.
+//! The environment `ext/Line-v0`: actions move a point on a line to a goal position.
 
 use swm::core::columns::STATE;
 use swm::core::env::{Action, FrameMut, ResetOptions, Snapshot, Transition};
@@ -14,9 +14,9 @@ pub const ENTRY: EnvEntry = EnvEntry {
     experts: &[],
 };
 
-/// Distance at which the goal is reached.
+/// Distance to the goal below which an episode succeeds.
 const TOLERANCE: f64 = 0.1;
-/// Movement per unit of action.
+/// Movement of the point per unit of action.
 const STEP: f64 = 0.3;
 
 struct Line {
@@ -92,7 +92,7 @@ impl Env for Line {
     fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
         let [position, goal] = snapshot.0.as_chunks::<8>().0 else {
             let given = format!("a snapshot of {} bytes", snapshot.0.len());
-            return Err(Error::mismatch("restoring ext/Line-v0", given, "16"));
+            return Err(Error::mismatch("restoring ext/Line-v0", given, "16 bytes"));
         };
         (self.position, self.goal) = (f64::from_le_bytes(*position), f64::from_le_bytes(*goal));
         Ok(())

@@ -1,4 +1,4 @@
-//! `line`: a world model of `ext/Line-v0`, `next = position + gain * action`.
+//! The model family `line`: a world model of `ext/Line-v0`, `next = position + gain * action`.
 
 use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor, TensorData};
@@ -14,7 +14,7 @@ pub const ENTRY: FamilyEntry = FamilyEntry::of::<Line>();
 
 #[derive(Module, Debug)]
 pub struct Line {
-    /// `[1]`.
+    /// Movement per unit of the normalised action, `[1]`.
     gain: Param<Tensor<1>>,
 }
 
@@ -99,13 +99,13 @@ impl ModelFamily for Line {
     }
 
     fn cost(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn CostModel>> {
-        // Movement per action in model units; the mean action moves the point, too.
         let gain = checkpoint.model.gain.val().into_data().iter::<f32>().next()?;
         Some(Box::new(LineCost { gain, contexts: vec![] }))
     }
 }
 
 struct LineCost {
+    /// Movement per unit of the normalised action.
     gain: f32,
     /// Position and goal of each observed environment.
     contexts: Vec<[f32; 2]>,

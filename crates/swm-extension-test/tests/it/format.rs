@@ -1,4 +1,4 @@
-//! `json`: a dataset in one JSON file, `NAME.extjson`.
+//! The format `json`: a dataset in one JSON file, `NAME.extjson`.
 
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
@@ -55,11 +55,11 @@ impl Reader for JsonReader {
 
     fn read_column(&self, column: &str, ranges: &[StepRange], mut out: &mut [u8]) -> Result<()> {
         let index = self.schema.index(column)?;
-        let width = self.schema.columns()[index].row_bytes();
+        let row_size = self.schema.columns()[index].row_bytes();
         for range in ranges {
-            let first = (self.starts[range.episode] + range.start) * width;
-            let (part, rest) = out.split_at_mut(range.length * width);
-            part.copy_from_slice(&self.stored.data[index][first..][..part.len()]);
+            let first = (self.starts[range.episode] + range.start) * row_size;
+            let (target, rest) = out.split_at_mut(range.length * row_size);
+            target.copy_from_slice(&self.stored.data[index][first..][..target.len()]);
             out = rest;
         }
         Ok(())

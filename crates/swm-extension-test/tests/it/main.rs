@@ -1,4 +1,4 @@
-//! Uses the extensions of this test in one run: collect, store, train, load, plan, evaluate.
+//! Collects, stores, trains, loads, plans and evaluates with the extensions of this crate.
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 mod env;

@@ -1,4 +1,4 @@
-//! `grid`: evaluates constant action sequences on a grid, for one-dimensional actions.
+//! The solver `grid`: evaluates constant action sequences on a grid, for one-dimensional actions.
 
 use swm::core::{Candidates, CostModel, Plan, PlanProblem, PlanSpace, Result, Solver};
 use swm::plan::{ActionKind, Family, SolverEntry};
@@ -14,6 +14,7 @@ pub const ENTRY: SolverEntry = SolverEntry {
     make: |_| Ok(Box::new(Grid)),
 };
 
+/// Number of grid points.
 const SAMPLES: usize = 41;
 
 struct Grid;

@@ -56,7 +56,7 @@ pub const AC_CHROMA: Table = Table {
     ],
 };
 
-/// The code of every symbol: its bits and their count.
+/// The code of every symbol, as `(bits, number of bits)`.
 pub type Codes = [(u16, u8); 256];
 
 const fn codes(table: &Table) -> Codes {

@@ -10,12 +10,12 @@ pub struct Step {
     pub size: u8,
 }
 
-/// Reads bits of a scan from the first to the last.
+/// A reader of the bits of a scan, in order.
 pub struct BitReader<'a> {
     bytes: &'a [u8],
     /// Index of the next byte to load.
     next: usize,
-    /// Loaded bits, from the top.
+    /// Loaded bits; the highest bit is the next to read.
     buffer: u64,
     /// The number of loaded bits.
     count: u32,
@@ -40,14 +40,14 @@ impl<'a> BitReader<'a> {
     fn load(&mut self) {
         if let Some(&next) = self.bytes.get(self.next..).and_then(<[u8]>::first_chunk::<8>) {
             let next = u64::from_be_bytes(next);
-            // A byte 0xff has its upper bit set, and adding one to its other seven carries into that bit.
+            // A byte 0xff has its highest bit set, and adding 1 to its seven lower bits carries into the highest bit.
             let ones = (next & 0x7f7f_7f7f_7f7f_7f7f) + 0x0101_0101_0101_0101;
             if ones & next & 0x8080_8080_8080_8080 == 0 {
                 self.buffer |= next >> self.count;
                 let taken = (63 - self.count) / 8;
                 self.next += taken as usize;
                 self.count += taken * 8;
-                // The next load repeats the bits of the byte that was taken in part.
+                // Clears the bits of the partial byte at the end, which the next load reads again.
                 self.buffer &= !0 << (64 - self.count);
                 return;
             }
@@ -55,7 +55,7 @@ impl<'a> BitReader<'a> {
         self.load_bytes();
     }
 
-    /// Loads byte by byte: skips the zero that follows a byte 0xff, and gives zeros beyond the end.
+    /// Loads bits byte by byte. Skips the zero that follows a byte 0xff, and loads zeros beyond the end.
     fn load_bytes(&mut self) {
         while self.count <= 56 {
             let byte = match self.bytes.get(self.next..) {
@@ -84,13 +84,13 @@ impl<'a> BitReader<'a> {
         self.count -= n;
     }
 
-    /// Whether the next `length` loaded bits are `code`.
+    /// Returns whether the next `length` loaded bits are `code`.
     #[inline(always)]
     pub const fn starts_with(&self, (code, length): (u64, u32)) -> bool {
         self.buffer >> (64 - length) == code
     }
 
-    /// Reads the next code.
+    /// Reads the next Huffman code. Returns `None` if the table does not contain it.
     #[inline(always)]
     pub fn entry(&mut self, table: &HuffmanTable, is_ac: bool) -> Option<Entry> {
         self.refill();
@@ -102,7 +102,7 @@ impl<'a> BitReader<'a> {
         Some(entry)
     }
 
-    /// Returns the coefficient of an entry. Reads those bits of the coefficient that the entry does not contain.
+    /// Returns the coefficient of an entry. Reads the bits of the coefficient that the entry does not contain.
     #[inline(always)]
     pub fn value(&mut self, entry: Entry) -> i32 {
         let size = entry.extra_bits();
@@ -114,8 +114,8 @@ impl<'a> BitReader<'a> {
         value
     }
 
-    /// Reads the AC coefficients of a block, times their steps, into `to`. Returns whether there was one, and `None`
-    /// when there are more than a block holds.
+    /// Reads the AC coefficients of a block, times their quantisation steps, into `to`. Returns whether the block has
+    /// AC coefficients, or `None` when it has more than 63 or a code is invalid.
     #[inline(always)]
     pub fn ac_coefficients(&mut self, table: &HuffmanTable, steps: &[Step; 64], to: &mut Block) -> Option<bool> {
         let mut k = 0;
@@ -133,12 +133,12 @@ impl<'a> BitReader<'a> {
         }
     }
 
-    /// Whether bits were read beyond the end.
+    /// Returns whether bits were read beyond the end of the scan.
     pub const fn is_past_end(&self) -> bool {
         self.count < self.beyond
     }
 
-    /// Whether the scan ends here with the end of the image. Padding fills the last byte.
+    /// Returns whether the end marker of the image follows the bits that were read. Padding may fill the last byte.
     pub fn is_at_end_of_image(&self) -> bool {
         let loaded_bytes = (self.count - self.beyond) / 8;
         loaded_bytes == 0 && self.bytes.get(self.next..).is_some_and(|left| left.starts_with(&[0xff, 0xd9]))

@@ -1,10 +1,11 @@
-//! The fast JPEG decoder: baseline JPEG as datasets hold it, bit for bit as libjpeg (and therefore Pillow, OpenCV and
-//! torchvision) decodes it.
+//! The fast decoder of baseline JPEG. The pixels equal the pixels that libjpeg (and therefore Pillow, OpenCV and
+//! torchvision) decodes, bit for bit.
 //!
-//! Frames of simulations have large areas of one colour, which are fast to decode: an MCU that repeats the last MCU is
-//! recognised by its code alone, and an MCU of a single colour whose neighbours have the same chroma is filled without
-//! inverse transform or upsampling. Supported is ITU-T T.81 baseline in YCbCr, chroma at full (4:4:4) or half
-//! resolution (4:2:0), without restart intervals. The general decoder handles all other files, including damaged ones.
+//! Frames of simulations have large areas of one colour, which are fast to decode: an MCU (minimum coded unit) that
+//! repeats the last MCU is recognised by its code alone, and an MCU of a single colour whose neighbours have the same
+//! chroma is filled without inverse transform or upsampling. The decoder supports ITU-T T.81 baseline in YCbCr, with
+//! chroma at full (4:4:4) or half resolution (4:2:0), without restart intervals. The general decoder handles all other
+//! files, including damaged files.
 
 use super::bit_reader::BitReader;
 use super::header::{Header, Tables};
@@ -14,7 +15,7 @@ use super::planes::{MARGIN, Mcu, Planes};
 use std::cell::RefCell;
 use swm_simd::{Kernel, Level, dispatch_avx2};
 
-/// Memory and Huffman tables that are reused from one image to the next; the tables are mostly the same.
+/// Memory and Huffman tables that are reused for the next image. Most images have equal tables.
 #[derive(Default)]
 struct Scratch {
     tables: Tables,
@@ -27,8 +28,8 @@ thread_local! {
 
 /// Decodes an image of `height` by `width` into `out`, `[height, width, 3]` RGB bytes.
 ///
-/// Returns `false`, with unspecified bytes in `out`, when the image has another size, is of a kind that is not
-/// supported, or is damaged.
+/// Returns `false`, with unspecified bytes in `out`, when the image has another size, is of an unsupported
+/// kind, or is damaged.
 pub fn decode(bytes: &[u8], height: usize, width: usize, out: &mut [u8]) -> bool {
     if out.len() != height * width * 3 || out.is_empty() {
         return false;
@@ -99,7 +100,7 @@ fn decode_planes<L: Level>(header: &Header, scan: &[u8], tables: &Tables, planes
                 planes.mcus.push(last);
                 continue;
             }
-            // The sample value of each block whose samples are all equal.
+            // For each block, the value of the samples if all samples are equal.
             let mut flat = [None; 6];
             for (block, flat) in flat.iter_mut().enumerate().take(luma_blocks + 2) {
                 let plane = block.saturating_sub(luma_blocks - 1);
@@ -136,12 +137,12 @@ fn decode_planes<L: Level>(header: &Header, scan: &[u8], tables: &Tables, planes
             return None;
         }
     }
-    // A file without an end marker here has another scan or is damaged.
+    // A file without an end marker after the scan has another scan or is damaged.
     bits.is_at_end_of_image().then_some(())
 }
 
-/// Returns the code of an MCU that repeats the last MCU, as bits and their number. Every block of such an MCU has a DC
-/// difference of 0 and no AC coefficients. `None` if the code has more than 32 bits.
+/// Returns the code of an MCU that repeats the last MCU, as `(bits, number of bits)`. Every block of such an MCU has a
+/// DC difference of 0 and no AC coefficients. Returns `None` if the code has more than 32 bits.
 fn repeated_mcu(tables: &PlaneTables<'_>, luma_blocks: usize) -> Option<(u64, u32)> {
     let code = |table: &HuffmanTable, run: u32| {
         let matches = |entry: &Entry| (1..=INDEX_BITS).any(|length| *entry == Entry::new(length, 0, run, 0));

@@ -1,4 +1,4 @@
-//! Tests of the fast decoder against files that Pillow wrote and decoded, and against itself without AVX2.
+//! Tests of the fast decoder, with and without AVX2, on files that Pillow wrote and decoded and on random images.
 
 use super::decode::decode;
 use super::encode;
@@ -24,7 +24,7 @@ fn pillow_images() -> Vec<PillowImage> {
     paths.iter().map(|path| read(path)).collect()
 }
 
-/// As [`decode`], without AVX2.
+/// Calls [`decode`] without AVX2.
 fn decode_at_baseline(bytes: &[u8], height: usize, width: usize, out: &mut [u8]) -> bool {
     static LIMITED: Mutex<()> = Mutex::new(());
     let _limited = LIMITED.lock().unwrap_or_else(PoisonError::into_inner);
@@ -48,7 +48,7 @@ fn decodes_bit_for_bit_as_pillow() {
             assert!(decode_at_baseline(&bytes, height, width, &mut out), "{name}");
             assert!(out == expected, "{name} without AVX2");
         }
-        // The general decoder also reads the kinds that the fast decoder does not support. It rounds differently.
+        // The general decoder also reads the kinds that the fast decoder does not support, and rounds differently.
         crate::decode(&bytes, height, width, &mut out).expect("an image");
         let off: u32 = out.iter().zip(&expected).map(|(a, b)| u32::from(a.abs_diff(*b))).sum();
         assert!(f64::from(off) / (expected.len() as f64) < 3.0, "{name}: {off}");

@@ -1,15 +1,16 @@
 //! A baseline JPEG encoder for frames of simulations.
 //!
-//! Such frames have large areas of one colour. An MCU (16 × 16 pixels) of one colour needs no transform, only a few
-//! bits for the difference of its value from the last MCU's. Finding these MCUs first makes encoding several times
-//! faster than the general encoders we measured, which transform every block. The output is ordinary: ITU-T T.81
-//! baseline, JFIF, chroma at half resolution (4:2:0), the example tables of Annex K scaled by quality as libjpeg does.
+//! Frames of simulations have large areas of one colour. An MCU (minimum coded unit, 16 × 16 pixels) of one colour
+//! needs no transform, only a few bits for the difference between its value and the value of the last MCU. The encoder
+//! finds these MCUs first, which makes it several times faster than general encoders, which transform every block. The
+//! output is ITU-T T.81 baseline, JFIF, with chroma at half resolution (4:2:0) and the example tables of Annex K,
+//! scaled by quality as in libjpeg.
 
 use super::ZIGZAG;
 use super::annex_k::{AC_CHROMA, AC_LUMA, CHROMA, CODES, DC_CHROMA, DC_LUMA, LUMA};
 use super::forward_dct::{Block, forward_dct};
 
-/// Side of an MCU in pixels: 4 blocks of luma, one of each chroma plane.
+/// Side of an MCU in pixels. An MCU consists of four luma blocks and one block of each chroma plane.
 const MCU: usize = 16;
 /// Bytes in a row of an MCU.
 const LINE: usize = MCU * 3;
@@ -60,7 +61,7 @@ fn gather(rgb: &[u8], (h, w): (usize, usize), (top, left): (usize, usize), mcu: 
     }
 }
 
-/// Whether one quarter of an MCU (0 and 1 in the upper half, 2 and 3 in the lower half) has one colour.
+/// Returns whether one quarter of an MCU (0 and 1 in the upper half, 2 and 3 in the lower half) has one colour.
 fn quarter_is_flat(mcu: &[u8; MCU * LINE], quarter: usize) -> bool {
     let start = quarter / 2 * 8 * LINE + quarter % 2 * (LINE / 2);
     let row = |row: usize| &mcu[start + row * LINE..][..LINE / 2];
@@ -86,9 +87,9 @@ fn round(value: f32) -> i32 {
 
 /// The entropy-coded part of an image.
 struct Scan<'a> {
-    /// Bits that are not written yet, at the low end.
+    /// Bits that are not written yet; the lowest bit is the newest.
     bits: u64,
-    /// The number of bits that still fit.
+    /// The number of bits that still fit into `bits`.
     free: u32,
     out: &'a mut Vec<u8>,
     /// The last DC coefficient of each component.
@@ -148,7 +149,7 @@ impl Scan<'_> {
     /// Writes a block whose samples are all equal.
     fn flat_block(&mut self, component: usize, value: f32) {
         let kind = usize::from(component > 0);
-        // The DC coefficient is 8 times the value, and 64 times with the factor that the transform keeps.
+        // The DC coefficient is 8 times the value. `forward_dct` keeps another factor of 8.
         self.dc(component, round(64.0 * value * self.reciprocals[kind][0]));
         self.symbol(kind, 1, 0);
     }
@@ -170,7 +171,7 @@ impl Scan<'_> {
             let value = coefficients[k as usize];
             let size = size(value);
             let (code, length) = CODES[kind][1][(zeros << 4 | size) as usize];
-            self.put(u32::from(code) << size | magnitude(value, size), u32::from(length) + size);
+            self.push_bits(u32::from(code) << size | magnitude(value, size), u32::from(length) + size);
             last = k;
             left &= left - 1;
         }
@@ -179,22 +180,22 @@ impl Scan<'_> {
         }
     }
 
-    /// Writes the DC coefficient of a block, as its difference from the last block's.
+    /// Writes the difference between the DC coefficients of a block and of the component's last block.
     fn dc(&mut self, component: usize, value: i32) {
         let difference = value - self.last_dc[component];
         self.last_dc[component] = value;
         let size = size(difference);
         let (code, length) = CODES[usize::from(component > 0)][0][size as usize];
-        self.put(u32::from(code) << size | magnitude(difference, size), u32::from(length) + size);
+        self.push_bits(u32::from(code) << size | magnitude(difference, size), u32::from(length) + size);
     }
 
     fn symbol(&mut self, kind: usize, class: usize, symbol: usize) {
         let (code, length) = CODES[kind][class][symbol];
-        self.put(code.into(), length.into());
+        self.push_bits(code.into(), length.into());
     }
 
     /// Appends at most 32 bits.
-    fn put(&mut self, bits: u32, length: u32) {
+    fn push_bits(&mut self, bits: u32, length: u32) {
         if self.free < length {
             self.flush();
         }
@@ -202,7 +203,7 @@ impl Scan<'_> {
         self.free -= length;
     }
 
-    /// Writes whole bytes. A zero follows each byte 0xff, which would be a marker otherwise.
+    /// Writes whole bytes. A zero follows each byte 0xff, which would otherwise start a marker.
     fn flush(&mut self) {
         while self.free <= 56 {
             let byte = (self.bits >> (56 - self.free)) as u8;
@@ -218,15 +219,15 @@ impl Scan<'_> {
         self.flush();
         let rest = 64 - self.free;
         if rest > 0 {
-            // Ones fill the last byte.
-            self.put((1 << (8 - rest)) - 1, 8 - rest);
+            // Fills the last byte with ones.
+            self.push_bits((1 << (8 - rest)) - 1, 8 - rest);
             self.flush();
         }
         self.out.extend([0xff, 0xd9]);
     }
 }
 
-/// Returns the bits that stand for a value of `size` bits: the value, or one less if it is negative.
+/// Returns the lowest `size` bits of a value, or of the value minus 1 if the value is negative.
 fn magnitude(value: i32, size: u32) -> u32 {
     (value + (value >> 31)) as u32 & ((1 << size) - 1)
 }
@@ -236,7 +237,8 @@ fn size(value: i32) -> u32 {
     32 - value.unsigned_abs().leading_zeros()
 }
 
-/// Returns the reciprocals of a table's steps, times the factors that [`forward_dct`] keeps, in its transposed order.
+/// Returns 1 / (step × factor) for each quantisation step of a table and the factor that [`forward_dct`] keeps, in the
+/// transposed order of [`forward_dct`].
 fn reciprocals(table: &[u8; 64]) -> [f32; 64] {
     // 1, and sqrt 2 times cos(k pi / 16).
     const SCALE: [f64; 8] =
@@ -267,7 +269,7 @@ fn write_headers(height: u16, width: u16, tables: &[[u8; 64]; 2], out: &mut Vec<
         segment(out, 0xdb, &[&[i], &ZIGZAG.map(|position| table[usize::from(position)])]);
     }
     let ([h1, h0], [w1, w0]) = (height.to_be_bytes(), width.to_be_bytes());
-    // 8 bits, 3 components: luma at twice the rate in both directions.
+    // Declares 8 bits and 3 components, with luma at twice the chroma rate in both directions.
     segment(out, 0xc0, &[&[8, h1, h0, w1, w0, 3, 1, 0x22, 0, 2, 0x11, 1, 3, 0x11, 1]]);
     for (id, table) in [(0x00, DC_LUMA), (0x10, AC_LUMA), (0x01, DC_CHROMA), (0x11, AC_CHROMA)] {
         segment(out, 0xc4, &[&[id], &table.counts, table.symbols]);
@@ -291,7 +293,7 @@ mod tests {
     fn decoded(rgb: &[u8], height: u16, width: u16, quality: u8) -> Vec<u8> {
         let mut bytes = vec![7];
         encode(rgb, height, width, quality, &mut bytes);
-        assert_eq!(bytes[0], 7, "appends");
+        assert_eq!(bytes[0], 7, "the encoder appends to the vector");
         let options = DecoderOptions::default().jpeg_set_out_colorspace(ColorSpace::RGB).set_strict_mode(true);
         let mut decoder = zune_jpeg::JpegDecoder::new_with_options(ZCursor::new(&bytes[1..]), options);
         let pixels = decoder.decode().expect("a JPEG image");
@@ -322,7 +324,7 @@ mod tests {
 
     #[test]
     fn images_of_many_sizes_are_close_after_decoding() {
-        // A disc on one colour, which has both kinds of MCU, and gradients.
+        // The disc on a background of one colour has both kinds of MCU.
         let disc =
             |y: i32, x: i32| if (y - 30).pow(2) + (x - 20).pow(2) < 150 { [30, 60, 250] } else { [250, 240, 230] };
         let gradient = |y: i32, x: i32| [x * 3, y * 3, x + y].map(|v| v.min(255) as u8);

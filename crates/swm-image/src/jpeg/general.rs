@@ -19,7 +19,7 @@ impl<'a> Decoder<'a> {
     /// # Errors
     /// When the headers are damaged.
     pub fn new(bytes: &'a [u8]) -> Result<Self> {
-        // Strict: a truncated file is an error, not a grey area.
+        // In strict mode, a truncated file is an error. Otherwise, the missing pixels would be grey.
         let options = DecoderOptions::default().jpeg_set_out_colorspace(ColorSpace::RGB).set_strict_mode(true);
         let mut inner = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
         inner.decode_headers().map_err(|error| Error::external("reading a JPEG header", error))?;

@@ -22,7 +22,7 @@ pub struct Header {
 
 impl Header {
     /// Reads the segments up to the scan. Returns the header and the bytes of the scan; Huffman tables go to `tables`.
-    /// `None` for files that the fast decoder does not support.
+    /// Returns `None` for files that the fast decoder does not support.
     pub fn read<'a>(bytes: &'a [u8], tables: &mut Tables) -> Option<(Self, &'a [u8])> {
         let mut header = Self::default();
         let mut rest = bytes.strip_prefix(&[0xff, 0xd8])?;
@@ -40,8 +40,8 @@ impl Header {
                     return (body == [3, 1, 0x00, 2, 0x11, 3, 0x11, 0, 63, 0]).then_some((header, rest));
                 }
                 0xdb => header.read_quantisation(body)?,
-                // JFIF, other application segments and comments. Adobe's segment is unsupported, because it may change
-                // the colour space.
+                // Skips JFIF, other application segments and comments. Adobe's segment is unsupported, because it may
+                // change the colour space.
                 0xe0..=0xed | 0xef | 0xfe => {}
                 _ => return None,
             }
@@ -58,7 +58,7 @@ impl Header {
         self.height = u16::from_be_bytes([h1, h0]).into();
         self.width = u16::from_be_bytes([w1, w0]).into();
         self.steps_of_plane = [y, u, v].map(usize::from);
-        // libjpeg repeats the chroma of images this narrow instead of interpolating it.
+        // Rejects narrow images, because libjpeg repeats their chroma instead of interpolating it.
         (self.height > 0 && self.width > if self.subsampling == 2 { 4 } else { 0 }).then_some(())
     }
 
@@ -90,7 +90,7 @@ impl Header {
     }
 }
 
-/// Reads Huffman tables, unless they equal those of the last image.
+/// Reads Huffman tables. Tables that equal the tables of the last image are not rebuilt.
 fn read_huffman_tables(mut body: &[u8], tables: &mut Tables, given: &mut [[bool; 2]; 2]) -> Option<()> {
     while let Some((&id, rest)) = body.split_first() {
         let (class, plane_kind) = (usize::from(id >> 4), usize::from(id & 15));

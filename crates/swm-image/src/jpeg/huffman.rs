@@ -8,9 +8,12 @@ pub const END_OF_BLOCK: u32 = 64;
 
 /// The meaning of the next bits of a scan, packed into one register.
 ///
-/// From the lowest bit: 5 bits, the length of the code, plus the bits of its coefficient where these fit into the
-/// index; 0 for a code that is longer than [`INDEX_BITS`]. 4 bits, how many bits of the coefficient follow. 7 bits, the
-/// zeros before the coefficient, or [`END_OF_BLOCK`]. 16 bits, the coefficient.
+/// Fields from the lowest bit:
+/// - 5 bits: the length of the code, plus the length of the coefficient if both fit into the index; 0 for a code that
+///   is longer than [`INDEX_BITS`].
+/// - 4 bits: the number of bits of the coefficient that follow the code.
+/// - 7 bits: the number of zeros before the coefficient, or [`END_OF_BLOCK`].
+/// - 16 bits: the coefficient.
 #[derive(Clone, Copy, Default, PartialEq, Eq)]
 pub struct Entry(u32);
 
@@ -105,8 +108,8 @@ impl HuffmanTable {
     }
 }
 
-/// Returns the zero run and the coefficient size of a symbol, sections F.1.2.1 and F.1.2.2. `None` for symbols that
-/// baseline JPEG does not have.
+/// Returns the zero run and the coefficient size of a symbol, sections F.1.2.1 and F.1.2.2. Returns `None` for symbols
+/// that baseline JPEG does not have.
 fn run_and_size(symbol: u8, is_ac: bool) -> Option<(u32, u32)> {
     let (run, size) = (u32::from(symbol >> 4), u32::from(symbol & 15));
     match (is_ac, run, size) {
@@ -116,7 +119,7 @@ fn run_and_size(symbol: u8, is_ac: bool) -> Option<(u32, u32)> {
     }
 }
 
-/// Returns the coefficient that `size` bits stand for, table F.1: those that begin with 0 are negative.
+/// Returns the coefficient that `size` bits encode, table F.1. Bits that begin with 0 encode a negative coefficient.
 #[inline(always)]
 pub fn sign_extend(bits: u32, size: u32) -> i32 {
     let bits = bits as i32;

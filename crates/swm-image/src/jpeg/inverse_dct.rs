@@ -1,5 +1,5 @@
-//! The inverse cosine transform of 8 × 8 blocks: the algorithm of Loeffler, Ligtenberg and Moschytz (1989) in integers,
-//! bit for bit as libjpeg's accurate method (`islow`) rounds it.
+//! The inverse cosine transform of 8 × 8 blocks: the algorithm of Loeffler, Ligtenberg and Moschytz (1989) in integers.
+//! The results equal the results of libjpeg's accurate method (`islow`), bit for bit.
 
 use swm_simd::{CpuLevel, Level};
 
@@ -9,29 +9,30 @@ pub type Block = [i16; 64];
 /// A row of eight values.
 type Row<T> = [T; 8];
 
-/// Factors of the products `a·x + b·y` of two rows that make up the transform, in units of 2⁻¹³. They are those of the
-/// paper's figure 1 with its three-multiplication rotations multiplied out, which is exact in integers.
+/// Factors of the products `a·x + b·y` of two rows that make up the transform, in units of 2⁻¹³. They follow
+/// from figure 1 of the paper, with the three-multiplication rotations multiplied out, which is exact in integers.
 mod factors {
     pub type Pair = (i16, i16);
     pub const SUM: Pair = (8192, 8192);
     pub const DIFFERENCE: Pair = (8192, -8192);
-    /// Rows 2 and 6.
+    /// Factors of rows 2 and 6.
     pub const E2: Pair = (4433, -10704);
     pub const E3: Pair = (10703, 4433);
-    /// The sums of rows 7 and 3, and of 5 and 1.
+    /// Factors of two sums: of rows 7 and 3, and of rows 5 and 1.
     pub const Z3: Pair = (-6436, 9633);
     pub const Z4: Pair = (9633, 6437);
-    /// Rows 7 and 1.
+    /// Factors of rows 7 and 1.
     pub const O0: Pair = (-4927, -7373);
     pub const O3: Pair = (-7373, 4926);
-    /// Rows 5 and 3.
+    /// Factors of rows 5 and 3.
     pub const O1: Pair = (-4176, -20995);
     pub const O2: Pair = (-20995, 4177);
 }
 
-/// Bits that the first pass rounds away; it keeps two fraction bits.
+/// Number of bits that the first pass rounds away: all fraction bits of the factors except two.
 const FIRST: i32 = 11;
-/// Bits that the second pass rounds away: those of its factors, the two kept ones and the transform's factor of 8.
+/// Number of bits that the second pass rounds away: 13 fraction bits of the factors, 2 fraction bits of the first pass,
+/// and 3 bits of the transform's factor of 8.
 const SECOND: i32 = 18;
 
 /// Writes the 8 × 8 samples of a block, 128 added, as rows that are `stride` apart.
@@ -101,7 +102,7 @@ mod avx2 {
 
     type Rows = [__m128i; 8];
 
-    /// As [`super::portable`].
+    /// Computes the same result as [`super::portable`].
     #[target_feature(enable = "avx2")]
     pub fn inverse_dct(block: &Block, to: &mut [u8], stride: usize) {
         let mut rows = [_mm_setzero_si128(); 8];
@@ -194,7 +195,7 @@ mod tests {
         for round in 0..3000 {
             let block = std::array::from_fn(|_| {
                 seed = seed.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-                // Many zeros, and values from small ones to larger ones than those of images.
+                // Most values are 0. The largest values exceed the values of images.
                 if seed >> 30 == 0 { (seed as i32 >> 15 >> (round % 16)) as i16 } else { 0 }
             });
             let (mut plain, mut fast) = ([0; 80], [0; 80]);

@@ -4,12 +4,12 @@ use super::header::Header;
 use super::ycbcr::{Samples, convert, convert_halved};
 use swm_simd::Level;
 
-/// Extra samples at the sides of a plane. In chroma planes they repeat the outermost samples, so that every sample has
-/// neighbours.
+/// Number of extra samples at the sides of a row. In chroma planes they repeat the outermost samples, so that every
+/// sample has neighbours.
 pub const MARGIN: usize = 8;
 
-/// A minimum coded unit (MCU), a square of blocks that are coded together: the value of each plane whose samples are
-/// all equal.
+/// A minimum coded unit (MCU), a square of blocks that are coded together. Holds the value of each plane whose samples
+/// are all equal.
 #[derive(Clone, Copy, Default, PartialEq, Eq)]
 pub struct Mcu {
     pub luma: Option<u8>,
@@ -99,7 +99,7 @@ impl Planes {
         let (rows, columns) = header.mcu_grid();
         let mcu = self.mcus[row * columns + column];
         let (luma, chroma) = (mcu.luma?, mcu.chroma?);
-        // Chroma at half resolution is interpolated with that of the neighbours.
+        // Chroma at half resolution is interpolated with the chroma of neighbouring MCUs.
         if header.subsampling == 2 {
             for row in row.saturating_sub(1)..(row + 2).min(rows) {
                 for column in column.saturating_sub(1)..(column + 2).min(columns) {

@@ -8,7 +8,7 @@ pub type Samples = [u8; 16];
 /// Converts sixteen pixels whose chroma is at half resolution.
 ///
 /// Chroma is interpolated with weights 3/4 (nearest sample) and 1/4 (next sample) in both directions. `us` and `vs` are
-/// the nearest row and the next one; samples 1 to 8 belong to the pixels, samples 0 and 9 are their neighbours.
+/// the nearest row and the next row. Samples 1 to 8 belong to the pixels; samples 0 and 9 are neighbours.
 #[inline(always)]
 pub fn convert_halved<L: Level>(ys: &Samples, us: [&Samples; 2], vs: [&Samples; 2], out: &mut [u8; 48]) {
     #[cfg(target_arch = "x86_64")]
@@ -67,13 +67,13 @@ mod avx2 {
         to[8..].copy_from_slice(&_mm_extract_epi64::<1>(value).to_le_bytes());
     }
 
-    /// As [`super::convert_halved`].
+    /// Computes the same result as [`super::convert_halved`].
     #[target_feature(enable = "avx2")]
     pub fn convert_halved(ys: &Samples, us: [&Samples; 2], vs: [&Samples; 2], out: &mut [u8; 48]) {
         pixels(load(ys), interpolate(us), interpolate(vs), out);
     }
 
-    /// As [`super::convert`].
+    /// Computes the same result as [`super::convert`].
     #[target_feature(enable = "avx2")]
     pub fn convert(ys: &Samples, us: &Samples, vs: &Samples, out: &mut [u8; 48]) {
         pixels(load(ys), load(us), load(vs), out);
@@ -97,12 +97,12 @@ mod avx2 {
         let u = _mm256_sub_epi16(_mm256_cvtepu8_epi16(u), _mm256_set1_epi16(128));
         let v = _mm256_sub_epi16(_mm256_cvtepu8_epi16(v), _mm256_set1_epi16(128));
         // 1.402 v = v + 0.402 v and 1.772 u = 2 u − 0.228 u, so that the factors fit 16 bits.
-        let part = |value: __m256i, factor: i16| {
+        let scaled = |value: __m256i, factor: i16| {
             let twice = _mm256_mulhi_epi16(_mm256_add_epi16(value, value), _mm256_set1_epi16(factor));
             _mm256_srai_epi16::<1>(_mm256_add_epi16(twice, _mm256_set1_epi16(1)))
         };
-        let red = _mm256_add_epi16(_mm256_add_epi16(y, v), part(v, 26345));
-        let blue = _mm256_add_epi16(_mm256_add_epi16(y, _mm256_add_epi16(u, u)), part(u, -14942));
+        let red = _mm256_add_epi16(_mm256_add_epi16(y, v), scaled(v, 26345));
+        let blue = _mm256_add_epi16(_mm256_add_epi16(y, _mm256_add_epi16(u, u)), scaled(u, -14942));
         // 0.34414 u + 0.71414 v = 0.34414 u − 0.28586 v + v.
         let factors = _mm256_set1_epi32((18734 << 16) | (-22554 & 0xffff));
         let green = |pairs: __m256i| {
@@ -123,8 +123,8 @@ mod avx2 {
         }
     }
 
-    /// For each third of sixteen pixels and each channel, the shuffle that moves its bytes to their positions in the
-    /// output.
+    /// For each third of the output of sixteen pixels, and each channel, the shuffle that moves the channel's bytes to
+    /// their positions in the output.
     const SHUFFLES: [[[i64; 2]; 3]; 3] = {
         let mut shuffles = [[[0; 2]; 3]; 3];
         let mut i = 0;

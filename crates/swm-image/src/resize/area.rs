@@ -1,6 +1,7 @@
-//! [`AreaResizer`]: OpenCV's area interpolation (`INTER_AREA`), in which every pixel is the mean of the area it covers.
+//! [`AreaResizer`]: OpenCV's area interpolation (`INTER_AREA`), in which every pixel is the mean of the area that it
+//! covers in the source.
 
-/// For each pixel along one side of the result, the pixels of the source and their weights.
+/// The source pixels and the weights of every pixel along one side of the result.
 #[derive(Clone)]
 struct Taps {
     /// The largest number of source pixels per pixel of the result.
@@ -17,8 +18,9 @@ impl Taps {
         let span = taps.iter().map(|(_, weights)| weights.len()).max().unwrap_or(1);
         let first: Vec<usize> = taps.iter().map(|(first, _)| (*first).min(from - span)).collect();
         let mut padded = vec![0.0; span * taps.len()];
-        for (((wanted, weights), first), padded) in taps.iter().zip(&first).zip(padded.chunks_exact_mut(span)) {
-            padded[wanted - first..][..weights.len()].copy_from_slice(weights);
+        for (((requested_first, weights), first), padded) in taps.iter().zip(&first).zip(padded.chunks_exact_mut(span))
+        {
+            padded[requested_first - first..][..weights.len()].copy_from_slice(weights);
         }
         Self { span, first, weights: padded }
     }
@@ -49,12 +51,12 @@ impl AreaResizer {
         Self { from, to, columns, rows, line: vec![0.0; 3 * from[0]] }
     }
 
-    /// Whether the resizer is for these sizes.
+    /// Returns whether the resizer is for these sizes.
     pub fn is_for(&self, from: [usize; 2], to: [usize; 2]) -> bool {
         self.from == from && self.to == to
     }
 
-    /// Resizes an RGB image.
+    /// Resizes an RGB image, `[height, width, 3]` bytes.
     pub fn resize(&mut self, source: &[u8], result: &mut [u8]) {
         let stride = self.line.len();
         for ((first, weights), result) in self.rows.iter().zip(result.chunks_exact_mut(3 * self.to[0])) {
@@ -96,8 +98,8 @@ fn growing(from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
     let tap = |i: usize| {
         let first = ((i as f64 * scale) as usize).min(from - 1);
         let reach = (i + 1) as f64 - (first + 1) as f64 / scale;
-        let part = if reach <= 0.0 { 0.0 } else { reach.fract() as f32 };
-        (first, if part > 0.0 && first + 1 < from { vec![1.0 - part, part] } else { vec![1.0] })
+        let fraction = if reach <= 0.0 { 0.0 } else { reach.fract() as f32 };
+        (first, if fraction > 0.0 && first + 1 < from { vec![1.0 - fraction, fraction] } else { vec![1.0] })
     };
     (0..to).map(tap).collect()
 }

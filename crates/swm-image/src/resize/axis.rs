@@ -4,7 +4,7 @@ use std::ops::Range;
 
 /// Fraction bits of integer weights, as in Pillow.
 pub const WEIGHT_BITS: u32 = 22;
-/// Added to a sum of weighted bytes before [`weighted_byte`], so that the result is rounded to the nearest byte.
+/// The weight 1/2. Callers add it to a sum of weighted bytes, so that [`weighted_byte`] rounds to the nearest byte.
 pub const WEIGHT_HALF: i32 = 1 << (WEIGHT_BITS - 1);
 
 /// Returns a sum of bytes with integer weights as a byte. Weights may sum to slightly more than 1.
@@ -13,11 +13,12 @@ pub fn weighted_byte(sum: i32) -> u8 {
     (sum >> WEIGHT_BITS).min(255) as u8
 }
 
-/// For each pixel along one side of the result, the pixels of the source that it averages, and their weights.
+/// The source pixels and the weights of every pixel along one side of the result.
 #[derive(Clone, Debug, Default)]
 pub struct FilterAxis<W> {
-    /// For each pixel of the result, its first source pixel, and the index after its last source pixel.
+    /// For each pixel of the result, its first source pixel.
     first: Vec<usize>,
+    /// For each pixel of the result, the index after its last source pixel.
     end: Vec<usize>,
     /// For each pixel of the result, the index of its first weight.
     start: Vec<usize>,
@@ -25,13 +26,13 @@ pub struct FilterAxis<W> {
 }
 
 impl FilterAxis<i32> {
-    /// Pillow's triangle filter with weights of [`WEIGHT_BITS`] fraction bits. It averages when it shrinks and
+    /// Pillow's triangle filter with weights of [`WEIGHT_BITS`] fraction bits. The filter averages when it shrinks and
     /// interpolates linearly when it enlarges.
     pub fn triangle(from: usize, to: usize) -> Self {
         Self::from_triangle(from, to, |weight| (weight * f64::from(1 << WEIGHT_BITS) + 0.5) as i32)
     }
 
-    /// Pillow's `NEAREST`: the pixel of the source under the centre, with weight 1.
+    /// Pillow's `NEAREST`: for each pixel of the result, the source pixel under its centre, with weight 1.
     pub fn nearest(from: usize, to: usize) -> Self {
         let mut axis = Self::default();
         let scale = from as f64 / to as f64;
@@ -83,7 +84,7 @@ impl<W> FilterAxis<W> {
         self.first.len()
     }
 
-    /// Whether the result has no pixels.
+    /// Returns whether the result has no pixels.
     pub fn is_empty(&self) -> bool {
         self.first.is_empty()
     }

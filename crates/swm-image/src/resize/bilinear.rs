@@ -11,7 +11,7 @@ pub struct BilinearTap {
     pub first: usize,
     /// The pixel to the right or below.
     pub second: usize,
-    /// Their weights in 1/2048, which sum to 2048.
+    /// Weights of `first` and `second` in units of 1/2048. They sum to 2048.
     pub weights: [i32; 2],
 }
 
@@ -30,7 +30,8 @@ pub fn bilinear_taps(from: usize, to: usize) -> Vec<BilinearTap> {
         .collect()
 }
 
-/// Blends four pixels: left and right above, left and right below. `across` and `down` are weights of taps.
+/// Blends four pixels: upper left, upper right, lower left, lower right. `across` and `down` are the weights of the
+/// horizontal tap and of the vertical tap.
 #[inline(always)]
 pub fn bilinear_blend(pixels: [[u8; 3]; 4], across: [i32; 2], down: [i32; 2]) -> [u8; 3] {
     std::array::from_fn(|i| {

@@ -20,8 +20,9 @@ pub struct PillowResizer {
     sizes: [(usize, usize); 2],
     columns: FilterAxis<i32>,
     rows: FilterAxis<i32>,
-    /// A row of the result before it is resized along x: sums, then bytes.
+    /// A row of the result before it is resized along x, as weighted sums.
     sums: Vec<i32>,
+    /// A row of the result before it is resized along x, as bytes.
     line: Vec<u8>,
 }
 
@@ -32,7 +33,7 @@ impl PillowResizer {
         Self { filter, sizes: [(0, 0); 2], columns, rows, sums: vec![], line: vec![] }
     }
 
-    /// Computes the weights for sizes, unless they are those of the last image.
+    /// Computes the weights for two sizes, unless the last image had the same sizes.
     fn prepare(&mut self, from: (usize, usize), to: (usize, usize)) {
         if self.sizes == [from, to] {
             return;
@@ -47,7 +48,8 @@ impl PillowResizer {
         self.sizes = [from, to];
     }
 
-    /// Resizes an image of `from = (height, width)` to `to = (height, width)`. Equal sizes copy it.
+    /// Resizes an image of `from = (height, width)` to `to = (height, width)`. If the sizes are equal, copies the
+    /// image.
     pub fn resize(&mut self, source: &[u8], from: (usize, usize), result: &mut [u8], to: (usize, usize)) {
         if from == to {
             result.copy_from_slice(source);
@@ -77,11 +79,11 @@ impl PillowResizer {
 mod tests {
     use super::*;
 
-    /// The red channel of (x * 37 + y * y * 11) % 256 over 9 x 6 pixels, at another size.
+    /// Resizes an image of 9 x 6 pixels with the red channel (x * 37 + y * y * 11) % 256. Returns the red channel.
     fn red(width: usize, height: usize, filter: PillowFilter) -> Vec<u8> {
         let old: Vec<u8> = (0..54).flat_map(|i| [((i % 9 * 37 + (i / 9) * (i / 9) * 11) % 256) as u8, 1, 2]).collect();
         let mut resizer = PillowResizer::new(filter);
-        // The first resize has another size, so the second one must compute new weights.
+        // The first resize has another size, so the second resize must compute new weights.
         for (width, height) in [(5, 4), (width, height)] {
             let mut new = vec![7; width * height * 3];
             resizer.resize(&old, (6, 9), &mut new, (height, width));
@@ -96,12 +98,12 @@ mod tests {
     #[test]
     fn results_equal_pillow() {
         // Image.fromarray(image).resize(size, Image.BILINEAR), then Image.NEAREST.
-        for (width, height, wanted) in BILINEAR {
-            let got = red(*width, *height, PillowFilter::Triangle);
-            assert!(got.iter().zip(*wanted).all(|(a, b)| a.abs_diff(*b) <= 1), "{width} x {height}: {got:?}");
+        for (width, height, expected) in BILINEAR {
+            let found = red(*width, *height, PillowFilter::Triangle);
+            assert!(found.iter().zip(*expected).all(|(a, b)| a.abs_diff(*b) <= 1), "{width} x {height}: {found:?}");
         }
-        for (width, height, wanted) in NEAREST {
-            assert_eq!(red(*width, *height, PillowFilter::Nearest), *wanted, "{width} x {height}");
+        for (width, height, expected) in NEAREST {
+            assert_eq!(red(*width, *height, PillowFilter::Nearest), *expected, "{width} x {height}");
         }
     }
 

@@ -1,6 +1,6 @@
 //! [`TriangleResizer`]: the triangle filter of Pillow's `BILINEAR` in `f32`, for parts of images.
 //!
-//! The vertical pass runs first, because it works on whole rows. The result is rounded once, at the end. Pillow rounds
+//! The vertical pass runs first, because it works on full rows. The result is rounded once, at the end. Pillow rounds
 //! between the two passes, so some bytes may differ by 1.
 
 use super::FilterAxis;
@@ -33,7 +33,7 @@ impl TriangleResizer {
         [&self.columns, &self.rows]
     }
 
-    /// Writes the part of the result that depends on some columns and rows of the source.
+    /// Writes the part of the result that depends on the given columns and rows of the source.
     pub fn resize_part(&mut self, source: &[u8], columns: Range<usize>, rows: Range<usize>, result: &mut [u8]) {
         let (columns, rows) = (self.columns.touched(&columns), self.rows.touched(&rows));
         if columns.is_empty() || rows.is_empty() {
@@ -68,22 +68,22 @@ mod tests {
 
     #[test]
     fn results_are_close_to_pillow() {
-        // The red channel of an image of 6 x 6, (x * 37 + y * y * 11) % 256, as
-        // Image.fromarray(image).resize((4, 3), Image.BILINEAR) and (2, 8) give it.
+        // The expected values are the results of Image.fromarray(image).resize(size, Image.BILINEAR) for an image of
+        // 6 x 6 pixels with the red channel (x * 37 + y * y * 11) % 256.
         let old: Vec<u8> = (0..36).flat_map(|i| [((i % 6 * 37 + (i / 6) * (i / 6) * 11) % 256) as u8, 0, 0]).collect();
         let red = |width: usize, height: usize, part: usize| {
             let mut new = vec![7; width * height * 3];
             TriangleResizer::new(6, width, height).resize_part(&old, 0..part, 0..part, &mut new);
             new.chunks(3).map(|pixel| pixel[0]).collect::<Vec<_>>()
         };
-        let near = |got: &[u8], wanted: &[u8]| got.iter().zip(wanted).all(|(a, b)| a.abs_diff(*b) <= 1);
-        let (whole, other) = (red(4, 3, 6), red(2, 8, 6));
-        assert!(near(&whole, &PILLOW_4_3), "{whole:?}");
+        let near = |found: &[u8], expected: &[u8]| found.iter().zip(expected).all(|(a, b)| a.abs_diff(*b) <= 1);
+        let (full, other) = (red(4, 3, 6), red(2, 8, 6));
+        assert!(near(&full, &PILLOW_4_3), "{full:?}");
         assert!(near(&other, &PILLOW_2_8), "{other:?}");
-        // A part equals the same part of the whole, and nothing else is written.
+        // The part equals the full result, and the other pixels are not written.
         let part = red(4, 3, 1);
-        assert!(part.iter().zip(&whole).all(|(a, b)| *a == 7 || a == b));
-        assert_eq!((part[0], part[11]), (whole[0], 7));
+        assert!(part.iter().zip(&full).all(|(a, b)| *a == 7 || a == b));
+        assert_eq!((part[0], part[11]), (full[0], 7));
     }
 
     const PILLOW_4_3: [u8; 12] = [25, 77, 130, 182, 91, 139, 168, 156, 112, 151, 119, 136];

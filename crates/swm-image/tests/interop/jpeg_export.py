@@ -1,4 +1,4 @@
-"""Writes JPEG images with Pillow, and next to each the PNG image that Pillow decodes it to, for the decoder tests.
+"""Writes JPEG images with Pillow, and the pixels that Pillow decodes from each image as a PNG image beside it.
 
 Run with Pillow and numpy: `python jpeg_export.py`. Pillow decodes with libjpeg-turbo's defaults, as OpenCV and
 torchvision do.

@@ -5,7 +5,7 @@ use super::{Activation, DropoutRng, Init, LayerNorm, Linear};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
-/// The epsilon of the layer normalisations.
+/// The value that the layer normalisations add to the variance.
 const EPSILON: f64 = 1e-5;
 
 /// Computes scaled dot-product attention with `heads` heads, `softmax(Q Kᵀ / √d + mask) V` (Vaswani et al. 2017,
@@ -50,7 +50,7 @@ pub struct SelfAttention {
     pub norm: LayerNorm,
     /// The projection to queries, keys and values.
     pub to_qkv: Linear,
-    /// The output projection; `None` for a single head whose dimension is that of the tokens.
+    /// The output projection; `None` for a single head whose dimension equals the token dimension.
     pub to_out: Option<AttentionOutput>,
     heads: usize,
     dropout: f32,

@@ -1,4 +1,4 @@
-//! [`Backbone`]: any of the image encoders.
+//! [`Backbone`]: an image encoder of one of three kinds.
 
 use super::{Dino, DinoConfig, Init, PatchCnn, PatchCnnConfig, Vit, VitConfig};
 use burn::module::Module;
@@ -61,7 +61,8 @@ impl BackboneConfig {
         }
     }
 
-    /// Checks that the sizes fit each other and images with a side of `image` pixels. `at` is the path of the settings.
+    /// Checks that the sizes fit each other and images with a side of `image` pixels. `at` is the dotted path
+    /// of the settings, for errors.
     ///
     /// # Errors
     /// When a size does not fit; the error names the first such size.

@@ -44,13 +44,13 @@ pub struct Dino {
 /// Patch, class, register and position embeddings.
 #[derive(Module, Debug)]
 pub struct Embeddings {
-    /// `[1, 1, dim]`.
+    /// The class token, `[1, 1, dim]`.
     pub cls_token: Param<Tensor<3>>,
-    /// `[1, dim]`: replaces masked patches in pretraining; not used here.
+    /// The mask token, `[1, dim]`: replaces masked patches in pretraining; this encoder does not use it.
     pub mask_token: Param<Tensor<2>>,
-    /// `[1, 1 + grid * grid, dim]`.
+    /// The position embeddings, `[1, 1 + grid * grid, dim]`.
     pub position_embeddings: Param<Tensor<3>>,
-    /// `[1, registers, dim]`.
+    /// The register tokens, `[1, registers, dim]`.
     pub register_tokens: Option<Param<Tensor<3>>>,
     /// The projection of patches to tokens.
     pub patch_embeddings: Patches,
@@ -80,14 +80,14 @@ pub struct Layer {
     pub layer_scale2: Scale,
 }
 
-/// A factor for every channel.
+/// The LayerScale: a factor for every channel.
 #[derive(Module, Debug)]
 pub struct Scale {
-    /// `[dim]`.
+    /// The factors, `[dim]`.
     pub lambda1: Param<Tensor<1>>,
 }
 
-/// Linear, GELU, linear.
+/// The feed-forward block of a [`Layer`]: linear, GELU, linear.
 #[derive(Module, Debug)]
 pub struct FeedForward {
     /// The layer to the hidden features.
@@ -96,11 +96,11 @@ pub struct FeedForward {
     pub fc2: Linear,
 }
 
-/// Added to the variance by the layer normalisations.
+/// The value that the layer normalisations add to the variance.
 const EPSILON: f64 = 1e-6;
 
 impl DinoConfig {
-    /// The published sizes: patches of 14 pixels, trained on images of 518.
+    /// The config of a published size: patches of 14 pixels, trained on images with a side of 518 pixels.
     const fn sized(dim: usize, heads: usize) -> Self {
         Self { patch: 14, dim, depth: 12, heads, mlp: 4 * dim, grid: 37, registers: 0 }
     }
@@ -158,7 +158,7 @@ impl Dino {
         class.reshape([frames, dim])
     }
 
-    /// Computes all tokens: the class token, the registers, one for every patch.
+    /// Computes all tokens: the class token, the registers, then one token for every patch.
     ///
     /// # Shapes
     /// Maps `[frames, patches, 3 * patch * patch]` to `[frames, 1 + registers + patches, dim]`.
@@ -177,7 +177,10 @@ impl Dino {
         tokens.slice([0..frames, all - count..all, 0..dim])
     }
 
-    /// Computes the first `outputs` tokens, or all of them.
+    /// Computes the first `outputs` tokens, or all tokens for `None`.
+    ///
+    /// # Shapes
+    /// Maps `[frames, patches, 3 * patch * patch]` to `[frames, outputs, dim]`.
     fn run(&self, patches: Tensor<3>, outputs: Option<usize>) -> Tensor<3> {
         let parts = &self.embeddings;
         let resampling = match parts.register_tokens {
@@ -188,9 +191,12 @@ impl Dino {
         let projection = &parts.patch_embeddings.projection;
         let mut tokens = embed(patches, projection, &parts.cls_token, &parts.position_embeddings, resampling);
         if let Some(registers) = &parts.register_tokens {
-            let [_, more, dim] = registers.dims();
-            let rest = tokens.clone().slice([0..frames, 1..1 + count, 0..dim]);
-            tokens = Tensor::cat(vec![leading(tokens, 1), registers.val().expand([frames, more, dim]), rest], 1);
+            let [_, register_count, dim] = registers.dims();
+            let patch_tokens = tokens.clone().slice([0..frames, 1..1 + count, 0..dim]);
+            tokens = Tensor::cat(
+                vec![leading(tokens, 1), registers.val().expand([frames, register_count, dim]), patch_tokens],
+                1,
+            );
         }
         for (index, layer) in self.encoder.layer.iter().enumerate() {
             tokens = layer.forward(tokens, outputs.filter(|_| index + 1 == self.encoder.layer.len()));

@@ -1,4 +1,4 @@
-//! Layers in the form that the CPU kernels of `swm-kernels` read.
+//! Conversion of layers to the parameter layouts of the CPU kernels in `swm-kernels`.
 
 use super::norm::BatchNorm;
 use super::parameters::{Named, host};
@@ -7,13 +7,13 @@ use super::vit::{Layer, Projection};
 use super::{LayerNorm, Linear, Projector, Vit};
 use swm_kernels::{Affine, Norm, Panels, VitEncoder, VitGradient, VitLayerParameters, VitParameters};
 
-/// Lays out a linear layer.
+/// Converts a linear layer to [`Panels`].
 pub(crate) fn panels(layer: &Linear) -> Panels {
     let [outputs, _] = layer.weight.dims();
     output_panels(layer, 0..outputs)
 }
 
-/// Lays out a range of the outputs of a linear layer.
+/// Converts a range of the outputs of a linear layer to [`Panels`].
 pub(crate) fn output_panels(layer: &Linear, range: std::ops::Range<usize>) -> Panels {
     let ([_, inputs], weight) = (layer.weight.dims(), host(layer.weight.val()));
     let panels = Panels::new(inputs, range.len(), |i, o| weight[(range.start + o) * inputs + i]);
@@ -23,7 +23,7 @@ pub(crate) fn output_panels(layer: &Linear, range: std::ops::Range<usize>) -> Pa
     }
 }
 
-/// Lays out the two layers of a projector, with the batch normalisation between them folded into the first.
+/// Converts the two layers of a projector to [`Panels`]. The first layer includes the batch normalisation.
 pub(crate) fn projector_panels(projector: &Projector) -> [Panels; 2] {
     let (first, norm) = (&projector.net._0, &projector.net._1);
     let scale = host(norm.weight.val() / (norm.running_var.val() + BatchNorm::EPSILON).sqrt());
@@ -38,19 +38,19 @@ pub(crate) fn projector_panels(projector: &Projector) -> [Panels; 2] {
     [Panels::new(inputs, outputs, |i, o| weight[o * inputs + i] * scale[o]).with_bias(&bias), panels(&projector.net._3)]
 }
 
-/// Copies a layer normalisation.
+/// Converts a layer normalisation.
 pub(crate) fn norm(layer: &LayerNorm) -> Norm {
     Norm::new(norm_parameters(layer), layer.epsilon() as f32)
 }
 
-/// Lays out a vision transformer for images of `patches` patches.
+/// Converts a vision transformer for images of `patches` patches; returns `None` for a transformer without layers.
 pub(crate) fn vit_encoder(vit: &Vit, patches: usize) -> Option<VitEncoder> {
     let heads = vit.encoder.layer.first()?.attention.heads();
     Some(VitEncoder::new(&vit_parameters(vit, patches), heads, vit.layernorm.epsilon() as f32))
 }
 
-/// Lays out a vision transformer for training on images of `patches` patches; returns `None` if the learnt
-/// positions are for another number of patches.
+/// Converts a vision transformer for training on images of `patches` patches; returns `None` if the learnt position
+/// embeddings are for another number of patches.
 pub(crate) fn vit_gradient(vit: &Vit, patches: usize) -> Option<VitGradient> {
     let [_, learnt, _] = vit.embeddings.position_embeddings.dims();
     let heads = vit.encoder.layer.first()?.attention.heads();
@@ -58,7 +58,7 @@ pub(crate) fn vit_gradient(vit: &Vit, patches: usize) -> Option<VitGradient> {
         .then(|| VitGradient::new(&vit_parameters(vit, patches), heads, vit.layernorm.epsilon() as f32))
 }
 
-/// Names the gradients of a vision transformer as [`Vit`] names its parameters.
+/// Returns the gradients of a vision transformer under the parameter names of [`Vit`].
 pub(crate) fn named_vit_gradients(gradients: VitParameters) -> Named<Vec<f32>> {
     let dim = gradients.norm.bias.len();
     let mut named = Named::new();
@@ -134,7 +134,8 @@ mod tests {
     #[test]
     fn vit_encoder_matches_module_on_any_number_of_threads() {
         let sizes = VitConfig { patch: 2, dim: 24, depth: 2, heads: 3, mlp: 40 };
-        // The 50 tokens fill two blocks. There are more patches than learnt positions, so the positions are resampled.
+        // The 50 tokens need two blocks of the kernel. The image has more patches than there are learnt positions, so
+        // the positions are resampled.
         let (patches, elements) = (49, 12);
         let vit = sizes.init(&Init::new(Key::new(1), &Device::flex()), 12);
         let encoder = vit_encoder(&vit, patches).expect("a transformer with layers");

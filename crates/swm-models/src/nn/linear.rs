@@ -4,12 +4,12 @@ use super::Init;
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
 
-/// `y = x Wᵀ + b`.
+/// A linear layer, `y = x Wᵀ + b`.
 #[derive(Module, Debug)]
 pub struct Linear {
-    /// `[outputs, inputs]`.
+    /// The weights `W`, `[outputs, inputs]`.
     pub weight: Param<Tensor<2>>,
-    /// `[outputs]`.
+    /// The bias `b`, `[outputs]`.
     pub bias: Option<Param<Tensor<1>>>,
 }
 

@@ -1,11 +1,11 @@
-//! Multi-layer perceptrons: projector, action embedder, read-out.
+//! Multi-layer perceptrons: the projector of latents, the action embedder, and a network with two hidden layers.
 
 use super::{Activation, BatchNorm, BatchStatistics, Init, Linear};
 use burn::module::Module;
 use burn::tensor::Tensor;
 
-/// Linear, batch normalisation, GELU, linear. The layers have the published names `net.0`, `net.1`, `net.3`: a field
-/// `_3` is element 3 of a sequence.
+/// A projector: linear, batch normalisation, GELU, linear. The layers have the published names `net.0`, `net.1`,
+/// `net.3`: a field `_3` is element 3 of a sequence.
 #[derive(Module, Debug)]
 pub struct Projector {
     /// The sequence.
@@ -35,7 +35,7 @@ impl Projector {
         }
     }
 
-    /// Normalises with the running statistics, for evaluation.
+    /// Applies the projector with the running statistics, for evaluation.
     ///
     /// # Shapes
     /// Maps `[rows, inputs]` to `[rows, outputs]`.
@@ -44,7 +44,7 @@ impl Projector {
         self.net._3.forward(Activation::Gelu.forward(hidden))
     }
 
-    /// Normalises with the statistics of the batch, which it also returns, for training.
+    /// Applies the projector with the statistics of the batch, for training; returns the output and the statistics.
     ///
     /// # Shapes
     /// Maps `[rows, inputs]` to `[rows, outputs]`.
@@ -53,7 +53,7 @@ impl Projector {
         (self.net._3.forward(Activation::Gelu.forward(hidden)), statistics)
     }
 
-    /// Updates the running statistics with those of a batch.
+    /// Updates the running statistics with the statistics of a batch.
     pub fn track(&mut self, batch: BatchStatistics) {
         self.net._1.track(batch);
     }
@@ -71,9 +71,9 @@ pub struct Embedder {
 /// A convolution with a kernel of 1, which is a linear layer.
 #[derive(Module, Debug)]
 pub struct PointwiseConv {
-    /// `[outputs, inputs, 1]`.
+    /// The weights, `[outputs, inputs, 1]`.
     pub weight: burn::module::Param<Tensor<3>>,
-    /// `[outputs]`.
+    /// The bias, `[outputs]`.
     pub bias: burn::module::Param<Tensor<1>>,
 }
 
@@ -114,7 +114,7 @@ impl Embedder {
     }
 }
 
-/// Two hidden layers with GELU. A field `_2` is element 2 of a sequence, as in PyTorch.
+/// A network of two hidden layers with GELU. A field `_2` is element 2 of a sequence, as in PyTorch.
 #[derive(Module, Debug)]
 pub struct Mlp {
     /// The layer to the hidden features.

@@ -1,6 +1,5 @@
-//! Building blocks with the parameter names and layouts of PyTorch checkpoints, so that weights are exchanged without
-//! renaming. A [`Key`] and the name of a parameter determine the initial values; no global generator is
-//! used.
+//! Network modules with the parameter names and layouts of PyTorch checkpoints, so that weights need no renaming. A
+//! [`Key`] and the name of a parameter determine the initial values; no global generator is used.
 
 pub mod activation;
 pub mod attention;
@@ -54,13 +53,13 @@ impl Init {
         Self { key, device: device.clone() }
     }
 
-    /// Returns the source for the part named `part`.
+    /// Returns the source for the submodule named `part`.
     #[must_use]
     pub fn of(&self, part: &str) -> Self {
         Self { key: self.key.with(part), device: self.device.clone() }
     }
 
-    /// Returns the source for the part with the index `index`.
+    /// Returns the source for the submodule with the index `index`.
     #[must_use]
     pub fn at(&self, index: usize) -> Self {
         Self { key: self.key.at(index as u64), device: self.device.clone() }

@@ -105,7 +105,7 @@ impl BatchNorm {
         x * scale.unsqueeze() + shift.unsqueeze()
     }
 
-    /// Normalises with the statistics of the batch, which it returns for [`BatchNorm::track`].
+    /// Normalises with the statistics of the batch; also returns the statistics, for [`BatchNorm::track`].
     ///
     /// # Shapes
     /// Maps `[rows, features]` to the same shape.
@@ -123,7 +123,7 @@ impl BatchNorm {
         (normal * self.weight.val().unsqueeze() + self.bias.val().unsqueeze(), statistics)
     }
 
-    /// Updates the running statistics with those of a batch.
+    /// Updates the running statistics with the statistics of a batch.
     pub fn track(&mut self, batch: BatchStatistics) {
         let update = |running: &mut Param<Tensor<1>>, value: Tensor<1>| {
             let next = running.val().inner() * (1.0 - Self::MOMENTUM) + value * Self::MOMENTUM;

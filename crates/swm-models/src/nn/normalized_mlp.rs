@@ -1,12 +1,12 @@
 //! Multi-layer perceptrons with normalised hidden layers (Hansen, Su and Wang 2024, arXiv 2310.16828): every hidden
-//! layer is linear, normalised, and goes through Mish; latents are simplices.
+//! layer is linear, normalised, and goes through Mish; a latent is a concatenation of simplices.
 
 use super::norm::standardize;
 use super::{DropoutRng, Init, LayerNorm, Linear, with_derivative};
 use burn::module::{Module, Param};
 use burn::tensor::{Tensor, activation};
 
-/// Added to the variance by the normalisations.
+/// The value that the normalisations add to the variance.
 const EPSILON: f64 = 1e-5;
 /// The standard deviation of initial weights, which are truncated at twice the standard deviation.
 const STD: f32 = 0.02;
@@ -14,9 +14,9 @@ const STD: f32 = 0.02;
 /// A linear layer followed by layer normalisation.
 #[derive(Module, Debug)]
 pub struct NormalizedLinear {
-    /// `[outputs, inputs]`.
+    /// The weights, `[outputs, inputs]`.
     pub weight: Param<Tensor<2>>,
-    /// `[outputs]`.
+    /// The bias, `[outputs]`.
     pub bias: Param<Tensor<1>>,
     /// The normalisation.
     pub ln: LayerNorm,
@@ -41,7 +41,7 @@ impl NormalizedLinear {
     }
 }
 
-/// Two hidden layers and a linear output layer. A field `_2` is element 2 of a sequence, as in PyTorch.
+/// A network of two hidden layers and a linear output layer. A field `_2` is element 2 of a sequence, as in PyTorch.
 #[derive(Module, Debug)]
 pub struct Head {
     /// The layer to the hidden features.
@@ -78,7 +78,7 @@ impl Head {
     }
 }
 
-/// Two hidden layers and an output layer whose output is a latent on simplices.
+/// A network of two hidden layers and an output layer whose output is a latent of simplices.
 #[derive(Module, Debug)]
 pub struct Dynamics {
     /// The layer to the hidden features.
@@ -114,7 +114,7 @@ pub struct Ensemble {
     layers: [Layer; 3],
 }
 
-/// The same layer of every head: weights `[heads, inputs, outputs]`; bias, scale and shift `[heads, 1, outputs]`.
+/// One layer of all heads: weights `[heads, inputs, outputs]`; bias, scale and shift `[heads, 1, outputs]`.
 struct Layer {
     weight: Tensor<3>,
     bias: Option<Tensor<3>>,
@@ -122,7 +122,7 @@ struct Layer {
 }
 
 impl Ensemble {
-    /// Combines heads; gradients flow back to them.
+    /// Combines heads; gradients flow back to the heads.
     pub fn of(heads: &[&Head]) -> Self {
         let hidden = |get: fn(&Head) -> &NormalizedLinear| Layer {
             weight: matrices(heads.iter().map(|head| &get(head).weight)),
@@ -174,7 +174,7 @@ fn matrices<'a>(parameters: impl Iterator<Item = &'a Param<Tensor<2>>>) -> Tenso
     Tensor::stack::<3>(parameters.map(Param::val).collect(), 0).swap_dims(1, 2)
 }
 
-/// Stacks the vectors of several heads, or returns `None` if one is missing.
+/// Stacks the vectors of several heads, or returns `None` if a vector is missing.
 ///
 /// # Shapes
 /// Maps vectors `[outputs]` to `[heads, 1, outputs]`.
@@ -200,7 +200,8 @@ impl Layer {
     }
 }
 
-/// Mish (Misra 2019), `x tanh(ln(1 + exp x))`, with one exponential: for `n = exp x (exp x + 2)` it is `x n / (n + 2)`.
+/// Mish (Misra 2019), `x tanh(ln(1 + exp x))`, with one exponential: for `n = exp x (exp x + 2)`, Mish is
+/// `x n / (n + 2)`.
 /// The derivative is computed explicitly, so that an autodiff graph holds one product instead of six functions.
 ///
 /// # Shapes

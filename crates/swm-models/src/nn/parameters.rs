@@ -16,7 +16,7 @@ pub struct HostTensor {
 /// Values by parameter name, in the order of names.
 pub type Named<T> = BTreeMap<String, T>;
 
-/// The path of a traversal.
+/// The path of the current module in a traversal.
 #[derive(Default)]
 struct Path(Vec<String>);
 
@@ -61,7 +61,7 @@ pub fn values<M: Module>(module: &M) -> Named<HostTensor> {
     visitor.1
 }
 
-/// Returns names and shapes of every parameter and buffer of a module.
+/// Returns the shape of every parameter and buffer of a module, by name.
 pub fn shapes<M: Module>(module: &M) -> Named<Vec<usize>> {
     struct Visitor(Path, Named<Vec<usize>>);
     impl ModuleVisitor for Visitor {
@@ -80,8 +80,8 @@ pub fn shapes<M: Module>(module: &M) -> Named<Vec<usize>> {
     visitor.1
 }
 
-/// Returns the gradients of a module's parameters, flattened to one axis, without those of parameters that the loss
-/// does not depend on.
+/// Returns the gradients of a module's parameters, flattened to one axis. Omits parameters on which the loss does not
+/// depend.
 pub fn gradients<M: Module>(module: &M, gradients: &Gradients) -> Named<Tensor<1>> {
     struct Visitor<'a>(Path, &'a Gradients, Named<Tensor<1>>);
     impl ModuleVisitor for Visitor<'_> {

@@ -25,9 +25,9 @@ pub struct PatchCnnConfig {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Stage {
-    /// Kernel size and stride.
+    /// Kernel size and stride, in pixels of the input of the convolution.
     pub patch: usize,
-    /// Output channels.
+    /// The number of output channels.
     pub channels: usize,
 }
 
@@ -75,7 +75,7 @@ impl PatchCnn {
     /// Computes the features of images.
     ///
     /// # Shapes
-    /// `[frames, patches, 3 * patch * patch]`, patches in row-major order of the image, to `[frames, dim]`.
+    /// Maps `[frames, patches, 3 * patch * patch]`, patches in row-major order of the image, to `[frames, dim]`.
     pub fn forward(&self, patches: Tensor<3>) -> Tensor<2> {
         let [frames, count, width] = patches.dims();
         let activation = self.config.activation;

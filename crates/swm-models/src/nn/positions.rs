@@ -1,4 +1,4 @@
-//! Resampling of position embeddings from the patch grid of their training to another grid.
+//! Resampling of position embeddings from the patch grid of the trained embeddings to another grid.
 
 use burn::tensor::{Tensor, TensorData};
 
@@ -11,10 +11,11 @@ pub enum Resampling {
     Antialiased,
 }
 
-/// Resamples position embeddings to a square grid of `count` patches; unchanged if the grid already has that size.
+/// Resamples position embeddings to a square grid of `count` patches. Returns them unchanged if the grid already has
+/// that size.
 ///
 /// # Shapes
-/// `[1, 1 + grid * grid, dim]`, with the class token first, to `[1, 1 + count, dim]`.
+/// Maps `[1, 1 + grid * grid, dim]`, with the class token first, to `[1, 1 + count, dim]`.
 pub fn positions(trained: Tensor<3>, count: usize, resampling: Resampling) -> Tensor<3> {
     let [_, all, dim] = trained.dims();
     if all == 1 + count {
@@ -23,7 +24,7 @@ pub fn positions(trained: Tensor<3>, count: usize, resampling: Resampling) -> Te
     let (from, to) = ((all - 1).isqrt(), count.isqrt());
     let resize = Tensor::<2>::from_data(TensorData::new(matrix(from, to, resampling), [to, from]), &trained.device());
     let class = trained.clone().slice([0..1, 0..1, 0..dim]);
-    // Rows, then columns: the same matrix, applied to the first axis, which is then swapped with the second.
+    // Resamples the first axis and swaps it with the second axis, so that two calls resample both axes.
     let along = |grid: Tensor<3>| {
         let [_, other, dim] = grid.dims();
         resize.clone().matmul(grid.reshape([from, other * dim])).reshape([to, other, dim]).swap_dims(0, 1)
@@ -38,8 +39,8 @@ pub fn positions(trained: Tensor<3>, count: usize, resampling: Resampling) -> Te
 /// `[to, from]`.
 fn matrix(from: usize, to: usize, resampling: Resampling) -> Vec<f32> {
     let scale = from as f64 / to as f64;
-    // The parameter `a` and the width of the kernel. PyTorch uses other values with antialiasing.
-    let (sharpness, width) = match resampling {
+    // The parameter `a` and the width of the kernel, as in PyTorch.
+    let (a, width) = match resampling {
         Resampling::Bicubic => (-0.75, 1.0),
         Resampling::Antialiased => (-0.5, scale.max(1.0)),
     };
@@ -48,7 +49,7 @@ fn matrix(from: usize, to: usize, resampling: Resampling) -> Vec<f32> {
         let centre = (index as f64 + 0.5) * scale - 0.5;
         let reach = 2.0 * width;
         for index in (centre - reach).ceil() as i64..=(centre + reach).floor() as i64 {
-            let weight = cubic((index as f64 - centre) / width, sharpness);
+            let weight = cubic((index as f64 - centre) / width, a);
             match resampling {
                 // Repeats the border value outside of the grid.
                 Resampling::Bicubic => row[index.clamp(0, from as i64 - 1) as usize] += weight,
@@ -85,7 +86,7 @@ mod tests {
                 for (index, row) in weights.chunks(from).enumerate() {
                     assert!((row.iter().sum::<f32>() - 1.0).abs() < 1e-6);
                     let centre = (index as f32 + 0.5) * from as f32 / to as f32 - 0.5;
-                    // The kernel must not reach the border.
+                    // Only a kernel that does not reach the border of the grid preserves a ramp.
                     let reach = 2.0 * (from as f32 / to as f32).max(1.0);
                     if centre > reach && centre + reach < from as f32 - 1.0 && to > from {
                         let value: f32 = row.iter().enumerate().map(|(index, weight)| index as f32 * weight).sum();

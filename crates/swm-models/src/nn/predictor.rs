@@ -32,10 +32,10 @@ pub struct PredictorConfig {
     pub emb_dropout: f32,
 }
 
-/// Predicts the latent after each latent of a window, given the action taken from it.
+/// Predicts the latent that follows each latent of a window, given the action between the two latents.
 #[derive(Module, Debug)]
 pub struct Predictor {
-    /// `[1, history, latent]`.
+    /// The position embeddings, `[1, history, latent]`.
     pub pos_embedding: Param<Tensor<3>>,
     /// The layers.
     pub transformer: Transformer,
@@ -69,24 +69,24 @@ pub struct Block {
     pub adaLN_modulation: Modulation,
 }
 
-/// SiLU, then linear: `[rows, dim]` to `[rows, 6 * dim]`, the shift, scale and gate of the attention, then those of
-/// the feed-forward block. Zero-initialised.
+/// The zero-initialised map of conditions, `[…, dim]`, to `[…, 6 * dim]`: shift, scale and gate of the attention, then
+/// shift, scale and gate of the feed-forward block. The field `_1` is element 1 of a `torch.nn.Sequential`.
 #[derive(Module, Debug)]
 pub struct Modulation {
     /// The layer.
     pub _1: Linear,
 }
 
-/// Added to the variance by the normalisations before a modulation.
+/// The value that the normalisations before a modulation add to the variance.
 pub(crate) const MODULATED_EPSILON: f64 = 1e-6;
-/// Added to the variance by the normalisation after the last layer.
+/// The value that the normalisation after the last layer adds to the variance.
 const EPSILON: f64 = 1e-5;
 
 impl PredictorConfig {
     /// Creates a predictor of latents with `latent` elements.
     pub fn init(&self, init: &Init, latent: usize) -> Predictor {
         let dim = self.dim;
-        let bridge =
+        let projection =
             |name: &str, inputs, outputs| (inputs != outputs).then(|| Linear::new(&init.of(name), inputs, outputs));
         let layer = |index| {
             let init = init.of("layer").at(index);
@@ -100,9 +100,9 @@ impl PredictorConfig {
             pos_embedding: init.normal("pos_embedding", [1, self.history, latent], 1.0),
             transformer: Transformer {
                 norm: LayerNorm::new(init, dim, EPSILON),
-                input_proj: bridge("input_proj", latent, dim),
-                cond_proj: bridge("cond_proj", latent, dim),
-                output_proj: bridge("output_proj", dim, latent),
+                input_proj: projection("input_proj", latent, dim),
+                cond_proj: projection("cond_proj", latent, dim),
+                output_proj: projection("output_proj", dim, latent),
                 layers: (0..self.depth).map(layer).collect(),
             },
             config: self.clone(),
@@ -119,8 +119,8 @@ impl Predictor {
     /// Predicts the next latents.
     ///
     /// # Shapes
-    /// Latents `[windows, steps, latent]` and embedded actions of the same shape, `steps` at most the history, to
-    /// predictions of the same shape.
+    /// `latents` and the embedded `actions` are `[windows, steps, latent]` with at most `history` steps; returns the
+    /// same shape.
     pub fn forward(&self, latents: Tensor<3>, actions: Tensor<3>, noise: &mut DropoutRng<'_>) -> Tensor<3> {
         let [_, steps, latent] = latents.dims();
         let x = latents + self.pos_embedding.val().slice([0..1, 0..steps, 0..latent]);

@@ -27,9 +27,9 @@ pub fn symexp<const D: usize>(x: Tensor<D>) -> Tensor<D> {
 pub struct Bins {
     /// The number of bins, at least 2.
     pub count: usize,
-    /// The centre of the first bin, as `symlog`.
+    /// The centre of the first bin, on the axis of [`symlog`].
     pub low: f64,
-    /// The centre of the last bin, as `symlog`.
+    /// The centre of the last bin, on the axis of [`symlog`].
     pub high: f64,
 }
 
@@ -38,7 +38,7 @@ impl Bins {
         (self.high - self.low) / (self.count - 1) as f64
     }
 
-    /// The centres of the bins as `symlog`, `[bins]`.
+    /// The centres of the bins on the axis of [`symlog`], `[bins]`.
     fn centres(&self, device: &Device) -> Tensor<1> {
         let centres: Vec<f32> = (0..self.count).map(|i| (self.low + i as f64 * self.width()) as f32).collect();
         Tensor::from_data(TensorData::new(centres, [self.count]), device)

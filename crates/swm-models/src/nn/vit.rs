@@ -1,5 +1,6 @@
 //! A vision transformer (Dosovitskiy et al. 2021: pre-norm, class token, trained position embeddings). Parameters have
-//! the names of the published checkpoints. Position embeddings are interpolated for images of other sizes.
+//! the names of the published checkpoints. Position embeddings are interpolated for images of another size than that of
+//! [`VitConfig::init`].
 
 use super::attention::attend;
 use super::positions::{Resampling, positions};
@@ -38,9 +39,9 @@ pub struct Vit {
 /// Patch, class and position embeddings.
 #[derive(Module, Debug)]
 pub struct Embeddings {
-    /// `[1, 1, dim]`.
+    /// The class token, `[1, 1, dim]`.
     pub cls_token: Param<Tensor<3>>,
-    /// `[1, 1 + patches, dim]`.
+    /// The position embeddings, `[1, 1 + patches, dim]`.
     pub position_embeddings: Param<Tensor<3>>,
     /// The projection of patches to tokens.
     pub patch_embeddings: Patches,
@@ -56,9 +57,9 @@ pub struct Patches {
 /// A convolution whose stride equals its kernel size: one matrix product over patches.
 #[derive(Module, Debug)]
 pub struct Projection {
-    /// `[dim, 3, patch, patch]`.
+    /// The weights, `[dim, channels, patch, patch]`.
     pub weight: Param<Tensor<4>>,
-    /// `[dim]`.
+    /// The bias, `[dim]`.
     pub bias: Param<Tensor<1>>,
 }
 
@@ -131,11 +132,11 @@ pub struct Dense {
 
 /// The standard deviation of initial weights.
 pub(super) const STD: f32 = 0.02;
-/// Added to the variance by the layer normalisations.
+/// The value that the layer normalisations add to the variance.
 const EPSILON: f64 = 1e-12;
 
 impl VitConfig {
-    /// A published size; the feed-forward block has four times the features of a token.
+    /// The config of a published size; the feed-forward block has four times the features of a token.
     const fn sized(patch: usize, dim: usize, depth: usize, heads: usize) -> Self {
         Self { patch, dim, depth, heads, mlp: 4 * dim }
     }
@@ -203,7 +204,7 @@ impl Vit {
         class.reshape([frames, dim])
     }
 
-    /// Computes all tokens: the class token, then one for every patch.
+    /// Computes all tokens: the class token, then one token for every patch.
     ///
     /// # Shapes
     /// Maps `[frames, patches, 3 * patch * patch]` to `[frames, 1 + patches, dim]`.
@@ -211,7 +212,7 @@ impl Vit {
         self.run(patches, None)
     }
 
-    /// Computes the first `outputs` tokens, or all of them. The last layer does not compute the remaining tokens.
+    /// Computes the first `outputs` tokens, or all tokens for `None`. The last layer computes only the returned tokens.
     ///
     /// # Shapes
     /// Maps `[frames, patches, 3 * patch * patch]` to `[frames, outputs, dim]`.

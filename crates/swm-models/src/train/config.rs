@@ -13,7 +13,7 @@ use swm_core::{Error, Result};
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields, bound = "")]
 pub struct TrainConfig<M: Trainable> {
-    /// The seed of initial weights, order of the data and every other draw.
+    /// The seed of the initial weights, the order of the data and all other random draws.
     pub seed: u64,
     /// The sizes of the model.
     pub model: M::Config,
@@ -23,7 +23,7 @@ pub struct TrainConfig<M: Trainable> {
     pub data: DataConfig,
     /// The optimizer.
     pub optim: OptimConfig,
-    /// The learning rate over time.
+    /// The schedule of the learning rate.
     pub schedule: ScheduleConfig,
     /// Validation on held-out episodes.
     #[serde(default)]
@@ -31,11 +31,11 @@ pub struct TrainConfig<M: Trainable> {
     /// Online training, for a model that can learn by interaction.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub online: Option<OnlineConfig>,
-    /// Shards of a batch, which can run in parallel. Their number changes the last bits of the results.
+    /// The number of shards of a batch, which run in parallel. The number changes the last bits of the results.
     pub shards: usize,
-    /// Steps between two lines of the log.
+    /// The number of steps between two lines of the log.
     pub log_every: usize,
-    /// Steps between two checkpoints; 0 saves at the end only.
+    /// The number of steps between two checkpoints; 0 saves at the end only.
     pub save_every: usize,
 }
 
@@ -68,11 +68,11 @@ impl<M: Trainable> std::fmt::Debug for TrainConfig<M> {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DataConfig {
-    /// Frames of a clip.
+    /// The number of frames of a clip.
     pub num_steps: usize,
-    /// Environment steps from one frame to the next.
+    /// The number of environment steps from one frame of a clip to the next.
     pub frameskip: usize,
-    /// Clips of a batch.
+    /// The number of clips of a batch.
     pub batch_size: usize,
     /// Whether the episodes that [`swm_data::Split::default`] holds out, a tenth for validation and a tenth for
     /// testing, are left out of the training data, so that `swm eval --split test` starts from episodes no model was
@@ -85,11 +85,11 @@ pub struct DataConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ValidationConfig {
-    /// Steps between two validations; 0 for none.
+    /// The number of steps between two validations; 0 disables validation.
     pub every: usize,
-    /// Batches of a validation, always the same batches.
+    /// The number of batches of a validation. Every validation uses the same batches.
     pub batches: usize,
-    /// Number of validations without a lower loss after which training stops; 0 trains to the end.
+    /// The number of validations without a lower loss after which training stops; 0 trains to the end.
     pub patience: usize,
 }
 
@@ -99,7 +99,7 @@ impl Default for ValidationConfig {
     }
 }
 
-/// The settings of a [`TrainConfig`] that the loop itself reads, which do not depend on the family.
+/// The settings of a [`TrainConfig`] that the training loop reads and that have the same type for every family.
 #[derive(Clone)]
 pub(crate) struct LoopConfig {
     pub seed: u64,
@@ -111,7 +111,7 @@ pub(crate) struct LoopConfig {
     pub save_every: usize,
 }
 
-/// Settings that a preset may leave out.
+/// The settings that a preset may omit, with their defaults.
 const OPTIONAL: &str = "optim.accumulate = 1\noptim.ema = 0.0\nvalidation = { every = 0, batches = 8, patience = 0 }\n";
 
 impl<M: Trainable> TrainConfig<M> {
@@ -119,7 +119,7 @@ impl<M: Trainable> TrainConfig<M> {
     /// as `optim.lr=3e-4`.
     ///
     /// # Errors
-    /// When there is no such preset or key (the error names the nearest), or a value does not fit.
+    /// When there is no such preset or key (the error names the nearest), or a value has the wrong type.
     pub fn load(preset: &str, settings: &[String]) -> Result<Self> {
         let text = preset_text(M::PRESETS, preset)?;
         let presets: Vec<&str> = M::PRESETS.iter().map(|preset| preset.toml).chain([OPTIONAL]).collect();
@@ -131,7 +131,7 @@ impl<M: Trainable> TrainConfig<M> {
     /// The configuration as TOML.
     ///
     /// # Errors
-    /// Never for a configuration that was loaded.
+    /// Never, if [`TrainConfig::load`] returned the configuration.
     pub fn to_toml(&self) -> Result<String> {
         toml::to_string_pretty(self).map_err(|error| Error::external("writing a configuration", error))
     }
@@ -155,7 +155,7 @@ impl<M: Trainable> TrainConfig<M> {
         M::check(self)
     }
 
-    /// The settings that the loop reads.
+    /// The settings that the training loop reads.
     pub(crate) fn loop_config(&self) -> LoopConfig {
         LoopConfig {
             seed: self.seed,
@@ -170,7 +170,7 @@ impl<M: Trainable> TrainConfig<M> {
 }
 
 impl LoopConfig {
-    /// Checks optimizer and validation.
+    /// Checks the settings of the optimizer and of the validation.
     fn check(&self) -> Result<()> {
         let positive =
             [("optim.lr", self.optim.lr), ("optim.epsilon", self.optim.epsilon), ("optim.clip", self.optim.clip)];

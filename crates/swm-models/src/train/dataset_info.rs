@@ -11,15 +11,15 @@ use swm_plan::ActionScale;
 /// The statistics of the dataset a model was trained on; stored in its checkpoint.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DatasetInfo {
-    /// The map between the environment's actions and the model's.
+    /// The map between the actions of the environment and the actions of the model.
     pub action: ActionScale,
-    /// The other numeric columns that the model observes.
+    /// The statistics of the numeric columns that the model observes, except actions.
     pub columns: Named<ColumnInfo>,
     /// The environment the data came from, if the dataset names it.
     pub env: Option<String>,
 }
 
-/// The statistics of a column, element by element of a row.
+/// The statistics of a column, one value for each element of a row.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ColumnInfo {
     /// The shape of a row.
@@ -58,7 +58,7 @@ impl ColumnInfo {
 }
 
 impl DatasetInfo {
-    /// Computes the statistics of a dataset. `columns` are those that the model observes; images among them are
+    /// Computes the statistics of a dataset. `columns` names the columns that the model observes; images are
     /// skipped. Actions are standardised, or, if `bounded`, mapped from their range in the data to -1 ..= 1.
     ///
     /// # Errors
@@ -95,8 +95,13 @@ impl DatasetInfo {
         let action = bounds_scale(spec)?;
         let info = |name: &String| {
             let column = spec.columns.iter().find(|column| column.name == *name).ok_or_else(|| {
-                let known = spec.columns.iter().map(|column| column.name.as_str());
-                Error::unknown("column of the environment", name, known, format!("{} observes these", spec.id))
+                let names: Vec<&str> = spec.columns.iter().map(|column| column.name.as_str()).collect();
+                Error::unknown(
+                    "column of the environment",
+                    name,
+                    names.iter().copied(),
+                    format!("{} observes {}", spec.id, names.join(", ")),
+                )
             })?;
             Ok((name.clone(), ColumnInfo::identity(column)))
         };
@@ -112,13 +117,13 @@ impl DatasetInfo {
     /// When the model was trained without the column.
     pub fn column(&self, name: &str) -> Result<&ColumnInfo> {
         self.columns.get(name).ok_or_else(|| {
-            let known = self.columns.keys().map(String::as_str);
-            Error::unknown("column of the model", name, known, "it was trained on these")
+            let names: Vec<&str> = self.columns.keys().map(String::as_str).collect();
+            let hint = format!("the model was trained on {}", names.join(", "));
+            Error::unknown("column of the model", name, names, hint)
         })
     }
 
-    /// The actions of a batch of clips, in model units. Missing actions (NaN in the last row of an episode) become 0,
-    /// which is the mean.
+    /// The actions of a batch of clips, in model units. Missing actions (NaN in the last row of an episode) become 0.
     ///
     /// # Shapes
     /// `[clips, steps, frameskip * action_dim]`.
@@ -158,7 +163,7 @@ fn range_scale(action: &ColumnInfo) -> ActionScale {
 /// Maps the bounds of the action space to -1 and 1.
 fn bounds_scale(spec: &EnvSpec) -> Result<ActionScale> {
     let refused = |fix: &str| {
-        let given = format!("its actions are {}", spec.action_space.describe());
+        let given = format!("the actions are {}", spec.action_space.describe());
         Err(Error::config(format!("training online in {}", spec.id), given, fix))
     };
     let Space::Box { low, high, .. } = &spec.action_space else {

@@ -4,8 +4,8 @@ use safetensors::tensor::{Dtype, TensorView};
 use std::path::{Path, PathBuf};
 use swm_core::{Batch, DType, Error, Result};
 
-/// Saves `batch` in `folder` and returns the error that reports it: `what` is not finite, with the `values` of the
-/// step.
+/// Saves `batch` in `folder` and returns the error that `what` is not finite. The error contains the `values` of the
+/// step and the path of the batch.
 pub(crate) fn error(folder: &Path, batch: &Batch, what: String, values: &str, fix: &str) -> Error {
     let saved = match save(folder, batch) {
         Ok(path) => format!("the batch is in {}", path.display()),

@@ -1,4 +1,5 @@
-//! [`Learner`]: a model, its optimizer and their progress, which both training loops update.
+//! [`Learner`]: a model, its optimizer and the progress of the run. The training loop on datasets and the
+//! online training loop both update a learner.
 //!
 //! The loops access a model through the object-safe trait [`DynLearner`], so they are compiled once and not once per
 //! family.
@@ -25,19 +26,19 @@ pub(crate) trait DynLearner {
     /// The mutable progress of the run.
     fn state_mut(&mut self) -> &mut RunState;
 
-    /// Saves the weights below `out` if `loss` is the lowest so far; returns whether it is.
+    /// Saves the weights in a folder inside `out` if `loss` is the lowest so far; returns whether `loss` is the lowest.
     ///
     /// # Errors
     /// When writing fails.
     fn save_if_best(&mut self, loss: f64, out: &Path) -> Result<bool>;
 
-    /// Computes loss and gradients of a batch; without `training`, with the averaged weights if an average is kept.
+    /// Computes loss and gradients of a batch. Without `training`, uses the averaged weights if an average is kept.
     ///
     /// # Errors
     /// When the batch does not fit the model.
     fn loss_and_gradients(&self, batch: &Batch, key: Key, training: bool) -> Result<StepOutput>;
 
-    /// Makes one optimizer step, then [`Trainable::after_step`] with `key`.
+    /// Makes one optimizer step, then calls [`Trainable::after_step`] with `key`.
     fn update(&mut self, output: StepOutput, key: Key) -> Update;
 
     /// Saves the checkpoint and the state from which training continues, and returns the hash of the weights.
@@ -69,7 +70,7 @@ pub(crate) struct Learner<'a, M: Trainable> {
     device: &'a Device,
     /// The trained weights.
     model: M,
-    /// The exponential moving average of the weights, where one is kept.
+    /// The exponential moving average of the weights; `None` if the configuration sets no average.
     average: Option<M>,
     dataset_info: DatasetInfo,
     manifest: Manifest,

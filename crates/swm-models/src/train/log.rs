@@ -34,8 +34,8 @@ impl Writer {
 }
 
 impl Log {
-    /// Opens the log of a folder; `resume` appends to the lines of an earlier run. Each run gets its own event file, as
-    /// TensorBoard expects.
+    /// Opens the log of a folder; `resume` appends to the lines of an earlier run. Each run writes a new event
+    /// file, as TensorBoard expects.
     ///
     /// # Errors
     /// When the folder cannot be written.
@@ -133,19 +133,19 @@ mod tests {
     fn events_round_trip_with_valid_checksums() {
         let folder = tempfile::tempdir().expect("a folder");
         let mut log = Log::new(folder.path(), false).expect("a log");
-        log.write(7, &[("loss", 0.5), ("lr", 1e-3)]).expect("a written file");
-        let line = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("lines");
+        log.write(7, &[("loss", 0.5), ("lr", 1e-3)]).expect("writing scalars");
+        let line = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("reading train.jsonl");
         assert_eq!(line, "{\"loss\":0.5,\"lr\":0.001,\"step\":7}\n");
-        let events = std::fs::read(&log.events.path).expect("events");
-        let mut rest = &events[..];
+        let events = std::fs::read(&log.events.path).expect("reading the event file");
+        let mut unread = &events[..];
         let mut found = vec![];
-        while !rest.is_empty() {
-            let word = |at: usize| u32::from_le_bytes(rest[at..at + 4].try_into().expect("4 bytes"));
-            let length = u64::from_le_bytes(rest[..8].try_into().expect("8 bytes")) as usize;
-            assert_eq!(word(8), masked_crc(&rest[..8]));
-            assert_eq!(word(12 + length), masked_crc(&rest[12..12 + length]));
-            found.push(Event::decode(&rest[12..12 + length]).expect("an event"));
-            rest = &rest[16 + length..];
+        while !unread.is_empty() {
+            let word = |at: usize| u32::from_le_bytes(unread[at..at + 4].try_into().expect("4 bytes"));
+            let length = u64::from_le_bytes(unread[..8].try_into().expect("8 bytes")) as usize;
+            assert_eq!(word(8), masked_crc(&unread[..8]));
+            assert_eq!(word(12 + length), masked_crc(&unread[12..12 + length]));
+            found.push(Event::decode(&unread[12..12 + length]).expect("an event"));
+            unread = &unread[16 + length..];
         }
         assert_eq!(found[0].file_version.as_deref(), Some("brain.Event:2"));
         assert_eq!(found[1].step, 7);

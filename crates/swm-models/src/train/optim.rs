@@ -1,7 +1,7 @@
 //! AdamW (Loshchilov and Hutter 2019, algorithm 2) with clipping of the global gradient norm, as PyTorch computes both.
 //!
 //! Burn's optimizer clips every tensor separately and keys its state by ids that change from run to run. This optimizer
-//! clips the whole gradient and keys its state by parameter name, so that the state can be stored beside the weights.
+//! clips the whole gradient and keys its state by parameter name, so that the state can be stored with the weights.
 
 use crate::nn::parameters::{self, HostTensor, IntoF32, Named};
 use burn::module::Module;
@@ -15,19 +15,20 @@ use std::collections::BTreeMap;
 pub struct OptimConfig {
     /// The peak learning rate.
     pub lr: f64,
-    /// Decay of the weights per step, times the learning rate.
+    /// The decay of the weights in a step, as a multiple of the learning rate.
     pub weight_decay: f64,
-    /// Decay of the first moment (running gradient) and of the second (running squared gradient).
+    /// The decay of the first moment (running gradient) and of the second moment (running squared gradient).
     pub betas: [f64; 2],
-    /// Added to the root of the second moment.
+    /// The value added to the square root of the second moment.
     pub epsilon: f64,
-    /// The largest gradient norm, of all parameters or of each parameter group; larger gradients are scaled down to it.
+    /// The largest gradient norm of a clipping group ([`ParameterGroup::clip`]); larger gradients are scaled down to
+    /// this norm.
     pub clip: f64,
-    /// Batches whose gradients are averaged for one step.
+    /// The number of batches whose gradients are averaged for one step.
     #[serde(default = "one")]
     pub accumulate: usize,
-    /// Decay of the exponential moving average of the weights, such as 0.999, which are then the weights of the
-    /// checkpoint; 0 for no average.
+    /// The decay of the exponential moving average of the weights, such as 0.999; 0 for no average. The checkpoint
+    /// stores the averaged weights.
     #[serde(default)]
     pub ema: f64,
 }
@@ -39,7 +40,7 @@ fn one() -> usize {
 /// The clipping group and the learning rate of a parameter.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ParameterGroup {
-    /// The index of the clipping group: its parameters share one gradient norm.
+    /// The index of the clipping group. The parameters of a group have one common gradient norm.
     pub clip: usize,
     /// A factor of the learning rate.
     pub lr: f64,

@@ -1,4 +1,5 @@
-//! [`TrainOptions`] and [`TrainSummary`]: the options of a run that do not change its results, and its summary.
+//! [`TrainOptions`] and [`TrainSummary`]: the options of a run that do not change its results, and the summary of a
+//! run.
 
 use burn::tensor::Device;
 use serde::Serialize;
@@ -8,7 +9,7 @@ use std::path::PathBuf;
 /// Options of a run that do not change its results.
 #[derive(Clone, Debug)]
 pub struct TrainOptions {
-    /// Whether to continue the run in the output folder, if there is one.
+    /// Whether to continue the run in the output folder, if the folder holds a run.
     pub resume: bool,
     /// The device that holds the tensors.
     pub device: Device,
@@ -36,9 +37,9 @@ pub struct TrainSummary {
     pub checkpoint: PathBuf,
     /// The hash of the weights.
     pub weights: String,
-    /// Steps done.
+    /// The number of finished steps.
     pub steps: usize,
-    /// Whether the run was interrupted; training again with `resume` continues it.
+    /// Whether the run was interrupted; training again with `resume` continues the run.
     pub interrupted: bool,
     /// Whether the run ended early because the validation loss no longer fell.
     pub stopped_early: bool,
@@ -48,7 +49,7 @@ pub struct TrainSummary {
     pub metrics: BTreeMap<String, f64>,
     /// The number of trained scalars.
     pub parameters: usize,
-    /// Clips trained on per second.
+    /// The number of training clips per second.
     pub clips_per_second: f64,
     /// The fraction of the time spent waiting for data.
     pub data_wait: f64,

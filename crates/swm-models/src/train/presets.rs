@@ -38,11 +38,15 @@ pub(crate) fn preset_text(presets: &[Preset], preset: &str) -> Result<String> {
 /// `presets`.
 ///
 /// # Errors
-/// When there is no such key (the error names the nearest), or a value does not fit.
+/// When there is no such key (the error names the nearest), or a value has the wrong type.
 pub(crate) fn parse<C: DeserializeOwned>(text: &str, settings: &[String], presets: &[&str]) -> Result<C> {
     merge(text, settings, presets)?.extract().map_err(|error| {
         let key = if error.path.is_empty() { "configuration".to_owned() } else { error.path.join(".") };
-        Error::config(key, error.kind.to_string(), "give a value that fits (`--print-config` shows them all)")
+        Error::config(
+            key,
+            error.kind.to_string(),
+            "give a value of the right type (`--print-config` shows all settings)",
+        )
     })
 }
 
@@ -54,7 +58,7 @@ fn merge(text: &str, settings: &[String], presets: &[&str]) -> Result<Figment> {
             return Ok(());
         }
         let known = known.iter().map(String::as_str);
-        Err(Error::unknown("setting", key, known, "`--print-config` shows them all"))
+        Err(Error::unknown("setting", key, known, "`--print-config` shows all settings"))
     };
     let table: toml::Table =
         toml::from_str(text).map_err(|error| Error::config("configuration", error.message(), "correct the file"))?;

@@ -1,4 +1,4 @@
-//! Whether a stored run may be continued with a given configuration and dataset.
+//! Checks that a stored run can be continued with a given configuration and dataset.
 
 use serde_json::Value;
 use std::path::Path;
@@ -9,27 +9,27 @@ pub(crate) fn refuse_existing(out: &Path) -> Error {
     Error::config(
         out.display().to_string(),
         "holds a training run already",
-        "continue it with `resume`, or choose another folder",
+        "continue the run with `resume`, or choose another folder",
     )
 }
 
-/// Checks that a stored run has the configuration and the data of the requested one.
+/// Checks that a stored run has the configuration and the data of the requested run.
 ///
 /// # Errors
 /// When the configuration or the data differ; the error names the settings that differ.
 pub(crate) fn check_same_run(path: &Path, stored: &Manifest, requested: &Manifest) -> Result<()> {
     let problem = if stored.config != requested.config {
         let differing = differences("", &stored.config, &requested.config);
-        format!("the run there has another configuration ({})", differing.join(", "))
+        format!("the stored run has another configuration ({})", differing.join(", "))
     } else if stored.hashes.get("dataset") != requested.hashes.get("dataset") {
-        "the run there was trained on other data".to_owned()
+        "the stored run was trained on other data".to_owned()
     } else {
         return Ok(());
     };
     Err(Error::config(
         path.display().to_string(),
         problem,
-        "continue with the configuration and the data it began with, or choose another folder",
+        "continue with the configuration and the data of the stored run, or choose another folder",
     ))
 }
 
@@ -48,6 +48,6 @@ fn differences(prefix: &str, stored: &Value, requested: &Value) -> Vec<String> {
                 .collect()
         }
         _ if stored == requested => vec![],
-        _ => vec![format!("{prefix}: {stored} there, {requested} here")],
+        _ => vec![format!("{prefix}: stored {stored}, requested {requested}")],
     }
 }

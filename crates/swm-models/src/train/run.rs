@@ -24,8 +24,9 @@ pub(crate) const STAGE: &str = "train";
 /// Trains a model on a dataset; the checkpoint and the logs go to the folder `out`.
 ///
 /// `control` is checked before every step. An interrupted run saves its checkpoint and returns a summary with
-/// `interrupted`. The metrics of the progress events are the model's, then `validation_loss` (once there is one), `lr`,
-/// `gradient_norm`, `clips_per_second` and `data_wait`, the fraction of the time spent waiting for data.
+/// `interrupted`. The metrics of the progress events are the metrics of the model, then `validation_loss` (after the
+/// first validation), `lr`, `gradient_norm`, `clips_per_second` and `data_wait`, the fraction of the time spent waiting
+/// for data.
 ///
 /// # Errors
 /// When the configuration contradicts itself or the data, `out` holds a run that cannot be continued, the loss or its
@@ -51,7 +52,7 @@ pub fn train<M: Trainable>(
                 .with_pretrained_weights(&options.cache)?,
         };
         let run = Run::new(config.loop_config(), loader_config, &reader, out, options, &mut learner)?;
-        run.go(M::FAMILY, control)
+        run.run_steps(M::FAMILY, control)
     })
 }
 
@@ -70,7 +71,7 @@ struct Run<'a> {
 struct Batches {
     loader: Loader,
     epoch: Epoch,
-    /// Batches taken since the run first began.
+    /// The number of batches taken since the start of the run, including the batches before an interruption.
     taken: usize,
 }
 
@@ -96,7 +97,8 @@ impl<'a> Run<'a> {
         let loader = |part| {
             let config = LoaderConfig {
                 batch_size: config.data.batch_size,
-                // Validation is shuffled, too: in stored order, the first batches would come from one or two episodes.
+                // Validation clips are shuffled, because the first batches in stored order come from one or two
+                // episodes.
                 shuffle: true,
                 seed: config.seed,
                 threads: options.loader_threads,
@@ -118,7 +120,7 @@ impl<'a> Run<'a> {
         Ok(Self { config, out, learner, batches, validation, log, clock })
     }
 
-    fn go(mut self, family: &'static str, control: &mut Control<'_>) -> Result<TrainSummary> {
+    fn run_steps(mut self, family: &'static str, control: &mut Control<'_>) -> Result<TrainSummary> {
         let steps = self.config.schedule.steps;
         control.emit(Event::Started(Stage { name: STAGE, subject: &[family], total: steps, unit: "steps" }));
         self.clock.start = Instant::now();
@@ -174,19 +176,19 @@ impl<'a> Run<'a> {
         let mut sum = StepOutput::default();
         for _ in 0..accumulate {
             let start = Instant::now();
-            let number = self.batches.taken;
+            let index = self.batches.taken;
             let batch = self.batches.next()?;
             self.clock.waited += start.elapsed().as_secs_f64();
-            sum.add(self.loss_and_gradients(&batch, number)?);
+            sum.add(self.loss_and_gradients(&batch, index)?);
         }
         let mean = if accumulate > 1 { sum.scaled(1.0 / accumulate as f64) } else { sum };
         let key = Key::new(self.config.seed).with("after").at(self.learner.state().step as u64);
         Ok(self.learner.update(mean, key))
     }
 
-    /// Computes loss and gradients of the batch with the index `number`, and checks that they are finite.
-    fn loss_and_gradients(&self, batch: &Batch, number: usize) -> Result<StepOutput> {
-        let key = Key::new(self.config.seed).with("step").at(number as u64);
+    /// Computes loss and gradients of the batch with the index `index`, and checks that they are finite.
+    fn loss_and_gradients(&self, batch: &Batch, index: usize) -> Result<StepOutput> {
+        let key = Key::new(self.config.seed).with("step").at(index as u64);
         let output = self.learner.loss_and_gradients(batch, key, true)?;
         let not_finite = if !output.loss().is_finite() {
             "the loss"
@@ -204,8 +206,8 @@ impl<'a> Run<'a> {
     fn validate(&mut self) -> Result<f64> {
         let Some(loader) = &self.validation else { return Ok(f64::NAN) };
         let mut window = MetricWindow::default();
-        for (number, batch) in loader.epoch(0, 0).take(self.config.validation.batches).enumerate() {
-            let key = Key::new(self.config.seed).with("validation").at(number as u64);
+        for (index, batch) in loader.epoch(0, 0).take(self.config.validation.batches).enumerate() {
+            let key = Key::new(self.config.seed).with("validation").at(index as u64);
             window.add(&self.learner.loss_and_gradients(&*batch?, key, false)?.metrics, 0.0);
         }
         if window.is_empty() {

@@ -6,19 +6,19 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ScheduleConfig {
-    /// Training steps in all.
+    /// The number of training steps.
     pub steps: usize,
-    /// Steps of the warm-up, which are among `steps`.
+    /// The number of warm-up steps, included in `steps`.
     pub warmup: usize,
     /// The last learning rate, as a fraction of the peak.
     pub floor: f64,
 }
 
 impl ScheduleConfig {
-    /// Returns the learning rate of a step (the first is 0) as a fraction of the peak.
+    /// Returns the learning rate of a step (the first step is 0) as a fraction of the peak.
     ///
-    /// Step `t` has `(t + 1) / warmup` during the warm-up, then `floor + (1 - floor) (1 + cos πp) / 2` with
-    /// `p = (t - warmup) / (steps - warmup)`.
+    /// The fraction of step `t` is `(t + 1) / warmup` during the warm-up, then `floor + (1 - floor) (1 + cos πp) / 2`
+    /// with `p = (t - warmup) / (steps - warmup)`.
     pub fn lr_factor(&self, step: usize) -> f64 {
         if step < self.warmup {
             return (step + 1) as f64 / self.warmup as f64;

@@ -2,7 +2,7 @@
 //!
 //! Burn computes on one thread, so shards of a batch run on several threads. The configuration, not the machine, sets
 //! the number of shards a batch is cut into. Each shard differentiates its own copy of the model, and the results are
-//! added in the order of the shards, so they do not depend on the number of threads.
+//! added in the order of the shards, so the results do not depend on the number of threads.
 
 use super::step_output::StepOutput;
 use rayon::prelude::*;

@@ -3,8 +3,7 @@
 use swm_core::{Error, Result};
 use swm_data::{Part, Reader, Split};
 
-/// Returns the indices of the episodes of a part of the dataset, or `None` (all episodes) if none are held
-/// out.
+/// Returns the indices of the episodes of a part of the dataset, or `None` (all episodes) without `hold_out`.
 ///
 /// # Errors
 /// When no episode is left for the part.
@@ -18,7 +17,7 @@ pub(crate) fn episodes(hold_out: bool, part: Part, reader: &dyn Reader) -> Resul
             "data.hold_out",
             format!("of the {} episodes of the dataset, none is left for {part:?}", reader.episodes().len())
                 .to_lowercase(),
-            "collect more episodes, or train on all of them with data.hold_out=false validation.every=0",
+            "collect more episodes, or train on all episodes with data.hold_out=false validation.every=0",
         )),
     }
 }

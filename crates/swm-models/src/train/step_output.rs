@@ -1,4 +1,4 @@
-//! [`StepOutput`]: loss, gradients and buffers of a batch, and how those of several batches are combined.
+//! [`StepOutput`]: the loss, the gradients and the buffers of a batch, and their weighted sums over several batches.
 
 use crate::nn::parameters::Named;
 use burn::tensor::Tensor;
@@ -44,8 +44,8 @@ impl StepOutput {
     }
 }
 
-fn add_by_name(sums: &mut Named<Tensor<1>>, others: Named<Tensor<1>>) {
-    for (name, tensor) in others {
+fn add_by_name(sums: &mut Named<Tensor<1>>, terms: Named<Tensor<1>>) {
+    for (name, tensor) in terms {
         let tensor = match sums.remove(&name) {
             Some(sum) => sum + tensor,
             None => tensor,

@@ -16,7 +16,7 @@ use swm_data::LoaderConfig;
 
 /// A model that the training loop can train: a module with its configuration, its data and its loss.
 ///
-/// Everything a model stores is a parameter of its module, under its published name: target networks and running
+/// Every stored tensor of a model is a parameter of the module, under its published name. Target networks and running
 /// statistics are parameters that need no gradient.
 pub trait Trainable: Module + Sync + 'static {
     /// The name of the family, as in `config.json` and on the command line.
@@ -25,8 +25,8 @@ pub trait Trainable: Module + Sync + 'static {
     const SUMMARY: &'static str;
     /// The built-in configurations; the first is the default.
     const PRESETS: &'static [Preset];
-    /// Whether model units map the smallest and the largest action of the data to -1 and 1, instead of standardising
-    /// actions to mean 0 and standard deviation 1.
+    /// Whether the smallest and the largest action of the data are mapped to -1 and 1. Otherwise, actions are
+    /// standardised to mean 0 and standard deviation 1.
     const BOUNDED_ACTIONS: bool = false;
     /// The sizes of the networks: the table `model` of a configuration.
     type Config: Serialize + DeserializeOwned + Clone + Debug + PartialEq + Send + Sync;
@@ -45,7 +45,7 @@ pub trait Trainable: Module + Sync + 'static {
     /// Returns the clips, columns and goals of a batch. The training loop sets batch size, order, threads and episodes.
     ///
     /// # Errors
-    /// When the dataset lacks a column, or it is of another shape.
+    /// When the dataset lacks a column, or a column has another shape.
     fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig>;
 
     /// Creates a model whose initial values `key` determines.
@@ -54,7 +54,8 @@ pub trait Trainable: Module + Sync + 'static {
     /// When the data do not fit the configuration.
     fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self>;
 
-    /// Loads pretrained weights, such as an encoder's, into a new model. `cache` is the folder for downloads.
+    /// Loads pretrained weights, such as the weights of an encoder, into a new model. `cache` is the folder for
+    /// downloads.
     ///
     /// # Errors
     /// When the weights cannot be fetched or do not fit.

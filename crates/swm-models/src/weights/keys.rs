@@ -5,7 +5,7 @@ use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, SeqAccess, Vis
 use serde::ser::{Serialize, SerializeMap as _, Serializer};
 use std::fmt;
 
-/// The keys of an object in order, each with the keys of its value.
+/// The keys of a JSON object in the order of the file. Each key has the keys of its value.
 #[derive(Debug, Default, PartialEq)]
 pub(crate) struct Keys(pub Vec<(String, Keys)>);
 

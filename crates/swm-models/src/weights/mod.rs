@@ -1,12 +1,13 @@
 //! Pretrained weights: read from safetensors and PyTorch files and from the Hugging Face hub, and written for PyTorch.
 //!
 //! - [`read`]: the tensors of a `.safetensors`, `.pt`, `.pth`, `.bin` or `.ckpt` file.
-//! - [`fetch`]: a file of the Hugging Face hub; [`locate`]: a file, or the weights of a repository.
+//! - [`fetch`]: downloads a file of the Hugging Face hub. [`locate`]: finds a local file of weights or downloads the
+//!   weights of a repository.
 //! - [`torch::write`]: a state dict that `torch.load(weights_only=True)` reads.
-//! - [`names`]: the names of a vision transformer's weights in the versions of `transformers`.
-//! - [`fill`]: replaces the weights of a module and reports those that do not fit.
+//! - [`names`]: the names of a vision transformer's weights in versions of the Python package `transformers`.
+//! - [`fill`]: replaces the weights of a module and reports weights that do not fit.
 //!
-//! Pickles are never executed: the reader understands only the operations that describe tensors.
+//! Pickles are never executed: the reader accepts only the operations that describe tensors.
 
 pub mod hub;
 pub(crate) mod keys;
@@ -31,7 +32,8 @@ use swm_core::{Error, Result};
 /// For a training checkpoint with weights under `state_dict`, returns those weights only.
 ///
 /// # Errors
-/// When the file cannot be read, has another format, is damaged, or holds anything but tensors of real values.
+/// When the file cannot be read, has another format, is damaged, or holds an object that is not a tensor of real
+/// values.
 pub fn read(path: &Path) -> Result<Named<HostTensor>> {
     let tensors = match path.extension().and_then(|end| end.to_str()) {
         Some("safetensors") => safetensors(path)?,
@@ -128,13 +130,15 @@ pub fn fill<M: Module>(module: M, weights: &Named<HostTensor>, path: &Path, what
     }
 }
 
-/// The first difference between weights and the shapes that `what` requires, or `None` if they agree.
+/// The first difference between weights and the shapes that `what` requires, or `None` if the shapes agree.
 pub(crate) fn mismatch(shapes: &Named<Vec<usize>>, weights: &Named<HostTensor>, what: &str) -> Option<String> {
     for (name, shape) in shapes {
         match weights.get(name) {
             Some(tensor) if &tensor.shape == shape => {}
-            Some(tensor) => return Some(format!("'{name}' is {:?}, but {what} makes it {shape:?}", tensor.shape)),
-            None => return Some(format!("'{name}' is missing, which {what} requires")),
+            Some(tensor) => {
+                return Some(format!("'{name}' has the shape {:?}, but {what} requires {shape:?}", tensor.shape));
+            }
+            None => return Some(format!("'{name}' is missing from the weights of {what}")),
         }
     }
     let unknown = weights.keys().find(|name| !shapes.contains_key(*name))?;

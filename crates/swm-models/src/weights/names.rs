@@ -15,7 +15,7 @@ pub enum Naming {
     Transformers5,
 }
 
-/// Parts of names in a ViT: published, and in version 5.
+/// Parts of weight names in a ViT: the published part, then the part in version 5 of `transformers`.
 const VIT: &[(&str, &str)] = &[
     ("encoder.layer.", "layers."),
     (".attention.attention.query.", ".attention.q_proj."),
@@ -26,7 +26,7 @@ const VIT: &[(&str, &str)] = &[
     (".output.dense.", ".mlp.fc2."),
 ];
 
-/// Parts of names in a DINOv2: published, and in version 5.
+/// Parts of weight names in a DINOv2: the published part, then the part in version 5 of `transformers`.
 const DINO: &[(&str, &str)] = &[
     (".attention.attention.query.", ".attention.q_proj."),
     (".attention.attention.key.", ".attention.k_proj."),
@@ -51,7 +51,7 @@ pub fn to_published<T>(weights: Named<T>, prefix: &str) -> Named<T> {
     rename(weights, prefix, |name, (old, new)| name.replacen(new, old, 1), table)
 }
 
-/// Renames the weights of the transformer below `prefix` from their published names to those of `naming`.
+/// Renames the weights of the transformer below `prefix` from their published names to the names of `naming`.
 pub fn to_naming<T>(weights: Named<T>, prefix: &str, naming: Naming) -> Named<T> {
     let table = table(&weights, prefix);
     match naming {

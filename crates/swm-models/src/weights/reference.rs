@@ -14,7 +14,7 @@ use swm_core::{Error, Result};
 pub(crate) struct Reference {
     /// The file of weights.
     pub path: PathBuf,
-    /// The tree of classes, from the model down.
+    /// The tree of classes, whose root is the model.
     pub config: Value,
     /// The keys of the tree, in the order of the file.
     pub keys: Keys,
@@ -27,7 +27,7 @@ const TARGET: &str = "_target_";
 
 impl Reference {
     /// Reads a checkpoint of the class `class`: a folder with a `config.json` and one file of weights, or the path of
-    /// that file.
+    /// the file of weights.
     ///
     /// # Errors
     /// When a file is missing or damaged, there are several files of weights, or the checkpoint is of another class.
@@ -51,9 +51,9 @@ impl Reference {
             config = config["model"].take();
             keys = keys.0.into_iter().find_map(|(name, keys)| (name == "model").then_some(keys)).unwrap_or_default();
         }
-        let found = config[TARGET].as_str().unwrap_or("nothing with a _target_").to_owned();
+        let found = config[TARGET].as_str().unwrap_or("an object without _target_").to_owned();
         if found.rsplit('.').next() != Some(class) {
-            return Err(invalid(format!("it describes {found}")));
+            return Err(invalid(format!("the file describes {found}")));
         }
         let mut weights = read(&path)?;
         weights.retain(|name, _| !name.ends_with(BATCHES_TRACKED));
@@ -74,7 +74,7 @@ impl Reference {
     /// When there is neither a size at the path nor a default.
     pub fn size_or(&self, at: &str, default: Option<usize>) -> Result<usize> {
         let found = self.at(at).and_then(Value::as_u64).and_then(|size| usize::try_from(size).ok());
-        found.or(default).ok_or_else(|| self.wrong(format!("{CONFIG} has no number at {at}")))
+        found.or(default).ok_or_else(|| self.wrong(format!("{CONFIG} has no size at {at}")))
     }
 
     /// Returns the rate at a dotted path, or 0 if there is no rate at the path.
@@ -107,14 +107,14 @@ impl Reference {
         found.ok_or_else(|| self.wrong(format!("'{name}' is missing")))
     }
 
-    /// Returns the sizes and the image size of the vision transformer at a dotted path, and renames its weights to
+    /// Returns the sizes and the image size of the vision transformer at a dotted path, and renames the weights to
     /// their published names.
     ///
     /// # Errors
     /// When the encoder is not a vision transformer, or its size is unknown.
     pub fn vit(&mut self, at: &str) -> Result<(VitConfig, usize)> {
         if self.class(at) != "vit_hf" {
-            return Err(self.wrong(format!("its encoder is '{}', not the vision transformer 'vit_hf'", self.class(at))));
+            return Err(self.wrong(format!("the encoder is '{}', not the vision transformer 'vit_hf'", self.class(at))));
         }
         let patch = self.size_or(&format!("{at}.patch_size"), Some(16))?;
         let image = self.size_or(&format!("{at}.image_size"), Some(224))?;
@@ -142,7 +142,7 @@ impl Reference {
         Ok((config, image))
     }
 
-    /// Returns the sizes of the DINOv2 below `prefix`, and renames its weights to their published names.
+    /// Returns the sizes of the DINOv2 below `prefix`, and renames the weights to their published names.
     ///
     /// # Errors
     /// When a weight is missing.
@@ -152,7 +152,7 @@ impl Reference {
         let of = |name: &str| self.shape(&format!("{prefix}{name}"));
         let projection = of("embeddings.patch_embeddings.projection.weight")?;
         let [dim, _, patch, _] = *projection else {
-            return Err(self.wrong("its encoder does not begin with a convolution".to_owned()));
+            return Err(self.wrong("the encoder does not begin with a convolution".to_owned()));
         };
         let mlp = of("encoder.layer.0.mlp.fc1.weight")?[0];
         let grid = (of("embeddings.position_embeddings")?.get(1).copied().unwrap_or(1) - 1).isqrt();
@@ -172,10 +172,12 @@ fn only_weights(folder: &Path) -> Result<PathBuf> {
     files.sort();
     match files.as_slice() {
         [file] => Ok(file.clone()),
-        [] => {
-            Err(Error::corrupt(folder, "there is no .pt file", "give the folder of a checkpoint, or the file itself"))
-        }
-        _ => Err(Error::corrupt(folder, "there are several files of weights", "give the path of one of them")),
+        [] => Err(Error::corrupt(
+            folder,
+            "there is no .pt or .safetensors file",
+            "give the folder of a checkpoint, or the path of its weights",
+        )),
+        _ => Err(Error::corrupt(folder, "there are several files of weights", "give the path of one file")),
     }
 }
 

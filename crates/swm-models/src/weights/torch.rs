@@ -1,4 +1,5 @@
-//! State dicts in PyTorch's format: a zip archive with a pickle that describes the tensors, and their values.
+//! State dicts in PyTorch's format: a zip archive of a pickle, which describes the tensors, and the values of the
+//! tensors.
 
 use crate::nn::parameters::{HostTensor, Named};
 use std::io::{Seek, Write};
@@ -7,7 +8,7 @@ use swm_core::{Error, Result};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
-/// The batch counter of a batch normalisation, `[]`: the only integer in a state dict.
+/// The name of the batch counter of a batch normalisation, a scalar: the only integer in a state dict.
 pub const BATCHES_TRACKED: &str = "num_batches_tracked";
 
 /// Writes a state dict that `torch.load(path, weights_only=True)` reads: single precision, except for the counters of
@@ -50,7 +51,8 @@ fn is_counter(name: &str) -> bool {
     name.ends_with(BATCHES_TRACKED)
 }
 
-/// The pickle (protocol 2) of an ordered dictionary of tensors, whose values are in `data/0`, `data/1` and so on.
+/// The pickle (protocol 2) of an ordered dictionary of tensors. The values of the tensors are in `data/0`, `data/1` and
+/// so on.
 fn pickle(tensors: &Named<HostTensor>) -> Vec<u8> {
     let mut out = vec![0x80, 2];
     empty_dict(&mut out);
@@ -79,7 +81,7 @@ fn pickle(tensors: &Named<HostTensor>) -> Vec<u8> {
     out
 }
 
-/// `collections.OrderedDict()`.
+/// Appends an empty `collections.OrderedDict`.
 fn empty_dict(out: &mut Vec<u8>) {
     global(out, "collections", "OrderedDict");
     out.extend(b")R");
@@ -95,7 +97,7 @@ fn text(out: &mut Vec<u8>, text: &str) {
     out.extend(text.bytes());
 }
 
-/// An integer, as a long of eight bytes.
+/// Appends an integer, as a long of eight bytes.
 fn integer(out: &mut Vec<u8>, value: usize) {
     out.extend([0x8a, 8]);
     out.extend((value as u64).to_le_bytes());

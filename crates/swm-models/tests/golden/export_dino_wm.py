@@ -1,11 +1,12 @@
-"""Writes dino-wm-model-small.safetensors: numerics of the published DINO-WM at a very small size.
+"""Writes dino-wm-model-small.safetensors: inputs, weights, outputs and gradients of a very small DINO-WM.
 
 Run with an interpreter that has torch, transformers and the reference package:
 
     python export_dino_wm.py dino-wm-model-small.safetensors
 
-Encoding, prediction, rollout and cost are the reference's (`PreJEPA`); the loss follows its training script: everything
-is predicted except the actions. The encoder is a tiny DINOv2 whose position embeddings are for larger images.
+The reference's class `PreJEPA` computes encoding, prediction, rollout and cost. The loss follows the reference's
+training script: all parts of a frame's embedding are predicted except the actions. The encoder is a tiny DINOv2 whose
+position embeddings are for larger images.
 """
 
 import json
@@ -62,7 +63,7 @@ def main(path):
     predicted = model.predict(embedding)
     target = info["emb"][:, 1:].detach()
     out |= {"o.emb": info["emb"], "o.pred": predicted}
-    # Actions are the last column.
+    # The action embedding is the last part of a frame's embedding and is not predicted.
     free = info["emb"].shape[-1] - c["columns"][-1][2]
     loss = (predicted - target)[..., :free].square().mean()
     loss.backward()
@@ -71,10 +72,10 @@ def main(path):
         "o.pixels_loss": (predicted - target)[..., : c["dim"]].square().mean()[None],
         "o.columns_loss": (predicted - target)[..., c["dim"] : free].square().mean()[None],
     }
-    # The encoder is frozen (its features are detached): it has no gradients.
+    # The encoder is frozen (the model detaches its features), so its parameters have no gradients.
     out |= {f"g.{name}": value.grad for name, value in model.named_parameters() if value.grad is not None}
 
-    # One environment, one frame of context; horizon beyond the history.
+    # One environment with one frame of context; the horizon is longer than the history.
     samples, horizon = 4, 5
     candidates = torch.randn(1, samples, horizon, c["columns"][-1][1])
     goal = torch.randn(1, 1, 3, c["image"], c["image"])

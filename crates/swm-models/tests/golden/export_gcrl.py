@@ -1,15 +1,17 @@
-"""Writes gcbc-small.safetensors, gcivl-small.safetensors and gciql-small.safetensors: numerics of goal-conditioned
-models at a very small size; and reference/gcivl, a checkpoint in the form of the published training script.
+"""Writes gcbc-small.safetensors, gcivl-small.safetensors and gciql-small.safetensors: inputs, weights, losses and
+gradients of very small goal-conditioned models. Also writes reference/gcivl, a checkpoint in the form of the published
+training script.
 
 Run with an interpreter that has torch and the reference package (`pip install stable-worldmodel torch`):
 
     python export_gcrl.py FOLDER
 
-Model, heads and expectile loss are the reference's (`wm/gcrl`). The package holds no training code, so the losses are
-transcribed here from the algorithms of the paper's appendix (GCBC, GCIVL and GCIQL training), with the additions of the
-published training scripts: the weight of an action is at most 100, the policy is a normal distribution with one trained
-standard deviation per element, values are pooled by the mean. Values and policy are trained together: the policy's
-loss has no gradient to encoder and values, so the gradients equal those of the paper's two phases.
+Model, heads and expectile loss come from the reference package (`wm/gcrl`). The package holds no training code, so this
+script implements the losses of the algorithms in the paper's appendix (GCBC, GCIVL and GCIQL training), with the
+additions of the published training scripts: the weight of an action is at most 100, the policy is a normal distribution
+with one trained standard deviation per element, and the value head pools tokens by their mean. Values and policy are
+trained together: the policy's loss has no gradient to encoder and values, so the gradients equal the gradients of the
+paper's two training phases.
 """
 
 import json
@@ -38,12 +40,12 @@ class TeacherStudent(nn.Module):
 
 
 def flat(embedding):
-    """[rows, frames, patches, dim] to [rows, frames * patches, dim]."""
+    """Flattens [rows, frames, patches, dim] to [rows, frames * patches, dim]."""
     return embedding.flatten(1, 2)
 
 
 def save(model, folder):
-    """The state dict and the settings of the script that trained it."""
+    """Writes the state dict and the settings in the form of the published training script."""
     c = CONFIG
     sizes = dict(depth=c["depth"], heads=c["heads"], mlp_dim=c["mlp"], dim_head=c["dim_head"], dropout=0.0)
     settings = dict(
@@ -73,7 +75,7 @@ def main(family, path):
             )
         )
     model = GCRL(encoder=Vit(c), action_predictor=Predictor(out_dim=c["action_dim"], **size), **parts)
-    # Parameters at their initial values could hide errors.
+    # Initial values such as zeros and ones could hide errors, so noise is added.
     with torch.no_grad():
         for value in model.state_dict().values():
             if value.is_floating_point():
@@ -84,7 +86,7 @@ def main(family, path):
     pixels = torch.randn(clips, steps, 3, c["image"], c["image"])
     action = torch.randn(clips, steps, c["action_dim"])
     goal = torch.randn(clips, 1, 3, c["image"], c["image"])
-    goal[0, 0] = pixels[0, history - 1]  # one clip has reached its goal
+    goal[0, 0] = pixels[0, history - 1]  # the last observation of clip 0 equals the goal
     actor_goal = torch.randn_like(goal)
     out = {"i.pixels": pixels, "i.action": action, "i.goal": goal}
     out |= {f"w.{name}": value.clone() for name, value in model.state_dict().items()}

@@ -1,11 +1,12 @@
-"""Writes lewm-small.safetensors: numerics of the published LeWM at a very small size.
+"""Writes lewm-small.safetensors: inputs, weights, outputs, losses and gradients of a very small LeWM.
 
 Run with an interpreter that has torch and the reference package (`pip install stable-worldmodel torch`):
 
     python export_lewm.py lewm-small.safetensors
 
-Model, rollout, cost and SIGReg are the reference's. Its encoder comes from another package, so the vision
-transformer is implemented here, with that package's names of weights.
+Model, rollout and cost come from the reference package. The encoder of the reference comes from another package, so
+this script implements a vision transformer with the weight names of published checkpoints. `sigreg` implements SIGReg
+for given directions.
 """
 
 import json
@@ -24,7 +25,7 @@ CONFIG = dict(
 
 
 def tree(**parts):
-    """A module that consists of its named parts."""
+    """Returns a module with the submodules `parts`."""
     module = nn.Module()
     for name, part in parts.items():
         setattr(module, name, part)
@@ -73,7 +74,8 @@ class Vit(nn.Module):
 
 
 def sigreg(latents, directions, knots):
-    """The regulariser of the reference (wm/loss.py) with given directions: Epps-Pulley, trapezoid weights."""
+    """The regulariser of the reference (wm/loss.py) with given directions: the Epps-Pulley statistic, integrated by the
+    trapezoidal rule."""
     t = torch.linspace(0, 3, knots)
     window = torch.exp(-t.square() / 2)
     angles = (latents @ directions).unsqueeze(-1) * t
@@ -95,7 +97,7 @@ def main(path):
         projector=MLP(c["dim"], c["proj_hidden"], c["dim"], norm),
         pred_proj=MLP(c["dim"], c["proj_hidden"], c["dim"], norm),
     )
-    # Initial values could hide errors: zero modulations, unit scales, default statistics.
+    # Initial values (zero modulations, unit scales, default statistics) could hide errors, so noise is added.
     with torch.no_grad():
         for name, value in model.state_dict().items():
             if name.endswith("running_var"):
@@ -121,7 +123,7 @@ def main(path):
         emb, act = info["emb"], info["act_emb"]
         out |= {"o.eval.emb": emb, "o.eval.act_emb": act}
         out["o.eval.pred"] = model.predict(emb[:, : c["history"]], act[:, : c["history"]])
-        # One environment at a time: the reference cannot broadcast the goals of several.
+        # One environment at a time, because the reference cannot broadcast the goals of several environments.
         for history in (1, 3):
             costs, rollouts = [], []
             for env in range(envs):

@@ -1,12 +1,12 @@
-"""Writes pldm-model-small.safetensors: numerics of the published PLDM at a very small size.
+"""Writes pldm-model-small.safetensors: inputs, weights, outputs, losses and gradients of a very small PLDM.
 
 Run with an interpreter that has torch, transformers and the reference package:
 
     python export_pldm.py pldm-model-small.safetensors
 
-Model, rollout, cost and loss terms are the reference's; their combination follows its training script: the input of the
-inverse dynamics is the next latent, then the present one. Weights have their published names below `model.` and
-`idm.`.
+Model, rollout, cost and loss terms come from the reference package. The sum of the terms follows the reference's
+training script: the input of the inverse dynamics is the next latent, then the present latent. Weights have their
+published names below `model.` and `idm.`.
 """
 
 import json
@@ -52,7 +52,7 @@ def main(path):
     torch.manual_seed(0)
     c = CONFIG
     parts = build(c)
-    # Zero-initialised parameters could hide errors.
+    # Zero-initialised parameters could hide errors, so noise is added.
     with torch.no_grad():
         for value in parts.parameters():
             value.add_(0.2 * torch.randn_like(value))
@@ -76,7 +76,7 @@ def main(path):
     info = model.encode(dict(pixels=pixels, action=action))
     tensors["o.eval.emb"] = info["emb"]
     tensors["o.eval.pred"] = model.predict(info["emb"][:, : c["history"]], info["act_emb"][:, : c["history"]])
-    # One environment: the published cost does not broadcast the goals of several.
+    # One environment only, because the published cost does not broadcast the goals of several environments.
     samples, horizon = 5, 3
     candidates = torch.randn(1, samples, horizon, c["action_dim"])
     goal = torch.randn(1, 1, 3, c["image"], c["image"])

@@ -1,12 +1,13 @@
-"""Writes checkpoints of the reference to reference/{lewm,pldm,prejepa}, and their outputs to reference-*.safetensors.
+"""Writes checkpoints of the reference to reference/{lewm,pldm,prejepa}, and recorded inputs and outputs to
+reference-*.safetensors.
 
 Run with an interpreter that has the reference package, stable-pretraining, hydra, torch and transformers:
 
     python export_reference.py FOLDER/reference
 
-Hydra builds the models from the `config.json` that is stored with them; the reference's `save_pretrained` saves them.
-The state dict of `lewm` has the names of transformers 5, the state dict of `pldm` the names of version 4 and of
-published files, and the state dict of `prejepa` the prefix of a wrapped encoder.
+Hydra builds each model from the configuration that is stored as `config.json`; the reference's `save_pretrained` saves
+the model. The state dict of `lewm` has the names of transformers 5, the state dict of `pldm` the names of version 4 and
+of published files, and the state dict of `prejepa` the prefix of a wrapped encoder.
 """
 
 import json

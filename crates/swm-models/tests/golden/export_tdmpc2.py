@@ -4,10 +4,10 @@ Run with an interpreter that has torch and the reference package (`pip install s
 
     python export_tdmpc2.py tdmpc2-train.safetensors
 
-Model and loss are the reference's (`wm/tdmpc2`). The reference's random draws (noise and pairs of Q functions) are
-recorded; dropout is off. The reference bootstraps after terminations, so `o.terminated.*` additionally has the loss of
-a batch with terminations, in which the value of the next frame is multiplied by 0, as in the publication of SAC and the
-later official TD-MPC2.
+Model and loss come from the reference package (`wm/tdmpc2`). The random draws of the reference (noise and pairs of Q
+functions) are recorded; dropout is off. The reference bootstraps after terminations, so `o.terminated.*` additionally
+contains the loss of a batch with terminations, in which the value of the next frame is multiplied by 0, as in the
+publication of SAC and the later official TD-MPC2.
 """
 
 import json
@@ -31,7 +31,7 @@ CLIPS = 5
 
 
 class Config(dict):
-    """Keys as attributes, as the reference reads them."""
+    """A dictionary with its keys as attributes, as the reference requires."""
 
     def __getattr__(self, name):
         value = self[name]
@@ -39,7 +39,7 @@ class Config(dict):
 
 
 def record(model, config, batch, out, prefix):
-    """Losses and gradients; the random draws are added to `out`."""
+    """Computes losses and gradients; adds the losses and the random draws to `out`."""
     noise, pairs, scalars = [], [], {}
     draw, choose = torch.randn_like, random.sample
     reference.torch.randn_like = lambda x: noise.append(draw(x)) or noise[-1]
@@ -49,7 +49,7 @@ def record(model, config, batch, out, prefix):
     loss = reference.tdmpc2_forward(context, batch, "validate", config)["loss"]
     loss.backward()
     reference.torch.randn_like, reference.random.sample = draw, choose
-    # For every step, the draws of the target, then the draws of the policy.
+    # Every step draws for the target first, then for the policy.
     pairs = torch.tensor(pairs, dtype=torch.float32)
     out[f"{prefix}.target_noise"], out[f"{prefix}.policy_noise"] = torch.stack(noise[::2]), torch.stack(noise[1::2])
     out[f"{prefix}.target_critics"], out[f"{prefix}.policy_critics"] = pairs[::2], pairs[1::2]
@@ -58,7 +58,7 @@ def record(model, config, batch, out, prefix):
 
 
 def terminated(model, config, batch, done, out):
-    """The value loss where some steps terminate: the reference's targets with the next value masked."""
+    """Records the value loss of a batch with terminations: the reference's targets with the next value masked."""
     original = reference.two_hot_inv
     step = SimpleNamespace(call=0)
     # In every step, the reference decodes two values of the next frame (masked), then one value per Q function.
@@ -81,7 +81,7 @@ def main(path):
     random.seed(0)
     config = Config(CONFIG)
     model = reference.TDMPC2(config)
-    # Initial values could hide errors: zero output layers, unit scales, equal targets.
+    # Initial values (zero output layers, unit scales, equal targets) could hide errors, so noise is added.
     with torch.no_grad():
         for value in model.state_dict().values():
             value.add_(0.2 * torch.randn_like(value))

@@ -1,12 +1,12 @@
-"""Writes vit-*.safetensors and dinov2-*.safetensors: numerics of published backbones at very small sizes.
+"""Writes vit-*.safetensors and dinov2-*.safetensors: inputs, weights, tokens and gradients of very small backbones.
 
 Run with an interpreter that has torch and transformers:
 
     python export_vit.py FOLDER
 
-Weights are written under the names of published checkpoints (transformers 4; version 5 renames them when it loads).
-Each file has images of the model's size (`i.pixels`) and of another size (`i.other`), the tokens of both,
-and the gradients of the mean square of the tokens of `i.other`.
+Weights are written under the names of published checkpoints (those of transformers 4; transformers 5 renames weights
+when it loads a checkpoint). Each file has images of the model's size (`i.pixels`) and of another size (`i.other`), the
+tokens of all images, and the gradients of the mean square of the tokens of `i.other`.
 """
 
 import json
@@ -56,7 +56,7 @@ def write(path, model, dino, config):
     rename = lambda name: published(name, dino)
     tensors = {"i.pixels": pixels, "i.other": other, "o.tokens": tokens, "o.other": resized}
     tensors |= {f"w.{rename(name)}": value for name, value in model.state_dict().items()}
-    # The mask token is not used.
+    # The mask token has no gradient, because the model does not use it.
     grads = {name: value.grad for name, value in model.named_parameters() if value.grad is not None}
     tensors |= {f"g.{rename(name)}": value for name, value in grads.items()}
     tensors = {name: value.detach().contiguous().clone() for name, value in tensors.items()}

@@ -1,4 +1,4 @@
-"""Writes weights-*: files of weights in the formats of torch.save, and their content as safetensors.
+"""Writes weights-*: one state dict in the formats of torch.save and as safetensors files.
 
 Run with an interpreter that has torch and safetensors:
 
@@ -19,7 +19,7 @@ def main(folder):
     state = OrderedDict(
         {
             "single.weight": base,
-            "single.column": base[:, 1],  # a view of the same values, with strides
+            "single.column": base[:, 1],  # a strided view of `base`
             "single.transposed": base.t(),
             "half.weight": torch.randn(3, 2).half(),
             "brain.weight": torch.randn(5).bfloat16(),

@@ -1,4 +1,4 @@
-"""Loads an exported checkpoint with the reference's `load_pretrained` and compares its outputs with recorded ones.
+"""Loads an exported checkpoint with the reference's `load_pretrained` and compares the outputs with recorded outputs.
 
     python load_reference.py CHECKPOINT reference-lewm.safetensors
 """

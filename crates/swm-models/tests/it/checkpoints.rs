@@ -27,19 +27,19 @@ fn damaged_checkpoints_are_refused() {
 
     let inner = trained.join("checkpoint");
     let weights = inner.join("weights.safetensors");
-    let whole = std::fs::read(&weights).expect("a readable file");
-    std::fs::write(&weights, &whole[..whole.len() / 2]).expect("a written file");
+    let valid_weights = std::fs::read(&weights).expect("a readable file");
+    std::fs::write(&weights, &valid_weights[..valid_weights.len() / 2]).expect("a written file");
     assert!(message(&trained).contains("is damaged"), "{}", message(&trained));
-    let mut flipped = whole.clone();
+    let mut flipped = valid_weights.clone();
     *flipped.last_mut().expect("bytes") ^= 1;
     std::fs::write(&weights, flipped).expect("a written file");
     assert!(message(&trained).contains("its hash differs"), "{}", message(&trained));
-    std::fs::write(&weights, &whole).expect("a written file");
+    std::fs::write(&weights, &valid_weights).expect("a written file");
 
     let config_file = inner.join("config.json");
     let original = std::fs::read(&config_file).expect("a readable file");
     edit(&config_file, |file| file["config"]["model"]["latent"] = 8.into());
-    assert!(message(&trained).contains("config.json makes it"), "{}", message(&trained));
+    assert!(message(&trained).contains("but config.json requires"), "{}", message(&trained));
     std::fs::write(&config_file, &original).expect("a written file");
     edit(&config_file, |file| file["config"]["model"]["predictor"]["depth"] = 1.into());
     assert!(message(&trained).contains("is not a weight of config.json"), "{}", message(&trained));
@@ -48,7 +48,7 @@ fn damaged_checkpoints_are_refused() {
     assert!(message(&trained).contains("family 'pldm'"), "{}", message(&trained));
     std::fs::write(&config_file, &original).expect("a written file");
 
-    // If a process is killed between the two renames, the old checkpoint remains.
+    // If a process is killed between the two renames of a save, the folder `checkpoint.old` remains.
     std::fs::rename(&inner, trained.join("checkpoint.old")).expect("a renamed folder");
     load(&trained).expect("the old checkpoint");
 }
@@ -60,5 +60,5 @@ fn resuming_with_another_configuration_is_refused() {
     let resume = TrainOptions { resume: true, ..TrainOptions::default() };
     let error = run(&config(&["schedule.steps=1", "optim.lr=2e-3"]), folder.path(), &resume, 0);
     let message = error.expect_err("another configuration").to_string();
-    assert!(message.contains("optim.lr: 0.001 there, 0.002 here"), "{message}");
+    assert!(message.contains("optim.lr: stored 0.001, requested 0.002"), "{message}");
 }

@@ -6,11 +6,11 @@ use swm_models::{TrainConfig, Trainable as _};
 type Config = TrainConfig<Lewm>;
 
 #[test]
-fn presets_round_trip_and_settings_override_them() {
+fn presets_round_trip_and_settings_override_presets() {
     for preset in Lewm::PRESETS {
         let config = Config::load(preset.id, &[]).expect(preset.id);
         let text = config.to_toml().expect("TOML");
-        let again = toml::from_str::<Config>(&text).expect("the same configuration");
+        let again = toml::from_str::<Config>(&text).expect("parsing the written configuration");
         assert_eq!(again.to_toml().expect("TOML"), text);
     }
     let settings = ["optim.lr=3e-4".to_owned(), "model.latent=16".to_owned(), "optim.betas=[0.9, 0.99]".to_owned()];
@@ -19,8 +19,9 @@ fn presets_round_trip_and_settings_override_them() {
 }
 
 #[test]
-fn invalid_settings_are_named() {
-    let message = |setting: &str| Config::load("tiny", &[setting.to_owned()]).expect_err("an error").to_string();
+fn errors_name_invalid_settings() {
+    let message =
+        |setting: &str| Config::load("tiny", &[setting.to_owned()]).expect_err("an invalid setting").to_string();
     assert!(message("optim.rl=1").contains("did you mean optim.lr"), "{}", message("optim.rl=1"));
     assert!(message("optim.lr=fast").contains("optim.lr"), "{}", message("optim.lr=fast"));
     assert!(message("optim.lr").contains("key=value"));

@@ -17,9 +17,9 @@ const SAMPLES: usize = 19;
 const HORIZON: usize = 3;
 const DIM: usize = 4;
 
-/// Observes images, positions and actions.
+/// The setting of a model that observes images, positions and actions.
 const POSITIONS: &str = "model.columns=[{ name = \"position\", dim = 3 }, { name = \"action\", dim = 5 }]";
-/// Observes images and actions.
+/// The setting of a model that observes images and actions.
 const IMAGES: &str = "model.columns=[{ name = \"action\", dim = 5 }]";
 
 /// A model of a few thousand parameters.
@@ -83,7 +83,7 @@ fn training_reduces_every_loss() {
         "optim.lr=3e-3",
     ];
     run(&config(&overrides).expect("a configuration"), folder.path(), 2).expect("a trained model");
-    let lines = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("lines");
+    let lines = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("reading train.jsonl");
     let value = |line: Option<&str>, name: &str| {
         let line: serde_json::Value = serde_json::from_str(line.expect("a line")).expect("JSON");
         line[name].as_f64().unwrap_or_else(|| panic!("{name} in {line}"))
@@ -118,9 +118,9 @@ fn checkpoint(overrides: &[&str]) -> Checkpoint<DinoWm> {
     Checkpoint { model, config, dataset_info, manifest: Manifest::new("train", 0, serde_json::Value::Null) }
 }
 
-fn infos(more: &[&str]) -> Batch {
+fn infos(extra_columns: &[&str]) -> Batch {
     let mut columns = vec![ColumnSpec::image("pixels", SIDE, SIDE), ColumnSpec::image("goal", SIDE, SIDE)];
-    columns.extend(more.iter().map(|name| match *name {
+    columns.extend(extra_columns.iter().map(|name| match *name {
         "history.length" => ColumnSpec::new(*name, DType::Int32, []),
         "history.action" => ColumnSpec::new(*name, DType::Float32, [1, DIM]),
         "history.pixels" => ColumnSpec::new(*name, DType::U8, [1, SIDE, SIDE, 3]),
@@ -131,7 +131,7 @@ fn infos(more: &[&str]) -> Batch {
         let mut row = infos.row_mut(env);
         draw([3.0 + env as f32, 5.0], row.at::<u8>(0));
         draw([10.0, 3.0 + 2.0 * env as f32], row.at::<u8>(1));
-        for (index, name) in more.iter().enumerate() {
+        for (index, name) in extra_columns.iter().enumerate() {
             match *name {
                 "history.length" => row.set(2 + index, &[env as i32 % 2]),
                 "history.action" => row.set(2 + index, &[0.5, -0.5, env as f32, 0.25]),
@@ -174,8 +174,10 @@ fn costs(overrides: &[&str], infos: &Batch, envs: &[usize], threads: usize) -> (
 #[test]
 fn costs_do_not_depend_on_other_environments_or_threads() {
     let history = ["history.length", "history.action", "history.pixels"];
-    for (overrides, more) in [(IMAGES, &[][..]), (IMAGES, &history), (POSITIONS, &["position", "goal_position"])] {
-        let infos = infos(more);
+    for (overrides, extra_columns) in
+        [(IMAGES, &[][..]), (IMAGES, &history), (POSITIONS, &["position", "goal_position"])]
+    {
+        let infos = infos(extra_columns);
         let together = costs(&[overrides], &infos, &[0, 1, 2], 2);
         assert!(together.0.windows(2).any(|pair| pair[0] != pair[1]), "actions have no effect");
         assert_eq!(together, costs(&[overrides], &infos, &[0, 1, 2], 1));
@@ -221,8 +223,11 @@ fn history_and_column_goals_change_the_cost() {
         costs(&[POSITIONS], &infos(&["position", "goal_position"]), &[0], 1),
         costs(&[POSITIONS], &infos(&["position"]), &[0], 1),
     );
-    assert!(with.0.iter().zip(&without.0).all(|(with, without)| with > without), "the distance of the column is added");
+    assert!(
+        with.0.iter().zip(&without.0).all(|(with, without)| with > without),
+        "the cost includes the distance of the column"
+    );
     let mut model = DinoWmCost::new(&checkpoint(&[POSITIONS]));
-    let message = model.observe(&infos(&[]), &[0]).expect_err("no position").to_string();
+    let message = model.observe(&infos(&[]), &[0]).expect_err("infos without a position").to_string();
     assert!(message.contains("position"), "{message}");
 }

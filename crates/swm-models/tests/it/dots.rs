@@ -41,7 +41,7 @@ impl Dots {
     }
 }
 
-/// Draws a dot at a position, in pixels.
+/// Draws a dot into `rgb`, `[SIDE, SIDE, 3]`; `at` is the position of the dot in pixels.
 pub fn draw(at: [f32; 2], rgb: &mut [u8]) {
     for (i, pixel) in rgb.chunks_mut(3).enumerate() {
         let (dx, dy) = ((i % SIDE) as f32 - at[0], (i / SIDE) as f32 - at[1]);

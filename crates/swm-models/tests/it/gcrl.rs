@@ -58,7 +58,7 @@ fn box_actions() -> Space {
     Space::uniform_box([2], DType::Float32, -1.0, 1.0)
 }
 
-/// Observations and goal images: `positions` lists the positions of the dot in both.
+/// Infos with one row per entry of `positions`: the positions of the dot in the observation and in the goal image.
 fn infos(positions: &[([f32; 2], [f32; 2])]) -> Batch {
     let schema = Schema::new([ColumnSpec::image("pixels", SIDE, SIDE), ColumnSpec::image("goal", SIDE, SIDE)]);
     let mut infos = Batch::zeros(&schema.expect("columns"), positions.len());
@@ -107,14 +107,15 @@ fn results_do_not_depend_on_threads() {
 
 /// Returns a value in the first and the last line of a run's log.
 fn first_and_last(run: &Path, name: &str) -> (f64, f64) {
-    let lines = std::fs::read_to_string(run.join("train.jsonl")).expect("lines");
-    let value =
-        |line: &str| serde_json::from_str::<serde_json::Value>(line).expect("JSON")[name].as_f64().expect("a number");
+    let lines = std::fs::read_to_string(run.join("train.jsonl")).expect("reading train.jsonl");
+    let value = |line: &str| {
+        serde_json::from_str::<serde_json::Value>(line).expect("JSON")[name].as_f64().expect("a value in the log")
+    };
     (value(lines.lines().next().expect("a line")), value(lines.lines().last().expect("a line")))
 }
 
 #[test]
-fn cloning_reduces_the_loss() {
+fn behaviour_cloning_reduces_the_loss() {
     let folder = tempfile::tempdir().expect("a folder");
     let overrides = ["schedule.steps=240", "log_every=40", "model.history=2", "data.num_steps=2"];
     trained(&config::<Gcbc>(&overrides), folder.path());
@@ -123,13 +124,13 @@ fn cloning_reduces_the_loss() {
 }
 
 #[test]
-fn training_lowers_the_values() {
+fn training_lowers_the_mean_value() {
     fn check<M: GoalConditioned<Config = GcrlConfig>>() {
         let folder = tempfile::tempdir().expect("a folder");
         let overrides = ["schedule.steps=240", "log_every=20", "loss.target=0.9"];
         trained(&config::<M>(&overrides), folder.path());
         let (first, last) = first_and_last(folder.path(), "value");
-        // Every step before the goal has the reward -1, so a value is about minus the number of steps to the goal.
+        // Every step before the goal has the reward -1, so a value approximates minus the number of steps to the goal.
         assert!(last < first - 0.3 && last > -20.0, "{}: {first} to {last}", M::FAMILY);
     }
     check::<Gcivl>();
@@ -177,7 +178,7 @@ fn policy_acts_in_chunks_within_bounds_independent_of_other_environments() {
         Gcbc::actor(&checkpoint).policy(&spec(box_actions()), slots).expect("a policy")
     };
     let scene = ([4.0, 5.0], [11.0, 9.0]);
-    // The environment takes five steps alone, and five steps together with an environment that begins later.
+    // One policy acts for this environment only. The other policy also acts for an environment that begins later.
     let observed = |step: usize| ([4.0 + step as f32, 5.0], scene.1);
     let (mut alone, mut together) = (policy(1), policy(2));
     alone.begin(0, Key::new(0));
@@ -212,7 +213,7 @@ fn invalid_settings_data_and_environments_are_refused() {
     assert!(message(&["loss.goals.random=0.9"]).contains("add up to 1"));
     assert!(message(&["model.image=20"]).contains("patches"), "{}", message(&["model.image=20"]));
 
-    // Images of another size than the model's.
+    // The images of the dataset have another size than the images of the model.
     let mut large = config::<Gcbc>(&[]);
     large.model.image = 32;
     let error = run(&large, &folder.path().join("large"), &TrainOptions::default()).expect_err("an error").to_string();
@@ -220,14 +221,14 @@ fn invalid_settings_data_and_environments_are_refused() {
 
     let checkpoint = trained(&config::<Gcbc>(&[]), &folder.path().join("run"));
     let discrete = Gcbc::actor(&checkpoint).policy(&spec(Space::Discrete { n: 3, start: 0 }), 1);
-    let error = discrete.err().expect("discrete actions").to_string();
+    let error = discrete.err().expect("an error for discrete actions").to_string();
     assert!(error.contains("2 means"), "{error}");
     let mut policy = Gcbc::actor(&checkpoint).policy(&spec(box_actions()), 1).expect("a policy");
     policy.begin(0, Key::new(0));
     let without_goal = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", SIDE, SIDE)]).expect("a column"), 1);
-    let error = policy.act(&without_goal, &[true], &mut actions(1)).expect_err("no goal").to_string();
+    let error = policy.act(&without_goal, &[true], &mut actions(1)).expect_err("infos without a goal").to_string();
     assert!(error.contains("'goal'"), "{error}");
-    // A checkpoint of another family.
+    // The checkpoint belongs to another family.
     let error =
         Checkpoint::<Gciql>::load(&folder.path().join("run"), &Device::flex()).expect_err("another family").to_string();
     assert!(error.contains("gcbc") && error.contains("gciql"), "{error}");
@@ -270,7 +271,11 @@ fn probes_read_the_position_and_reconstruct_the_image() {
         assert!(r2 > 0.95, "{score:?}");
         assert!((r2 - (1.0 - (score.rmse / score.spread).powi(2))).abs() < 1e-9);
     }
-    assert_eq!(probe::read_state(&Profiles, &data, &settings).expect("a report"), report, "deterministic");
+    assert_eq!(
+        probe::read_state(&Profiles, &data, &settings).expect("a report"),
+        report,
+        "a second fit gives another report"
+    );
     // Images do not determine the actions. The probe skips the last row of an episode, which has no action.
     let actions = StateConfig { columns: vec!["action".to_owned()], ..settings };
     let report = probe::read_state(&Profiles, &data, &actions).expect("a report");

@@ -8,7 +8,8 @@ use swm_models::weights::hub::Hub;
 
 const FILE: &[u8] = b"the content of a weights file";
 
-/// Serves one file at the hub's path for it. Returns the address of the server and the number of requests.
+/// Serves [`FILE`] as `model.safetensors` of the repository `owner/name`. Returns the address of the server and the
+/// counter of its requests.
 fn serve() -> (String, Arc<AtomicUsize>) {
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
     let address = format!("http://{}", listener.local_addr().expect("an address"));
@@ -37,9 +38,9 @@ fn serve() -> (String, Arc<AtomicUsize>) {
                 body.len(),
                 if request.starts_with("GET") { &range } else { "" },
             );
-            stream.write_all(head.as_bytes()).expect("an answer");
+            stream.write_all(head.as_bytes()).expect("sending an answer");
             if request.starts_with("GET") {
-                stream.write_all(body).expect("an answer");
+                stream.write_all(body).expect("sending an answer");
             }
         }
     });
@@ -51,13 +52,13 @@ fn files_are_downloaded_once() {
     let folder = tempfile::tempdir().expect("a folder");
     let (address, requests) = serve();
     let hub = Hub::at(&address, folder.path());
-    let path = hub.fetch("owner/name", "model.safetensors").expect("the served file");
-    assert_eq!(std::fs::read(&path).expect("cached"), FILE);
+    let path = hub.fetch("owner/name", "model.safetensors").expect("downloading the served file");
+    assert_eq!(std::fs::read(&path).expect("reading the cached file"), FILE);
     assert!(path.ends_with("models--owner--name/snapshots/main/model.safetensors"), "{}", path.display());
     let before = requests.load(Ordering::Relaxed);
-    assert_eq!(hub.fetch("owner/name", "model.safetensors").expect("cached"), path);
+    assert_eq!(hub.fetch("owner/name", "model.safetensors").expect("finding the cached file"), path);
     assert_eq!(requests.load(Ordering::Relaxed), before, "no further request");
-    let missing = hub.fetch("owner/name", "other.safetensors").expect_err("no such file").to_string();
+    let missing = hub.fetch("owner/name", "other.safetensors").expect_err("a missing file").to_string();
     assert!(missing.contains("no such object"), "{missing}");
 }
 
@@ -66,6 +67,6 @@ fn unreachable_hub_error_names_the_fix() {
     let folder = tempfile::tempdir().expect("a folder");
     // The top-level domain `invalid` is reserved and never resolves.
     let hub = Hub::at("http://hub.invalid", folder.path());
-    let message = hub.fetch("owner/name", "model.safetensors").expect_err("unreachable").to_string();
+    let message = hub.fetch("owner/name", "model.safetensors").expect_err("an unreachable hub").to_string();
     assert!(message.contains("check the network connection") && message.contains("give the file's path"), "{message}");
 }

@@ -59,7 +59,7 @@ fn run<M: Agent>(config: &TrainConfig<M>, out: &Path, options: &TrainOptions, st
     train_online(config, &pools(PENDULUM, Some(20)), out, options, &mut stop_after(stop_at))
 }
 
-/// Reads the files of a run that are determined by its configuration.
+/// Reads the files of a run that its configuration determines.
 fn files(run: &Path) -> Vec<Vec<u8>> {
     let of = |folder: &str, name: &str| std::fs::read(run.join(folder).join(name)).expect(name);
     let data_folders = std::fs::read_dir(run).expect("a folder").map(|entry| entry.expect("an entry").file_name());
@@ -77,7 +77,7 @@ fn files(run: &Path) -> Vec<Vec<u8>> {
 
 /// The lines of the log without the values that depend on time.
 fn lines(run: &Path) -> Vec<serde_json::Value> {
-    let lines = std::fs::read_to_string(run.join("train.jsonl")).expect("lines");
+    let lines = std::fs::read_to_string(run.join("train.jsonl")).expect("reading train.jsonl");
     let fixed = |line: &str| {
         let mut line: serde_json::Value = serde_json::from_str(line).expect("JSON");
         for name in ["clips_per_second", "playing", "seconds"] {
@@ -96,7 +96,7 @@ fn check_threads<M: Agent>() {
         let options = TrainOptions { threads, ..TrainOptions::default() };
         let summary = run(&config, &out(name), &options, 0).expect("a trained model");
         assert_eq!((summary.steps, summary.interrupted), (24, false));
-        // 60 steps of warm-up, then 12 rounds of 3 environments.
+        // The warm-up makes 60 environment steps; each of the 12 later rounds makes one step of 3 environments.
         assert_eq!(summary.env_steps, 60 + 12 * 3);
         assert!(summary.evaluated.is_some() && summary.best.is_some());
     }
@@ -122,7 +122,7 @@ fn resumed_online_run_gives_the_same_bytes() {
     run(&config, &complete, &options, 0).expect("a trained model");
     let first = run(&config, &resumed, &options, 10).expect("a trained model");
     assert_eq!((first.steps, first.interrupted), (10, true));
-    let refused = run(&config, &resumed, &options, 0).expect_err("a run is there").to_string();
+    let refused = run(&config, &resumed, &options, 0).expect_err("the folder holds a run").to_string();
     assert!(refused.contains("resume"), "{refused}");
     let resume = TrainOptions { resume: true, ..options };
     let second = run(&config, &resumed, &resume, 0).expect("a trained model");
@@ -165,6 +165,6 @@ fn invalid_settings_and_data_are_refused() {
         &TrainOptions::default(),
         &mut Control::new(),
     );
-    let error = error.expect_err("no rewards").to_string();
+    let error = error.expect_err("a dataset without rewards").to_string();
     assert!(error.contains("'reward'") && error.contains("swm collect"), "{error}");
 }

@@ -102,14 +102,14 @@ fn invalid_candidates_and_observations_are_refused() {
     cost.observe(&infos(false), &[0]).expect("observed environments");
     let actions = vec![0.0; 6];
     let wrong = Candidates { actions: &actions, envs: 1, samples: 1, horizon: 2, dim: 3 };
-    let message = cost.cost(wrong, &mut [0.0]).expect_err("three elements").to_string();
+    let message = cost.cost(wrong, &mut [0.0]).expect_err("actions of dimension 3").to_string();
     assert!(message.contains("4 action elements a model step"), "{message}");
     let schema = Schema::new([ColumnSpec::image("pixels", SIDE, SIDE)]).expect("a column");
-    let message = cost.observe(&Batch::zeros(&schema, 1), &[0]).expect_err("no goal").to_string();
+    let message = cost.observe(&Batch::zeros(&schema, 1), &[0]).expect_err("infos without a goal").to_string();
     assert!(message.contains("'goal'"), "{message}");
     let large = Schema::new([ColumnSpec::image("pixels", 2 * SIDE, 2 * SIDE), ColumnSpec::image("goal", SIDE, SIDE)])
         .expect("columns");
-    let message = cost.observe(&Batch::zeros(&large, 1), &[0]).expect_err("32 pixels").to_string();
+    let message = cost.observe(&Batch::zeros(&large, 1), &[0]).expect_err("images of 32 pixels").to_string();
     assert!(message.contains("[16, 16, 3]"), "{message}");
 }
 
@@ -124,15 +124,15 @@ fn observed() -> LewmCost {
 fn gradients_match_finite_differences() {
     let (samples, width) = (5, HORIZON * DIM);
     let actions = &candidates()[..2 * samples * width];
-    fn of(actions: &[f32]) -> Candidates<'_> {
+    fn candidates_of(actions: &[f32]) -> Candidates<'_> {
         Candidates { actions, envs: 2, samples: 5, horizon: HORIZON, dim: DIM }
     }
     let mut model = observed();
     let (mut costs, mut slopes) = (vec![0.0; 2 * samples], vec![0.0; actions.len()]);
     let differentiable = model.differentiable().expect("a LeWM has a gradient");
-    differentiable.cost_and_gradient(of(actions), &mut costs, &mut slopes).expect("gradients");
+    differentiable.cost_and_gradient(candidates_of(actions), &mut costs, &mut slopes).expect("gradients");
     let mut plain = vec![0.0; 2 * samples];
-    model.cost(of(actions), &mut plain).expect("costs");
+    model.cost(candidates_of(actions), &mut plain).expect("costs");
     for (cost, plain) in costs.iter().zip(&plain) {
         assert!((cost - plain).abs() < 1e-4 * plain.abs(), "{cost}, not {plain}");
     }
@@ -140,7 +140,7 @@ fn gradients_match_finite_differences() {
     let mut moved = |i: usize, by: f32| {
         let mut actions = actions.to_vec();
         actions[i] += by;
-        model.cost(of(&actions), &mut plain).expect("costs");
+        model.cost(candidates_of(&actions), &mut plain).expect("costs");
         f64::from(plain[i / width])
     };
     let largest = slopes.iter().fold(0.0, |most, slope| slope.abs().max(most));
@@ -185,10 +185,10 @@ fn vector_jacobian_products_match_finite_differences() {
     let actions = candidates()[..2 * DIM].to_vec();
     let mut next = vec![0.0; 2 * width];
     latent.predict(&start, &actions, &mut next).expect("a step");
-    // The products with a fixed vector are the gradient of a scalar function.
+    // The vector-Jacobian products with the vector `pull` are the gradients of the scalar `next · pull`.
     let pull: Vec<f32> = (0..2 * width).map(|i| ((i * 29 % 17) as f32 - 8.0) / 8.0).collect();
     let (mut by_latent, mut by_action) = (vec![0.0; 2 * width], vec![0.0; 2 * DIM]);
-    latent.predict_vjp(&start, &actions, &pull, &mut by_latent, &mut by_action).expect("products");
+    latent.predict_vjp(&start, &actions, &pull, &mut by_latent, &mut by_action).expect("vector-Jacobian products");
     let mut value = |start: &[f32], actions: &[f32]| {
         latent.predict(start, actions, &mut next).expect("a step");
         next.iter().zip(&pull).map(|(a, b)| f64::from(a * b)).sum::<f64>()
@@ -207,6 +207,7 @@ fn vector_jacobian_products_match_finite_differences() {
             assert!((difference - slope).abs() < 0.02 * f64::from(largest), "{i}: {slope}, not {difference}");
         }
     }
-    let message = latent.predict(&start, &actions[..DIM], &mut goal).expect_err("one action").to_string();
+    let message =
+        latent.predict(&start, &actions[..DIM], &mut goal).expect_err("one action for two latents").to_string();
     assert!(message.contains("actions"), "{message}");
 }

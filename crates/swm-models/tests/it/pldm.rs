@@ -57,7 +57,7 @@ fn every_term_is_logged_and_the_loss_decreases() {
     let folder = tempfile::tempdir().expect("a folder");
     let overrides = ["schedule.steps=300", "log_every=20", "model.predictor.dropout=0", "optim.lr=3e-3", "loss.idm=10"];
     run(&config(&overrides).expect("a configuration"), folder.path(), 2);
-    let lines = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("lines");
+    let lines = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("reading train.jsonl");
     let line = |line: Option<&str>| serde_json::from_str::<serde_json::Value>(line.expect("a line")).expect("JSON");
     let (first, last) = (line(lines.lines().next()), line(lines.lines().last()));
     let value =
@@ -68,13 +68,13 @@ fn every_term_is_logged_and_the_loss_decreases() {
     for name in ["loss", "idm"] {
         assert!(value(&last, name) < 0.7 * value(&first, name), "{name}: {first}\n{last}");
     }
-    // Collapsed latents have a standard deviation of 0, so this term would be 1.
+    // Collapsed latents have a standard deviation of 0, for which the term `std` is 1.
     assert!(value(&last, "std") < 0.5, "{last}");
 }
 
 #[test]
 fn invalid_settings_are_refused() {
-    let message = |overrides: &[&str]| config(overrides).expect_err("an error").to_string();
+    let message = |overrides: &[&str]| config(overrides).expect_err("an invalid setting").to_string();
     assert!(message(&["model.latent=1"]).contains("model.latent"), "{}", message(&["model.latent=1"]));
     let short = message(&["data.num_steps=2", "model.predictor.history=1"]);
     assert!(short.contains("loss.temp_straight") && short.contains("data.num_steps of at least 3"), "{short}");

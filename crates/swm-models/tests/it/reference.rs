@@ -1,4 +1,4 @@
-//! Checkpoints of the reference implementation load, give the recorded outputs, and are exported again.
+//! Checkpoints of the reference implementation load, give the recorded outputs, and can be exported.
 
 use crate::golden::{Golden, check, values};
 use burn::tensor::Tensor;
@@ -17,11 +17,11 @@ fn folder(family: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/reference").join(family)
 }
 
-fn dataset_info(action: usize) -> DatasetInfo {
+fn dataset_info(action_dim: usize) -> DatasetInfo {
     let all = |value: f64| vec![value; 3];
     let proprio = ColumnInfo { shape: vec![3], mean: all(0.0), std: all(1.0), min: all(-1.0), max: all(1.0) };
     DatasetInfo {
-        action: ActionScale::identity(action),
+        action: ActionScale::identity(action_dim),
         columns: BTreeMap::from([("proprio".to_owned(), proprio)]),
         env: None,
     }
@@ -50,7 +50,7 @@ fn lewm_checkpoints_load() {
 
 #[test]
 fn pldm_checkpoints_load() {
-    // The path can also be the path of the weights file.
+    // `import` accepts the path of the weights file as well as the folder.
     let checkpoint = pldm::import::import(&folder("pldm").join("weights.pt"), dataset_info(4)).expect("a checkpoint");
     assert_eq!((checkpoint.config.data.frameskip, checkpoint.config.model.predictor.history), (1, 3));
     check_world_model(&recorded("pldm"), &checkpoint.model.model);
@@ -92,20 +92,21 @@ fn exported_checkpoints_load_again() {
         assert_eq!(parameters::values(&again.model), parameters::values(&pldm.model));
     }
     // Weights with published names are exported unchanged, except for counters.
-    let mut reference = weights::read(&folder("pldm").join("weights.pt")).expect("the reference");
-    let mut exported = weights::read(&out.path().join("pldm-Published/weights.pt")).expect("exported");
+    let mut reference = weights::read(&folder("pldm").join("weights.pt")).expect("reading the reference weights");
+    let mut exported =
+        weights::read(&out.path().join("pldm-Published/weights.pt")).expect("reading the exported weights");
     for state in [&mut reference, &mut exported] {
         state.retain(|name, _| !name.ends_with("num_batches_tracked"));
     }
     assert_eq!(exported, reference);
 
-    // The reference builds the encoder from a published one, so its config.json cannot describe a smaller one; only the
-    // state dict can be compared.
+    // A config.json of the reference names a published encoder. The encoder of this checkpoint is smaller than all
+    // published encoders, so only the state dict can be compared.
     let checkpoint = dino_wm_checkpoint();
     let refused = dino_wm::import::export(&checkpoint, &out.path().join("dino"), Naming::Published);
-    assert!(refused.expect_err("no published encoder").to_string().contains("DINOv2-small"));
+    assert!(refused.expect_err("an encoder that is not published").to_string().contains("DINOv2-small"));
     let exported = dino_wm::import::state(&checkpoint.model, Naming::Transformers5);
-    let reference = weights::read(&folder("prejepa").join("weights.pt")).expect("the reference");
+    let reference = weights::read(&folder("prejepa").join("weights.pt")).expect("reading the reference weights");
     let reference: parameters::Named<_> = reference
         .into_iter()
         .map(|(name, tensor)| (name.replacen("backbone.backbone.", "backbone.", 1), tensor))
@@ -115,14 +116,16 @@ fn exported_checkpoints_load_again() {
 
 #[test]
 fn unsuitable_checkpoints_are_refused() {
-    let message = |found: swm_core::Result<swm_models::Checkpoint<Lewm>>| found.expect_err("an error").to_string();
+    let message = |found: swm_core::Result<swm_models::Checkpoint<Lewm>>| {
+        found.expect_err("an unsuitable checkpoint").to_string()
+    };
     let other = message(lewm::import::import(&folder("pldm"), dataset_info(2)));
     assert!(other.contains("PLDM") && other.contains("class LeWM"), "{other}");
     let actions = message(lewm::import::import(&folder("lewm"), dataset_info(3)));
     assert!(actions.contains("3 action elements") && actions.contains("divisor of 4"), "{actions}");
-    let none = message(lewm::import::import(Path::new("nowhere"), dataset_info(2)));
-    assert!(none.contains("nowhere"), "{none}");
-    // Weights of another size than in config.json.
+    let missing = message(lewm::import::import(Path::new("nowhere"), dataset_info(2)));
+    assert!(missing.contains("nowhere"), "{missing}");
+    // The config.json has fewer layers than the weights.
     let out = tempfile::tempdir().expect("a folder");
     let text = std::fs::read_to_string(folder("lewm").join("config.json")).expect("a configuration file");
     std::fs::write(out.path().join("config.json"), text.replace("\"depth\": 2", "\"depth\": 1"))
@@ -132,7 +135,8 @@ fn unsuitable_checkpoints_are_refused() {
     assert!(mismatch.contains("layers.1") && mismatch.contains("config.json"), "{mismatch}");
 }
 
-/// Runs the interpreter in `SWM_TORCH_PYTHON`, which needs the reference, stable-pretraining and transformers 5.
+/// Runs the Python interpreter that `SWM_TORCH_PYTHON` names. It must have the packages stable-worldmodel,
+/// stable-pretraining and transformers 5.
 #[test]
 #[ignore = "needs SWM_TORCH_PYTHON"]
 fn exported_checkpoints_load_in_the_reference() {

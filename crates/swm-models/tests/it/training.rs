@@ -59,20 +59,21 @@ fn files(run: &Path) -> Vec<Vec<u8>> {
 fn resumed_run_gives_the_same_bytes() {
     let folder = tempfile::tempdir().expect("a folder");
     let (complete, resumed) = (folder.path().join("complete"), folder.path().join("resumed"));
-    // 6 episodes of 17 clips: an epoch ends after the sixth step, so the resumed part crosses the end of the epoch.
+    // 6 episodes of 17 clips give 6 batches of 16 clips. The first epoch therefore ends after step 6, which the resumed
+    // run makes.
     let config = config(&[]);
     let options = TrainOptions::default();
     let summary = run(&config, &complete, &options, 0).expect("a trained model");
     assert!((summary.steps, summary.interrupted) == (10, false));
     let first = run(&config, &resumed, &options, 5).expect("a trained model");
     assert!((first.steps, first.interrupted) == (5, true));
-    let refused = run(&config, &resumed, &options, 0).expect_err("a run is there").to_string();
+    let refused = run(&config, &resumed, &options, 0).expect_err("the folder holds a run").to_string();
     assert!(refused.contains("resume"), "{refused}");
     let resume = TrainOptions { resume: true, ..options };
     let second = run(&config, &resumed, &resume, 0).expect("a trained model");
     assert_eq!((second.steps, &second.weights), (10, &summary.weights));
     assert_eq!(files(&complete), files(&resumed));
-    let lines = std::fs::read_to_string(resumed.join("train.jsonl")).expect("lines");
+    let lines = std::fs::read_to_string(resumed.join("train.jsonl")).expect("reading train.jsonl");
     let steps: Vec<u64> = lines
         .lines()
         .map(|line| serde_json::from_str::<serde_json::Value>(line).expect("JSON")["step"].as_u64().expect("a step"))
@@ -102,13 +103,13 @@ fn training_reduces_the_loss() {
     let folder = tempfile::tempdir().expect("a folder");
     let overrides = ["schedule.steps=300", "log_every=20", "model.predictor.dropout=0", "optim.lr=3e-3"];
     run(&config(&overrides), folder.path(), &TrainOptions::default(), 0).expect("a trained model");
-    let lines = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("lines");
+    let lines = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("reading train.jsonl");
     let value = |line: &str, name: &str| {
         serde_json::from_str::<serde_json::Value>(line).expect("JSON")[name].as_f64().expect(name)
     };
     let (first, last) = (lines.lines().next().expect("a line"), lines.lines().last().expect("a line"));
     assert!(value(last, "loss") < 0.5 * value(first, "loss"), "{first}\n{last}");
-    // Collapsed latents are predicted perfectly, but their SIGReg is about a tenth of the batch size.
+    // Collapsed latents are predicted perfectly, but their SIGReg loss is about a tenth of the batch size.
     assert!(value(last, "sigreg") < 2.0, "{last}");
 }
 
@@ -116,6 +117,6 @@ fn training_reduces_the_loss() {
 fn non_finite_loss_stops_the_run() {
     let folder = tempfile::tempdir().expect("a folder");
     let error = run(&config(&["optim.lr=1e30", "optim.clip=1e30"]), folder.path(), &TrainOptions::default(), 0);
-    let message = error.expect_err("not finite").to_string();
+    let message = error.expect_err("a loss that is not finite").to_string();
     assert!(message.contains("not finite") && message.contains("optim.lr"), "{message}");
 }

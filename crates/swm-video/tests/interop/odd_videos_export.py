@@ -1,5 +1,6 @@
 """Writes videos with unusual timing, codecs or pixel formats as `odd-NAME.mp4`, and the frames that FFmpeg's library
-decodes from them, one below the other, as `odd-NAME.png`. The tests of `swm-video/src/decode.rs` compare both.
+decodes from them, one below the other, as `odd-NAME.png`. The tests of `swm-video/src/decode.rs` compare their decoded
+frames with these images.
 
 python odd_videos_export.py    (av 15)
 """

@@ -9,9 +9,9 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use swm_core::{ColumnSpec, Error, Result};
 
-/// Each record starts with this tag, the lengths of its head and body, and the BLAKE3 hash of both.
+/// The tag that starts every record. The lengths of the record's head and body, and their BLAKE3 hash, follow.
 const MAGIC: &[u8; 8] = b"swm-ep-1";
-/// Size in bytes of the part of a record that precedes its head.
+/// Size in bytes of the tag, the lengths and the hash, which precede the head of a record.
 const LEAD: usize = 8 + 8 + 8 + 32;
 
 /// The head of a record. The body holds the numeric columns, one after another, then the constants in order of their
@@ -20,6 +20,7 @@ const LEAD: usize = 8 + 8 + 8 + 32;
 struct Head {
     episode: usize,
     rows: usize,
+    /// Size in bytes of each constant.
     constants: BTreeMap<String, usize>,
 }
 
@@ -47,7 +48,7 @@ pub(super) fn record(episode: usize, pending: &PendingEpisode, out: &mut Vec<u8>
     Ok(())
 }
 
-/// The episodes of a journal, the first of which has index `from`. An incomplete record at the end was never committed
+/// Parses the episodes of a journal, from episode index `from` on. An incomplete record at the end was never committed
 /// and is ignored.
 ///
 /// # Errors
@@ -64,8 +65,8 @@ pub(super) fn replay(
     while let Some((lead, rest)) = bytes.split_at_checked(LEAD) {
         let length = |at: usize| u64::from_le_bytes(std::array::from_fn(|i| lead[at + i]));
         let sizes = usize::try_from(length(8)).ok().zip(usize::try_from(length(16)).ok());
-        let whole = sizes.and_then(|(head, body)| Some((head, rest.split_at_checked(head.checked_add(body)?)?)));
-        let Some((head, (record, rest))) = whole.filter(|_| lead.starts_with(MAGIC)) else { break };
+        let complete = sizes.and_then(|(head, body)| Some((head, rest.split_at_checked(head.checked_add(body)?)?)));
+        let Some((head, (record, rest))) = complete.filter(|_| lead.starts_with(MAGIC)) else { break };
         if *blake3::hash(record).as_bytes() != lead[24..] {
             if rest.is_empty() {
                 break;
@@ -119,7 +120,7 @@ impl Journal {
         Ok(Self { path, file, length: 0 })
     }
 
-    /// Appends records and syncs them to disk, all or none.
+    /// Appends records and syncs them to disk. If writing fails, truncates the journal to its previous length.
     ///
     /// # Errors
     /// If writing fails.
@@ -147,8 +148,8 @@ impl Journal {
     fn truncate(&mut self, length: u64) -> Result<()> {
         use std::io::Seek as _;
         let seek = std::io::SeekFrom::Start(length);
-        let cut = self.file.set_len(length).and_then(|()| self.file.seek(seek));
-        cut.map(drop).map_err(|e| Error::io(&self.path, "truncating the journal", e))
+        let truncated = self.file.set_len(length).and_then(|()| self.file.seek(seek));
+        truncated.map(drop).map_err(|e| Error::io(&self.path, "truncating the journal", e))
     }
 
     /// Deletes the journal.

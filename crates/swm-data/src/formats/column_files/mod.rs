@@ -1,23 +1,23 @@
-//! Column files: the common part of the formats `folder` and `video`, as in the reference's datasets of these formats.
-//! A folder holds one file for each numeric column, and a subfolder for each image column, whose content the format
-//! defines.
+//! Column files: the numeric columns of the formats `folder` and `video`, in the layout of the reference's datasets.
+//! A folder holds one file for each numeric column, and one subfolder for each image column. The format defines the
+//! content of the subfolders.
 //!
 //! ```text
 //! NAME/
 //!   ep_len.npz, ep_offset.npz    length and first row of every episode
 //!   COLUMN.npz                   [rows, shape…], all episodes one after another
 //!   COLUMN/                      images
-//!   ep_len.journal               only while a writer is active, or after it was killed
+//!   ep_len.journal               only while a writer is active, or after a writer was killed
 //! ```
 //!
 //! The reference treats every file as a column unless its name starts with `ep_len` or `ep_offset`. Therefore schema,
-//! manifest and constants are additional members of `ep_len.npz`, which the reference ignores, and the names of other
-//! files start with `ep_len` as well.
+//! manifest and constants are additional members of `ep_len.npz`, which the reference ignores, and the names of the
+//! journal and of temporary files start with `ep_len`.
 //!
 //! **Commits.** Arrays in archives cannot grow in place. Finished episodes are therefore appended to the journal, each
 //! as a record with a checksum. A merge copies the journal into the column files: each column file is written to a
 //! temporary file and renamed, `ep_len.npz` last. Readers use only as many rows of a column file as `ep_len.npz`
-//! declares. The journal is merged when it is half as long as the column files, and when the writer finishes, so the
+//! declares. The journal is merged when it is half as large as the column files, and when the writer finishes, so the
 //! total amount written is a small multiple of the data.
 
 mod journal;
@@ -34,11 +34,11 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use swm_core::{Error, Manifest, Result, Schema};
 
-/// Lengths of the episodes. Replacing this file commits a merge.
+/// Name of the file with the lengths of the episodes. Replacing this file commits a merge.
 const LENGTHS: &str = "ep_len";
-/// First rows of the episodes.
+/// Name of the file with the first rows of the episodes.
 const OFFSETS: &str = "ep_offset";
-/// The member of `ep_len.npz` with [`Metadata`].
+/// The member of `ep_len.npz` that holds [`Metadata`].
 const METADATA: &str = "stable_worldmodel.json";
 
 /// Metadata of the dataset, stored in `ep_len.npz`.
@@ -52,7 +52,7 @@ struct Metadata {
     constants: Vec<BTreeMap<String, usize>>,
 }
 
-/// The member of `ep_len.npz` that holds a constant of some episodes.
+/// Name of the member of `ep_len.npz` that holds the constant with an index.
 fn constant_member(index: usize) -> String {
     format!("constants/{index}")
 }
@@ -65,19 +65,19 @@ struct PendingEpisode {
     constants: Constants,
 }
 
-/// Whether a folder contains column files, complete or not.
+/// Returns whether a folder contains `ep_len.npz`.
 pub(crate) fn exists(folder: &Path) -> bool {
     column_path(folder, LENGTHS).is_file()
 }
 
-/// Whether the subfolders of a folder contain videos rather than images.
+/// Returns whether the first file of a subfolder of `folder` is a video.
 pub(crate) fn contains_videos(folder: &Path) -> bool {
     let entries = |folder: &Path| folder.read_dir().into_iter().flatten().flatten();
     let is_video = |path: &Path| path.extension().is_some_and(|suffix| suffix.eq_ignore_ascii_case("mp4"));
     entries(folder).any(|entry| entries(&entry.path()).next().is_some_and(|first| is_video(&first.path())))
 }
 
-/// The file of a column.
+/// Path of the file of a column.
 fn column_path(folder: &Path, column: &str) -> PathBuf {
     folder.join(format!("{column}.npz"))
 }

@@ -13,12 +13,12 @@ use zip::{ZipArchive, ZipWriter};
 
 /// The member that holds the array passed to `numpy.savez(file, array)`.
 const ARRAY: &str = "arr_0.npy";
-/// The magic number of an array.
+/// The first bytes of a `.npy` array.
 const MAGIC: &[u8] = b"\x93NUMPY";
-/// Maximum compression ratio of deflate. An archive that declares more is damaged.
+/// Maximum compression ratio of deflate. An archive that declares a higher ratio is damaged.
 const MAX_COMPRESSION: u64 = 1032;
 
-/// The header of an array.
+/// The header of a `.npy` array.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Header {
     /// Type of the elements; `None` for text and objects.
@@ -33,7 +33,7 @@ impl Header {
         self.shape.first().copied().unwrap_or(1)
     }
 
-    /// The column that the array holds, if its elements are numeric.
+    /// The description of the array as a column, or `None` if the elements are not numeric.
     pub fn spec(&self, name: &str) -> Option<ColumnSpec> {
         let dtype = self.stored?.dtype()?;
         Some(ColumnSpec::new(name, dtype, self.shape.get(1..).unwrap_or_default()))
@@ -57,12 +57,12 @@ impl Npz {
         Ok(Self { path: path.to_owned(), archive })
     }
 
-    /// Whether the archive has a member of this name.
+    /// Returns whether the archive has a member of this name.
     pub fn has(&self, member: &str) -> bool {
         self.archive.index_for_name(member).is_some()
     }
 
-    /// Whether the array is the only member.
+    /// Returns whether the archive has only one member.
     pub fn is_plain(&self) -> bool {
         self.archive.len() == 1
     }
@@ -94,7 +94,7 @@ impl Npz {
         Ok(parse(&start).map_err(|problem| damaged(&path, problem))?.0)
     }
 
-    /// Reads the array as a column with type [`StoredScalar::dtype`], and its header.
+    /// Reads the header of the array, and the elements, converted to the type [`StoredScalar::dtype`].
     ///
     /// # Errors
     /// If there is no array, its elements are not numeric, or the array is damaged.
@@ -180,14 +180,14 @@ impl NpzWriter {
         Ok(Self { path: path.to_owned(), zip: ZipWriter::new(BufWriter::with_capacity(1 << 20, file)) })
     }
 
-    /// Adds the array with shape `[rows, shape…]`; `parts` are its concatenated bytes.
+    /// Adds the array with shape `[rows, shape…]`, whose bytes are the concatenation of `parts`.
     ///
     /// # Errors
     /// If writing fails.
     pub fn array(&mut self, dtype: DType, rows: usize, shape: &[usize], parts: &[&[u8]]) -> Result<()> {
         let header = npy_header(dtype, rows, shape);
         let all: Vec<&[u8]> = std::iter::once(&*header).chain(parts.iter().copied()).collect();
-        self.parts(ARRAY, &all)
+        self.add_member(ARRAY, &all)
     }
 
     /// Adds a member.
@@ -195,10 +195,10 @@ impl NpzWriter {
     /// # Errors
     /// If writing fails.
     pub fn member(&mut self, name: &str, bytes: &[u8]) -> Result<()> {
-        self.parts(name, &[bytes])
+        self.add_member(name, &[bytes])
     }
 
-    fn parts(&mut self, name: &str, parts: &[&[u8]]) -> Result<()> {
+    fn add_member(&mut self, name: &str, parts: &[&[u8]]) -> Result<()> {
         let options = SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored).large_file(true);
         self.zip.start_file(name, options).map_err(|e| Error::io(&self.path, "writing a column file", e.into()))?;
         for part in parts {
@@ -248,11 +248,11 @@ mod tests {
     fn arrays_and_members_round_trip() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("a.npz");
-        let mut writer = NpzWriter::create(&path).expect("creates");
-        writer.array(DType::Int32, 3, &[2], &[&[1; 8], &[2; 16]]).expect("writes");
-        writer.member("note", b"hello").expect("writes");
-        writer.finish().expect("finishes");
-        let mut npz = Npz::open(&path).expect("opens");
+        let mut writer = NpzWriter::create(&path).expect("creating the archive");
+        writer.array(DType::Int32, 3, &[2], &[&[1; 8], &[2; 16]]).expect("writing to the archive");
+        writer.member("note", b"hello").expect("writing to the archive");
+        writer.finish().expect("completing the archive");
+        let mut npz = Npz::open(&path).expect("opening the archive");
         let (header, bytes) = npz.array().expect("an array");
         assert_eq!((header.rows(), header.spec("a")), (3, Some(ColumnSpec::new("a", DType::Int32, [2]))));
         assert_eq!(header.stored, Some(StoredScalar::of(DType::Int32)));

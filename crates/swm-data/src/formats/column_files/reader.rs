@@ -37,7 +37,7 @@ impl ColumnFiles {
     /// # Errors
     /// If the column files are damaged or inconsistent.
     pub fn open(folder: &Path) -> Result<Self> {
-        // Reads the journal before the lengths, so that episodes merged between both reads are skipped as duplicates.
+        // Reads the journal before the lengths, so that episodes merged between the two reads are skipped.
         let journal_path = journal::path(folder);
         let journal = match std::fs::read(&journal_path) {
             Ok(bytes) => bytes,
@@ -96,8 +96,8 @@ impl ColumnFiles {
         self.recorded.schema.as_ref()
     }
 
-    /// The schema for readers: index columns, then numeric and image columns in recorded order, or by name if none is
-    /// recorded.
+    /// The schema for readers: index columns, then numeric and image columns, in the order of the recorded schema or,
+    /// without a recorded schema, by name.
     ///
     /// # Errors
     /// If two columns have the same name.
@@ -121,7 +121,7 @@ impl ColumnFiles {
     /// Reads ranges of rows of a numeric column or an index column.
     ///
     /// # Errors
-    /// As [`Reader::read_column`](crate::Reader::read_column).
+    /// See [`Reader::read_column`](crate::Reader::read_column).
     pub fn read(&self, spec: &ColumnSpec, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
         if spec.name == EPISODE_IDX || spec.name == STEP_IDX {
             return self.rows.fill_index_column(spec, ranges, out);
@@ -153,7 +153,7 @@ impl ColumnFiles {
         Ok(column.data.get_or_init(|| data))
     }
 
-    /// The committed rows of a column in its file.
+    /// Reads the committed rows of a column from the column's file.
     pub(super) fn in_file(&self, name: &str) -> Result<Vec<u8>> {
         let column = self.column(name)?;
         if column.in_file == 0 {
@@ -182,7 +182,7 @@ impl ColumnFiles {
     /// The constants of an episode.
     ///
     /// # Errors
-    /// If the file that holds them is damaged.
+    /// If `ep_len.npz` is damaged.
     pub fn constants(&self, episode: usize) -> Result<Constants> {
         let in_file = self.rows.episodes().len() - self.pending_constants.len();
         if let Some(pending) = episode.checked_sub(in_file).and_then(|i| self.pending_constants.get(i)) {
@@ -195,12 +195,12 @@ impl ColumnFiles {
         named.iter().map(|(name, &index)| Ok((name.clone(), lengths.member(&constant_member(index))?))).collect()
     }
 
-    /// Names of the column files without numeric elements, which are not read.
+    /// Names of the column files that are not read, because their elements are not numeric.
     pub(super) fn skipped(&self) -> &[String] {
         &self.skipped
     }
 
-    /// The constants in `ep_len.npz`, in the order of its members.
+    /// Reads the constants in `ep_len.npz`, sorted by the indices of their members.
     pub(super) fn stored_constants(&self) -> Result<Vec<Vec<u8>>> {
         let count = self.recorded.constants.iter().flat_map(BTreeMap::values).max().map_or(0, |last| last + 1);
         let mut lengths = Npz::open(&column_path(&self.folder, LENGTHS))?;
@@ -217,7 +217,7 @@ impl ColumnFiles {
         self.rows.episodes().len() - self.pending_constants.len()
     }
 
-    /// Bytes per column (including subfolders) and of all other files together, largest first.
+    /// Size in bytes of each column (including its subfolder) and of all other files in total, largest first.
     ///
     /// # Errors
     /// If the folder cannot be listed.
@@ -253,8 +253,8 @@ fn folder_size(folder: &Path) -> Result<u64> {
         .sum()
 }
 
-/// The numeric columns: as recorded, or all files with numeric elements. Also returns the names of files without such
-/// elements.
+/// The numeric columns of the recorded schema or, without a recorded schema, of all files with numeric elements. Also
+/// returns the names of the column files whose elements are not numeric.
 fn columns(folder: &Path, recorded: &Metadata, rows: usize) -> Result<(Vec<Column>, Vec<String>)> {
     let names: Vec<String> = match &recorded.schema {
         Some(schema) => schema.columns().iter().filter(|c| !c.is_image()).map(|c| c.name.clone()).collect(),
@@ -292,7 +292,7 @@ fn columns(folder: &Path, recorded: &Metadata, rows: usize) -> Result<(Vec<Colum
     Ok((columns, skipped))
 }
 
-/// The columns of a third-party folder, by name.
+/// The names of the column files in a folder, sorted.
 fn column_file_names(folder: &Path) -> Result<Vec<String>> {
     let io = |e| Error::io(folder, "listing the folder", e);
     let mut names = vec![];
@@ -308,7 +308,7 @@ fn column_file_names(folder: &Path) -> Result<Vec<String>> {
     Ok(names)
 }
 
-/// The array of an archive, as integers.
+/// Reads the integers in the one-dimensional array of an archive.
 fn integers(npz: &mut Npz, path: &Path) -> Result<Vec<i64>> {
     let (header, bytes) = npz.array()?;
     match header.spec("").filter(|_| header.shape.len() == 1).map(|spec| spec.dtype) {

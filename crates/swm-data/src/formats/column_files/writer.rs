@@ -14,15 +14,15 @@ use std::time::Instant;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{Batch, ColumnSpec, DType, Error, Result, Schema};
 
-/// Bounds, in bytes, of the journal size at which the journal is merged. Between these bounds, that size is half the
-/// size of the column files. The bounds also limit the memory of a writer.
+/// Bounds, in bytes, of the journal size at which the journal is merged: half the size of the column files, clamped to
+/// these bounds. The upper bound also limits the memory of a writer.
 const MERGE_BYTES: std::ops::RangeInclusive<usize> = 16 << 20..=256 << 20;
 
 /// Commits the numeric columns of episodes. Formats write an episode's images first, then call
 /// [`ColumnFilesWriter::write`].
 pub(crate) struct ColumnFilesWriter {
     folder: PathBuf,
-    /// Holds the lock of the folder against other writers.
+    /// The open folder. Its lock excludes other writers.
     _lock: File,
     journal: Option<Journal>,
     schema: Schema,
@@ -31,19 +31,23 @@ pub(crate) struct ColumnFilesWriter {
     recorded: Metadata,
     policy: CommitPolicy,
     last_commit: Instant,
-    /// All episodes, including uncommitted ones.
+    /// The rows of all episodes, including uncommitted episodes.
     rows: EpisodeRows,
     /// Records of uncommitted episodes.
     group: Vec<u8>,
+    /// Number of uncommitted episodes.
     in_group: usize,
-    /// Number of rows in the column files, and their size in bytes.
+    /// Number of rows in the column files.
     rows_in_files: usize,
+    /// Size of the rows in the column files, in bytes.
     bytes_in_files: usize,
-    /// Data that is not in the column files: the bytes of each column, and constants.
+    /// For each column, the bytes of the rows that are not in the column file.
     unmerged: Vec<Vec<u8>>,
+    /// Constants that are not in `ep_len.npz`.
     new_constants: Vec<Vec<u8>>,
-    /// Number of members that hold constants, and their indices by hash of the content.
+    /// Number of members that hold constants, including those of `new_constants`.
     constants: usize,
+    /// Index of the member of each constant, by the hash of the constant.
     known_constants: HashMap<blake3::Hash, usize>,
     /// Whether a commit failed.
     failed: bool,
@@ -155,12 +159,12 @@ impl ColumnFilesWriter {
         Ok(())
     }
 
-    /// Number of episodes, including uncommitted ones.
+    /// Number of episodes, including uncommitted episodes.
     pub fn episodes(&self) -> usize {
         self.rows.episodes().len()
     }
 
-    /// The folder.
+    /// The folder of the dataset.
     pub fn folder(&self) -> &Path {
         &self.folder
     }
@@ -269,7 +273,7 @@ impl ColumnFilesWriter {
         Ok(())
     }
 
-    /// Replaces a file atomically.
+    /// Replaces a column file atomically.
     fn replace_column(&self, name: &str, fill: impl FnOnce(&mut NpzWriter) -> Result<()>) -> Result<()> {
         // The reference ignores names that start with `ep_len`.
         let temporary = self.folder.join(format!("{LENGTHS}.tmp"));
@@ -311,7 +315,7 @@ impl Drop for ColumnFilesWriter {
     }
 }
 
-/// Locks a folder against other writers, until the file is dropped or the process ends.
+/// Locks a folder against other writers, until the returned file is dropped or the process ends.
 pub(crate) fn lock_folder(folder: &Path) -> Result<File> {
     let file = File::open(folder).map_err(|e| Error::io(folder, "opening the folder", e))?;
     match file.try_lock() {

@@ -3,7 +3,7 @@
 //! ```text
 //! NAME.folder/
 //!   ep_len.npz, ep_offset.npz, action.npz, …    see `column_files`
-//!   pixels/ep_0_step_0.jpeg, …                  one image each
+//!   pixels/ep_0_step_0.jpeg, …                  one image per file
 //! ```
 //!
 //! This is the layout of the reference's `FolderDataset`, which accepts only names ending in `.jpeg` or `.jpg`, but
@@ -43,7 +43,7 @@ fn detect(location: &Location) -> bool {
     ENTRY.has_suffix(location)
 }
 
-/// The file of an image.
+/// Path of the image file of a step.
 fn image_path(folder: &Path, column: &str, episode: usize, step: usize, suffix: &str) -> PathBuf {
     folder.join(column).join(format!("ep_{episode}_step_{step}.{suffix}"))
 }

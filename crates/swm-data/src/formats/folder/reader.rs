@@ -10,10 +10,10 @@ use std::path::Path;
 use std::sync::Arc;
 use swm_core::{ColumnSpec, Error, Manifest, Result, Schema};
 
-/// Maximum compression ratio of an image file (deflate's limit). A header that declares more is damaged.
+/// Maximum compression ratio of an image file (deflate's limit). A file with a higher ratio is damaged.
 const MAX_COMPRESSION: usize = 1032;
 
-/// Opens a folder.
+/// Opens a dataset of the format `folder`.
 pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
     Ok(Arc::new(FolderReader::open(location.local("folder")?)?))
 }
@@ -41,7 +41,7 @@ impl FolderReader {
     fn read_images(&self, column: &ColumnSpec, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
         let mut slots = self.files.rows().row_slots(column, ranges, out)?;
         let (height, width) = (column.shape[0], column.shape[1]);
-        // One group per distinct image: the output slots that receive it.
+        // Each group holds the output slots of one image, which is decoded once.
         slots.par_chunk_by_mut(|a, b| a.0 == b.0).try_for_each(|group| {
             let Some((((episode, step), first), others)) = group.split_first_mut() else { return Ok(()) };
             let bytes = read_image(self.files.folder(), &column.name, *episode, *step)?;
@@ -101,7 +101,7 @@ impl Reader for FolderReader {
     }
 }
 
-/// The image columns of a third-party folder: its subfolders, by name. The first image of a subfolder determines the
+/// The image columns of a third-party folder: one column per subfolder. The first image of a subfolder determines the
 /// image size.
 fn infer_image_columns(files: &ColumnFiles) -> Result<Vec<ColumnSpec>> {
     let folder = files.folder();
@@ -129,7 +129,7 @@ fn infer_image_columns(files: &ColumnFiles) -> Result<Vec<ColumnSpec>> {
     Ok(columns)
 }
 
-/// Reads the file of an image, with any of the suffixes.
+/// Reads the image file of a step, with any suffix of [`SUFFIXES`].
 fn read_image(folder: &Path, column: &str, episode: usize, step: usize) -> Result<Vec<u8>> {
     for suffix in SUFFIXES {
         let path = image_path(folder, column, episode, step, suffix);

@@ -1,4 +1,4 @@
-//! Writes a folder: the images of an episode first, then its numeric columns, which commit it.
+//! Writes the images of an episode, then its numeric columns. Committing the numeric columns commits the episode.
 
 use super::reader::FolderReader;
 use super::{SUFFIXES, episode_of, image_path};
@@ -11,7 +11,7 @@ use std::path::Path;
 use swm_core::{Batch, Error, Result, Schema};
 use swm_image::ImageCodec;
 
-/// Creates, continues or replaces a dataset in a folder.
+/// Creates, continues or replaces a dataset of the format `folder`.
 pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
     let folder = location.local("folder")?;
     options.codec.check()?;

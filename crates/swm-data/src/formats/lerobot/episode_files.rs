@@ -1,4 +1,4 @@
-//! The list of episodes in `meta/`: the files that hold each episode, and its position in them.
+//! The list of episodes in `meta/`: the files, length, tasks and constants of each episode.
 
 use super::info::{Info, damaged};
 use super::{CONSTANTS, table};
@@ -9,13 +9,14 @@ use serde::Deserialize;
 use std::path::{Path, PathBuf};
 use swm_core::{Error, Result};
 
-/// Files of an episode, and its position in them.
+/// The files, length, tasks and constants of an episode.
 pub(super) struct EpisodeFiles {
     pub tasks: Vec<String>,
     pub data: PathBuf,
-    /// For every video feature, its file and the episode's start time in it, in seconds.
+    /// For every video feature, the path of a video and the start time of the episode in this video, in seconds.
     pub videos: Vec<(PathBuf, f64)>,
     pub length: usize,
+    /// The constants as JSON.
     pub constants: Option<String>,
     /// Index of the episode's files, counted over all chunks.
     pub file: usize,
@@ -31,7 +32,7 @@ impl EpisodeFiles {
     }
 }
 
-/// The episodes of version 2.1, which has one line and one file per episode.
+/// Reads the list of episodes of version 2.1, which has one line and one data file per episode.
 fn episode_files_v2(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
     #[derive(Deserialize)]
     struct Line {
@@ -75,25 +76,25 @@ fn video_file(root: &Path, info: &Info, key: &str, indices: &[(&str, usize)]) ->
     info.file(root, template, key, indices)
 }
 
-/// The episodes of version 3.0, which has one row per episode.
+/// Reads the list of episodes of version 3.0, which has one row per episode.
 #[allow(clippy::too_many_lines, reason = "one block per column of the table")]
 fn episode_files_v3(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
     let folder = root.join("meta").join("episodes");
     let mut files = vec![];
-    // The folder is empty if there are no episodes yet.
+    // The folder does not exist if there are no episodes yet.
     for chunk in std::fs::read_dir(&folder).into_iter().flatten().flatten() {
         let entries = std::fs::read_dir(chunk.path()).into_iter().flatten().flatten().map(|entry| entry.path());
         files.extend(entries.filter(|path| path.extension().is_some_and(|suffix| suffix == "parquet")));
     }
     files.sort();
     let keys = info.video_keys();
-    let named = |key: &str, what: &str| format!("videos/{key}/{what}");
+    let video_column = |key: &str, field: &str| format!("videos/{key}/{field}");
     let mut columns: Vec<String> =
         ["episode_index", "tasks", "length", "data/chunk_index", "data/file_index", CONSTANTS]
             .map(str::to_owned)
             .to_vec();
     for key in &keys {
-        columns.extend(["chunk_index", "file_index", "from_timestamp"].map(|what| named(key, what)));
+        columns.extend(["chunk_index", "file_index", "from_timestamp"].map(|field| video_column(key, field)));
     }
     let columns: Vec<&str> = columns.iter().map(String::as_str).collect();
     let mut files_of_episodes = vec![];
@@ -110,14 +111,14 @@ fn episode_files_v3(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
         for key in &keys {
             let mut start_times = vec![];
             for batch in &batches {
-                let column = batch.column_by_name(&named(key, "from_timestamp"));
+                let column = batch.column_by_name(&video_column(key, "from_timestamp"));
                 let column = column.and_then(|array| array.as_primitive_opt::<Float64Type>());
                 let column = column.ok_or_else(|| damaged(path, format!("it has no start times of '{key}'")))?;
                 start_times.extend_from_slice(column.values());
             }
             videos.push((
-                column_values(&named(key, "chunk_index"))?,
-                column_values(&named(key, "file_index"))?,
+                column_values(&video_column(key, "chunk_index"))?,
+                column_values(&video_column(key, "file_index"))?,
                 start_times,
             ));
         }
@@ -136,17 +137,17 @@ fn episode_files_v3(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
                 let problem = format!("found episode {} instead of {}", index[row], files_of_episodes.len());
                 return Err(damaged(path, problem));
             }
-            let at = |chunk: usize, file: usize| [("chunk_index", chunk), ("file_index", file)];
+            let indices = |chunk: usize, file: usize| [("chunk_index", chunk), ("file_index", file)];
             let files: Result<Vec<(PathBuf, f64)>> = keys
                 .iter()
                 .zip(&videos)
                 .map(|(key, (chunk, file, begin))| {
-                    Ok((video_file(root, info, key, &at(chunk[row], file[row]))?, begin[row]))
+                    Ok((video_file(root, info, key, &indices(chunk[row], file[row]))?, begin[row]))
                 })
                 .collect();
             files_of_episodes.push(EpisodeFiles {
                 tasks: std::mem::take(&mut tasks[row]),
-                data: info.file(root, &info.data_path, "", &at(chunk[row], file[row]))?,
+                data: info.file(root, &info.data_path, "", &indices(chunk[row], file[row]))?,
                 videos: files?,
                 length: length[row],
                 constants: constants[row].take(),
@@ -157,7 +158,7 @@ fn episode_files_v3(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
     Ok(files_of_episodes)
 }
 
-/// A column of lists of strings.
+/// The values of a column of lists of strings, or `None` if there is no such column.
 fn texts(batch: &arrow_array::RecordBatch, column: &str) -> Option<Vec<Vec<String>>> {
     let lists = batch.column_by_name(column)?.as_list_opt::<i32>()?;
     let text = |list: arrow_array::ArrayRef| -> Option<Vec<String>> {

@@ -1,13 +1,14 @@
-//! The features of new datasets: how columns are named and described in `meta/info.json`.
+//! The features of new datasets: the names and descriptions of the columns in `meta/info.json`.
 
-use super::info::{DATA_PATH, Feature, Features, Info, Recorded, VERSION, VIDEO_PATH, native_name};
+use super::info::{DATA_PATH, Feature, Features, Info, VERSION, VIDEO_PATH, WriterMetadata, native_name};
 use crate::dataset::WriteOptions;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{DType, Error, Result, Schema};
 
-/// Frames per second in timestamps. Steps of simulated environments have no common rate.
+/// Frame rate of videos and timestamps, in frames per second. The rate is arbitrary, because simulated environments
+/// have no common rate.
 pub const FRAMES_PER_SECOND: u32 = 25;
 
 /// Indices of the columns to store, with the names of their features.
@@ -23,8 +24,8 @@ pub fn stored_columns(schema: &Schema) -> Result<Vec<(usize, String)>> {
         }
         let native = native_name(column, schema);
         let reserved = ["timestamp", "frame_index", "episode_index", "index", "task_index", "task"];
-        let unfit = native.contains(['/', '\\', '\0']) || native.starts_with('.');
-        if unfit || reserved.contains(&&*native) || columns.iter().any(|(_, other)| *other == native) {
+        let invalid = native.contains(['/', '\\', '\0']) || native.starts_with('.');
+        if invalid || reserved.contains(&&*native) || columns.iter().any(|(_, other)| *other == native) {
             return refuse(format!("'{native}' is not a valid LeRobot feature name"), "rename the column");
         }
         columns.push((index, native));
@@ -35,7 +36,7 @@ pub fn stored_columns(schema: &Schema) -> Result<Vec<(usize, String)>> {
     Ok(columns)
 }
 
-/// The description of a dataset without episodes.
+/// The content of `meta/info.json` of a dataset without episodes.
 pub fn new_info(schema: &Schema, columns: &[(usize, String)], options: &WriteOptions) -> Info {
     let mut features: Vec<(String, Feature)> = columns
         .iter()
@@ -45,7 +46,8 @@ pub fn new_info(schema: &Schema, columns: &[(usize, String)], options: &WriteOpt
                 let names = json!(["height", "width", "channels"]);
                 let details = json!({
                     "video.height": column.shape[0], "video.width": column.shape[1], "video.codec": "h264",
-                    "video.fps": FRAMES_PER_SECOND, "video.channels": 3, "video.is_depth_map": false, "has_audio": false,
+                    "video.fps": FRAMES_PER_SECOND, "video.channels": 3, "video.is_depth_map": false,
+                    "has_audio": false,
                 });
                 Feature { dtype: "video".to_owned(), shape: column.shape.clone(), names, info: Some(details) }
             } else {
@@ -56,12 +58,12 @@ pub fn new_info(schema: &Schema, columns: &[(usize, String)], options: &WriteOpt
             (native.clone(), feature)
         })
         .collect();
-    let mut default = |name: &str, dtype: DType| {
+    let mut add_required = |name: &str, dtype: DType| {
         let feature = Feature { dtype: dtype.name().to_owned(), shape: vec![1], names: Value::Null, info: None };
         features.push((name.to_owned(), feature));
     };
-    default("timestamp", DType::Float32);
-    ["frame_index", "episode_index", "index", "task_index"].iter().for_each(|name| default(name, DType::Int64));
+    add_required("timestamp", DType::Float32);
+    ["frame_index", "episode_index", "index", "task_index"].iter().for_each(|name| add_required(name, DType::Int64));
     let cameras = columns.iter().any(|(index, _)| schema.columns()[*index].is_image());
     Info {
         codebase_version: VERSION.to_owned(),
@@ -77,7 +79,7 @@ pub fn new_info(schema: &Schema, columns: &[(usize, String)], options: &WriteOpt
         data_path: DATA_PATH.to_owned(),
         video_path: cameras.then(|| VIDEO_PATH.to_owned()),
         features: Features(features),
-        stable_worldmodel: Some(Recorded {
+        stable_worldmodel: Some(WriterMetadata {
             schema: schema.clone(),
             manifest: options.manifest.clone(),
             last_action_repeats: true,

@@ -12,11 +12,11 @@ use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema};
 /// The LeRobot version of written datasets.
 pub const VERSION: &str = "v3.0";
 
-/// Path templates of version 3.0.
+/// Path template of data files in version 3.0.
 pub const DATA_PATH: &str = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet";
-/// See [`DATA_PATH`].
+/// Path template of videos in version 3.0.
 pub const VIDEO_PATH: &str = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4";
-/// See [`DATA_PATH`].
+/// Path template of the list of episodes in version 3.0.
 pub const EPISODES_PATH: &str = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet";
 
 /// The content of `meta/info.json`.
@@ -29,11 +29,11 @@ pub struct Info {
     pub total_frames: usize,
     #[serde(default)]
     pub total_tasks: usize,
-    #[serde(default = "thousand")]
+    #[serde(default = "default_chunks_size")]
     pub chunks_size: usize,
-    #[serde(default = "hundred")]
+    #[serde(default = "default_file_size_in_mb")]
     pub data_files_size_in_mb: usize,
-    #[serde(default = "hundred")]
+    #[serde(default = "default_file_size_in_mb")]
     pub video_files_size_in_mb: usize,
     pub fps: serde_json::Number,
     #[serde(default)]
@@ -42,33 +42,33 @@ pub struct Info {
     #[serde(default)]
     pub video_path: Option<String>,
     pub features: Features,
-    /// Metadata of this format's writer.
+    /// Metadata that only this project's writer adds.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub stable_worldmodel: Option<Recorded>,
+    pub stable_worldmodel: Option<WriterMetadata>,
 }
 
-fn thousand() -> usize {
+fn default_chunks_size() -> usize {
     1000
 }
 
-fn hundred() -> usize {
+fn default_file_size_in_mb() -> usize {
     100
 }
 
-/// Metadata of this format's writer.
+/// Metadata that only this project's writer adds to `meta/info.json`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-pub struct Recorded {
+pub struct WriterMetadata {
     pub schema: Schema,
     pub manifest: Option<Manifest>,
-    /// Whether the last action of an episode is a copy of the previous one and stands for a missing action.
+    /// Whether the last action of an episode is a copy of the previous action and stands for a missing action.
     pub last_action_repeats: bool,
 }
 
-/// Features by name, in file order. The first camera is the main one.
+/// Features by name, in file order. The first camera becomes the column `pixels`.
 #[derive(Clone, Debug, Default)]
 pub struct Features(pub Vec<(String, Feature)>);
 
-/// One feature.
+/// The description of a feature, LeRobot's word for a column.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Feature {
     pub dtype: String,
@@ -111,14 +111,14 @@ impl<'de> Deserialize<'de> for Features {
     }
 }
 
-/// How the values of a column are stored.
+/// Storage of the values of a column.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
-    /// In the data files.
+    /// Numeric values in the data files.
     Values,
-    /// As encoded images in the data files.
+    /// Encoded images in the data files.
     Images,
-    /// In videos, with the index among video features.
+    /// Frames in videos. Holds the index of the column among the video features.
     Video(usize),
 }
 
@@ -135,7 +135,7 @@ impl Info {
     /// Reads `meta/info.json` of a dataset.
     ///
     /// # Errors
-    /// If it is missing or damaged, or its version is not supported.
+    /// If the file is missing or damaged, or the version is not supported.
     pub fn read(root: &Path) -> Result<Self> {
         let path = root.join("meta").join("info.json");
         let bytes = std::fs::read(&path).map_err(|e| match e.kind() {
@@ -143,7 +143,7 @@ impl Info {
                 let problem = if root.exists() { "it holds no meta/info.json" } else { "there is no such dataset" };
                 Error::corrupt(root, problem, "check the path; `swm datasets` lists the stored datasets")
             }
-            _ => Error::io(&path, "reading what the dataset holds", e),
+            _ => Error::io(&path, "reading the description of the dataset", e),
         })?;
         let info: Self = serde_json::from_slice(&bytes).map_err(|e| damaged(&path, format!("is unreadable: {e}")))?;
         if !info.is_v3() && info.codebase_version != "v2.1" && info.codebase_version != "v2.0" {
@@ -170,10 +170,10 @@ impl Info {
         self.features.0.iter().filter(|(_, feature)| feature.dtype == "video").map(|(name, _)| name.as_str()).collect()
     }
 
-    /// The columns. Features with text or with unsupported shapes are skipped.
+    /// The columns of the dataset. Features with text or without elements are skipped.
     ///
     /// # Errors
-    /// If the shape of a camera is invalid.
+    /// If the shape of a feature is invalid.
     pub fn columns(&self, root: &Path) -> Result<Vec<Column>> {
         let (mut columns, mut videos, mut primary) = (vec![], 0, true);
         for (native, feature) in &self.features.0 {
@@ -226,12 +226,17 @@ impl Info {
     pub fn file(&self, root: &Path, template: &str, key: &str, indices: &[(&str, usize)]) -> Result<PathBuf> {
         let name = fill(template, key, indices);
         let inside = Path::new(&name).components().all(|part| matches!(part, std::path::Component::Normal(_)));
-        if inside { Ok(root.join(name)) } else { Err(damaged(root, format!("'{name}' is outside of it"))) }
+        if inside {
+            Ok(root.join(name))
+        } else {
+            Err(damaged(root, format!("'{name}' is outside of the dataset's folder")))
+        }
     }
 }
 
 impl Feature {
-    /// Height and width of a camera's images: as named, otherwise by the position of the colour axis.
+    /// Height and width of a camera's images, from the names of the axes or, without names, from the position of the
+    /// colour axis.
     fn size(&self) -> Option<(usize, usize)> {
         let [a, b, c] = self.shape[..] else { return None };
         let named = |name: &str| self.names.as_array()?.iter().position(|found| found.as_str() == Some(name));
@@ -244,7 +249,7 @@ impl Feature {
         (sides.0 > 0 && sides.1 > 0 && sides.0 < 1 << 16 && sides.1 < 1 << 16).then_some(sides)
     }
 
-    /// The column type that holds the feature's values without loss.
+    /// The column type for the feature's values, or `None` for text. Only `uint64` values from 2^63 on do not fit.
     fn column_dtype(&self) -> Option<DType> {
         Some(match self.dtype.as_str() {
             "bool" => DType::Bool,
@@ -284,7 +289,7 @@ pub fn fill(template: &str, key: &str, indices: &[(&str, usize)]) -> String {
         if name == "video_key" || name == "image_key" {
             filled.push_str(key);
         } else if let Some((_, index)) = indices.iter().find(|(known, _)| *known == name) {
-            // A format such as `03d`.
+            // `form` is a format such as `03d`.
             let width = form.trim_end_matches('d').trim_start_matches('0').parse::<usize>().unwrap_or(0).min(20);
             filled.push_str(&format!("{index:0width$}"));
         }

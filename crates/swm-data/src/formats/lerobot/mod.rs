@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! NAME.lerobot/
-//!   meta/info.json                                   features, path templates, number of episodes; commits
+//!   meta/info.json                                   features, path templates, number of episodes; written last
 //!   meta/episodes/chunk-000/file-000.parquet         position of the rows and frames of each episode
 //!   meta/tasks.parquet, meta/stats.json
 //!   data/chunk-000/file-000.parquet                  numeric columns, one row per step, several episodes per file
@@ -14,13 +14,14 @@
 //! Datasets written here are read with their original names: images are stored as `observation.images.NAME`, and
 //! `proprio` (or `state`, if there is none) as `observation.state`. `episode_index` and `frame_index` become
 //! `episode_idx` and `step_idx`. `timestamp`, `index` and `task_index` can be read by name but are not columns, because
-//! writers compute them. The only text that is read is the task, as the constant `task` of the episode.
+//! writers compute them. Text features are not read, except the task, which becomes the episode's constant `task`.
 //!
-//! **Time.** LeRobot's last row has an action. Third-party datasets are read unchanged. Datasets written here repeat
-//! the previous action in the last row, so that other programs get no NaN; reading them here restores NaN (or -1).
+//! **Time.** In LeRobot, the last row of an episode has an action. In this project, the action of the last row is NaN
+//! (or -1 for integers). Third-party datasets are read unchanged. Datasets written here repeat the previous action in
+//! the last row, so that other programs get no NaN; the reader restores NaN (or -1).
 //!
-//! **Frames** are located by time: the start time of the episode in the file plus the timestamp of the row. It is an
-//! error if the nearest frame is further away than a quarter of a frame.
+//! **Frames** are located by time: the start time of the episode in the file plus the timestamp of the row. Reading
+//! fails if the time of the nearest frame differs by more than a quarter of a frame interval.
 //!
 //! [`ImageCodec`](swm_image::ImageCodec) determines the encoding of frames as in the format `video`; use JPEG for
 //! datasets that browsers must play.

@@ -1,5 +1,5 @@
-//! Reads numeric columns from Parquet files, which stay in memory after the first access, and frames from videos, by
-//! time.
+//! Reads numeric columns from Parquet files, and frames from videos by time. Numeric columns are cached in memory after
+//! the first access.
 
 use super::episode_files::EpisodeFiles;
 use super::info::{Column, Info, Kind, damaged};
@@ -19,8 +19,8 @@ use swm_core::columns::ACTION;
 use swm_core::{Batch, ColumnSpec, DType, Error, Manifest, Result, Schema};
 use swm_video::{Source, Video, VideoCache};
 
-/// Features with row counters, which every dataset has.
-const ROW_COUNTERS: [&str; 3] = ["timestamp", "index", "task_index"];
+/// Features that LeRobot's writers compute for every row of every dataset.
+const COMPUTED_FEATURES: [&str; 3] = ["timestamp", "index", "task_index"];
 
 /// Opens a dataset.
 pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
@@ -32,17 +32,17 @@ pub(super) struct LerobotReader {
     pub info: Info,
     fps: f64,
     schema: Schema,
-    /// The columns of the schema after the index columns, then LeRobot's row counters, which are only read by name.
+    /// The columns of the schema after the index columns, then the computed features, which are only read by name.
     columns: Vec<Column>,
     /// Specs of the index columns and of `columns`.
     specs: Vec<ColumnSpec>,
     rows: EpisodeRows,
     pub files_of_episodes: Vec<EpisodeFiles>,
-    /// Data files, and the positions of the episodes in each.
+    /// Each data file, with the positions of the episodes in it.
     files: Vec<(PathBuf, Range<usize>)>,
     /// The values of each numeric column.
     data: Vec<OnceLock<Vec<u8>>>,
-    /// The timestamp of each row, if stored.
+    /// The timestamp of each row in seconds, if stored.
     timestamps: OnceLock<Option<Vec<f32>>>,
     videos: VideoCache<PathBuf>,
 }
@@ -52,17 +52,16 @@ impl LerobotReader {
         let info = Info::read(root)?;
         let fps = info.fps().unwrap_or(1.0);
         let mut columns = info.columns(root)?;
-        // Datasets written here may have columns with these names.
-        let is_row_counter =
-            |column: &Column| info.stable_worldmodel.is_none() && ROW_COUNTERS.contains(&&*column.native);
-        columns.sort_by_key(is_row_counter);
-        let visible = 2 + columns.iter().filter(|column| !is_row_counter(column)).count();
+        let is_computed =
+            |column: &Column| info.stable_worldmodel.is_none() && COMPUTED_FEATURES.contains(&&*column.native);
+        columns.sort_by_key(is_computed);
+        let visible = 2 + columns.iter().filter(|column| !is_computed(column)).count();
         let files_of_episodes = EpisodeFiles::read(root, &info)?;
         let mut rows = EpisodeRows::default();
         files_of_episodes.iter().for_each(|files| rows.push(files.length));
         if info.total_episodes != files_of_episodes.len() || rows.total() != info.total_frames as u64 {
             let problem = format!(
-                "meta/info.json declares {} episodes with {} rows in total, but {} with {} are described",
+                "meta/info.json declares {} episodes and {} rows, but the list of episodes has {} episodes and {} rows",
                 info.total_episodes,
                 info.total_frames,
                 files_of_episodes.len(),
@@ -80,7 +79,7 @@ impl LerobotReader {
         let recorded = info.stable_worldmodel.as_ref().map(|recorded| recorded.schema.columns()).unwrap_or_default();
         let specs: Vec<ColumnSpec> =
             index_columns(recorded).into_iter().chain(columns.iter().map(|column| column.spec.clone())).collect();
-        // Checks the declared frame size before memory for it is allocated.
+        // Checks the declared frame size before memory for frames is allocated.
         let videos = VideoCache::default();
         for column in &columns {
             if let (Kind::Video(feature), Some(episode)) =
@@ -134,7 +133,7 @@ impl LerobotReader {
         if repeats && column.spec.name == ACTION {
             let size = column.spec.row_bytes();
             for (&first, episode) in self.rows.first_rows().iter().zip(self.rows.episodes()) {
-                // The offset fits, because all rows are in memory.
+                // The offset fits in `usize`, because all rows are in memory.
                 let last = (first as usize + episode.length) * size;
                 set_missing(column.spec.dtype, &mut data[last - size..last]);
             }
@@ -175,7 +174,7 @@ impl LerobotReader {
         Err(damaged(path, "its rows do not belong to the episodes that it should contain".to_owned()))
     }
 
-    /// The timestamp of each row, relative to the start of its episode.
+    /// The timestamp of each row, in seconds from the start of the row's episode.
     fn timestamps(&self) -> Result<Option<&[f32]>> {
         if let Some(known) = self.timestamps.get() {
             return Ok(known.as_deref());
@@ -208,7 +207,7 @@ impl LerobotReader {
         times.and_then(|times| times.get(row)).map_or(step as f64 / self.fps, |&time| f64::from(time))
     }
 
-    /// The frame at a time.
+    /// Index of the frame at a time in seconds.
     fn frame(&self, video: &Video, time: f64) -> Result<usize> {
         match video.frame_at(time) {
             Some((frame, distance)) if distance <= 0.25 / self.fps => Ok(frame),
@@ -216,7 +215,7 @@ impl LerobotReader {
         }
     }
 
-    /// Calls `each` with the encoded images of some rows of a file, and their positions in the list of rows.
+    /// Calls `each` with every encoded image of some rows of a file, and with the image's index among these rows.
     fn each_encoded_image(
         &self,
         native: &str,
@@ -312,11 +311,11 @@ impl Reader for LerobotReader {
     }
 
     fn read(&self, columns: &[&str], ranges: &[StepRange]) -> Result<Batch> {
-        // As the default implementation, but also accepts LeRobot names.
+        // Unlike the default implementation, accepts LeRobot names.
         let spec = |name: &&str| -> Result<ColumnSpec> {
             let index = self.index(name)?;
             let known = &self.specs[index];
-            // Reads the files before memory for the batch is allocated, because they may be shorter than declared.
+            // Reads the files before memory for the batch is allocated, because files may be shorter than declared.
             if let Some(index) = index.checked_sub(2).filter(|&index| self.columns[index].kind == Kind::Values) {
                 self.data(index)?;
             }
@@ -341,7 +340,7 @@ impl Reader for LerobotReader {
         };
         let mut constants = Constants::new();
         if let Some(stored) = &files.constants {
-            let stored: BTreeMap<String, Stored> = serde_json::from_str(stored)
+            let stored: BTreeMap<String, StoredConstant> = serde_json::from_str(stored)
                 .map_err(|e| damaged(&self.root, format!("the constants of episode {episode} are unreadable: {e}")))?;
             constants.extend(stored.into_iter().map(|(name, value)| (name, value.into_bytes())));
         } else if !files.tasks.is_empty() {
@@ -372,7 +371,7 @@ impl Reader for LerobotReader {
                 });
                 let part = match camera {
                     Some(column) => column.spec.name.clone(),
-                    None if path.starts_with(self.root.join("data")) => "(numbers)".to_owned(),
+                    None if path.starts_with(self.root.join("data")) => "(numeric columns)".to_owned(),
                     None => "(metadata)".to_owned(),
                 };
                 *parts.entry(part).or_default() += metadata.len();
@@ -424,12 +423,12 @@ impl Reader for LerobotReader {
 /// A constant in JSON: a string, or bytes that are not UTF-8.
 #[derive(Deserialize, serde::Serialize)]
 #[serde(untagged)]
-pub(super) enum Stored {
+pub(super) enum StoredConstant {
     Text(String),
     Bytes(Vec<u8>),
 }
 
-impl Stored {
+impl StoredConstant {
     fn into_bytes(self) -> Vec<u8> {
         match self {
             Self::Text(text) => text.into_bytes(),

@@ -1,5 +1,5 @@
 //! `meta/stats.json`: minimum, maximum, mean and standard deviation of every feature, which LeRobot's policies use for
-//! normalisation. Statistics of new episodes are merged with the stored ones. Quantiles are not written.
+//! normalisation. Statistics of new episodes are merged with the stored statistics. Quantiles are not written.
 
 use serde_json::{Value, json};
 use swm_core::{ColumnSpec, Result};
@@ -9,11 +9,12 @@ use swm_core::{ColumnSpec, Result};
 pub struct Stats {
     /// Number of rows or frames.
     count: f64,
-    /// Per element of a row, or per colour channel.
+    /// Statistics of each element of a row, or of each colour channel.
     dims: Vec<Dim>,
     camera: bool,
 }
 
+/// Statistics of one element of a row, or of one colour channel.
 #[derive(Clone, Copy, Debug)]
 struct Dim {
     min: f64,
@@ -31,13 +32,13 @@ impl Stats {
         Self { count: 0.0, dims: vec![EMPTY; if camera { 3 } else { column.len() }], camera }
     }
 
-    /// Adds rows of values in row-major order; for a camera, the pixels of its frames.
+    /// Adds values, row-major `[rows, elements]`; for a camera, pixels `[rows, height, width, 3]`.
     pub fn add(&mut self, values: impl Iterator<Item = f64> + Clone, rows: usize) {
-        let width = self.dims.len();
-        let mut added = vec![EMPTY; width];
-        let mut sums = vec![(0.0, 0.0, 0.0); width];
+        let dim_count = self.dims.len();
+        let mut added = vec![EMPTY; dim_count];
+        let mut sums = vec![(0.0, 0.0, 0.0); dim_count];
         for (i, value) in values.enumerate() {
-            let (dim, sum) = (&mut added[i % width], &mut sums[i % width]);
+            let (dim, sum) = (&mut added[i % dim_count], &mut sums[i % dim_count]);
             dim.min = dim.min.min(value);
             dim.max = dim.max.max(value);
             // Welford's algorithm.
@@ -85,7 +86,7 @@ impl Stats {
         })
     }
 
-    /// Loads stored statistics, if they are of this feature.
+    /// Merges stored statistics. Returns `None` if the number of elements differs.
     pub fn continue_from(&mut self, stored: &Value) -> Option<()> {
         let scale = if self.camera { 255.0 } else { 1.0 };
         let list = |name: &str| -> Option<Vec<f64>> {
@@ -108,7 +109,7 @@ impl Stats {
 /// The content of `meta/stats.json`.
 ///
 /// # Errors
-/// If it cannot be serialised.
+/// If serialising the statistics fails.
 pub fn file<'a>(features: impl Iterator<Item = (&'a str, &'a Stats)>) -> Result<Vec<u8>> {
     let all: serde_json::Map<String, Value> =
         features.map(|(name, stats)| (name.to_owned(), stats.to_json())).collect();
@@ -121,26 +122,26 @@ mod tests {
     use swm_core::DType;
 
     #[test]
-    fn statistics_of_parts_equal_those_of_the_whole() {
+    fn merged_statistics_equal_statistics_of_all_rows() {
         let column = ColumnSpec::new("state", DType::Float64, [2]);
         let values: Vec<f64> = (0..40).map(|i| f64::from(i * i % 17) + if i % 2 == 0 { 100.0 } else { -3.0 }).collect();
-        let mut whole = Stats::new(&column);
-        whole.add(values.iter().copied(), 20);
+        let mut all_rows = Stats::new(&column);
+        all_rows.add(values.iter().copied(), 20);
         let mut first = Stats::new(&column);
         first.add(values[..14].iter().copied(), 7);
         let mut second = Stats::new(&column);
-        second.continue_from(&first.to_json()).expect("is of this feature");
+        second.continue_from(&first.to_json()).expect("merging the stored statistics");
         second.add(values[14..].iter().copied(), 13);
-        let (a, b) = (whole.to_json(), second.to_json());
+        let (a, b) = (all_rows.to_json(), second.to_json());
         for name in ["min", "max", "mean", "std", "count"] {
-            for i in 0..a[name].as_array().expect("a list").len() {
-                let (a, b) = (a[name][i].as_f64().expect("a number"), b[name][i].as_f64().expect("a number"));
+            for i in 0..a[name].as_array().expect("a JSON array").len() {
+                let (a, b) = (a[name][i].as_f64().expect("a JSON number"), b[name][i].as_f64().expect("a JSON number"));
                 assert!((a - b).abs() < 1e-9, "{name}: {a} {b}");
             }
         }
         let even: Vec<f64> = values.iter().step_by(2).copied().collect();
         let mean = even.iter().sum::<f64>() / 20.0;
-        assert!((a["mean"][0].as_f64().expect("a number") - mean).abs() < 1e-9);
+        assert!((a["mean"][0].as_f64().expect("a JSON number") - mean).abs() < 1e-9);
         assert!(Stats::new(&ColumnSpec::image("pixels", 4, 4)).continue_from(&a).is_none());
     }
 }

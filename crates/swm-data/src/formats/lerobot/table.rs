@@ -19,7 +19,7 @@ use swm_core::{Error, Result};
 /// Rows per decoded batch.
 const ROWS: usize = 4096;
 
-/// Reads columns of a file: all rows, or some ascending ranges. Columns that do not exist are missing from the result.
+/// Reads columns of a file: all rows, or ascending ranges of rows. The result lacks the columns that do not exist.
 ///
 /// # Errors
 /// If the file cannot be read or is damaged, including when the Parquet library panics.
@@ -51,10 +51,10 @@ pub fn read(path: &Path, columns: &[&str], rows: Option<Vec<Range<usize>>>) -> R
     catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|_| Err(failed(&"its content is invalid")))
 }
 
-/// An integer column.
+/// The values of an integer column.
 ///
 /// # Errors
-/// If there is no such column, or it has another type.
+/// If there is no such column, or the column has another type.
 pub fn integers(path: &Path, batches: &[RecordBatch], column: &str) -> Result<Vec<i64>> {
     let mut integers = vec![];
     for batch in batches {
@@ -67,13 +67,13 @@ pub fn integers(path: &Path, batches: &[RecordBatch], column: &str) -> Result<Ve
     Ok(integers)
 }
 
-/// Writes a file atomically.
+/// Writes a table to a file atomically.
 ///
 /// # Errors
 /// If writing fails.
 pub fn write(path: &Path, schema: &Arc<ArrowSchema>, batch: &RecordBatch) -> Result<()> {
     let failed = |e: parquet::errors::ParquetError| Error::external(format!("writing {}", path.display()), e);
-    // Other readers expect the schema's metadata here.
+    // Other readers expect the schema's metadata in the Parquet key-value metadata.
     let metadata = schema.metadata().iter().map(|(key, value)| KeyValue::new(key.clone(), value.clone())).collect();
     let properties =
         WriterProperties::builder().set_compression(Compression::SNAPPY).set_key_value_metadata(Some(metadata)).build();

@@ -14,7 +14,7 @@ use swm_core::{ColumnSpec, DType, Error, Result};
 /// Appends an array with `column.len()` values per row as bytes of the column's type.
 ///
 /// # Errors
-/// If a row has another number of values, values are missing, or they are not numeric.
+/// If a row does not have `column.len()` values, or if values are missing or not numeric.
 pub fn append(array: &dyn Array, column: &ColumnSpec, out: &mut Vec<u8>) -> Result<(), String> {
     let expected = array.len() * column.len();
     let mut leaf: ArrayRef = arrow_array::make_array(array.to_data());
@@ -39,23 +39,23 @@ pub fn append(array: &dyn Array, column: &ColumnSpec, out: &mut Vec<u8>) -> Resu
     match leaf.data_type() {
         DataType::Boolean => {
             let values = leaf.as_boolean().values().iter().map(i64::from);
-            put(values, column.dtype, out, |v| v, |v| v as f64);
+            append_values(values, column.dtype, out, |v| v, |v| v as f64);
         }
-        DataType::Int8 => whole::<Int8Type>(&leaf, column, out),
-        DataType::Int16 => whole::<Int16Type>(&leaf, column, out),
-        DataType::Int32 => whole::<Int32Type>(&leaf, column, out),
-        DataType::Int64 => whole::<Int64Type>(&leaf, column, out),
-        DataType::UInt8 => whole::<UInt8Type>(&leaf, column, out),
-        DataType::UInt16 => whole::<UInt16Type>(&leaf, column, out),
-        DataType::UInt32 => whole::<UInt32Type>(&leaf, column, out),
-        DataType::UInt64 => whole::<UInt64Type>(&leaf, column, out),
+        DataType::Int8 => append_integers::<Int8Type>(&leaf, column, out),
+        DataType::Int16 => append_integers::<Int16Type>(&leaf, column, out),
+        DataType::Int32 => append_integers::<Int32Type>(&leaf, column, out),
+        DataType::Int64 => append_integers::<Int64Type>(&leaf, column, out),
+        DataType::UInt8 => append_integers::<UInt8Type>(&leaf, column, out),
+        DataType::UInt16 => append_integers::<UInt16Type>(&leaf, column, out),
+        DataType::UInt32 => append_integers::<UInt32Type>(&leaf, column, out),
+        DataType::UInt64 => append_integers::<UInt64Type>(&leaf, column, out),
         DataType::Float16 => {
-            real(leaf.as_primitive::<Float16Type>().values().iter().map(|v| f64::from(*v)), column, out)
+            append_floats(leaf.as_primitive::<Float16Type>().values().iter().map(|v| f64::from(*v)), column, out)
         }
         DataType::Float32 => {
-            real(leaf.as_primitive::<Float32Type>().values().iter().map(|v| f64::from(*v)), column, out)
+            append_floats(leaf.as_primitive::<Float32Type>().values().iter().map(|v| f64::from(*v)), column, out)
         }
-        DataType::Float64 => real(leaf.as_primitive::<Float64Type>().values().iter().copied(), column, out),
+        DataType::Float64 => append_floats(leaf.as_primitive::<Float64Type>().values().iter().copied(), column, out),
         other => return Err(format!("it holds {other}, which is not numeric")),
     }
     Ok(())
@@ -63,37 +63,37 @@ pub fn append(array: &dyn Array, column: &ColumnSpec, out: &mut Vec<u8>) -> Resu
 
 /// Checks that all lists have the same length. Damaged files may declare invalid offsets.
 fn check_offsets(offsets: &[i32]) -> Result<(), String> {
-    let steady = offsets.windows(2).all(|pair| pair[1] - pair[0] == offsets[1] - offsets[0]);
-    if steady { Ok(()) } else { Err("its rows have different lengths".to_owned()) }
+    let equal = offsets.windows(2).all(|pair| pair[1] - pair[0] == offsets[1] - offsets[0]);
+    if equal { Ok(()) } else { Err("its rows have different lengths".to_owned()) }
 }
 
-fn whole<T: ArrowPrimitiveType>(leaf: &ArrayRef, column: &ColumnSpec, out: &mut Vec<u8>)
+fn append_integers<T: ArrowPrimitiveType>(leaf: &ArrayRef, column: &ColumnSpec, out: &mut Vec<u8>)
 where
     T::Native: ArrowNativeType + TryInto<i64>,
 {
     // Unsigned 64-bit values from 2^63 on are clamped.
     let values = leaf.as_primitive::<T>().values().iter().map(|&v| v.try_into().unwrap_or(i64::MAX));
-    put(values, column.dtype, out, |v| v, |v| v as f64);
+    append_values(values, column.dtype, out, |v| v, |v| v as f64);
 }
 
-fn real(values: impl Iterator<Item = f64>, column: &ColumnSpec, out: &mut Vec<u8>) {
-    put(values, column.dtype, out, |v| v as i64, |v| v);
+fn append_floats(values: impl Iterator<Item = f64>, column: &ColumnSpec, out: &mut Vec<u8>) {
+    append_values(values, column.dtype, out, |v| v as i64, |v| v);
 }
 
-fn put<V: Copy>(
+fn append_values<V: Copy>(
     values: impl Iterator<Item = V>,
     dtype: DType,
     out: &mut Vec<u8>,
-    whole: impl Fn(V) -> i64,
-    real: impl Fn(V) -> f64,
+    to_integer: impl Fn(V) -> i64,
+    to_float: impl Fn(V) -> f64,
 ) {
     match dtype {
-        DType::Bool => out.extend(values.map(|v| u8::from(real(v) != 0.0))),
-        DType::U8 => out.extend(values.map(|v| whole(v) as u8)),
-        DType::Int32 => values.for_each(|v| out.extend((whole(v) as i32).to_ne_bytes())),
-        DType::Int64 => values.for_each(|v| out.extend(whole(v).to_ne_bytes())),
-        DType::Float32 => values.for_each(|v| out.extend((real(v) as f32).to_ne_bytes())),
-        DType::Float64 => values.for_each(|v| out.extend(real(v).to_ne_bytes())),
+        DType::Bool => out.extend(values.map(|v| u8::from(to_float(v) != 0.0))),
+        DType::U8 => out.extend(values.map(|v| to_integer(v) as u8)),
+        DType::Int32 => values.for_each(|v| out.extend((to_integer(v) as i32).to_ne_bytes())),
+        DType::Int64 => values.for_each(|v| out.extend(to_integer(v).to_ne_bytes())),
+        DType::Float32 => values.for_each(|v| out.extend((to_float(v) as f32).to_ne_bytes())),
+        DType::Float64 => values.for_each(|v| out.extend(to_float(v).to_ne_bytes())),
     }
 }
 

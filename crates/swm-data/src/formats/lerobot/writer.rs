@@ -1,10 +1,10 @@
 //! Writes version 3.0. Finished episodes accumulate until the [`CommitPolicy`](crate::CommitPolicy) requires a commit.
-//! They then become one data file, one video per camera, and one file that describes the episodes. All files are
-//! written atomically; `meta/info.json`, the last, declares the number of episodes and thereby commits them.
+//! A commit writes one data file, one video per camera, and one file that describes the episodes, each atomically. It
+//! then replaces `meta/info.json`, which declares the number of committed episodes.
 
 use super::features::{FRAMES_PER_SECOND, new_info, stored_columns};
-use super::info::{DATA_PATH, EPISODES_PATH, Info, Recorded, VIDEO_PATH, damaged, fill};
-use super::reader::{LerobotReader, Stored};
+use super::info::{DATA_PATH, EPISODES_PATH, Info, VIDEO_PATH, WriterMetadata, damaged, fill};
+use super::reader::{LerobotReader, StoredConstant};
 use super::stats::{self, Stats};
 use super::table::{self, write_atomically};
 use super::{CONSTANTS, NO_TASK, TASK, values};
@@ -32,7 +32,7 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
 
 struct LerobotWriter {
     root: PathBuf,
-    /// Holds the lock of the folder against other writers.
+    /// The open folder. Its lock excludes other writers.
     _lock: std::fs::File,
     options: WriteOptions,
     encoding: Encoding,
@@ -120,7 +120,7 @@ impl LerobotWriter {
         episodes::check_appendable(&self.root.display(), &self.schema, old.schema())?;
         self.file = old.files_of_episodes.last().map_or(0, |files| files.file + 1);
         let manifest = self.options.manifest.clone().or(recorded.manifest);
-        self.info = Info { stable_worldmodel: Some(Recorded { manifest, ..recorded }), ..old.info };
+        self.info = Info { stable_worldmodel: Some(WriterMetadata { manifest, ..recorded }), ..old.info };
         let path = self.root.join("meta").join("stats.json");
         let read = |path: &Path| std::fs::read(path).map_err(|e| Error::io(path, "reading the statistics", e));
         if self.info.total_episodes > 0 {
@@ -141,7 +141,7 @@ impl LerobotWriter {
         self.remove_uncommitted()
     }
 
-    /// Removes files with higher indices than the committed ones.
+    /// Removes temporary files, and files with higher indices than the committed files.
     fn remove_uncommitted(&self) -> Result<()> {
         let mut folders = vec![self.root.clone()];
         while let Some(folder) = folders.pop() {
@@ -189,7 +189,7 @@ impl LerobotWriter {
                 if column.name == ACTION {
                     repeat_last(&mut stored[start..], column.row_bytes());
                 }
-                let values = read_values(column, &stored[start..]);
+                let values = as_f64(column, &stored[start..]);
                 stats.add(values.iter().copied(), rows);
                 return Ok(());
             }
@@ -205,9 +205,11 @@ impl LerobotWriter {
         })?;
         let text = |bytes: &Vec<u8>| String::from_utf8(bytes.clone()).ok();
         let task = constants.get(TASK).and_then(text).unwrap_or_else(|| NO_TASK.to_owned());
-        let as_json: BTreeMap<&String, Stored> = constants
+        let as_json: BTreeMap<&String, StoredConstant> = constants
             .iter()
-            .map(|(name, bytes)| (name, text(bytes).map_or_else(|| Stored::Bytes(bytes.clone()), Stored::Text)))
+            .map(|(name, bytes)| {
+                (name, text(bytes).map_or_else(|| StoredConstant::Bytes(bytes.clone()), StoredConstant::Text))
+            })
             .collect();
         let constants = serde_json::to_string(&as_json).map_err(|e| Error::external("describing an episode", e))?;
         if !self.tasks.contains(&task) {
@@ -243,7 +245,7 @@ impl LerobotWriter {
         self.describe()
     }
 
-    /// The rows of a group, with the features that LeRobot requires of every dataset.
+    /// The table of a group's rows, with the features that LeRobot requires of every dataset.
     fn data(&self, episodes: &[PendingEpisode], bytes: &[Vec<u8>]) -> Result<(Arc<ArrowSchema>, RecordBatch)> {
         let (mut fields, mut arrays): (Vec<Field>, Vec<ArrayRef>) = (vec![], vec![]);
         for ((index, native), bytes) in self.columns.iter().zip(bytes) {
@@ -255,24 +257,25 @@ impl LerobotWriter {
             }
         }
         let steps = || episodes.iter().flat_map(|episode| 0..episode.rows);
-        let numbered = || episodes.iter().enumerate().flat_map(|(e, episode)| std::iter::repeat_n(e, episode.rows));
+        let episodes_of_rows =
+            || episodes.iter().enumerate().flat_map(|(e, episode)| std::iter::repeat_n(e, episode.rows));
         let task = |e: usize| self.tasks.iter().position(|task| *task == episodes[e].task).unwrap_or(0) as i64;
         let times: arrow_array::Float32Array =
             steps().map(|step| (step as f64 / f64::from(FRAMES_PER_SECOND)) as f32).collect::<Vec<_>>().into();
         fields.push(Field::new("timestamp", DataType::Float32, false));
         arrays.push(Arc::new(times));
-        let mut whole = |name: &str, values: Vec<i64>| {
+        let mut add_integers = |name: &str, values: Vec<i64>| {
             fields.push(Field::new(name, DataType::Int64, false));
             arrays.push(Arc::new(Int64Array::from(values)));
         };
-        whole("frame_index", steps().map(|step| step as i64).collect());
-        whole("episode_index", numbered().map(|e| (self.info.total_episodes + e) as i64).collect());
-        whole("index", (0..steps().count()).map(|row| (self.info.total_frames + row) as i64).collect());
-        whole("task_index", numbered().map(task).collect());
+        add_integers("frame_index", steps().map(|step| step as i64).collect());
+        add_integers("episode_index", episodes_of_rows().map(|e| (self.info.total_episodes + e) as i64).collect());
+        add_integers("index", (0..steps().count()).map(|row| (self.info.total_frames + row) as i64).collect());
+        add_integers("task_index", episodes_of_rows().map(task).collect());
         record(fields, arrays)
     }
 
-    /// The descriptions of a group's episodes.
+    /// The table that describes a group's episodes.
     fn episodes(&self, episodes: &[PendingEpisode], indices: [usize; 2]) -> Result<(Arc<ArrowSchema>, RecordBatch)> {
         let (mut fields, mut arrays): (Vec<Field>, Vec<ArrayRef>) = (vec![], vec![]);
         let mut tasks = ListBuilder::new(StringBuilder::new());
@@ -288,25 +291,25 @@ impl LerobotWriter {
             })
             .collect();
         let starts: Vec<usize> = ends.iter().zip(episodes).map(|(end, episode)| end - episode.rows).collect();
-        let mut whole = |name: String, values: Vec<usize>| {
+        let mut add_integers = |name: String, values: Vec<usize>| {
             fields.push(Field::new(name, DataType::Int64, false));
             arrays.push(Arc::new(values.into_iter().map(|value| value as i64).collect::<Int64Array>()));
         };
-        let same = |value: usize| vec![value; episodes.len()];
+        let repeated = |value: usize| vec![value; episodes.len()];
         let [chunk, file] = indices;
-        whole("episode_index".to_owned(), (0..episodes.len()).map(|e| self.info.total_episodes + e).collect());
-        whole("length".to_owned(), episodes.iter().map(|episode| episode.rows).collect());
+        add_integers("episode_index".to_owned(), (0..episodes.len()).map(|e| self.info.total_episodes + e).collect());
+        add_integers("length".to_owned(), episodes.iter().map(|episode| episode.rows).collect());
         for folder in ["data", "meta/episodes"] {
-            whole(format!("{folder}/chunk_index"), same(chunk));
-            whole(format!("{folder}/file_index"), same(file));
+            add_integers(format!("{folder}/chunk_index"), repeated(chunk));
+            add_integers(format!("{folder}/file_index"), repeated(file));
         }
         let before = self.info.total_frames;
-        whole("dataset_from_index".to_owned(), starts.iter().map(|row| before + row).collect());
-        whole("dataset_to_index".to_owned(), ends.iter().map(|row| before + row).collect());
+        add_integers("dataset_from_index".to_owned(), starts.iter().map(|row| before + row).collect());
+        add_integers("dataset_to_index".to_owned(), ends.iter().map(|row| before + row).collect());
         let cameras: Vec<&str> = self.info.video_keys();
         for camera in &cameras {
-            whole(format!("videos/{camera}/chunk_index"), same(chunk));
-            whole(format!("videos/{camera}/file_index"), same(file));
+            add_integers(format!("videos/{camera}/chunk_index"), repeated(chunk));
+            add_integers(format!("videos/{camera}/file_index"), repeated(file));
         }
         for camera in &cameras {
             for (name, rows) in [("from_timestamp", &starts), ("to_timestamp", &ends)] {
@@ -321,7 +324,7 @@ impl LerobotWriter {
         record(fields, arrays)
     }
 
-    /// Writes the files that describe the whole dataset. Writing `meta/info.json`, the last, commits the episodes.
+    /// Writes the files that describe the dataset. Writing the last file, `meta/info.json`, commits the episodes.
     fn describe(&mut self) -> Result<()> {
         let meta = self.root.join("meta");
         if self.info.total_episodes > 0 {
@@ -425,16 +428,16 @@ fn record(fields: Vec<Field>, arrays: Vec<ArrayRef>) -> Result<(Arc<ArrowSchema>
 }
 
 /// Copies the previous action into the last row, which has no action. Writes 0 if there is no previous row.
-fn repeat_last(bytes: &mut [u8], row: usize) {
-    let last = bytes.len() - row;
-    match last.checked_sub(row) {
+fn repeat_last(bytes: &mut [u8], row_size: usize) {
+    let last = bytes.len() - row_size;
+    match last.checked_sub(row_size) {
         Some(before) => bytes.copy_within(before..last, last),
         None => bytes.fill(0),
     }
 }
 
-/// The values of a column.
-fn read_values(column: &ColumnSpec, bytes: &[u8]) -> Vec<f64> {
+/// Converts the bytes of a column to `f64` values.
+fn as_f64(column: &ColumnSpec, bytes: &[u8]) -> Vec<f64> {
     match column.dtype {
         DType::Bool | DType::U8 => bytes.iter().map(|&v| f64::from(v)).collect(),
         DType::Int32 => bytes.as_chunks().0.iter().map(|&b| f64::from(i32::from_ne_bytes(b))).collect(),

@@ -6,12 +6,13 @@
 //!   pixels/ep_0.mp4, …                          H.264, one frame per row
 //! ```
 //!
-//! This is the layout of the reference's `VideoDataset`; each opens the other's datasets. Frames are addressed by their
-//! presentation index. Decoding a frame requires decoding from the preceding key frame, so videos written here have a
-//! key frame every few frames; those of the reference have one every 250.
+//! This is the layout of the reference's `VideoDataset`. The reference opens datasets written here, and this format
+//! opens datasets written by the reference. Frames are addressed by their presentation index. Decoding a frame requires
+//! decoding from the preceding key frame, so videos written here have a key frame every few frames; videos written by
+//! the reference have one every 250 frames.
 //!
 //! [`ImageCodec`](swm_image::ImageCodec) determines the encoding. A lossless codec becomes lossless H.264 in RGB
-//! (profile High 4:4:4 Predictive, which FFmpeg, and thus decord, PyAV and torchcodec, decode, but few browsers play).
+//! (profile High 4:4:4 Predictive). FFmpeg, decord, PyAV and torchcodec decode this profile, but few browsers play it.
 //! JPEG with quality `q` becomes H.264 4:2:0 with the constant rate factor 8 + 2 (100 − `q`).
 //!
 //! The videos of an episode are written before its numeric columns are committed, each to a temporary file that is then
@@ -52,7 +53,7 @@ fn detect(location: &Location) -> bool {
     ENTRY.has_suffix(location)
 }
 
-/// The video of an episode.
+/// Path of the video of an episode.
 #[cfg(feature = "ffmpeg")]
 fn video_path(folder: &Path, column: &str, episode: usize) -> PathBuf {
     folder.join(column).join(format!("ep_{episode}.mp4"))

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use swm_core::{ColumnSpec, Error, Manifest, Result, Schema};
 use swm_video::{Source, VideoCache};
 
-/// Opens a folder of videos.
+/// Opens a dataset of the format `video`.
 pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
     Ok(Arc::new(VideoReader::open(location.local("video")?)?))
 }
@@ -107,7 +107,7 @@ impl Reader for VideoReader {
     }
 }
 
-/// The image columns of a third-party folder: its subfolders, by name. The first video of a subfolder determines the
+/// The image columns of a third-party folder: one column per subfolder. The first video of a subfolder determines the
 /// frame size.
 fn infer_image_columns(files: &ColumnFiles) -> Result<Vec<ColumnSpec>> {
     let folder = files.folder();

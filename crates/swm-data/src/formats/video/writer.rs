@@ -1,4 +1,4 @@
-//! Writes the videos of an episode first, then its numeric columns, which commit it.
+//! Writes the videos of an episode, then its numeric columns. Committing the numeric columns commits the episode.
 
 use super::reader::VideoReader;
 use super::video_path;
@@ -11,10 +11,10 @@ use std::path::Path;
 use swm_core::{Batch, Error, Result, Schema};
 use swm_video::{Encoding, encode};
 
-/// Frames per second in players; the reference's default.
+/// Frame rate of written videos, in frames per second: the reference's default.
 const FPS: u32 = 25;
 
-/// Creates, continues or replaces a folder of videos.
+/// Creates, continues or replaces a dataset of the format `video`.
 pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
     let folder = location.local("video")?;
     options.codec.check()?;

@@ -6,7 +6,7 @@ use serde::Serialize;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{Batch, ColumnSpec, DType, Schema};
 
-/// The columns that are compared, with their indices: all except index columns.
+/// The columns of a schema except index columns, with their indices.
 pub(super) fn data_columns(schema: &Schema) -> impl Iterator<Item = (usize, &ColumnSpec)> {
     schema.columns().iter().enumerate().filter(|(_, column)| column.name != EPISODE_IDX && column.name != STEP_IDX)
 }
@@ -18,9 +18,9 @@ pub struct ColumnComparison {
     pub column: String,
     /// Whether all bytes are equal.
     pub exact: bool,
-    /// The largest difference of two values.
+    /// The largest absolute difference between a value of the source and the value of the target.
     pub max_error: f64,
-    /// Peak signal-to-noise ratio of images in decibels, if they differ.
+    /// Peak signal-to-noise ratio of images in decibels, if the images differ.
     pub psnr: Option<f64>,
     /// Sum of squared differences.
     #[serde(skip)]
@@ -74,7 +74,7 @@ impl ColumnComparison {
     }
 }
 
-/// A value of a column as `f64`.
+/// Converts the bytes of a value to `f64`.
 fn scalar(dtype: DType, bytes: &[u8]) -> f64 {
     match dtype {
         DType::Bool | DType::U8 => f64::from(bytes[0]),
@@ -85,9 +85,9 @@ fn scalar(dtype: DType, bytes: &[u8]) -> f64 {
     }
 }
 
-/// The hash of an episode, combined from hashes of its rows that are computed in parallel.
+/// The hash of an episode, combined from hashes of groups of its rows, which are computed in parallel.
 pub(super) fn episode_hash(rows: &Batch) -> [u8; 32] {
-    /// Bytes per task; small rows are grouped.
+    /// Approximate size of a group of rows in bytes.
     const PIECE: usize = 128 << 10;
     let mut hasher = blake3::Hasher::new();
     for (i, column) in data_columns(rows.schema()) {
@@ -106,8 +106,8 @@ pub(super) fn dataset_hash(schema: &Schema, hashes: &[[u8; 32]]) -> String {
     let mut hasher = blake3::Hasher::new();
     let columns: Vec<ColumnSpec> = data_columns(schema).map(|(_, column)| column.clone()).collect();
     hasher.update(describe_columns(&columns).as_bytes());
-    hashes.iter().for_each(|sum| {
-        hasher.update(sum);
+    hashes.iter().for_each(|hash| {
+        hasher.update(hash);
     });
     hasher.finalize().to_hex().to_string()
 }

@@ -1,7 +1,7 @@
 //! Converts datasets between formats: resumes interrupted conversions, and verifies the result against the source.
 //!
-//! The verification compares decoded content: images as pixels, other columns as values. A lossless target must
-//! reproduce every byte; a lossy one every numeric value, and images with a minimum peak signal-to-noise ratio.
+//! The verification compares decoded content. Values of the target must equal the values of the source, except for
+//! rounding to single precision. Images must reach a minimum peak signal-to-noise ratio.
 
 mod comparison;
 
@@ -27,10 +27,10 @@ const UNIT: &str = "episodes";
 /// The treatment of an existing target.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ConvertMode {
-    /// Continues the target after its last episode, if its content is the beginning of the source.
+    /// Continues the target after its last episode, if the target's content is the beginning of the source.
     #[default]
     Resume,
-    /// Returns an error.
+    /// Fails if the target exists.
     Create,
     /// Replaces the target.
     Overwrite,
@@ -45,13 +45,13 @@ pub struct ConvertOptions {
     pub format: Option<String>,
     /// The treatment of an existing target.
     pub mode: ConvertMode,
-    /// How the target encodes images, if its format supports several codecs.
+    /// The image codec of the target, if the target's format supports several codecs.
     pub codec: ImageCodec,
     /// Whether the target is read back and compared with the source.
     pub verify: bool,
     /// Minimum peak signal-to-noise ratio of an image column, in decibels.
     pub least_psnr: f64,
-    /// When written episodes are committed. A killed conversion rewrites uncommitted episodes.
+    /// The conditions for committing written episodes. A killed conversion rewrites uncommitted episodes.
     pub commit: CommitPolicy,
 }
 
@@ -78,7 +78,7 @@ pub struct Converted {
     pub existing: usize,
     /// Number of written rows.
     pub rows: usize,
-    /// Number of episodes whose last row had an action. It was omitted, because no observation follows it.
+    /// Number of episodes whose last row had an action. This action was omitted, because no observation follows it.
     pub last_actions: usize,
     /// The [`checksum`] of the compared episodes of the source; `None` without verification.
     pub checksum: Option<String>,
@@ -102,7 +102,7 @@ pub fn checksum(reader: &dyn Reader) -> Result<String> {
     Ok(dataset_hash(&source.schema, &hashes))
 }
 
-/// Writes a dataset to another location. If the run is stopped, another call continues it.
+/// Writes a dataset to another location. If the run is stopped, another call continues the conversion.
 ///
 /// # Errors
 /// If the source is damaged, the target cannot be written or differs from the source, or the run is stopped
@@ -208,12 +208,12 @@ struct Source<'a> {
     schema: Schema,
 }
 
-/// An episode on the way to the writer.
+/// An episode that the reading thread sends to the writer.
 struct SourceEpisode {
     rows: Batch,
     constants: Constants,
     hash: Option<[u8; 32]>,
-    /// Whether its last action was omitted.
+    /// Whether the action of the last row was omitted.
     cut: bool,
 }
 
@@ -222,15 +222,15 @@ impl<'a> Source<'a> {
         Self { reader, schema: reader.schema().clone() }
     }
 
-    /// Reads an episode and removes its last action. Returns whether there was one.
+    /// Reads an episode and removes the action of the last row. Returns whether the last row had an action.
     fn read(&self, episode: usize, rows: &mut Batch) -> Result<bool> {
         let length = self.reader.episodes()[episode].length;
         read(self.reader, &self.schema, episode, length, rows)?;
         Ok(cut_last_action(rows))
     }
 
-    /// Copies episodes while a thread reads ahead of the writer. Stores their hashes in `hashes`, if given.
-    #[allow(clippy::too_many_arguments, reason = "a part of `convert`, which has all of these")]
+    /// Copies episodes while a thread reads ahead of the writer. Stores the episode hashes in `hashes`, if given.
+    #[allow(clippy::too_many_arguments, reason = "a part of `convert` that uses the state of `convert`")]
     fn copy(
         &self,
         target: &Location,
@@ -273,7 +273,7 @@ impl<'a> Source<'a> {
         Ok(())
     }
 
-    /// Reads episodes and sends them, until the receiver is gone.
+    /// Reads episodes into the batches from `empty`, or into new batches, and sends them to the writer.
     fn send(
         &self,
         episodes: Range<usize>,
@@ -295,8 +295,9 @@ impl<'a> Source<'a> {
         }
     }
 
-    /// Compares episodes with those of `copy`, whose positions are higher by `base`, and stores the episodes' hashes.
-    #[allow(clippy::too_many_arguments, reason = "a part of `convert`, which has all of these")]
+    /// Compares episodes of the source with episodes of `copy`, whose positions are higher by `base`. Stores the hashes
+    /// of the episodes of the source.
+    #[allow(clippy::too_many_arguments, reason = "a part of `convert` that uses the state of `convert`")]
     fn compare(
         &self,
         stage: &'static str,
@@ -341,7 +342,7 @@ impl<'a> Source<'a> {
                 return Err(Error::mismatch(
                     format!("constants of episode {episode}"),
                     "different values",
-                    "those of the source",
+                    "the values of the source",
                 ));
             }
             advance(control, stage, done + 1, total)?;
@@ -356,7 +357,7 @@ fn start(control: &mut Control<'_>, name: &'static str, total: usize) {
     control.emit(Event::Started(Stage { name, subject: &[], total, unit: UNIT }));
 }
 
-/// Reports progress. Fails if the run is to stop.
+/// Reports progress. Fails if the run is interrupted.
 fn advance(control: &mut Control<'_>, stage: &'static str, done: usize, total: usize) -> Result<()> {
     control.progress(Progress { stage, done, total, unit: UNIT, metrics: &[] });
     control.check()
@@ -384,8 +385,8 @@ fn read(reader: &dyn Reader, schema: &Schema, episode: usize, length: usize, row
     Ok(())
 }
 
-/// Removes the action of the last row, which no observation follows. Returns whether there was one, as in some
-/// third-party datasets.
+/// Removes the action of the last row, which no observation follows. Returns whether the last row had an action, as in
+/// some third-party datasets.
 fn cut_last_action(rows: &mut Batch) -> bool {
     let Some(index) = rows.schema().find(ACTION) else { return false };
     let Some(last) = rows.rows().checked_sub(1) else { return false };

@@ -1,5 +1,5 @@
-//! Examines a dataset for defects, and reports the models that it can train. A repair writes the intact episodes to a
-//! new dataset.
+//! Examines a dataset for defects, and reports the models that the dataset can train. A repair writes the intact
+//! episodes to a new dataset.
 //!
 //! The examination reads every row of every column as training does, so a loader reads an intact dataset without
 //! errors. Defects that only the format can detect come from [`Reader::irregularities`].
@@ -53,7 +53,7 @@ pub struct Diagnosis {
     /// Positions of the episodes without a problem.
     #[serde(rename = "sound")]
     pub intact: Vec<usize>,
-    /// For each model, whether the intact episodes can train it.
+    /// For each model, the comparison of the model's requirements with the intact episodes.
     pub models: Vec<ModelFit>,
 }
 
@@ -70,10 +70,10 @@ impl Diagnosis {
     }
 }
 
-/// Opens a dataset, or the readable part of a damaged one with descriptions of the losses.
+/// Opens a dataset. Of a damaged dataset, opens the readable part and describes the losses.
 ///
 /// # Errors
-/// If no part of it can be opened.
+/// If no part of the dataset can be opened.
 pub fn open_damaged(location: &Location) -> Result<(Arc<dyn Reader>, Vec<String>)> {
     open(location).map(|reader| (reader, vec![])).or_else(|error| {
         if !(lance::ENTRY.detect)(location) {
@@ -95,7 +95,9 @@ pub fn examine(reader: &dyn Reader, models: &[DatasetRequirements], control: &mu
     control.emit(Event::Started(Stage { name: stage, subject: &[], total, unit }));
     let mut found = Findings::default();
     match reader.irregularities() {
-        Ok(irregularities) => irregularities.into_iter().for_each(|it| found.problem(it.episode, it.what)),
+        Ok(irregularities) => {
+            irregularities.into_iter().for_each(|irregularity| found.problem(irregularity.episode, irregularity.what))
+        }
         Err(error) => found.problem(None, error.to_string()),
     }
     let episodes = reader.episodes();
@@ -111,7 +113,7 @@ pub fn examine(reader: &dyn Reader, models: &[DatasetRequirements], control: &mu
     let mut intact = vec![];
     for (position, episode) in episodes.iter().enumerate() {
         if !indices.insert(episode.index) {
-            found.problem(Some(position), format!("the index {} is also that of another episode", episode.index));
+            found.problem(Some(position), format!("the index {} is also the index of another episode", episode.index));
         }
         match episode.length {
             0 => found.problem(Some(position), "it has no rows".to_owned()),

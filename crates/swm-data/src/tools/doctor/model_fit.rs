@@ -5,13 +5,13 @@ use swm_core::columns::{ACTION, PIXELS, REWARD, STATE};
 use swm_core::requirements::{DatasetRequirements, RequiredObservations};
 use swm_core::{ColumnSpec, DType, Schema};
 
-/// The observation of environments that do not name their columns.
+/// The observation column of environments with a single, unnamed observation.
 const OBSERVATION: &str = "observation";
 
-/// Whether a dataset can train a model.
+/// The result of comparing a dataset with the requirements of a model.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct ModelFit {
-    /// The model.
+    /// Name of the model.
     pub model: &'static str,
     /// The unmet requirements; empty if the dataset can train the model.
     pub missing: Vec<String>,
@@ -20,7 +20,7 @@ pub struct ModelFit {
 }
 
 impl ModelFit {
-    /// Compares a dataset with these columns, and with episodes of these lengths in rows, with the requirements.
+    /// Compares requirements with a dataset that has the columns of `schema` and episodes of `lengths` rows.
     pub fn new(required: &DatasetRequirements, schema: &Schema, lengths: &[usize]) -> Self {
         let mut missing = vec![];
         let images = schema.column(PIXELS).is_ok_and(ColumnSpec::is_image);
@@ -82,7 +82,7 @@ mod tests {
         let action = |dtype| ColumnSpec::new(ACTION, dtype, [2]);
         let reward = ColumnSpec::new(REWARD, DType::Float32, []);
         let missing = |columns: &[ColumnSpec], lengths: &[usize]| -> Vec<usize> {
-            let schema = Schema::new(columns.to_vec()).expect("schema");
+            let schema = Schema::new(columns.to_vec()).expect("a valid schema");
             [world_model, from_rewards]
                 .iter()
                 .map(|required| ModelFit::new(required, &schema, lengths).missing.len())
@@ -94,7 +94,7 @@ mod tests {
         let states = [ColumnSpec::new(STATE, DType::Float64, [4]), action(DType::Float32), reward.clone()];
         assert_eq!(missing(&states, &[30]), [1, 0]);
         assert_eq!(missing(&[pixels, action(DType::Int64), reward], &[30]), [1, 1]);
-        let schema = Schema::new(states.to_vec()).expect("schema");
+        let schema = Schema::new(states.to_vec()).expect("a valid schema");
         assert_eq!(ModelFit::new(&world_model, &schema, &[30]).missing, ["there are no images ('pixels')"]);
     }
 }

@@ -3,7 +3,7 @@
 /// Width and height of a letter in points.
 const SIZE: (usize, usize) = (3, 5);
 
-/// The rows of a letter from the top; bits from the left.
+/// The rows of a letter from top to bottom. Bit 2 of a row is the left point, bit 0 the right point.
 fn glyph(letter: char) -> [u8; 5] {
     match letter.to_ascii_lowercase() {
         '0' => [7, 5, 5, 5, 7],
@@ -51,7 +51,7 @@ fn glyph(letter: char) -> [u8; 5] {
     }
 }
 
-/// Height of a line of text in pixels. A point has `scale` pixels.
+/// Height of a line of text in pixels. A point is a square with side `scale`.
 pub(super) const fn height(scale: usize) -> usize {
     (SIZE.1 + 2) * scale
 }
@@ -61,18 +61,25 @@ pub(super) fn width(text: &str, scale: usize) -> usize {
     (text.chars().count() * (SIZE.0 + 1) + 1) * scale
 }
 
-/// Draws white text on an image that is `wide` pixels wide, with its upper left corner at `(left, top)`. Letters beyond
-/// `right` are omitted.
-pub(super) fn draw(rgb: &mut [u8], wide: usize, (left, top): (usize, usize), right: usize, scale: usize, text: &str) {
+/// Draws white text on an image `[height, image_width, 3]`, with the upper left corner of the text at `(left, top)`.
+/// Letters beyond `right` are omitted.
+pub(super) fn draw(
+    rgb: &mut [u8],
+    image_width: usize,
+    (left, top): (usize, usize),
+    right: usize,
+    scale: usize,
+    text: &str,
+) {
     for (i, letter) in text.chars().enumerate() {
         let (x, y) = (left + (i * (SIZE.0 + 1) + 1) * scale, top + scale);
-        if x + SIZE.0 * scale > right.min(wide) {
+        if x + SIZE.0 * scale > right.min(image_width) {
             return;
         }
         for (row, bits) in glyph(letter).into_iter().enumerate() {
             for point in (0..SIZE.0).filter(|point| bits >> (SIZE.0 - 1 - point) & 1 == 1) {
                 for line in 0..scale {
-                    let at = ((y + row * scale + line) * wide + x + point * scale) * 3;
+                    let at = ((y + row * scale + line) * image_width + x + point * scale) * 3;
                     rgb[at..at + scale * 3].fill(255);
                 }
             }

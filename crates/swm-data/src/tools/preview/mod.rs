@@ -1,5 +1,5 @@
-//! Previews of datasets: videos of sampled episodes and a contact sheet of them, with all cameras side by side and
-//! labelled; and functions to write such videos and sheets.
+//! Previews of datasets: one video per selected episode, and a contact sheet of all selected episodes. Every frame
+//! shows the labelled images of all cameras side by side.
 
 mod label;
 mod sheet;
@@ -17,11 +17,11 @@ use swm_image::write_png;
 /// Settings of a preview.
 #[derive(Clone, Debug)]
 pub struct PreviewOptions {
-    /// Number of episodes, spread over the dataset.
+    /// Number of episodes, which are spread evenly over the dataset.
     pub episodes: usize,
     /// The image columns to show; all if empty.
     pub columns: Vec<String>,
-    /// Frames per second.
+    /// Frame rate of the videos, in frames per second.
     pub fps: u32,
 }
 
@@ -31,43 +31,43 @@ impl Default for PreviewOptions {
     }
 }
 
-/// Frames of an episode on the contact sheet.
+/// Number of frames per episode on the contact sheet.
 const SHEET_COLUMNS: usize = 8;
 
 /// Target side of enlarged images, in pixels.
 const ENLARGED_SIDE: usize = 256;
 
-/// Rows decoded at once, which bounds the memory.
+/// Number of rows decoded at once, which limits the memory.
 const ROWS: usize = 32;
 
-/// Writes `episode_N.mp4` for some episodes and `contact_sheet.png` of all of them into a folder, and returns the
-/// paths. Calls `progress` with the number of finished episodes.
+/// Writes `episode_N.mp4` for each selected episode and one `contact_sheet.png` into a folder. Returns the paths. Calls
+/// `progress` with the number of finished episodes.
 ///
 /// # Errors
-/// If the dataset has no images or no such column, is damaged, or the folder cannot be written.
+/// If the dataset has no images, lacks one of the columns or is damaged, or the folder cannot be written.
 pub fn preview(
     reader: &dyn Reader,
     folder: &Path,
     options: &PreviewOptions,
     mut progress: impl FnMut(usize),
 ) -> Result<Vec<PathBuf>> {
-    let strip = Strip::new(reader, &options.columns)?;
+    let layout = FrameLayout::new(reader, &options.columns)?;
     std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, "creating the folder", e))?;
     let chosen = chosen(reader, options.episodes)?;
     let (mut written, mut sheet) = (vec![], vec![]);
-    let scale = integer_scale(strip.width, strip.height, ENLARGED_SIDE);
+    let scale = integer_scale(layout.width, layout.height, ENLARGED_SIDE);
     for (done, &episode) in chosen.iter().enumerate() {
         let index = reader.episodes()[episode].index;
         let path = folder.join(format!("episode_{index}.mp4"));
         let length = reader.episodes()[episode].length;
         let last = length - 1;
-        let mut video = VideoFile::begin(&path, strip.width, strip.height, options.fps, scale)?;
+        let mut video = VideoFile::begin(&path, layout.width, layout.height, options.fps, scale)?;
         let on_sheet: Vec<usize> = (0..SHEET_COLUMNS).map(|i| i * last / (SHEET_COLUMNS - 1)).collect();
         for start in (0..length).step_by(ROWS) {
             let rows = ROWS.min(length - start);
-            let batch = reader.read(&strip.names(), &[StepRange::new(episode, start, rows)])?;
+            let batch = reader.read(&layout.names(), &[StepRange::new(episode, start, rows)])?;
             for row in 0..rows {
-                let image = strip.draw(&batch, row, &format!("episode {index} step {}", start + row));
+                let image = layout.draw(&batch, row, &format!("episode {index} step {}", start + row));
                 video.add(&image)?;
                 // Short episodes repeat frames on the sheet.
                 let times = on_sheet.iter().filter(|&&step| step == start + row).count();
@@ -78,7 +78,7 @@ pub fn preview(
         written.push(path);
         progress(done + 1);
     }
-    let image = contact_sheet(strip.width, strip.height, &sheet, SHEET_COLUMNS, 1)?;
+    let image = contact_sheet(layout.width, layout.height, &sheet, SHEET_COLUMNS, 1)?;
     let path = folder.join("contact_sheet.png");
     write_png(&path, image.width, image.height, &image.rgb)?;
     written.push(path);
@@ -95,19 +95,19 @@ fn chosen(reader: &dyn Reader, count: usize) -> Result<Vec<usize>> {
     Ok((0..count).map(|i| all[i * all.len() / count]).collect())
 }
 
-/// Layout of a row: cameras side by side below their labels.
-struct Strip {
+/// Layout of a preview frame: the images of all cameras side by side below their labels.
+struct FrameLayout {
     cameras: Vec<ColumnSpec>,
     width: usize,
     height: usize,
-    /// Size of a letter's point in pixels.
+    /// Side of a letter's point in pixels.
     point: usize,
 }
 
 /// Pixels between two cameras.
 const GAP: usize = 2;
 
-impl Strip {
+impl FrameLayout {
     fn new(reader: &dyn Reader, names: &[String]) -> Result<Self> {
         let schema = reader.schema();
         let cameras: Vec<ColumnSpec> = if names.is_empty() {

@@ -5,14 +5,14 @@ use swm_image::RgbImage;
 
 /// Pixels between and around the frames of a contact sheet.
 const GAP: usize = 2;
-/// Grey level between frames; environments are drawn on white or black.
+/// Grey level between frames. It differs from the white or black background of frames.
 const BACKGROUND: u8 = 128;
 
 /// Arranges `frames` (each `[height, width, 3]` RGB bytes) in a grid with `columns` columns, in reading order. Every
 /// pixel becomes a square with side `scale`.
 ///
 /// # Errors
-/// If there is no frame, a frame has another size, or `columns`, `scale` or a side is 0.
+/// If there is no frame, a frame does not have the given size, or `columns`, `scale` or a side is 0.
 pub fn contact_sheet<F: AsRef<[u8]>>(
     width: usize,
     height: usize,
@@ -24,7 +24,7 @@ pub fn contact_sheet<F: AsRef<[u8]>>(
         return Err(Error::config(
             "contact sheet",
             format!("{} frames of {width} x {height} pixels in {columns} columns, scaled by {scale}", frames.len()),
-            "give each of them at least 1",
+            "give at least one frame, and make each size at least 1",
         ));
     }
     let columns = columns.min(frames.len());
@@ -62,14 +62,14 @@ mod tests {
     #[test]
     fn frames_are_laid_out_in_reading_order() {
         let frames: Vec<Vec<u8>> = (1..=3).map(|v| vec![v; 2 * 3]).collect();
-        let sheet = contact_sheet(2, 1, &frames, 2, 3).expect("sheet");
+        let sheet = contact_sheet(2, 1, &frames, 2, 3).expect("a contact sheet");
         assert_eq!((sheet.width, sheet.height), (GAP + 2 * (6 + GAP), GAP + 2 * (3 + GAP)));
         let at = |x: usize, y: usize| sheet.rgb[(y * sheet.width + x) * 3];
         assert_eq!([at(0, 0), at(2, 2), at(7, 4), at(8, 4), at(10, 2)], [BACKGROUND, 1, 1, BACKGROUND, 2]);
         assert_eq!([at(2, 5), at(2, 7), at(10, 7)], [BACKGROUND, 3, BACKGROUND]);
         // Fewer frames than columns leave no empty cells.
-        assert_eq!(contact_sheet(2, 1, &frames[..1], 8, 1).expect("sheet").width, 2 + 2 * GAP);
-        let wrong = contact_sheet(2, 2, &frames, 2, 1).expect_err("too small").to_string();
+        assert_eq!(contact_sheet(2, 1, &frames[..1], 8, 1).expect("a contact sheet").width, 2 + 2 * GAP);
+        let wrong = contact_sheet(2, 2, &frames, 2, 1).expect_err("frames of another size").to_string();
         assert!(wrong.contains("frame 0") && wrong.contains("12"), "{wrong}");
         assert!(contact_sheet::<Vec<u8>>(2, 2, &[], 2, 1).is_err());
     }

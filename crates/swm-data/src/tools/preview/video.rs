@@ -5,12 +5,12 @@ use std::path::{Path, PathBuf};
 use swm_core::{Error, Result};
 
 /// Writes `frames` (each `[height, width, 3]` RGB bytes) as an MP4 that browsers play. Odd sizes get an additional
-/// black row or column, because H.264 halves the colour planes. The file is written atomically. Equal frames give equal
+/// black row or column, because H.264 halves the chroma planes. The file is written atomically. Equal frames give equal
 /// bytes with the same FFmpeg version.
 ///
 /// # Errors
-/// If this build lacks the feature `ffmpeg`, FFmpeg has no H.264 encoder, a frame has another size, there is no frame,
-/// or writing fails.
+/// If this build lacks the feature `ffmpeg`, FFmpeg has no H.264 encoder, a frame does not have the given size, there
+/// is no frame, or writing fails.
 pub fn write_mp4<I>(path: &Path, width: usize, height: usize, fps: u32, frames: I) -> Result<()>
 where
     I: IntoIterator,
@@ -19,11 +19,11 @@ where
     write_mp4_scaled(path, width, height, fps, 1, frames)
 }
 
-/// As [`write_mp4`], with every pixel enlarged to a square with side `scale`, so that small frames are visible and stay
-/// sharp.
+/// Writes a video as [`write_mp4`] does, with every pixel enlarged to a square with side `scale`, so that small frames
+/// are visible and stay sharp.
 ///
 /// # Errors
-/// As [`write_mp4`], and if `scale` is 0.
+/// See [`write_mp4`]. `scale` must not be 0.
 pub fn write_mp4_scaled<I>(path: &Path, width: usize, height: usize, fps: u32, scale: usize, frames: I) -> Result<()>
 where
     I: IntoIterator,
@@ -60,7 +60,7 @@ impl VideoFile {
             return Err(Error::config(
                 format!("video {}", path.display()),
                 format!("{width} x {height} pixels at {fps} frames a second, scaled by {scale}"),
-                "give each of them at least 1",
+                "make each value at least 1",
             ));
         }
         let (wide, high) = even(width, height, scale);
@@ -108,7 +108,7 @@ impl VideoFile {
             let problem = format!("'{}' names no file", self.path.display());
             return Err(Error::config("video path", problem, "end it in .mp4"));
         };
-        // The process id separates processes that write the same video.
+        // With the process id in the name, processes that write the same video use different temporary files.
         let mut hidden = OsString::from(".");
         hidden.push(name);
         hidden.push(format!(".{}.partial", std::process::id()));
@@ -122,12 +122,12 @@ impl VideoFile {
     }
 }
 
-/// The size of the video: enlarged, then made even.
+/// The size of the video in pixels: the enlarged size, rounded up to even sides.
 fn even(width: usize, height: usize, scale: usize) -> (usize, usize) {
     ((width * scale).next_multiple_of(2), (height * scale).next_multiple_of(2))
 }
 
-/// Starts the encoder of a video for viewing.
+/// Creates the encoder of a video for viewing.
 #[cfg(feature = "ffmpeg")]
 fn begin(width: usize, height: usize, fps: u32) -> Result<encoder::Encoder> {
     encoder::Encoder::new(width, height, fps, swm_video::Encoding::viewing())
@@ -175,7 +175,7 @@ mod tests {
     }
 
     fn names(folder: &Path) -> Vec<OsString> {
-        std::fs::read_dir(folder).expect("folder").map(|entry| entry.expect("entry").file_name()).collect()
+        std::fs::read_dir(folder).expect("listing the folder").map(|entry| entry.expect("entry").file_name()).collect()
     }
 
     #[test]
@@ -185,8 +185,8 @@ mod tests {
         let twice = |width, height| {
             let frames = frames(width, height, 12);
             [&a, &b].map(|path| {
-                write_mp4(path, width, height, 10, &frames).expect("video");
-                std::fs::read(path).expect("video")
+                write_mp4(path, width, height, 10, &frames).expect("writing a video");
+                std::fs::read(path).expect("reading a video")
             })
         };
         for (width, height) in [(48, 48), (64, 64), (31, 18)] {
@@ -194,13 +194,15 @@ mod tests {
             assert!(first == second, "{width} x {height}");
         }
         let frames = frames(31, 18, 12);
-        let open = |path: &Path| Video::open(Source::File(path.to_owned())).expect("opens");
+        let open = |path: &Path| Video::open(Source::File(path.to_owned())).expect("opening a video");
         assert_eq!((open(&a).size(), open(&a).frames()), ((18, 32), 12));
-        write_mp4_scaled(&b, 31, 18, 10, 4, frames.iter().map(Vec::as_slice)).expect("video");
+        write_mp4_scaled(&b, 31, 18, 10, 4, frames.iter().map(Vec::as_slice)).expect("writing a video");
         let video = open(&b);
         assert_eq!((video.size(), video.frames()), ((72, 124), 12));
         let mut out = vec![0; 72 * 124 * 3];
-        DecoderPool::default().read(vec![FrameRequest { video: &video, frame: 5, out: &mut out }]).expect("decodes");
+        DecoderPool::default()
+            .read(vec![FrameRequest { video: &video, frame: 5, out: &mut out }])
+            .expect("decoding a frame");
         let off: f64 = (0..72 * 124)
             .map(|i| f64::from(out[i * 3].abs_diff(frames[5][(i / 124 / 4 * 31 + i % 124 / 4) * 3])))
             .sum();
@@ -213,7 +215,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("folder");
         let path = folder.path().join("a.mp4");
         let message = |scale, frames: &[Vec<u8>]| {
-            write_mp4_scaled(&path, 4, 4, 10, scale, frames).expect_err("fails").to_string()
+            write_mp4_scaled(&path, 4, 4, 10, scale, frames).expect_err("a failed write").to_string()
         };
         let good = frames(4, 4, 3);
         assert!(message(0, &good).contains("scaled by 0"));
@@ -221,7 +223,7 @@ mod tests {
         assert!(found.contains("frame 1") && found.contains("5 bytes") && found.contains("48"), "{found}");
         assert!(message(1, &[]).contains("no frame"));
         let missing = folder.path().join("missing").join("a.mp4");
-        let error = write_mp4(&missing, 4, 4, 10, good).expect_err("fails").to_string();
+        let error = write_mp4(&missing, 4, 4, 10, good).expect_err("a failed write").to_string();
         assert!(error.contains("No such file or directory"), "{error}");
         assert!(names(folder.path()).is_empty());
     }

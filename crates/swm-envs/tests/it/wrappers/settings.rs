@@ -119,7 +119,7 @@ fn missing_and_damaged_backgrounds_are_errors_that_name_the_file() {
     std::fs::write(folder.path().join("damaged.png"), b"\x89PNG and nothing else").expect("a file");
     assert!(message("missing.png").contains("missing.png"));
     assert!(message("missing.mp4").contains("No such file"));
-    assert!(message("damaged.png").contains("PNG file that opens"));
+    assert!(message("damaged.png").contains("readable PNG file"));
     assert!(message("").contains("no PNG file") || message("").contains("damaged.png"));
     if has_ffmpeg() {
         std::fs::write(folder.path().join("damaged.mp4"), b"no video").expect("a file");

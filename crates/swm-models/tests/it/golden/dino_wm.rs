@@ -8,7 +8,7 @@ use swm_models::dino_wm::{ColumnConfig, DinoWm, DinoWmConfig, FramePredictor, Fr
 use swm_models::nn::parameters::{self, HostTensor, Named};
 use swm_models::nn::{BackboneConfig, DinoConfig, DropoutRng, Init};
 
-/// Published weights without the attention masks, which are computed here.
+/// The published weights without the attention masks, which [`FramePredictor`] computes and does not load.
 fn without_masks(weights: Named<HostTensor>) -> Named<HostTensor> {
     weights.into_iter().filter(|(name, weight)| !(name.ends_with(".0.bias") && weight.shape.len() == 4)).collect()
 }
@@ -38,8 +38,8 @@ fn golden_predictor() {
         let x = golden.tensor::<3>("i.x");
         check(&golden, "o.y", &values(predictor.forward(x.clone(), &mut DropoutRng::disabled())));
         let [windows, tokens, dim] = x.dims();
-        let two = x.slice([0..windows, 0..tokens - size("num_patches"), 0..dim]);
-        check(&golden, "o.y_two_frames", &values(predictor.forward(two, &mut DropoutRng::disabled())));
+        let two_frames = x.slice([0..windows, 0..tokens - size("num_patches"), 0..dim]);
+        check(&golden, "o.y_two_frames", &values(predictor.forward(two_frames, &mut DropoutRng::disabled())));
     }
 }
 
@@ -127,7 +127,7 @@ fn golden_model() {
         let start = frames.slice([0..1, 0..1, 0..patches, 0..dim]).expand([samples, 1, patches, dim]);
         let rollout = model.rollout(start, golden.tensor("i.candidates"));
         let expected = golden.get("o.rollout");
-        // The action part of the last frame has no meaning; both implementations leave the predictor's output there.
+        // The action part of the last frame has no meaning; both implementations return the predictor's output for it.
         assert_eq!(expected.shape, rollout.dims());
         check(&golden, "o.rollout", &values(rollout));
     }

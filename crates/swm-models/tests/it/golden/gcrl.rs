@@ -50,12 +50,16 @@ impl Golden {
         }
     }
 
-    /// Loads the published weights, all of which the module must have.
+    /// Loads the published weights; checks that the module has exactly these weights.
     fn fill<M: Module>(&self, prefix: &str, module: M) -> M {
         let weights = self.group(prefix);
         let shapes = parameters::shapes(&module);
         for (name, shape) in &shapes {
-            assert_eq!(weights.get(name).map(|weight| &weight.shape), Some(shape), "published weight {name}");
+            assert_eq!(
+                weights.get(name).map(|weight| &weight.shape),
+                Some(shape),
+                "the shape of the published weight {name}"
+            );
         }
         assert_eq!(shapes.len(), weights.len());
         parameters::load(module, &weights)
@@ -84,7 +88,7 @@ impl Golden {
         }
     }
 
-    /// Compares the metrics that were recorded, and all gradients.
+    /// Compares the recorded metrics and all gradients.
     fn compare(&self, output: &StepOutput) {
         for (name, actual) in &output.metrics {
             if self.tensors.contains_key(&format!("o.{name}")) {
@@ -96,8 +100,8 @@ impl Golden {
         let largest = expected.values().flat_map(|g| &g.values).fold(0.0f32, |m, v| m.max(v.abs()));
         for (name, gradient) in &expected {
             let actual = values(output.gradients.get(name).unwrap_or_else(|| panic!("a gradient of {name}")).clone());
-            // A softmax cancels the bias of the keys, so its gradient is zero up to rounding; its error is relative to
-            // the largest gradient of all.
+            // A softmax cancels the bias of the keys, so its gradient is zero up to rounding; the error is relative
+            // to the largest gradient of all parameters.
             let has_no_effect = name.ends_with(".key.bias");
             let error = error(&actual, &gradient.values, if has_no_effect { largest } else { 1e-6 });
             if error > worst.0 {
@@ -126,13 +130,13 @@ fn golden_gcrl_heads() {
         let policy = Head::new(&init, &golden.head(), grid, Pool::Attention, golden.size("out_dim"));
         let means = golden.fill("w.policy.", policy).forward(&frames, &goal, &mut DropoutRng::disabled());
         check(&golden, "o.policy", &values(means));
-        let (actions, hidden) = (golden.size("action_dim"), golden.size("q_hidden_dim"));
-        let critic = Critic::new(&init, &golden.head(), grid, Pool::Attention, actions, hidden);
+        let (action_dim, hidden) = (golden.size("action_dim"), golden.size("q_hidden_dim"));
+        let critic = Critic::new(&init, &golden.head(), grid, Pool::Attention, action_dim, hidden);
         let critic = golden.fill("w.q.", critic);
         let action_values = critic.forward(&frames, golden.tensor("i.action"), &goal, &mut DropoutRng::disabled());
         check(&golden, "o.q", &values(action_values));
         for name in golden.tensors.keys().filter(|name| name.starts_with("o.expectile_")) {
-            let tau = name.trim_start_matches("o.expectile_").parse().expect("a number");
+            let tau = name.trim_start_matches("o.expectile_").parse().expect("an expectile in the tensor name");
             let loss = loss::expectile::<1>(golden.tensor("i.preds"), golden.tensor("i.targets"), tau);
             check(&golden, name, &values(loss));
         }
@@ -176,10 +180,11 @@ fn golden_gciql() {
 
 #[test]
 fn golden_gcrl_checkpoints_round_trip() {
-    let here = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/golden");
+    let golden_folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/golden");
     let dataset_info = DatasetInfo { action: ActionScale::identity(2), columns: Default::default(), env: None };
-    let checkpoint = import::import::<Gcivl>(&here.join("reference/gcivl"), dataset_info.clone()).expect("imported");
-    let golden = Golden::read(&here.join("gcivl-small.safetensors"));
+    let checkpoint = import::import::<Gcivl>(&golden_folder.join("reference/gcivl"), dataset_info.clone())
+        .expect("importing the reference checkpoint");
+    let golden = Golden::read(&golden_folder.join("gcivl-small.safetensors"));
     let sizes = &checkpoint.config.model;
     assert_eq!((&sizes.head, &sizes.encoder), (&golden.head(), &golden.gcrl().encoder));
     assert_eq!((sizes.image, sizes.history, checkpoint.config.data.frameskip), (8, 3, 2));
@@ -188,27 +193,31 @@ fn golden_gcrl_checkpoints_round_trip() {
 
     // Exported weights have the names and shapes of the reference's class, without the target networks.
     let folder = tempfile::tempdir().expect("a folder");
-    import::export(&checkpoint, folder.path(), Naming::Published).expect("exported");
-    let written = weights::read(&folder.path().join("weights.pt")).expect("weights");
-    let expected = weights::read(&here.join("reference/gcivl/weights.pt")).expect("weights");
+    import::export(&checkpoint, folder.path(), Naming::Published).expect("exporting a checkpoint");
+    let written = weights::read(&folder.path().join("weights.pt")).expect("reading the exported weights");
+    let expected =
+        weights::read(&golden_folder.join("reference/gcivl/weights.pt")).expect("reading the reference weights");
     let expected: BTreeMap<_, _> = expected
         .into_iter()
         .filter(|(name, _)| !name.contains(".teacher."))
         .map(|(name, weight)| (name.replace(".student.", "."), weight))
         .collect();
     assert_eq!(written, expected);
-    let again = import::import::<Gcivl>(folder.path(), dataset_info.clone()).expect("imported again");
+    let again =
+        import::import::<Gcivl>(folder.path(), dataset_info.clone()).expect("importing the exported checkpoint");
     let again = parameters::values(&again.model);
     for (name, weight) in &again {
         assert_eq!(weight, &actual[&name.replace(".teacher.", ".student.")], "{name}");
     }
 
     // The checkpoint contains a policy but no critic, and does not fit another action dimension.
-    let cloned = import::import::<Gcbc>(folder.path(), dataset_info.clone()).expect("the policy alone");
+    let cloned = import::import::<Gcbc>(folder.path(), dataset_info.clone()).expect("importing the policy");
     assert_eq!(parameters::values(&cloned.model)["log_stds"], actual["log_stds"]);
-    let message = import::import::<Gciql>(folder.path(), dataset_info).expect_err("no critic").to_string();
+    let message =
+        import::import::<Gciql>(folder.path(), dataset_info).expect_err("a checkpoint without a critic").to_string();
     assert!(message.contains("critic_predictor"), "{message}");
     let dataset_info = DatasetInfo { action: ActionScale::identity(3), columns: Default::default(), env: None };
-    let message = import::import::<Gcivl>(folder.path(), dataset_info).expect_err("other actions").to_string();
+    let message =
+        import::import::<Gcivl>(folder.path(), dataset_info).expect_err("another action dimension").to_string();
     assert!(message.contains("a divisor of 4"), "{message}");
 }

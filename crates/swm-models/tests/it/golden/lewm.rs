@@ -43,7 +43,7 @@ impl Golden {
         let model = Lewm::init(&self.config(), self.size("action_dim"), Key::new(0), &Device::flex());
         let weights = self.group("w.");
         for (name, shape) in parameters::shapes(&model) {
-            assert_eq!(weights.get(&name).map(|w| &w.shape), Some(&shape), "published weight {name}");
+            assert_eq!(weights.get(&name).map(|w| &w.shape), Some(&shape), "the shape of the published weight {name}");
         }
         parameters::load(model, &weights)
     }
@@ -59,7 +59,7 @@ fn golden_evaluation() {
         let dim = golden.size("dim");
         let latents = model.encode(golden.patches("i.pixels")).reshape([clips, steps, dim]);
         check(&golden, "o.eval.emb", &values(latents.clone()));
-        // The CPU encoder, one image at a time.
+        // The CPU encoder encodes one image at a time.
         let fast = HostEncoder::new(&model, &golden.config()).expect("a transformer");
         let images = golden.patches("i.pixels");
         let size = images.dims()[1] * images.dims()[2];
@@ -78,7 +78,7 @@ fn golden_evaluation() {
         let candidates = golden.tensor::<4>("i.candidates").reshape([envs * samples, horizon, action_dim]);
         let goal = model.encode(golden.patches("i.goal")).reshape([envs, 1, dim]).expand([envs, samples, dim]);
         for history in [1, 3] {
-            // The first frames of the first clips, and the actions between them.
+            // The start of every candidate: the first frames of a clip and the actions between these frames.
             let repeat = |x: Tensor<3>, length: usize, width: usize| {
                 let x: Tensor<4> = x.slice([0..envs, 0..length, 0..width]).unsqueeze_dim(1);
                 x.expand([envs, samples, length, width]).reshape([envs * samples, length, width])
@@ -89,7 +89,7 @@ fn golden_evaluation() {
             }
             let rollout = model.rollout(repeat(latents.clone(), history, dim), actions.clone());
             let [_, length, _] = rollout.dims();
-            // The CPU rollout of each environment.
+            // The CPU rollout computes one environment at a time.
             let fast = Rollout::new(&model);
             let steps = length - 1;
             let values_of = |x: Tensor<3>, env: usize| {
@@ -104,7 +104,10 @@ fn golden_evaluation() {
                     for (sample, latent) in latents.chunks(dim).enumerate() {
                         let expected = &expected[(sample * length + time) * dim..][..dim];
                         let error = error(latent, expected, 1.0);
-                        assert!(error < TOLERANCE / 10.0, "fast rollout h{history} {time}: {error:.1e}");
+                        assert!(
+                            error < TOLERANCE / 10.0,
+                            "CPU rollout with history {history}, step {time}: {error:.1e}"
+                        );
                     }
                 }
             }

@@ -1,6 +1,7 @@
 //! Parity with the published models: names of weights, outputs, losses and gradients of the reference implementation.
-//! Every test reads each `<model>-*.safetensors` of the folder named by `SWM_GOLDEN_MODELS`, or of `tests/golden`
-//! (written by the exporters in that folder) and of the shared reference folder.
+//! Every test reads all files `MODEL-*.safetensors` in the folder that the environment variable `SWM_GOLDEN_MODELS`
+//! names. The default folders are `tests/golden`, which also contains the exporters of the files, and
+//! `shared/reference/models` next to the workspace.
 
 mod dino_wm;
 mod gcrl;
@@ -28,9 +29,9 @@ pub struct Golden {
 
 impl Golden {
     pub fn read(path: &std::path::Path) -> Self {
-        let bytes = std::fs::read(path).expect("the file is readable");
+        let bytes = std::fs::read(path).expect("reading a golden file");
         let (_, metadata) = SafeTensors::read_metadata(&bytes).expect("a safetensors file");
-        let config = &metadata.metadata().as_ref().expect("metadata")["config"];
+        let config = &metadata.metadata().as_ref().expect("the metadata of a golden file")["config"];
         let tensors = SafeTensors::deserialize(&bytes).expect("a safetensors file");
         let tensors = tensors
             .iter()
@@ -41,11 +42,11 @@ impl Golden {
                 (name.to_owned(), HostTensor { shape: view.shape().to_vec(), values })
             })
             .collect();
-        Self { text: config.clone(), config: serde_json::from_str(config).expect("JSON"), tensors }
+        Self { text: config.clone(), config: serde_json::from_str(config).expect("parsing the configuration"), tensors }
     }
 
     fn size(&self, name: &str) -> usize {
-        usize::try_from(self.config[name].as_u64().expect(name)).expect("a size")
+        usize::try_from(self.config[name].as_u64().expect(name)).expect("a size that fits usize")
     }
 
     fn get(&self, name: &str) -> &HostTensor {
@@ -54,7 +55,7 @@ impl Golden {
 
     pub fn tensor<const D: usize>(&self, name: &str) -> Tensor<D> {
         let host = self.get(name);
-        let shape: [usize; D] = host.shape.clone().try_into().expect("rank");
+        let shape: [usize; D] = host.shape.clone().try_into().expect("a tensor of rank D");
         Tensor::from_data(TensorData::new(host.values.clone(), shape), &Device::flex())
     }
 
@@ -64,9 +65,9 @@ impl Golden {
         self.tensors.iter().filter_map(strip).collect()
     }
 
-    /// Compares gradients with all recorded ones. Parameters whose names end in one of `without_effect` have no effect,
-    /// because a batch normalisation or a softmax cancels them: their gradients are zero up to rounding, so their
-    /// errors are relative to the largest gradient of all.
+    /// Compares gradients with all recorded gradients. Parameters whose names end in an entry of `without_effect` have
+    /// no effect, because a batch normalisation or a softmax cancels them. Their gradients are zero up to rounding, so
+    /// the errors of these gradients are relative to the largest gradient of all parameters.
     fn check_gradients(&self, actual: &Named<Tensor<1>>, without_effect: &[&str]) {
         let expected = self.group("g.");
         let largest = expected.values().flat_map(|g| &g.values).fold(0.0f32, |m, v| m.max(v.abs()));
@@ -87,11 +88,11 @@ impl Golden {
 
     /// Normalised images of the configured size as patches.
     pub fn patches(&self, name: &str) -> Tensor<3> {
-        self.cut(name, self.size("image"))
+        self.patches_of_side(name, self.size("image"))
     }
 
     /// Normalised images `[…, 3, image, image]` as patches `[frames, patches, 3 * patch * patch]`.
-    fn cut(&self, name: &str, image: usize) -> Tensor<3> {
+    fn patches_of_side(&self, name: &str, image: usize) -> Tensor<3> {
         let patch = self.size("patch");
         let (host, grid) = (self.get(name), image / patch);
         let frames = host.values.len() / (3 * image * image);
@@ -105,7 +106,7 @@ impl Golden {
     }
 }
 
-/// The largest difference, relative to the largest value, or to `floor` where all are smaller.
+/// The largest difference, relative to the largest expected value, or to `floor` if all expected values are smaller.
 fn error(actual: &[f32], expected: &[f32], floor: f32) -> f32 {
     assert_eq!(actual.len(), expected.len());
     let scale = expected.iter().fold(floor, |m, v| m.max(v.abs()));

@@ -31,7 +31,8 @@ fn golden_loss_terms() {
         for (name, term) in terms {
             check(&golden, name, &values(term.clone().inner()));
         }
-        // The recorded gradient is that of the sum of all terms except inverse dynamics, which does not depend on `z`.
+        // The recorded gradient is the gradient of the sum of all terms except inverse dynamics, which does not depend
+        // on `z`.
         let mut all = (std + std_t + cov + cov_t + temp_align + temp_straight).backward();
         check(&golden, "g.z_of_sum", &values(z.grad_remove(&mut all).expect("a gradient")));
     }
@@ -67,8 +68,8 @@ impl Golden {
     }
 
     fn pldm(&self) -> Pldm {
-        let (actions, hidden) = (self.size("action_dim"), self.size("idm_hidden"));
-        let model = Pldm::init(&self.world_model_config(), actions, hidden, Key::new(0), &Device::flex());
+        let (action_dim, hidden) = (self.size("action_dim"), self.size("idm_hidden"));
+        let model = Pldm::init(&self.world_model_config(), action_dim, hidden, Key::new(0), &Device::flex());
         let weights = self.group("w.");
         let published: Named<Vec<usize>> =
             weights.iter().map(|(name, weight)| (name.clone(), weight.shape.clone())).collect();
@@ -83,7 +84,7 @@ fn golden_evaluation() {
         println!("{}", file.display());
         let golden = Golden::read(&file);
         let model = golden.pldm().model;
-        let ([clips, steps, actions], latent) = (golden.tensor::<3>("i.action").dims(), golden.size("latent"));
+        let ([clips, steps, action_dim], latent) = (golden.tensor::<3>("i.action").dims(), golden.size("latent"));
         let latents = model.encode(golden.patches("i.pixels")).reshape([clips, steps, latent]);
         check(&golden, "o.eval.emb", &values(latents.clone()));
         let window = [0..clips, 0..golden.size("history"), 0..latent];
@@ -98,16 +99,16 @@ fn golden_evaluation() {
         let goal = model.encode(golden.patches("i.goal")).reshape([1, 1, latent]);
         let last = rollout.slice([0..samples, horizon..horizon + 1, 0..latent]);
         check(&golden, "o.cost", &values((last - goal).square().sum_dim(2)));
-        // The CPU rollout, which planning uses.
+        // Planning uses the CPU rollout.
         let fast = Rollout::new(&model).run(&values(start), &values(candidates), samples, horizon);
         let expected = &golden.get("o.rollout").values;
         for (time, latents) in fast.iter().enumerate() {
             for (sample, actual) in latents.chunks(latent).enumerate() {
                 let expected = &expected[(sample * (horizon + 1) + time) * latent..][..latent];
-                assert!(error(actual, expected, 1.0) < TOLERANCE / 10.0, "fast rollout {time}");
+                assert!(error(actual, expected, 1.0) < TOLERANCE / 10.0, "CPU rollout, step {time}");
             }
         }
-        assert_eq!(actions, golden.size("action_dim"));
+        assert_eq!(action_dim, golden.size("action_dim"));
     }
 }
 

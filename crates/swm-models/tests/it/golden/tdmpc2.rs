@@ -10,7 +10,7 @@ use swm_models::train::{DatasetInfo, TrainConfig};
 use swm_plan::ActionScale;
 
 impl Golden {
-    fn wm(&self, name: &str) -> f64 {
+    fn world_model_setting(&self, name: &str) -> f64 {
         self.config["wm"][name].as_f64().expect(name)
     }
 
@@ -47,7 +47,11 @@ fn golden_tdmpc2_forward() {
         check(&golden, "o.symexp", &values(two_hot::symexp(scalars.clone() * 0.2)));
         check(&golden, "o.two_hot", &values(config.bins.two_hot(scalars)));
 
-        let rollouts = Rollouts::new(&model, golden.wm("discount"), golden.wm("uncertainty_penalty"));
+        let rollouts = Rollouts::new(
+            &model,
+            golden.world_model_setting("discount"),
+            golden.world_model_setting("uncertainty_penalty"),
+        );
         let (latents, actions) = (values(z), values(golden.tensor::<4>("i.candidates")));
         let mut costs = vec![0.0; envs * samples];
         for (env, costs) in costs.chunks_mut(samples).enumerate() {
@@ -79,19 +83,21 @@ fn golden_tdmpc2_checkpoints_round_trip() {
         assert_eq!(parameters::values(&again.model), parameters::values(&checkpoint.model));
         assert_eq!((&again.config.model, &again.config.loss), (&checkpoint.config.model, &checkpoint.config.loss));
         let other = DatasetInfo { action: ActionScale::identity(1), columns: Named::new(), env: None };
-        assert!(import(folder.path(), other).expect_err("other actions").to_string().contains("action elements"));
+        assert!(
+            import(folder.path(), other).expect_err("another action dimension").to_string().contains("action elements")
+        );
     }
 }
 
 #[test]
 fn golden_tdmpc2_training() {
-    let mut read = 0;
+    let mut checked_files = 0;
     for file in files("tdmpc2") {
         let golden = Golden::read(&file);
         if !golden.tensors.contains_key("o.train.loss") {
             continue;
         }
-        read += 1;
+        checked_files += 1;
         let (model, published) = golden.tdmpc2();
         let (config, loss) = (published.model(), published.loss());
         for shards in [1, 3] {
@@ -118,7 +124,7 @@ fn golden_tdmpc2_training() {
             assert_eq!(step.gradients.len(), expected.len());
         }
     }
-    assert!(read > 0, "no file with the losses of a training step");
+    assert!(checked_files > 0, "no file with the losses of a training step");
 }
 
 impl Golden {

@@ -1,4 +1,4 @@
-//! Backbones: tokens and gradients, for images of the original size and of another one.
+//! Backbones: tokens and gradients, for images of the original size and of another size.
 
 use super::{Golden, check, files, values};
 use burn::module::Module;
@@ -6,7 +6,7 @@ use burn::tensor::{Device, Tensor};
 use swm_core::Key;
 use swm_models::nn::{Dino, DinoConfig, Init, Vit, VitConfig, parameters};
 
-/// Compares the tokens and gradients of a module with the recorded ones.
+/// Compares the tokens and gradients of a module with the recorded tokens and gradients.
 fn compare<M: Module>(golden: &Golden, module: M, tokens: impl Fn(&M, Tensor<3>) -> Tensor<3>) {
     let weights = golden.group("w.");
     let shapes = parameters::shapes(&module);
@@ -14,7 +14,7 @@ fn compare<M: Module>(golden: &Golden, module: M, tokens: impl Fn(&M, Tensor<3>)
     assert_eq!(shapes, published, "names and shapes of the published weights");
     let module = parameters::load(module, &weights);
     check(golden, "o.tokens", &values(tokens(&module, golden.patches("i.pixels"))));
-    let patches = |side: usize| golden.cut("i.other", side);
+    let patches = |side: usize| golden.patches_of_side("i.other", side);
     let module = module.train();
     let other = tokens(&module, patches(golden.size("other")).autodiff());
     check(golden, "o.other", &values(other.clone().inner()));

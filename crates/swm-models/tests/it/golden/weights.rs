@@ -9,8 +9,9 @@ fn file(name: &str) -> PathBuf {
 }
 
 #[test]
-fn golden_files_of_weights() {
-    let expected = weights::read(&file("weights-single.safetensors")).expect("single precision throughout");
+fn weight_files_of_all_formats_have_equal_content() {
+    let expected =
+        weights::read(&file("weights-single.safetensors")).expect("reading the file of single-precision weights");
     assert_eq!(expected["norm.num_batches_tracked"], HostTensor { shape: vec![], values: vec![7.0] });
     for name in ["weights-zip.pt", "weights-legacy.pth", "weights-training.ckpt", "weights-same.safetensors"] {
         assert_eq!(weights::read(&file(name)).expect(name), expected, "{name}");
@@ -34,8 +35,8 @@ fn state_dicts_round_trip() {
     .into_iter()
     .map(|(name, tensor)| (name.to_owned(), tensor))
     .collect();
-    weights::torch::write(&path, &state).expect("a written file");
-    assert_eq!(weights::read(&path).expect("the written state dict"), state);
+    weights::torch::write(&path, &state).expect("writing a file");
+    assert_eq!(weights::read(&path).expect("reading the written state dict"), state);
 }
 
 #[test]
@@ -43,8 +44,8 @@ fn invalid_files_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     let message = |name: &str, bytes: &[u8]| {
         let path = folder.path().join(name);
-        std::fs::write(&path, bytes).expect("a written file");
-        weights::read(&path).expect_err("no weights").to_string()
+        std::fs::write(&path, bytes).expect("writing a file");
+        weights::read(&path).expect_err("an invalid file").to_string()
     };
     assert!(message("weights.txt", b"").contains(".safetensors, .pt"));
     assert!(message("weights.pt", b"not a pickle").contains("torch.save"));
@@ -52,9 +53,9 @@ fn invalid_files_are_refused() {
     // A pickle that calls a program is refused, not executed.
     let attack = b"\x80\x02cos\nsystem\nX\x04\x00\x00\x00true\x85R.";
     assert!(message("attack.pt", attack).contains("torch.save"), "{}", message("attack.pt", attack));
-    let missing = weights::read(&folder.path().join("none.pt")).expect_err("no file").to_string();
+    let missing = weights::read(&folder.path().join("none.pt")).expect_err("a missing file").to_string();
     assert!(missing.contains("reading weights"), "{missing}");
-    // A truncated file.
-    let whole = std::fs::read(file("weights-zip.pt")).expect("the fixture");
-    assert!(message("cut.pt", &whole[..whole.len() / 2]).contains("torch.save"));
+    // A truncated file is refused.
+    let valid_file = std::fs::read(file("weights-zip.pt")).expect("reading weights-zip.pt");
+    assert!(message("cut.pt", &valid_file[..valid_file.len() / 2]).contains("torch.save"));
 }

@@ -1,7 +1,7 @@
 //! [`Background`]: the static part of a frame, drawn once per episode and resized once per frame size.
 //!
 //! A frame copies the resized background, draws the moving shapes at the original size, and resizes only the pixels
-//! they touch.
+//! that these shapes touch.
 
 use super::{Area, BySize, Pixels};
 use swm_core::FrameMut;
@@ -10,7 +10,7 @@ use swm_image::resize::TriangleResizer;
 /// A square background image with resized copies, and a canvas to draw moving shapes over it.
 pub struct Background {
     side: usize,
-    /// `[side, side, 3]`.
+    /// The background, `[side, side, 3]`.
     image: Vec<u8>,
     /// A copy of `image` into which a frame's moving shapes are drawn; made for the first resized frame.
     canvas: Option<Vec<u8>>,
@@ -20,7 +20,7 @@ pub struct Background {
 /// The background at one frame size.
 struct Resized {
     resizer: TriangleResizer,
-    /// `[height, width, 3]`.
+    /// The resized background, `[height, width, 3]`.
     rgb: Vec<u8>,
 }
 
@@ -106,7 +106,7 @@ mod tests {
                 Pixels::new(30, &mut full).fill(dot(x), [255, 10, 30]);
                 let mut expected = vec![0; width * height * 3];
                 TriangleResizer::new(30, width, height).resize_part(&full, 0..30, 0..30, &mut expected);
-                assert!(frame == expected, "{width} x {height}, {x}");
+                assert!(frame == expected, "{width} x {height}, dot at {x}");
             }
         }
     }

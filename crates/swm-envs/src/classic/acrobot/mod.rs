@@ -26,7 +26,7 @@ pub const ENTRY: EnvEntry = EnvEntry {
 /// Two links with a motor in the joint between them.
 struct Acrobot(Physics);
 
-/// Half-width of the uniform distribution around 0 (hanging at rest) from which every value of the start is drawn.
+/// Half-width of the uniform distribution around 0 (hanging at rest) of angles (rad) and velocities (rad/s) at the start.
 const START: f64 = 0.1;
 /// Tolerance of both angles for a goal below the line, in radians.
 const NEAR: f64 = 0.2;

@@ -33,7 +33,7 @@ const GOAL: [f64; 2] = [0.5, 1.5];
 const NEAR: [f64; 2] = [0.1, 0.1];
 /// Twice the angle at which an episode ends, in radians: the bound of the observation in the reference.
 const MAX_ANGLE: f64 = 24.0 * std::f64::consts::PI / 180.0;
-/// Bound of the states that a caller may give, far beyond those that occur in an episode.
+/// Bound of the states that a caller may give, far beyond the values of an episode.
 const MAX_STATE: f64 = 1000.0;
 
 impl ControlTask for CartPole {

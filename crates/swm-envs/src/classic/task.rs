@@ -4,7 +4,8 @@ use super::factors::{ColorFactor, PhysicsFactor};
 use super::frame::Surface;
 use swm_core::{Result, Rng, Space, Transition};
 
-/// The dynamics, goal, controller and drawing of one classic-control environment, with the physical factors of an episode.
+/// The dynamics, goal, controller and drawing of one classic-control environment, for the physical factors of one
+/// episode.
 pub trait ControlTask: Send + Sized + 'static {
     /// The registered id of the environment.
     const ID: &'static str;

@@ -268,8 +268,8 @@ impl Canvas {
 
     /// Draws a thick line of [`WIDTH`] with round ends. A line of length 0 is not drawn.
     ///
-    /// The sides are computed from absolute coordinate differences, as in the reference's debug drawing. They are skewed
-    /// if the line descends from left to right.
+    /// The sides are computed from absolute coordinate differences, as in the reference's debug drawing. They are
+    /// skewed if the line descends from left to right.
     pub fn thick_line(&mut self, from: Point, to: Point, index: u8) {
         let radius = WIDTH / 2;
         self.flat_line(from, to, index);

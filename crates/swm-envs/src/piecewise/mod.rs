@@ -115,7 +115,7 @@ impl PointTask for Piecewise {
     }
 }
 
-/// Names, bounds, defaults and order of the reference.
+/// Returns the variation space, with names, bounds, defaults and order of the reference.
 fn variation_space() -> VariationSpace {
     let mut factors = vec![
         color("background.color", [255.0; 3]),

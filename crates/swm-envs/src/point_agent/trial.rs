@@ -3,8 +3,8 @@
 use super::position::Position64;
 use swm_core::{Action, Batch, EnvEntry, ExpertEntry, Key, ResetOptions, Schema, VariationRequest};
 
-/// Plays one episode, towards a sampled goal if `sampled_goal` is set. Returns the positions the agent visited and
-/// whether the goal was reached.
+/// Plays one episode, towards a sampled goal if `sampled_goal` is set. Returns the positions that the agent visited,
+/// and true if it reached the goal.
 pub fn play(
     entry: &EnvEntry,
     expert: &ExpertEntry,
@@ -35,8 +35,8 @@ pub fn play(
 }
 
 /// Plays the first expert over seeds 0 to 199 and asserts that it reaches every goal within `steps` with the default
-/// variation, and every sampled goal within `varied_steps` with all factors varied. Returns how many goals of the reset
-/// it reaches with all factors varied.
+/// variation, and every sampled goal within `varied_steps` with all factors varied. Returns the number of
+/// goals of the reset that it reaches with all factors varied.
 pub fn reached_of_200(entry: &EnvEntry, steps: usize, varied_steps: usize) -> u32 {
     let all = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
     let all = ResetOptions { variation: all, ..ResetOptions::default() };

@@ -42,11 +42,11 @@ mod index {
     pub const LAYOUT: usize = 3;
 }
 
-/// A square with walls in it.
+/// A square maze with rectangular walls.
 struct PointMaze {
     layout: Layout,
     appearance: MazeAppearance,
-    /// The agent's disc at the start of the episode; its position is not used.
+    /// The agent's disc, of which only radius and colour are used.
     agent: Disc,
     /// The visibility graph of the walls, built at the first use.
     graph: OnceCell<VisibilityGraph>,
@@ -226,15 +226,15 @@ mod tests {
     fn goal_distance_decreases_along_the_expert_path() {
         let mut env = PointAgentEnv::<PointMaze>::new();
         let mut row = Batch::zeros(&Schema::new(env.spec.columns.clone()).expect("a schema"), 1);
-        let mut around = 0;
+        let mut detours = 0;
         for seed in 0..200 {
             env.reset(seed, &vary(&["all"])).expect("a reset");
             env.sample_goal(Key::new(seed)).expect("a goal");
             let mut expert = (ENTRY.experts[0].make)();
             let straight = f64::from(distance(env.agent, env.goal));
-            let mut left = env.goal_distance();
-            assert!(left >= straight - 1e-6, "seed {seed}: no path is shorter than the straight line");
-            around += u32::from(left > straight + 0.01);
+            let mut remaining = env.goal_distance();
+            assert!(remaining >= straight - 1e-6, "seed {seed}: no path is shorter than the straight line");
+            detours += u32::from(remaining > straight + 0.01);
             while !env.is_success() {
                 env.observe(&mut row.row_mut(0));
                 let mut action = [0.0; 2];
@@ -243,16 +243,16 @@ mod tests {
                 env.step(Action::Continuous(&action.map(|v| v as f32))).expect("a step");
                 let walked = f64::from(distance(before, env.agent));
                 let now = env.goal_distance();
-                // The polygons around round corners are a little longer than what the agent can walk.
-                assert!(now < left - walked + 1e-5, "seed {seed}: from {left} to {now} by walking {walked}");
+                // Paths along the polygons around round corners are a little longer than the agent's shortest path.
+                assert!(now < remaining - walked + 1e-5, "seed {seed}: from {remaining} to {now} by walking {walked}");
                 assert!(
-                    walked > 0.0 && left - walked - now < 0.02,
-                    "seed {seed}: from {left} to {now} by walking {walked}"
+                    walked > 0.0 && remaining - walked - now < 0.02,
+                    "seed {seed}: from {remaining} to {now} by walking {walked}"
                 );
-                left = now;
+                remaining = now;
             }
         }
-        assert!(around > 50, "{around} paths lead around walls");
+        assert!(detours > 50, "{detours} paths lead around walls");
         env.set_goal(env.agent);
         assert_eq!(env.goal_distance(), 0.0);
     }

@@ -1,4 +1,4 @@
-//! The controller: state feedback on a flat output.
+//! The controller of CartPole: state feedback on a flat output.
 
 use super::physics::Physics;
 

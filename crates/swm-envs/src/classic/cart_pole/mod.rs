@@ -12,7 +12,7 @@ use swm_core::{DType, EnvEntry, ExpertEntry, Rng, Space, Transition};
 /// The registry row of this environment.
 pub const ENTRY: EnvEntry = EnvEntry {
     id: CartPole::ID,
-    summary: "push a cart left or right so that the pole on it stays up, and take it to a position",
+    summary: "push a cart left or right so that the pole on it stays up, and bring the cart to a position",
     options: &[],
     make: |_| Ok(Box::new(ClassicEnv::<CartPole>::new())),
     experts: &[ExpertEntry {

@@ -110,8 +110,8 @@ impl Surface {
         let (low, high) = corners.iter().fold((i32::MAX, i32::MIN), |(low, high), p| (low.min(p.y), high.max(p.y)));
         let last = self.drawn.len() as i32 - 1;
         for y in low.max(0)..=high.min(last) {
-            // The columns at which the sides cross this row, in 1/65536 pixel. A side includes its lower end; the topmost sides also
-            // include their upper end.
+            // The columns at which the sides cross this row, in 1/65536 pixel. A side includes its lower end; the topmost
+            // sides also include their upper end.
             let mut crossings = [0; MAX_CORNERS];
             let mut count = 0;
             for (a, b) in sides() {
@@ -135,7 +135,7 @@ impl Surface {
     /// Fills a disc and anti-aliases its outline.
     pub fn disc(&mut self, centre: Point, radius: i32, color: Color) {
         self.smooth_circle(centre, radius, color);
-        // The midpoint algorithm. Rows nearer to the top and the bottom than to the centre are filled at their first step.
+        // The midpoint algorithm. The outer rows are filled at the first step of the circle in each row.
         let (mut decision, mut x, mut y, mut row) = (1 - radius, 0, radius, radius + 1);
         while x <= y {
             if row != y {
@@ -160,8 +160,8 @@ impl Surface {
     /// Draws an anti-aliased circle: from bottom and top outwards to the diagonal, then on to the sides. Every step is
     /// shared between the two pixels nearest to the exact circle.
     ///
-    /// `off` is r² - x² - y², which is positive inside the circle. Divided by 2y (or 2x) it approximates the distance to
-    /// the circle along y (or x), in pixels.
+    /// `off` is r² - x² - y², which is positive inside the circle. Divided by 2y (or 2x) it approximates the distance
+    /// to the circle along y (or x), in pixels.
     fn smooth_circle(&mut self, centre: Point, radius: i32, color: Color) {
         let steps = (f64::from(radius) * std::f64::consts::FRAC_1_SQRT_2).round_ties_even() as i32;
         for y in [-radius, radius] {

@@ -1,4 +1,4 @@
-//! The controller: it pumps energy into the rod, then stabilises it upright by state feedback.
+//! The controller of Pendulum, which adds energy to the rod, then holds the rod upright by state feedback.
 
 use super::physics::Physics;
 use crate::classic::angle::between;

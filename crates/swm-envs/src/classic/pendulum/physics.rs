@@ -1,7 +1,7 @@
 //! The dynamics: a rod that a motor rotates about one of its ends, integrated by the semi-implicit Euler method.
 //!
-//! Equations, and the order and precision of operations, are those of Gymnasium's Pendulum: double precision, except for
-//! products with the float32 action, which numpy computes in single precision.
+//! Equations, and the order and precision of operations, are those of Gymnasium's Pendulum: double precision, except
+//! for products with the float32 action, which numpy computes in single precision.
 
 use crate::classic::angle::between;
 use swm_core::Transition;

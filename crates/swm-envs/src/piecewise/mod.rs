@@ -156,7 +156,7 @@ mod tests {
         let mut env = PointAgentEnv::<Piecewise>::new();
         let mut trapped = vec![];
         for seed in 0..10_000 {
-            env.reset(seed, &all).expect("a reset");
+            env.reset(seed, &all).expect("resetting the environment");
             if env.sample_goal(Key::new(seed)).is_err() {
                 trapped.push(seed);
                 continue;

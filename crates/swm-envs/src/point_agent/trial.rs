@@ -13,21 +13,21 @@ pub fn play(
     sampled_goal: bool,
     steps: usize,
 ) -> (Vec<Position64>, bool) {
-    let (mut env, mut expert) = (entry.env().expect("an environment"), (expert.make)());
-    env.reset(seed, options).expect("a reset");
+    let (mut env, mut expert) = (entry.env().expect("creating the environment"), (expert.make)());
+    env.reset(seed, options).expect("resetting the environment");
     if sampled_goal {
-        env.sample_goal(Key::new(seed)).expect("a goal");
+        env.sample_goal(Key::new(seed)).expect("sampling a goal");
     }
     expert.begin(Key::new(seed));
     let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("columns"), 1);
     let (mut action, mut positions) = ([0.0; 2], vec![]);
     for _ in 0..steps {
         env.observe(&mut row.row_mut(0));
-        expert.act(row.row(0), &mut action).expect("an action");
-        let state = row.row(0).to_f64("state").expect("a state");
+        expert.act(row.row(0), &mut action).expect("the expert's action");
+        let state = row.row(0).to_f64("state").expect("reading the state");
         positions.push([state[0], state[1]]);
         let action = action.map(|a| a as f32);
-        if env.step(Action::Continuous(&action)).expect("a step").terminated {
+        if env.step(Action::Continuous(&action)).expect("stepping the environment").terminated {
             return (positions, true);
         }
     }

@@ -202,9 +202,9 @@ mod tests {
     fn resets_and_sampled_goals_never_fail() {
         let mut env = PointAgentEnv::<PointMaze>::new();
         for seed in 0..10_000 {
-            env.reset(seed, &vary(&["all"])).expect("a reset");
+            env.reset(seed, &vary(&["all"])).expect("resetting the environment");
             assert!(!env.task.layout.touches(env.agent, env.task.layout.radius), "seed {seed}");
-            env.sample_goal(Key::new(seed)).expect("a goal");
+            env.sample_goal(Key::new(seed)).expect("sampling a goal");
             assert!(!env.is_success(), "seed {seed}");
         }
     }
@@ -215,7 +215,7 @@ mod tests {
         let keys = ["agent", "goal", "walls", "agent.radius", "walls.shape", "walls.number"];
         for (i, seed) in (0..1200).enumerate() {
             let options = vary(&[keys[i % 6], keys[i / 6 % 6], "agent.position"]);
-            env.reset(seed, &options).expect("a reset");
+            env.reset(seed, &options).expect("resetting the environment");
             let (layout, goal_radius) = (&env.task.layout, env.task.appearance.goal.radius);
             assert!(!layout.touches(env.agent, layout.radius), "{options:?}, seed {seed}");
             assert!(!layout.touches(env.goal, goal_radius), "{options:?}, seed {seed}");
@@ -225,11 +225,11 @@ mod tests {
     #[test]
     fn goal_distance_decreases_along_the_expert_path() {
         let mut env = PointAgentEnv::<PointMaze>::new();
-        let mut row = Batch::zeros(&Schema::new(env.spec.columns.clone()).expect("a schema"), 1);
+        let mut row = Batch::zeros(&Schema::new(env.spec.columns.clone()).expect("building the schema"), 1);
         let mut detours = 0;
         for seed in 0..200 {
-            env.reset(seed, &vary(&["all"])).expect("a reset");
-            env.sample_goal(Key::new(seed)).expect("a goal");
+            env.reset(seed, &vary(&["all"])).expect("resetting the environment");
+            env.sample_goal(Key::new(seed)).expect("sampling a goal");
             let mut expert = (ENTRY.experts[0].make)();
             let straight = f64::from(distance(env.agent, env.goal));
             let mut remaining = env.goal_distance();
@@ -238,9 +238,9 @@ mod tests {
             while !env.is_success() {
                 env.observe(&mut row.row_mut(0));
                 let mut action = [0.0; 2];
-                expert.act(row.row(0), &mut action).expect("an action");
+                expert.act(row.row(0), &mut action).expect("the expert's action");
                 let before = env.agent;
-                env.step(Action::Continuous(&action.map(|v| v as f32))).expect("a step");
+                env.step(Action::Continuous(&action.map(|v| v as f32))).expect("stepping the environment");
                 let walked = f64::from(distance(before, env.agent));
                 let now = env.goal_distance();
                 // Paths along the polygons around round corners are a little longer than the agent's shortest path.

@@ -1,8 +1,8 @@
 //! The dynamics: a disc moves by `action * speed`, stays where it is if it would touch a wall, and is held inside the
 //! square.
 //!
-//! Constants, the order of the checks and the single precision are those of the reference (`simple_point_maze.py`). Only
-//! the end of a step is checked, and this happens before the end is clipped to the square: a step may jump over a
+//! Constants, the order of the checks and the single precision are those of the reference (`simple_point_maze.py`).
+//! Only the end of a step is checked, and this happens before the end is clipped to the square: a step may jump over a
 //! corner, and a step that ends outside the square may be clipped into a wall at the border. Lengths are in maze units,
 //! y up.
 

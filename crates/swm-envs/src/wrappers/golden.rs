@@ -1,4 +1,4 @@
-//! Every wrapper compared with the Python reference on one image, `tests/golden/wrappers.npz`. The random draws of the
+//! Eight wrappers compared with the Python reference on one image, `tests/golden/wrappers.npz`. The random draws of the
 //! reference are part of the file.
 
 use super::chroma_key::ChromaKey;
@@ -40,9 +40,9 @@ fn floats(value: &Value) -> Vec<f64> {
 /// The tolerated mean and maximal difference of a wrapper from the reference, of 255.
 fn tolerance(id: &str) -> (f64, u8) {
     match id {
-        // Rounding of means whose fraction is one half.
+        // Means whose fraction is one half are rounded differently.
         "resolution" | "chroma-key" => (0.03, 1),
-        // Products that are an integer, or just below it, depending on the order of multiplication.
+        // The order of multiplication decides if a product is an integer or just below it.
         "color-jitter" => (0.001, 1),
         _ => (0.0, 0),
     }
@@ -52,15 +52,15 @@ fn tolerance(id: &str) -> (f64, u8) {
 #[allow(clippy::too_many_lines, reason = "one match over the wrappers of the golden file")]
 fn wrappers_equal_the_reference() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/golden/wrappers.npz");
-    let mut golden = Golden(NpzArchive::open(path).expect("the golden file"));
+    let mut golden = Golden(NpzArchive::open(path).expect("opening the golden file"));
     let original = golden.image("frame");
     let (mut compared, mut wrong) = (std::collections::BTreeSet::new(), vec![]);
     for (i, mut case) in golden.cases().into_iter().enumerate() {
         let expected = golden.image(&format!("out_{i}"));
-        let what = format!("case {i}, {case:?}");
+        let case_name = format!("case {i}, {case:?}");
         let id = case.remove("wrapper").expect("a wrapper").as_str().expect("a name").to_owned();
         let drawn = case.remove("drawn").filter(|drawn| !drawn.is_null()).map(|drawn| floats(&drawn));
-        let step = case.remove("step").and_then(|step| step.as_u64()).expect("a step");
+        let step = case.remove("step").and_then(|step| step.as_u64()).expect("stepping the environment");
         let RgbImage { width, height, mut rgb } = RgbImage { rgb: original.rgb.clone(), ..original };
         let mut frame = FrameMut::new(width, height, &mut rgb);
         match (id.as_str(), drawn) {
@@ -108,7 +108,7 @@ fn wrappers_equal_the_reference() {
         );
         let (mean_allowed, most_allowed) = tolerance(&id);
         if mean > mean_allowed || most > Some(&most_allowed) {
-            wrong.push(format!("{what}: mean {mean:.4}, most {most:?} of 255"));
+            wrong.push(format!("{case_name}: mean {mean:.4}, most {most:?} of 255"));
         }
         compared.insert(id);
     }

@@ -110,8 +110,8 @@ impl Surface {
         let (low, high) = corners.iter().fold((i32::MAX, i32::MIN), |(low, high), p| (low.min(p.y), high.max(p.y)));
         let last = self.drawn.len() as i32 - 1;
         for y in low.max(0)..=high.min(last) {
-            // The columns at which the sides cross this row, in 1/65536 pixel. A side includes its lower end; the topmost
-            // sides also include their upper end.
+            // The columns at which the sides cross this row, in 1/65536 pixel. A side includes its lower end; the
+            // topmost sides also include their upper end.
             let mut crossings = [0; MAX_CORNERS];
             let mut count = 0;
             for (a, b) in sides() {

@@ -100,7 +100,7 @@ fn start(entry: &EnvEntry, env: &dyn Env, golden: &mut Golden) -> ResetOptions {
 fn frames(env: &mut dyn Env, golden: &mut Golden, name: &str) -> Frames {
     let (height, width, golden) = golden.image(name);
     let mut ours = vec![0; golden.len()];
-    env.render(FrameMut::new(width, height, &mut ours)).expect("a frame");
+    env.render(FrameMut::new(width, height, &mut ours)).expect("rendering a frame");
     Frames { height, width, golden, ours }
 }
 

@@ -45,7 +45,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             for (column, (seed, steps)) in [(1, 0), (1, 10), (2, 0)].into_iter().enumerate() {
                 play(&mut *env, seed, steps)?;
                 let mut rgb = vec![0; 3 * SIDE * SIDE];
-                env.render(FrameMut::new(SIDE, SIDE, &mut rgb)).expect("a frame");
+                env.render(FrameMut::new(SIDE, SIDE, &mut rgb)).expect("rendering a frame");
                 let left = (3 * half + column) * (SIDE + GAP);
                 for (y, line) in rgb.chunks_exact(3 * SIDE).enumerate() {
                     let start = 3 * ((row * (SIDE + GAP) + y) * width + left);

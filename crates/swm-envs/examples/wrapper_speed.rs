@@ -39,7 +39,7 @@ fn rate(wrapper: &mut dyn VisualWrapper, side: usize, noisy: bool) -> Result<f64
     let mut env = push_t::ENTRY.env().expect("creating the environment");
     env.reset(0, &ResetOptions::default())?;
     let mut original = vec![0; 3 * side * side];
-    env.render(FrameMut::new(side, side, &mut original)).expect("a frame");
+    env.render(FrameMut::new(side, side, &mut original)).expect("rendering a frame");
     if noisy {
         parse("noise")?.apply(&mut FrameMut::new(side, side, &mut original), EpisodeFrame::Step(0));
     }

@@ -19,7 +19,7 @@ pub fn play(
         env.sample_goal(Key::new(seed)).expect("sampling a goal");
     }
     expert.begin(Key::new(seed));
-    let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("columns"), 1);
+    let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("the schema of the columns"), 1);
     let (mut action, mut positions) = ([0.0; 2], vec![]);
     for _ in 0..steps {
         env.observe(&mut row.row_mut(0));

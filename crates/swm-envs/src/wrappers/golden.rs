@@ -19,21 +19,27 @@ struct Golden(NpzArchive<BufReader<File>>);
 
 impl Golden {
     fn image(&mut self, name: &str) -> RgbImage {
-        let array = self.0.by_name(name).expect("a readable archive").expect("an array of this name");
-        let [height, width] = [0, 1].map(|axis| usize::try_from(array.shape()[axis]).expect("a size"));
-        RgbImage { width, height, rgb: array.into_vec().expect("bytes") }
+        let array = self.0.by_name(name).expect("reading the archive").expect("an array of this name");
+        let [height, width] = [0, 1].map(|axis| usize::try_from(array.shape()[axis]).expect("a valid size"));
+        RgbImage { width, height, rgb: array.into_vec().expect("reading the bytes") }
     }
 
     fn cases(&mut self) -> Vec<Map<String, Value>> {
-        let text: Vec<String> = self.0.by_name("cases").expect("an archive").expect("cases").into_vec().expect("text");
-        serde_json::from_str(&text.concat()).expect("JSON")
+        let text: Vec<String> = self
+            .0
+            .by_name("cases")
+            .expect("reading the archive")
+            .expect("the array `cases`")
+            .into_vec()
+            .expect("reading strings");
+        serde_json::from_str(&text.concat()).expect("parsing the cases")
     }
 }
 
 fn floats(value: &Value) -> Vec<f64> {
     match value {
         Value::Array(values) => values.iter().flat_map(floats).collect(),
-        number => vec![number.as_f64().expect("a number")],
+        number => vec![number.as_f64().expect("reading a number")],
     }
 }
 
@@ -58,16 +64,17 @@ fn wrappers_equal_the_reference() {
     for (i, mut case) in golden.cases().into_iter().enumerate() {
         let expected = golden.image(&format!("out_{i}"));
         let case_name = format!("case {i}, {case:?}");
-        let id = case.remove("wrapper").expect("a wrapper").as_str().expect("a name").to_owned();
+        let id = case.remove("wrapper").expect("the entry `wrapper`").as_str().expect("the id of a wrapper").to_owned();
         let drawn = case.remove("drawn").filter(|drawn| !drawn.is_null()).map(|drawn| floats(&drawn));
         let step = case.remove("step").and_then(|step| step.as_u64()).expect("stepping the environment");
         let RgbImage { width, height, mut rgb } = RgbImage { rgb: original.rgb.clone(), ..original };
         let mut frame = FrameMut::new(width, height, &mut rgb);
         match (id.as_str(), drawn) {
             ("chroma-key", _) => {
-                let media = golden.image(&format!("background_{}", case["media"].as_str().expect("a name")));
-                let key: Vec<u8> = serde_json::from_value(case["key_color"].clone()).expect("a colour");
-                let tolerance = case["tolerance"].as_f64().expect("a number");
+                let media =
+                    golden.image(&format!("background_{}", case["media"].as_str().expect("the name of a background")));
+                let key: Vec<u8> = serde_json::from_value(case["key_color"].clone()).expect("reading a colour");
+                let tolerance = case["tolerance"].as_f64().expect("reading a number");
                 ChromaKey::new(&key, Media::new(vec![media]), tolerance).apply(&mut frame, EpisodeFrame::Step(step));
             }
             ("color-jitter", Some(drawn)) => {
@@ -76,13 +83,13 @@ fn wrappers_equal_the_reference() {
                 ColorJitter::new(ranges).apply(&mut frame, EpisodeFrame::Step(step));
             }
             ("random-conv", Some(weights)) => {
-                let side = usize::try_from(case["kernel_size"].as_u64().expect("a size")).expect("a size");
+                let side = usize::try_from(case["kernel_size"].as_u64().expect("reading a size")).expect("a size");
                 let mut conv = RandomConv::new(side);
                 conv.set(weights.iter().map(|&weight| weight as f32));
                 conv.apply(&mut frame, EpisodeFrame::Step(step));
             }
             ("occlusion", Some(patches)) => {
-                let color: [u8; 3] = serde_json::from_value(case["color"].clone()).expect("a colour");
+                let color: [u8; 3] = serde_json::from_value(case["color"].clone()).expect("reading a colour");
                 for patch in patches.as_chunks::<4>().0 {
                     let [y, x, height, width] = patch.map(|v| v as usize);
                     Rect { x, y, width, height }.fill(color, &mut frame);
@@ -97,7 +104,8 @@ fn wrappers_equal_the_reference() {
                 }
             }
             (id, _) => {
-                let mut wrapper = WRAPPERS.get(id).expect("a wrapper").make(&case).expect("settings");
+                let mut wrapper =
+                    WRAPPERS.get(id).expect("finding the wrapper").make(&case).expect("making the wrapper");
                 wrapper.apply(&mut frame, EpisodeFrame::Step(step));
             }
         }

@@ -182,7 +182,8 @@ mod tests {
     fn missing_ffmpeg_and_oversized_videos_are_errors() {
         let folder = tempfile::tempdir().expect("creating a temporary folder");
         let path = folder.path().join("a.mp4");
-        let message = |program: &str| read_video(Path::new(program), &path, LIMIT).expect_err("fails").to_string();
+        let message =
+            |program: &str| read_video(Path::new(program), &path, LIMIT).expect_err("reading must fail").to_string();
         assert!(message("ffmpeg").contains("a.mp4"));
         std::fs::write(&path, b"no video").expect("writing the file");
         assert!(message("no-such-ffmpeg").contains("install FFmpeg"), "{}", message("no-such-ffmpeg"));

@@ -328,7 +328,7 @@ mod tests {
     #[test]
     fn schedules_follow_their_formulas() {
         let at = |json: &str, steps: [u64; 4]| {
-            let schedule: Schedule = serde_json::from_str(json).expect("a schedule");
+            let schedule: Schedule = serde_json::from_str(json).expect("parsing a schedule");
             steps.map(|step| (schedule.at(step) * 1e6).round() / 1e6)
         };
         // Values of the functions of the reference with these names.

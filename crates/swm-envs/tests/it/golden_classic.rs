@@ -5,7 +5,7 @@ use swm_core::{Action, Batch, Env, FrameMut, ResetOptions, Schema, Space};
 
 fn frame(env: &mut dyn Env, (width, height): (usize, usize)) -> Vec<u8> {
     let mut rgb = vec![0; width * height * 3];
-    env.render(FrameMut::new(width, height, &mut rgb)).expect("a frame");
+    env.render(FrameMut::new(width, height, &mut rgb)).expect("rendering a frame");
     rgb
 }
 

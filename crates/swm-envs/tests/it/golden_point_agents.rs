@@ -10,7 +10,7 @@ const FRAME_TOLERANCE: f64 = 3.0;
 fn frame_difference(env: &mut dyn Env, golden: &mut Golden, name: &str) -> f64 {
     let (height, width, expected) = golden.image(name);
     let mut rgb = vec![0; height * width * 3];
-    env.render(FrameMut::new(width, height, &mut rgb)).expect("a frame");
+    env.render(FrameMut::new(width, height, &mut rgb)).expect("rendering a frame");
     image_difference(&rgb, &expected)
 }
 

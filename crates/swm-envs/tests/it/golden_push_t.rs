@@ -25,7 +25,7 @@ impl Probe {
 
     fn frame(&mut self) -> Vec<u8> {
         let mut rgb = vec![0; 224 * 224 * 3];
-        self.env.render(FrameMut::new(224, 224, &mut rgb)).expect("a frame");
+        self.env.render(FrameMut::new(224, 224, &mut rgb)).expect("rendering a frame");
         rgb
     }
 }
@@ -44,7 +44,8 @@ fn contacts_follow_the_reference() {
         let mut golden = Golden::open(&file);
         for pair in golden.names().iter().filter_map(|name| name.strip_suffix(".state")) {
             // A pair is named `b<block shape>a<agent shape>`.
-            let shapes: Vec<f64> = pair[1..].split('a').map(|shape| shape.parse().expect("a shape")).collect();
+            let shapes: Vec<f64> =
+                pair[1..].split('a').map(|shape| shape.parse().expect("parsing a shape index")).collect();
             let case = format!("{}, {pair}", file.display());
             let mut read = |name: &str| golden.read::<f64>(&format!("{pair}.{name}"));
             let [states, rewards, start, goal] = ["state", "reward", "start", "goal"].map(&mut read);

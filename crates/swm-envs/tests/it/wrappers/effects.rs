@@ -57,7 +57,7 @@ fn background_replaces_the_key_colours_and_follows_the_steps() {
             command.args(["-loglevel", "error", "-framerate", "7", "-i"]).arg(folder.path().join("%d.png"));
             command.args(["-vf", filter]);
             command.args(if name == "a.mkv" { &["-c:v", "png"][..] } else { &[] });
-            let made = command.arg(&path).stdin(Stdio::null()).status().expect("ffmpeg runs").success();
+            let made = command.arg(&path).stdin(Stdio::null()).status().expect("running ffmpeg").success();
             assert!(made, "ffmpeg makes {name}");
             backgrounds.push(path);
         }
@@ -151,7 +151,7 @@ fn shifts_are_uniform_and_repeat_the_edge() {
             assert_eq!([0, 1].map(|axis| i32::from(pixel[axis])), expected, "step {step}, pixel {i}");
         }
         for (counts, offset) in counts.iter_mut().zip(offset) {
-            counts[usize::try_from(offset + 3).expect("at most pad")] += 1;
+            counts[usize::try_from(offset + 3).expect("an offset of at least -pad")] += 1;
         }
     }
     for count in counts.as_flattened() {

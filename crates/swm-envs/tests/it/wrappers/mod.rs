@@ -92,7 +92,7 @@ fn write_png(path: &Path, width: u32, height: u32, rgb: &[u8]) {
     let file = std::fs::File::create(path).expect("writing the file");
     let mut encoder = png::Encoder::new(file, width, height);
     encoder.set_color(png::ColorType::Rgb);
-    encoder.write_header().expect("a header").write_image_data(rgb).expect("a frame");
+    encoder.write_header().expect("writing the header").write_image_data(rgb).expect("writing the image");
 }
 
 /// Applies a wrapper to the test image in the episode of a seed.

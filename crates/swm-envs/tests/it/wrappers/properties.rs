@@ -22,18 +22,18 @@ fn wrapped<S: AsRef<str>>(texts: &[S], goal: GoalFrame) -> Box<dyn Env> {
 
 fn frame(env: &mut dyn Env) -> Vec<u8> {
     let mut rgb = vec![0; 3 * SIZE[0] * SIZE[1]];
-    env.render(FrameMut::new(SIZE[0], SIZE[1], &mut rgb)).expect("a frame");
+    env.render(FrameMut::new(SIZE[0], SIZE[1], &mut rgb)).expect("rendering a frame");
     rgb
 }
 
 fn goal_frame(env: &mut dyn Env) -> Vec<u8> {
     let mut rgb = vec![0; 3 * SIZE[0] * SIZE[1]];
-    env.render_goal(FrameMut::new(SIZE[0], SIZE[1], &mut rgb)).expect("a frame");
+    env.render_goal(FrameMut::new(SIZE[0], SIZE[1], &mut rgb)).expect("rendering a frame");
     rgb
 }
 
 fn step(env: &mut dyn Env) {
-    env.step(Action::Continuous(&[0.5, -0.3])).expect("an action");
+    env.step(Action::Continuous(&[0.5, -0.3])).expect("stepping the environment");
 }
 
 #[test]

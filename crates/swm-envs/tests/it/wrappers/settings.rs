@@ -82,14 +82,14 @@ fn invalid_settings_are_errors_that_name_the_setting() {
         ("chroma-key,media=a.png,key_color=1/2/3/4", "1/2/3/4", "red/green/blue"),
         ("chroma-key,media=,key_color=1/2/3", "media", "a path"),
     ] {
-        let name = text.split([',', '=']).nth(1).expect("a name");
+        let name = text.split([',', '=']).nth(1).expect("the name of a parameter");
         let name = if text.starts_with("chroma-key") && given.contains('/') { "key_color" } else { name };
-        error_contains(text, &[text.split(',').next().expect("a wrapper"), name, given, allowed]);
+        error_contains(text, &[text.split(',').next().expect("the name of a wrapper"), name, given, allowed]);
     }
     // The same settings as JSON.
     let json = |id: &str, settings: Value| {
-        let settings = settings.as_object().expect("an object").clone();
-        WRAPPERS.get(id).expect("a wrapper").make(&settings).err().map(|error| error.to_string())
+        let settings = settings.as_object().expect("a JSON object").clone();
+        WRAPPERS.get(id).expect("finding the wrapper").make(&settings).err().map(|error| error.to_string())
     };
     assert_eq!(json("noise", json!({"std": ["cosine", 1, 2, 3], "amount": 1})), None);
     assert_eq!(json("cutout", json!({"size": [0, 1.0], "color": [1, 2, 3], "num": 2})), None);

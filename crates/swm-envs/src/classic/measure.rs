@@ -13,8 +13,8 @@ pub struct Tally {
     pub reward: f64,
 }
 
-/// Plays 200 episodes with the first expert until they terminate or are truncated. `all` varies all factors. The goal
-/// is drawn by `sample_goal` if `sampled` is set, otherwise by the reset.
+/// Plays 200 episodes with the first expert, each until it terminates or is truncated. `all` varies all factors. The
+/// goal is drawn by `sample_goal` if `sampled` is set, otherwise by the reset.
 pub fn tally(entry: &EnvEntry, all: bool, sampled: bool) -> Tally {
     let variation = VariationRequest { variation: all.then(|| vec!["all".to_owned()]), ..VariationRequest::default() };
     let options = ResetOptions { variation, ..ResetOptions::default() };

@@ -40,7 +40,8 @@ impl Background {
         self.resized.invalidate();
     }
 
-    /// Fills a frame with the background. Returns the filter it was resized with, or `None` at the original size.
+    /// Fills a frame with the background. Returns the filter that resized the background, or `None` at the original
+    /// size.
     pub fn copy_to(&mut self, frame: &mut FrameMut<'_>) -> Option<&TriangleResizer> {
         if (frame.width, frame.height) == (self.side, self.side) {
             frame.rgb.copy_from_slice(&self.image);
@@ -51,8 +52,8 @@ impl Background {
         Some(&resized.resizer)
     }
 
-    /// Renders a frame: the background, and the shapes that `draw` draws over it. `draw` returns the area it may have
-    /// changed.
+    /// Renders a frame: the background, and the shapes that `draw` draws over it. `draw` returns the area that may
+    /// have changed.
     pub fn draw_over(&mut self, mut frame: FrameMut<'_>, draw: impl FnOnce(&mut Pixels<'_>) -> Area) {
         let side = self.side;
         if self.copy_to(&mut frame).is_none() {

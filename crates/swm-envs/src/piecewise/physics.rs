@@ -1,4 +1,4 @@
-//! The dynamics: a disc moves by `action * speed` and by the drift of the zone it is in, and is held inside the border.
+//! The dynamics: a disc moves by `action * speed` and by the drift of its zone, and is held inside the border.
 //!
 //! Constants, and the single precision of positions, are those of the reference (`piecewise/piecewise_env.py`).
 //! Lengths are in pixels of the 224-pixel frame.

@@ -7,7 +7,7 @@ use crate::draw::{Area, Background, Brush, Rgb, SoftDisc, rect};
 use crate::point_agent::room::{BORDER, LINE, SIZE};
 use swm_core::FrameMut;
 
-/// Side of the frame as it is drawn, in pixels.
+/// Side of the square frame before it is resized, in pixels.
 const SIDE: usize = SIZE as usize;
 
 /// Colours and geometry of everything but the agent.

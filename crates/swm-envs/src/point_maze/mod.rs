@@ -98,7 +98,7 @@ impl PointTask for PointMaze {
         }
     }
 
-    /// Reuses the visibility graph if the layout is unchanged, and the paths if the goal is unchanged too.
+    /// Keeps the cached visibility graph and paths if the layout is unchanged.
     fn set_factors(&mut self, factors: &FactorValues) {
         let (layout, goal) = (layout(factors), self.appearance.goal.center);
         if layout != self.layout {

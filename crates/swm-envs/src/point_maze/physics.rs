@@ -1,4 +1,4 @@
-//! The dynamics: a disc moves by `action * speed`, stays where it is if it would touch a wall, and is held inside the
+//! The dynamics: a disc moves by `action * speed` unless it would touch a wall, and is held inside the
 //! square.
 //!
 //! Constants, the order of the checks and the single precision are those of the reference (`simple_point_maze.py`).

@@ -7,7 +7,7 @@ use crate::draw::{Area, Background, Pixels, Rgb, rect};
 use crate::point_agent::Position;
 use swm_core::{FactorValues, FrameMut};
 
-/// Side of the frame as it is drawn, in pixels.
+/// Side of the square frame before it is resized, in pixels.
 const SIDE: usize = 500;
 /// Pixels per maze unit.
 const SCALE: f64 = SIDE as f64 / SIZE as f64;

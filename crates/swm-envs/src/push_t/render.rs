@@ -1,5 +1,5 @@
-//! Rendering: the goal pose, the block and the agent with outlines, the walls, and red marks at contacts, drawn at 512
-//! x 512 pixels as in the reference and resized.
+//! Rendering: the goal pose, the block and the agent with outlines, the walls, and red marks at contacts. Frames are
+//! drawn at 512 x 512 pixels as in the reference, then resized.
 //!
 //! The table with goal pose and walls is static during an episode: it is drawn once, and resampled once per frame size.
 //! A frame copies the resampled table, draws agent and block on the canvas, resamples their area, and restores the

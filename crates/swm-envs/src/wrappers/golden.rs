@@ -83,7 +83,8 @@ fn wrappers_equal_the_reference() {
                 ColorJitter::new(ranges).apply(&mut frame, EpisodeFrame::Step(step));
             }
             ("random-conv", Some(weights)) => {
-                let side = usize::try_from(case["kernel_size"].as_u64().expect("reading a size")).expect("a size");
+                let side =
+                    usize::try_from(case["kernel_size"].as_u64().expect("reading a size")).expect("a valid size");
                 let mut conv = RandomConv::new(side);
                 conv.set(weights.iter().map(|&weight| weight as f32));
                 conv.apply(&mut frame, EpisodeFrame::Step(step));

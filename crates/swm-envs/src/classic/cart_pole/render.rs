@@ -3,7 +3,7 @@
 use crate::classic::frame::{Color, Surface, pixel};
 use crate::classic::geometry::rotated;
 
-/// Width and height of the frame as it is drawn, in pixels.
+/// Width and height of frames before they are resized, in pixels.
 pub const SIZE: (usize, usize) = (600, 400);
 /// Colour of cart and track.
 pub const CART: [u8; 3] = [0, 0, 0];

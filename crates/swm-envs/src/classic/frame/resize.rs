@@ -192,7 +192,8 @@ mod tests {
             (13, 6, &[200, 200, 200, 200, 145, 122, 148, 174, 191, 200, 200, 200, 200]),
         ];
         for (width, height, expected) in expected {
-            // Of every four diagonals of pixels, this many belong to the background; all others are drawn over it.
+            // Of every four diagonals of pixels, this many belong to the background; all other pixels are drawn over
+            // it.
             for diagonals in 0..4 {
                 let mut resize = Resize::new((9, 6), width, height);
                 let mut background = surface(|x, y| (x + y) % 4 < diagonals);

@@ -71,7 +71,7 @@ impl Surface {
         &self.pixels[y * self.width..][..self.width]
     }
 
-    /// A range that contains the drawn columns of a row; empty if there are none.
+    /// A range that contains the drawn columns of a row; empty if the row has no drawn column.
     pub fn drawn(&self, y: usize) -> Range<usize> {
         self.drawn[y].clone()
     }

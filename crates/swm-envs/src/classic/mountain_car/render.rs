@@ -5,7 +5,7 @@ use crate::classic::frame::{Color, Surface, pixel};
 use crate::classic::geometry::rotated;
 use crate::draw::Point;
 
-/// Width and height of the frame as it is drawn, in pixels.
+/// Width and height of frames before they are resized, in pixels.
 pub const SIZE: (usize, usize) = (600, 400);
 /// Colour of hill, car and flagpole.
 pub const INK: [u8; 3] = [0, 0, 0];

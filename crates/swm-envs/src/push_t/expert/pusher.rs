@@ -1,7 +1,7 @@
 //! [`Pusher`]: the expert that plans pushes in a copy of the simulation.
 //!
 //! A plan is a path around the block to a point beside it, and a push from there: a direction, a strength and a number
-//! of steps. Pushes from all around the block are tried in the model, and the expert chooses the one that reduces the
+//! of steps. Pushes from all around the block are tried in the model, and the expert chooses the push that reduces the
 //! error fastest. If no push reduces the error enough, the expert searches for a push after which a good push is
 //! possible. When the block is at its goal, the agent walks to its own goal.
 

@@ -103,7 +103,7 @@ struct Nearest {
     hint: u32,
 }
 
-/// A corner `ab` of the Minkowski difference `b - a`, and the corners of both shapes that it consists of.
+/// A corner `ab` of the Minkowski difference `b - a`, with the corners `a` and `b` of the two shapes.
 #[derive(Clone, Copy)]
 struct Corner {
     a: Vec2,

@@ -66,7 +66,7 @@ fn wrappers_equal_the_reference() {
         let case_name = format!("case {i}, {case:?}");
         let id = case.remove("wrapper").expect("the entry `wrapper`").as_str().expect("the id of a wrapper").to_owned();
         let drawn = case.remove("drawn").filter(|drawn| !drawn.is_null()).map(|drawn| floats(&drawn));
-        let step = case.remove("step").and_then(|step| step.as_u64()).expect("stepping the environment");
+        let step = case.remove("step").and_then(|step| step.as_u64()).expect("the entry `step`");
         let RgbImage { width, height, mut rgb } = RgbImage { rgb: original.rgb.clone(), ..original };
         let mut frame = FrameMut::new(width, height, &mut rgb);
         match (id.as_str(), drawn) {

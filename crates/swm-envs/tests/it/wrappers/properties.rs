@@ -230,7 +230,7 @@ fn frames_do_not_depend_on_threads_or_other_environments() {
         for _ in 0..5 {
             for (slot, frames) in frames.iter_mut().enumerate() {
                 for column in ["pixels", "goal"] {
-                    let column = pool.infos().schema().index(column).expect("reading the column");
+                    let column = pool.infos().schema().index(column).expect("finding the column");
                     frames.extend_from_slice(pool.infos().row(slot).at::<u8>(column));
                 }
             }

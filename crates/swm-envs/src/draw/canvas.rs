@@ -358,6 +358,7 @@ impl Edge {
         }
     }
 
+    /// Moves the edge to the next row.
     fn advance(&mut self) {
         self.x += self.step;
         self.rest += self.step_rest;

@@ -30,7 +30,7 @@ struct SteeringExpert {
     plan: Option<Plan>,
 }
 
-/// The way to a target with given dynamics.
+/// A path to a target for given dynamics, straight or by detours.
 struct Plan {
     dynamics: Dynamics,
     to: Position,

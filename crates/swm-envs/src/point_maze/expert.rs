@@ -53,7 +53,7 @@ impl Planner {
     }
 }
 
-/// Returns the step towards `next`: as far as the agent gets along a straight line, but not beyond `next`.
+/// Returns the longest step straight towards `next` that does not pass `next`, with components of at most 1.
 fn step_towards(layout: &Layout, from: Position64, next: Position64) -> Position64 {
     let away = [0, 1].map(|i| next[i] - from[i]);
     let longest = f64::from(layout.speed * MAX_ACTION);

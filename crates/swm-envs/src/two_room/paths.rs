@@ -6,7 +6,7 @@ use super::physics::{Layout, WALL_CENTER};
 use crate::point_agent::room::GOAL_RADIUS;
 use crate::point_agent::{Position64, distance64};
 
-/// Distance that a path keeps from the edges of a door, where the door is wide enough, in pixels.
+/// Distance that a path keeps from the edges of a door if the door is wide enough, in pixels.
 const CLEARANCE: f64 = 3.0;
 /// Gap between the agent and the wall at which a path turns into a door, in pixels.
 const STAND_OFF: f64 = 1.0;
@@ -58,7 +58,7 @@ pub fn length(layout: &Layout, from: Position64, to: Position64) -> Option<f64> 
     best_door(layout, from, to).map(|(_, _, length)| length)
 }
 
-/// The openings of all passable doors.
+/// Returns the openings of all passable doors.
 fn openings(layout: &Layout) -> impl Iterator<Item = [f64; 2]> + use<> {
     let layout = *layout;
     layout.doors.into_iter().filter_map(move |door| usable_opening(&layout, door))

@@ -168,45 +168,45 @@ impl Surface {
             self.horizontal_line(centre.y + y, centre.x, centre.x, color);
         }
         let (mut x, mut y, mut off) = (0, -radius, 0);
-        // 2x and 2y, which give the change of `off` by the next step along x and along y.
-        let (mut outwards, mut inwards) = (0, -2 * radius);
+        // 2x and 2y determine the change of `off` by the next step along x and along y.
+        let (mut twice_x, mut twice_y) = (0, -2 * radius);
         for _ in 0..steps {
             x -= 1;
-            off += outwards - 1;
+            off += twice_x - 1;
             let neighbour = if off >= 0 {
                 y - 1
-            } else if off - inwards > 1 && 2 * off - inwards >= 1 {
+            } else if off - twice_y > 1 && 2 * off - twice_y >= 1 {
                 y + 1
             } else {
                 let before = y;
-                let is_past = off - inwards > 1;
+                let is_past = off - twice_y > 1;
                 y += 1;
-                off -= inwards + 1;
-                inwards += 2;
+                off -= twice_y + 1;
+                twice_y += 2;
                 if is_past { before } else { y + 1 }
             };
-            outwards -= 2;
-            let weight = neighbour_share(off, inwards);
+            twice_x -= 2;
+            let weight = neighbour_share(off, twice_y);
             self.mirrored(centre, [x, y], color, 255 - weight);
             self.mirrored(centre, [x, neighbour], color, weight);
         }
         for _ in 0..steps {
             y += 1;
-            off -= inwards + 1;
+            off -= twice_y + 1;
             let neighbour = if off <= 0 {
                 x + 1
-            } else if off + outwards < 1 && 2 * off + outwards <= 1 {
+            } else if off + twice_x < 1 && 2 * off + twice_x <= 1 {
                 x - 1
             } else {
                 let before = x;
-                let is_past = off + outwards < 1;
+                let is_past = off + twice_x < 1;
                 x -= 1;
-                off += outwards - 1;
-                outwards -= 2;
+                off += twice_x - 1;
+                twice_x -= 2;
                 if is_past { before } else { x - 1 }
             };
-            inwards += 2;
-            let weight = neighbour_share(off, outwards);
+            twice_y += 2;
+            let weight = neighbour_share(off, twice_x);
             self.mirrored(centre, [x, y], color, 255 - weight);
             self.mirrored(centre, [neighbour, y], color, weight);
         }

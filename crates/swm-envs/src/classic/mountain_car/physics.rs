@@ -1,7 +1,7 @@
 //! The dynamics: a car in a sinusoidal valley whose motor is weaker than gravity (Moore 1990).
 //!
 //! Constants, and the order and precision of operations, are those of Gymnasium's MountainCar (double precision) and
-//! Continuous_MountainCar (single precision, as its state). Lengths are in track units, times in steps.
+//! Continuous_MountainCar (single precision, like its state). Lengths are in track units, times in steps.
 
 /// Positions of the walls at both ends of the track, in track units.
 pub const ENDS: [f64; 2] = [-1.2, 0.6];

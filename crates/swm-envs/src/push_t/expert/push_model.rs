@@ -110,7 +110,7 @@ impl PushModel {
         }
     }
 
-    /// Returns the action that brings the agent to a position in one step, as far as actions allow.
+    /// Returns the action that moves the agent to a position in one step, or as near as the largest action allows.
     pub fn approach(&self, now: &Observation, to: Vec2) -> [f64; 2] {
         let drift = Vec2::new(now.state[5], now.state[6]) * self.drift;
         let wanted = (to - now.agent() - drift) * (1.0 / self.speed);

@@ -1,4 +1,4 @@
-//! Success counts of every expert of every environment, as a table; the READMEs quote it.
+//! Prints a table of the success counts of every expert of every environment. The READMEs quote these counts.
 //!
 //!     cargo run --release -p swm-envs --example experts [PART OF AN ID] [EPISODES]
 //!
@@ -16,7 +16,7 @@ const EPISODES: u64 = 200;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let part = arguments.first().map_or("", String::as_str).to_lowercase();
+    let id_part = arguments.first().map_or("", String::as_str).to_lowercase();
     let episodes = arguments.get(1).map_or(Ok(EPISODES), |number| number.parse())?;
     let mut out = std::io::stdout();
     writeln!(
@@ -24,12 +24,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         "| environment | expert | factors varied | success | steps, median | solved at start | steps/s of a core |"
     )?;
     writeln!(out, "| --- | --- | --- | --- | --- | --- | --- |")?;
-    for entry in ENVS.rows.iter().filter(|entry| entry.id.to_lowercase().contains(&part)) {
+    for entry in ENVS.rows.iter().filter(|entry| entry.id.to_lowercase().contains(&id_part)) {
         for expert in entry.experts {
-            for (words, variation) in [("default", None), ("all", Some(vec!["all".to_owned()]))] {
+            for (factors, variation) in [("default", None), ("all", Some(vec!["all".to_owned()]))] {
                 let variation = VariationRequest { variation, ..VariationRequest::default() };
                 let tally = play(entry, expert, &ResetOptions { variation, ..ResetOptions::default() }, episodes)?;
-                writeln!(out, "| `{}` | `{}` | {words} | {tally} |", entry.id, expert.id)?;
+                writeln!(out, "| `{}` | `{}` | {factors} | {tally} |", entry.id, expert.id)?;
             }
         }
     }
@@ -40,7 +40,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 #[derive(Default)]
 struct Tally {
     episodes: usize,
-    solved_before: usize,
+    solved_at_start: usize,
     /// The number of steps of every successful episode.
     successes: Vec<usize>,
     steps: usize,
@@ -53,15 +53,15 @@ impl std::fmt::Display for Tally {
         successes.sort_unstable();
         let median = successes.get(successes.len() / 2).map_or("–".to_owned(), ToString::to_string);
         let speed = self.steps as f64 / self.time.as_secs_f64();
-        let tried = self.episodes - self.solved_before;
-        write!(f, "{} of {tried} | {median} | {} | {speed:.0}", successes.len(), self.solved_before)
+        let tried = self.episodes - self.solved_at_start;
+        write!(f, "{} of {tried} | {median} | {} | {speed:.0}", successes.len(), self.solved_at_start)
     }
 }
 
 /// Plays episodes 0, 1, … on all cores.
 fn play(entry: &EnvEntry, expert: &ExpertEntry, options: &ResetOptions, episodes: u64) -> Result<Tally> {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    let parts = std::thread::scope(|scope| {
+    let tallies = std::thread::scope(|scope| {
         let workers: Vec<_> = (0..cores)
             .map(|first| {
                 scope.spawn(move || {
@@ -71,14 +71,17 @@ fn play(entry: &EnvEntry, expert: &ExpertEntry, options: &ResetOptions, episodes
                 })
             })
             .collect();
-        workers.into_iter().map(|worker| worker.join().expect("no worker panics")).collect::<Result<Vec<Tally>>>()
+        workers
+            .into_iter()
+            .map(|worker| worker.join().expect("joining a worker thread"))
+            .collect::<Result<Vec<Tally>>>()
     })?;
-    Ok(parts.into_iter().fold(Tally::default(), |mut sum, part| {
-        sum.episodes += part.episodes;
-        sum.solved_before += part.solved_before;
-        sum.successes.extend(part.successes);
-        sum.steps += part.steps;
-        sum.time += part.time;
+    Ok(tallies.into_iter().fold(Tally::default(), |mut sum, tally| {
+        sum.episodes += tally.episodes;
+        sum.solved_at_start += tally.solved_at_start;
+        sum.successes.extend(tally.successes);
+        sum.steps += tally.steps;
+        sum.time += tally.time;
         sum
     }))
 }
@@ -93,7 +96,7 @@ struct Player {
 
 impl Player {
     fn new(entry: &EnvEntry, expert: &ExpertEntry) -> Result<Self> {
-        let env = entry.env().expect("an environment");
+        let env = entry.env().expect("creating the environment");
         let row = Batch::zeros(&Schema::new(env.spec().columns.clone())?, 1);
         Ok(Self { env, expert: (expert.make)(), row, tally: Tally::default() })
     }
@@ -103,7 +106,7 @@ impl Player {
         self.expert.begin(Key::new(seed));
         self.tally.episodes += 1;
         if self.env.is_success() {
-            self.tally.solved_before += 1;
+            self.tally.solved_at_start += 1;
             return Ok(());
         }
         let begun = Instant::now();

@@ -3,8 +3,8 @@
 //!
 //!     cargo run --release -p swm-envs --example golden_sheet
 //!
-//! It reads the recorded rollouts of the golden tests (`SWM_GOLDEN`, by default `../shared/reference/golden`): for each
-//! environment the first one with default factors and the first one with all of them varied.
+//! It reads the recorded rollouts of the golden tests (`tests/golden` and the folder `SWM_GOLDEN`): for each
+//! environment, the first rollout with default factors and the first rollout with all factors varied.
 
 use std::fmt::Write as _;
 use std::fs::File;
@@ -64,7 +64,7 @@ struct Frames {
 
 /// Replays a rollout and returns its first and last frame.
 fn compare(entry: &EnvEntry, mut golden: Golden) -> Result<[Frames; 2]> {
-    let mut env = entry.env().expect("an environment");
+    let mut env = entry.env().expect("creating the environment");
     env.reset(0, &start(entry, &*env, &mut golden))?;
     let first = frames(&mut *env, &mut golden, "frame_first");
     let n = env.spec().action_dim();
@@ -100,7 +100,7 @@ fn start(entry: &EnvEntry, env: &dyn Env, golden: &mut Golden) -> ResetOptions {
 fn frames(env: &mut dyn Env, golden: &mut Golden, name: &str) -> Frames {
     let (height, width, golden) = golden.image(name);
     let mut ours = vec![0; golden.len()];
-    env.render(FrameMut::new(width, height, &mut ours)).expect("a frame");
+    env.render(FrameMut::new(width, height, &mut ours)).expect("rendering a frame");
     Frames { height, width, golden, ours }
 }
 
@@ -118,23 +118,23 @@ impl Sheet {
         self.rgb.resize((top + LABELS + height + GAP) * self.width * 3, 255);
         for (i, (frame, difference)) in frames.iter().zip(differences).enumerate() {
             let left = GAP + 3 * i * (CELL + GAP);
-            // The name is as wide as two cells.
+            // The name may take two cells, so the second cell has no label.
             let label = if i == 0 { name.trim_start_matches("swm/") } else { "last frame" };
             self.text(label, left, top + 5);
             self.text(&format!("difference {difference:.3}"), left + 2 * (CELL + GAP), top + 5);
-            let apart: Vec<u8> = frame
+            let amplified: Vec<u8> = frame
                 .golden
                 .iter()
                 .zip(&frame.ours)
                 .map(|(a, b)| a.abs_diff(*b).saturating_mul(AMPLIFICATION))
                 .collect();
-            for (k, rgb) in [&frame.golden, &frame.ours, &apart].into_iter().enumerate() {
+            for (k, rgb) in [&frame.golden, &frame.ours, &amplified].into_iter().enumerate() {
                 self.image(frame, rgb, left + k * (CELL + GAP), top + LABELS);
             }
         }
     }
 
-    /// Draws a frame, shrunk to a cell: every pixel is the mean of those it covers.
+    /// Draws a frame, shrunk to a cell: every pixel is the mean of the pixels that it covers.
     fn image(&mut self, Frames { height, width, .. }: &Frames, rgb: &[u8], left: usize, top: usize) {
         let rows = CELL * height / width;
         for (y, x) in (0..rows).flat_map(|y| (0..CELL).map(move |x| (y, x))) {

@@ -1,5 +1,6 @@
-//! Draws a contact sheet of all wrappers, `docs/wrappers.png`: one row per wrapper, the first one without any; Push-T
-//! on the left and Two-Room on the right, each at steps 0 and 10 of an episode and at step 0 of another one.
+//! Draws a contact sheet of all wrappers, `docs/wrappers.png`: a row of frames without wrappers, then one row per
+//! wrapper. Push-T is on the left and Two-Room on the right, each at steps 0 and 10 of one episode and at step 0 of
+//! another episode.
 //!
 //!     cargo run --release -p swm-envs --example wrapper_sheet [OUT.png]
 
@@ -40,11 +41,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for (row, texts) in rows.iter().enumerate() {
         let stack = Stack::parse(texts)?;
         for (half, entry) in [push_t::ENTRY, two_room::ENTRY].iter().enumerate() {
-            let mut env = stack.wrap(entry.env().expect("an environment"), GoalFrame::Clean);
+            let mut env = stack.wrap(entry.env().expect("creating the environment"), GoalFrame::Clean);
             for (column, (seed, steps)) in [(1, 0), (1, 10), (2, 0)].into_iter().enumerate() {
                 play(&mut *env, seed, steps)?;
                 let mut rgb = vec![0; 3 * SIDE * SIDE];
-                env.render(FrameMut::new(SIDE, SIDE, &mut rgb)).expect("a frame");
+                env.render(FrameMut::new(SIDE, SIDE, &mut rgb)).expect("rendering a frame");
                 let left = (3 * half + column) * (SIDE + GAP);
                 for (y, line) in rgb.chunks_exact(3 * SIDE).enumerate() {
                     let start = 3 * ((row * (SIDE + GAP) + y) * width + left);

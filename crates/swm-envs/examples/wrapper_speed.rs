@@ -1,4 +1,4 @@
-//! Measures frames per second of every wrapper on one core, with frames of Push-T; the table of `docs/wrappers.md`.
+//! Measures frames per second of every wrapper on one core, with frames of Push-T, for the table of `docs/wrappers.md`.
 //!
 //!     cargo run --release -p swm-envs --example wrapper_speed
 
@@ -9,7 +9,7 @@ use swm_core::{FrameMut, Key, ResetOptions, Result};
 use swm_envs::push_t;
 use swm_envs::wrappers::{EpisodeFrame, VisualWrapper, WRAPPERS, parse};
 
-/// Frames per measurement, of which the median counts.
+/// The number of timed frames per measurement; the result is the median.
 const FRAMES: u64 = 101;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -36,10 +36,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 
 /// Returns frames per second, without the time to draw and copy them.
 fn rate(wrapper: &mut dyn VisualWrapper, side: usize, noisy: bool) -> Result<f64> {
-    let mut env = push_t::ENTRY.env().expect("an environment");
+    let mut env = push_t::ENTRY.env().expect("creating the environment");
     env.reset(0, &ResetOptions::default())?;
     let mut original = vec![0; 3 * side * side];
-    env.render(FrameMut::new(side, side, &mut original)).expect("a frame");
+    env.render(FrameMut::new(side, side, &mut original)).expect("rendering a frame");
     if noisy {
         parse("noise")?.apply(&mut FrameMut::new(side, side, &mut original), EpisodeFrame::Step(0));
     }

@@ -1,5 +1,7 @@
 //! Native 2-D environments, one folder each with physics, rendering, experts and a README, and the visual wrappers that
 //! change the frames of any environment.
+//!
+//! "The reference" is the Python package `stable-worldmodel`, whose environments and wrappers this crate reproduces.
 
 pub mod classic;
 mod draw;

@@ -20,8 +20,8 @@ pub fn check(what: &str, cos: f64, sin: f64) -> Result<()> {
 
 /// Returns the angle of a cosine and a sine, in radians.
 ///
-/// If both are in single precision, as observations are, the result is the middle of all angles with these values, so
-/// that an angle restored from an observation gives the same observation to the last bit.
+/// If cosine and sine are single-precision values, as in observations, the result is the middle of the interval of
+/// angles that round to them. The restored angle then gives the same observation bit for bit.
 pub fn from_cos_sin(cos: f64, sin: f64) -> f64 {
     if [cos, sin].iter().any(|&v| f64::from(v as f32) != v) {
         return sin.atan2(cos);
@@ -29,7 +29,7 @@ pub fn from_cos_sin(cos: f64, sin: f64) -> f64 {
     // The interval of double-precision values that round to a single-precision value.
     let rounding_interval = |v: f64| {
         let v = v as f32;
-        let [below, above] = [v.next_down(), v.next_up()].map(|other| f64::midpoint(f64::from(v), f64::from(other)));
+        let [below, above] = [v.next_down(), v.next_up()].map(|next| f64::midpoint(f64::from(v), f64::from(next)));
         (below.clamp(-1.0, 1.0), above.clamp(-1.0, 1.0))
     };
     let ((cos_low, cos_high), (sin_low, sin_high)) = (rounding_interval(cos), rounding_interval(sin));

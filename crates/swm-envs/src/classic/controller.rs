@@ -6,7 +6,7 @@ use swm_core::columns::{GOAL_STATE, STATE};
 use swm_core::policy::Expert;
 use swm_core::{Key, Result, RowRef};
 
-/// Acts by [`ControlTask::control`]. It reads only the columns `state`, `goal_state` and `physics`.
+/// An expert that acts by [`ControlTask::control`]. It reads only the columns `state`, `goal_state` and `physics`.
 pub struct Controller<T>(PhantomData<fn() -> T>);
 
 impl<T> Controller<T> {

@@ -40,11 +40,11 @@ pub struct ClassicEnv<T: ControlTask> {
     goal: T::State,
     /// Created when the first frame is drawn.
     renderer: Option<FrameRenderer>,
-    /// Whether the renderer has the background and colours of this episode.
+    /// True while the renderer has the background and colours of this episode.
     is_renderer_current: bool,
 }
 
-/// The bounds of a `state` column, in single precision as the reference has them.
+/// The bounds of a `state` column, rounded to single precision as in the reference.
 fn observation_space<T: ControlTask>() -> Space {
     let single = |bound: f64| f64::from(bound as f32);
     let (low, high) = T::STATE_BOUNDS.iter().map(|&(low, high)| (single(low), single(high))).unzip();
@@ -79,7 +79,7 @@ impl<T: ControlTask> ClassicEnv<T> {
 
     /// Starts an episode with these factors, state and goal.
     fn begin(&mut self, factors: FactorValues, state: T::State, goal: T::State) {
-        // Most episodes have the same factors as the previous one, so the renderer's background stays valid.
+        // The renderer's background stays valid if the factors equal those of the previous episode.
         self.is_renderer_current &= factors.iter().eq(self.factors.iter());
         self.physics = physics::<T>(&factors);
         self.task = T::new(&self.physics);

@@ -2,7 +2,8 @@
 
 /// Rotates a vector counter-clockwise by an angle in radians.
 ///
-/// As in pygame, angles within a millionth of a quarter turn count as quarter turns, which decides whole pixels.
+/// As in pygame, an angle within 10⁻⁶ radians of a multiple of a quarter turn counts as this multiple. Otherwise
+/// rounding errors could move corners by a pixel.
 pub fn rotated([x, y]: [f64; 2], angle: f64) -> [f64; 2] {
     const TOLERANCE: f64 = 1e-6;
     let quarter = std::f64::consts::FRAC_PI_2;

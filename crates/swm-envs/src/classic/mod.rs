@@ -1,7 +1,7 @@
 //! Classic control: the environments of Gymnasium, with the factors of variation of the reference.
 //!
 //! Each environment implements [`ControlTask`]: equations of motion, a goal, a controller and drawing. [`ClassicEnv`]
-//! is the [`swm_core::Env`] of any of them, and [`Controller`] its expert.
+//! is the [`swm_core::Env`] of any [`ControlTask`], and [`Controller`] its expert.
 
 pub mod acrobot;
 mod angle;

@@ -4,7 +4,8 @@ use super::factors::{ColorFactor, PhysicsFactor};
 use super::frame::Surface;
 use swm_core::{Result, Rng, Space, Transition};
 
-/// The dynamics, goal, controller and drawing of one classic-control environment, with the physics of an episode.
+/// The dynamics, goal, controller and drawing of one classic-control environment, for the physical factors of one
+/// episode.
 pub trait ControlTask: Send + Sized + 'static {
     /// The registered id of the environment.
     const ID: &'static str;
@@ -31,7 +32,7 @@ pub trait ControlTask: Send + Sized + 'static {
     /// Samples the start state of an episode.
     fn sample_start(rng: &mut Rng) -> Self::State;
 
-    /// Samples the goal of the task, which an episode has unless the caller gives one.
+    /// Samples the goal of an episode whose reset options contain no goal.
     fn sample_task_goal(rng: &mut Rng) -> Self::State;
 
     /// Advances the state by one step. A discrete action is the index of the choice.
@@ -40,7 +41,7 @@ pub trait ControlTask: Send + Sized + 'static {
     /// Writes the `state` column.
     fn observe(state: &Self::State, row: &mut [f32]);
 
-    /// The values of the `state` column that a caller may give.
+    /// The space of the `state` columns that callers may give.
     fn state_space() -> Space;
 
     /// Reads a state from a `state` column within [`ControlTask::state_space`].

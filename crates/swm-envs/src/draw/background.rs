@@ -1,7 +1,7 @@
 //! [`Background`]: the static part of a frame, drawn once per episode and resized once per frame size.
 //!
 //! A frame copies the resized background, draws the moving shapes at the original size, and resizes only the pixels
-//! they touch.
+//! that these shapes touch.
 
 use super::{Area, BySize, Pixels};
 use swm_core::FrameMut;
@@ -10,7 +10,7 @@ use swm_image::resize::TriangleResizer;
 /// A square background image with resized copies, and a canvas to draw moving shapes over it.
 pub struct Background {
     side: usize,
-    /// `[side, side, 3]`.
+    /// The background, `[side, side, 3]`.
     image: Vec<u8>,
     /// A copy of `image` into which a frame's moving shapes are drawn; made for the first resized frame.
     canvas: Option<Vec<u8>>,
@@ -20,7 +20,7 @@ pub struct Background {
 /// The background at one frame size.
 struct Resized {
     resizer: TriangleResizer,
-    /// `[height, width, 3]`.
+    /// The resized background, `[height, width, 3]`.
     rgb: Vec<u8>,
 }
 
@@ -40,7 +40,8 @@ impl Background {
         self.resized.invalidate();
     }
 
-    /// Fills a frame with the background. Returns the filter it was resized with, or `None` at the original size.
+    /// Fills a frame with the background. Returns the filter that resized the background, or `None` at the original
+    /// size.
     pub fn copy_to(&mut self, frame: &mut FrameMut<'_>) -> Option<&TriangleResizer> {
         if (frame.width, frame.height) == (self.side, self.side) {
             frame.rgb.copy_from_slice(&self.image);
@@ -51,8 +52,8 @@ impl Background {
         Some(&resized.resizer)
     }
 
-    /// Renders a frame: the background, and the shapes that `draw` draws over it. `draw` returns the area it may have
-    /// changed.
+    /// Renders a frame: the background, and the shapes that `draw` draws over it. `draw` returns the area that may
+    /// have changed.
     pub fn draw_over(&mut self, mut frame: FrameMut<'_>, draw: impl FnOnce(&mut Pixels<'_>) -> Area) {
         let side = self.side;
         if self.copy_to(&mut frame).is_none() {
@@ -106,7 +107,7 @@ mod tests {
                 Pixels::new(30, &mut full).fill(dot(x), [255, 10, 30]);
                 let mut expected = vec![0; width * height * 3];
                 TriangleResizer::new(30, width, height).resize_part(&full, 0..30, 0..30, &mut expected);
-                assert!(frame == expected, "{width} x {height}, {x}");
+                assert!(frame == expected, "{width} x {height}, dot at {x}");
             }
         }
     }

@@ -1,4 +1,4 @@
-//! [`Canvas`]: an image of palette indices and shapes to fill in it, pixel for pixel those of pygame 2.6.
+//! [`Canvas`]: an image of palette indices, with shapes that cover the same pixels as those of pygame 2.6.
 
 use std::ops::Range;
 
@@ -31,7 +31,7 @@ impl Point {
     }
 }
 
-/// A rectangle of pixels from `low` to `high`, which is excluded.
+/// A rectangle of pixels from the corner `low`, included, to the corner `high`, excluded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Area {
     low: Point,
@@ -68,7 +68,7 @@ impl Area {
     }
 }
 
-/// The colours of the indices. Colours of blended pixels are added while drawing and dropped by
+/// A colour for every index. Colours of blended pixels are added while drawing and dropped by
 /// [`Palette::drop_blended`].
 #[derive(Clone, Debug)]
 pub struct Palette {
@@ -247,12 +247,12 @@ impl Canvas {
                 None if steep => self.span(at.y, first.x, at.x + after, index),
                 None => (first.y..=at.y + after).for_each(|y| self.span(y, at.x, at.x, index)),
             }
-            let twice = error;
-            if twice > -dx {
+            let previous = error;
+            if previous > -dx {
                 error -= dy;
                 at.x += step_x;
             }
-            if twice < dy {
+            if previous < dy {
                 error += dx;
                 at.y += step_y;
             }
@@ -268,8 +268,8 @@ impl Canvas {
 
     /// Draws a thick line of [`WIDTH`] with round ends. A line of length 0 is not drawn.
     ///
-    /// Its sides follow from absolute differences, as in the reference's debug drawing, so they are skewed where the
-    /// line descends from left to right.
+    /// The sides are computed from absolute coordinate differences, as in the reference's debug drawing. They are
+    /// skewed if the line descends from left to right.
     pub fn thick_line(&mut self, from: Point, to: Point, index: u8) {
         let radius = WIDTH / 2;
         self.flat_line(from, to, index);
@@ -326,22 +326,23 @@ const MAX_CORNERS: usize = 8;
 #[derive(Clone, Copy, Default)]
 struct Edge {
     top: i32,
-    /// The row after its last row.
+    /// The row after the edge's last row.
     end: i32,
-    /// The column at which it crosses the current row, rounded down.
+    /// The column at which the edge crosses the current row, rounded down.
     x: i32,
-    /// The remainder of that rounding, in units of 1 / `height`.
+    /// The remainder of rounding `x`, in units of 1 / `height`.
     rest: i32,
     /// The change of `x` per row, rounded down.
     step: i32,
-    /// The remainder of that rounding, in units of 1 / `height`.
+    /// The remainder of rounding `step`, in units of 1 / `height`.
     step_rest: i32,
     /// The number of rows that the edge crosses.
     height: i32,
 }
 
 impl Edge {
-    /// Makes the edge between two corners, at its first row from `first` on.
+    /// Makes the edge between two corners, at the first of its rows that is not above row `first`. `bottom` is the last
+    /// row of the polygon.
     fn new(a: Point, b: Point, first: i32, bottom: i32) -> Self {
         let (upper, lower) = if a.y < b.y { (a, b) } else { (b, a) };
         let (width, height) = (lower.x - upper.x, lower.y - upper.y);
@@ -357,6 +358,7 @@ impl Edge {
         }
     }
 
+    /// Moves the edge to the next row.
     fn advance(&mut self) {
         self.x += self.step;
         self.rest += self.step_rest;
@@ -371,7 +373,7 @@ impl Edge {
 mod tests {
     use super::*;
 
-    /// The canvas as text.
+    /// Returns the rows of the canvas as text.
     fn text(canvas: &Canvas) -> Vec<String> {
         (0..canvas.side()).map(|y| canvas.row(y).iter().map(|&p| if p == 0 { '.' } else { '#' }).collect()).collect()
     }

@@ -6,7 +6,7 @@ use std::ops::Range;
 /// A colour: red, green and blue.
 pub type Rgb = [u8; 3];
 
-/// Returns the pixels from `low` (column and row) to `high`, which is excluded.
+/// Returns the rectangle of pixels from `low` (column, row), included, to `high`, excluded.
 pub fn rect(low: [i32; 2], high: [i32; 2]) -> Area {
     Area::EMPTY.with(Point::new(low[0], low[1]), 0).with(Point::new(high[0] - 1, high[1] - 1), 0)
 }
@@ -88,7 +88,7 @@ impl<'a> Pixels<'a> {
         }
     }
 
-    /// Returns the pixels that a circle can touch.
+    /// Returns an area that contains every pixel of a circle.
     pub fn circle_bounds([cx, cy]: [f64; 2], radius: f64) -> Area {
         Area::EMPTY.with(Point::nearest(cx, cy), radius.ceil() as i32 + 1)
     }
@@ -131,8 +131,10 @@ fn mix(pixel: &mut Rgb, color: Rgb, share: f64) {
     }
 }
 
-/// Adds the part of an edge within the row from `top` to `top + 1`: for each pixel that it crosses the signed area
-/// right of it within the pixel, and the signed height for the pixels beyond.
+/// Adds the coverage by the part of an edge in the row from `top` to `top + 1`.
+///
+/// Every pixel that the edge crosses gets two values: the signed area of the pixel right of the edge, and the signed
+/// height of the edge within the pixel, which is the coverage of all pixels further right.
 fn add_edge(added: &mut [[f64; 2]], columns: &Range<usize>, from: [f64; 2], to: [f64; 2], top: f64) {
     let (low, high, sign) = if from[1] < to[1] { (from, to, 1.0) } else { (to, from, -1.0) };
     let (y0, y1) = (low[1].max(top), high[1].min(top + 1.0));
@@ -183,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn circle_coverage_adds_up_to_its_area() {
+    fn circle_coverage_adds_up_to_the_area() {
         for (x, y, radius) in [(20.0, 20.0, 10.0), (19.3, 20.7, 5.2), (15.5, 15.5, 2.7), (22.1, 18.0, 14.9)] {
             let all = Area::square(40);
             let image = painted(40, |pixels| pixels.circle([x, y], radius, [255; 3], 1.0, all));

@@ -12,17 +12,17 @@ pub struct Resampler {
 }
 
 impl Resampler {
-    /// Makes a resampler from canvases of `side`² to images of `width` x `height`.
+    /// Makes a resampler from canvases of `side`² pixels to images of `width` x `height` pixels.
     pub fn new(side: usize, width: usize, height: usize) -> Self {
         Self { columns: bilinear_taps(side, width), rows: bilinear_taps(side, height) }
     }
 
-    /// Pixels in a row of the image.
+    /// The width of the image, in pixels.
     pub fn width(&self) -> usize {
         self.columns.len()
     }
 
-    /// Writes the part of the image that depends on an area of the canvas.
+    /// Writes the part of the image `rgb`, `[height, width, 3]`, that depends on an area of the canvas.
     pub fn draw(&self, canvas: &Canvas, palette: &Palette, area: Area, rgb: &mut [u8]) {
         let (columns, rows) = area.within(canvas.side());
         if columns.is_empty() || rows.is_empty() {
@@ -48,7 +48,7 @@ impl Resampler {
     }
 }
 
-/// The taps that depend on a range of the canvas.
+/// Returns the indices of the taps that read a range of pixels of the canvas.
 fn touched(taps: &[BilinearTap], range: &Range<usize>) -> Range<usize> {
     let from = taps.partition_point(|tap| tap.second < range.start);
     let to = taps.partition_point(|tap| tap.first < range.end);
@@ -61,7 +61,7 @@ mod tests {
     use crate::draw::Point;
 
     #[test]
-    fn images_equal_opencv() {
+    fn images_equal_those_of_opencv() {
         let mut canvas = Canvas::new(8);
         canvas.fill_polygon(&[Point::new(0, 0), Point::new(3, 0), Point::new(3, 5), Point::new(0, 5)], 1);
         let palette = Palette::new(&[[0, 0, 0], [200, 100, 50]]);

@@ -1,6 +1,6 @@
-//! Soft discs: Gaussian blobs at positions of the reference's 224-pixel frame, drawn at any frame size.
+//! Soft discs, whose opacity is a Gaussian, at positions in the reference's 224-pixel frame, drawn at any frame size.
 //!
-//! Two-Room and Piecewise draw agent and target with them.
+//! Two-Room and Piecewise draw the agent and the target as soft discs.
 
 use super::Rgb;
 use swm_image::resize::TriangleResizer;
@@ -11,11 +11,11 @@ const NATIVE: f64 = 224.0;
 /// A soft disc: a Gaussian whose standard deviation is the radius.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SoftDisc {
-    /// Its centre, x and y, in pixels of the 224-pixel frame. Integers are centres of pixels.
+    /// The centre, x and y, in pixels of the 224-pixel frame. Integers are centres of pixels.
     pub center: [f32; 2],
-    /// Its standard deviation, in pixels of the 224-pixel frame.
+    /// The standard deviation, in pixels of the 224-pixel frame.
     pub radius: f64,
-    /// Its colour.
+    /// The colour.
     pub color: Rgb,
 }
 
@@ -41,7 +41,7 @@ fn quantized(opacity: f64) -> u16 {
 }
 
 impl Brush {
-    /// Blends one disc into an image, `[height, width, 3]`. Only the square that it changes is written.
+    /// Blends one disc into an image, `[height, width, 3]`. Only the pixels within its extent are written.
     pub fn blend(&mut self, disc: &SoftDisc, width: usize, height: usize, rgb: &mut [u8]) {
         let [x, y] = [Profile::new(disc, 0, width), Profile::new(disc, 1, height)];
         self.clear(width, height);
@@ -50,8 +50,8 @@ impl Brush {
         self.blend_profiles(disc.color, width, [x.pixels().start, y.pixels().start], rgb);
     }
 
-    /// Blends one disc into an image, `[height, width, 3]`, that a filter made of a 224-pixel frame. Where the image
-    /// has one colour, this equals blending before resizing.
+    /// Blends one disc into an image, `[height, width, 3]`, that `resizer` made from a 224-pixel frame. Where the
+    /// image has one colour, the result equals blending before resizing.
     pub fn blend_resized(&mut self, disc: &SoftDisc, resizer: &TriangleResizer, rgb: &mut [u8]) {
         let mut start = [0; 2];
         self.clear(resizer.size().0, resizer.size().1);
@@ -93,8 +93,8 @@ impl Brush {
             for ((byte, &across), &tone) in row.iter_mut().zip(&self.across).zip(&self.tones) {
                 let opacity = (((u32::from(across) * u32::from(down)) >> 16) as u16 >> 1) as i16;
                 let difference = (tone - i16::from(*byte)) << 7;
-                let part = ((i32::from(difference) * i32::from(opacity)) >> 16) as i16;
-                *byte = (i16::from(*byte) + ((part + 32) >> 6)) as u8;
+                let change = ((i32::from(difference) * i32::from(opacity)) >> 16) as i16;
+                *byte = (i16::from(*byte) + ((change + 32) >> 6)) as u8;
             }
         }
     }
@@ -107,7 +107,7 @@ struct Profile {
     pixels: usize,
     radius: f64,
     /// Squared distance from the centre to the nearest pixel of the 224-pixel frame, in pixels: the reference scales
-    /// its discs to be opaque there.
+    /// discs to be opaque at this pixel.
     nearest: f64,
 }
 
@@ -162,8 +162,8 @@ mod tests {
             resizer.resize_part(&native, 0..224, 0..224, &mut expected);
             let mut rgb = vec![120; w * h * 3];
             Brush::default().blend_resized(&disc, &resizer, &mut rgb);
-            let apart = rgb.iter().zip(&expected).map(|(a, b)| a.abs_diff(*b)).max();
-            assert!(apart <= Some(1), "{w} x {h}: {apart:?}");
+            let difference = rgb.iter().zip(&expected).map(|(a, b)| a.abs_diff(*b)).max();
+            assert!(difference <= Some(1), "{w} x {h}: {difference:?}");
         }
     }
 }

@@ -30,11 +30,11 @@ struct SteeringExpert {
     plan: Option<Plan>,
 }
 
-/// How to reach a target with given dynamics.
+/// A path to a target for given dynamics, straight or by detours.
 struct Plan {
     dynamics: Dynamics,
     to: Position,
-    /// The detours to the target, where steering straight does not reach it.
+    /// The detours to the target, if steering straight does not reach it.
     detours: Option<Detours>,
 }
 

@@ -115,7 +115,7 @@ impl PointTask for Piecewise {
     }
 }
 
-/// Names, bounds, defaults and order of the reference.
+/// Returns the variation space, with names, bounds, defaults and order of the reference.
 fn variation_space() -> VariationSpace {
     let mut factors = vec![
         color("background.color", [255.0; 3]),
@@ -156,7 +156,7 @@ mod tests {
         let mut env = PointAgentEnv::<Piecewise>::new();
         let mut trapped = vec![];
         for seed in 0..10_000 {
-            env.reset(seed, &all).expect("a reset");
+            env.reset(seed, &all).expect("resetting the environment");
             if env.sample_goal(Key::new(seed)).is_err() {
                 trapped.push(seed);
                 continue;

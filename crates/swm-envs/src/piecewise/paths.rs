@@ -1,4 +1,4 @@
-//! Paths against the drift: straight ones, and detours where the drift is stronger than the agent.
+//! Paths against the drift: straight paths, and detours where the drift is stronger than the agent.
 
 use super::physics::Dynamics;
 use crate::point_agent::Position;
@@ -7,7 +7,8 @@ use crate::point_agent::room::{GOAL_RADIUS, distance};
 /// The maximal number of steps of a straight path.
 const MAX_STEPS: usize = 400;
 
-/// Steers straight towards `to`. Returns the last position and the number of steps to the target, if it is reached.
+/// Steers straight towards `to`. Returns the last position and the number of steps, or `None` if `to`
+/// is not reached.
 pub fn steer_to(dynamics: &Dynamics, from: Position, to: Position) -> (Position, Option<usize>) {
     let mut at = from;
     for steps in 0..MAX_STEPS {
@@ -105,7 +106,7 @@ impl Detours {
         })
     }
 
-    /// Returns the node to step to, or `None` where no path is known.
+    /// Returns the node at which the next step should end, or `None` if no path is known.
     pub fn next(&self, from: Position) -> Option<Position> {
         let [[left, right], [top, bottom]] = self.window(from);
         let nodes = (top..bottom.min(SIDE)).flat_map(|y| (left..right.min(SIDE)).map(move |x| y * SIDE + x));

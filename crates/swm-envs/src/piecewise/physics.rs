@@ -1,6 +1,6 @@
-//! The dynamics: a disc moves by `action * speed` and by the drift of the zone it is in, and is held inside the border.
+//! The dynamics: a disc moves by `action * speed` and by the drift of its zone, and is held inside the border.
 //!
-//! Constants are those of the reference (`piecewise/piecewise_env.py`), and so is single precision for positions.
+//! Constants, and the single precision of positions, are those of the reference (`piecewise/piecewise_env.py`).
 //! Lengths are in pixels of the 224-pixel frame.
 
 use crate::point_agent::Position;
@@ -11,7 +11,7 @@ pub const GRID: usize = 2;
 /// The number of zones, which are numbered row by row.
 pub const ZONES: usize = GRID * GRID;
 
-/// The part of an episode's configuration that decides how the agent moves. Lengths are in pixels.
+/// The parameters of the agent's motion in an episode. Lengths are in pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Dynamics {
     /// The agent's radius.

@@ -1,5 +1,5 @@
-//! Rendering: a room within lines, the zones and their drift where they are shown, and soft discs for target and agent,
-//! drawn at the reference's 224 pixels.
+//! Rendering: the lines around the room, the zones and arrows of their drift if shown, and soft discs for target and
+//! agent, drawn at the reference's 224 pixels.
 
 use super::arrows;
 use super::physics::{GRID, ZONES};
@@ -7,7 +7,7 @@ use crate::draw::{Area, Background, Brush, Rgb, SoftDisc, rect};
 use crate::point_agent::room::{BORDER, LINE, SIZE};
 use swm_core::FrameMut;
 
-/// Side of the frame as it is drawn, in pixels.
+/// Side of the square frame before it is resized, in pixels.
 const SIDE: usize = SIZE as usize;
 
 /// Colours and geometry of everything but the agent.
@@ -47,7 +47,7 @@ impl ZonesRenderer {
         }
         match self.background.copy_to(&mut frame) {
             None => self.brush.blend(agent, SIDE, SIDE, frame.rgb),
-            Some(tent) => self.brush.blend_resized(agent, tent, frame.rgb),
+            Some(resizer) => self.brush.blend_resized(agent, resizer, frame.rgb),
         }
     }
 

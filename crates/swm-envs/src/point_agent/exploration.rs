@@ -16,13 +16,13 @@ const NOISE_WIDTH: f64 = 0.2;
 /// One leg of a random walk.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Leg {
-    /// The position it leads to, in the environment's unit of length.
+    /// The position to which the leg leads, in the environment's unit of length.
     pub to: Position64,
-    /// Length of the action before noise, as a share of the largest action. Above 1 the action is clipped.
+    /// Length of the action before noise, as a share of the largest action. If it is above 1, the action is clipped.
     pub pace: f64,
     /// Steps until the next leg is drawn.
     pub steps: u32,
-    /// Whether the leg leads around walls; otherwise it leads straight, possibly into them.
+    /// True if the leg leads around walls; false if it leads straight, possibly into walls.
     pub avoids_walls: bool,
 }
 
@@ -31,13 +31,13 @@ pub trait RandomWalk: Default + Send + 'static {
     /// Largest value of an action component.
     const ACTION_SCALE: f64;
 
-    /// The columns of a row that the walk depends on.
+    /// The values of the columns that the walk depends on.
     type Observed;
 
-    /// Reads the columns.
+    /// Reads the values from a row.
     ///
     /// # Errors
-    /// When the row lacks one of them.
+    /// When the row lacks one of the columns.
     fn read(row: RowRef<'_>) -> Result<Self::Observed>;
 
     /// Draws the next leg.

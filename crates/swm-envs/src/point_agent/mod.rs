@@ -1,8 +1,8 @@
 //! Code shared by the environments in which a disc moves to a goal position: Two-Room, SimplePointMaze and Piecewise.
 //!
 //! [`PointAgentEnv`] implements [`swm_core::Env`] for any [`PointTask`], which holds the dynamics, the goal rule and
-//! the drawing of one environment. [`Explorer`] is the random-walk expert of all three, and [`room`] the 224-pixel room
-//! of Two-Room and Piecewise.
+//! the drawing of one environment. [`Explorer`] is the random-walk expert of these environments, and [`room`] the
+//! 224-pixel room of Two-Room and Piecewise.
 
 mod env;
 mod exploration;

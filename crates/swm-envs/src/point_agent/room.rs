@@ -12,9 +12,9 @@ use swm_core::{ColumnSpec, DType, EnvSpec, Factor, FactorValues, RowMut, Space, 
 pub const SIZE: f64 = 224.0;
 /// Width of the border that the agent cannot enter, on every side, in pixels.
 pub const BORDER: f64 = 14.0;
-/// Width of the lines drawn around the room, which end where the border ends, in pixels.
+/// Width of the lines drawn around the room, whose inner edges are those of the border, in pixels.
 pub const LINE: f64 = 4.0;
-/// The episode terminates when the target is nearer than this, in pixels.
+/// The distance to the target below which the episode terminates, in pixels.
 pub const GOAL_RADIUS: f32 = 16.0;
 /// The maximal number of candidates drawn for a sampled goal.
 pub const GOAL_TRIES: usize = 256;
@@ -30,7 +30,7 @@ mod index {
 }
 
 /// Describes an environment in the room: an `observation` of `observation_len` values, and a column `privileged`, given
-/// as name and length, with the values that its experts read.
+/// as name and length, with the values that the experts read.
 pub fn spec(id: &str, observation_len: usize, privileged: (&str, usize), variation_space: VariationSpace) -> EnvSpec {
     let column = |name: &str, len: usize| ColumnSpec::new(name, DType::Float32, [len]);
     EnvSpec {
@@ -63,7 +63,7 @@ pub fn observe(agent: Position, goal: Position, observation: &[f32], privileged:
 
 /// Returns the Euclidean distance between two positions, in pixels.
 ///
-/// Computed in single precision with a fused sum of squares, because the reference decides termination with
+/// It is computed in single precision with a fused sum of squares, because the reference decides termination with
 /// `torch.norm`, which rounds this way.
 pub fn distance(a: Position, b: Position) -> f32 {
     let [dx, dy] = [a[0] - b[0], a[1] - b[1]];

@@ -14,10 +14,10 @@ pub trait PointTask: Sized + Send + 'static {
     /// The maximal number of candidates that [`PointTask::find_goal`] draws.
     const GOAL_TRIES: usize;
 
-    /// Draws frames and caches what does not change between them.
+    /// The renderer, which draws frames and caches their static parts.
     type Renderer: Default + Send;
 
-    /// Describes actions, columns and factors.
+    /// Describes the actions, columns and factors of the environment.
     fn spec() -> EnvSpec;
 
     /// Builds the task of an episode from its factors.
@@ -48,7 +48,7 @@ pub trait PointTask: Sized + Send + 'static {
     /// Writes the columns of [`PointTask::spec`] into a row.
     fn observe(&self, agent: Position, goal: Position, row: &mut RowMut<'_>);
 
-    /// Moves the drawn goal, and drops data cached for the former one.
+    /// Moves the drawn goal, and drops data cached for the previous goal.
     fn set_goal(&mut self, goal: Position);
 
     /// Draws a frame with the agent at a position.
@@ -61,7 +61,7 @@ pub trait PointTask: Sized + Send + 'static {
     fn goal_distance(&self, agent: Position, goal: Position) -> f64;
 }
 
-/// Draws goal candidates until one is at least `wanted` away. Returns that one, or the farthest of `tries` candidates.
+/// Draws up to `tries` goal candidates until one is at least `wanted` away. Returns the farthest candidate.
 ///
 /// `candidate` returns a distance (in steps or in units of length) with its position, and `None` for a candidate that
 /// does not qualify.

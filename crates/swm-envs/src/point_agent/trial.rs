@@ -3,8 +3,8 @@
 use super::position::Position64;
 use swm_core::{Action, Batch, EnvEntry, ExpertEntry, Key, ResetOptions, Schema, VariationRequest};
 
-/// Plays one episode, towards a sampled goal if `sampled_goal` is set. Returns the positions the agent visited and
-/// whether the goal was reached.
+/// Plays one episode, towards a sampled goal if `sampled_goal` is set. Returns the positions that the agent visited,
+/// and true if it reached the goal.
 pub fn play(
     entry: &EnvEntry,
     expert: &ExpertEntry,
@@ -13,21 +13,21 @@ pub fn play(
     sampled_goal: bool,
     steps: usize,
 ) -> (Vec<Position64>, bool) {
-    let (mut env, mut expert) = (entry.env().expect("an environment"), (expert.make)());
-    env.reset(seed, options).expect("a reset");
+    let (mut env, mut expert) = (entry.env().expect("creating the environment"), (expert.make)());
+    env.reset(seed, options).expect("resetting the environment");
     if sampled_goal {
-        env.sample_goal(Key::new(seed)).expect("a goal");
+        env.sample_goal(Key::new(seed)).expect("sampling a goal");
     }
     expert.begin(Key::new(seed));
-    let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("columns"), 1);
+    let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("the schema of the columns"), 1);
     let (mut action, mut positions) = ([0.0; 2], vec![]);
     for _ in 0..steps {
         env.observe(&mut row.row_mut(0));
-        expert.act(row.row(0), &mut action).expect("an action");
-        let state = row.row(0).to_f64("state").expect("a state");
+        expert.act(row.row(0), &mut action).expect("the expert's action");
+        let state = row.row(0).to_f64("state").expect("reading the state");
         positions.push([state[0], state[1]]);
         let action = action.map(|a| a as f32);
-        if env.step(Action::Continuous(&action)).expect("a step").terminated {
+        if env.step(Action::Continuous(&action)).expect("stepping the environment").terminated {
             return (positions, true);
         }
     }
@@ -35,8 +35,8 @@ pub fn play(
 }
 
 /// Plays the first expert over seeds 0 to 199 and asserts that it reaches every goal within `steps` with the default
-/// variation, and every sampled goal within `varied_steps` with all factors varied. Returns how many goals of the reset
-/// it reaches with all factors varied.
+/// variation, and every sampled goal within `varied_steps` with all factors varied. Returns the number of
+/// goals of the reset that it reaches with all factors varied.
 pub fn reached_of_200(entry: &EnvEntry, steps: usize, varied_steps: usize) -> u32 {
     let all = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
     let all = ResetOptions { variation: all, ..ResetOptions::default() };

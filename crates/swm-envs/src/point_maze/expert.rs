@@ -45,14 +45,15 @@ impl Planner {
         }
     }
 
-    /// Returns the step from a position along its path, components at most 1; straight where there is no path.
+    /// Returns the step along the path from a position, with components of at most 1. Without a path, the step leads
+    /// straight to the goal.
     fn step(&self, from: Position64) -> Position64 {
         let next = self.graph.next(from, &self.paths).map_or(self.to, |(next, _)| next);
         step_towards(self.graph.layout(), from, next)
     }
 }
 
-/// Returns the step towards `next`: as far as the agent gets along a straight line, but not beyond `next`.
+/// Returns the longest step straight towards `next` that does not pass `next`, with components of at most 1.
 fn step_towards(layout: &Layout, from: Position64, next: Position64) -> Position64 {
     let away = [0, 1].map(|i| next[i] - from[i]);
     let longest = f64::from(layout.speed * MAX_ACTION);
@@ -149,7 +150,7 @@ mod tests {
             visited.extend(positions.iter().map(|p| p.map(|v| (v * 2.0).min(9.0) as i64)));
             stopped += positions.windows(2).filter(|p| p[0] == p[1]).count();
         }
-        // 10 x 10 cells of half a unit, less those inside walls.
+        // 10 x 10 cells of half a unit, less the cells inside walls.
         assert!(visited.len() >= 80 && stopped >= 100, "{} cells visited, stopped {stopped} times", visited.len());
     }
 }

@@ -1,4 +1,4 @@
-//! The factors of variation of the maze, and what they describe: walls, discs and the constraints between them.
+//! The factors of variation of the maze, their constraints, and the walls and discs that they describe.
 
 use super::physics::{Layout, MAX_WALLS, SIZE, Wall};
 use super::render::Disc;
@@ -16,7 +16,7 @@ const WALLS: [[[f32; 2]; 2]; MAX_WALLS] = [
     [[1.504_300_8, 2.397_299_3], [0.714_128_6, 0.655_603_7]],
 ];
 
-/// Names, bounds, defaults, order and constraints of the reference.
+/// Returns the variation space, with names, bounds, defaults, order and constraints of the reference.
 pub fn variation_space() -> VariationSpace {
     let single = |v: f32| f64::from(v);
     let color = |key, default: [f64; 3]| Factor::new(key, Space::Rgb, default);
@@ -68,7 +68,7 @@ fn single(factors: &FactorValues, key: &str) -> f32 {
     factors.scalar(key) as f32
 }
 
-/// The layout that the factors describe.
+/// Returns the layout that the factors describe.
 pub fn layout(factors: &FactorValues) -> Layout {
     let pairs = |key| factors.get(key).as_chunks::<2>().0.iter().map(|pair| position(pair));
     let count = usize::try_from(factors.integer("walls.number")).unwrap_or(0);
@@ -77,7 +77,7 @@ pub fn layout(factors: &FactorValues) -> Layout {
     Layout::new(single(factors, "agent.radius"), single(factors, "agent.speed"), walls)
 }
 
-/// The disc of the `agent` or of the `goal`, at the position that the factors give.
+/// Returns the disc of the `agent` or of the `goal`, at the position that the factors give.
 pub fn disc(factors: &FactorValues, name: &str) -> Disc {
     Disc {
         center: position(factors.get(&format!("{name}.position"))),

@@ -42,11 +42,11 @@ mod index {
     pub const LAYOUT: usize = 3;
 }
 
-/// A square with walls in it.
+/// A square maze with rectangular walls.
 struct PointMaze {
     layout: Layout,
     appearance: MazeAppearance,
-    /// The agent's disc at the start of the episode; its position is not used.
+    /// The agent's disc, of which only radius and colour are used.
     agent: Disc,
     /// The visibility graph of the walls, built at the first use.
     graph: OnceCell<VisibilityGraph>,
@@ -98,7 +98,7 @@ impl PointTask for PointMaze {
         }
     }
 
-    /// Reuses the visibility graph if the layout is unchanged, and the paths if the goal is unchanged too.
+    /// Keeps the cached visibility graph and paths if the layout is unchanged.
     fn set_factors(&mut self, factors: &FactorValues) {
         let (layout, goal) = (layout(factors), self.appearance.goal.center);
         if layout != self.layout {
@@ -202,9 +202,9 @@ mod tests {
     fn resets_and_sampled_goals_never_fail() {
         let mut env = PointAgentEnv::<PointMaze>::new();
         for seed in 0..10_000 {
-            env.reset(seed, &vary(&["all"])).expect("a reset");
+            env.reset(seed, &vary(&["all"])).expect("resetting the environment");
             assert!(!env.task.layout.touches(env.agent, env.task.layout.radius), "seed {seed}");
-            env.sample_goal(Key::new(seed)).expect("a goal");
+            env.sample_goal(Key::new(seed)).expect("sampling a goal");
             assert!(!env.is_success(), "seed {seed}");
         }
     }
@@ -215,7 +215,7 @@ mod tests {
         let keys = ["agent", "goal", "walls", "agent.radius", "walls.shape", "walls.number"];
         for (i, seed) in (0..1200).enumerate() {
             let options = vary(&[keys[i % 6], keys[i / 6 % 6], "agent.position"]);
-            env.reset(seed, &options).expect("a reset");
+            env.reset(seed, &options).expect("resetting the environment");
             let (layout, goal_radius) = (&env.task.layout, env.task.appearance.goal.radius);
             assert!(!layout.touches(env.agent, layout.radius), "{options:?}, seed {seed}");
             assert!(!layout.touches(env.goal, goal_radius), "{options:?}, seed {seed}");
@@ -225,34 +225,34 @@ mod tests {
     #[test]
     fn goal_distance_decreases_along_the_expert_path() {
         let mut env = PointAgentEnv::<PointMaze>::new();
-        let mut row = Batch::zeros(&Schema::new(env.spec.columns.clone()).expect("a schema"), 1);
-        let mut around = 0;
+        let mut row = Batch::zeros(&Schema::new(env.spec.columns.clone()).expect("building the schema"), 1);
+        let mut detours = 0;
         for seed in 0..200 {
-            env.reset(seed, &vary(&["all"])).expect("a reset");
-            env.sample_goal(Key::new(seed)).expect("a goal");
+            env.reset(seed, &vary(&["all"])).expect("resetting the environment");
+            env.sample_goal(Key::new(seed)).expect("sampling a goal");
             let mut expert = (ENTRY.experts[0].make)();
             let straight = f64::from(distance(env.agent, env.goal));
-            let mut left = env.goal_distance();
-            assert!(left >= straight - 1e-6, "seed {seed}: no path is shorter than the straight line");
-            around += u32::from(left > straight + 0.01);
+            let mut remaining = env.goal_distance();
+            assert!(remaining >= straight - 1e-6, "seed {seed}: no path is shorter than the straight line");
+            detours += u32::from(remaining > straight + 0.01);
             while !env.is_success() {
                 env.observe(&mut row.row_mut(0));
                 let mut action = [0.0; 2];
-                expert.act(row.row(0), &mut action).expect("an action");
+                expert.act(row.row(0), &mut action).expect("the expert's action");
                 let before = env.agent;
-                env.step(Action::Continuous(&action.map(|v| v as f32))).expect("a step");
+                env.step(Action::Continuous(&action.map(|v| v as f32))).expect("stepping the environment");
                 let walked = f64::from(distance(before, env.agent));
                 let now = env.goal_distance();
-                // The polygons around round corners are a little longer than what the agent can walk.
-                assert!(now < left - walked + 1e-5, "seed {seed}: from {left} to {now} by walking {walked}");
+                // Paths along the polygons around round corners are a little longer than the agent's shortest path.
+                assert!(now < remaining - walked + 1e-5, "seed {seed}: from {remaining} to {now} by walking {walked}");
                 assert!(
-                    walked > 0.0 && left - walked - now < 0.02,
-                    "seed {seed}: from {left} to {now} by walking {walked}"
+                    walked > 0.0 && remaining - walked - now < 0.02,
+                    "seed {seed}: from {remaining} to {now} by walking {walked}"
                 );
-                left = now;
+                remaining = now;
             }
         }
-        assert!(around > 50, "{around} paths lead around walls");
+        assert!(detours > 50, "{detours} paths lead around walls");
         env.set_goal(env.agent);
         assert_eq!(env.goal_distance(), 0.0);
     }

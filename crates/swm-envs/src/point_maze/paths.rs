@@ -17,11 +17,11 @@ const NODES_PER_CORNER: u8 = 3;
 pub struct VisibilityGraph {
     layout: Layout,
     nodes: Vec<Position64>,
-    /// Distances between nodes, `[nodes, nodes]`; infinite where a wall is between them.
+    /// Distances between nodes, `[nodes, nodes]`; infinite if a wall lies between the nodes.
     distances: Vec<f64>,
 }
 
-/// The shortest paths from everywhere to one position.
+/// The shortest paths from every position to one position.
 pub struct ShortestPaths {
     to: Position64,
     /// Path lengths from every node of the graph, `[nodes]`.
@@ -34,7 +34,7 @@ impl VisibilityGraph {
         let mut graph = Self { layout: *layout, nodes: vec![], distances: vec![] };
         let clear = f64::from(layout.radius) + SPARE;
         let step = std::f64::consts::FRAC_PI_2 / f64::from(NODES_PER_CORNER);
-        // The polygon's sides touch the circle, so its corners lie a little farther out.
+        // The polygon's sides touch the circle, so the polygon's corners lie outside the circle.
         let reach = clear / (step / 2.0).cos();
         for wall in layout.walls() {
             for (corner, [sx, sy]) in corners(wall) {
@@ -70,8 +70,8 @@ impl VisibilityGraph {
         self.layout.walls().iter().map(|wall| point_to_wall(at, wall)).fold(f64::INFINITY, f64::min)
     }
 
-    /// Returns the length of the straight path, or `None` if the path comes nearer to a wall than the agent may and
-    /// than both ends of the path are.
+    /// Returns the length of the straight path, or `None` if the path is blocked: if it comes nearer to a wall than the
+    /// agent's radius, and nearer than both ends of the path.
     fn straight(&self, from: Position64, to: Position64) -> Option<f64> {
         let clear = f64::from(self.layout.radius) + SPARE / 2.0;
         let free = self.layout.walls().iter().all(|wall| {
@@ -81,7 +81,7 @@ impl VisibilityGraph {
         free.then(|| distance64(from, to))
     }
 
-    /// Finds the shortest paths from everywhere to a position (Dijkstra's algorithm).
+    /// Finds the shortest paths from every position to one position (Dijkstra's algorithm).
     pub fn shortest_paths(&self, to: Position64) -> ShortestPaths {
         let n = self.nodes.len();
         let mut lengths: Vec<f64> =
@@ -97,7 +97,7 @@ impl VisibilityGraph {
     }
 
     /// Returns the next node (or the end) of the shortest path from a position, and the length of the whole path.
-    /// Returns `None` where there is no path.
+    /// Returns `None` if there is no path.
     pub fn next(&self, from: Position64, paths: &ShortestPaths) -> Option<(Position64, f64)> {
         if let Some(length) = self.straight(from, paths.to) {
             return Some((paths.to, length));
@@ -120,9 +120,9 @@ impl VisibilityGraph {
         for _ in 0..16 {
             for wall in self.layout.walls() {
                 let nearest = nearest_in_wall(at, wall);
-                let apart = distance64(at, nearest);
-                if apart > 0.0 && apart < clear {
-                    at = [0, 1].map(|i| nearest[i] + (at[i] - nearest[i]) * clear / apart);
+                let distance = distance64(at, nearest);
+                if distance > 0.0 && distance < clear {
+                    at = [0, 1].map(|i| nearest[i] + (at[i] - nearest[i]) * clear / distance);
                 }
             }
             at = at.map(|v| v.clamp(0.0, f64::from(SIZE)));

@@ -1,10 +1,10 @@
-//! The dynamics: a disc moves by `action * speed`, stays where it is if it would touch a wall, and is held inside the
+//! The dynamics: a disc moves by `action * speed` unless it would touch a wall, and is held inside the
 //! square.
 //!
-//! Constants and the order of the checks are those of the reference (`simple_point_maze.py`), and so is single
-//! precision. Only the end of a step is checked, and this happens before the end is clipped to the square: a step may
-//! jump over a corner, and a step that ends outside the square may be clipped into a wall at the border. Lengths are in
-//! maze units, y up.
+//! Constants, the order of the checks and the single precision are those of the reference (`simple_point_maze.py`).
+//! Only the end of a step is checked, and this happens before the end is clipped to the square: a step may jump over a
+//! corner, and a step that ends outside the square may be clipped into a wall at the border. Lengths are in maze units,
+//! y up.
 
 use crate::point_agent::Position;
 
@@ -12,7 +12,7 @@ use crate::point_agent::Position;
 pub const SIZE: f32 = 5.0;
 /// The maximal number of walls.
 pub const MAX_WALLS: usize = 6;
-/// The largest action component; larger ones are clipped.
+/// The largest action component; larger components are clipped.
 pub const MAX_ACTION: f32 = 0.2;
 
 /// A rectangular wall.
@@ -32,7 +32,7 @@ impl Wall {
     }
 }
 
-/// The part of an episode's configuration that decides how the agent moves. Lengths are in maze units.
+/// The parameters of the agent's motion in an episode. Lengths are in maze units.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Layout {
     walls: [Wall; MAX_WALLS],
@@ -113,11 +113,7 @@ mod tests {
         assert_eq!(layout.advance([1.8, 2.5], [0.05, 0.05]), [1.8499999, 2.55], "no wall is near");
         assert_eq!(layout.advance([1.8, 2.5], [0.15, 0.0]), [1.8, 2.5], "the rim of the disc would touch the wall");
         assert_eq!(layout.advance([1.8, 1.8], [0.12, 0.12]), [1.92, 1.92], "a round disc fits beside the corner");
-        assert_eq!(
-            layout.advance([1.8, 1.8], [0.14, 0.14]),
-            [1.8, 1.8],
-            "nearer to the corner, the disc would touch it"
-        );
+        assert_eq!(layout.advance([1.8, 1.8], [0.14, 0.14]), [1.8, 1.8], "the disc would touch the corner");
         assert_eq!(layout.advance([0.1, 0.1], [-0.2, 0.9]), [0.0, 0.3], "position and action are clipped");
     }
 

@@ -7,25 +7,25 @@ use crate::draw::{Area, Background, Pixels, Rgb, rect};
 use crate::point_agent::Position;
 use swm_core::{FactorValues, FrameMut};
 
-/// Side of the frame as it is drawn, in pixels.
+/// Side of the square frame before it is resized, in pixels.
 const SIDE: usize = 500;
 /// Pixels per maze unit.
 const SCALE: f64 = SIDE as f64 / SIZE as f64;
 /// Opacity of the goal.
 const GOAL_OPACITY: f64 = 0.5;
-/// Coverage of the pixels that the border line covers in part. It is a black line of 1.11 pixels (0.8 points) along the
-/// edge of the frame: left and above it covers the first pixel and this share of the second, right and below the same
-/// share of the last.
+/// Coverage of the pixels that the border line covers in part. The border line is black, 1.11 pixels (0.8 points) wide,
+/// and lies along the edge of the frame. At the left and at the top it covers the first pixel and this share of the
+/// second pixel; at the right and at the bottom it covers this share of the last pixel.
 const BORDER_COVERAGE: f64 = 0.0556;
 
 /// A disc in the maze.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Disc {
-    /// Its centre, in maze units.
+    /// The centre, in maze units.
     pub center: Position,
-    /// Its radius, in maze units.
+    /// The radius, in maze units.
     pub radius: f32,
-    /// Its colour.
+    /// The colour.
     pub color: Rgb,
 }
 
@@ -51,7 +51,7 @@ pub struct MazeAppearance {
 }
 
 impl MazeAppearance {
-    /// The appearance that the factors describe.
+    /// Makes the appearance that the factors describe.
     pub fn new(factors: &FactorValues, layout: Layout) -> Self {
         Self {
             background: factors.rgb("background.color"),
@@ -111,12 +111,12 @@ const END: i32 = SIDE as i32;
 const PARTLY_COVERED: [(i32, i32); 2] = [(1, 2), (END - 1, END)];
 
 /// Draws the agent as if the border line were drawn over it: darkened where the line covers a share of the pixels.
-/// Returns the area it may have changed.
+/// Returns the area that may have changed.
 fn draw_agent(agent: &Disc, pixels: &mut Pixels<'_>) -> Area {
     let (center, radius) = agent.in_pixels();
     let bounds = Pixels::circle_bounds(center, radius);
     let [first, last] = PARTLY_COVERED;
-    // Each band with the number of times that the line covers it in part.
+    // Bands of columns or rows, each with 1 if the line covers the band in part, otherwise 0.
     let bands = [(first, 1), ((first.1, last.0), 0), (last, 1)];
     for ((left, right), covered_x) in bands {
         for ((top, bottom), covered_y) in bands {

@@ -45,7 +45,7 @@ pub fn action(bins: &[i64]) -> [f32; 2] {
     [(radius * angle.cos()) as f32, (radius * angle.sin()) as f32]
 }
 
-/// Returns the bins of a continuous action; outside the unit circle those of the outermost ring.
+/// Returns the bins of a continuous action. Actions outside the unit circle belong to the outermost ring.
 pub fn bins([x, y]: [f64; 2]) -> [i64; 2] {
     let shares = [x.hypot(y), y.atan2(x).rem_euclid(TAU) / TAU];
     std::array::from_fn(|i| ((shares[i] * BINS[i] as f64) as i64).clamp(0, BINS[i] - 1))

@@ -1,4 +1,4 @@
-//! The factors of variation of Push-T, and the columns it writes.
+//! The factors of variation of Push-T, and the columns that Push-T writes.
 
 use super::TABLE;
 use super::shapes::BodyShape;

@@ -10,7 +10,7 @@ mod state;
 mod table;
 
 use factors::{columns, index, observation_space, shapes_row, variation_space};
-use physics::{AGENT, BLOCK, Simulation, put, take_array};
+use physics::{AGENT, BLOCK, Simulation, append_items, take_array};
 use render::{DrawnState, TableRenderer};
 use state::{State, checked, goal_distance, is_reached, set_state, settled, start_state, state_distance, state_of};
 use std::f64::consts::TAU;
@@ -151,7 +151,8 @@ impl Env for PushT {
             None => find_goal(&factors, &start, key.with("goal"))?,
         };
         self.begin(factors, goal);
-        // As in the reference, the simulation continues from the goal, so that the solver's contacts there persist.
+        // As in the reference, the simulation continues from the goal, so that the solver's contacts at the goal
+        // persist.
         set_state(&mut self.simulation, &start);
         self.simulation.step();
         self.contacts += self.simulation.contact_count();
@@ -206,8 +207,8 @@ impl Env for PushT {
 
     fn snapshot(&self) -> Snapshot {
         let Snapshot(mut bytes) = snapshot(&self.spec.id, &self.factors, []);
-        put(&mut bytes, &self.goal);
-        put(&mut bytes, &[self.contacts as u64]);
+        append_items(&mut bytes, &self.goal);
+        append_items(&mut bytes, &[self.contacts as u64]);
         self.simulation.save(&mut bytes);
         Snapshot(bytes)
     }
@@ -266,28 +267,29 @@ mod tests {
     fn snapshot_contains_the_impulses_of_contacts() {
         let mut env = PushT::new();
         let start = vec![256.0, 300.0, 256.0, 256.0, 0.0, 0.0, 0.0];
-        env.reset(3, &ResetOptions { state: Some(start), ..ResetOptions::default() }).expect("a start");
+        env.reset(3, &ResetOptions { state: Some(start), ..ResetOptions::default() })
+            .expect("resetting to the start state");
         let push = Action::Continuous(&[0.0, -0.5]);
         (0..3).for_each(|_| {
-            env.step(push).expect("a step");
+            env.step(push).expect("stepping the environment");
         });
         assert!(env.contacts > 0, "the agent pushes the block");
         let snapshot = env.snapshot();
         let after = |env: &mut PushT| {
             (0..20).for_each(|_| {
-                env.step(push).expect("a step");
+                env.step(push).expect("stepping the environment");
             });
             env.snapshot()
         };
         let expected = after(&mut env);
-        let mut other = PushT::new();
-        other.restore(&snapshot).expect("a snapshot");
-        assert_eq!(other.snapshot(), snapshot);
-        assert_eq!(after(&mut other), expected);
-        assert!(other.restore(&Snapshot(snapshot.0[..snapshot.0.len() - 1].to_vec())).is_err());
+        let mut restored = PushT::new();
+        restored.restore(&snapshot).expect("restoring the snapshot");
+        assert_eq!(restored.snapshot(), snapshot);
+        assert_eq!(after(&mut restored), expected);
+        assert!(restored.restore(&Snapshot(snapshot.0[..snapshot.0.len() - 1].to_vec())).is_err());
         // The same positions and velocities without the solver's contacts continue differently.
         let mut without_contacts = PushT::new();
-        without_contacts.restore(&snapshot).expect("a snapshot");
+        without_contacts.restore(&snapshot).expect("restoring the snapshot");
         let state = without_contacts.state();
         without_contacts.simulation = table::simulation(&without_contacts.factors);
         set_state(&mut without_contacts.simulation, &state);
@@ -297,17 +299,17 @@ mod tests {
     #[test]
     fn expert_reaches_most_goals() {
         let mut env = PushT::new();
-        let schema = swm_core::Schema::new(env.spec.columns.clone()).expect("a schema");
+        let schema = swm_core::Schema::new(env.spec.columns.clone()).expect("building the schema");
         let mut row = swm_core::Batch::zeros(&schema, 1);
         let mut reaches = |seed: u64, options: &ResetOptions| {
             let mut expert = (EXPERTS[0].make)();
             expert.begin(Key::new(seed));
-            env.reset(seed, options).expect("a reset");
+            env.reset(seed, options).expect("resetting the environment");
             (0..env.spec.max_episode_steps).any(|_| {
                 env.observe(&mut row.row_mut(0));
                 let mut action = [0.0; 2];
-                expert.act(row.row(0), &mut action).expect("an action");
-                env.step(Action::Continuous(&action.map(|v| v as f32))).expect("a step").terminated
+                expert.act(row.row(0), &mut action).expect("the expert's action");
+                env.step(Action::Continuous(&action.map(|v| v as f32))).expect("stepping the environment").terminated
             })
         };
         assert!((0..10).filter(|&seed| reaches(seed, &ResetOptions::default())).count() >= 9);

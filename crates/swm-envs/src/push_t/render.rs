@@ -1,9 +1,9 @@
-//! Rendering: the goal pose, the block and the agent with outlines, the walls, and red marks at contacts, drawn at 512
-//! x 512 pixels as in the reference and resized.
+//! Rendering: the goal pose, the block and the agent with outlines, the walls, and red marks at contacts. Frames are
+//! drawn at 512 x 512 pixels as in the reference, then resized.
 //!
 //! The table with goal pose and walls is static during an episode: it is drawn once, and resampled once per frame size.
-//! A frame copies it, draws agent and block on the canvas, resamples their area, and restores the canvas. While nothing
-//! touches the block it does not move, so it stays on the canvas from frame to frame and only the agent is drawn.
+//! A frame copies the resampled table, draws agent and block on the canvas, resamples their area, and restores the
+//! canvas. An untouched block does not move, so it stays on the canvas from frame to frame and only the agent is drawn.
 
 use super::factors::body_shape;
 use super::physics::{AGENT, BLOCK, Pose, Simulation, Vec2, visiting_order};
@@ -46,9 +46,9 @@ pub struct DrawnState {
 /// A short line across a contact.
 #[derive(Clone, Copy, Default)]
 struct ContactMark {
-    /// Both ends, in pixels of the table.
+    /// Both ends of the line, in pixels of the table.
     ends: [Vec2; 2],
-    /// The body whose area it belongs to.
+    /// The body whose area contains the mark.
     body: usize,
 }
 
@@ -82,7 +82,7 @@ pub struct TableRenderer {
     table: Canvas,
     /// The table, with the block while it does not move.
     canvas: Canvas,
-    /// The block on the canvas.
+    /// The block that the canvas contains, if any.
     drawn_block: Option<DrawnBlock>,
     /// The table at the frame sizes in use.
     resampled: BySize<ResampledTable>,
@@ -98,7 +98,7 @@ struct DrawnBlock {
 /// The table at one frame size.
 struct ResampledTable {
     resampler: Resampler,
-    /// `[height, width, 3]`.
+    /// The table without the block, `[height, width, 3]`.
     table: Vec<u8>,
     /// The table with the block, `[height, width, 3]`; valid if `has_block` is set.
     with_block: Vec<u8>,
@@ -175,7 +175,7 @@ impl TableRenderer {
             resampler.draw(&self.canvas, &self.palette, block, with_block);
             *has_block = true;
         }
-        // Only the area of the agent is restored afterwards; the block is outside it.
+        // Only the area of the agent is restored afterwards; the block lies outside this area.
         self.draw_body(AGENT, &drawn.poses[AGENT]);
         self.canvas.draw_walls(&[area]);
         let ResampledTable { resampler, with_block, .. } = &self.resampled[slot];
@@ -319,9 +319,9 @@ mod tests {
     fn caching_the_block_changes_no_frame() {
         let all = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
         let space = variation_space();
-        let mut apart = 0;
+        let mut frames_apart = 0;
         for seed in 0..40 {
-            let factors = space.resolve(&all, Key::new(seed)).expect("factors");
+            let factors = space.resolve(&all, Key::new(seed)).expect("resolving the factors");
             let mut renderer = TableRenderer::new(&factors);
             let mut simulation = settled(simulation(&factors), &start_state(&factors));
             for t in 0..6 {
@@ -334,15 +334,15 @@ mod tests {
                 for side in [64, 100] {
                     let [mut frame, mut expected] = [vec![0; side * side * 3], vec![0; side * side * 3]];
                     renderer.draw(&drawn, FrameMut::new(side, side, &mut frame));
-                    let mut other = TableRenderer::new(&factors);
-                    let areas = [AGENT, BLOCK].map(|body| other.area(body, &drawn.poses[body]));
-                    apart += usize::from(drawn.contacts == 0 && !areas[AGENT].touches(areas[BLOCK]));
-                    let slot = other.slot(side, side);
-                    other.draw_both(&drawn, areas, slot, FrameMut::new(side, side, &mut expected));
+                    let mut uncached = TableRenderer::new(&factors);
+                    let areas = [AGENT, BLOCK].map(|body| uncached.area(body, &drawn.poses[body]));
+                    frames_apart += usize::from(drawn.contacts == 0 && !areas[AGENT].touches(areas[BLOCK]));
+                    let slot = uncached.slot(side, side);
+                    uncached.draw_both(&drawn, areas, slot, FrameMut::new(side, side, &mut expected));
                     assert!(frame == expected, "seed {seed}, frame {t}, {side} pixels");
                 }
             }
         }
-        assert!(apart > 100, "{apart} frames with agent and block apart");
+        assert!(frames_apart > 100, "{frames_apart} frames with agent and block apart");
     }
 }

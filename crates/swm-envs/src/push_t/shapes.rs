@@ -1,8 +1,8 @@
 //! The shapes of the agent and the block: a circle, or a union of rectangles.
 //!
-//! Dimensions, centres of gravity and moments of inertia are those of the reference (`env.py`). The centre of gravity
-//! is the mean of the rectangles' centres, whatever their size, and some shapes count the moment of their first
-//! rectangle several times; both follow the reference.
+//! Dimensions, centres of gravity and moments of inertia are those of the reference (`env.py`). As in the reference,
+//! the centre of gravity is the unweighted mean of the rectangles' centres, and some shapes count the moment of their
+//! first rectangle several times.
 
 use super::physics::{Body, Shape, Vec2};
 use std::f64::consts::{PI, TAU};
@@ -29,7 +29,7 @@ pub struct BodyShape {
 impl BodyShape {
     /// Makes the shape of an index (0 circle, 1 L, 2 T, 3 Z, 4 square, 5 I, 6 small T, 7 +) at a scale in pixels.
     ///
-    /// Corners are computed in single precision, because scales are sampled in it.
+    /// Corners are computed in single precision, because scales are sampled in single precision.
     pub fn new(shape: i64, scale: f64) -> Self {
         let s = scale as f32;
         match shape {
@@ -56,7 +56,8 @@ impl BodyShape {
         }
     }
 
-    /// Makes a union of rectangles; `inertias` are the indices of those whose moments are summed.
+    /// Makes a union of rectangles; `inertias` are the indices of the rectangles whose moments are
+    /// summed.
     fn union(rects: &[Rect], inertias: &[usize]) -> Self {
         let rects: Vec<[Vec2; 4]> = rects
             .iter()

@@ -40,7 +40,7 @@ pub fn state_of(simulation: &Simulation) -> State {
     [a.x, a.y, b.x, b.y, block.angle.rem_euclid(TAU), agent.velocity.x, agent.velocity.y]
 }
 
-/// The start state that the factors describe.
+/// Returns the start state that the factors describe.
 pub fn start_state(factors: &FactorValues) -> State {
     let (agent, block) = (factors.get("agent.start_position"), factors.get("block.start_position"));
     let velocity = factors.get("agent.velocity");
@@ -50,7 +50,7 @@ pub fn start_state(factors: &FactorValues) -> State {
 /// Checks a state that a caller gave.
 ///
 /// # Errors
-/// When it does not have 7 values, or one of them is not finite.
+/// When the state does not have 7 values, or one of the values is not finite.
 pub fn checked(state: &[f64], what: &str) -> Result<State> {
     if let Some(bad) = state.iter().find(|v| !v.is_finite()) {
         let fix = "give finite positions, angle and velocities".to_owned();
@@ -106,7 +106,8 @@ mod tests {
         for (shape, quarter, half) in
             [(1, false, false), (2, false, false), (3, false, true), (4, true, true), (5, false, true), (7, true, true)]
         {
-            let factors = variation_space().resolve(&pinned(f64::from(shape)), Key::new(0)).expect("a shape");
+            let factors =
+                variation_space().resolve(&pinned(f64::from(shape)), Key::new(0)).expect("resolving the shape");
             for (angle, expected) in [(0.0, true), (TAU, true), (0.4, false), (PI / 2.0, quarter), (PI, half)] {
                 let state = [110.0, 100.0, 200.0, 210.0, goal[4] + angle, 50.0, 0.0];
                 assert_eq!(is_reached(&factors, &goal, &state), expected, "shape {shape}, rotated by {angle}");

@@ -46,7 +46,7 @@ pub fn advance(simulation: &mut Simulation, action: [f32; 2]) -> usize {
     contacts
 }
 
-/// The simulation of an episode, before any step.
+/// Returns the simulation of an episode, before any step.
 pub fn simulation(factors: &FactorValues) -> Simulation {
     let shapes = ["agent", "block"].map(|name| body_shape(factors, name));
     let mut bodies = [shapes[AGENT].body(), shapes[BLOCK].body()];

@@ -36,7 +36,7 @@ impl Expert for ShortestPath {
         let (at, goal) = (read_position(row, STATE)?, read_position(row, GOAL_STATE)?);
         let next = paths::waypoint(&layout, at, goal);
         let [dx, dy] = [next[0] - at[0], next[1] - at[1]];
-        // Full speed, but not beyond the waypoint.
+        // The agent walks at full speed, but not beyond the waypoint.
         let divisor = dx.hypot(dy).max(layout.speed);
         action.copy_from_slice(&[dx / divisor, dy / divisor]);
         Ok(())
@@ -108,7 +108,7 @@ mod tests {
             crossings += positions.windows(2).filter(|p| (p[0][0] < 112.0) != (p[1][0] < 112.0)).count();
             touches += positions.iter().filter(|p| p[0] == 99.5 || p[0] == 124.5).count();
         }
-        // 12 x 12 cells of 16 pixels, less those inside the wall.
+        // 12 x 12 cells of 16 pixels, less the cells inside the wall.
         assert!(visited.len() >= 130, "{} cells visited", visited.len());
         assert!(crossings >= 50 && touches >= 100, "{crossings} crossings, {touches} touches of the wall");
     }

@@ -115,7 +115,7 @@ impl PointTask for TwoRoom {
     }
 }
 
-/// Names, bounds, defaults, order and constraints of the reference.
+/// Returns the variation space, with names, bounds, defaults, order and constraints of the reference.
 fn variation_space() -> VariationSpace {
     let per_door = |key, n: i64, start: i64, default: f64| {
         let space = Space::MultiDiscrete { nvec: vec![n; MAX_DOORS], start: vec![start; MAX_DOORS] };
@@ -155,14 +155,14 @@ fn variation_space() -> VariationSpace {
     })
 }
 
-/// Centre and half-width of every existing door, along the wall, in pixels.
+/// Returns centre and half-width of every existing door, along the wall, in pixels.
 fn doors(factors: &FactorValues) -> Vec<[f64; 2]> {
     let pairs = factors.get("door.position").iter().zip(factors.get("door.size"));
     let count = usize::try_from(factors.integer("door.number")).unwrap_or(0);
     pairs.take(count).map(|(&center, &size)| [center, size]).collect()
 }
 
-/// The layout that the factors describe.
+/// Returns the layout that the factors describe.
 fn layout(factors: &FactorValues) -> Layout {
     let mut openings = [[0.0; 2]; MAX_DOORS];
     for (opening, [center, size]) in openings.iter_mut().zip(doors(factors)) {

@@ -6,7 +6,7 @@ use super::physics::{Layout, WALL_CENTER};
 use crate::point_agent::room::GOAL_RADIUS;
 use crate::point_agent::{Position64, distance64};
 
-/// Distance that a path keeps from the edges of a door, where the door is wide enough, in pixels.
+/// Distance that a path keeps from the edges of a door if the door is wide enough, in pixels.
 const CLEARANCE: f64 = 3.0;
 /// Gap between the agent and the wall at which a path turns into a door, in pixels.
 const STAND_OFF: f64 = 1.0;
@@ -34,7 +34,8 @@ fn best_door(layout: &Layout, from: Position64, to: Position64) -> Option<([f64;
     let (across, along) = (layout.across, 1 - layout.across);
     let before = (from[across] - WALL_CENTER).abs();
     let after = (to[across] - WALL_CENTER).abs();
-    // Where the straight line meets the wall; a path crosses each door at the point nearest to it.
+    // The coordinate along the wall at which the straight line crosses it. A path crosses each door at the point
+    // nearest to this coordinate.
     let straight = from[along] + (to[along] - from[along]) * before / (before + after).max(1e-9);
     let mut best = None;
     for opening in openings(layout) {
@@ -57,15 +58,16 @@ pub fn length(layout: &Layout, from: Position64, to: Position64) -> Option<f64> 
     best_door(layout, from, to).map(|(_, _, length)| length)
 }
 
-/// The openings of all passable doors.
+/// Returns the openings of all passable doors.
 fn openings(layout: &Layout) -> impl Iterator<Item = [f64; 2]> + use<> {
     let layout = *layout;
     layout.doors.into_iter().filter_map(move |door| usable_opening(&layout, door))
 }
 
-/// Returns the position to walk to in order to reach `to`. This is `to` itself unless it lies inside the wall; then it
-/// is the position, among those at the wall's faces and in the doors, that reaches `to` by the shortest path. If none
-/// of them is near enough, it is the nearest of them.
+/// Returns the end of the path to `to`, which is `to` itself if it lies outside the wall.
+///
+/// Otherwise the candidates are positions at the wall's faces and in the doors. The result is the candidate within
+/// [`NEAR`] of `to` that has the shortest path, or else the reachable candidate nearest to `to`.
 fn reachable_end(layout: &Layout, from: Position64, to: Position64) -> Position64 {
     let (across, along) = (layout.across, 1 - layout.across);
     let beyond = layout.contact_depth() + SPARE;
@@ -78,25 +80,26 @@ fn reachable_end(layout: &Layout, from: Position64, to: Position64) -> Position6
         let [first, last] = narrowed(opening, 0.25);
         at(to[across], to[along].clamp(first, last))
     });
-    // Ordered by: near enough and reachable, reachable only, unreachable.
+    // The order of candidates: reachable and near enough, reachable, unreachable.
     let cost = |end: Position64| {
-        let apart = distance64(end, to);
+        let gap = distance64(end, to);
         let length = length(layout, from, end);
-        length.map_or((2, apart), |length| if apart < NEAR { (0, length) } else { (1, apart) })
+        length.map_or((2, gap), |length| if gap < NEAR { (0, length) } else { (1, gap) })
     };
     let best = faces.into_iter().chain(doors).map(|end| (cost(end), end));
     best.min_by(|((a, b), _), ((c, d), _)| a.cmp(c).then(b.total_cmp(d))).map_or(to, |(_, end)| end)
 }
 
-/// Returns the position to head for from `from` on the way to `to`: the target, the mouth of a door, or the other end
-/// of the door.
+/// Returns the next waypoint on the path from `from` to `to`: the target, the near end of a door, or the far end of the
+/// door.
 ///
-/// It depends on the two positions alone, so an agent that noise pushes off the path still gets a valid waypoint.
+/// The waypoint depends on the two positions alone, so an agent that noise pushes off the path still gets a valid
+/// waypoint.
 pub fn waypoint(layout: &Layout, from: Position64, to: Position64) -> Position64 {
     let to = reachable_end(layout, from, to);
     let (across, along) = (layout.across, 1 - layout.across);
     let contact = layout.contact_depth();
-    // Depth grows towards the other room: the agent's room lies below -contact, the other one above contact.
+    // Depth grows towards the other room: the agent's room lies below -contact, the other room above contact.
     let outward = if from[across] < WALL_CENTER { 1.0 } else { -1.0 };
     let depth = |p: Position64| (p[across] - WALL_CENTER) * outward;
     let in_wall = |p: Position64| depth(p).abs() <= contact;

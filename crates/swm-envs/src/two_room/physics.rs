@@ -2,7 +2,7 @@
 //! between the rooms unless its centre passes through a door.
 //!
 //! Constants and the order of the checks are those of the reference (`two_room/env.py`). Positions are in single
-//! precision as there, so that rollouts agree to the last bit. Lengths are in pixels of the 224-pixel frame.
+//! precision as in the reference, so that rollouts agree to the last bit. Lengths are in pixels of the 224-pixel frame.
 
 use crate::point_agent::Position;
 use crate::point_agent::room;
@@ -16,10 +16,10 @@ const PUSH_BACK: f64 = 0.5;
 /// The maximal number of doors.
 pub const MAX_DOORS: usize = 3;
 
-/// The part of an episode's configuration that decides how the agent moves. Lengths are in pixels.
+/// The parameters of the agent's motion in an episode. Lengths are in pixels.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Layout {
-    /// The axis that crosses the wall: 0 (x) for a vertical wall, 1 (y) for a horizontal one.
+    /// The axis that crosses the wall: 0 (x) for a vertical wall, 1 (y) for a horizontal wall.
     pub across: usize,
     /// Half the wall's thickness.
     pub half_thickness: f64,

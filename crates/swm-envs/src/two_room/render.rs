@@ -11,7 +11,7 @@ use crate::point_agent::room::{BORDER, LINE, SIZE};
 use swm_core::FrameMut;
 
 /// Width of the outermost part of the room's lines, drawn in `border_color`, in pixels. The reference ignores that
-/// colour; a narrow line shows it and hardly changes the frame.
+/// colour; a narrow line shows the colour and hardly changes the frame.
 const EDGE: f64 = 0.5;
 
 /// Geometry and colours of everything but the agent. Lengths are in pixels of the 224-pixel frame.
@@ -21,7 +21,7 @@ pub struct RoomAppearance {
     pub floor: Rgb,
     /// Colour of the wall and of the lines around the room.
     pub wall: Rgb,
-    /// Colour of the outer edge of these lines.
+    /// Colour of the outer edge of the lines around the room.
     pub border: Rgb,
     /// Colour of the doors.
     pub door: Rgb,
@@ -38,7 +38,7 @@ pub struct RoomAppearance {
 impl RoomAppearance {
     /// Returns the colour at a point of the 224-pixel frame, measured from its upper left corner.
     fn color_at(&self, p: [f64; 2]) -> Rgb {
-        // How far inside the outer edge of the room's lines a coordinate is; negative outside.
+        // The distance of each coordinate from the outer edge of the room's lines; negative outside.
         let depth = p.map(|v| v.min(SIZE - v) - (BORDER - LINE));
         let on = |depth: f64, width: f64| (0.0..width).contains(&depth);
         if depth.iter().all(|&d| d >= 0.0) && depth.iter().any(|&d| on(d, EDGE)) {
@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn other_sizes_are_area_averages() {
+    fn frames_of_other_sizes_are_area_averages() {
         let native = drawn(224, 224);
         for (w, h) in [(112, 112), (32, 56), (7, 1)] {
             let (dx, dy) = (224 / w, 224 / h);

@@ -5,8 +5,8 @@
 //! | `kernel` | pixels; even values mean the next odd one | 5 | 1 to 99 |
 //! | `sigma` | pixels; 0: `0.3 (kernel - 1) / 2 + 0.5` | 0 | 0 to 100 |
 //!
-//! Source: `BlurWrapper` of the reference, which calls OpenCV. The result is equal bit for bit, including the window in
-//! units of 2⁻⁸ (up to 7 pixels without a `sigma` it is binomial).
+//! Source: `BlurWrapper` of the reference, which calls OpenCV. The result is equal bit for bit: the window is in units
+//! of 2⁻⁸, and for kernels up to 7 pixels without a `sigma` it is OpenCV's fixed window.
 
 use super::border::mirror;
 use super::settings::{Domain, Parameter};

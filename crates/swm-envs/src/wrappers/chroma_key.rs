@@ -7,11 +7,11 @@
 //! | parameter | unit | default | range |
 //! | --- | --- | --- | --- |
 //! | `key_color` | red/green/blue, again for every further colour | must be given | 0 to 255 |
-//! | `media` | path of a PNG, a folder of PNGs, or what `ffmpeg` decodes | must be given | |
+//! | `media` | path of a PNG, a folder of PNGs, or a file that `ffmpeg` decodes | must be given | |
 //! | `tolerance` | levels of 255, distance in RGB | 0 | 0 to 442 |
 //!
-//! Source: `ChromaKeyWrapper` of the reference. Deviation: a video follows the steps of the episode, where the
-//! reference's advances with every frame drawn and is never restarted.
+//! Source: `ChromaKeyWrapper` of the reference. Deviation: a video follows the steps of the episode, but in the
+//! reference it advances with every drawn frame and never restarts.
 
 use super::media::{Media, SizedMedia};
 use super::settings::{Domain, Parameter};

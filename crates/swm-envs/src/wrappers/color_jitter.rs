@@ -92,8 +92,8 @@ impl ColorJitter {
     }
 }
 
-/// Returns `numerator / divisor` for every divisor, in units of 2⁻¹². As in OpenCV, multiplication by them replaces
-/// division.
+/// Returns `numerator / divisor` for every divisor, in units of 2⁻¹². As in OpenCV, multiplication by these quotients
+/// replaces division.
 const fn quotients(numerator: u32) -> [u32; 256] {
     let mut quotients = [0; 256];
     let mut divisor = 1;

@@ -1,4 +1,4 @@
-//! Every wrapper compared with the Python reference on one image, `tests/golden/wrappers.npz`. The random draws of the
+//! Eight wrappers compared with the Python reference on one image, `tests/golden/wrappers.npz`. The random draws of the
 //! reference are part of the file.
 
 use super::chroma_key::ChromaKey;
@@ -19,30 +19,36 @@ struct Golden(NpzArchive<BufReader<File>>);
 
 impl Golden {
     fn image(&mut self, name: &str) -> RgbImage {
-        let array = self.0.by_name(name).expect("a readable archive").expect("an array of this name");
-        let [height, width] = [0, 1].map(|axis| usize::try_from(array.shape()[axis]).expect("a size"));
-        RgbImage { width, height, rgb: array.into_vec().expect("bytes") }
+        let array = self.0.by_name(name).expect("reading the archive").expect("an array of this name");
+        let [height, width] = [0, 1].map(|axis| usize::try_from(array.shape()[axis]).expect("a valid size"));
+        RgbImage { width, height, rgb: array.into_vec().expect("reading the bytes") }
     }
 
     fn cases(&mut self) -> Vec<Map<String, Value>> {
-        let text: Vec<String> = self.0.by_name("cases").expect("an archive").expect("cases").into_vec().expect("text");
-        serde_json::from_str(&text.concat()).expect("JSON")
+        let text: Vec<String> = self
+            .0
+            .by_name("cases")
+            .expect("reading the archive")
+            .expect("the array `cases`")
+            .into_vec()
+            .expect("reading strings");
+        serde_json::from_str(&text.concat()).expect("parsing the cases")
     }
 }
 
 fn floats(value: &Value) -> Vec<f64> {
     match value {
         Value::Array(values) => values.iter().flat_map(floats).collect(),
-        number => vec![number.as_f64().expect("a number")],
+        number => vec![number.as_f64().expect("reading a number")],
     }
 }
 
 /// The tolerated mean and maximal difference of a wrapper from the reference, of 255.
 fn tolerance(id: &str) -> (f64, u8) {
     match id {
-        // Rounding of means whose fraction is one half.
+        // Means whose fraction is one half are rounded differently.
         "resolution" | "chroma-key" => (0.03, 1),
-        // Products that are an integer, or just below it, depending on the order of multiplication.
+        // The order of multiplication decides if a product is an integer or just below it.
         "color-jitter" => (0.001, 1),
         _ => (0.0, 0),
     }
@@ -52,22 +58,23 @@ fn tolerance(id: &str) -> (f64, u8) {
 #[allow(clippy::too_many_lines, reason = "one match over the wrappers of the golden file")]
 fn wrappers_equal_the_reference() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/golden/wrappers.npz");
-    let mut golden = Golden(NpzArchive::open(path).expect("the golden file"));
+    let mut golden = Golden(NpzArchive::open(path).expect("opening the golden file"));
     let original = golden.image("frame");
     let (mut compared, mut wrong) = (std::collections::BTreeSet::new(), vec![]);
     for (i, mut case) in golden.cases().into_iter().enumerate() {
         let expected = golden.image(&format!("out_{i}"));
-        let what = format!("case {i}, {case:?}");
-        let id = case.remove("wrapper").expect("a wrapper").as_str().expect("a name").to_owned();
+        let case_name = format!("case {i}, {case:?}");
+        let id = case.remove("wrapper").expect("the entry `wrapper`").as_str().expect("the id of a wrapper").to_owned();
         let drawn = case.remove("drawn").filter(|drawn| !drawn.is_null()).map(|drawn| floats(&drawn));
-        let step = case.remove("step").and_then(|step| step.as_u64()).expect("a step");
+        let step = case.remove("step").and_then(|step| step.as_u64()).expect("the entry `step`");
         let RgbImage { width, height, mut rgb } = RgbImage { rgb: original.rgb.clone(), ..original };
         let mut frame = FrameMut::new(width, height, &mut rgb);
         match (id.as_str(), drawn) {
             ("chroma-key", _) => {
-                let media = golden.image(&format!("background_{}", case["media"].as_str().expect("a name")));
-                let key: Vec<u8> = serde_json::from_value(case["key_color"].clone()).expect("a colour");
-                let tolerance = case["tolerance"].as_f64().expect("a number");
+                let media =
+                    golden.image(&format!("background_{}", case["media"].as_str().expect("the name of a background")));
+                let key: Vec<u8> = serde_json::from_value(case["key_color"].clone()).expect("reading a colour");
+                let tolerance = case["tolerance"].as_f64().expect("reading a number");
                 ChromaKey::new(&key, Media::new(vec![media]), tolerance).apply(&mut frame, EpisodeFrame::Step(step));
             }
             ("color-jitter", Some(drawn)) => {
@@ -76,13 +83,14 @@ fn wrappers_equal_the_reference() {
                 ColorJitter::new(ranges).apply(&mut frame, EpisodeFrame::Step(step));
             }
             ("random-conv", Some(weights)) => {
-                let side = usize::try_from(case["kernel_size"].as_u64().expect("a size")).expect("a size");
+                let side =
+                    usize::try_from(case["kernel_size"].as_u64().expect("reading a size")).expect("a valid size");
                 let mut conv = RandomConv::new(side);
                 conv.set(weights.iter().map(|&weight| weight as f32));
                 conv.apply(&mut frame, EpisodeFrame::Step(step));
             }
             ("occlusion", Some(patches)) => {
-                let color: [u8; 3] = serde_json::from_value(case["color"].clone()).expect("a colour");
+                let color: [u8; 3] = serde_json::from_value(case["color"].clone()).expect("reading a colour");
                 for patch in patches.as_chunks::<4>().0 {
                     let [y, x, height, width] = patch.map(|v| v as usize);
                     Rect { x, y, width, height }.fill(color, &mut frame);
@@ -97,7 +105,8 @@ fn wrappers_equal_the_reference() {
                 }
             }
             (id, _) => {
-                let mut wrapper = WRAPPERS.get(id).expect("a wrapper").make(&case).expect("settings");
+                let mut wrapper =
+                    WRAPPERS.get(id).expect("finding the wrapper").make(&case).expect("making the wrapper");
                 wrapper.apply(&mut frame, EpisodeFrame::Step(step));
             }
         }
@@ -108,7 +117,7 @@ fn wrappers_equal_the_reference() {
         );
         let (mean_allowed, most_allowed) = tolerance(&id);
         if mean > mean_allowed || most > Some(&most_allowed) {
-            wrong.push(format!("{what}: mean {mean:.4}, most {most:?} of 255"));
+            wrong.push(format!("{case_name}: mean {mean:.4}, most {most:?} of 255"));
         }
         compared.insert(id);
     }

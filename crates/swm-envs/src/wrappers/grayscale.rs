@@ -1,7 +1,8 @@
 //! Luma in all three channels: `Y = 0.299 R + 0.587 G + 0.114 B`.
 //!
-//! No parameters. Source: `GrayscaleWrapper` of the reference, which calls OpenCV; the result is equal bit for bit
-//! (weights in units of 2⁻¹⁵). Deviation: frames always have three channels, so there is no `keep_channels`.
+//! The wrapper has no parameters. Source: `GrayscaleWrapper` of the reference, which calls OpenCV; the result is equal
+//! bit for bit (weights in units of 2⁻¹⁵). Deviation: frames always have three channels, so there is no
+//! `keep_channels`.
 
 use super::{EpisodeFrame, VisualWrapper, WrapperEntry};
 use swm_core::FrameMut;

@@ -111,7 +111,7 @@ fn read_video(program: &Path, path: &Path, limit: usize) -> Result<Vec<RgbImage>
     let output = Command::new(program)
         .args(["-nostdin", "-hide_banner", "-loglevel", "error", "-i"])
         .arg(input)
-        // Every frame once, regardless of its duration.
+        // These options write every frame once, regardless of its duration.
         .args(["-an", "-vf", "settb=1/25,setpts=N", "-r", "25", "-fs", &limit.to_string()])
         .args(["-f", "image2pipe", "-c:v", "ppm", "-pix_fmt", "rgb24", "pipe:1"])
         .stdin(Stdio::null())
@@ -180,11 +180,12 @@ mod tests {
 
     #[test]
     fn missing_ffmpeg_and_oversized_videos_are_errors() {
-        let folder = tempfile::tempdir().expect("a folder");
+        let folder = tempfile::tempdir().expect("creating a temporary folder");
         let path = folder.path().join("a.mp4");
-        let message = |program: &str| read_video(Path::new(program), &path, LIMIT).expect_err("fails").to_string();
+        let message =
+            |program: &str| read_video(Path::new(program), &path, LIMIT).expect_err("reading must fail").to_string();
         assert!(message("ffmpeg").contains("a.mp4"));
-        std::fs::write(&path, b"no video").expect("a file");
+        std::fs::write(&path, b"no video").expect("writing the file");
         assert!(message("no-such-ffmpeg").contains("install FFmpeg"), "{}", message("no-such-ffmpeg"));
         assert!(too_large(&path).to_string().contains("1024 MiB"));
     }

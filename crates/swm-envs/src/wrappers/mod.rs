@@ -1,12 +1,13 @@
 //! Visual wrappers: changes to the frames of any environment that leave its dynamics untouched.
 //!
 //! A [`VisualWrapper`] changes a frame in place. [`Wrapped`] is an environment whose frames pass through an ordered
-//! stack of them. Random draws of a wrapper depend on the episode's seed, its index in the stack and the step, never on
-//! how often a frame was drawn: drawing twice gives equal bytes, and a restored snapshot continues bit for bit.
+//! stack of wrappers. Random draws of a wrapper depend on the episode's seed, its index in the stack and the step,
+//! never on how often a frame was drawn: drawing twice gives equal bytes, and a restored snapshot continues bit for
+//! bit.
 //!
 //! Wrappers, their parameters, defaults and meanings are those of the Python package `stable-worldmodel` 0.1.1
-//! (`wrapper/visual.py`) and of the paper's table of visual wrappers; every file lists its deviations, and
-//! `docs/wrappers.md` has example frames.
+//! (`wrapper/visual.py`) and of the paper's table of visual wrappers; the file of every wrapper lists its deviations,
+//! and `docs/wrappers.md` has example frames.
 
 mod blur;
 mod border;
@@ -57,9 +58,9 @@ pub static WRAPPERS: Registry<WrapperEntry> = Registry {
 /// The frame of an episode that a wrapper changes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum EpisodeFrame {
-    /// The frame after that many steps.
+    /// The frame after this number of steps.
     Step(u64),
-    /// The goal frame; moving wrappers are as at step 0.
+    /// The goal frame, in which positions and schedules are those of step 0.
     Goal,
 }
 
@@ -102,11 +103,11 @@ pub trait VisualWrapper: Send + Sync {
 
 /// A row of the registry of wrappers.
 pub struct WrapperEntry {
-    /// Its id, such as `noise`.
+    /// The id, such as `noise`.
     pub id: &'static str,
-    /// A one-sentence description of its effect on a frame.
+    /// A one-sentence description of the effect on a frame.
     pub summary: &'static str,
-    /// Its parameters.
+    /// The parameters.
     pub parameters: &'static [Parameter],
     /// Makes a wrapper from checked values of all parameters.
     build: fn(Value) -> Result<Box<dyn VisualWrapper>>,
@@ -164,6 +165,6 @@ pub fn read(text: &str) -> Result<(&'static WrapperEntry, Settings)> {
 /// Converts checked values to the typed settings of a wrapper.
 fn typed<T: serde::de::DeserializeOwned>(wrapper: &str, settings: Value) -> Result<T> {
     serde_json::from_value(settings).map_err(|error| {
-        Error::config(format!("wrapper '{wrapper}'"), error.to_string(), "`swm wrappers` lists what it takes")
+        Error::config(format!("wrapper '{wrapper}'"), error.to_string(), "`swm wrappers` lists its parameters")
     })
 }

@@ -8,8 +8,8 @@
 //! | `speed` | pixels a step | 2 | 0 to 1000 |
 //!
 //! Position and direction are drawn uniformly at the start of an episode. In the goal frame the rectangles are at their
-//! start positions. Source: `MovingPatchWrapper` of the reference. It moves the rectangles step by step; here the
-//! position is a function of the step, which gives the same path while `speed` is below the free length of a
+//! start positions. Source: `MovingPatchWrapper` of the reference. The reference moves the rectangles step by step;
+//! here the position is a function of the step. Both give the same path if `speed` is less than the free length of a
 //! rectangle's path.
 
 use super::patch::{Patch, Rect};

@@ -12,7 +12,7 @@
 //! Source: `NoiseWrapper` of the reference (Gaussian with a schedule); the paper's table adds salt and pepper, for
 //! which `amount` is the usual measure. Deviations: a schedule counts the steps of the episode, where the reference
 //! counts all steps since the wrapper was made; Gaussian draws are the centres of 8192 intervals of equal probability,
-//! so none lies beyond 3.8 standard deviations.
+//! so no draw lies beyond 3.85 standard deviations.
 
 use super::settings::{Domain, Parameter, Schedule};
 use super::{EpisodeFrame, VisualWrapper, WrapperEntry, gaussian, typed};
@@ -68,7 +68,7 @@ enum Kind {
 /// The number of intervals of the normal distribution; a power of 2.
 const INTERVALS: usize = 8192;
 
-/// The centres of the intervals, scaled to a variance of 1 (the discretisation reduces the variance by 0.1 %).
+/// The centres of the intervals, scaled to a variance of 1 (the discretisation reduces the variance by 0.02 %).
 static STANDARD: LazyLock<Vec<f64>> = LazyLock::new(|| {
     let mut centres: Vec<f64> =
         (0..INTERVALS).map(|i| gaussian::quantile((i as f64 + 0.5) / INTERVALS as f64)).collect();

@@ -1,4 +1,4 @@
-//! Rectangles of one colour at random positions, the parts of cutouts, occlusions and moving patches.
+//! Rectangles of one colour at random positions, which the wrappers `cutout`, `occlusion` and `moving-patch` draw.
 
 use rand::Rng as _;
 use swm_core::{FrameMut, Rng};
@@ -33,7 +33,7 @@ pub struct Patch {
 }
 
 impl Patch {
-    /// Draws a rectangle whose sides lie in a range.
+    /// Samples a rectangle whose sides lie in a range.
     pub fn draw(size: [f64; 2], rng: &mut Rng) -> Self {
         let side = |rng: &mut Rng| size[0] + (size[1] - size[0]) * rng.random::<f64>();
         Self { size: [side(rng), side(rng)], position: [rng.random(), rng.random()] }

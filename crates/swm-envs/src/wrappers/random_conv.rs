@@ -39,17 +39,17 @@ struct Settings {
     kernel_size: usize,
 }
 
-/// Pixels computed together.
+/// The number of pixels that are computed together.
 const BLOCK: usize = 8;
 
 #[derive(Clone)]
 pub(super) struct RandomConv {
     side: usize,
-    /// The weights of the three results, `[row, channel, column]`.
+    /// The weights of the three output channels, `[row, channel, column]`.
     weights: Vec<[f32; 3]>,
     /// The frame as `[height, channel, stride]`, each row with its mirrored surroundings.
     planes: Vec<f32>,
-    /// One row of the result.
+    /// One row of the output, in blocks of pixels.
     sums: Vec<[[f32; BLOCK]; 3]>,
 }
 

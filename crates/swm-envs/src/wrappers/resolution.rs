@@ -4,8 +4,8 @@
 //! | --- | --- | --- | --- |
 //! | `scale` | share of width and height; the sides are rounded and at least 1 | 0.5 | 0 to 1 |
 //!
-//! Source: `ResolutionWrapper` of the reference (area interpolation down, nearest neighbour up). Deviation: no
-//! `scale` above 1, which changes nothing but time.
+//! Source: `ResolutionWrapper` of the reference (area interpolation down, nearest neighbour up). Deviation:
+//! `scale` is at most 1, because larger values leave the frame unchanged.
 
 use super::settings::{Domain, Parameter};
 use super::{EpisodeFrame, VisualWrapper, WrapperEntry, typed};
@@ -57,9 +57,9 @@ impl VisualWrapper for Resolution {
         let to = from.map(|side| ((side as f64 * self.scale).round_ties_even() as usize).max(1));
         let resizer = match &mut self.resizer {
             Some(resizer) if resizer.is_for(from, to) => resizer,
-            other => {
+            outdated => {
                 self.columns = (0..from[0]).map(|x| x * to[0] / from[0]).collect();
-                other.insert(AreaResizer::new(from, to))
+                outdated.insert(AreaResizer::new(from, to))
             }
         };
         self.small.resize(3 * to[0] * to[1], 0);

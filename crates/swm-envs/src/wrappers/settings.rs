@@ -12,13 +12,13 @@ pub type Settings = serde_json::Map<String, Value>;
 /// One parameter of a wrapper.
 #[derive(Clone, Copy, Debug)]
 pub struct Parameter {
-    /// Its name.
+    /// The name.
     pub name: &'static str,
-    /// A short description with its unit.
+    /// A short description with the unit.
     pub summary: &'static str,
-    /// Its allowed values.
+    /// The allowed values.
     pub domain: Domain,
-    /// Its default in command-line form; `None` if it is required.
+    /// The default in command-line form; `None` if the parameter is required.
     pub default: Option<&'static str>,
 }
 
@@ -160,7 +160,7 @@ impl Parameter {
     }
 }
 
-/// Returns the parameter of a name.
+/// Returns the parameter with a name.
 fn find(wrapper: &str, table: &'static [Parameter], name: &str) -> Result<&'static Parameter> {
     table.iter().find(|parameter| parameter.name == name).ok_or_else(|| {
         let names: Vec<&str> = table.iter().map(|parameter| parameter.name).collect();
@@ -189,7 +189,7 @@ pub(super) fn read(wrapper: &str, table: &'static [Parameter], text: &str) -> Re
     Ok(settings)
 }
 
-/// Returns all parameters of the table: the given values, checked, and the defaults of the others.
+/// Returns a value for every parameter of the table: the given value, checked, or the default.
 pub(super) fn complete(wrapper: &str, table: &'static [Parameter], given: &Settings) -> Result<Settings> {
     for name in given.keys() {
         find(wrapper, table, name)?;
@@ -249,13 +249,13 @@ impl Schedule {
         use std::f64::consts::{PI, TAU};
         let index = usize::try_from(step).unwrap_or(usize::MAX);
         let step = step as f64;
-        let part = |steps: f64| (step / steps.max(1.0)).min(1.0);
+        let progress = |steps: f64| (step / steps.max(1.0)).min(1.0);
         match *self {
             Self::Constant(value) => value,
             Self::Steps(ref values) => values.get(index).or(values.last()).copied().unwrap_or_default(),
-            Self::Formula(Formula::Linear, start, end, steps) => start + (end - start) * part(steps),
+            Self::Formula(Formula::Linear, start, end, steps) => start + (end - start) * progress(steps),
             Self::Formula(Formula::Cosine, start, end, steps) => {
-                end + 0.5 * (start - end) * (1.0 + (PI * part(steps)).cos())
+                end + 0.5 * (start - end) * (1.0 + (PI * progress(steps)).cos())
             }
             Self::Formula(Formula::Exponential, start, decay, floor) => (start * decay.powf(step)).max(floor),
             Self::Formula(Formula::Sinusoidal, low, high, period) => {
@@ -328,7 +328,7 @@ mod tests {
     #[test]
     fn schedules_follow_their_formulas() {
         let at = |json: &str, steps: [u64; 4]| {
-            let schedule: Schedule = serde_json::from_str(json).expect("a schedule");
+            let schedule: Schedule = serde_json::from_str(json).expect("parsing a schedule");
             steps.map(|step| (schedule.at(step) * 1e6).round() / 1e6)
         };
         // Values of the functions of the reference with these names.

@@ -1,4 +1,4 @@
-//! [`Wrapped`]: an environment whose frames pass through visual wrappers, and [`Stack`], which makes them.
+//! [`Wrapped`]: an environment whose frames pass through visual wrappers, and [`Stack`], which wraps environments.
 
 use super::{EpisodeFrame, VisualWrapper, parse};
 use std::collections::BTreeMap;
@@ -7,7 +7,7 @@ use swm_core::{
     ResetOptions, Result, RowMut, RowRef, Schema, Snapshot, Transition, dataset_start,
 };
 
-/// Whether wrappers change the goal frame.
+/// The treatment of the goal frame by wrappers.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum GoalFrame {
     /// The goal frame stays unchanged, as in the reference, whose wrappers change only the frames of steps. This is the
@@ -50,7 +50,7 @@ impl Stack {
     }
 }
 
-/// An environment whose frames pass through wrappers, first to last. Everything else is unchanged.
+/// An environment whose frames pass through wrappers, first to last. Everything but the frames is unchanged.
 ///
 /// Steps are counted from the last reset or [`Env::restore_from`]; randomness comes from the seed of the last reset.
 /// Both are part of the snapshot.

@@ -1,6 +1,6 @@
 """Records rollouts of the Python reference's SimplePointMaze and Piecewise (pip install stable-worldmodel matplotlib)
 that bump into walls, cross zones and end at their goals, in the layout of the other golden files.
-Run here: MPLBACKEND=agg python export_maze_and_piecewise.py [FOLDER]"""
+Run in this folder: MPLBACKEND=agg python export_maze_and_piecewise.py [FOLDER]"""
 
 import json
 import sys
@@ -9,7 +9,7 @@ import numpy as np
 from stable_worldmodel.envs.piecewise.piecewise_env import PiecewiseEnv
 from stable_worldmodel.envs.simple_point_maze import SimplePointMazeEnv
 
-# Environment, name, what varies, steps, and the seeds whose files lie here.
+# Environment class, name, varied factors, number of steps, and the seeds whose files are in this folder.
 RECORDINGS = [
     (PiecewiseEnv, "Piecewise", None, 120, [3]),
     (PiecewiseEnv, "Piecewise", ["all"], 150, [8, 12]),
@@ -27,7 +27,7 @@ def plain(value):
 
 
 def action(env, rng, position, goal, aim):
-    """Towards `aim`, farther than one step goes, with noise."""
+    """Returns a noisy action towards `aim` (or `goal` without an aim), larger than the action space allows."""
     away = (goal if aim is None else aim) - position
     size = env.action_space.high[0]
     return (1.2 * size * away / max(np.abs(away).max(), size) + rng.normal(0, 0.4 * size, 2)).astype(np.float32)

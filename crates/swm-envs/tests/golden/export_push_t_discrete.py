@@ -1,6 +1,6 @@
 """Records contact-rich rollouts of the Python reference's swm/PushT-Discrete-v1 (pip install stable-worldmodel), in the
-layout of the other golden files. Release 0.1.1 has another Z, and a T of scale 30 only: the first rollout is one with
-that T and the default factors, the others vary all factors and keep to the remaining shapes. Run here:
+layout of the other golden files. Release 0.1.1 has another shape Z, and a T of scale 30 only. The first rollout has
+this T and the default factors; later rollouts vary all factors, with the shapes other than T and Z. Run in this folder:
 python export_push_t_discrete.py"""
 
 import json

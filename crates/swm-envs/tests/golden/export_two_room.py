@@ -1,5 +1,5 @@
 """Records Two-Room rollouts of the Python reference (pip install stable-worldmodel) that bump into walls and walk
-through doors, in the layout of the other golden files. Run here: python export_two_room.py"""
+through doors, in the layout of the other golden files. Run in this folder: python export_two_room.py"""
 
 import json
 

@@ -60,44 +60,44 @@ def record(wrapper, settings, drawn=None, steps=0):
     cases.append(dict(settings, drawn=drawn(wrapper) if drawn else None, step=steps))
 
 
-def numbers(value):
+def to_list(value):
     return np.asarray(value, np.float64).tolist()
 
 
-still = StaticEnv(frame)
-record(visual.GrayscaleWrapper(still), {"wrapper": "grayscale"})
+static_env = StaticEnv(frame)
+record(visual.GrayscaleWrapper(static_env), {"wrapper": "grayscale"})
 for kernel, sigma in [(3, 0), (5, 0), (7, 0), (9, 0), (4, 1.3), (15, 2.5), (31, 20)]:
-    record(visual.BlurWrapper(still, kernel, sigma), {"wrapper": "blur", "kernel": kernel, "sigma": sigma})
+    record(visual.BlurWrapper(static_env, kernel, sigma), {"wrapper": "blur", "kernel": kernel, "sigma": sigma})
 for scale in [0.5, 0.25, 0.3, 0.73, 0.01]:
-    record(visual.ResolutionWrapper(still, scale), {"wrapper": "resolution", "scale": scale})
+    record(visual.ResolutionWrapper(static_env, scale), {"wrapper": "resolution", "scale": scale})
 for background in backgrounds:
     for color, tolerance in [([255, 255, 255], 0), ([220, 30, 40, 0, 0, 0], 60.5)]:
         record(
-            visual.ChromaKeyWrapper(still, color, backgrounds[background], tolerance),
+            visual.ChromaKeyWrapper(static_env, color, backgrounds[background], tolerance),
             {"wrapper": "chroma-key", "key_color": color, "tolerance": tolerance, "media": background},
         )
 for seed, options in enumerate([{}, {"brightness": 0.8, "contrast": 0.9, "saturation": 0.9, "hue": 0.5}, {"hue": 0.3}]):
     record(
-        visual.ColorJitterWrapper(still, seed=seed, **options),
+        visual.ColorJitterWrapper(static_env, seed=seed, **options),
         {"wrapper": "color-jitter"},
-        lambda w: numbers([w._db, w._dc, w._ds, w._dh]),
+        lambda w: to_list([w._db, w._dc, w._ds, w._dh]),
     )
 for kernel in [3, 5]:
     record(
-        visual.RandomConvWrapper(still, kernel, seed=kernel),
+        visual.RandomConvWrapper(static_env, kernel, seed=kernel),
         {"wrapper": "random-conv", "kernel_size": kernel},
-        lambda w: numbers(w._weights.ravel()),
+        lambda w: to_list(w._weights.ravel()),
     )
 record(
-    visual.OcclusionWrapper(still, 3, (0.1, 0.4), (200, 10, 30), seed=1),
+    visual.OcclusionWrapper(static_env, 3, (0.1, 0.4), (200, 10, 30), seed=1),
     {"wrapper": "occlusion", "num_patches": 3, "size": [0.1, 0.4], "color": [200, 10, 30]},
-    lambda w: numbers(w._patches),
+    lambda w: to_list(w._patches),
 )
 for steps in [0, 40]:
-    moving = visual.MovingPatchWrapper(still, 2, (0.1, 0.3), speed=2.5, seed=2)
+    moving = visual.MovingPatchWrapper(static_env, 2, (0.1, 0.3), speed=2.5, seed=2)
     moving.reset()
     moving.render()
-    drawn = numbers(moving._patches)
+    drawn = to_list(moving._patches)
     moving.reset = lambda: None
     record(
         moving,

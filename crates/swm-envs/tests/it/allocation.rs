@@ -1,4 +1,4 @@
-//! Steps, observations and frames allocate no memory after the first ones.
+//! Tests that steps, observations and frames allocate no memory after the first step.
 
 use swm_conformance::allocation::{self, Counting};
 use swm_envs::ENVS;

@@ -5,7 +5,7 @@ use swm_core::{Action, Batch, Env, FrameMut, ResetOptions, Schema, Space};
 
 fn frame(env: &mut dyn Env, (width, height): (usize, usize)) -> Vec<u8> {
     let mut rgb = vec![0; width * height * 3];
-    env.render(FrameMut::new(width, height, &mut rgb)).expect("a frame");
+    env.render(FrameMut::new(width, height, &mut rgb)).expect("rendering a frame");
     rgb
 }
 
@@ -16,8 +16,8 @@ fn follow(id: &str, size: (usize, usize)) {
     for file in files {
         let mut golden = Golden::open(&file);
         let name = file.display();
-        let mut env = swm_envs::ENVS.get(id).expect("a registered environment").env().expect("an environment");
-        let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("a schema"), 1);
+        let mut env = swm_envs::ENVS.get(id).expect("finding the environment").env().expect("creating the environment");
+        let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("building the schema"), 1);
         let states = golden.read::<f64>("info.state");
         // Some files contain the start state in double precision.
         let exact = golden.has("start");
@@ -27,7 +27,7 @@ fn follow(id: &str, size: (usize, usize)) {
             state: Some(if exact { golden.read("start") } else { states[..n].to_vec() }),
             ..ResetOptions::default()
         };
-        env.reset(0, &options).expect("recorded values are possible");
+        env.reset(0, &options).expect("resetting to the recorded start");
         let first = image_difference(&frame(&mut *env, size), &golden.read("frame_first"));
 
         let (rewards, terminations) = (golden.read::<f64>("reward"), golden.read::<bool>("terminated"));
@@ -36,14 +36,14 @@ fn follow(id: &str, size: (usize, usize)) {
         let values = if discrete { vec![] } else { golden.read::<f32>("action") };
         for t in 0..rewards.len() {
             let action = if discrete { Action::Discrete(&choices[t..=t]) } else { Action::Continuous(&values[t..=t]) };
-            let transition = env.step(action).expect("a step");
+            let transition = env.step(action).expect("stepping the environment");
             env.observe(&mut row.row_mut(0));
-            let state = row.row(0).to_f64("state").expect("a column");
+            let state = row.row(0).to_f64("state").expect("reading the column");
             let expected = &states[n * (t + 1)..][..n];
-            let apart = state.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-            assert!(apart <= 1e-5, "{name}, state {t}: {state:?}, expected {expected:?}");
-            let apart = (transition.reward - rewards[t]).abs();
-            assert!(apart <= 1e-5, "{name}, reward {t}: {}, expected {}", transition.reward, rewards[t]);
+            let error = state.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+            assert!(error <= 1e-5, "{name}, state {t}: {state:?}, expected {expected:?}");
+            let error = (transition.reward - rewards[t]).abs();
+            assert!(error <= 1e-5, "{name}, reward {t}: {}, expected {}", transition.reward, rewards[t]);
             assert_eq!(transition.terminated, terminations[t], "{name}, terminated {t}");
         }
         let last = image_difference(&frame(&mut *env, size), &golden.read("frame_last"));

@@ -10,7 +10,7 @@ const FRAME_TOLERANCE: f64 = 3.0;
 fn frame_difference(env: &mut dyn Env, golden: &mut Golden, name: &str) -> f64 {
     let (height, width, expected) = golden.image(name);
     let mut rgb = vec![0; height * width * 3];
-    env.render(FrameMut::new(width, height, &mut rgb)).expect("a frame");
+    env.render(FrameMut::new(width, height, &mut rgb)).expect("rendering a frame");
     image_difference(&rgb, &expected)
 }
 
@@ -24,15 +24,15 @@ fn follow(entry: &EnvEntry, files: usize, columns: &[(&str, &str)], options: fn(
         let name = file.display();
         let options = options(&mut golden);
         let expected: Vec<Vec<f64>> = columns.iter().map(|(_, array)| golden.read(array)).collect();
-        let mut env = entry.env().expect("an environment");
-        env.reset(0, &options).expect("recorded values are possible");
+        let mut env = entry.env().expect("creating the environment");
+        env.reset(0, &options).expect("resetting to the recorded start");
         let first = frame_difference(&mut *env, &mut golden, "frame_first");
 
-        let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("a schema"), 1);
+        let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("building the schema"), 1);
         let mut compare = |env: &dyn Env, t: usize| {
             env.observe(&mut row.row_mut(0));
             for ((column, _), expected) in columns.iter().zip(&expected) {
-                let values = row.row(0).to_f64(column).expect("a column");
+                let values = row.row(0).to_f64(column).expect("reading the column");
                 let expected = &expected[values.len() * t..][..values.len()];
                 let error = values.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
                 assert!(error <= 1e-5, "{name}, {column} {t}: {values:?}, expected {expected:?}");
@@ -41,7 +41,7 @@ fn follow(entry: &EnvEntry, files: usize, columns: &[(&str, &str)], options: fn(
         compare(&*env, 0);
         let (rewards, terminations) = (golden.read::<f64>("reward"), golden.read::<bool>("terminated"));
         for (t, action) in golden.read::<f32>("action").chunks_exact(2).enumerate() {
-            let transition = env.step(Action::Continuous(action)).expect("a step");
+            let transition = env.step(Action::Continuous(action)).expect("stepping the environment");
             compare(&*env, t + 1);
             assert_eq!(transition.reward, rewards[t], "{name}, reward {t}");
             assert_eq!(transition.terminated, terminations[t], "{name}, terminated {t}");

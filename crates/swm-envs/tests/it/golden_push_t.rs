@@ -12,20 +12,20 @@ struct Probe {
 
 impl Probe {
     fn new(entry: &EnvEntry, options: &ResetOptions) -> Self {
-        let mut env = entry.env().expect("an environment");
-        env.reset(0, options).expect("recorded values are possible");
-        let schema = Schema::new(env.spec().columns.clone()).expect("a schema");
+        let mut env = entry.env().expect("creating the environment");
+        env.reset(0, options).expect("resetting to the recorded start");
+        let schema = Schema::new(env.spec().columns.clone()).expect("building the schema");
         Self { env, row: Batch::zeros(&schema, 1) }
     }
 
     fn observe(&mut self, column: &str) -> Vec<f64> {
         self.env.observe(&mut self.row.row_mut(0));
-        self.row.row(0).to_f64(column).expect("a column")
+        self.row.row(0).to_f64(column).expect("reading the column")
     }
 
     fn frame(&mut self) -> Vec<u8> {
         let mut rgb = vec![0; 224 * 224 * 3];
-        self.env.render(FrameMut::new(224, 224, &mut rgb)).expect("a frame");
+        self.env.render(FrameMut::new(224, 224, &mut rgb)).expect("rendering a frame");
         rgb
     }
 }
@@ -43,9 +43,10 @@ fn contacts_follow_the_reference() {
     for file in files {
         let mut golden = Golden::open(&file);
         for pair in golden.names().iter().filter_map(|name| name.strip_suffix(".state")) {
-            // b<block>a<agent>
-            let shapes: Vec<f64> = pair[1..].split('a').map(|shape| shape.parse().expect("a shape")).collect();
-            let what = format!("{}, {pair}", file.display());
+            // A pair is named `b<block shape>a<agent shape>`.
+            let shapes: Vec<f64> =
+                pair[1..].split('a').map(|shape| shape.parse().expect("parsing a shape index")).collect();
+            let case = format!("{}, {pair}", file.display());
             let mut read = |name: &str| golden.read::<f64>(&format!("{pair}.{name}"));
             let [states, rewards, start, goal] = ["state", "reward", "start", "goal"].map(&mut read);
             let actions = golden.read::<f32>(&format!("{pair}.action"));
@@ -60,26 +61,26 @@ fn contacts_follow_the_reference() {
             let mut probe = Probe::new(&push_t::ENTRY, &options);
 
             let mut errors = vec![max_difference(&states[..4], &probe.observe("state")[..4])];
-            assert!(errors[0] < 1e-6, "{what}: off by {} at the reset", errors[0]);
+            assert!(errors[0] < 1e-6, "{case}: off by {} at the reset", errors[0]);
             let mut touched = false;
             for (t, action) in actions.chunks_exact(2).enumerate() {
-                let transition = probe.env.step(Action::Continuous(action)).expect("a step");
+                let transition = probe.env.step(Action::Continuous(action)).expect("stepping the environment");
                 let (expected, state) = (&states[7 * (t + 1)..][..7], probe.observe("state"));
                 let error = max_difference(&expected[..4], &state[..4]);
                 errors.push(error);
                 touched |= contacts[t] > 0;
-                assert!(touched || error < 1e-6, "{what}: off by {error} at {t}, before any contact");
+                assert!(touched || error < 1e-6, "{case}: off by {error} at {t}, before any contact");
                 if max_difference(expected, &state) < 1e-6 {
-                    assert!((transition.reward - rewards[t]).abs() < 1e-6, "{what}: reward {t}");
-                    assert_eq!(transition.terminated, terminations[t], "{what}: terminated {t}");
-                    assert_eq!(transition.terminated, probe.env.is_success(), "{what}: success {t}");
-                    assert_eq!(probe.observe("n_contacts"), [contacts[t] as f64], "{what}: contacts {t}");
+                    assert!((transition.reward - rewards[t]).abs() < 1e-6, "{case}: reward {t}");
+                    assert_eq!(transition.terminated, terminations[t], "{case}: terminated {t}");
+                    assert_eq!(transition.terminated, probe.env.is_success(), "{case}: success {t}");
+                    assert_eq!(probe.observe("n_contacts"), [contacts[t] as f64], "{case}: contacts {t}");
                 }
             }
             // On x86-64 Linux all errors are 0; elsewhere sine and cosine may round differently.
             errors.sort_by(f64::total_cmp);
             let median = errors[errors.len() / 2];
-            assert!(median < 0.1, "{what}: median error {median} px");
+            assert!(median < 0.1, "{case}: median error {median} px");
         }
     }
 }
@@ -119,7 +120,7 @@ fn rollouts_and_frames_follow_the_reference() {
         let first = image_difference(&probe.frame(), &golden.read("frame_first"));
         let (rewards, terminations) = (golden.read::<f64>("reward"), golden.read::<bool>("terminated"));
         for (t, action) in golden.read::<f32>("action").chunks_exact(2).enumerate() {
-            let transition = probe.env.step(Action::Continuous(action)).expect("a step");
+            let transition = probe.env.step(Action::Continuous(action)).expect("stepping the environment");
             follows(&mut probe, t + 1);
             assert!((transition.reward - rewards[t]).abs() < 1e-6, "{name}: reward {t}");
             assert_eq!(transition.terminated, terminations[t], "{name}: terminated {t}");
@@ -144,7 +145,7 @@ fn discrete_actions_follow_the_reference() {
         let (rewards, terminations) = (golden.read::<f64>("reward"), golden.read::<bool>("terminated"));
         let mut errors = vec![max_difference(&states[..7], &probe.observe("state"))];
         for (t, action) in golden.read::<i64>("action").chunks_exact(2).enumerate() {
-            let transition = probe.env.step(Action::Discrete(action)).expect("a step");
+            let transition = probe.env.step(Action::Discrete(action)).expect("stepping the environment");
             errors.push(max_difference(&states[7 * (t + 1)..][..7], &probe.observe("state")));
             assert!((transition.reward - rewards[t]).abs() < 1e-6, "{name}: reward {t}");
             assert_eq!(transition.terminated, terminations[t], "{name}: terminated {t}");

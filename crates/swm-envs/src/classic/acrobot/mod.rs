@@ -18,7 +18,7 @@ pub const ENTRY: EnvEntry = EnvEntry {
     make: |_| Ok(Box::new(ClassicEnv::<Acrobot>::new())),
     experts: &[ExpertEntry {
         id: "expert",
-        summary: "applies torque in the direction of the joint's rotation, which adds energy until the end is high enough",
+        summary: "applies torque in the direction of the joint's rotation, which adds energy in every step",
         make: || Box::new(Controller::<Acrobot>::new()),
     }],
 };
@@ -26,7 +26,8 @@ pub const ENTRY: EnvEntry = EnvEntry {
 /// Two links with a motor in the joint between them.
 struct Acrobot(Physics);
 
-/// Half-width of the uniform distribution around 0 (hanging at rest) from which every value of the start is drawn.
+/// Half-width of the uniform distribution around 0 (hanging at rest) of the angles (rad) and the velocities (rad/s) at
+/// the start.
 const START: f64 = 0.1;
 /// Tolerance of both angles for a goal below the line, in radians.
 const NEAR: f64 = 0.2;

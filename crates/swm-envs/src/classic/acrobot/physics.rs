@@ -45,7 +45,7 @@ impl Physics {
         Self { centre: [c1, c2], length: [l1, l2], mass: [m1, m2], inertia }
     }
 
-    /// Returns d1 and d2 of the equations of motion, the first row of the inertia matrix.
+    /// Returns d1 and d2 of the equations of motion, the first row of the inertia matrix, in kg m².
     fn inertias(&self, joint: f64) -> [f64; 2] {
         let Self { centre: [c1, c2], length: [l1, _], mass: [m1, m2], inertia } = *self;
         let coupled = l1 * c2 * joint.cos();
@@ -53,7 +53,7 @@ impl Physics {
         [first, m2 * (c2 * c2 + coupled) + inertia]
     }
 
-    /// Returns the time derivative of the state.
+    /// Returns the time derivative of the state under a torque in N m.
     fn derivative(&self, &[angle, joint, velocity, joint_velocity]: &State, torque: f64) -> State {
         let Self { centre: [c1, c2], length: [l1, _], mass: [m1, m2], inertia } = *self;
         let [d1, d2] = self.inertias(joint);

@@ -5,7 +5,7 @@ use crate::classic::frame::{Color, Surface, pixel};
 use crate::classic::geometry::rotated;
 use std::f64::consts::FRAC_PI_2;
 
-/// Width and height of the frame as it is drawn, in pixels.
+/// Width and height of frames before they are resized, in pixels.
 pub const SIZE: (usize, usize) = (500, 500);
 /// Colour of the links.
 pub const LINK: [u8; 3] = [0, 204, 204];

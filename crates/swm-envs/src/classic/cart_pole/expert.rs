@@ -1,4 +1,4 @@
-//! The controller: state feedback on a flat output.
+//! The controller of CartPole: state feedback on a flat output.
 
 use super::physics::Physics;
 
@@ -41,10 +41,10 @@ mod tests {
     fn expert_reaches_the_goal_and_keeps_the_pole_up() {
         for (all, sampled, reached) in [(false, false, 200), (false, true, 200), (true, false, 199), (true, true, 198)]
         {
-            let what = format!("all varied: {all}, sampled goal: {sampled}");
+            let case = format!("all varied: {all}, sampled goal: {sampled}");
             let Tally { successes, reward, .. } = tally(&ENTRY, all, sampled);
-            assert_eq!(successes, reached, "{what}");
-            assert_eq!(reward, 200.0 * 500.0, "{what}: the pole fell");
+            assert_eq!(successes, reached, "{case}");
+            assert_eq!(reward, 200.0 * 500.0, "{case}: the pole fell");
         }
     }
 }

@@ -12,7 +12,7 @@ use swm_core::{DType, EnvEntry, ExpertEntry, Rng, Space, Transition};
 /// The registry row of this environment.
 pub const ENTRY: EnvEntry = EnvEntry {
     id: CartPole::ID,
-    summary: "push a cart left or right so that the pole on it stays up, and take it to a position",
+    summary: "push a cart left or right so that the pole on it stays up, and bring the cart to a position",
     options: &[],
     make: |_| Ok(Box::new(ClassicEnv::<CartPole>::new())),
     experts: &[ExpertEntry {
@@ -33,7 +33,7 @@ const GOAL: [f64; 2] = [0.5, 1.5];
 const NEAR: [f64; 2] = [0.1, 0.1];
 /// Twice the angle at which an episode ends, in radians: the bound of the observation in the reference.
 const MAX_ANGLE: f64 = 24.0 * std::f64::consts::PI / 180.0;
-/// Bound of the states that a caller may give, far beyond those that occur in an episode.
+/// Bound of the states that a caller may give, far beyond the values of an episode.
 const MAX_STATE: f64 = 1000.0;
 
 impl ControlTask for CartPole {

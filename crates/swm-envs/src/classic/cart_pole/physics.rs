@@ -1,7 +1,7 @@
 //! The dynamics: a cart on a frictionless track and a pole hinged on it (Barto, Sutton and Anderson 1983), integrated
 //! by the Euler method in double precision.
 //!
-//! Equations, their order and constants are those of Gymnasium's CartPole.
+//! Equations, constants and the order of operations are those of Gymnasium's CartPole.
 
 use swm_core::Transition;
 
@@ -34,8 +34,9 @@ impl Physics {
         Self { force, gravity, length, pole, total: pole + cart, tau }
     }
 
-    /// Advances the state by one step with a push to the right or to the left. The reward is 1 up to and including the
-    /// step in which the pole falls, and 0 afterwards.
+    /// Advances the state by one step with a push to the right or to the left. The state is position (m), velocity
+    /// (m/s), angle (rad), angular velocity (rad/s), and 1 after the episode terminated. The reward is 1 up to and
+    /// including the step that terminates the episode, and 0 on later steps outside the bounds.
     pub fn step(&self, state: &mut [f64; 5], right: bool) -> Transition {
         let [x, v, angle, angular_velocity, fell] = *state;
         let Self { gravity, length, pole, total, tau, .. } = *self;

@@ -3,7 +3,7 @@
 use crate::classic::frame::{Color, Surface, pixel};
 use crate::classic::geometry::rotated;
 
-/// Width and height of the frame as it is drawn, in pixels.
+/// Width and height of frames before they are resized, in pixels.
 pub const SIZE: (usize, usize) = (600, 400);
 /// Colour of cart and track.
 pub const CART: [u8; 3] = [0, 0, 0];
@@ -46,6 +46,6 @@ pub fn cart(surface: &mut Surface, state: &[f64; 5], length: f64) {
     surface.polygon(&corners.map(to_pixel), Color::new(POLE));
     surface.disc(pixel([x, y + AXLE_ABOVE]), POLE_HALF as i32, Color::new(AXLE));
 
-    // Only the drawn columns, because the resizing of a frame costs time for every drawn pixel.
+    // The track is redrawn only in the drawn columns, because resizing costs time for every drawn pixel.
     surface.fill_drawn(TRACK, Color::new(CART));
 }

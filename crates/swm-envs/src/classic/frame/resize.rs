@@ -2,11 +2,11 @@
 //! resize.
 //!
 //! The arithmetic is Pillow's: weights in units of 2⁻²², first along x, then along y, with bytes in between. (From
-//! version 13 on, Pillow begins with y where that is faster; single bytes then differ by 1.)
+//! version 13 on, Pillow begins with y where that is faster; some bytes then differ by 1.)
 //!
 //! A pixel of a frame is a weighted mean of the surface pixels under the filter. Rows of a drawing consist of a few
 //! runs of one colour, so the mean along x is computed per run, from precomputed partial sums of the weights. Only the
-//! columns that were drawn on the surface since the background are filtered again.
+//! columns of the surface that are marked as drawn are filtered again.
 
 use super::surface::{Color, NONE, Surface};
 use std::ops::Range;
@@ -18,7 +18,7 @@ struct Axis {
     filter: FilterAxis<i32>,
     /// For every pixel of the frame, the index of its first partial sum in `sums`.
     sums_start: Vec<usize>,
-    /// For every pixel of the frame, the sums of the weights before each pixel of the surface (one more than pixels).
+    /// For every pixel of the frame, the partial sums of its weights, from 0 to the sum of all its weights.
     sums: Vec<i32>,
     /// For every pixel of the surface, the range of frame pixels that depend on it.
     reach: Vec<Range<usize>>,
@@ -41,7 +41,7 @@ impl Axis {
         Self { filter, sums_start, sums, reach }
     }
 
-    /// Returns the range of frame pixels that depend on some of these surface pixels.
+    /// Returns the range of frame pixels that depend on any surface pixel in `pixels`.
     fn reached(&self, pixels: &Range<usize>) -> Range<usize> {
         self.reach[pixels.start].start..self.reach[pixels.end - 1].end
     }
@@ -145,7 +145,7 @@ impl Resize {
         for y in 0..self.rows.filter.len() {
             let lines = self.rows.filter.source(y);
             let changed = self.changed[lines.clone()].iter().filter(|columns| !columns.is_empty());
-            let columns = changed.fold(NONE, |all, one| all.start.min(one.start)..all.end.max(one.end));
+            let columns = changed.fold(NONE, |union, one| union.start.min(one.start)..union.end.max(one.end));
             if columns.is_empty() {
                 continue;
             }
@@ -192,16 +192,17 @@ mod tests {
             (13, 6, &[200, 200, 200, 200, 145, 122, 148, 174, 191, 200, 200, 200, 200]),
         ];
         for (width, height, expected) in expected {
-            // Some pixels belong to the background; all other pixels are drawn in front of it.
-            for part in 0..4 {
+            // Of every four diagonals of pixels, this many belong to the background; all other pixels are drawn over
+            // it.
+            for diagonals in 0..4 {
                 let mut resize = Resize::new((9, 6), width, height);
-                let mut background = surface(|x, y| (x + y) % 4 < part);
+                let mut background = surface(|x, y| (x + y) % 4 < diagonals);
                 background.set_drawn(true);
                 resize.set_background(&background, &[]);
                 let mut front = background.clone();
                 front.set_drawn(false);
                 for (x, y) in (0..54).map(|i| (i % 9, i / 9)) {
-                    if (x + y) % 4 >= part {
+                    if (x + y) % 4 >= diagonals {
                         front.blend(Point::new(x as i32, 5 - y as i32), Color::new([0; 3]), 0);
                         front.horizontal_line(5 - y as i32, x as i32, x as i32, Color::new([grey(x, y); 3]));
                     }
@@ -210,7 +211,7 @@ mod tests {
                     let mut rgb = vec![1; width * height * 3];
                     resize.draw(&front, &[], &mut rgb);
                     let red: Vec<u8> = rgb.chunks(3).map(|pixel| pixel[0]).collect();
-                    assert_eq!(red[..expected.len()], *expected, "{width} x {height}, part {part}");
+                    assert_eq!(red[..expected.len()], *expected, "{width} x {height}, {diagonals} diagonals");
                 }
             }
         }

@@ -48,7 +48,7 @@ impl Surface {
     }
 
     /// Draws an anti-aliased line between points with fractional coordinates. Every step along its major axis is shared
-    /// between the two nearest pixels; its ends cover their pixels in part.
+    /// between the two nearest pixels; the pixels at the ends are covered in part.
     pub fn fine_line(&mut self, from: [f64; 2], to: [f64; 2], color: Color) {
         let steep = (to[0] - from[0]).abs() < (to[1] - from[1]).abs();
         let along = usize::from(steep);
@@ -59,8 +59,8 @@ impl Surface {
             let across = from[1 - along] + slope * (at - from[along]);
             let covered = (1.0 + at - from[along]).min(1.0 + to[along] - at).min(1.0);
             let share = across - across.floor();
-            for (beside, share) in [(1, share), (0, 1.0 - share)] {
-                let across = across as i32 + beside;
+            for (offset, share) in [(1, share), (0, 1.0 - share)] {
+                let across = across as i32 + offset;
                 let at = if steep { Point::new(across, step) } else { Point::new(step, across) };
                 self.blend_share(at, color, (share * covered) as f32);
             }
@@ -110,8 +110,8 @@ impl Surface {
         let (low, high) = corners.iter().fold((i32::MAX, i32::MIN), |(low, high), p| (low.min(p.y), high.max(p.y)));
         let last = self.drawn.len() as i32 - 1;
         for y in low.max(0)..=high.min(last) {
-            // Where the sides cross this row, in 1/65536 pixel. A side includes its lower end; the topmost sides also
-            // include their upper end.
+            // The columns at which the sides cross this row, in 1/65536 pixel. A side includes its lower end; the
+            // topmost sides also include their upper end.
             let mut crossings = [0; MAX_CORNERS];
             let mut count = 0;
             for (a, b) in sides() {
@@ -119,7 +119,7 @@ impl Surface {
                 if (a.y..b.y).contains(&y) || (y == high && a.y < y && y == b.y) {
                     let along = (i64::from(y - a.y) << 16) / i64::from(b.y - a.y);
                     let at = along * i64::from(b.x - a.x) + (i64::from(a.x) << 16);
-                    let slot = crossings[..count].partition_point(|&other| other <= at);
+                    let slot = crossings[..count].partition_point(|&crossing| crossing <= at);
                     crossings.copy_within(slot..count, slot + 1);
                     crossings[slot] = at;
                     count += 1;
@@ -135,7 +135,7 @@ impl Surface {
     /// Fills a disc and anti-aliases its outline.
     pub fn disc(&mut self, centre: Point, radius: i32, color: Color) {
         self.smooth_circle(centre, radius, color);
-        // The midpoint algorithm; the width of a row is where the circle enters it.
+        // The midpoint algorithm. The outer rows are filled at the first step of the circle in each row.
         let (mut decision, mut x, mut y, mut row) = (1 - radius, 0, radius, radius + 1);
         while x <= y {
             if row != y {
@@ -160,54 +160,55 @@ impl Surface {
     /// Draws an anti-aliased circle: from bottom and top outwards to the diagonal, then on to the sides. Every step is
     /// shared between the two pixels nearest to the exact circle.
     ///
-    /// `off` is x² + y² - r², which is positive outside the circle; divided by the slope along y (or x) it is a length.
+    /// `off` is r² - x² - y², which is positive inside the circle. Divided by 2y (or 2x) it approximates the distance
+    /// to the circle along y (or x), in pixels.
     fn smooth_circle(&mut self, centre: Point, radius: i32, color: Color) {
         let steps = (f64::from(radius) * std::f64::consts::FRAC_1_SQRT_2).round_ties_even() as i32;
         for y in [-radius, radius] {
             self.horizontal_line(centre.y + y, centre.x, centre.x, color);
         }
         let (mut x, mut y, mut off) = (0, -radius, 0);
-        // The changes of `off` with the next step outwards, and with the next one towards the centre line.
-        let (mut outwards, mut inwards) = (0, -2 * radius);
+        // 2x and 2y determine the change of `off` by the next step along x and along y.
+        let (mut twice_x, mut twice_y) = (0, -2 * radius);
         for _ in 0..steps {
             x -= 1;
-            off += outwards - 1;
-            let other = if off >= 0 {
+            off += twice_x - 1;
+            let neighbour = if off >= 0 {
                 y - 1
-            } else if off - inwards > 1 && 2 * off - inwards >= 1 {
+            } else if off - twice_y > 1 && 2 * off - twice_y >= 1 {
                 y + 1
             } else {
                 let before = y;
-                let is_past = off - inwards > 1;
+                let is_past = off - twice_y > 1;
                 y += 1;
-                off -= inwards + 1;
-                inwards += 2;
+                off -= twice_y + 1;
+                twice_y += 2;
                 if is_past { before } else { y + 1 }
             };
-            outwards -= 2;
-            let weight = neighbour_share(off, inwards);
+            twice_x -= 2;
+            let weight = neighbour_share(off, twice_y);
             self.mirrored(centre, [x, y], color, 255 - weight);
-            self.mirrored(centre, [x, other], color, weight);
+            self.mirrored(centre, [x, neighbour], color, weight);
         }
         for _ in 0..steps {
             y += 1;
-            off -= inwards + 1;
-            let other = if off <= 0 {
+            off -= twice_y + 1;
+            let neighbour = if off <= 0 {
                 x + 1
-            } else if off + outwards < 1 && 2 * off + outwards <= 1 {
+            } else if off + twice_x < 1 && 2 * off + twice_x <= 1 {
                 x - 1
             } else {
                 let before = x;
-                let is_past = off + outwards < 1;
+                let is_past = off + twice_x < 1;
                 x -= 1;
-                off += outwards - 1;
-                outwards -= 2;
+                off += twice_x - 1;
+                twice_x -= 2;
                 if is_past { before } else { x - 1 }
             };
-            inwards += 2;
-            let weight = neighbour_share(off, outwards);
+            twice_y += 2;
+            let weight = neighbour_share(off, twice_x);
             self.mirrored(centre, [x, y], color, 255 - weight);
-            self.mirrored(centre, [other, y], color, weight);
+            self.mirrored(centre, [neighbour, y], color, weight);
         }
     }
 
@@ -219,7 +220,7 @@ impl Surface {
     }
 }
 
-/// Returns the share of a pixel that the circle leaves to its neighbour, in 1/255.
+/// Returns the weight of the second of the two pixels that share a step of the circle, in 1/255.
 fn neighbour_share(off: i32, slope: i32) -> i32 {
     if slope == 0 { 255 } else { ((off.abs() as f32 / slope.abs() as f32).min(1.0) * 255.0) as i32 }
 }

@@ -1,7 +1,7 @@
 //! [`Surface`]: an RGB image with y up, and the pixels and straight lines drawn on it.
 //!
 //! The surface records which columns of every row were drawn since it was last equal to its background, so that a frame
-//! restores and resizes only these.
+//! restores and resizes only these columns.
 
 use crate::draw::Point;
 use std::ops::Range;
@@ -22,8 +22,7 @@ impl Color {
         [r, g, b]
     }
 
-    /// Blends this colour over another one with `weight` / 256; a weight of 255 leaves almost nothing of the other
-    /// colour.
+    /// Blends this colour over `below` with a weight of `weight` / 256.
     fn over(self, below: Self, weight: i32) -> Self {
         // SDL_gfx scales the weight by the opacity, which is 255 of 256 for an opaque colour.
         let share = (255 * weight) >> 8;
@@ -45,9 +44,9 @@ pub fn pixel([x, y]: [f64; 2]) -> Point {
 #[derive(Clone)]
 pub struct Surface {
     pub(super) width: usize,
-    /// `[height, width]`.
+    /// The colours, `[height, width]`.
     pixels: Vec<Color>,
-    /// For every row, a range of columns that contains the drawn ones.
+    /// For every row, a range of columns that contains all drawn columns.
     pub(super) drawn: Vec<Range<usize>>,
     /// Scratch memory: the coverage of the pixels of a row by a shape.
     pub(super) covered: Vec<f32>,
@@ -72,7 +71,7 @@ impl Surface {
         &self.pixels[y * self.width..][..self.width]
     }
 
-    /// A range that contains the drawn columns of a row; empty if there are none.
+    /// A range that contains the drawn columns of a row; empty if the row has no drawn column.
     pub fn drawn(&self, y: usize) -> Range<usize> {
         self.drawn[y].clone()
     }

@@ -58,7 +58,7 @@ trait Variant: Send + 'static {
     fn push(right: bool) -> f64;
 }
 
-/// Three actions: push left, do nothing, push right.
+/// The variant with three actions: push left, do nothing, push right.
 struct Discrete;
 
 impl Variant for Discrete {
@@ -93,7 +93,7 @@ impl Variant for Discrete {
     }
 }
 
-/// Continuous power from -1 to 1, at a cost.
+/// The variant whose action is a motor power from -1 to 1, which the reward penalises.
 struct Continuous;
 
 impl Variant for Continuous {
@@ -200,6 +200,7 @@ impl<V: Variant> ControlTask for MountainCar<V> {
         if Self::at_flag(goal) && self.is_reached(state, goal) {
             return 0.0;
         }
+        // The hill's slope is at most 1.35, where gravity accelerates the car by `gravity`.
         let potential = |state: &[f64; 2]| height(state[0]) / 1.35 * self.0.gravity;
         let missing_height = (potential(goal) - potential(state) - state[1] * state[1] / 2.0).max(0.0) / self.0.gravity;
         (state[0] - goal[0]).abs() + HEIGHT_WEIGHT * missing_height

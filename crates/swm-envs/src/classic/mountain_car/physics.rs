@@ -1,11 +1,11 @@
 //! The dynamics: a car in a sinusoidal valley whose motor is weaker than gravity (Moore 1990).
 //!
-//! Constants, the order of operations and their precision are those of Gymnasium's MountainCar (double precision) and
-//! Continuous_MountainCar (single precision, as its state). Lengths are in track units, times in steps.
+//! Constants, and the order and precision of operations, are those of Gymnasium's MountainCar (double precision) and
+//! Continuous_MountainCar (single precision, like its state). Lengths are in track units, times in steps.
 
 /// Positions of the walls at both ends of the track, in track units.
 pub const ENDS: [f64; 2] = [-1.2, 0.6];
-/// The maximal speed with any factors, in track units per step.
+/// The largest value of the factor `physics.max_speed`, in track units per step.
 pub const MAX_SPEED: f32 = 0.105;
 
 /// The physical factors of an episode.
@@ -37,8 +37,8 @@ impl Hill {
     pub fn continuous_step(&self, [x, speed]: [f64; 2], power: f64) -> [f64; 2] {
         let [mut x, mut speed, power, limit] = [x, speed, power, self.max_speed].map(|v| v as f32);
         let slope = self.gravity * f64::from(3.0 * x).cos();
-        // As in numpy: with an element of the action, every operation is rounded to single precision; with a clipped
-        // action, which is a Python float, only the result is.
+        // As in numpy: an action that is not clipped is a float32, so every operation is rounded to single precision. A
+        // clipped action is a Python float, so only the result is rounded.
         speed += if (-1.0..=1.0).contains(&power) {
             power * self.push as f32 - slope as f32
         } else {

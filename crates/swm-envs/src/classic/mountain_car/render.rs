@@ -5,7 +5,7 @@ use crate::classic::frame::{Color, Surface, pixel};
 use crate::classic::geometry::rotated;
 use crate::draw::Point;
 
-/// Width and height of the frame as it is drawn, in pixels.
+/// Width and height of frames before they are resized, in pixels.
 pub const SIZE: (usize, usize) = (600, 400);
 /// Colour of hill, car and flagpole.
 pub const INK: [u8; 3] = [0, 0, 0];
@@ -18,7 +18,7 @@ const FLAG: [u8; 3] = [204, 204, 0];
 const SCALE: f64 = 600.0 / (ENDS[1] - ENDS[0]);
 /// Points of the polyline of the hill.
 const HILL_POINTS: usize = 100;
-/// Half the length and the height of the car, in pixels.
+/// Half the length, and the full height, of the car, in pixels.
 const CAR: [f64; 2] = [20.0, 20.0];
 /// Height of the car above the hill, in pixels.
 const CLEARANCE: f64 = 10.0;
@@ -44,7 +44,7 @@ pub fn hill(surface: &mut Surface) {
     }
 }
 
-/// Draws the car at a position, and the flag in front of it.
+/// Draws the car at position `x` and, over it, the flag at position `flag`, both in track units.
 pub fn car(surface: &mut Surface, x: f64, flag: f64) {
     let ink = Color::new(INK);
     let [at, height] = hill_point(x);

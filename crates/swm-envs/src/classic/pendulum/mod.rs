@@ -18,7 +18,7 @@ pub const ENTRY: EnvEntry = EnvEntry {
     make: |_| Ok(Box::new(ClassicEnv::<Pendulum>::new())),
     experts: &[ExpertEntry {
         id: "expert",
-        summary: "pumps energy into the rod until state feedback can hold it upright, then holds it (state feedback)",
+        summary: "adds energy to the rod until state feedback can hold it upright, then holds it upright",
         make: || Box::new(Controller::<Pendulum>::new()),
     }],
 };

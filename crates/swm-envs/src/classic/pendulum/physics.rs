@@ -1,13 +1,12 @@
-//! The dynamics: a rod that rotates about its end, with a weak motor there, integrated by the semi-implicit Euler
-//! method.
+//! The dynamics: a rod that a motor rotates about one of its ends, integrated by the semi-implicit Euler method.
 //!
-//! Equations, their order and precision are those of Gymnasium's Pendulum: double precision, except for what numpy
-//! computes from an action, which is in single precision.
+//! Equations, and the order and precision of operations, are those of Gymnasium's Pendulum: double precision, except
+//! for products with the float32 action, which numpy computes in single precision.
 
 use crate::classic::angle::between;
 use swm_core::Transition;
 
-/// The maximal angular speed with any factors, in rad/s.
+/// The largest value of the factor `physics.max_speed`, in rad/s.
 pub const MAX_SPEED: f32 = 12.0;
 
 /// The physical factors of an episode.
@@ -44,8 +43,8 @@ impl Physics {
         3.0 * self.gravity / (2.0 * self.length)
     }
 
-    /// Advances the state by one step with a torque. The state is the angle, the angular velocity, and the torque of
-    /// the last step. The reward is the negative cost of angle, angular velocity and torque.
+    /// Advances the state by one step with a torque in N m. The state is the angle (rad), the angular velocity (rad/s)
+    /// and the torque of the last step (N m). The reward is the negative cost of angle, angular velocity and torque.
     pub fn step(&self, state: &mut [f64; 3], torque: f64) -> Transition {
         let [angle, velocity, _] = *state;
         let limit = self.max_torque as f32;

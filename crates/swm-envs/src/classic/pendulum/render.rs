@@ -5,14 +5,14 @@ use crate::classic::geometry::rotated;
 use crate::draw::Point;
 use std::f64::consts::FRAC_PI_2;
 
-/// Width and height of the frame as it is drawn, in pixels.
+/// Width and height of frames before they are resized, in pixels.
 pub const SIZE: (usize, usize) = (500, 500);
 /// Colour of the rod.
 pub const ROD: [u8; 3] = [204, 77, 77];
 /// Colour of hub and arrow.
 pub const HUB: [u8; 3] = [0, 0, 0];
 
-/// Length of the rod, whatever its physical length, in pixels.
+/// Length of the drawn rod, for every physical length, in pixels.
 const SCALE: f64 = 500.0 / 4.4;
 /// Coordinate of the centre of the frame, in pixels.
 const MIDDLE: f64 = 250.0;
@@ -38,9 +38,9 @@ pub fn rod(surface: &mut Surface, &[angle, _, torque]: &[f64; 3]) {
 }
 
 // The arrow for a clockwise torque: a ring from the top clockwise to the left, and a head at its end. Coordinates are
-// in pixels of Gymnasium's arrow image, y down, measured on it.
+// in pixels of Gymnasium's arrow image, y down, and were measured on this image.
 
-/// Width and height of the image.
+/// Width and height of the arrow image.
 const BOX: [f64; 2] = [329.0, 312.0];
 /// Centre of the ring.
 const CENTRE: [f64; 2] = [173.0, 156.0];
@@ -56,8 +56,8 @@ const NOTCH: [f64; 2] = [22.0, 153.5];
 const BARBS: [f64; 2] = [0.0, 45.0];
 /// y of the ends of the barbs.
 const BARBS_AT: f64 = 170.0;
-/// Opacity of the arrow. pygame's `smoothscale` leaves it slightly below 1, so the colour replacement does not match
-/// and the arrow stays black whatever the colour of the hub is.
+/// Opacity of the arrow. pygame's `smoothscale` leaves the opacity slightly below 1, so the colour replacement does not
+/// match and the arrow stays black for every colour of the hub.
 const OPACITY: f32 = 0.992;
 
 /// Returns the intervals in which the arrow crosses a horizontal line: the ring right and left of its centre, and the

@@ -1,12 +1,12 @@
 //! [`ConfigurationSpace`]: the positions of the agent at which it overlaps neither the block nor the walls.
 //!
 //! An agent with a fixed angle touches a convex part of the block exactly when its origin is on the edge of the
-//! Minkowski difference of the two. So the agent is treated as a point among convex polygons, whatever the shapes are.
+//! Minkowski difference of part and agent. So the agent is treated as a point among convex polygons.
 
 use crate::push_t::TABLE;
 use crate::push_t::physics::Vec2;
 
-/// Distance that agents keep from the edge of the table, walls included, in pixels.
+/// Distance that agents keep from the edge of the table, which includes the walls, in pixels.
 const MARGIN: f64 = 9.0;
 
 /// A convex obstacle for the agent's origin; its corners are ordered from x towards y.
@@ -63,7 +63,7 @@ impl Obstacle {
         enter < leave
     }
 
-    /// Returns a point outside each corner, `margin` pixels from both its edges.
+    /// Returns a point outside each corner, `margin` pixels from both edges of the corner.
     pub fn around(&self, margin: f64) -> impl Iterator<Item = Vec2> {
         let last = self.normals.iter().cycle().skip(self.normals.len() - 1);
         self.corners
@@ -74,7 +74,7 @@ impl Obstacle {
     }
 }
 
-/// Returns the corners of a convex polygon by index, cyclically, from the topmost (then leftmost) one.
+/// Returns the corners of a convex polygon by index, cyclically, from the corner of least y (then least x).
 fn from_lowest(corners: &[Vec2]) -> impl Fn(usize) -> Vec2 {
     let key = |&i: &usize| (corners[i].y, corners[i].x);
     let first = (0..corners.len()).min_by(|a, b| key(a).partial_cmp(&key(b)).unwrap_or(std::cmp::Ordering::Equal));
@@ -85,12 +85,13 @@ fn from_lowest(corners: &[Vec2]) -> impl Fn(usize) -> Vec2 {
 pub struct ConfigurationSpace {
     low: Vec2,
     high: Vec2,
-    /// The obstacles that the block's parts are for the agent's origin.
+    /// The obstacles for the agent's origin: one for each pair of a part of the block and a part of the agent.
     pub obstacles: Vec<Obstacle>,
 }
 
 impl ConfigurationSpace {
-    /// Makes the space of an agent of these convex parts, relative to its origin, and a block of these parts.
+    /// Makes the space of an agent of these convex parts, relative to the agent's origin, and of a block of these
+    /// parts, in table coordinates.
     pub fn new(agent: &[Vec<Vec2>], block: &[[Vec2; 4]]) -> Self {
         let (mut low, mut high) = (Vec2::ZERO, Vec2::ZERO);
         for corner in agent.iter().flatten() {
@@ -103,8 +104,7 @@ impl ConfigurationSpace {
         Self { low: inset - low, high: Vec2::new(TABLE, TABLE) - inset - high, obstacles: obstacles.collect() }
     }
 
-    /// Returns the distance at which an agent at a point is from touching the block, in pixels; negative when it
-    /// overlaps.
+    /// Returns the gap between the block and an agent at a point, in pixels; negative if they overlap.
     pub fn clearance(&self, at: Vec2) -> f64 {
         self.obstacles.iter().map(|obstacle| obstacle.clearance(at)).fold(f64::INFINITY, f64::min)
     }
@@ -114,8 +114,8 @@ impl ConfigurationSpace {
         (self.low.x..=self.high.x).contains(&at.x) && (self.low.y..=self.high.y).contains(&at.y)
     }
 
-    /// Returns points `gap` pixels from touching the block and about `spacing` pixels apart, each with the direction
-    /// into the block.
+    /// Returns positions of the agent with a gap of `gap` pixels to the block and about `spacing` pixels apart, each
+    /// with the direction into the block.
     pub fn contact_points(&self, gap: f64, spacing: f64) -> Vec<(Vec2, Vec2)> {
         let mut points = vec![];
         for Obstacle { corners, normals } in &self.obstacles {

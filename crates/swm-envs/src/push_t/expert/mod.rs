@@ -1,5 +1,5 @@
-//! The experts of Push-T: [`Pusher`] plans pushes in a copy of the simulation, [`WeakExpert`] acts at random near the
-//! block.
+//! The experts of Push-T: [`Pusher`] plans pushes in a copy of the simulation, [`WeakExpert`] takes random actions near
+//! the block.
 
 mod configuration_space;
 mod paths;

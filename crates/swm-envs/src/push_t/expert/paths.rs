@@ -6,7 +6,7 @@ use crate::push_t::physics::Vec2;
 /// Distance that a path keeps from touching the block, unless it starts or ends nearer, in pixels.
 const SPARE: f64 = 3.0;
 
-/// The shortest paths from one point to every other, around the corners of obstacles.
+/// The shortest paths from one point to every other point, around the corners of obstacles.
 pub struct ShortestPaths<'a> {
     space: &'a ConfigurationSpace,
     /// The start, then the corners that a path may pass.
@@ -39,7 +39,7 @@ impl<'a> ShortestPaths<'a> {
         Self { space, nodes, reached }
     }
 
-    /// Returns the length of the shortest path to a point and the last node on it, or `None` where there is no path.
+    /// Returns the length of the shortest path to a point and the last node on it, or `None` if there is no path.
     pub fn to(&self, end: Vec2) -> Option<(f64, usize)> {
         let mut best: Option<(f64, usize)> = None;
         for (node, (&at, &(length, _))) in self.nodes.iter().zip(&self.reached).enumerate() {
@@ -62,8 +62,8 @@ impl<'a> ShortestPaths<'a> {
     }
 }
 
-/// Returns whether the straight path between two points is free. An end that is nearer to an obstacle than a path
-/// should be reduces the distance required, so that the agent can leave the obstacle.
+/// Returns whether the straight path between two points is free. The required distance from an obstacle is at most that
+/// of the ends, so that an agent near the obstacle can leave it.
 fn is_free(space: &ConfigurationSpace, from: Vec2, to: Vec2) -> bool {
     space.obstacles.iter().all(|obstacle| {
         let margin = SPARE.min(obstacle.clearance(from) - 0.01).min(obstacle.clearance(to) - 0.01);
@@ -83,7 +83,7 @@ mod tests {
         let space = ConfigurationSpace::new(&[agent], &[square]);
         let (from, to) = (Vec2::new(150.0, 250.0), Vec2::new(350.0, 250.0));
         let paths = ShortestPaths::from(&space, from);
-        let (length, node) = paths.to(to).expect("a path");
+        let (length, node) = paths.to(to).expect("finding a path");
         let waypoints = paths.waypoints(to, node);
         assert!(waypoints.len() == 3 && waypoints[0] == to, "past two corners: {waypoints:?}");
         let mut at = from;
@@ -98,10 +98,10 @@ mod tests {
         assert!((walked - length).abs() < 1e-9);
         // A path is straight if nothing is between its ends, leads away from a block that the agent touches, and never
         // leads through the block.
-        let (_, node) = paths.to(Vec2::new(150.0, 50.0)).expect("a path");
+        let (_, node) = paths.to(Vec2::new(150.0, 50.0)).expect("finding a path");
         assert_eq!(node, 0);
         let touching = ShortestPaths::from(&space, Vec2::new(186.0, 250.0));
-        assert_eq!(touching.to(from).expect("a path").1, 0);
-        assert!(touching.to(to).expect("a path").0 > 250.0);
+        assert_eq!(touching.to(from).expect("finding a path").1, 0);
+        assert!(touching.to(to).expect("finding a path").0 > 250.0);
     }
 }

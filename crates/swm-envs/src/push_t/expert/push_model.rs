@@ -15,12 +15,12 @@ use swm_core::Rng;
 const GAP: f64 = 4.0;
 /// Corners of the polygon that approximates a round agent.
 const CIRCLE_CORNERS: usize = 16;
-/// Cost of one radian of rotation, in units of the block's radius of gyration. Pushing the block at that radius rotates
-/// it by one radian for every two radii pushed.
+/// Cost of one radian of rotation, in units of the block's radius of gyration. A push at this radius rotates the
+/// block by one radian per two radii of distance.
 const ROTATION_WEIGHT: f64 = 1.6;
 /// Steps added to the cost of every push, so that few long pushes are preferred to many short ones.
 const PUSH_OVERHEAD: f64 = 30.0;
-/// A push ends when it has not brought the block nearer for this many steps.
+/// The number of steps for which a push is continued after the step with the best rate.
 const PATIENCE: usize = 3;
 
 /// The part of the observation that the expert reads.
@@ -39,7 +39,7 @@ impl Observation {
 
 /// A push that was tried in the model.
 pub struct Push {
-    /// The waypoints to where the push starts, in reverse order.
+    /// The waypoints to the starting point of the push, in reverse order.
     pub waypoints: Vec<Vec2>,
     pub action: [f64; 2],
     pub steps: usize,
@@ -61,11 +61,11 @@ pub struct Candidates<'a> {
     pub strengths: &'a [f64],
 }
 
-/// A copy of the simulation, with a model of how actions move the agent.
+/// A copy of the simulation, with a model of the agent's motion.
 pub struct PushModel {
     /// The `shapes` column: agent shape and scale, block shape and scale.
     pub shapes: [f64; 4],
-    /// Rounds an action to one of the action space.
+    /// Rounds an action to an action of the action space.
     round_action: fn([f64; 2]) -> [f64; 2],
     body_shapes: [BodyShape; 2],
     /// The simulation before any step.
@@ -110,7 +110,7 @@ impl PushModel {
         }
     }
 
-    /// Returns the action that brings the agent to a position in one step, as far as actions allow.
+    /// Returns the action that moves the agent to a position in one step, or as near as the largest action allows.
     pub fn approach(&self, now: &Observation, to: Vec2) -> [f64; 2] {
         let drift = Vec2::new(now.state[5], now.state[6]) * self.drift;
         let wanted = (to - now.agent() - drift) * (1.0 / self.speed);
@@ -193,9 +193,9 @@ impl PushModel {
             let steps = rng.random_range(2..=self.max_steps);
             self.set_start(now, from);
             (0..steps).for_each(|_| self.advance(action));
-            let then =
+            let after =
                 Observation { state: state_of(&self.simulation), agent_angle: self.simulation.bodies[AGENT].angle };
-            let (Some((length, node)), Some(next)) = (paths.to(from), self.best_push(&then, goal, candidates)) else {
+            let (Some((length, node)), Some(next)) = (paths.to(from), self.best_push(&after, goal, candidates)) else {
                 continue;
             };
             let time = length / self.speed + steps as f64 + next.time;

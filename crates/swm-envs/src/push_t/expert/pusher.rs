@@ -1,7 +1,7 @@
 //! [`Pusher`]: the expert that plans pushes in a copy of the simulation.
 //!
 //! A plan is a path around the block to a point beside it, and a push from there: a direction, a strength and a number
-//! of steps. Pushes from all around the block are tried in the model, and the expert chooses the one that reduces the
+//! of steps. Pushes from all around the block are tried in the model, and the expert chooses the push that reduces the
 //! error fastest. If no push reduces the error enough, the expert searches for a push after which a good push is
 //! possible. When the block is at its goal, the agent walks to its own goal.
 
@@ -24,7 +24,7 @@ const DETOURS: usize = 40;
 const MIN_PROGRESS: f64 = 0.5;
 /// The least reduction of the error per step that a push must achieve, in pixels.
 const MIN_RATE: f64 = 0.1;
-/// The block is not pushed any more when it is nearer to its goal than this, in pixels and radians.
+/// The distance of the block from its goal (pixels, radians) below which the block is not pushed any more.
 const IN_PLACE: (f64, f64) = (12.0, 0.28);
 /// A waypoint counts as passed within this distance, in pixels.
 const PASSED: f64 = 5.0;
@@ -33,9 +33,9 @@ const ARRIVED: f64 = 2.0;
 /// A plan that has not ended after this many steps is abandoned.
 const PATIENCE: usize = 60;
 
-/// The expert.
+/// The expert that plans pushes.
 pub struct Pusher {
-    /// Rounds an action to one of the action space.
+    /// Rounds an action to an action of the action space.
     round_action: fn([f64; 2]) -> [f64; 2],
     rng: Rng,
     model: Option<PushModel>,

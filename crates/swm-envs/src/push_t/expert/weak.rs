@@ -5,7 +5,7 @@ use rand::Rng as _;
 use swm_core::policy::Expert;
 use swm_core::{Key, Result, Rng, RowRef};
 
-/// Uniformly random actions whose targets stay near the block, so that the agent pushes it now and then.
+/// Uniformly random actions whose targets stay near the block, so that the agent sometimes pushes the block.
 pub struct WeakExpert {
     rng: Rng,
 }

@@ -23,13 +23,13 @@ impl Bounds {
         self.merged(Self { low: p, high: p })
     }
 
-    /// Returns the box enlarged by `by` on every side.
+    /// Returns the box enlarged by `by` pixels on every side.
     pub fn grown(self, by: f64) -> Self {
         let by = Vec2::new(by, by);
         Self { low: self.low - by, high: self.high + by }
     }
 
-    /// Returns the smallest box that contains both.
+    /// Returns the smallest box that contains both boxes.
     pub fn merged(self, other: Self) -> Self {
         Self {
             low: Vec2::new(self.low.x.min(other.low.x), self.low.y.min(other.low.y)),
@@ -45,7 +45,7 @@ impl Bounds {
             && other.low.y <= self.high.y
     }
 
-    /// Returns whether `other` lies inside.
+    /// Returns whether `other` lies inside this box.
     pub fn contains(&self, other: &Self) -> bool {
         self.low.x <= other.low.x
             && self.high.x >= other.high.x
@@ -53,17 +53,17 @@ impl Bounds {
             && self.high.y >= other.high.y
     }
 
-    /// The centre.
+    /// The centre of the box.
     pub fn centre(&self) -> Vec2 {
         self.low.lerp(self.high, 0.5)
     }
 
-    /// The area.
+    /// The area of the box, in pixels².
     pub fn area(&self) -> f64 {
         (self.high.x - self.low.x) * (self.high.y - self.low.y)
     }
 
-    /// Returns twice the Manhattan distance between the centres.
+    /// Returns twice the Manhattan distance between the centres of two boxes.
     pub fn proximity(&self, other: &Self) -> f64 {
         (self.low.x + self.high.x - other.low.x - other.high.x).abs()
             + (self.low.y + self.high.y - other.low.y - other.high.y).abs()

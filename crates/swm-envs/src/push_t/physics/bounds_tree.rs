@@ -34,7 +34,7 @@ pub struct BoundsTree {
     pub root: u32,
     /// The number of leaves.
     pub leaves: u32,
-    /// An unused inner node, or [`NONE`]: removing a leaf frees one, inserting it again needs one.
+    /// An unused inner node, or [`NONE`]: removing a leaf frees an inner node, inserting the leaf again uses it.
     pub spare: u32,
 }
 
@@ -107,15 +107,15 @@ impl BoundsTree {
             return;
         }
         let [a, b] = self.node(parent).children;
-        let other = if a == leaf { b } else { a };
+        let sibling = if a == leaf { b } else { a };
         let grandparent = self.node(parent).parent;
-        self.node_mut(other).parent = grandparent;
+        self.node_mut(sibling).parent = grandparent;
         self.spare = parent;
         if grandparent == NONE {
-            self.root = other;
+            self.root = sibling;
             return;
         }
-        self.replace_child(grandparent, parent, other);
+        self.replace_child(grandparent, parent, sibling);
         let mut up = grandparent;
         while up != NONE {
             let [a, b] = self.node(up).children;
@@ -182,7 +182,7 @@ impl BoundsTree {
 
 /// Returns the box of a moving shape, widened so that the shape stays inside for some steps.
 pub fn widened(bounds: Bounds, velocity: Vec2) -> Bounds {
-    // A single-precision constant in Chipmunk; it decides ties between boxes.
+    // A single-precision constant in Chipmunk, whose rounding decides ties between boxes.
     const MARGIN_FRACTION: f64 = 0.1f32 as f64;
     let margin = (bounds.high - bounds.low) * MARGIN_FRACTION;
     let ahead = velocity * MARGIN_FRACTION;

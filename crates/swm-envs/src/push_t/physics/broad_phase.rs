@@ -1,4 +1,4 @@
-//! The broad phase: which pairs of shapes may touch, in the order in which Chipmunk finds them.
+//! The broad phase: finds the pairs of shapes that may touch, in the order of Chipmunk.
 
 use super::bounds_tree::{NONE, widened};
 use super::simulation::Simulation;
@@ -13,7 +13,7 @@ const MAX_SHAPES: usize = 16;
 pub struct CandidatePair {
     a: u32,
     b: u32,
-    /// Where the contact search starts.
+    /// The hint with which the contact search starts.
     hint: u32,
 }
 
@@ -94,9 +94,10 @@ impl Simulation {
 #[derive(Clone, Copy, Default)]
 struct Neighbour {
     shape: u32,
-    /// Whether the queried shape and the neighbour become a new pair.
+    /// True if the queried shape and the neighbour become a new pair.
     becomes_pair: bool,
-    /// Whether the neighbour is the second shape of the pair: contacts of the pair are then found when it is updated.
+    /// True if the neighbour is the second shape of the pair. The contacts of the pair are then found when the
+    /// neighbour is updated.
     comes_second: bool,
 }
 

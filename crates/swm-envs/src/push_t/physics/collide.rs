@@ -2,8 +2,8 @@
 //!
 //! Shapes overlap when their Minkowski difference, enlarged by their radii, contains the origin. GJK (Gilbert, Johnson
 //! and Keerthi 1988) finds the edge of the difference nearest to the origin. When the origin lies inside, EPA (the
-//! expanding polytope algorithm) expands the polygon until that edge is on the surface. The edges of the two shapes
-//! that face each other there are clipped against each other, which gives up to two contacts.
+//! expanding polytope algorithm) expands a polygon inside the difference until its edge nearest to the origin lies on
+//! the surface. The facing edges of the two shapes are clipped against each other, which gives up to two contacts.
 
 use super::contact::Contact;
 use super::shape::{Kind, Shape};
@@ -103,7 +103,7 @@ struct Nearest {
     hint: u32,
 }
 
-/// A corner of the Minkowski difference `b - a`.
+/// A corner `ab` of the Minkowski difference `b - a`, with the corners `a` and `b` of the two shapes.
 #[derive(Clone, Copy)]
 struct Corner {
     a: Vec2,

@@ -10,11 +10,11 @@ use bytemuck::{Pod, Zeroable};
 pub struct Contact {
     /// Lever arms: from the centre of gravity of each body to the surface of its shape, in pixels.
     pub arms: [Vec2; 2],
-    /// Identifies the contact in the next step.
+    /// A hash that identifies the contact in the next step.
     pub hash: u64,
     /// The accumulated normal impulse, in mass × pixels per second.
     pub impulse: f64,
-    /// The accumulated impulse of this step that separates overlapping shapes.
+    /// The accumulated impulse of this step that separates overlapping shapes, in mass × pixels per second.
     pub bias_impulse: f64,
     /// The speed at which the overlap is removed, in pixels per second.
     pub bias_speed: f64,
@@ -34,13 +34,13 @@ pub struct Arbiter {
     pub count: u32,
     /// Indices of the two shapes.
     pub shapes: [u32; 2],
-    /// Indices of their bodies.
+    /// Indices of the bodies of the two shapes.
     pub bodies: [u32; 2],
-    /// The last step in which they touched.
+    /// The last step in which the shapes touched.
     pub stamp: u32,
-    /// 1 if they did not touch in the last step, so that there are no impulses to start from.
+    /// 1 if the shapes did not touch in the last step, so that no impulses exist for a warm start.
     pub is_new: u32,
-    /// 1 if they touched in an earlier step and no longer touch.
+    /// 1 if the shapes touched in an earlier step and no longer touch.
     pub separated: u32,
 }
 

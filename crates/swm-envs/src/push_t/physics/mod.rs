@@ -1,10 +1,11 @@
-//! A small rigid-body solver that computes what Chipmunk 7 computes, as pymunk 7 runs it. Datasets and published
-//! checkpoints depend on its trajectories, so the order of operations is the same.
+//! A small rigid-body solver with the results of pymunk 7.3, whose solver Munk2D derives from Chipmunk 7. Datasets and
+//! published checkpoints depend on pymunk's trajectories, so the order of operations is the same.
 //!
 //! There are two bodies (the agent and the block) between four walls, without gravity, friction and restitution, and
 //! with a damping that stops every body between two steps. [`Simulation::step`] moves the bodies with the velocities of
 //! the last step, finds contacts ([`bounds_tree`] finds the pairs, [`collide`] their contacts), and solves for the
-//! velocities that separate overlapping shapes by sequential impulses, warm-started from those of the step before.
+//! velocities that separate overlapping shapes by sequential impulses, warm-started from the impulses of the previous
+//! step.
 
 mod body;
 mod bounds;
@@ -20,5 +21,5 @@ mod vec2;
 pub use body::{Body, Pose};
 pub use shape::Shape;
 pub use simulation::{AGENT, BLOCK, DT, Simulation, WALLS, visiting_order};
-pub use snapshot::{put, take_array};
+pub use snapshot::{append_items, take_array};
 pub use vec2::Vec2;

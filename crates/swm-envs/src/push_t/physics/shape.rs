@@ -11,7 +11,7 @@ pub enum Kind {
     Circle,
     /// Two points and a radius.
     Segment,
-    /// Four points, counter-clockwise (x towards y), no radius.
+    /// Four points, ordered from x towards y, without a radius.
     Quad,
 }
 
@@ -20,7 +20,7 @@ pub enum Kind {
 pub struct Shape {
     /// The kind.
     pub kind: Kind,
-    /// Index of its body.
+    /// Index of the shape's body.
     pub body: usize,
     /// The distance by which the shape extends beyond its points, in pixels.
     pub radius: f64,

@@ -20,17 +20,17 @@ pub const WALLS: usize = 2;
 pub const DT: f64 = 0.01;
 /// Iterations of sequential impulses (Chipmunk's default).
 const ITERATIONS: usize = 10;
-/// Overlap that is tolerated, in pixels (Chipmunk's default, a single-precision constant there).
+/// Overlap that is tolerated, in pixels (Chipmunk's default, in single precision).
 const SLOP: f64 = 0.1f32 as f64;
-/// Fraction of an overlap that remains after 1/60 second (Chipmunk's default, single precision there).
+/// Fraction of an overlap that remains after 1/60 second (Chipmunk's default, in single precision).
 const OVERLAP_LEFT: f64 = (1.0f32 - 0.1f32) as f64;
 /// Steps for which the impulses of a vanished contact are stored (Chipmunk's default).
 const PERSISTENCE: u32 = 3;
 
-/// The agent, the block and the walls.
+/// A simulation of the agent, the block and the walls.
 #[derive(Clone, Debug)]
 pub struct Simulation {
-    /// Agent, block, walls.
+    /// The bodies: agent, block, walls.
     pub bodies: [Body; 3],
     /// The shapes of the walls, then of the agent, then of the block.
     pub shapes: Vec<Shape>,
@@ -237,7 +237,8 @@ impl Simulation {
 
 /// Returns the order in which Chipmunk updates and draws moving shapes.
 ///
-/// It is the order of Chipmunk's hash table, whose size is the first of these primes that exceeds the number of shapes.
+/// It is the order of Chipmunk's hash table, whose size is the first of the primes 5, 13 and 23 that exceeds the number
+/// of moving shapes.
 pub fn visiting_order(walls: usize, moving: usize) -> Vec<usize> {
     let size = [5, 13, 23].into_iter().find(|&size| size > moving).unwrap_or(usize::MAX);
     let mut order: Vec<usize> = (0..moving).collect();

@@ -7,12 +7,12 @@ use bytemuck::Pod;
 impl Simulation {
     /// Appends the state to `bytes`, without the shapes and walls, which never change during an episode.
     pub fn save(&self, bytes: &mut Vec<u8>) {
-        put(bytes, &self.bodies);
-        put(bytes, &self.tree.nodes);
-        put(bytes, &[self.tree.root, self.tree.spare, self.tree_stamp, self.stamp]);
-        put(bytes, &self.pairs);
-        put(bytes, &self.arbiters);
-        put(bytes, &self.active);
+        append_items(bytes, &self.bodies);
+        append_items(bytes, &self.tree.nodes);
+        append_items(bytes, &[self.tree.root, self.tree.spare, self.tree_stamp, self.stamp]);
+        append_items(bytes, &self.pairs);
+        append_items(bytes, &self.arbiters);
+        append_items(bytes, &self.active);
     }
 
     /// Reads a state that [`Simulation::save`] wrote for the same shapes, and advances `bytes` past it. Returns `None`,
@@ -33,19 +33,19 @@ impl Simulation {
 }
 
 /// Appends the number of items, then the items.
-pub fn put<T: Pod>(bytes: &mut Vec<u8>, items: &[T]) {
+pub fn append_items<T: Pod>(bytes: &mut Vec<u8>, items: &[T]) {
     bytes.extend_from_slice(&(items.len() as u64).to_le_bytes());
     bytes.extend_from_slice(bytemuck::cast_slice(items));
 }
 
-/// Reads items that [`put`] wrote into a vector.
+/// Reads items that [`append_items`] wrote into a vector.
 pub fn take<T: Pod>(bytes: &mut &[u8], items: &mut Vec<T>) -> Option<()> {
     items.clear();
     items.extend(take_items::<T>(bytes)?);
     Some(())
 }
 
-/// Reads exactly `N` items that [`put`] wrote.
+/// Reads exactly `N` items that [`append_items`] wrote.
 pub fn take_array<T: Pod, const N: usize>(bytes: &mut &[u8]) -> Option<[T; N]> {
     let mut items = take_items(bytes)?;
     let mut array = [T::zeroed(); N];

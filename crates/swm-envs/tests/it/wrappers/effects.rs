@@ -1,4 +1,4 @@
-//! The effect of each wrapper: moments of noise, positions of rectangles, colours, backgrounds.
+//! Tests of the effect of each wrapper: moments of noise, positions of rectangles, colours, backgrounds.
 
 use super::{has_ffmpeg, make, write_png};
 use std::collections::BTreeSet;
@@ -35,13 +35,13 @@ fn bounds(rgb: &[u8], width: usize) -> Option<[usize; 4]> {
         .collect();
     let side = |axis: usize| Some((at.iter().map(|p| p[axis]).min()?, at.iter().map(|p| p[axis]).max()? + 1));
     let ((x0, x1), (y0, y1)) = (side(0)?, side(1)?);
-    assert_eq!(at.len(), (x1 - x0) * (y1 - y0), "a full rectangle");
+    assert_eq!(at.len(), (x1 - x0) * (y1 - y0), "the non-zero pixels fill their bounding box");
     Some([x0, y0, x1 - x0, y1 - y0])
 }
 
 #[test]
 fn background_replaces_the_key_colours_and_follows_the_steps() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let levels = [250, 10, 130, 70];
     for (i, level) in levels.into_iter().enumerate() {
         write_png(&folder.path().join(format!("{i}.png")), 16, 16, &[level; 768]);
@@ -57,7 +57,7 @@ fn background_replaces_the_key_colours_and_follows_the_steps() {
             command.args(["-loglevel", "error", "-framerate", "7", "-i"]).arg(folder.path().join("%d.png"));
             command.args(["-vf", filter]);
             command.args(if name == "a.mkv" { &["-c:v", "png"][..] } else { &[] });
-            let made = command.arg(&path).stdin(Stdio::null()).status().expect("ffmpeg runs").success();
+            let made = command.arg(&path).stdin(Stdio::null()).status().expect("running ffmpeg").success();
             assert!(made, "ffmpeg makes {name}");
             backgrounds.push(path);
         }
@@ -66,7 +66,8 @@ fn background_replaces_the_key_colours_and_follows_the_steps() {
         let text = format!("chroma-key,key_color=1/2/3/9/9/9,tolerance=2,media={}", media.display());
         let mut wrapper = make(&text);
         let mut level_at = |step| {
-            // The key colour, one at distance 2, one just beyond, the other key colour, an unrelated colour.
+            // The first key colour, a colour at distance 2, a colour just beyond, a colour near the second key colour,
+            // and an unrelated colour.
             let mut rgb = [[1, 2, 3], [1, 4, 3], [2, 4, 3], [9, 9, 8], [200, 0, 0]].concat();
             wrapper.apply(&mut FrameMut::new(5, 1, &mut rgb), EpisodeFrame::Step(step));
             assert_eq!((&rgb[6..9], &rgb[12..]), (&[2, 4, 3][..], &[200, 0, 0][..]), "{text}: other colours change");
@@ -150,7 +151,7 @@ fn shifts_are_uniform_and_repeat_the_edge() {
             assert_eq!([0, 1].map(|axis| i32::from(pixel[axis])), expected, "step {step}, pixel {i}");
         }
         for (counts, offset) in counts.iter_mut().zip(offset) {
-            counts[usize::try_from(offset + 3).expect("at most pad")] += 1;
+            counts[usize::try_from(offset + 3).expect("an offset of at least -pad")] += 1;
         }
     }
     for count in counts.as_flattened() {
@@ -167,7 +168,7 @@ fn rectangles_have_the_requested_size_and_uniform_positions() {
                 let mut rgb = vec![0; 3 * 100 * 60];
                 wrapper.reset(Key::new(seed));
                 wrapper.apply(&mut FrameMut::new(100, 60, &mut rgb), EpisodeFrame::Step(seed % 50));
-                bounds(&rgb, 100).expect("a rectangle")
+                bounds(&rgb, 100).expect("the wrapper draws a rectangle")
             })
             .collect();
         for &[x, y, width, height] in &found {
@@ -192,7 +193,7 @@ fn moving_patches_move_straight_and_stay_inside() {
             .map(|step| {
                 let mut rgb = vec![0; 3 * 100 * 60];
                 wrapper.apply(&mut FrameMut::new(100, 60, &mut rgb), EpisodeFrame::Step(step));
-                bounds(&rgb, 100).expect("a rectangle")
+                bounds(&rgb, 100).expect("the wrapper draws a rectangle")
             })
             .collect();
         assert!(rectangles.iter().all(|rectangle| rectangle[2..] == [20, 12]), "the size does not change");
@@ -258,7 +259,7 @@ fn random_convolutions_have_weights_of_the_documented_variance() {
         // Rounding down lowers a positive response by half a level on average.
         let square = mean(responses.iter().filter(|v| **v > 0).map(|&v| (f64::from(v) + 0.5).powi(2)));
         let positive = mean(responses.iter().map(|&v| f64::from(u8::from(v > 0))));
-        // Weights up to 1 are rounded to level 0.
+        // Positive responses below 1 are rounded down to level 0.
         let hidden = 0.4 / deviation;
         assert!((positive + hidden - 0.5).abs() < 0.03, "side {side}: {positive} of the weights are positive");
         let found = (square * positive / 0.5).sqrt();

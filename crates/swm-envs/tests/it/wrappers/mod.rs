@@ -1,4 +1,4 @@
-//! Tests of the visual wrappers: settings, properties that all of them have, and the effect of each.
+//! Tests of the visual wrappers: settings, properties of all wrappers, and the effect of each wrapper.
 
 mod effects;
 mod properties;
@@ -30,7 +30,7 @@ fn variants(folder: &Path) -> Vec<(String, Varies)> {
     use Varies::{Never, PerEpisode, PerStep, WithStep};
     let image = folder.join("image.png");
     let frames = folder.join("frames");
-    std::fs::create_dir(&frames).expect("a folder");
+    std::fs::create_dir(&frames).expect("creating a temporary folder");
     write_png(&image, 20, 30, &pattern(20, 30));
     for (i, level) in [10, 200, 60].into_iter().enumerate() {
         write_png(&frames.join(format!("{i}.png")), 5, 4, &[level; 60]);
@@ -89,10 +89,10 @@ fn pattern(width: usize, height: usize) -> Vec<u8> {
 }
 
 fn write_png(path: &Path, width: u32, height: u32, rgb: &[u8]) {
-    let file = std::fs::File::create(path).expect("a file");
+    let file = std::fs::File::create(path).expect("writing the file");
     let mut encoder = png::Encoder::new(file, width, height);
     encoder.set_color(png::ColorType::Rgb);
-    encoder.write_header().expect("a header").write_image_data(rgb).expect("a frame");
+    encoder.write_header().expect("writing the header").write_image_data(rgb).expect("writing the image");
 }
 
 /// Applies a wrapper to the test image in the episode of a seed.

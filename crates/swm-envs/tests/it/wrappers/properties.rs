@@ -15,28 +15,30 @@ fn fixed_factors() -> ResetOptions {
 }
 
 fn wrapped<S: AsRef<str>>(texts: &[S], goal: GoalFrame) -> Box<dyn Env> {
-    Stack::parse(texts).expect("wrappers").wrap(two_room::ENTRY.env().expect("an environment"), goal)
+    Stack::parse(texts)
+        .expect("parsing the wrappers")
+        .wrap(two_room::ENTRY.env().expect("creating the environment"), goal)
 }
 
 fn frame(env: &mut dyn Env) -> Vec<u8> {
     let mut rgb = vec![0; 3 * SIZE[0] * SIZE[1]];
-    env.render(FrameMut::new(SIZE[0], SIZE[1], &mut rgb)).expect("a frame");
+    env.render(FrameMut::new(SIZE[0], SIZE[1], &mut rgb)).expect("rendering a frame");
     rgb
 }
 
 fn goal_frame(env: &mut dyn Env) -> Vec<u8> {
     let mut rgb = vec![0; 3 * SIZE[0] * SIZE[1]];
-    env.render_goal(FrameMut::new(SIZE[0], SIZE[1], &mut rgb)).expect("a frame");
+    env.render_goal(FrameMut::new(SIZE[0], SIZE[1], &mut rgb)).expect("rendering a frame");
     rgb
 }
 
 fn step(env: &mut dyn Env) {
-    env.step(Action::Continuous(&[0.5, -0.3])).expect("an action");
+    env.step(Action::Continuous(&[0.5, -0.3])).expect("stepping the environment");
 }
 
 #[test]
 fn frames_depend_only_on_seed_and_step() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     for (text, varies) in variants(folder.path()) {
         let (mut wrapper, mut other) = (make(&text), make(&text));
         let at = EpisodeFrame::Step;
@@ -62,7 +64,7 @@ fn frames_depend_only_on_seed_and_step() {
 
 #[test]
 fn accepts_frames_of_any_size() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let sizes = [[1, 1], [1, 9], [9, 1], [2, 2], [3, 2], [8, 17], [130, 3], [3, 130], [0, 0], [0, 4], [4, 0]];
     for (text, _) in variants(folder.path()) {
         let mut wrapper = make(&text);
@@ -76,14 +78,14 @@ fn accepts_frames_of_any_size() {
 
 #[test]
 fn restored_snapshot_continues_bit_for_bit() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let mut texts: Vec<String> = variants(folder.path()).into_iter().map(|(text, _)| text).collect();
     texts.retain(|text| !text.contains("=256"));
     for text in &texts {
         let stack = ["blur,kernel=3", text, "noise,std=linear/0/30/6"];
         let (mut env, mut other) = (wrapped(&stack, GoalFrame::Wrapped), wrapped(&stack, GoalFrame::Wrapped));
-        env.reset(3, &fixed_factors()).expect("a reset");
-        other.reset(8, &fixed_factors()).expect("a reset");
+        env.reset(3, &fixed_factors()).expect("resetting the environment");
+        other.reset(8, &fixed_factors()).expect("resetting the environment");
         (0..3).for_each(|_| step(&mut *env));
         step(&mut *other);
         let snapshot = env.snapshot();
@@ -97,18 +99,18 @@ fn restored_snapshot_continues_bit_for_bit() {
         };
         let expected = follow(&mut *env);
         for env in [&mut *env, &mut *other] {
-            env.restore(&snapshot).expect("its own snapshot");
+            env.restore(&snapshot).expect("restoring a snapshot of the same stack");
             assert!(follow(env) == expected, "{text}: a restored environment continues differently");
         }
-        let bare = two_room::ENTRY.env().expect("an environment").snapshot().0;
+        let bare = two_room::ENTRY.env().expect("creating the environment").snapshot().0;
         let cut = snapshot.0[..20].to_vec();
         let other_stack = wrapped(&["grayscale"], GoalFrame::Clean).snapshot().0;
         for foreign in [bare, cut, other_stack, vec![]] {
             assert!(env.restore(&Snapshot(foreign)).is_err(), "{text}: a foreign snapshot is refused");
         }
         assert!(
-            two_room::ENTRY.env().expect("an environment").restore(&snapshot).is_err(),
-            "{text}: an unwrapped environment accepts it"
+            two_room::ENTRY.env().expect("creating the environment").restore(&snapshot).is_err(),
+            "{text}: an unwrapped environment refuses the snapshot"
         );
     }
 }
@@ -116,14 +118,16 @@ fn restored_snapshot_continues_bit_for_bit() {
 #[test]
 fn everything_but_the_frames_is_unchanged() {
     for entry in ENVS.rows {
-        let stack = Stack::parse(&["noise", "occlusion"]).expect("wrappers");
-        let (mut env, mut bare) =
-            (stack.wrap(entry.env().expect("an environment"), GoalFrame::Clean), entry.env().expect("an environment"));
+        let stack = Stack::parse(&["noise", "occlusion"]).expect("parsing the wrappers");
+        let (mut env, mut bare) = (
+            stack.wrap(entry.env().expect("creating the environment"), GoalFrame::Clean),
+            entry.env().expect("creating the environment"),
+        );
         assert_eq!(env.spec().id, bare.spec().id);
-        let schema = Schema::new(bare.spec().columns.clone()).expect("a schema");
+        let schema = Schema::new(bare.spec().columns.clone()).expect("building the schema");
         let [mut wrapped_row, mut bare_row] = [Batch::zeros(&schema, 1), Batch::zeros(&schema, 1)];
-        env.reset(4, &ResetOptions::default()).expect("a reset");
-        bare.reset(4, &ResetOptions::default()).expect("a reset");
+        env.reset(4, &ResetOptions::default()).expect("resetting the environment");
+        bare.reset(4, &ResetOptions::default()).expect("resetting the environment");
         for goal in 0..3 {
             let key = Key::new(goal);
             assert_eq!(env.sample_goal(key).is_ok(), bare.sample_goal(key).is_ok());
@@ -141,13 +145,13 @@ fn everything_but_the_frames_is_unchanged() {
         assert!(env.reset(5, &refused).is_err());
         assert_eq!(frame(&mut *env), before, "{}: a refused reset changes nothing", entry.id);
     }
-    let none = Stack::parse::<&str>(&[]).expect("no wrapper");
-    let mut env = none.wrap(two_room::ENTRY.env().expect("an environment"), GoalFrame::Wrapped);
+    let none = Stack::parse::<&str>(&[]).expect("parsing an empty stack");
+    let mut env = none.wrap(two_room::ENTRY.env().expect("creating the environment"), GoalFrame::Wrapped);
     assert!(
-        two_room::ENTRY.env().expect("an environment").restore(&env.snapshot()).is_ok(),
+        two_room::ENTRY.env().expect("creating the environment").restore(&env.snapshot()).is_ok(),
         "an empty stack adds nothing"
     );
-    assert_eq!(frame(&mut *env), frame(&mut *two_room::ENTRY.env().expect("an environment")));
+    assert_eq!(frame(&mut *env), frame(&mut *two_room::ENTRY.env().expect("creating the environment")));
 }
 
 #[test]
@@ -157,7 +161,7 @@ fn wrapped_goal_has_the_appearance_of_the_episode() {
     let at_goal =
         ResetOptions { state: Some(vec![60.0, 112.0]), goal_state: Some(vec![60.0, 112.0]), ..fixed_factors() };
     for env in [&mut env, &mut clean] {
-        env.reset(2, &at_goal).expect("a reset");
+        env.reset(2, &at_goal).expect("resetting the environment");
     }
     assert_eq!(frame(&mut *clean), goal_frame(&mut *clean), "values sampled per episode apply to the goal frame");
     assert_ne!(frame(&mut *env), goal_frame(&mut *env), "goal frame and step frame have different noise");
@@ -170,15 +174,15 @@ fn wrapped_goal_has_the_appearance_of_the_episode() {
 fn dataset_row_starts_an_episode_of_the_last_seed() {
     let texts = ["noise", "occlusion,num_patches=3"];
     let (mut env, mut other) = (wrapped(&texts, GoalFrame::Clean), wrapped(&texts, GoalFrame::Clean));
-    env.reset(6, &fixed_factors()).expect("a reset");
-    other.reset(6, &fixed_factors()).expect("a reset");
+    env.reset(6, &fixed_factors()).expect("resetting the environment");
+    other.reset(6, &fixed_factors()).expect("resetting the environment");
     let at_start = frame(&mut *env);
     (0..3).for_each(|_| step(&mut *env));
-    let schema = Schema::new([ColumnSpec::new("state", DType::Float64, [2])]).expect("a schema");
+    let schema = Schema::new([ColumnSpec::new("state", DType::Float64, [2])]).expect("building the schema");
     let mut row = Batch::zeros(&schema, 1);
-    row.get_mut("state").expect("the state").copy_from_slice(&[60.0, 112.0]);
+    row.get_mut("state").expect("the `state` column").copy_from_slice(&[60.0, 112.0]);
     for env in [&mut env, &mut other] {
-        env.restore_from(row.row(0), row.row(0)).expect("a row");
+        env.restore_from(row.row(0), row.row(0)).expect("restoring from the row");
         assert_eq!(frame(&mut **env), at_start, "steps are counted from the row");
     }
     step(&mut *env);
@@ -190,7 +194,7 @@ fn dataset_row_starts_an_episode_of_the_last_seed() {
 fn frames_depend_on_the_order_and_index_of_wrappers() {
     let frames = |texts: &[&str]| {
         let mut env = wrapped(texts, GoalFrame::Clean);
-        env.reset(1, &fixed_factors()).expect("a reset");
+        env.reset(1, &fixed_factors()).expect("resetting the environment");
         frame(&mut *env)
     };
     assert_ne!(frames(&["noise,std=60", "blur"]), frames(&["blur", "noise,std=60"]));
@@ -208,27 +212,29 @@ fn frames_depend_on_the_order_and_index_of_wrappers() {
 fn frames_do_not_depend_on_threads_or_other_environments() {
     let texts = ["color-jitter", "moving-patch", "noise", "random-shift,resample=step"];
     let play = |seeds: &[u64], workers: usize| -> Vec<Vec<u8>> {
-        let stack = Stack::parse(&texts).expect("wrappers");
+        let stack = Stack::parse(&texts).expect("parsing the wrappers");
         let envs = seeds
             .iter()
-            .map(|_| stack.wrap(two_room::ENTRY.env().expect("an environment"), GoalFrame::Wrapped))
+            .map(|_| stack.wrap(two_room::ENTRY.env().expect("creating the environment"), GoalFrame::Wrapped))
             .collect();
         let image = Some((SIZE[1], SIZE[0]));
-        let mut pool = EnvPool::new(envs, image, None, threads(workers).expect("threads")).expect("a pool");
+        let mut pool = EnvPool::new(envs, image, None, threads(workers).expect("creating the threads"))
+            .expect("creating the pool");
         let resets: Vec<Reset> =
             seeds.iter().enumerate().map(|(slot, &seed)| Reset { slot, seed, options: fixed_factors() }).collect();
-        pool.reset(&resets).expect("a reset");
-        let mut actions = Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("a schema"), seeds.len());
-        actions.get_mut::<f32>("action").expect("actions").fill(0.3);
+        pool.reset(&resets).expect("resetting the environment");
+        let mut actions =
+            Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("building the schema"), seeds.len());
+        actions.get_mut::<f32>("action").expect("the action column").fill(0.3);
         let mut frames = vec![vec![]; seeds.len()];
         for _ in 0..5 {
             for (slot, frames) in frames.iter_mut().enumerate() {
                 for column in ["pixels", "goal"] {
-                    let column = pool.infos().schema().index(column).expect("a column");
+                    let column = pool.infos().schema().index(column).expect("finding the column");
                     frames.extend_from_slice(pool.infos().row(slot).at::<u8>(column));
                 }
             }
-            pool.step(&actions, &vec![true; seeds.len()]).expect("a step");
+            pool.step(&actions, &vec![true; seeds.len()]).expect("stepping the environment");
         }
         frames
     };

@@ -6,7 +6,7 @@ use swm_envs::wrappers::{WRAPPERS, parse};
 
 #[test]
 fn every_row_and_parameter_is_tested_and_documented() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let variants = variants(folder.path());
     let docs = include_str!("../../../../../docs/wrappers.md");
     assert_eq!(WRAPPERS.rows.len(), 11);
@@ -82,14 +82,14 @@ fn invalid_settings_are_errors_that_name_the_setting() {
         ("chroma-key,media=a.png,key_color=1/2/3/4", "1/2/3/4", "red/green/blue"),
         ("chroma-key,media=,key_color=1/2/3", "media", "a path"),
     ] {
-        let name = text.split([',', '=']).nth(1).expect("a name");
+        let name = text.split([',', '=']).nth(1).expect("the name of a parameter");
         let name = if text.starts_with("chroma-key") && given.contains('/') { "key_color" } else { name };
-        error_contains(text, &[text.split(',').next().expect("a wrapper"), name, given, allowed]);
+        error_contains(text, &[text.split(',').next().expect("the name of a wrapper"), name, given, allowed]);
     }
     // The same settings as JSON.
     let json = |id: &str, settings: Value| {
-        let settings = settings.as_object().expect("an object").clone();
-        WRAPPERS.get(id).expect("a wrapper").make(&settings).err().map(|error| error.to_string())
+        let settings = settings.as_object().expect("a JSON object").clone();
+        WRAPPERS.get(id).expect("finding the wrapper").make(&settings).err().map(|error| error.to_string())
     };
     assert_eq!(json("noise", json!({"std": ["cosine", 1, 2, 3], "amount": 1})), None);
     assert_eq!(json("cutout", json!({"size": [0, 1.0], "color": [1, 2, 3], "num": 2})), None);
@@ -111,18 +111,18 @@ fn invalid_settings_are_errors_that_name_the_setting() {
 
 #[test]
 fn missing_and_damaged_backgrounds_are_errors_that_name_the_file() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let message = |name: &str| {
         let text = format!("chroma-key,key_color=0/0/0,media={}", folder.path().join(name).display());
         parse(&text).err().unwrap_or_else(|| panic!("{name} is accepted")).to_string()
     };
-    std::fs::write(folder.path().join("damaged.png"), b"\x89PNG and nothing else").expect("a file");
+    std::fs::write(folder.path().join("damaged.png"), b"\x89PNG and nothing else").expect("writing the file");
     assert!(message("missing.png").contains("missing.png"));
     assert!(message("missing.mp4").contains("No such file"));
     assert!(message("damaged.png").contains("readable PNG file"));
     assert!(message("").contains("no PNG file") || message("").contains("damaged.png"));
     if has_ffmpeg() {
-        std::fs::write(folder.path().join("damaged.mp4"), b"no video").expect("a file");
+        std::fs::write(folder.path().join("damaged.mp4"), b"no video").expect("writing the file");
         assert!(message("damaged.mp4").contains("ffmpeg can decode"), "{}", message("damaged.mp4"));
     }
 }

@@ -1,12 +1,12 @@
 //! Goal sampling for goal-conditioned learning: every clip gets a row of the dataset as its goal.
 //!
 //! Goals are drawn from a mixture of distributions relative to the *anchor*, the step of the clip that counts as the
-//! current one. Goals in the future are a whole number of model steps (frameskips) after the anchor.
+//! current step. Goals in the future are a whole number of model steps (frameskips) after the anchor.
 //!
-//! [`GoalMixture::default`], and the rule that clips without a future step are excluded, are those of the reference's
-//! `GoalDataset`. The geometric distribution with discount γ is that of hindsight relabelling in GCRL (Eysenbach et al.
-//! 2022, OGBench): the goal is `k` model steps ahead with probability `(1 - γ) γ^(k - 1)`. A goal beyond the end of the
-//! episode becomes the last model step of the episode.
+//! [`GoalMixture::default`], and the rule that excludes clips without a future step, equal those of the reference
+//! implementation's `GoalDataset`. The geometric distribution with discount γ is the one used for hindsight relabelling
+//! in goal-conditioned reinforcement learning (Eysenbach et al. 2022, OGBench): the goal is `k` model steps ahead with
+//! probability `(1 - γ) γ^(k - 1)`. A goal beyond the end of the episode becomes the last model step of the episode.
 
 use crate::dataset::clips::ClipSpec;
 use crate::dataset::reader::{Episode, StepRange};
@@ -60,9 +60,9 @@ impl Default for GoalMixture {
 pub struct GoalSpec {
     /// Prefix of the goal's columns. Goals with different names are drawn independently.
     pub name: String,
-    /// The columns of the goal to load.
+    /// Columns of the goal's row to load.
     pub columns: Vec<String>,
-    /// The step of the clip that counts as the current one; the last step for `None`.
+    /// The step of the clip that counts as the current step; the last step for `None`.
     pub anchor: Option<usize>,
     /// The distribution of goals.
     pub mixture: GoalMixture,
@@ -120,8 +120,8 @@ impl GoalSpec {
 
     /// Number of rows, counted from the clip's first row, that an episode must have for a goal to exist.
     pub(crate) fn reach(&self, clip: &ClipSpec) -> usize {
-        let later = self.mixture.future > 0.0 || self.mixture.geometric > 0.0;
-        self.anchor_row(clip) + 1 + if later { clip.frameskip } else { 0 }
+        let needs_future_step = self.mixture.future > 0.0 || self.mixture.geometric > 0.0;
+        self.anchor_row(clip) + 1 + if needs_future_step { clip.frameskip } else { 0 }
     }
 
     /// Draws the goal of a clip.
@@ -162,13 +162,13 @@ impl GoalSpec {
 pub(crate) struct Goals {
     /// Length of every episode of the dataset, in rows.
     lengths: Vec<usize>,
-    /// `(position, preceding rows)` of the episodes that random goals come from.
+    /// `(position, number of rows in the preceding used episodes)` of each episode that random goals are drawn from.
     used: Vec<(usize, usize)>,
     rows: usize,
 }
 
 impl Goals {
-    /// The rows of the episodes at these positions.
+    /// The rows of the episodes at `positions`.
     pub fn new(episodes: &[Episode], positions: &[usize]) -> Self {
         let mut goals = Self { lengths: episodes.iter().map(|episode| episode.length).collect(), ..Self::default() };
         for &position in positions {
@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn draws_mixtures_and_different_names_independently() {
+    fn draws_the_default_mixture_and_different_names_independently() {
         let goals = drawn(GoalMixture::default());
         let current = goals.iter().filter(|goal| goal.offset == 0).count() as f64;
         // A fifth of the goals, plus the random goals that hit the anchor.

@@ -1,4 +1,4 @@
-//! [`Split`]: divides the episodes of a dataset into training, validation and test.
+//! [`Split`]: divides the episodes of a dataset into the parts train, validation and test.
 //!
 //! A keyed hash of an episode's index determines its part, independently of all other episodes. An episode therefore
 //! stays in its part while the dataset grows, and training and evaluation with the same split use the same parts.
@@ -13,21 +13,21 @@ use swm_core::{Error, Key, Result};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Part {
-    /// For training models.
+    /// Episodes for training models.
     Train,
-    /// For choosing settings.
+    /// Episodes for choosing settings.
     Validation,
-    /// For the final evaluation.
+    /// Episodes for the final evaluation.
     Test,
 }
 
-/// The fractions of the parts, and the seed of the division.
+/// The fractions of the held-out parts, and the seed of the division.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Split {
     /// Fraction of episodes held out for validation.
     pub validation: f64,
-    /// Fraction of episodes held out for the test.
+    /// Fraction of episodes held out for testing.
     pub test: f64,
     /// Seed of the hash.
     pub seed: u64,

@@ -1,7 +1,7 @@
 //! [`BlockCache`]: an in-memory cache of blocks of objects.
 //!
-//! A request costs as much as transferring a megabyte. Training reads small ranges in random order, so the cache
-//! fetches whole blocks, several neighbours per request.
+//! A request takes as long as transferring a megabyte. Training reads small ranges in random order, so the cache
+//! fetches whole blocks, several neighbouring blocks per request.
 
 use bytes::{Bytes, BytesMut};
 use futures::{StreamExt as _, TryStreamExt as _};
@@ -50,7 +50,7 @@ struct Cached {
 }
 
 impl BlockCache {
-    /// A cache for objects with `total` bytes in all.
+    /// Creates a cache for objects that have `total` bytes together.
     pub(crate) fn new(total: u64) -> Self {
         Self::with(if total <= CAPACITY { LARGE } else { SMALL }, CAPACITY)
     }
@@ -104,7 +104,7 @@ impl BlockCache {
         complete
     }
 
-    /// Fetches the requested blocks that are not in `held`, several neighbours per request.
+    /// Fetches the requested blocks that are not in `held`, several neighbouring blocks per request.
     async fn fetch(
         &self,
         store: &dyn ObjectStore,
@@ -143,10 +143,10 @@ impl BlockCache {
         for ((object, run), bytes) in requests.into_iter().zip(fetched) {
             for (at, block) in run.enumerate() {
                 let start = (at as u64 * self.block) as usize;
-                // Copied, because a slice would keep the whole response in memory.
-                let part = Bytes::copy_from_slice(&bytes[start..bytes.len().min(start + self.block as usize)]);
-                held.insert((object.path.clone(), block), part.clone());
-                cached.insert((object.path.clone(), block), part, self.capacity);
+                // Copies the block, because a slice would keep the whole response in memory.
+                let copy = Bytes::copy_from_slice(&bytes[start..bytes.len().min(start + self.block as usize)]);
+                held.insert((object.path.clone(), block), copy.clone());
+                cached.insert((object.path.clone(), block), copy, self.capacity);
             }
         }
         Ok(())
@@ -174,9 +174,9 @@ impl BlockCache {
         match parts.len() {
             1 => Ok(parts.swap_remove(0)),
             _ => {
-                let mut whole = BytesMut::with_capacity((range.end - range.start) as usize);
-                parts.iter().for_each(|part| whole.extend_from_slice(part));
-                Ok(whole.freeze())
+                let mut joined = BytesMut::with_capacity((range.end - range.start) as usize);
+                parts.iter().for_each(|part| joined.extend_from_slice(part));
+                Ok(joined.freeze())
             }
         }
     }
@@ -214,7 +214,7 @@ mod tests {
             let contents: Vec<Vec<u8>> = [1000, 37, 256].map(|n| (0..n).map(|i| (i * i / 3) as u8).collect()).into();
             let paths = ["a", "b", "c"].map(StorePath::from);
             for (path, content) in paths.iter().zip(&contents) {
-                store.put(path, content.clone().into()).await.expect("puts");
+                store.put(path, content.clone().into()).await.expect("storing an object");
             }
             let blocks = BlockCache::with(16, 200);
             let mut rng = Key::new(3).rng();
@@ -229,7 +229,7 @@ mod tests {
                         ObjectRanges { path: paths[index].clone(), size, ranges: ranges.collect() }
                     })
                     .collect();
-                let read = blocks.read(&store, &objects).await.expect("reads");
+                let read = blocks.read(&store, &objects).await.expect("reading the ranges");
                 for ((object, read), content) in objects.iter().zip(&read).zip(&contents) {
                     for (range, bytes) in object.ranges.iter().zip(read) {
                         assert_eq!(bytes, &content[range.start as usize..range.end as usize]);

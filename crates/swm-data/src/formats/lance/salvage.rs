@@ -28,7 +28,7 @@ pub fn salvage(location: &Location) -> Result<(Arc<dyn Reader>, Vec<String>)> {
     Ok((Arc::new(LanceReader::of(store, only(&version.manifest, readable))?), lost))
 }
 
-/// The table restricted to these fragments.
+/// The table restricted to `fragments`.
 fn only(table: &Table, fragments: Vec<Fragment>) -> Arc<Table> {
     let mut table = table.clone();
     table.fragments = Arc::new(fragments);

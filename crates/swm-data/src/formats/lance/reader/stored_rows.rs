@@ -21,7 +21,7 @@ pub(super) struct StoredRows {
 }
 
 impl LanceReader {
-    /// The stored values of disjoint ascending ranges of rows, counted over the table.
+    /// Reads the stored values of disjoint, ascending ranges of rows, counted over the table.
     pub(super) fn stored_rows(&self, stored_name: &str, ranges: &[Range<u64>]) -> Result<Vec<StoredRows>> {
         // Splits the ranges at fragment boundaries.
         let mut jobs: Vec<(usize, Vec<Range<u64>>)> = vec![];
@@ -47,7 +47,7 @@ impl LanceReader {
         Ok(chunks)
     }
 
-    /// The stored values of some rows of some fragments.
+    /// Reads the stored values of jobs. A job is a fragment, and ranges of rows within this fragment.
     pub(super) fn read_stored_rows(
         &self,
         stored_name: &str,

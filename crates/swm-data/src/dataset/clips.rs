@@ -36,7 +36,7 @@ impl ClipSpec {
     pub fn schema(&self, dataset: &Schema) -> Result<Schema> {
         for (name, value) in [("num_steps", self.num_steps), ("frameskip", self.frameskip)] {
             if value == 0 {
-                return Err(Error::config(name, "it is 0", "clips need at least one"));
+                return Err(Error::config(name, "it is 0", "use a value of at least 1"));
             }
         }
         let columns: Result<Vec<ColumnSpec>> = self

@@ -3,7 +3,7 @@
 //! Goals are drawn from a mixture of distributions relative to the *anchor*, the step of the clip that counts as the
 //! current step. Goals in the future are a whole number of model steps (frameskips) after the anchor.
 //!
-//! [`GoalMixture::default`], and the rule that excludes clips without a future step, equal those of the reference
+//! [`GoalMixture::default`] and the exclusion of clips without a future step are the same as in the reference
 //! implementation's `GoalDataset`. The geometric distribution with discount γ is the one used for hindsight relabelling
 //! in goal-conditioned reinforcement learning (Eysenbach et al. 2022, OGBench): the goal is `k` model steps ahead with
 //! probability `(1 - γ) γ^(k - 1)`. A goal beyond the end of the episode becomes the last model step of the episode.

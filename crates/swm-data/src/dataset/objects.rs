@@ -287,8 +287,8 @@ mod tests {
 
     #[test]
     fn block_on_works_inside_another_runtime_and_reports_panics() -> Result<()> {
-        let other = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
-        assert_eq!(other.block_on(async { block_on(async { 7 }) })?, Some(7));
+        let outer = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
+        assert_eq!(outer.block_on(async { block_on(async { 7 }) })?, Some(7));
         let panics = block_on::<()>(async { std::panic::resume_unwind(Box::new("damaged")) })?;
         assert_eq!(panics, None);
         Ok(())

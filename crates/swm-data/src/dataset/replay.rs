@@ -54,13 +54,18 @@ struct StoredEpisode {
 }
 
 impl ReplayBuffer {
-    /// A buffer of at most `capacity` rows for episodes with these columns. An episode of `n` steps has `n + 1` rows.
+    /// A buffer of at most `capacity` rows for episodes with the columns of `schema`. An episode of `n` steps has `n +
+    /// 1` rows.
     ///
     /// # Errors
     /// If the capacity is 0.
     pub fn new(schema: &Schema, capacity: usize) -> Result<Self> {
         if capacity == 0 {
-            return Err(Error::config("replay buffer", "its capacity is 0 rows", "make room for one episode at least"));
+            return Err(Error::config(
+                "replay buffer",
+                "its capacity is 0 rows",
+                "use a capacity of at least one episode",
+            ));
         }
         let dataset_schema = dataset_schema(schema)?;
         Ok(Self(Arc::new(Inner { schema: schema.clone(), dataset_schema, capacity, state: Mutex::default() })))
@@ -154,7 +159,7 @@ impl ReplayBuffer {
         writer.finish()
     }
 
-    /// Fills a new buffer from a dataset. If not all episodes fit, the buffer holds the last ones. If
+    /// Fills a new buffer from a dataset. If not all episodes fit, the buffer holds the last episodes. If
     /// [`ReplayBuffer::save`] wrote the dataset, stored and future episodes get the same `episode_idx` as in the
     /// original buffer.
     ///

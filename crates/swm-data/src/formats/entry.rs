@@ -54,7 +54,7 @@ impl FormatEntry {
         (self.backend()?.open)(location)
     }
 
-    /// Creates, continues or replaces a dataset whose episodes have these columns.
+    /// Creates, continues or replaces a dataset whose episodes have the columns of `schema`.
     ///
     /// # Errors
     /// If the dataset exists and `options.mode` forbids it, the schema differs from that of the dataset to continue,

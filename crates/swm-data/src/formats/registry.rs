@@ -44,8 +44,8 @@ pub fn open(location: impl Into<Location>) -> Result<Arc<dyn Reader>> {
     Err(Error::corrupt(location.label(), problem, fix))
 }
 
-/// Creates, continues or replaces a dataset whose episodes have these columns, in the format that the location's suffix
-/// names. Use [`FormatEntry::create`] for locations without such a suffix.
+/// Creates, continues or replaces a dataset whose episodes have the columns of `schema`, in the format that the
+/// location's suffix names. Use [`FormatEntry::create`] for locations without such a suffix.
 ///
 /// # Errors
 /// If the location names no known format, the dataset exists and `options.mode` forbids it, the schema differs from
@@ -54,7 +54,7 @@ pub fn create(location: impl Into<Location>, schema: &Schema, options: WriteOpti
     let location = location.into();
     let Some(format) = detect(&location) else {
         let problem = format!("{location} has no suffix of a known format");
-        let fix = format!("end it in .{}", lance::ENTRY.suffixes[0]);
+        let fix = format!("use a name that ends in .{}", lance::ENTRY.suffixes[0]);
         return Err(Error::config("dataset path", problem, fix));
     };
     format.create(&location, schema, options)

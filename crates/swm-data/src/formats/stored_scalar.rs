@@ -137,7 +137,9 @@ mod tests {
         assert_eq!(convert(Class::Signed, 1, false, &[0x80]), Ok((-128_i32).to_ne_bytes().to_vec()));
         assert_eq!(convert(Class::Float, 8, true, &1.5_f64.to_be_bytes()), Ok(1.5_f64.to_ne_bytes().to_vec()));
         assert_eq!(convert(Class::Unsigned, 8, false, &7_u64.to_le_bytes()), Ok(7_i64.to_ne_bytes().to_vec()));
-        assert!(convert(Class::Unsigned, 8, false, &u64::MAX.to_le_bytes()).expect_err("too large").contains("64"));
+        assert!(
+            convert(Class::Unsigned, 8, false, &u64::MAX.to_le_bytes()).expect_err("a value above 2^63").contains("64")
+        );
         assert_eq!(StoredScalar { class: Class::Float, size: 16, big_endian: false }.dtype(), None);
     }
 

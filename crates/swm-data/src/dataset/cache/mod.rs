@@ -93,7 +93,7 @@ impl Budget {
     }
 }
 
-/// Cached rows of one column. Several threads use a cache at once.
+/// Cached rows of one column. Several threads may use a cache at the same time.
 trait RowCache: Send + Sync {
     /// Copies a row to `out` if it is cached, and returns whether the row is cached.
     fn get(&self, row: usize, out: &mut [u8]) -> bool;

@@ -86,7 +86,7 @@ impl Reader for Merge {
         Ok(sizes)
     }
 
-    /// A hash of both content hashes and the names of the added columns.
+    /// A hash of the content hashes of the two datasets and of the names of the added columns.
     fn content_hash(&self) -> Result<String> {
         let hashes = [self.base.content_hash()?, self.other.content_hash()?];
         Ok(view_hash("merge", hashes.into_iter().chain(self.added().map(str::to_owned))))

@@ -1,12 +1,12 @@
 //! The format `hdf5`: one file that the reference implementation's `HDF5Dataset` and every HDF5 library read.
 //!
-//! Each column is a dataset `[rows, shape…]` with all episodes one after another; `ep_len` and `ep_offset` hold the
-//! length and first row of every episode. Types, names and shapes are those of the columns.
+//! Each column is an HDF5 dataset `[rows, shape…]` with the name and type of the column, and holds all episodes one
+//! after another. The datasets `ep_len` and `ep_offset` hold the length and first row of every episode.
 //!
 //! **Reading.** The crate `hdf5-pure` reads the structure of a file; this module reads the chunks. The chunks of a
 //! batch are planned together, read once each, and decoded on all threads, usually straight into the batch. All chunk
 //! layouts and the usual filters of h5py and hdf5plugin are supported (`filters/`). From `s3://` and `http://`
-//! locations, all byte ranges of a batch are read at once.
+//! locations, all byte ranges of a batch are read concurrently.
 //!
 //! **Writing.** Images are chunks of one row with LZF compression, which h5py reads without plugins; rendered frames
 //! shrink to about 2% of their size, and are read faster than uncompressed frames. A chunk that would shrink by less

@@ -56,7 +56,7 @@ impl Source {
 
     /// Wraps an open local file, with the present size of the file.
     pub fn of(file: File, path: &Path) -> Result<Self> {
-        let len = file.metadata().map_err(|e| Error::io(path, "reading its size", e))?.len();
+        let len = file.metadata().map_err(|e| Error::io(path, "reading the size of the file", e))?.len();
         Ok(Self(Arc::new(Kind::Local { file, path: path.to_owned(), len })))
     }
 

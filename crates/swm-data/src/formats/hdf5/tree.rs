@@ -156,7 +156,7 @@ impl Tree {
         Ok(())
     }
 
-    /// Updates nodes in the file and the root. The tree in the file is valid after each of these small writes.
+    /// Updates nodes in the file and the root. The tree in the file is valid after each write.
     pub fn write_changes(&mut self, file: &File) -> io::Result<()> {
         for node in self.full.iter().chain(&self.edge) {
             let Some(written) = node.written else { continue };

@@ -96,7 +96,7 @@ fn lock(path: &Path) -> Result<File> {
     }
 }
 
-/// A temporary name in the same folder.
+/// A temporary path in the folder of `path`.
 fn temporary_path(path: &Path) -> PathBuf {
     let name = format!(".{}.tmp", uuid::Uuid::new_v4().simple());
     path.with_file_name(name)

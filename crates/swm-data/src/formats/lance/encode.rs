@@ -52,8 +52,8 @@ impl EncodedEpisode {
     }
 }
 
-/// Encodes the images of a column in parallel. An image that equals the previous image, such as a goal
-/// image, is not encoded again.
+/// Encodes the images of a column in parallel. An image that equals the previous image, such as a goal image,
+/// is not encoded again.
 fn encode_images(episode: &Batch, index: usize, codec: ImageCodec) -> Result<BinaryArray> {
     let spec = &episode.schema().columns()[index];
     let (height, width) = (spec.shape[0], spec.shape[1]);

@@ -71,7 +71,7 @@ impl Record {
 
     /// Parses a stored record.
     pub fn decode(stored: &[u8]) -> Result<Self, String> {
-        serde_json::from_slice(stored).map_err(|e| format!("the record of its episodes is unreadable: {e}"))
+        serde_json::from_slice(stored).map_err(|e| format!("the record of a data file is unreadable: {e}"))
     }
 
     /// Extracts the constants of an episode from the stored values. `position` is the episode's position in the file.
@@ -79,14 +79,14 @@ impl Record {
         let Some(episode) = self.episodes.get(position) else {
             return Err(format!("episode {position} has no record"));
         };
-        let unreadable = |e: std::io::Error| format!("its constants are unreadable: {e}");
+        let unreadable = |e: std::io::Error| format!("the constants are unreadable: {e}");
         // Limits the output to the recorded size, so that a damaged file cannot expand without bound.
         let total = self.sizes.iter().fold(0_u64, |sum, &size| sum.saturating_add(size));
         let mut values = vec![];
         let reader = zstd::stream::read::Decoder::new(stored).map_err(unreadable)?;
         reader.take(total.saturating_add(1)).read_to_end(&mut values).map_err(unreadable)?;
         if values.len() as u64 != total {
-            return Err(format!("its constants have {} bytes instead of {total}", values.len()));
+            return Err(format!("the constants have {} bytes instead of {total}", values.len()));
         }
         let value = |&index: &usize| {
             let start = self.sizes[..index.min(self.sizes.len())].iter().sum::<u64>() as usize;

@@ -67,9 +67,9 @@ struct ShardEnd {
     groups: usize,
 }
 
-/// Writes one shard of a dataset. Readers return these episodes only after [`commit_shards`]. `options.mode` refers to
-/// the shard: [`WriteMode::Append`] continues a killed shard, [`WriteMode::Overwrite`] replaces the shard. The dataset
-/// may be new or contain episodes.
+/// Writes one shard of a dataset. Readers return the episodes of a shard only after [`commit_shards`]. `options.mode`
+/// refers to the shard: [`WriteMode::Append`] continues a killed shard, [`WriteMode::Overwrite`] replaces the shard.
+/// The dataset may be new or contain episodes.
 ///
 /// # Errors
 /// If the shard exists and `options.mode` forbids it, the columns differ from those of the dataset, or writing fails.

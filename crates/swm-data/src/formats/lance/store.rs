@@ -376,7 +376,7 @@ impl Store {
     }
 }
 
-/// Number of bytes that Lance reads at once from an object.
+/// Number of bytes that Lance reads with one request.
 const BLOCK: usize = 64 << 10;
 /// Maximum number of concurrent requests of Lance.
 const REQUESTS: usize = 64;

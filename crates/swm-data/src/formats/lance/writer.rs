@@ -376,7 +376,7 @@ fn append(table: &mut Table, next: &mut i64, episodes: &[EncodedEpisode]) -> Res
             }
             Err(error) => {
                 if is_full(&error) {
-                    // The manifest was not written, so nothing refers to the data file.
+                    // The manifest was not written, so no version refers to the data file.
                     table.discard(&fragment);
                 }
                 return Err(error);

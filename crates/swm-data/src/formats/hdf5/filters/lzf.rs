@@ -27,8 +27,8 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
             if length > out.len() - at {
                 return Err("LZF: the data exceeds the chunk".to_owned());
             }
-            // If there is space, copies the maximum length, because a constant length compiles to two moves instead of
-            // a call.
+            // If both buffers have space, copies the maximum length, because a constant length compiles to two moves
+            // instead of a call.
             match (from[i..].first_chunk::<MAX_LITERALS>(), out[at..].first_chunk_mut::<MAX_LITERALS>()) {
                 (Some(literals), Some(target)) => *target = *literals,
                 _ => out[at..at + length].copy_from_slice(literals),

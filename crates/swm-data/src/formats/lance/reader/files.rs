@@ -54,10 +54,10 @@ impl LanceReader {
         Ok((file, projected))
     }
 
-    /// Verifies a local file against the hash in its name, once, before anything in it is decoded. Lance does not
-    /// validate the file, so a flipped bit could cause an allocation of any size. A large file is verified only when
-    /// data other than the episode indices is read (`reads_data`), so that opening a dataset does not read large files
-    /// completely. Object stores verify their content themselves.
+    /// Verifies a local file against the hash in its name, once, before any of the file's data is decoded. Lance does
+    /// not validate the file, so a flipped bit could cause an allocation of any size. A large file is verified only
+    /// when data other than the episode indices is read (`reads_data`), so that opening a dataset does not read large
+    /// files completely. Object stores verify their content themselves.
     pub(super) fn verify(&self, file: &DataFile, reads_data: bool) -> Result<()> {
         let Some(expected) = store::hash_in_name(&file.path).filter(|_| !self.store.remote) else { return Ok(()) };
         if lock(&self.verified).contains(&file.path) {
@@ -148,6 +148,6 @@ impl LanceReader {
         };
         let reader = Arc::clone(reader);
         let read = async move { reader.read_global_buffer(index).await.map(Some) };
-        block_on(self.folder(), "reading the record of its episodes", read)
+        block_on(self.folder(), "reading the record of a data file", read)
     }
 }

@@ -358,7 +358,9 @@ fn unwritable_locations_are_explained() {
     std::fs::write(&file, "not a folder").expect("writes");
     let error = failure(&file.join("d.lance"), &schema(), WriteMode::Create);
     assert!(error.contains("Not a directory"), "{error}");
-    assert!(failure(&folder.path().join("name"), &schema(), WriteMode::Create).contains("end it in .lance"));
+    assert!(
+        failure(&folder.path().join("name"), &schema(), WriteMode::Create).contains("use a name that ends in .lance")
+    );
     // Not even root can create a folder in `/proc`.
     let error = create(Path::new("/proc/d.lance"), &schema(), options(WriteMode::Create)).err().expect("an error");
     assert!(matches!(error, Error::Io { .. }), "{error}");

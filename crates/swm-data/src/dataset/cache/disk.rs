@@ -21,7 +21,7 @@ use std::sync::atomic::{AtomicU8, Ordering};
 use swm_core::{ColumnSpec, Error, Result};
 
 /// Size of a mark in bytes.
-const MARK: usize = 8;
+const MARK_BYTES: usize = 8;
 
 /// State of a row whose mark this process has not checked.
 const UNKNOWN: u8 = 0;
@@ -61,7 +61,7 @@ impl DiskRowCache {
             Ok(file)
         };
         let row_bytes = column.row_bytes();
-        let (file, marks) = (open("rows", rows * row_bytes)?, open("marks", rows * MARK)?);
+        let (file, marks) = (open("rows", rows * row_bytes)?, open("marks", rows * MARK_BYTES)?);
         let fills = marks.try_lock().is_ok();
         let map = map(&file).map_err(|e| Error::io(&folder, "mapping the cache", e))?;
         let cache = Self {
@@ -83,15 +83,15 @@ impl DiskRowCache {
 
     /// Number of rows with a mark.
     fn marked(&self) -> std::io::Result<usize> {
-        let mut marks = vec![0; self.states.len() * MARK];
+        let mut marks = vec![0; self.states.len() * MARK_BYTES];
         self.marks.read_exact_at(&mut marks, 0)?;
-        Ok(marks.chunks_exact(MARK).filter(|mark| mark.iter().any(|&byte| byte != 0)).count())
+        Ok(marks.chunks_exact(MARK_BYTES).filter(|mark| mark.iter().any(|&byte| byte != 0)).count())
     }
 
-    fn mark(&self, row: usize) -> Option<[u8; MARK]> {
-        let mut mark = [0; MARK];
-        self.marks.read_exact_at(&mut mark, (row * MARK) as u64).ok()?;
-        (mark != [0; MARK]).then_some(mark)
+    fn mark(&self, row: usize) -> Option<[u8; MARK_BYTES]> {
+        let mut mark = [0; MARK_BYTES];
+        self.marks.read_exact_at(&mut mark, (row * MARK_BYTES) as u64).ok()?;
+        (mark != [0; MARK_BYTES]).then_some(mark)
     }
 
     fn row(&self, row: usize) -> &[u8] {
@@ -126,7 +126,7 @@ impl RowCache for DiskRowCache {
         }
         // If writing fails, for example because the disk is full, the row is not cached.
         let written = self.file.write_all_at(bytes, (row * self.row_bytes) as u64).is_ok()
-            && self.marks.write_all_at(&hash(bytes), (row * MARK) as u64).is_ok();
+            && self.marks.write_all_at(&hash(bytes), (row * MARK_BYTES) as u64).is_ok();
         if written {
             self.states[row].store(VALID, Ordering::Release);
         }
@@ -134,9 +134,9 @@ impl RowCache for DiskRowCache {
 }
 
 /// The mark of a row; never zero.
-fn hash(bytes: &[u8]) -> [u8; MARK] {
-    let mut mark = [0; MARK];
-    mark.copy_from_slice(&blake3::hash(bytes).as_bytes()[..MARK]);
+fn hash(bytes: &[u8]) -> [u8; MARK_BYTES] {
+    let mut mark = [0; MARK_BYTES];
+    mark.copy_from_slice(&blake3::hash(bytes).as_bytes()[..MARK_BYTES]);
     mark[0] |= 1;
     mark
 }

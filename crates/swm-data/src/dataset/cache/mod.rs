@@ -87,7 +87,7 @@ pub(crate) struct Budget {
 }
 
 impl Budget {
-    /// Reserves `bytes` if the budget allows, and returns whether it did.
+    /// Reserves `bytes` if enough bytes are left, and returns whether it reserved them.
     fn take(&self, bytes: usize) -> bool {
         self.left.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |left| left.checked_sub(bytes)).is_ok()
     }

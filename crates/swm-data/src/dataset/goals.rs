@@ -240,13 +240,13 @@ mod tests {
     }
 
     #[test]
-    fn geometric_goals_follow_the_discount() {
+    fn geometric_goals_have_the_expected_frequencies() {
         let discount: f64 = 0.8;
         let goals = drawn(GoalMixture::geometric(discount));
         for k in 1..=15_usize {
             let frequency = goals.iter().filter(|goal| goal.offset == 2 * k as i64).count() as f64 / 20_000.0;
             let before = discount.powi(k as i32 - 1);
-            // Goals beyond the end of the episode become its last step.
+            // Goals beyond the end of the episode become the last step of the episode.
             let expected = if k == 15 { before } else { before * (1.0 - discount) };
             assert!((frequency - expected).abs() < 5.0 * (expected / 20_000.0).sqrt(), "{k}: {frequency} {expected}");
         }

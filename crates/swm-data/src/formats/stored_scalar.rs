@@ -11,7 +11,7 @@ pub(crate) enum Class {
     Float,
 }
 
-/// A numeric type in a file.
+/// A numeric type as stored in a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct StoredScalar {
     pub class: Class,

@@ -18,7 +18,7 @@ use super::source::Source;
 use super::tree::read_u64;
 use swm_core::{ColumnSpec, DType, Error, Result};
 
-/// The undefined address.
+/// The address that stands for a missing object in HDF5.
 pub(super) const UNDEFINED: u64 = u64::MAX;
 /// The signature of HDF5 files.
 pub(super) const SIGNATURE: [u8; 8] = *b"\x89HDF\r\n\x1a\n";
@@ -57,7 +57,7 @@ mod message {
     pub const SYMBOL_TABLE: u16 = 17;
 }
 
-/// The header of a dataset.
+/// The header of an HDF5 dataset.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Table {
     pub spec: ColumnSpec,
@@ -335,7 +335,7 @@ fn filter(out: &mut Vec<u8>, id: u16, name: &[u8], flags: u16, settings: &[u32])
     out.resize(out.len().next_multiple_of(8), 0);
 }
 
-/// The message of a numeric type.
+/// The header message that declares a numeric type.
 fn datatype(dtype: DType) -> Vec<u8> {
     let integer = |signed: u8, size: u8| vec![0x10, signed << 3, 0, 0, size, 0, 0, 0, 0, 0, size * 8, 0, 0, 0, 0, 0];
     let float = |size: u8, sign: u8, [exponent, exponent_bits, fraction_bits]: [u8; 3], bias: u32| {

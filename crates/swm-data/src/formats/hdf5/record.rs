@@ -14,7 +14,7 @@ use swm_core::{Error, Manifest, Result, Schema};
 #[derive(Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 enum Line {
-    /// The columns.
+    /// The columns of the file.
     Schema(Schema),
     /// The manifest; the last line of this kind is valid.
     Manifest(Box<Manifest>),
@@ -105,12 +105,12 @@ impl RecordWriter {
         Self { count: hashes.len(), number_by_hash: hashes.into_iter().zip(0..).collect() }
     }
 
-    /// The line of the columns.
+    /// The line that stores the columns.
     pub fn schema(schema: &Schema) -> Result<Vec<u8>> {
         line(&Line::Schema(schema.clone()))
     }
 
-    /// The line of a manifest.
+    /// The line that stores a manifest.
     pub fn manifest(manifest: &Manifest) -> Result<Vec<u8>> {
         line(&Line::Manifest(Box::new(manifest.clone())))
     }

@@ -22,7 +22,7 @@ thread_local! {
 
 /// Allocates space at the end of the file.
 pub(super) struct Space {
-    /// The end of the file.
+    /// Offset of the end of the file, in bytes.
     pub end: u64,
     /// Unused part of the latest region for nodes.
     nodes: std::ops::Range<u64>,

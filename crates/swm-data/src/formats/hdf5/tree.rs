@@ -36,7 +36,7 @@ struct Node {
     /// Address of the right sibling.
     right: u64,
     entries: Vec<Entry>,
-    /// The first row after the node.
+    /// The first row after the chunks of the node.
     end: u64,
     /// Number of entries in the file; `None` if the node is not written yet.
     written: Option<usize>,

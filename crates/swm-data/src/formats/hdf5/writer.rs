@@ -64,7 +64,7 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
     Ok(Box::new(writer))
 }
 
-/// Whether a complete file exists.
+/// Whether a complete HDF5 file exists at `path`.
 fn is_complete_file(path: &Path) -> Result<bool> {
     let mut start = [0; SIGNATURE.len()];
     match File::open(path) {

@@ -95,9 +95,9 @@ pub fn create_shard(
         Logs::read(&store)?.remove_committed(&store, old);
     }
     let begun = ShardStart { columns: schema.clone(), codec: options.codec, manifest: options.manifest.clone() };
-    let log = Logs::read(&store)?;
+    let logs = Logs::read(&store)?;
     let (mut groups, mut episodes) = (0, 0);
-    if let Some(shard_log) = log.shards.get(&(shard.count, shard.index)) {
+    if let Some(shard_log) = logs.shards.get(&(shard.count, shard.index)) {
         match options.mode {
             WriteMode::Create => {
                 let problem = format!("shard {} of {} already exists", shard.index, shard.count);
@@ -161,13 +161,13 @@ struct ShardLogFiles {
 
 impl Logs {
     fn read(store: &Store) -> Result<Self> {
-        let mut log = Self::default();
+        let mut logs = Self::default();
         for file in store.list("_shards")? {
             let mut components =
                 file.location.parts().map(|component| component.as_ref().to_owned()).collect::<Vec<_>>().into_iter();
             let (Some(name), Some(folder)) = (components.next_back(), components.next_back()) else { continue };
             let Some(shard) = Shard::parse(&folder) else { continue };
-            let shard_log = log.shards.entry((shard.count, shard.index)).or_default();
+            let shard_log = logs.shards.entry((shard.count, shard.index)).or_default();
             match name.as_str() {
                 "begun.json" => shard_log.begun = Some(parse(store, &file.location)?),
                 "done.json" => shard_log.done = Some(parse(store, &file.location)?),
@@ -175,7 +175,7 @@ impl Logs {
                 _ => shard_log.groups.push(parse(store, &file.location)?),
             }
         }
-        Ok(log)
+        Ok(logs)
     }
 
     /// Removes the logs of committed shards, in case a commit was killed before it removed them. All shards are
@@ -262,8 +262,8 @@ fn parse<T: DeserializeOwned>(store: &Store, path: &object_store::path::Path) ->
 /// # Errors
 /// If a log is damaged or cannot be read.
 pub fn shard_manifests(location: &Location) -> Result<Vec<Manifest>> {
-    let log = Logs::read(&Store::new(location)?)?;
-    Ok(log.shards.into_values().filter_map(|shard_log| shard_log.begun?.manifest).collect())
+    let logs = Logs::read(&Store::new(location)?)?;
+    Ok(logs.shards.into_values().filter_map(|shard_log| shard_log.begun?.manifest).collect())
 }
 
 /// Commits the episodes of all shards as one version, in the order of the shards, after the existing episodes. Returns
@@ -274,12 +274,12 @@ pub fn shard_manifests(location: &Location) -> Result<Vec<Manifest>> {
 pub fn commit_shards(location: &Location) -> Result<usize> {
     let store = Store::new(location)?;
     for _ in 0..MAX_ATTEMPTS {
-        let log = Logs::read(&store)?;
+        let logs = Logs::read(&store)?;
         let version = store.latest()?;
-        if version.as_ref().is_some_and(|version| log.remove_committed(&store, version)) {
+        if version.as_ref().is_some_and(|version| logs.remove_committed(&store, version)) {
             return Ok(0);
         }
-        let shards = log.complete(&store)?;
+        let shards = logs.complete(&store)?;
         let Some(begun) = shards.first().and_then(|shard_log| shard_log.begun.as_ref()) else {
             return Err(damaged(&store.label, "a shard has no begun.json"));
         };
@@ -300,7 +300,7 @@ pub fn commit_shards(location: &Location) -> Result<usize> {
             None => table.overwrite_operation(fragments.clone()),
         };
         if table.commit(operation)? {
-            log.remove(&store);
+            logs.remove(&store);
             return Ok((next - first) as usize);
         }
         for indices in fragments.iter().filter_map(|fragment| fragment.files.last()) {

@@ -92,7 +92,7 @@ fn tables_in(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
     Ok(tables)
 }
 
-/// The table at a location.
+/// The location of the table: `location` itself, or the only table in that folder.
 fn table(location: &Location) -> Result<Location> {
     let Some(path) = location.path().filter(|_| !location.has_suffix("lance")) else { return Ok(location.clone()) };
     let tables = tables_in(path).map_err(|e| Error::io(path, "listing the folder", e))?;

@@ -44,7 +44,7 @@ const VIDEO: &str = "lance-video/video/";
 #[cfg(feature = "ffmpeg")]
 const SCHEMA: &str = "lance-video/schema.json";
 
-/// The table within the folder.
+/// The location of the Lance table within the dataset's folder.
 #[cfg(feature = "ffmpeg")]
 fn table(location: &Location) -> swm_core::Result<Location> {
     Ok(match location {

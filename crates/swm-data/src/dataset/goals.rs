@@ -129,7 +129,7 @@ impl GoalSpec {
         let mixture = self.mixture;
         let now = clip.start + self.anchor_row(spec);
         let end = goals.length(clip.episode) - 1;
-        // Model steps after the anchor.
+        // Number of model steps after the anchor.
         let steps = (end - now) / spec.frameskip;
         let mut rng = key.rng();
         let mut remaining = rng.random::<f64>();
@@ -141,7 +141,7 @@ impl GoalSpec {
         let (episode, row) = if chosen(mixture.random) {
             goals.row(rng.random_range(0..goals.rows as u64) as usize)
         } else if chosen(mixture.geometric) {
-            // Inverse transform sampling.
+            // Draws `k` from the geometric distribution by inverse transform sampling.
             let u = 1.0 - rng.random::<f64>();
             let k = 1.0 + (u.ln() / mixture.discount.ln()).floor();
             (clip.episode, now + k.clamp(1.0, steps as f64) as usize * spec.frameskip)
@@ -227,7 +227,7 @@ mod tests {
         }
         for (row, &count) in counts.iter().enumerate() {
             let possible = row >= 10 && row % 2 == 0;
-            // Five standard deviations of 20000 draws with probability 1/15.
+            // The tolerance is five standard deviations of the count in 20000 draws with probability 1/15.
             assert!(if possible { (count as f64 - 1333.3).abs() < 180.0 } else { count == 0 }, "{row}: {count}");
         }
         let mut rows = [0; 2];
@@ -258,7 +258,7 @@ mod tests {
     fn draws_the_default_mixture_and_different_names_independently() {
         let goals = drawn(GoalMixture::default());
         let current = goals.iter().filter(|goal| goal.offset == 0).count() as f64;
-        // A fifth of the goals, plus the random goals that hit the anchor.
+        // A fifth of the goals are the anchor, and so are some of the random goals.
         assert!((current - 20_000.0 * (0.2 + 0.3 / 43.0)).abs() < 300.0, "{current}");
         let rows_of = |name: &str| {
             let goals = Goals::new(&episodes(), &[1, 2]);

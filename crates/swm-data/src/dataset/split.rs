@@ -110,12 +110,12 @@ mod tests {
         let split = Split { validation: 0.2, test: 0.1, seed: 3 };
         let parts: Vec<Part> = (0..10_000).map(|episode| split.part(episode)).collect();
         let count = |expected| parts.iter().filter(|&&part| part == expected).count();
-        // Three standard deviations of the binomial distribution: 120 of 2000, 90 of 1000.
+        // The tolerances are three standard deviations of the binomial distribution: 120 of 2000, 90 of 1000.
         assert!(count(Part::Validation).abs_diff(2000) < 120 && count(Part::Test).abs_diff(1000) < 90);
         let other = Split { seed: 4, ..split };
         let changed = (0..10_000).filter(|&episode| other.part(episode) != split.part(episode)).count();
         assert!(changed > 3000, "{changed}");
-        // Fixed indices, because published results depend on the default split.
+        // The default split must never change, because published results depend on it.
         let episodes_of =
             |part| (0..40).filter(|&episode| Split::default().part(episode) == part).collect::<Vec<i64>>();
         assert_eq!((episodes_of(Part::Test), episodes_of(Part::Validation)), (vec![14], vec![4, 6, 16, 23, 24, 32]));

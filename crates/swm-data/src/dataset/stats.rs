@@ -153,7 +153,7 @@ mod tests {
         let schema = Schema::new([ColumnSpec::new("state", DType::Float32, [2])]).expect("schema");
         let buffer = ReplayBuffer::new(&schema, 1000).expect("a buffer");
         let mut episode = Batch::zeros(&schema, 6);
-        // Unsorted values, one of them missing.
+        // The values are unsorted, and one value is missing (NaN).
         let values = [[4.0, 0.5], [1.0, f32::NAN], [3.0, 0.1], [0.0, 0.4], [2.0, 0.2], [5.0, 0.3]];
         episode.get_mut::<f32>("state").expect("states").copy_from_slice(values.as_flattened());
         buffer.add(&episode, &Constants::new()).expect("adding an episode");

@@ -167,7 +167,7 @@ impl Layout {
 
         let mut out = superblock(leaf_k as u16, at, tree, heap_at);
         out.extend(header(&root_messages(tree, heap_at, headers[0].0)));
-        // The group's B-tree has one child.
+        // The B-tree of the root group has one child.
         out.extend(b"TREE\0\0");
         out.extend(1_u16.to_le_bytes());
         for value in [UNDEFINED, UNDEFINED, 0, symbols, last] {
@@ -248,7 +248,7 @@ fn superblock(leaf_k: u16, end: u64, tree: u64, heap: u64) -> Vec<u8> {
     out.extend(leaf_k.to_le_bytes());
     out.extend(GROUP_K.to_le_bytes());
     out.extend(0_u32.to_le_bytes());
-    // Base address, free space, end of file, drivers; then the root group: its name and header.
+    // Addresses of base, free space, end of file and drivers; then name and header of the root group.
     for value in [0, UNDEFINED, end, UNDEFINED, 0, ROOT, 1, tree, heap] {
         out.extend(value.to_le_bytes());
     }
@@ -280,7 +280,7 @@ fn header(messages: &[Message]) -> Vec<u8> {
 
 fn root_messages(tree: u64, heap: u64, record: u64) -> Vec<Message> {
     let group = [tree, heap].iter().flat_map(|value| value.to_le_bytes()).collect();
-    // The type of the attribute: an object reference.
+    // The attribute is an object reference.
     let reference = [0x17, 0, 0, 0, 8, 0, 0, 0];
     let mut attribute = vec![1, 0];
     for size in [ATTRIBUTE.len() + 1, reference.len(), 8] {

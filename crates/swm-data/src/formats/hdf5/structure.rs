@@ -25,7 +25,7 @@ pub(super) fn scalar_type(datatype: &Datatype) -> Option<StoredScalar> {
             (if layout.signed { Class::Signed } else { Class::Unsigned }, *size, *byte_order)
         }
         Datatype::FloatingPoint { size, byte_order, layout } => {
-            // IEEE 754 with 16, 32 or 64 bits.
+            // Accepts IEEE 754 types with 16, 32 or 64 bits.
             let half = FloatingPointLayout {
                 bit_precision: 16,
                 exponent_location: 10,
@@ -41,7 +41,7 @@ pub(super) fn scalar_type(datatype: &Datatype) -> Option<StoredScalar> {
             }
             (Class::Float, *size, *byte_order)
         }
-        // The type of booleans in files of h5py.
+        // h5py stores booleans as an enumeration with two members.
         Datatype::Enumeration { size: 1, members, .. } if members.len() == 2 => {
             (Class::Bool, 1, DatatypeByteOrder::LittleEndian)
         }

@@ -128,7 +128,7 @@ fn copy_to_this_layout(path: &Path, reader: &Hdf5Reader) -> Result<Hdf5Writer> {
         replace_file(writer, &temporary, path)
     };
     copy().inspect_err(|_| {
-        // The copy is incomplete, so the temporary file is useless.
+        // Returns the error of the copy, even if the temporary file cannot be removed.
         let _ = std::fs::remove_file(&temporary);
     })
 }

@@ -252,7 +252,7 @@ impl Store {
             };
             let transaction = Transaction::new(manifest.map_or(0, |m| m.version), operation, None);
             let indices = current.as_ref().map(|version| version.indices.clone()).unwrap_or_default();
-            // The manifest contains the transaction, so it needs no separate file.
+            // The manifest contains the transaction, so no separate transaction file is needed.
             let (mut next, indices) = transaction.build_manifest(manifest, indices, "", &config)?;
             let result = ConditionalPutCommitHandler
                 .commit(

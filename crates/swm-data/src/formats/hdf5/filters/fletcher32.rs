@@ -13,8 +13,8 @@ pub fn sum(bytes: &[u8]) -> u32 {
     let (mut plain, mut weighted) = (0_u64, 0_u64);
     let (words, odd) = bytes.as_chunks::<2>();
     for block in words.chunks(BLOCK) {
-        // A block of n words adds the previous plain sum n times to the weighted sum, and word i of the block (from 0)
-        // n - i times.
+        // Over a block of n words, the weighted sum grows by n times the previous plain sum, and by n - i times word i
+        // of the block, counted from 0.
         let n = block.len() as u32;
         let (mut sum, mut sums) = (0_u32, 0_u32);
         for (&word, weight) in block.iter().zip((1..=n).rev()) {

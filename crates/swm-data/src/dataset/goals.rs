@@ -34,14 +34,14 @@ pub struct GoalMixture {
 
 impl GoalMixture {
     const ZERO: Self = Self { last: 0.0, future: 0.0, geometric: 0.0, random: 0.0, current: 0.0, discount: 0.99 };
-    /// Always the last row of the episode.
+    /// The goal is always the last row of the episode.
     pub const LAST: Self = Self { last: 1.0, ..Self::ZERO };
-    /// Always a later step of the episode, uniformly distributed.
+    /// The goal is always a later step of the episode, uniformly distributed.
     pub const FUTURE: Self = Self { future: 1.0, ..Self::ZERO };
-    /// Always a row of the whole dataset, uniformly distributed.
+    /// The goal is always a row of the whole dataset, uniformly distributed.
     pub const RANDOM: Self = Self { random: 1.0, ..Self::ZERO };
 
-    /// Always a later step of the episode, geometrically distributed.
+    /// The goal is always a later step of the episode, geometrically distributed.
     pub const fn geometric(discount: f64) -> Self {
         Self { geometric: 1.0, discount, ..Self::ZERO }
     }

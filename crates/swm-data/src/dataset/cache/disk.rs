@@ -74,7 +74,7 @@ impl DiskRowCache {
             budget,
         };
         // Rows that are already cached count towards the budget.
-        let count = cache.marked().map_err(|e| Error::io(&folder, "reading the cache's marks", e))?;
+        let count = cache.count_marks().map_err(|e| Error::io(&folder, "reading the cache's marks", e))?;
         for _ in 0..count {
             cache.budget.take(row_bytes);
         }
@@ -82,7 +82,7 @@ impl DiskRowCache {
     }
 
     /// Number of rows with a mark.
-    fn marked(&self) -> std::io::Result<usize> {
+    fn count_marks(&self) -> std::io::Result<usize> {
         let mut marks = vec![0; self.states.len() * MARK_BYTES];
         self.marks.read_exact_at(&mut marks, 0)?;
         Ok(marks.chunks_exact(MARK_BYTES).filter(|mark| mark.iter().any(|&byte| byte != 0)).count())

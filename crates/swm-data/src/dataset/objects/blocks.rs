@@ -52,10 +52,10 @@ struct Cached {
 impl BlockCache {
     /// Creates a cache for objects that have `total` bytes together.
     pub(crate) fn new(total: u64) -> Self {
-        Self::with(if total <= CAPACITY { LARGE } else { SMALL }, CAPACITY)
+        Self::with_block_size(if total <= CAPACITY { LARGE } else { SMALL }, CAPACITY)
     }
 
-    fn with(block: u64, capacity: u64) -> Self {
+    fn with_block_size(block: u64, capacity: u64) -> Self {
         Self { block, capacity, cached: Mutex::default(), fetching: tokio::sync::Mutex::default() }
     }
 
@@ -70,10 +70,10 @@ impl BlockCache {
         objects: &[ObjectRanges],
     ) -> object_store::Result<Vec<Vec<Bytes>>> {
         let mut held = HashMap::new();
-        if !self.hold(objects, &mut held) {
+        if !self.hold_cached(objects, &mut held) {
             let _guard = self.fetching.lock().await;
             // Another reader may have fetched these blocks in the meantime.
-            self.hold(objects, &mut held);
+            self.hold_cached(objects, &mut held);
             self.fetch(store, objects, &mut held).await?;
         }
         objects
@@ -83,17 +83,17 @@ impl BlockCache {
     }
 
     /// The indices of the blocks that overlap a range.
-    fn touched(&self, range: &Range<u64>) -> Range<u64> {
+    fn block_indices(&self, range: &Range<u64>) -> Range<u64> {
         if range.is_empty() { 0..0 } else { range.start / self.block..range.end.div_ceil(self.block) }
     }
 
     /// Copies references to the requested cached blocks into `held`, so that they outlive eviction. Returns whether all
     /// requested blocks are cached.
-    fn hold(&self, objects: &[ObjectRanges], held: &mut HashMap<(StorePath, u64), Bytes>) -> bool {
+    fn hold_cached(&self, objects: &[ObjectRanges], held: &mut HashMap<(StorePath, u64), Bytes>) -> bool {
         let cached = self.cached();
         let mut complete = true;
         for object in objects {
-            for block in object.ranges.iter().flat_map(|range| self.touched(range)) {
+            for block in object.ranges.iter().flat_map(|range| self.block_indices(range)) {
                 let key = (object.path.clone(), block);
                 match cached.blocks.get(&key) {
                     Some(bytes) => drop(held.insert(key, bytes.clone())),
@@ -113,7 +113,7 @@ impl BlockCache {
     ) -> object_store::Result<()> {
         let mut requests: Vec<(&ObjectRanges, Range<u64>)> = vec![];
         for object in objects {
-            let mut missing: Vec<u64> = object.ranges.iter().flat_map(|range| self.touched(range)).collect();
+            let mut missing: Vec<u64> = object.ranges.iter().flat_map(|range| self.block_indices(range)).collect();
             missing.sort_unstable();
             missing.dedup();
             missing.retain(|&block| !held.contains_key(&(object.path.clone(), block)));
@@ -159,7 +159,7 @@ impl BlockCache {
         held: &HashMap<(StorePath, u64), Bytes>,
     ) -> object_store::Result<Bytes> {
         let mut parts = vec![];
-        for block in self.touched(range) {
+        for block in self.block_indices(range) {
             let start = block * self.block;
             let (from, to) = (range.start.max(start) - start, range.end.min(start + self.block) - start);
             let bytes = held.get(&(object.path.clone(), block)).filter(|bytes| to <= bytes.len() as u64);
@@ -216,7 +216,7 @@ mod tests {
             for (path, content) in paths.iter().zip(&contents) {
                 store.put(path, content.clone().into()).await.expect("storing an object");
             }
-            let blocks = BlockCache::with(16, 200);
+            let blocks = BlockCache::with_block_size(16, 200);
             let mut rng = Key::new(3).rng();
             for _ in 0..50 {
                 let objects: Vec<ObjectRanges> = (0..3)

@@ -1,6 +1,6 @@
 //! Reads the images of a batch from their locations and decodes them in parallel.
 
-use super::lance_reader::{FileImages, LanceReader, RowSlot, lock, merged, open_at_once};
+use super::lance_reader::{FileImages, LanceReader, RowSlot, lock, max_open_files, merged};
 use crate::dataset::objects::{self, ObjectRanges};
 use crate::formats::lance::convert::image_bytes;
 use crate::formats::lance::image_locations::{ImageLocation, ImageLocations};
@@ -59,7 +59,7 @@ impl LanceReader {
                 None => unlocated.extend(rows),
             }
         }
-        for fragments in located.chunks_mut(open_at_once(&self.store)) {
+        for fragments in located.chunks_mut(max_open_files(&self.store)) {
             self.read_located_images(column, fragments)?;
         }
         let stored = self.stored_rows(&column.name, &merged(&unlocated))?;

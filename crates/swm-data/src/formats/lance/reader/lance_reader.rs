@@ -71,7 +71,7 @@ pub(super) struct RecentFiles<T> {
 
 impl<T> RecentFiles<T> {
     pub(super) fn new(store: &Store) -> Self {
-        Self { by_path: HashMap::new(), order: VecDeque::new(), limit: open_at_once(store) }
+        Self { by_path: HashMap::new(), order: VecDeque::new(), limit: max_open_files(store) }
     }
 
     pub(super) fn get(&self, path: &str) -> Option<Arc<T>> {
@@ -92,7 +92,7 @@ impl<T> RecentFiles<T> {
 }
 
 /// Maximum number of data files open at a time.
-pub(super) fn open_at_once(store: &Store) -> usize {
+pub(super) fn max_open_files(store: &Store) -> usize {
     if store.remote { OPEN_OBJECTS } else { OPEN_FILES }
 }
 

@@ -1,6 +1,6 @@
 //! Reads any rows of a column with Lance's decoder.
 
-use super::lance_reader::{LanceReader, open_at_once};
+use super::lance_reader::{LanceReader, max_open_files};
 use crate::formats::lance::store::block_on;
 use arrow_array::ArrayRef;
 use futures::{StreamExt as _, TryStreamExt as _};
@@ -41,7 +41,7 @@ impl LanceReader {
             }
         }
         let mut chunks = vec![];
-        for jobs in jobs.chunks(open_at_once(&self.store)) {
+        for jobs in jobs.chunks(max_open_files(&self.store)) {
             chunks.extend(self.read_stored_rows(stored_name, jobs)?);
         }
         Ok(chunks)

@@ -1,8 +1,8 @@
 //! Clips: short windows of episodes, the samples that world models train on.
 //!
 //! A clip with `num_steps` steps and frameskip `f` that starts at row `s` covers `num_steps * f` rows of one episode.
-//! Step `k` holds the observation of row `s + k * f` and the concatenated actions of rows `s + k * f .. s + (k + 1) *
-//! f`. The last row of an episode has no action (NaN or -1), so only the very last action of a clip can be missing;
+//! Step `k` holds the observation of row `s + k * f` and the concatenated actions of the `f` rows from row `s + k * f`
+//! on. The last row of an episode has no action (NaN or -1), so only the very last action of a clip can be missing;
 //! models must ignore or replace it. The reference implementation's `Dataset` defines clips in the same way.
 
 use crate::dataset::reader::{Episode, StepRange};

@@ -54,8 +54,8 @@ struct StoredEpisode {
 }
 
 impl ReplayBuffer {
-    /// A buffer of at most `capacity` rows for episodes with the columns of `schema`. An episode of `n` steps has `n +
-    /// 1` rows.
+    /// A buffer of at most `capacity` rows for episodes with the columns of `schema`.
+    /// An episode of `n` steps has `n + 1` rows.
     ///
     /// # Errors
     /// If the capacity is 0.

@@ -137,8 +137,8 @@ impl Reader for Concat {
         Ok(found)
     }
 
-    /// The manifest of the parts, if all parts have the same manifest. Otherwise a new manifest that contains the
-    /// manifests of the parts, and the config entries that all these manifests share.
+    /// Returns the manifest of the first part if all parts have the same manifest. Otherwise, returns a new manifest
+    /// that contains the manifests of the parts, and the config entries that all these manifests share.
     fn manifest(&self) -> Option<Manifest> {
         let manifests: Vec<Manifest> = self.parts.iter().filter_map(|part| part.manifest()).collect();
         let first = manifests.first()?;

@@ -1,8 +1,8 @@
 //! Datasets of episodes: writing them during collection, and reading clips of them for training.
 //!
-//! - [`dataset`]: the contracts [`Reader`] and [`Writer`], and their users: clips, goals, [`Loader`], cache,
-//!   [`ReplayBuffer`], [`Split`], statistics, views, [`Location`]. This module does not depend on any format.
-//! - [`formats`]: a folder for each format on disk, and their registry [`FORMATS`]. [`lance`] is the default.
+//! - [`dataset`]: the contracts [`Reader`] and [`Writer`], and the code that uses them: clips, goals, [`Loader`],
+//!   cache, [`ReplayBuffer`], [`Split`], statistics, views, [`Location`]. This module does not depend on any format.
+//! - [`formats`]: a module for each format on disk, and the registry [`FORMATS`]. [`lance`] is the default.
 //! - [`tools`]: [`convert`](mod@convert) between formats, [`doctor`], [`preview`](mod@preview).
 
 pub mod dataset;

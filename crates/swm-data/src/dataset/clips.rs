@@ -1,9 +1,9 @@
 //! Clips: short windows of episodes, the samples that world models train on.
 //!
 //! A clip with `num_steps` steps and frameskip `f` that starts at row `s` covers `num_steps * f` rows of one episode.
-//! Step `k` holds the observation of row `s + k * f` and the concatenated actions of rows `s + k * f .. s + (k + 1) *
-//! f`. The last row of an episode has no action (NaN or -1), so only the very last action of a clip can be missing;
-//! models must ignore or replace it. The reference's `Dataset` defines clips in the same way.
+//! Step `k` holds the observation of row `s + k * f` and the concatenated actions of the `f` rows from row `s + k * f`
+//! on. The last row of an episode has no action (NaN or -1), so only the very last action of a clip can be missing;
+//! models must ignore or replace it. The reference implementation's `Dataset` defines clips in the same way.
 
 use crate::dataset::reader::{Episode, StepRange};
 use swm_core::columns::ACTION;
@@ -36,7 +36,7 @@ impl ClipSpec {
     pub fn schema(&self, dataset: &Schema) -> Result<Schema> {
         for (name, value) in [("num_steps", self.num_steps), ("frameskip", self.frameskip)] {
             if value == 0 {
-                return Err(Error::config(name, "it is 0", "clips need at least one"));
+                return Err(Error::config(name, "it is 0", "use a value of at least 1"));
             }
         }
         let columns: Result<Vec<ColumnSpec>> = self
@@ -56,17 +56,18 @@ impl ClipSpec {
     }
 }
 
-/// All clips of some episodes, in order. Memory is proportional to the number of episodes, not of clips.
+/// All clips of some episodes, in order. Memory use is proportional to the number of episodes, not to the number of
+/// clips.
 #[derive(Clone, Debug)]
 pub struct Clips {
     span: usize,
-    /// `(position of the episode, preceding clips)` of the episodes that are long enough.
+    /// `(position of the episode, number of preceding clips)` of each episode that is long enough.
     episodes: Vec<(usize, usize)>,
     total: usize,
 }
 
 impl Clips {
-    /// The clips of the episodes at these positions.
+    /// Lists the clips of the episodes at `positions`.
     ///
     /// # Errors
     /// If a position does not exist, or no episode is long enough.
@@ -74,8 +75,8 @@ impl Clips {
         Self::reaching(spec, spec.span(), episodes, positions)
     }
 
-    /// The clips whose episode continues for at least `reach` rows from the clip's first row, so that a goal after the
-    /// clip exists.
+    /// Lists the clips whose episode continues for at least `reach` rows from the clip's first row, so that a goal
+    /// after the clip exists.
     ///
     /// # Errors
     /// As [`Clips::new`].

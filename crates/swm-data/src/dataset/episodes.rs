@@ -1,11 +1,11 @@
-//! Positions of episodes in a table of rows, index columns, and the time convention that writers check.
+//! Positions of episodes in a table of rows, index columns, and the checks of new episodes that all writers share.
 
 use crate::dataset::reader::{Episode, StepRange};
 use std::ops::Range;
 use swm_core::columns::{ACTION, EPISODE_IDX, STEP_IDX};
 use swm_core::{Batch, ColumnSpec, DType, Error, Result, Schema};
 
-/// A row to read, as `(position of its episode, step)`, and the part of the output that receives it.
+/// A row to read, as `(position of its episode, step)`, and the bytes of the output that receive the row.
 pub(crate) type RowSlot<'a> = ((usize, usize), &'a mut [u8]);
 
 /// Lengths and first rows of the episodes of a dataset whose rows form one table.
@@ -18,7 +18,7 @@ pub(crate) struct EpisodeRows {
 }
 
 impl EpisodeRows {
-    /// Episodes with these lengths that start at these rows.
+    /// Creates episodes with `lengths` that start at the rows `first`.
     ///
     /// # Errors
     /// If there are fewer first rows than lengths, or a value is negative or too large.
@@ -114,7 +114,7 @@ impl EpisodeRows {
         ))
     }
 
-    /// Pairs every requested row with its part of `out`. Sorted in stored order.
+    /// Pairs every requested row with its bytes in `out`; the pairs are sorted in stored order.
     ///
     /// # Errors
     /// If a row does not exist, or `out` has the wrong length.
@@ -136,7 +136,7 @@ impl EpisodeRows {
         Ok(requested)
     }
 
-    /// Computes an index column ([`index_columns`]) for these ranges.
+    /// Computes an index column (see [`index_columns`]) for `ranges`.
     ///
     /// # Errors
     /// If a row does not exist, or `out` has the wrong length.
@@ -161,8 +161,8 @@ impl EpisodeRows {
     }
 }
 
-/// Specs of the index columns [`EPISODE_IDX`] and [`STEP_IDX`]: as declared in `columns` if they are scalars there,
-/// otherwise `int32`.
+/// Specs of the index columns [`EPISODE_IDX`] and [`STEP_IDX`]. Each is taken from `columns` if `columns` contains it
+/// as a scalar; otherwise it is an `int32` scalar.
 pub(crate) fn index_columns(columns: &[ColumnSpec]) -> [ColumnSpec; 2] {
     [EPISODE_IDX, STEP_IDX].map(|name| {
         let declared = columns.iter().find(|column| column.name == name && column.len() == 1);
@@ -170,7 +170,7 @@ pub(crate) fn index_columns(columns: &[ColumnSpec]) -> [ColumnSpec; 2] {
     })
 }
 
-/// Names, types and shapes of columns, for messages.
+/// Names, types and shapes of columns, for error messages.
 pub(crate) fn describe_columns(columns: &[ColumnSpec]) -> String {
     let columns: Vec<String> = columns.iter().map(|c| format!("{} {}{:?}", c.name, c.dtype.name(), c.shape)).collect();
     columns.join(", ")
@@ -248,7 +248,7 @@ pub(crate) fn check_episode(episode: &Batch, schema: &Schema) -> Result<()> {
 /// `each_row` must call the function it receives with the stored bytes of every row of a column, in order.
 ///
 /// # Errors
-/// Those of `each_row`.
+/// If `each_row` fails.
 pub(crate) fn content_hash(
     rows: &EpisodeRows,
     columns: &[ColumnSpec],

@@ -1,12 +1,12 @@
 //! Goal sampling for goal-conditioned learning: every clip gets a row of the dataset as its goal.
 //!
 //! Goals are drawn from a mixture of distributions relative to the *anchor*, the step of the clip that counts as the
-//! current one. Goals in the future are a whole number of model steps (frameskips) after the anchor.
+//! current step. Goals in the future are a whole number of model steps (frameskips) after the anchor.
 //!
-//! [`GoalMixture::default`], and the rule that clips without a future step are excluded, are those of the reference's
-//! `GoalDataset`. The geometric distribution with discount γ is that of hindsight relabelling in GCRL (Eysenbach et al.
-//! 2022, OGBench): the goal is `k` model steps ahead with probability `(1 - γ) γ^(k - 1)`. A goal beyond the end of the
-//! episode becomes the last model step of the episode.
+//! [`GoalMixture::default`] and the exclusion of clips without a future step are the same as in the reference
+//! implementation's `GoalDataset`. The geometric distribution with discount γ is the one used for hindsight relabelling
+//! in goal-conditioned reinforcement learning (Eysenbach et al. 2022, OGBench): the goal is `k` model steps ahead with
+//! probability `(1 - γ) γ^(k - 1)`. A goal beyond the end of the episode becomes the last model step of the episode.
 
 use crate::dataset::clips::ClipSpec;
 use crate::dataset::reader::{Episode, StepRange};
@@ -34,14 +34,14 @@ pub struct GoalMixture {
 
 impl GoalMixture {
     const ZERO: Self = Self { last: 0.0, future: 0.0, geometric: 0.0, random: 0.0, current: 0.0, discount: 0.99 };
-    /// Always the last row of the episode.
+    /// The goal is always the last row of the episode.
     pub const LAST: Self = Self { last: 1.0, ..Self::ZERO };
-    /// Always a later step of the episode, uniformly distributed.
+    /// The goal is always a later step of the episode, uniformly distributed.
     pub const FUTURE: Self = Self { future: 1.0, ..Self::ZERO };
-    /// Always a row of the whole dataset, uniformly distributed.
+    /// The goal is always a row of the whole dataset, uniformly distributed.
     pub const RANDOM: Self = Self { random: 1.0, ..Self::ZERO };
 
-    /// Always a later step of the episode, geometrically distributed.
+    /// The goal is always a later step of the episode, geometrically distributed.
     pub const fn geometric(discount: f64) -> Self {
         Self { geometric: 1.0, discount, ..Self::ZERO }
     }
@@ -60,9 +60,9 @@ impl Default for GoalMixture {
 pub struct GoalSpec {
     /// Prefix of the goal's columns. Goals with different names are drawn independently.
     pub name: String,
-    /// The columns of the goal to load.
+    /// Columns of the goal's row to load.
     pub columns: Vec<String>,
-    /// The step of the clip that counts as the current one; the last step for `None`.
+    /// The step of the clip that counts as the current step; the last step for `None`.
     pub anchor: Option<usize>,
     /// The distribution of goals.
     pub mixture: GoalMixture,
@@ -120,8 +120,8 @@ impl GoalSpec {
 
     /// Number of rows, counted from the clip's first row, that an episode must have for a goal to exist.
     pub(crate) fn reach(&self, clip: &ClipSpec) -> usize {
-        let later = self.mixture.future > 0.0 || self.mixture.geometric > 0.0;
-        self.anchor_row(clip) + 1 + if later { clip.frameskip } else { 0 }
+        let needs_future_step = self.mixture.future > 0.0 || self.mixture.geometric > 0.0;
+        self.anchor_row(clip) + 1 + if needs_future_step { clip.frameskip } else { 0 }
     }
 
     /// Draws the goal of a clip.
@@ -129,7 +129,7 @@ impl GoalSpec {
         let mixture = self.mixture;
         let now = clip.start + self.anchor_row(spec);
         let end = goals.length(clip.episode) - 1;
-        // Model steps after the anchor.
+        // Number of model steps after the anchor.
         let steps = (end - now) / spec.frameskip;
         let mut rng = key.rng();
         let mut remaining = rng.random::<f64>();
@@ -141,7 +141,7 @@ impl GoalSpec {
         let (episode, row) = if chosen(mixture.random) {
             goals.row(rng.random_range(0..goals.rows as u64) as usize)
         } else if chosen(mixture.geometric) {
-            // Inverse transform sampling.
+            // Draws `k` from the geometric distribution by inverse transform sampling.
             let u = 1.0 - rng.random::<f64>();
             let k = 1.0 + (u.ln() / mixture.discount.ln()).floor();
             (clip.episode, now + k.clamp(1.0, steps as f64) as usize * spec.frameskip)
@@ -162,13 +162,13 @@ impl GoalSpec {
 pub(crate) struct Goals {
     /// Length of every episode of the dataset, in rows.
     lengths: Vec<usize>,
-    /// `(position, preceding rows)` of the episodes that random goals come from.
+    /// `(position, number of rows in the preceding used episodes)` of each episode that random goals are drawn from.
     used: Vec<(usize, usize)>,
     rows: usize,
 }
 
 impl Goals {
-    /// The rows of the episodes at these positions.
+    /// The rows of the episodes at `positions`.
     pub fn new(episodes: &[Episode], positions: &[usize]) -> Self {
         let mut goals = Self { lengths: episodes.iter().map(|episode| episode.length).collect(), ..Self::default() };
         for &position in positions {
@@ -227,7 +227,7 @@ mod tests {
         }
         for (row, &count) in counts.iter().enumerate() {
             let possible = row >= 10 && row % 2 == 0;
-            // Five standard deviations of 20000 draws with probability 1/15.
+            // The tolerance is five standard deviations of the count in 20000 draws with probability 1/15.
             assert!(if possible { (count as f64 - 1333.3).abs() < 180.0 } else { count == 0 }, "{row}: {count}");
         }
         let mut rows = [0; 2];
@@ -240,13 +240,13 @@ mod tests {
     }
 
     #[test]
-    fn geometric_goals_follow_the_discount() {
+    fn geometric_goals_have_the_expected_frequencies() {
         let discount: f64 = 0.8;
         let goals = drawn(GoalMixture::geometric(discount));
         for k in 1..=15_usize {
             let frequency = goals.iter().filter(|goal| goal.offset == 2 * k as i64).count() as f64 / 20_000.0;
             let before = discount.powi(k as i32 - 1);
-            // Goals beyond the end of the episode become its last step.
+            // Goals beyond the end of the episode become the last step of the episode.
             let expected = if k == 15 { before } else { before * (1.0 - discount) };
             assert!((frequency - expected).abs() < 5.0 * (expected / 20_000.0).sqrt(), "{k}: {frequency} {expected}");
         }
@@ -255,10 +255,10 @@ mod tests {
     }
 
     #[test]
-    fn draws_mixtures_and_different_names_independently() {
+    fn draws_the_default_mixture_and_different_names_independently() {
         let goals = drawn(GoalMixture::default());
         let current = goals.iter().filter(|goal| goal.offset == 0).count() as f64;
-        // A fifth of the goals, plus the random goals that hit the anchor.
+        // A fifth of the goals are the anchor, and so are some of the random goals.
         assert!((current - 20_000.0 * (0.2 + 0.3 / 43.0)).abs() < 300.0, "{current}");
         let rows_of = |name: &str| {
             let goals = Goals::new(&episodes(), &[1, 2]);

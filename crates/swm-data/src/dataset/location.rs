@@ -45,13 +45,13 @@ impl Location {
         }
     }
 
-    /// The path; an error for URIs.
+    /// The path, or an error for a URI.
     ///
     /// # Errors
     /// If the location is a URI, which `format` cannot read or write.
     pub fn local(&self, format: &str) -> Result<&Path> {
         self.path().ok_or_else(|| {
-            let fix = "copy it to this machine, or use the format lance or hdf5, which are read from object stores";
+            let fix = "copy the dataset to this machine, or use the format lance or hdf5, which support object stores";
             Error::config("dataset", format!("the format {format} does not support object stores: {self}"), fix)
         })
     }
@@ -64,7 +64,7 @@ impl Location {
         }
     }
 
-    /// The last component: the name of a file or folder.
+    /// The last component of the path or URI: the name of a file or folder.
     pub fn name(&self) -> &str {
         match self {
             Self::Path(path) => path.file_name().and_then(|name| name.to_str()).unwrap_or_default(),
@@ -123,7 +123,7 @@ mod tests {
         let uri = Location::parse("s3://bucket/runs/pusht.LANCE/")?;
         assert!(uri.path().is_none() && uri.has_suffix("lance") && uri.name() == "pusht.LANCE");
         assert_eq!(uri.to_string(), "s3://bucket/runs/pusht.LANCE/");
-        assert!(!Location::parse("runs/.lance")?.has_suffix("lance"), "a hidden file without a name");
+        assert!(!Location::parse("runs/.lance")?.has_suffix("lance"), "`.lance` is a hidden file, not a suffix");
         Ok(())
     }
 

@@ -1,6 +1,6 @@
 //! Datasets of episodes, independent of their format on disk.
 //!
-//! The contracts are [`Reader`] and [`Writer`]. Everything else builds on them: clips and goals, the loader and its
+//! The contracts are [`Reader`] and [`Writer`]. All other modules use these contracts: clips, goals, the loader, the
 //! cache, the replay buffer, splits, statistics and views. No file in this folder depends on a format.
 
 pub mod cache;

@@ -3,7 +3,7 @@
 //! Credentials and endpoints come from the environment variables of each provider's own tools: `AWS_ACCESS_KEY_ID`,
 //! `AWS_SECRET_ACCESS_KEY`, `AWS_SESSION_TOKEN`, `AWS_REGION`, `AWS_ENDPOINT_URL`, `AWS_SKIP_SIGNATURE=true` for public
 //! buckets; `GOOGLE_APPLICATION_CREDENTIALS`; `AZURE_STORAGE_ACCOUNT_NAME`, `AZURE_STORAGE_ACCOUNT_KEY`. Each kind of
-//! store is a Cargo feature.
+//! store has its own Cargo feature.
 
 mod blocks;
 
@@ -27,7 +27,7 @@ use url::Url;
 pub use bytes::Bytes;
 
 /// Ranges with a smaller gap than this, in bytes, are fetched in one request. At 100 MB/s, transferring such a gap
-/// takes one millisecond, while another request takes several.
+/// takes one millisecond, while another request takes several milliseconds.
 const GAP: u64 = 128 << 10;
 
 /// Maximum number of concurrent requests per read.
@@ -75,7 +75,7 @@ pub(crate) fn block_on<T: Send + 'static>(future: impl Future<Output = T> + Send
     Ok(receiver.recv().ok().and_then(std::result::Result::ok))
 }
 
-/// The object store of a location, and the path within it.
+/// The object store of a location, and the path within that store.
 ///
 /// # Errors
 /// If the location names no bucket, this build lacks the feature for the store, or the store's environment variables
@@ -147,7 +147,7 @@ fn provide_tls() {
     let _ = rustls::crypto::ring::default_provider().install_default();
 }
 
-/// Converts an error of a store.
+/// Converts an error of an object store to an [`Error`].
 pub(crate) fn store_error(label: &Path, action: &str, error: &object_store::Error) -> Error {
     match error {
         object_store::Error::NotFound { .. } => Error::corrupt(
@@ -171,7 +171,7 @@ impl ObjectFile {
     /// Opens a file.
     ///
     /// # Errors
-    /// If it does not exist, or a request to the store fails.
+    /// If the file does not exist, or a request to the store fails.
     pub fn open(location: &Location) -> Result<Self> {
         let (store, path) = store(location)?;
         let label = location.label();
@@ -273,7 +273,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("file");
         let content: Vec<u8> = (0..3_000_000_u32).map(|i| ((i * i) >> 7) as u8).collect();
-        std::fs::write(&path, &content).expect("writes");
+        std::fs::write(&path, &content).expect("writing the file");
         let file = ObjectFile::open(&Location::from(&path))?;
         assert_eq!(file.len(), 3_000_000);
         let ranges = [2_000_000..2_000_100, 5..10, 7..7, 8..300, 2_050_000..3_000_000, 0..0, 500_000..500_001];
@@ -287,8 +287,8 @@ mod tests {
 
     #[test]
     fn block_on_works_inside_another_runtime_and_reports_panics() -> Result<()> {
-        let other = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
-        assert_eq!(other.block_on(async { block_on(async { 7 }) })?, Some(7));
+        let outer = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
+        assert_eq!(outer.block_on(async { block_on(async { 7 }) })?, Some(7));
         let panics = block_on::<()>(async { std::panic::resume_unwind(Box::new("damaged")) })?;
         assert_eq!(panics, None);
         Ok(())

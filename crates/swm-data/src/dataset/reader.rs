@@ -1,8 +1,8 @@
 //! The contract for reading episodes: [`Reader`] and the types it uses.
 //!
 //! A dataset is a sequence of episodes; an episode is a sequence of rows. Row `t` holds the observation at step `t` and
-//! the action taken *from* it. The last row of an episode is its final observation; its action is NaN (float) or -1
-//! (integer).
+//! the action that follows this observation. The last row of an episode is its final observation; its action is NaN
+//! (float) or -1 (integer).
 
 use std::collections::BTreeMap;
 use swm_core::{Batch, ColumnSpec, Manifest, Result, Schema};
@@ -65,7 +65,7 @@ pub trait Reader: Send + Sync {
     /// If the column or a row does not exist, `out` has another length, or the stored data is damaged.
     fn read_column(&self, column: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()>;
 
-    /// Reads the rows of all `ranges` of several columns, as [`Reader::read_column`] does for one.
+    /// Reads the rows of all `ranges` of several columns, as [`Reader::read_column`] does for one column.
     ///
     /// # Errors
     /// As [`Reader::read_column`].
@@ -78,7 +78,8 @@ pub trait Reader: Send + Sync {
         Ok(batch)
     }
 
-    /// The constants of the episode at this position of [`Reader::episodes`]. Empty if the format does not store any.
+    /// The constants of the episode at this position of [`Reader::episodes`]. Empty if the format does not store
+    /// constants.
     ///
     /// # Errors
     /// If the stored data is damaged.
@@ -95,18 +96,18 @@ pub trait Reader: Send + Sync {
         Ok(vec![])
     }
 
-    /// Provenance of the data, if it is stored.
+    /// The manifest, which records the provenance of the data, if the dataset stores one.
     fn manifest(&self) -> Option<Manifest>;
 
-    /// Bytes on disk per part of the dataset (a column, usually), largest first.
+    /// Bytes on disk per part of the dataset (usually a column), largest first.
     ///
     /// # Errors
     /// If the dataset's files cannot be listed.
     fn footprint(&self) -> Result<Vec<(String, u64)>>;
 
     /// A BLAKE3 hash of the content: names and types of the columns, lengths of the episodes, and every stored value in
-    /// column and row order (images as their encoded bytes). It does not depend on how the content is divided into
-    /// files.
+    /// column and row order (images as their encoded bytes). The division of the content into files does not affect the
+    /// hash.
     ///
     /// # Errors
     /// If the stored data is damaged.

@@ -1,7 +1,7 @@
 //! [`ReplayBuffer`]: the most recent episodes of a running collection, in memory, for training during collection.
 //!
 //! Collection writes into the buffer through its [`Writer`]; training reads a [`ReplayBuffer::snapshot`], which does
-//! not change while the buffer does. When a new episode does not fit, the oldest episodes are evicted.
+//! not change when the buffer changes. When a new episode does not fit, the oldest episodes are evicted.
 //!
 //! Samples depend only on the key and on the buffer's content.
 
@@ -27,7 +27,7 @@ const SPARE: usize = 2;
 pub struct ReplayBuffer(Arc<Inner>);
 
 struct Inner {
-    /// Columns of the episodes that are added.
+    /// Columns of the episodes to add.
     schema: Schema,
     /// Columns of the buffer as a dataset: index columns, then the columns of the episodes.
     dataset_schema: Schema,
@@ -47,20 +47,25 @@ struct State {
 }
 
 struct StoredEpisode {
-    /// Number of episodes added before this one: its value in the column `episode_idx`.
+    /// Number of episodes added before this episode: its value in the column `episode_idx`.
     index: u64,
     rows: Batch,
     constants: Constants,
 }
 
 impl ReplayBuffer {
-    /// A buffer of at most `capacity` rows for episodes with these columns. An episode of `n` steps has `n + 1` rows.
+    /// A buffer of at most `capacity` rows for episodes with the columns of `schema`.
+    /// An episode of `n` steps has `n + 1` rows.
     ///
     /// # Errors
     /// If the capacity is 0.
     pub fn new(schema: &Schema, capacity: usize) -> Result<Self> {
         if capacity == 0 {
-            return Err(Error::config("replay buffer", "its capacity is 0 rows", "make room for one episode at least"));
+            return Err(Error::config(
+                "replay buffer",
+                "its capacity is 0 rows",
+                "use a capacity of at least one episode",
+            ));
         }
         let dataset_schema = dataset_schema(schema)?;
         Ok(Self(Arc::new(Inner { schema: schema.clone(), dataset_schema, capacity, state: Mutex::default() })))
@@ -94,7 +99,7 @@ impl ReplayBuffer {
             let expected = format!("at most {capacity}, the buffer's capacity");
             return Err(Error::mismatch("adding an episode to a replay buffer", format!("{rows} rows"), expected));
         }
-        // Copies without holding the lock, so that readers continue.
+        // Copies the episode without holding the lock, so that readers need not wait.
         let spare = lock(state).spare.pop();
         let mut copy = spare.unwrap_or_else(|| Batch::zeros(schema, 0));
         copy.resize(rows);
@@ -120,8 +125,8 @@ impl ReplayBuffer {
         Ok(())
     }
 
-    /// A writer into the buffer. [`Writer::episodes`] returns the number of episodes ever added, so that a resumed
-    /// collection continues with new episodes.
+    /// Returns a writer that adds episodes to the buffer. [`Writer::episodes`] returns the number of episodes ever
+    /// added, so that a resumed collection continues with new episodes.
     pub fn writer(&self) -> Box<dyn Writer> {
         Box::new(ReplayWriter(self.clone()))
     }
@@ -154,7 +159,7 @@ impl ReplayBuffer {
         writer.finish()
     }
 
-    /// Fills a new buffer from a dataset. If not all episodes fit, the buffer holds the last ones. If
+    /// Fills a new buffer from a dataset. If not all episodes fit, the buffer holds the last episodes. If
     /// [`ReplayBuffer::save`] wrote the dataset, stored and future episodes get the same `episode_idx` as in the
     /// original buffer.
     ///
@@ -182,10 +187,10 @@ impl ReplayBuffer {
         Ok(buffer)
     }
 
-    /// Samples batches from the buffer's content at the time each batch is loaded.
+    /// Creates a loader. It samples each batch from the buffer's content at the time of loading.
     ///
     /// # Errors
-    /// If a column does not exist, a count is 0, or a goal's probabilities are invalid.
+    /// If a column does not exist, a size in `config` is 0, or a goal's probabilities are invalid.
     pub fn loader(&self, config: ReplayConfig) -> Result<ReplayLoader> {
         if config.batch_size == 0 {
             return Err(Error::config("batch_size", "it is 0", "a batch needs at least one clip"));
@@ -301,7 +306,7 @@ impl Reader for Snapshot {
         Some(Manifest::new("replay", 0, config))
     }
 
-    /// Bytes in memory.
+    /// Bytes in memory per column, largest first.
     fn footprint(&self) -> Result<Vec<(String, u64)>> {
         let rows: u64 = self.episodes.iter().map(|episode| episode.length as u64).sum();
         let mut sizes: Vec<(String, u64)> =
@@ -335,7 +340,7 @@ pub struct ReplayConfig {
     pub goals: Vec<GoalSpec>,
     /// Windows per batch.
     pub batch_size: usize,
-    /// Samples only from the latest episodes that have at least this many rows in total; from all for `None`.
+    /// Samples only from the latest episodes that have at least this many rows in total; from all episodes for `None`.
     pub recent: Option<usize>,
     /// Seed of the samples; combined with the index of the batch and the buffer's content.
     pub seed: u64,
@@ -384,8 +389,8 @@ impl ReplayLoader {
         self.source.sample(key)
     }
 
-    /// The batches with indices from `first` on, without end. Iteration stops after the first error, for example if no
-    /// stored episode is long enough for a window.
+    /// An unbounded iterator over sampled batches, starting at index `first`. Iteration stops after the first error,
+    /// for example if no stored episode is long enough for a window.
     pub fn batches(&self, first: usize) -> Epoch {
         Workers::start(
             &self.workers,
@@ -419,8 +424,8 @@ impl Source {
     /// The windows of the current content.
     fn windows(&self) -> Result<Arc<Windows>> {
         let snapshot = self.buffer.current_snapshot();
-        let mut known = lock(&self.windows);
-        if let Some(windows) = known.as_ref().filter(|windows| Arc::ptr_eq(&windows.snapshot, &snapshot)) {
+        let mut cached = lock(&self.windows);
+        if let Some(windows) = cached.as_ref().filter(|windows| Arc::ptr_eq(&windows.snapshot, &snapshot)) {
             return Ok(Arc::clone(windows));
         }
         let episodes = snapshot.episodes();
@@ -435,7 +440,7 @@ impl Source {
         let clips = Clips::reaching(self.filler.clip(), self.filler.reach(), episodes, &positions)?;
         let goals = Goals::new(episodes, &positions);
         let windows = Arc::new(Windows { snapshot, clips, goals });
-        *known = Some(Arc::clone(&windows));
+        *cached = Some(Arc::clone(&windows));
         Ok(windows)
     }
 

@@ -1,4 +1,4 @@
-//! [`Split`]: divides the episodes of a dataset into training, validation and test.
+//! [`Split`]: divides the episodes of a dataset into the parts train, validation and test.
 //!
 //! A keyed hash of an episode's index determines its part, independently of all other episodes. An episode therefore
 //! stays in its part while the dataset grows, and training and evaluation with the same split use the same parts.
@@ -13,21 +13,21 @@ use swm_core::{Error, Key, Result};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Part {
-    /// For training models.
+    /// Episodes for training models.
     Train,
-    /// For choosing settings.
+    /// Episodes for choosing settings.
     Validation,
-    /// For the final evaluation.
+    /// Episodes for the final evaluation.
     Test,
 }
 
-/// The fractions of the parts, and the seed of the division.
+/// The fractions of the held-out parts, and the seed of the division.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Split {
     /// Fraction of episodes held out for validation.
     pub validation: f64,
-    /// Fraction of episodes held out for the test.
+    /// Fraction of episodes held out for testing.
     pub test: f64,
     /// Seed of the hash.
     pub seed: u64,
@@ -110,12 +110,12 @@ mod tests {
         let split = Split { validation: 0.2, test: 0.1, seed: 3 };
         let parts: Vec<Part> = (0..10_000).map(|episode| split.part(episode)).collect();
         let count = |expected| parts.iter().filter(|&&part| part == expected).count();
-        // Three standard deviations of the binomial distribution: 120 of 2000, 90 of 1000.
+        // The tolerances are three standard deviations of the binomial distribution: 120 of 2000, 90 of 1000.
         assert!(count(Part::Validation).abs_diff(2000) < 120 && count(Part::Test).abs_diff(1000) < 90);
         let other = Split { seed: 4, ..split };
         let changed = (0..10_000).filter(|&episode| other.part(episode) != split.part(episode)).count();
         assert!(changed > 3000, "{changed}");
-        // Fixed indices, because published results depend on the default split.
+        // The default split must never change, because published results depend on it.
         let episodes_of =
             |part| (0..40).filter(|&episode| Split::default().part(episode) == part).collect::<Vec<i64>>();
         assert_eq!((episodes_of(Part::Test), episodes_of(Part::Validation)), (vec![14], vec![4, 6, 16, 23, 24, 32]));

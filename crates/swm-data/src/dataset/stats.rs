@@ -7,7 +7,7 @@ use swm_core::{Error, Result};
 /// Statistics of a column, per element of a row.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ColumnStats {
-    /// Number of rows that are not NaN in this element.
+    /// Number of rows whose value of this element is not NaN.
     pub count: Vec<u64>,
     /// Mean.
     pub mean: Vec<f64>,
@@ -19,17 +19,17 @@ pub struct ColumnStats {
     pub max: Vec<f64>,
 }
 
-/// Rows read at once.
-const ROWS: usize = 16 << 10;
+/// Number of rows after which a read starts.
+const ROWS_PER_READ: usize = 16 << 10;
 
 /// Computes the statistics of a column over some episodes (all for `None`). NaN, such as the missing action of a last
 /// row, is ignored; -1, the missing action of an integer column, is counted as a value.
 ///
 /// # Errors
-/// If there is no such column, it holds images, an episode does not exist, or the data is damaged.
+/// If the column does not exist or holds images, an episode does not exist, or the data is damaged.
 pub fn column_stats(reader: &dyn Reader, column: &str, episodes: Option<&[usize]>) -> Result<ColumnStats> {
     let n = reader.schema().column(column)?.len();
-    // Welford's algorithm, which is accurate for columns far from zero.
+    // Welford's algorithm, which stays accurate if the mean is much larger than the standard deviation.
     let mut stats = ColumnStats {
         count: vec![0; n],
         mean: vec![0.0; n],
@@ -89,7 +89,7 @@ fn for_each_row(
         };
         pending.push(StepRange::new(position, 0, episode.length));
         rows += episode.length;
-        if rows >= ROWS || i + 1 == positions.len() {
+        if rows >= ROWS_PER_READ || i + 1 == positions.len() {
             let batch = reader.read(&[column], &pending)?;
             for row in 0..batch.rows() {
                 each(&batch.row(row).to_f64(column)?);
@@ -103,12 +103,12 @@ fn for_each_row(
 
 /// Quantiles of a column, per element of a row, over some episodes (all for `None`), ignoring NaN. Quantiles between
 /// two values are interpolated linearly. Unlike minimum and maximum, quantiles are robust to outliers: the reference
-/// scales the range between the 0.01 and 0.99 quantiles to `[-1, 1]`.
+/// implementation scales the range between the 0.01 and 0.99 quantiles to `[-1, 1]`.
 ///
 /// The whole column is held in memory. `quantiles` are fractions in `0 ..= 1`.
 ///
 /// # Shapes
-/// `[quantiles, elements of a row]`.
+/// The result is `[quantiles, elements of a row]`.
 ///
 /// # Errors
 /// As [`column_stats`], and if a quantile is not within `0 ..= 1`.
@@ -153,10 +153,10 @@ mod tests {
         let schema = Schema::new([ColumnSpec::new("state", DType::Float32, [2])]).expect("schema");
         let buffer = ReplayBuffer::new(&schema, 1000).expect("a buffer");
         let mut episode = Batch::zeros(&schema, 6);
-        // Unsorted values, one of them missing.
+        // The values are unsorted, and one value is missing (NaN).
         let values = [[4.0, 0.5], [1.0, f32::NAN], [3.0, 0.1], [0.0, 0.4], [2.0, 0.2], [5.0, 0.3]];
         episode.get_mut::<f32>("state").expect("states").copy_from_slice(values.as_flattened());
-        buffer.add(&episode, &Constants::new()).expect("adds");
+        buffer.add(&episode, &Constants::new()).expect("adding an episode");
         let reader = buffer.snapshot();
         let found = column_quantiles(&*reader, "state", None, &[0.0, 0.01, 0.5, 1.0]).expect("quantiles");
         let expected = [[0.0, 0.1], [0.05, 0.104], [2.5, 0.3], [5.0, 0.5]];

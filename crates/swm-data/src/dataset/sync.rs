@@ -1,8 +1,8 @@
-//! Locks that ignore poisoning.
+//! [`lock`]: locks a mutex and ignores poisoning.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-/// Locks a mutex, also after another thread panicked while it held the lock.
+/// Locks a mutex, even if another thread panicked while that thread held the lock.
 ///
 /// The data guarded in this crate is valid after every single statement, so a panic cannot leave it half updated.
 pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {

@@ -4,7 +4,7 @@ use crate::dataset::{Location, Reader, WriteOptions, Writer};
 use std::sync::Arc;
 use swm_core::{Error, Named, Result, Schema};
 
-/// A dataset format: its names, and the functions that detect, open and create its datasets.
+/// A dataset format: its id, its suffixes, and the functions that detect, open and create its datasets.
 pub struct FormatEntry {
     /// Id of the format, such as `lance`.
     pub id: &'static str,
@@ -14,7 +14,7 @@ pub struct FormatEntry {
     pub suffixes: &'static [&'static str],
     /// The Cargo feature of `swm-data` that this format requires, if any.
     pub feature: Option<&'static str>,
-    /// Returns whether the location of an existing dataset, or of one to create, is of this format.
+    /// Returns whether an existing dataset, or a dataset to create, at this location has this format.
     pub detect: fn(&Location) -> bool,
     /// The implementation; `None` if the program was built without [`FormatEntry::feature`].
     pub backend: Option<Backend>,
@@ -54,7 +54,7 @@ impl FormatEntry {
         (self.backend()?.open)(location)
     }
 
-    /// Creates, continues or replaces a dataset whose episodes have these columns.
+    /// Creates, continues or replaces a dataset whose episodes have the columns of `schema`.
     ///
     /// # Errors
     /// If the dataset exists and `options.mode` forbids it, the schema differs from that of the dataset to continue,

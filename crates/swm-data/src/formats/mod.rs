@@ -1,7 +1,7 @@
 //! Dataset formats on disk: one module for each format, and the list of formats in [`registry`].
 //!
-//! A format implements [`Reader`](crate::Reader) and [`Writer`](crate::Writer), and has one row, `ENTRY`, beside its
-//! implementation.
+//! Each format implements [`Reader`](crate::Reader) and [`Writer`](crate::Writer). Its module declares `ENTRY`, its row
+//! of the registry.
 
 mod column_files;
 pub mod entry;

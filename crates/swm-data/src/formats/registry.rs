@@ -6,7 +6,7 @@ use crate::dataset::{Location, Reader, WriteOptions, Writer};
 use std::sync::Arc;
 use swm_core::{Error, Named, Registry, Result, Schema};
 
-/// All dataset formats. The first one that detects a location is used.
+/// All dataset formats. The first format that detects a location is used.
 pub static FORMATS: Registry<FormatEntry> = Registry {
     kind: "dataset format",
     hint: "`swm formats` lists them",
@@ -21,7 +21,7 @@ pub static FORMATS: Registry<FormatEntry> = Registry {
     ],
 };
 
-/// The format of an existing dataset, or of a dataset to create under this name.
+/// The format of an existing dataset, or of a dataset to create, at this location.
 pub fn detect(location: &Location) -> Option<&'static FormatEntry> {
     FORMATS.rows.iter().find(|format| (format.detect)(location))
 }
@@ -40,12 +40,12 @@ pub fn open(location: impl Into<Location>) -> Result<Arc<dyn Reader>> {
         _ => "it is not a dataset of a known format",
     };
     let known: Vec<&str> = FORMATS.rows.iter().map(Named::id).collect();
-    let fix = format!("`swm formats` says how each is recognised ({})", known.join(", "));
+    let fix = format!("use a dataset of a format that `swm formats` lists ({})", known.join(", "));
     Err(Error::corrupt(location.label(), problem, fix))
 }
 
-/// Creates, continues or replaces a dataset whose episodes have these columns, in the format that the location's suffix
-/// names. Use [`FormatEntry::create`] for locations without such a suffix.
+/// Creates, continues or replaces a dataset whose episodes have the columns of `schema`, in the format that the
+/// location's suffix names. Use [`FormatEntry::create`] for locations without such a suffix.
 ///
 /// # Errors
 /// If the location names no known format, the dataset exists and `options.mode` forbids it, the schema differs from
@@ -54,7 +54,7 @@ pub fn create(location: impl Into<Location>, schema: &Schema, options: WriteOpti
     let location = location.into();
     let Some(format) = detect(&location) else {
         let problem = format!("{location} has no suffix of a known format");
-        let fix = format!("end it in .{}", lance::ENTRY.suffixes[0]);
+        let fix = format!("use a name that ends in .{}", lance::ENTRY.suffixes[0]);
         return Err(Error::config("dataset path", problem, fix));
     };
     format.create(&location, schema, options)

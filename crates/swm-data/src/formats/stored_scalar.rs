@@ -11,7 +11,7 @@ pub(crate) enum Class {
     Float,
 }
 
-/// A numeric type in a file.
+/// A numeric type as stored in a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct StoredScalar {
     pub class: Class,
@@ -21,7 +21,7 @@ pub(crate) struct StoredScalar {
 }
 
 impl StoredScalar {
-    /// The type that files written here use for a column of this type.
+    /// The stored type, in files that this crate writes, of a column with type `dtype`.
     pub const fn of(dtype: DType) -> Self {
         let class = match dtype {
             DType::Bool => Class::Bool,
@@ -45,7 +45,7 @@ impl StoredScalar {
         })
     }
 
-    /// Whether the stored bytes equal the bytes of the column.
+    /// Whether the stored bytes of a value equal its bytes in a column.
     pub fn is_plain(self) -> bool {
         let little = Self { big_endian: self.big_endian && self.size > 1, ..self };
         self.dtype().is_some_and(|dtype| little == Self::of(dtype))
@@ -61,14 +61,20 @@ impl StoredScalar {
             return Ok(());
         }
         match (self.class, self.size) {
-            (Class::Signed, 1) => put(from, to, |[b]: [u8; 1]| i32::from(b.cast_signed()).to_ne_bytes()),
-            (Class::Signed, 2) => put(from, to, |b| i32::from(self.order(b, i16::from_le_bytes)).to_ne_bytes()),
-            (Class::Unsigned, 2) => put(from, to, |b| i32::from(self.order(b, u16::from_le_bytes)).to_ne_bytes()),
-            (Class::Unsigned, 4) => put(from, to, |b| i64::from(self.order(b, u32::from_le_bytes)).to_ne_bytes()),
+            (Class::Signed, 1) => convert_each(from, to, |[b]: [u8; 1]| i32::from(b.cast_signed()).to_ne_bytes()),
+            (Class::Signed, 2) => {
+                convert_each(from, to, |b| i32::from(self.read_value(b, i16::from_le_bytes)).to_ne_bytes())
+            }
+            (Class::Unsigned, 2) => {
+                convert_each(from, to, |b| i32::from(self.read_value(b, u16::from_le_bytes)).to_ne_bytes())
+            }
+            (Class::Unsigned, 4) => {
+                convert_each(from, to, |b| i64::from(self.read_value(b, u32::from_le_bytes)).to_ne_bytes())
+            }
             (Class::Unsigned, 8) => {
                 let mut largest = 0;
-                put(from, to, |b| {
-                    let value = self.order(b, u64::from_le_bytes);
+                convert_each(from, to, |b| {
+                    let value = self.read_value(b, u64::from_le_bytes);
                     largest = largest.max(value);
                     value.to_ne_bytes()
                 });
@@ -76,14 +82,14 @@ impl StoredScalar {
                     return Err(format!("{largest} is too large for a signed 64-bit integer"));
                 }
             }
-            (Class::Float, 2) => put(from, to, |b| half(self.order(b, u16::from_le_bytes)).to_ne_bytes()),
-            (_, 4) => put(from, to, |b| self.order(b, u32::from_le_bytes).to_ne_bytes()),
-            _ => put(from, to, |b| self.order(b, u64::from_le_bytes).to_ne_bytes()),
+            (Class::Float, 2) => convert_each(from, to, |b| half(self.read_value(b, u16::from_le_bytes)).to_ne_bytes()),
+            (_, 4) => convert_each(from, to, |b| self.read_value(b, u32::from_le_bytes).to_ne_bytes()),
+            _ => convert_each(from, to, |b| self.read_value(b, u64::from_le_bytes).to_ne_bytes()),
         }
         Ok(())
     }
 
-    fn order<const N: usize, T>(self, mut bytes: [u8; N], read: impl Fn([u8; N]) -> T) -> T {
+    fn read_value<const N: usize, T>(self, mut bytes: [u8; N], read: impl Fn([u8; N]) -> T) -> T {
         if self.big_endian {
             bytes.reverse();
         }
@@ -91,12 +97,16 @@ impl StoredScalar {
     }
 }
 
-fn put<const N: usize, const M: usize>(from: &[u8], to: &mut [u8], mut convert: impl FnMut([u8; N]) -> [u8; M]) {
+fn convert_each<const N: usize, const M: usize>(
+    from: &[u8],
+    to: &mut [u8],
+    mut convert: impl FnMut([u8; N]) -> [u8; M],
+) {
     let (from, to) = (from.as_chunks::<N>().0, to.as_chunks_mut::<M>().0);
     to.iter_mut().zip(from).for_each(|(to, from)| *to = convert(*from));
 }
 
-/// Converts half precision (IEEE 754 binary16).
+/// Converts half precision (IEEE 754 binary16) to single precision.
 fn half(bits: u16) -> f32 {
     let sign = u32::from(bits >> 15) << 31;
     let exponent = u32::from(bits >> 10) & 31;
@@ -127,7 +137,9 @@ mod tests {
         assert_eq!(convert(Class::Signed, 1, false, &[0x80]), Ok((-128_i32).to_ne_bytes().to_vec()));
         assert_eq!(convert(Class::Float, 8, true, &1.5_f64.to_be_bytes()), Ok(1.5_f64.to_ne_bytes().to_vec()));
         assert_eq!(convert(Class::Unsigned, 8, false, &7_u64.to_le_bytes()), Ok(7_i64.to_ne_bytes().to_vec()));
-        assert!(convert(Class::Unsigned, 8, false, &u64::MAX.to_le_bytes()).expect_err("too large").contains("64"));
+        assert!(
+            convert(Class::Unsigned, 8, false, &u64::MAX.to_le_bytes()).expect_err("a value above 2^63").contains("64")
+        );
         assert_eq!(StoredScalar { class: Class::Float, size: 16, big_endian: false }.dtype(), None);
     }
 

@@ -142,11 +142,7 @@ fn finds_restarting_steps_and_shared_rows_in_an_hdf5_file() {
         diagnosis.findings.iter().filter(here).map(|found| found.what.clone()).collect::<Vec<_>>()
     };
     assert_eq!(problems_of(1), ["the stored steps do not count up from 0: row 2 holds 0"]);
-    assert!(
-        problems_of(3).contains(&"some of its rows are also those of episode 2".to_owned()),
-        "{:?}",
-        problems_of(3)
-    );
+    assert!(problems_of(3).contains(&"some of its rows also belong to episode 2".to_owned()), "{:?}", problems_of(3));
     assert_eq!(diagnosis.intact, [0, 2]);
 }
 

@@ -40,5 +40,5 @@ fn reads_files_in_a_bucket_and_on_a_web_server() {
 fn does_not_write_to_a_web_server() {
     let location = Location::parse("http://127.0.0.1:9/d.h5").expect("a location");
     let error = format_suite::writer(&location, WriteMode::Create).err().expect("an error").to_string();
-    assert!(error.contains("hdf5") && error.contains("copy it"), "{error}");
+    assert!(error.contains("hdf5") && error.contains("copy the dataset"), "{error}");
 }

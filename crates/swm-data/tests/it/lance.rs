@@ -370,8 +370,10 @@ fn unwritable_locations_are_explained() {
     std::fs::write(&file, "not a folder").expect("writing a file");
     let error = failure(&file.join("d.lance"), &schema(), WriteMode::Create);
     assert!(error.contains("Not a directory"), "{error}");
-    assert!(failure(&folder.path().join("name"), &schema(), WriteMode::Create).contains("end it in .lance"));
-    // No user can create a folder in `/proc`, not even root.
+    assert!(
+        failure(&folder.path().join("name"), &schema(), WriteMode::Create).contains("use a name that ends in .lance")
+    );
+    // Not even root can create a folder in `/proc`.
     let error = create(Path::new("/proc/d.lance"), &schema(), options(WriteMode::Create)).err().expect("an error");
     assert!(matches!(error, Error::Io { .. }), "{error}");
     // A folder with other files is left unchanged.

@@ -1,8 +1,9 @@
 //! A cache of decoded rows in memory-mapped files.
 //!
 //! The cache of a column consists of two files, in a folder named after the dataset's content hash. `COLUMN.rows`
-//! stores row `r` at `r * row_bytes`; rows that are not cached are holes and take no space. `COLUMN.marks` stores eight
-//! bytes per row: zero, or the first bytes of the BLAKE3 hash of the row.
+//! stores row `r` at `r * row_bytes`; rows that are not cached are file holes, which take no disk space. `COLUMN.marks`
+//! stores eight bytes per row, its mark: zero, or the first bytes of the BLAKE3 hash of the row, with the lowest bit
+//! set.
 //!
 //! A row is written before its mark, and each process verifies the mark when it first reads the row. A row that was
 //! only half written at a power failure, or that was changed later, is therefore decoded again. A dataset with changed
@@ -20,20 +21,23 @@ use std::sync::atomic::{AtomicU8, Ordering};
 use swm_core::{ColumnSpec, Error, Result};
 
 /// Size of a mark in bytes.
-const MARK: usize = 8;
+const MARK_BYTES: usize = 8;
 
-/// State of a row in this process.
+/// State of a row whose mark this process has not checked.
 const UNKNOWN: u8 = 0;
+/// State of a row that matches its mark.
 const VALID: u8 = 1;
+/// State of a row that has no mark, or does not match its mark.
 const ABSENT: u8 = 2;
 
-/// Cached rows of a column in a mapped file.
+/// Cached rows of a column in a memory-mapped file.
 pub struct DiskRowCache {
     map: Mmap,
     file: File,
     marks: File,
     row_bytes: usize,
-    known: Vec<AtomicU8>,
+    /// State of each row in this process: [`UNKNOWN`], [`VALID`] or [`ABSENT`].
+    states: Vec<AtomicU8>,
     /// Whether this process fills the cache.
     fills: bool,
     budget: Arc<Budget>,
@@ -57,7 +61,7 @@ impl DiskRowCache {
             Ok(file)
         };
         let row_bytes = column.row_bytes();
-        let (file, marks) = (open("rows", rows * row_bytes)?, open("marks", rows * MARK)?);
+        let (file, marks) = (open("rows", rows * row_bytes)?, open("marks", rows * MARK_BYTES)?);
         let fills = marks.try_lock().is_ok();
         let map = map(&file).map_err(|e| Error::io(&folder, "mapping the cache", e))?;
         let cache = Self {
@@ -65,12 +69,12 @@ impl DiskRowCache {
             file,
             marks,
             row_bytes,
-            known: (0..rows).map(|_| AtomicU8::new(UNKNOWN)).collect(),
+            states: (0..rows).map(|_| AtomicU8::new(UNKNOWN)).collect(),
             fills,
             budget,
         };
         // Rows that are already cached count towards the budget.
-        let count = cache.marked().map_err(|e| Error::io(&folder, "reading the cache's marks", e))?;
+        let count = cache.count_marks().map_err(|e| Error::io(&folder, "reading the cache's marks", e))?;
         for _ in 0..count {
             cache.budget.take(row_bytes);
         }
@@ -78,16 +82,16 @@ impl DiskRowCache {
     }
 
     /// Number of rows with a mark.
-    fn marked(&self) -> std::io::Result<usize> {
-        let mut marks = vec![0; self.known.len() * MARK];
+    fn count_marks(&self) -> std::io::Result<usize> {
+        let mut marks = vec![0; self.states.len() * MARK_BYTES];
         self.marks.read_exact_at(&mut marks, 0)?;
-        Ok(marks.chunks_exact(MARK).filter(|mark| mark.iter().any(|&byte| byte != 0)).count())
+        Ok(marks.chunks_exact(MARK_BYTES).filter(|mark| mark.iter().any(|&byte| byte != 0)).count())
     }
 
-    fn mark(&self, row: usize) -> Option<[u8; MARK]> {
-        let mut mark = [0; MARK];
-        self.marks.read_exact_at(&mut mark, (row * MARK) as u64).ok()?;
-        (mark != [0; MARK]).then_some(mark)
+    fn mark(&self, row: usize) -> Option<[u8; MARK_BYTES]> {
+        let mut mark = [0; MARK_BYTES];
+        self.marks.read_exact_at(&mut mark, (row * MARK_BYTES) as u64).ok()?;
+        (mark != [0; MARK_BYTES]).then_some(mark)
     }
 
     fn row(&self, row: usize) -> &[u8] {
@@ -97,42 +101,42 @@ impl DiskRowCache {
 
 impl RowCache for DiskRowCache {
     fn get(&self, row: usize, out: &mut [u8]) -> bool {
-        match self.known[row].load(Ordering::Acquire) {
+        match self.states[row].load(Ordering::Acquire) {
             VALID => {
                 out.copy_from_slice(self.row(row));
                 return true;
             }
-            // A process that does not fill the cache checks again, because the other process may have added the row.
+            // A process that does not fill the cache checks again, because the filling process may have added the row.
             ABSENT if self.fills => return false,
             _ => {}
         }
         let Some(mark) = self.mark(row) else {
-            self.known[row].store(ABSENT, Ordering::Release);
+            self.states[row].store(ABSENT, Ordering::Release);
             return false;
         };
         out.copy_from_slice(self.row(row));
         let intact = hash(out) == mark;
-        self.known[row].store(if intact { VALID } else { ABSENT }, Ordering::Release);
+        self.states[row].store(if intact { VALID } else { ABSENT }, Ordering::Release);
         intact
     }
 
     fn put(&self, row: usize, bytes: &[u8]) {
-        if !self.fills || self.known[row].load(Ordering::Acquire) == VALID || !self.budget.take(bytes.len()) {
+        if !self.fills || self.states[row].load(Ordering::Acquire) == VALID || !self.budget.take(bytes.len()) {
             return;
         }
         // If writing fails, for example because the disk is full, the row is not cached.
         let written = self.file.write_all_at(bytes, (row * self.row_bytes) as u64).is_ok()
-            && self.marks.write_all_at(&hash(bytes), (row * MARK) as u64).is_ok();
+            && self.marks.write_all_at(&hash(bytes), (row * MARK_BYTES) as u64).is_ok();
         if written {
-            self.known[row].store(VALID, Ordering::Release);
+            self.states[row].store(VALID, Ordering::Release);
         }
     }
 }
 
 /// The mark of a row; never zero.
-fn hash(bytes: &[u8]) -> [u8; MARK] {
-    let mut mark = [0; MARK];
-    mark.copy_from_slice(&blake3::hash(bytes).as_bytes()[..MARK]);
+fn hash(bytes: &[u8]) -> [u8; MARK_BYTES] {
+    let mut mark = [0; MARK_BYTES];
+    mark.copy_from_slice(&blake3::hash(bytes).as_bytes()[..MARK_BYTES]);
     mark[0] |= 1;
     mark
 }

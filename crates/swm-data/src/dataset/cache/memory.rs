@@ -3,7 +3,7 @@
 use super::{Budget, RowCache};
 use std::sync::{Arc, OnceLock};
 
-/// Cached rows of a column.
+/// Cached rows of a column in memory.
 pub struct MemoryRowCache {
     rows: Vec<OnceLock<Box<[u8]>>>,
     budget: Arc<Budget>,

@@ -19,19 +19,20 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, OnceLock};
 use swm_core::{Manifest, Result, Schema};
 
-/// Where decoded rows are cached.
+/// Storage and size limit of a cache of decoded rows.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum CacheConfig {
     /// No cache: every row is decoded whenever it is read.
     #[default]
     Off,
-    /// In memory.
+    /// Rows of all columns are cached in memory.
     Memory {
         /// Maximum size in bytes.
         bytes: usize,
     },
-    /// Images in files, in a subfolder named after the dataset's content hash; other columns, which are small, in
-    /// memory. If several processes use the same files, one process fills them and all processes read them.
+    /// Images are cached in files, in a subfolder named after the dataset's content hash; columns without images, which
+    /// are small, are cached in memory. If several processes use the same files, one process fills them and all
+    /// processes read them.
     Disk {
         /// The folder; several datasets may share it.
         folder: PathBuf,
@@ -41,7 +42,7 @@ pub enum CacheConfig {
 }
 
 impl CacheConfig {
-    /// Wraps a reader with a cache for these columns.
+    /// Wraps a reader with a cache for `columns`.
     ///
     /// # Errors
     /// If a column does not exist, the dataset's content cannot be hashed, or the folder cannot be written.
@@ -60,8 +61,8 @@ impl CacheConfig {
             let index = reader.schema().index(name)?;
             let spec = &reader.schema().columns()[index];
             caches[index] = match self {
-                // Columns of values are cached as a whole if they fit, because caching their small rows one by one
-                // costs more than reading them.
+                // Columns without images are cached as a whole if they fit into the budget, because caching their small
+                // rows one by one costs more than reading them.
                 _ if !spec.is_image() => match budget.take(rows.saturating_mul(spec.row_bytes())) {
                     true => ColumnCache::Whole(OnceLock::new(), Mutex::default()),
                     false => ColumnCache::Uncached,
@@ -86,13 +87,13 @@ pub(crate) struct Budget {
 }
 
 impl Budget {
-    /// Reserves `bytes` if that many are left.
+    /// Reserves `bytes` if enough bytes are left, and returns whether it reserved them.
     fn take(&self, bytes: usize) -> bool {
         self.left.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |left| left.checked_sub(bytes)).is_ok()
     }
 }
 
-/// Cached rows of one column. Several threads use a cache at once.
+/// Cached rows of one column. Several threads may use a cache at the same time.
 trait RowCache: Send + Sync {
     /// Copies a row to `out` if it is cached, and returns whether the row is cached.
     fn get(&self, row: usize, out: &mut [u8]) -> bool;
@@ -103,18 +104,18 @@ trait RowCache: Send + Sync {
 
 /// How one column is cached.
 enum ColumnCache {
-    /// Not at all.
+    /// The column is not cached.
     Uncached,
-    /// As a whole, read at the first access; the mutex is held during that read.
+    /// The whole column is read at the first access; the mutex is held during that read.
     Whole(OnceLock<Vec<u8>>, Mutex<()>),
-    /// Row by row.
+    /// Each row is cached when it is read.
     ByRow(Box<dyn RowCache>),
 }
 
-/// A reader with a cache.
+/// A reader that caches the rows of another reader.
 struct CachedReader {
     inner: Arc<dyn Reader>,
-    /// Rows of every episode, counted over the whole dataset.
+    /// First row and length of every episode; rows are counted over the whole dataset.
     rows_of_episodes: EpisodeRows,
     /// One entry per column of the schema.
     columns: Vec<ColumnCache>,
@@ -126,8 +127,8 @@ impl CachedReader {
         self.rows_of_episodes.range(range).ok().map(|rows| rows.start as usize..rows.end as usize)
     }
 
-    /// A column that is cached as a whole.
-    fn whole<'a>(&self, column: &str, cache: &'a OnceLock<Vec<u8>>, reading: &Mutex<()>) -> Result<&'a [u8]> {
+    /// The bytes of a column that is cached as a whole. The first call reads the column.
+    fn whole_column<'a>(&self, column: &str, cache: &'a OnceLock<Vec<u8>>, reading: &Mutex<()>) -> Result<&'a [u8]> {
         if let Some(bytes) = cache.get() {
             return Ok(bytes);
         }
@@ -145,7 +146,8 @@ impl CachedReader {
 }
 
 thread_local! {
-    /// Buffer of a loader thread for rows that are not cached; allocating one per batch would cost as much as decoding.
+    /// Buffer of a loader thread for rows that are not cached. Allocating a buffer for each batch would take as long as
+    /// decoding.
     static DECODED: RefCell<Vec<u8>> = const { RefCell::new(vec![]) };
 }
 
@@ -169,7 +171,7 @@ impl Reader for CachedReader {
             _ if !valid => self.inner.read_column(column, ranges, out),
             ColumnCache::Uncached => self.inner.read_column(column, ranges, out),
             ColumnCache::Whole(cache, reading) => {
-                let bytes = self.whole(column, cache, reading)?;
+                let bytes = self.whole_column(column, cache, reading)?;
                 let mut out = out;
                 for rows in rows {
                     let (slot, rest) = out.split_at_mut(rows.len() * n);

@@ -9,11 +9,11 @@ use swm_core::{Batch, ColumnSpec, DType, Key, Result, Schema};
 /// Rows of a batch; the lists are reused between batches.
 #[derive(Default)]
 pub(crate) struct BatchRows {
-    /// All rows of every clip.
+    /// One range per clip: all rows of the clip.
     clips: Vec<StepRange>,
-    /// One row per step of every clip.
-    frames: Vec<StepRange>,
-    /// One row per clip: its goal.
+    /// One range per step of every clip: the row of the step's observation.
+    step_rows: Vec<StepRange>,
+    /// One range per clip: the row of the goal.
     goals: Vec<StepRange>,
 }
 
@@ -69,7 +69,7 @@ impl BatchFiller {
         names
     }
 
-    /// Number of rows that an episode must have, counted from a clip's first row.
+    /// Number of rows, counted from a clip's first row, that an episode must have for the clip and its goals.
     pub fn reach(&self) -> usize {
         self.goals.iter().map(|goal| goal.reach(&self.clip)).fold(self.clip.span(), usize::max)
     }
@@ -83,10 +83,10 @@ impl BatchFiller {
         key: impl Fn(usize) -> Key,
         out: &mut Batch,
     ) -> Result<()> {
-        let BatchRows { clips, frames, goals } = rows;
+        let BatchRows { clips, step_rows, goals } = rows;
         let (steps, skip) = (self.clip.num_steps, self.clip.frameskip);
-        frames.clear();
-        frames.extend(
+        step_rows.clear();
+        step_rows.extend(
             clips.iter().flat_map(|clip| (0..steps).map(|k| StepRange::new(clip.episode, clip.start + k * skip, 1))),
         );
         if out.rows() != clips.len() {
@@ -94,7 +94,7 @@ impl BatchFiller {
         }
         let mut column = 0;
         for name in &self.clip.columns {
-            let ranges = if name == ACTION || skip == 1 { &*clips } else { &*frames };
+            let ranges = if name == ACTION || skip == 1 { &*clips } else { &*step_rows };
             reader.read_column(name, ranges, out.bytes_mut(column))?;
             column += 1;
         }

@@ -5,7 +5,7 @@
 //!
 //! - `batch`: selects the rows of a batch; one call of [`Reader::read_column`] reads all rows of a column.
 //! - `workers`: threads that prefetch batches within a budget of bytes.
-//! - [`LoadedBatch`]: a batch whose memory returns to the loader.
+//! - [`LoadedBatch`]: a batch whose memory the loader reuses.
 
 mod batch;
 mod workers;
@@ -36,7 +36,8 @@ pub struct LoaderConfig {
     pub shuffle: bool,
     /// Seed of the random order and of the goals; combined with the epoch.
     pub seed: u64,
-    /// Prefetching threads; 0 loads in the caller's thread. Images are decoded by these threads and rayon's pool.
+    /// Prefetching threads; 0 loads in the caller's thread. Images are decoded by these threads and by rayon's thread
+    /// pool.
     pub threads: usize,
     /// Maximum number of prefetched batches.
     pub prefetch: usize,
@@ -68,7 +69,7 @@ impl Default for LoaderConfig {
     }
 }
 
-/// Yields batches of clips, epoch after epoch.
+/// Yields batches of clips for any epoch.
 pub struct Loader {
     source: Arc<Source>,
     workers: Arc<Workers>,
@@ -78,11 +79,11 @@ pub struct Loader {
 }
 
 impl Loader {
-    /// Creates a loader. Dropping it stops its threads.
+    /// Creates a loader. Dropping the loader stops its threads.
     ///
     /// # Errors
-    /// If a column or an episode does not exist, no episode is long enough for a clip, a count is 0, a goal's
-    /// probabilities are invalid, or the cache's folder cannot be used.
+    /// If a column or an episode does not exist, no episode is long enough for a clip, a size in `config` is 0, a
+    /// goal's probabilities are invalid, or the cache's folder cannot be used.
     pub fn new(reader: Arc<dyn Reader>, config: LoaderConfig) -> Result<Self> {
         let filler = BatchFiller::new(reader.schema(), config.clip, config.goals)?;
         if config.batch_size == 0 {
@@ -103,7 +104,7 @@ impl Loader {
             return Err(Error::config(
                 "batch_size",
                 format!("{} clips do not fill one batch of {}", clips.len(), config.batch_size),
-                "make it smaller, or keep the last batch (drop_last = false)",
+                "use a smaller batch_size, or keep the last batch (drop_last = false)",
             ));
         }
         let goals = Goals::new(reader.episodes(), &positions);

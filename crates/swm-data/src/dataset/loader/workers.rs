@@ -1,4 +1,4 @@
-//! Worker threads that prefetch batches in the order of their indices, within a bounded window.
+//! Worker threads that prefetch batches in the order of their indices, a limited number of batches ahead.
 
 use crate::dataset::sync::lock;
 use std::collections::VecDeque;
@@ -9,7 +9,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 use swm_core::{Batch, Error, Result, Schema};
 
-/// Produces batches by index. Several threads call it concurrently.
+/// Produces batches by index. Several threads call [`BatchSource::produce`] concurrently.
 pub(crate) trait BatchSource: Send + Sync {
     /// Produces a batch. The same index always gives the same batch.
     fn produce(&self, batch: usize) -> Result<LoadedBatch>;
@@ -24,7 +24,7 @@ pub struct LoadedBatch {
 }
 
 impl LoadedBatch {
-    /// Takes the batch out; the loader allocates new memory instead.
+    /// Converts to a plain batch, whose memory the loader does not reuse.
     pub fn into_batch(mut self) -> Batch {
         self.batch.take().expect("into_batch consumes self")
     }
@@ -66,7 +66,7 @@ impl BatchPool {
         Arc::new(Self { batches: Mutex::default(), limit })
     }
 
-    /// Returns a batch to fill: a reused one, with its old rows and content, or an empty one.
+    /// Returns a batch to fill: a reused batch, with its old rows and values, or a batch without rows.
     pub fn take(self: &Arc<Self>, schema: &Schema) -> LoadedBatch {
         let batch = lock(&self.batches).pop().unwrap_or_else(|| Batch::zeros(schema, 0));
         LoadedBatch { batch: Some(batch), pool: Arc::clone(self) }
@@ -87,7 +87,7 @@ struct Shared {
 
 #[derive(Default)]
 struct State {
-    /// Epochs in use, oldest first; usually one.
+    /// Epochs that are being loaded, oldest first; usually there is one.
     jobs: Vec<Job>,
     /// Id of the next job.
     next_id: u64,
@@ -104,7 +104,7 @@ struct Job {
     end: usize,
     /// Maximum number of batches that are started and not consumed.
     window: usize,
-    /// Results of the batches from `next_out` on; `None` for unfinished ones.
+    /// Results of the batches from `next_out` on; `None` for an unfinished batch.
     finished: VecDeque<Option<Result<LoadedBatch>>>,
 }
 
@@ -159,7 +159,7 @@ impl Workers {
         Ok(Arc::new(Self { shared, threads }))
     }
 
-    /// Starts loading batches, at most `window` ahead.
+    /// Starts loading batches, at most `window` batches ahead of the consumer.
     pub fn start(workers: &Arc<Self>, source: Arc<dyn BatchSource>, batches: Range<usize>, window: usize) -> Epoch {
         let mut id = 0;
         if !workers.threads.is_empty() {
@@ -214,7 +214,7 @@ impl Iterator for Epoch {
 }
 
 impl Epoch {
-    /// Waits until [`Iterator::next`] can return without blocking, at most for `at_most`. Returns `false` on a timeout.
+    /// Waits at most `at_most` until [`Iterator::next`] can return without blocking. Returns `false` on a timeout.
     /// Callers that also check for signals call this method repeatedly.
     pub fn wait(&self, at_most: Duration) -> bool {
         if self.remaining.is_empty() || self.workers.threads.is_empty() {

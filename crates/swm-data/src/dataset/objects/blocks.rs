@@ -1,7 +1,7 @@
 //! [`BlockCache`]: an in-memory cache of blocks of objects.
 //!
-//! A request costs as much as transferring a megabyte. Training reads small ranges in random order, so the cache
-//! fetches whole blocks, several neighbours per request.
+//! A request takes as long as transferring a megabyte. Training reads small ranges in random order, so the cache
+//! fetches whole blocks, several neighbouring blocks per request.
 
 use bytes::{Bytes, BytesMut};
 use futures::{StreamExt as _, TryStreamExt as _};
@@ -50,12 +50,12 @@ struct Cached {
 }
 
 impl BlockCache {
-    /// A cache for objects with `total` bytes in all.
+    /// Creates a cache for objects that have `total` bytes together.
     pub(crate) fn new(total: u64) -> Self {
-        Self::with(if total <= CAPACITY { LARGE } else { SMALL }, CAPACITY)
+        Self::with_block_size(if total <= CAPACITY { LARGE } else { SMALL }, CAPACITY)
     }
 
-    fn with(block: u64, capacity: u64) -> Self {
+    fn with_block_size(block: u64, capacity: u64) -> Self {
         Self { block, capacity, cached: Mutex::default(), fetching: tokio::sync::Mutex::default() }
     }
 
@@ -70,10 +70,10 @@ impl BlockCache {
         objects: &[ObjectRanges],
     ) -> object_store::Result<Vec<Vec<Bytes>>> {
         let mut held = HashMap::new();
-        if !self.hold(objects, &mut held) {
+        if !self.hold_cached(objects, &mut held) {
             let _guard = self.fetching.lock().await;
             // Another reader may have fetched these blocks in the meantime.
-            self.hold(objects, &mut held);
+            self.hold_cached(objects, &mut held);
             self.fetch(store, objects, &mut held).await?;
         }
         objects
@@ -83,17 +83,17 @@ impl BlockCache {
     }
 
     /// The indices of the blocks that overlap a range.
-    fn touched(&self, range: &Range<u64>) -> Range<u64> {
+    fn block_indices(&self, range: &Range<u64>) -> Range<u64> {
         if range.is_empty() { 0..0 } else { range.start / self.block..range.end.div_ceil(self.block) }
     }
 
     /// Copies references to the requested cached blocks into `held`, so that they outlive eviction. Returns whether all
     /// requested blocks are cached.
-    fn hold(&self, objects: &[ObjectRanges], held: &mut HashMap<(StorePath, u64), Bytes>) -> bool {
+    fn hold_cached(&self, objects: &[ObjectRanges], held: &mut HashMap<(StorePath, u64), Bytes>) -> bool {
         let cached = self.cached();
         let mut complete = true;
         for object in objects {
-            for block in object.ranges.iter().flat_map(|range| self.touched(range)) {
+            for block in object.ranges.iter().flat_map(|range| self.block_indices(range)) {
                 let key = (object.path.clone(), block);
                 match cached.blocks.get(&key) {
                     Some(bytes) => drop(held.insert(key, bytes.clone())),
@@ -104,7 +104,7 @@ impl BlockCache {
         complete
     }
 
-    /// Fetches the requested blocks that are not in `held`, several neighbours per request.
+    /// Fetches the requested blocks that are not in `held`, several neighbouring blocks per request.
     async fn fetch(
         &self,
         store: &dyn ObjectStore,
@@ -113,7 +113,7 @@ impl BlockCache {
     ) -> object_store::Result<()> {
         let mut requests: Vec<(&ObjectRanges, Range<u64>)> = vec![];
         for object in objects {
-            let mut missing: Vec<u64> = object.ranges.iter().flat_map(|range| self.touched(range)).collect();
+            let mut missing: Vec<u64> = object.ranges.iter().flat_map(|range| self.block_indices(range)).collect();
             missing.sort_unstable();
             missing.dedup();
             missing.retain(|&block| !held.contains_key(&(object.path.clone(), block)));
@@ -143,10 +143,10 @@ impl BlockCache {
         for ((object, run), bytes) in requests.into_iter().zip(fetched) {
             for (at, block) in run.enumerate() {
                 let start = (at as u64 * self.block) as usize;
-                // Copied, because a slice would keep the whole response in memory.
-                let part = Bytes::copy_from_slice(&bytes[start..bytes.len().min(start + self.block as usize)]);
-                held.insert((object.path.clone(), block), part.clone());
-                cached.insert((object.path.clone(), block), part, self.capacity);
+                // Copies the block, because a slice would keep the whole response in memory.
+                let copy = Bytes::copy_from_slice(&bytes[start..bytes.len().min(start + self.block as usize)]);
+                held.insert((object.path.clone(), block), copy.clone());
+                cached.insert((object.path.clone(), block), copy, self.capacity);
             }
         }
         Ok(())
@@ -159,7 +159,7 @@ impl BlockCache {
         held: &HashMap<(StorePath, u64), Bytes>,
     ) -> object_store::Result<Bytes> {
         let mut parts = vec![];
-        for block in self.touched(range) {
+        for block in self.block_indices(range) {
             let start = block * self.block;
             let (from, to) = (range.start.max(start) - start, range.end.min(start + self.block) - start);
             let bytes = held.get(&(object.path.clone(), block)).filter(|bytes| to <= bytes.len() as u64);
@@ -174,9 +174,9 @@ impl BlockCache {
         match parts.len() {
             1 => Ok(parts.swap_remove(0)),
             _ => {
-                let mut whole = BytesMut::with_capacity((range.end - range.start) as usize);
-                parts.iter().for_each(|part| whole.extend_from_slice(part));
-                Ok(whole.freeze())
+                let mut joined = BytesMut::with_capacity((range.end - range.start) as usize);
+                parts.iter().for_each(|part| joined.extend_from_slice(part));
+                Ok(joined.freeze())
             }
         }
     }
@@ -214,9 +214,9 @@ mod tests {
             let contents: Vec<Vec<u8>> = [1000, 37, 256].map(|n| (0..n).map(|i| (i * i / 3) as u8).collect()).into();
             let paths = ["a", "b", "c"].map(StorePath::from);
             for (path, content) in paths.iter().zip(&contents) {
-                store.put(path, content.clone().into()).await.expect("puts");
+                store.put(path, content.clone().into()).await.expect("storing an object");
             }
-            let blocks = BlockCache::with(16, 200);
+            let blocks = BlockCache::with_block_size(16, 200);
             let mut rng = Key::new(3).rng();
             for _ in 0..50 {
                 let objects: Vec<ObjectRanges> = (0..3)
@@ -229,7 +229,7 @@ mod tests {
                         ObjectRanges { path: paths[index].clone(), size, ranges: ranges.collect() }
                     })
                     .collect();
-                let read = blocks.read(&store, &objects).await.expect("reads");
+                let read = blocks.read(&store, &objects).await.expect("reading the ranges");
                 for ((object, read), content) in objects.iter().zip(&read).zip(&contents) {
                     for (range, bytes) in object.ranges.iter().zip(read) {
                         assert_eq!(bytes, &content[range.start as usize..range.end as usize]);

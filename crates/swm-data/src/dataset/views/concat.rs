@@ -12,7 +12,8 @@ use swm_core::{ColumnSpec, Error, Manifest, Result, Schema};
 /// Concatenates datasets with the same columns (in any order). Episodes are numbered from 0.
 ///
 /// # Errors
-/// If there is no dataset, or a dataset has other columns than the first; the error lists them.
+/// If there is no dataset, or the columns of a dataset differ from those of the first dataset; the error lists the
+/// differing columns.
 pub fn concat(parts: Vec<Arc<dyn Reader>>) -> Result<Arc<dyn Reader>> {
     let Some(first) = parts.first() else {
         return Err(Error::config("concatenation", "there is no dataset", "name at least one"));
@@ -93,7 +94,7 @@ impl Reader for Concat {
             jobs.push((part, offset, StepRange { episode, ..*range }));
             offset += range.length * n;
         }
-        // If all ranges belong to one part, that part reads directly into the output.
+        // If all ranges belong to one part, the rows are read directly into the output.
         let single_part = jobs.iter().all(|job| job.0 == jobs[0].0);
         if let (true, Some(&(part, ..))) = (single_part, jobs.first()) {
             let ranges: Vec<StepRange> = jobs.iter().map(|job| job.2).collect();
@@ -101,15 +102,15 @@ impl Reader for Concat {
         }
         let mut read = lock(&self.scratch).pop().unwrap_or_default();
         for (i, part) in self.parts.iter().enumerate() {
-            let of_part = jobs.iter().filter(|job| job.0 == i);
-            let ranges: Vec<StepRange> = of_part.clone().map(|job| job.2).collect();
+            let part_jobs = jobs.iter().filter(|job| job.0 == i);
+            let ranges: Vec<StepRange> = part_jobs.clone().map(|job| job.2).collect();
             if ranges.is_empty() {
                 continue;
             }
             read.resize(ranges.iter().map(|range| range.length * n).sum(), 0);
             part.read_column(column, &ranges, &mut read)?;
             let mut rest = &read[..];
-            for (_, offset, range) in of_part {
+            for (_, offset, range) in part_jobs {
                 let (bytes, after) = rest.split_at(range.length * n);
                 out[*offset..*offset + bytes.len()].copy_from_slice(bytes);
                 rest = after;
@@ -136,8 +137,8 @@ impl Reader for Concat {
         Ok(found)
     }
 
-    /// The manifest of the parts, if all parts have the same manifest. Otherwise a new manifest with the manifests of
-    /// the parts, and with the config entries that all of these share.
+    /// Returns the manifest of the first part if all parts have the same manifest. Otherwise, returns a new manifest
+    /// that contains the manifests of the parts, and the config entries that all these manifests share.
     fn manifest(&self) -> Option<Manifest> {
         let manifests: Vec<Manifest> = self.parts.iter().filter_map(|part| part.manifest()).collect();
         let first = manifests.first()?;

@@ -5,12 +5,12 @@ use crate::dataset::reader::{Constants, Episode, Irregularity, Reader, StepRange
 use std::sync::Arc;
 use swm_core::{Error, Manifest, Result, Schema};
 
-/// Adds columns of `other` to `base`, such as embeddings computed from its images. Both must have episodes of the same
-/// lengths in the same order. Episode indices, manifest and constants come from `base`; constants of `other` are added
-/// if `base` has none of that name.
+/// Adds columns of `other` to `base`, such as embeddings of the images of `base`. Both datasets must have episodes of
+/// the same lengths in the same order. Episode indices, manifest and constants come from `base`; constants of `other`
+/// are added if `base` has no constant of the same name.
 ///
 /// # Errors
-/// If the episodes differ, a column does not exist, or `base` already has a column of that name.
+/// If the episodes differ, a column does not exist, or `base` already has a column of the same name.
 pub fn merge(base: Arc<dyn Reader>, other: Arc<dyn Reader>, columns: &[&str]) -> Result<Arc<dyn Reader>> {
     let lengths = |reader: &Arc<dyn Reader>| reader.episodes().iter().map(|e| e.length).collect::<Vec<_>>();
     let (expected, given) = (lengths(&base), lengths(&other));
@@ -86,7 +86,7 @@ impl Reader for Merge {
         Ok(sizes)
     }
 
-    /// A hash of both content hashes and the names of the added columns.
+    /// A hash of the content hashes of the two datasets and of the names of the added columns.
     fn content_hash(&self) -> Result<String> {
         let hashes = [self.base.content_hash()?, self.other.content_hash()?];
         Ok(view_hash("merge", hashes.into_iter().chain(self.added().map(str::to_owned))))

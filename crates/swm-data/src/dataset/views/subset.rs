@@ -6,7 +6,7 @@ use std::sync::Arc;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{ColumnSpec, Error, Manifest, Result, Schema};
 
-/// The episodes at these positions, in this order. The episodes keep their `episode_idx`.
+/// Selects the episodes at `positions`, in the given order. The episodes keep their values of `episode_idx`.
 ///
 /// # Errors
 /// If `positions` is empty, a position does not exist, or a position appears twice.
@@ -37,7 +37,7 @@ pub fn subset(reader: Arc<dyn Reader>, positions: Vec<usize>) -> Result<Arc<dyn 
     Ok(Arc::new(Subset { reader, positions: Some(positions), episodes, schema }))
 }
 
-/// Some of the columns, in this order, preceded by the index columns.
+/// Selects columns, in the given order, preceded by the index columns.
 ///
 /// # Errors
 /// If a column does not exist.
@@ -57,7 +57,7 @@ pub fn select(reader: Arc<dyn Reader>, columns: &[&str]) -> Result<Arc<dyn Reade
 
 struct Subset {
     reader: Arc<dyn Reader>,
-    /// Positions of the selected episodes in the inner reader; `None` if all are selected.
+    /// Positions of the selected episodes in the inner reader; `None` if all episodes are selected.
     positions: Option<Vec<usize>>,
     episodes: Vec<Episode>,
     schema: Schema,
@@ -116,7 +116,7 @@ impl Reader for Subset {
         Ok(self.reader.footprint()?.into_iter().filter(|(name, _)| selected(name)).collect())
     }
 
-    /// A hash of the inner content hash, the columns and the positions.
+    /// A hash of the inner reader's content hash, the column names and the positions.
     fn content_hash(&self) -> Result<String> {
         let positions = self.positions.iter().flatten().map(usize::to_string);
         let columns = self.schema.columns().iter().map(|column| column.name.clone());

@@ -1,4 +1,4 @@
-//! Chunks of a dataset: their index in the file, the grid in which they tile the rows, and reading of single chunks.
+//! Chunks of a dataset: the list of chunks, the grid that they form over the rows, and the reading of single chunks.
 
 use super::filters::{Pipeline, Scratch};
 use super::source::Source;
@@ -8,17 +8,21 @@ use std::ops::Range;
 /// The chunks, sorted by their index in the grid of chunks.
 pub(super) struct Index {
     pub chunks: Vec<Chunk>,
-    /// Row in the grid and decoded bytes of the last chunk, if chunks hold several rows and whole rows. Cached, because
-    /// an active writer moves the last chunk.
+    /// Grid row and decoded bytes of the last chunk, if each chunk holds several whole rows. Cached, because an active
+    /// writer moves the last chunk.
     pub tail: Option<(u64, Vec<u8>)>,
 }
 
+/// A stored chunk.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Chunk {
     /// Index in the grid.
     pub index: u64,
+    /// Offset in the file, in bytes.
     pub address: u64,
+    /// Stored size in bytes.
     pub size: u32,
+    /// Bits of the filters that were skipped.
     pub filter_mask: u32,
 }
 
@@ -32,19 +36,20 @@ pub(super) fn read_chunk(
     scratch: &mut Scratch,
     out: &mut [u8],
 ) -> Result<(), String> {
-    let within = |problem: String| format!("chunk {}: {problem}", chunk.index);
+    let in_chunk = |problem: String| format!("chunk {}: {problem}", chunk.index);
     if let Some(bytes) = fetched {
-        return pipeline.decode(bytes, chunk.filter_mask, scratch, out).map_err(within);
+        return pipeline.decode(bytes, chunk.filter_mask, scratch, out).map_err(in_chunk);
     }
     if pipeline.is_empty() {
-        return source.read(chunk.address, out).map_err(|e| within(e.to_string()));
+        return source.read(chunk.address, out).map_err(|e| in_chunk(e.to_string()));
     }
     stored.resize(chunk.size as usize, 0);
-    source.read(chunk.address, stored).map_err(|e| within(e.to_string()))?;
-    pipeline.decode(stored, chunk.filter_mask, scratch, out).map_err(within)
+    source.read(chunk.address, stored).map_err(|e| in_chunk(e.to_string()))?;
+    pipeline.decode(stored, chunk.filter_mask, scratch, out).map_err(in_chunk)
 }
 
 impl Chunk {
+    /// Byte range in the file.
     pub fn range(&self) -> Range<u64> {
         self.address..self.address + u64::from(self.size)
     }
@@ -63,11 +68,11 @@ impl Index {
 pub(super) struct Grid<'a> {
     /// Rows per chunk.
     pub rows: u64,
-    /// Sides of a chunk along the axes of a row.
+    /// Side lengths of a chunk along the axes of a row, in elements.
     sides: &'a [usize],
     /// Shape of a row.
     shape: &'a [usize],
-    /// Number of chunks along each side.
+    /// Number of chunks along each axis of a row.
     counts: Vec<usize>,
     /// Size of an element in bytes.
     size: usize,
@@ -76,7 +81,8 @@ pub(super) struct Grid<'a> {
 }
 
 impl<'a> Grid<'a> {
-    /// The grid of chunks of `rows` rows and `sides` in rows of shape `shape`, with elements of `size` bytes.
+    /// The grid of chunks with `rows` rows and side lengths `sides`, over rows of shape `shape` with elements of `size`
+    /// bytes.
     pub fn new(rows: u64, sides: &'a [usize], shape: &'a [usize], size: usize) -> Self {
         let counts = shape.iter().zip(sides).map(|(whole, side)| whole.div_ceil(*side)).collect();
         let chunk_bytes = sides.iter().product::<usize>() * rows as usize * size;
@@ -98,7 +104,7 @@ impl<'a> Grid<'a> {
         self.rows == 1 && self.covers_rows()
     }
 
-    /// The index of the chunk at this offset.
+    /// The index of the chunk at an offset (row, then element along each axis of the row); `None` outside the grid.
     pub fn chunk_index(&self, offset: &[u64]) -> Option<u64> {
         let (&row, offsets) = offset.split_first()?;
         let mut index = row / self.rows;

@@ -1,4 +1,4 @@
-//! One column: its storage layout in the file, and reading of requested rows.
+//! One column: the storage layout of the column in the file, and the reading of requested rows.
 
 use super::chunks::{Chunk, Grid, Index, read_chunk};
 use super::filters::{Pipeline, Scratch};
@@ -56,7 +56,7 @@ enum Storage {
         pipeline: Pipeline,
         /// Rows per chunk.
         rows: u64,
-        /// Sides of a chunk along the axes of a row.
+        /// Side lengths of a chunk along the axes of a row, in elements.
         sides: Vec<usize>,
         index: OnceLock<Result<Index, String>>,
     },
@@ -134,7 +134,7 @@ impl Column {
         }))
     }
 
-    /// Whether the file stores the column's type.
+    /// Whether the stored type equals the type of the column.
     pub fn is_plain(&self) -> bool {
         self.stored.is_plain()
     }
@@ -201,7 +201,7 @@ impl Column {
     ) -> Result<(), String> {
         let size = self.stored_row() as u64;
         let most = (RUN_BYTES / size).max(1);
-        // Runs of consecutive rows, each read at once.
+        // Runs of consecutive rows; each run is read with one request.
         let runs: Vec<&mut [RowSlot<'_>]> = {
             let mut runs = vec![];
             let mut rest = slots;
@@ -273,7 +273,7 @@ impl Column {
     ) -> Result<(), String> {
         let index = self.index(source)?;
         let same_chunks = |a: &RowSlot<'_>, b: &RowSlot<'_>| row_of(a.0) / grid.rows == row_of(b.0) / grid.rows;
-        // From a remote file, all chunks are fetched at once.
+        // All chunks of a remote file are fetched together.
         let mut ranges: Vec<Range<u64>> = vec![];
         if source.is_remote() {
             let rows = slots.chunk_by(same_chunks).map(|group| row_of(group[0].0) / grid.rows);
@@ -293,7 +293,7 @@ impl Column {
             BUFFERS.with_borrow_mut(|buffers| {
                 let Buffers { stored, chunk, rows_buffer, scratch } = buffers;
                 let chunks = index.row(row, grid);
-                // The common case: the chunk is one row, requested once.
+                // In the common case, the chunk is one row that is requested once.
                 if let ([found], [(_, slot)], true) = (chunks, &mut *group, self.stored.is_plain() && grid.is_row()) {
                     return read_chunk(source, pipeline, found, fetched(found), stored, scratch, slot);
                 }
@@ -330,9 +330,9 @@ impl Column {
         let listed = catch_panic("the list of its chunks", || self.dataset.chunks())?;
         let mut chunks = Vec::with_capacity(listed.len());
         for chunk in listed {
-            let whole = pipeline.is_empty() && chunk.storage_size != grid.chunk_bytes as u64;
-            let (Ok(size), false) = (u32::try_from(chunk.storage_size), whole) else {
-                return Err(format!("a chunk of {} bytes is stored in {}", grid.chunk_bytes, chunk.storage_size));
+            let wrong_size = pipeline.is_empty() && chunk.storage_size != grid.chunk_bytes as u64;
+            let (Ok(size), false) = (u32::try_from(chunk.storage_size), wrong_size) else {
+                return Err(format!("a chunk of {} bytes is stored in {} bytes", grid.chunk_bytes, chunk.storage_size));
             };
             let inside = chunk.address.checked_add(size.into()).is_some_and(|end| end <= source.size());
             if !inside {

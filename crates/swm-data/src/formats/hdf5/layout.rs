@@ -1,11 +1,11 @@
-//! The layout of files written here. It uses the oldest structures of HDF5 (superblock 0, object headers 1, B-trees 1),
-//! which every version of the library reads. They have no checksums, so a commit can change a single integer in place,
-//! and the file is valid at any time, even if the writer is killed.
+//! The layout of files that this module writes. It uses the oldest structures of HDF5 (superblock 0, object headers 1,
+//! B-trees 1), which every version of the library reads. These structures have no checksums, so a commit can change a
+//! single integer in place, and the file is valid at any time, even if the writer is killed.
 //!
 //! ```text
 //! superblock                               end of the file
 //! root group                               attribute: a reference to the record
-//! its B-tree, heap, and symbol table
+//! B-tree, heap, and symbol table of the root group
 //! headers of the record, of ep_len, of ep_offset, of the columns
 //!                                          number of rows; address of the B-tree of chunks
 //! chunks and nodes of B-trees, in order of writing
@@ -18,7 +18,7 @@ use super::source::Source;
 use super::tree::read_u64;
 use swm_core::{ColumnSpec, DType, Error, Result};
 
-/// The undefined address.
+/// The address that stands for a missing object in HDF5.
 pub(super) const UNDEFINED: u64 = u64::MAX;
 /// The signature of HDF5 files.
 pub(super) const SIGNATURE: [u8; 8] = *b"\x89HDF\r\n\x1a\n";
@@ -40,7 +40,9 @@ const CHUNK_BYTES: usize = 8192;
 /// Rows of at least this size in bytes are single chunks and are compressed.
 const LARGE_ROW: usize = 1024;
 
+/// Name of the dataset of episode lengths.
 pub(super) const LENGTHS: &str = "ep_len";
+/// Name of the dataset of the first rows of episodes.
 pub(super) const OFFSETS: &str = "ep_offset";
 
 /// Types of header messages.
@@ -55,7 +57,7 @@ mod message {
     pub const SYMBOL_TABLE: u16 = 17;
 }
 
-/// The header of a dataset.
+/// The header of an HDF5 dataset.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Table {
     pub spec: ColumnSpec,
@@ -89,13 +91,13 @@ impl Table {
         self.chunk_rows * self.spec.row_bytes()
     }
 
-    /// Sides of a chunk and size of an element, as B-tree keys require.
+    /// Number of offsets in a B-tree key: one per axis of a chunk, and one within an element.
     pub fn sides(&self) -> usize {
         self.spec.shape.len() + 2
     }
 }
 
-/// The first part of a file, whose size is constant.
+/// The start of a file, before the chunks; its size is constant.
 pub(super) struct Layout {
     /// The bytes of a file without episodes.
     pub bytes: Vec<u8>,
@@ -104,7 +106,7 @@ pub(super) struct Layout {
 }
 
 impl Layout {
-    /// The layout for these columns.
+    /// The layout for `columns`.
     ///
     /// # Errors
     /// If a name or a shape cannot be stored.
@@ -131,7 +133,7 @@ impl Layout {
     }
 
     fn of(mut tables: Vec<Table>) -> Self {
-        // Names in the heap, each at a multiple of eight; the first is empty.
+        // The heap holds the names, each at a multiple of eight bytes; the first name is empty.
         let mut heap = vec![0; 8];
         let mut names: Vec<(&str, u64, usize)> = vec![];
         for (i, table) in tables.iter().enumerate().skip(1) {
@@ -165,7 +167,7 @@ impl Layout {
 
         let mut out = superblock(leaf_k as u16, at, tree, heap_at);
         out.extend(header(&root_messages(tree, heap_at, headers[0].0)));
-        // A B-tree with one child.
+        // The B-tree of the root group has one child.
         out.extend(b"TREE\0\0");
         out.extend(1_u16.to_le_bytes());
         for value in [UNDEFINED, UNDEFINED, 0, symbols, last] {
@@ -173,7 +175,7 @@ impl Layout {
         }
         out.resize(heap_at as usize, 0);
         out.extend(b"HEAP\0\0\0\0");
-        // 1 means that there is no free list.
+        // The value 1 means that there is no free list.
         for value in [heap.len() as u64, 1, heap_data] {
             out.extend(value.to_le_bytes());
         }
@@ -192,8 +194,8 @@ impl Layout {
         Self { bytes: out, tables }
     }
 
-    /// Whether `file` is the first part of a file with this layout, apart from integers that change.
-    pub fn is_that_of(&self, file: &[u8]) -> bool {
+    /// Whether `file` is the start of a file with this layout, apart from integers that change.
+    pub fn matches_start(&self, file: &[u8]) -> bool {
         if file.len() != self.bytes.len() {
             return false;
         }
@@ -213,7 +215,7 @@ impl Layout {
 /// Size of the root's header without spare bytes.
 const ROOT_BYTES: u64 = 16 + 8 + 16 + 8 + 8 + 32 + 8 + 8 + 8;
 
-/// The record of a file that was written here.
+/// The record of a file that this module wrote; `None` for a third-party file.
 ///
 /// # Errors
 /// If the file is truncated.
@@ -241,12 +243,12 @@ pub(super) fn record(source: &Source) -> Result<Option<Table>, String> {
 
 fn superblock(leaf_k: u16, end: u64, tree: u64, heap: u64) -> Vec<u8> {
     let mut out = SIGNATURE.to_vec();
-    // Versions; addresses and lengths take eight bytes.
+    // Versions, then the sizes of addresses and of lengths: 8 bytes.
     out.extend([0, 0, 0, 0, 0, 8, 8, 0]);
     out.extend(leaf_k.to_le_bytes());
     out.extend(GROUP_K.to_le_bytes());
     out.extend(0_u32.to_le_bytes());
-    // Base address, free space, end of file, drivers; then the root group: its name and header.
+    // Addresses of base, free space, end of file and drivers; then name and header of the root group.
     for value in [0, UNDEFINED, end, UNDEFINED, 0, ROOT, 1, tree, heap] {
         out.extend(value.to_le_bytes());
     }
@@ -278,7 +280,7 @@ fn header(messages: &[Message]) -> Vec<u8> {
 
 fn root_messages(tree: u64, heap: u64, record: u64) -> Vec<Message> {
     let group = [tree, heap].iter().flat_map(|value| value.to_le_bytes()).collect();
-    // The type of the attribute: an object reference.
+    // The attribute is an object reference.
     let reference = [0x17, 0, 0, 0, 8, 0, 0, 0];
     let mut attribute = vec![1, 0];
     for size in [ATTRIBUTE.len() + 1, reference.len(), 8] {
@@ -300,7 +302,7 @@ fn messages(table: &Table) -> Vec<Message> {
     let mut dataspace = vec![1, rank, 1, 0, 0, 0, 0, 0];
     dataspace.extend(sides(0).chain(sides(UNDEFINED)).flat_map(u64::to_le_bytes));
 
-    // Version 3, chunked.
+    // The layout message has version 3 and declares chunks.
     let mut layout = vec![3, 2, rank + 1];
     layout.extend(UNDEFINED.to_le_bytes());
     let chunk = std::iter::once(table.chunk_rows).chain(shape.iter().copied()).chain([table.spec.dtype.size()]);
@@ -309,8 +311,8 @@ fn messages(table: &Table) -> Vec<Message> {
 
     let mut filters = vec![1, 1 + u8::from(table.compressed), 0, 0, 0, 0, 0, 0];
     if table.compressed {
-        // Optional filter: chunks that do not become smaller are stored uncompressed. Its settings are versions and the
-        // chunk size.
+        // LZF is an optional filter: chunks that do not become smaller are stored uncompressed. The settings of LZF are
+        // two versions and the chunk size.
         filter(&mut filters, id::LZF, b"lzf\0\0\0\0\0", 1, &[4, 0x105, table.chunk_bytes() as u32]);
     }
     filter(&mut filters, id::FLETCHER32, b"fletcher32\0\0\0\0\0\0", 0, &[]);
@@ -333,10 +335,10 @@ fn filter(out: &mut Vec<u8>, id: u16, name: &[u8], flags: u16, settings: &[u32])
     out.resize(out.len().next_multiple_of(8), 0);
 }
 
-/// The message of a numeric type.
+/// The header message that declares a numeric type.
 fn datatype(dtype: DType) -> Vec<u8> {
-    let whole = |signed: u8, size: u8| vec![0x10, signed << 3, 0, 0, size, 0, 0, 0, 0, 0, size * 8, 0, 0, 0, 0, 0];
-    let real = |size: u8, sign: u8, [exponent, exponent_bits, fraction_bits]: [u8; 3], bias: u32| {
+    let integer = |signed: u8, size: u8| vec![0x10, signed << 3, 0, 0, size, 0, 0, 0, 0, 0, size * 8, 0, 0, 0, 0, 0];
+    let float = |size: u8, sign: u8, [exponent, exponent_bits, fraction_bits]: [u8; 3], bias: u32| {
         let mut out =
             vec![0x11, 0x20, sign, 0, size, 0, 0, 0, 0, 0, size * 8, 0, exponent, exponent_bits, 0, fraction_bits];
         out.extend(bias.to_le_bytes());
@@ -351,15 +353,15 @@ fn datatype(dtype: DType) -> Vec<u8> {
             out.resize(out.len().next_multiple_of(8), 0);
             out
         }
-        DType::U8 => whole(0, 1),
-        DType::Int32 => whole(1, 4),
-        DType::Int64 => whole(1, 8),
-        DType::Float32 => real(4, 31, [23, 8, 23], 127),
-        DType::Float64 => real(8, 63, [52, 11, 52], 1023),
+        DType::U8 => integer(0, 1),
+        DType::Int32 => integer(1, 4),
+        DType::Int64 => integer(1, 8),
+        DType::Float32 => float(4, 31, [23, 8, 23], 127),
+        DType::Float64 => float(8, 63, [52, 11, 52], 1023),
     }
 }
 
 /// Stored size of an uncompressed chunk in bytes, including the checksum.
-pub(super) fn summed_bytes(table: &Table) -> usize {
+pub(super) fn stored_chunk_bytes(table: &Table) -> usize {
     table.chunk_bytes() + fletcher32::SIZE
 }

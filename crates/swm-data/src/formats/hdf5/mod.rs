@@ -1,25 +1,26 @@
-//! The format `hdf5`: one file that the reference's `HDF5Dataset` and every HDF5 library read.
+//! The format `hdf5`: one file that the reference implementation's `HDF5Dataset` and every HDF5 library read.
 //!
-//! Each column is a dataset `[rows, shape…]` with all episodes one after another; `ep_len` and `ep_offset` hold the
-//! length and first row of every episode. Types, names and shapes are those of the columns.
+//! Each column is an HDF5 dataset `[rows, shape…]` with the name and type of the column, and holds all episodes one
+//! after another. The datasets `ep_len` and `ep_offset` hold the length and first row of every episode.
 //!
-//! **Reading.** `hdf5-pure` reads the structure of a file; chunks are read here. The chunks of a batch are planned
-//! together, read once each, and decoded on all threads, usually straight into the batch. All chunk layouts and the
-//! usual filters of h5py and hdf5plugin are supported (`filters/`). From `s3://` and `http://` locations, all byte
-//! ranges of a batch are read at once.
+//! **Reading.** The crate `hdf5-pure` reads the structure of a file; this module reads the chunks. The chunks of a
+//! batch are planned together, read once each, and decoded on all threads, usually straight into the batch. All chunk
+//! layouts and the usual filters of h5py and hdf5plugin are supported (`filters/`). From `s3://` and `http://`
+//! locations, all byte ranges of a batch are read concurrently.
 //!
 //! **Writing.** Images are chunks of one row with LZF compression, which h5py reads without plugins; rendered frames
-//! shrink to a fiftieth and read faster than uncompressed. A chunk that would shrink by less than a third (noise,
-//! photographs) is stored uncompressed. Other columns have chunks of 8 KiB. Every chunk has a Fletcher checksum, so
-//! that other programs also detect damage (except words 0xffff replacing 0x0000, which this checksum cannot
-//! distinguish).
+//! shrink to about 2% of their size, and are read faster than uncompressed frames. A chunk that would shrink by less
+//! than a third (noise, photographs) is stored uncompressed. Other columns have chunks of 8 KiB. Every chunk has a
+//! Fletcher checksum, so that other programs also detect damage (except a 16-bit word 0xffff in place of 0x0000, which
+//! does not change this checksum).
 //!
-//! The structure is of the oldest kind (see `layout`), because it can be changed safely in place. A commit writes
-//! chunks first, then the B-trees that refer to them, then the lengths of the columns, and the length of `ep_len` last.
-//! The file is valid at any time; data of a killed writer is not counted and is overwritten by the next writer.
+//! Files use the oldest structures of HDF5 (see `layout`), because these can be changed safely in place. A commit
+//! writes chunks first, then the B-trees that refer to them, then the lengths of the columns, and the length of
+//! `ep_len` last. The file is valid at any time; uncommitted data of a killed writer lies beyond these lengths, and the
+//! next writer overwrites it.
 //!
-//! A writer locks the file. h5py also locks it for reading, unless `HDF5_USE_FILE_LOCKING=FALSE`. To append to a file
-//! with another layout, the writer first copies it to this layout and replaces it.
+//! A writer locks the file. h5py locks the file even for reading, unless `HDF5_USE_FILE_LOCKING=FALSE`. To append to
+//! a file with another layout, the writer first replaces the file with a copy in this layout.
 
 #[cfg(feature = "hdf5")]
 mod chunks;
@@ -78,7 +79,7 @@ fn files(folder: &Path) -> Vec<PathBuf> {
     files
 }
 
-/// The file of a dataset: the location itself, or the only file in a folder, which the reference also supports.
+/// The file of a dataset: the location itself, or the only file in a folder, as in the reference implementation.
 #[cfg(feature = "hdf5")]
 fn file(location: &Location) -> Result<Location> {
     let Some(folder) = location.path().filter(|path| path.is_dir()) else { return Ok(location.clone()) };

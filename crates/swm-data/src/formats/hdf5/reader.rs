@@ -13,8 +13,8 @@ use std::sync::Arc;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{Batch, ColumnSpec, DType, Error, Manifest, Result, Schema};
 
-/// Rows hashed at once.
-const ROWS_AT_ONCE: usize = 64;
+/// Number of rows that are read together for the content hash.
+const ROWS_PER_READ: usize = 64;
 
 /// Opens a file.
 pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
@@ -27,8 +27,8 @@ pub(super) struct Hdf5Reader {
     schema: Schema,
     columns: Vec<Column>,
     record: Record,
-    /// Datasets that are not numeric.
-    left_out: Vec<String>,
+    /// Names of datasets that are not numeric.
+    non_numeric: Vec<String>,
 }
 
 impl Hdf5Reader {
@@ -67,14 +67,15 @@ impl Hdf5Reader {
             }
         };
         let rows = EpisodeRows::from_lengths(&counts(LENGTHS)?, &counts(OFFSETS)?).map_err(damaged)?;
-        let (mut columns, mut left_out) = (vec![], vec![]);
+        let (mut columns, mut non_numeric) = (vec![], vec![]);
         for name in names.iter().filter(|name| *name != LENGTHS && *name != OFFSETS) {
             let Some(column) = column(name)? else {
-                left_out.push(name.clone());
+                non_numeric.push(name.clone());
                 continue;
             };
             if column.rows < rows.total() {
-                let problem = format!("column '{name}' has {} rows, its episodes {}", column.rows, rows.total());
+                let problem =
+                    format!("column '{name}' has {} rows, but its episodes have {}", column.rows, rows.total());
                 return Err(damaged(problem));
             }
             columns.push(column);
@@ -96,10 +97,10 @@ impl Hdf5Reader {
         let specs: Vec<ColumnSpec> = columns.iter().map(|column| column.spec.clone()).collect();
         let data = specs.iter().filter(|spec| spec.name != EPISODE_IDX && spec.name != STEP_IDX).cloned();
         let schema = Schema::new(index_columns(&specs).into_iter().chain(data).collect::<Vec<_>>())?;
-        Ok(Self { source, rows, schema, columns, record, left_out })
+        Ok(Self { source, rows, schema, columns, record, non_numeric })
     }
 
-    /// The rows of the episodes.
+    /// First row and length of every episode.
     pub const fn rows(&self) -> &EpisodeRows {
         &self.rows
     }
@@ -115,8 +116,8 @@ impl Hdf5Reader {
     }
 
     /// Names of datasets that are not numeric.
-    pub fn left_out(&self) -> &[String] {
-        &self.left_out
+    pub fn non_numeric(&self) -> &[String] {
+        &self.non_numeric
     }
 
     fn fail(&self, column: &str, problem: &str) -> Error {
@@ -125,7 +126,7 @@ impl Hdf5Reader {
 }
 
 fn damaged(source: &Source, problem: String) -> Error {
-    Error::corrupt(source.label(), problem, "restore it from a copy, or convert the part that h5py can read")
+    Error::corrupt(source.label(), problem, "restore it from a copy, or convert the columns that h5py can read")
 }
 
 impl Reader for Hdf5Reader {
@@ -158,7 +159,7 @@ impl Reader for Hdf5Reader {
         Ok(self.record.constants(episode))
     }
 
-    /// Episodes that share rows, and stored step indices that differ from the positions in the episode.
+    /// Reports episodes that share rows, and stored step indices that differ from the positions in the episode.
     fn irregularities(&self) -> Result<Vec<Irregularity>> {
         let mut found = vec![];
         let mut order: Vec<usize> = (0..self.episodes().len()).collect();
@@ -167,7 +168,7 @@ impl Reader for Hdf5Reader {
             if self.rows.first_rows()[pair[0]] + self.episodes()[pair[0]].length as u64
                 > self.rows.first_rows()[pair[1]]
             {
-                let what = format!("some of its rows are also those of episode {}", pair[0]);
+                let what = format!("some of its rows also belong to episode {}", pair[0]);
                 found.push(Irregularity { episode: Some(pair[1]), what });
             }
         }
@@ -212,8 +213,8 @@ impl Reader for Hdf5Reader {
         content_hash(&self.rows, &self.schema.columns()[2..], |column, add| {
             let mut bytes = vec![];
             for (position, episode) in self.rows.episodes().iter().enumerate() {
-                for start in (0..episode.length).step_by(ROWS_AT_ONCE) {
-                    let length = ROWS_AT_ONCE.min(episode.length - start);
+                for start in (0..episode.length).step_by(ROWS_PER_READ) {
+                    let length = ROWS_PER_READ.min(episode.length - start);
                     bytes.resize(length * column.row_bytes(), 0);
                     self.read_column(&column.name, &[StepRange::new(position, start, length)], &mut bytes)?;
                     bytes.chunks_exact(column.row_bytes()).for_each(&mut *add);

@@ -1,8 +1,8 @@
 //! The record: metadata that is stored beside the columns (original schema, manifest, constants of episodes). It is an
-//! unnamed byte dataset, so no program treats it as a column; the root's attribute `stable_worldmodel.record` refers to
-//! it.
+//! unnamed byte dataset, so no program treats it as a column; the attribute `stable_worldmodel.record` of the root
+//! group refers to it.
 //!
-//! The record consists of JSON lines and is only appended to. The bytes of a constant follow its line.
+//! The record consists of JSON lines; writers only append lines. The bytes of a constant follow the constant's line.
 
 use crate::dataset::Constants;
 use serde::{Deserialize, Serialize};
@@ -10,18 +10,19 @@ use std::collections::{BTreeMap, HashMap};
 use std::ops::Range;
 use swm_core::{Error, Manifest, Result, Schema};
 
+/// A line of the record.
 #[derive(Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 enum Line {
-    /// The columns.
+    /// The columns of the file.
     Schema(Schema),
-    /// The manifest; the last such line is valid.
+    /// The manifest; the last line of this kind is valid.
     Manifest(Box<Manifest>),
-    /// A constant with this many bytes, which follow. Constants are numbered in order.
+    /// The size of a constant in bytes; these bytes follow the line. Constants are numbered from 0 in stored order.
     Constant(usize),
-    /// A writer finished, with this many episodes.
+    /// The number of episodes when a writer finished.
     Closed(usize),
-    /// The constants of an episode, by their numbers.
+    /// The position of an episode, and the number of each of its constants by name.
     Episode { number: usize, constants: BTreeMap<String, usize> },
 }
 
@@ -34,7 +35,7 @@ pub(super) struct Record {
     /// Byte ranges of the constants.
     constants: Vec<Range<usize>>,
     episodes: HashMap<usize, BTreeMap<String, usize>>,
-    /// Length of the part that belongs to committed episodes.
+    /// Length in bytes of the part that belongs to committed episodes.
     pub committed: usize,
 }
 
@@ -90,24 +91,26 @@ impl Record {
 /// Produces the lines of a record.
 #[derive(Default)]
 pub(super) struct RecordWriter {
-    known: HashMap<blake3::Hash, usize>,
+    /// Number of each stored constant, by its BLAKE3 hash.
+    number_by_hash: HashMap<blake3::Hash, usize>,
+    /// Number of stored constants.
     count: usize,
 }
 
 impl RecordWriter {
-    /// Continues the committed part of a record.
-    pub fn continued(record: &Record) -> Self {
+    /// Continues after the committed part of a record.
+    pub fn resume(record: &Record) -> Self {
         let committed = record.constants.iter().take_while(|range| range.end <= record.committed);
         let hashes: Vec<blake3::Hash> = committed.map(|range| blake3::hash(&record.bytes[range.clone()])).collect();
-        Self { count: hashes.len(), known: hashes.into_iter().zip(0..).collect() }
+        Self { count: hashes.len(), number_by_hash: hashes.into_iter().zip(0..).collect() }
     }
 
-    /// The line of the columns.
+    /// The line that stores the columns.
     pub fn schema(schema: &Schema) -> Result<Vec<u8>> {
         line(&Line::Schema(schema.clone()))
     }
 
-    /// The line of a manifest.
+    /// The line that stores a manifest.
     pub fn manifest(manifest: &Manifest) -> Result<Vec<u8>> {
         line(&Line::Manifest(Box::new(manifest.clone())))
     }
@@ -117,7 +120,7 @@ impl RecordWriter {
         line(&Line::Closed(episodes))
     }
 
-    /// The lines of an episode. Constants that are stored already are referred to by number.
+    /// The lines of an episode. Constants that are stored already are not stored again.
     pub fn episode(&mut self, number: usize, constants: &Constants) -> Result<Vec<u8>> {
         if constants.is_empty() {
             return Ok(vec![]);
@@ -125,7 +128,7 @@ impl RecordWriter {
         let mut out = vec![];
         let mut named = BTreeMap::new();
         for (name, bytes) in constants {
-            let index = *self.known.entry(blake3::hash(bytes)).or_insert(self.count);
+            let index = *self.number_by_hash.entry(blake3::hash(bytes)).or_insert(self.count);
             if index == self.count {
                 self.count += 1;
                 out.extend(line(&Line::Constant(bytes.len()))?);

@@ -29,7 +29,7 @@ enum Kind {
 #[derive(Default)]
 struct Blocks {
     by_index: HashMap<u64, Bytes>,
-    /// Oldest first.
+    /// Block indices, oldest first.
     order: VecDeque<u64>,
 }
 
@@ -37,7 +37,7 @@ impl Source {
     /// Opens a file.
     ///
     /// # Errors
-    /// If it does not exist or cannot be read.
+    /// If the file does not exist or cannot be read.
     pub fn open(location: &Location) -> Result<Self> {
         let Some(path) = location.path() else {
             let file = ObjectFile::open(location)?;
@@ -54,9 +54,9 @@ impl Source {
         Self::of(file, path)
     }
 
-    /// An open local file, with its present size.
+    /// Wraps an open local file, with the present size of the file.
     pub fn of(file: File, path: &Path) -> Result<Self> {
-        let len = file.metadata().map_err(|e| Error::io(path, "reading its size", e))?.len();
+        let len = file.metadata().map_err(|e| Error::io(path, "reading the size of the file", e))?.len();
         Ok(Self(Arc::new(Kind::Local { file, path: path.to_owned(), len })))
     }
 
@@ -76,7 +76,7 @@ impl Source {
         }
     }
 
-    /// Whether the file is in an object store. Requests to a store take long and should run concurrently.
+    /// Whether the file is in an object store. Requests to a store are slow and should run concurrently.
     pub fn is_remote(&self) -> bool {
         matches!(&*self.0, Kind::Remote { .. })
     }
@@ -115,7 +115,8 @@ impl Source {
         }
     }
 
-    /// Reads all ranges of a remote file concurrently, returned in the given order. Returns nothing for a local file.
+    /// Reads all ranges of a remote file concurrently, returned in the given order. Returns an empty list for a local
+    /// file.
     ///
     /// # Errors
     /// As [`Source::read`].

@@ -6,12 +6,12 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// Calls `hdf5-pure`, which may panic on damaged files.
 pub(super) fn catch_panic<T, E: std::fmt::Display>(
-    what: &str,
+    action: &str,
     code: impl FnOnce() -> Result<T, E>,
 ) -> Result<T, String> {
     match catch_unwind(AssertUnwindSafe(code)) {
-        Ok(result) => result.map_err(|e| format!("{what}: {e}")),
-        Err(_) => Err(format!("{what}: the HDF5 library panicked")),
+        Ok(result) => result.map_err(|e| format!("{action}: {e}")),
+        Err(_) => Err(format!("{action}: the HDF5 library panicked")),
     }
 }
 
@@ -25,7 +25,7 @@ pub(super) fn scalar_type(datatype: &Datatype) -> Option<StoredScalar> {
             (if layout.signed { Class::Signed } else { Class::Unsigned }, *size, *byte_order)
         }
         Datatype::FloatingPoint { size, byte_order, layout } => {
-            // IEEE 754 with 16, 32 or 64 bits.
+            // Accepts IEEE 754 types with 16, 32 or 64 bits.
             let half = FloatingPointLayout {
                 bit_precision: 16,
                 exponent_location: 10,
@@ -41,7 +41,7 @@ pub(super) fn scalar_type(datatype: &Datatype) -> Option<StoredScalar> {
             }
             (Class::Float, *size, *byte_order)
         }
-        // The type that h5py stores booleans as.
+        // h5py stores booleans as an enumeration with two members.
         Datatype::Enumeration { size: 1, members, .. } if members.len() == 2 => {
             (Class::Bool, 1, DatatypeByteOrder::LittleEndian)
         }

@@ -1,7 +1,7 @@
-//! Writes one HDF5 dataset: stores rows in chunks, which readers see after the next commit.
+//! Writes one HDF5 dataset: stores rows in chunks, which the next commit makes visible to readers.
 
 use super::filters::{fletcher32, lzf};
-use super::layout::{Table, summed_bytes};
+use super::layout::{Table, stored_chunk_bytes};
 use super::source::Source;
 use super::tree::{Entry, Tree, read_u64};
 use rayon::prelude::*;
@@ -22,8 +22,9 @@ thread_local! {
 
 /// Allocates space at the end of the file.
 pub(super) struct Space {
-    /// The end of the file.
+    /// Offset of the end of the file, in bytes.
     pub end: u64,
+    /// Unused part of the latest region for nodes.
     nodes: std::ops::Range<u64>,
 }
 
@@ -64,6 +65,7 @@ pub(super) struct TableWriter {
     free_after_commit: Vec<u64>,
     /// Encoded chunks of an episode.
     encoded: Vec<Vec<u8>>,
+    /// Bytes of the current write; the buffer is reused.
     writing: Vec<u8>,
 }
 
@@ -155,9 +157,9 @@ impl TableWriter {
         Ok(())
     }
 
-    /// Writes the incomplete chunk to a new region.
+    /// Writes the incomplete chunk to a free address or to the end of the file.
     fn store_open(&mut self, file: &File, space: &mut Space) -> io::Result<()> {
-        let size = summed_bytes(&self.table);
+        let size = stored_chunk_bytes(&self.table);
         let address = self.free.pop().unwrap_or_else(|| space.take(size));
         self.writing.clear();
         self.writing.extend(&self.open);
@@ -212,15 +214,15 @@ pub(super) fn read_all(table: &Table, source: &Source) -> Result<Vec<u8>, String
     }
     let expected = usize::try_from(rows).ok().and_then(|rows| rows.checked_mul(size));
     let Some(expected) = expected.filter(|&expected| expected <= all.len()) else {
-        return Err(format!("it has {rows} rows, but chunks for {}", all.len() / size));
+        return Err(format!("it has {rows} rows, but its chunks hold {}", all.len() / size));
     };
     all.truncate(expected);
     Ok(all)
 }
 
 fn read_chunk(table: &Table, source: &Source, entry: &Entry) -> Result<Vec<u8>, String> {
-    if entry.size as usize != summed_bytes(table) || entry.filter_mask != 0 {
-        return Err(format!("a chunk has {} bytes instead of {}", entry.size, summed_bytes(table)));
+    if entry.size as usize != stored_chunk_bytes(table) || entry.filter_mask != 0 {
+        return Err(format!("a chunk has {} bytes instead of {}", entry.size, stored_chunk_bytes(table)));
     }
     let mut bytes = vec![0; entry.size as usize];
     source.read(entry.address, &mut bytes).map_err(|e| e.to_string())?;

@@ -1,8 +1,8 @@
 //! The B-tree (version 1) of a dataset's chunks. It only grows at its right edge.
 //!
 //! A node has room for 64 children. Each child is preceded by the key of its first chunk (size, skipped filters, offset
-//! along every side); a key beyond all chunks follows the last child. A commit first writes new nodes, to which nothing
-//! refers yet; then appends children to existing nodes; then updates child counts and the root.
+//! along every side); a key beyond all chunks follows the last child. A commit first writes new nodes, to which the
+//! file does not refer yet. It then appends children to existing nodes, and finally updates child counts and the root.
 
 use super::layout::{Table, UNDEFINED};
 use super::source::Source;
@@ -10,28 +10,33 @@ use std::fs::File;
 use std::io;
 use std::os::unix::fs::FileExt as _;
 
-/// Maximum number of children of a node: twice the library's default.
-const FULL: usize = 64;
+/// Maximum number of children of a node: `2 K`, with the HDF5 library's default `K` of 32.
+const MAX_CHILDREN: usize = 64;
 
 /// An entry of a node: a chunk, or a node one level below, identified by its first chunk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Entry {
-    /// Stored size of the (first) chunk in bytes, and the mask of skipped filters.
+    /// Stored size of the (first) chunk in bytes.
     pub size: u32,
+    /// Bits of the filters that were skipped for the (first) chunk.
     pub filter_mask: u32,
-    /// First row of the chunk.
+    /// First row of the (first) chunk.
     pub row: u64,
+    /// Offset of the chunk or node in the file, in bytes.
     pub address: u64,
 }
 
 /// A node on the right edge, or a node that was completed since the last commit.
 struct Node {
     address: u64,
+    /// 0 for a leaf.
     level: u8,
+    /// Address of the left sibling.
     left: u64,
+    /// Address of the right sibling.
     right: u64,
     entries: Vec<Entry>,
-    /// The first row after the node.
+    /// The first row after the chunks of the node.
     end: u64,
     /// Number of entries in the file; `None` if the node is not written yet.
     written: Option<usize>,
@@ -39,11 +44,14 @@ struct Node {
     moved: bool,
 }
 
+/// The B-tree of a dataset's chunks.
 pub(super) struct Tree {
+    /// See [`Table::sides`].
     sides: usize,
     chunk_rows: u64,
-    /// Offset of the root's address in the file, and the stored address.
+    /// Offset in the file of the root's address.
     root_at: u64,
+    /// Stored address of the root.
     root: u64,
     /// Nodes of the right edge, leaf first.
     edge: Vec<Node>,
@@ -82,7 +90,7 @@ impl Tree {
         tree.edge.reverse();
         let end = tree.last().map_or(0, |last| last.row + tree.chunk_rows);
         if end < rows || end.saturating_sub(rows) >= tree.chunk_rows {
-            return Err(format!("its chunks end before row {end}, its rows before {rows}"));
+            return Err(format!("its chunks end before row {end} instead of row {rows}"));
         }
         tree.edge.iter_mut().for_each(|node| node.end = end);
         Ok(tree)
@@ -115,7 +123,7 @@ impl Tree {
         if level == self.edge.len() {
             self.edge.push(fresh(UNDEFINED, allocate(size)));
         }
-        if self.edge[level].entries.len() == FULL {
+        if self.edge[level].entries.len() == MAX_CHILDREN {
             let (left, first) = (self.edge[level].address, self.edge[level].entries[0]);
             if level + 1 == self.edge.len() {
                 self.insert(level + 1, Entry { address: left, ..first }, allocate);
@@ -129,7 +137,7 @@ impl Tree {
         self.edge[level].entries.push(entry);
     }
 
-    /// Changes the address of the last chunk, and returns the previous one.
+    /// Changes the address of the last chunk, and returns the previous address.
     pub fn move_last(&mut self, address: u64) -> Option<u64> {
         let node = self.edge.first_mut()?;
         let last = node.entries.len().checked_sub(1)?;
@@ -137,7 +145,7 @@ impl Tree {
         Some(std::mem::replace(&mut node.entries[last].address, address))
     }
 
-    /// Writes the nodes to which nothing in the file refers yet.
+    /// Writes new nodes, to which the file does not refer yet.
     pub fn write_new(&self, file: &File) -> io::Result<()> {
         for node in self.full.iter().chain(&self.edge).filter(|node| node.written.is_none()) {
             let mut bytes = node.head();
@@ -148,7 +156,7 @@ impl Tree {
         Ok(())
     }
 
-    /// Updates nodes in the file and the root. The tree in the file is valid after each of these small writes.
+    /// Updates nodes in the file and the root. The tree in the file is valid after each write.
     pub fn write_changes(&mut self, file: &File) -> io::Result<()> {
         for node in self.full.iter().chain(&self.edge) {
             let Some(written) = node.written else { continue };
@@ -158,7 +166,7 @@ impl Tree {
                 let at = node.address + self.key_at(written - 1) + self.key_bytes();
                 file.write_all_at(&entry.address.to_le_bytes(), at)?;
             }
-            // The child count and the siblings, within 24 bytes.
+            // Writes the child count and the sibling addresses, which lie within the first 24 bytes.
             file.write_all_at(&node.head()[6..], node.address + 6)?;
         }
         if let Some(root) = self.edge.last()
@@ -207,10 +215,10 @@ impl Tree {
     }
 
     fn node_bytes(&self) -> usize {
-        (self.key_at(FULL) + self.key_bytes()) as usize
+        (self.key_at(MAX_CHILDREN) + self.key_bytes()) as usize
     }
 
-    /// The bytes of a node, from the key of an entry to the final key.
+    /// The bytes of a node, from the key of entry `from` to the final key.
     fn tail(&self, node: &Node, from: usize) -> Vec<u8> {
         let mut out = vec![];
         let key = |out: &mut Vec<u8>, size: u32, filter_mask: u32, row: u64| {
@@ -234,7 +242,7 @@ impl Tree {
         let count = usize::from(u16::from_le_bytes([bytes[6], bytes[7]]));
         let u64_at = |at: usize| u64::from_le_bytes(std::array::from_fn(|i| bytes[at + i]));
         let u32_at = |at: usize| u32::from_le_bytes(std::array::from_fn(|i| bytes[at + i]));
-        if bytes[..4] != *b"TREE" || kind != 1 || count > FULL || (level > 0 && count == 0) {
+        if bytes[..4] != *b"TREE" || kind != 1 || count > MAX_CHILDREN || (level > 0 && count == 0) {
             return Err(format!("there is no B-tree node at byte {address}"));
         }
         let entry = |i: usize| {

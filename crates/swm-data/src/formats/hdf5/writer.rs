@@ -48,12 +48,12 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
             let mut writer = match Hdf5Writer::resume(path, &reader, old)? {
                 Ok(writer) => writer,
                 // The old file stays locked until its copy replaces it.
-                Err(_old) => copied(path, &reader)?,
+                Err(_old) => copy_to_this_layout(path, &reader)?,
             };
             if let Some(manifest) = manifest
                 && reader.manifest().as_ref() != Some(manifest)
             {
-                writer.record(&RecordWriter::manifest(manifest)?)?;
+                writer.append_record(&RecordWriter::manifest(manifest)?)?;
                 writer.commit()?;
             }
             writer
@@ -64,7 +64,7 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
     Ok(Box::new(writer))
 }
 
-/// Whether a complete file exists.
+/// Whether a complete HDF5 file exists at `path`.
 fn is_complete_file(path: &Path) -> Result<bool> {
     let mut start = [0; SIGNATURE.len()];
     match File::open(path) {
@@ -90,13 +90,13 @@ fn lock(path: &Path) -> Result<File> {
         Ok(()) => Ok(file),
         Err(TryLockError::WouldBlock) => {
             let problem = format!("another process writes to {}", path.display());
-            Err(Error::config("dataset", problem, "wait until it is done, or choose another path"))
+            Err(Error::config("dataset", problem, "wait until that process has finished, or choose another path"))
         }
         Err(TryLockError::Error(e)) => Err(Error::io(path, "locking the file", e)),
     }
 }
 
-/// A temporary name in the same folder.
+/// A temporary path in the folder of `path`.
 fn temporary_path(path: &Path) -> PathBuf {
     let name = format!(".{}.tmp", uuid::Uuid::new_v4().simple());
     path.with_file_name(name)
@@ -109,9 +109,9 @@ fn replace_file(mut writer: Hdf5Writer, temporary: &Path, path: &Path) -> Result
     Ok(writer)
 }
 
-/// Copies a file with another layout to a file with this layout, which replaces it.
-fn copied(path: &Path, reader: &Hdf5Reader) -> Result<Hdf5Writer> {
-    if let [name, ..] = reader.left_out() {
+/// Copies the file at `path` to this module's layout, and replaces the file with the copy.
+fn copy_to_this_layout(path: &Path, reader: &Hdf5Reader) -> Result<Hdf5Writer> {
+    if let [name, ..] = reader.non_numeric() {
         let problem = format!("its dataset '{name}' is not numeric and cannot be appended to");
         return Err(Error::corrupt(path, problem, "convert it to a new dataset, without this column"));
     }
@@ -128,7 +128,7 @@ fn copied(path: &Path, reader: &Hdf5Reader) -> Result<Hdf5Writer> {
         replace_file(writer, &temporary, path)
     };
     copy().inspect_err(|_| {
-        // Nothing refers to the temporary file yet.
+        // Returns the error of the copy, even if the temporary file cannot be removed.
         let _ = std::fs::remove_file(&temporary);
     })
 }
@@ -139,7 +139,7 @@ struct Hdf5Writer {
     space: Space,
     /// The record, lengths and first rows of episodes, then the columns.
     tables: Vec<TableWriter>,
-    /// Columns of the episodes that are added.
+    /// Columns of the episodes to add.
     schema: Schema,
     policy: CommitPolicy,
     last_commit: Instant,
@@ -147,7 +147,7 @@ struct Hdf5Writer {
     committed_end: u64,
     /// Number of episodes since the last commit.
     in_group: usize,
-    /// Whether episodes were added since the file was last closed.
+    /// Whether episodes were added since the record was last closed.
     unclosed: bool,
     rows: EpisodeRows,
     record: RecordWriter,
@@ -156,13 +156,13 @@ struct Hdf5Writer {
     scratch: Vec<u8>,
 }
 
-/// Indices in [`Hdf5Writer::tables`].
+/// Index of the record in [`Hdf5Writer::tables`].
 const RECORD: usize = 0;
-/// See [`RECORD`].
+/// Index of the lengths of episodes in [`Hdf5Writer::tables`].
 const LENGTHS: usize = 1;
-/// See [`RECORD`].
+/// Index of the first rows of episodes in [`Hdf5Writer::tables`].
 const OFFSETS: usize = 2;
-/// See [`RECORD`].
+/// Index of the first column in [`Hdf5Writer::tables`].
 const COLUMNS: usize = 3;
 
 impl Hdf5Writer {
@@ -176,9 +176,9 @@ impl Hdf5Writer {
         let space = Space::new(layout.bytes.len() as u64);
         let tables = layout.tables.into_iter().map(TableWriter::new).collect();
         let mut writer = Self::of(path, file, space, tables, schema);
-        writer.record(&RecordWriter::schema(schema)?)?;
+        writer.append_record(&RecordWriter::schema(schema)?)?;
         if let Some(manifest) = manifest {
-            writer.record(&RecordWriter::manifest(manifest)?)?;
+            writer.append_record(&RecordWriter::manifest(manifest)?)?;
         }
         writer.commit()?;
         writer.file.write_all_at(signature, 0).map_err(io)?;
@@ -196,7 +196,7 @@ impl Hdf5Writer {
             return Ok(Err(file));
         }
         source.read(0, &mut start)?;
-        if !layout.is_that_of(&start) || !reader.rows().is_contiguous() {
+        if !layout.matches_start(&start) || !reader.rows().is_contiguous() {
             return Ok(Err(file));
         }
         let rows = reader.rows().clone();
@@ -211,7 +211,7 @@ impl Hdf5Writer {
                 Error::corrupt(path, format!("column '{name}': {problem}"), "convert it to a new dataset")
             })?);
         }
-        let record = RecordWriter::continued(reader.record());
+        let record = RecordWriter::resume(reader.record());
         let mut writer = Self::of(path, file, Space::new(source.size()), tables, schema);
         (writer.rows, writer.record) = (rows, record);
         Ok(Ok(writer))
@@ -236,20 +236,20 @@ impl Hdf5Writer {
         }
     }
 
-    fn put(&mut self, table: usize, rows: &[u8]) -> Result<()> {
+    fn append_rows(&mut self, table: usize, rows: &[u8]) -> Result<()> {
         let written = self.tables[table].append(&self.file, &mut self.space, rows);
         written.map_err(|e| Error::io(&self.path, "writing an episode", e))
     }
 
-    fn record(&mut self, lines: &[u8]) -> Result<()> {
-        self.put(RECORD, lines)
+    fn append_record(&mut self, lines: &[u8]) -> Result<()> {
+        self.append_rows(RECORD, lines)
     }
 
     /// Appends the rows of an episode.
     fn append(&mut self, episode: &Batch, constants: &Constants) -> Result<()> {
         let position = self.rows.episodes().len();
         let first = self.rows.total();
-        let too_many = || Error::mismatch("writing an episode", "more than 2^31 - 1 rows", "fewer");
+        let too_many = || Error::mismatch("writing an episode", "more than 2^31 - 1 rows", "fewer rows");
         let length = i32::try_from(episode.rows()).map_err(|_| too_many())?;
         // Remains `true` if a write fails, because incomplete data must not be committed.
         self.failed = true;
@@ -260,7 +260,7 @@ impl Hdf5Writer {
                 let mut indices = std::mem::take(&mut self.scratch);
                 indices.resize(episode.rows() * spec.row_bytes(), 0);
                 self.rows.fill_index_column(&spec, &[StepRange::new(position, 0, episode.rows())], &mut indices)?;
-                self.put(at, &indices)?;
+                self.append_rows(at, &indices)?;
                 self.scratch = indices;
             } else {
                 let column = episode.schema().index(&spec.name)?;
@@ -269,16 +269,16 @@ impl Hdf5Writer {
             }
         }
         let lines = self.record.episode(position, constants)?;
-        self.record(&lines)?;
-        self.put(OFFSETS, &first.to_le_bytes())?;
-        self.put(LENGTHS, &length.to_le_bytes())?;
+        self.append_record(&lines)?;
+        self.append_rows(OFFSETS, &first.to_le_bytes())?;
+        self.append_rows(LENGTHS, &length.to_le_bytes())?;
         self.in_group += 1;
         self.unclosed = true;
         self.failed = false;
         Ok(())
     }
 
-    /// Commits everything that was added.
+    /// Commits all added episodes and record lines.
     fn commit(&mut self) -> Result<()> {
         self.failed = true;
         self.try_commit().map_err(|e| Error::io(&self.path, "committing episodes", e))?;
@@ -312,7 +312,7 @@ impl Hdf5Writer {
             return Ok(());
         }
         self.failed = true;
-        self.record(&RecordWriter::closed(self.rows.episodes().len())?)?;
+        self.append_record(&RecordWriter::closed(self.rows.episodes().len())?)?;
         self.commit()?;
         self.unclosed = false;
         Ok(())
@@ -366,7 +366,7 @@ mod tests {
     #[test]
     fn rejects_invalid_column_names() {
         for name in ["ep_len", "a/b", "."] {
-            let error = Layout::new(&[ColumnSpec::new(name, DType::U8, [])]).err().expect("an error");
+            let error = Layout::new(&[ColumnSpec::new(name, DType::U8, [])]).err().expect("an invalid name");
             assert!(error.to_string().contains(name), "{error}");
         }
     }

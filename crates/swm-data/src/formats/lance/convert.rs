@@ -26,7 +26,7 @@ pub fn image_bytes(values: &ArrayRef, row: usize) -> Result<&[u8]> {
 pub fn convert(values: &ArrayRef, n: usize, dtype: DType, out: &mut [u8]) -> Result<(), String> {
     let elements = match values.as_fixed_size_list_opt() {
         Some(lists) if lists.value_length() as usize == n && lists.null_count() == 0 => {
-            // `values` has the list's offset applied by slicing.
+            // `values()` ignores the offset of the list array, so the slice applies it.
             lists.values().slice(lists.value_offset(0) as usize, lists.len() * n)
         }
         Some(lists) => {
@@ -67,7 +67,7 @@ pub fn convert(values: &ArrayRef, n: usize, dtype: DType, out: &mut [u8]) -> Res
 
 /// A value that is converted to the type of a column.
 pub trait Scalar: Copy {
-    /// The value that stands for a null; `None` if the type has none.
+    /// The value that stands for a null; `None` if the type has no such value.
     const MISSING: Option<Self>;
     /// The value, rounded to `f64`.
     fn f64(self) -> f64;
@@ -112,20 +112,20 @@ where
 
 /// Writes values as a column with type `dtype`.
 pub fn cast<N: Scalar>(values: impl Iterator<Item = N>, dtype: DType, out: &mut [u8]) {
-    fn put<const SIZE: usize>(out: &mut [u8], values: impl Iterator<Item = [u8; SIZE]>) {
+    fn write_each<const SIZE: usize>(out: &mut [u8], values: impl Iterator<Item = [u8; SIZE]>) {
         out.chunks_exact_mut(SIZE).zip(values).for_each(|(slot, value)| slot.copy_from_slice(&value));
     }
     match dtype {
-        DType::Bool => put(out, values.map(|v| [u8::from(v.f64() != 0.0)])),
-        DType::U8 => put(out, values.map(|v| [v.i64() as u8])),
-        DType::Int32 => put(out, values.map(|v| (v.i64() as i32).to_ne_bytes())),
-        DType::Int64 => put(out, values.map(|v| v.i64().to_ne_bytes())),
-        DType::Float32 => put(out, values.map(|v| (v.f64() as f32).to_ne_bytes())),
-        DType::Float64 => put(out, values.map(|v| v.f64().to_ne_bytes())),
+        DType::Bool => write_each(out, values.map(|v| [u8::from(v.f64() != 0.0)])),
+        DType::U8 => write_each(out, values.map(|v| [v.i64() as u8])),
+        DType::Int32 => write_each(out, values.map(|v| (v.i64() as i32).to_ne_bytes())),
+        DType::Int64 => write_each(out, values.map(|v| v.i64().to_ne_bytes())),
+        DType::Float32 => write_each(out, values.map(|v| (v.f64() as f32).to_ne_bytes())),
+        DType::Float64 => write_each(out, values.map(|v| v.f64().to_ne_bytes())),
     }
 }
 
-/// Reads integers of any width.
+/// Converts integers of any width to 64 bits.
 pub fn integers(values: &ArrayRef, out: &mut [i64]) -> Result<()> {
     convert(values, 1, DType::Int64, bytemuck::cast_slice_mut(out))
         .map_err(|problem| Error::mismatch("reading index columns", problem, "integers"))

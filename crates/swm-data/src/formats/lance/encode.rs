@@ -10,13 +10,13 @@ use std::sync::Arc;
 use swm_core::{Batch, DType, Error, Result};
 use swm_image::ImageCodec;
 
-/// An encoded episode; its index is assigned when it is committed.
+/// An encoded episode. The commit assigns its `episode_idx`.
 pub struct EncodedEpisode {
     /// Number of rows.
     pub rows: i32,
     /// `step_idx`, then the columns in the order of the table.
     pub values: Vec<ArrayRef>,
-    /// See [`ContentHash`].
+    /// Hash of the values and the constants; see [`ContentHash`].
     pub hash: String,
     /// The constants of the episode.
     pub constants: Constants,
@@ -26,7 +26,7 @@ impl EncodedEpisode {
     /// Encodes an episode, with all images in parallel.
     ///
     /// # Errors
-    /// If it is too long, or a value does not fit its stored type.
+    /// If the episode is too long, or a value does not fit its stored type.
     pub fn new(columns: &[StoredColumn], episode: &Batch, codec: ImageCodec, constants: &Constants) -> Result<Self> {
         let Ok(rows) = i32::try_from(episode.rows()) else {
             return Err(Error::mismatch("writing an episode", "2^31 or more rows", "fewer rows"));
@@ -52,8 +52,8 @@ impl EncodedEpisode {
     }
 }
 
-/// Encodes the images of a column in parallel. An image that equals the previous one (a goal, for example) is encoded
-/// once.
+/// Encodes the images of a column in parallel. An image that equals the previous image, such as a goal image,
+/// is not encoded again.
 fn encode_images(episode: &Batch, index: usize, codec: ImageCodec) -> Result<BinaryArray> {
     let spec = &episode.schema().columns()[index];
     let (height, width) = (spec.shape[0], spec.shape[1]);

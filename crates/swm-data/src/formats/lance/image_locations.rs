@@ -1,8 +1,8 @@
-//! Locations of the encoded images of a column within a data file, so that each can be read directly.
+//! Locations of the encoded images of a column within a data file, so that each image can be read directly.
 //!
-//! Lance's decoder plans every read anew, which takes longer than decoding for a batch of single images. Its "full zip"
-//! pages, which it uses for values of this size, have a simple layout: a buffer of values, each with a length prefix,
-//! and a buffer of row bounds. Columns with any other layout are read with Lance's decoder.
+//! Lance's decoder plans every read anew; for a batch of single images, planning takes longer than decoding. Lance
+//! stores values as large as images in "full zip" pages, which have a simple layout: a buffer of values, each with a
+//! length prefix, and a buffer of row bounds. Columns with pages of any other layout are read with Lance's decoder.
 
 use bytes::Bytes;
 use lance_encoding::decoder::{ColumnInfo, PageEncoding, PageInfo};
@@ -22,7 +22,7 @@ struct Page {
     rows: u64,
     /// Byte range of the values within the file.
     values: Range<u64>,
-    /// Start of each row within `values` and the end of the last: little-endian integers of `width` bytes.
+    /// Start of each row within `values`, then the end of the last row: little-endian integers of `width` bytes.
     bounds: Bytes,
     width: usize,
     /// Size of the length prefix of each value, in bytes.
@@ -30,10 +30,11 @@ struct Page {
 }
 
 impl ImageLocations {
-    /// Reads the locations; `None` if the column has another layout. `read` returns byte ranges of the file.
+    /// Reads the locations; `None` if a page of the column is not a full-zip page. `read` returns byte ranges of the
+    /// file.
     ///
     /// # Errors
-    /// Errors of `read`.
+    /// If `read` fails.
     pub fn read<E>(
         column: &ColumnInfo,
         file_size: u64,
@@ -90,7 +91,7 @@ pub struct ImageLocation {
 }
 
 impl ImageLocation {
-    /// The encoded image in the bytes of this location; `None` if the length prefix differs from the bounds.
+    /// Extracts the encoded image from the bytes of this location; `None` if the length prefix differs from the bounds.
     pub fn image<'a>(&self, bytes: &'a [u8]) -> Option<&'a [u8]> {
         let (stored_length, image) = bytes.split_at_checked(self.prefix)?;
         let mut padded = [0; 8];

@@ -11,9 +11,9 @@ use std::collections::BTreeMap;
 use std::io::Read as _;
 use swm_core::{Error, Result};
 
-/// Keys of the file's metadata whose values are indices of global buffers.
+/// Key of a data file's metadata: the index of the global buffer that holds the [`Record`].
 pub const EPISODES_KEY: &str = "stable_worldmodel.episodes";
-/// See [`EPISODES_KEY`].
+/// Key of a data file's metadata: the index of the global buffer that holds the compressed values of the constants.
 pub const CONSTANTS_KEY: &str = "stable_worldmodel.constants";
 
 /// The record of a data file, with episodes in stored order.
@@ -22,11 +22,12 @@ pub struct Record {
     pub episodes: Vec<RecordedEpisode>,
     /// Size in bytes of each constant's value. Equal values of several episodes are stored once.
     sizes: Vec<u64>,
-    /// The concatenated values.
+    /// The concatenated values of the constants.
     #[serde(skip)]
     values: Vec<u8>,
+    /// Index of each value, by its BLAKE3 hash.
     #[serde(skip)]
-    known: BTreeMap<[u8; 32], usize>,
+    index_by_hash: BTreeMap<[u8; 32], usize>,
 }
 
 /// The record of one episode.
@@ -34,7 +35,7 @@ pub struct Record {
 pub struct RecordedEpisode {
     /// Number of rows.
     pub rows: u64,
-    /// See [`ContentHash`].
+    /// Hash of the values and the constants; see [`ContentHash`].
     pub hash: String,
     /// The name of each constant and the index of its value.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
@@ -47,7 +48,7 @@ impl Record {
         let mut names = BTreeMap::new();
         for (name, value) in constants {
             let next = self.sizes.len();
-            let index = *self.known.entry(*blake3::hash(value).as_bytes()).or_insert(next);
+            let index = *self.index_by_hash.entry(*blake3::hash(value).as_bytes()).or_insert(next);
             if index == next {
                 self.sizes.push(value.len() as u64);
                 self.values.extend_from_slice(value);
@@ -70,22 +71,22 @@ impl Record {
 
     /// Parses a stored record.
     pub fn decode(stored: &[u8]) -> Result<Self, String> {
-        serde_json::from_slice(stored).map_err(|e| format!("the record of its episodes is unreadable: {e}"))
+        serde_json::from_slice(stored).map_err(|e| format!("the record of a data file is unreadable: {e}"))
     }
 
-    /// Extracts the constants of an episode from the stored values. `position` is its position in the file.
+    /// Extracts the constants of an episode from the stored values. `position` is the episode's position in the file.
     pub fn constants(&self, position: usize, stored: &[u8]) -> Result<Constants, String> {
         let Some(episode) = self.episodes.get(position) else {
             return Err(format!("episode {position} has no record"));
         };
-        let unreadable = |e: std::io::Error| format!("its constants are unreadable: {e}");
+        let unreadable = |e: std::io::Error| format!("the constants are unreadable: {e}");
         // Limits the output to the recorded size, so that a damaged file cannot expand without bound.
         let total = self.sizes.iter().fold(0_u64, |sum, &size| sum.saturating_add(size));
         let mut values = vec![];
         let reader = zstd::stream::read::Decoder::new(stored).map_err(unreadable)?;
         reader.take(total.saturating_add(1)).read_to_end(&mut values).map_err(unreadable)?;
         if values.len() as u64 != total {
-            return Err(format!("its constants have {} bytes instead of {total}", values.len()));
+            return Err(format!("the constants have {} bytes instead of {total}", values.len()));
         }
         let value = |&index: &usize| {
             let start = self.sizes[..index.min(self.sizes.len())].iter().sum::<u64>() as usize;
@@ -99,12 +100,12 @@ impl Record {
 }
 
 /// A BLAKE3 hash of the stored values of an episode, column by column, and of its constants.
-/// [`crate::Reader::content_hash`] combines these hashes. They depend neither on `episode_idx` nor on the file's
-/// layout.
+/// [`crate::Reader::content_hash`] combines these hashes. The hashes do not depend on `episode_idx` or on
+/// the layout of the file.
 pub struct ContentHash(blake3::Hasher);
 
 impl ContentHash {
-    /// The hash of no values.
+    /// Starts a hash, without values.
     pub fn new() -> Self {
         Self(blake3::Hasher::new())
     }
@@ -150,7 +151,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn constants_round_trip_and_equal_ones_are_stored_once() {
+    fn constants_round_trip_and_equal_constants_are_stored_once() {
         let constants = |text: &str| Constants::from([("scene.xml".to_owned(), text.as_bytes().to_vec())]);
         let scene = "<body/>".repeat(1000);
         let mut record = Record::default();
@@ -159,16 +160,16 @@ mod tests {
         }
         record.push(3, "none".to_owned(), &Constants::new());
         assert_eq!(record.sizes, [7000, 5]);
-        let (stored, values) = record.encode().expect("encodes");
+        let (stored, values) = record.encode().expect("encoding the record");
         let values = values.expect("the values of constants");
-        let back = Record::decode(&stored).expect("decodes");
+        let back = Record::decode(&stored).expect("decoding the record");
         assert_eq!(back.episodes, record.episodes);
         assert_eq!(back.constants(0, &values), Ok(constants(&scene)));
         assert_eq!(back.constants(1, &values), Ok(constants("other")));
         assert_eq!(back.constants(3, &values), Ok(Constants::new()));
         assert!(back.constants(4, &values).is_err());
         assert!(back.constants(0, &values[..values.len() / 2]).is_err());
-        let absurd = Record { sizes: vec![u64::MAX, 5], ..back };
-        assert!(absurd.constants(0, &values).is_err());
+        let oversized = Record { sizes: vec![u64::MAX, 5], ..back };
+        assert!(oversized.constants(0, &values).is_err());
     }
 }

@@ -17,7 +17,7 @@ pub fn salvage(location: &Location) -> Result<(Arc<dyn Reader>, Vec<String>)> {
     let Some(version) = store.latest()? else { return Ok((reader::open(location)?, vec![])) };
     let (mut readable, mut lost) = (vec![], vec![]);
     for fragment in version.manifest.fragments.iter() {
-        match LanceReader::of(store.clone(), only(&version.manifest, vec![fragment.clone()])) {
+        match LanceReader::of(store.clone(), restricted_to(&version.manifest, vec![fragment.clone()])) {
             Ok(_) => readable.push(fragment.clone()),
             Err(error) => {
                 let rows = fragment.physical_rows.unwrap_or_default();
@@ -25,11 +25,11 @@ pub fn salvage(location: &Location) -> Result<(Arc<dyn Reader>, Vec<String>)> {
             }
         }
     }
-    Ok((Arc::new(LanceReader::of(store, only(&version.manifest, readable))?), lost))
+    Ok((Arc::new(LanceReader::of(store, restricted_to(&version.manifest, readable))?), lost))
 }
 
-/// The table restricted to these fragments.
-fn only(table: &Table, fragments: Vec<Fragment>) -> Arc<Table> {
+/// The table restricted to `fragments`.
+fn restricted_to(table: &Table, fragments: Vec<Fragment>) -> Arc<Table> {
     let mut table = table.clone();
     table.fragments = Arc::new(fragments);
     Arc::new(table)

@@ -10,26 +10,26 @@ use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema, columns};
 use swm_image::{self, ImageCodec};
 
-/// Keys of the table's metadata.
+/// Key of the table's metadata: the [`RecordedSchema`] as JSON.
 const SCHEMA_KEY: &str = "stable_worldmodel.schema";
-/// See [`SCHEMA_KEY`].
+/// Key of the table's metadata: the [`Manifest`] as JSON.
 pub const MANIFEST_KEY: &str = "stable_worldmodel.manifest";
 
-/// Stored in the table's metadata to restore types and shapes.
+/// The schema in the table's metadata, from which readers restore types and shapes.
 #[derive(Serialize, Deserialize)]
 struct RecordedSchema {
     columns: Schema,
     codec: ImageCodec,
 }
 
-/// How a dataset column is stored.
+/// The stored form of a dataset column.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StoredColumn {
     /// The column as readers return it.
     pub spec: ColumnSpec,
-    /// Its name in the table.
+    /// Name of the column in the table.
     pub name: String,
-    /// The kind of its stored values.
+    /// Kind of the stored values.
     pub kind: Kind,
 }
 
@@ -42,10 +42,10 @@ pub enum Kind {
     Values(Precision),
 }
 
-/// The type that numeric values are written as.
+/// The stored type of numeric values.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Precision {
-    /// `float32`, as the reference writes all numeric columns.
+    /// `float32`, as the reference implementation writes all numeric columns.
     Single,
     /// `float64`, without rounding.
     Double,
@@ -131,10 +131,10 @@ pub fn stored_precision(data_type: &DataType) -> Option<Precision> {
     }
 }
 
-/// The table's metadata.
+/// The metadata of a new table: schema, codec and manifest.
 ///
 /// # Errors
-/// If it cannot be serialised as JSON.
+/// If the metadata cannot be serialised as JSON.
 pub fn metadata(schema: &Schema, codec: ImageCodec, manifest: Option<&Manifest>) -> Result<HashMap<String, String>> {
     let recorded = RecordedSchema { columns: schema.clone(), codec };
     let mut metadata = HashMap::from([(SCHEMA_KEY.to_owned(), json(&recorded)?)]);
@@ -160,11 +160,11 @@ pub fn codec(lance: &LanceSchema) -> Option<ImageCodec> {
 }
 
 /// The columns of a table, and the schema for readers, which starts with the index columns. Columns come from the
-/// table's metadata if it was written here, and are inferred otherwise. Text and nested columns of third-party tables
-/// are skipped.
+/// table's metadata if this module wrote the table, and are inferred from the stored types otherwise. Text and nested
+/// columns of third-party tables are skipped.
 ///
-/// `first_image` returns the first stored image of a column, or `None` if there are no rows. Its header gives the image
-/// size.
+/// `first_image` returns the first stored image of a column, or `None` if there are no rows. The header of this
+/// image contains the image size.
 ///
 /// # Errors
 /// If the table has no index columns, or its columns contradict the recorded schema.

@@ -1,10 +1,10 @@
 //! Shards: several machines write one dataset. Each machine writes its episodes to data files and logs them; when all
-//! have finished, one commit combines them into one version.
+//! machines have finished, one commit adds all episodes as one version of the table.
 //!
-//! The log of shard 1 of 3 is the folder `_shards/1-of-3`. `begun.json` holds its columns, `00000000.json` and so on
-//! describe one group of episodes each, and `done.json` holds the number of groups. Data files are written before the
-//! log entry that names them, so a killed shard continues after its last group. Episode indices are only known once all
-//! shards are complete; the commit writes them to separate data files.
+//! The log of shard 1 of 3 is the folder `_shards/1-of-3`. `begun.json` holds the columns; `00000000.json` and the
+//! following files describe one group of episodes each; `done.json` holds the number of groups. Data files are written
+//! before the log entry that names them, so a killed shard continues after its last group. Episode indices are only
+//! known once all shards are complete; the commit writes them to separate data files.
 
 use super::encode::EncodedEpisode;
 use super::reader::LanceReader;
@@ -33,7 +33,7 @@ pub struct Shard {
 }
 
 impl Shard {
-    /// The folder of its log, below the table's folder.
+    /// The folder of the shard's log, below the table's folder.
     fn folder(self) -> String {
         format!("_shards/{}-of-{}", self.index, self.count)
     }
@@ -45,7 +45,7 @@ impl Shard {
     }
 }
 
-/// Content of `begun.json`. All shards of a dataset must agree.
+/// Content of `begun.json`. All shards of a dataset must have the same columns.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 struct ShardStart {
     columns: Schema,
@@ -61,17 +61,18 @@ struct Group {
     rows: Vec<u64>,
 }
 
+/// Content of `done.json`.
 #[derive(Debug, Serialize, Deserialize)]
 struct ShardEnd {
     groups: usize,
 }
 
-/// Writes one shard of a dataset. Readers see its episodes only after [`commit_shards`]. `options.mode` refers to the
-/// shard: [`WriteMode::Append`] continues a killed shard, [`WriteMode::Overwrite`] starts it again. The dataset may be
-/// new or contain episodes.
+/// Writes one shard of a dataset. Readers return the episodes of a shard only after [`commit_shards`]. `options.mode`
+/// refers to the shard: [`WriteMode::Append`] continues a killed shard, [`WriteMode::Overwrite`] replaces the shard.
+/// The dataset may be new or contain episodes.
 ///
 /// # Errors
-/// If the shard exists and `options.mode` forbids it, its columns differ from the dataset's, or writing fails.
+/// If the shard exists and `options.mode` forbids it, the columns differ from those of the dataset, or writing fails.
 pub fn create_shard(
     location: &Location,
     schema: &Schema,
@@ -94,13 +95,13 @@ pub fn create_shard(
         Logs::read(&store)?.remove_committed(&store, old);
     }
     let begun = ShardStart { columns: schema.clone(), codec: options.codec, manifest: options.manifest.clone() };
-    let log = Logs::read(&store)?;
+    let logs = Logs::read(&store)?;
     let (mut groups, mut episodes) = (0, 0);
-    if let Some(shard_log) = log.shards.get(&(shard.count, shard.index)) {
+    if let Some(shard_log) = logs.shards.get(&(shard.count, shard.index)) {
         match options.mode {
             WriteMode::Create => {
                 let problem = format!("shard {} of {} already exists", shard.index, shard.count);
-                return Err(Error::config("shard", problem, "continue it (append) or overwrite it"));
+                return Err(Error::config("shard", problem, "append to the shard or overwrite it"));
             }
             WriteMode::Overwrite => shard_log.remove(&store, shard),
             WriteMode::Append => {
@@ -111,7 +112,7 @@ pub fn create_shard(
         }
     }
     let mut log = ShardLog { table: Table::new(store, version, fresh), folder: shard.folder(), groups };
-    log.put("begun.json", &begun)?;
+    log.write_entry("begun.json", &begun)?;
     PreparedWriter { sink: Sink::Shard(log), columns, episodes }.start(schema, &options)
 }
 
@@ -128,17 +129,17 @@ impl ShardLog {
     pub fn append(&mut self, episodes: &[EncodedEpisode]) -> Result<()> {
         let fragment = self.table.write_episodes(episodes, None)?;
         let rows = episodes.iter().map(|episode| episode.rows as u64).collect();
-        self.put(&format!("{:08}.json", self.groups), &Group { fragment, rows })?;
+        self.write_entry(&format!("{:08}.json", self.groups), &Group { fragment, rows })?;
         self.groups += 1;
         Ok(())
     }
 
     /// Logs that the shard is complete.
     pub fn finish(&mut self) -> Result<()> {
-        self.put("done.json", &ShardEnd { groups: self.groups })
+        self.write_entry("done.json", &ShardEnd { groups: self.groups })
     }
 
-    fn put(&mut self, name: &str, value: &impl Serialize) -> Result<()> {
+    fn write_entry(&mut self, name: &str, value: &impl Serialize) -> Result<()> {
         let path = self.table.store.path(&format!("{}/{name}", self.folder));
         self.table.store.write(&path, schema::json(value)?.into())
     }
@@ -160,13 +161,13 @@ struct ShardLogFiles {
 
 impl Logs {
     fn read(store: &Store) -> Result<Self> {
-        let mut log = Self::default();
+        let mut logs = Self::default();
         for file in store.list("_shards")? {
             let mut components =
                 file.location.parts().map(|component| component.as_ref().to_owned()).collect::<Vec<_>>().into_iter();
             let (Some(name), Some(folder)) = (components.next_back(), components.next_back()) else { continue };
             let Some(shard) = Shard::parse(&folder) else { continue };
-            let shard_log = log.shards.entry((shard.count, shard.index)).or_default();
+            let shard_log = logs.shards.entry((shard.count, shard.index)).or_default();
             match name.as_str() {
                 "begun.json" => shard_log.begun = Some(parse(store, &file.location)?),
                 "done.json" => shard_log.done = Some(parse(store, &file.location)?),
@@ -174,7 +175,7 @@ impl Logs {
                 _ => shard_log.groups.push(parse(store, &file.location)?),
             }
         }
-        Ok(log)
+        Ok(logs)
     }
 
     /// Removes the logs of committed shards, in case a commit was killed before it removed them. All shards are
@@ -209,7 +210,7 @@ impl Logs {
         };
         if let Some((other, _)) = self.shards.keys().find(|(other, _)| *other != count) {
             let problem = format!("there are shards of {count} and shards of {other}");
-            return unfinished(problem, "remove the wrong ones from the folder _shards");
+            return unfinished(problem, "remove the wrong shards from the folder _shards");
         }
         let mut complete: Vec<&ShardLogFiles> = vec![];
         for index in 0..count {
@@ -261,24 +262,24 @@ fn parse<T: DeserializeOwned>(store: &Store, path: &object_store::path::Path) ->
 /// # Errors
 /// If a log is damaged or cannot be read.
 pub fn shard_manifests(location: &Location) -> Result<Vec<Manifest>> {
-    let log = Logs::read(&Store::new(location)?)?;
-    Ok(log.shards.into_values().filter_map(|shard_log| shard_log.begun?.manifest).collect())
+    let logs = Logs::read(&Store::new(location)?)?;
+    Ok(logs.shards.into_values().filter_map(|shard_log| shard_log.begun?.manifest).collect())
 }
 
 /// Commits the episodes of all shards as one version, in the order of the shards, after the existing episodes. Returns
-/// the number of added episodes. If a previous commit was killed, this one completes it.
+/// the number of added episodes. If a previous commit was killed, this call completes it.
 ///
 /// # Errors
-/// If a shard is missing, incomplete or has other columns, or writing fails.
+/// If a shard is missing or incomplete, the columns of the shards differ, or writing fails.
 pub fn commit_shards(location: &Location) -> Result<usize> {
     let store = Store::new(location)?;
     for _ in 0..MAX_ATTEMPTS {
-        let log = Logs::read(&store)?;
+        let logs = Logs::read(&store)?;
         let version = store.latest()?;
-        if version.as_ref().is_some_and(|version| log.remove_committed(&store, version)) {
+        if version.as_ref().is_some_and(|version| logs.remove_committed(&store, version)) {
             return Ok(0);
         }
-        let shards = log.complete(&store)?;
+        let shards = logs.complete(&store)?;
         let Some(begun) = shards.first().and_then(|shard_log| shard_log.begun.as_ref()) else {
             return Err(damaged(&store.label, "a shard has no begun.json"));
         };
@@ -299,7 +300,7 @@ pub fn commit_shards(location: &Location) -> Result<usize> {
             None => table.overwrite_operation(fragments.clone()),
         };
         if table.commit(operation)? {
-            log.remove(&store);
+            logs.remove(&store);
             return Ok((next - first) as usize);
         }
         for indices in fragments.iter().filter_map(|fragment| fragment.files.last()) {

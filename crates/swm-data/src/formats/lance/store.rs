@@ -41,7 +41,7 @@ where
     }
 }
 
-/// The error for a dataset with damaged files.
+/// An error that reports a dataset with damaged files.
 pub fn damaged(path: &Path, problem: impl Into<String>) -> Error {
     Error::corrupt(
         path,
@@ -92,7 +92,7 @@ fn tables_in(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
     Ok(tables)
 }
 
-/// The table at a location.
+/// The location of the table: `location` itself, or the only table in that folder.
 fn table(location: &Location) -> Result<Location> {
     let Some(path) = location.path().filter(|_| !location.has_suffix("lance")) else { return Ok(location.clone()) };
     let tables = tables_in(path).map_err(|e| Error::io(path, "listing the folder", e))?;
@@ -121,18 +121,18 @@ pub struct Version {
 /// Location of a table and access to its objects.
 #[derive(Clone)]
 pub struct Store {
-    /// The location in messages: the absolute path or the URI.
+    /// The location in error messages: the absolute path or the URI.
     pub label: PathBuf,
     /// Whether the table is in an object store.
     pub remote: bool,
-    /// Whether objects can be listed. Web servers usually cannot list.
+    /// Whether objects can be listed. Web servers usually have no listing.
     pub lists: bool,
     base: StorePath,
     objects: Arc<ObjectStore>,
 }
 
 impl Store {
-    /// The storage at a location, which need not exist yet.
+    /// Opens the storage at a location. The table need not exist yet.
     ///
     /// # Errors
     /// If the location is invalid, or this build does not support its scheme.
@@ -146,7 +146,7 @@ impl Store {
             return Ok(Self { label, remote: false, lists: true, base, objects });
         };
         let lists = !url.scheme().starts_with("http");
-        // This build does not include Lance's own stores, so it passes its store to Lance. The scheme can be any that
+        // This build does not include Lance's own object stores, so `store` is passed to Lance, with any scheme that
         // Lance supports.
         let scheme = Url::parse("memory:///").map_err(|e| Error::external("opening an object store", e))?;
         let objects = ObjectStore::new(store, scheme, Some(BLOCK), None, false, lists, REQUESTS, RETRIES, None);
@@ -156,7 +156,7 @@ impl Store {
     /// Checks that the location can be written.
     ///
     /// # Errors
-    /// If it is on a web server.
+    /// If the location is on a web server.
     pub fn check_writable(&self) -> Result<()> {
         if self.lists {
             return Ok(());
@@ -213,7 +213,7 @@ impl Store {
         Ok(())
     }
 
-    /// Names in the folder; empty if it does not exist.
+    /// Names in the folder; empty if the folder does not exist.
     fn entries(&self) -> Result<Vec<OsString>> {
         let io = |e| Error::io(&self.label, "listing the folder", e);
         match std::fs::read_dir(&self.label) {
@@ -252,7 +252,7 @@ impl Store {
             };
             let transaction = Transaction::new(manifest.map_or(0, |m| m.version), operation, None);
             let indices = current.as_ref().map(|version| version.indices.clone()).unwrap_or_default();
-            // The manifest contains the transaction, so it needs no separate file.
+            // The manifest contains the transaction, so no separate transaction file is needed.
             let (mut next, indices) = transaction.build_manifest(manifest, indices, "", &config)?;
             let result = ConditionalPutCommitHandler
                 .commit(
@@ -310,12 +310,12 @@ impl Store {
         Path::new("/").join(path.as_ref())
     }
 
-    /// All files below a part of the folder; empty if it does not exist.
+    /// All files below a subfolder; empty if the subfolder does not exist.
     ///
     /// # Errors
     /// If listing fails.
-    pub fn list(&self, part: &str) -> Result<Vec<ObjectMeta>> {
-        let (objects, prefix) = (Arc::clone(&self.objects), self.path(part));
+    pub fn list(&self, subfolder: &str) -> Result<Vec<ObjectMeta>> {
+        let (objects, prefix) = (Arc::clone(&self.objects), self.path(subfolder));
         let mut files: Vec<ObjectMeta> = block_on(&self.label, "listing the dataset", async move {
             match objects.inner.list(Some(&prefix)).try_collect().await {
                 Err(object_store::Error::NotFound { .. }) => Ok(vec![]),
@@ -329,7 +329,7 @@ impl Store {
     /// Reads a whole file.
     ///
     /// # Errors
-    /// If it does not exist or reading fails.
+    /// If the file does not exist or reading fails.
     pub fn read(&self, path: &StorePath) -> Result<Bytes> {
         let (objects, path) = (Arc::clone(&self.objects), path.clone());
         block_on(&self.label, "reading a file", async move { Ok(objects.inner.get(&path).await?.bytes().await?) })
@@ -343,7 +343,7 @@ impl Store {
         let (objects, path, remote) = (Arc::clone(&self.objects), path.clone(), self.remote);
         block_on(&self.label, "writing a file", async move {
             if remote {
-                // A multipart upload, which retries each part separately.
+                // Makes a multipart upload, which retries each part separately.
                 objects.put(&path, &content).await?;
             } else {
                 // Lance's own writer does not report a full disk.
@@ -376,19 +376,19 @@ impl Store {
     }
 }
 
-/// Number of bytes that Lance reads at once from an object.
+/// Number of bytes that Lance reads with one request.
 const BLOCK: usize = 64 << 10;
 /// Maximum number of concurrent requests of Lance.
 const REQUESTS: usize = 64;
 /// Number of retries of a failed download.
 const RETRIES: usize = 3;
 
-/// Tag followed by a BLAKE3 hash of all other bytes of a manifest's file. It is stored before Lance's message, whose
-/// offset is in the file's footer, so other readers skip it.
+/// Start of the checksum in a manifest's file; a BLAKE3 hash of all other bytes of the file follows. The checksum is
+/// stored before Lance's protobuf message, whose offset is in the file's footer, so other readers skip the checksum.
 const CHECKSUM_TAG: &[u8; 8] = b"swmSEAL1";
-/// See [`CHECKSUM_TAG`].
+/// Size of the checksum in bytes: the tag and the hash.
 const CHECKSUM_LEN: usize = CHECKSUM_TAG.len() + 32;
-/// Size of the footer: offset of the message, format versions, and magic number.
+/// Size of the footer in bytes: offset of the message, format versions, and magic number.
 const FOOTER: usize = 16;
 
 /// Writes a manifest as Lance does, with a checksum.
@@ -478,14 +478,14 @@ mod tests {
         let plain = [&b"transaction"[..], &7_u32.to_le_bytes(), b"message", &11_u64.to_le_bytes(), b"\0\0\x02\0LANC"];
         let plain = plain.concat();
         assert!(verify_checksum(&plain).is_ok(), "a manifest of another writer has no checksum");
-        let intact = with_checksum(&plain).expect("adds a checksum");
+        let intact = with_checksum(&plain).expect("adding a checksum");
         assert_eq!(&intact[message_start(&intact).expect("a message")..][4..11], b"message");
         assert!(verify_checksum(&intact).is_ok());
         for at in (0..intact.len()).filter(|at| !(11..19).contains(at)) {
             let mut damaged = intact.clone();
             damaged[at] ^= 4;
-            let in_place = at >= intact.len() - FOOTER && at < intact.len() - 8;
-            assert!(verify_checksum(&damaged).is_err() || in_place, "byte {at}");
+            let in_message_offset = at >= intact.len() - FOOTER && at < intact.len() - 8;
+            assert!(verify_checksum(&damaged).is_err() || in_message_offset, "byte {at}");
         }
     }
 }

@@ -23,14 +23,14 @@ use std::time::SystemTime;
 use swm_core::columns::EPISODE_IDX;
 use swm_core::{Error, Result};
 
-/// The file format of new tables; the reference uses the same.
+/// The version of the file format of new tables; the reference implementation uses the same version.
 const FILE_VERSION: ConcreteFileVersion = ConcreteFileVersion::V2_2;
 
-/// Number of versions of this writer that are retained, for readers that have just opened one of them. Every version
-/// lists all fragments, so retaining all versions would take space quadratic in the number of commits.
+/// Number of this writer's versions that are retained for readers that have just opened one of these versions. Every
+/// version lists all fragments, so retaining all versions would take space quadratic in the number of commits.
 const RETAINED_VERSIONS: usize = 8;
 
-/// The key in a data file's metadata that makes every file unique.
+/// The key in a data file's metadata whose value makes every file unique.
 const MADE_KEY: &str = "stable_worldmodel.made";
 
 /// Maximum number of attempts per commit. Each failed attempt means that another writer committed.
@@ -40,7 +40,7 @@ pub const MAX_ATTEMPTS: usize = 1000;
 pub struct Table {
     pub store: Store,
     pub version: Option<Version>,
-    /// The schema of the first version, if the table is new.
+    /// The schema of a new or replaced table.
     fresh: LanceSchema,
     file_version: ConcreteFileVersion,
     /// Manifests of versions that this writer committed, oldest first.
@@ -48,19 +48,19 @@ pub struct Table {
 }
 
 impl Table {
-    /// The table at this version, or a new table with this schema.
+    /// The table at `version`, or for `None` a new table with the schema `fresh`.
     pub fn new(store: Store, version: Option<Version>, fresh: LanceSchema) -> Self {
         let file_version =
             version.as_ref().map_or(FILE_VERSION, |version| version.manifest.data_storage_format.lance_file_format());
         Self { store, version, fresh, file_version, manifests: VecDeque::new() }
     }
 
-    /// The schema. Its field ids are those of the existing table.
+    /// The schema, with the field ids of the existing table if the table exists.
     pub fn fields(&self) -> &LanceSchema {
         self.version.as_ref().map_or(&self.fresh, |version| &version.manifest.schema)
     }
 
-    /// The operation that replaces the table's content with these fragments.
+    /// The operation that replaces the table's content with `fragments`.
     pub fn overwrite_operation(&self, fragments: Vec<Fragment>) -> Operation {
         Operation::Overwrite { fragments, schema: self.fresh.clone(), config_upsert_values: None, initial_bases: None }
     }
@@ -116,7 +116,7 @@ impl Table {
         Ok(reader.next_episode())
     }
 
-    /// The operation that replaces the stored manifest, or `None` if it is unchanged.
+    /// The operation that replaces the stored manifest, or `None` if `manifest` is stored already.
     pub fn manifest_operation(&self, manifest: String) -> Option<Operation> {
         if self.fields().metadata.get(schema::MANIFEST_KEY) == Some(&manifest) {
             return None;
@@ -130,8 +130,8 @@ impl Table {
         })
     }
 
-    /// Writes episodes to a new data file. They are numbered from `first` on; with `None` they get no `episode_idx`,
-    /// and [`Table::write_episode_indices`] must add it.
+    /// Writes episodes to a new data file. Episodes are numbered from `first` on; with `None`, the file contains no
+    /// `episode_idx`, and [`Table::write_episode_indices`] must add it.
     ///
     /// # Errors
     /// If there are too many episodes, or writing fails.
@@ -159,7 +159,7 @@ impl Table {
         Ok(Fragment { files: vec![file], ..Fragment::new(0) }.with_physical_rows(rows))
     }
 
-    /// Writes `episode_idx` of a fragment to a separate data file. `rows` are the lengths of its episodes.
+    /// Writes `episode_idx` of a fragment to a separate data file. `rows` are the lengths of the fragment's episodes.
     ///
     /// # Errors
     /// As [`Table::write_episodes`].
@@ -176,8 +176,8 @@ impl Table {
         self.write_file(fields, batches?, None)
     }
 
-    /// Writes a data file. It is assembled in memory, because its name is the hash of its content, and becomes visible
-    /// only when it is complete.
+    /// Writes a data file. The file is assembled in memory, because its name is the hash of its content, and becomes
+    /// visible only when it is complete.
     fn write_file(
         &self,
         fields: LanceSchema,
@@ -199,7 +199,8 @@ impl Table {
                     writer.add_schema_metadata(CONSTANTS_KEY, buffer.to_string());
                 }
             }
-            // A unique value: two writers never produce files with the same name, so no writer removes another's file.
+            // The value is unique, so that two writers never produce files with the same name, and no writer removes a
+            // file of another writer.
             writer.add_schema_metadata(MADE_KEY, uuid::Uuid::new_v4().simple().to_string());
             writer.finish().await?;
             let indices = writer.field_id_to_column_indices().iter().copied();

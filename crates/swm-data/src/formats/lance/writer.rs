@@ -28,9 +28,9 @@ use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{Batch, ColumnSpec, Error, Result, Schema};
 use swm_image::ImageCodec;
 
-/// Maximum number of episodes queued for the committing thread. Together with the policy's byte limit it bounds the
-/// memory.
-const WAITING: usize = 2;
+/// Maximum number of episodes queued for the committing thread. This limit and the byte limit of
+/// [`CommitPolicy`] bound the writer's memory.
+const MAX_QUEUED: usize = 2;
 
 /// Creates, continues or replaces a table.
 pub fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
@@ -48,7 +48,7 @@ pub fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Re
 }
 
 pub fn too_many_conflicts(label: &Path) -> Error {
-    let problem = format!("commits of other writers to {} keep getting ahead of this one", label.display());
+    let problem = format!("{MAX_ATTEMPTS} attempts to commit to {} conflicted with other writers", label.display());
     Error::config("dataset", problem, "try again, or write to a separate dataset and merge it")
 }
 
@@ -82,7 +82,7 @@ pub fn new_table_schema(columns: &[StoredColumn], schema: &Schema, options: &Wri
     Ok(fresh)
 }
 
-/// Creates, continues or replaces the table. Returns `None` if another process did so at the same time.
+/// Creates, continues or replaces the table. Returns `None` if another process changed the table at the same time.
 fn prepare(store: &Store, schema: &Schema, options: &WriteOptions) -> Result<Option<PreparedWriter>> {
     let mut columns = schema::columns_to_write(schema)?;
     let fresh = new_table_schema(&columns, schema, options)?;
@@ -128,7 +128,7 @@ impl PreparedWriter {
             Sink::Shard(log) => log.table.store.label.clone(),
         };
         let shared = Arc::<Shared>::default();
-        let (sender, receiver) = sync_channel(WAITING);
+        let (sender, receiver) = sync_channel(MAX_QUEUED);
         let committer =
             Committer { sink: self.sink, policy: options.commit, group: vec![], bytes: 0, shared: Arc::clone(&shared) };
         let thread = std::thread::Builder::new()
@@ -149,7 +149,7 @@ impl PreparedWriter {
     }
 }
 
-/// Puts the columns to append in the order of the existing table, with its precision.
+/// Sorts the columns to append in the order of the existing table, and sets their precision to the stored precision.
 pub fn match_table_columns(
     folder: &Path,
     mut incoming: Vec<StoredColumn>,
@@ -158,7 +158,7 @@ pub fn match_table_columns(
 ) -> Result<Vec<StoredColumn>> {
     let stored = ArrowSchema::from(&old.manifest.schema);
     for column in &mut incoming {
-        // The reference, and older versions of this format, store all numeric columns as `float32`.
+        // The reference implementation, and older versions of this format, store all numeric columns as `float32`.
         let precision = stored.field_with_name(&column.name).ok().and_then(|f| schema::stored_precision(f.data_type()));
         if let (Kind::Values(own), Some(precision)) = (&mut column.kind, precision) {
             *own = precision;
@@ -179,7 +179,7 @@ pub fn match_table_columns(
             format!("the columns it has: {}", describe(&stored)),
         ));
     }
-    // Tables written here also record types and image sizes.
+    // Tables that this module writes also record types and image sizes.
     for column in &incoming {
         if let Ok(spec) = known.column(&column.spec.name)
             && (spec.dtype, &spec.shape) != (column.spec.dtype, &column.spec.shape)
@@ -194,7 +194,7 @@ pub fn match_table_columns(
         }
     }
     incoming.sort_by_key(|column| stored.index_of(&column.name).unwrap_or(usize::MAX));
-    // Tables written here start with the index columns; third-party tables may not.
+    // Tables that this module writes start with the index columns; third-party tables may not.
     let leads = stored.fields().iter().take(2).map(|field| field.name().as_str()).eq([EPISODE_IDX, STEP_IDX]);
     if !leads {
         return Err(Error::mismatch(
@@ -209,7 +209,7 @@ pub fn match_table_columns(
 /// State shared by the writer and its committing thread.
 #[derive(Default)]
 struct Shared {
-    /// The error that stopped the thread.
+    /// The error that stopped the committing thread.
     failure: Mutex<Option<Error>>,
     /// Whether [`Writer::finish`] was called, as opposed to dropping the writer.
     complete: AtomicBool,
@@ -257,7 +257,7 @@ impl Writer for LanceWriter {
 }
 
 impl LanceWriter {
-    /// The error that stopped the committing thread.
+    /// Takes the error that stopped the committing thread.
     fn failed(&mut self) -> Error {
         self.reported = true;
         let known = self.shared.failure().take();
@@ -376,7 +376,7 @@ fn append(table: &mut Table, next: &mut i64, episodes: &[EncodedEpisode]) -> Res
             }
             Err(error) => {
                 if is_full(&error) {
-                    // The manifest was not written, so nothing refers to the data file.
+                    // The manifest was not written, so no version refers to the data file.
                     table.discard(&fragment);
                 }
                 return Err(error);

@@ -7,7 +7,7 @@
 //!
 //! Videos are constants of their episode ([`Constants`](crate::Constants)), so one commit covers an episode with its
 //! frames, and all features of Lance tables (object stores, concurrent writers) apply. All constants of a data file are
-//! read together, so data files are kept small. [`ImageCodec`](swm_image::ImageCodec) determines the encoding as in the
+//! read together, so data files are small. [`ImageCodec`](swm_image::ImageCodec) determines the encoding as in the
 //! format `video`.
 
 #[cfg(feature = "ffmpeg")]
@@ -44,7 +44,7 @@ const VIDEO: &str = "lance-video/video/";
 #[cfg(feature = "ffmpeg")]
 const SCHEMA: &str = "lance-video/schema.json";
 
-/// The table within the folder.
+/// The location of the Lance table within the dataset's folder.
 #[cfg(feature = "ffmpeg")]
 fn table(location: &Location) -> swm_core::Result<Location> {
     Ok(match location {

@@ -1,4 +1,4 @@
-//! Reads numeric columns from the table, and frames from the videos in its constants.
+//! Reads numeric columns from the table, and frames from the videos among the constants of the episodes.
 
 use super::{SCHEMA, VIDEO, table};
 use crate::dataset::Location;
@@ -10,7 +10,7 @@ use std::sync::Arc;
 use swm_core::{ColumnSpec, Error, Manifest, Result, Schema};
 use swm_video::{Source, VideoCache};
 
-/// Opens a folder.
+/// Opens a dataset.
 pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
     let steps = lance::ENTRY.open(&table(location)?)?;
     let schema = match steps.episodes() {
@@ -93,8 +93,8 @@ impl Reader for LanceVideoReader {
     }
 
     fn irregularities(&self) -> Result<Vec<Irregularity>> {
-        let cameras = self.schema.columns().iter().enumerate().filter(|(_, column)| column.is_image());
-        let found = cameras.flat_map(|(index, column)| {
+        let image_columns = self.schema.columns().iter().enumerate().filter(|(_, column)| column.is_image());
+        let found = image_columns.flat_map(|(index, column)| {
             self.episodes().iter().enumerate().filter_map(move |(position, episode)| {
                 let key = (index, position);
                 let what = self.videos.irregularity(&key, || self.source(&key), &column.name, episode.length)?;

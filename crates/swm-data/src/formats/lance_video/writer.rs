@@ -1,4 +1,4 @@
-//! Writes episodes to the table, with their videos as constants, in one commit.
+//! Writes episodes to the table, with the videos as constants of their episode.
 
 use super::{SCHEMA, VIDEO, table};
 use crate::dataset::Location;
@@ -10,19 +10,20 @@ use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{Batch, ColumnSpec, Error, Result, Schema};
 use swm_video::{Encoding, encode};
 
-/// Frames per second in players.
+/// Frame rate of the videos, in frames per second.
 const FPS: u32 = 25;
 
-/// Maximum size of a data file in bytes, unless one episode is larger. Reading one video reads the whole file.
-const DATA_FILE: usize = 4 << 20;
+/// Maximum size of a data file in bytes, unless one episode is larger. Reading one video reads all constants of its
+/// data file.
+const MAX_DATA_FILE_BYTES: usize = 4 << 20;
 
-/// Creates, continues or replaces a folder.
+/// Creates, continues or replaces a dataset.
 pub(super) fn create(location: &Location, schema: &Schema, mut options: WriteOptions) -> Result<Box<dyn Writer>> {
     options.codec.check()?;
     let table_location = table(location)?;
     let columns: Vec<ColumnSpec> = schema.columns().iter().filter(|column| !column.is_image()).cloned().collect();
     if columns.iter().all(|column| column.name == EPISODE_IDX || column.name == STEP_IDX) {
-        let fix = "add one, or use the format video";
+        let fix = "add a numeric column, or use the format video";
         return Err(Error::config("schema", "the format lance-video needs a numeric column", fix));
     }
     if options.mode == WriteMode::Append
@@ -32,7 +33,7 @@ pub(super) fn create(location: &Location, schema: &Schema, mut options: WriteOpt
         episodes::check_appendable(location, schema, known.schema())?;
     }
     let encoding = Encoding::training(options.codec);
-    options.commit.bytes = options.commit.bytes.min(DATA_FILE);
+    options.commit.bytes = options.commit.bytes.min(MAX_DATA_FILE_BYTES);
     let steps = Schema::new(columns)?;
     let listed = serde_json::to_vec(schema).map_err(|e| Error::external("describing the dataset", e))?;
     let writer = lance::ENTRY.create(&table_location, &steps, options)?;

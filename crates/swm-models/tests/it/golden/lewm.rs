@@ -68,11 +68,8 @@ fn golden_evaluation() {
         let conditions = model.embed_actions(golden.tensor("i.action"));
         check(&golden, "o.eval.act_emb", &values(conditions.clone()));
         let window = [0..clips, 0..golden.get("o.eval.pred").shape[1], 0..dim];
-        check(
-            &golden,
-            "o.eval.pred",
-            &values(model.predict(latents.clone().slice(window.clone()), conditions.slice(window))),
-        );
+        let predictions = model.predict(latents.clone().slice(window.clone()), conditions.slice(window));
+        check(&golden, "o.eval.pred", &values(predictions));
 
         let [envs, samples, horizon, _] = golden.tensor::<4>("i.candidates").dims();
         let candidates = golden.tensor::<4>("i.candidates").reshape([envs * samples, horizon, action_dim]);

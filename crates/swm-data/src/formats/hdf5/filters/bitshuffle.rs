@@ -3,7 +3,7 @@
 
 use super::{Input, lz4_block, zstd_frame};
 
-/// Compression of blocks.
+/// Compression of bitshuffled blocks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Codec {
     None,
@@ -18,7 +18,7 @@ impl Codec {
             0 => Ok(Self::None),
             2 => Ok(Self::Lz4),
             3 => Ok(Self::Zstd),
-            _ => Err(format!("its chunks are bitshuffled and compressed with codec {setting}")),
+            _ => Err(format!("its chunks are bitshuffled and compressed with the unsupported codec {setting}")),
         }
     }
 }
@@ -28,7 +28,7 @@ fn default_block(size: usize) -> usize {
     (8192 / size / 8 * 8).max(128) * size
 }
 
-/// Decodes a chunk into `out`, which has its decoded length.
+/// Decodes a chunk into `out`, which has the decoded length of the chunk.
 pub fn decode(from: &[u8], size: usize, codec: Codec, out: &mut [u8]) -> Result<(), String> {
     let mut input = Input(from);
     let block = if codec == Codec::None {
@@ -36,14 +36,17 @@ pub fn decode(from: &[u8], size: usize, codec: Codec, out: &mut [u8]) -> Result<
     } else {
         let (total, block) = (input.u64_be()?, input.u32_be()? as usize);
         if total != out.len() as u64 || block == 0 {
-            return Err(format!("bitshuffle: it declares {total} bytes in blocks of {block} instead of {}", out.len()));
+            return Err(format!(
+                "bitshuffle: the header declares {total} bytes in blocks of {block} instead of {}",
+                out.len()
+            ));
         }
         block
     };
     // Eight elements share a byte for each bit; the remaining elements are stored unshuffled.
-    let eight = 8 * size;
-    let block = (block / eight * eight).max(eight);
-    let whole = out.len() / eight * eight;
+    let group_bytes = 8 * size;
+    let block = (block / group_bytes * group_bytes).max(group_bytes);
+    let whole = out.len() / group_bytes * group_bytes;
     let (blocks, rest) = out.split_at_mut(whole);
     let mut bits = vec![];
     for target in blocks.chunks_mut(block) {
@@ -68,10 +71,10 @@ pub fn undo(from: &[u8], size: usize, out: &mut [u8]) {
     let row = out.len() / size / 8;
     for byte in 0..size {
         let rows: [&[u8]; 8] = std::array::from_fn(|bit| &from[(byte * 8 + bit) * row..(byte * 8 + bit + 1) * row]);
-        for eight in 0..row {
-            let bits = transpose(u64::from_le_bytes(std::array::from_fn(|bit| rows[bit][eight])));
+        for group in 0..row {
+            let bits = transpose(u64::from_le_bytes(std::array::from_fn(|bit| rows[bit][group])));
             for (i, value) in bits.to_le_bytes().into_iter().enumerate() {
-                out[(eight * 8 + i) * size + byte] = value;
+                out[(group * 8 + i) * size + byte] = value;
             }
         }
     }

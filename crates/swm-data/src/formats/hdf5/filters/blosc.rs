@@ -6,6 +6,7 @@
 
 use super::{Input, bitshuffle, copy_match, inflate, lz4_block, shuffle, zstd_frame};
 
+/// Bits of the flags in the header.
 mod flag {
     pub const SHUFFLE: u8 = 1;
     pub const STORED: u8 = 2;
@@ -13,9 +14,10 @@ mod flag {
     pub const ONE_STREAM: u8 = 16;
 }
 
+/// Size of the header in bytes.
 const HEADER: usize = 16;
 
-/// Decodes a chunk into `out`, which has its decoded length.
+/// Decodes a chunk into `out`, which has the decoded length of the chunk.
 pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     let mut input = Input(from);
     let [version, _, flags, size] = input.array()?;
@@ -31,7 +33,7 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
         ));
     }
     if flags & flag::STORED != 0 {
-        let bytes = from.get(HEADER..HEADER + total).ok_or("Blosc: it is truncated")?;
+        let bytes = from.get(HEADER..HEADER + total).ok_or("Blosc: the chunk is truncated")?;
         out.copy_from_slice(bytes);
         return Ok(());
     }
@@ -79,18 +81,18 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     Ok(())
 }
 
-/// BloscLZ, a descendant of FastLZ: like LZF, but lengths have any number of bytes, and two more bytes follow the
-/// largest distance.
+/// Decodes BloscLZ, a descendant of FastLZ. It differs from LZF in two ways: a length may have any number of bytes, and
+/// two more bytes follow the largest distance.
 fn blosclz(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     const FAR: usize = 8191;
     let mut input = Input(from);
     let mut at = 0;
-    // The first instruction is always literals.
+    // The first instruction is always a run of literals.
     let mut control = usize::from(input.array::<1>()?[0] & 31);
     loop {
         if control < 32 {
             let literals = input.take(control + 1)?;
-            let target = out.get_mut(at..at + literals.len()).ok_or("BloscLZ: it exceeds the chunk")?;
+            let target = out.get_mut(at..at + literals.len()).ok_or("BloscLZ: the data exceeds the chunk")?;
             target.copy_from_slice(literals);
             at += literals.len();
         } else {
@@ -115,5 +117,5 @@ fn blosclz(from: &[u8], out: &mut [u8]) -> Result<(), String> {
         let Ok([next]) = input.array() else { break };
         control = usize::from(next);
     }
-    if at == out.len() { Ok(()) } else { Err(format!("BloscLZ: it ends after {at} of {} bytes", out.len())) }
+    if at == out.len() { Ok(()) } else { Err(format!("BloscLZ: the data ends after {at} of {} bytes", out.len())) }
 }

@@ -1,4 +1,5 @@
-//! The 32-bit Fletcher checksum over big-endian 16-bit words, as HDF5 defines it. It is stored after the data.
+//! The 32-bit Fletcher checksum over big-endian 16-bit words, as HDF5 defines it. The checksum is stored after the
+//! data.
 
 /// Size of a checksum in bytes.
 pub const SIZE: usize = 4;
@@ -12,7 +13,8 @@ pub fn sum(bytes: &[u8]) -> u32 {
     let (mut plain, mut weighted) = (0_u64, 0_u64);
     let (words, odd) = bytes.as_chunks::<2>();
     for block in words.chunks(BLOCK) {
-        // Over a block of n words, the plain sum enters the weighted one n times, and word i of the block n - i times.
+        // Over a block of n words, the weighted sum grows by n times the previous plain sum, and by n - i times word i
+        // of the block, counted from 0.
         let n = block.len() as u32;
         let (mut sum, mut sums) = (0_u32, 0_u32);
         for (&word, weight) in block.iter().zip((1..=n).rev()) {

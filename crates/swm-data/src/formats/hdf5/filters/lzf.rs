@@ -1,22 +1,22 @@
 //! LZF, Marc Lehmann's fast codec. It is part of h5py, which therefore reads LZF without plugins.
 //!
 //! The format is a stream of instructions. A byte `n` below 32 is followed by `n + 1` literals. Any other byte starts a
-//! match: its upper three bits are the length less 2 (7 means that another byte is added), and its lower five bits with
-//! the next byte are the distance less 1.
+//! match, a copy of earlier output. The upper three bits of that byte are the length less 2 (7 means that the next byte
+//! is added to the length). The lower five bits, followed by the last byte of the match, are the distance less 1.
 
 use super::copy_match;
 
 const MAX_LITERALS: usize = 32;
 const MAX_DISTANCE: usize = 1 << 13;
 const MAX_LENGTH: usize = 264;
-/// Matches up to this length are copied at once.
+/// Length in bytes up to which a match is copied with a constant length.
 const SHORT: usize = 16;
 /// Number of bits of the hash that addresses the table of positions. The hash covers the three bytes at a position.
 const TABLE_BITS: u32 = 14;
 
-/// Decodes a chunk into `out`, which has its decoded length.
+/// Decodes a chunk into `out`, which has the decoded length of the chunk.
 pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
-    let cut = || "LZF: it is truncated".to_owned();
+    let cut = || "LZF: the chunk is truncated".to_owned();
     let (mut i, mut at) = (0, 0);
     while let Some(&control) = from.get(i) {
         let control = usize::from(control);
@@ -25,10 +25,10 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
             let length = control + 1;
             let literals = from.get(i..i + length).ok_or_else(cut)?;
             if length > out.len() - at {
-                return Err("LZF: it exceeds the chunk".to_owned());
+                return Err("LZF: the data exceeds the chunk".to_owned());
             }
-            // If there is space, copies the maximum length, because a constant length compiles to two moves instead of
-            // a call.
+            // If both buffers have space, copies the maximum length, because a constant length compiles to two moves
+            // instead of a call.
             match (from[i..].first_chunk::<MAX_LITERALS>(), out[at..].first_chunk_mut::<MAX_LITERALS>()) {
                 (Some(literals), Some(target)) => *target = *literals,
                 _ => out[at..at + length].copy_from_slice(literals),
@@ -55,7 +55,7 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
             at += length;
         }
     }
-    if at == out.len() { Ok(()) } else { Err(format!("LZF: it ends after {at} of {} bytes", out.len())) }
+    if at == out.len() { Ok(()) } else { Err(format!("LZF: the data ends after {at} of {} bytes", out.len())) }
 }
 
 /// The state of an encoder, reused between chunks.
@@ -88,16 +88,16 @@ impl Encoder {
                 continue;
             };
             let longest = MAX_LENGTH.min(bytes.len() - at);
-            let same = common(&bytes[before..], &bytes[at..at + longest]);
-            put_literals(&bytes[literals..at], out);
-            put_match(at - before, same, out);
-            at += same;
+            let length = common_prefix(&bytes[before..], &bytes[at..at + longest]);
+            write_literals(&bytes[literals..at], out);
+            write_match(at - before, length, out);
+            at += length;
             literals = at;
             if out.len() - begin > most {
                 break;
             }
         }
-        put_literals(&bytes[literals..], out);
+        write_literals(&bytes[literals..], out);
         let smaller = out.len() - begin <= most;
         if !smaller {
             out.truncate(begin);
@@ -107,7 +107,7 @@ impl Encoder {
 }
 
 /// Length of the common prefix of `a` and `b`. Compares eight bytes at a time.
-fn common(a: &[u8], b: &[u8]) -> usize {
+fn common_prefix(a: &[u8], b: &[u8]) -> usize {
     let words = a.as_chunks::<8>().0.iter().zip(b.as_chunks::<8>().0);
     for (i, (x, y)) in words.enumerate() {
         let differ = u64::from_le_bytes(*x) ^ u64::from_le_bytes(*y);
@@ -119,14 +119,14 @@ fn common(a: &[u8], b: &[u8]) -> usize {
     whole + a[whole..].iter().zip(&b[whole..]).take_while(|(x, y)| x == y).count()
 }
 
-fn put_literals(literals: &[u8], out: &mut Vec<u8>) {
+fn write_literals(literals: &[u8], out: &mut Vec<u8>) {
     for run in literals.chunks(MAX_LITERALS) {
         out.push(run.len() as u8 - 1);
         out.extend(run);
     }
 }
 
-fn put_match(distance: usize, length: usize, out: &mut Vec<u8>) {
+fn write_match(distance: usize, length: usize, out: &mut Vec<u8>) {
     let (distance, length) = (distance - 1, length - 2);
     if length < 7 {
         out.push((length << 5 | distance >> 8) as u8);

@@ -1,6 +1,6 @@
 //! Decoders for HDF5 filters.
 //!
-//! Supported are the filters of the HDF5 library (deflate, shuffle, Fletcher's checksum), h5py's LZF, and LZ4,
+//! This module supports the filters of the HDF5 library (deflate, shuffle, Fletcher's checksum), h5py's LZF, and LZ4,
 //! Zstandard, bitshuffle and Blosc (with all codecs except Snappy) of the package hdf5plugin.
 
 mod bitshuffle;
@@ -88,7 +88,7 @@ impl Pipeline {
     pub fn decode(&self, stored: &[u8], skipped: u32, scratch: &mut Scratch, out: &mut [u8]) -> Result<(), String> {
         let applied = |at: usize| at >= 32 || skipped & 1 << at == 0;
         let Scratch { from, to } = scratch;
-        // The remaining data is in `stored` at first, then in `from`.
+        // The data that is still encoded is in `stored` at first, then in `from`.
         let mut first = true;
         let mut end = stored.len();
         for at in (0..self.0.len()).rev().filter(|&at| applied(at)) {
@@ -118,7 +118,7 @@ impl Pipeline {
 }
 
 impl Filter {
-    /// Reverses the filter. The result is exactly as long as `out`.
+    /// Reverses the filter. The decoded data must be exactly as long as `out`.
     fn undo(self, from: &[u8], out: &mut [u8]) -> Result<(), String> {
         match self {
             Self::Deflate => inflate(from, out),
@@ -142,19 +142,23 @@ fn inflate(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     if status == Status::StreamEnd && state.total_out() == out.len() as u64 {
         return Ok(());
     }
-    Err(format!("deflate: it ends after {} of {} bytes", state.total_out(), out.len()))
+    Err(format!("deflate: the data ends after {} of {} bytes", state.total_out(), out.len()))
 }
 
 /// Decodes an LZ4 block.
 fn lz4_block(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     let size = lz4_flex::block::decompress_into(from, out).map_err(|e| format!("LZ4: {e}"))?;
-    if size == out.len() { Ok(()) } else { Err(format!("LZ4: it ends after {size} of {} bytes", out.len())) }
+    if size == out.len() { Ok(()) } else { Err(format!("LZ4: the data ends after {size} of {} bytes", out.len())) }
 }
 
 /// Decodes a Zstandard frame.
 fn zstd_frame(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     let size = zstd::bulk::decompress_to_buffer(from, out).map_err(|e| format!("Zstandard: {e}"))?;
-    if size == out.len() { Ok(()) } else { Err(format!("Zstandard: it ends after {size} of {} bytes", out.len())) }
+    if size == out.len() {
+        Ok(())
+    } else {
+        Err(format!("Zstandard: the data ends after {size} of {} bytes", out.len()))
+    }
 }
 
 /// Decodes the output of the LZ4 filter: total length, block length, then blocks with length prefixes. A block that
@@ -163,7 +167,7 @@ fn lz4_blocks(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     let mut input = Input(from);
     let (total, block) = (input.u64_be()?, input.u32_be()? as usize);
     if total != out.len() as u64 || block == 0 {
-        return Err(format!("LZ4: it declares {total} bytes in blocks of {block} instead of {}", out.len()));
+        return Err(format!("LZ4: the header declares {total} bytes in blocks of {block} instead of {}", out.len()));
     }
     for target in out.chunks_mut(block) {
         let size = input.u32_be()? as usize;

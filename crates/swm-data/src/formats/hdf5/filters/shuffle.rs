@@ -44,7 +44,7 @@ mod tests {
             let mut shuffled: Vec<u8> = (0..size).flat_map(|b| (0..count).map(move |i| (i * size + b) as u8)).collect();
             shuffled.extend(&bytes[count * size..]);
             let mut out = vec![0; 100];
-            undo(&shuffled, size, &mut out).expect("fits");
+            undo(&shuffled, size, &mut out).expect("unshuffling the bytes");
             assert_eq!(out, bytes, "{size}");
         }
         assert!(undo(&[1, 2], 2, &mut [0; 3]).is_err());

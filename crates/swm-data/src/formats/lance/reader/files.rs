@@ -16,15 +16,15 @@ use std::path::Path;
 use std::sync::Arc;
 use swm_core::{Error, Result};
 
-/// Data files in an object store that are opened concurrently.
+/// Maximum number of data files in an object store that are opened concurrently.
 const OPENED_TOGETHER: usize = 16;
 
-/// Data files up to this size are verified before even their episode indices are read.
+/// Size in bytes up to which a data file is verified before any of its data is read, including the episode indices.
 const SMALL_FILE: u64 = 1 << 20;
 
 impl LanceReader {
-    /// Opens data files in an object store concurrently, because each takes several requests. Skips files that are
-    /// already open.
+    /// Opens data files in an object store concurrently, because opening one file takes several requests.
+    /// Skips files that are already open.
     pub(super) fn open_together(&self, files: Vec<DataFile>) -> Result<()> {
         let store = self.store.clone();
         let missing: Vec<DataFile> = {
@@ -39,7 +39,7 @@ impl LanceReader {
             opening.buffered(OPENED_TOGETHER).try_collect().await
         })?;
         for (path, reader) in opened {
-            lock(&self.files).keep(&path, &Arc::new(reader));
+            lock(&self.files).insert(&path, &Arc::new(reader));
         }
         Ok(())
     }
@@ -54,17 +54,18 @@ impl LanceReader {
         Ok((file, projected))
     }
 
-    /// Verifies a local file against the hash in its name, once, before anything in it is decoded. Lance trusts its
-    /// input, so a flipped bit could make it allocate any amount of memory. A large file is verified only when its data
-    /// is read, so that opening a dataset does not read all of it. Object stores verify their content themselves.
-    pub(super) fn verify(&self, file: &DataFile, data_wanted: bool) -> Result<()> {
+    /// Verifies a local file against the hash in its name, once, before any of the file's data is decoded. Lance does
+    /// not validate the file, so a flipped bit could cause an allocation of any size. A large file is verified only
+    /// when data other than the episode indices is read (`reads_data`), so that opening a dataset does not read large
+    /// files completely. Object stores verify their content themselves.
+    pub(super) fn verify(&self, file: &DataFile, reads_data: bool) -> Result<()> {
         let Some(expected) = store::hash_in_name(&file.path).filter(|_| !self.store.remote) else { return Ok(()) };
         if lock(&self.verified).contains(&file.path) {
             return Ok(());
         }
         let path = self.store.local(&self.store.data_path(&file.path));
         let io = |e: std::io::Error| self.file_error(&path, e);
-        if !data_wanted && std::fs::metadata(&path).map_err(io)?.len() > SMALL_FILE {
+        if !reads_data && std::fs::metadata(&path).map_err(io)?.len() > SMALL_FILE {
             return Ok(());
         }
         if store::hash_file(&path).map_err(io)? != expected {
@@ -106,7 +107,7 @@ impl LanceReader {
         let path = self.folder().join("data").join(&file.path);
         let reader = block_on(&path, "opening a data file", async move { store.open_file(&data_file).await })?;
         let reader = Arc::new(reader);
-        lock(&self.files).keep(&file.path, &reader);
+        lock(&self.files).insert(&file.path, &reader);
         Ok(reader)
     }
 
@@ -117,7 +118,7 @@ impl LanceReader {
         }
         let local = self.store.local(&self.store.data_path(path));
         let file = Arc::new(File::open(&local).map_err(|e| self.file_error(&local, e))?);
-        lock(&self.handles).keep(path, &file);
+        lock(&self.handles).insert(path, &file);
         Ok(file)
     }
 
@@ -147,6 +148,6 @@ impl LanceReader {
         };
         let reader = Arc::clone(reader);
         let read = async move { reader.read_global_buffer(index).await.map(Some) };
-        block_on(self.folder(), "reading the record of its episodes", read)
+        block_on(self.folder(), "reading the record of a data file", read)
     }
 }

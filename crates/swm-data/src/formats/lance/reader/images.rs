@@ -1,6 +1,6 @@
 //! Reads the images of a batch from their locations and decodes them in parallel.
 
-use super::lance_reader::{FileImages, LanceReader, RowSlot, lock, merged, open_at_once};
+use super::lance_reader::{FileImages, LanceReader, RowSlot, lock, max_open_files, merged};
 use crate::dataset::objects::{self, ObjectRanges};
 use crate::formats::lance::convert::image_bytes;
 use crate::formats::lance::image_locations::{ImageLocation, ImageLocations};
@@ -14,7 +14,7 @@ use std::sync::Arc;
 use swm_core::Result;
 
 impl LanceReader {
-    /// Locations of a column's images in a fragment; `None` if the column has another layout.
+    /// Locations of a column's images in a fragment; `None` if the column needs Lance's decoder.
     pub(super) fn locate_images(&self, fragment: usize, column: &str) -> Result<Option<Arc<FileImages>>> {
         let key = (fragment, column.to_owned());
         if let Some(known) = lock(&self.image_locations).get(&key) {
@@ -44,26 +44,26 @@ impl LanceReader {
         Ok(found)
     }
 
-    /// Empty ranges of a data file.
+    /// A request for a data file, without byte ranges so far.
     pub(super) fn ranges_of(&self, file: &FileImages) -> ObjectRanges {
         ObjectRanges { path: self.store.data_path(&file.path), size: file.size, ranges: vec![] }
     }
 
     pub(super) fn read_images(&self, column: &StoredColumn, requested: &mut [RowSlot]) -> Result<()> {
         let mut located = vec![];
-        let mut others: Vec<&mut RowSlot> = vec![];
+        let mut unlocated: Vec<&mut RowSlot> = vec![];
         for rows in requested.chunk_by_mut(|a, b| self.fragment_of(a.0) == self.fragment_of(b.0)) {
             let fragment = self.fragment_of(rows[0].0);
             match self.locate_images(fragment, &column.name)? {
                 Some(images) => located.push((self.fragment_rows[fragment], images, rows)),
-                None => others.extend(rows),
+                None => unlocated.extend(rows),
             }
         }
-        for fragments in located.chunks_mut(open_at_once(&self.store)) {
+        for fragments in located.chunks_mut(max_open_files(&self.store)) {
             self.read_located_images(column, fragments)?;
         }
-        let stored = self.stored_rows(&column.name, &merged(&others))?;
-        let mut groups = others.chunk_by_mut(|a, b| a.0 == b.0);
+        let stored = self.stored_rows(&column.name, &merged(&unlocated))?;
+        let mut groups = unlocated.chunk_by_mut(|a, b| a.0 == b.0);
         let mut jobs = vec![];
         for rows in &stored {
             for (i, group) in (0..rows.rows).zip(groups.by_ref()) {
@@ -71,16 +71,16 @@ impl LanceReader {
             }
         }
         jobs.into_par_iter().with_max_len(1).try_for_each(|(bytes, group)| {
-            let Some(((row, first), others)) = group.split_first_mut().map(|(a, b)| ((a.0, &mut *a.1), b)) else {
+            let Some(((row, first), repeats)) = group.split_first_mut().map(|(a, b)| ((a.0, &mut *a.1), b)) else {
                 return Ok(());
             };
             self.decode(column, row, bytes, first)?;
-            others.iter_mut().for_each(|(_, slot)| slot.copy_from_slice(first));
+            repeats.iter_mut().for_each(|(_, slot)| slot.copy_from_slice(first));
             Ok(())
         })
     }
 
-    /// Reads and decodes images with known locations, from some fragments.
+    /// Reads and decodes images with known locations. Each fragment is `(first row, images, requested rows)`.
     pub(super) fn read_located_images(
         &self,
         column: &StoredColumn,
@@ -98,12 +98,12 @@ impl LanceReader {
             }
         }
         let finish = |location: &ImageLocation, bytes: &[u8], group: &mut [RowSlot]| {
-            let Some(((row, first), others)) = group.split_first_mut() else { return Ok(()) };
+            let Some(((row, first), repeats)) = group.split_first_mut() else { return Ok(()) };
             let image = location.image(bytes).ok_or_else(|| {
                 damaged(self.folder(), format!("row {row} of column '{}' has a wrong length prefix", column.name))
             })?;
             self.decode(column, *row, image, first)?;
-            others.iter_mut().for_each(|(_, slot)| slot.copy_from_slice(first));
+            repeats.iter_mut().for_each(|(_, slot)| slot.copy_from_slice(first));
             Ok(())
         };
         if self.store.remote {

@@ -14,13 +14,14 @@ use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use swm_core::Schema;
 
-/// Maximum number of open local data files. Each takes up to two file descriptors; a process usually has 1024.
+/// Maximum number of open local data files. Each file takes up to two file descriptors; a process may usually open
+/// 1024.
 const OPEN_FILES: usize = 32;
 
 /// Maximum number of open data files in an object store, which only take memory.
 const OPEN_OBJECTS: usize = 1024;
 
-/// A table of episodes.
+/// An open table of episodes.
 pub struct LanceReader {
     pub(super) store: Store,
     pub(super) table: Arc<Table>,
@@ -29,12 +30,12 @@ pub struct LanceReader {
     pub(super) episodes: Vec<Episode>,
     /// First row of each episode, counted over the table.
     pub(super) first_rows: Vec<u64>,
-    /// First row of each fragment, followed by the number of rows.
+    /// First row of each fragment, followed by the number of rows of the table.
     pub(super) fragment_rows: Vec<u64>,
     pub(super) files: Mutex<RecentFiles<FileReader>>,
     /// Local data files, opened for reading at offsets.
     pub(super) handles: Mutex<RecentFiles<File>>,
-    /// Known locations of images.
+    /// Locations of images that were looked up before.
     pub(super) image_locations: Mutex<ImageLocationCache>,
     pub(super) value_cache: Mutex<ValueCache>,
     /// Cached blocks of an object store.
@@ -44,7 +45,7 @@ pub struct LanceReader {
 }
 
 impl LanceReader {
-    /// The folder or address of the table, for messages.
+    /// The folder or address of the table, for error messages.
     pub(super) fn folder(&self) -> &Path {
         &self.store.label
     }
@@ -63,21 +64,21 @@ impl LanceReader {
 /// The most recently opened files by path, up to `limit`.
 pub(super) struct RecentFiles<T> {
     by_path: HashMap<String, Arc<T>>,
-    /// Oldest first.
+    /// Paths, oldest first.
     order: VecDeque<String>,
     limit: usize,
 }
 
 impl<T> RecentFiles<T> {
     pub(super) fn new(store: &Store) -> Self {
-        Self { by_path: HashMap::new(), order: VecDeque::new(), limit: open_at_once(store) }
+        Self { by_path: HashMap::new(), order: VecDeque::new(), limit: max_open_files(store) }
     }
 
     pub(super) fn get(&self, path: &str) -> Option<Arc<T>> {
         self.by_path.get(path).map(Arc::clone)
     }
 
-    pub(super) fn keep(&mut self, path: &str, file: &Arc<T>) {
+    pub(super) fn insert(&mut self, path: &str, file: &Arc<T>) {
         if self.by_path.insert(path.to_owned(), Arc::clone(file)).is_some() {
             return;
         }
@@ -91,7 +92,7 @@ impl<T> RecentFiles<T> {
 }
 
 /// Maximum number of data files open at a time.
-pub(super) fn open_at_once(store: &Store) -> usize {
+pub(super) fn max_open_files(store: &Store) -> usize {
     if store.remote { OPEN_OBJECTS } else { OPEN_FILES }
 }
 
@@ -114,10 +115,10 @@ pub(super) struct FileImages {
 /// Locations by fragment and column name; `None` if the column must be read with Lance's decoder.
 type ImageLocationCache = HashMap<(usize, String), Option<Arc<FileImages>>>;
 
-/// A row of the table, and the part of the output that receives it.
+/// A row of the table, and the bytes of the output that receive the row.
 pub(super) type RowSlot<'a> = (u64, &'a mut [u8]);
 
-/// Locks a mutex, whether or not it is poisoned.
+/// Locks a mutex, even if it is poisoned.
 pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     // The guarded data is valid after every statement, so poisoning is ignored.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)

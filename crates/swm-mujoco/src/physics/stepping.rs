@@ -73,7 +73,7 @@ impl Physics {
         self.guarded("computing contact forces", || unsafe { ffi::mj_rnePostConstraint(model, data) });
     }
 
-    /// Stores the present state as the one from which `derivation` starts.
+    /// Stores the present state as the state from which `derivation` computes the derived quantities.
     pub(super) fn set_derivation(&mut self, derivation: Derivation) {
         copy_state(&self.data, &mut self.source_state);
         self.derivation = derivation;
@@ -174,8 +174,8 @@ unsafe fn array<'a, T>(first: *const T, count: i32) -> &'a [T] {
     if first.is_null() || count == 0 { &[] } else { unsafe { std::slice::from_raw_parts(first, count) } }
 }
 
-/// Replaces the contacts that MuJoCo found. The first ones overwrite the found ones; MuJoCo allocates room for the
-/// rest.
+/// Replaces the contacts that MuJoCo found: overwrites as many as were found, and adds further contacts, for which MuJoCo
+/// allocates memory.
 ///
 /// # Safety
 /// Model and data must be valid and belong together.
@@ -183,12 +183,12 @@ unsafe fn write_contacts(model: *const mjModel, data: *mut mjData, contacts: &[m
     // SAFETY: guaranteed by the caller; `contact` has room for the `ncon` contacts that were found.
     unsafe {
         let found = usize::try_from((*data).ncon).unwrap_or(0);
-        let (fitting, more) = contacts.split_at(contacts.len().min(found));
-        for (i, contact) in fitting.iter().enumerate() {
+        let (overwriting, further) = contacts.split_at(contacts.len().min(found));
+        for (i, contact) in overwriting.iter().enumerate() {
             (*data).contact.add(i).write(contact.clone());
         }
-        (*data).ncon = i32::try_from(fitting.len()).unwrap_or(0);
-        for contact in more {
+        (*data).ncon = i32::try_from(overwriting.len()).unwrap_or(0);
+        for contact in further {
             ffi::mj_addContact(model, data, contact);
         }
     }

@@ -1,4 +1,5 @@
-//! The OpenGL contexts of a render thread: one of MuJoCo's contexts per model group, with its meshes and textures.
+//! The OpenGL contexts of a render thread. Each model group (all copies of one compiled model) has one `mjrContext`, which
+//! holds its meshes and textures.
 
 use super::library::{Display, GlContext, Library};
 use crate::physics::Appearance;
@@ -12,14 +13,14 @@ use std::ffi::c_int;
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::{Error, Result};
 
-/// Contexts that a thread caches; the least recently used one is dropped first. Each context holds a shadow map of 64
+/// The number of contexts that a thread caches; the least recently used context is dropped first. Each context holds a shadow map of 64
 /// MB, a frame buffer, meshes and textures.
 const MAX_CONTEXTS: usize = 4;
 
 /// Serialises the creation and destruction of contexts: MuJoCo counts them in an unguarded variable.
 static CONTEXT_LOCK: Mutex<()> = Mutex::new(());
 
-/// The contexts of one thread, the most recently used one last.
+/// The contexts of one thread. The most recently used context is the last.
 pub struct RenderContexts {
     library: Arc<Library>,
     display: Display,
@@ -138,7 +139,7 @@ impl RenderContext {
         })
     }
 
-    /// Prepares the context for a model of its group and a frame size.
+    /// Prepares the context for a frame size and for a model of the context's group.
     fn prepare(&mut self, model: &MjModel, appearance: &Appearance, rect: mjrRect) -> Result<()> {
         let (width, height) = (rect.width.max(self.inner.offWidth), rect.height.max(self.inner.offHeight));
         if (width, height) != (self.inner.offWidth, self.inner.offHeight) {

@@ -19,7 +19,8 @@ pub(crate) struct StepOutcome {
 /// The part of an environment that differs between families: start, step, observation, reward and goal.
 ///
 /// The *task state* contains the values of a task that are not part of the physics, such as a score; it is part of the
-/// `state` column. The *goal values* are stored in snapshots only, because the `state` column does not contain the goal.
+/// `state` column. The *goal values* are stored in snapshots only, because the `state` column does not contain the
+/// goal.
 pub(crate) trait Task: Send {
     /// Edits the model for these factors of variation. Earlier edits are undone before the call, unless
     /// [`Task::overwrites_edits`]. The method is called only when the factors change.
@@ -28,8 +29,8 @@ pub(crate) trait Task: Send {
     /// When the model lacks an element, or cannot be compiled for these factors.
     fn apply_factors(&mut self, physics: &mut Physics, factors: &FactorValues) -> Result<()>;
 
-    /// Whether [`Task::apply_factors`] sets every value of the model that the task ever edits. Earlier edits are then not
-    /// undone before the call, because undoing them is slow for models with many meshes.
+    /// Whether [`Task::apply_factors`] sets every value of the model that the task ever edits. Earlier edits are then
+    /// not undone before the call, because undoing them is slow for models with many meshes.
     fn overwrites_edits(&self) -> bool {
         false
     }
@@ -38,8 +39,8 @@ pub(crate) trait Task: Send {
     /// requested.
     fn receive_request(&mut self, _request: &VariationRequest) {}
 
-    /// Starts an episode. Before the call, the state is the model's initial state ([`Physics::reset`]); derived quantities must be up to
-    /// date on return.
+    /// Starts an episode. Before the call, the state is the model's initial state ([`Physics::reset`]); derived
+    /// quantities must be up to date on return.
     ///
     /// # Errors
     /// When no valid start was found.
@@ -71,8 +72,8 @@ pub(crate) trait Task: Send {
     /// Restores the goal values.
     fn load_goal(&mut self, _goal: &[f64]) {}
 
-    /// Sets the goal to a state: a vector of [`Physics::state`], and the task state at the goal. May change the state of the
-    /// physics; the environment restores it.
+    /// Sets the goal to a state: a vector of [`Physics::state`], and the task state at the goal. May change the state
+    /// of the physics; the environment restores it.
     ///
     /// # Errors
     /// When the state is invalid.

@@ -9,7 +9,8 @@ use std::sync::{Arc, Mutex, PoisonError, Weak};
 /// Identifies the meshes and textures of a model, so that renderers can cache them between frames.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Appearance {
-    /// The number of the compiled model that this model is a copy of. All copies have the same meshes and texture sizes.
+    /// The number of the compiled model that this model is a copy of. All copies have the same meshes and texture
+    /// sizes.
     pub group: u64,
     /// A hash of the content of each texture; 0 where the content is that of the compiled model.
     pub textures: Arc<[u64]>,

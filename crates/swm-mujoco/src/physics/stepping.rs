@@ -174,8 +174,8 @@ unsafe fn array<'a, T>(first: *const T, count: i32) -> &'a [T] {
     if first.is_null() || count == 0 { &[] } else { unsafe { std::slice::from_raw_parts(first, count) } }
 }
 
-/// Replaces the contacts that MuJoCo found: overwrites as many as were found, and adds further contacts, for which MuJoCo
-/// allocates memory.
+/// Replaces the contacts that MuJoCo found: overwrites as many as were found, and adds further contacts, for which
+/// MuJoCo allocates memory.
 ///
 /// # Safety
 /// Model and data must be valid and belong together.

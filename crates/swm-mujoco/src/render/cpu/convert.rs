@@ -136,8 +136,8 @@ fn shape(from: &mjvGeom, model: &MjModel, of_model: bool) -> Option<Shape> {
     })
 }
 
-/// Tessellates a plane along an axis as MuJoCo does. `size` is half the extent in metres (0: infinite), `spacing` half the
-/// distance between grid lines in metres.
+/// Tessellates a plane along an axis as MuJoCo does. `size` is half the extent in metres (0: infinite), `spacing` half
+/// the distance between grid lines in metres.
 fn axis(size: f64, spacing: f64, repeat: f32, model: &MjModel) -> Axis {
     if size > 0.0 {
         let spacing = spacing.max(size / (MAX_CELLS - 2) as f64);

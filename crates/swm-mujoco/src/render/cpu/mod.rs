@@ -1,8 +1,9 @@
 //! The CPU renderer: draws MuJoCo's abstract scenes with `swm-raster`, on the calling thread and on idle threads of its
 //! pool.
 //!
-//! The renderer needs no graphics library and produces the same bytes on every machine. Plane grids, mesh vertices and mip maps,
-//! which MuJoCo computes when it creates a rendering context, are computed here once per model group and cached.
+//! The renderer needs no graphics library and produces the same bytes on every machine. Plane grids, mesh vertices and
+//! mip maps, which MuJoCo computes when it creates a rendering context, are computed here once per model group and
+//! cached.
 
 mod assets;
 mod convert;

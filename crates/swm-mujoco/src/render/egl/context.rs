@@ -1,5 +1,5 @@
-//! The OpenGL contexts of a render thread. Each model group (all copies of one compiled model) has one `mjrContext`, which
-//! holds its meshes and textures.
+//! The OpenGL contexts of a render thread. Each model group (all copies of one compiled model) has one `mjrContext`,
+//! which holds its meshes and textures.
 
 use super::library::{Display, GlContext, Library};
 use crate::physics::Appearance;
@@ -13,8 +13,8 @@ use std::ffi::c_int;
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::{Error, Result};
 
-/// The number of contexts that a thread caches; the least recently used context is dropped first. Each context holds a shadow map of 64
-/// MB, a frame buffer, meshes and textures.
+/// The number of contexts that a thread caches; the least recently used context is dropped first. Each context holds a
+/// shadow map of 64 MB, a frame buffer, meshes and textures.
 const MAX_CONTEXTS: usize = 4;
 
 /// Serialises the creation and destruction of contexts: MuJoCo counts them in an unguarded variable.

@@ -171,18 +171,18 @@ mod tests {
         let vary = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
         let variation = if all { vary } else { VariationRequest::default() };
         let options = ResetOptions { variation, ..ResetOptions::default() };
-        let mut env = entry.env().expect("an environment");
-        let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("a schema"), 1);
+        let mut env = entry.env().expect("creating the environment");
+        let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("creating a schema"), 1);
         let mut count = 0;
         for seed in 0..seeds {
             let mut expert = (entry.experts[0].make)();
-            env.reset(seed, &options).expect("a reset");
+            env.reset(seed, &options).expect("resetting the environment");
             expert.begin(Key::new(seed));
             for _ in 0..env.spec().max_episode_steps {
                 env.observe(&mut row.row_mut(0));
                 let mut action = [0.0; 4];
-                expert.act(row.row(0), &mut action).expect("an action");
-                env.step(Action::Continuous(&action.map(|a| a as f32))).expect("a step");
+                expert.act(row.row(0), &mut action).expect("choosing an action");
+                env.step(Action::Continuous(&action.map(|a| a as f32))).expect("stepping the environment");
             }
             count += u32::from(env.is_success());
         }

@@ -124,8 +124,8 @@ mod tests {
 
     #[test]
     fn state_equals_that_of_mj_get_state() {
-        let model = compile_xml("a test's model", MODEL, &[]).expect("a model");
-        let mut physics = Physics::new(Arc::new(model)).expect("a state");
+        let model = compile_xml("a test's model", MODEL, &[]).expect("compiling the model");
+        let mut physics = Physics::new(Arc::new(model)).expect("allocating the state");
         physics.data_mut().ctrl_mut().copy_from_slice(&[0.5, -0.25]);
         physics.step(3);
         let (mut ours, mut theirs) = (vec![f64::NAN; physics.state_len()], vec![0.0; physics.state_len()]);

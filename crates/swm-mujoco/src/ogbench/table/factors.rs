@@ -23,31 +23,31 @@ const GRIPPER_MATERIALS: [&str; 2] = ["ur5e/robotiq/black", "ur5e/robotiq/pad_gr
 /// The default colour of a closed lock.
 const LOCK_COLOR: [f64; 3] = CUBE_COLORS[0];
 
-/// The factors of a table of which `cameras` cameras (1 or 2) vary.
+/// The factors of a table; `camera.angle_delta` rotates `cameras` cameras (1 or 2).
 pub fn space(config: &TableConfig, cameras: usize) -> VariationSpace {
     let n = config.cubes;
-    let boxed = |shape: &[usize], low: &[f64], high: &[f64]| Space::Box {
+    let bounded = |shape: &[usize], low: &[f64], high: &[f64]| Space::Box {
         shape: shape.to_vec(),
         dtype: DType::Float64,
         low: low.to_vec(),
         high: high.to_vec(),
     };
-    let same = |shape: &[usize], low, high| Space::uniform_box(shape, DType::Float64, low, high);
+    let uniform = |shape: &[usize], low, high| Space::uniform_box(shape, DType::Float64, low, high);
     let [low, high] = config.object_bounds;
-    let positions = || boxed(&[n, 2], &low.repeat(n), &high.repeat(n));
+    let positions = || bounded(&[n, 2], &low.repeat(n), &high.repeat(n));
     let [arm_low, arm_high] = config.arm_bounds;
     let middle: Vec<f64> = (0..3).map(|i| (arm_low[i] + arm_high[i]) / 2.0).collect();
-    let (color, max_angle) = (|shape: &[usize]| same(shape, 0.0, 1.0), config.factors.camera_angle);
+    let (color, max_angle) = (|shape: &[usize]| uniform(shape, 0.0, 1.0), config.factors.camera_angle);
     let mut factors = vec![
         Factor::new("agent.color", color(&[3]), PURPLE),
-        Factor::new("agent.ee_start_position", boxed(&[3], &arm_low, &arm_high), middle),
-        Factor::new("camera.angle_delta", same(&[cameras, 2], -max_angle, max_angle), vec![0.0; 2 * cameras]),
+        Factor::new("agent.ee_start_position", bounded(&[3], &arm_low, &arm_high), middle),
+        Factor::new("camera.angle_delta", uniform(&[cameras, 2], -max_angle, max_angle), vec![0.0; 2 * cameras]),
         Factor::new("cube.color", color(&[n, 3]), CUBE_COLORS[..n].concat()),
         Factor::new("cube.goal_position", positions(), config.factors.cube.repeat(n)),
-        Factor::new("cube.goal_yaw", same(&[n], 0.0, TAU), vec![0.0; n]),
-        Factor::new("cube.size", same(&[n], 0.01, 0.03), vec![HALF_EDGE; n]),
+        Factor::new("cube.goal_yaw", uniform(&[n], 0.0, TAU), vec![0.0; n]),
+        Factor::new("cube.size", uniform(&[n], 0.01, 0.03), vec![HALF_EDGE; n]),
         Factor::new("cube.start_position", positions(), config.factors.cube.repeat(n)),
-        Factor::new("cube.start_yaw", same(&[n], 0.0, TAU), vec![0.0; n]),
+        Factor::new("cube.start_yaw", uniform(&[n], 0.0, TAU), vec![0.0; n]),
         Factor::new("floor.color", color(&[2, 3]), floor::COLORS.concat()),
         Factor::new("light.intensity", color(&[1]), [config.factors.light]),
     ];
@@ -104,7 +104,8 @@ pub fn apply(physics: &mut Physics, config: &TableConfig, parts: &Parts, factors
     floor::set_colors(physics, factors.get("floor.color"))
 }
 
-/// Updates the means that only the compiler computes: the solver's tolerance is relative to the mean inertia.
+/// Updates the mean mass and the mean inertia, which MuJoCo computes only when it compiles a model. The solver's
+/// tolerance is relative to the mean inertia.
 fn set_mean_inertia(physics: &mut Physics) {
     let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
     let (inertia, mass) = (mean(physics.model().dof_m0()), mean(&physics.model().body_mass()[1..]));
@@ -191,7 +192,7 @@ mod tests {
                 physics.forward();
             }
             let mut bytes = vec![0; physics.model().size()];
-            physics.model().save_to_buffer(&mut bytes).expect("a buffer of that size");
+            physics.model().save_to_buffer(&mut bytes).expect("saving the model to a buffer");
             Ok(bytes)
         };
         let (fresh, used) = (bytes(&[1])?, bytes(&[90, 1])?);

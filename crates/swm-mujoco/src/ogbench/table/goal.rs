@@ -1,4 +1,4 @@
-//! The goal of a table environment: its parts, its success criterion, and the distance to it.
+//! The goal of a table environment: its objects, its success criterion, and the distance to the goal.
 
 use super::config::FixtureState;
 use super::parts::Parts;
@@ -36,7 +36,7 @@ impl Subject {
         }
     }
 
-    /// The subject of a code; [`Subject::All`] for an unknown one.
+    /// The subject with a code; [`Subject::All`] for an unknown code.
     pub fn from_code(code: i64) -> Self {
         match code {
             i @ 0..100 => Self::Cube(i as usize),
@@ -51,15 +51,15 @@ impl Subject {
 /// One object of a goal.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GoalTerm {
-    /// The distance from its goal, in metres.
+    /// The distance of the object from its goal, in metres.
     pub distance: f64,
-    /// Whether it is at its goal.
+    /// Whether the object is at its goal.
     pub reached: bool,
-    /// The position at which the gripper manipulates it, in metres.
+    /// The position at which the gripper manipulates the object, in metres.
     pub grip: Vec3,
 }
 
-/// A state and a goal to compare.
+/// The comparison of a state with a goal.
 pub struct GoalCheck<'a> {
     /// The indices of all objects.
     pub parts: &'a Parts,
@@ -88,10 +88,10 @@ impl GoalCheck<'_> {
         );
         let fixtures = self.parts.fixtures.iter().flat_map(move |fixtures| {
             let button = |i: usize| {
-                let right = self.now.buttons[i] == self.goal.buttons[i];
-                let distance = if right { 0.0 } else { WRONG_LOCK_DISTANCE };
+                let is_equal = self.now.buttons[i] == self.goal.buttons[i];
+                let distance = if is_equal { 0.0 } else { WRONG_LOCK_DISTANCE };
                 let grip = self.sites[fixtures.buttons[i].top];
-                (Subject::Button(i), GoalTerm { distance, reached: right, grip })
+                (Subject::Button(i), GoalTerm { distance, reached: is_equal, grip })
             };
             let opening =
                 |subject, now: f64, goal: f64, site: usize| (subject, within((now - goal).abs(), self.sites[site]));
@@ -114,8 +114,8 @@ impl GoalCheck<'_> {
         self.terms(subject).all(|term| term.reached)
     }
 
-    /// The sum of the distances of all terms that are not reached, plus the distance of the gripper from the nearest of
-    /// them, in metres.
+    /// The sum of the distances of all terms that are not reached, plus the distance of the gripper from the nearest
+    /// object that is not at its goal, in metres.
     pub fn distance(&self, subject: Subject, gripper: Vec3) -> f64 {
         let open = || self.terms(subject).filter(|term| !term.reached);
         let terms: f64 = open().map(|term| term.distance).sum();

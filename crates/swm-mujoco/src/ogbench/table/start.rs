@@ -1,4 +1,4 @@
-//! The start of episodes, and how goals are drawn.
+//! The start of episodes, and the sampling of goals.
 
 use super::config::{AWAY, Bounds, CUBE_HEIGHT, FixtureState, OPEN};
 use super::goal::{GOAL_TOLERANCE, Subject};
@@ -11,11 +11,12 @@ use rand::seq::{IndexedRandom as _, SliceRandom as _};
 use std::f64::consts::{PI, TAU};
 use swm_core::{Error, FactorValues, Key, Result, Rng};
 
-/// Largest distance of cubes, drawer and window from the start that a task gives, in metres.
+/// Largest distance of cubes, drawer and window from their initial positions in the task, in metres.
 const START_NOISE: f64 = 0.01;
-/// Random actions in which objects settle at the goal.
+/// The number of random actions in which objects settle at the goal.
 const SETTLE_STEPS: usize = 2;
-/// Height of a cube's centre above that of the cube below it, in metres; for cubes of any size, as in the reference.
+/// Height of a cube's centre above the centre of the cube below it, in metres; for cubes of any size, as in the
+/// reference.
 const STACK_HEIGHT: f64 = 0.04;
 /// The position of a cube in an open drawer, in metres.
 const IN_OPEN_DRAWER: Vec3 = [0.33, -0.24, 0.066];
@@ -29,7 +30,7 @@ const P_DRAWER: f64 = 0.3;
 const LOCKED_WEIGHT: f64 = 0.25;
 /// Probability that a sampled goal stacks a cube.
 const P_GOAL_STACK: f64 = 0.3;
-/// Distance of two cubes side by side at a sampled goal, in metres: the gripper fits between them.
+/// The smallest distance of two cubes on the table at a sampled goal, in metres: the gripper fits between them.
 const MIN_DISTANCE: f64 = 0.08;
 /// The maximal number of goals drawn before sampling fails, and of positions drawn for each cube.
 const TRIES: usize = 256;
@@ -59,7 +60,7 @@ impl Table {
         physics.forward();
     }
 
-    /// Starts a task. The goal is simulated first, for its observation; then the start is set.
+    /// Starts a task. The goal is simulated first, to compute its observation; then the start is set.
     fn begin_task(&mut self, physics: &mut Physics, task: usize, factors: &FactorValues, rng: &mut Rng) {
         let task = &self.config.tasks[task];
         let mut order: Vec<usize> = (0..self.config.cubes).collect();
@@ -67,12 +68,12 @@ impl Table {
             order.shuffle(rng);
         }
         let gripper = factors.get("agent.ee_start_position");
-        let rest = physics.data().qpos().to_vec();
+        let initial_qpos = physics.data().qpos().to_vec();
         let cubes = order.iter().map(|&i| (task.goals[i], IDENTITY)).collect();
         let [start, goal] = task.fixtures;
         self.settle_goal(physics, gripper, cubes, goal, rng);
         // Joints that the start does not set, such as the fingers, return to their initial positions.
-        physics.data_mut().qpos_mut().copy_from_slice(&rest);
+        physics.data_mut().qpos_mut().copy_from_slice(&initial_qpos);
         physics.data_mut().qvel_mut().fill(0.0);
         self.set_gripper(physics, gripper, rng);
         for (cube, &i) in self.parts.cubes.iter().zip(&order) {
@@ -112,7 +113,7 @@ impl Table {
         self.store_goal(physics);
     }
 
-    /// Stores the present pose as that of the goal. The physics has the derived quantities of the goal afterwards.
+    /// Stores the present pose as the goal pose. The physics has the derived quantities of the goal afterwards.
     fn store_goal(&mut self, physics: &mut Physics) {
         let (qpos, qvel) = (physics.data().qpos(), physics.data().qvel());
         self.goal.pose[..qpos.len()].copy_from_slice(qpos);
@@ -136,7 +137,7 @@ impl Table {
         }
     }
 
-    /// Starts an episode of `mode=data_collection`: the start of the factors, and one object to manipulate.
+    /// Starts an episode of `mode=data_collection`: the factors set the start, and the goal is one object.
     fn begin_from_factors(&mut self, physics: &mut Physics, factors: &FactorValues, rng: &mut Rng) {
         self.set_gripper(physics, factors.get("agent.ee_start_position"), rng);
         let (positions, yaws) = (factors.get("cube.start_position"), factors.get("cube.start_yaw"));
@@ -151,7 +152,7 @@ impl Table {
         self.set_fixtures(physics, fixtures);
         self.draw_subject(physics, factors, rng);
         self.move_marker_bodies(physics);
-        // The pose at the goal is the start with the subject at its goal.
+        // The goal pose is the start with the subject at its goal.
         let start = physics.data().qpos().to_vec();
         if let Subject::Cube(i) = self.goal.subject {
             let (position, rotation) = self.goal.cubes[i];
@@ -264,7 +265,7 @@ impl Table {
         })
     }
 
-    /// Draws poses for the cubes, apart from each other or stacked; `None` if there was no room.
+    /// Draws poses for the cubes, apart from each other or stacked; `None` if no free position was drawn.
     fn draw_cube_poses(&self, rng: &mut Rng) -> Option<Vec<(Vec3, Quat)>> {
         let mut poses: Vec<(Vec3, Quat)> = vec![];
         let mut tops: Vec<usize> = vec![];

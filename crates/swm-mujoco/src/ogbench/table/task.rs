@@ -1,4 +1,4 @@
-//! [`Table`]: step, reward and goal of a table. Its start is in `start`, its columns are in `observe`.
+//! [`Table`]: step, reward and goal of a table. The module `start` has the start of episodes, `observe` the columns.
 
 use super::config::{AWAY, CUBE_HEIGHT, FRONT, FixtureState, TableConfig, WORKSPACE, observation_len};
 use super::factors;
@@ -15,9 +15,9 @@ use swm_core::{FactorValues, Key, Result, RowMut};
 
 /// Time steps of 2 ms per action.
 const SUBSTEPS: usize = 25;
-/// Elements of the task state before the pose: contact, and locks now and before the step.
+/// The number of elements of the task state before the pose: contact, the locks, and the locks before the last step.
 pub const TASK_STATE_HEAD: usize = 5;
-/// Elements of the goal values before the cubes: subject, locks, openings, contact.
+/// The number of elements of the goal values before the cubes: subject, locks, openings, contact.
 const GOAL_HEAD: usize = 6;
 /// Distance outside the workspace at which a cube is brought back, in metres.
 const LOST_DISTANCE: f64 = 0.2;
@@ -33,7 +33,7 @@ pub enum Mode {
     DataCollection,
 }
 
-/// A table on its model.
+/// A table task on a compiled model.
 pub struct Table {
     pub(super) config: &'static TableConfig,
     pub(super) mode: Mode,
@@ -66,9 +66,9 @@ pub struct Goal {
     pub fixtures: FixtureState,
     /// `qpos` and `qvel` of a pose at the goal.
     pub pose: Vec<f64>,
-    /// Contact of the gripper in that pose.
+    /// Contact of the gripper in `pose`, 0 to 1.
     pub contact: f64,
-    /// The observation in that pose.
+    /// The observation in `pose`.
     pub observation: Vec<f64>,
     /// Whether `observation` was computed in `pose`.
     observed: bool,
@@ -122,7 +122,7 @@ impl Table {
         self.arm.proprioception(physics, self.contact)
     }
 
-    /// The present state and the goal, to compare.
+    /// Returns the comparison of the present state with the goal.
     fn goal_check<'a>(&'a self, physics: &'a Physics) -> GoalCheck<'a> {
         let qpos = physics.data().qpos();
         GoalCheck {
@@ -135,7 +135,7 @@ impl Table {
         }
     }
 
-    /// Stores the present pose and locks as those before the next step.
+    /// Stores the present pose and locks as the pose and locks before the next step.
     pub(super) fn store_previous(&mut self, physics: &Physics) {
         let (qpos, qvel) = (physics.data().qpos(), physics.data().qvel());
         self.previous[..qpos.len()].copy_from_slice(qpos);
@@ -198,8 +198,8 @@ impl Table {
         }
     }
 
-    /// Computes the observation at the goal; the physics is in the goal pose afterwards. The reference computes no such
-    /// observation in data collection.
+    /// Computes the observation at the goal; the physics is in the goal pose afterwards. In data collection, the
+    /// observation is not computed, as in the reference.
     pub(super) fn observe_goal(&mut self, physics: &mut Physics) {
         self.goal.observed = true;
         if self.mode == Mode::DataCollection {
@@ -245,8 +245,8 @@ impl Task for Table {
         let success = self.is_success(physics);
         let reward = match self.mode {
             Mode::FixedTask(_) => {
-                let terms = self.goal_check(physics);
-                -terms.terms(self.goal.subject).map(|term| f64::from(!term.reached)).sum::<f64>()
+                let check = self.goal_check(physics);
+                -check.terms(self.goal.subject).map(|term| f64::from(!term.reached)).sum::<f64>()
             }
             _ => f64::from(success),
         };
@@ -302,7 +302,8 @@ impl Task for Table {
             position.copy_from_slice(&values[..3]);
             rotation.copy_from_slice(&values[3..]);
         }
-        // Planning restores thousands of states of one episode, all with the same goal, so its observation is cached.
+        // Planning restores thousands of states of one episode, all with the same goal, so the goal's observation is
+        // cached.
         if self.goal.pose != pose || self.goal.contact != head[5] {
             self.goal.pose.copy_from_slice(pose);
             self.goal.contact = head[5];

@@ -1,8 +1,8 @@
 //! Third-party assets that the environments need and this project does not ship: MuJoCo's library, and the models and
 //! meshes of three Python packages.
 //!
-//! Each asset is a Python wheel of a pinned version and SHA-256. [`install`] downloads it with `pip download`, checks
-//! it, and unpacks the required files to `NAME-VERSION/` in [`folder`]; this folder appears only when the
+//! Each asset is a Python wheel of a pinned version and SHA-256. [`install`] downloads the wheel with `pip download`,
+//! checks its hash, and unpacks the required files to `NAME-VERSION/` in [`folder`]; this folder appears only when the
 //! installation is complete. It contains a list of its files with their hashes; [`verify`] compares the files with the
 //! list.
 //!

@@ -6,8 +6,8 @@
 //! loading calls [`not_loaded`].
 //!
 //! The module also replaces MuJoCo's error handling. By default MuJoCo writes errors to `MUJOCO_LOG.TXT` in the working
-//! directory and exits the process. Here, messages go to the program's log, and an error inside [`guard`] unwinds to it
-//! and is returned as an [`Error`].
+//! directory and exits the process. Here, messages go to the program's log, and an error inside [`guard`] unwinds to
+//! `guard`, which returns an [`Error`].
 #![allow(unsafe_code, reason = "foreign symbols, a table of addresses, and a handler that MuJoCo calls")]
 
 mod symbols;
@@ -183,7 +183,7 @@ unsafe extern "C-unwind" fn on_message(message: *const Message) {
     };
     if message.level == mjtLogLevel::mjLOG_ERROR as i32 {
         if GUARDED.get() {
-            // Not a panic, so no panic hook prints it; `guard` catches it.
+            // `resume_unwind` runs no panic hook, so nothing is printed; `guard` catches the unwinding.
             resume_unwind(Box::new(Fault(text)));
         }
         tracing::error!("MuJoCo: {text}");

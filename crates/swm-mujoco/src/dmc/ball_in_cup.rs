@@ -33,7 +33,7 @@ pub struct BallInCup {
 }
 
 impl BallInCup {
-    /// Whether the whole ball is inside the cup, in the plane of its motion.
+    /// Whether the whole ball is inside the cup along x and z.
     fn caught(&self, physics: &Physics) -> bool {
         let (inside, ball) = (physics.data().site_xpos()[self.inside], physics.data().xpos()[self.ball]);
         let (room, size) = (physics.model().site_size()[self.inside], physics.model().geom_size()[self.ball_geom][0]);

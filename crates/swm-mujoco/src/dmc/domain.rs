@@ -67,7 +67,7 @@ pub trait Domain: Send + Sized + 'static {
     const INFO: &'static [InfoColumn<Self>] = &[];
     /// Joints that goals do not include.
     const IGNORED_JOINTS: &'static [&'static str] = &[];
-    /// The number of values that describe the task's target, if it differs between episodes.
+    /// The number of values that describe a target that is drawn per episode; 0 without such a target.
     const TARGET_LEN: usize = 0;
     /// The largest difference from the goal at each joint, in radians or metres.
     const GOAL_TOLERANCE: f64 = 0.1;

@@ -60,7 +60,7 @@ impl GoalCoordinates {
         })
     }
 
-    /// Whether every coordinate of `qpos` differs from that of `goal` by less than `tolerance`.
+    /// Whether every coordinate of `qpos` differs from the coordinate of `goal` by less than `tolerance`.
     pub fn reached(&self, qpos: &[f64], goal: &[f64], tolerance: f64) -> bool {
         self.differences(qpos, goal).all(|difference| difference < tolerance)
     }

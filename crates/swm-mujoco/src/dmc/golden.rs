@@ -129,7 +129,7 @@ fn replay_one<D: Domain>(file: &Path) -> Worst {
     physics.set_state(&state).expect("setting the state");
     physics.forward_passive();
 
-    // The columns as in an environment: `state` and `unstable`, then those of the task.
+    // The columns of the environment: `state` and `unstable`, then the columns of the task.
     let common_columns = [ColumnSpec::new("state", DType::Float64, [1]), ColumnSpec::new("unstable", DType::Bool, [])];
     let specs: Vec<ColumnSpec> = common_columns.into_iter().chain(spec.columns.clone()).collect();
     let row = Batch::zeros(&Schema::new(specs).expect("creating the schema"), 1);

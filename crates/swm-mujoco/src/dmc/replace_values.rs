@@ -28,8 +28,8 @@ pub fn replace_values(model: &mut MjModel, other: &MjModel) -> Result<()> {
         }
     }
     // SAFETY: the ranges lie in the buffers of two models, and `model` is borrowed exclusively. The arrays in them have
-    // equal lengths, so every index of one is valid in the other; the texture sizes lie between the ranges and are not
-    // copied.
+    // equal lengths, so every index of one model is valid in the other model; the texture sizes lie between the ranges
+    // and are not copied.
     unsafe {
         let (to, source) = (model.ffi_mut(), other.ffi());
         for (to_range, range) in [(head, from.0), (tail, from.1)] {

@@ -1,4 +1,4 @@
-//! The environment of any [`Domain`]: [`SuiteTask`] runs it in the shared MuJoCo environment.
+//! [`SuiteTask`]: runs a task of any [`Domain`] in [`MujocoEnv`], the environment shared by all families.
 
 use super::domain::Domain;
 use super::goal::GoalCoordinates;

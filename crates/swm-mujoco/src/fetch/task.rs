@@ -64,7 +64,7 @@ pub struct Fetch {
     goal: Vec3,
     /// `qpos` and `qvel` of a pose at the goal.
     goal_pose: Vec<f64>,
-    /// Whether the reset requested each of [`START_FACTORS`]; those not requested are drawn.
+    /// Whether the reset requested each of [`START_FACTORS`]; factors that are not requested are drawn.
     requested: [bool; 3],
 }
 

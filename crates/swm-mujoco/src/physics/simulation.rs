@@ -39,7 +39,7 @@ pub struct Physics {
     pub(super) hooks: Option<Arc<dyn StepHooks>>,
     /// Scratch memory for the contacts that the hooks return.
     pub(super) contacts: Vec<mjContact>,
-    /// Whether the model may differ from the original.
+    /// Whether the model may differ from `original`.
     edited: bool,
     appearance: Appearance,
     /// Whether the texture hashes of `appearance` may be out of date.

@@ -18,7 +18,7 @@ impl Physics {
         self.guarded("resetting", || unsafe { ffi::mj_resetData(model, data) });
     }
 
-    /// Computes everything derived from the state (`mj_forward`) without advancing time.
+    /// Computes all derived quantities (`mj_forward`) without advancing time.
     pub fn forward(&mut self) {
         self.set_derivation(Derivation::Forward);
         self.derive();
@@ -116,7 +116,7 @@ impl Physics {
             ffi::mj_checkVel(model, data);
         })?;
         self.forward_with_hooks(&hooks)?;
-        // SAFETY: as above.
+        // SAFETY: model and data are valid and belong together; the calls are those of `mj_step`, in its order.
         self.guarded("stepping", || unsafe {
             ffi::mj_checkAcc(model, data);
             ffi::mj_Euler(model, data);
@@ -143,7 +143,7 @@ impl Physics {
         let found = unsafe { array((*data).contact, (*data).ncon) };
         hooks.replace_contacts(self.data.model(), poses, found, &mut self.contacts);
         let contacts = std::mem::take(&mut self.contacts);
-        // SAFETY: as for the first stages; the two helpers have the same requirements.
+        // SAFETY: model and data are valid and belong together, which the two helpers also require.
         let done = self.guarded("computing constraints", || unsafe {
             write_contacts(model, data, &contacts);
             ffi::mj_makeConstraint(model, data);

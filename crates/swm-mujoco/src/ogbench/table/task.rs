@@ -162,7 +162,7 @@ impl Table {
     }
 
     /// Moves cubes that left the workspace to the middle of the table. This happens when a drawer with a cube inside is
-    /// locked while it moves. The reference moves them to a random position.
+    /// locked while it moves. The reference moves such cubes to a random position.
     fn return_lost_cubes(&self, physics: &mut Physics) {
         let [low, high] = WORKSPACE;
         for cube in &self.parts.cubes {

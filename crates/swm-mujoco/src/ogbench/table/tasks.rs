@@ -28,7 +28,7 @@ pub const SINGLE: &[Task] = &[
     cubes(&[[0.35, 0.2, 0.02]], &[[0.5, -0.2, 0.02]]),
 ];
 
-/// Two cubes: move one, move both, spread, swap, stack.
+/// Two cubes: move one cube, move both cubes, spread, swap, stack.
 pub const DOUBLE: &[Task] = &[
     cubes(&[[0.425, 0.0, 0.02], [0.425, -0.1, 0.02]], &[[0.425, 0.0, 0.02], [0.425, 0.1, 0.02]]),
     cubes(&[[0.35, -0.1, 0.02], [0.5, -0.1, 0.02]], &[[0.35, 0.1, 0.02], [0.5, 0.1, 0.02]]),
@@ -199,8 +199,8 @@ pub const OCTUPLE: &[Task] = &[
     ),
 ];
 
-/// Open both fixtures; close and lock both; rearrange; cube into the drawer; cube into the locked drawer with the
-/// window open.
+/// The scene: open drawer and window; close and lock them; move cube, drawer and window; put the cube into the drawer;
+/// put the cube into the drawer and open the window, both locked at start and goal.
 pub const SCENE: &[Task] = &[
     scene(
         [&[[0.35, 0.05, 0.02]], &[[0.35, 0.05, 0.02]]],

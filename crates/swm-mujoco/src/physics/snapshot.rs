@@ -90,12 +90,12 @@ impl Physics {
     /// When the values were not written by [`Physics::save`].
     pub fn load(&mut self, saved: &[f64]) -> Result<()> {
         let kinds = [Derivation::Forward, Derivation::ForwardPassive, Derivation::Step, Derivation::ControlStep];
-        let parts = saved.split_first_chunk::<2>();
-        let parts = parts.and_then(|(&[unstable, kind], state)| {
+        let split = saved.split_first_chunk::<2>();
+        let decoded = split.and_then(|(&[unstable, kind], state)| {
             let derivation = kinds.into_iter().find(|&known| f64::from(known as u8) == kind)?;
             Some((unstable != 0.0, derivation, state))
         });
-        let Some((unstable, derivation, state)) = parts else {
+        let Some((unstable, derivation, state)) = decoded else {
             return Err(Error::mismatch("restoring a MuJoCo state", format!("{saved:?}"), "values that `save` wrote"));
         };
         self.write_state(state)?;

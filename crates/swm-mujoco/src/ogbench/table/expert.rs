@@ -171,9 +171,9 @@ impl Inputs {
         };
         let grid =
             (0..6).flat_map(|i| (0..13).map(move |j| [0.3 + 0.05 * f64::from(i), -0.3 + 0.05 * f64::from(j), 0.02]));
-        let here = self.cubes[cube].0;
+        let cube_position = self.cubes[cube].0;
         let free = grid.filter(is_free);
-        free.min_by(|a, b| horizontal_distance(*a, here).total_cmp(&horizontal_distance(*b, here)))
+        free.min_by(|a, b| horizontal_distance(*a, cube_position).total_cmp(&horizontal_distance(*b, cube_position)))
             .unwrap_or([0.425, 0.0, 0.02])
     }
 

@@ -2,7 +2,7 @@
 //! those of the reference.
 
 use super::config::{CUBE_COLORS, Camera, FRONT, SIDE, TableConfig};
-use super::parts::Parts;
+use super::objects::Objects;
 use crate::Physics;
 use crate::ogbench::arm::find;
 use crate::ogbench::arm::pose::{Quat, Vec3, cross, norm, normalized, scale, sub};
@@ -71,7 +71,7 @@ fn color(value: &[f64]) -> [f32; 3] {
 ///
 /// # Errors
 /// When the model lacks an element.
-pub fn apply(physics: &mut Physics, config: &TableConfig, parts: &Parts, factors: &FactorValues) -> Result<()> {
+pub fn apply(physics: &mut Physics, config: &TableConfig, objects: &Objects, factors: &FactorValues) -> Result<()> {
     let find = |physics: &Physics, kind, name: &str| find(physics.model(), kind, name);
     for name in GRIPPER_MATERIALS {
         let material = find(physics, mjOBJ_MATERIAL, name)?;
@@ -86,7 +86,7 @@ pub fn apply(physics: &mut Physics, config: &TableConfig, parts: &Parts, factors
         let Some(camera) = config.cameras.iter().find(|camera| camera.name == name) else { continue };
         physics.model_mut().cam_quat_mut()[at] = rotated_camera(camera, [angle[0], angle[1]]);
     }
-    for (i, cube) in parts.cubes.iter().enumerate() {
+    for (i, cube) in objects.cubes.iter().enumerate() {
         let color = color(&factors.get("cube.color")[3 * i..][..3]);
         let half = factors.get("cube.size")[i];
         for (body, geom) in cube.bodies.into_iter().zip(cube.geoms) {
@@ -97,7 +97,7 @@ pub fn apply(physics: &mut Physics, config: &TableConfig, parts: &Parts, factors
     physics.set_const();
     // Markers are moved relative to their bodies. MuJoCo would skip the transform of geoms that coincide with their
     // bodies.
-    for cube in &parts.cubes {
+    for cube in &objects.cubes {
         physics.model_mut().geom_sameframe_mut()[cube.geoms[1]] = mjtSameFrame::mjSAMEFRAME_NONE;
     }
     set_mean_inertia(physics);
@@ -185,9 +185,9 @@ mod tests {
         let all = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
         let bytes = |seeds: &[u64]| -> Result<Vec<u8>> {
             let mut physics = Physics::new(Arc::clone(&model))?;
-            let parts = Parts::new(physics.model(), config)?;
+            let objects = Objects::new(physics.model(), config)?;
             for &seed in seeds {
-                apply(&mut physics, config, &parts, &space.resolve(&all, Key::new(seed))?)?;
+                apply(&mut physics, config, &objects, &space.resolve(&all, Key::new(seed))?)?;
                 physics.reset();
                 physics.forward();
             }

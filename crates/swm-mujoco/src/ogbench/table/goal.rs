@@ -1,7 +1,7 @@
 //! The goal of a table environment: its objects, its success criterion, and the distance to the goal.
 
 use super::config::FixtureState;
-use super::parts::Parts;
+use super::objects::Objects;
 use crate::ogbench::arm::pose::{Quat, Vec3, distance};
 
 /// The distance within which cubes and openings are at their goal, in metres.
@@ -62,7 +62,7 @@ pub struct GoalTerm {
 /// The comparison of a state with a goal.
 pub struct GoalCheck<'a> {
     /// The indices of all objects.
-    pub parts: &'a Parts,
+    pub objects: &'a Objects,
     /// The joint positions of the state.
     pub qpos: &'a [f64],
     /// The positions of all sites, in metres.
@@ -80,13 +80,13 @@ impl GoalCheck<'_> {
     pub fn terms(&self, subject: Subject) -> impl Iterator<Item = GoalTerm> {
         let included = move |one: Subject| subject == Subject::All || subject == one;
         let within = |distance: f64, grip| GoalTerm { distance, reached: distance <= GOAL_TOLERANCE, grip };
-        let cubes = self.parts.cubes.iter().enumerate().filter(move |(i, _)| included(Subject::Cube(*i))).map(
+        let cubes = self.objects.cubes.iter().enumerate().filter(move |(i, _)| included(Subject::Cube(*i))).map(
             move |(i, cube)| {
                 let position = cube.position(self.qpos);
                 within(distance(position, self.cubes[i].0), position)
             },
         );
-        let fixtures = self.parts.fixtures.iter().flat_map(move |fixtures| {
+        let fixtures = self.objects.fixtures.iter().flat_map(move |fixtures| {
             let button = |i: usize| {
                 let is_equal = self.now.buttons[i] == self.goal.buttons[i];
                 let distance = if is_equal { 0.0 } else { WRONG_LOCK_DISTANCE };

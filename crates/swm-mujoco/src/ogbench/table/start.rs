@@ -76,7 +76,7 @@ impl Table {
         physics.data_mut().qpos_mut().copy_from_slice(&initial_qpos);
         physics.data_mut().qvel_mut().fill(0.0);
         self.set_gripper(physics, gripper, rng);
-        for (cube, &i) in self.parts.cubes.iter().zip(&order) {
+        for (cube, &i) in self.objects.cubes.iter().zip(&order) {
             let [x, y, z] = task.starts[i];
             let mut noise = || rng.random_range(-START_NOISE..=START_NOISE);
             let position = [x + noise(), y + noise(), z];
@@ -99,7 +99,7 @@ impl Table {
     ) {
         (self.goal.subject, self.goal.cubes, self.goal.fixtures) = (Subject::All, cubes, fixtures);
         self.set_gripper(physics, gripper, rng);
-        for (cube, &(position, rotation)) in self.parts.cubes.iter().zip(&self.goal.cubes) {
+        for (cube, &(position, rotation)) in self.objects.cubes.iter().zip(&self.goal.cubes) {
             cube.set_pose(physics, position, rotation);
         }
         self.move_marker_bodies(physics);
@@ -131,7 +131,7 @@ impl Table {
 
     /// Sets drawer, window and locks.
     fn set_fixtures(&mut self, physics: &mut Physics, state: FixtureState) {
-        if let Some(fixtures) = self.parts.fixtures {
+        if let Some(fixtures) = self.objects.fixtures {
             self.buttons = state.buttons;
             fixtures.set_openings(physics, state);
         }
@@ -141,7 +141,7 @@ impl Table {
     fn begin_from_factors(&mut self, physics: &mut Physics, factors: &FactorValues, rng: &mut Rng) {
         self.set_gripper(physics, factors.get("agent.ee_start_position"), rng);
         let (positions, yaws) = (factors.get("cube.start_position"), factors.get("cube.start_yaw"));
-        for (i, cube) in self.parts.cubes.iter().enumerate() {
+        for (i, cube) in self.objects.cubes.iter().enumerate() {
             cube.set_pose(physics, [positions[2 * i], positions[2 * i + 1], CUBE_HEIGHT], about_z(yaws[i]));
         }
         let fixtures = FixtureState {
@@ -156,9 +156,9 @@ impl Table {
         let start = physics.data().qpos().to_vec();
         if let Subject::Cube(i) = self.goal.subject {
             let (position, rotation) = self.goal.cubes[i];
-            self.parts.cubes[i].set_pose(physics, position, rotation);
+            self.objects.cubes[i].set_pose(physics, position, rotation);
         }
-        if let Some(fixtures) = self.parts.fixtures {
+        if let Some(fixtures) = self.objects.fixtures {
             fixtures.set_openings(physics, self.goal.fixtures);
         }
         self.store_goal(physics);
@@ -195,7 +195,7 @@ impl Table {
     /// position.
     fn draw_cube(&mut self, physics: &Physics, now: FixtureState, factors: &FactorValues, rng: &mut Rng) {
         let qpos = physics.data().qpos();
-        let positions: Vec<Vec3> = self.parts.cubes.iter().map(|cube| cube.position(qpos)).collect();
+        let positions: Vec<Vec3> = self.objects.cubes.iter().map(|cube| cube.position(qpos)).collect();
         let above = |a: Vec3, b: Vec3| b[2] > a[2] && (a[0] - b[0]).hypot(a[1] - b[1]) < 0.02;
         let is_top = |&i: &usize| !positions.iter().any(|&b| above(positions[i], b));
         let tops: Vec<usize> = (0..positions.len()).filter(is_top).collect();
@@ -232,7 +232,7 @@ impl Table {
         let (contact, previous) = (self.contact, self.previous.clone());
         let qpos = physics.data().qpos();
         let now = self.fixture_state(qpos);
-        let positions: Vec<Vec3> = self.parts.cubes.iter().map(|cube| cube.position(qpos)).collect();
+        let positions: Vec<Vec3> = self.objects.cubes.iter().map(|cube| cube.position(qpos)).collect();
         for _ in 0..TRIES {
             let Some(mut cubes) = self.draw_cube_poses(rng) else { continue };
             let mut fixtures = now;

@@ -3,7 +3,7 @@
 use super::config::{AWAY, CUBE_HEIGHT, FRONT, FixtureState, TableConfig, WORKSPACE, observation_len};
 use super::factors;
 use super::goal::{GoalCheck, Subject};
-use super::parts::Parts;
+use super::objects::Objects;
 use crate::Physics;
 use crate::ogbench::arm::pose::{IDENTITY, Pose, Quat, Vec3};
 use crate::ogbench::arm::{Arm, Proprioception, find};
@@ -42,7 +42,7 @@ pub struct Table {
     /// Whether an episode terminates at its goal.
     terminate: bool,
     pub(super) arm: Arm,
-    pub(super) parts: Parts,
+    pub(super) objects: Objects,
     camera: usize,
     lock_colors: [[f32; 3]; 2],
     /// The locks: 0 locked, 1 unlocked.
@@ -93,7 +93,7 @@ impl Table {
             permute,
             terminate,
             arm: Arm::new(model)?,
-            parts: Parts::new(model, config)?,
+            objects: Objects::new(model, config)?,
             camera: find(model, mjOBJ_CAMERA, FRONT)?,
             lock_colors: [[0.0; 3]; 2],
             buttons: [0; 2],
@@ -114,7 +114,7 @@ impl Table {
 
     /// The state of the fixtures in a configuration.
     pub(super) fn fixture_state(&self, qpos: &[f64]) -> FixtureState {
-        self.parts.fixtures.map_or_else(FixtureState::default, |fixtures| fixtures.state(qpos, self.buttons))
+        self.objects.fixtures.map_or_else(FixtureState::default, |fixtures| fixtures.state(qpos, self.buttons))
     }
 
     /// The state of the gripper.
@@ -126,7 +126,7 @@ impl Table {
     fn goal_check<'a>(&'a self, physics: &'a Physics) -> GoalCheck<'a> {
         let qpos = physics.data().qpos();
         GoalCheck {
-            parts: &self.parts,
+            objects: &self.objects,
             qpos,
             sites: physics.data().site_xpos(),
             now: self.fixture_state(qpos),
@@ -150,7 +150,7 @@ impl Table {
         physics.step(SUBSTEPS);
         physics.contact_forces();
         self.contact = self.arm.contact(physics);
-        if let Some(fixtures) = self.parts.fixtures {
+        if let Some(fixtures) = self.objects.fixtures {
             if matches!(self.mode, Mode::RandomTask | Mode::FixedTask(_)) {
                 self.return_lost_cubes(physics);
             }
@@ -165,7 +165,7 @@ impl Table {
     /// locked while it moves. The reference moves such cubes to a random position.
     fn return_lost_cubes(&self, physics: &mut Physics) {
         let [low, high] = WORKSPACE;
-        for cube in &self.parts.cubes {
+        for cube in &self.objects.cubes {
             let at = cube.position(physics.data().qpos());
             if (0..3).any(|i| at[i] <= low[i] - LOST_DISTANCE || at[i] >= high[i] + LOST_DISTANCE) {
                 let [x, y] = self.config.factors.cube;
@@ -177,11 +177,11 @@ impl Table {
 
     /// Updates the parts of the model that display locks and goal.
     pub(super) fn update_model(&self, physics: &mut Physics) {
-        if let Some(fixtures) = self.parts.fixtures {
+        if let Some(fixtures) = self.objects.fixtures {
             fixtures.apply_locks(physics, self.buttons, &self.lock_colors);
             fixtures.place_markers(physics, self.goal.fixtures);
         }
-        for (i, cube) in self.parts.cubes.iter().enumerate() {
+        for (i, cube) in self.objects.cubes.iter().enumerate() {
             let included = matches!(self.goal.subject, Subject::All) || self.goal.subject == Subject::Cube(i);
             cube.set_marker_visible(physics, included);
         }
@@ -190,7 +190,7 @@ impl Table {
     /// Moves the mocap bodies of the cubes' markers, which are part of the state, to the goal. Called at the start of
     /// an episode.
     pub(super) fn move_marker_bodies(&self, physics: &mut Physics) {
-        for (cube, &(position, rotation)) in self.parts.cubes.iter().zip(&self.goal.cubes) {
+        for (cube, &(position, rotation)) in self.objects.cubes.iter().zip(&self.goal.cubes) {
             let at = Pose { position, rotation };
             cube.place_marker(physics, at, at);
             physics.data_mut().mocap_pos_mut()[cube.mocap] = position;
@@ -230,7 +230,7 @@ impl Task for Table {
         if self.config.fixtures {
             self.lock_colors = factors::lock_colors(factors);
         }
-        factors::apply(physics, self.config, &self.parts, factors)?;
+        factors::apply(physics, self.config, &self.objects, factors)?;
         self.update_model(physics);
         Ok(())
     }
@@ -315,10 +315,10 @@ impl Task for Table {
         let pose = &state[1..=self.goal.pose.len()];
         self.goal.pose.copy_from_slice(pose);
         (self.goal.subject, self.goal.contact) = (Subject::All, task_state[0]);
-        for (goal, cube) in self.goal.cubes.iter_mut().zip(&self.parts.cubes) {
+        for (goal, cube) in self.goal.cubes.iter_mut().zip(&self.objects.cubes) {
             *goal = (cube.position(pose), cube.rotation(pose));
         }
-        if let Some(fixtures) = self.parts.fixtures {
+        if let Some(fixtures) = self.objects.fixtures {
             self.goal.fixtures = fixtures.state(pose, locks(&task_state[1..]));
         }
         self.observe_goal(physics);
@@ -337,7 +337,7 @@ impl Task for Table {
         // Positions and quaternions of the mocap bodies are at the end of a state.
         let n = self.config.cubes;
         let (positions, quats) = state[state.len() - 7 * n..].split_at(3 * n);
-        for (cube, &(position, rotation)) in self.parts.cubes.iter().zip(&self.goal.cubes) {
+        for (cube, &(position, rotation)) in self.objects.cubes.iter().zip(&self.goal.cubes) {
             let body = Pose {
                 position: std::array::from_fn(|i| positions[3 * cube.mocap + i]),
                 rotation: std::array::from_fn(|i| quats[4 * cube.mocap + i]),
@@ -351,7 +351,7 @@ impl Task for Table {
         physics.data_mut().qpos_mut().copy_from_slice(qpos);
         physics.data_mut().qvel_mut().copy_from_slice(qvel);
         self.move_marker_bodies(physics);
-        if let Some(fixtures) = self.parts.fixtures {
+        if let Some(fixtures) = self.objects.fixtures {
             fixtures.apply_locks(physics, self.goal.fixtures.buttons, &self.lock_colors);
         }
         physics.forward();

@@ -28,7 +28,7 @@ struct Group {
 pub(super) fn fill(assets: &mut Assets, model: &MjModel, appearance: &Appearance) {
     static CACHE: Mutex<Vec<(u64, Group)>> = Mutex::new(vec![]);
     let mut cache = CACHE.lock().unwrap_or_else(PoisonError::into_inner);
-    let (number, mut group) = match cache.iter().position(|(number, _)| *number == appearance.group) {
+    let (group_number, mut group) = match cache.iter().position(|(group_number, _)| *group_number == appearance.group) {
         Some(index) => cache.remove(index),
         None => {
             let meshes = (0..model.mesh_vertadr().len()).map(|i| Arc::new(mesh(model, i)));
@@ -51,7 +51,7 @@ pub(super) fn fill(assets: &mut Assets, model: &MjModel, appearance: &Appearance
     if cache.len() >= MAX_GROUPS {
         cache.remove(0);
     }
-    cache.push((number, group));
+    cache.push((group_number, group));
 }
 
 /// Converts a count or an address of MuJoCo to an index; 0 for negative values.
@@ -69,11 +69,11 @@ fn mesh(model: &MjModel, asset: usize) -> Mesh {
         let positions = model.mesh_face()[face].map(|i| model.mesh_vert()[vertices + index(i)]);
         let flat = face_normal(positions);
         std::array::from_fn(|k| {
-            let own = model.mesh_normal()[normals + index(model.mesh_facenormal()[face][k])];
-            let smooth = own.iter().zip(flat).map(|(a, b)| a * b).sum::<f32>() >= SMOOTH_COSINE;
+            let vertex_normal = model.mesh_normal()[normals + index(model.mesh_facenormal()[face][k])];
+            let smooth = vertex_normal.iter().zip(flat).map(|(a, b)| a * b).sum::<f32>() >= SMOOTH_COSINE;
             Corner {
                 position: positions[k],
-                normal: if coordinates.is_some() || smooth { own } else { flat },
+                normal: if coordinates.is_some() || smooth { vertex_normal } else { flat },
                 coordinates: coordinates
                     .map_or([0.0; 2], |first| model.mesh_texcoord()[first + index(model.mesh_facetexcoord()[face][k])]),
             }

@@ -66,14 +66,14 @@ pub fn edge_contacts(a: &OrientedBox, b: &OrientedBox, edges: &Edges, margin: f6
             }
             let limit = size[q] * side;
             let fraction = (limit - projected_start[q]) * (1.0 / projected_edge[q]);
-            let other = projected_start[1 - q] + projected_edge[1 - q] * fraction;
+            let cross_coordinate = projected_start[1 - q] + projected_edge[1 - q] * fraction;
             let distance = (start[2] + edge[2] * fraction) * along_normal;
-            if !(0.0..=1.0).contains(&fraction) || other.abs() > size[1 - q] || distance > margin {
+            if !(0.0..=1.0).contains(&fraction) || cross_coordinate.abs() > size[1 - q] || distance > margin {
                 continue;
             }
             let mut at = add(start, edge, fraction).map(|x| 0.5 * x);
             at[q] += 0.5 * limit;
-            at[1 - q] += 0.5 * other;
+            at[1 - q] += 0.5 * cross_coordinate;
             add_contact(&mut contacts, at, distance);
         }
     }

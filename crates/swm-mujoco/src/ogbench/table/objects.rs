@@ -1,4 +1,4 @@
-//! [`Parts`]: indices of cubes, buttons, drawer and window in a model, and functions that read and move these objects.
+//! [`Objects`]: indices of cubes, buttons, drawer and window in a model, and functions that read and move them.
 
 use super::config::{FixtureState, TableConfig};
 use crate::Physics;
@@ -69,7 +69,7 @@ pub struct Fixtures {
 
 /// The indices of all objects on a table.
 #[derive(Clone, Debug)]
-pub struct Parts {
+pub struct Objects {
     /// The cubes.
     pub cubes: Vec<Cube>,
     /// Buttons, drawer and window, in the scene only.
@@ -83,7 +83,7 @@ const DAMPING: [f64; 2] = [1e6, 2.0];
 /// The colour of unlocked fixtures.
 const UNLOCKED_COLOR: [f32; 3] = [0.9; 3];
 
-impl Parts {
+impl Objects {
     /// Finds the objects of a table in a model.
     ///
     /// # Errors

@@ -10,7 +10,7 @@ use swm_core::{Action, Batch, Key, ResetOptions, Schema};
 use swm_mujoco::physics::{Physics, compile_file};
 use swm_mujoco::{ENVS, assets};
 
-/// The number of rounds. The fastest round of each side counts, because other load on the machine only slows rounds.
+/// The number of rounds. The fastest round counts, because other load on the machine only slows rounds.
 const ROUNDS: usize = 15;
 
 /// The CPU time of this thread, which does not include time spent waiting for other processes.
@@ -38,7 +38,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let (start, start_state) = (env.snapshot(), row.row(0).to_f64("state")?);
 
         let mut physics = Physics::new(Arc::new(compile_file(&suite.join(file))?))?;
-        let [mut whole, mut raw] = [Duration::MAX; 2];
+        let [mut env_time, mut mujoco_time] = [Duration::MAX; 2];
         for _ in 0..ROUNDS {
             env.restore(&start)?;
             let clock = cpu_time()?;
@@ -46,7 +46,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 env.step(Action::Continuous(action))?;
                 env.observe(&mut row.row_mut(0));
             }
-            whole = whole.min(cpu_time()? - clock);
+            env_time = env_time.min(cpu_time()? - clock);
 
             physics.set_state(&start_state[..physics.state_len()])?;
             let clock = cpu_time()?;
@@ -55,11 +55,15 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 data.ctrl_mut().iter_mut().zip(action).for_each(|(control, &action)| *control = f64::from(action));
                 (0..substeps).for_each(|_| data.step());
             }
-            raw = raw.min(cpu_time()? - clock);
+            mujoco_time = mujoco_time.min(cpu_time()? - clock);
         }
         let rate = |time: Duration| f64::from(steps) / time.as_secs_f64();
-        let overhead = (whole.as_secs_f64() / raw.as_secs_f64() - 1.0) * 100.0;
-        println!("{id}: {:.0} steps/s, mj_step alone {:.0}; {overhead:.1} % overhead", rate(whole), rate(raw));
+        let overhead = (env_time.as_secs_f64() / mujoco_time.as_secs_f64() - 1.0) * 100.0;
+        println!(
+            "{id}: {:.0} steps/s, mj_step alone {:.0}; {overhead:.1} % overhead",
+            rate(env_time),
+            rate(mujoco_time)
+        );
 
         let envs = (0..4).map(|_| entry.env()).collect::<Result<Vec<_>, _>>()?;
         let mut pool = EnvPool::new(envs, None, Some(usize::MAX), threads(2)?)?;

@@ -5,7 +5,8 @@
 //! SWM_GOLDEN_IMAGES=DIR cargo nextest run --release -p swm-mujoco golden
 //! cargo run --release -p swm-mujoco --example golden_sheet_3d DIR
 //! ```
-//! The golden tests write triptychs to the folder: the recorded frame, that of the CPU renderer, and their difference.
+//! The golden tests write triptychs to the folder: the recorded frame, the frame of the CPU renderer, and their
+//! difference.
 #![allow(clippy::print_stdout, reason = "a command-line program")]
 
 use std::fmt::Write as _;
@@ -14,9 +15,9 @@ use std::io::{BufReader, BufWriter};
 use std::path::Path;
 use swm_mujoco::ENVS;
 
-/// Side of a cell, in pixels.
+/// Side of a frame in the sheet, in pixels.
 const CELL: usize = 66;
-/// Gap between the cells of two triptychs, in pixels.
+/// Gap between two triptychs in the sheet, in pixels.
 const GAP: usize = 4;
 
 type Failure = Box<dyn std::error::Error>;
@@ -30,7 +31,7 @@ struct Image {
 impl Image {
     fn read(path: &Path) -> Result<Self, Failure> {
         let mut reader = png::Decoder::new(BufReader::new(File::open(path)?)).read_info()?;
-        let mut rgb = vec![0; reader.output_buffer_size().ok_or("no size")?];
+        let mut rgb = vec![0; reader.output_buffer_size().ok_or("the image is too large")?];
         let width = reader.next_frame(&mut rgb)?.width as usize;
         Ok(Self { width, rgb })
     }
@@ -43,7 +44,7 @@ impl Image {
         3.0 * total / self.rgb.len() as f64
     }
 
-    /// Shrinks a triptych to three cells by averaging pixels.
+    /// Shrinks the three frames of a triptych to [`CELL`] pixels a side by averaging pixels.
     fn shrunk(&self) -> Self {
         let (third, height) = (self.width / 3, self.rgb.len() / 3 / self.width);
         let mut rgb = vec![];

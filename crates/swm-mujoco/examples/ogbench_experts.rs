@@ -1,11 +1,11 @@
-//! Success rates of OGBench's experts: `ogbench_experts [SEEDS] [ID …]` runs 200 seeds with default factors and 200
-//! with all varied, towards the goals of resets and towards sampled ones.
+//! Measures success rates of OGBench's experts: `ogbench_experts [SEEDS] [ID …]` runs SEEDS episodes (default 200) with
+//! default factors and as many with all factors varied, towards the goals of resets and towards sampled goals.
 #![allow(clippy::print_stdout, reason = "a command-line program")]
 
 use swm_core::{Action, Batch, Key, ResetOptions, Result, Schema, VariationRequest};
 use swm_mujoco::ENVS;
 
-/// The environments if none are given.
+/// The environments that are measured if no ID is given.
 const DEFAULT_IDS: [&str; 7] = [
     "swm/OGBCube-v0",
     "swm/OGBCube-v0,env_type=double",
@@ -16,7 +16,7 @@ const DEFAULT_IDS: [&str; 7] = [
     "swm/OGBMaze-v0",
 ];
 
-/// Steps to the goal of the episodes that reach it, sorted.
+/// Returns the sorted numbers of steps of the episodes that reach their goals.
 fn trial(id: &str, varied: bool, sampled: bool, seeds: u64) -> Result<Vec<usize>> {
     let choice = ENVS.choose(id)?;
     let (mut env, mut expert) = (choice.env()?, (choice.entry.experts[0].make)());

@@ -1,6 +1,6 @@
-//! Frames per second on one thread, and steps with a frame each, for several environments:
-//! `render_speed RENDERER SIZE SECONDS ENV…`. CPU time of the thread is measured, except for OpenGL, which renders on
-//! other threads.
+//! Measures frames per second, and steps with a rendered frame per second, of several environments on one thread:
+//! `render_speed RENDERER SIZE SECONDS ENV…`. Speeds are per CPU time of the thread; for OpenGL, which renders on other
+//! threads, the elapsed time of rendering is measured.
 
 use std::time::{Duration, Instant};
 use swm_core::{Action, FrameMut, ResetOptions};
@@ -15,8 +15,8 @@ fn cpu_time() -> Duration {
 
 #[allow(clippy::print_stdout, reason = "a command-line program")]
 fn main() -> swm_core::Result<()> {
-    let words: Vec<String> = std::env::args().skip(1).collect();
-    let [renderer, size, seconds, ids @ ..] = &words[..] else {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let [renderer, size, seconds, ids @ ..] = &arguments[..] else {
         println!("render_speed auto|cpu|egl SIZE SECONDS ENV…");
         return Ok(());
     };

@@ -1,4 +1,4 @@
-//! Steps every environment with all factors varied, reset after reset, and reports memory use: `soak [STEPS]`. The
+//! Steps every environment in short episodes with all factors varied, and reports memory use: `soak [STEPS]`. The
 //! steps (a million by default) are divided among the environments, which run in parallel pools.
 #![allow(clippy::print_stdout, reason = "a command-line program")]
 
@@ -7,9 +7,9 @@ use swm_core::pool::{Reset, threads};
 use swm_core::{Batch, EnvPool, Key, ResetOptions, Result, Schema, VariationRequest};
 use swm_mujoco::ENVS;
 
-/// Steps of an episode; each starts with new factors.
+/// The number of steps of an episode; each episode starts with new factors.
 const EPISODE: usize = 25;
-/// Environments in a pool.
+/// The number of environments in a pool.
 const SLOTS: usize = 8;
 
 fn main() -> Result<()> {

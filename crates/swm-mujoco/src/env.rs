@@ -1,10 +1,10 @@
 //! [`MujocoEnv`]: the environment shared by all families of this crate, around a [`Task`].
 //!
 //! The environment owns the model and its state ([`Physics`]), the factors of the episode, and the renderer's scene;
-//! the task edits the model, starts episodes, steps, rewards, and holds the goal.
+//! the task edits the model, starts episodes, applies actions, computes rewards, and stores the goal.
 //!
 //! The `state` column contains the state of the physics (time, `qpos`, `qvel`, `act`, `qacc_warmstart`, `ctrl`,
-//! `eq_active`, `mocap_pos`, `mocap_quat`) followed by the task state. An episode can continue from it.
+//! `eq_active`, `mocap_pos`, `mocap_quat`) followed by the task state. An episode can continue from a recorded `state`.
 
 use crate::physics::check_finite;
 use crate::render::{self, AbstractScene, Camera, FrameBuffer};
@@ -25,11 +25,11 @@ pub(crate) struct MujocoEnv<T> {
     physics: Physics,
     task: T,
     factors: FactorValues,
-    /// The cameras of the model by name, the default one first.
+    /// The cameras of the model by name. The default camera is the first.
     cameras: Vec<(String, Camera)>,
     /// Allocated at the first rendering.
     scene: Option<Box<AbstractScene>>,
-    /// Reused for the state to restore after a goal was rendered or sampled.
+    /// Memory for the state that is restored after a goal was rendered or sampled; reused.
     scratch: Vec<f64>,
 }
 
@@ -61,7 +61,7 @@ impl<T: Task> MujocoEnv<T> {
         self.task.start(&mut self.physics, &self.factors, Key::new(seed).with("start"))
     }
 
-    /// Edits the model for these factors, unless they are the present ones.
+    /// Edits the model for these factors, unless they equal the present factors.
     fn apply_factors(&mut self, factors: FactorValues) -> Result<()> {
         if factors.iter().eq(self.factors.iter()) {
             return Ok(());
@@ -79,7 +79,8 @@ impl<T: Task> MujocoEnv<T> {
         self.spec.columns[0].len()
     }
 
-    /// Splits a state into task state and physics. The task state is `None` if only `qpos` and `qvel` were given.
+    /// Splits a state into the task state and the state of the physics. The task state is `None` if `state` contains
+    /// only `qpos` and `qvel`. `what` names the state in errors.
     fn split_state<'a>(&self, what: &str, state: &'a [f64]) -> Result<(Option<&'a [f64]>, &'a [f64])> {
         let (physics, pose) = (self.physics.state_len(), self.physics.pose_len());
         match state.len() {
@@ -107,7 +108,7 @@ impl<T: Task> MujocoEnv<T> {
         }
     }
 
-    /// Sets the goal to a state given by the caller, or from values in another form that the task accepts.
+    /// Sets the goal to a state given by the caller, or from other values that the task accepts, such as a position.
     fn set_goal(&mut self, goal: &[f64]) -> Result<()> {
         check_finite("a goal state", goal)?;
         if ![self.state_len(), self.physics.pose_len()].contains(&goal.len())
@@ -119,7 +120,7 @@ impl<T: Task> MujocoEnv<T> {
         if let Some(task_state) = task_state {
             return self.preserving_state(|task, physics, _| task.set_goal_state(physics, state, task_state))?;
         }
-        // Given qpos and qvel only, the rest of the goal state is the present one.
+        // If only `qpos` and `qvel` are given, the goal state takes its other values from the present state.
         let mut full = vec![0.0; self.state_len()];
         let (present, task_state) = full.split_at_mut(self.physics.state_len());
         self.physics.state(present);
@@ -144,7 +145,7 @@ impl<T: Task> MujocoEnv<T> {
     }
 }
 
-/// The cameras of a model by name: the default one first, the free one last.
+/// The cameras of a model by name. The default camera is the first.
 fn cameras(model: &MjModel, default: Camera) -> Vec<(String, Camera)> {
     let count = usize::try_from(model.ncam()).unwrap_or(0);
     let name = |index| {
@@ -180,7 +181,7 @@ impl<T: Task> Env for MujocoEnv<T> {
     fn step(&mut self, action: Action<'_>) -> Result<Transition> {
         let action = action.continuous(self.spec.action_dim())?;
         let StepOutcome { reward, terminated } = self.task.step(&mut self.physics, action);
-        // MuJoCo resets the state of a diverged simulation: the following steps would belong to another episode.
+        // MuJoCo resets the state of a diverged simulation, so later steps would not continue this episode.
         let terminated = terminated || self.physics.is_unstable();
         Ok(Transition { reward, terminated, truncated: false })
     }
@@ -215,7 +216,7 @@ impl<T: Task> Env for MujocoEnv<T> {
             }
         };
         let misaligned =
-            |_| Error::mismatch("rendering a camera view", "a buffer not aligned to 4 bytes", "a column's row");
+            |_| Error::mismatch("rendering a camera view", "a buffer not aligned to 4 bytes", "an aligned buffer");
         let buffer = match view.modality {
             Modality::Rgb => FrameBuffer::Rgb(out),
             Modality::Depth => FrameBuffer::Depth(bytemuck::try_cast_slice_mut(out).map_err(misaligned)?),
@@ -226,7 +227,7 @@ impl<T: Task> Env for MujocoEnv<T> {
 
     fn libraries(&self) -> BTreeMap<String, String> {
         let mut libraries = BTreeMap::from([("mujoco".to_owned(), link::VERSION.to_owned())]);
-        // Without a renderer, the environment still works from states.
+        // An environment without a renderer can still be reset and stepped.
         if let Ok(name) = render::name() {
             libraries.insert("renderer".to_owned(), name);
         }

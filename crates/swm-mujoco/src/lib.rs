@@ -2,7 +2,8 @@
 //!
 //! MuJoCo's library and the models of the environments are not part of the program: [`assets`] installs them, and
 //! [`link`] loads the library when the first environment needs it. The environment variable `SWM_ASSETS` names the
-//! folder of the assets, for example `SWM_ASSETS=~/.cache/swm/assets`.
+//! folder of the assets, for example `SWM_ASSETS=~/.cache/swm/assets`. *The reference* is the published Python package
+//! `stable-worldmodel`, whose environments this crate reproduces.
 //!
 //! Read [`physics`] (a model and its state), [`render`] (rendering), `env` (the environment shared by all families) and
 //! `task` (the trait that a family implements) first, then a family.

@@ -1,13 +1,13 @@
 //! MuJoCo's library, loaded when the first environment needs it.
 //!
 //! `mujoco-rs` declares MuJoCo's functions as symbols for the linker. This module defines them as trampolines: one jump
-//! each, through a table that [`load`] fills from `libmujoco` of the installed assets. The same program therefore
-//! starts, and works apart from these environments, where MuJoCo is not installed. A call before loading ends in
-//! [`not_loaded`].
+//! each, through a table that [`load`] fills from `libmujoco` of the installed assets. A program with this crate
+//! therefore starts where MuJoCo is not installed, and only the environments of this crate fail there. A call before
+//! loading calls [`not_loaded`].
 //!
 //! The module also replaces MuJoCo's error handling. By default MuJoCo writes errors to `MUJOCO_LOG.TXT` in the working
-//! directory and exits the process. Here, messages go to the program's log, and an error inside [`guard`] unwinds to it
-//! and is returned as an [`Error`].
+//! directory and exits the process. Here, messages go to the program's log, and an error inside [`guard`] unwinds to
+//! `guard`, which returns an [`Error`].
 #![allow(unsafe_code, reason = "foreign symbols, a table of addresses, and a handler that MuJoCo calls")]
 
 mod symbols;
@@ -21,7 +21,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::OnceLock;
 use swm_core::{Error, Result};
 
-/// The version of MuJoCo that is loaded. No other version works: `mujoco-rs` declares the structures of this one.
+/// The version of MuJoCo that is loaded. No other version works: `mujoco-rs` declares the structures of this version.
 pub const VERSION: &str = "3.17.0";
 
 macro_rules! trampolines {
@@ -88,16 +88,16 @@ extern "C" fn not_loaded() -> ! {
     std::process::abort();
 }
 
-/// Loads MuJoCo if it is not loaded. Its functions may be called afterwards.
+/// Loads MuJoCo's library on the first call; later calls do nothing. MuJoCo's functions may be called afterwards.
 ///
 /// # Errors
-/// When it is not installed (the error names the command to install it), or cannot be loaded.
+/// When MuJoCo is not installed (the error names the command to install it), or its library cannot be loaded.
 pub fn load() -> Result<()> {
     static LOADED: OnceLock<()> = OnceLock::new();
     if LOADED.get().is_some() {
         return Ok(());
     }
-    // Concurrent callers wait for the first; after a failure, the next call tries again.
+    // Concurrent callers wait for the first caller; after a failure, the next call tries again.
     static LOADING: std::sync::Mutex<()> = std::sync::Mutex::new(());
     let _lock = LOADING.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
     if LOADED.get().is_none() {
@@ -136,17 +136,17 @@ thread_local! {
 /// The payload that unwinds from MuJoCo's log handler to [`guard`].
 struct Fault(String);
 
-/// Calls MuJoCo and returns its errors, which would otherwise end the process.
+/// Runs `call` and returns MuJoCo's error, which would otherwise end the process.
 ///
-/// `call` may only use functions declared `extern "C-unwind"` (`crate::ffi`). After an error, the objects it worked on
-/// are in an undefined state; the environment resets them.
+/// `call` may only use functions declared `extern "C-unwind"` (`crate::ffi`). After an error, the MuJoCo objects that
+/// `call` used are in an undefined state: `Physics` resets its state, and the renderer drops its context.
 ///
 /// # Errors
 /// MuJoCo's error message.
 pub(crate) fn guard<T>(doing: &str, call: impl FnOnce() -> T) -> Result<T> {
-    let nested = GUARDED.replace(true);
+    let was_guarded = GUARDED.replace(true);
     let outcome = catch_unwind(AssertUnwindSafe(call));
-    GUARDED.set(nested);
+    GUARDED.set(was_guarded);
     outcome.map_err(|payload| match payload.downcast::<Fault>() {
         Ok(fault) => Error::external(format!("MuJoCo, {doing}"), fault.0),
         Err(other) => resume_unwind(other),
@@ -165,11 +165,11 @@ struct Message {
 type Handler = unsafe extern "C-unwind" fn(*const Message);
 
 unsafe extern "C" {
-    /// As declared by `mujoco-rs`, but for a handler that may unwind.
+    /// Sets MuJoCo's log handler. `mujoco-rs` declares the same function for handlers that may not unwind.
     fn mju_setLogHandler(handler: Option<Handler>) -> Option<Handler>;
 }
 
-/// The log handler: receives every message of MuJoCo.
+/// The log handler, which MuJoCo calls with each of its messages.
 unsafe extern "C-unwind" fn on_message(message: *const Message) {
     // SAFETY: MuJoCo passes a message that is valid during the call.
     let message = unsafe { &*message };
@@ -183,7 +183,7 @@ unsafe extern "C-unwind" fn on_message(message: *const Message) {
     };
     if message.level == mjtLogLevel::mjLOG_ERROR as i32 {
         if GUARDED.get() {
-            // Not a panic, so no panic hook prints it; `guard` catches it.
+            // `resume_unwind` runs no panic hook, so nothing is printed; `guard` catches the unwinding.
             resume_unwind(Box::new(Fault(text)));
         }
         tracing::error!("MuJoCo: {text}");

@@ -19,17 +19,18 @@ pub(crate) struct StepOutcome {
 /// The part of an environment that differs between families: start, step, observation, reward and goal.
 ///
 /// The *task state* contains the values of a task that are not part of the physics, such as a score; it is part of the
-/// `state` column. The *goal values* are stored in snapshots only, because a state is the same for every goal.
+/// `state` column. The *goal values* are stored in snapshots only, because the `state` column does not contain the
+/// goal.
 pub(crate) trait Task: Send {
-    /// Edits the model for these factors of variation. The model is the compiled one, unless
+    /// Edits the model for these factors of variation. Earlier edits are undone before the call, unless
     /// [`Task::overwrites_edits`]. The method is called only when the factors change.
     ///
     /// # Errors
     /// When the model lacks an element, or cannot be compiled for these factors.
     fn apply_factors(&mut self, physics: &mut Physics, factors: &FactorValues) -> Result<()>;
 
-    /// Whether [`Task::apply_factors`] sets every value of the model that the task ever edits. The model is then not
-    /// restored first, which is slow for models with many meshes.
+    /// Whether [`Task::apply_factors`] sets every value of the model that the task ever edits. Earlier edits are then
+    /// not undone before the call, because undoing them is slow for models with many meshes.
     fn overwrites_edits(&self) -> bool {
         false
     }
@@ -38,8 +39,8 @@ pub(crate) trait Task: Send {
     /// requested.
     fn receive_request(&mut self, _request: &VariationRequest) {}
 
-    /// Starts an episode. The state is the model's initial one ([`Physics::reset`]); derived quantities must be up to
-    /// date on return.
+    /// Starts an episode. Before the call, the state is the model's initial state ([`Physics::reset`]); derived
+    /// quantities must be up to date on return.
     ///
     /// # Errors
     /// When no valid start was found.
@@ -71,15 +72,15 @@ pub(crate) trait Task: Send {
     /// Restores the goal values.
     fn load_goal(&mut self, _goal: &[f64]) {}
 
-    /// Sets the goal to a state: a vector of [`Physics::state`], and the task state there. May change the state of the
-    /// physics; the environment restores it.
+    /// Sets the goal to a state: a vector of [`Physics::state`], and the task state at the goal. May change the state
+    /// of the physics; the environment restores it.
     ///
     /// # Errors
     /// When the state is invalid.
     fn set_goal_state(&mut self, physics: &mut Physics, state: &[f64], task_state: &[f64]) -> Result<()>;
 
-    /// Sets the goal from values of another form than a state, such as a position; `None` if these are not of such a
-    /// form. May change the state of the physics; the environment restores it.
+    /// Sets the goal from values that are not a state, such as a position; `None` if the task does not accept these
+    /// values. May change the state of the physics; the environment restores it.
     fn set_goal_values(&mut self, _physics: &mut Physics, _goal: &[f64]) -> Option<Result<()>> {
         None
     }
@@ -101,7 +102,7 @@ pub(crate) trait Task: Send {
     /// Whether the goal is reached.
     fn is_success(&self, physics: &Physics) -> bool;
 
-    /// The distance to the goal; 0 at the goal. The unit is the family's.
+    /// The distance to the goal; 0 at the goal. The unit depends on the task.
     fn goal_distance(&self, physics: &Physics) -> f64;
 
     /// The default camera.

@@ -24,11 +24,11 @@ const TARGET_RADIUS: f64 = 0.2;
 pub enum Task {
     /// 1 within the target, 0 outside.
     Sparse,
-    /// Falls with the distance from the target.
+    /// 1 within the target, falling with the distance outside.
     Dense,
 }
 
-/// The indices of the domain's elements.
+/// The task and the indices of the domain's elements in the model.
 pub struct Acrobot {
     task: Task,
     arms: [usize; 2],

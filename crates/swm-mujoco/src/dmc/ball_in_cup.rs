@@ -1,5 +1,5 @@
-//! Ball in cup: a ball hangs on a string from a cup that moves in a plane; swing it up and catch it
-//! (`dm_control/suite/ball_in_cup.py`).
+//! Ball in cup: a ball hangs on a string from a cup that moves in a plane; the task is to swing the ball up and catch
+//! it (`dm_control/suite/ball_in_cup.py`).
 
 use super::domain::{Domain, TaskTable, tasks};
 use super::measures::norm;
@@ -22,10 +22,10 @@ const CUP: [usize; 2] = [0, 1];
 const BALL: [usize; 2] = [2, 3];
 /// Half the width, depth and height of the inside of the cup, in metres.
 const CUP_INSIDE: [f64; 3] = [0.05, 0.006, 0.05];
-/// Positions of the ball's slides at which the ball is in the middle of a cup at its origin, in metres.
+/// Positions (m) of the ball's slides with the ball in the middle of the cup, if the cup's slides are at 0.
 const CAUGHT: [f64; 2] = [0.0, 0.35];
 
-/// The indices of the domain's elements.
+/// The indices of the domain's elements in the model.
 pub struct BallInCup {
     ball: usize,
     ball_geom: usize,
@@ -33,7 +33,7 @@ pub struct BallInCup {
 }
 
 impl BallInCup {
-    /// Whether the whole ball is inside the cup, in the plane of its motion.
+    /// Whether the whole ball is inside the cup along x and z.
     fn caught(&self, physics: &Physics) -> bool {
         let (inside, ball) = (physics.data().site_xpos()[self.inside], physics.data().xpos()[self.ball]);
         let (room, size) = (physics.model().site_size()[self.inside], physics.model().geom_size()[self.ball_geom][0]);
@@ -68,8 +68,8 @@ impl Domain for BallInCup {
     fn edit(edit: &mut ModelEdit<'_>, _task: ()) -> Result<()> {
         edit.common("light")?;
         edit.gravity();
-        for part in ["cup_part_0", "cup_part_1", "cup_part_2", "cup_part_3", "cup_part_4"] {
-            edit.density(part, "agent.density")?;
+        for geom in ["cup_part_0", "cup_part_1", "cup_part_2", "cup_part_3", "cup_part_4"] {
+            edit.density(geom, "agent.density")?;
         }
         edit.density("ball", "ball.density")?;
         edit.radius("ball", "ball.size")?;
@@ -104,7 +104,7 @@ impl Domain for BallInCup {
         true
     }
 
-    /// A goal with the ball in the cup is reached whenever the ball is in the cup, wherever the cup is.
+    /// A goal with the ball in the cup is reached when the ball is in the cup, at any position of the cup.
     fn goal_reached(&self, physics: &Physics, goal: &[f64]) -> Option<bool> {
         let [x, z] = off_centre(goal);
         let (room, size) = (physics.model().site_size()[self.inside], physics.model().geom_size()[self.ball_geom][0]);

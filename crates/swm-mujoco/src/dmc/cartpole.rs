@@ -19,16 +19,16 @@ pub const ENTRY: EnvEntry = entry::<Cartpole>(&[]);
 /// The start and the reward of a task.
 #[derive(Clone, Copy)]
 pub struct Task {
-    /// Whether the pole starts hanging down, not upright.
+    /// Whether the pole hangs down at the start; otherwise it is upright.
     swing_up: bool,
-    /// Whether the reward is 0 or 1.
+    /// Whether the reward is either 0 or 1; otherwise it is continuous.
     sparse: bool,
 }
 
-/// The index of the pole's body, after those of the world and the cart.
+/// The index of the pole's body. The bodies of the world and of the cart precede it.
 const POLE: usize = 2;
 
-/// A cart with a pole.
+/// A task of the cartpole domain.
 pub struct Cartpole {
     task: Task,
 }

@@ -16,16 +16,16 @@ use swm_core::{EnvEntry, Factor, Result, Rng};
 /// The registry row of this domain.
 pub const ENTRY: EnvEntry = entry::<Cheetah>(&[]);
 
-/// Time steps in which a random start falls to the ground.
+/// The number of time steps in which the cheetah falls to the ground at the start.
 const SETTLE_STEPS: usize = 200;
-/// Height of torso or foot in a jump, in metres.
+/// Indicator of a jump, by the height of torso or foot in metres.
 const JUMP: Tolerance = Tolerance::at_least(1.2).gaussian(0.6);
-/// Height of a lying torso or foot, in metres.
+/// The maximal height of a lying torso or foot, in metres.
 const LIE_HEIGHT: f64 = 0.25;
-/// Forward angular momentum of a flip, in kg m²/s.
+/// Indicator of a flip, by the forward angular momentum in kg m²/s.
 const FLIP: Tolerance = Tolerance::at_least(8.0).linear(8.0, 0.0);
 
-/// The reward and the indices of the domain's elements.
+/// The reward and the indices of the domain's elements in the model.
 pub struct Cheetah {
     reward: RewardFn<Self>,
     torso: usize,
@@ -40,43 +40,43 @@ impl Cheetah {
         physics.data().sensordata()[self.velocity]
     }
 
-    /// Standing on one foot: torso and raised foot up. The speed term is 1 only at a speed of exactly 0, as in the
-    /// reference.
+    /// The reward for standing on one foot, with the torso and the other foot raised. The speed term is 1 only at a
+    /// speed of exactly 0, as in the reference.
     fn stand(&self, physics: &Physics, raised: usize) -> f64 {
         let up = JUMP.of(f64::midpoint(height(physics, self.torso), height(physics, raised)));
         (5.0 * up + Tolerance::within(0.0, 0.0).of(self.speed(physics))) / 6.0
     }
 
-    /// The mean of both stands.
+    /// The reward for a jump: the mean of the rewards for standing on each foot.
     fn jump(&self, physics: &Physics) -> f64 {
         f64::midpoint(self.stand(physics, self.back_foot), self.stand(physics, self.front_foot))
     }
 
-    /// One foot and the torso up.
+    /// The reward for raising a foot and the torso.
     fn one_foot(&self, physics: &Physics, raised: usize) -> f64 {
         (3.0 * JUMP.of(height(physics, raised)) + 2.0 * JUMP.of(height(physics, self.torso))) / 5.0
     }
 
-    /// Running at half speed with one foot and the torso up.
+    /// The reward for running at half speed with a foot and the torso raised.
     fn run_on_one_foot(&self, physics: &Physics, raised: usize) -> f64 {
         let fast = Tolerance::at_least(5.0).linear(5.0, 0.0).of(self.speed(physics));
         self.one_foot(physics, raised) * (5.0 * fast + 1.0) / 6.0
     }
 
-    /// Torso and feet low.
+    /// The reward for a low torso and low feet.
     fn lie_down(&self, physics: &Physics) -> f64 {
         let low = |height| Tolerance::at_most(LIE_HEIGHT).linear(LIE_HEIGHT, 0.0).of(height);
         let feet = f64::midpoint(height(physics, self.front_foot), height(physics, self.back_foot));
         (3.0 * low(height(physics, self.torso)) + low(feet)) / 4.0
     }
 
-    /// Torso low, back foot up.
+    /// The reward for a low torso and a raised back foot.
     fn legs_up(&self, physics: &Physics) -> f64 {
         let down = Tolerance::at_most(LIE_HEIGHT).gaussian(LIE_HEIGHT / 2.0).of(height(physics, self.torso));
         (5.0 * down + self.one_foot(physics, self.back_foot)) / 6.0
     }
 
-    /// Rotating and moving forward (`direction` 1) or backward (-1).
+    /// The reward for rotating and moving forward (`direction` 1) or backward (-1).
     fn flip(&self, physics: &Physics, direction: f64) -> f64 {
         let along = Tolerance::at_least(0.0).of(direction * self.speed(physics));
         (2.0 * FLIP.of(direction * forward_spin(physics, self.torso)) + along) / 3.0

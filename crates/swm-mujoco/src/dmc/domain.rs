@@ -1,4 +1,4 @@
-//! [`Domain`], the contract of a domain of the suite; [`TaskTable`] and [`InfoColumn`], the tables that describe it.
+//! [`Domain`]: the trait that each domain of the suite implements; [`TaskTable`] and [`InfoColumn`]: its tables.
 
 use super::model_edit::ModelEdit;
 use super::observation::ObservationWriter;
@@ -15,7 +15,7 @@ pub struct TaskTable<T: 'static> {
 }
 
 impl<T: Copy> TaskTable<T> {
-    /// The task of that name; the default one for an unknown name.
+    /// Returns the task with this name, or the default task for an unknown name.
     pub fn get(&self, name: &str) -> T {
         let index = self.names.iter().position(|known| *known == name);
         self.tasks[index.unwrap_or(0)]
@@ -30,7 +30,7 @@ macro_rules! tasks {
 }
 pub(super) use tasks;
 
-/// The task of a domain whose tasks differ in the reward only: the reward of one control step.
+/// The reward of one control step; the type [`Domain::Task`] of domains whose tasks differ in the reward only.
 pub type RewardFn<D> = fn(&D, &Physics) -> f64;
 
 /// A column in addition to the observation (an entry of `info` in the reference).
@@ -43,8 +43,8 @@ pub struct InfoColumn<D> {
     pub write: fn(&D, &Physics, &mut [f64]),
 }
 
-/// A domain of the suite: the model and the code that its tasks have in common. A value of the type is one task on a
-/// compiled model.
+/// A domain of the suite: the model and the code that its tasks have in common. A value of the implementing type is one
+/// task on a compiled model.
 pub trait Domain: Send + Sized + 'static {
     /// The parameters that distinguish the tasks.
     type Task: Copy + Send + 'static;
@@ -59,7 +59,7 @@ pub trait Domain: Send + Sized + 'static {
     const TASKS: TaskTable<Self::Task>;
     /// Time steps per control step.
     const SUBSTEPS: usize;
-    /// Steps after which an episode is truncated: the suite's time limit.
+    /// The number of actions after which an episode is truncated: the suite's time limit.
     const MAX_STEPS: usize = 500;
     /// The index of the default camera.
     const CAMERA: usize = 0;
@@ -67,7 +67,7 @@ pub trait Domain: Send + Sized + 'static {
     const INFO: &'static [InfoColumn<Self>] = &[];
     /// Joints that goals do not include.
     const IGNORED_JOINTS: &'static [&'static str] = &[];
-    /// The number of values that describe the task's target, if it differs between episodes.
+    /// The number of values that describe a target that is drawn per episode; 0 without such a target.
     const TARGET_LEN: usize = 0;
     /// The largest difference from the goal at each joint, in radians or metres.
     const GOAL_TOLERANCE: f64 = 0.1;
@@ -104,7 +104,7 @@ pub trait Domain: Send + Sized + 'static {
     /// When no valid start was found.
     fn start(&self, physics: &mut Physics, rng: &mut Rng) -> Result<()>;
 
-    /// Reads the target of the task. Shape of `into`: `[TARGET_LEN]`.
+    /// Writes the target of the task. Shape of `into`: `[TARGET_LEN]`.
     fn target(&self, _physics: &Physics, _into: &mut [f64]) {}
 
     /// Sets the target of the task. The caller updates derived quantities.
@@ -116,7 +116,7 @@ pub trait Domain: Send + Sized + 'static {
     /// The reward of one control step.
     fn reward(&self, physics: &Physics) -> f64;
 
-    /// Writes the goal configuration of the task and returns true, if the task has exactly one.
+    /// Writes the goal configuration and returns true if the task determines it; otherwise returns false.
     fn goal_qpos(&self, _physics: &Physics, _qpos: &mut [f64]) -> bool {
         false
     }
@@ -126,7 +126,7 @@ pub trait Domain: Send + Sized + 'static {
         None
     }
 
-    /// The distance to the goal configuration; `None` to compare joint by joint.
+    /// The distance to the goal configuration, in radians or metres; `None` to compare joint by joint.
     fn goal_distance(&self, _physics: &Physics, _goal: &[f64]) -> Option<f64> {
         None
     }

@@ -21,7 +21,7 @@ const SPIN_VELOCITY: f64 = -15.0;
 /// Damping of the hinge in the spin task, in N m s/rad.
 const SPIN_DAMPING: f64 = 0.03;
 
-/// The task.
+/// A task of the finger domain.
 #[derive(Clone, Copy)]
 pub enum Task {
     /// Turn the body's tip to a target of this radius, in metres.
@@ -41,7 +41,7 @@ struct Sensors {
     touch: [usize; 2],
 }
 
-/// The indices of the domain's elements.
+/// The task and the indices of the domain's elements in the model.
 pub struct Finger {
     task: Task,
     sensors: Sensors,

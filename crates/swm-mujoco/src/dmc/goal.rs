@@ -24,8 +24,8 @@ pub struct GoalCoordinates {
 }
 
 impl GoalCoordinates {
-    /// The coordinates of every joint except `ignored`. Of a free body, these are height and orientation: its position
-    /// on the floor is not observed, so goals do not include it.
+    /// The coordinates of every joint except `ignored`. Of a free body, goals include height and orientation, but not
+    /// the position on the floor, which is not observed.
     pub fn new(model: &MjModel, ignored: &[&str]) -> Self {
         let (mut included, mut limits) = (vec![], vec![]);
         for joint in 0..model.jnt_type().len() {
@@ -60,7 +60,7 @@ impl GoalCoordinates {
         })
     }
 
-    /// Whether every coordinate of `qpos` differs from that of `goal` by less than `tolerance`.
+    /// Whether every coordinate of `qpos` differs from the coordinate of `goal` by less than `tolerance`.
     pub fn reached(&self, qpos: &[f64], goal: &[f64], tolerance: f64) -> bool {
         self.differences(qpos, goal).all(|difference| difference < tolerance)
     }
@@ -89,11 +89,11 @@ mod tests {
     #[test]
     fn angle_between_orientations_is_the_shortest() {
         let about_x = |angle: f64| [(angle / 2.0).cos(), (angle / 2.0).sin(), 0.0, 0.0];
-        for (a, b, wanted) in [(0.0, 0.5, 0.5), (0.0, -2.0, 2.0), (3.0, -3.0, 2.0 * PI - 6.0), (1.0, 1.0, 0.0)] {
-            assert!((angle_between(&about_x(a), &about_x(b)) - wanted).abs() < 1e-12, "from {a} to {b}");
+        for (a, b, expected) in [(0.0, 0.5, 0.5), (0.0, -2.0, 2.0), (3.0, -3.0, 2.0 * PI - 6.0), (1.0, 1.0, 0.0)] {
+            assert!((angle_between(&about_x(a), &about_x(b)) - expected).abs() < 1e-12, "from {a} to {b}");
             let opposite = about_x(b).map(|value| -2.0 * value);
             assert!(
-                (angle_between(&about_x(a), &opposite) - wanted).abs() < 1e-12,
+                (angle_between(&about_x(a), &opposite) - expected).abs() < 1e-12,
                 "from {a} to {b}, with a scaled and negated quaternion"
             );
         }

@@ -1,12 +1,12 @@
 //! Golden tests: every domain reproduces rollouts that the Python reference recorded (`SWM_GOLDEN`, and
 //! `tests/golden`).
 //!
-//! The rollouts are replayed below [`swm_core::Env`], whose actions are in single precision: those of the reference are
-//! in double precision, and with contacts the difference grows quickly.
+//! The tests call [`SuiteTask`] instead of [`swm_core::Env`], whose actions are in single precision: actions of the
+//! reference are in double precision, and with contacts the difference grows quickly.
 
 use super::ENTRIES;
 use super::domain::Domain;
-use super::suite_env::{SuiteTask, parts};
+use super::suite_env::{SuiteTask, env_arguments};
 use crate::Physics;
 use crate::render::similarity::ImageSimilarity;
 use crate::render::{self, Choice, FrameBuffer};
@@ -34,19 +34,19 @@ fn target<D: Domain>(golden: &mut Golden) -> Vec<f64> {
     }
     match D::MODEL {
         "reacher.xml" => golden.values("info.target_pos")[..2].to_vec(),
-        // The column is relative to the hinge.
+        // The recorded position is relative to the hinge.
         "finger.xml" => {
             let relative = golden.values("info.target_position");
             vec![relative[0] + 0.2, relative[1] + 0.4]
         }
-        // The last elements of the observation, in single precision.
+        // The target's pose is at the end of the observation, in single precision.
         "manipulator.xml" => golden.values("obs")[40..44].to_vec(),
         _ => vec![],
     }
 }
 
 /// The largest difference of two vectors; two NaN count as equal.
-fn apart(a: &[f64], b: &[f64]) -> f64 {
+fn largest_difference(a: &[f64], b: &[f64]) -> f64 {
     assert_eq!(a.len(), b.len());
     a.iter()
         .zip(b)
@@ -54,7 +54,7 @@ fn apart(a: &[f64], b: &[f64]) -> f64 {
         .fold(0.0, |worst, d| if d.is_nan() { f64::INFINITY } else { worst.max(d) })
 }
 
-/// A domain during the replay of a rollout.
+/// The replay of a rollout in a domain.
 struct Replay<D: Domain> {
     physics: Physics,
     task: SuiteTask<D>,
@@ -65,7 +65,7 @@ struct Replay<D: Domain> {
 impl<D: Domain> Replay<D> {
     fn column(&mut self, name: &str) -> Vec<f64> {
         self.task.observe(&self.physics, &mut self.row.row_mut(0));
-        self.row.row(0).to_f64(name).expect("a column")
+        self.row.row(0).to_f64(name).expect("reading a column")
     }
 
     /// The mean difference between MuJoCo's frame and a recorded image, from 0 to 255, and whether the frame of the CPU
@@ -80,7 +80,7 @@ impl<D: Domain> Replay<D> {
         let mut draw = |choice| {
             let buffer = FrameBuffer::Rgb(&mut rgb);
             render::with(choice, || render::draw(&mut self.scene, &mut self.physics, camera, (width, height), buffer))
-                .expect("a frame");
+                .expect("rendering a frame");
             rgb.clone()
         };
         let (cpu, egl) = (draw(Choice::Cpu), draw(Choice::Egl));
@@ -106,17 +106,17 @@ fn replay_one<D: Domain>(file: &Path) -> Worst {
     let mut golden = Golden::open(file);
     let task = if golden.has("task") { golden.text("task") } else { D::TASKS.names[0].to_owned() };
     let registry = Registry { kind: "environment", hint: "", rows: &ENTRIES };
-    let choice: EnvChoice = registry.choose(&format!("{},task={task}", D::ID)).expect("a registered environment");
-    let (spec, model, mut task) = parts::<D>(&choice).expect("an environment");
-    let factors = spec.variation_space.resolve(&golden.variation(), Key::new(0)).expect("valid factors");
-    let mut physics = Physics::new(Arc::clone(&model)).expect("a state");
-    task.apply_factors(&mut physics, &factors).expect("a model");
-    task.start(&mut physics, &factors, Key::new(0)).expect("a start");
+    let choice: EnvChoice = registry.choose(&format!("{},task={task}", D::ID)).expect("choosing the environment");
+    let (spec, model, mut task) = env_arguments::<D>(&choice).expect("preparing the environment");
+    let factors = spec.variation_space.resolve(&golden.variation(), Key::new(0)).expect("resolving the factors");
+    let mut physics = Physics::new(Arc::clone(&model)).expect("allocating the state");
+    task.apply_factors(&mut physics, &factors).expect("applying the factors");
+    task.start(&mut physics, &factors, Key::new(0)).expect("starting an episode");
 
-    // The recorded start.
+    // Sets the recorded start.
     let mut state = vec![];
     for name in
-        ["time", "qpos", "qvel", "act", "qacc_warmstart", "ctrl", "eq_active"].map(|part| format!("start.{part}"))
+        ["time", "qpos", "qvel", "act", "qacc_warmstart", "ctrl", "eq_active"].map(|field| format!("start.{field}"))
     {
         if golden.has(&name) {
             state.extend(golden.values(&name));
@@ -126,13 +126,13 @@ fn replay_one<D: Domain>(file: &Path) -> Worst {
     task.save_task_state(&mut task_state);
     task_state[1..=D::TARGET_LEN].copy_from_slice(&target::<D>(&mut golden));
     task.load_task_state(&mut physics, &task_state);
-    physics.set_state(&state).expect("a state");
+    physics.set_state(&state).expect("setting the state");
     physics.forward_passive();
 
-    // The columns as in an environment: `state` and `unstable`, then those of the task.
+    // The columns of the environment: `state` and `unstable`, then the columns of the task.
     let common_columns = [ColumnSpec::new("state", DType::Float64, [1]), ColumnSpec::new("unstable", DType::Bool, [])];
     let specs: Vec<ColumnSpec> = common_columns.into_iter().chain(spec.columns.clone()).collect();
-    let row = Batch::zeros(&Schema::new(specs).expect("columns"), 1);
+    let row = Batch::zeros(&Schema::new(specs).expect("creating the schema"), 1);
     let mut replay = Replay { physics, task, scene: None, row };
 
     let (actions, rewards, terminations) =
@@ -149,17 +149,18 @@ fn replay_one<D: Domain>(file: &Path) -> Worst {
                 .task
                 .apply_action(&mut replay.physics, actions[(t - 1) * action_dim..t * action_dim].iter().copied());
             worst.reward = worst.reward.max((step.reward - rewards[t - 1]).abs());
-            assert_eq!(step.terminated, terminations[t - 1] > 0.0, "{}, terminated {t}", file.display());
+            assert_eq!(step.terminated, terminations[t - 1] > 0.0, "{}: termination at step {t}", file.display());
         }
-        let mut now = replay.column("qpos");
-        now.extend(replay.column("qvel"));
-        worst.state = worst.state.max(apart(&now, &states[t * now.len()..][..now.len()]));
+        let mut qpos_qvel = replay.column("qpos");
+        qpos_qvel.extend(replay.column("qvel"));
+        worst.state =
+            worst.state.max(largest_difference(&qpos_qvel, &states[t * qpos_qvel.len()..][..qpos_qvel.len()]));
         let observation = replay.column("observation");
         let expected = &observations[t * observation.len()..][..observation.len()];
-        worst.observation = worst.observation.max(apart(&observation, expected));
+        worst.observation = worst.observation.max(largest_difference(&observation, expected));
         for (name, recorded) in &infos {
             let info = replay.column(name);
-            worst.info = worst.info.max(apart(&info, &recorded[t * info.len()..][..info.len()]));
+            worst.info = worst.info.max(largest_difference(&info, &recorded[t * info.len()..][..info.len()]));
         }
     }
     worst.images[1] = replay.compare_image(file, &mut golden, "frame_last");
@@ -170,18 +171,18 @@ fn replay_one<D: Domain>(file: &Path) -> Worst {
 #[allow(clippy::print_stderr, reason = "a table for `--nocapture`")]
 fn replay_all<D: Domain>() {
     let files = golden::files(env!("CARGO_MANIFEST_DIR"), &format!("{}-", D::ID.replace('/', "_")));
-    assert!(!files.is_empty(), "`tests/golden` has files of every domain");
-    let mut wrong = vec![];
+    assert!(!files.is_empty(), "`tests/golden` has no file of {}", D::ID);
+    let mut different = vec![];
     for file in files {
         let worst = replay_one::<D>(&file);
-        let name = file.file_name().expect("a name").to_string_lossy().into_owned();
+        let name = file.file_name().expect("reading the file name").to_string_lossy().into_owned();
         eprintln!("{name}: {worst:?}");
         let values = worst.state.max(worst.observation).max(worst.reward).max(worst.info);
         if values > TOLERANCE || worst.images.iter().any(|(egl, cpu)| *egl > IMAGE_TOLERANCE || !cpu) {
-            wrong.push(format!("{name}: {worst:?}"));
+            different.push(format!("{name}: {worst:?}"));
         }
     }
-    assert!(wrong.is_empty(), "rollouts that differ: {wrong:#?}");
+    assert!(different.is_empty(), "rollouts that differ: {different:#?}");
 }
 
 macro_rules! replay_tests {

@@ -16,12 +16,12 @@ use swm_core::{EnvEntry, Factor, Result, Rng};
 /// The registry row of this domain.
 pub const ENTRY: EnvEntry = entry::<Hopper>(&[]);
 
-/// Height of the torso above the foot when standing, in metres.
+/// Indicator of standing, by the height of the torso above the foot in metres.
 const STANDING: Tolerance = Tolerance::within(0.6, 2.0);
-/// Forward angular momentum of a flip, in kg m²/s.
+/// Indicator of a flip, by the forward angular momentum in kg m²/s.
 const FLIP: Tolerance = Tolerance::at_least(5.0).linear(2.5, 0.0);
 
-/// The reward and the indices of the domain's elements.
+/// The reward and the indices of the domain's elements in the model.
 pub struct Hopper {
     reward: RewardFn<Self>,
     torso: usize,
@@ -42,12 +42,12 @@ impl Hopper {
         centres[self.torso][2] - centres[self.foot][2]
     }
 
-    /// Standing and moving at a speed.
+    /// The reward for standing and moving at a speed (m/s).
     fn hop(&self, physics: &Physics, speed: Tolerance) -> f64 {
         STANDING.of(self.height(physics)) * speed.of(self.speed(physics))
     }
 
-    /// Standing with small controls.
+    /// The reward for standing with small controls.
     fn stand(&self, physics: &Physics) -> f64 {
         let standing = STANDING.of(self.height(physics));
         let small_control = mean(Tolerance::within(0.0, 0.0).quadratic(1.0), physics.data().ctrl());

@@ -15,11 +15,11 @@ use swm_core::{EnvEntry, Factor, Result, Rng};
 /// The registry row of this domain.
 pub const ENTRY: EnvEntry = entry::<Humanoid>(&[]);
 
-/// Head height, in metres.
+/// Indicator of standing, by the height of the head in metres.
 const STANDING: Tolerance = Tolerance::at_least(1.4).gaussian(0.35);
-/// Vertical component of the torso's z-axis.
+/// Indicator of an upright torso, by the vertical component of its z-axis.
 const UPRIGHT: Tolerance = Tolerance::at_least(0.9).linear(1.9, 0.0);
-/// Elements of `qpos` for position and orientation of the root body.
+/// The number of elements of `qpos` for position and orientation of the root body.
 const ROOT_LEN: usize = 7;
 
 /// The speed and the observation of a task.
@@ -31,7 +31,7 @@ pub struct Task {
     pure_state: bool,
 }
 
-/// The indices of the domain's elements.
+/// The task and the indices of the domain's elements in the model.
 pub struct Humanoid {
     task: Task,
     torso: usize,

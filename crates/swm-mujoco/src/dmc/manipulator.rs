@@ -1,5 +1,5 @@
-//! Manipulator: a planar arm with a hand brings a ball or a peg to a target, or inserts it
-//! (`dm_control/suite/manipulator.py`).
+//! Manipulator: a planar arm with a hand brings a ball or a peg to a target, or inserts the
+//! object into a receptacle (`dm_control/suite/manipulator.py`).
 
 use super::domain::{Domain, TaskTable, tasks};
 use super::measures::distance;
@@ -24,7 +24,7 @@ const ARM: [&str; 8] =
     ["arm_root", "arm_shoulder", "arm_elbow", "arm_wrist", "finger", "fingertip", "thumb", "thumbtip"];
 /// The touch sensors of the hand.
 const TOUCH: [&str; 5] = ["palm_touch", "finger_touch", "thumb_touch", "fingertip_touch", "thumbtip_touch"];
-/// The bodies that only some tasks use; the model of a task contains only those that the task uses.
+/// The bodies that only some tasks use. The model of a task lacks the bodies that the task does not use.
 const PROPS: [&str; 6] = ["ball", "target_ball", "cup", "peg", "target_peg", "slot"];
 /// Reward for the closeness of two sites, as a function of their distance in metres (`_CLOSE` of the suite).
 const CLOSE: Tolerance = Tolerance::within(0.0, 0.01).gaussian(0.02);
@@ -54,7 +54,7 @@ struct Peg {
     tip: [usize; 2],
 }
 
-/// The indices of the domain's elements.
+/// The task and the indices of the domain's elements in the model.
 pub struct Manipulator {
     task: Task,
     /// Index, `qpos` index and `qvel` index of each joint of [`ARM`].
@@ -74,7 +74,7 @@ pub struct Manipulator {
 
 impl Manipulator {
     /// The closeness of two sites: 1 up to a distance of 1 cm, falling towards 0 as the distance grows.
-    fn close(&self, physics: &Physics, [a, b]: [usize; 2]) -> f64 {
+    fn closeness(&self, physics: &Physics, [a, b]: [usize; 2]) -> f64 {
         let sites = physics.data().site_xpos();
         CLOSE.of(distance(sites[a], sites[b]))
     }
@@ -167,7 +167,7 @@ impl Domain for Manipulator {
 
     fn new(model: &MjModel, task: Task) -> Result<Self> {
         let index = ModelIndex(model);
-        let both = |joint: &str| Ok([index.qpos(joint)?, index.qvel(joint)?]);
+        let addresses = |joint: &str| Ok([index.qpos(joint)?, index.qvel(joint)?]);
         let mut arm = [[0; 3]; 8];
         for (indices, name) in arm.iter_mut().zip(ARM) {
             *indices = [index.joint(name)?, index.qpos(name)?, index.qvel(name)?];
@@ -176,7 +176,7 @@ impl Domain for Manipulator {
         for (sensor, name) in touch.iter_mut().zip(TOUCH) {
             *sensor = index.sensor(name)?;
         }
-        let joint = |axis: &str| both(&format!("{}_{axis}", task.object));
+        let joint = |axis: &str| addresses(&format!("{}_{axis}", task.object));
         let peg = match task.object {
             "peg" => Some(Peg {
                 grasp: [index.site("peg_grasp")?, index.site("grasp")?],
@@ -233,12 +233,12 @@ impl Domain for Manipulator {
     }
 
     fn reward(&self, physics: &Physics) -> f64 {
-        let brought = self.close(physics, self.object_and_target);
+        let brought = self.closeness(physics, self.object_and_target);
         match &self.peg {
             None => brought,
             Some(peg) => {
-                let held = f64::midpoint(self.close(physics, peg.grasp), self.close(physics, peg.pinch));
-                f64::midpoint(brought, self.close(physics, peg.tip)).max(held / 3.0)
+                let held = f64::midpoint(self.closeness(physics, peg.grasp), self.closeness(physics, peg.pinch));
+                f64::midpoint(brought, self.closeness(physics, peg.tip)).max(held / 3.0)
             }
         }
     }

@@ -2,7 +2,7 @@
 
 use crate::Physics;
 
-/// The distance of two points.
+/// The Euclidean distance of two points, in metres.
 pub fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
     norm(&[a[0] - b[0], a[1] - b[1], a[2] - b[2]])
 }

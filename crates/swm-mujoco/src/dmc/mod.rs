@@ -2,7 +2,7 @@
 //! reference adds.
 //!
 //! Each domain is one file: a [`Domain`](domain::Domain) with its tasks, factors, start, observation and rewards.
-//! `suite_env` makes an environment of it. Constants and formulas are those of `dm_control` 1.0.50
+//! `suite_env` runs a domain as an environment. Constants and formulas are those of `dm_control` 1.0.50
 //! (`dm_control/suite/`) and, for the added tasks, of TD-MPC2 and Newt (Hansen et al. 2024).
 
 mod acrobot;

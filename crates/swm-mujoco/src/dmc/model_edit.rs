@@ -6,7 +6,7 @@ use mujoco_rs::wrappers::mj_model::MjtGeomBase;
 use swm_core::{Error, FactorValues, Result};
 
 /// Edits a model's description. Arguments name elements of the model and keys of factors; values are rounded to single
-/// precision where those of the reference are. Every method fails if the model lacks the element.
+/// precision where the reference rounds them. Every method fails if the model lacks the element.
 pub struct ModelEdit<'a> {
     spec: &'a mut MjSpec,
     factors: &'a FactorValues,
@@ -17,7 +17,7 @@ fn missing(what: &str, name: &str) -> Error {
     Error::mismatch("editing a dm_control suite model", format!("no {what} '{name}'"), "the pinned files")
 }
 
-/// A colour in MuJoCo's form.
+/// Converts an RGB colour and an opacity to MuJoCo's RGBA.
 fn rgba(color: &[f64], alpha: f32) -> [f32; 4] {
     [color[0] as f32, color[1] as f32, color[2] as f32, alpha]
 }
@@ -33,7 +33,7 @@ impl<'a> ModelEdit<'a> {
         Self { spec, factors }
     }
 
-    /// Shrinks the textures that no factor changes to one pixel, so that generating them takes no time.
+    /// Shrinks the textures that no factor changes to one pixel, so that generating them takes little time.
     pub fn shrink_sky(&mut self) {
         for name in ["skybox", "background", "ball"] {
             if let Some(texture) = self.spec.texture_mut(name) {
@@ -50,15 +50,15 @@ impl<'a> ModelEdit<'a> {
         grid.rgb1_mut().copy_from_slice(&floor[..3]);
         grid.rgb2_mut().copy_from_slice(&floor[3..]);
         self.material_color("self", "agent.color", 1.0)?;
-        let part = self.spec.light_mut(light).ok_or_else(|| missing("light", light))?;
-        *part.diffuse_mut() = [self.factors.scalar("light.intensity") as f32; 3];
+        let light = self.spec.light_mut(light).ok_or_else(|| missing("light", light))?;
+        *light.diffuse_mut() = [self.factors.scalar("light.intensity") as f32; 3];
         Ok(())
     }
 
     /// Sets the colour of a material.
     pub fn material_color(&mut self, material: &str, key: &str, alpha: f32) -> Result<()> {
-        let part = self.spec.material_mut(material).ok_or_else(|| missing("material", material))?;
-        *part.rgba_mut() = rgba(self.factors.get(key), alpha);
+        let material = self.spec.material_mut(material).ok_or_else(|| missing("material", material))?;
+        *material.rgba_mut() = rgba(self.factors.get(key), alpha);
         Ok(())
     }
 
@@ -82,28 +82,28 @@ impl<'a> ModelEdit<'a> {
     /// Sets the shape of the site `target`: a box or a sphere with this half side or radius, in metres.
     pub fn target_site(&mut self, size: f64) -> Result<()> {
         let (shape, sizes) = self.target_shape();
-        let part = self.spec.site_mut("target").ok_or_else(|| missing("site", "target"))?;
-        part.set_type(shape);
-        part.size_mut()[..sizes].fill(single(size));
+        let site = self.spec.site_mut("target").ok_or_else(|| missing("site", "target"))?;
+        site.set_type(shape);
+        site.size_mut()[..sizes].fill(single(size));
         Ok(())
     }
 
     /// Sets the shape of a target that is a geom, with this half side or radius in metres.
     pub fn target_geom(&mut self, geom: &str, size: f64) -> Result<()> {
         let (shape, sizes) = self.target_shape();
-        let part = self.geom(geom)?;
-        part.set_type(shape);
-        part.size_mut()[..sizes].fill(single(size));
+        let geom = self.geom(geom)?;
+        geom.set_type(shape);
+        geom.size_mut()[..sizes].fill(single(size));
         Ok(())
     }
 
     /// Sets shape and colour of a target that is a region, with its half sizes in metres.
     pub fn target_region(&mut self, site: &str, sizes: [f64; 3]) -> Result<()> {
         let ((shape, _), color) = (self.target_shape(), rgba(self.factors.get("target.color"), self.target_alpha()));
-        let part = self.spec.site_mut(site).ok_or_else(|| missing("site", site))?;
-        part.set_type(shape);
-        *part.size_mut() = sizes.map(single);
-        *part.rgba_mut() = color;
+        let site = self.spec.site_mut(site).ok_or_else(|| missing("site", site))?;
+        site.set_type(shape);
+        *site.size_mut() = sizes.map(single);
+        *site.rgba_mut() = color;
         Ok(())
     }
 
@@ -111,7 +111,7 @@ impl<'a> ModelEdit<'a> {
         self.spec.geom_mut(geom).ok_or_else(|| missing("geom", geom))
     }
 
-    /// Sets the density of a geom, in kg/m³. A geom with an explicit mass keeps it.
+    /// Sets the density of a geom, in kg/m³. The mass of a geom with an explicit mass does not change.
     pub fn density(&mut self, geom: &str, key: &str) -> Result<()> {
         let density = self.factors.scalar(key);
         self.geom(geom)?.set_density(density);
@@ -160,7 +160,7 @@ impl<'a> ModelEdit<'a> {
         Ok(())
     }
 
-    /// Sets the acceleration of gravity.
+    /// Sets the acceleration of gravity, in m/s².
     pub fn gravity(&mut self) {
         let gravity = ["gravity.x", "gravity.y", "gravity.z"].map(|key| self.factors.scalar(key));
         self.spec.option_mut().gravity = gravity;
@@ -169,8 +169,8 @@ impl<'a> ModelEdit<'a> {
     /// Sets the dry friction of a joint, in N m.
     pub fn joint_friction(&mut self, joint: &str, key: &str) -> Result<()> {
         let friction = self.factors.scalar(key);
-        let part = self.spec.joint_mut(joint).ok_or_else(|| missing("joint", joint))?;
-        part.set_frictionloss(friction);
+        let joint = self.spec.joint_mut(joint).ok_or_else(|| missing("joint", joint))?;
+        joint.set_frictionloss(friction);
         Ok(())
     }
 }

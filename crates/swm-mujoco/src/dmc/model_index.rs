@@ -4,16 +4,16 @@ use mujoco_rs::wrappers::MjModel;
 use mujoco_rs::wrappers::mj_model::MjtObjBase;
 use swm_core::{Error, Result};
 
-/// Looks up elements of a model by name. Every method fails if the model has no element of that name.
+/// Looks up elements of a model by name. Every method fails if the model has no element with this name.
 pub struct ModelIndex<'a>(pub &'a MjModel);
 
 impl ModelIndex<'_> {
-    fn id(&self, kind: MjtObjBase, what: &str, name: &str) -> Result<usize> {
+    fn id(&self, kind: MjtObjBase, kind_name: &str, name: &str) -> Result<usize> {
         self.0.name_to_id(kind, name).ok_or_else(|| {
             Error::mismatch(
                 "loading a dm_control suite model",
-                format!("no {what} '{name}'"),
-                format!("a {what} '{name}': `swm assets verify dm_control` checks the files"),
+                format!("no {kind_name} '{name}'"),
+                format!("a {kind_name} '{name}': `swm assets verify dm_control` checks the files"),
             )
         })
     }

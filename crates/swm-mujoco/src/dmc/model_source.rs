@@ -52,7 +52,7 @@ impl ModelSource {
     }
 }
 
-/// Removes the element of that tag and name, with its content, from MJCF text.
+/// Returns MJCF text without the element of the given tag and name.
 ///
 /// # Errors
 /// When there is no such element.
@@ -84,10 +84,15 @@ mod tests {
     #[test]
     fn removes_elements_with_their_content() {
         let text = r#"<w><body name="a"><body name="b"><geom/></body><body name="c"/><body name="d"></body></body><body name="e"/></w>"#;
-        let rest = |tag, name| without_element(text, tag, name).expect("the element exists");
-        assert_eq!(rest("body", "a"), r#"<w><body name="e"/></w>"#);
-        assert_eq!(rest("body", "e"), text.replace(r#"<body name="e"/>"#, ""));
-        assert_eq!(rest("body", "b"), text.replace(r#"<body name="b"><geom/></body>"#, ""));
-        assert!(without_element(text, "body", "z").expect_err("no such element").to_string().contains("body 'z'"));
+        let without = |tag, name| without_element(text, tag, name).expect("removing an element");
+        assert_eq!(without("body", "a"), r#"<w><body name="e"/></w>"#);
+        assert_eq!(without("body", "e"), text.replace(r#"<body name="e"/>"#, ""));
+        assert_eq!(without("body", "b"), text.replace(r#"<body name="b"><geom/></body>"#, ""));
+        assert!(
+            without_element(text, "body", "z")
+                .expect_err("removing a missing element")
+                .to_string()
+                .contains("body 'z'")
+        );
     }
 }

@@ -18,7 +18,7 @@ pub const ENTRY: EnvEntry = entry::<Pendulum>(&[]);
 /// Deviation from the vertical that counts as upright, in radians (8 degrees).
 const UPRIGHT_ANGLE: f64 = 8.0 * std::f64::consts::PI / 180.0;
 
-/// The index of the pole's body.
+/// The pendulum domain: the index of the pole's body in the model.
 pub struct Pendulum {
     pole: usize,
 }

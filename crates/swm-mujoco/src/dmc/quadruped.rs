@@ -20,16 +20,16 @@ use swm_core::{EnvEntry, Error, Factor, Result, Rng};
 /// The registry row of this domain.
 pub const ENTRY: EnvEntry = entry::<Quadruped>(&[]);
 
-/// Vertical component of the torso's z-axis.
+/// Indicator of an upright torso, by the vertical component of its z-axis.
 const UPRIGHT: Tolerance = Tolerance::at_least(1.0).linear(2.0, 0.0);
-/// Elements of `qpos` for position and orientation of the torso.
+/// The number of elements of `qpos` for position and orientation of the torso.
 const ROOT_LEN: usize = 7;
-/// Difference of the heights at which a start is tried, in metres.
+/// The step between the heights at which a start is tried, in metres.
 const HEIGHT_STEP: f64 = 0.01;
-/// Heights at which a start is tried.
+/// The maximal number of heights at which a start is tried.
 const HEIGHT_TRIES: u32 = 10_000;
 
-/// The task.
+/// A task of the quadruped domain.
 #[derive(Clone, Copy)]
 pub enum Task {
     /// Move forward at this speed, in m/s.
@@ -49,7 +49,7 @@ struct Fetch {
     floor: usize,
 }
 
-/// The indices of the domain's elements.
+/// The task and the indices of the domain's elements in the model.
 pub struct Quadruped {
     task: Task,
     torso: usize,
@@ -69,8 +69,8 @@ impl Quadruped {
         std::array::from_fn(|axis| physics.data().sensordata()[self.velocimeter + axis])
     }
 
-    /// Puts the robot at a horizontal position (m), at the lowest height where nothing is in contact.
-    fn put_above_floor(&self, physics: &mut Physics, [x, y]: [f64; 2], quat: [f64; 4]) -> Result<()> {
+    /// Places the robot at a horizontal position (m), at the lowest height without contacts.
+    fn place_above_floor(&self, physics: &mut Physics, [x, y]: [f64; 2], quat: [f64; 4]) -> Result<()> {
         for i in 0..HEIGHT_TRIES {
             let root = &mut physics.data_mut().qpos_mut()[..ROOT_LEN];
             root[..3].copy_from_slice(&[x, y, f64::from(i) * HEIGHT_STEP]);
@@ -127,7 +127,7 @@ impl Domain for Quadruped {
 
     fn edit(edit: &mut ModelEdit<'_>, task: Task) -> Result<()> {
         if let Task::Move(speed) = task {
-            // The distance of 20 seconds at this speed, as in the suite.
+            // Half a side is the distance covered in 20 seconds at this speed, as in the suite.
             edit.floor_size("floor", 20.0 * speed)?;
         }
         edit.common("light")?;
@@ -140,8 +140,8 @@ impl Domain for Quadruped {
     fn new(model: &MjModel, task: Task) -> Result<Self> {
         let index = ModelIndex(model);
         let joints = (0..model.jnt_type().len()).filter(|&joint| model.jnt_type()[joint] == mjtJoint::mjJNT_HINGE);
-        let values_of = |wanted: [mjtSensor; 2]| {
-            let sensors = model.sensor_type().iter().enumerate().filter(|(_, kind)| wanted.contains(kind));
+        let values_of = |kinds: [mjtSensor; 2]| {
+            let sensors = model.sensor_type().iter().enumerate().filter(|(_, kind)| kinds.contains(kind));
             let ranges =
                 sensors.map(|(sensor, _)| (model.sensor_adr()[sensor] as usize, model.sensor_dim()[sensor] as usize));
             ranges.flat_map(|(begin, n)| begin..begin + n).collect()
@@ -175,13 +175,13 @@ impl Domain for Quadruped {
         let Some(fetch) = &self.fetch else {
             let quat: [f64; 4] = std::array::from_fn(|_| rng.sample(StandardNormal));
             let length = norm(&quat);
-            return self.put_above_floor(physics, [0.0; 2], quat.map(|value| value / length));
+            return self.place_above_floor(physics, [0.0; 2], quat.map(|value| value / length));
         };
         let (sin, cos) = (rng.random_range(0.0..2.0 * PI) / 2.0f64).sin_cos();
         let radius = 0.9 * physics.model().geom_size()[fetch.floor][0];
         let mut coordinate = || rng.random_range(-radius..radius);
         let (robot, ball) = ([coordinate(), coordinate()], [coordinate(), coordinate()]);
-        self.put_above_floor(physics, robot, [cos, 0.0, 0.0, sin])?;
+        self.place_above_floor(physics, robot, [cos, 0.0, 0.0, sin])?;
         let data = physics.data_mut();
         data.qpos_mut()[fetch.ball_position..][..3].copy_from_slice(&[ball[0], ball[1], 2.0]);
         for speed in &mut data.qvel_mut()[fetch.ball_velocity..][..2] {

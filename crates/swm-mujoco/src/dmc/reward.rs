@@ -12,7 +12,7 @@ enum Falloff {
     Quadratic,
 }
 
-/// 1 between two bounds, falling outside them.
+/// An indicator that is 1 between two bounds and falls outside them.
 #[derive(Clone, Copy, Debug)]
 pub struct Tolerance {
     low: f64,
@@ -22,17 +22,17 @@ pub struct Tolerance {
 }
 
 impl Tolerance {
-    /// 1 from `low` to `high` inclusive, 0 outside.
+    /// An indicator that is 1 from `low` to `high` inclusive, 0 outside.
     pub const fn within(low: f64, high: f64) -> Self {
         Self { low, high, margin: 0.0, falloff: Falloff::Gaussian }
     }
 
-    /// 1 from `low` upwards.
+    /// An indicator that is 1 from `low` upwards, 0 below.
     pub const fn at_least(low: f64) -> Self {
         Self::within(low, f64::INFINITY)
     }
 
-    /// 1 up to `high`.
+    /// An indicator that is 1 up to `high`, 0 above.
     pub const fn at_most(high: f64) -> Self {
         Self::within(f64::NEG_INFINITY, high)
     }
@@ -63,7 +63,8 @@ impl Tolerance {
         if self.margin == 0.0 {
             return 0.0;
         }
-        let distance = if x < self.low { self.low - x } else { x - self.high } / self.margin;
+        let outside = if x < self.low { self.low - x } else { x - self.high };
+        let distance = outside / self.margin;
         match self.falloff {
             Falloff::Gaussian => {
                 let scaled = distance * (-2.0 * 0.1f64.ln()).sqrt();

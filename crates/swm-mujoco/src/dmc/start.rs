@@ -7,7 +7,7 @@ use rand::Rng as _;
 use std::f64::consts::PI;
 use swm_core::{Error, Result, Rng};
 
-/// Starts drawn before [`sample_without_contacts`] fails.
+/// The number of starts that [`sample_without_contacts`] draws before it fails.
 const START_TRIES: usize = 1000;
 
 /// Randomises every joint: limited joints within their limits, unlimited hinges over the full circle, free bodies in
@@ -47,7 +47,7 @@ pub fn randomize_limited_joints(physics: &mut Physics, rng: &mut Rng) {
     }
 }
 
-/// Draws starts until one has no contacts.
+/// Draws starts until a start has no contacts.
 ///
 /// # Errors
 /// When every drawn start has contacts.

@@ -1,4 +1,4 @@
-//! The environment of any [`Domain`]: [`SuiteTask`] runs it in the shared MuJoCo environment.
+//! [`SuiteTask`]: runs a task of any [`Domain`] in [`MujocoEnv`], the environment shared by all families.
 
 use super::domain::Domain;
 use super::goal::GoalCoordinates;
@@ -28,7 +28,7 @@ const MAX_OBSERVATION: usize = 256;
 const START_TRIES: u64 = 10;
 /// The maximal number of random walks that are tried to find a goal.
 const GOAL_TRIES: u64 = 32;
-/// Actions of a random walk.
+/// The range of the number of actions of a random walk.
 const GOAL_STEPS: RangeInclusive<usize> = 5..=25;
 
 // Indices of the columns.
@@ -73,12 +73,12 @@ pub const fn entry<D: Domain>(experts: &'static [ExpertEntry]) -> EnvEntry {
 /// # Errors
 /// When MuJoCo or the models of the suite are not installed.
 fn make<D: Domain>(choice: &EnvChoice) -> Result<Box<dyn Env>> {
-    let (spec, model, task) = parts::<D>(choice)?;
+    let (spec, model, task) = env_arguments::<D>(choice)?;
     Ok(Box::new(MujocoEnv::new(spec, model, task)?))
 }
 
-/// The arguments of [`MujocoEnv::new`].
-pub(super) fn parts<D: Domain>(choice: &EnvChoice) -> Result<(EnvSpec, Arc<MjModel>, SuiteTask<D>)> {
+/// Returns the arguments of [`MujocoEnv::new`]: specification, compiled model and task.
+pub(super) fn env_arguments<D: Domain>(choice: &EnvChoice) -> Result<(EnvSpec, Arc<MjModel>, SuiteTask<D>)> {
     let name = choice.choices.get("task");
     let task = D::TASKS.get(name);
     let source = ModelSource::read(D::MODEL, |text| D::prepare_xml(text, task))?;
@@ -93,7 +93,7 @@ pub(super) fn parts<D: Domain>(choice: &EnvChoice) -> Result<(EnvSpec, Arc<MjMod
     let mut row = [0.0; MAX_OBSERVATION];
     let mut observation = ObservationWriter::new(&mut row);
     domain.observe(&physics, &mut observation);
-    let observed = observation.written();
+    let observation_len = observation.written();
     let mut target = vec![0.0; D::TARGET_LEN];
     domain.target(&physics, &mut target);
 
@@ -101,7 +101,7 @@ pub(super) fn parts<D: Domain>(choice: &EnvChoice) -> Result<(EnvSpec, Arc<MjMod
     let control_ranges = model.actuator_ctrlrange().to_vec();
     let mut columns = vec![
         ColumnSpec::new(columns::GOAL_STATE, DType::Float64, [nq + nv]),
-        ColumnSpec::new("observation", DType::Float32, [observed]),
+        ColumnSpec::new("observation", DType::Float32, [observation_len]),
         ColumnSpec::new("qpos", DType::Float64, [nq]),
         ColumnSpec::new("qvel", DType::Float64, [nv]),
         ColumnSpec::new("score", DType::Float64, []),
@@ -110,7 +110,7 @@ pub(super) fn parts<D: Domain>(choice: &EnvChoice) -> Result<(EnvSpec, Arc<MjMod
         1 => ColumnSpec::new(column.name, DType::Float64, []),
         len => ColumnSpec::new(column.name, DType::Float64, [len]),
     }));
-    let unbounded = Space::uniform_box([observed], DType::Float32, f64::NEG_INFINITY, f64::INFINITY);
+    let unbounded = Space::uniform_box([observation_len], DType::Float32, f64::NEG_INFINITY, f64::INFINITY);
     let spec = EnvSpec {
         id: choice.id(),
         action_space: Space::uniform_box([control_ranges.len()], DType::Float32, -1.0, 1.0),
@@ -127,7 +127,8 @@ pub(super) fn parts<D: Domain>(choice: &EnvChoice) -> Result<(EnvSpec, Arc<MjMod
 }
 
 impl<D: Domain> SuiteTask<D> {
-    /// Compiles the model for these factors. Without its sky, this is about 200 times faster.
+    /// Compiles the model for these factors. With a sky texture of one pixel (`sky` false), compilation is about 200
+    /// times faster.
     pub(super) fn compile(&self, factors: &FactorValues, sky: bool) -> Result<MjModel> {
         self.source.compile(factors, |edit| {
             if !sky {
@@ -157,7 +158,7 @@ impl<D: Domain> SuiteTask<D> {
     }
 
     /// Takes a random walk. Returns `qpos` and `qvel` of the first state after the drawn number of steps that is within
-    /// the joint limits and differs from the start; `None` if there is none.
+    /// the joint limits and differs from the start; `None` if the walk reaches no such state.
     fn random_walk(&self, physics: &mut Physics, rng: &mut Rng) -> Option<Vec<f64>> {
         let from = physics.data().qpos().to_vec();
         let (min_steps, mut hold) = (rng.random_range(GOAL_STEPS), 0);
@@ -174,25 +175,25 @@ impl<D: Domain> SuiteTask<D> {
             if physics.is_unstable() {
                 return None;
             }
-            let there = physics.data().qpos();
-            let is_new = || !self.coordinates.reached(&from, there, D::GOAL_TOLERANCE);
-            if step >= min_steps && self.coordinates.within_limits(there, D::GOAL_TOLERANCE / 2.0) && is_new() {
-                return Some([there, physics.data().qvel()].concat());
+            let qpos = physics.data().qpos();
+            let is_new = || !self.coordinates.reached(&from, qpos, D::GOAL_TOLERANCE);
+            if step >= min_steps && self.coordinates.within_limits(qpos, D::GOAL_TOLERANCE / 2.0) && is_new() {
+                return Some([qpos, physics.data().qvel()].concat());
             }
         }
         None
     }
 
-    /// Takes random walks until one leads to a new goal.
+    /// Takes random walks until a walk reaches a new goal.
     fn find_goal(&mut self, physics: &mut Physics, key: Key) -> Result<()> {
-        let mut here = vec![];
-        physics.save(&mut here);
+        let mut saved = vec![];
+        physics.save(&mut saved);
         for attempt in 0..GOAL_TRIES {
             if let Some(goal) = self.random_walk(physics, &mut key.at(attempt).rng()) {
                 self.goal = goal;
                 return Ok(());
             }
-            physics.load(&here)?;
+            physics.load(&saved)?;
         }
         Err(Error::Unsatisfiable {
             factor: "goal".to_owned(),
@@ -246,10 +247,10 @@ impl<D: Domain> Task for SuiteTask<D> {
         if self.domain.goal_qpos(physics, &mut self.goal[..nq]) && !self.is_success(physics) {
             return Ok(());
         }
-        let mut here = vec![];
-        physics.save(&mut here);
+        let mut saved = vec![];
+        physics.save(&mut saved);
         self.find_goal(physics, key.with("goal"))?;
-        physics.load(&here)
+        physics.load(&saved)
     }
 
     fn step(&mut self, physics: &mut Physics, action: &[f32]) -> StepOutcome {

@@ -16,24 +16,24 @@ use swm_core::{EnvEntry, Factor, Result, Rng};
 /// The registry row of this domain.
 pub const ENTRY: EnvEntry = entry::<Walker>(&[]);
 
-/// Height of a standing torso, in metres.
+/// Indicator of a standing walker, by the height of the torso in metres.
 const STANDING: Tolerance = Tolerance::at_least(1.2).gaussian(0.6);
-/// Height of a raised body in a pose, in metres.
+/// Indicator of a raised body in a pose, by its height in metres.
 const UP: Tolerance = Tolerance::at_least(1.0).gaussian(0.5);
-/// Height of a lying body, in metres.
+/// Indicator of a lying body, by its height in metres.
 const LYING: Tolerance = Tolerance::at_most(0.08).gaussian(0.04);
-/// Height of a foot on the ground in a pose, in metres.
+/// Indicator of a foot on the ground in a pose, by its height in metres.
 const FOOT_DOWN: Tolerance = Tolerance::at_most(0.08).gaussian(0.5);
-/// Height of raised feet, in metres.
+/// Indicator of raised feet, by their mean height in metres.
 const FEET_UP: Tolerance = Tolerance::at_least(1.1).gaussian(0.55);
 
-/// The reward and the indices of the domain's elements.
+/// The reward and the indices of the domain's elements in the model.
 pub struct Walker {
     reward: RewardFn<Self>,
     torso: usize,
-    /// Left and right.
+    /// Bodies of the left and the right foot.
     feet: [usize; 2],
-    /// Left and right.
+    /// Bodies of the left and the right thigh.
     thighs: [usize; 2],
     velocity: usize,
 }
@@ -49,7 +49,7 @@ impl Walker {
         physics.data().sensordata()[self.velocity]
     }
 
-    /// From 0 (upright) to 1 (upside down).
+    /// The inclination of the torso: 0 upright, 1 upside down.
     fn upside_down(&self, physics: &Physics) -> f64 {
         f64::midpoint(1.0, -uprightness(physics, self.torso))
     }
@@ -59,12 +59,12 @@ impl Walker {
         (3.0 * STANDING.of(height(physics, self.torso)) + upright) / 4.0
     }
 
-    /// Standing and moving at a speed.
+    /// The reward for standing and moving at a speed (m/s).
     fn locomotion(&self, physics: &Physics, speed: Tolerance) -> f64 {
         self.stand(physics) * (5.0 * speed.of(self.speed(physics)) + 1.0) / 6.0
     }
 
-    /// Moving forward at `speed` m/s.
+    /// The reward for moving forward at `speed` m/s.
     fn forward(&self, physics: &Physics, speed: f64) -> f64 {
         self.locomotion(physics, Tolerance::at_least(speed).linear(speed / 2.0, 0.5))
     }

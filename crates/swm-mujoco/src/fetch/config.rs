@@ -26,12 +26,12 @@ pub struct TaskConfig {
     object: Option<[f64; 3]>,
     /// Whether the fingers stay closed (`block_gripper`).
     pub fingers_closed: bool,
-    /// Initial height of the gripper above the object's height, in metres (`gripper_extra_height`).
+    /// Offset added to the initial height of the gripper, in metres (`gripper_extra_height`).
     gripper_height: f64,
     /// Half the side of the square around the gripper in which the object starts, in metres (`obj_range`).
     pub object_range: f64,
-    /// Half the side of the square (without an object: cube) around the gripper in which goals are drawn, in metres
-    /// (`target_range`).
+    /// Half the side of the square around the gripper in which goals are drawn, in metres (`target_range`). Without an
+    /// object, the goals are drawn in a cube.
     pub target_range: f64,
     /// Offset of goals along `x`, in metres (`target_offset`).
     pub target_offset: f64,
@@ -122,11 +122,12 @@ impl TaskConfig {
         Ok(setup)
     }
 
+    /// Compiles the model and simulates the initial state.
     fn simulate_setup(&self) -> Result<Setup> {
         let folder = assets::path("gymnasium-robotics")?.join("gymnasium_robotics/envs/assets/fetch");
         let mut model = physics::compile_file(&folder.join(self.file))?;
-        // The weld holds the gripper at the mocap body itself, not at the relative pose of the model's reference
-        // configuration.
+        // The weld holds the gripper at the pose of the mocap body. The compiled model has the relative pose of its
+        // reference configuration.
         physics::edit_welds(&mut model, |data| data[..7].copy_from_slice(&[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]));
         // As in MuJoCo 3.3.2: one contact point per pair of meshes, and one constraint system, which decides when the
         // solver stops.

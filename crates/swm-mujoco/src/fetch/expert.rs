@@ -1,4 +1,4 @@
-//! Scripted experts for the four tasks: memoryless controllers on the columns `proprio` and `desired_goal`.
+//! Scripted experts for the four tasks: stateless controllers that read the columns `proprio` and `desired_goal`.
 
 use super::task::proprio_len;
 use swm_core::policy::Expert;
@@ -56,9 +56,9 @@ impl Expert for Controller {
                     goal,
                 }
             }
-            n => return Err(Error::mismatch("acting as Fetch's expert", format!("{n} values"), "a `proprio` column")),
+            n => return Err(Error::mismatch("controlling a Fetch robot", format!("{n} values"), "a `proprio` column")),
         };
-        action.copy_from_slice(&(self.0)(&inputs).map(|part| part.clamp(-1.0, 1.0)));
+        action.copy_from_slice(&(self.0)(&inputs).map(|value| value.clamp(-1.0, 1.0)));
         Ok(())
     }
 }
@@ -68,8 +68,8 @@ const STEP: f64 = 0.05;
 
 /// The action that moves the gripper towards a point, with a command for the fingers.
 fn move_to(inputs: &Inputs, target: Vec3, fingers: f64) -> [f64; 4] {
-    let part = |i: usize| (target[i] - inputs.gripper[i]) / STEP;
-    [part(0), part(1), part(2), fingers]
+    let displacement = |i: usize| (target[i] - inputs.gripper[i]) / STEP;
+    [displacement(0), displacement(1), displacement(2), fingers]
 }
 
 fn reach(inputs: &Inputs) -> [f64; 4] {
@@ -83,14 +83,14 @@ fn direction_and_distance(from: Vec3, to: Vec3) -> ([f64; 2], f64) {
     if length < 1e-9 { ([1.0, 0.0], 0.0) } else { ([x / length, y / length], length) }
 }
 
-/// The gripper's offset from the object along a horizontal direction and to the left of it, in metres.
+/// The gripper's offset from the object along a horizontal direction, and to the left of this direction, in metres.
 fn gripper_offset([x, y]: [f64; 2], inputs: &Inputs) -> (f64, f64) {
     let offset = [inputs.gripper[0] - inputs.object[0], inputs.gripper[1] - inputs.object[1]];
     (offset[0] * x + offset[1] * y, offset[1] * x - offset[0] * y)
 }
 
-/// Moves the gripper behind the object, `back` metres from its centre, and over the object where that is in the way.
-/// `None` when the gripper is behind the object.
+/// Moves the gripper at the given height (m) to a point `back` metres behind the object's centre. Above the object's
+/// height, the gripper can pass over the object. Returns `None` when the gripper is behind the object.
 fn move_behind(inputs: &Inputs, direction: [f64; 2], back: f64, height: f64) -> Option<[f64; 4]> {
     let (ahead, left) = gripper_offset(direction, inputs);
     let [x, y] = [0, 1].map(|i| inputs.object[i] - back * direction[i]);
@@ -126,8 +126,8 @@ fn slide(inputs: &Inputs) -> [f64; 4] {
     let (direction, remaining) = direction_and_distance(inputs.object, inputs.goal);
     let speed = inputs.velocity[0].hypot(inputs.velocity[1]);
     // The speed, in metres per action of 0.04 s, from which friction stops the puck at the goal: v² = 2 μ g d.
-    let wanted = (2.0 * 0.1 * 9.81 * remaining).sqrt() * 0.04;
-    if speed >= wanted || remaining < 0.02 {
+    let target_speed = (2.0 * 0.1 * 9.81 * remaining).sqrt() * 0.04;
+    if speed >= target_speed || remaining < 0.02 {
         let (ahead, _) = gripper_offset(direction, inputs);
         return if ahead > -0.15 { [-direction[0], -direction[1], 0.0, 0.0] } else { [0.0; 4] };
     }
@@ -137,7 +137,7 @@ fn slide(inputs: &Inputs) -> [f64; 4] {
         return action;
     }
     let (_, left) = gripper_offset(direction, inputs);
-    let command = wanted / STEP;
+    let command = target_speed / STEP;
     let to = [0, 1].map(|i| direction[i] * command - [-direction[1], direction[0]][i] * 2.0 * left / STEP);
     [to[0], to[1], (0.415 - inputs.gripper[2]) / STEP, 0.0]
 }
@@ -147,7 +147,7 @@ fn pick(inputs: &Inputs) -> [f64; 4] {
     let horizontal = offset[0].hypot(offset[1]);
     let (open, shut) = (1.0, -1.0);
     if horizontal < 0.02 && offset[2].abs() < 0.015 {
-        // The object is between the fingers, and grasped once the gap stops shrinking.
+        // The object is between the fingers, and is grasped when the gap is at most 6 cm.
         return if inputs.gap > 0.06 {
             move_to(inputs, inputs.object, shut)
         } else {
@@ -167,22 +167,22 @@ mod tests {
     use swm_core::{Action, Batch, EnvEntry, Key, ResetOptions, Schema, VariationRequest};
 
     /// Counts the seeds in `0..seeds` for which the goal is reached at the end of the episode.
-    fn solved(entry: &EnvEntry, seeds: u64, all: bool) -> u32 {
+    fn count_successes(entry: &EnvEntry, seeds: u64, all: bool) -> u32 {
         let vary = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
         let variation = if all { vary } else { VariationRequest::default() };
         let options = ResetOptions { variation, ..ResetOptions::default() };
-        let mut env = entry.env().expect("an environment");
-        let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("a schema"), 1);
+        let mut env = entry.env().expect("creating the environment");
+        let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("creating a schema"), 1);
         let mut count = 0;
         for seed in 0..seeds {
             let mut expert = (entry.experts[0].make)();
-            env.reset(seed, &options).expect("a reset");
+            env.reset(seed, &options).expect("resetting the environment");
             expert.begin(Key::new(seed));
             for _ in 0..env.spec().max_episode_steps {
                 env.observe(&mut row.row_mut(0));
                 let mut action = [0.0; 4];
-                expert.act(row.row(0), &mut action).expect("an action");
-                env.step(Action::Continuous(&action.map(|a| a as f32))).expect("a step");
+                expert.act(row.row(0), &mut action).expect("choosing an action");
+                env.step(Action::Continuous(&action.map(|a| a as f32))).expect("stepping the environment");
             }
             count += u32::from(env.is_success());
         }
@@ -193,17 +193,17 @@ mod tests {
     #[test]
     fn experts_reach_expected_success_rates() {
         let seeds: u64 = std::env::var("SEEDS").ok().and_then(|text| text.parse().ok()).unwrap_or(10);
-        // Minimum success in percent, with default factors and with all varied. Sliding the puck succeeds rarely.
-        let least = [("Reach", 95, 95), ("Push", 90, 80), ("Slide", 15, 0), ("PickAndPlace", 90, 80)];
-        for (entry, (name, usual, all)) in ENTRIES.iter().step_by(3).zip(least) {
+        // Minimum success rates in percent: with default factors, and with all factors varied.
+        let minimums = [("Reach", 95, 95), ("Push", 90, 80), ("Slide", 15, 0), ("PickAndPlace", 90, 80)];
+        for (entry, (name, default, all)) in ENTRIES.iter().step_by(3).zip(minimums) {
             assert!(entry.id.contains(name));
-            let reached = [solved(entry, seeds, false), solved(entry, seeds, true)];
+            let reached = [count_successes(entry, seeds, false), count_successes(entry, seeds, true)];
             #[allow(clippy::print_stderr, reason = "the table of the README")]
             {
                 eprintln!("{}: {} of {seeds}, {} with all factors varied", entry.id, reached[0], reached[1]);
             }
-            for (reached, least) in reached.into_iter().zip([usual, all]) {
-                assert!(u64::from(reached) * 100 >= least * seeds, "{}: {reached} of {seeds}", entry.id);
+            for (reached, minimum) in reached.into_iter().zip([default, all]) {
+                assert!(u64::from(reached) * 100 >= minimum * seeds, "{}: {reached} of {seeds}", entry.id);
             }
         }
     }

@@ -7,7 +7,7 @@ use mujoco_rs::wrappers::mj_model::MjtObjBase;
 use std::f64::consts::PI;
 use swm_core::{DType, Factor, FactorValues, Result, Space, VariationSpace};
 
-/// The factors of a task; those of the block only where there is one.
+/// The factors of a task, with the factors of the block if `block` is true.
 pub fn variation_space(block: bool) -> VariationSpace {
     let within = |shape: &[usize], low: &[f64], high: &[f64]| Space::Box {
         shape: shape.to_vec(),
@@ -16,14 +16,14 @@ pub fn variation_space(block: bool) -> VariationSpace {
         high: high.to_vec(),
     };
     let color = |key, default: [f64; 3]| Factor::new(key, within(&[3], &[0.0; 3], &[1.0; 3]), default);
-    let number = |key, low, high, default: f64| Factor::new(key, within(&[1], &[low], &[high]), [default]);
+    let scalar = |key, low, high, default: f64| Factor::new(key, within(&[1], &[low], &[high]), [default]);
     let mut all = vec![
         Factor::new("agent.start_position", within(&[2], &[1.25, 0.6], &[1.45, 0.9]), [1.3418, 0.7491]),
         color("background.color", [0.1; 3]),
     ];
     if block {
-        all.push(number("block.angle", -PI, PI, 0.0));
-        all.push(number("block.mass", 0.01, 50.0, 2.0));
+        all.push(scalar("block.angle", -PI, PI, 0.0));
+        all.push(scalar("block.mass", 0.01, 50.0, 2.0));
         all.push(Factor::new("block.start_position", within(&[2], &[1.15, 0.6], &[1.45, 0.9]), [1.3, 0.74]));
     }
     // Goals on the table: the height is that of a block's centre.
@@ -31,7 +31,7 @@ pub fn variation_space(block: bool) -> VariationSpace {
     all.extend([
         Factor::new("camera.angle_delta", within(&[1, 2], &[-10.0; 2], &[10.0; 2]), [0.0; 2]),
         Factor::new("goal.start_position", goal, [1.3, 0.74, 0.4247]),
-        number("light.intensity", 0.0, 1.0, 0.7),
+        scalar("light.intensity", 0.0, 1.0, 0.7),
         color("object.color", [0.8, 0.1, 0.1]),
         Factor::new("rendering.transparent_arm", Space::Discrete { n: 2, start: 0 }, [0.0]),
         color("table.color", [0.3; 3]),
@@ -86,12 +86,12 @@ impl FactorTargets {
             let factor = factors.factors().iter().find(|factor| factor.key == key);
             Some(factors.get(key)).filter(|value| factor.is_some_and(|factor| factor.init_value != *value))
         };
-        let single = |color: &[f64]| [color[0] as f32, color[1] as f32, color[2] as f32];
+        let rgb = |color: &[f64]| [color[0] as f32, color[1] as f32, color[2] as f32];
         for (key, geoms) in
             [("table.color", &self.tables), ("background.color", &self.floors), ("object.color", &self.objects)]
         {
             if let Some(color) = changed(key) {
-                geoms.iter().for_each(|&geom| physics.set_geom_color(geom, single(color)));
+                geoms.iter().for_each(|&geom| physics.set_geom_color(geom, rgb(color)));
             }
         }
         if let (Some(color), Some(skybox)) = (changed("background.color"), self.skybox) {
@@ -101,7 +101,7 @@ impl FactorTargets {
             let channels = usize::try_from(model.tex_nchannel()[skybox]).unwrap_or(3);
             let bytes = begin..begin + usize::try_from(pixels).unwrap_or(0) * channels;
             for pixel in model.tex_data_mut()[bytes].chunks_exact_mut(channels) {
-                pixel.iter_mut().zip(color).for_each(|(byte, part)| *byte = (part * 255.0) as u8);
+                pixel.iter_mut().zip(color).for_each(|(byte, channel)| *byte = (channel * 255.0) as u8);
             }
             physics.mark_textures_edited();
         }

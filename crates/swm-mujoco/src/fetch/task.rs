@@ -15,10 +15,10 @@ use swm_core::{Error, FactorValues, Key, Result, Rng, RowMut, VariationRequest};
 /// Displacement of the gripper for an action of 1, in metres.
 const ACTION_SCALE: f32 = 0.05;
 
-/// Goals drawn by [`Task::sample_goal`] before it fails.
+/// The number of goals that [`Task::sample_goal`] draws before it fails.
 const GOAL_TRIES: usize = 256;
 
-/// Actions that move the gripper to a goal, to obtain a pose there.
+/// The number of actions that move the gripper to a goal to obtain the goal pose.
 const GOAL_POSE_STEPS: usize = 25;
 
 type Vec3 = [f64; 3];
@@ -41,7 +41,7 @@ pub enum ObservationKind {
     Dict,
 }
 
-/// A Fetch task on its model.
+/// A Fetch task, with the indices of its elements in the model.
 pub struct Fetch {
     config: &'static TaskConfig,
     reward: Reward,
@@ -56,7 +56,7 @@ pub struct Fetch {
     target: usize,
     /// Index of the body that the mocap body moves.
     hand: usize,
-    /// Indices of the fingers in `qpos` and `qvel`, the right one first.
+    /// Indices of the finger joints in `qpos` and `qvel`, the right finger first.
     fingers: [(usize, usize); 2],
     /// Index of the object's free joint in `qpos`.
     object_qpos: usize,
@@ -64,7 +64,7 @@ pub struct Fetch {
     goal: Vec3,
     /// `qpos` and `qvel` of a pose at the goal.
     goal_pose: Vec<f64>,
-    /// Whether the reset requested each of [`START_FACTORS`]; those not requested are drawn.
+    /// Whether the reset requested each of [`START_FACTORS`]; factors that are not requested are drawn.
     requested: [bool; 3],
 }
 
@@ -112,7 +112,7 @@ impl Fetch {
         })
     }
 
-    /// The position of the object, or of the gripper if there is none.
+    /// The position (m) of the object, or of the gripper in a task without an object.
     fn achieved(&self, physics: &Physics) -> Vec3 {
         physics.data().site_xpos()[self.object.unwrap_or(self.gripper)]
     }
@@ -121,7 +121,7 @@ impl Fetch {
         distance(self.achieved(physics), self.goal)
     }
 
-    /// Sets the goal and finds a pose where it is reached. Changes the state of the physics.
+    /// Sets the goal and finds a pose at which the goal is reached. Changes the state of the physics.
     fn set_goal(&mut self, physics: &mut Physics, goal: Vec3) {
         self.goal = goal;
         if self.object.is_some() {
@@ -137,14 +137,14 @@ impl Fetch {
         self.store_goal_pose(physics);
     }
 
-    /// Stores the present pose as the one at the goal.
+    /// Stores the present pose as the goal pose.
     fn store_goal_pose(&mut self, physics: &Physics) {
         self.goal_pose.clear();
         self.goal_pose.extend(physics.data().qpos());
         self.goal_pose.extend(physics.data().qvel());
     }
 
-    /// Draws a goal around a point.
+    /// Draws a goal around a point, in metres.
     fn draw_goal(&self, around: Vec3, rng: &mut Rng) -> Vec3 {
         let range = self.config.target_range;
         let mut goal = around.map(|x| x + rng.random_range(-range..=range));
@@ -158,7 +158,8 @@ impl Fetch {
         goal
     }
 
-    /// The point around which objects and goals are drawn: the factor if it was changed, otherwise the gripper.
+    /// The point (m) around which objects and goals are drawn: the factor `agent.start_position` if it differs from its
+    /// default, otherwise the gripper's position.
     fn draw_center(&self, factors: &FactorValues) -> Vec3 {
         let given = factors.get("agent.start_position");
         let factor = factors.factors().iter().find(|factor| factor.key == "agent.start_position");
@@ -198,27 +199,27 @@ impl Fetch {
         let gripper = data.site_xpos()[self.gripper];
         let gripper_velocity = scaled(physics.site_velocity(self.gripper).0);
         let mut next = 0;
-        let mut put = |values: &[f64]| {
+        let mut append = |values: &[f64]| {
             into[next..next + values.len()].copy_from_slice(values);
             next += values.len();
         };
-        put(&gripper);
+        append(&gripper);
         let fingers = self.fingers.map(|(at, _)| data.qpos()[at]);
         if let Some(object) = self.object {
             let at = data.site_xpos()[object];
             let (linear, angular) = physics.site_velocity(object);
             let linear = scaled(linear);
-            put(&at);
-            put(&std::array::from_fn::<_, 3, _>(|i| at[i] - gripper[i]));
-            put(&fingers);
-            put(&euler(&data.site_xmat()[object]));
-            put(&std::array::from_fn::<_, 3, _>(|i| linear[i] - gripper_velocity[i]));
-            put(&scaled(angular));
+            append(&at);
+            append(&std::array::from_fn::<_, 3, _>(|i| at[i] - gripper[i]));
+            append(&fingers);
+            append(&euler(&data.site_xmat()[object]));
+            append(&std::array::from_fn::<_, 3, _>(|i| linear[i] - gripper_velocity[i]));
+            append(&scaled(angular));
         } else {
-            put(&fingers);
+            append(&fingers);
         }
-        put(&gripper_velocity);
-        put(&self.fingers.map(|(_, at)| data.qvel()[at] * dt));
+        append(&gripper_velocity);
+        append(&self.fingers.map(|(_, at)| data.qvel()[at] * dt));
     }
 }
 
@@ -264,7 +265,7 @@ impl Task for Fetch {
         data.qvel_mut().copy_from_slice(&self.setup.qvel);
         if self.object.is_some() {
             let range = self.config.object_range;
-            // At least 10 cm from the gripper, which may touch the table.
+            // The object starts at least 10 cm from the gripper, which may be at the object's height.
             let drawn = loop {
                 let away = [0, 1].map(|_| rng.random_range(-range..=range));
                 if away[0].hypot(away[1]) >= 0.1 {
@@ -367,7 +368,7 @@ impl Task for Fetch {
         let mut rng = key.rng();
         let at = self.achieved(physics);
         let goals = (0..GOAL_TRIES).map(|_| self.draw_goal(self.setup.gripper, &mut rng));
-        // Twice the tolerance, so that the goal is not reached by accident.
+        // At a distance of twice the tolerance, a small disturbance does not reach the goal.
         let goal = goals.into_iter().find(|&goal| distance(goal, at) > 2.0 * GOAL_TOLERANCE);
         let goal = goal.ok_or_else(|| Error::Unsatisfiable {
             factor: "goal".to_owned(),
@@ -380,7 +381,7 @@ impl Task for Fetch {
 
     fn move_to_goal(&mut self, physics: &mut Physics) {
         let set = physics.set_pose(&self.goal_pose);
-        debug_assert!(set.is_ok(), "a pose of this model");
+        debug_assert!(set.is_ok(), "the goal pose is invalid for this model");
     }
 
     fn is_success(&self, physics: &Physics) -> bool {

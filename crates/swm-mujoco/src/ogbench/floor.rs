@@ -22,13 +22,13 @@ fn texture_range(model: &mujoco_rs::wrappers::MjModel, texture: usize) -> (Range
     (from..from + 3 * width * height, width, height)
 }
 
-/// Sets the two colours of the floor. Texels of other colours, such as a cross, stay.
+/// Sets the two colours of the floor. Texels of other colours, such as a cross, do not change.
 ///
 /// # Shapes
 /// `colors`: `[2, 3]`, from 0 to 1.
 ///
 /// # Errors
-/// When the model has no such floor.
+/// When the model has no texture `grid`.
 pub fn set_colors(physics: &mut Physics, colors: &[f64]) -> Result<()> {
     let texture = find(physics.model(), mjOBJ_TEXTURE, "grid")?;
     let swaps = [(bytes(&COLORS[0]), bytes(&colors[..3])), (bytes(&COLORS[1]), bytes(&colors[3..]))];
@@ -43,7 +43,7 @@ pub fn set_colors(physics: &mut Physics, colors: &[f64]) -> Result<()> {
     Ok(())
 }
 
-/// Encodes the position on the floor in its colour: red increases with the rows, green with the columns.
+/// Encodes each position on the floor in its colour: red increases with the row of the texel, green with the column.
 pub fn encode_position(physics: &mut Physics, texture: usize) {
     const BRIGHTEST: usize = 192;
     let model = physics.model_mut();

@@ -34,7 +34,7 @@ pub const ENTRIES: [EnvEntry; 3] = [
     },
 ];
 
-/// The compiled models of these environments by name, to compare them with those of the reference.
+/// The compiled models of these environments by name, for a comparison with the models of the reference.
 pub fn models() -> impl Iterator<Item = (String, Result<Arc<MjModel>>)> {
     table::models().chain(maze::models())
 }

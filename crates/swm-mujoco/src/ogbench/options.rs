@@ -1,9 +1,9 @@
-//! Options of both table and maze environments.
+//! Options that table and maze environments have in common.
 
 use swm_core::columns;
 use swm_core::registry::EnvOption;
 
-/// The value of `ob_type` for agents that observe frames: the name of their column.
+/// The value of `ob_type` for agents that observe frames, which is the name of the frame column.
 pub const PIXELS: &str = columns::PIXELS;
 
 /// Whether an episode terminates at its goal.

@@ -9,7 +9,8 @@ use std::sync::{Arc, Mutex, PoisonError, Weak};
 /// Identifies the meshes and textures of a model, so that renderers can cache them between frames.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Appearance {
-    /// The compiled model that this model is a copy of. Models of one group have the same meshes and texture sizes.
+    /// The number of the compiled model that this model is a copy of. All copies have the same meshes and texture
+    /// sizes.
     pub group: u64,
     /// A hash of the content of each texture; 0 where the content is that of the compiled model.
     pub textures: Arc<[u64]>,
@@ -38,7 +39,7 @@ impl Appearance {
 
 /// The group number of a compiled model, unique while the process runs.
 fn group_of(original: &Arc<MjModel>) -> u64 {
-    /// The models that have a number. A weak pointer prevents the reuse of its address.
+    /// The compiled models by group number. While a weak pointer exists, no other model is allocated at its address.
     static GROUPS: Mutex<BTreeMap<u64, Weak<MjModel>>> = Mutex::new(BTreeMap::new());
     static NEXT: AtomicU64 = AtomicU64::new(0);
     let mut groups = GROUPS.lock().unwrap_or_else(PoisonError::into_inner);

@@ -36,10 +36,10 @@ pub fn compile_xml(label: &str, xml: &str, files: &[(&str, &[u8])]) -> Result<Mj
     MjModel::from_xml_vfs("model.xml", &vfs).map_err(|error| failed(&error))
 }
 
-/// Returns the model of that name, compiling it on the first call in this process.
+/// Returns the model with this name; the first call in this process compiles it.
 ///
 /// # Errors
-/// Those of `compile`.
+/// Returns the error of `compile`.
 pub fn shared_model(name: &str, compile: impl FnOnce() -> Result<MjModel>) -> Result<Arc<MjModel>> {
     static MODELS: Mutex<BTreeMap<String, Arc<MjModel>>> = Mutex::new(BTreeMap::new());
     let mut models = MODELS.lock().unwrap_or_else(PoisonError::into_inner);
@@ -62,7 +62,7 @@ pub(crate) fn edit_welds(model: &mut MjModel, edit: impl Fn(&mut [f64; mjNEQDATA
 /// The index of a named element of a model.
 ///
 /// # Errors
-/// When the model has no element of that kind and name.
+/// When the model has no element of this kind with this name.
 pub fn index_of(model: &MjModel, kind: MjtObjBase, name: &str) -> Result<usize> {
     model.name_to_id(kind, name).ok_or_else(|| {
         let known = (0..).map_while(|i| model.id_to_name(kind, i));

@@ -12,17 +12,16 @@ pub(crate) struct EqualityRow {
     pub kbip: [f64; 4],
     /// Constraint violation, in metres or radians.
     pub position: f64,
-    /// Violation from which the constraint acts, in metres or radians.
+    /// Violation at which the constraint begins to act, in metres or radians.
     pub margin: f64,
     /// Rate of the violation, in metres or radians per second.
     pub velocity: f64,
 }
 
-/// Replaces parts of every time step. Only for models without activations, flexes and tendons that use Euler
-/// integration.
+/// Replaces the contacts and the reference accelerations of equality constraints in every time step. Supports only
+/// models with Euler integration and without activations, flexes and tendons.
 pub(crate) trait StepHooks: Send + Sync {
-    /// Appends to `contacts` the contacts to simulate, given those that MuJoCo found; `found` is grouped by pair of
-    /// geoms.
+    /// Appends the contacts to simulate to `contacts`. `found` are MuJoCo's contacts, grouped by pair of geoms.
     fn replace_contacts(
         &self,
         model: &MjModel,

@@ -3,9 +3,9 @@
 //! A model is compiled once per process ([`shared_model`]) and copied for every environment. An environment edits its
 //! copy to apply factors of variation; [`Physics::restore_model`] undoes all edits.
 //!
-//! **Instability.** When a simulation diverges, MuJoCo resets the state and continues; on an internal error it would
-//! end the process. Both cases set [`Physics::is_unstable`] until the next reset, and the environment terminates the
-//! episode.
+//! **Instability.** When a simulation diverges, MuJoCo resets the state and continues. On an internal error, MuJoCo
+//! ends the process by default; this crate resets the state instead. Both cases set [`Physics::is_unstable`] until the
+//! next reset, and the environment terminates the episode.
 
 mod appearance;
 mod compile;

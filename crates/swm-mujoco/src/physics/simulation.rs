@@ -39,7 +39,7 @@ pub struct Physics {
     pub(super) hooks: Option<Arc<dyn StepHooks>>,
     /// Scratch memory for the contacts that the hooks return.
     pub(super) contacts: Vec<mjContact>,
-    /// Whether the model may differ from the original.
+    /// Whether the model may differ from `original`.
     edited: bool,
     appearance: Appearance,
     /// Whether the texture hashes of `appearance` may be out of date.
@@ -47,7 +47,7 @@ pub struct Physics {
 }
 
 impl Physics {
-    /// Copies a compiled model and puts it into its initial state.
+    /// Copies a compiled model and creates its initial state.
     ///
     /// # Errors
     /// When memory cannot be allocated.
@@ -105,7 +105,7 @@ impl Physics {
         }
         let original = std::ptr::from_ref(self.original.ffi());
         let (model, _) = self.pointers();
-        // SAFETY: both are valid models of equal sizes, and this `Physics` owns the destination.
+        // SAFETY: original and copy are valid models of equal sizes, and this `Physics` owns the copy.
         let copied = self.guarded("copying a model", || unsafe { ffi::mj_copyModel(model, original) });
         debug_assert!(copied.is_some(), "models of equal sizes");
     }
@@ -164,13 +164,13 @@ impl Physics {
         let site = i32::try_from(site).unwrap_or(0);
         // SAFETY: both matrices have three rows of `nv` values, and the index is that of a site of this model.
         unsafe { mj_jacSite(self.model().ffi(), self.data.ffi(), linear.as_mut_ptr(), angular.as_mut_ptr(), site) };
-        let times = |matrix: &[f64]| {
+        let times_qvel = |matrix: &[f64]| {
             std::array::from_fn(|i| {
                 let row = &matrix[i * velocities.len()..(i + 1) * velocities.len()];
                 row.iter().zip(velocities).map(|(a, b)| a * b).sum()
             })
         };
-        (times(linear), times(angular))
+        (times_qvel(linear), times_qvel(angular))
     }
 
     /// Whether the simulation diverged or failed since the last reset.

@@ -5,7 +5,7 @@ use super::state_layout::{STATE_FIELDS, check_finite, copy_state};
 use swm_core::{Error, Result};
 
 impl Physics {
-    /// The length of [`Physics::state`].
+    /// The length of the vector that [`Physics::state`] writes.
     pub fn state_len(&self) -> usize {
         self.source_state.len()
     }
@@ -21,7 +21,7 @@ impl Physics {
         copy_state(&self.data, into);
     }
 
-    /// Sets a state of [`Physics::state`] and computes the derived quantities.
+    /// Sets a state that [`Physics::state`] wrote and computes the derived quantities.
     ///
     /// # Errors
     /// When the length differs, or a value is not finite.
@@ -47,7 +47,7 @@ impl Physics {
         self.data.qpos().len() + self.data.qvel().len()
     }
 
-    /// Sets `qpos` and `qvel`, keeps the rest of the state, and computes the derived quantities.
+    /// Sets `qpos` and `qvel`, keeps the other fields of the state, and computes the derived quantities.
     ///
     /// # Errors
     /// When the length differs, or a value is not finite.
@@ -66,21 +66,20 @@ impl Physics {
         Ok(())
     }
 
-    /// The length of [`Physics::save`].
+    /// The number of values that [`Physics::save`] appends.
     pub fn saved_len(&self) -> usize {
         self.source_state.len() + 2
     }
 
     /// Appends the state and the kind of call that computed the derived quantities, so that [`Physics::load`] restores
-    /// both bit for bit.
+    /// the state and the derived quantities bit for bit.
     pub fn save(&self, into: &mut Vec<f64>) {
         into.push(f64::from(u8::from(self.unstable)));
         into.push(f64::from(self.derivation as u8));
         into.extend(&self.source_state);
     }
 
-    /// The state within the values that [`Physics::save`] wrote: the one from which the derived quantities were
-    /// computed.
+    /// The state in the values that [`Physics::save`] wrote, from which the derived quantities were computed.
     pub(crate) fn saved_state(saved: &[f64]) -> &[f64] {
         saved.get(2..).unwrap_or_default()
     }
@@ -91,12 +90,12 @@ impl Physics {
     /// When the values were not written by [`Physics::save`].
     pub fn load(&mut self, saved: &[f64]) -> Result<()> {
         let kinds = [Derivation::Forward, Derivation::ForwardPassive, Derivation::Step, Derivation::ControlStep];
-        let parts = saved.split_first_chunk::<2>();
-        let parts = parts.and_then(|(&[unstable, kind], state)| {
+        let split = saved.split_first_chunk::<2>();
+        let decoded = split.and_then(|(&[unstable, kind], state)| {
             let derivation = kinds.into_iter().find(|&known| f64::from(known as u8) == kind)?;
             Some((unstable != 0.0, derivation, state))
         });
-        let Some((unstable, derivation, state)) = parts else {
+        let Some((unstable, derivation, state)) = decoded else {
             return Err(Error::mismatch("restoring a MuJoCo state", format!("{saved:?}"), "values that `save` wrote"));
         };
         self.write_state(state)?;
@@ -124,15 +123,18 @@ mod tests {
     <actuator><general joint="hinge" dyntype="integrator"/><motor joint="hinge"/></actuator></mujoco>"#;
 
     #[test]
-    fn state_equals_mujocos_own() {
-        let model = compile_xml("a test's model", MODEL, &[]).expect("a model");
-        let mut physics = Physics::new(Arc::new(model)).expect("a state");
+    fn state_equals_that_of_mj_get_state() {
+        let model = compile_xml("a test's model", MODEL, &[]).expect("compiling the model");
+        let mut physics = Physics::new(Arc::new(model)).expect("allocating the state");
         physics.data_mut().ctrl_mut().copy_from_slice(&[0.5, -0.25]);
         physics.step(3);
         let (mut ours, mut theirs) = (vec![f64::NAN; physics.state_len()], vec![0.0; physics.state_len()]);
         physics.state(&mut ours);
         assert_eq!(physics.data().read_state_into(STATE_FIELDS, &mut theirs), ours.len());
         assert_eq!(ours, theirs);
-        assert!([1, 2].map(|from_end| ours[ours.len() - 7 - from_end]) == [1.0, 0.0], "the equalities: {ours:?}");
+        assert!(
+            [1, 2].map(|from_end| ours[ours.len() - 7 - from_end]) == [1.0, 0.0],
+            "`eq_active` must be 0, 1: {ours:?}"
+        );
     }
 }

@@ -1,4 +1,4 @@
-//! The layout of a state vector: which fields it has, and in which order.
+//! The layout of a state vector: its fields and their order.
 
 use mujoco_rs::mujoco_c::mjtState;
 use mujoco_rs::wrappers::{MjData, MjModel};
@@ -21,24 +21,24 @@ pub fn state_len(model: &MjModel) -> usize {
     model.state_size(STATE_FIELDS)
 }
 
-/// Copies the fields of [`STATE_FIELDS`]. MuJoCo's `mj_getState` visits every possible field, which in a small model
-/// takes 2 % of a step.
+/// Copies the fields of [`STATE_FIELDS`] to `into`. MuJoCo's `mj_getState` visits every possible field, which takes 2 %
+/// of a step of a small model.
 pub(super) fn copy_state(data: &MjData<Box<MjModel>>, into: &mut [f64]) {
     let mut rest = into;
-    let mut put = |values: &[f64]| {
-        let (here, after) = std::mem::take(&mut rest).split_at_mut(values.len());
-        here.copy_from_slice(values);
+    let mut append = |values: &[f64]| {
+        let (target, after) = std::mem::take(&mut rest).split_at_mut(values.len());
+        target.copy_from_slice(values);
         rest = after;
     };
-    put(&[data.time()]);
-    put(data.qpos());
-    put(data.qvel());
-    put(data.act());
-    put(data.qacc_warmstart());
-    put(data.ctrl());
-    data.eq_active().iter().for_each(|&active| put(&[f64::from(u8::from(active))]));
-    put(data.mocap_pos().as_flattened());
-    put(data.mocap_quat().as_flattened());
+    append(&[data.time()]);
+    append(data.qpos());
+    append(data.qvel());
+    append(data.act());
+    append(data.qacc_warmstart());
+    append(data.ctrl());
+    data.eq_active().iter().for_each(|&active| append(&[f64::from(u8::from(active))]));
+    append(data.mocap_pos().as_flattened());
+    append(data.mocap_quat().as_flattened());
 }
 
 /// Returns an error if a value is NaN or infinite. `what` names the vector in the error.

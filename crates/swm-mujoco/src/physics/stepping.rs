@@ -18,7 +18,7 @@ impl Physics {
         self.guarded("resetting", || unsafe { ffi::mj_resetData(model, data) });
     }
 
-    /// Computes everything derived from the state (`mj_forward`) without advancing time.
+    /// Computes all derived quantities (`mj_forward`) without advancing time.
     pub fn forward(&mut self) {
         self.set_derivation(Derivation::Forward);
         self.derive();
@@ -73,7 +73,7 @@ impl Physics {
         self.guarded("computing contact forces", || unsafe { ffi::mj_rnePostConstraint(model, data) });
     }
 
-    /// Stores the present state as the one from which `derivation` starts.
+    /// Stores the present state as the state from which `derivation` computes the derived quantities.
     pub(super) fn set_derivation(&mut self, derivation: Derivation) {
         copy_state(&self.data, &mut self.source_state);
         self.derivation = derivation;
@@ -116,7 +116,7 @@ impl Physics {
             ffi::mj_checkVel(model, data);
         })?;
         self.forward_with_hooks(&hooks)?;
-        // SAFETY: as above.
+        // SAFETY: model and data are valid and belong together; the calls are those of `mj_step`, in its order.
         self.guarded("stepping", || unsafe {
             ffi::mj_checkAcc(model, data);
             ffi::mj_Euler(model, data);
@@ -143,7 +143,7 @@ impl Physics {
         let found = unsafe { array((*data).contact, (*data).ncon) };
         hooks.replace_contacts(self.data.model(), poses, found, &mut self.contacts);
         let contacts = std::mem::take(&mut self.contacts);
-        // SAFETY: as for the first stages; the two helpers have the same requirements.
+        // SAFETY: model and data are valid and belong together, which the two helpers also require.
         let done = self.guarded("computing constraints", || unsafe {
             write_contacts(model, data, &contacts);
             ffi::mj_makeConstraint(model, data);
@@ -174,8 +174,8 @@ unsafe fn array<'a, T>(first: *const T, count: i32) -> &'a [T] {
     if first.is_null() || count == 0 { &[] } else { unsafe { std::slice::from_raw_parts(first, count) } }
 }
 
-/// Replaces the contacts that MuJoCo found. The first ones overwrite the found ones; MuJoCo allocates room for the
-/// rest.
+/// Replaces the contacts that MuJoCo found: overwrites as many as were found, and adds further contacts, for which
+/// MuJoCo allocates memory.
 ///
 /// # Safety
 /// Model and data must be valid and belong together.
@@ -183,12 +183,12 @@ unsafe fn write_contacts(model: *const mjModel, data: *mut mjData, contacts: &[m
     // SAFETY: guaranteed by the caller; `contact` has room for the `ncon` contacts that were found.
     unsafe {
         let found = usize::try_from((*data).ncon).unwrap_or(0);
-        let (fitting, more) = contacts.split_at(contacts.len().min(found));
-        for (i, contact) in fitting.iter().enumerate() {
+        let (overwriting, further) = contacts.split_at(contacts.len().min(found));
+        for (i, contact) in overwriting.iter().enumerate() {
             (*data).contact.add(i).write(contact.clone());
         }
-        (*data).ncon = i32::try_from(fitting.len()).unwrap_or(0);
-        for contact in more {
+        (*data).ncon = i32::try_from(overwriting.len()).unwrap_or(0);
+        for contact in further {
             ffi::mj_addContact(model, data, contact);
         }
     }

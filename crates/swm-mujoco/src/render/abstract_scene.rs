@@ -11,7 +11,7 @@ use mujoco_rs::wrappers::MjModel;
 use std::mem::MaybeUninit;
 use swm_core::Result;
 
-/// Geoms that a scene has room for in addition to those of the model.
+/// The number of geoms that a scene has room for in addition to the geoms and sites of the model.
 const EXTRA_GEOMS: usize = 1000;
 
 /// A scene with camera and options, reused from frame to frame.
@@ -29,14 +29,14 @@ impl AbstractScene {
     /// An empty scene for models of these sizes, with MuJoCo's default visual options.
     pub fn new(model: &MjModel) -> Self {
         let geoms = model.ffi().ngeom + model.ffi().nsite;
-        let room = usize::try_from(geoms).unwrap_or(0) + EXTRA_GEOMS;
+        let max_geoms = usize::try_from(geoms).unwrap_or(0) + EXTRA_GEOMS;
         let mut scene = Box::new_uninit();
         let (mut option, mut perturb, mut camera) =
             (MaybeUninit::uninit(), MaybeUninit::uninit(), MaybeUninit::uninit());
         // SAFETY: each function initialises its argument; the scene is set to defaults before it is allocated.
         unsafe {
             mjv_defaultScene(scene.as_mut_ptr());
-            mjv_makeScene(model.ffi(), scene.as_mut_ptr(), i32::try_from(room).unwrap_or(i32::MAX));
+            mjv_makeScene(model.ffi(), scene.as_mut_ptr(), i32::try_from(max_geoms).unwrap_or(i32::MAX));
             mjv_defaultOption(option.as_mut_ptr());
             mjv_defaultPerturb(perturb.as_mut_ptr());
             mjv_defaultCamera(camera.as_mut_ptr());

@@ -7,13 +7,13 @@ use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU8, Ordering};
 use swm_core::{Error, Result};
 
-/// Selects a renderer.
+/// A choice of renderer.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Choice {
     /// MuJoCo's renderer if there is a graphics card, otherwise the CPU renderer.
     #[default]
     Auto,
-    /// MuJoCo's renderer, in OpenGL through EGL: on a graphics card, or in Mesa's software, which is slow.
+    /// MuJoCo's OpenGL renderer through EGL: on a graphics card, or slowly in Mesa's software renderer.
     Egl,
     /// The CPU renderer of this project.
     Cpu,
@@ -32,7 +32,7 @@ impl std::str::FromStr for Choice {
     }
 }
 
-/// The choice of this process, as its discriminant.
+/// The discriminant of this process's choice.
 static PROCESS_CHOICE: AtomicU8 = AtomicU8::new(Choice::Auto as u8);
 
 thread_local! {
@@ -58,7 +58,7 @@ pub fn with<T>(choice: Choice, draw: impl FnOnce() -> T) -> T {
     draw()
 }
 
-/// The present choice.
+/// Returns the choice of this thread, otherwise that of this process.
 fn chosen() -> Choice {
     THREAD_CHOICE.get().unwrap_or_else(|| match PROCESS_CHOICE.load(Ordering::Relaxed) {
         chosen if chosen == Choice::Egl as u8 => Choice::Egl,

@@ -1,8 +1,8 @@
 //! Rendering of environments: RGB, depth and segmentation, through any camera, at any size, into the caller's buffer.
 //!
 //! An [`AbstractScene`] converts the state of an environment to MuJoCo's abstract scene (geoms, lights, cameras) on the
-//! thread that owns the environment. A [`Renderer`](renderer::Renderer) draws it: MuJoCo's own in OpenGL through EGL
-//! (`egl`), or this project's on the CPU (`cpu`). [`choose`] selects the renderer.
+//! thread that owns the environment. A [`Renderer`](renderer::Renderer) draws this scene: MuJoCo's OpenGL renderer
+//! through EGL (`egl`), or this project's CPU renderer (`cpu`). [`choose`] selects the renderer.
 
 mod abstract_scene;
 mod choice;

@@ -5,7 +5,7 @@ use mujoco_rs::mujoco_c::mjvScene;
 use mujoco_rs::wrappers::MjModel;
 use swm_core::Result;
 
-/// A viewpoint.
+/// The viewpoint of a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Camera {
     /// The free camera at the default pose of the model.
@@ -31,7 +31,7 @@ pub enum FrameBuffer<'a> {
     Rgb(&'a mut [u8]),
     /// Distance from the camera plane, in metres.
     Depth(&'a mut [f32]),
-    /// The index of the geom at each pixel, -1 where there is none.
+    /// The index of the geom at each pixel, -1 at pixels without a geom.
     Segmentation(&'a mut [i32]),
 }
 

@@ -1,4 +1,4 @@
-//! [`ImageSimilarity`]: compares rendered with recorded images; for tests.
+//! [`ImageSimilarity`]: compares rendered images with recorded images in tests.
 
 /// The mean absolute difference and the structural similarity (SSIM, Wang et al. 2004) of two RGB images.
 #[derive(Clone, Copy, Debug)]
@@ -32,10 +32,10 @@ impl ImageSimilarity {
                 for x in 0..width {
                     let pixel = 3 * (y * width + x) + channel;
                     let (p, q) = (f64::from(a[pixel]), f64::from(b[pixel]));
-                    let own = [p, q, p * p, q * q, p * q];
+                    let products = [p, q, p * p, q * q, p * q];
                     let index = (y + 1) * (width + 1) + x + 1;
                     sums[index] = std::array::from_fn(|k| {
-                        own[k] + sums[index - 1][k] + sums[index - width - 1][k] - sums[index - width - 2][k]
+                        products[k] + sums[index - 1][k] + sums[index - width - 1][k] - sums[index - width - 2][k]
                     });
                 }
             }
@@ -71,15 +71,19 @@ impl ImageSimilarity {
             let rows = recorded.chunks(3 * width).zip(rendered.chunks(3 * width)).zip(difference.chunks(3 * width));
             let sheet: Vec<u8> = rows.flat_map(|((a, b), c)| [a, b, c].concat()).collect();
             let file = std::path::Path::new(&folder).join(format!("{name}.png"));
-            let file = std::fs::File::create(file).expect("a file");
+            let file = std::fs::File::create(file).expect("creating the PNG file");
             let mut encoder = png::Encoder::new(file, 3 * width as u32, (rendered.len() / (3 * width)) as u32);
             encoder.set_color(png::ColorType::Rgb);
-            encoder.write_header().expect("a header").write_image_data(&sheet).expect("an image");
+            encoder
+                .write_header()
+                .expect("writing the PNG header")
+                .write_image_data(&sheet)
+                .expect("writing the PNG image");
         }
         similarity
     }
 
-    /// Whether the images are close enough for models trained on one renderer to work with the other.
+    /// Whether the images are close enough for models trained on one renderer to work with frames of another renderer.
     pub fn is_close(&self) -> bool {
         self.difference <= 6.0 && self.ssim >= 0.95
     }

@@ -2,11 +2,11 @@
 
     python export_dmc.py OUT [--seeds 1 2 3] [--steps 40] [--tasks hop walk …] [--domains Hopper …] [--no-frames]
 
-Needs `stable-worldmodel` 0.1.1 with `mujoco` 3.17.0 and `dm_control` 1.0.50. The layout is that of the shared golden files;
+Needs `stable-worldmodel` 0.1.1 with `mujoco` 3.17.0 and `dm_control` 1.0.50. The layout is that of `swm_conformance::golden`;
 each file also contains the name of the task (`task`) and the position of its target (`start.target`).
 
-The reference's environments have their own tasks and some of the suite's. The suite's other tasks are added to its environments
-here, with the same factors and the same action repeat.
+The reference has some tasks of the suite and tasks of its own. This script adds the remaining tasks of the suite to the reference's
+environments, with the factors and the action repeat of these environments.
 """
 
 import argparse
@@ -49,8 +49,8 @@ ADDED = {
     ("Manipulator", "insert_peg"): lambda: manipulator.Bring(use_peg=True, insert=True, fully_observable=True),
     ("Quadruped", "fetch"): lambda: quadruped.Fetch(),
 }
-# Environments of the reference without a `task` argument: their task is the first one above.
-ALONE = ["Acrobot", "BallInCup", "Cartpole", "Manipulator", "Pendulum"]
+# Environments of the reference without a `task` argument: their task is the first in `TASKS`.
+SINGLE_TASK = ["Acrobot", "BallInCup", "Cartpole", "Manipulator", "Pendulum"]
 START = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "eq_active", "time")
 
 
@@ -73,7 +73,7 @@ def own_model(domain, task):
 def make(domain, task):
     name = f"swm/{domain}DMControl-v0"
     if (domain, task) not in ADDED:
-        return gym.make(name, **({} if domain in ALONE else {"task": task})).unwrapped
+        return gym.make(name, **({} if domain in SINGLE_TASK else {"task": task})).unwrapped
     env = gym.make(name).unwrapped
     inner = env.compile_model
 
@@ -84,7 +84,7 @@ def make(domain, task):
     if task in ("bring_peg", "insert_ball", "insert_peg", "fetch"):
         env._mjcf_model = own_model(domain, task)
         if "peg" in task:
-            # The reference edits the ball's target, which this model lacks: a dummy receives the edit.
+            # The reference edits the ball's target, which this model lacks, so a dummy object receives the edit.
             edit = env.modify_mjcf_model
 
             class WithBall:

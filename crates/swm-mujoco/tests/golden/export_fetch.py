@@ -1,9 +1,9 @@
-"""Records rollouts of the reference's Fetch environments in the layout of the shared golden files.
+"""Records rollouts of the reference's Fetch environments in the layout of `swm_conformance::golden`.
 
     python export_fetch.py FOLDER [SEED ...] [--steps N] [--factors KEY,KEY] [--no-frames]
 
-Needs stable-worldmodel, gymnasium-robotics 1.4.2 and mujoco 3.3.2. `--factors` lists factors by name: for `all`, the
-reference samples every factor but applies only `block.mass`.
+Needs stable-worldmodel, gymnasium-robotics 1.4.2 and mujoco 3.3.2. `--factors` lists the factors to vary; `each` stands
+for the names of all factors. For `all`, the reference samples every factor but applies only `block.mass`.
 """
 
 import argparse
@@ -19,23 +19,23 @@ TASKS = ["FetchReach-v3", "FetchPush-v3", "FetchSlide-v3", "FetchPickAndPlace-v3
 
 
 def factors(space):
-    """The value of every factor, nested as the space is."""
+    """Returns the values of all factors, nested like the space."""
     if hasattr(space, "spaces"):
-        return {key: factors(part) for key, part in space.spaces.items()}
+        return {key: factors(subspace) for key, subspace in space.spaces.items()}
     return np.asarray(space.value).tolist()
 
 
 def leaves(space, prefix=""):
-    for key, part in space.spaces.items():
+    for key, subspace in space.spaces.items():
         name = f"{prefix}{key}"
-        yield from leaves(part, name + ".") if hasattr(part, "spaces") else [name]
+        yield from leaves(subspace, name + ".") if hasattr(subspace, "spaces") else [name]
 
 
-def record(task, seed, steps, wanted, frames):
+def record(task, seed, steps, requested, frames):
     env = gym.make(f"swm/{task}", render_mode="rgb_array" if frames else None)
     data = env.unwrapped.data
     space = env.get_wrapper_attr("variation_space")
-    options = None if wanted is None else {"variation": list(leaves(space)) if wanted == ["each"] else wanted}
+    options = None if requested is None else {"variation": list(leaves(space)) if requested == ["each"] else requested}
     obs, info = env.reset(seed=seed, options=options)
     start = {key: np.array(getattr(data, key), dtype=np.float64) for key in
              ["qpos", "qvel", "mocap_pos", "mocap_quat", "qacc_warmstart", "eq_active"]}
@@ -74,11 +74,11 @@ def main():
     parser.add_argument("--factors")
     parser.add_argument("--no-frames", action="store_true")
     args = parser.parse_args()
-    wanted = args.factors.split(",") if args.factors else None
+    requested = args.factors.split(",") if args.factors else None
     for task in TASKS:
         for seed in args.seeds:
-            kind = "default" if wanted is None else "all" if wanted == ["all"] else "each"
-            arrays = record(task, seed, args.steps, wanted, not args.no_frames)
+            kind = "default" if requested is None else "all" if requested == ["all"] else "each"
+            arrays = record(task, seed, args.steps, requested, not args.no_frames)
             np.savez_compressed(os.path.join(args.folder, f"swm_{task}-{kind}-{seed}.npz"), **arrays)
 
 

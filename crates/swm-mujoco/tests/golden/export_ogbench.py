@@ -2,9 +2,9 @@
 
     python export_ogbench.py OUT [--envs cube scene maze] [--seeds 1 2] [--steps 40] [--no-frames]
 
-Needs `stable-worldmodel` 0.1.1 with `mujoco` 3.17.0, `dm_control` 1.0.50 and `ogbench` 1.2.2. The layout is that of the shared
-golden files; options are part of the name (`swm_OGBCube-v0,env_type=double-all-1.npz`), and files of mazes contain the goal
-(`goal.xy`). Actions of odd seeds are random, those of even seeds are held for eight steps.
+Needs `stable-worldmodel` 0.1.1 with `mujoco` 3.17.0, `dm_control` 1.0.50 and `ogbench` 1.2.2. The layout is that of
+`swm_conformance::golden`; options are part of the name (`swm_OGBCube-v0,env_type=double-all-1.npz`), and files of mazes contain the goal
+(`goal.xy`). Odd seeds draw a new random action in every step, even seeds in every eighth step.
 """
 
 import argparse
@@ -88,15 +88,15 @@ def main():
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2])
     parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--no-frames", action="store_true")
-    asked = parser.parse_args()
-    os.makedirs(asked.out, exist_ok=True)
-    for env_id, options in ((ENVS[name][0], options) for name in asked.envs for options in ENVS[name][1]):
+    args = parser.parse_args()
+    os.makedirs(args.out, exist_ok=True)
+    for env_id, options in ((ENVS[name][0], options) for name in args.envs for options in ENVS[name][1]):
         for varied in (False, True):
-            for seed in asked.seeds:
+            for seed in args.seeds:
                 name = "".join([env_id.replace("/", "_")] + [f",{key}={value}" for key, value in options.items()])
                 file = f"{name}-{'all' if varied else 'default'}-{seed}.npz"
-                arrays = record(env_id, options, varied, seed, asked.steps, not asked.no_frames)
-                np.savez_compressed(os.path.join(asked.out, file), **arrays)
+                arrays = record(env_id, options, varied, seed, args.steps, not args.no_frames)
+                np.savez_compressed(os.path.join(args.out, file), **arrays)
                 print(file)
 
 

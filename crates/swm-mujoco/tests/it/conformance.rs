@@ -12,10 +12,10 @@ const EXPLICIT_MASS: &str = "the geom has an explicit mass";
 const HIDDEN_GROUP: &str = "it is in a group that is not rendered";
 /// Planar environments do not move along y.
 const PLANAR: &str = "nothing moves along y";
-/// The effect appears only after more steps than the check takes.
-const NO_EARLY_CONTACT: &str = "there is no contact with it in the first steps";
-/// The default camera of Fetch is a free one, and the factor rotates those of the model.
-const FREE_CAMERA: &str = "the default camera is not one of the model's";
+/// The effect appears only at a contact, which needs more steps than the check takes.
+const NO_EARLY_CONTACT: &str = "it has no effect before a contact, which the first steps do not have";
+/// The default camera of Fetch is free, and the factor rotates only the cameras of the model.
+const FREE_CAMERA: &str = "it does not rotate the default camera";
 /// The factor applies with `mode=data_collection` only.
 const SET_BY_TASK: &str = "the task sets it";
 /// The factor applies with `ob_type=pixels` only.
@@ -24,7 +24,7 @@ const PIXELS_ONLY: &str = "it applies with ob_type=pixels only";
 const NO_OBJECT: &str = "there is no object";
 
 /// Factors without effect in these environments, or without effect in the first steps.
-const IDLE: &[(&str, &str, &str)] = &[
+const INERT: &[(&str, &str, &str)] = &[
     ("swm/AcrobotDMControl-v0", "agent.lower_arm_density", EXPLICIT_MASS),
     ("swm/AcrobotDMControl-v0", "agent.upper_arm_density", EXPLICIT_MASS),
     ("swm/AcrobotDMControl-v0", "agent.upper_arm_locked", NEVER_APPLIED),
@@ -93,7 +93,7 @@ static SUITE: Suite = Suite {
     contexts: 1,
     requests: 1,
     resets: 20,
-    inert_factors: IDLE,
+    inert_factors: INERT,
     ..Suite::of(ENVS.rows)
 };
 

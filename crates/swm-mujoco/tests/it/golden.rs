@@ -9,7 +9,7 @@ use swm_core::{Action, Batch, Env, FrameMut, ResetOptions, Schema, VariationRequ
 use swm_mujoco::ENVS;
 use swm_mujoco::render::{self, Choice};
 
-/// How to replay the recordings of a family of environments.
+/// The settings with which the recordings of a family of environments are replayed and compared.
 struct Family {
     /// Whether an id belongs to the family.
     includes: fn(&str) -> bool,
@@ -23,7 +23,7 @@ struct Family {
     step: f64,
     /// The number of rows that can be compared.
     comparable_rows: fn(&str, &mut Golden) -> usize,
-    /// Names of infos in the reference and of the corresponding columns, where they differ.
+    /// Names of infos in the reference and of the corresponding columns, where the names differ.
     renamed: &'static [(&'static str, &'static str)],
     /// Changes a copy of the start state into the goal (a `state` column or a position).
     goal: fn(&mut Golden, &mut Vec<f64>),
@@ -32,10 +32,10 @@ struct Family {
 const FAMILIES: &[Family] = &[
     Family {
         includes: |id| id.starts_with("swm/Fetch"),
-        // Recorded with MuJoCo 3.3.2.
+        // The rollouts were recorded with MuJoCo 3.3.2.
         tolerance: 1e-4,
-        // For a request of `all`, the reference samples every factor but applies this one only, because it tests for
-        // the names in the request.
+        // For a request of `all`, the reference samples every factor but applies only `block.mass`, because it looks
+        // for the names of the other factors in the request.
         factors: |file, mut request| {
             if file.contains("-all-") {
                 request.variation_values.retain(|key, _| key == "block.mass");
@@ -112,21 +112,21 @@ fn table_goal(golden: &mut Golden, state: &mut [f64]) {
 }
 
 /// The number of rows to compare: all rows; for Slide, the rows before the puck is struck or the simulation becomes
-/// chaotic. A puck is a cylinder: contacts with a finger are computed iteratively, with last digits that differ between
-/// versions, and contacts with the table jump along its rim.
+/// chaotic. A puck is a cylinder: MuJoCo computes its contacts with a finger iteratively, with last digits that differ
+/// between versions, and its contacts with the table jump along the puck's rim.
 fn fetch_rows(file: &str, golden: &mut Golden) -> usize {
     if !file.contains("FetchSlide") {
         return usize::MAX;
     }
     let proprio = golden.values("info.proprio");
-    // The puck's velocity is relative to the gripper's, in metres per action.
+    // The recorded velocity of the puck is relative to the gripper, in metres per action.
     let speeds: Vec<f64> = proprio.chunks_exact(25).map(|row| (row[14] + row[20]).hypot(row[15] + row[21])).collect();
     let struck = speeds.windows(2).position(|pair| pair[1] - pair[0] > 5e-3).map_or(usize::MAX, |before| before + 1);
     struck.min(rows_before_chaos(&FAMILIES[0], file, golden))
 }
 
-/// Infos without a column, or that cannot be compared: the name, success (which the pool writes), and the observation
-/// at a goal whose state was not recorded.
+/// Infos that are not compared: the name, which has no column; success, which the pool writes; and the observation at
+/// the goal, whose state was not recorded.
 const SKIPPED_INFOS: [&str; 4] = ["env_name", "success", "is_success", "target"];
 
 /// The largest allowed mean absolute difference of images, in units of 1/255.
@@ -153,7 +153,7 @@ fn rollouts_match_the_reference() {
     assert!(problems.is_empty(), "{}", problems.join("\n"));
 }
 
-/// The environment of a file named `swm_ID,option=value-default-SEED.npz`.
+/// Creates the environment of a file named `swm_ID,option=value-default-SEED.npz`.
 fn recorded_env(file: &Path) -> swm_core::Result<Box<dyn Env>> {
     let name = file.file_stem().unwrap_or_default().to_string_lossy();
     let end = ["-all-", "-each-", "-default-"].into_iter().find_map(|kind| name.rfind(kind)).unwrap_or(name.len());
@@ -180,9 +180,9 @@ fn start(env: &dyn Env, family: &Family, golden: &mut Golden) -> Vec<f64> {
 
 /// The present value of a column.
 fn column(env: &dyn Env, name: &str) -> Vec<f64> {
-    let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("a schema"), 1);
+    let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("creating a schema"), 1);
     env.observe(&mut row.row_mut(0));
-    row.row(0).to_f64(name).expect("a column")
+    row.row(0).to_f64(name).expect("reading a column")
 }
 
 /// The number of rows before the simulation becomes chaotic: where the gripper's mesh touches a button, the contacts
@@ -199,13 +199,13 @@ fn rows_before_chaos(family: &Family, name: &str, golden: &mut Golden) -> usize 
     let action_dim = actions.len() / golden.values("reward").len();
     let qpos_len = golden.values("start.qpos").len();
     let mut play = |perturbation: f64| -> Vec<Vec<f64>> {
-        let mut env = recorded_env(Path::new(name)).expect("an environment");
-        env.reset(0, &options).expect("a reset");
+        let mut env = recorded_env(Path::new(name)).expect("creating the environment");
+        env.reset(0, &options).expect("resetting the environment");
         let mut state = start(&*env, family, golden);
         state[1] += perturbation;
-        env.reset(0, &ResetOptions { state: Some(state), ..options.clone() }).expect("a reset");
+        env.reset(0, &ResetOptions { state: Some(state), ..options.clone() }).expect("resetting the environment");
         let mut step = |action| {
-            env.step(Action::Continuous(action)).expect("a step");
+            env.step(Action::Continuous(action)).expect("stepping the environment");
             column(&*env, "state")[1..=qpos_len].to_vec()
         };
         actions.chunks_exact(action_dim).map(&mut step).collect()
@@ -238,7 +238,7 @@ struct Comparison<'a> {
 
 impl<'a> Comparison<'a> {
     fn new(family: &'a Family, env: Box<dyn Env>, file: &Path) -> Self {
-        let row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("a schema"), 1);
+        let row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("creating a schema"), 1);
         let name = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         Self { family, name, env, row, golden: Golden::open(file), differences: BTreeMap::new() }
     }
@@ -302,7 +302,7 @@ impl<'a> Comparison<'a> {
         self.report(row_count.min(rewards.len() + 1))
     }
 
-    /// Compares the infos of a step; the reference's mazes have none at a reset.
+    /// Compares the infos of a step. Mazes of the reference have no infos at a reset.
     fn compare_infos(&mut self, step: usize, infos: &[(String, Vec<f64>)], steps: usize) {
         for (info, recorded) in infos {
             let renamed = self.family.renamed.iter().find(|(theirs, _)| theirs == info);
@@ -315,7 +315,7 @@ impl<'a> Comparison<'a> {
         }
     }
 
-    /// Prints the largest difference of each array, and returns a message for each that exceeds its tolerance.
+    /// Prints the largest difference of each array, and returns a message for each array that exceeds its tolerance.
     #[allow(clippy::print_stderr, reason = "a table for `--no-capture`")]
     fn report(&self, rows: usize) -> Vec<String> {
         let limit = |array: &str| if array.starts_with("frame") { IMAGE_TOLERANCE } else { self.family.tolerance };
@@ -334,13 +334,13 @@ impl<'a> Comparison<'a> {
         self.row.row(0).to_f64(name).unwrap_or_else(|error| panic!("{}: {error}", self.name))
     }
 
-    /// The observation: one part of it, or all parts in order.
-    fn observation(&self, part: Option<&str>) -> Vec<f64> {
-        let parts: Vec<&str> = match part {
-            Some(part) => vec![part],
+    /// One array of the observation, or all arrays in order.
+    fn observation(&self, array: Option<&str>) -> Vec<f64> {
+        let arrays: Vec<&str> = match array {
+            Some(array) => vec![array],
             None => self.env.spec().observation_space.iter().map(|(name, _)| *name).collect(),
         };
-        parts.into_iter().flat_map(|part| self.column(part)).collect()
+        arrays.into_iter().flat_map(|array| self.column(array)).collect()
     }
 
     /// Compares positions, and velocities as displacements in a step.
@@ -354,7 +354,7 @@ impl<'a> Comparison<'a> {
         self.compare("qpos_qvel", step, &ours, &[vec![0.0; step * ours.len()], theirs].concat());
     }
 
-    /// Compares the values of a step with those of a recorded array.
+    /// Compares the values of a step with the values of the same step in a recorded array.
     fn compare(&mut self, array: &str, step: usize, ours: &[f64], recorded: &[f64]) {
         let Some(theirs) = recorded.get(step * ours.len()..(step + 1) * ours.len()) else {
             return self.note_difference(array, step, f64::NAN);

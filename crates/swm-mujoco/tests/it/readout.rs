@@ -1,4 +1,5 @@
-//! A linear read-out of the state that is trained on the frames of one renderer works on the frames of the other.
+//! Tests that a linear read-out of the state, trained on frames of one renderer, has the same error on frames of the
+//! other renderer.
 
 use rand::Rng;
 use swm_core::{Action, Batch, FrameMut, Key, ResetOptions, Schema};
@@ -11,12 +12,12 @@ const SIDE: usize = 64;
 const POOL: usize = 4;
 const EPISODES: u64 = 25;
 const STEPS: usize = 12;
-/// One in this many episodes is held out for testing.
+/// Every fourth episode is held out for testing.
 const HELD_OUT: usize = 4;
 /// The ridge penalty on the weights.
 const RIDGE: f64 = 1.0;
 
-/// Mean colours of squares, from 0 to 1, and a constant 1.
+/// The mean colours of all squares (0 to 1), followed by a constant 1.
 fn features(rgb: &[u8]) -> Vec<f64> {
     let side = SIDE / POOL;
     let mut sums = vec![0.0; side * side * 3];
@@ -36,17 +37,17 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
 fn solve(mut a: Vec<Vec<f64>>, mut b: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
     let n = a.len();
     for i in 0..n {
-        let (pivot, known) = (a[i].clone(), b[i].clone());
+        let (pivot, right) = (a[i].clone(), b[i].clone());
         for j in i + 1..n {
             let by = a[j][i] / pivot[i];
             a[j].iter_mut().zip(&pivot).for_each(|(x, p)| *x -= by * p);
-            b[j].iter_mut().zip(&known).for_each(|(x, p)| *x -= by * p);
+            b[j].iter_mut().zip(&right).for_each(|(x, p)| *x -= by * p);
         }
     }
     for i in (0..n).rev() {
         for k in 0..b[i].len() {
-            let rest: f64 = (i + 1..n).map(|j| a[i][j] * b[j][k]).sum();
-            b[i][k] = (b[i][k] - rest) / a[i][i];
+            let known: f64 = (i + 1..n).map(|j| a[i][j] * b[j][k]).sum();
+            b[i][k] = (b[i][k] - known) / a[i][i];
         }
     }
     b
@@ -55,24 +56,24 @@ fn solve(mut a: Vec<Vec<f64>>, mut b: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
 #[test]
 #[ignore = "renders 300 frames with OpenGL"]
 #[allow(clippy::print_stderr, clippy::too_many_lines, reason = "one experiment with a table for `--no-capture`")]
-fn read_out_trained_on_one_renderer_works_on_the_other() {
-    let mut env = ENVS.get(ID).and_then(|entry| entry.env()).expect("an environment");
+fn read_out_error_is_equal_for_frames_of_both_renderers() {
+    let mut env = ENVS.get(ID).and_then(|entry| entry.env()).expect("creating the environment");
     let (mut poses, mut frames) = (vec![], [vec![], vec![]]);
-    let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("a schema"), 1);
+    let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("creating a schema"), 1);
     for episode in 0..EPISODES {
-        env.reset(episode, &ResetOptions::default()).expect("a reset");
+        env.reset(episode, &ResetOptions::default()).expect("resetting the environment");
         let mut rng = Key::new(episode).rng();
         for _ in 0..STEPS {
             for _ in 0..3 {
                 let action: Vec<f32> = (0..env.spec().action_dim()).map(|_| rng.random_range(-1.0..1.0)).collect();
-                env.step(Action::Continuous(&action)).expect("a step");
+                env.step(Action::Continuous(&action)).expect("stepping the environment");
             }
             env.observe(&mut row.row_mut(0));
             // The camera follows the cheetah, so frames do not show its position along the track.
-            poses.push(row.row(0).to_f64("qpos").expect("a column")[1..].to_vec());
+            poses.push(row.row(0).to_f64("qpos").expect("reading a column")[1..].to_vec());
             for (choice, frames) in [Choice::Egl, Choice::Cpu].into_iter().zip(&mut frames) {
                 let mut rgb = vec![0; SIDE * SIDE * 3];
-                render::with(choice, || env.render(FrameMut::new(SIDE, SIDE, &mut rgb))).expect("a frame");
+                render::with(choice, || env.render(FrameMut::new(SIDE, SIDE, &mut rgb))).expect("rendering a frame");
                 frames.push(features(&rgb));
             }
         }
@@ -98,16 +99,21 @@ fn read_out_trained_on_one_renderer_works_on_the_other() {
         (squares / test.len() as f64).sqrt()
     };
     let [egl, cpu] = &frames;
-    for (name, trained, other) in [("egl", egl, cpu), ("cpu", cpu, egl)] {
-        let (own, foreign) = (error(trained, trained), error(trained, other));
+    for (name, trained, untrained) in [("egl", egl, cpu), ("cpu", cpu, egl)] {
+        let (trained_error, untrained_error) = (error(trained, trained), error(trained, untrained));
         let mean: Vec<f64> =
             (0..poses[0].len()).map(|k| train.iter().map(|&i| poses[i][k]).sum::<f64>() / train.len() as f64).collect();
         let mean_error =
             (test.iter().map(|&i| poses[i].iter().zip(&mean).map(|(a, b)| (a - b).powi(2)).sum::<f64>()).sum::<f64>()
                 / test.len() as f64)
                 .sqrt();
-        eprintln!("trained on {name}: error {own:.4}, on the other renderer {foreign:.4}, of the mean {mean_error:.4}");
-        assert!(own < 0.7 * mean_error, "frames contain the state");
-        assert!((foreign - own).abs() < 0.1 * own, "trained on {name}: {own} and {foreign}");
+        eprintln!(
+            "trained on {name}: errors {trained_error:.4}, {untrained_error:.4} (other renderer), {mean_error:.4} (mean pose)"
+        );
+        assert!(trained_error < 0.7 * mean_error, "trained on {name}: the read-out is no better than the mean pose");
+        assert!(
+            (untrained_error - trained_error).abs() < 0.1 * trained_error,
+            "trained on {name}: {trained_error} and {untrained_error}"
+        );
     }
 }

@@ -11,11 +11,11 @@ pub const EXPERTS: &[ExpertEntry] = &[ExpertEntry {
     make: || Box::new(Controller),
 }];
 
-/// Stiffness (control per radian) and damping (control per rad/s) for shoulder and wrist. The wrist is light enough to
-/// be damped by its joint.
+/// Stiffness (control per radian) and damping (control per rad/s) for shoulder and wrist. The damping of the
+/// wrist's joint suffices for the wrist.
 const GAINS: [[f64; 2]; 2] = [[2.0, 0.15], [2.0, 0.0]];
 
-/// Reads `qpos`, `qvel` and `goal_state`; stateless.
+/// A stateless controller that reads `qpos`, `qvel` and `goal_state`.
 struct Controller;
 
 impl Expert for Controller {
@@ -25,7 +25,7 @@ impl Expert for Controller {
         let [angles, speeds, goal] = [row.to_f64("qpos")?, row.to_f64("qvel")?, row.to_f64(columns::GOAL_STATE)?];
         let (&[shoulder, wrist], &[goal_shoulder, goal_wrist, ..]) = (&angles[..], &goal[..]) else {
             let given = format!("{} angles and {} goal values", angles.len(), goal.len());
-            return Err(Error::mismatch("controlling a reacher", given, "2 and at least 2"));
+            return Err(Error::mismatch("controlling a reacher", given, "2 angles and at least 2 goal values"));
         };
         // The shoulder is periodic, the wrist is limited.
         let error = [(goal_shoulder - shoulder + PI).rem_euclid(2.0 * PI) - PI, goal_wrist - wrist];

@@ -22,7 +22,7 @@ pub const ENTRY: EnvEntry = entry::<Reacher>(expert::EXPERTS);
 /// Lengths of the links from shoulder to wrist and from wrist to finger, in metres.
 const LINKS: [f64; 2] = [0.12, 0.12];
 
-/// The task.
+/// A task of the reacher domain.
 #[derive(Clone, Copy)]
 pub enum Task {
     /// Keep the finger within a target of this radius, in metres.
@@ -41,7 +41,7 @@ impl Task {
     }
 }
 
-/// The indices of the domain's elements.
+/// The task and the indices of the domain's elements in the model.
 pub struct Reacher {
     task: Task,
     target: usize,

@@ -6,7 +6,7 @@
 //! 1. The reference acceleration of a weld now includes the change of its Jacobian. The gripper is attached by a weld.
 //! 2. A mesh on a plane now has four contact points instead of three. This concerns the base of the robot.
 //! 3. Contacts of two boxes are computed differently: see [`box_contacts`].
-//! 4. The margin of a pair of geoms is now the sum of both margins; it was the larger one.
+//! 4. The margin of a pair of geoms is now the sum of their margins; in 3.3.2 it was the larger margin.
 
 mod box_contacts;
 
@@ -17,7 +17,7 @@ use mujoco_rs::wrappers::MjModel;
 use mujoco_rs::wrappers::mj_model::{MjtGeomBase, MjtObjBase};
 use swm_core::Result;
 
-/// The vertices of the base's mesh that touched the floor.
+/// The vertices of the base's mesh that touch the floor in MuJoCo 3.3.2.
 const BASE_VERTICES: [usize; 3] = [1751, 1782, 1806];
 
 /// Step hooks that reproduce the dynamics of MuJoCo 3.3.2 for a model of Fetch.
@@ -170,12 +170,12 @@ mod tests {
     use crate::Physics;
 
     #[test]
-    fn box_contacts_equal_those_of_mujoco_apart_from_their_points() {
-        let setup = PUSH.setup().expect("the models");
-        let mut physics = Physics::new(setup.model.clone()).expect("a state");
+    fn contact_templates_of_boxes_have_the_parameters_of_mujoco() {
+        let setup = PUSH.setup().expect("simulating the setup of FetchPush");
+        let mut physics = Physics::new(setup.model.clone()).expect("allocating the state");
         physics.data_mut().qpos_mut().copy_from_slice(&setup.qpos);
         physics.forward();
-        let compat = Compat332::new(&setup.model).expect("a model of Fetch");
+        let compat = Compat332::new(&setup.model).expect("creating the step hooks");
         let found = physics.data().contact();
         let mut compared = 0;
         for ours in &compat.box_pairs {

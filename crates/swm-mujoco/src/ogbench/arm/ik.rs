@@ -11,6 +11,7 @@ pub const JOINTS: usize = 6;
 const MAX_ITERATIONS: usize = 20;
 /// Tolerance of position and orientation, in metres and radians.
 const TOLERANCE: f64 = 1e-4;
+/// The damping λ of the least squares.
 const DAMPING: f64 = 1e-12;
 /// The maximal rotation of a joint in one iteration, in radians.
 const MAX_STEP: f64 = std::f64::consts::FRAC_PI_4;
@@ -35,7 +36,7 @@ pub struct Chain {
     pub flange: Pose,
 }
 
-/// Three rows for the linear velocity of the flange, three for its angular velocity.
+/// The Jacobian of the flange: three rows for linear velocity (m/rad), then three for angular velocity (rad/rad).
 type Jacobian = [[f64; JOINTS]; 6];
 
 impl Chain {

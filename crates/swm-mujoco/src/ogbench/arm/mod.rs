@@ -2,7 +2,7 @@
 //!
 //! An action moves the gripper relative to its present pose: up to 5 cm along each axis, 0.3 rad about the vertical,
 //! and the full range of the fingers. The target pose is clipped to the workspace and converted to joint angles by
-//! inverse kinematics; the arm's position actuators hold these for one control step. Constants are OGBench's
+//! inverse kinematics; the arm's position actuators hold these angles for one control step. Constants are OGBench's
 //! (`manipspace/envs/manipspace_env.py`).
 
 pub mod ik;
@@ -16,9 +16,9 @@ use pose::{Pose, Quat, Vec3};
 use std::f64::consts::FRAC_PI_2;
 use swm_core::{Error, Result};
 
-/// Elements of an action.
+/// The number of elements of an action.
 pub const ACTION: usize = 5;
-/// Actuators: six joints and the fingers.
+/// The number of actuators: six joints and the fingers.
 pub const CONTROLS: usize = JOINTS + 1;
 
 /// The effect of an action of 1: metres along x, y and z, radians of yaw, and fraction of the fingers' range.
@@ -60,7 +60,7 @@ pub struct Arm {
     pinch_to_flange: Pose,
     /// The site between the fingers.
     pinch: usize,
-    /// The body of the pad that measures contact.
+    /// The body of the right finger's pad, whose contact force is measured.
     pad: usize,
 }
 
@@ -83,26 +83,26 @@ impl Arm {
     /// Finds the arm in a model.
     ///
     /// # Errors
-    /// When the model lacks a part of it.
+    /// When the model lacks a part of the arm.
     pub fn new(model: &MjModel) -> Result<Self> {
         let body = |name| find(model, MjtObjBase::mjOBJ_BODY, name);
         let site = |name| find(model, MjtObjBase::mjOBJ_SITE, name);
-        let at = |body: usize| Pose { position: model.body_pos()[body], rotation: model.body_quat()[body] };
-        let on = |site: usize| Pose { position: model.site_pos()[site], rotation: model.site_quat()[site] };
-        let mut links = [Link { rest: at(0), axis: [0.0; 3] }; JOINTS];
+        let body_pose = |body: usize| Pose { position: model.body_pos()[body], rotation: model.body_quat()[body] };
+        let site_pose = |site: usize| Pose { position: model.site_pos()[site], rotation: model.site_quat()[site] };
+        let mut links = [Link { rest: body_pose(0), axis: [0.0; 3] }; JOINTS];
         for (link, (body_name, joint_name)) in links.iter_mut().zip(LINKS) {
             let joint = find(model, MjtObjBase::mjOBJ_JOINT, joint_name)?;
-            *link = Link { rest: at(body(body_name)?), axis: model.jnt_axis()[joint] };
+            *link = Link { rest: body_pose(body(body_name)?), axis: model.jnt_axis()[joint] };
         }
-        let (flange, pinch) = (on(site("ur5e/attachment_site")?), site("ur5e/robotiq/pinch")?);
+        let (flange, pinch) = (site_pose(site("ur5e/attachment_site")?), site("ur5e/robotiq/pinch")?);
         // The pose of the gripper's base in the frame of the last link.
-        let mut gripper = at(body("ur5e/robotiq/")?);
+        let mut gripper = body_pose(body("ur5e/robotiq/")?);
         for name in ["ur5e/robotiq/base_mount", "ur5e/robotiq/base"] {
-            gripper = gripper.then(at(body(name)?));
+            gripper = gripper.then(body_pose(body(name)?));
         }
         Ok(Self {
-            chain: Chain { base: at(body("ur5e/base")?), links, flange },
-            pinch_to_flange: gripper.then(on(pinch)).inverse().then(flange),
+            chain: Chain { base: body_pose(body("ur5e/base")?), links, flange },
+            pinch_to_flange: gripper.then(site_pose(pinch)).inverse().then(flange),
             pinch,
             pad: body("ur5e/robotiq/right_pad")?,
         })

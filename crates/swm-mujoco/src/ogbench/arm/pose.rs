@@ -1,6 +1,6 @@
 //! Rotations and rigid transforms. Quaternions are unit quaternions `[w, x, y, z]`, as in MuJoCo.
 
-/// A position or direction.
+/// A position (m) or a direction.
 pub type Vec3 = [f64; 3];
 /// A rotation.
 pub type Quat = [f64; 4];
@@ -33,7 +33,7 @@ pub fn norm(a: &[f64]) -> f64 {
     a.iter().map(|v| v * v).sum::<f64>().sqrt()
 }
 
-/// The distance of two points.
+/// The Euclidean distance of two points, in metres.
 pub fn distance(a: Vec3, b: Vec3) -> f64 {
     norm(&sub(a, b))
 }

@@ -12,7 +12,7 @@ pub const EXPERTS: &[ExpertEntry] = &[ExpertEntry {
     make: || Box::new(PathFollower),
 }];
 
-/// Moves towards the column `goal/next_xy`.
+/// An expert that moves the point towards the position in the column `goal/next_xy`.
 struct PathFollower;
 
 impl Expert for PathFollower {
@@ -27,9 +27,9 @@ impl Expert for PathFollower {
                 "choose loco_env_type=point, or use a policy for the ant",
             ));
         }
-        let (here, next) = (row.to_f64("xy")?, row.to_f64("goal/next_xy")?);
-        for (i, by) in action.iter_mut().enumerate() {
-            *by = ((next[i] - here[i]) / f64::from(POINT_STEP)).clamp(-1.0, 1.0);
+        let (xy, next_xy) = (row.to_f64("xy")?, row.to_f64("goal/next_xy")?);
+        for (i, displacement) in action.iter_mut().enumerate() {
+            *displacement = ((next_xy[i] - xy[i]) / f64::from(POINT_STEP)).clamp(-1.0, 1.0);
         }
         Ok(())
     }

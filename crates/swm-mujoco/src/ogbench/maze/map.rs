@@ -12,12 +12,12 @@ const OFFSET: f64 = 4.0;
 
 /// A point in the plane, in metres.
 pub type Xy = [f64; 2];
-/// Row and column.
+/// The row and the column of a cell.
 pub type Cell = (usize, usize);
 
-/// A maze.
+/// The map of a maze.
 pub struct Map {
-    /// Its name.
+    /// The name, a value of the option `maze_type`.
     pub name: &'static str,
     /// Rows of cells; `#` is a wall, `.` is free.
     pub rows: &'static [&'static str],
@@ -94,7 +94,7 @@ pub static MAPS: [Map; 5] = [
     },
 ];
 
-/// The centre of a cell.
+/// The centre of a cell, in metres.
 pub fn center((row, column): Cell) -> Xy {
     [column as f64 * UNIT - OFFSET, row as f64 * UNIT - OFFSET]
 }
@@ -132,14 +132,14 @@ impl Map {
         self.rows.get(row).and_then(|cells| cells.as_bytes().get(column)) == Some(&b'.')
     }
 
-    /// The cell of a point; the nearest one for a point outside.
+    /// The cell of a point; the nearest cell for a point outside the map.
     pub fn cell(&self, [x, y]: Xy) -> Cell {
         let (rows, columns) = self.size();
         let at = |v: f64, n: usize| (((v + OFFSET) / UNIT + 0.5).max(0.0) as usize).min(n - 1);
         (at(y, rows), at(x, columns))
     }
 
-    /// The free cells adjacent to a cell, itself first.
+    /// The free cells among a cell and its four neighbours, in this order.
     fn neighbours(&self, (row, column): Cell) -> impl Iterator<Item = Cell> {
         let offsets = [(0, 0), (-1, 0), (0, -1), (1, 0), (0, 1)];
         let step = move |(i, j): (isize, isize)| Some((row.checked_add_signed(i)?, column.checked_add_signed(j)?));
@@ -164,7 +164,7 @@ impl ShortestPaths {
         paths
     }
 
-    /// Changes the goal, by breadth-first search.
+    /// Changes the goal and recomputes the paths by breadth-first search.
     pub fn set_goal(&mut self, goal: Xy) {
         self.goal = goal;
         self.steps.fill(None);
@@ -188,8 +188,8 @@ impl ShortestPaths {
         self.steps[self.index(self.map.cell(from))].is_some()
     }
 
-    /// The next point on the path: the goal in its own cell, otherwise the centre of the neighbouring cell nearest to
-    /// the goal.
+    /// The next point on the path: the goal if `from` is in the goal's cell, otherwise the centre of the neighbouring
+    /// cell nearest to the goal.
     pub fn next(&self, from: Xy) -> Xy {
         let cell = self.map.cell(from);
         if cell == self.map.cell(self.goal) {
@@ -230,7 +230,7 @@ mod tests {
                 assert!(paths.is_reachable(at), "{}: {start:?} to {goal:?}", map.name);
                 while at != center(goal) {
                     at = paths.next(at);
-                    assert!(paths.length(at) < left, "{}: the path gets shorter with every cell", map.name);
+                    assert!(paths.length(at) < left, "{}: the path must get shorter with every cell", map.name);
                     left = paths.length(at);
                 }
                 assert_eq!(left, 0.0);

@@ -34,7 +34,7 @@ pub const OPTIONS: &[EnvOption] = &[
     },
     EnvOption {
         key: "reward_task_id",
-        summary: "a fixed task (0: the default one) with reward -1 until success; none: a random task",
+        summary: "a fixed task (0: the default task) with reward -1 until success; none: a random task",
         values: &["none", "0", "1", "2", "3", "4", "5"],
     },
     TERMINATE_AT_GOAL,
@@ -45,7 +45,7 @@ pub const OPTIONS: &[EnvOption] = &[
     },
 ];
 
-/// Creates a maze.
+/// Creates a maze environment.
 ///
 /// # Errors
 /// When MuJoCo or OGBench's files are not installed, or the maze lacks the task of `reward_task_id`.
@@ -78,15 +78,15 @@ pub fn make(choice: &EnvChoice) -> Result<Box<dyn Env>> {
 
 /// Columns, spaces and time limit of a maze.
 fn spec(choice: &EnvChoice, agent: Agent, pixels: bool, model: &MjModel) -> EnvSpec {
-    let (nq, nv, actions) = (model.qpos0().len(), model.dof_damping().len(), model.actuator_ctrlrange().len());
-    let observation = if agent == Agent::Ant { nq + nv } else { nq };
-    let unbounded = Space::uniform_box([observation], DType::Float64, f64::NEG_INFINITY, f64::INFINITY);
+    let (nq, nv, action_dim) = (model.qpos0().len(), model.dof_damping().len(), model.actuator_ctrlrange().len());
+    let observation_len = if agent == Agent::Ant { nq + nv } else { nq };
+    let unbounded = Space::uniform_box([observation_len], DType::Float64, f64::NEG_INFINITY, f64::INFINITY);
     let float = |name: &str, n: usize| ColumnSpec::new(name, DType::Float64, [n]);
     EnvSpec {
         id: choice.id(),
-        action_space: Space::uniform_box([actions], DType::Float32, -1.0, 1.0),
+        action_space: Space::uniform_box([action_dim], DType::Float32, -1.0, 1.0),
         columns: vec![
-            float("observation", observation),
+            float("observation", observation_len),
             float(columns::GOAL_STATE, physics::state_len(model) + TASK_STATE_HEAD + nq + nv),
             float("xy", 2),
             float("prev_qpos", nq),

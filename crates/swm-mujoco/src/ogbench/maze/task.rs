@@ -19,15 +19,16 @@ const SUBSTEPS: usize = 5;
 pub const POINT_STEP: f32 = 0.2;
 /// Largest distance of start and goal from the centres of their cells along each axis, in metres.
 const NOISE: f64 = UNIT / 4.0;
-/// Half range of the uniform noise on initial positions, and standard deviation of initial velocities.
+/// Half range of the uniform noise on initial positions (m, rad), and standard deviation of initial velocities (m/s,
+/// rad/s).
 const START_NOISE: f64 = 0.1;
 /// The number of random actions at the goal before the goal pose is stored.
 const SETTLE_STEPS: usize = 5;
 /// Distance from the centre of an entrance within which the agent is teleported, in metres.
 const TELEPORT_DISTANCE: f64 = 1.5 * TELEPORT_RADIUS;
-/// Goals drawn by [`Task::sample_goal`] before it fails.
+/// The number of goals that [`Task::sample_goal`] draws before it fails.
 const GOAL_TRIES: usize = 1000;
-/// Elements of the task state before the pose: the teleport seed.
+/// The number of elements of the task state before the pose: the teleport seed.
 pub const TASK_STATE_HEAD: usize = 1;
 
 /// The options of a maze.
@@ -36,7 +37,7 @@ pub struct Settings {
     pub agent: Agent,
     /// The map.
     pub map: &'static Map,
-    /// The task of all episodes, if it is fixed; the reward is then -1 until the goal is reached, and 0 afterwards.
+    /// The task of all episodes, if it is fixed; the reward is then 0 at the goal and -1 elsewhere.
     pub fixed_task: Option<usize>,
     /// Whether an episode terminates at its goal.
     pub terminate: bool,
@@ -46,14 +47,14 @@ pub struct Settings {
     pub pixels: bool,
 }
 
-/// A maze on its model.
+/// A maze task on a compiled model.
 pub struct Maze {
     settings: Settings,
     /// The geom that marks the goal, if it is displayed.
     marker: Option<usize>,
     goal: Xy,
     paths: ShortestPaths,
-    /// `qpos` and `qvel` at the goal.
+    /// `qpos` and `qvel` of the agent at the goal.
     goal_pose: Vec<f64>,
     /// `qpos` and `qvel` before the last step.
     previous: Vec<f64>,
@@ -90,7 +91,7 @@ impl Maze {
         })
     }
 
-    /// Stores the present pose as the one before the next step.
+    /// Stores the present pose in `previous`, as the pose before the next step.
     fn store_previous(&mut self, physics: &Physics) {
         let (qpos, qvel) = (physics.data().qpos(), physics.data().qvel());
         self.previous[..qpos.len()].copy_from_slice(qpos);
@@ -283,7 +284,7 @@ impl Task for Maze {
         self.set_goal(before);
         Err(Error::Unsatisfiable {
             factor: "goal".to_owned(),
-            constraint: "in a cell that has a path to it, and not already reached".to_owned(),
+            constraint: "reachable, and not already reached".to_owned(),
             tries: GOAL_TRIES,
         })
     }

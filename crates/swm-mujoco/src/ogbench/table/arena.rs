@@ -2,8 +2,8 @@
 //! window.
 //!
 //! OGBench composes its MJCF files with `dm_control.mjcf`. This module composes the same files with MuJoCo's model
-//! editing, in the order that gives every body, geom and material the same index. The compiled models are equal, apart
-//! from the names of unnamed elements.
+//! editing, in the order that gives every body, geom and material the same index. The compiled models are equal, with
+//! the exceptions that OGBench's README in this crate lists.
 #![allow(unsafe_code, reason = "`mjs_attach`, which `mujoco-rs` does not wrap")]
 
 use super::config::{Bounds, TableConfig};
@@ -57,8 +57,8 @@ pub fn compile(config: &TableConfig, arm_rendering: ArmRendering) -> Result<MjMo
     let files = Files(assets::path("ogbench")?.join("ogbench/manipspace/descriptions"));
     let mut arena = files.read("floor_wall.xml")?;
     set_options(&mut arena);
-    // The arm's body precedes those of the objects, but its meshes and materials follow theirs: the body is therefore
-    // added now, and its content attached at the end.
+    // The arm's body must precede the objects' bodies, but the arm's meshes and materials must follow those of the
+    // objects. The body is therefore added here, and its content is attached at the end.
     arena.world_body_mut().add_body().with_name("ur5e/");
     for cube in 0..config.cubes {
         let mut spec = files.read("cube.xml")?;
@@ -122,16 +122,16 @@ fn body<'a>(spec: &'a mut MjSpec, name: &str) -> Result<&'a mut MjsBody> {
 /// Adds the content of `child` to `parent`; `prefix` is prepended to the names.
 fn attach(parent: &mut MjsBody, mut child: MjSpec, prefix: &CStr) -> Result<()> {
     let frame = parent.add_frame().element_mut_pointer();
-    // SAFETY: both are elements of live descriptions; MuJoCo counts references to the child, which may be dropped
-    // afterwards.
+    // SAFETY: frame and child are elements of live descriptions; MuJoCo counts references to the child, which may be
+    // dropped afterwards.
     let attached = unsafe { mjs_attach(frame, child.ffi_mut().element, prefix.as_ptr(), c"".as_ptr()) };
     match attached.is_null() {
         false => Ok(()),
-        true => Err(Error::external("composing OGBench's table", "MuJoCo could not attach a part")),
+        true => Err(Error::external("composing OGBench's table", "MuJoCo could not attach an element")),
     }
 }
 
-/// Sets the options that `dm_control` collects from all files, and those that the environment sets.
+/// Sets the options that `dm_control` collects from all files, and the options that the environment sets.
 fn set_options(arena: &mut MjSpec) {
     let option = arena.option_mut();
     option.timestep = TIMESTEP;
@@ -184,8 +184,8 @@ fn bounding_box(world: &mut MjsBody, name: &str, [low, high]: &Bounds<3>, color:
 /// Sets the gains of the arm's actuators and the transparency of its materials.
 fn configure_arm(model: &mut MjModel, arm_rendering: ArmRendering) {
     for (i, (stiffness, damping)) in GAINS.into_iter().enumerate() {
-        // The actuator's bias keeps the damping of the file: the reference writes it to the gains, where it has no
-        // effect. SAFETY: any finite gain is valid.
+        // The bias keeps the damping of the file: the reference writes the damping to the gains, which has no effect.
+        // SAFETY: any finite gain is valid.
         let gain = unsafe { &mut model.actuator_gainprm_mut()[i] };
         (gain[0], gain[2]) = (stiffness, -damping);
         model.actuator_biasprm_mut()[i][1] = -stiffness;

@@ -7,14 +7,14 @@ use crate::ogbench::arm::pose::Vec3;
 /// Lower and upper bound of each coordinate, in metres.
 pub type Bounds<const N: usize> = [[f64; N]; 2];
 
-/// A camera.
+/// A camera of a table's model.
 #[derive(Debug)]
 pub struct Camera {
-    /// Its name.
+    /// The name of the camera.
     pub name: &'static str,
-    /// Its position, in metres.
+    /// The position, in metres.
     pub position: [f64; 3],
-    /// Its x-axis (right in the frame) and y-axis (up).
+    /// The x-axis (right in the frame), then the y-axis (up in the frame).
     pub axes: [f64; 6],
 }
 
@@ -53,12 +53,12 @@ pub struct FactorConfig {
     pub sampled_by_default: &'static [&'static str],
 }
 
-/// A table.
+/// The configuration of a table.
 #[derive(Debug)]
 pub struct TableConfig {
-    /// The id of its environment.
+    /// The id of the environment.
     pub id: &'static str,
-    /// The name of its model.
+    /// The name of the model.
     pub name: &'static str,
     /// The number of cubes.
     pub cubes: usize,
@@ -74,7 +74,7 @@ pub struct TableConfig {
     pub factors: FactorConfig,
     /// The tasks.
     pub tasks: &'static [Task],
-    /// Steps after which an episode is truncated.
+    /// The number of steps after which an episode is truncated.
     pub max_steps: usize,
 }
 
@@ -90,7 +90,7 @@ pub const fn observation_len(cubes: usize, fixtures: bool) -> usize {
     19 + 9 * cubes + if fixtures { 12 } else { 0 }
 }
 
-/// Bounds of the gripper's target position; targets outside are clipped.
+/// Bounds of the gripper's target position (m), to which targets are clipped.
 pub const WORKSPACE: Bounds<3> = [[0.25, -0.35, 0.02], [0.6, 0.35, 0.35]];
 
 /// The default colours of the cubes.

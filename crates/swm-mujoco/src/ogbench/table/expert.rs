@@ -1,9 +1,9 @@
-//! The scripted expert of tables: performs one job after another, planning every action from the present columns, so
-//! that it recovers from errors.
+//! The scripted expert of tables. It performs one [`Job`] after another and plans every action from the present
+//! columns, so that it recovers from errors.
 //!
 //! As in OGBench's oracles, a job is a sequence of moves: above an object, down, grasp, up, over the target, down,
-//! release. The order of jobs is planned here, because a goal may include several: lower cubes before those on top,
-//! obstacles first, unlocking before sliding, and locks last.
+//! release. A goal may require several jobs. The expert carries lower cubes before the cubes on top of them, removes
+//! obstacles first, unlocks before it slides, and sets the locks last.
 
 use super::config::OPEN;
 use super::goal::{GOAL_TOLERANCE, Subject};
@@ -33,7 +33,7 @@ const ABOVE_TOLERANCE: f64 = 0.012;
 const GRASP_TOLERANCE: f64 = 0.012;
 /// Horizontal tolerance before a cube is released, in metres.
 const RELEASE_TOLERANCE: f64 = 0.012;
-/// Contact above which a cube counts as grasped.
+/// Contact (0 to 1) above which a cube counts as grasped.
 const GRASP_CONTACT: f64 = 0.5;
 /// Height to which the gripper rises above a cube, a handle or a button, in metres.
 const CLEARANCE: f64 = 0.06;
@@ -45,10 +45,10 @@ const PRESS_DEPTH: f64 = 0.035;
 const OVER_DRAWER: Vec3 = [0.33, -0.24, 0.09];
 /// The y coordinate below which objects are in the drawer, in metres.
 const DRAWER_EDGE: f64 = -0.16;
-/// Steps after which a job is planned again.
+/// The number of steps after which a job is planned again.
 const MAX_JOB_STEPS: usize = 120;
 
-/// A job.
+/// A manipulation of one object.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Job {
     /// Carry a cube to a position (m) and yaw (rad).
@@ -59,7 +59,7 @@ enum Job {
     Slide(usize, f64),
 }
 
-/// Performs one job after another.
+/// The expert of tables, with its present job.
 #[derive(Default)]
 struct TableExpert {
     job: Option<Job>,
@@ -140,7 +140,7 @@ impl Inputs {
         self.subject == Subject::All || self.subject == subject
     }
 
-    /// Whether a cube is at its goal, with a margin to the tolerance.
+    /// Whether a cube is within 70 % of the tolerance of its goal, or is not part of the goal.
     fn is_placed(&self, cube: usize) -> bool {
         !self.includes(Subject::Cube(cube)) || distance(self.cubes[cube].0, self.goals[cube].0) <= 0.7 * GOAL_TOLERANCE
     }
@@ -171,9 +171,9 @@ impl Inputs {
         };
         let grid =
             (0..6).flat_map(|i| (0..13).map(move |j| [0.3 + 0.05 * f64::from(i), -0.3 + 0.05 * f64::from(j), 0.02]));
-        let here = self.cubes[cube].0;
+        let cube_position = self.cubes[cube].0;
         let free = grid.filter(is_free);
-        free.min_by(|a, b| horizontal_distance(*a, here).total_cmp(&horizontal_distance(*b, here)))
+        free.min_by(|a, b| horizontal_distance(*a, cube_position).total_cmp(&horizontal_distance(*b, cube_position)))
             .unwrap_or([0.425, 0.0, 0.02])
     }
 
@@ -182,7 +182,7 @@ impl Inputs {
         self.next_drawer_job().or_else(|| self.next_cube_job()).or_else(|| self.next_fixture_job())
     }
 
-    /// The next job before the cube can move into the drawer or out of it.
+    /// The next job that moves the cube into the drawer or out of it, or prepares this move.
     fn next_drawer_job(&self) -> Option<Job> {
         let fixtures = self.fixtures.as_ref()?;
         let (cube, goal) = (self.cubes[0], self.goals[0]);
@@ -204,13 +204,13 @@ impl Inputs {
 
     /// The next cube to carry: to its goal, or away from the goal of another cube.
     fn next_cube_job(&self) -> Option<Job> {
-        let mut open: Vec<usize> = (0..self.cubes.len()).filter(|&cube| !self.is_placed(cube)).collect();
+        let mut unplaced: Vec<usize> = (0..self.cubes.len()).filter(|&cube| !self.is_placed(cube)).collect();
         if self.fixtures.is_some() && self.goals[0].0[1] < DRAWER_EDGE {
             return None;
         }
-        open.sort_by(|&a, &b| self.goals[a].0[2].total_cmp(&self.goals[b].0[2]));
+        unplaced.sort_by(|&a, &b| self.goals[a].0[2].total_cmp(&self.goals[b].0[2]));
         let mut obstacle = None;
-        for &cube in &open {
+        for &cube in &unplaced {
             let (goal, yaw) = self.goals[cube];
             let supported = goal[2] < 0.03
                 || (0..self.cubes.len()).any(|other| {
@@ -227,14 +227,14 @@ impl Inputs {
             }
         }
         // Cubes on top of the obstacle are removed first.
-        let mut other = obstacle.or_else(|| open.first().copied())?;
+        let mut other = obstacle.or_else(|| unplaced.first().copied())?;
         while let Some(top) = self.on_top(other) {
             other = top;
         }
         Some(Job::Carry(other, self.free_position(other), self.cubes[other].1))
     }
 
-    /// The next job on drawer, window and, last, locks.
+    /// The next job for the drawer, the window or, last, a lock.
     fn next_fixture_job(&self) -> Option<Job> {
         let fixtures = self.fixtures.as_ref()?;
         for (i, subject) in [Subject::Drawer, Subject::Window].into_iter().enumerate() {
@@ -268,9 +268,9 @@ impl FixtureInputs {
         })
     }
 
-    /// The job that slides the drawer or the window, or unlocks it first.
-    fn slide(&self, which: usize, to: f64) -> Job {
-        if self.locks[which] == 0 { Job::Press(which) } else { Job::Slide(which, to) }
+    /// The job that slides the drawer (0) or the window (1), or first unlocks it.
+    fn slide(&self, index: usize, to: f64) -> Job {
+        if self.locks[index] == 0 { Job::Press(index) } else { Job::Slide(index, to) }
     }
 }
 
@@ -302,10 +302,11 @@ impl TableExpert {
         match job {
             Job::Carry(cube, target, yaw) => self.carry(inputs, cube, target, yaw),
             Job::Press(button) => self.press(inputs, button),
-            Job::Slide(which, to) => slide(inputs, which, to),
+            Job::Slide(index, to) => slide(inputs, index, to),
         }
     }
 
+    /// The next move that carries a cube to a position (m) and yaw (rad).
     fn carry(&mut self, inputs: &Inputs, cube: usize, target: Vec3, yaw: f64) -> Option<Move> {
         let (at, cube_yaw) = inputs.cubes[cube];
         let gripper = inputs.gripper;
@@ -343,6 +344,7 @@ impl TableExpert {
         Some(Move { to, rotation: grasp_rotation, close })
     }
 
+    /// The next move that presses a button.
     fn press(&mut self, inputs: &Inputs, button: usize) -> Option<Move> {
         let fixtures = inputs.fixtures.as_ref()?;
         if fixtures.locks[button] != self.locks[button] {
@@ -359,7 +361,7 @@ impl TableExpert {
         Some(Move { to, rotation: 0.0, close: true })
     }
 
-    /// Updates whether the gripper must still retreat: until it is above all nearby objects and open.
+    /// Updates `retreating`: the gripper retreats until it is open and above all nearby objects.
     fn update_retreat(&mut self, inputs: &Inputs) {
         let height = inputs.gripper[2];
         let cubes = inputs.cubes.iter().map(|(at, _)| height - at[2]).fold(height, f64::min);
@@ -375,15 +377,16 @@ impl TableExpert {
     }
 }
 
-fn slide(inputs: &Inputs, which: usize, to: f64) -> Option<Move> {
+/// The next move that slides the drawer (0) or the window (1) to an opening (m).
+fn slide(inputs: &Inputs, index: usize, to: f64) -> Option<Move> {
     let fixtures = inputs.fixtures.as_ref()?;
-    let (handle, yaw) = fixtures.handles[which];
-    let remaining = to - fixtures.openings[which];
+    let (handle, yaw) = fixtures.handles[index];
+    let remaining = to - fixtures.openings[index];
     if remaining.abs() <= 0.01 {
         return None;
     }
     // The drawer opens along y, the window along x.
-    let along = if which == 0 { [0.0, -remaining, 0.0] } else { [remaining, 0.0, 0.0] };
+    let along = if index == 0 { [0.0, -remaining, 0.0] } else { [remaining, 0.0, 0.0] };
     let rotation = symmetric_rotation(inputs.yaw, yaw, PI);
     let gripper = inputs.gripper;
     let near = horizontal_distance(gripper, handle);
@@ -400,7 +403,7 @@ fn slide(inputs: &Inputs, which: usize, to: f64) -> Option<Move> {
     } else {
         handle
     };
-    Some(Move { to: target, rotation, close: gripped && which == 1 })
+    Some(Move { to: target, rotation, close: gripped && index == 1 })
 }
 
 impl Expert for TableExpert {
@@ -439,14 +442,14 @@ impl Expert for TableExpert {
             self.update_retreat(&inputs);
         }
         let step = scale(sub(motion.to, inputs.gripper), GAIN / ACTION_POSITION);
-        for (i, part) in action.iter_mut().enumerate() {
+        for (i, element) in action.iter_mut().enumerate() {
             let value = match i {
                 0..3 => step[i],
                 3 => motion.rotation / ACTION_YAW,
                 _ if motion.close => 1.0,
                 _ => -1.0,
             };
-            *part = value.clamp(-1.0, 1.0);
+            *element = value.clamp(-1.0, 1.0);
         }
         Ok(())
     }

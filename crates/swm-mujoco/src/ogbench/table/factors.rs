@@ -2,7 +2,7 @@
 //! those of the reference.
 
 use super::config::{CUBE_COLORS, Camera, FRONT, SIDE, TableConfig};
-use super::parts::Parts;
+use super::objects::Objects;
 use crate::Physics;
 use crate::ogbench::arm::find;
 use crate::ogbench::arm::pose::{Quat, Vec3, cross, norm, normalized, scale, sub};
@@ -23,31 +23,31 @@ const GRIPPER_MATERIALS: [&str; 2] = ["ur5e/robotiq/black", "ur5e/robotiq/pad_gr
 /// The default colour of a closed lock.
 const LOCK_COLOR: [f64; 3] = CUBE_COLORS[0];
 
-/// The factors of a table of which `cameras` cameras (1 or 2) vary.
+/// The factors of a table; `camera.angle_delta` rotates `cameras` cameras (1 or 2).
 pub fn space(config: &TableConfig, cameras: usize) -> VariationSpace {
     let n = config.cubes;
-    let boxed = |shape: &[usize], low: &[f64], high: &[f64]| Space::Box {
+    let bounded = |shape: &[usize], low: &[f64], high: &[f64]| Space::Box {
         shape: shape.to_vec(),
         dtype: DType::Float64,
         low: low.to_vec(),
         high: high.to_vec(),
     };
-    let same = |shape: &[usize], low, high| Space::uniform_box(shape, DType::Float64, low, high);
+    let uniform = |shape: &[usize], low, high| Space::uniform_box(shape, DType::Float64, low, high);
     let [low, high] = config.object_bounds;
-    let positions = || boxed(&[n, 2], &low.repeat(n), &high.repeat(n));
+    let positions = || bounded(&[n, 2], &low.repeat(n), &high.repeat(n));
     let [arm_low, arm_high] = config.arm_bounds;
     let middle: Vec<f64> = (0..3).map(|i| (arm_low[i] + arm_high[i]) / 2.0).collect();
-    let (color, max_angle) = (|shape: &[usize]| same(shape, 0.0, 1.0), config.factors.camera_angle);
+    let (color, max_angle) = (|shape: &[usize]| uniform(shape, 0.0, 1.0), config.factors.camera_angle);
     let mut factors = vec![
         Factor::new("agent.color", color(&[3]), PURPLE),
-        Factor::new("agent.ee_start_position", boxed(&[3], &arm_low, &arm_high), middle),
-        Factor::new("camera.angle_delta", same(&[cameras, 2], -max_angle, max_angle), vec![0.0; 2 * cameras]),
+        Factor::new("agent.ee_start_position", bounded(&[3], &arm_low, &arm_high), middle),
+        Factor::new("camera.angle_delta", uniform(&[cameras, 2], -max_angle, max_angle), vec![0.0; 2 * cameras]),
         Factor::new("cube.color", color(&[n, 3]), CUBE_COLORS[..n].concat()),
         Factor::new("cube.goal_position", positions(), config.factors.cube.repeat(n)),
-        Factor::new("cube.goal_yaw", same(&[n], 0.0, TAU), vec![0.0; n]),
-        Factor::new("cube.size", same(&[n], 0.01, 0.03), vec![HALF_EDGE; n]),
+        Factor::new("cube.goal_yaw", uniform(&[n], 0.0, TAU), vec![0.0; n]),
+        Factor::new("cube.size", uniform(&[n], 0.01, 0.03), vec![HALF_EDGE; n]),
         Factor::new("cube.start_position", positions(), config.factors.cube.repeat(n)),
-        Factor::new("cube.start_yaw", same(&[n], 0.0, TAU), vec![0.0; n]),
+        Factor::new("cube.start_yaw", uniform(&[n], 0.0, TAU), vec![0.0; n]),
         Factor::new("floor.color", color(&[2, 3]), floor::COLORS.concat()),
         Factor::new("light.intensity", color(&[1]), [config.factors.light]),
     ];
@@ -71,7 +71,7 @@ fn color(value: &[f64]) -> [f32; 3] {
 ///
 /// # Errors
 /// When the model lacks an element.
-pub fn apply(physics: &mut Physics, config: &TableConfig, parts: &Parts, factors: &FactorValues) -> Result<()> {
+pub fn apply(physics: &mut Physics, config: &TableConfig, objects: &Objects, factors: &FactorValues) -> Result<()> {
     let find = |physics: &Physics, kind, name: &str| find(physics.model(), kind, name);
     for name in GRIPPER_MATERIALS {
         let material = find(physics, mjOBJ_MATERIAL, name)?;
@@ -86,7 +86,7 @@ pub fn apply(physics: &mut Physics, config: &TableConfig, parts: &Parts, factors
         let Some(camera) = config.cameras.iter().find(|camera| camera.name == name) else { continue };
         physics.model_mut().cam_quat_mut()[at] = rotated_camera(camera, [angle[0], angle[1]]);
     }
-    for (i, cube) in parts.cubes.iter().enumerate() {
+    for (i, cube) in objects.cubes.iter().enumerate() {
         let color = color(&factors.get("cube.color")[3 * i..][..3]);
         let half = factors.get("cube.size")[i];
         for (body, geom) in cube.bodies.into_iter().zip(cube.geoms) {
@@ -97,14 +97,15 @@ pub fn apply(physics: &mut Physics, config: &TableConfig, parts: &Parts, factors
     physics.set_const();
     // Markers are moved relative to their bodies. MuJoCo would skip the transform of geoms that coincide with their
     // bodies.
-    for cube in &parts.cubes {
+    for cube in &objects.cubes {
         physics.model_mut().geom_sameframe_mut()[cube.geoms[1]] = mjtSameFrame::mjSAMEFRAME_NONE;
     }
     set_mean_inertia(physics);
     floor::set_colors(physics, factors.get("floor.color"))
 }
 
-/// Updates the means that only the compiler computes: the solver's tolerance is relative to the mean inertia.
+/// Updates the mean mass and the mean inertia, which MuJoCo computes only when it compiles a model. The solver's
+/// tolerance is relative to the mean inertia.
 fn set_mean_inertia(physics: &mut Physics) {
     let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
     let (inertia, mass) = (mean(physics.model().dof_m0()), mean(&physics.model().body_mass()[1..]));
@@ -184,14 +185,14 @@ mod tests {
         let all = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
         let bytes = |seeds: &[u64]| -> Result<Vec<u8>> {
             let mut physics = Physics::new(Arc::clone(&model))?;
-            let parts = Parts::new(physics.model(), config)?;
+            let objects = Objects::new(physics.model(), config)?;
             for &seed in seeds {
-                apply(&mut physics, config, &parts, &space.resolve(&all, Key::new(seed))?)?;
+                apply(&mut physics, config, &objects, &space.resolve(&all, Key::new(seed))?)?;
                 physics.reset();
                 physics.forward();
             }
             let mut bytes = vec![0; physics.model().size()];
-            physics.model().save_to_buffer(&mut bytes).expect("a buffer of that size");
+            physics.model().save_to_buffer(&mut bytes).expect("saving the model to a buffer");
             Ok(bytes)
         };
         let (fresh, used) = (bytes(&[1])?, bytes(&[90, 1])?);

@@ -1,7 +1,7 @@
-//! The goal of a table environment: its parts, its success criterion, and the distance to it.
+//! The goal of a table environment: its objects, its success criterion, and the distance to the goal.
 
 use super::config::FixtureState;
-use super::parts::Parts;
+use super::objects::Objects;
 use crate::ogbench::arm::pose::{Quat, Vec3, distance};
 
 /// The distance within which cubes and openings are at their goal, in metres.
@@ -36,7 +36,7 @@ impl Subject {
         }
     }
 
-    /// The subject of a code; [`Subject::All`] for an unknown one.
+    /// The subject with a code; [`Subject::All`] for an unknown code.
     pub fn from_code(code: i64) -> Self {
         match code {
             i @ 0..100 => Self::Cube(i as usize),
@@ -51,18 +51,18 @@ impl Subject {
 /// One object of a goal.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GoalTerm {
-    /// The distance from its goal, in metres.
+    /// The distance of the object from its goal, in metres.
     pub distance: f64,
-    /// Whether it is at its goal.
+    /// Whether the object is at its goal.
     pub reached: bool,
-    /// The position at which the gripper manipulates it, in metres.
+    /// The position at which the gripper manipulates the object, in metres.
     pub grip: Vec3,
 }
 
-/// A state and a goal to compare.
+/// The comparison of a state with a goal.
 pub struct GoalCheck<'a> {
     /// The indices of all objects.
-    pub parts: &'a Parts,
+    pub objects: &'a Objects,
     /// The joint positions of the state.
     pub qpos: &'a [f64],
     /// The positions of all sites, in metres.
@@ -80,18 +80,18 @@ impl GoalCheck<'_> {
     pub fn terms(&self, subject: Subject) -> impl Iterator<Item = GoalTerm> {
         let included = move |one: Subject| subject == Subject::All || subject == one;
         let within = |distance: f64, grip| GoalTerm { distance, reached: distance <= GOAL_TOLERANCE, grip };
-        let cubes = self.parts.cubes.iter().enumerate().filter(move |(i, _)| included(Subject::Cube(*i))).map(
+        let cubes = self.objects.cubes.iter().enumerate().filter(move |(i, _)| included(Subject::Cube(*i))).map(
             move |(i, cube)| {
                 let position = cube.position(self.qpos);
                 within(distance(position, self.cubes[i].0), position)
             },
         );
-        let fixtures = self.parts.fixtures.iter().flat_map(move |fixtures| {
+        let fixtures = self.objects.fixtures.iter().flat_map(move |fixtures| {
             let button = |i: usize| {
-                let right = self.now.buttons[i] == self.goal.buttons[i];
-                let distance = if right { 0.0 } else { WRONG_LOCK_DISTANCE };
+                let is_equal = self.now.buttons[i] == self.goal.buttons[i];
+                let distance = if is_equal { 0.0 } else { WRONG_LOCK_DISTANCE };
                 let grip = self.sites[fixtures.buttons[i].top];
-                (Subject::Button(i), GoalTerm { distance, reached: right, grip })
+                (Subject::Button(i), GoalTerm { distance, reached: is_equal, grip })
             };
             let opening =
                 |subject, now: f64, goal: f64, site: usize| (subject, within((now - goal).abs(), self.sites[site]));
@@ -114,8 +114,8 @@ impl GoalCheck<'_> {
         self.terms(subject).all(|term| term.reached)
     }
 
-    /// The sum of the distances of all terms that are not reached, plus the distance of the gripper from the nearest of
-    /// them, in metres.
+    /// The sum of the distances of all terms that are not reached, plus the distance of the gripper from the nearest
+    /// object that is not at its goal, in metres.
     pub fn distance(&self, subject: Subject, gripper: Vec3) -> f64 {
         let open = || self.terms(subject).filter(|term| !term.reached);
         let terms: f64 = open().map(|term| term.distance).sum();

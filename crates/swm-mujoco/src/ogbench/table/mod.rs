@@ -6,8 +6,8 @@ mod config;
 mod expert;
 mod factors;
 mod goal;
+mod objects;
 mod observe;
-mod parts;
 mod start;
 mod task;
 mod tasks;
@@ -38,7 +38,7 @@ macro_rules! options {
             },
             EnvOption {
                 key: "reward_task_id",
-                summary: "a fixed task (0: the default one) with reward minus the unreached objects; none: a random task",
+                summary: "a fixed task (0: the default task), rewarded by -1 per unreached object; none: a random task",
                 values: &["none", "0", "1", "2", "3", "4", "5"],
             },
             EnvOption {
@@ -54,7 +54,7 @@ macro_rules! options {
             TERMINATE_AT_GOAL,
             EnvOption {
                 key: "multiview",
-                summary: "whether the camera at the side varies too",
+                summary: "whether camera.angle_delta also rotates the camera at the side",
                 values: &["false", "true"],
             },
         ]
@@ -71,10 +71,10 @@ pub const CUBE_OPTIONS: &[EnvOption] = options![EnvOption {
 /// The options of `swm/OGBScene-v0`.
 pub const SCENE_OPTIONS: &[EnvOption] = options![];
 
-/// The task, counted from 1, of `reward_task_id=0`.
+/// The task that `reward_task_id=0` selects, counted from 1.
 const DEFAULT_TASK: usize = 2;
 
-/// Creates a table with cubes.
+/// Creates a table environment with cubes.
 ///
 /// # Errors
 /// When MuJoCo or OGBench's files are not installed.
@@ -83,7 +83,7 @@ pub fn make_cube(choice: &EnvChoice) -> Result<Box<dyn Env>> {
     make(CUBES.iter().find(|config| config.name == name).unwrap_or(&CUBES[0]), choice)
 }
 
-/// Creates a scene.
+/// Creates the scene environment.
 ///
 /// # Errors
 /// When MuJoCo or OGBench's files are not installed.
@@ -102,6 +102,7 @@ pub fn models() -> impl Iterator<Item = (String, Result<Arc<MjModel>>)> {
     CUBES.iter().chain([&SCENE]).map(|config| (config.name.to_owned(), model(config, ArmRendering::Opaque)))
 }
 
+/// Creates a table environment.
 fn make(config: &'static TableConfig, choice: &EnvChoice) -> Result<Box<dyn Env>> {
     let chosen = |key| choice.choices.get(key);
     let arm_rendering = if chosen("ob_type") == PIXELS { ArmRendering::Transparent } else { ArmRendering::Opaque };
@@ -114,8 +115,8 @@ fn make(config: &'static TableConfig, choice: &EnvChoice) -> Result<Box<dyn Env>
     };
     let (permute, terminate) = (chosen("permute_blocks") == "true", chosen("terminate_at_goal") == "true");
     let table = Table::new(config, &model, mode, permute, terminate)?;
-    let observation = observation_len(config.cubes, config.fixtures);
-    let unbounded = Space::uniform_box([observation], DType::Float64, f64::NEG_INFINITY, f64::INFINITY);
+    let len = observation_len(config.cubes, config.fixtures);
+    let unbounded = Space::uniform_box([len], DType::Float64, f64::NEG_INFINITY, f64::INFINITY);
     let spec = EnvSpec {
         id: choice.id(),
         action_space: Space::uniform_box([ACTION], DType::Float32, -1.0, 1.0),

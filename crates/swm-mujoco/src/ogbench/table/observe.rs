@@ -1,7 +1,7 @@
 //! The columns of a table: the observation, and the state of every object. Names and scales are those of the reference.
 
 use super::config::observation_len;
-use super::parts::Fixtures;
+use super::objects::Fixtures;
 use super::task::{TASK_STATE_HEAD, Table};
 use crate::Physics;
 use crate::ogbench::arm::CONTROLS;
@@ -126,13 +126,13 @@ impl Table {
         writer.position(gripper.position);
         writer.angle(gripper.yaw);
         writer.write(&[gripper.closed * GRIPPER_SCALE, gripper.contact]);
-        for cube in &self.parts.cubes {
+        for cube in &self.objects.cubes {
             let rotation = cube.rotation(data.qpos());
             writer.position(cube.position(data.qpos()));
             writer.write(&rotation);
             writer.angle(yaw(rotation));
         }
-        if let Some(fixtures) = &self.parts.fixtures {
+        if let Some(fixtures) = &self.objects.fixtures {
             for (button, state) in fixtures.buttons.iter().zip(self.buttons) {
                 let unlocked = f64::from(state);
                 let (at, speed) = (data.qpos()[button.slide.qpos], data.qvel()[button.slide.qvel]);
@@ -168,7 +168,7 @@ impl Table {
         for value in [gripper.yaw, gripper.closed, gripper.closing, gripper.contact] {
             columns.set(&[value]);
         }
-        for cube in &self.parts.cubes {
+        for cube in &self.objects.cubes {
             let rotation = cube.rotation(qpos);
             columns.set(&cube.position(qpos));
             columns.set(&rotation);
@@ -192,7 +192,7 @@ impl Table {
         }
         columns.next += 2;
         columns.integers(&[self.goal.subject.code()]);
-        if let Some(fixtures) = &self.parts.fixtures {
+        if let Some(fixtures) = &self.objects.fixtures {
             self.write_fixtures(physics, fixtures, &mut columns);
         }
     }

@@ -1,4 +1,4 @@
-//! The start of episodes, and how goals are drawn.
+//! The start of episodes, and the sampling of goals.
 
 use super::config::{AWAY, Bounds, CUBE_HEIGHT, FixtureState, OPEN};
 use super::goal::{GOAL_TOLERANCE, Subject};
@@ -11,11 +11,12 @@ use rand::seq::{IndexedRandom as _, SliceRandom as _};
 use std::f64::consts::{PI, TAU};
 use swm_core::{Error, FactorValues, Key, Result, Rng};
 
-/// Largest distance of cubes, drawer and window from the start that a task gives, in metres.
+/// Largest distance of cubes, drawer and window from their initial positions in the task, in metres.
 const START_NOISE: f64 = 0.01;
-/// Random actions in which objects settle at the goal.
+/// The number of random actions in which objects settle at the goal.
 const SETTLE_STEPS: usize = 2;
-/// Height of a cube's centre above that of the cube below it, in metres; for cubes of any size, as in the reference.
+/// Height of a cube's centre above the centre of the cube below it, in metres; for cubes of any size, as in the
+/// reference.
 const STACK_HEIGHT: f64 = 0.04;
 /// The position of a cube in an open drawer, in metres.
 const IN_OPEN_DRAWER: Vec3 = [0.33, -0.24, 0.066];
@@ -29,7 +30,7 @@ const P_DRAWER: f64 = 0.3;
 const LOCKED_WEIGHT: f64 = 0.25;
 /// Probability that a sampled goal stacks a cube.
 const P_GOAL_STACK: f64 = 0.3;
-/// Distance of two cubes side by side at a sampled goal, in metres: the gripper fits between them.
+/// The smallest distance of two cubes on the table at a sampled goal, in metres: the gripper fits between them.
 const MIN_DISTANCE: f64 = 0.08;
 /// The maximal number of goals drawn before sampling fails, and of positions drawn for each cube.
 const TRIES: usize = 256;
@@ -59,7 +60,7 @@ impl Table {
         physics.forward();
     }
 
-    /// Starts a task. The goal is simulated first, for its observation; then the start is set.
+    /// Starts a task. The goal is simulated first, to compute its observation; then the start is set.
     fn begin_task(&mut self, physics: &mut Physics, task: usize, factors: &FactorValues, rng: &mut Rng) {
         let task = &self.config.tasks[task];
         let mut order: Vec<usize> = (0..self.config.cubes).collect();
@@ -67,15 +68,15 @@ impl Table {
             order.shuffle(rng);
         }
         let gripper = factors.get("agent.ee_start_position");
-        let rest = physics.data().qpos().to_vec();
+        let initial_qpos = physics.data().qpos().to_vec();
         let cubes = order.iter().map(|&i| (task.goals[i], IDENTITY)).collect();
         let [start, goal] = task.fixtures;
         self.settle_goal(physics, gripper, cubes, goal, rng);
         // Joints that the start does not set, such as the fingers, return to their initial positions.
-        physics.data_mut().qpos_mut().copy_from_slice(&rest);
+        physics.data_mut().qpos_mut().copy_from_slice(&initial_qpos);
         physics.data_mut().qvel_mut().fill(0.0);
         self.set_gripper(physics, gripper, rng);
-        for (cube, &i) in self.parts.cubes.iter().zip(&order) {
+        for (cube, &i) in self.objects.cubes.iter().zip(&order) {
             let [x, y, z] = task.starts[i];
             let mut noise = || rng.random_range(-START_NOISE..=START_NOISE);
             let position = [x + noise(), y + noise(), z];
@@ -98,7 +99,7 @@ impl Table {
     ) {
         (self.goal.subject, self.goal.cubes, self.goal.fixtures) = (Subject::All, cubes, fixtures);
         self.set_gripper(physics, gripper, rng);
-        for (cube, &(position, rotation)) in self.parts.cubes.iter().zip(&self.goal.cubes) {
+        for (cube, &(position, rotation)) in self.objects.cubes.iter().zip(&self.goal.cubes) {
             cube.set_pose(physics, position, rotation);
         }
         self.move_marker_bodies(physics);
@@ -112,7 +113,7 @@ impl Table {
         self.store_goal(physics);
     }
 
-    /// Stores the present pose as that of the goal. The physics has the derived quantities of the goal afterwards.
+    /// Stores the present pose as the goal pose. The physics has the derived quantities of the goal afterwards.
     fn store_goal(&mut self, physics: &mut Physics) {
         let (qpos, qvel) = (physics.data().qpos(), physics.data().qvel());
         self.goal.pose[..qpos.len()].copy_from_slice(qpos);
@@ -130,17 +131,17 @@ impl Table {
 
     /// Sets drawer, window and locks.
     fn set_fixtures(&mut self, physics: &mut Physics, state: FixtureState) {
-        if let Some(fixtures) = self.parts.fixtures {
+        if let Some(fixtures) = self.objects.fixtures {
             self.buttons = state.buttons;
             fixtures.set_openings(physics, state);
         }
     }
 
-    /// Starts an episode of `mode=data_collection`: the start of the factors, and one object to manipulate.
+    /// Starts an episode of `mode=data_collection`: the factors set the start, and the goal is one object.
     fn begin_from_factors(&mut self, physics: &mut Physics, factors: &FactorValues, rng: &mut Rng) {
         self.set_gripper(physics, factors.get("agent.ee_start_position"), rng);
         let (positions, yaws) = (factors.get("cube.start_position"), factors.get("cube.start_yaw"));
-        for (i, cube) in self.parts.cubes.iter().enumerate() {
+        for (i, cube) in self.objects.cubes.iter().enumerate() {
             cube.set_pose(physics, [positions[2 * i], positions[2 * i + 1], CUBE_HEIGHT], about_z(yaws[i]));
         }
         let fixtures = FixtureState {
@@ -151,13 +152,13 @@ impl Table {
         self.set_fixtures(physics, fixtures);
         self.draw_subject(physics, factors, rng);
         self.move_marker_bodies(physics);
-        // The pose at the goal is the start with the subject at its goal.
+        // The goal pose is the start with the subject at its goal.
         let start = physics.data().qpos().to_vec();
         if let Subject::Cube(i) = self.goal.subject {
             let (position, rotation) = self.goal.cubes[i];
-            self.parts.cubes[i].set_pose(physics, position, rotation);
+            self.objects.cubes[i].set_pose(physics, position, rotation);
         }
-        if let Some(fixtures) = self.parts.fixtures {
+        if let Some(fixtures) = self.objects.fixtures {
             fixtures.set_openings(physics, self.goal.fixtures);
         }
         self.store_goal(physics);
@@ -194,7 +195,7 @@ impl Table {
     /// position.
     fn draw_cube(&mut self, physics: &Physics, now: FixtureState, factors: &FactorValues, rng: &mut Rng) {
         let qpos = physics.data().qpos();
-        let positions: Vec<Vec3> = self.parts.cubes.iter().map(|cube| cube.position(qpos)).collect();
+        let positions: Vec<Vec3> = self.objects.cubes.iter().map(|cube| cube.position(qpos)).collect();
         let above = |a: Vec3, b: Vec3| b[2] > a[2] && (a[0] - b[0]).hypot(a[1] - b[1]) < 0.02;
         let is_top = |&i: &usize| !positions.iter().any(|&b| above(positions[i], b));
         let tops: Vec<usize> = (0..positions.len()).filter(is_top).collect();
@@ -231,7 +232,7 @@ impl Table {
         let (contact, previous) = (self.contact, self.previous.clone());
         let qpos = physics.data().qpos();
         let now = self.fixture_state(qpos);
-        let positions: Vec<Vec3> = self.parts.cubes.iter().map(|cube| cube.position(qpos)).collect();
+        let positions: Vec<Vec3> = self.objects.cubes.iter().map(|cube| cube.position(qpos)).collect();
         for _ in 0..TRIES {
             let Some(mut cubes) = self.draw_cube_poses(rng) else { continue };
             let mut fixtures = now;
@@ -264,7 +265,7 @@ impl Table {
         })
     }
 
-    /// Draws poses for the cubes, apart from each other or stacked; `None` if there was no room.
+    /// Draws poses for the cubes, apart from each other or stacked; `None` if no free position was drawn.
     fn draw_cube_poses(&self, rng: &mut Rng) -> Option<Vec<(Vec3, Quat)>> {
         let mut poses: Vec<(Vec3, Quat)> = vec![];
         let mut tops: Vec<usize> = vec![];

@@ -1,9 +1,9 @@
-//! [`Table`]: step, reward and goal of a table. Its start is in `start`, its columns are in `observe`.
+//! [`Table`]: step, reward and goal of a table. The module `start` has the start of episodes, `observe` the columns.
 
 use super::config::{AWAY, CUBE_HEIGHT, FRONT, FixtureState, TableConfig, WORKSPACE, observation_len};
 use super::factors;
 use super::goal::{GoalCheck, Subject};
-use super::parts::Parts;
+use super::objects::Objects;
 use crate::Physics;
 use crate::ogbench::arm::pose::{IDENTITY, Pose, Quat, Vec3};
 use crate::ogbench::arm::{Arm, Proprioception, find};
@@ -15,9 +15,9 @@ use swm_core::{FactorValues, Key, Result, RowMut};
 
 /// Time steps of 2 ms per action.
 const SUBSTEPS: usize = 25;
-/// Elements of the task state before the pose: contact, and locks now and before the step.
+/// The number of elements of the task state before the pose: contact, the locks, and the locks before the last step.
 pub const TASK_STATE_HEAD: usize = 5;
-/// Elements of the goal values before the cubes: subject, locks, openings, contact.
+/// The number of elements of the goal values before the cubes: subject, locks, openings, contact.
 const GOAL_HEAD: usize = 6;
 /// Distance outside the workspace at which a cube is brought back, in metres.
 const LOST_DISTANCE: f64 = 0.2;
@@ -33,7 +33,7 @@ pub enum Mode {
     DataCollection,
 }
 
-/// A table on its model.
+/// A table task on a compiled model.
 pub struct Table {
     pub(super) config: &'static TableConfig,
     pub(super) mode: Mode,
@@ -42,7 +42,7 @@ pub struct Table {
     /// Whether an episode terminates at its goal.
     terminate: bool,
     pub(super) arm: Arm,
-    pub(super) parts: Parts,
+    pub(super) objects: Objects,
     camera: usize,
     lock_colors: [[f32; 3]; 2],
     /// The locks: 0 locked, 1 unlocked.
@@ -66,9 +66,9 @@ pub struct Goal {
     pub fixtures: FixtureState,
     /// `qpos` and `qvel` of a pose at the goal.
     pub pose: Vec<f64>,
-    /// Contact of the gripper in that pose.
+    /// Contact of the gripper in `pose`, 0 to 1.
     pub contact: f64,
-    /// The observation in that pose.
+    /// The observation in `pose`.
     pub observation: Vec<f64>,
     /// Whether `observation` was computed in `pose`.
     observed: bool,
@@ -93,7 +93,7 @@ impl Table {
             permute,
             terminate,
             arm: Arm::new(model)?,
-            parts: Parts::new(model, config)?,
+            objects: Objects::new(model, config)?,
             camera: find(model, mjOBJ_CAMERA, FRONT)?,
             lock_colors: [[0.0; 3]; 2],
             buttons: [0; 2],
@@ -114,7 +114,7 @@ impl Table {
 
     /// The state of the fixtures in a configuration.
     pub(super) fn fixture_state(&self, qpos: &[f64]) -> FixtureState {
-        self.parts.fixtures.map_or_else(FixtureState::default, |fixtures| fixtures.state(qpos, self.buttons))
+        self.objects.fixtures.map_or_else(FixtureState::default, |fixtures| fixtures.state(qpos, self.buttons))
     }
 
     /// The state of the gripper.
@@ -122,11 +122,11 @@ impl Table {
         self.arm.proprioception(physics, self.contact)
     }
 
-    /// The present state and the goal, to compare.
+    /// Returns the comparison of the present state with the goal.
     fn goal_check<'a>(&'a self, physics: &'a Physics) -> GoalCheck<'a> {
         let qpos = physics.data().qpos();
         GoalCheck {
-            parts: &self.parts,
+            objects: &self.objects,
             qpos,
             sites: physics.data().site_xpos(),
             now: self.fixture_state(qpos),
@@ -135,7 +135,7 @@ impl Table {
         }
     }
 
-    /// Stores the present pose and locks as those before the next step.
+    /// Stores the present pose and locks as the pose and locks before the next step.
     pub(super) fn store_previous(&mut self, physics: &Physics) {
         let (qpos, qvel) = (physics.data().qpos(), physics.data().qvel());
         self.previous[..qpos.len()].copy_from_slice(qpos);
@@ -150,7 +150,7 @@ impl Table {
         physics.step(SUBSTEPS);
         physics.contact_forces();
         self.contact = self.arm.contact(physics);
-        if let Some(fixtures) = self.parts.fixtures {
+        if let Some(fixtures) = self.objects.fixtures {
             if matches!(self.mode, Mode::RandomTask | Mode::FixedTask(_)) {
                 self.return_lost_cubes(physics);
             }
@@ -162,10 +162,10 @@ impl Table {
     }
 
     /// Moves cubes that left the workspace to the middle of the table. This happens when a drawer with a cube inside is
-    /// locked while it moves. The reference moves them to a random position.
+    /// locked while it moves. The reference moves such cubes to a random position.
     fn return_lost_cubes(&self, physics: &mut Physics) {
         let [low, high] = WORKSPACE;
-        for cube in &self.parts.cubes {
+        for cube in &self.objects.cubes {
             let at = cube.position(physics.data().qpos());
             if (0..3).any(|i| at[i] <= low[i] - LOST_DISTANCE || at[i] >= high[i] + LOST_DISTANCE) {
                 let [x, y] = self.config.factors.cube;
@@ -177,11 +177,11 @@ impl Table {
 
     /// Updates the parts of the model that display locks and goal.
     pub(super) fn update_model(&self, physics: &mut Physics) {
-        if let Some(fixtures) = self.parts.fixtures {
+        if let Some(fixtures) = self.objects.fixtures {
             fixtures.apply_locks(physics, self.buttons, &self.lock_colors);
             fixtures.place_markers(physics, self.goal.fixtures);
         }
-        for (i, cube) in self.parts.cubes.iter().enumerate() {
+        for (i, cube) in self.objects.cubes.iter().enumerate() {
             let included = matches!(self.goal.subject, Subject::All) || self.goal.subject == Subject::Cube(i);
             cube.set_marker_visible(physics, included);
         }
@@ -190,7 +190,7 @@ impl Table {
     /// Moves the mocap bodies of the cubes' markers, which are part of the state, to the goal. Called at the start of
     /// an episode.
     pub(super) fn move_marker_bodies(&self, physics: &mut Physics) {
-        for (cube, &(position, rotation)) in self.parts.cubes.iter().zip(&self.goal.cubes) {
+        for (cube, &(position, rotation)) in self.objects.cubes.iter().zip(&self.goal.cubes) {
             let at = Pose { position, rotation };
             cube.place_marker(physics, at, at);
             physics.data_mut().mocap_pos_mut()[cube.mocap] = position;
@@ -198,8 +198,8 @@ impl Table {
         }
     }
 
-    /// Computes the observation at the goal; the physics is in the goal pose afterwards. The reference computes no such
-    /// observation in data collection.
+    /// Computes the observation at the goal; the physics is in the goal pose afterwards. In data collection, the
+    /// observation is not computed, as in the reference.
     pub(super) fn observe_goal(&mut self, physics: &mut Physics) {
         self.goal.observed = true;
         if self.mode == Mode::DataCollection {
@@ -230,7 +230,7 @@ impl Task for Table {
         if self.config.fixtures {
             self.lock_colors = factors::lock_colors(factors);
         }
-        factors::apply(physics, self.config, &self.parts, factors)?;
+        factors::apply(physics, self.config, &self.objects, factors)?;
         self.update_model(physics);
         Ok(())
     }
@@ -245,8 +245,8 @@ impl Task for Table {
         let success = self.is_success(physics);
         let reward = match self.mode {
             Mode::FixedTask(_) => {
-                let terms = self.goal_check(physics);
-                -terms.terms(self.goal.subject).map(|term| f64::from(!term.reached)).sum::<f64>()
+                let check = self.goal_check(physics);
+                -check.terms(self.goal.subject).map(|term| f64::from(!term.reached)).sum::<f64>()
             }
             _ => f64::from(success),
         };
@@ -302,7 +302,8 @@ impl Task for Table {
             position.copy_from_slice(&values[..3]);
             rotation.copy_from_slice(&values[3..]);
         }
-        // Planning restores thousands of states of one episode, all with the same goal, so its observation is cached.
+        // Planning restores thousands of states of one episode, all with the same goal, so the goal's observation is
+        // cached.
         if self.goal.pose != pose || self.goal.contact != head[5] {
             self.goal.pose.copy_from_slice(pose);
             self.goal.contact = head[5];
@@ -314,10 +315,10 @@ impl Task for Table {
         let pose = &state[1..=self.goal.pose.len()];
         self.goal.pose.copy_from_slice(pose);
         (self.goal.subject, self.goal.contact) = (Subject::All, task_state[0]);
-        for (goal, cube) in self.goal.cubes.iter_mut().zip(&self.parts.cubes) {
+        for (goal, cube) in self.goal.cubes.iter_mut().zip(&self.objects.cubes) {
             *goal = (cube.position(pose), cube.rotation(pose));
         }
-        if let Some(fixtures) = self.parts.fixtures {
+        if let Some(fixtures) = self.objects.fixtures {
             self.goal.fixtures = fixtures.state(pose, locks(&task_state[1..]));
         }
         self.observe_goal(physics);
@@ -336,7 +337,7 @@ impl Task for Table {
         // Positions and quaternions of the mocap bodies are at the end of a state.
         let n = self.config.cubes;
         let (positions, quats) = state[state.len() - 7 * n..].split_at(3 * n);
-        for (cube, &(position, rotation)) in self.parts.cubes.iter().zip(&self.goal.cubes) {
+        for (cube, &(position, rotation)) in self.objects.cubes.iter().zip(&self.goal.cubes) {
             let body = Pose {
                 position: std::array::from_fn(|i| positions[3 * cube.mocap + i]),
                 rotation: std::array::from_fn(|i| quats[4 * cube.mocap + i]),
@@ -350,7 +351,7 @@ impl Task for Table {
         physics.data_mut().qpos_mut().copy_from_slice(qpos);
         physics.data_mut().qvel_mut().copy_from_slice(qvel);
         self.move_marker_bodies(physics);
-        if let Some(fixtures) = self.parts.fixtures {
+        if let Some(fixtures) = self.objects.fixtures {
             fixtures.apply_locks(physics, self.goal.fixtures.buttons, &self.lock_colors);
         }
         physics.forward();

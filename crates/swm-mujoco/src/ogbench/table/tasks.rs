@@ -15,7 +15,7 @@ const fn scene(cube: [&'static [[f64; 3]]; 2], fixtures: [FixtureState; 2]) -> T
 }
 
 /// A state of the fixtures.
-const fn fixed(buttons: [u8; 2], drawer: f64, window: f64) -> FixtureState {
+const fn fixture_state(buttons: [u8; 2], drawer: f64, window: f64) -> FixtureState {
     FixtureState { buttons, drawer, window }
 }
 
@@ -28,7 +28,7 @@ pub const SINGLE: &[Task] = &[
     cubes(&[[0.35, 0.2, 0.02]], &[[0.5, -0.2, 0.02]]),
 ];
 
-/// Two cubes: move one, move both, spread, swap, stack.
+/// Two cubes: move one cube, move both cubes, spread, swap, stack.
 pub const DOUBLE: &[Task] = &[
     cubes(&[[0.425, 0.0, 0.02], [0.425, -0.1, 0.02]], &[[0.425, 0.0, 0.02], [0.425, 0.1, 0.02]]),
     cubes(&[[0.35, -0.1, 0.02], [0.5, -0.1, 0.02]], &[[0.35, 0.1, 0.02], [0.5, 0.1, 0.02]]),
@@ -199,12 +199,27 @@ pub const OCTUPLE: &[Task] = &[
     ),
 ];
 
-/// Open both fixtures; close and lock both; rearrange; cube into the drawer; cube into the locked drawer with the
-/// window open.
+/// The scene: open drawer and window; close and lock them; move cube, drawer and window; put the cube into the drawer;
+/// put the cube into the drawer and open the window, both locked at start and goal.
 pub const SCENE: &[Task] = &[
-    scene([&[[0.35, 0.05, 0.02]], &[[0.35, 0.05, 0.02]]], [fixed([1, 1], 0.0, 0.0), fixed([1, 1], -0.16, 0.2)]),
-    scene([&[[0.35, -0.05, 0.02]], &[[0.35, -0.05, 0.02]]], [fixed([0, 0], -0.16, 0.2), fixed([0, 0], 0.0, 0.0)]),
-    scene([&[[0.4, -0.05, 0.02]], &[[0.4, 0.15, 0.02]]], [fixed([1, 0], 0.0, 0.2), fixed([1, 1], -0.16, 0.0)]),
-    scene([&[[0.35, 0.05, 0.02]], &[[0.33, -0.356, 0.065986]]], [fixed([0, 0], 0.0, 0.0), fixed([1, 0], 0.0, 0.0)]),
-    scene([&[[0.35, 0.15, 0.02]], &[[0.33, -0.356, 0.065986]]], [fixed([0, 0], 0.0, 0.0), fixed([0, 0], 0.0, 0.2)]),
+    scene(
+        [&[[0.35, 0.05, 0.02]], &[[0.35, 0.05, 0.02]]],
+        [fixture_state([1, 1], 0.0, 0.0), fixture_state([1, 1], -0.16, 0.2)],
+    ),
+    scene(
+        [&[[0.35, -0.05, 0.02]], &[[0.35, -0.05, 0.02]]],
+        [fixture_state([0, 0], -0.16, 0.2), fixture_state([0, 0], 0.0, 0.0)],
+    ),
+    scene(
+        [&[[0.4, -0.05, 0.02]], &[[0.4, 0.15, 0.02]]],
+        [fixture_state([1, 0], 0.0, 0.2), fixture_state([1, 1], -0.16, 0.0)],
+    ),
+    scene(
+        [&[[0.35, 0.05, 0.02]], &[[0.33, -0.356, 0.065986]]],
+        [fixture_state([0, 0], 0.0, 0.0), fixture_state([1, 0], 0.0, 0.0)],
+    ),
+    scene(
+        [&[[0.35, 0.15, 0.02]], &[[0.33, -0.356, 0.065986]]],
+        [fixture_state([0, 0], 0.0, 0.0), fixture_state([0, 0], 0.0, 0.2)],
+    ),
 ];

@@ -8,10 +8,10 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_raster::{Assets, Corner, Mesh, Texture, V3};
 
-/// Model groups that are cached; the least recently used one is dropped first.
+/// The number of model groups that are cached; the least recently used group is dropped first.
 const MAX_GROUPS: usize = 16;
 
-/// Textures that are cached per group before edited ones are dropped.
+/// The number of textures that are cached per group before edited textures are dropped.
 const MAX_TEXTURES: usize = 64;
 
 /// Below this cosine between vertex and face normal, MuJoCo shades a mesh vertex with the face normal.
@@ -28,7 +28,7 @@ struct Group {
 pub(super) fn fill(assets: &mut Assets, model: &MjModel, appearance: &Appearance) {
     static CACHE: Mutex<Vec<(u64, Group)>> = Mutex::new(vec![]);
     let mut cache = CACHE.lock().unwrap_or_else(PoisonError::into_inner);
-    let (number, mut group) = match cache.iter().position(|(number, _)| *number == appearance.group) {
+    let (group_number, mut group) = match cache.iter().position(|(group_number, _)| *group_number == appearance.group) {
         Some(index) => cache.remove(index),
         None => {
             let meshes = (0..model.mesh_vertadr().len()).map(|i| Arc::new(mesh(model, i)));
@@ -51,10 +51,10 @@ pub(super) fn fill(assets: &mut Assets, model: &MjModel, appearance: &Appearance
     if cache.len() >= MAX_GROUPS {
         cache.remove(0);
     }
-    cache.push((number, group));
+    cache.push((group_number, group));
 }
 
-/// A count or address of MuJoCo as an index; 0 for negative values.
+/// Converts a count or an address of MuJoCo to an index; 0 for negative values.
 fn index(value: impl TryInto<usize>) -> usize {
     value.try_into().unwrap_or(0)
 }
@@ -69,11 +69,11 @@ fn mesh(model: &MjModel, asset: usize) -> Mesh {
         let positions = model.mesh_face()[face].map(|i| model.mesh_vert()[vertices + index(i)]);
         let flat = face_normal(positions);
         std::array::from_fn(|k| {
-            let own = model.mesh_normal()[normals + index(model.mesh_facenormal()[face][k])];
-            let smooth = own.iter().zip(flat).map(|(a, b)| a * b).sum::<f32>() >= SMOOTH_COSINE;
+            let vertex_normal = model.mesh_normal()[normals + index(model.mesh_facenormal()[face][k])];
+            let smooth = vertex_normal.iter().zip(flat).map(|(a, b)| a * b).sum::<f32>() >= SMOOTH_COSINE;
             Corner {
                 position: positions[k],
-                normal: if coordinates.is_some() || smooth { own } else { flat },
+                normal: if coordinates.is_some() || smooth { vertex_normal } else { flat },
                 coordinates: coordinates
                     .map_or([0.0; 2], |first| model.mesh_texcoord()[first + index(model.mesh_facetexcoord()[face][k])]),
             }
@@ -81,7 +81,7 @@ fn mesh(model: &MjModel, asset: usize) -> Mesh {
     }))
 }
 
-/// The unit normal of a triangle; +z for a degenerate one.
+/// The unit normal of a triangle; +z for a degenerate triangle.
 fn face_normal([a, b, c]: [V3; 3]) -> V3 {
     let (u, v): (V3, V3) = (std::array::from_fn(|k| b[k] - a[k]), std::array::from_fn(|k| c[k] - a[k]));
     let n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
@@ -126,7 +126,7 @@ fn height_field(model: &MjModel, asset: usize) -> Mesh {
     Mesh::new(triangles)
 }
 
-/// Converts a texture. Returns a white one if its data do not match its size or its channels are not supported.
+/// Converts a texture. Returns a white texture if its data do not match its size or its channels are not supported.
 fn texture(model: &MjModel, asset: usize) -> Texture {
     let (width, height) = (index(model.tex_width()[asset]), index(model.tex_height()[asset]));
     let channels = index(model.tex_nchannel()[asset]);

@@ -1,7 +1,7 @@
 //! Converts MuJoCo's abstract scene to a scene of `swm-raster`.
 //!
-//! Constants and mappings reproduce MuJoCo's OpenGL renderer: how planes are tessellated, how textures map onto shapes.
-#![allow(unsafe_code, reason = "MuJoCo stores the geoms of a scene in an array of its own")]
+//! Constants and mappings reproduce MuJoCo's OpenGL renderer: its tessellation of planes, its texture coordinates.
+#![allow(unsafe_code, reason = "MuJoCo stores the geoms of a scene in an array that it allocates")]
 
 use mujoco_rs::mujoco_c::{
     mjtCatBit, mjtGeom, mjtLightType, mjtObj, mjtRndFlag, mjtTexture, mjtTextureRole, mjvGLCamera, mjvGeom, mjvLight,
@@ -13,7 +13,7 @@ use swm_raster::{Axis, Camera, Geom, Haze, Light, Mapping, Paint, Scene, Shape, 
 /// The maximal number of cells along each axis of a model's plane.
 const MAX_CELLS: usize = 200;
 
-/// Cells along each axis of a plane that is not a geom of the model.
+/// The number of cells along each axis of a plane that is not a geom of the model.
 const DECOR_CELLS: usize = 4;
 
 /// Fills a scene from MuJoCo's abstract scene.
@@ -136,8 +136,8 @@ fn shape(from: &mjvGeom, model: &MjModel, of_model: bool) -> Option<Shape> {
     })
 }
 
-/// How MuJoCo tessellates a plane along an axis. `size` is half the extent in metres (0: infinite), `spacing` half the
-/// distance between grid lines in metres.
+/// Tessellates a plane along an axis as MuJoCo does. `size` is half the extent in metres (0: infinite), `spacing` half
+/// the distance between grid lines in metres.
 fn axis(size: f64, spacing: f64, repeat: f32, model: &MjModel) -> Axis {
     if size > 0.0 {
         let spacing = spacing.max(size / (MAX_CELLS - 2) as f64);

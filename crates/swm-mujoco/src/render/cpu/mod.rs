@@ -1,8 +1,9 @@
 //! The CPU renderer: draws MuJoCo's abstract scenes with `swm-raster`, on the calling thread and on idle threads of its
 //! pool.
 //!
-//! It needs no graphics library and produces the same bytes on every machine. Plane grids, mesh vertices and mip maps,
-//! which MuJoCo computes when it creates a rendering context, are computed here once per model group and cached.
+//! The renderer needs no graphics library and produces the same bytes on every machine. Plane grids, mesh vertices and
+//! mip maps, which MuJoCo computes when it creates a rendering context, are computed here once per model group and
+//! cached.
 
 mod assets;
 mod convert;
@@ -45,12 +46,12 @@ impl Renderer for CpuRenderer {
 
 thread_local! {
     /// One workspace per rendering in progress: a thread that waits for other threads to finish its frame may start
-    /// another.
+    /// another frame.
     static WORKSPACES: RefCell<Vec<Workspace>> = RefCell::default();
 }
 
 impl Workspace {
-    /// Renders a scene.
+    /// Renders a scene of MuJoCo into `buffer`.
     fn draw(&mut self, from: &ModelScene<'_>, size: (usize, usize), buffer: FrameBuffer<'_>) {
         let ModelScene { scene, model, appearance } = from;
         if self.appearance.as_ref() != Some(appearance) {

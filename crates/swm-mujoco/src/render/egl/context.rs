@@ -1,4 +1,5 @@
-//! The OpenGL contexts of a render thread: one of MuJoCo's contexts per model group, with its meshes and textures.
+//! The OpenGL contexts of a render thread. Each model group (all copies of one compiled model) has one `mjrContext`,
+//! which holds its meshes and textures.
 
 use super::library::{Display, GlContext, Library};
 use crate::physics::Appearance;
@@ -12,14 +13,14 @@ use std::ffi::c_int;
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::{Error, Result};
 
-/// Contexts that a thread caches; the least recently used one is dropped first. Each context holds a shadow map of 64
-/// MB, a frame buffer, meshes and textures.
+/// The number of contexts that a thread caches; the least recently used context is dropped first. Each context holds a
+/// shadow map of 64 MB, a frame buffer, meshes and textures.
 const MAX_CONTEXTS: usize = 4;
 
 /// Serialises the creation and destruction of contexts: MuJoCo counts them in an unguarded variable.
 static CONTEXT_LOCK: Mutex<()> = Mutex::new(());
 
-/// The contexts of one thread, the most recently used one last.
+/// The contexts of one thread. The most recently used context is the last.
 pub struct RenderContexts {
     library: Arc<Library>,
     display: Display,
@@ -115,7 +116,7 @@ impl RenderContext {
         let mut inner = Box::new_uninit();
         let model: *const mjModel = model.ffi();
         let lock = CONTEXT_LOCK.lock().unwrap_or_else(PoisonError::into_inner);
-        // SAFETY: the first call initialises the context, the second fills it for a valid model.
+        // SAFETY: `mjr_defaultContext` initialises the context, and `mjr_makeContext` fills it for a valid model.
         let inner = unsafe {
             mjr_defaultContext(inner.as_mut_ptr());
             let mut inner = inner.assume_init();
@@ -138,7 +139,7 @@ impl RenderContext {
         })
     }
 
-    /// Prepares the context for a model of its group and a frame size.
+    /// Prepares the context for a frame size and for a model of the context's group.
     fn prepare(&mut self, model: &MjModel, appearance: &Appearance, rect: mjrRect) -> Result<()> {
         let (width, height) = (rect.width.max(self.inner.offWidth), rect.height.max(self.inner.offHeight));
         if (width, height) != (self.inner.offWidth, self.inner.offHeight) {
@@ -160,7 +161,7 @@ impl RenderContext {
                 if now != uploaded {
                     let index = c_int::try_from(index).unwrap_or(c_int::MAX);
                     let (model, context) = (std::ptr::from_ref(model.ffi()), &raw const *self.inner);
-                    // SAFETY: the model has the sizes of the one that the context was created for.
+                    // SAFETY: the model has the sizes of the model for which the context was created.
                     link::guard("uploading a texture", || unsafe { ffi::mjr_uploadTexture(model, context, index) })?;
                 }
             }

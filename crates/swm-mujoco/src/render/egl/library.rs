@@ -98,7 +98,7 @@ impl Library {
         (!address.is_null()).then(|| unsafe { std::mem::transmute_copy(&address) })
     }
 
-    /// Opens the device that `MUJOCO_EGL_DEVICE_ID` selects, otherwise the first usable one, graphics cards first.
+    /// Opens the device that `MUJOCO_EGL_DEVICE_ID` selects, otherwise the first usable device, graphics cards first.
     ///
     /// # Errors
     /// When no device is usable.
@@ -109,7 +109,11 @@ impl Library {
                 let chosen = text.parse().ok().and_then(|index: usize| devices.get(index).copied());
                 devices = vec![chosen.ok_or_else(|| {
                     let problem = format!("'{text}' is not the index of a device: there are {}", devices.len());
-                    Error::config("MUJOCO_EGL_DEVICE_ID", problem, "give an index from 0 on, or leave it unset")
+                    Error::config(
+                        "MUJOCO_EGL_DEVICE_ID",
+                        problem,
+                        "give an index from 0 on, or leave the variable unset",
+                    )
                 })?];
             }
             None => devices.sort_by_key(|display| !display.hardware),
@@ -171,10 +175,10 @@ impl Library {
     }
 
     /// The error that EGL recorded on this thread.
-    fn last_error(&self, what: &str) -> Error {
+    fn last_error(&self, operation: &str) -> Error {
         // SAFETY: the function takes no arguments.
         let code = unsafe { (self.get_error)() };
-        Error::external("EGL", format!("{what} failed with {code:#x}"))
+        Error::external("EGL", format!("{operation} failed with {code:#x}"))
     }
 
     /// Creates an OpenGL context and binds it to this thread.
@@ -213,7 +217,7 @@ impl Library {
     /// When EGL fails.
     pub fn bind(&self, gl: &GlContext) -> Result<()> {
         let GlContext { display, context, surface } = *gl;
-        // SAFETY: all three were returned by EGL and are used by this thread only.
+        // SAFETY: the pointers were returned by EGL and are used by this thread only.
         match unsafe { (self.make_current)(display, surface, surface, context) } {
             TRUE => Ok(()),
             _ => Err(self.last_error("making a context current")),
@@ -224,7 +228,7 @@ impl Library {
     pub fn destroy_context(&self, gl: &GlContext) {
         let GlContext { display, context, surface } = *gl;
         let null = std::ptr::null_mut();
-        // SAFETY: as in `bind`; none of them is used again.
+        // SAFETY: the pointers were returned by EGL and are not used again.
         unsafe {
             (self.make_current)(display, null, null, null);
             if !surface.is_null() {

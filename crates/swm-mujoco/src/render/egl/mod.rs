@@ -1,7 +1,7 @@
 //! MuJoCo's OpenGL renderer without a window, in contexts that EGL creates on a device.
 //!
 //! OpenGL requires that each context is used by one thread, while environments run on any thread. Contexts therefore
-//! belong to render threads of this module, which draw the jobs of a queue while the callers wait. Graphics cards are
+//! belong to render threads of this module, which render the jobs of a queue while the callers wait. Graphics cards are
 //! preferred; Mesa renders in software. `MUJOCO_EGL_DEVICE_ID` selects a device by index, as in MuJoCo's Python
 //! packages.
 #![allow(
@@ -26,8 +26,8 @@ const MAX_THREADS: usize = 8;
 /// The maximal number of render threads on a graphics card; more threads do not increase the utilisation of the card.
 const MAX_HARDWARE_THREADS: usize = 4;
 
-/// Whether there is a usable graphics card. EGL is loaded only if the system has a device file of a card; otherwise it
-/// would load Mesa with its compiler, whose symbols conflict with those that PyTorch's Triton loads into the same
+/// Whether there is a usable graphics card. EGL is loaded only if the system has a device file of a card; otherwise EGL
+/// would load Mesa with the LLVM compiler, whose symbols conflict with those that PyTorch's Triton loads into the same
 /// process.
 pub(crate) fn has_hardware() -> bool {
     let is_card = |name: &str| name == "dri" || name == "dxg" || name.starts_with("nvidia");
@@ -36,7 +36,7 @@ pub(crate) fn has_hardware() -> bool {
     known && Library::open().and_then(|library| library.display()).is_ok_and(|display| display.hardware)
 }
 
-/// The renderer: a queue of jobs, and threads that work on it.
+/// MuJoCo's OpenGL renderer: a queue of jobs, and threads that render them.
 pub(crate) struct EglRenderer {
     name: String,
     queue: Arc<Queue>,
@@ -50,8 +50,8 @@ struct Job {
     completion: Arc<Completion>,
 }
 
-// SAFETY: the caller keeps the memory that a job points to valid until the job is complete; only one thread accesses it
-// in between.
+// SAFETY: the caller keeps the memory that a job points to valid until the job is complete; until then, only one
+// thread accesses this memory.
 unsafe impl Send for Job {}
 
 /// Jobs in order of arrival.

@@ -1,5 +1,5 @@
-//! Contacts of two boxes of which one touches with a face: the part of the other box that is parallel to the face,
-//! clipped by it. That part is a face, an edge or a corner; an axis counts as parallel up to 30 degrees.
+//! Contacts of two boxes, one of which touches with a face. The contacts are those of the face, edge or corner of the
+//! other box that is parallel to this face, clipped by this face. An axis counts as parallel up to 30 degrees.
 
 use super::{BoxContacts, Face, OrientedBox, TINY, Vector, add, from_face_frame, sign, to_face_frame};
 
@@ -15,7 +15,7 @@ pub fn face_contacts(flat: &OrientedBox, other: &OrientedBox, face: &Face, margi
     let [lx, ly, height] = to_face_frame(axis, positive, flat.half).map(f64::abs);
     let size = [lx, ly];
     let axes: [Vector; 3] = std::array::from_fn(|k| view(other.axis(k)));
-    // The deepest corner, and the sides that lead from it parallel to the face.
+    // The deepest corner of the other box, and the edges from this corner that are parallel to the face.
     let mut corner = view(add(other.center, flat.center, -1.0));
     corner[2] -= height;
     let (mut sides, mut count) = ([[0.0; 3]; 2], 0);
@@ -32,23 +32,23 @@ pub fn face_contacts(flat: &OrientedBox, other: &OrientedBox, face: &Face, margi
 
     let mut contacts =
         BoxContacts::new(flat.world_direction(from_face_frame(axis, positive, [0.0, 0.0, sign(!of_second)])));
-    let mut put = |[x, y, z]: Vector| {
+    let mut add_contact = |[x, y, z]: Vector| {
         if z <= margin {
             let point = from_face_frame(axis, positive, [x, y, 0.5 * z + height]);
             contacts.add(add(flat.world_direction(point), flat.center, 1.0), 0.5 * z);
         }
     };
-    // Intersections of the sides with those of the rectangle.
+    // Intersections of these edges, and of the edges opposite to them, with the sides of the rectangle.
     let lines = [(corner, along), (corner, across), (along_end, across), (across_end, along)];
-    for (start, way) in &lines[..[0, 1, 4][count]] {
+    for (start, edge) in &lines[..[0, 1, 4][count]] {
         for (q, side) in [(0, -1.0), (0, 1.0), (1, -1.0), (1, 1.0)] {
-            if way[q].abs() <= TINY {
+            if edge[q].abs() <= TINY {
                 continue;
             }
-            let part = (size[q] * side - start[q]) * (1.0 / way[q]);
-            let at = add(*start, *way, part);
-            if (0.0..=1.0).contains(&part) && at[1 - q].abs() <= size[1 - q] {
-                put(at);
+            let fraction = (size[q] * side - start[q]) * (1.0 / edge[q]);
+            let at = add(*start, *edge, fraction);
+            if (0.0..=1.0).contains(&fraction) && at[1 - q].abs() <= size[1 - q] {
+                add_contact(at);
             }
         }
     }
@@ -60,15 +60,15 @@ pub fn face_contacts(flat: &OrientedBox, other: &OrientedBox, face: &Face, margi
             let u = (x * across[1] - y * across[0]) * (1.0 / area);
             let v = (y * along[0] - x * along[1]) * (1.0 / area);
             if u > 0.0 && v > 0.0 && u < 1.0 && v < 1.0 {
-                put([cx, cy, corner[2] + u * along[2] + v * across[2]]);
+                add_contact([cx, cy, corner[2] + u * along[2] + v * across[2]]);
             }
         }
     }
-    // Corners of the other box over the rectangle; the deepest one wherever it is.
-    put(corner);
+    // Corners of the other box over the rectangle. The deepest corner is added also where it is beside the rectangle.
+    add_contact(corner);
     for at in &[along_end, across_end, add(along_end, across, 1.0)][..[0, 1, 3][count]] {
         if (0..2).all(|q| at[q].abs() < size[q]) {
-            put(*at);
+            add_contact(*at);
         }
     }
     contacts

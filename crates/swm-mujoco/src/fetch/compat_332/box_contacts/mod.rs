@@ -1,8 +1,9 @@
 //! Contacts of two boxes, as MuJoCo 3.3.2 computes them.
 //!
 //! Later versions prefer a face to an edge pair of nearly equal overlap, which turns the contact normal by a tenth of a
-//! degree; and where an edge lies on a face, they add contacts of the adjacent face. Both change the path of a block
-//! within 40 actions. Here, the separating axis test decides between [`faces`] and [`edges`].
+//! degree; and where an edge lies on a face, they add contacts of the adjacent face. Each of these differences
+//! changes the path of a block within 40 actions. Here, the separating axis test selects face contacts ([`faces`]) or
+//! edge contacts ([`edges`]).
 //!
 //! The distance of a contact on a face is half the overlap: a bug of MuJoCo 3.3.2, reproduced for equal results.
 
@@ -17,7 +18,7 @@ const TINY: f64 = 1e-15;
 /// Relative distance from the surface within which a point counts as neither inside nor outside.
 const SLACK: f64 = 0.01;
 
-/// The maximal number of contacts of two boxes: two for each side of the rectangle on each edge, and all corners.
+/// The maximal number of contacts of two boxes: 16 intersections of the edges of two faces, and 8 corners.
 const MAX_CONTACTS: usize = 24;
 
 /// A box in world coordinates.
@@ -49,14 +50,14 @@ impl BoxContacts {
         Self { normal, points: [([0.0; 3], 0.0); MAX_CONTACTS], count: 0 }
     }
 
-    /// Removes points that are outside one box and not well inside the other.
+    /// Removes points that are outside one box and not inside the other by more than [`SLACK`].
     fn remove_outside(&mut self, a: &OrientedBox, b: &OrientedBox, margin: f64) {
         let mut count = 0;
         for i in 0..self.count {
             let (point, _) = self.points[i];
             let depths = [a, b].map(|solid| solid.relative_depth(point, margin));
-            let bad = |one: f64, other: f64| one > 1.0 + SLACK && other >= 1.0 - SLACK;
-            if !bad(depths[0], depths[1]) && !bad(depths[1], depths[0]) {
+            let outside = |first: f64, second: f64| first > 1.0 + SLACK && second >= 1.0 - SLACK;
+            if !outside(depths[0], depths[1]) && !outside(depths[1], depths[0]) {
                 self.points[count] = self.points[i];
                 count += 1;
             }
@@ -93,8 +94,8 @@ impl OrientedBox {
     /// The distance of a point from the centre in the maximum norm, relative to the surface (1), which `margin` moves
     /// outwards.
     fn relative_depth(&self, point: Vector, margin: f64) -> f64 {
-        let own = self.local_direction(add(point, self.center, -1.0));
-        (0..3).map(|i| own[i].abs() / (self.half[i] + margin)).fold(0.0, f64::max)
+        let local = self.local_direction(add(point, self.center, -1.0));
+        (0..3).map(|i| local[i].abs() / (self.half[i] + margin)).fold(0.0, f64::max)
     }
 
     /// Rotates a direction from world axes to the axes of the box.
@@ -127,11 +128,11 @@ struct Face {
 
 /// The two edges between which the boxes overlap least.
 struct Edges {
-    /// The axis of the first box parallel to its edge, and that of the second.
+    /// For each box, the axis parallel to its edge.
     along: [usize; 2],
-    /// The sides of the boxes' other axes on which the edges lie.
+    /// For each box, whether its edge lies at the positive end of each of the two other axes.
     sides: [[bool; 3]; 2],
-    /// Perpendicular to both edges, in the axes of the first box.
+    /// The unit vector perpendicular to both edges, in the axes of the first box.
     normal: Vector,
     /// Whether the normal points to the first box.
     inward: bool,
@@ -146,10 +147,10 @@ fn least_overlap(a: &OrientedBox, b: &OrientedBox, margin: f64) -> Option<LeastO
     let mut least = margin + 3.0 * (a.half.iter().sum::<f64>() + b.half.iter().sum::<f64>());
     let mut found = None;
     for axis in 0..3 {
-        let shadow_b: f64 = (0..3).map(|j| axes[j][axis].abs() * b.half[j]).sum();
-        let shadow_a: f64 = (0..3).map(|j| axes[axis][j].abs() * a.half[j]).sum();
+        let extent_b: f64 = (0..3).map(|j| axes[j][axis].abs() * b.half[j]).sum();
+        let extent_a: f64 = (0..3).map(|j| axes[axis][j].abs() * a.half[j]).sum();
         for (of_second, size, offset) in
-            [(false, a.half[axis] + shadow_b, from_a[axis]), (true, b.half[axis] + shadow_a, from_b[axis])]
+            [(false, a.half[axis] + extent_b, from_a[axis]), (true, b.half[axis] + extent_a, from_b[axis])]
         {
             let overlap = size - offset.abs();
             if overlap < -margin {
@@ -169,9 +170,9 @@ fn least_overlap(a: &OrientedBox, b: &OrientedBox, margin: f64) -> Option<LeastO
         }
         let normal = across.map(|x| x / length);
         let offset = dot(from_a, normal);
-        let shadow_a: f64 = (0..3).filter(|&k| k != i).map(|k| a.half[k] * normal[k].abs()).sum();
-        let shadow_b: f64 = (0..3).filter(|&k| k != j).map(|k| b.half[k] * axes[3 - k - j][i].abs() / length).sum();
-        let overlap = shadow_a + shadow_b - offset.abs();
+        let extent_a: f64 = (0..3).filter(|&k| k != i).map(|k| a.half[k] * normal[k].abs()).sum();
+        let extent_b: f64 = (0..3).filter(|&k| k != j).map(|k| b.half[k] * axes[3 - k - j][i].abs() / length).sum();
+        let overlap = extent_a + extent_b - offset.abs();
         if overlap < -margin {
             return None;
         }
@@ -222,7 +223,7 @@ pub fn box_contacts(a: &OrientedBox, b: &OrientedBox, margin: f64) -> Option<Box
     Some(contacts)
 }
 
-/// 1 for the positive side, -1 for the negative one.
+/// 1 for the positive side, -1 for the negative side.
 fn sign(positive: bool) -> f64 {
     if positive { 1.0 } else { -1.0 }
 }

@@ -1,4 +1,4 @@
-//! [`Parts`]: indices of cubes, buttons, drawer and window in a model, and how they are read and moved.
+//! [`Objects`]: indices of cubes, buttons, drawer and window in a model, and functions that read and move them.
 
 use super::config::{FixtureState, TableConfig};
 use crate::Physics;
@@ -11,9 +11,9 @@ use swm_core::{Error, Result};
 /// The indices of a cube and the marker of its goal.
 #[derive(Clone, Copy, Debug)]
 pub struct Cube {
-    /// The first index of its free joint in `qpos`: position, then quaternion.
+    /// The first index of the cube's free joint in `qpos`: position, then quaternion.
     pub qpos: usize,
-    /// The first index of its free joint in `qvel`.
+    /// The first index of the cube's free joint in `qvel`.
     pub qvel: usize,
     /// Bodies of cube and marker.
     pub bodies: [usize; 2],
@@ -26,9 +26,9 @@ pub struct Cube {
 /// The indices of a slide joint.
 #[derive(Clone, Copy, Debug)]
 pub struct Slide {
-    /// Its index in `qpos`.
+    /// The index of the joint in `qpos`.
     pub qpos: usize,
-    /// Its index in `qvel`.
+    /// The index of the joint in `qvel`.
     pub qvel: usize,
 }
 
@@ -50,16 +50,16 @@ pub struct Sliding {
 pub struct Button {
     /// The joint; its position is negative when pressed.
     pub slide: Slide,
-    /// The geom of its top, whose colour shows the lock.
+    /// The geom of the button's top, whose colour shows the lock.
     pub geom: usize,
-    /// The site at the centre of its top.
+    /// The site at the centre of the button's top.
     pub top: usize,
 }
 
 /// The indices of buttons, drawer and window.
 #[derive(Clone, Copy, Debug)]
 pub struct Fixtures {
-    /// The button that locks the drawer, and the one that locks the window.
+    /// The button of the drawer's lock, then the button of the window's lock.
     pub buttons: [Button; 2],
     /// The drawer.
     pub drawer: Sliding,
@@ -69,7 +69,7 @@ pub struct Fixtures {
 
 /// The indices of all objects on a table.
 #[derive(Clone, Debug)]
-pub struct Parts {
+pub struct Objects {
     /// The cubes.
     pub cubes: Vec<Cube>,
     /// Buttons, drawer and window, in the scene only.
@@ -83,7 +83,7 @@ const DAMPING: [f64; 2] = [1e6, 2.0];
 /// The colour of unlocked fixtures.
 const UNLOCKED_COLOR: [f32; 3] = [0.9; 3];
 
-impl Parts {
+impl Objects {
     /// Finds the objects of a table in a model.
     ///
     /// # Errors
@@ -171,7 +171,7 @@ impl Cube {
 }
 
 impl Fixtures {
-    /// The state of the fixtures in a configuration with these buttons.
+    /// The state of the fixtures in a configuration with these lock states.
     pub fn state(&self, qpos: &[f64], buttons: [u8; 2]) -> FixtureState {
         FixtureState { buttons, drawer: qpos[self.drawer.slide.qpos], window: qpos[self.window.slide.qpos] }
     }
@@ -201,7 +201,8 @@ impl Fixtures {
         }
     }
 
-    /// The buttons after a step from configuration `before` to `qpos`: a button that was pressed toggles.
+    /// The lock states after a step from configuration `before` to `qpos`: each button that was pressed toggles its
+    /// lock.
     pub fn toggled(&self, buttons: [u8; 2], before: &[f64], qpos: &[f64]) -> [u8; 2] {
         std::array::from_fn(|i| {
             let at = self.buttons[i].slide.qpos;

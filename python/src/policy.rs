@@ -1,4 +1,4 @@
-//! [`Actor`]: a policy bound to a world: a policy of the engine, or one implemented in Python.
+//! [`Actor`]: a policy bound to a world, implemented in the engine or in Python.
 
 use crate::cost::planning_model;
 use crate::errors::{from_py_err, json, to_py_err};

@@ -376,7 +376,7 @@ impl World {
         stored.map_err(to_py_err)
     }
 
-    /// The seed that resets the environment for an episode.
+    /// The seed of the environment's reset at the start of an episode.
     #[staticmethod]
     fn episode_seed(seed: u64, episode: usize) -> u64 {
         reset_seed(episode_key(seed, episode))

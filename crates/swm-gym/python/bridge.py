@@ -5,7 +5,7 @@ of a reset, a step or a render into a single buffer, each at its own 64-byte ali
 reads them from there. The same class serves a worker process (`worker.py`, over shared memory) and the interpreter of
 the Python package.
 
-Columns come from two places:
+Columns come from two sources:
 
 * the observation: a `Box` is `observation`, a `Dict` one column per key, a `Tuple` `observation_0`, `observation_1` …;
   nested spaces join their keys with `_`;
@@ -155,7 +155,7 @@ class Actions:
         if isinstance(part, spaces.Box) and part.dtype.kind in 'iub':
             low, high = (np.asarray(v, np.int64).reshape(-1) for v in (part.low, part.high))
             return high - low + 1, low
-        raise Unsupported(f'actions of {part} (mixed with discrete ones, if there are several): wrap the environment')
+        raise Unsupported(f'actions of {part} (or a mix of continuous and discrete spaces): wrap the environment')
 
     def read(self, values):
         """The action in the environment's action space; a copy, not a view of the buffer."""
@@ -233,7 +233,7 @@ def factors(space, prefix=''):
 # ---- states ----
 
 
-# Names of methods that set a state, and the column each takes.
+# Names of methods that set a state, and the column that each method takes.
 SETTERS = [(('set_state', '_set_state'), 'state'), (('set_goal_state', '_set_goal_state'), 'goal_state')]
 
 
@@ -363,7 +363,7 @@ class Bridge:
         return name
 
     def first_frame(self):
-        """A frame from `render`, or an RGB observation; None, with the reason in `no_frame`, if there is neither."""
+        """A frame from `render`, or an RGB observation; None, with the reason in `no_frame`, without either."""
         try:
             # Some environments without a render mode support `render`.
             frame = self.env.render() if self.env.render_mode in ('rgb_array', None) else None
@@ -534,20 +534,20 @@ class Bridge:
         self.env.close()
 
 
-# ---- by id ----
+# ---- environments by id ----
 
 
 class Missing(Exception):
     """Raised when a package is missing. The arguments are the asset that installs it and the import error."""
 
 
-WORDS = {'true': True, 'false': False, 'none': None}
+CONSTANTS = {'true': True, 'false': False, 'none': None}
 
 
 def literal(text):
-    """The value of a command-line word: a Python literal, a truth value, or else the text itself."""
+    """The value of a command-line word: true, false, none, a Python literal, or else the text itself."""
     try:
-        return WORDS[text] if text in WORDS else ast.literal_eval(text)
+        return CONSTANTS[text] if text in CONSTANTS else ast.literal_eval(text)
     except (ValueError, SyntaxError):
         return text
 

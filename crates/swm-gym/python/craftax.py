@@ -1,7 +1,7 @@
 """Craftax as Gymnasium environments, under the ids, spaces and sizes of stable-worldmodel's Python package.
 
-Craftax is a pure JAX function from a key, a state and an action to the next state; an environment here holds key and
-state. Symbolic variants render with the renderer of the pixel observations.
+Craftax is a pure JAX function from a key, a state and an action to the next state; `Craftax` holds the key and
+the state. Symbolic variants render with the renderer of the pixel observations.
 """
 
 import importlib

@@ -36,12 +36,12 @@ impl<'a> Request<'a> {
     }
 }
 
-/// Why a request failed.
+/// The reason for which a request failed.
 #[derive(Debug)]
 pub enum Failure {
     /// A repeated request would fail in the same way, for example because the id is unknown or a package is missing.
     Refused(Error),
-    /// The environment raised an exception, whose traceback this is. A repeated request would raise it again.
+    /// The environment raised an exception; the text is the traceback. A repeated request would raise it again.
     Raised(String),
     /// The worker process is lost; the text says how it ended and contains its last output. A new worker may succeed.
     Lost(String),
@@ -68,7 +68,7 @@ impl Failure {
 
 /// The connection to one environment.
 pub trait Transport: Send {
-    /// Starts to make the environment again, in whatever state the old environment is, without waiting for the new one.
+    /// Discards the environment in any state, and starts to make a new one without waiting for it.
     ///
     /// # Errors
     /// When no worker can be started.

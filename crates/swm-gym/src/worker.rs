@@ -39,7 +39,7 @@ struct Process {
     socket: UnixStream,
     file: File,
     memory: Option<MmapMut>,
-    /// Whether a request was sent whose answer is not read yet. Only the worker accesses the memory until then.
+    /// Whether a request was sent whose answer is not read yet. Until the answer is read, only the worker accesses the memory.
     pending: bool,
     tail: Tail,
 }
@@ -63,7 +63,7 @@ impl WorkerTransport {
         self.process.as_ref().map(|process| process.child.id())
     }
 
-    /// Ends a process that violates the protocol or a timeout, and returns how it ended with its last output.
+    /// Ends a process that violates the protocol or a timeout. The failure contains the exit status and the last output.
     fn lose(&mut self, problem: &std::io::Error, limit: Duration) -> Failure {
         use std::io::ErrorKind::{TimedOut, WouldBlock};
         let Some(mut process) = self.process.take() else { return Failure::Lost("its worker process is gone".into()) };
@@ -252,7 +252,7 @@ impl Process {
         self.socket.set_read_timeout(Some(answer))?;
         let allocated = self.file.metadata()?.len();
         if allocated < size as u64 {
-            return Err(std::io::Error::other(format!("it has {allocated} bytes of {size}")));
+            return Err(std::io::Error::other(format!("the shared file has {allocated} bytes of {size}")));
         }
         self.memory = Some(map(&self.file)?);
         Ok(())
@@ -283,7 +283,7 @@ impl Drop for Process {
     fn drop(&mut self) {
         let closed = self.socket.shutdown(std::net::Shutdown::Write);
         if closed.and_then(|()| self.socket.set_read_timeout(Some(EXIT_TIMEOUT))).is_ok() {
-            // The worker's end of the socket closes when it ends.
+            // The worker's end of the socket closes when the worker ends.
             let mut rest = [0; 64];
             while matches!(self.socket.read(&mut rest), Ok(1..)) {}
         }
@@ -296,7 +296,7 @@ fn map(file: &File) -> std::io::Result<MmapMut> {
     // SAFETY: the file is anonymous; only this process and its worker hold a descriptor of it, and the worker never
     // changes its size. The worker writes to it only between a request and its answer, when this process holds no
     // reference: `Transport::dispatch` and `call` borrow the transport mutably, and between the two it returns no
-    // reference to the memory. A worker that does not answer in time is killed before the memory is touched again.
+    // reference to the memory. A worker that does not answer in time is killed before the memory is accessed again.
     unsafe { MmapMut::map_mut(file) }
 }
 

@@ -1,5 +1,4 @@
-//! Checks of the dataset that a collection writes to: whether it may be continued, and whether all its frames come from
-//! one renderer.
+//! Checks that a collection may write to an existing dataset, and that all frames of a dataset come from one renderer.
 
 use swm_core::{Error, Manifest, Result};
 use swm_data::lance::shard_manifests;

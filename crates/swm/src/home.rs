@@ -63,7 +63,7 @@ pub fn checkpoint(given: &str) -> PathBuf {
 /// Opens a dataset given as a path, as a URI, or as a name in [`datasets`].
 ///
 /// # Errors
-/// When it does not exist (the message names the closest name), or it is damaged.
+/// When the dataset does not exist (the message names the closest name), or is damaged.
 pub fn open_dataset(given: &str) -> Result<Arc<dyn Reader>> {
     swm_data::open(find_dataset(given)?)
 }

@@ -1,6 +1,6 @@
 //! Support for forked processes, such as the workers of a torch `DataLoader`.
 //!
-//! A forked process has the memory of its parent but not the parent's threads, so waiting for one of them never ends.
+//! A forked process has the memory of its parent but not the parent's threads, so waiting for a parent's thread never ends.
 //! Forked processes therefore open datasets again, and run the engine on one new thread each (one, because there are
 //! usually several forked processes).
 

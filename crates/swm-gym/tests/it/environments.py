@@ -41,7 +41,7 @@ class IntegerFactor(spaces.Discrete):
 
 
 class Group(spaces.Dict):
-    """A group of factors, or all of them."""
+    """A group of factors, or all factors."""
 
     def leaves(self, prefix=''):
         for key, space in self.spaces.items():
@@ -217,13 +217,13 @@ class Declared(Jointed):
 
 
 class Choices(gymnasium.Env):
-    """Observes its last action only, and does not render."""
+    """An environment that observes only its last action and does not render."""
 
     SPACES = {
         'discrete': spaces.Discrete(3, start=-1),
         'multi': spaces.MultiDiscrete([2, 3]),
         'binary': spaces.MultiBinary(3),
-        'whole': spaces.Box(0, 2, (2, 2), np.int32),
+        'integer_box': spaces.Box(0, 2, (2, 2), np.int32),
         'tuple': spaces.Tuple([spaces.Discrete(2), spaces.MultiDiscrete([3, 4])]),
         'dict': spaces.Dict({'a': spaces.Box(-1, 1, (2,)), 'b': spaces.Box(0, np.inf, (1,))}),
         'mixed': spaces.Dict({'a': spaces.Box(-1, 1, (2,)), 'b': spaces.Discrete(2)}),
@@ -249,7 +249,7 @@ class Choices(gymnasium.Env):
 
 
 class Coated(gymnasium.Wrapper):
-    """A wrapper that adds factors and rendering to an environment with neither, whatever the render mode."""
+    """A wrapper that adds factors, and rendering in every render mode, to an environment without them."""
 
     def __init__(self):
         super().__init__(Choices('discrete'))

@@ -93,7 +93,7 @@ fn outputs_do_not_depend_on_threads_or_other_environments() {
         assert!(serial == play(text, &config, &[0, 1, 2, 3], 4, 6), "{text}: four threads differ from one");
         assert!(serial[0] != serial[1], "{text}: two seeds give two episodes");
         assert!(serial[..2] == play(text, &config, &[0, 1], 2, 6), "{text}: two environments differ from four");
-        assert!(serial[3] == play(text, &config, &[3], 1, 6)[0], "{text}: one alone differs");
+        assert!(serial[3] == play(text, &config, &[3], 1, 6)[0], "{text}: a single environment differs");
     }
 }
 

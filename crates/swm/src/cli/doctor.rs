@@ -76,7 +76,7 @@ fn report(diagnosis: &Diagnosis) -> String {
     if diagnosis.problems() == 0 {
         text += "       no problems\n";
     } else {
-        text += &format!("    sound: {} of {} episodes\n", diagnosis.intact.len(), diagnosis.episodes);
+        text += &format!("   intact: {} of {} episodes\n", diagnosis.intact.len(), diagnosis.episodes);
     }
     let models = diagnosis.models.iter().map(|fit| {
         let answer = if fit.fits() { format!("yes, on {} episodes", fit.episodes) } else { fit.missing.join("; ") };

@@ -23,7 +23,7 @@ enum NamedKind {
     Direct(PolicyKind),
     /// Planning by stepping the environment itself.
     Simulator,
-    /// A checkpoint that predicts. If it also acts (`direct`), it plans only where a solver is named.
+    /// A checkpoint that predicts. If it also acts (`direct`), it plans only if the command names a solver.
     Checkpoint { given: String, block: usize, history: usize, direct: Option<PolicyKind> },
 }
 

@@ -366,7 +366,7 @@ class Adapter:
                 gradients.append(torch.zeros_like(part) if gradient is None else gradient)
         return self._numpy(gradients)
 
-    # Between numpy and torch.
+    # Conversion between numpy and torch.
 
     def _checked_cost(self, infos: dict[str, Any], candidates: Any) -> Any:
         cost = self.model.get_cost(infos, candidates)

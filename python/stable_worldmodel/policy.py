@@ -37,7 +37,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class PlanConfig:
-    """How far to plan and how much of a plan to execute.
+    """The length of a plan and the number of steps that are executed before planning again.
 
     Attributes:
         horizon: Model steps to plan.
@@ -104,7 +104,7 @@ class _EnginePolicy(BasePolicy):
         """The actions for the current infos of the world; `obs` is ignored."""
         if self.env is None:
             raise RuntimeError(f"{type(self).__name__}: world.set_policy(policy) first")
-        return self.env._world._ask(self)
+        return self.env._world._engine_actions(self)
 
 
 class RandomPolicy(_EnginePolicy):
@@ -120,7 +120,7 @@ class RandomPolicy(_EnginePolicy):
         """Sets the policy's seed, which is combined with the seed of each episode."""
         self.seed = seed
         if self.env is not None:
-            self.env._world._forget(self)
+            self.env._world._drop_actor(self)
 
     def _actor(self, world: World) -> Any:
         return _engine.Actor.random(world._world, self.seed)
@@ -176,7 +176,7 @@ class FeedForwardPolicy(BasePolicy):
         if isinstance(self.model, str) or hasattr(self.model, "_engine_policy"):
             if self.env is None:
                 raise RuntimeError("FeedForwardPolicy: world.set_policy(policy) first")
-            return self.env._world._ask(self)
+            return self.env._world._engine_actions(self)
         infos = prepared({key: value for key, value in obs.items() if key[0] != "_"}, self.process, self.transform)
         if "goal" in infos:
             infos["goal_pixels"] = infos["goal"]

@@ -32,7 +32,7 @@ class _Factor:
             raise ValueError(f"init_value {init_value!r} is not in {self}, or violates its constrain_fn")
 
     def _typed(self, value: Any) -> Any:
-        """The value in the type of the space, if the conversion is exact."""
+        """The value in the type of the space, unless the conversion to integers is inexact."""
         typed = np.asarray(value, dtype=self.dtype)  # type: ignore[attr-defined]
         return typed if np.array_equal(typed, np.asarray(value)) or typed.dtype.kind == "f" else np.asarray(value)
 
@@ -239,7 +239,7 @@ class Dict(spaces.Dict):
     def sample(
         self, mask: Any = None, probability: Any = None, *, max_tries: int = TRIES, set_value: bool = True
     ) -> dict[str, Any]:
-        """Samples every factor, in order, until the condition on the whole holds."""
+        """Samples every factor, in order, until the condition of the `Dict` holds."""
         for _ in range(max_tries):
             masks, chances = mask or {}, probability or {}
             value = {

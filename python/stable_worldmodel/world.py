@@ -46,7 +46,7 @@ class World:
         threads: The number of worker threads, which does not affect results; 0 uses one for each core.
         workers: Whether each third-party environment runs in a worker process instead of this interpreter. The processes
             step in parallel and are restarted after a crash. They must be able to import the environment.
-        image_resample: How frames of third-party environments are resized: `"bilinear"`, or `"nearest"` for pixel art.
+        image_resample: The interpolation that resizes third-party frames: `"bilinear"`, or `"nearest"` for pixel art.
         **kwargs: Options of the environment.
 
     Attributes:
@@ -137,7 +137,7 @@ class World:
             return True
         import gymnasium
 
-        # An unregistered id in this namespace is a misspelt native id. The engine's error suggests similar ids.
+        # An unregistered id of the namespace `swm` is a misspelt native id. The engine's error suggests similar ids.
         return name.startswith("swm/") and not name.startswith("swm/Craftax") and name not in gymnasium.registry
 
     # Properties.
@@ -198,7 +198,7 @@ class World:
 
     def __getattr__(self, name: str) -> Any:
         if name == "_world":
-            raise RuntimeError("World: it is closed; make a new one")
+            raise RuntimeError("World: the world is closed; create a new world")
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def __enter__(self) -> World:
@@ -218,7 +218,7 @@ class World:
         if callable(getattr(policy, "set_env", None)):
             policy.set_env(self.envs)
         self.policy = policy
-        self._forget(policy)
+        self._drop_actor(policy)
 
     def reset(self, seed: int | Sequence[int] | None = None, options: Mapping[str, Any] | None = None) -> None:
         """Starts an episode in every environment and refreshes `infos`.
@@ -292,7 +292,7 @@ class World:
                 for slot in slots:
                     self._world.begin(actor, slot, self.seed or 0, self._episodes[slot])
 
-    def _ask(self, policy: Any) -> np.ndarray:
+    def _engine_actions(self, policy: Any) -> np.ndarray:
         """The actions `(num_envs, ..)` of a policy of the engine for the current infos."""
         active = ~(self.terminateds | self.truncateds)
         self._world.act(self._actor(policy), active.tolist())
@@ -330,11 +330,11 @@ class World:
                 self._world.begin(actor, slot, self.seed or 0, self._episodes[slot])
         return actor
 
-    def _forget(self, policy: Any) -> None:
+    def _drop_actor(self, policy: Any) -> None:
         self._actors.pop(id(policy), None)
 
     def _playing(self, policy: Any) -> Any:
-        """The actor of a policy for collection and evaluation. The actor of a policy implemented in Python calls back."""
+        """The actor of a policy for collection and evaluation. A policy implemented in Python gets an actor that calls it."""
         actor = self._actor(policy)
         if actor is not None:
             return actor
@@ -377,9 +377,9 @@ class World:
             progress: Whether to show progress.
             dataset_path: Another name for `path`.
             policy: The policy to set first; `None` keeps the policy of `set_policy`.
-            mode: What to do if the dataset exists: `"error"` raises, `"overwrite"` replaces it, `"append"` adds `episodes`
+            mode: The treatment of an existing dataset: `"error"` raises, `"overwrite"` replaces it, `"append"` adds `episodes`
                 more, `"resume"` continues until the dataset has `episodes`.
-            codec: How frames are stored: `"qoi"` (lossless), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
+            codec: The codec of frames: `"qoi"` (lossless), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
             goal: Whether to store the frame of the goal in every row.
 
         Returns:
@@ -434,7 +434,7 @@ class World:
             outcome = self._world.collect(
                 self._playing(policy), path, writer, format, mode, codec_json(codec), json.dumps(config), bar
             )
-        self._settle()
+        self._end_interactive_loop()
         return dict(zip(("episodes", "added", "steps"), outcome, strict=True))
 
     def evaluate(
@@ -530,7 +530,7 @@ class World:
             given = json.dumps({**config, "policy": name, "videos": recording})
             with _progress.bar(f"evaluate {name}", episodes, progress) as bar:
                 runs.append(json.loads(self._world.evaluate(actor, given, dataset, bar)))
-        self._settle()
+        self._end_interactive_loop()
         if hasattr(policy, "plans"):
             policy.plans = json.loads(acting[0][1].take_plans())
         return Metrics._of(self, config, runs, dataset)
@@ -552,7 +552,7 @@ class World:
             raise RuntimeError("World: no policy; call set_policy, or give policy=…")
         return self.policy
 
-    def _settle(self) -> None:
+    def _end_interactive_loop(self) -> None:
         """Makes the next interactive loop start with a reset, after a collection or an evaluation."""
         self.seed = None
         self._actors.clear()
@@ -610,8 +610,8 @@ class Metrics(dict):
     """The metrics of an evaluation.
 
     Keys: `success_rate` in percent; `interval`, its 95 % Wilson interval; `random_success_rate` and `random_interval`,
-    the same two metrics of the random-policy floor; `episode_successes`, `seeds` and `steps`, one entry for each episode;
-    `solved_at_start`, the number of starts that satisfy the goal; `time_to_goal`, the steps of successful episodes;
+    the success rate and interval of the random-policy floor; `episode_successes`, `seeds` and `steps`, one entry for each
+    episode; `solved_at_start`, the number of starts that satisfy the goal; `time_to_goal`, the steps of successful episodes;
     `plan_seconds`, the planning times; `videos`.
     """
 

@@ -1,4 +1,4 @@
-"""The native environments as Gymnasium environments."""
+"""Tests of the native environments as Gymnasium environments."""
 
 import copy
 import pickle

@@ -1,4 +1,4 @@
-"""The Python classes match the registries of the engine: ids, settings and defaults."""
+"""Tests that the Python classes match the registries of the engine: ids, settings and defaults."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""A torch model and a Burn model with the same weights give the same plan for the same seed.
+"""Tests that a torch model and a Burn model with the same weights give the same plan for the same seed.
 
 The engine trains the Burn model, a small LeWM. The torch model loads its weights under their published names and implements
 LeWM as the engine documents it. The two models sum in different orders, so their costs differ only in the last bits of
@@ -292,10 +292,10 @@ def test_engine_model_accepts_numpy_and_torch(twins, infos):
     candidates = np.random.default_rng(1).normal(size=(3, 1, 2, 10)).astype(np.float32)
     expected = burn.get_cost(infos, candidates)
     assert isinstance(expected, np.ndarray) and expected.shape == (3, 1)
-    asked = torch.from_numpy(candidates).double()
+    tensor = torch.from_numpy(candidates).double()
     for samples in (1, 4):
         repeated = {key: torch.from_numpy(value)[:, None].expand(-1, samples, *value.shape[1:]) for key, value in infos.items()}
-        cost = burn.get_cost(repeated, asked.expand(-1, samples, -1, -1))
+        cost = burn.get_cost(repeated, tensor.expand(-1, samples, -1, -1))
         assert torch.is_tensor(cost) and np.array_equal(cost.numpy(), np.repeat(expected, samples, 1))
     # Infos of several steps (as many as candidates), of which the last step counts.
     steps = {key: np.concatenate([np.zeros_like(value), value], 1) for key, value in infos.items()}

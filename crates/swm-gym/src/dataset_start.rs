@@ -1,9 +1,9 @@
 //! Starts of Gymnasium environments at dataset rows: the arguments of `Bridge.reset`.
 //!
 //! Gymnasium has no interface for setting a state, so methods of the environment are called after the reset: methods
-//! that the caller names, or methods that the bridge found by their names. These methods return no observation, so the columns
-//! take the values of the start row until the next step. Columns of the goal (`goal_NAME`) take the values of the goal
-//! row in the whole episode.
+//! that the caller names, or methods that the bridge found by their names. These methods return no observation, so the
+//! columns take the values of the start row until the next step. Columns of the goal (`goal_NAME`) take the values of
+//! the goal row in the whole episode.
 
 use crate::EnvLayout;
 use serde_json::{Value, json};

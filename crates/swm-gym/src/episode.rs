@@ -26,7 +26,7 @@ impl Episode {
         Snapshot(bytes)
     }
 
-    /// Parses a snapshot of the environment `id`, whose actions have `action_bytes` bytes; `None` for any other snapshot.
+    /// Parses a snapshot of the environment `id`, whose actions have `action_bytes` bytes; `None` for another snapshot.
     pub fn parse(snapshot: &Snapshot, id: &str, action_bytes: usize) -> Option<Self> {
         let (snapshot_id, rest) = line(&snapshot.0)?;
         let (reset, rest) = line(rest)?;

@@ -39,7 +39,7 @@ struct Process {
     socket: UnixStream,
     file: File,
     memory: Option<MmapMut>,
-    /// Whether a request was sent whose answer is not read yet. Until the answer is read, only the worker accesses the memory.
+    /// Whether the answer to a sent request is not read yet. Meanwhile only the worker accesses the memory.
     pending: bool,
     tail: Tail,
 }
@@ -63,7 +63,7 @@ impl WorkerTransport {
         self.process.as_ref().map(|process| process.child.id())
     }
 
-    /// Ends a process that violates the protocol or a timeout. The failure contains the exit status and the last output.
+    /// Ends a process that violates the protocol or a timeout. The failure contains its exit status and last output.
     fn lose(&mut self, problem: &std::io::Error, limit: Duration) -> Failure {
         use std::io::ErrorKind::{TimedOut, WouldBlock};
         let Some(mut process) = self.process.take() else { return Failure::Lost("its worker process is gone".into()) };

@@ -64,7 +64,7 @@ class ReplayBuffer(Dataset):
         self.seed = int(seed)
         self._buffer: Any = None
         self._columns: list[tuple[str, str, list[int]]] = []
-        #: The engine's view of the current content, and the samplers by batch size and history.
+        #: The engine's view of the current content. The samplers are stored by batch size and history length.
         self._snapshot: Any = None
         self._samplers: dict[tuple[int, int], Any] = {}
         self._step = 0
@@ -128,7 +128,7 @@ class ReplayBuffer(Dataset):
 
     @property
     def num_episodes_added(self) -> int:
-        """The number of episodes added, removed ones included."""
+        """The number of episodes added since the last `clear`, including removed episodes."""
         return 0 if self._buffer is None else int(self._buffer.added())
 
     def num_valid_ends(self, history_len: int | None = None) -> int:

@@ -2,8 +2,8 @@
 
     python benches/bench_loader.py --reference /path/to/python
 
-The loop is that of LeRobot's benchmark: shuffled batches of 64 clips of 4 frames, 5 rows apart, at 224 pixels. Each batch
-goes through a training step of a trivial model, the same on all sides. Our loader runs twice: without a cache, and
+The loop loads shuffled batches of 64 clips of 4 frames, 5 rows apart, at 224 pixels. Each batch goes through a training
+step of a trivial model, the same on all sides. Our loader runs twice: without a cache, and
 with its default cache of decoded frames. All datasets have the content of one collection; the reference reads datasets
 that its own writers wrote. The reference runs in the Python that `--reference` (or `$SWM_REFERENCE_PYTHON`) names, in turns
 with our loader; the result is the median of the ratios of neighbouring turns. The reference runs with every number of

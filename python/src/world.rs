@@ -154,7 +154,7 @@ impl World {
         let options = reset_options(options)?;
         if let Some((slot, _)) = starts.iter().find(|(slot, _)| *slot >= self.envs) {
             return Err(PyIndexError::new_err(format!(
-                "reset: environment {slot} does not exist, there are {}",
+                "reset: environment {slot} does not exist, the world has {} environments",
                 self.envs
             )));
         }

@@ -195,8 +195,8 @@ class Adapter:
     Args:
         model: A `Costable`, or a `Dynamics`.
         device: The device of torch tensors.
-        batch_size: The number of environments in one call of the model; all of them for `None`. It does not affect the
-            result.
+        batch_size: The number of environments in one call of the model; all environments for `None`. The batch
+            size does not affect the result.
         process, transform: As for `stable_worldmodel.policy.MPCPolicy`.
         history: The number of frames that the model gets, including the current frame.
         dim: The dimension of one model step.

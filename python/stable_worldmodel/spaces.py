@@ -148,7 +148,7 @@ class Dict(spaces.Dict):
     """Factors by name, nested: a `variation_space`.
 
     Factors are sampled in `sampling_order` (by default the order of definition), so the condition of a factor may read the
-    values of earlier ones. All factors are sampled again until the condition of the whole `Dict` holds.
+    values of earlier factors. All factors are sampled again until the condition of the whole `Dict` holds.
     """
 
     def __init__(
@@ -210,7 +210,7 @@ class Dict(spaces.Dict):
         space: Any = self
         for part in key.split("."):
             if not isinstance(space, Dict) or part not in space.spaces:
-                raise ValueError(f"no factor is called {key!r}; there are {self.names()}")
+                raise ValueError(f"no factor is called {key!r}; the factors are {self.names()}")
             space = space.spaces[part]
         return space
 
@@ -304,8 +304,8 @@ def reset_variation_space(
 ) -> None:
     """Resets the factors of an environment for an episode.
 
-    Sets all factors to their defaults, samples those of `options["variation"]` (`default_variations` if it is missing), and
-    sets those of `options["variation_values"]`.
+    Sets all factors to their defaults, samples the factors in `options["variation"]` (`default_variations` if it is
+    missing), and sets the factors in `options["variation_values"]`.
     """
     options = options or {}
     variation_space.seed(seed)

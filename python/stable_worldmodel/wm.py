@@ -1,8 +1,10 @@
 """The engine's models: checkpoints of LeWM, PLDM, DINO-WM, TD-MPC2, GCBC, GCIVL, GCIQL, SAC.
 
-    model = swm.wm.load("lewm-rooms")            # a name under $STABLEWM_HOME/checkpoints, or a path
-    solver = swm.solver.CEMSolver(model)         # planning runs in the engine, without Python
     swm.wm.train("lewm", data="rooms", out="lewm-rooms", preset="tiny")
+    model = swm.wm.load("lewm-rooms")  # a name under $STABLEWM_HOME/checkpoints, or a path
+    solver = swm.solver.CEMSolver(model)
+
+Planning with these models runs in the engine, without Python.
 """
 
 from __future__ import annotations
@@ -127,7 +129,7 @@ def train(
         out: The checkpoint's name or path.
         preset: The name of a configuration; the first one of the family for `None`.
         device: `cpu`, or a GPU if the engine was built with GPU support.
-        **overrides: Settings that replace those of the preset, with `__` for dots: `schedule__steps=1000`.
+        **overrides: Settings that replace the preset's settings, with `__` for dots: `schedule__steps=1000`.
 
     Returns:
         `out`.

@@ -282,7 +282,7 @@ class World:
         return self._world.snapshot(index)
 
     def restore(self, state: bytes, index: int = 0) -> None:
-        """Restores a snapshot. The steps that follow repeat those after the snapshot bit for bit."""
+        """Restores a snapshot. Later steps repeat the steps after the snapshot bit for bit."""
         self._world.restore(index, state)
 
     def _begin(self, slots: Sequence[int]) -> None:
@@ -470,7 +470,7 @@ class World:
             episodes_idx, start_steps: The episodes and steps of the dataset to start from; chosen by the seed for `None`.
             goal_offset: The number of steps from a start to its goal; 25 for `None`.
             eval_budget: The time limit of an episode in steps. `None` uses the world's time limit, or 50 with a dataset.
-            callables: The methods that put an environment into a recorded state, called in this order after its reset:
+            callables: The methods that set an environment's recorded state, called in this order after its reset:
                 `{"method": NAME, "args": {KEYWORD: {"value": COLUMN}}}`. A column name with the prefix `goal_` reads the
                 row of the goal. `{"value": ANYTHING, "in_dataset": False}` passes the value itself. The default is
                 `set_state(state)` and `set_goal_state(goal_state)`, with or without a leading `_`. Native environments
@@ -488,7 +488,7 @@ class World:
             The metrics.
         """
         if reset_mode not in (None, "auto", "wait"):
-            raise ValueError(f"reset_mode: {reset_mode!r}; expected 'auto' or 'wait' (both behave the same)")
+            raise ValueError(f"reset_mode: {reset_mode!r}; expected 'auto' or 'wait', which have the same effect")
         if protocol not in ("strict", "compat"):
             raise ValueError(f"protocol: {protocol!r}; expected 'strict' or 'compat'")
         policy = self._chosen(policy)
@@ -498,7 +498,7 @@ class World:
             goal_offset = 25 if goal_offset is None else int(goal_offset)
             eval_budget = 50 if eval_budget is None else int(eval_budget)
             if (episodes_idx is None) != (start_steps is None):
-                raise ValueError("episodes_idx, start_steps: give both, or none of them")
+                raise ValueError("episodes_idx, start_steps: give both or neither")
             if episodes_idx is not None and start_steps is not None:
                 picks = [[int(e), int(s)] for e, s in zip(episodes_idx, start_steps, strict=True)]
                 episodes = len(picks)

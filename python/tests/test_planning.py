@@ -179,7 +179,7 @@ FEW = {"num_samples": 20, "n_steps": 3, "topk": 5}
 
 
 def few(solver, model, **more):
-    """A solver with a short search: those settings of `FEW` that the solver has."""
+    """A solver with a short search: with all settings of `FEW` that the solver supports."""
     known = json.loads(_engine.solvers())[solver.id]
     settings = {name: value for name, value in FEW.items() if solver._names.get(name, name) in known}
     return solver(model, **settings, **more)
@@ -260,21 +260,21 @@ class MyError(Exception):
 
 
 class Wrong(Quadratic):
-    def __init__(self, how):
+    def __init__(self, defect):
         super().__init__()
-        self.how = how
+        self.defect = defect
 
     def get_cost(self, info_dict, action_candidates):
         cost = (action_candidates**2).sum((2, 3))
-        if self.how == "shape":
+        if self.defect == "shape":
             return cost[:, :-1]
-        if self.how == "scalar":
+        if self.defect == "scalar":
             return 3.0
-        if self.how == "nothing":
+        if self.defect == "nothing":
             return None
-        if self.how == "nan":
+        if self.defect == "nan":
             return cost * torch.where(torch.arange(cost.shape[1]) == 2, torch.nan, 1.0)
-        if self.how == "detached":
+        if self.defect == "detached":
             return cost.detach()
         raise MyError("mine")
 
@@ -288,17 +288,17 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("how", "error", "words"), WRONG, ids=[how for how, _, _ in WRONG])
+@pytest.mark.parametrize(("defect", "error", "words"), WRONG, ids=[defect for defect, _, _ in WRONG])
 @pytest.mark.parametrize("solver", [solvers.CEMSolver, solvers.MPPISolver, solvers.GradientSolver])
-def test_wrong_model_raises_a_clear_error(solver, how, error, words):
+def test_wrong_model_raises_a_clear_error(solver, defect, error, words):
     with pytest.raises(error, match=words):
-        plan(few(solver, Wrong(how)))
+        plan(few(solver, Wrong(defect)))
 
 
-@pytest.mark.parametrize(("how", "error", "words"), WRONG, ids=[how for how, _, _ in WRONG])
-def test_wrong_model_stops_an_evaluation(how, error, words):
+@pytest.mark.parametrize(("defect", "error", "words"), WRONG, ids=[defect for defect, _, _ in WRONG])
+def test_wrong_model_stops_an_evaluation(defect, error, words):
     world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(16, 16), max_episode_steps=8)
-    world.set_policy(swm.policy.MPCPolicy(few(solvers.CEMSolver, Wrong(how))))
+    world.set_policy(swm.policy.MPCPolicy(few(solvers.CEMSolver, Wrong(defect))))
     with pytest.raises(error, match=words):
         world.evaluate(episodes=2, seed=0, progress=False)
     # The world remains usable.

@@ -1,6 +1,6 @@
 """Tests that a torch model and a Burn model with the same weights give the same plan for the same seed.
 
-The engine trains the Burn model, a small LeWM. The torch model loads its weights under their published names and implements
+The engine trains the Burn model, a small LeWM. The torch model loads the same weights under their published names and implements
 LeWM as the engine documents it. The two models sum in different orders, so their costs differ only in the last bits of
 single precision.
 """

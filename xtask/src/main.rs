@@ -22,7 +22,7 @@ use graph::Graph;
 use std::path::PathBuf;
 use std::process::{Command, ExitCode};
 
-/// A check: its name, the property that it checks, and the function that checks it.
+/// A check: the name, the checked property, and the function that runs the check.
 type Check = (&'static str, &'static str, fn() -> Result<()>);
 
 /// The checks, cheapest first.

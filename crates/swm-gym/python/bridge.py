@@ -2,7 +2,7 @@
 
 A `Bridge` describes its environment (`describe`: spaces, columns, frames, factors of variation) and writes the outputs
 of a reset, a step or a render into a single buffer, each at its own 64-byte aligned offset. The owner of the buffer
-reads them from there. The same class serves a worker process (`worker.py`, over shared memory) and the interpreter of
+reads the outputs. The same class serves a worker process (`worker.py`, over shared memory) and the interpreter of
 the Python package.
 
 Columns come from two sources:
@@ -58,7 +58,7 @@ class InvalidRequest(ValueError):
 
 
 def bounds(values):
-    """Bounds as JSON: one value if all are equal, None for an infinite one."""
+    """Bounds as JSON: one value if all are equal, None for an infinite bound."""
     flat = np.asarray(values).reshape(-1)
     if flat.size and (flat == flat[0]).all():
         flat = flat[:1]
@@ -108,7 +108,7 @@ def described(space):
     if isinstance(space, spaces.Discrete):
         return {'type': 'Discrete', 'n': int(space.n), 'start': int(space.start)}, np.dtype(np.int64), ()
     if isinstance(space, spaces.MultiDiscrete):
-        # The elements of a `MultiDiscrete` space are 64-bit integers, and so are those of the column.
+        # The elements of a `MultiDiscrete` space are 64-bit integers, so the column stores 64-bit integers.
         return multi(space.nvec, space.start), np.dtype(np.int64), space.shape
     if isinstance(space, spaces.MultiBinary):
         return box(np.zeros(space.shape), np.ones(space.shape), space.shape, bool), np.dtype(bool), space.shape
@@ -337,7 +337,7 @@ class Bridge:
         if self.goal_shape:
             self.goal_at = self.allocate(math.prod(self.goal_shape) * 3)
 
-        # Versions of the packages that define the environment's class and entry point, and of those in `swm_libraries`.
+        # Versions of the packages that define the environment's class and entry point, and of `swm_libraries`.
         modules = type(env.unwrapped).__module__, str(getattr(env.spec, 'entry_point', ''))
         packages = (module.partition(':')[0].partition('.')[0] for module in modules)
         self.libraries = {}
@@ -465,7 +465,7 @@ class Bridge:
         HEAD.pack_into(self.buffer, 0, 0.0, math.inf, False, False, False)
 
     def method(self, name):
-        """A method of the environment by name, or of its wrappers, from the outermost inwards."""
+        """Finds a method by name in the environment, else in its wrappers, from the outermost to the innermost."""
         env, layers = self.env, [self.env.unwrapped]
         while env is not env.unwrapped:
             layers.append(env)
@@ -506,7 +506,7 @@ class Bridge:
             if value.shape != view.shape or (value.dtype.kind == 'f') > (view.dtype.kind == 'f'):
                 raise ValueError(
                     f"info['{key}'] was {view.dtype} {list(view.shape)} at the first reset and step, and is"
-                    f' {value.dtype} {list(value.shape)} now: give it one type and shape'
+                    f' {value.dtype} {list(value.shape)} now: keep its type and shape'
                 )
             view[...] = value
         for view, value in self.held:

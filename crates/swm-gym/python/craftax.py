@@ -16,7 +16,7 @@ from craftax.craftax_env import make_craftax_env_from_name
 from gymnasium import spaces
 
 # Id: Craftax's own id, the shape of an observation (Craftax's `observation_space` swaps height and width), and the time
-# limit of its parameters.
+# limit in steps.
 VARIANTS = {
     'swm/CraftaxPixels-v1': ('Craftax-Pixels-v1', (130, 110, 3), 100_000),
     'swm/CraftaxSymbolic-v1': ('Craftax-Symbolic-v1', (8268,), 100_000),

@@ -29,7 +29,7 @@ pub const PACKAGES: &[Package] = &[
     Package {
         name: "gymnasium",
         version: "1.4.0",
-        summary: "Gymnasium and its classic control environments, in a virtual environment of their own",
+        summary: "Gymnasium and its classic control environments, in a separate virtual environment",
         distribution: "gymnasium",
         requirements: &[],
     },

@@ -106,7 +106,7 @@ pub fn reset(layout: &EnvLayout, seed: u64, options: &ResetOptions, start: RowRe
     Ok((seed, options))
 }
 
-/// The seed of the recorded episode, from the column `seed` of other programs or from `episode_seed`.
+/// The seed of the recorded episode, from the column `seed`, which other programs write, or from `episode_seed`.
 fn recorded_seed(start: RowRef<'_>) -> Result<Option<u64>> {
     let values = |name| start.schema().find(name).map(|_| start.to_f64(name)).transpose();
     if let Some(&[seed]) = values(SEED)?.as_deref()

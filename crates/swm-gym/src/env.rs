@@ -207,7 +207,7 @@ impl GymEnv {
         if self.renders_steps { Request::StepAndRender } else { Request::Step }
     }
 
-    /// Waits for the result of a dispatched call, when the caller makes another call than the dispatched one.
+    /// Waits for the result of a dispatched call, if there is one. The caller then makes another call.
     fn finish_dispatched(&mut self) -> Result<()> {
         match self.dispatched {
             None => Ok(()),

@@ -43,7 +43,7 @@ pub enum Failure {
     Refused(Error),
     /// The environment raised an exception; the text is the traceback. A repeated request would raise it again.
     Raised(String),
-    /// The worker process is lost; the text says how it ended and contains its last output. A new worker may succeed.
+    /// The worker process is lost; the text describes its end and contains its last output. A new worker may succeed.
     Lost(String),
 }
 

@@ -198,7 +198,7 @@ impl Process {
         command.args(["-c", WORKER, &std::process::id().to_string(), id]);
         command.stdin(Stdio::from(OwnedFd::from(remote)));
         command.stdout(Stdio::from(file.try_clone().map_err(io)?)).stderr(Stdio::piped());
-        // Terminal signals reach this process only, which then ends its workers.
+        // In a separate process group, a worker gets no terminal signals. This process gets them and ends its workers.
         command.process_group(0);
         // Each worker uses at most one core, because there are as many workers as environments. Variables that are
         // already set keep their values.
@@ -295,8 +295,8 @@ impl Drop for Process {
 fn map(file: &File) -> std::io::Result<MmapMut> {
     // SAFETY: the file is anonymous; only this process and its worker hold a descriptor of it, and the worker never
     // changes its size. The worker writes to it only between a request and its answer, when this process holds no
-    // reference: `Transport::dispatch` and `call` borrow the transport mutably, and between the two it returns no
-    // reference to the memory. A worker that does not answer in time is killed before the memory is accessed again.
+    // reference: `Transport::dispatch` and `call` borrow the transport mutably, and between the two calls the
+    // transport returns no reference to the memory. A worker that does not answer in time is killed before the memory is accessed again.
     unsafe { MmapMut::map_mut(file) }
 }
 
@@ -347,8 +347,8 @@ impl Tail {
 /// A command and the channel that receives its child.
 type Job = (Command, SyncSender<std::io::Result<Child>>);
 
-/// Starts a process from a thread that lives as long as this process, because the kernel ends a child with the thread
-/// that started it (`PR_SET_PDEATHSIG`).
+/// Starts a process from a thread that lives as long as this process, because the kernel kills a child when the
+/// thread that started it ends (`PR_SET_PDEATHSIG`).
 fn spawn(command: Command) -> std::io::Result<Child> {
     static STARTER: Mutex<Option<(u32, Sender<Job>)>> = Mutex::new(None);
     let (answer, child) = sync_channel(1);

@@ -64,8 +64,9 @@ class ReplayBuffer(Dataset):
         self.seed = int(seed)
         self._buffer: Any = None
         self._columns: list[tuple[str, str, list[int]]] = []
-        #: The engine's view of the current content. The samplers are stored by batch size and history length.
+        #: The engine's view of the current content.
         self._snapshot: Any = None
+        #: The samplers by batch size and history length.
         self._samplers: dict[tuple[int, int], Any] = {}
         self._step = 0
 

@@ -152,7 +152,7 @@ class StoredDataset(Dataset):
         transform: A function from the dict of a sample to the sample that the dataset returns.
         keys_to_load: The columns of a sample; all columns for `None`.
         keys_to_cache: Columns whose decoded rows stay in memory.
-        keys_to_merge: The columns to add, as arguments `target: source` of :meth:`merge_col`.
+        keys_to_merge: The columns to add: a dict from target to source, as in :meth:`merge_col`.
         format: The format; `None` detects it from the path.
         backend: `"torch"` or `"numpy"`; `None` selects torch if it is installed.
     """

@@ -146,7 +146,7 @@ _SCALERS: dict[str, Any] = {"zscore": ZScoreScaler, "percentile": PercentileScal
 def get_scaler(method: str = "zscore", **kwargs: Any) -> Any:
     """A scaler that is not fitted yet: `"zscore"`, `"percentile"` or `"none"`."""
     if method not in _SCALERS:
-        raise ValueError(f"unknown scaler {method!r}; there are {', '.join(_SCALERS)}")
+        raise ValueError(f"unknown scaler {method!r}; the scalers are {', '.join(_SCALERS)}")
     return _SCALERS[method](**kwargs)
 
 

@@ -139,7 +139,7 @@ class NativeEnv(gymnasium.Env):
         return self._env.snapshot()
 
     def restore(self, state: bytes) -> tuple[Any, dict[str, Any]]:
-        """Restores a snapshot. The steps that follow repeat those after the snapshot bit for bit."""
+        """Restores a snapshot. Later steps repeat the steps after the snapshot bit for bit."""
         columns = self._env.restore(state)
         return self._observation(columns), self._info(columns, self._env.is_success())
 

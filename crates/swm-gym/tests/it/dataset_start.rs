@@ -135,13 +135,13 @@ fn replays_a_killed_worker_from_the_recorded_state() {
         let id = transport.process_id().expect("a process");
         let mut field = RecordedEnv::of(Box::new(GymEnv::new(FIELD, Box::new(transport), 2).expect("an environment")));
         start(&mut *field.env, &ResetOptions::default(), &[]).expect("a start");
-        let mut outputs = vec![field.everything()];
+        let mut outputs = vec![field.all_outputs()];
         for t in 0..4 {
             if kill == Some(t) {
                 kill_process(id);
             }
             field.env.step(EAST).expect("a step");
-            outputs.push(field.everything());
+            outputs.push(field.all_outputs());
         }
         outputs
     };
@@ -161,7 +161,7 @@ fn snapshot_contains_the_dataset_start() {
     for env in [&mut field, &mut other] {
         env.env.step(EAST).expect("a step");
     }
-    assert!(field.everything() == other.everything());
+    assert!(field.all_outputs() == other.all_outputs());
     let goals = [&mut field, &mut other].map(|env| {
         let mut goal = vec![0; 27];
         env.env.render_goal(FrameMut::new(3, 3, &mut goal)).expect("a goal");

@@ -65,7 +65,7 @@ class Group(spaces.Dict):
 class Room(gymnasium.Env):
     """A point in a room, with every feature of environments that the bridge supports.
 
-    It prints, and it reads standard input, which workers use for requests.
+    The room prints text and reads standard input; workers use the descriptors of both for shared memory and requests.
     """
 
     metadata = {'render_modes': ['rgb_array']}
@@ -94,7 +94,7 @@ class Room(gymnasium.Env):
         super().reset(seed=seed)
         self.variation_space.start(seed, options or {})
         print('a new episode')
-        # The bridge resets the environment once with seed 0 to describe it; no other environment waits then.
+        # The bridge resets the environment once with seed 0 to describe it. At that time no other environment waits.
         self.meets = self.meet and seed
         if self.meets:
             self.wait_for_another('reset-')
@@ -202,7 +202,7 @@ class Field(gymnasium.Env):
 
 
 class Jointed(Field):
-    """Has a `set_state` method with two arguments, which no single column provides."""
+    """An environment whose `set_state` has two arguments, which no single column provides."""
 
     _set_state = None
 
@@ -211,7 +211,7 @@ class Jointed(Field):
 
 
 class Declared(Jointed):
-    """Declares in `swm_callables` which method sets its state."""
+    """An environment whose `swm_callables` names the method that sets its state."""
 
     swm_callables = [{'method': 'place', 'args': {'x': {'value': 'x'}, 'label': {'value': 'ab', 'in_dataset': False}}}]
 

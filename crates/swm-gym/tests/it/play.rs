@@ -70,7 +70,7 @@ impl RecordedEnv {
         self.row.row(0).to_f64(name).expect("a column")
     }
 
-    pub fn everything(&mut self) -> Vec<u8> {
+    pub fn all_outputs(&mut self) -> Vec<u8> {
         self.env.observe(&mut self.row.row_mut(0));
         let mut bytes: Vec<u8> =
             (0..self.row.schema().columns().len()).flat_map(|column| self.row.bytes(column)).copied().collect();
@@ -131,26 +131,26 @@ fn a_dispatched_call_runs_once() {
     plain.env.step(push).expect("a step");
     assert!(dispatched.dispatch(PendingCall::Step(push)));
     dispatched.env.step(push).expect("the step");
-    assert!(plain.everything() == dispatched.everything());
+    assert!(plain.all_outputs() == dispatched.all_outputs());
     // Any other call completes the dispatched step first.
     plain.env.step(push).expect("a step");
     assert!(dispatched.dispatch(PendingCall::Step(push)));
     assert!(plain.env.snapshot() == dispatched.env.snapshot());
-    assert!(plain.frame(9, 12) == dispatched.frame(9, 12) && plain.everything() == dispatched.everything());
+    assert!(plain.frame(9, 12) == dispatched.frame(9, 12) && plain.all_outputs() == dispatched.all_outputs());
     plain.env.step(push).and_then(|_| plain.env.step(none)).expect("two steps");
     assert!(dispatched.dispatch(PendingCall::Step(push)));
     dispatched.env.step(none).expect("another step");
-    assert!(plain.everything() == dispatched.everything());
+    assert!(plain.all_outputs() == dispatched.all_outputs());
     // A reset completes the dispatched step first, too.
     assert!(dispatched.dispatch(PendingCall::Step(push)));
     for env in [&mut plain, &mut dispatched] {
         env.env.reset(7, &start).expect("a reset");
     }
-    assert!(plain.everything() == dispatched.everything());
+    assert!(plain.all_outputs() == dispatched.all_outputs());
     // An invalid call is not dispatched; the call itself returns the error and changes nothing.
     assert!(!dispatched.dispatch(PendingCall::Step(Action::Discrete(&[0]))));
     assert!(dispatched.env.step(Action::Discrete(&[0])).is_err());
-    assert!(plain.everything() == dispatched.everything());
+    assert!(plain.all_outputs() == dispatched.all_outputs());
 }
 
 #[test]
@@ -282,7 +282,7 @@ fn restores_snapshot_bit_for_bit() {
         actions
             .flat_map(|action| {
                 room.env.step(Action::Continuous(&action)).expect("a step");
-                room.everything()
+                room.all_outputs()
             })
             .collect::<Vec<u8>>()
     };

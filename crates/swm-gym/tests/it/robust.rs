@@ -34,7 +34,7 @@ fn outputs_are_the_same_when_a_worker_is_killed() {
                 kill_process(id);
             }
             env.env.step(Action::Discrete(&[i64::from(t % 2)])).expect("a step");
-            outputs.push(env.everything());
+            outputs.push(env.all_outputs());
         }
         outputs
     };
@@ -62,11 +62,11 @@ fn dispatched_calls_are_repeated_in_a_new_worker() {
         };
         dispatch(&mut env, "reset", PendingCall::Reset(4, &options));
         env.env.reset(4, &options).expect("a reset");
-        let mut outputs = env.everything();
+        let mut outputs = env.all_outputs();
         for call in ["first", "second"] {
             dispatch(&mut env, call, PendingCall::Step(Action::Discrete(&[1])));
             env.env.step(Action::Discrete(&[1])).expect("a step");
-            outputs.extend(env.everything());
+            outputs.extend(env.all_outputs());
         }
         outputs
     };

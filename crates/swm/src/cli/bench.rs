@@ -164,7 +164,7 @@ struct PlanArgs {
     /// Iterations per plan with a LeWM; 0 skips the LeWM
     #[arg(long, default_value_t = 30)]
     iterations: usize,
-    /// Device of the LeWM: cpu, vulkan, cuda (:1 for the second such GPU) or auto
+    /// Device of the LeWM: cpu, vulkan[:I], cuda[:I] or auto
     #[arg(long, default_value = "cpu")]
     device: String,
 }
@@ -201,7 +201,7 @@ struct TrainArgs {
     /// Pairs of measurements: this engine and the reference implementation
     #[arg(long, default_value_t = 5)]
     pairs: usize,
-    /// Device: cpu, vulkan, cuda (:1 for the second such GPU) or auto
+    /// Device: cpu, vulkan[:I], cuda[:I] or auto
     #[arg(long, default_value = "cpu")]
     device: String,
 }

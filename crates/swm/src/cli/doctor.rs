@@ -1,4 +1,5 @@
-//! `swm doctor`: finds the defects of a dataset and the models it can train, and writes the intact episodes to a new one.
+//! `swm doctor`: finds the defects of a dataset and the models it can train, and writes the intact episodes
+//! to a new dataset.
 
 use super::convert::{self, TargetArgs};
 use super::progress::{control, print_summary};

@@ -66,7 +66,7 @@ enum Command {
     /// List the visual wrappers and their settings
     #[command(after_help = "Example: swm wrappers")]
     Wrappers,
-    /// List the solvers, the actions they plan, and what they require of a model
+    /// List the solvers, their kinds of actions, and their requirements of a model
     #[command(after_help = "Example: swm solvers --json")]
     Solvers,
     /// Run a policy and store its episodes

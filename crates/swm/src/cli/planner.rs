@@ -75,8 +75,8 @@ impl PlannerArgs {
         Ok(vec![Choice { id: first.id.to_owned(), settings: (first.defaults)() }])
     }
 
-    /// Returns the policy that plans in a model with a solver. `block` is the model's count of environment steps per
-    /// model step, `history` its count of observations.
+    /// Returns the policy that plans in a model with a solver. `block` is the number of environment steps in a
+    /// model step, `history` the number of observations that the model gets.
     ///
     /// # Errors
     /// When a setting of planning or of the objective is invalid.

@@ -59,7 +59,12 @@ fn doctor_finds_truncated_files() {
     collect(&swm, "rooms");
     let clean = swm.json(&["doctor", "rooms"]);
     assert_eq!((&clean["problems"], clean["sound"].as_array().map(Vec::len)), (&0.into(), Some(5)));
-    let lewm = clean["models"].as_array().expect("models").iter().find(|fit| fit["model"] == "LeWM").expect("listed");
+    let lewm = clean["models"]
+        .as_array()
+        .expect("models")
+        .iter()
+        .find(|fit| fit["model"] == "LeWM")
+        .expect("the doctor lists LeWM");
     assert_eq!(lewm["missing"].as_array().map(Vec::len), Some(0), "{lewm}");
     let output = text(&swm.run(&["doctor", "rooms"]).stdout);
     assert!(output.contains("no problems") && output.contains("TD-MPC2"), "{output}");

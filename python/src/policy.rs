@@ -62,7 +62,7 @@ impl Actor {
     }
 
     /// Creates a policy implemented in Python: `call(infos, active, fresh)` returns an array of actions. `infos` is a
-    /// copy of the dict of [`World::infos`]; `active` marks the slots that act, `fresh` the slots that begin an episode.
+    /// copy of the dict of [`World::infos`]; `active` marks the slots that act, `fresh` the slots with a new episode.
     #[staticmethod]
     fn python(world: &Bound<'_, World>, call: Py<PyAny>) -> PyResult<Self> {
         let infos = World::infos(world)?.unbind();

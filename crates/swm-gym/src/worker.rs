@@ -296,7 +296,8 @@ fn map(file: &File) -> std::io::Result<MmapMut> {
     // SAFETY: the file is anonymous; only this process and its worker hold a descriptor of it, and the worker never
     // changes its size. The worker writes to it only between a request and its answer, when this process holds no
     // reference: `Transport::dispatch` and `call` borrow the transport mutably, and between the two calls the
-    // transport returns no reference to the memory. A worker that does not answer in time is killed before the memory is accessed again.
+    // transport returns no reference to the memory. A worker that does not answer in time is killed before the memory
+    // is accessed again.
     unsafe { MmapMut::map_mut(file) }
 }
 

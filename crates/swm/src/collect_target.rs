@@ -9,7 +9,7 @@ use swm_eval::collect::check_continues;
 /// `mix_renderers` permits frames of another renderer than the renderer of the stored frames.
 ///
 /// # Errors
-/// When a dataset exists and `mode` is [`WriteMode::Create`], or when the dataset cannot be continued with this manifest.
+/// When a dataset exists and `mode` is [`WriteMode::Create`], or the dataset cannot be continued with this manifest.
 pub fn check(location: &Location, mode: WriteMode, new: &Manifest, mix_renderers: bool) -> Result<()> {
     let exists = match location.path() {
         Some(path) => path.exists(),

@@ -1,5 +1,5 @@
-//! Descriptions of environments as JSON, with the field names of Gymnasium's spaces, for `swm envs --json` and the Python
-//! package.
+//! Descriptions of environments as JSON, with the field names of Gymnasium's spaces, for `swm envs --json` and for the
+//! Python package.
 
 use serde_json::{Map, Value, json};
 use swm_core::{EnvEntry, EnvSpec, Named as _, Space, VariationSpace};

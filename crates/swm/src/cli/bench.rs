@@ -29,7 +29,8 @@ enum BenchCommand {
     Envs(EnvsArgs),
     /// Measure planning with CEM: the solver alone, then with a LeWM
     ///
-    /// First, iterations per second with a model that takes no time, and the solver's fraction of the time of a plan; then, with a LeWM of the published size, a plan, the costs of one iteration, and the encoding of an image.
+    /// First, iterations per second with a model that takes no time, and the solver's fraction of the time of a plan;
+    /// then, with a LeWM of the published size, a plan, the costs of one iteration, and the encoding of an image.
     #[command(after_help = "Example: swm bench plan --envs 16")]
     Plan(PlanArgs),
     /// Measure a training step of a LeWM of the published size

@@ -47,8 +47,8 @@ fn gymnasium_environments_are_collected_and_evaluated() {
     assert!(text(&output.stderr).contains("/no/such/python (named by $SWM_PYTHON)"), "{}", text(&output.stderr));
 }
 
-/// An environment whose state grows in every step by a value that depends on the seed and not on the action. An episode that
-/// starts from a recorded state therefore reaches all later recorded states.
+/// An environment whose state grows in every step by a value that depends on the seed and not on the action. An episode
+/// that starts from a recorded state therefore reaches all later recorded states.
 const TRAIN: &str = "
 import gymnasium, numpy as np
 from gymnasium import spaces

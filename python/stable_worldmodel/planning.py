@@ -394,11 +394,11 @@ class Adapter:
         infos: dict[str, Any] = {}
         for key, value in self._infos.items():
             if isinstance(value, np.ndarray):
-                some = value[rows][:, None]
-                infos[key] = np.broadcast_to(some, (some.shape[0], samples, *some.shape[2:]))
+                selected = value[rows][:, None]
+                infos[key] = np.broadcast_to(selected, (selected.shape[0], samples, *selected.shape[2:]))
             elif hasattr(value, "expand"):
-                some = self._on_device(value[rows]).unsqueeze(1)
-                infos[key] = some.expand(-1, samples, *some.shape[2:])
+                selected = self._on_device(value[rows]).unsqueeze(1)
+                infos[key] = selected.expand(-1, samples, *selected.shape[2:])
             else:
                 infos[key] = value[rows] if isinstance(value, list) else value
         if "action" not in infos and self.torch:

@@ -41,7 +41,7 @@ class PlanConfig:
 
     Attributes:
         horizon: Model steps to plan.
-        receding_horizon: Model steps to execute before planning again; the whole horizon is open loop.
+        receding_horizon: Model steps to execute before planning again; a value equal to `horizon` is open loop.
         history_len: The number of frames that the model gets, including the current frame.
         action_block: Environment steps in one model step (the frameskip that the model was trained with).
         warm_start: Whether a search starts from the part of the last plan that was not executed.
@@ -290,8 +290,8 @@ class MPCPolicy(BasePolicy):
         known = [self._rest.get(i) for i in due]
         init: Any = None
         if self.cfg.warm_start and any(rest is not None for rest in known):
-            some = next(rest for rest in known if rest is not None)
-            init = np.stack([np.zeros_like(some) if rest is None else rest for rest in known])
+            template = next(rest for rest in known if rest is not None)
+            init = np.stack([np.zeros_like(template) if rest is None else rest for rest in known])
             if has_torch():
                 import torch
 

@@ -252,16 +252,16 @@ class Dict(spaces.Dict):
 
     def update(self, keys: Iterable[str]) -> None:
         """Samples these factors and groups in sampling order; `all` selects every factor."""
-        wanted = set(keys)
-        if "all" in wanted:
+        selected = set(keys)
+        if "all" in selected:
             self.sample()
             return
-        for key in wanted:
+        for key in selected:
             self.find(key)
         for _ in range(TRIES):
             for key in self.sampling_order:
-                inside = any(key.startswith(f"{group}.") for group in wanted)
-                if key in wanted or (inside and not isinstance(self.find(key), Dict)):
+                inside = any(key.startswith(f"{group}.") for group in selected)
+                if key in selected or (inside and not isinstance(self.find(key), Dict)):
                     self.find(key).sample()
             if self.constrain_fn is None or self.constrain_fn(self.value):
                 return

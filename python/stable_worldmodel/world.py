@@ -686,7 +686,7 @@ def _seed(seed: int | None) -> int:
     if seed is None:
         return _random_seed()
     if int(seed) != seed or not 0 <= seed < 2**63:
-        raise ValueError(f"seed: {seed}; expected a whole number from 0 to 2^63 - 1")
+        raise ValueError(f"seed: {seed}; expected an integer from 0 to 2^63 - 1")
     return int(seed)
 
 

@@ -177,9 +177,9 @@ def test_user_defined_format_is_read_written_and_converted(tmp_path, numpy_forma
     with pytest.raises(FileExistsError):
         data.convert(tmp_path / "b.lance", tmp_path / "c", dest_format="npz", progress=False)
     # The loader returns the same batches from both formats.
-    theirs = data.Loader(dataset, 8, backend="numpy")
-    ours = data.Loader(tmp_path / "b.lance", 8, num_steps=3, frameskip=2, columns=dataset.column_names, backend="numpy")
-    for a, b in zip(theirs, ours, strict=True):
+    npz_loader = data.Loader(dataset, 8, backend="numpy")
+    lance_loader = data.Loader(tmp_path / "b.lance", 8, num_steps=3, frameskip=2, columns=dataset.column_names, backend="numpy")
+    for a, b in zip(npz_loader, lance_loader, strict=True):
         np.testing.assert_array_equal(a["pixels"], b["pixels"])
         np.testing.assert_array_equal(a["action"], b["action"])
     assert (

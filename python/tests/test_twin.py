@@ -1,8 +1,8 @@
 """Tests that a torch model and a Burn model with the same weights give the same plan for the same seed.
 
-The engine trains the Burn model, a small LeWM. The torch model loads the same weights under their published names and implements
-LeWM as the engine documents it. The two models sum in different orders, so their costs differ only in the last bits of
-single precision.
+The engine trains the Burn model, a small LeWM. The torch model loads the same weights under their published names and
+implements LeWM as the engine documents it. The two models sum in different orders, so their costs differ only in the last
+bits of single precision.
 """
 
 import json
@@ -255,15 +255,15 @@ def test_plans_are_the_same(twins, infos, solver, settings):
         planner = solver(model, seed=5, **settings)
         planner.configure(action_space=space, n_envs=3, config=config)
         plans.append(planner.solve(infos))
-    ours, theirs = (plan["actions"].numpy() for plan in plans)
-    assert ours.shape == (3, 4, 10)
-    assert np.abs(ours - theirs).max() < TOLERANCE * np.abs(ours).max()
+    burn_plan, torch_plan = (plan["actions"].numpy() for plan in plans)
+    assert burn_plan.shape == (3, 4, 10)
+    assert np.abs(burn_plan - torch_plan).max() < TOLERANCE * np.abs(burn_plan).max()
     assert np.allclose(plans[0]["costs"], plans[1]["costs"], rtol=1e-4)
     # The comparison is not trivial: plans differ between environments and between seeds.
     other = solver(burn, seed=6, **settings)
     other.configure(action_space=gymnasium.spaces.Box(-1, 1, (2,), np.float32), n_envs=3, config=config)
-    assert np.abs(other.solve(infos)["actions"].numpy() - ours).max() > 10 * TOLERANCE * np.abs(ours).max()
-    assert np.abs(ours[0] - ours[1]).max() > 10 * TOLERANCE * np.abs(ours).max()
+    assert np.abs(other.solve(infos)["actions"].numpy() - burn_plan).max() > 10 * TOLERANCE * np.abs(burn_plan).max()
+    assert np.abs(burn_plan[0] - burn_plan[1]).max() > 10 * TOLERANCE * np.abs(burn_plan).max()
 
 
 def test_evaluations_are_the_same(twins):

@@ -155,18 +155,18 @@ def test_visual_wrappers_run_in_the_engine():
 
 
 def test_function_of_the_step_is_a_schedule():
-    ours, theirs = (
+    scheduled, tabulated = (
         rooms(extra_wrappers=[partial(NoiseWrapper, std=schedule)])
         for schedule in (linear(8, 28, 10), lambda step: 8 + 2 * min(step, 10))
     )
-    for world in (ours, theirs):
+    for world in (scheduled, tabulated):
         world.set_policy(Zero(0.7))
         world.reset(seed=0)
-    first = ours.infos["pixels"].copy()
+    first = scheduled.infos["pixels"].copy()
     for _ in range(12):
-        assert np.array_equal(ours.infos["pixels"], theirs.infos["pixels"])
-        ours.step(), theirs.step()
-    assert not np.array_equal(ours.infos["pixels"], first)
+        assert np.array_equal(scheduled.infos["pixels"], tabulated.infos["pixels"])
+        scheduled.step(), tabulated.step()
+    assert not np.array_equal(scheduled.infos["pixels"], first)
     with pytest.raises(ValueError, match="std"):
         rooms(extra_wrappers=[partial(NoiseWrapper, std=lambda step: 250.0 + step)])
 

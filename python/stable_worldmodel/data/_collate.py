@@ -49,11 +49,11 @@ def collate(samples: list[Any], *, collate_fn_map: Any = None) -> Any:
     from torch.utils.data._utils.collate import collate as torch_collate
 
     batch = samples[0].batch
-    whole = len(samples) == batch.size and all(
+    is_complete = len(samples) == batch.size and all(
         isinstance(sample, Sample) and sample.batch is batch and sample.index == i and sample.untouched()
         for i, sample in enumerate(samples)
     )
-    if whole:
+    if is_complete:
         return dict(batch.columns)
     return torch_collate([dict(sample) for sample in samples], collate_fn_map=collate_fn_map)
 

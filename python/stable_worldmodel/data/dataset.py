@@ -315,8 +315,8 @@ class StoredDataset(Dataset):
         self._check(col)
         if col in self._merged:
             return self._merged[col]
-        everything = np.arange(self.num_episodes)
-        return self._read([col], everything, np.zeros_like(everything), self.lengths, 1)[col]
+        all_episodes = np.arange(self.num_episodes)
+        return self._read([col], all_episodes, np.zeros_like(all_episodes), self.lengths, 1)[col]
 
     def get_row_data(self, row_idx: Rows) -> dict[str, Array]:
         rows = np.atleast_1d(np.asarray(row_idx, dtype=np.int64))

@@ -160,7 +160,7 @@ class Loader:
         given = [goals] if isinstance(goals, Goals) else list(goals or [])
         self.num_steps = int(num_steps if num_steps is not None else getattr(dataset, "num_steps", 1))
         self.frameskip = int(frameskip if frameskip is not None else getattr(dataset, "frameskip", 1))
-        wanted = {
+        settings = {
             "num_steps": self.num_steps,
             "frameskip": self.frameskip,
             "columns": [*columns],
@@ -176,13 +176,13 @@ class Loader:
             "cache": bytes_of(cache),
             "cache_dir": None if cache_dir is None else os.fspath(cache_dir),
         }
-        if any(isinstance(value, int) and value < 0 for value in wanted.values()):
-            negative = {name: value for name, value in wanted.items() if isinstance(value, int) and value < 0}
+        if any(isinstance(value, int) and value < 0 for value in settings.values()):
+            negative = {name: value for name, value in settings.items() if isinstance(value, int) and value < 0}
             raise ValueError(f"expected no negative numbers, got {negative}")
-        self._loader = _engine.Loader(engine, json.dumps(wanted))
+        self._loader = _engine.Loader(engine, json.dumps(settings))
         #: The shape of a row of every column: the axes after the batch and the steps.
         self._shapes = {name: tuple(shape[1:]) for name, _, shape in self._loader.schema()}
-        # The dataset returns some scalar columns as lists of one element, so the loader does the same.
+        # The dataset returns some scalar columns as lists of one element, so the loader returns such lists, too.
         for name, (_, shape) in getattr(dataset, "schema", {}).items():
             for column in (name, *(f"{goal.name}_{name}" for goal in given)):
                 if name != "action" and self._shapes.get(column) == () and shape == (1,):

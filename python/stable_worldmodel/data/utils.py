@@ -131,14 +131,14 @@ def _options(format: str | None, mode: str, codec: str | None, quality: int | No
     if mode not in ("resume", "append", "overwrite", "error"):
         raise ValueError(f"mode: expected 'resume', 'append', 'overwrite' or 'error', got {mode!r}")
     chosen = codec_json(codec, quality)
-    wanted = {
+    settings = {
         "format": format,
         "mode": mode,
         "codec": None if chosen is None else json.loads(chosen),
         "verify": verify,
         "least_psnr": least_psnr,
     }
-    return json.dumps(wanted)
+    return json.dumps(settings)
 
 
 def convert(

@@ -46,7 +46,7 @@ def test_dataset_reports_its_columns_and_lengths(stored):
     assert "4 episodes, 71 rows" in repr(dataset)
 
 
-def test_chunks_episodes_columns_and_rows_equal_the_written_ones(stored):
+def test_chunks_episodes_columns_and_rows_equal_the_written_data(stored):
     path, written, lists = stored
     dataset = data.load_dataset(path, num_steps=2, frameskip=3, backend="numpy")
     chunks = dataset.load_chunk(np.array([3, 0]), np.array([2, 0]), np.array([14, 6]))
@@ -139,7 +139,7 @@ def test_names_are_resolved_in_the_home_folder(tmp_path, monkeypatch):
     assert data.load_dataset("rooms", cache_dir=tmp_path).lengths.tolist() == [5]
 
 
-def test_numpy_needs_no_torch(stored):
+def test_numpy_backend_does_not_import_torch(stored):
     path, _, _ = stored
     program = (
         "import sys; from stable_worldmodel import data\n"

@@ -61,13 +61,13 @@ def test_listing_of_the_full_loop(tmp_path, monkeypatch):
     assert wm_policy.plans and {plan["slot"] for plan in wm_policy.plans} <= set(range(8))
 
 
-def test_world_with_several_environments():
+def test_infos_have_one_row_per_environment():
     world = swm.World("swm/PushT-v1", num_envs=8, image_shape=(64, 64))
     world.reset(seed=0)
     assert world.infos["pixels"].shape == (8, 1, 64, 64, 3)
 
 
-def test_factors_of_variation(tmp_path):
+def test_collected_factors_are_sampled_and_pinned(tmp_path):
     world = swm.World("swm/PushT-v1", num_envs=2, image_shape=(32, 32), max_episode_steps=5)
     your_policy = swm.policy.RandomPolicy(seed=0)
     world.set_policy(your_policy)
@@ -90,7 +90,7 @@ def test_factors_of_variation(tmp_path):
     assert len(metrics["episode_successes"]) == 4
 
 
-def test_robustness_sweep_on_atari():
+def test_visual_wrappers_change_only_frames_on_atari():
     pytest.importorskip("ale_py")
     world, plain = (
         swm.World("ALE/Pong-v5", num_envs=2, image_shape=(84, 84), extra_wrappers=wrappers)

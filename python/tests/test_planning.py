@@ -131,7 +131,7 @@ class BlockPrices(Prices):
         return sum(super(BlockPrices, self).get_cost(info_dict, part) for part in each)
 
 
-def test_constraints_hold():
+def test_plans_satisfy_constraints():
     actions = plan(solvers.LagrangianSolver(Constrained(), num_samples=4, n_steps=60, n_outer_steps=8))
     allowed = np.minimum(TARGETS, [0.2, 1.0])
     assert np.abs(actions - allowed[:, None]).max() < 0.02
@@ -235,7 +235,7 @@ def test_model_runs_in_inference_mode_except_for_gradients():
     assert (False, False, True) in seen
 
 
-def test_infos_cached_by_a_model_stay_for_the_search():
+def test_infos_cached_by_a_model_last_for_one_search():
     computed = []
 
     class Caching(Quadratic):

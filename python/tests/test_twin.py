@@ -219,7 +219,7 @@ def in_model_units(card):
     return gymnasium.spaces.Box((-1 - mean) / std, (1 - mean) / std, dtype=np.float32)
 
 
-def test_costs_are_the_same(twins, infos):
+def test_torch_and_burn_costs_are_equal(twins, infos):
     burn, twin = twins
     draw = np.random.default_rng(0)
     candidates = draw.normal(size=(3, 20, 4, 10)).astype(np.float32)
@@ -246,7 +246,7 @@ SOLVERS = [
 
 
 @pytest.mark.parametrize(("solver", "settings"), SOLVERS, ids=[solver.id for solver, _ in SOLVERS])
-def test_plans_are_the_same(twins, infos, solver, settings):
+def test_torch_and_burn_plans_are_equal(twins, infos, solver, settings):
     burn, twin = twins
     config = swm.PlanConfig(horizon=4, receding_horizon=4, action_block=burn.action_block)
     plans = []
@@ -266,7 +266,7 @@ def test_plans_are_the_same(twins, infos, solver, settings):
     assert np.abs(burn_plan[0] - burn_plan[1]).max() > 10 * TOLERANCE * np.abs(burn_plan).max()
 
 
-def test_evaluations_are_the_same(twins):
+def test_torch_and_burn_policies_act_equally(twins):
     burn, twin = twins
     scaler = swm.data.ZScoreScaler(burn.card["action_mean"], burn.card["action_std"])
     config = swm.PlanConfig(horizon=3, receding_horizon=2, action_block=burn.action_block)

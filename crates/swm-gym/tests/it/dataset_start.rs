@@ -34,7 +34,7 @@ fn rows() -> Batch {
 }
 
 fn calls(json: &str) -> Vec<Callable> {
-    serde_json::from_str(json).expect("calls")
+    serde_json::from_str(json).expect("valid callables")
 }
 
 fn start(env: &mut dyn Env, options: &ResetOptions, callables: &[Callable]) -> swm_core::Result<()> {
@@ -115,7 +115,7 @@ fn dataset_start_calls_methods_by_name() {
 }
 
 #[test]
-fn environment_may_declare_its_setter() {
+fn environment_can_declare_the_method_that_sets_its_state() {
     let Some(config) = config() else { return };
     let mut declared = RecordedEnv::of(make("tests.it.environments:Declared-v0", &config));
     start(&mut *declared.env, &ResetOptions::default(), &[]).expect("a start");

@@ -18,7 +18,7 @@ pub fn make(text: &str, config: &GymConfig) -> Box<dyn Env> {
 /// Plays episodes with random actions and returns the bytes of all their outputs, one vector per slot.
 pub fn play(text: &str, config: &GymConfig, episodes: &[u64], workers: usize, steps: usize) -> Vec<Vec<u8>> {
     let envs = episodes.iter().map(|_| make(text, config)).collect();
-    let threads = threads(workers).expect("threads");
+    let threads = threads(workers).expect("a thread pool");
     let mut pool = EnvPool::new(envs, Some((48, 64)), Some(steps), threads).expect("a pool");
     let mut policy = RandomPolicy::new(pool.spec(), episodes.len());
     let mut actions = Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("a schema"), episodes.len());
@@ -104,7 +104,7 @@ fn environments_run_in_parallel_on_one_thread() {
     // Each environment waits in its reset and in its step for the other environment, except in episodes of seed 0.
     let text = format!("{ROOM},meet={}", folder.path().display());
     let envs = (0..2).map(|_| make(&text, &config)).collect();
-    let mut pool = EnvPool::new(envs, None, None, threads(1).expect("threads")).expect("a pool");
+    let mut pool = EnvPool::new(envs, None, None, threads(1).expect("a thread pool")).expect("a pool");
     let actions = Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("a schema"), 2);
     for seeds in [[0, 0], [1, 2]] {
         let reset = |(slot, seed)| Reset { slot, seed, options: ResetOptions::default() };

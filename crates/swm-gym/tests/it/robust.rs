@@ -82,7 +82,7 @@ pub fn kill_process(id: u32) {
 }
 
 #[test]
-fn a_worker_that_always_dies_is_an_error_with_its_output() {
+fn repeated_worker_deaths_are_an_error_with_the_last_output() {
     let Some(config) = config() else { return };
     let mut env = make(&format!("{ROOM},die_at=2"), &config);
     env.reset(0, &ResetOptions::default()).expect("a reset");
@@ -97,7 +97,7 @@ fn a_worker_that_always_dies_is_an_error_with_its_output() {
 }
 
 #[test]
-fn an_exception_is_an_error_without_another_attempt() {
+fn an_exception_is_reported_without_a_retry() {
     let Some(config) = config() else { return };
     let mut env = make(&format!("{ROOM},raise_at=2"), &config);
     env.reset(0, &ResetOptions::default()).expect("a reset");

@@ -120,7 +120,8 @@ fn compares_policies_from_the_same_starts_and_reproduces_results() {
         "planning with the true dynamics beats the floor"
     );
     let traces: Value =
-        serde_json::from_slice(&std::fs::read(swm.path("found/traces.json")).expect("traces")).expect("valid JSON");
+        serde_json::from_slice(&std::fs::read(swm.path("found/traces.json")).expect("the file of traces"))
+            .expect("valid JSON");
     assert!(traces[0]["policy"] == "small" && traces[0]["best"].as_array().map(Vec::len) == Some(2), "{}", traces[0]);
 
     // These solvers require gradients, latents, terms or constraints of the checkpoint.

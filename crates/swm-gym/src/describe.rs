@@ -115,7 +115,7 @@ impl SpaceJson {
     }
 }
 
-/// Returns the element type with a NumPy name.
+/// Returns the element type that a NumPy name denotes.
 fn dtype_of(name: &str) -> Result<DType> {
     const ALL: [DType; 6] = [DType::Bool, DType::U8, DType::Int32, DType::Int64, DType::Float32, DType::Float64];
     let known = || ALL.iter().map(|dtype| dtype.name());
@@ -212,7 +212,7 @@ impl EnvLayout {
         })
     }
 
-    /// The reason for which the environment does not render; empty if it renders.
+    /// The reason for which `render` returns no frame; empty if it returns one.
     pub(crate) fn no_frame(&self) -> &str {
         &self.description.no_frame
     }

@@ -1,7 +1,7 @@
 //! [`GymEnv`]: a Gymnasium environment as an [`Env`].
 //!
-//! A snapshot holds the seed, the options and the actions of the episode so far. A restore replays the actions, and so
-//! does the new worker after the loss of a worker. A restore is therefore exact for deterministic environments only.
+//! A snapshot holds the seed, the options and the actions of the episode so far. A restore replays the actions.
+//! After the loss of a worker, a new worker replays them, too. Both are exact for deterministic environments only.
 
 use crate::dataset_start::{self as start, GoalFrame};
 use crate::describe::header;
@@ -207,7 +207,7 @@ impl GymEnv {
         if self.renders_steps { Request::StepAndRender } else { Request::Step }
     }
 
-    /// Waits for the result of a dispatched call, if there is one. The caller then makes another call.
+    /// Waits for the result of the dispatched call, if there is one, because another call follows.
     fn finish_dispatched(&mut self) -> Result<()> {
         match self.dispatched {
             None => Ok(()),

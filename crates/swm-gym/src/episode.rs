@@ -14,7 +14,7 @@ pub(crate) struct Episode {
 }
 
 impl Episode {
-    /// The snapshot of an episode of the environment `id`; `None` stands for the time before the first reset.
+    /// The snapshot of an episode of the environment `id`; `None` before the first reset.
     pub fn snapshot(episode: Option<&Self>, id: &str) -> Snapshot {
         let mut bytes = format!("{id}\n").into_bytes();
         if let Some(Self { reset, goal, actions }) = episode {

@@ -126,7 +126,7 @@ class Actions:
             with np.errstate(over='ignore'):
                 sides = ('low', 'high')
                 low, high = np.float32([np.concatenate([getattr(p, s).reshape(-1) for p in parts]) for s in sides])
-            # Random actions need bounds, so infinite ones become 1. Actions themselves are not clipped.
+            # Random actions need finite bounds, so infinite bounds become -1 and 1. Actions are not clipped.
             low = np.where(np.isfinite(low), low, -1)
             high = np.where(np.isfinite(high), high, 1)
             shape = parts[0].shape if len(parts) == 1 else low.shape

@@ -51,7 +51,8 @@ pub enum Failure {
 const LINES: usize = 12;
 
 impl Failure {
-    /// Converts the failure of `what` in the environment `id`, after `lost` replaced workers, into an error.
+    /// Converts the failure into an error. `id` names the environment and `what` the failed call; `lost` is the number of
+    /// replaced workers.
     pub(crate) fn explain(self, id: &str, what: &str, lost: usize) -> Error {
         match self {
             Self::Refused(error) => error,

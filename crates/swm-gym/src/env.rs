@@ -1,7 +1,8 @@
 //! [`GymEnv`]: a Gymnasium environment as an [`Env`].
 //!
 //! A snapshot holds the seed, the options and the actions of the episode so far. A restore replays the actions.
-//! After the loss of a worker, a new worker replays the actions, too. A replay is exact for deterministic environments only.
+//! After the loss of a worker, a new worker replays the actions, too. A replay is exact for deterministic environments
+//! only.
 
 use crate::dataset_start::{self as start, GoalFrame};
 use crate::describe::header;

@@ -2,12 +2,12 @@
 
     python benches/bench_loader.py --reference /path/to/python
 
-The loop is LeRobot's: shuffled batches of 64 clips of 4 frames, 5 rows apart, at 224 pixels, each of which goes through a
-training step of a trivial model, the same on all sides. Our loader runs twice: without a cache, and with its default cache
-of decoded frames. All datasets have the content of one collection; the reference's are written by its own writers. The
-reference runs in the Python that `--reference` (or `$SWM_REFERENCE_PYTHON`) names, in turns with ours; the result is the
-median of the ratios of neighbouring turns. The reference runs with every number of workers, and ours is compared with the
-fastest.
+The loop loads shuffled batches of 64 clips of 4 frames, 5 rows apart, at 224 pixels. Each batch goes through a training
+step of a trivial model, the same on all sides. Our loader runs twice: without a cache, and
+with its default cache of decoded frames. All datasets have the content of one collection; the reference reads datasets
+that its own writers wrote. The reference runs in the Python that `--reference` (or `$SWM_REFERENCE_PYTHON`) names, in turns
+with our loader; the result is the median of the ratios of neighbouring turns. The reference runs with every number of
+workers, and its fastest run is compared with our loader.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ COLUMNS = ["pixels", "action"]
 CLIP = {"num_steps": 4, "frameskip": 5}
 BATCH = 64
 
-#: Name, our file, the writer's settings, the format of the reference's file.
+#: The name of the layout, our file, the settings of our writer, and the format of the reference's file.
 LAYOUTS = [
     ("lance, jpeg", "jpeg.lance", {"codec": "jpeg"}, "lance"),
     ("lance, lossless", "lossless.lance", {}, "lance"),
@@ -77,7 +77,7 @@ def torch_loader(dataset: Any, workers: int) -> Any:
 
 
 def serve() -> None:
-    """The reference's side: answers `write FORMAT SOURCE PATH` and `turn FORMAT PATH WORKERS SECONDS`, a JSON line each."""
+    """Runs in the reference's Python: answers `write FORMAT SOURCE PATH` and `turn FORMAT PATH WORKERS SECONDS` in JSON."""
     import numpy as np
     import torch
 
@@ -126,9 +126,9 @@ class Reference:
         for line in self.process.stdout:
             if line.startswith("SWM "):
                 return None if line == "SWM ready\n" else json.loads(line[4:])
-        raise SystemExit("the reference ended; run it by hand: REFERENCE benches/bench_loader.py --serve")
+        raise SystemExit("the reference ended; to see its error, run: REFERENCE_PYTHON benches/bench_loader.py --serve")
 
-    def ask(self, *words: Any) -> Any:
+    def request(self, *words: Any) -> Any:
         assert self.process.stdin is not None
         print(*words, sep="\t", file=self.process.stdin, flush=True)
         return self.answer()
@@ -159,10 +159,10 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=100)
     parser.add_argument("--size", type=int, default=224)
     parser.add_argument("--pairs", type=int, default=5, help="turns of each side")
-    parser.add_argument("--seconds", type=float, default=2.0, help="of a turn")
+    parser.add_argument("--seconds", type=float, default=2.0, help="seconds of a turn")
     parser.add_argument("--workers", type=int, nargs="*", default=[0, 2], help="worker processes of DataLoaders")
-    parser.add_argument("--threads", type=int, default=2, help="threads of our loader that load ahead")
-    parser.add_argument("--cache", default="512MiB", help="size of our loader's cache of decoded frames, in one row")
+    parser.add_argument("--threads", type=int, default=2, help="prefetch threads of our loader")
+    parser.add_argument("--cache", default="512MiB", help="size of the cache of decoded frames, in our loader's cached runs")
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.serve:
@@ -180,37 +180,38 @@ def main() -> None:
         folder = Path(name)
         source = collect(folder, given.episodes, given.steps, given.size)
         print(f"{given.episodes} episodes of {given.steps} steps at {given.size} px; load average {os.getloadavg()[0]:.1f}")
-        print(f"{'content':<17}{'how':<40}{'clips/s':>9}  {'x reference':>12}")
-        for layout, place, writing, beside in LAYOUTS:
-            data.convert(source, folder / place, progress=False, verify=False, **writing)
-            ways: dict[str, Callable[[], float]] = {}
+        print(f"{'layout':<17}{'loader':<40}{'clips/s':>9}  {'x reference':>12}")
+        for layout, file, codec, reference_format in LAYOUTS:
+            data.convert(source, folder / file, progress=False, verify=False, **codec)
+            turns: dict[str, Callable[[], float]] = {}
             for workers in given.workers if reference is not None else ():
-                theirs = folder / f"theirs-{beside}.{'lance' if beside == 'lance' else 'h5'}"
-                if not theirs.exists():
-                    reference.ask("write", beside, folder / "episodes", theirs)
-                ways[f"reference, {workers} workers"] = lambda theirs=theirs, workers=workers, beside=beside: reference.ask(
-                    "turn", beside, theirs, workers, given.seconds
-                )
+                stored = folder / f"reference.{'lance' if reference_format == 'lance' else 'h5'}"
+                if not stored.exists():
+                    reference.request("write", reference_format, folder / "episodes", stored)
+                request = ("turn", reference_format, stored, workers, given.seconds)
+                turns[f"reference, {workers} workers"] = lambda request=request: reference.request(*request)
             settings = {"columns": COLUMNS, "drop_last": True, "threads": given.threads, **CLIP}
-            for how, cache in (("Loader, every frame decoded", 0), (f"Loader, {given.cache} of frames cached", given.cache)):
-                batches = endless(data.Loader(folder / place, BATCH, cache=cache, **settings))
-                ways[how] = lambda batches=batches: turn(batches, step, given.seconds)
+            for label, cache in (("Loader, every frame decoded", 0), (f"Loader, {given.cache} of frames cached", given.cache)):
+                batches = endless(data.Loader(folder / file, BATCH, cache=cache, **settings))
+                turns[label] = lambda batches=batches: turn(batches, step, given.seconds)
             for workers in given.workers:
-                dataset = data.load_dataset(folder / place, keys_to_load=COLUMNS, **CLIP)
-                mine = endless(torch_loader(dataset, workers))
-                ways[f"load_dataset, DataLoader, {workers} workers"] = lambda mine=mine: turn(mine, step, given.seconds)
-            for way in ways.values():
-                way()
-            rates: dict[str, list[float]] = {how: [] for how in ways}
+                dataset = data.load_dataset(folder / file, keys_to_load=COLUMNS, **CLIP)
+                batches = endless(torch_loader(dataset, workers))
+                label = f"load_dataset, DataLoader, {workers} workers"
+                turns[label] = lambda batches=batches: turn(batches, step, given.seconds)
+            # The first turn of each side warms the caches and is not counted.
+            for run_turn in turns.values():
+                run_turn()
+            rates: dict[str, list[float]] = {label: [] for label in turns}
             for _ in range(given.pairs):
-                for how, way in ways.items():
-                    rates[how].append(way())
-            rivals = [how for how in ways if how.startswith("reference")]
-            fastest = max(rivals, key=lambda how: statistics.median(rates[how]), default=None)
-            for how, mine in rates.items():
-                line = f"{layout:<17}{how:<40}{statistics.median(mine):>9.0f}"
-                if fastest is not None and how not in rivals:
-                    ratio = statistics.median(a / b for a, b in zip(mine, rates[fastest], strict=True))
+                for label, run_turn in turns.items():
+                    rates[label].append(run_turn())
+            references = [label for label in turns if label.startswith("reference")]
+            fastest = max(references, key=lambda label: statistics.median(rates[label]), default=None)
+            for label, measured in rates.items():
+                line = f"{layout:<17}{label:<40}{statistics.median(measured):>9.0f}"
+                if fastest is not None and label not in references:
+                    ratio = statistics.median(a / b for a, b in zip(measured, rates[fastest], strict=True))
                     line += f"  {ratio:>11.1f}x"
                 print(line, flush=True)
 

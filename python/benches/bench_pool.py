@@ -48,13 +48,13 @@ def main() -> None:
     parser.add_argument("--chunk", type=int, default=1, help="steps in one call")
     given = parser.parse_args()
     for env, envs, side in CASES:
-        ours, theirs = [], []
+        rates, command_rates = [], []
         for _ in range(given.pairs):
-            ours.append(python(env, envs, side, given.seconds, given.chunk))
-            theirs.append(command(given.swm, env, envs, side))
-        ratio = statistics.median(a / b for a, b in zip(ours, theirs, strict=True))
+            rates.append(python(env, envs, side, given.seconds, given.chunk))
+            command_rates.append(command(given.swm, env, envs, side))
+        ratio = statistics.median(a / b for a, b in zip(rates, command_rates, strict=True))
         size = f"{side} px" if side else "no frames"
-        print(f"{env}, {envs} environments, {size}: {statistics.median(ours):,.0f} steps/s, {ratio:.2f} x the command line's")
+        print(f"{env}, {envs} environments, {size}: {statistics.median(rates):,.0f} steps/s, {ratio:.2f} x the command line")
 
 
 if __name__ == "__main__":

@@ -79,7 +79,7 @@ pub unsafe fn view<'py>(
     let rows = [batch.rows(), 1];
     let shape = with_rows(if time { &rows } else { &rows[..1] }, spec);
     let bytes = batch.bytes(column);
-    // SAFETY: the caller guarantees what `make` requires.
+    // SAFETY: the caller guarantees the lifetime that `make` requires.
     unsafe { with_dtype!(spec.dtype, make(bytes, &shape, owner)) }
 }
 

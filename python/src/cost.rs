@@ -72,7 +72,7 @@ impl PythonCost {
     /// Wraps an adapter.
     ///
     /// # Errors
-    /// If the adapter lacks one of its flags.
+    /// If the adapter lacks one of the attributes `has_gradient`, `latent_dim` and `has_constraints`.
     pub fn new(adapter: &Bound<'_, PyAny>) -> PyResult<Self> {
         Ok(Self {
             gradient: adapter.getattr("has_gradient")?.extract()?,

@@ -126,7 +126,7 @@ impl NativeEnv {
         factors(py, &*self.lock().env)
     }
 
-    /// The distance of the state from the goal.
+    /// The distance of the state from the goal, in the environment's units.
     fn goal_distance(&self) -> f64 {
         self.lock().env.goal_distance()
     }
@@ -163,7 +163,7 @@ impl NativeEnv {
         let (start, goal) = (arrays::batch(start)?, arrays::batch(goal)?);
         if start.rows() != 1 || goal.rows() != 1 {
             let given = format!("{} rows of a start, {} of a goal", start.rows(), goal.rows());
-            return Err(to_py_err(Error::mismatch("restoring from a dataset", given, "one of each")));
+            return Err(to_py_err(Error::mismatch("restoring from a dataset", given, "one row of each")));
         }
         let mut this = self.lock();
         this.env.restore_from(start.row(0), goal.row(0)).map_err(to_py_err)?;

@@ -41,7 +41,7 @@ impl Model {
         let loaded = load(&self.path, &self.device).map_err(to_py_err)?;
         let cost = loaded.cost().ok_or_else(|| {
             let what = format!("checkpoint {}", self.path.display());
-            to_py_err(Error::config(what, "it acts and does not predict", "let it act: FeedForwardPolicy"))
+            to_py_err(Error::config(what, "it acts and does not predict", "use it as a policy: FeedForwardPolicy"))
         })?;
         let objective: ObjectiveConfig = match &self.objective {
             Value::Null => ObjectiveConfig::default(),
@@ -118,7 +118,7 @@ impl Model {
             let spec = swm::env(id)?.env()?.spec().clone();
             if cached.as_ref().is_none_or(|(_, slots)| *slots != rows) {
                 let policy = load(&self.path, &self.device)?.policy(&spec, rows).ok_or_else(|| {
-                    Error::config(what(), "it predicts and does not act", "plan in it: get_cost, MPCPolicy")
+                    Error::config(what(), "it predicts and does not act", "plan with it: get_cost, MPCPolicy")
                 })??;
                 *cached = Some((policy, rows));
             }

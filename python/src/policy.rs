@@ -1,4 +1,4 @@
-//! [`Actor`]: a policy bound to a world: a policy of the engine, or one implemented in Python.
+//! [`Actor`]: a policy bound to a world, implemented in the engine or in Python.
 
 use crate::cost::planning_model;
 use crate::errors::{from_py_err, json, to_py_err};
@@ -62,7 +62,7 @@ impl Actor {
     }
 
     /// Creates a policy implemented in Python: `call(infos, active, fresh)` returns an array of actions. `infos` is a
-    /// copy of the dict of [`World::infos`]; `active` marks the slots that act, `fresh` those that begin an episode.
+    /// copy of the dict of [`World::infos`]; `active` marks the slots that act, `fresh` the slots with a new episode.
     #[staticmethod]
     fn python(world: &Bound<'_, World>, call: Py<PyAny>) -> PyResult<Self> {
         let infos = World::infos(world)?.unbind();

@@ -154,7 +154,7 @@ impl World {
         let options = reset_options(options)?;
         if let Some((slot, _)) = starts.iter().find(|(slot, _)| *slot >= self.envs) {
             return Err(PyIndexError::new_err(format!(
-                "reset: environment {slot} does not exist, there are {}",
+                "reset: environment {slot} does not exist, the world has {} environments",
                 self.envs
             )));
         }
@@ -376,7 +376,7 @@ impl World {
         stored.map_err(to_py_err)
     }
 
-    /// The seed that resets the environment for an episode.
+    /// The seed of the environment's reset at the start of an episode.
     #[staticmethod]
     fn episode_seed(seed: u64, episode: usize) -> u64 {
         reset_seed(episode_key(seed, episode))

@@ -86,7 +86,7 @@ def _plain(value: Any, what: str) -> Any:
 
 
 def _known(key: str, spaces: Mapping[str, Any]) -> str:
-    """The environment's key of a factor. The paper writes `agent.size` for the factor `agent.scale` of Push-T."""
+    """Returns the environment's key of a factor. The paper's listings write `agent.size` for `agent.scale` of Push-T."""
     group, _, name = key.rpartition(".")
     scale = f"{group}.scale"
     return scale if name == "size" and key not in spaces and scale in spaces else key

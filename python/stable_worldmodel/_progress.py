@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def bar(what: str, total: int, shown: bool) -> Iterator[Callable[[int, int, int], None] | None]:
-    """Yields a progress callback `(done, total, steps)`, or `None` if nothing is to be shown."""
+    """Yields a progress callback `(done, total, steps)`, or `None` without a display."""
     if not shown:
         yield None
         return

@@ -195,8 +195,8 @@ class Adapter:
     Args:
         model: A `Costable`, or a `Dynamics`.
         device: The device of torch tensors.
-        batch_size: The number of environments in one call of the model; all of them for `None`. It does not affect the
-            result.
+        batch_size: The number of environments in one call of the model; all environments for `None`. The batch
+            size does not affect the result.
         process, transform: As for `stable_worldmodel.policy.MPCPolicy`.
         history: The number of frames that the model gets, including the current frame.
         dim: The dimension of one model step.
@@ -366,7 +366,7 @@ class Adapter:
                 gradients.append(torch.zeros_like(part) if gradient is None else gradient)
         return self._numpy(gradients)
 
-    # Between numpy and torch.
+    # Conversion between numpy and torch.
 
     def _checked_cost(self, infos: dict[str, Any], candidates: Any) -> Any:
         cost = self.model.get_cost(infos, candidates)
@@ -394,11 +394,11 @@ class Adapter:
         infos: dict[str, Any] = {}
         for key, value in self._infos.items():
             if isinstance(value, np.ndarray):
-                some = value[rows][:, None]
-                infos[key] = np.broadcast_to(some, (some.shape[0], samples, *some.shape[2:]))
+                selected = value[rows][:, None]
+                infos[key] = np.broadcast_to(selected, (selected.shape[0], samples, *selected.shape[2:]))
             elif hasattr(value, "expand"):
-                some = self._on_device(value[rows]).unsqueeze(1)
-                infos[key] = some.expand(-1, samples, *some.shape[2:])
+                selected = self._on_device(value[rows]).unsqueeze(1)
+                infos[key] = selected.expand(-1, samples, *selected.shape[2:])
             else:
                 infos[key] = value[rows] if isinstance(value, list) else value
         if "action" not in infos and self.torch:

@@ -37,11 +37,11 @@ __all__ = [
 
 @dataclass(frozen=True)
 class PlanConfig:
-    """How far to plan and how much of a plan to execute.
+    """The length of a plan and the number of steps that are executed before planning again.
 
     Attributes:
         horizon: Model steps to plan.
-        receding_horizon: Model steps to execute before planning again; the whole horizon is open loop.
+        receding_horizon: Model steps to execute before planning again; a value equal to `horizon` is open loop.
         history_len: The number of frames that the model gets, including the current frame.
         action_block: Environment steps in one model step (the frameskip that the model was trained with).
         warm_start: Whether a search starts from the part of the last plan that was not executed.
@@ -104,7 +104,7 @@ class _EnginePolicy(BasePolicy):
         """The actions for the current infos of the world; `obs` is ignored."""
         if self.env is None:
             raise RuntimeError(f"{type(self).__name__}: world.set_policy(policy) first")
-        return self.env._world._ask(self)
+        return self.env._world._engine_actions(self)
 
 
 class RandomPolicy(_EnginePolicy):
@@ -120,7 +120,7 @@ class RandomPolicy(_EnginePolicy):
         """Sets the policy's seed, which is combined with the seed of each episode."""
         self.seed = seed
         if self.env is not None:
-            self.env._world._forget(self)
+            self.env._world._drop_actor(self)
 
     def _actor(self, world: World) -> Any:
         return _engine.Actor.random(world._world, self.seed)
@@ -176,7 +176,7 @@ class FeedForwardPolicy(BasePolicy):
         if isinstance(self.model, str) or hasattr(self.model, "_engine_policy"):
             if self.env is None:
                 raise RuntimeError("FeedForwardPolicy: world.set_policy(policy) first")
-            return self.env._world._ask(self)
+            return self.env._world._engine_actions(self)
         infos = prepared({key: value for key, value in obs.items() if key[0] != "_"}, self.process, self.transform)
         if "goal" in infos:
             infos["goal_pixels"] = infos["goal"]
@@ -290,8 +290,8 @@ class MPCPolicy(BasePolicy):
         known = [self._rest.get(i) for i in due]
         init: Any = None
         if self.cfg.warm_start and any(rest is not None for rest in known):
-            some = next(rest for rest in known if rest is not None)
-            init = np.stack([np.zeros_like(some) if rest is None else rest for rest in known])
+            template = next(rest for rest in known if rest is not None)
+            init = np.stack([np.zeros_like(template) if rest is None else rest for rest in known])
             if has_torch():
                 import torch
 

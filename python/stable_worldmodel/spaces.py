@@ -32,7 +32,7 @@ class _Factor:
             raise ValueError(f"init_value {init_value!r} is not in {self}, or violates its constrain_fn")
 
     def _typed(self, value: Any) -> Any:
-        """The value in the type of the space, if the conversion is exact."""
+        """The value in the type of the space, unless the conversion to integers is inexact."""
         typed = np.asarray(value, dtype=self.dtype)  # type: ignore[attr-defined]
         return typed if np.array_equal(typed, np.asarray(value)) or typed.dtype.kind == "f" else np.asarray(value)
 
@@ -148,7 +148,7 @@ class Dict(spaces.Dict):
     """Factors by name, nested: a `variation_space`.
 
     Factors are sampled in `sampling_order` (by default the order of definition), so the condition of a factor may read the
-    values of earlier ones. All factors are sampled again until the condition of the whole `Dict` holds.
+    values of earlier factors. All factors are sampled again until the condition of the whole `Dict` holds.
     """
 
     def __init__(
@@ -210,7 +210,7 @@ class Dict(spaces.Dict):
         space: Any = self
         for part in key.split("."):
             if not isinstance(space, Dict) or part not in space.spaces:
-                raise ValueError(f"no factor is called {key!r}; there are {self.names()}")
+                raise ValueError(f"no factor is called {key!r}; the factors are {self.names()}")
             space = space.spaces[part]
         return space
 
@@ -239,7 +239,7 @@ class Dict(spaces.Dict):
     def sample(
         self, mask: Any = None, probability: Any = None, *, max_tries: int = TRIES, set_value: bool = True
     ) -> dict[str, Any]:
-        """Samples every factor, in order, until the condition on the whole holds."""
+        """Samples every factor, in order, until the condition of the `Dict` holds."""
         for _ in range(max_tries):
             masks, chances = mask or {}, probability or {}
             value = {
@@ -252,16 +252,16 @@ class Dict(spaces.Dict):
 
     def update(self, keys: Iterable[str]) -> None:
         """Samples these factors and groups in sampling order; `all` selects every factor."""
-        wanted = set(keys)
-        if "all" in wanted:
+        selected = set(keys)
+        if "all" in selected:
             self.sample()
             return
-        for key in wanted:
+        for key in selected:
             self.find(key)
         for _ in range(TRIES):
             for key in self.sampling_order:
-                inside = any(key.startswith(f"{group}.") for group in wanted)
-                if key in wanted or (inside and not isinstance(self.find(key), Dict)):
+                inside = any(key.startswith(f"{group}.") for group in selected)
+                if key in selected or (inside and not isinstance(self.find(key), Dict)):
                     self.find(key).sample()
             if self.constrain_fn is None or self.constrain_fn(self.value):
                 return
@@ -304,8 +304,8 @@ def reset_variation_space(
 ) -> None:
     """Resets the factors of an environment for an episode.
 
-    Sets all factors to their defaults, samples those of `options["variation"]` (`default_variations` if it is missing), and
-    sets those of `options["variation_values"]`.
+    Sets all factors to their defaults, samples the factors in `options["variation"]` (`default_variations` if it is
+    missing), and sets the factors in `options["variation_values"]`.
     """
     options = options or {}
     variation_space.seed(seed)

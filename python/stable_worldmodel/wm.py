@@ -1,8 +1,10 @@
 """The engine's models: checkpoints of LeWM, PLDM, DINO-WM, TD-MPC2, GCBC, GCIVL, GCIQL, SAC.
 
-model = swm.wm.load("lewm-rooms")            # a name under $STABLEWM_HOME/checkpoints, or a path
-solver = swm.solver.CEMSolver(model)         # planning runs in the engine, without Python
-swm.wm.train("lewm", data="rooms", out="lewm-rooms", preset="tiny")
+    swm.wm.train("lewm", data="rooms", out="lewm-rooms", preset="tiny")
+    model = swm.wm.load("lewm-rooms")  # a name under $STABLEWM_HOME/checkpoints, or a path
+    solver = swm.solver.CEMSolver(model)
+
+Planning with these models runs in the engine, without Python.
 """
 
 from __future__ import annotations
@@ -30,8 +32,8 @@ class Model:
     Args:
         name: A name under `$STABLEWM_HOME/checkpoints`, or a path.
         device: `cpu`, or a GPU if the engine was built with GPU support.
-        objective: Terms of the planning objective, a dict in the form of `swm eval --objective`; `None` for the
-            model's own cost.
+        objective: The planning objective, a dict with `terms` and `constraints`, such as
+            `{"terms": [{"term": "control", "weight": 0.01}]}`; `None` for the model's own cost.
     """
 
     def __init__(self, name: str, device: str = "cpu", objective: dict[str, Any] | None = None) -> None:
@@ -127,7 +129,7 @@ def train(
         out: The checkpoint's name or path.
         preset: The name of a configuration; the first one of the family for `None`.
         device: `cpu`, or a GPU if the engine was built with GPU support.
-        **overrides: Settings that replace those of the preset, with `__` for dots: `train__steps=1000`.
+        **overrides: Settings that replace the preset's settings, with `__` for dots: `schedule__steps=1000`.
 
     Returns:
         `out`.

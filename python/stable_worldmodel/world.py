@@ -46,7 +46,7 @@ class World:
         threads: The number of worker threads, which does not affect results; 0 uses one for each core.
         workers: Whether each third-party environment runs in a worker process instead of this interpreter. The processes
             step in parallel and are restarted after a crash. They must be able to import the environment.
-        image_resample: How frames of third-party environments are resized: `"bilinear"`, or `"nearest"` for pixel art.
+        image_resample: The interpolation that resizes third-party frames: `"bilinear"`, or `"nearest"` for pixel art.
         **kwargs: Options of the environment.
 
     Attributes:
@@ -137,7 +137,7 @@ class World:
             return True
         import gymnasium
 
-        # An unregistered id in this namespace is a misspelt native id. The engine's error suggests similar ids.
+        # An unregistered id of the namespace `swm` is a misspelt native id. The engine's error suggests similar ids.
         return name.startswith("swm/") and not name.startswith("swm/Craftax") and name not in gymnasium.registry
 
     # Properties.
@@ -198,7 +198,7 @@ class World:
 
     def __getattr__(self, name: str) -> Any:
         if name == "_world":
-            raise RuntimeError("World: it is closed; make a new one")
+            raise RuntimeError("World: the world is closed; create a new world")
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def __enter__(self) -> World:
@@ -218,7 +218,7 @@ class World:
         if callable(getattr(policy, "set_env", None)):
             policy.set_env(self.envs)
         self.policy = policy
-        self._forget(policy)
+        self._drop_actor(policy)
 
     def reset(self, seed: int | Sequence[int] | None = None, options: Mapping[str, Any] | None = None) -> None:
         """Starts an episode in every environment and refreshes `infos`.
@@ -282,7 +282,7 @@ class World:
         return self._world.snapshot(index)
 
     def restore(self, state: bytes, index: int = 0) -> None:
-        """Restores a snapshot. The steps that follow repeat those after the snapshot bit for bit."""
+        """Restores a snapshot. Later steps repeat the steps after the snapshot bit for bit."""
         self._world.restore(index, state)
 
     def _begin(self, slots: Sequence[int]) -> None:
@@ -292,7 +292,7 @@ class World:
                 for slot in slots:
                     self._world.begin(actor, slot, self.seed or 0, self._episodes[slot])
 
-    def _ask(self, policy: Any) -> np.ndarray:
+    def _engine_actions(self, policy: Any) -> np.ndarray:
         """The actions `(num_envs, ..)` of a policy of the engine for the current infos."""
         active = ~(self.terminateds | self.truncateds)
         self._world.act(self._actor(policy), active.tolist())
@@ -330,11 +330,11 @@ class World:
                 self._world.begin(actor, slot, self.seed or 0, self._episodes[slot])
         return actor
 
-    def _forget(self, policy: Any) -> None:
+    def _drop_actor(self, policy: Any) -> None:
         self._actors.pop(id(policy), None)
 
     def _playing(self, policy: Any) -> Any:
-        """The actor of a policy for collection and evaluation. The actor of a policy implemented in Python calls back."""
+        """The actor of a policy for collection and evaluation. A policy implemented in Python gets an actor that calls it."""
         actor = self._actor(policy)
         if actor is not None:
             return actor
@@ -377,9 +377,9 @@ class World:
             progress: Whether to show progress.
             dataset_path: Another name for `path`.
             policy: The policy to set first; `None` keeps the policy of `set_policy`.
-            mode: What to do if the dataset exists: `"error"` raises, `"overwrite"` replaces it, `"append"` adds `episodes`
+            mode: The treatment of an existing dataset: `"error"` raises, `"overwrite"` replaces it, `"append"` adds `episodes`
                 more, `"resume"` continues until the dataset has `episodes`.
-            codec: How frames are stored: `"qoi"` (lossless), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
+            codec: The codec of frames: `"qoi"` (lossless), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
             goal: Whether to store the frame of the goal in every row.
 
         Returns:
@@ -434,7 +434,7 @@ class World:
             outcome = self._world.collect(
                 self._playing(policy), path, writer, format, mode, codec_json(codec), json.dumps(config), bar
             )
-        self._settle()
+        self._end_interactive_loop()
         return dict(zip(("episodes", "added", "steps"), outcome, strict=True))
 
     def evaluate(
@@ -470,7 +470,7 @@ class World:
             episodes_idx, start_steps: The episodes and steps of the dataset to start from; chosen by the seed for `None`.
             goal_offset: The number of steps from a start to its goal; 25 for `None`.
             eval_budget: The time limit of an episode in steps. `None` uses the world's time limit, or 50 with a dataset.
-            callables: The methods that put an environment into a recorded state, called in this order after its reset:
+            callables: The methods that set an environment's recorded state, called in this order after its reset:
                 `{"method": NAME, "args": {KEYWORD: {"value": COLUMN}}}`. A column name with the prefix `goal_` reads the
                 row of the goal. `{"value": ANYTHING, "in_dataset": False}` passes the value itself. The default is
                 `set_state(state)` and `set_goal_state(goal_state)`, with or without a leading `_`. Native environments
@@ -488,7 +488,7 @@ class World:
             The metrics.
         """
         if reset_mode not in (None, "auto", "wait"):
-            raise ValueError(f"reset_mode: {reset_mode!r}; expected 'auto' or 'wait' (both behave the same)")
+            raise ValueError(f"reset_mode: {reset_mode!r}; expected 'auto' or 'wait', which have the same effect")
         if protocol not in ("strict", "compat"):
             raise ValueError(f"protocol: {protocol!r}; expected 'strict' or 'compat'")
         policy = self._chosen(policy)
@@ -498,7 +498,7 @@ class World:
             goal_offset = 25 if goal_offset is None else int(goal_offset)
             eval_budget = 50 if eval_budget is None else int(eval_budget)
             if (episodes_idx is None) != (start_steps is None):
-                raise ValueError("episodes_idx, start_steps: give both, or none of them")
+                raise ValueError("episodes_idx, start_steps: give both or neither")
             if episodes_idx is not None and start_steps is not None:
                 picks = [[int(e), int(s)] for e, s in zip(episodes_idx, start_steps, strict=True)]
                 episodes = len(picks)
@@ -530,7 +530,7 @@ class World:
             given = json.dumps({**config, "policy": name, "videos": recording})
             with _progress.bar(f"evaluate {name}", episodes, progress) as bar:
                 runs.append(json.loads(self._world.evaluate(actor, given, dataset, bar)))
-        self._settle()
+        self._end_interactive_loop()
         if hasattr(policy, "plans"):
             policy.plans = json.loads(acting[0][1].take_plans())
         return Metrics._of(self, config, runs, dataset)
@@ -552,7 +552,7 @@ class World:
             raise RuntimeError("World: no policy; call set_policy, or give policy=…")
         return self.policy
 
-    def _settle(self) -> None:
+    def _end_interactive_loop(self) -> None:
         """Makes the next interactive loop start with a reset, after a collection or an evaluation."""
         self.seed = None
         self._actors.clear()
@@ -610,8 +610,8 @@ class Metrics(dict):
     """The metrics of an evaluation.
 
     Keys: `success_rate` in percent; `interval`, its 95 % Wilson interval; `random_success_rate` and `random_interval`,
-    the same two metrics of the random-policy floor; `episode_successes`, `seeds` and `steps`, one entry for each episode;
-    `solved_at_start`, the number of starts that satisfy the goal; `time_to_goal`, the steps of successful episodes;
+    the success rate and interval of the random-policy floor; `episode_successes`, `seeds` and `steps`, one entry for each
+    episode; `solved_at_start`, the number of starts that satisfy the goal; `time_to_goal`, the steps of successful episodes;
     `plan_seconds`, the planning times; `videos`.
     """
 
@@ -686,7 +686,7 @@ def _seed(seed: int | None) -> int:
     if seed is None:
         return _random_seed()
     if int(seed) != seed or not 0 <= seed < 2**63:
-        raise ValueError(f"seed: {seed}; expected a whole number from 0 to 2^63 - 1")
+        raise ValueError(f"seed: {seed}; expected an integer from 0 to 2^63 - 1")
     return int(seed)
 
 

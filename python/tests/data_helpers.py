@@ -49,7 +49,7 @@ def clips(written, num_steps, frameskip):
 
 
 def same(found, expected, lists=False):
-    """Asserts that two samples are the same; with `lists`, that scalars are lists of one element."""
+    """Asserts that two samples are equal; with `lists`, that `found` has scalars as lists of one element."""
     assert set(found) == set(expected)
     for name, array in expected.items():
         array = array[:, None] if lists and array.ndim == 1 else array

@@ -1,4 +1,4 @@
-"""Reading: clips, chunks, columns and rows equal the written episodes."""
+"""Tests of reading: clips, chunks, columns and rows equal the written episodes."""
 
 import pickle
 import subprocess
@@ -32,7 +32,7 @@ def test_clips_are_windows_of_episodes(stored, num_steps, frameskip):
         same(dataset[i], expected[i], lists)
 
 
-def test_dataset_description(stored):
+def test_dataset_reports_its_columns_and_lengths(stored):
     path, _, lists = stored
     dataset = data.load_dataset(path, keys_to_load=["action", "reward"])
     assert dataset.column_names == ["action", "reward"]
@@ -46,15 +46,15 @@ def test_dataset_description(stored):
     assert "4 episodes, 71 rows" in repr(dataset)
 
 
-def test_chunks_episodes_columns_rows(stored):
+def test_chunks_episodes_columns_and_rows_equal_the_written_data(stored):
     path, written, lists = stored
     dataset = data.load_dataset(path, num_steps=2, frameskip=3, backend="numpy")
     chunks = dataset.load_chunk(np.array([3, 0]), np.array([2, 0]), np.array([14, 6]))
     for chunk, (number, start, end) in zip(chunks, [(3, 2, 14), (0, 0, 6)], strict=True):
         expected = clips([{name: array[start:end] for name, array in written[number].items()}], (end - start) // 3, 3)
         same(chunk, expected[0], lists)
-    whole = dataset.load_episode(2)
-    assert whole["action"].shape == (9, 2) and whole["state"].shape == (3, 4)
+    loaded = dataset.load_episode(2)
+    assert loaded["action"].shape == (9, 2) and loaded["state"].shape == (3, 4)
     for name in ("pixels", "action", "state"):
         np.testing.assert_array_equal(dataset.get_col_data(name), np.concatenate([e[name] for e in written]))
     rows = dataset.get_row_data([70, 12, 12])
@@ -63,7 +63,7 @@ def test_chunks_episodes_columns_rows(stored):
     np.testing.assert_array_equal(dataset.get_col_data("episode_idx"), np.repeat(np.arange(4), LENGTHS))
 
 
-def test_cached_and_merged_columns(stored):
+def test_cached_and_merged_columns_have_the_stored_values(stored):
     path, written, _ = stored
     dataset = data.load_dataset(
         path, num_steps=2, keys_to_load=["pixels"], keys_to_cache=["pixels"], backend="numpy",
@@ -139,7 +139,7 @@ def test_names_are_resolved_in_the_home_folder(tmp_path, monkeypatch):
     assert data.load_dataset("rooms", cache_dir=tmp_path).lengths.tolist() == [5]
 
 
-def test_numpy_needs_no_torch(stored):
+def test_numpy_backend_does_not_import_torch(stored):
     path, _, _ = stored
     program = (
         "import sys; from stable_worldmodel import data\n"
@@ -151,7 +151,7 @@ def test_numpy_needs_no_torch(stored):
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
-def test_concat_and_merge(tmp_path):
+def test_concatenated_and_merged_datasets_have_all_clips_and_columns(tmp_path):
     first, second = write(tmp_path / "a.lance", (8, 9)), write(tmp_path / "b.lance", (7,))
     parts = [data.load_dataset(tmp_path / f"{name}.lance", num_steps=3, frameskip=2, backend="numpy") for name in "ab"]
     both = data.ConcatDataset(parts)
@@ -179,7 +179,7 @@ def test_concat_and_merge(tmp_path):
         np.testing.assert_array_equal(found, [dataset[i]["state"] for i in range(len(dataset))])
 
 
-def test_goals_follow_the_clip(tmp_path):
+def test_goals_are_sampled_from_the_requested_steps(tmp_path):
     write(tmp_path / "a.lance")
     dataset = data.load_dataset(tmp_path / "a.lance", num_steps=2, frameskip=2, backend="numpy")
     keys = {"reward": "goal"}
@@ -207,7 +207,7 @@ def test_goals_follow_the_clip(tmp_path):
         data.GoalDataset(dataset, (1, 1, 0, 0))
 
 
-def test_scalers(tmp_path):
+def test_scalers_normalise_and_invert(tmp_path):
     write(tmp_path / "a.lance")
     dataset = data.load_dataset(tmp_path / "a.lance", num_steps=3, frameskip=2, backend="numpy")
     action = dataset.get_col_data("action")
@@ -230,7 +230,7 @@ def test_scalers(tmp_path):
         data.get_scaler("minmax")
 
 
-def test_constants_of_episodes(tmp_path):
+def test_text_columns_become_constants(tmp_path):
     content = {**episode(0, 4), "scene": "<mujoco/>", "words": ["go"] * 4}
     with data.open_writer(tmp_path / "a.lance") as writer:
         writer.write_episode(content)

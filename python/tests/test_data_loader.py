@@ -1,4 +1,4 @@
-"""The loader: epochs, order, saved positions, goals, interrupts and errors."""
+"""Tests of the loader: epochs, order, saved positions, goals, interrupts and errors."""
 
 import signal
 import subprocess
@@ -55,8 +55,8 @@ def test_epoch_has_every_clip_once_in_random_order(stored):
 
 def test_saved_position_continues_with_the_same_batches(stored):
     path, _ = stored
-    whole = loader(path, seed=5)
-    epochs = [identities(whole), identities(whole)]
+    complete = loader(path, seed=5)
+    epochs = [identities(complete), identities(complete)]
     for stop in (3, 7):
         stopped = loader(path, seed=5)
         batches = iter(stopped)
@@ -71,10 +71,10 @@ def test_saved_position_continues_with_the_same_batches(stored):
     next(iter(stopped := loader(path, seed=5)))
     assert identities(stopped) == epochs[1]
     with pytest.raises(ValueError, match="seed was 5 and is 6"):
-        loader(path, seed=6).load_state_dict(whole.state_dict())
+        loader(path, seed=6).load_state_dict(complete.state_dict())
 
 
-def test_goals(stored):
+def test_goals_are_later_rows_of_the_episode(stored):
     path, _ = stored
     later = data.Goals(columns=["reward", "pixels"], random=0, current=0, geometric=1, discount=0.5)
     end = data.Goals(columns=["reward"], random=0, current=0, geometric=0, last=1, name="end")

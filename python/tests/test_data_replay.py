@@ -1,4 +1,4 @@
-"""The replay buffer: the latest episodes, and samples that depend on seed and step."""
+"""Tests of the replay buffer: the latest episodes, and samples that depend on seed and step."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def test_samples_depend_on_seed_and_step():
     assert (np.diff(batch["reward"], axis=1) == 1).all()
 
 
-def test_user_defined_sampler():
+def test_user_defined_sampler_chooses_the_clips():
     buffer = data.ReplayBuffer(100, history_len=2, sampler=lambda step, buffer, size, history: np.full(size, step))
     with pytest.raises(RuntimeError, match="no clip of 2 steps"):
         buffer.sample(4)
@@ -56,7 +56,7 @@ def test_user_defined_sampler():
         buffer.sample(3)
 
 
-def test_key_filter_loader_and_dump(tmp_path):
+def test_buffer_filters_columns_loads_and_dumps(tmp_path):
     buffer = data.ReplayBuffer(100, history_len=2, key_filter=data.classic_filter)
     buffer.write_episodes(episodes())
     assert buffer.column_names == ["pixels", "action", "reward", "terminated"]

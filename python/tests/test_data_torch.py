@@ -1,4 +1,4 @@
-"""Datasets in torch's DataLoader: with and without workers, spawned and forked."""
+"""Tests of datasets in torch's DataLoader: without workers, and with spawned and forked workers."""
 
 import numpy as np
 import pytest

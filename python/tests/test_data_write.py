@@ -1,4 +1,4 @@
-"""Writing episodes, native and user-defined formats, conversion and examination."""
+"""Tests of writing episodes, native and user-defined formats, conversion and examination."""
 
 import json
 import signal
@@ -14,7 +14,7 @@ from stable_worldmodel import data
 
 
 @pytest.mark.parametrize("name", ["a.lance", "a.h5"])
-def test_modes(tmp_path, name):
+def test_write_modes_append_replace_or_fail(tmp_path, name):
     path = tmp_path / name
     write(path, (5, 6))
     write(path, (7,))
@@ -27,7 +27,7 @@ def test_modes(tmp_path, name):
         write(path, (5,), mode="replace")
 
 
-def test_episodes_of_lists_and_other_types(tmp_path):
+def test_lists_and_small_types_are_converted(tmp_path):
     path = tmp_path / "a.lance"
     given = {
         "pixels": [np.full((8, 8, 3), step, dtype=np.uint8) for step in range(4)],
@@ -46,7 +46,7 @@ def test_episodes_of_lists_and_other_types(tmp_path):
     assert dataset.get_col_data("step_idx").tolist() == [0, 1, 2, 3], "the writer computes the indices"
 
 
-def test_discrete_actions_that_are_missing(tmp_path):
+def test_missing_discrete_action_is_stored_as_minus_one(tmp_path):
     with data.open_writer(tmp_path / "a.lance") as writer:
         writer.write_episode({"action": np.array([2, 0]), "state": np.zeros((3, 1))})
     assert data.load_dataset(tmp_path / "a.lance").get_col_data("action").ravel().tolist() == [2, 0, -1]
@@ -54,36 +54,36 @@ def test_discrete_actions_that_are_missing(tmp_path):
 
 def test_invalid_episodes_are_rejected_and_valid_ones_stored(tmp_path):
     path = tmp_path / "a.lance"
-    sound = episode(0, 5)
+    valid = episode(0, 5)
     cases = [
-        ({**sound, "action": np.zeros((5, 2), np.float32)}, ValueError, "the last row is the final observation"),
-        ({**sound, "state": np.zeros((4, 4))}, ValueError, "same number of steps"),
-        ({name: array for name, array in sound.items() if name != "reward"}, ValueError, r"missing \['reward'\]"),
-        ({**sound, "extra": np.zeros(5)}, ValueError, r"unexpected \['extra'\]"),
-        ({**sound, "state": np.zeros((5, 3))}, ValueError, r"steps of shape \(3,\), the dataset's of \(4,\)"),
-        ({**sound, "terminated": np.zeros(5)}, TypeError, "'terminated' is float64, the dataset's bool"),
-        ({**sound, "state": np.zeros((5, 4), complex)}, TypeError, "complex128 cannot be stored"),
-        ({**sound, "state": [np.zeros(4), np.zeros(3)]}, ValueError, "'state': its steps differ in shape"),
+        ({**valid, "action": np.zeros((5, 2), np.float32)}, ValueError, "the last row is the final observation"),
+        ({**valid, "state": np.zeros((4, 4))}, ValueError, "same number of steps"),
+        ({name: array for name, array in valid.items() if name != "reward"}, ValueError, r"missing \['reward'\]"),
+        ({**valid, "extra": np.zeros(5)}, ValueError, r"unexpected \['extra'\]"),
+        ({**valid, "state": np.zeros((5, 3))}, ValueError, r"steps of shape \(3,\), the dataset's of \(4,\)"),
+        ({**valid, "terminated": np.zeros(5)}, TypeError, "'terminated' is float64, the dataset's bool"),
+        ({**valid, "state": np.zeros((5, 4), complex)}, TypeError, "complex128 cannot be stored"),
+        ({**valid, "state": [np.zeros(4), np.zeros(3)]}, ValueError, "'state': its steps differ in shape"),
         ({}, ValueError, "at least one numeric column"),
     ]
     with data.open_writer(path) as writer:
-        writer.write_episode(sound)
+        writer.write_episode(valid)
         for broken, kind, message in cases:
             with pytest.raises(kind, match=message):
                 writer.write_episode(broken)
-        writer.write_episode(sound)
+        writer.write_episode(valid)
     with pytest.raises(ValueError, match="the writer is closed"):
-        writer.write_episode(sound)
+        writer.write_episode(valid)
     assert data.load_dataset(path).lengths.tolist() == [5, 5]
     with pytest.raises(RuntimeError, match="stop here"), data.open_writer(path) as writer:
-        writer.write_episode(sound)
+        writer.write_episode(valid)
         raise RuntimeError("stop here")
     assert data.load_dataset(path).num_episodes == 3
     with pytest.raises(ValueError, match="unexpected"), data.open_writer(path) as writer:
-        writer.write_episode({**sound, "other": np.zeros(5)})
+        writer.write_episode({**valid, "other": np.zeros(5)})
 
 
-def test_codecs(tmp_path):
+def test_lossless_codecs_are_exact(tmp_path):
     sizes = {}
     for codec in (None, "qoi", "png", "jpeg", "jpeg-20"):
         path = tmp_path / f"{codec}.lance"
@@ -159,7 +159,7 @@ def numpy_format():
     del data.FORMATS["npz"]
 
 
-def test_user_defined_format(tmp_path, numpy_format):
+def test_user_defined_format_is_read_written_and_converted(tmp_path, numpy_format):
     assert data.get_format("npz") is numpy_format and "npz" in data.list_formats()
     assert data.detect_format(tmp_path / "x.npzs") is numpy_format
     written = write(tmp_path / "a.npzs")
@@ -177,9 +177,9 @@ def test_user_defined_format(tmp_path, numpy_format):
     with pytest.raises(FileExistsError):
         data.convert(tmp_path / "b.lance", tmp_path / "c", dest_format="npz", progress=False)
     # The loader returns the same batches from both formats.
-    theirs = data.Loader(dataset, 8, backend="numpy")
-    ours = data.Loader(tmp_path / "b.lance", 8, num_steps=3, frameskip=2, columns=dataset.column_names, backend="numpy")
-    for a, b in zip(theirs, ours, strict=True):
+    npz_loader = data.Loader(dataset, 8, backend="numpy")
+    lance_loader = data.Loader(tmp_path / "b.lance", 8, num_steps=3, frameskip=2, columns=dataset.column_names, backend="numpy")
+    for a, b in zip(npz_loader, lance_loader, strict=True):
         np.testing.assert_array_equal(a["pixels"], b["pixels"])
         np.testing.assert_array_equal(a["action"], b["action"])
     assert (
@@ -188,7 +188,7 @@ def test_user_defined_format(tmp_path, numpy_format):
     )
 
 
-def test_registering(numpy_format):
+def test_registered_names_are_unique(numpy_format):
     with pytest.raises(ValueError, match="registered already"):
         data.register_format(type("Lance", (data.Format,), {"name": "lance"}))
     with pytest.raises(ValueError, match="needs a `name`"):
@@ -221,7 +221,7 @@ def test_convert_between_native_formats(tmp_path):
         data.convert(tmp_path / "a.lance", tmp_path / "f.lance", colour="red", progress=False)
 
 
-def test_doctor_and_inspect(tmp_path):
+def test_doctor_repairs_and_inspect_describes(tmp_path):
     write(tmp_path / "a.lance")
     assert data.doctor(tmp_path / "a.lance", progress=False)["problems"] == 0
     broken = episodes((6, 6))

@@ -1,4 +1,4 @@
-"""The native environments as Gymnasium environments."""
+"""Tests of the native environments as Gymnasium environments."""
 
 import copy
 import pickle
@@ -75,7 +75,7 @@ def test_episode_depends_only_on_its_seed(name):
 
 @pytest.mark.parametrize("name", ["swm/TwoRoom-v1", "swm/PushT-v1", "swm/CartPoleControl-v1"])
 @pytest.mark.parametrize("mode", ["sync", "async"])
-def test_vector_environments(name, mode):
+def test_vector_environments_match_single_environments(name, mode):
     envs = gymnasium.make_vec(name, num_envs=3, vectorization_mode=mode)
     try:
         observations, infos = envs.reset(seed=4)
@@ -114,7 +114,7 @@ def test_keyword_arguments_are_options_of_the_environment():
         swm.envs.NativeEnv("swm/PushT-v1", render_mode="human")
 
 
-def test_a_copy_has_the_options_of_the_environment():
+def test_copy_has_the_options_of_the_environment():
     env = make("swm/OGBCube-v0", env_type="double").unwrapped
     env.reset(seed=0)
     twin = copy.deepcopy(env)

@@ -1,4 +1,4 @@
-"""Failures during long runs: the original error is raised, and finished work remains."""
+"""Tests of failures during long runs: the original error is raised, and finished work is stored."""
 
 import os
 import signal
@@ -18,7 +18,7 @@ class Broken(Exception):
 
 
 class Fragile(gymnasium.Env):
-    """Counts steps, and raises in the step that `breaks` names."""
+    """An environment that counts steps and raises from the episode and step `breaks` on."""
 
     metadata = {"render_modes": ["rgb_array"]}
 
@@ -109,9 +109,9 @@ except KeyboardInterrupt:
 """
 
 
-@pytest.mark.parametrize("whose", ["engine", "python"])
-def test_ctrl_c_stops_an_evaluation(whose):
-    child = subprocess.Popen([sys.executable, "-c", CTRL_C, whose], stdout=subprocess.PIPE, text=True)
+@pytest.mark.parametrize("policy", ["engine", "python"])
+def test_ctrl_c_stops_an_evaluation(policy):
+    child = subprocess.Popen([sys.executable, "-c", CTRL_C, policy], stdout=subprocess.PIPE, text=True)
     try:
         assert child.stdout.readline().strip() == "ready"
         time.sleep(0.5)
@@ -157,22 +157,22 @@ def carts(**more):
 
 def test_killed_worker_is_replaced_during_an_episode(unrendered):
     before = set(children(os.getpid()))
-    alone, apart = carts(), carts(workers=True)
+    local, remote = carts(), carts(workers=True)
     workers = set(children(os.getpid())) - before
     assert len(workers) == 2
     for step in range(6):
         if step == 3:
             os.kill(min(workers), signal.SIGKILL)
-        for world in (alone, apart):
+        for world in (local, remote):
             world.step()
-        assert np.array_equal(alone.infos["observation"], apart.infos["observation"])
-        assert np.array_equal(alone.infos["pixels"], apart.infos["pixels"])
+        assert np.array_equal(local.infos["observation"], remote.infos["observation"])
+        assert np.array_equal(local.infos["pixels"], remote.infos["pixels"])
     workers = set(children(os.getpid())) - before
-    apart.close()
+    remote.close()
     assert gone(workers)
     with pytest.raises(RuntimeError, match="closed"):
-        apart.step()
-    apart.close()
+        remote.step()
+    remote.close()
 
 
 ABANDONED = """
@@ -223,8 +223,8 @@ def test_interrupted_training_saves_a_checkpoint(end, home):
     workers = children(child.pid)
     assert len(workers) == 1
     os.kill(child.pid, end)
-    said = child.communicate(timeout=20)[0].strip()
-    assert said == ("interrupted" if end == signal.SIGINT else "") and gone(workers)
+    output = child.communicate(timeout=20)[0].strip()
+    assert output == ("interrupted" if end == signal.SIGINT else "") and gone(workers)
     assert (home / "checkpoints/long/checkpoint/weights.safetensors").exists()
 
 

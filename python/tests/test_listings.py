@@ -1,4 +1,4 @@
-"""The listings of the paper, with smaller settings, and user-defined extensions."""
+"""Tests of the paper's code listings, with smaller settings, and of user-defined extensions."""
 
 from functools import partial
 from pathlib import Path
@@ -61,13 +61,13 @@ def test_listing_of_the_full_loop(tmp_path, monkeypatch):
     assert wm_policy.plans and {plan["slot"] for plan in wm_policy.plans} <= set(range(8))
 
 
-def test_world_with_several_environments():
+def test_infos_have_one_row_per_environment():
     world = swm.World("swm/PushT-v1", num_envs=8, image_shape=(64, 64))
     world.reset(seed=0)
     assert world.infos["pixels"].shape == (8, 1, 64, 64, 3)
 
 
-def test_factors_of_variation(tmp_path):
+def test_collected_factors_are_sampled_and_pinned(tmp_path):
     world = swm.World("swm/PushT-v1", num_envs=2, image_shape=(32, 32), max_episode_steps=5)
     your_policy = swm.policy.RandomPolicy(seed=0)
     world.set_policy(your_policy)
@@ -90,7 +90,7 @@ def test_factors_of_variation(tmp_path):
     assert len(metrics["episode_successes"]) == 4
 
 
-def test_robustness_sweep_on_atari():
+def test_visual_wrappers_change_only_frames_on_atari():
     pytest.importorskip("ale_py")
     world, plain = (
         swm.World("ALE/Pong-v5", num_envs=2, image_shape=(84, 84), extra_wrappers=wrappers)
@@ -118,7 +118,7 @@ def test_robustness_sweep_on_atari():
 
 
 class Straight:
-    """A user-defined solver: the cheapest of several constant action sequences."""
+    """A user-defined solver that returns the cheapest of five constant action sequences."""
 
     def __init__(self, model):
         self.model, self.calls = model, []
@@ -130,21 +130,21 @@ class Straight:
     def solve(self, info_dict, init_action=None):
         envs = len(info_dict["state"])
         self.calls.append((envs, init_action))
-        ways = torch.linspace(-1, 1, 5)[:, None, None].expand(-1, self.config.horizon, self.dim)
-        candidates = ways[None].expand(envs, -1, -1, -1)
+        constant_actions = torch.linspace(-1, 1, 5)[:, None, None].expand(-1, self.config.horizon, self.dim)
+        candidates = constant_actions[None].expand(envs, -1, -1, -1)
         infos = {key: value[:, None].expand(-1, 5, *value.shape[1:]) for key, value in info_dict.items()}
         best = self.model.get_cost(infos, candidates).argmin(1)
         return {"actions": candidates[torch.arange(envs), best]}
 
 
 class Rightward:
-    """A cost that is least for the action (1, 1)."""
+    """A model whose cost has its minimum at the action (1, 1)."""
 
     def get_cost(self, info_dict, action_candidates):
         return ((action_candidates - 1) ** 2).sum((2, 3))
 
 
-def test_user_defined_solver():
+def test_user_defined_solver_plans():
     solver = Straight(Rightward())
     world = swm.World("swm/TwoRoom-v1", num_envs=3, image_shape=(32, 32), max_episode_steps=10)
     policy = swm.policy.MPCPolicy(solver, config=swm.PlanConfig(horizon=4, receding_horizon=2, action_block=2))
@@ -161,7 +161,7 @@ def test_user_defined_solver():
     assert len(metrics["episode_successes"]) == 4
 
 
-def test_user_defined_format(tmp_path):
+def test_user_defined_format_is_collected_and_read(tmp_path):
     class Npz:
         """Writes one file for each episode."""
 
@@ -288,7 +288,7 @@ class Forward(swm.policy.BasePolicy):
         return np.ones(self.env.action_space.shape, np.float32)
 
 
-def test_user_defined_environment(tmp_path, corridor):
+def test_user_defined_environment_is_collected_and_evaluated(tmp_path, corridor):
     world = swm.World(corridor, num_envs=3, image_shape=(32, 32), length=12)
     assert world.variation_space.names() == ["agent.color", "agent.speed", "start"]
     assert world.max_episode_steps == 8 and world.gym_envs[0].unwrapped.length == 12
@@ -312,7 +312,7 @@ def test_user_defined_environment(tmp_path, corridor):
         world.reset(options={"variation": ["agent.velocity"]})
 
 
-def test_user_defined_wrapper(corridor):
+def test_user_defined_wrapper_changes_frames_and_rewards(corridor):
     class Negative(gymnasium.Wrapper):
         def __init__(self, env, offset=0):
             super().__init__(env)

@@ -1,4 +1,4 @@
-"""The engine's solvers with models implemented in Python."""
+"""Tests of the engine's solvers with models implemented in Python."""
 
 import json
 import os
@@ -25,7 +25,7 @@ TARGETS = np.array([[0.5, -0.3], [-0.6, 0.2], [0.1, 0.8]], np.float32)
 
 
 class Quadratic(torch.nn.Module):
-    """Costs the squared distance of every action to `infos["target"]`."""
+    """A model whose cost is the squared distance of every action to `infos["target"]`."""
 
     def get_cost(self, info_dict, action_candidates):
         target = info_dict["target"][:, :, -1, None].to(action_candidates)
@@ -33,14 +33,14 @@ class Quadratic(torch.nn.Module):
 
 
 class Constrained(Quadratic):
-    """Constrains the first element of an action to at most 0.2."""
+    """A `Quadratic` that constrains the first element of an action to at most 0.2."""
 
     def get_constraints(self, info_dict, action_candidates):
         return action_candidates[..., 0] - 0.2
 
 
 class Prices(torch.nn.Module):
-    """Every choice costs 1, except the environment's `choice`, which costs nothing."""
+    """A model in which every choice costs 1, except the environment's `choice`, which costs 0."""
 
     def get_cost(self, info_dict, action_candidates):
         free = info_dict["choice"][:, :, -1, None, 0]
@@ -111,7 +111,7 @@ def test_continuous_solvers_find_the_optimum(solver, settings, tolerance):
     actions = found["actions"].numpy()
     assert actions.shape == (3, 3, 2) and actions.dtype == np.float32 and len(found["trace"]) == 3
     assert np.abs(actions - TARGETS[:, None]).max() < tolerance
-    # Costs are those of the cheapest candidates; the plan may be a mean of several.
+    # The costs belong to the cheapest candidates; the plan may be the mean of several candidates.
     assert np.allclose(found["costs"], ((actions - TARGETS[:, None]) ** 2).sum((1, 2)), atol=0.02)
 
 
@@ -131,7 +131,7 @@ class BlockPrices(Prices):
         return sum(super(BlockPrices, self).get_cost(info_dict, part) for part in each)
 
 
-def test_constraints_hold():
+def test_plans_satisfy_constraints():
     actions = plan(solvers.LagrangianSolver(Constrained(), num_samples=4, n_steps=60, n_outer_steps=8))
     allowed = np.minimum(TARGETS, [0.2, 1.0])
     assert np.abs(actions - allowed[:, None]).max() < 0.02
@@ -179,7 +179,7 @@ FEW = {"num_samples": 20, "n_steps": 3, "topk": 5}
 
 
 def few(solver, model, **more):
-    """A solver with a short search: those settings of `FEW` that the solver has."""
+    """A solver with a short search: with all settings of `FEW` that the solver supports."""
     known = json.loads(_engine.solvers())[solver.id]
     settings = {name: value for name, value in FEW.items() if solver._names.get(name, name) in known}
     return solver(model, **settings, **more)
@@ -235,7 +235,7 @@ def test_model_runs_in_inference_mode_except_for_gradients():
     assert (False, False, True) in seen
 
 
-def test_infos_cached_by_a_model_stay_for_the_search():
+def test_infos_cached_by_a_model_last_for_one_search():
     computed = []
 
     class Caching(Quadratic):
@@ -252,7 +252,7 @@ def test_infos_cached_by_a_model_stay_for_the_search():
     assert computed == [3, 3]
 
 
-# Errors.
+# Tests of errors.
 
 
 class MyError(Exception):
@@ -260,21 +260,21 @@ class MyError(Exception):
 
 
 class Wrong(Quadratic):
-    def __init__(self, how):
+    def __init__(self, defect):
         super().__init__()
-        self.how = how
+        self.defect = defect
 
     def get_cost(self, info_dict, action_candidates):
         cost = (action_candidates**2).sum((2, 3))
-        if self.how == "shape":
+        if self.defect == "shape":
             return cost[:, :-1]
-        if self.how == "scalar":
+        if self.defect == "scalar":
             return 3.0
-        if self.how == "nothing":
+        if self.defect == "nothing":
             return None
-        if self.how == "nan":
+        if self.defect == "nan":
             return cost * torch.where(torch.arange(cost.shape[1]) == 2, torch.nan, 1.0)
-        if self.how == "detached":
+        if self.defect == "detached":
             return cost.detach()
         raise MyError("mine")
 
@@ -288,17 +288,17 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("how", "error", "words"), WRONG, ids=[how for how, _, _ in WRONG])
+@pytest.mark.parametrize(("defect", "error", "words"), WRONG, ids=[defect for defect, _, _ in WRONG])
 @pytest.mark.parametrize("solver", [solvers.CEMSolver, solvers.MPPISolver, solvers.GradientSolver])
-def test_wrong_model_raises_a_clear_error(solver, how, error, words):
+def test_wrong_model_raises_a_clear_error(solver, defect, error, words):
     with pytest.raises(error, match=words):
-        plan(few(solver, Wrong(how)))
+        plan(few(solver, Wrong(defect)))
 
 
-@pytest.mark.parametrize(("how", "error", "words"), WRONG, ids=[how for how, _, _ in WRONG])
-def test_wrong_model_stops_an_evaluation(how, error, words):
+@pytest.mark.parametrize(("defect", "error", "words"), WRONG, ids=[defect for defect, _, _ in WRONG])
+def test_wrong_model_stops_an_evaluation(defect, error, words):
     world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(16, 16), max_episode_steps=8)
-    world.set_policy(swm.policy.MPCPolicy(few(solvers.CEMSolver, Wrong(how))))
+    world.set_policy(swm.policy.MPCPolicy(few(solvers.CEMSolver, Wrong(defect))))
     with pytest.raises(error, match=words):
         world.evaluate(episodes=2, seed=0, progress=False)
     # The world remains usable.
@@ -332,11 +332,11 @@ def test_wrong_arguments_raise_clear_errors(make, error, words):
         make()
 
 
-# In a `World`.
+# Planning in a `World`.
 
 
 class ToGoal(torch.nn.Module):
-    """A cost that is least for an action along the straight line to the goal state."""
+    """A model whose cost has its minimum at an action along the straight line to the goal state."""
 
     def __init__(self, dtype=torch.float32):
         super().__init__()
@@ -345,8 +345,8 @@ class ToGoal(torch.nn.Module):
 
     def get_cost(self, info_dict, action_candidates):
         self.seen.append({key: value for key, value in info_dict.items() if not key.startswith("_")})
-        way = (info_dict["goal_state"] - info_dict["state"])[:, :, -1] * self.weight
-        return ((action_candidates.unflatten(-1, (-1, 2)).sum((2, 3)) - way) ** 2).sum(-1)
+        direction = (info_dict["goal_state"] - info_dict["state"])[:, :, -1] * self.weight
+        return ((action_candidates.unflatten(-1, (-1, 2)).sum((2, 3)) - direction) ** 2).sum(-1)
 
 
 class Wrapped:
@@ -379,13 +379,14 @@ def played(policy, steps=18, envs=2):
 
 @pytest.mark.parametrize("warm", [True, False])
 @pytest.mark.parametrize("process", [False, True])
-def test_the_engine_executes_plans_as_python_does(warm, process):
+def test_engine_and_python_execute_plans_equally(warm, process):
     # Without noise, a search depends only on its initial actions: on warm starts and on the start of an episode.
     config = swm.PlanConfig(horizon=3, receding_horizon=2, action_block=2, warm_start=warm)
     scaler = swm.data.ZScoreScaler(np.array([0.1, -0.1], np.float32), np.array([0.5, 0.8], np.float32))
     settings = {"num_samples": 1, "n_steps": 3, "var_scale": 0.0}
     given = {"config": config, "process": {"action": scaler} if process else None}
-    # The engine converts bounds to the model's units; user-defined solvers get the action space. Small actions meet both.
+    # The engine converts bounds to the model's units; user-defined solvers get the action space. Small actions
+    # are inside the bounds in both.
     small = ToGoal()
     small.weight.data *= 0.02
     ours = played(swm.policy.MPCPolicy(solvers.GradientSolver(small, **settings), **given))
@@ -498,7 +499,7 @@ import stable_worldmodel as swm
 class Slow:
     backend = "numpy"
     def get_cost(self, info_dict, action_candidates):
-        print("asked", flush=True)
+        print("planning", flush=True)
         time.sleep(30)
 
 import gymnasium, numpy as np
@@ -520,7 +521,7 @@ except KeyboardInterrupt:
 def test_ctrl_c_interrupts_a_slow_model_at_once(where):
     child = subprocess.Popen([sys.executable, "-c", SLOW, where], stdout=subprocess.PIPE, text=True)
     try:
-        assert child.stdout.readline().strip() == "asked"
+        assert child.stdout.readline().strip() == "planning"
         os.kill(child.pid, signal.SIGINT)
         assert child.communicate(timeout=4)[0].strip() == "interrupted" and child.returncode == 0
     finally:

@@ -1,4 +1,4 @@
-"""Evaluations of Gymnasium environments from recorded states, in this interpreter and in worker processes."""
+"""Tests of evaluations of Gymnasium environments from recorded states, in this interpreter and in worker processes."""
 
 import os
 import signal
@@ -36,20 +36,20 @@ class Field(gymnasium.Env):
         super().reset(seed=seed)
         self.wind = self.np_random.uniform(-0.02, 0.02, 2)
         self.position, self.goal = self.np_random.uniform(-1, 1, (2, 2))
-        self.put = False
+        self.is_set = False
         return self.position, self.info()
 
     def info(self):
-        return {"state": self.position, "goal_state": self.goal, "wind": self.wind, "put": self.put}
+        return {"state": self.position, "goal_state": self.goal, "wind": self.wind, "is_set": self.is_set}
 
     def _set_state(self, state):
-        self.position, self.put = np.array(state), True
+        self.position, self.is_set = np.array(state), True
 
     def _set_goal_state(self, goal_state):
         self.goal = np.array(goal_state)
 
     def step(self, action):
-        if self.marker and self.put and not os.path.exists(self.marker):
+        if self.marker and self.is_set and not os.path.exists(self.marker):
             open(self.marker, "w").close()
             os.kill(os.getpid(), signal.SIGKILL)
         self.position = self.position + action + self.wind
@@ -100,8 +100,8 @@ class Seeking(swm.policy.BasePolicy):
         for slot in np.flatnonzero(infos["_needs_flush"]):
             self.first.append((infos["state"][slot, 0].copy(), infos["wind"][slot, 0].copy()))
             self.goals.append(infos["goal"][slot, 0].copy())
-        way = infos["goal_state"][:, 0] - infos["state"][:, 0]
-        return np.clip(way, -0.3, 0.3).astype(np.float32)
+        offset = infos["goal_state"][:, 0] - infos["state"][:, 0]
+        return np.clip(offset, -0.3, 0.3).astype(np.float32)
 
 
 @pytest.fixture
@@ -148,21 +148,21 @@ def test_episodes_start_at_recorded_states(fields, recorded, name, callables):
             assert np.array_equal(wind, rows["wind"][0]), "the seed is the recorded one"
             goal = rows["pixels"][start + 6].transpose(1, 2, 0)
             assert any(np.array_equal(goal, shown) for shown in policy.goals), "the goal's frame is the recorded one"
-        noted = metrics.results["manifest"]["config"]["callables"]
-        assert [call["method"] for call in noted] == [call["method"] for call in callables or []]
+        stored = metrics.results["manifest"]["config"]["callables"]
+        assert [call["method"] for call in stored] == [call["method"] for call in callables or []]
         world.close()
     assert found[0] == found[1] == found[2]
 
 
 def test_restarted_worker_starts_at_the_recorded_state(fields, recorded, tmp_path):
-    wanted = evaluate(
+    expected = evaluate(
         swm.World(fields("Field"), num_envs=2, image_shape=None, add_pixels=False), recorded, floor=False, policy=Blind()
     )
     marker = tmp_path / "died"
     world = swm.World(fields("Field"), num_envs=2, image_shape=None, add_pixels=False, workers=True, marker=str(marker))
     metrics = evaluate(world, recorded, floor=False, policy=Blind())
     assert marker.exists() and metrics["success_rate"] == 100
-    assert np.array_equal(metrics["steps"], wanted["steps"])
+    assert np.array_equal(metrics["steps"], expected["steps"])
 
 
 class Blind(Seeking):
@@ -182,12 +182,12 @@ def test_worker_killed_between_steps_is_replaced(fields, recorded):
                 os.kill(min(workers), signal.SIGKILL)
             return super().get_action(infos)
 
-    wanted = evaluate(swm.World(fields("Field"), num_envs=2, image_shape=(32, 32)), recorded, floor=False)
+    expected = evaluate(swm.World(fields("Field"), num_envs=2, image_shape=(32, 32)), recorded, floor=False)
     before = set(children(os.getpid()))
     world = swm.World(fields("Field"), num_envs=2, image_shape=(32, 32), workers=True)
     workers = set(children(os.getpid())) - before
     metrics = evaluate(world, recorded, Killing(), floor=False)
-    assert Killing.killed and np.array_equal(metrics["steps"], wanted["steps"])
+    assert Killing.killed and np.array_equal(metrics["steps"], expected["steps"])
 
 
 @pytest.mark.parametrize("workers", [False, True])

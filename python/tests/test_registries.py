@@ -1,4 +1,4 @@
-"""The Python classes match the registries of the engine: ids, settings and defaults."""
+"""Tests that the Python classes match the registries of the engine: ids, settings and defaults."""
 
 import json
 
@@ -18,7 +18,7 @@ def test_every_solver_has_a_class():
 
 
 @pytest.mark.parametrize("id", SOLVERS)
-def test_solver_settings_are_those_of_the_engine(id):
+def test_solver_settings_equal_the_engine_settings(id):
     kind, defaults = SOLVERS[id], json.loads(_engine.solvers())[id]
     assert set(kind._names.values()) <= set(defaults)
     # The engine's defaults are valid settings of the class.
@@ -30,7 +30,7 @@ def test_every_visual_wrapper_has_a_class():
 
 
 @pytest.mark.parametrize("id", WRAPPERS)
-def test_positional_settings_of_wrappers_are_those_of_the_engine(id):
+def test_positional_settings_of_wrappers_exist_in_the_engine(id):
     parameters = json.loads(_engine.wrappers())[id]["parameters"]
     assert set(WRAPPERS[id].positional) <= set(parameters)
 
@@ -44,7 +44,7 @@ def test_every_format_is_registered():
 
 
 @pytest.mark.parametrize("env", swm.envs.ids())
-def test_experts_are_those_of_the_engine(env):
+def test_experts_equal_the_engine_experts(env):
     try:
         described = swm.utils.describe(env)
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Stable-Baselines3 trains on the native environments without adapters."""
+"""Tests that Stable-Baselines3 trains on the native environments without adapters."""
 
 import numpy as np
 import pytest
@@ -49,7 +49,7 @@ def test_sac_runs_on_continuous_actions():
 
 
 @pytest.mark.parametrize("name", ["swm/PushT-v1", "swm/PushT-Discrete-v1"])
-def test_dict_observations(name):
+def test_ppo_trains_on_dict_observations(name):
     model = sb3.PPO("MultiInputPolicy", envs(name, 2), n_steps=8, batch_size=16, n_epochs=1, seed=0)
     model.learn(32)
     observation = model.env.reset()

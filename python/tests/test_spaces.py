@@ -1,3 +1,5 @@
+"""Tests of the spaces of factors of variation."""
+
 import gymnasium
 import numpy as np
 import pytest
@@ -34,7 +36,7 @@ def test_space_has_a_default_a_value_and_a_condition():
     assert space.value["shape"] == 1
 
 
-def test_groups_are_sampled_whole_and_values_pinned():
+def test_all_factors_of_a_group_are_sampled_and_values_pinned():
     space = factors()
     space.seed(1)
     swm_spaces.reset_variation_space(space, 3, {"variation": ["agent"], "variation_values": {"shape": 3}})

@@ -1,8 +1,8 @@
-"""A torch model and a Burn model with the same weights give the same plan for the same seed.
+"""Tests that a torch model and a Burn model with the same weights give the same plan for the same seed.
 
-The engine trains the Burn model, a small LeWM. The torch model loads its weights under their published names and implements
-LeWM as the engine documents it. The two models sum in different orders, so their costs differ only in the last bits of
-single precision.
+The engine trains the Burn model, a small LeWM. The torch model loads the same weights under their published names and
+implements LeWM as the engine documents it. The two models sum in different orders, so their costs differ only in the last
+bits of single precision.
 """
 
 import json
@@ -219,7 +219,7 @@ def in_model_units(card):
     return gymnasium.spaces.Box((-1 - mean) / std, (1 - mean) / std, dtype=np.float32)
 
 
-def test_costs_are_the_same(twins, infos):
+def test_torch_and_burn_costs_are_equal(twins, infos):
     burn, twin = twins
     draw = np.random.default_rng(0)
     candidates = draw.normal(size=(3, 20, 4, 10)).astype(np.float32)
@@ -246,7 +246,7 @@ SOLVERS = [
 
 
 @pytest.mark.parametrize(("solver", "settings"), SOLVERS, ids=[solver.id for solver, _ in SOLVERS])
-def test_plans_are_the_same(twins, infos, solver, settings):
+def test_torch_and_burn_plans_are_equal(twins, infos, solver, settings):
     burn, twin = twins
     config = swm.PlanConfig(horizon=4, receding_horizon=4, action_block=burn.action_block)
     plans = []
@@ -255,18 +255,18 @@ def test_plans_are_the_same(twins, infos, solver, settings):
         planner = solver(model, seed=5, **settings)
         planner.configure(action_space=space, n_envs=3, config=config)
         plans.append(planner.solve(infos))
-    ours, theirs = (plan["actions"].numpy() for plan in plans)
-    assert ours.shape == (3, 4, 10)
-    assert np.abs(ours - theirs).max() < TOLERANCE * np.abs(ours).max()
+    burn_plan, torch_plan = (plan["actions"].numpy() for plan in plans)
+    assert burn_plan.shape == (3, 4, 10)
+    assert np.abs(burn_plan - torch_plan).max() < TOLERANCE * np.abs(burn_plan).max()
     assert np.allclose(plans[0]["costs"], plans[1]["costs"], rtol=1e-4)
     # The comparison is not trivial: plans differ between environments and between seeds.
     other = solver(burn, seed=6, **settings)
     other.configure(action_space=gymnasium.spaces.Box(-1, 1, (2,), np.float32), n_envs=3, config=config)
-    assert np.abs(other.solve(infos)["actions"].numpy() - ours).max() > 10 * TOLERANCE * np.abs(ours).max()
-    assert np.abs(ours[0] - ours[1]).max() > 10 * TOLERANCE * np.abs(ours).max()
+    assert np.abs(other.solve(infos)["actions"].numpy() - burn_plan).max() > 10 * TOLERANCE * np.abs(burn_plan).max()
+    assert np.abs(burn_plan[0] - burn_plan[1]).max() > 10 * TOLERANCE * np.abs(burn_plan).max()
 
 
-def test_evaluations_are_the_same(twins):
+def test_torch_and_burn_policies_act_equally(twins):
     burn, twin = twins
     scaler = swm.data.ZScoreScaler(burn.card["action_mean"], burn.card["action_std"])
     config = swm.PlanConfig(horizon=3, receding_horizon=2, action_block=burn.action_block)
@@ -292,10 +292,10 @@ def test_engine_model_accepts_numpy_and_torch(twins, infos):
     candidates = np.random.default_rng(1).normal(size=(3, 1, 2, 10)).astype(np.float32)
     expected = burn.get_cost(infos, candidates)
     assert isinstance(expected, np.ndarray) and expected.shape == (3, 1)
-    asked = torch.from_numpy(candidates).double()
+    tensor = torch.from_numpy(candidates).double()
     for samples in (1, 4):
         repeated = {key: torch.from_numpy(value)[:, None].expand(-1, samples, *value.shape[1:]) for key, value in infos.items()}
-        cost = burn.get_cost(repeated, asked.expand(-1, samples, -1, -1))
+        cost = burn.get_cost(repeated, tensor.expand(-1, samples, -1, -1))
         assert torch.is_tensor(cost) and np.array_equal(cost.numpy(), np.repeat(expected, samples, 1))
     # Infos of several steps (as many as candidates), of which the last step counts.
     steps = {key: np.concatenate([np.zeros_like(value), value], 1) for key, value in infos.items()}

@@ -1,3 +1,5 @@
+"""Tests of `World`: interactive loops, collection and evaluation."""
+
 import json
 import os
 import signal
@@ -29,7 +31,7 @@ class Zero(swm.policy.BasePolicy):
         return np.full(self.env.action_space.shape, self.value, dtype=np.float32)
 
 
-def test_infos_are_views_that_every_step_writes():
+def test_every_step_overwrites_the_arrays_of_infos():
     world = rooms()
     world.set_policy(swm.policy.RandomPolicy(seed=1))
     world.reset(seed=0)
@@ -59,7 +61,7 @@ def test_episode_does_not_depend_on_slot_or_threads():
             assert np.array_equal(value, other[key], equal_nan=value.dtype.kind == "f"), key
 
 
-def test_finished_episodes_are_followed_by_new_ones():
+def test_step_after_the_last_step_starts_new_episodes():
     world = rooms(max_episode_steps=4)
     world.set_policy(Zero())
     world.reset(seed=0)
@@ -124,7 +126,7 @@ def test_evaluation_reports_intervals_and_the_random_floor(tmp_path):
     assert [run["policy"] for run in saved["runs"]] == ["random", "expert"]
 
 
-def test_starts_and_goals_of_a_dataset(tmp_path):
+def test_evaluation_starts_at_rows_of_a_dataset(tmp_path):
     world = rooms()
     world.set_policy(swm.policy.ExpertPolicy())
     world.collect(tmp_path / "d.lance", episodes=4, seed=0, progress=False)
@@ -153,23 +155,23 @@ def test_visual_wrappers_run_in_the_engine():
 
 
 def test_function_of_the_step_is_a_schedule():
-    ours, theirs = (
+    scheduled, tabulated = (
         rooms(extra_wrappers=[partial(NoiseWrapper, std=schedule)])
         for schedule in (linear(8, 28, 10), lambda step: 8 + 2 * min(step, 10))
     )
-    for world in (ours, theirs):
+    for world in (scheduled, tabulated):
         world.set_policy(Zero(0.7))
         world.reset(seed=0)
-    first = ours.infos["pixels"].copy()
+    first = scheduled.infos["pixels"].copy()
     for _ in range(12):
-        assert np.array_equal(ours.infos["pixels"], theirs.infos["pixels"])
-        ours.step(), theirs.step()
-    assert not np.array_equal(ours.infos["pixels"], first)
+        assert np.array_equal(scheduled.infos["pixels"], tabulated.infos["pixels"])
+        scheduled.step(), tabulated.step()
+    assert not np.array_equal(scheduled.infos["pixels"], first)
     with pytest.raises(ValueError, match="std"):
         rooms(extra_wrappers=[partial(NoiseWrapper, std=lambda step: 250.0 + step)])
 
 
-def test_snapshot_and_restore():
+def test_restored_snapshot_repeats_the_next_step():
     world = rooms(num_envs=1)
     world.set_policy(Zero(0.7))
     world.reset(seed=0)
@@ -216,13 +218,13 @@ def test_exception_of_a_policy_is_raised_unchanged(tmp_path):
 
     world = rooms(max_episode_steps=3)
     world.set_policy(Failing())
-    assert world.collect(tmp_path / "fine.lance", episodes=3, seed=0, progress=False)["episodes"] == 3
+    assert world.collect(tmp_path / "finished.lance", episodes=3, seed=0, progress=False)["episodes"] == 3
     world = rooms(max_episode_steps=9)
     with pytest.raises(KeyError, match="mine"):
-        world.collect(tmp_path / "not.lance", episodes=3, seed=0, policy=Failing(), progress=False)
+        world.collect(tmp_path / "failed.lance", episodes=3, seed=0, policy=Failing(), progress=False)
 
 
-def test_planning_with_the_simulator():
+def test_planning_with_the_simulator_beats_the_floor():
     world = rooms(num_envs=2, add_pixels=False)
     solver = swm.solver.CEMSolver("simulator", num_samples=32, n_steps=4, topk=8)
     policy = swm.policy.MPCPolicy(solver, swm.PlanConfig(horizon=10, receding_horizon=5))
@@ -230,7 +232,7 @@ def test_planning_with_the_simulator():
     assert metrics["success_rate"] > metrics["random_success_rate"] and policy.plans
 
 
-def test_checkpoint_with_a_policy(tmp_path):
+def test_checkpoint_acts_as_a_policy_of_the_engine(tmp_path):
     """A GCBC trained for two steps acts the same through `get_action` and as a policy of the engine."""
     world = rooms(image_shape=(64, 64))
     world.collect(tmp_path / "rooms.lance", episodes=12, seed=0, policy=swm.policy.ExpertPolicy(), progress=False)

@@ -134,7 +134,7 @@ fn resolve(
     (1..=path.len()).rev().find_map(|n| index.get(&path[..n]).copied())
 }
 
-/// The crate-local paths that a file names, each with whether the file re-exports it.
+/// The crate-local paths that a file names. The flag is true for a path that the file re-exports.
 fn imports(code: &str, module: &[String], index: &HashMap<&[String], usize>) -> Vec<(bool, ModulePath)> {
     let mut found = vec![];
     for statement in code.split_inclusive(';') {
@@ -170,7 +170,7 @@ fn imports(code: &str, module: &[String], index: &HashMap<&[String], usize>) -> 
     found
 }
 
-/// `a::{b, c::{self, d}}` as `a::b`, `a::c`, `a::c::d`.
+/// Expands an import tree into paths: `a::{b, c::{self, d}}` becomes `a::b`, `a::c`, `a::c::d`.
 fn expand(tree: &str) -> Vec<ModulePath> {
     let tree = tree.trim();
     let Some(open) = tree.find('{') else {
@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn paths_of_every_form_count() {
+    fn imports_of_every_form_are_found() {
         for import in
             ["use super::b::B;", "use crate::b::{self, x::{y, z}};", "fn f() { crate::b::g() }", "use crate::{q, b};"]
         {

@@ -9,7 +9,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::process::Command;
 
-/// A build: its name, the packages it selects, and whether tests are part of it.
+/// A build: its name, the selected packages, and whether the build includes tests.
 const BUILDS: &[(&str, &[&str], bool)] = &[
     ("the tests", &["--workspace"], true),
     ("the program", &["-p", "swm"], false),

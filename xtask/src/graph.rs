@@ -11,9 +11,9 @@ use std::process::Command;
 pub struct Package {
     /// The name, which is the same for all versions of a package.
     pub name: String,
-    /// Whether it is a crate of the workspace.
+    /// Whether the package is a crate of the workspace.
     pub member: bool,
-    /// The indices of its direct dependencies.
+    /// The indices of the direct dependencies in the graph.
     pub dependencies: Vec<usize>,
 }
 
@@ -76,8 +76,8 @@ impl Graph {
             .map(|need| need.name.as_str())
     }
 
-    /// Returns the names on the shortest path from a package to one whose name is `forbidden`; `None` if there is no
-    /// path.
+    /// Returns the names on the shortest path from a package to a package with a forbidden name; `None` if there is no
+    /// such path.
     pub fn shortest_path(&self, from: &Package, forbidden: fn(&str) -> bool) -> Option<Vec<&str>> {
         let start = self.packages.iter().position(|package| std::ptr::eq(package, from))?;
         let mut before: HashMap<usize, usize> = HashMap::from([(start, start)]);

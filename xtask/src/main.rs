@@ -22,19 +22,19 @@ use graph::Graph;
 use std::path::PathBuf;
 use std::process::{Command, ExitCode};
 
-/// A check: its name, the property that it checks, and the function that checks it.
+/// A check: the name, the checked property, and the function that runs the check.
 type Check = (&'static str, &'static str, fn() -> Result<()>);
 
 /// The checks, cheapest first.
 const CHECKS: &[Check] = &[
     ("fmt", "the code is formatted", fmt),
-    ("words", "no word that has a better one (words.toml)", || verdict("words", &word_list()?.violations(&prose()?))),
+    ("words", "no refused word (words.toml)", || verdict("words", &word_list()?.violations(&prose()?))),
     ("typos", "no misspelt word (the program `typos`)", typos),
     ("sizes", "no file of more than 500 lines", || verdict("sizes", &sizes::violations(&sources()?))),
     ("cycles", "no import cycle of more than four files", || verdict("cycles", &cycles::violations(&sources()?))),
     ("columns", "only swm-core spells the standard columns", || verdict("columns", &columns::violations(&sources()?))),
-    ("registries", "every ENTRY is in a list", || verdict("registries", &registries::violations(&sources()?))),
-    ("layers", "no crate reaches what its layer excludes", || {
+    ("registries", "every ENTRY is in a registry list", || verdict("registries", &registries::violations(&sources()?))),
+    ("layers", "no crate depends on a package that its layer forbids", || {
         verdict("layers", &layers::violations(&graph()?, layers::RULES))
     }),
     ("table", "the crate table of ARCHITECTURE.md matches the workspace", table),
@@ -130,7 +130,7 @@ fn word_list() -> Result<words::Words> {
 
 fn verdict(what: &str, violations: &[String]) -> Result<()> {
     if violations.is_empty() {
-        println!("{what}: fine");
+        println!("{what}: passed");
         return Ok(());
     }
     bail!("{what}: {} found\n  {}", violations.len(), violations.join("\n  "))

@@ -62,7 +62,7 @@ pub fn violations(graph: &Graph, rows: &[Row]) -> Vec<String> {
         };
         for need in graph.member_dependencies(package).filter(|need| !row.may.iter().any(|name| name == need)) {
             found.push(format!(
-                "{} depends on {need}, which its row does not allow; drop the dependency or say in ARCHITECTURE.md why",
+                "{} depends on {need}, which its row in ARCHITECTURE.md does not allow; fix the dependency or the row",
                 package.name
             ));
         }

@@ -25,7 +25,7 @@ struct Refused {
     say: String,
 }
 
-/// A type name that is reserved.
+/// A type name that only some files may define.
 #[derive(Debug)]
 struct RefusedType {
     name: String,
@@ -44,7 +44,7 @@ struct Allowed {
 }
 
 impl Words {
-    /// Reads the list.
+    /// Parses the text of `words.toml`.
     pub fn parse(text: &str) -> Result<Self> {
         let table: Table = text.parse().context("words.toml")?;
         let mut words = Self::default();
@@ -102,7 +102,7 @@ impl Words {
         }
         for (row, _) in self.allowed.iter().zip(&used).filter(|(_, used)| !**used) {
             found.push(format!(
-                "words.toml allows `{}` in {}, where no refused word stands: delete the row",
+                "words.toml allows `{}` in {}, where no line contains a refused word: delete the row",
                 row.line, row.path
             ));
         }
@@ -188,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn an_allowed_line_that_is_gone_is_named() {
+    fn allowed_row_without_a_match_is_reported() {
         let found = Words::parse(LIST).expect("a valid list").violations(&[]);
         assert!(found[0].contains("delete the row"), "{found:?}");
     }

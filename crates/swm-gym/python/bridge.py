@@ -2,10 +2,10 @@
 
 A `Bridge` describes its environment (`describe`: spaces, columns, frames, factors of variation) and writes the outputs
 of a reset, a step or a render into a single buffer, each at its own 64-byte aligned offset. The owner of the buffer
-reads them from there. The same class serves a worker process (`worker.py`, over shared memory) and the interpreter of
+reads the outputs. The same class serves a worker process (`worker.py`, over shared memory) and the interpreter of
 the Python package.
 
-Columns come from two places:
+Columns come from two sources:
 
 * the observation: a `Box` is `observation`, a `Dict` one column per key, a `Tuple` `observation_0`, `observation_1` …;
   nested spaces join their keys with `_`;
@@ -58,7 +58,7 @@ class InvalidRequest(ValueError):
 
 
 def bounds(values):
-    """Bounds as JSON: one value if all are equal, None for an infinite one."""
+    """Bounds as JSON: one value if all are equal, None for an infinite bound."""
     flat = np.asarray(values).reshape(-1)
     if flat.size and (flat == flat[0]).all():
         flat = flat[:1]
@@ -108,7 +108,7 @@ def described(space):
     if isinstance(space, spaces.Discrete):
         return {'type': 'Discrete', 'n': int(space.n), 'start': int(space.start)}, np.dtype(np.int64), ()
     if isinstance(space, spaces.MultiDiscrete):
-        # The elements of a `MultiDiscrete` space are 64-bit integers, and so are those of the column.
+        # The elements of a `MultiDiscrete` space are 64-bit integers, so the column stores 64-bit integers.
         return multi(space.nvec, space.start), np.dtype(np.int64), space.shape
     if isinstance(space, spaces.MultiBinary):
         return box(np.zeros(space.shape), np.ones(space.shape), space.shape, bool), np.dtype(bool), space.shape
@@ -126,7 +126,7 @@ class Actions:
             with np.errstate(over='ignore'):
                 sides = ('low', 'high')
                 low, high = np.float32([np.concatenate([getattr(p, s).reshape(-1) for p in parts]) for s in sides])
-            # Random actions need bounds, so infinite ones become 1. Actions themselves are not clipped.
+            # Random actions need finite bounds, so infinite bounds become -1 and 1. Actions are not clipped.
             low = np.where(np.isfinite(low), low, -1)
             high = np.where(np.isfinite(high), high, 1)
             shape = parts[0].shape if len(parts) == 1 else low.shape
@@ -155,7 +155,7 @@ class Actions:
         if isinstance(part, spaces.Box) and part.dtype.kind in 'iub':
             low, high = (np.asarray(v, np.int64).reshape(-1) for v in (part.low, part.high))
             return high - low + 1, low
-        raise Unsupported(f'actions of {part} (mixed with discrete ones, if there are several): wrap the environment')
+        raise Unsupported(f'actions of {part} (or a mix of continuous and discrete spaces): wrap the environment')
 
     def read(self, values):
         """The action in the environment's action space; a copy, not a view of the buffer."""
@@ -233,7 +233,7 @@ def factors(space, prefix=''):
 # ---- states ----
 
 
-# Names of methods that set a state, and the column each takes.
+# Names of methods that set a state, and the column that each method takes.
 SETTERS = [(('set_state', '_set_state'), 'state'), (('set_goal_state', '_set_goal_state'), 'goal_state')]
 
 
@@ -337,7 +337,7 @@ class Bridge:
         if self.goal_shape:
             self.goal_at = self.allocate(math.prod(self.goal_shape) * 3)
 
-        # Versions of the packages that define the environment's class and entry point, and of those in `swm_libraries`.
+        # Versions of the packages that define the environment's class and entry point, and of `swm_libraries`.
         modules = type(env.unwrapped).__module__, str(getattr(env.spec, 'entry_point', ''))
         packages = (module.partition(':')[0].partition('.')[0] for module in modules)
         self.libraries = {}
@@ -363,7 +363,7 @@ class Bridge:
         return name
 
     def first_frame(self):
-        """A frame from `render`, or an RGB observation; None, with the reason in `no_frame`, if there is neither."""
+        """A frame from `render`, or an RGB observation; None, with the reason in `no_frame`, without either."""
         try:
             # Some environments without a render mode support `render`.
             frame = self.env.render() if self.env.render_mode in ('rgb_array', None) else None
@@ -465,7 +465,7 @@ class Bridge:
         HEAD.pack_into(self.buffer, 0, 0.0, math.inf, False, False, False)
 
     def method(self, name):
-        """A method of the environment by name, or of its wrappers, from the outermost inwards."""
+        """Finds a method by name in the environment, else in its wrappers, from the outermost to the innermost."""
         env, layers = self.env, [self.env.unwrapped]
         while env is not env.unwrapped:
             layers.append(env)
@@ -506,7 +506,7 @@ class Bridge:
             if value.shape != view.shape or (value.dtype.kind == 'f') > (view.dtype.kind == 'f'):
                 raise ValueError(
                     f"info['{key}'] was {view.dtype} {list(view.shape)} at the first reset and step, and is"
-                    f' {value.dtype} {list(value.shape)} now: give it one type and shape'
+                    f' {value.dtype} {list(value.shape)} now: keep its type and shape'
                 )
             view[...] = value
         for view, value in self.held:
@@ -534,20 +534,20 @@ class Bridge:
         self.env.close()
 
 
-# ---- by id ----
+# ---- environments by id ----
 
 
 class Missing(Exception):
     """Raised when a package is missing. The arguments are the asset that installs it and the import error."""
 
 
-WORDS = {'true': True, 'false': False, 'none': None}
+CONSTANTS = {'true': True, 'false': False, 'none': None}
 
 
 def literal(text):
-    """The value of a command-line word: a Python literal, a truth value, or else the text itself."""
+    """The value of a command-line word: true, false, none, a Python literal, or else the text itself."""
     try:
-        return WORDS[text] if text in WORDS else ast.literal_eval(text)
+        return CONSTANTS[text] if text in CONSTANTS else ast.literal_eval(text)
     except (ValueError, SyntaxError):
         return text
 

@@ -1,7 +1,7 @@
 """Craftax as Gymnasium environments, under the ids, spaces and sizes of stable-worldmodel's Python package.
 
-Craftax is a pure JAX function from a key, a state and an action to the next state; an environment here holds key and
-state. Symbolic variants render with the renderer of the pixel observations.
+Craftax is a pure JAX function from a key, a state and an action to the next state; `Craftax` holds the key and
+the state. Symbolic variants render with the renderer of the pixel observations.
 """
 
 import importlib
@@ -16,7 +16,7 @@ from craftax.craftax_env import make_craftax_env_from_name
 from gymnasium import spaces
 
 # Id: Craftax's own id, the shape of an observation (Craftax's `observation_space` swaps height and width), and the time
-# limit of its parameters.
+# limit in steps.
 VARIANTS = {
     'swm/CraftaxPixels-v1': ('Craftax-Pixels-v1', (130, 110, 3), 100_000),
     'swm/CraftaxSymbolic-v1': ('Craftax-Symbolic-v1', (8268,), 100_000),

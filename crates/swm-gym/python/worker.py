@@ -75,7 +75,7 @@ class Connection:
 
 
 def make(connection, memory):
-    """Makes the environment of the first request and answers with its description, or why it cannot be made."""
+    """Makes the environment of the first request and answers with its description, or with the reason for a failure."""
     request = json.loads(connection.request()[1])
     sys.meta_path.append(Sources(request['modules']))
     try:

@@ -9,13 +9,13 @@ use swm_core::{Error, Result};
 
 /// A package and its requirements.
 pub struct Package {
-    /// Its name for `swm assets install`.
+    /// The name of the package for `swm assets install`.
     pub name: &'static str,
-    /// Its version.
+    /// The pinned version.
     pub version: &'static str,
-    /// Its purpose, in a few words.
+    /// The purpose of the package, in a few words.
     pub summary: &'static str,
-    /// The distribution whose metadata shows that it is installed.
+    /// The Python distribution whose metadata shows that the package is installed.
     distribution: &'static str,
     /// The requirements for pip besides Gymnasium.
     requirements: &'static [&'static str],
@@ -29,7 +29,7 @@ pub const PACKAGES: &[Package] = &[
     Package {
         name: "gymnasium",
         version: "1.4.0",
-        summary: "Gymnasium and its classic control environments, in a virtual environment of their own",
+        summary: "Gymnasium and its classic control environments, in a separate virtual environment",
         distribution: "gymnasium",
         requirements: &[],
     },
@@ -55,7 +55,7 @@ impl Package {
         virtual_environment()
     }
 
-    /// Whether this version is installed.
+    /// Returns whether the pinned version is installed.
     pub fn is_installed(&self) -> bool {
         let name = format!("{}-{}.dist-info", self.distribution, self.version);
         let Ok(entries) = std::fs::read_dir(virtual_environment().join("lib")) else { return false };
@@ -101,7 +101,7 @@ pub fn install(package: &Package) -> Result<PathBuf> {
 /// Checks with pip that a package and its dependencies are installed and compatible.
 ///
 /// # Errors
-/// When they are not.
+/// When a package is missing or incompatible.
 pub fn verify(package: &Package) -> Result<()> {
     let fix = || format!("run `swm assets install {}`", package.name);
     if !package.is_installed() {
@@ -115,7 +115,7 @@ pub fn verify(package: &Package) -> Result<()> {
     )
 }
 
-/// Runs a command to its end.
+/// Runs a command and waits until it ends.
 fn run(what: &str, command: &mut Command) -> Result<()> {
     let output = command.output().map_err(|error| {
         Error::external(what, format!("{error}; Python 3 must be installed (Debian: apt install python3-venv)"))

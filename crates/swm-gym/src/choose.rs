@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::{Env, EnvChoice, EnvEntry, Error, Result};
 
-/// Example ids for listings of environments, with what they require.
+/// Example ids for listings of environments, each with a description of its environments and their requirements.
 pub const EXAMPLES: &[(&str, &str)] = &[
     ("CartPole-v1", "any environment registered with Gymnasium: `swm assets install gymnasium`"),
     ("module:Name-v0", "any environment that importing the module registers"),
@@ -36,7 +36,7 @@ pub fn choose(text: &str) -> Result<EnvChoice> {
     parse(text)?;
     let mut entries = ENTRIES.lock().unwrap_or_else(PoisonError::into_inner);
     let entry = *entries.entry(text.to_owned()).or_insert_with(|| {
-        // Rows of a registry are static, so each distinct text leaks one.
+        // Rows of a registry are static, so each distinct text leaks one row.
         Box::leak(Box::new(EnvEntry {
             id: interned(text),
             summary: "a Gymnasium environment",
@@ -62,7 +62,7 @@ pub fn make(text: &str, config: GymConfig) -> Result<Box<dyn Env>> {
     // parallel.
     let known = LAYOUTS.lock().unwrap_or_else(PoisonError::into_inner).get(&key).cloned();
     let env = match known {
-        Some(layout) => GymEnv::like(layout, transport, restarts)?,
+        Some(layout) => GymEnv::with_layout(layout, transport, restarts)?,
         None => {
             let env = GymEnv::new(text, transport, restarts)?;
             LAYOUTS.lock().unwrap_or_else(PoisonError::into_inner).insert(key, Arc::clone(env.layout()));

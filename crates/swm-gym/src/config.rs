@@ -38,9 +38,9 @@ const NAMED: &str = "named by $SWM_PYTHON";
 /// A Python interpreter.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Python {
-    /// The program.
+    /// The path of the program, or its name on the search path.
     pub program: PathBuf,
-    /// How it was found, for messages.
+    /// The origin of the interpreter, for messages.
     pub origin: &'static str,
 }
 
@@ -62,9 +62,11 @@ impl Python {
     /// Returns an instruction for installing one of the [`assets::PACKAGES`].
     pub(crate) fn fix(&self, asset: &str) -> String {
         if self.origin == NAMED {
-            return format!("install it there, or unset $SWM_PYTHON and run `swm assets install {asset}`");
+            return format!(
+                "install the package in this Python, or unset $SWM_PYTHON and run `swm assets install {asset}`"
+            );
         }
-        format!("run `swm assets install {asset}`, or set $SWM_PYTHON to a Python that has it")
+        format!("run `swm assets install {asset}`, or set $SWM_PYTHON to a Python that has the package")
     }
 }
 

@@ -1,16 +1,16 @@
 //! Starts of Gymnasium environments at dataset rows: the arguments of `Bridge.reset`.
 //!
-//! Gymnasium has no interface for setting a state, so methods of the environment are called after the reset: those that
-//! the caller names, or those that the bridge found by their names. These methods return no observation, so the columns
-//! take the values of the start row until the next step. Columns of the goal (`goal_NAME`) take the values of the goal
-//! row in the whole episode.
+//! Gymnasium has no interface for setting a state, so methods of the environment are called after the reset: methods
+//! that the caller names, or methods that the bridge found by their names. These methods return no observation, so the
+//! columns take the values of the start row until the next step. Columns of the goal (`goal_NAME`) take the values of
+//! the goal row in the whole episode.
 
 use crate::EnvLayout;
 use serde_json::{Value, json};
 use swm_core::columns::{EPISODE_SEED, PIXELS, SEED, flat, flat_factor, goal_source, is_flat_factor, join_seed};
 use swm_core::{Callable, CallableArgument, DType, DatasetStart, Error, ResetOptions, Result, RowRef, Schema};
 
-/// The methods to call: `named`, or else those of the environment's description.
+/// Returns the methods to call: `named`, or else the methods in the environment's description.
 pub fn callables<'a>(layout: &'a EnvLayout, named: &'a [Callable]) -> Result<&'a [Callable]> {
     let callables = if named.is_empty() { layout.callables() } else { named };
     if !callables.is_empty() {
@@ -85,7 +85,7 @@ fn argument_column(argument: &CallableArgument) -> Result<Option<String>> {
         (other, true) => Err(Error::mismatch(
             "reading callables",
             format!("the value {other} from the dataset"),
-            "a column's name; with 'in_dataset': False it is the value itself",
+            "a column's name; with 'in_dataset': False, any value, which is passed unchanged",
         )),
     }
 }
@@ -106,7 +106,7 @@ pub fn reset(layout: &EnvLayout, seed: u64, options: &ResetOptions, start: RowRe
     Ok((seed, options))
 }
 
-/// The seed of the recorded episode, from the column `seed` of other programs or from `episode_seed`.
+/// The seed of the recorded episode, from the column `seed`, which other programs write, or from `episode_seed`.
 fn recorded_seed(start: RowRef<'_>) -> Result<Option<u64>> {
     let values = |name| start.schema().find(name).map(|_| start.to_f64(name)).transpose();
     if let Some(&[seed]) = values(SEED)?.as_deref()
@@ -161,7 +161,7 @@ fn array(row: RowRef<'_>, index: usize) -> Value {
     json!({"dtype": column.dtype.name(), "shape": column.shape, "data": data})
 }
 
-/// The frame of a goal.
+/// The frame that shows the goal of an episode.
 #[derive(Clone, PartialEq)]
 pub struct GoalFrame {
     /// Height and width in pixels.

@@ -24,7 +24,7 @@ pub struct Description {
     /// The methods that set the state of the environment; empty if it has none.
     #[serde(rename = "calls")]
     callables: Vec<Callable>,
-    /// Bytes of the buffer.
+    /// The size of the buffer in bytes.
     pub size: usize,
 }
 
@@ -32,7 +32,7 @@ impl Description {
     /// Parses the JSON of `Bridge.describe()`.
     ///
     /// # Errors
-    /// When the text is not such JSON.
+    /// When the text is not the JSON of a description.
     pub fn parse(json: &str) -> Result<Self> {
         serde_json::from_str(json).map_err(|error| Error::external("parsing the description of an environment", error))
     }
@@ -115,7 +115,7 @@ impl SpaceJson {
     }
 }
 
-/// The element type of a NumPy name.
+/// Returns the element type that a NumPy name denotes.
 fn dtype_of(name: &str) -> Result<DType> {
     const ALL: [DType; 6] = [DType::Bool, DType::U8, DType::Int32, DType::Int64, DType::Float32, DType::Float64];
     let known = || ALL.iter().map(|dtype| dtype.name());
@@ -212,7 +212,7 @@ impl EnvLayout {
         })
     }
 
-    /// Why the environment does not render.
+    /// The reason for which `render` returns no frame; empty if it returns one.
     pub(crate) fn no_frame(&self) -> &str {
         &self.description.no_frame
     }

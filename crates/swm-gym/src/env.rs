@@ -1,7 +1,8 @@
 //! [`GymEnv`]: a Gymnasium environment as an [`Env`].
 //!
-//! A snapshot holds the seed, the options and the actions of the episode so far. A restore replays them, and so does a
-//! new worker that replaces a lost one. A restore is therefore exact for deterministic environments only.
+//! A snapshot holds the seed, the options and the actions of the episode so far. A restore replays the actions.
+//! After the loss of a worker, a new worker replays the actions, too. A replay is exact for deterministic environments
+//! only.
 
 use crate::dataset_start::{self as start, GoalFrame};
 use crate::describe::header;
@@ -74,7 +75,7 @@ impl GymEnv {
                 Err(failure) => return Err(failure.explain(id, "making it", lost)),
             }
         };
-        let mut env = Self::like(Arc::new(EnvLayout::new(id, description)?), transport, restarts)?;
+        let mut env = Self::with_layout(Arc::new(EnvLayout::new(id, description)?), transport, restarts)?;
         env.stage = Stage::Ready;
         Ok(env)
     }
@@ -83,7 +84,7 @@ impl GymEnv {
     ///
     /// # Errors
     /// When the defaults of its factors violate a constraint.
-    pub fn like(layout: Arc<EnvLayout>, transport: Box<dyn Transport>, restarts: usize) -> Result<Self> {
+    pub fn with_layout(layout: Arc<EnvLayout>, transport: Box<dyn Transport>, restarts: usize) -> Result<Self> {
         let no_factors = VariationRequest { variation: Some(vec![]), ..VariationRequest::default() };
         Ok(Self {
             factors: layout.spec.variation_space.resolve(&no_factors, Key::new(0))?,
@@ -207,7 +208,7 @@ impl GymEnv {
         if self.renders_steps { Request::StepAndRender } else { Request::Step }
     }
 
-    /// Waits for the result of a dispatched call, when the caller makes another call than the dispatched one.
+    /// Waits for the result of the dispatched call, if there is one, because another call follows.
     fn finish_dispatched(&mut self) -> Result<()> {
         match self.dispatched {
             None => Ok(()),
@@ -216,7 +217,7 @@ impl GymEnv {
         }
     }
 
-    /// Replaces the current episode with one that has no actions yet, and reuses its memory.
+    /// Replaces the current episode with an episode without actions, and reuses the memory of the actions.
     fn start_episode(&mut self, reset: String, goal: Option<GoalFrame>) {
         let mut actions = self.episode.take().map(|episode| episode.actions).unwrap_or_default();
         actions.clear();
@@ -247,13 +248,13 @@ impl GymEnv {
         self.env_call(EnvCall::Step)
     }
 
-    /// Reads a double in the header of the buffer; 0 before there is a buffer.
+    /// Reads a double in the header of the buffer; 0 before the buffer exists.
     fn double(&self, at: usize) -> f64 {
         let bytes = self.transport.memory().get(at..at + 8);
         bytes.map_or(0.0, bytemuck::pod_read_unaligned)
     }
 
-    /// Reads a flag in the header of the buffer; false before there is a buffer.
+    /// Reads a flag in the header of the buffer; false before the buffer exists.
     fn flag(&self, at: usize) -> bool {
         self.transport.memory().get(at).is_some_and(|&byte| byte != 0)
     }
@@ -387,7 +388,7 @@ impl Env for GymEnv {
         Ok(())
     }
 
-    /// The frame of the goal's dataset row, or that of `info['goal']` at the reset; black if there is neither.
+    /// Writes the frame of the goal's dataset row, else `info['goal']` of the reset, else black pixels.
     fn render_goal(&mut self, frame: FrameMut<'_>) -> Result<()> {
         self.finish_dispatched()?;
         match (self.layout.goal(), &self.episode) {
@@ -421,14 +422,14 @@ impl Env for GymEnv {
     }
 
     /// Replays the episode of the snapshot. If the current episode has the same reset and its actions are a prefix of
-    /// the snapshot's, the replay continues the current episode.
+    /// the snapshot's actions, the replay continues the current episode.
     fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
         let id = &self.layout.spec.id;
         let Some(Episode { reset, goal, actions }) = Episode::parse(snapshot, id, self.layout.action.len()) else {
             return Err(Error::mismatch(
                 format!("restoring {id}"),
-                "a snapshot of another environment, or of one before its first reset",
-                "one of an episode of this environment",
+                "a snapshot of another environment, or a snapshot from before the first reset",
+                "a snapshot of an episode of this environment",
             ));
         };
         self.finish_dispatched()?;
@@ -457,7 +458,7 @@ impl Env for GymEnv {
         Err(Error::config(
             format!("starting {} from a row of a dataset", self.layout.spec.id),
             "it sets a state at a reset only",
-            "start an episode there with `swm_core::dataset_start::reset`",
+            "start an episode at the row with `swm_core::dataset_start::reset`",
         ))
     }
 

@@ -14,7 +14,7 @@ pub(crate) struct Episode {
 }
 
 impl Episode {
-    /// The snapshot of an episode of the environment `id`; `None` stands for one before its first reset.
+    /// The snapshot of an episode of the environment `id`; `None` before the first reset.
     pub fn snapshot(episode: Option<&Self>, id: &str) -> Snapshot {
         let mut bytes = format!("{id}\n").into_bytes();
         if let Some(Self { reset, goal, actions }) = episode {
@@ -26,7 +26,7 @@ impl Episode {
         Snapshot(bytes)
     }
 
-    /// Parses a snapshot of the environment `id`, whose actions have `action_bytes` bytes; `None` if it is not one.
+    /// Parses a snapshot of the environment `id`, whose actions have `action_bytes` bytes; `None` for another snapshot.
     pub fn parse(snapshot: &Snapshot, id: &str, action_bytes: usize) -> Option<Self> {
         let (snapshot_id, rest) = line(&snapshot.0)?;
         let (reset, rest) = line(rest)?;

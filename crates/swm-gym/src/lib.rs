@@ -26,7 +26,7 @@ pub use env::GymEnv;
 pub use transport::{Failure, Request, Transport};
 pub use worker::WorkerTransport;
 
-/// The Python module of the bridge: `Bridge(env)` wraps an existing environment, `make(id, options)` makes one by id.
+/// The Python module of the bridge: `Bridge(env)` wraps an environment, `make(id, options)` makes and wraps one.
 pub const BRIDGE: &str = include_str!("../python/bridge.py");
 
 /// The Python module of Craftax's environments; [`BRIDGE`] imports it as `swm_craftax`.

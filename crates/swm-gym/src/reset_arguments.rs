@@ -14,7 +14,7 @@ pub fn reset_arguments(layout: &EnvLayout, seed: u64, options: &ResetOptions) ->
         return Err(Error::config(
             format!("{id}, the state of a reset"),
             "the seed decides the initial state of a Gymnasium environment",
-            "choose the start by seed, or by its factors of variation if it has any",
+            "choose the initial state by the seed, or by factors of variation if the environment has any",
         ));
     }
     let space = &layout.spec.variation_space;

@@ -36,14 +36,14 @@ impl<'a> Request<'a> {
     }
 }
 
-/// Why a request failed.
+/// The reason for which a request failed.
 #[derive(Debug)]
 pub enum Failure {
     /// A repeated request would fail in the same way, for example because the id is unknown or a package is missing.
     Refused(Error),
-    /// The environment raised an exception, whose traceback this is. A repeated request would raise it again.
+    /// The environment raised an exception; the text is the traceback. A repeated request would raise it again.
     Raised(String),
-    /// The worker process is lost; the text says how it ended and contains its last output. A new worker may succeed.
+    /// The worker process is lost; the text describes its end and contains its last output. A new worker may succeed.
     Lost(String),
 }
 
@@ -51,7 +51,8 @@ pub enum Failure {
 const LINES: usize = 12;
 
 impl Failure {
-    /// Converts the failure of `what` in the environment `id`, after `lost` replaced workers, into an error.
+    /// Converts the failure into an error. `id` names the environment and `what` the failed call; `lost` is the number of
+    /// replaced workers.
     pub(crate) fn explain(self, id: &str, what: &str, lost: usize) -> Error {
         match self {
             Self::Refused(error) => error,
@@ -68,7 +69,7 @@ impl Failure {
 
 /// The connection to one environment.
 pub trait Transport: Send {
-    /// Starts to make the environment again, in whatever state the old environment is, without waiting for the new one.
+    /// Discards the environment in any state, and starts to make a new one without waiting for it.
     ///
     /// # Errors
     /// When no worker can be started.

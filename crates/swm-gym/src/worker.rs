@@ -39,7 +39,7 @@ struct Process {
     socket: UnixStream,
     file: File,
     memory: Option<MmapMut>,
-    /// Whether a request was sent whose answer is not read yet. Only the worker accesses the memory until then.
+    /// Whether the answer to a sent request is not read yet. Meanwhile only the worker accesses the memory.
     pending: bool,
     tail: Tail,
 }
@@ -63,7 +63,7 @@ impl WorkerTransport {
         self.process.as_ref().map(|process| process.child.id())
     }
 
-    /// Ends a process that violates the protocol or a timeout, and returns how it ended with its last output.
+    /// Ends a process that violates the protocol or a timeout. The failure contains its exit status and last output.
     fn lose(&mut self, problem: &std::io::Error, limit: Duration) -> Failure {
         use std::io::ErrorKind::{TimedOut, WouldBlock};
         let Some(mut process) = self.process.take() else { return Failure::Lost("its worker process is gone".into()) };
@@ -198,7 +198,7 @@ impl Process {
         command.args(["-c", WORKER, &std::process::id().to_string(), id]);
         command.stdin(Stdio::from(OwnedFd::from(remote)));
         command.stdout(Stdio::from(file.try_clone().map_err(io)?)).stderr(Stdio::piped());
-        // Terminal signals reach this process only, which then ends its workers.
+        // In a separate process group, a worker gets no terminal signals. This process gets them and ends its workers.
         command.process_group(0);
         // Each worker uses at most one core, because there are as many workers as environments. Variables that are
         // already set keep their values.
@@ -252,7 +252,7 @@ impl Process {
         self.socket.set_read_timeout(Some(answer))?;
         let allocated = self.file.metadata()?.len();
         if allocated < size as u64 {
-            return Err(std::io::Error::other(format!("it has {allocated} bytes of {size}")));
+            return Err(std::io::Error::other(format!("the shared file has {allocated} bytes of {size}")));
         }
         self.memory = Some(map(&self.file)?);
         Ok(())
@@ -283,7 +283,7 @@ impl Drop for Process {
     fn drop(&mut self) {
         let closed = self.socket.shutdown(std::net::Shutdown::Write);
         if closed.and_then(|()| self.socket.set_read_timeout(Some(EXIT_TIMEOUT))).is_ok() {
-            // The worker's end of the socket closes when it ends.
+            // The worker's end of the socket closes when the worker ends.
             let mut rest = [0; 64];
             while matches!(self.socket.read(&mut rest), Ok(1..)) {}
         }
@@ -295,8 +295,9 @@ impl Drop for Process {
 fn map(file: &File) -> std::io::Result<MmapMut> {
     // SAFETY: the file is anonymous; only this process and its worker hold a descriptor of it, and the worker never
     // changes its size. The worker writes to it only between a request and its answer, when this process holds no
-    // reference: `Transport::dispatch` and `call` borrow the transport mutably, and between the two it returns no
-    // reference to the memory. A worker that does not answer in time is killed before the memory is touched again.
+    // reference: `Transport::dispatch` and `call` borrow the transport mutably, and between the two calls the
+    // transport returns no reference to the memory. A worker that does not answer in time is killed before the memory
+    // is accessed again.
     unsafe { MmapMut::map_mut(file) }
 }
 
@@ -347,8 +348,8 @@ impl Tail {
 /// A command and the channel that receives its child.
 type Job = (Command, SyncSender<std::io::Result<Child>>);
 
-/// Starts a process from a thread that lives as long as this process, because the kernel ends a child with the thread
-/// that started it (`PR_SET_PDEATHSIG`).
+/// Starts a process from a thread that lives as long as this process, because the kernel kills a child when the
+/// thread that started it ends (`PR_SET_PDEATHSIG`).
 fn spawn(command: Command) -> std::io::Result<Child> {
     static STARTER: Mutex<Option<(u32, Sender<Job>)>> = Mutex::new(None);
     let (answer, child) = sync_channel(1);

@@ -19,13 +19,15 @@ fn cpu_time() -> std::io::Result<Duration> {
     Ok(Duration::from_nanos(text.split(' ').next().and_then(|first| first.parse().ok()).unwrap_or(0)))
 }
 
+/// Environment ids, model files, steps per round, and physics time steps per step.
+const TASKS: [(&str, &str, u32, u32); 2] = [
+    ("swm/CheetahDMControl-v0", "cheetah.xml", 10_000, 2),
+    ("swm/HumanoidDMControl-v0", "humanoid.xml", 400, 10),
+];
+
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let suite = assets::path("dm_control")?.join("dm_control/suite");
-    // Id, model file, steps per round, and physics time steps per step.
-    for (id, file, steps, substeps) in [
-        ("swm/CheetahDMControl-v0", "cheetah.xml", 10_000u32, 2),
-        ("swm/HumanoidDMControl-v0", "humanoid.xml", 400, 10),
-    ] {
+    for (id, file, steps, substeps) in TASKS {
         let entry = ENVS.get(id)?;
         let mut env = entry.env()?;
         let space = env.spec().action_space.clone();

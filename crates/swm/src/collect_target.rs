@@ -1,5 +1,4 @@
-//! Checks of the dataset that a collection writes to: whether it may be continued, and whether all its frames come from
-//! one renderer.
+//! Checks that a collection may write to an existing dataset, and that all frames of a dataset come from one renderer.
 
 use swm_core::{Error, Manifest, Result};
 use swm_data::lance::shard_manifests;
@@ -10,7 +9,7 @@ use swm_eval::collect::check_continues;
 /// `mix_renderers` permits frames of another renderer than the renderer of the stored frames.
 ///
 /// # Errors
-/// When a dataset exists and `mode` is [`WriteMode::Create`], or when it cannot be continued with this manifest.
+/// When a dataset exists and `mode` is [`WriteMode::Create`], or the dataset cannot be continued with this manifest.
 pub fn check(location: &Location, mode: WriteMode, new: &Manifest, mix_renderers: bool) -> Result<()> {
     let exists = match location.path() {
         Some(path) => path.exists(),

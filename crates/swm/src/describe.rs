@@ -1,10 +1,10 @@
-//! Descriptions of environments as JSON, with the field names of Gymnasium's spaces. `swm envs --json` and the Python
-//! package use them.
+//! Descriptions of environments as JSON, with the field names of Gymnasium's spaces, for `swm envs --json` and for the
+//! Python package.
 
 use serde_json::{Map, Value, json};
 use swm_core::{EnvEntry, EnvSpec, Named as _, Space, VariationSpace};
 
-/// Returns a registered environment: its spec, summary, options and experts.
+/// Describes a registered environment: its spec, summary, options and experts.
 pub fn env(row: &EnvEntry, made: &EnvSpec) -> Value {
     let mut value = spec(made);
     value["summary"] = json!(row.summary);

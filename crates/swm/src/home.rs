@@ -73,7 +73,7 @@ pub fn new_checkpoint(given: &str) -> Result<PathBuf> {
 /// Opens a dataset given as a path, as a URI, or as a name in [`datasets`].
 ///
 /// # Errors
-/// When it does not exist (the message names the closest name), or it is damaged.
+/// When the dataset does not exist (the message names the closest name), or is damaged.
 pub fn open_dataset(given: &str) -> Result<Arc<dyn Reader>> {
     swm_data::open(find_dataset(given)?)
 }
@@ -81,7 +81,7 @@ pub fn open_dataset(given: &str) -> Result<Arc<dyn Reader>> {
 /// Returns the location of an existing dataset given as a path, as a URI, or as a name in [`datasets`].
 ///
 /// # Errors
-/// When it does not exist; the message names the closest name. The existence of a URI is not checked.
+/// When the dataset does not exist; the message names the closest name. The existence of a URI is not checked.
 pub fn find_dataset(given: &str) -> Result<Location> {
     let location = location(given)?;
     match location.path() {
@@ -93,7 +93,7 @@ pub fn find_dataset(given: &str) -> Result<Location> {
 /// Returns the folder of an existing checkpoint given as a path or as a name in [`checkpoints`].
 ///
 /// # Errors
-/// When it does not exist; the message names the closest name.
+/// When the checkpoint does not exist; the message names the closest name.
 pub fn find_checkpoint(given: &str) -> Result<PathBuf> {
     check_name("checkpoint", given)?;
     let path = checkpoint(given);

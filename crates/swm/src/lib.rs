@@ -34,8 +34,8 @@ const ROWS: [EnvEntry; swm_envs::ENVS.rows.len() + swm_mujoco::ENVS.rows.len()] 
 /// Gymnasium (`docs/gymnasium.md`).
 ///
 /// # Errors
-/// When no built-in environment has the id and the id does not have Gymnasium's form. An id that Gymnasium does not
-/// know is an error only when the environment is made.
+/// When no built-in environment has the id and the id does not have Gymnasium's form. An id that is not
+/// registered with Gymnasium is an error only when the environment is made.
 pub fn env(text: &str) -> Result<EnvChoice> {
     let id = text.split(',').next().unwrap_or_default();
     let is_builtin = |id: &str| ENVS.get(id).is_ok();

@@ -1,5 +1,5 @@
 //! [`HomeResolver`] loads the environments, wrappers, solvers, datasets and checkpoints that an evaluation request
-//! names. Environments, wrappers and solvers are those of this build; datasets and checkpoints are in the [home
+//! names. Environments, wrappers and solvers belong to this build; datasets and checkpoints are in the [home
 //! folder](crate::home).
 
 use crate::home;
@@ -57,7 +57,7 @@ impl HomeResolver {
     /// Returns the checkpoint with this path or name; it is loaded at the first call.
     ///
     /// # Errors
-    /// When it does not exist or is damaged.
+    /// When the checkpoint does not exist or is damaged.
     pub fn checkpoint(&self, given: &str) -> Result<Rc<dyn LoadedModel>> {
         let path = home::find_checkpoint(given)?;
         if let Some(loaded) = self.checkpoints.borrow().get(&path) {
@@ -202,8 +202,8 @@ fn with_provenance(policy: ResolvedPolicy, info: CheckpointInfo) -> ResolvedPoli
     }
 }
 
-/// Returns the policy with this name for a world, and the hash of its weights if it is a checkpoint: a [`scripted`]
-/// policy, or a checkpoint that acts without a solver.
+/// Returns the policy with a name for a world: a [`scripted`] policy, or a checkpoint that acts without a solver. For a
+/// checkpoint, also returns the hash of the weights.
 ///
 /// # Errors
 /// When neither an expert nor a checkpoint has the name, or the checkpoint was trained on another environment or
@@ -220,7 +220,7 @@ pub fn policy_by_name(entry: &EnvEntry, name: &str, world: &World) -> Result<(Bo
 /// Loads a checkpoint that acts without a solver; returns its policy for `slots` environments and its description.
 ///
 /// # Errors
-/// When it does not exist, was trained on another environment, or requires a solver.
+/// When the checkpoint does not exist, was trained on another environment, or requires a solver.
 pub fn checkpoint_policy(given: &str, spec: &EnvSpec, slots: usize) -> Result<(Box<dyn Policy>, CheckpointInfo)> {
     direct(&*HomeResolver::default().checkpoint(given)?, given, spec, slots)
 }
@@ -278,7 +278,7 @@ fn check_trained_on(info: &CheckpointInfo, name: &str, spec: &EnvSpec) -> Result
         Some(env) if *env != spec.id => Err(Error::config(
             format!("checkpoint {name}"),
             format!("it was trained on {env}, not on {}", spec.id),
-            format!("evaluate it with --env {env}, or train one on {}", spec.id),
+            format!("evaluate it with --env {env}, or train a checkpoint on {}", spec.id),
         )),
         _ => Ok(()),
     }

@@ -27,9 +27,9 @@ pub struct LewmSubject {
     model: Lewm,
     cost: LewmCost,
     cem: Cem,
-    /// `pixels` and `goal` of one environment.
+    /// The columns `pixels` and `goal` of one environment.
     infos: Batch,
-    /// `[samples, HORIZON, frameskip * ACTION_DIM]`.
+    /// Candidate action sequences, `[samples, HORIZON, frameskip * ACTION_DIM]`.
     candidates: Vec<f32>,
     training: Option<TrainingRun>,
 }

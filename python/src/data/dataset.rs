@@ -109,7 +109,7 @@ impl Dataset {
         Self::of(py, Arc::new(open))
     }
 
-    /// The same dataset, with decoded rows of some columns cached in memory, up to `bytes`.
+    /// A view of the dataset that caches decoded rows of some columns in memory, up to `bytes` bytes.
     fn cached(slf: Py<Self>, py: Python<'_>, names: Vec<String>, bytes: usize) -> PyResult<Self> {
         let open = move || {
             let names: Vec<&str> = names.iter().map(String::as_str).collect();

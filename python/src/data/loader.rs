@@ -81,8 +81,8 @@ impl<T: Send> Threaded<T> {
     /// The error of `work`; an error if the object belongs to another process, or if its threads have ended.
     fn with<R>(&self, work: impl FnOnce(&mut T) -> Result<R>) -> Result<R> {
         if self.process != std::process::id() {
-            let problem = "it was made in the process that this one was forked from";
-            return Err(Error::config("loader", problem, "make it in the process that uses it"));
+            let problem = "it was created before this process was forked";
+            return Err(Error::config("loader", problem, "create it in the process that uses it"));
         }
         match &mut *lock(&self.inner) {
             Some(inner) => work(inner),

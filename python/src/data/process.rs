@@ -1,8 +1,8 @@
 //! Support for forked processes, such as the workers of a torch `DataLoader`.
 //!
-//! A forked process has the memory of its parent but not the parent's threads, so waiting for one of them never ends.
-//! Forked processes therefore open datasets again, and run the engine on one new thread each (one, because there are
-//! usually several forked processes).
+//! A forked process has the memory of its parent but not the parent's threads, so waiting for such a thread never
+//! ends. A forked process therefore opens datasets again, and runs the engine on one new thread. One thread is
+//! enough, because several forked processes usually run in parallel.
 
 use pyo3::prelude::*;
 use std::sync::{Mutex, OnceLock, PoisonError};

@@ -97,7 +97,7 @@ pub fn convert(
     to_json(&converted.map_err(to_py_err)?)
 }
 
-/// Examines a dataset, and writes its sound episodes to `target` if one is given. Returns the diagnosis as JSON.
+/// Examines a dataset, and writes its intact episodes to `target` if one is given. Returns the diagnosis as JSON.
 #[pyfunction]
 pub fn doctor(
     py: Python<'_>,

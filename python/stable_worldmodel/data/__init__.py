@@ -2,7 +2,7 @@
 
 - `load_dataset` opens a dataset of any format for a torch `DataLoader`; `Loader` yields shuffled batches directly.
 - `open_writer` stores episodes; `convert`, `doctor` and `inspect` convert, examine and describe datasets.
-- `register_format` adds a user-defined format to all of these.
+- `register_format` adds a user-defined format to these functions.
 - `MergeDataset`, `ConcatDataset`, `GoalDataset`, `ReplayBuffer`: datasets derived from other datasets or a collection.
 """
 

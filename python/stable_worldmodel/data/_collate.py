@@ -11,7 +11,7 @@ from typing import Any
 
 
 class Batch:
-    """A batch that was read in one call: its columns `(B, ...)`, and a view of them for each sample."""
+    """A batch that was read in one call: the columns `(B, ...)`, and a view of each column for each sample."""
 
     __slots__ = ("columns", "size", "views")
 
@@ -21,7 +21,7 @@ class Batch:
         self.views = {name: [column[i] for i in range(size)] for name, column in columns.items()}
 
     def samples(self) -> list[dict[str, Any]]:
-        """One dict for each sample."""
+        """Returns one dict for each sample."""
         return [Sample(self, i) for i in range(self.size)]
 
 
@@ -45,15 +45,15 @@ class Sample(dict[str, Any]):
 
 
 def collate(samples: list[Any], *, collate_fn_map: Any = None) -> Any:
-    """Collates samples: returns the batch they were read in if they are all of its samples, unchanged and in order."""
+    """Collates samples. All samples of one `Batch`, unchanged and in order, become the columns of that batch."""
     from torch.utils.data._utils.collate import collate as torch_collate
 
     batch = samples[0].batch
-    whole = len(samples) == batch.size and all(
+    is_complete = len(samples) == batch.size and all(
         isinstance(sample, Sample) and sample.batch is batch and sample.index == i and sample.untouched()
         for i, sample in enumerate(samples)
     )
-    if whole:
+    if is_complete:
         return dict(batch.columns)
     return torch_collate([dict(sample) for sample in samples], collate_fn_map=collate_fn_map)
 

@@ -64,8 +64,9 @@ class ReplayBuffer(Dataset):
         self.seed = int(seed)
         self._buffer: Any = None
         self._columns: list[tuple[str, str, list[int]]] = []
-        #: The engine's view of the current content, and the samplers by batch size and history.
+        #: The engine's view of the current content.
         self._snapshot: Any = None
+        #: The samplers by batch size and history length.
         self._samplers: dict[tuple[int, int], Any] = {}
         self._step = 0
 
@@ -128,7 +129,7 @@ class ReplayBuffer(Dataset):
 
     @property
     def num_episodes_added(self) -> int:
-        """The number of episodes added, removed ones included."""
+        """The number of episodes added since the last `clear`, including removed episodes."""
         return 0 if self._buffer is None else int(self._buffer.added())
 
     def num_valid_ends(self, history_len: int | None = None) -> int:
@@ -163,7 +164,7 @@ class ReplayBuffer(Dataset):
             return self._chosen(np.asarray(self.sampler(step, self, batch_size, steps)), batch_size, steps)
         key = (batch_size, steps)
         if key not in self._samplers:
-            wanted = {
+            settings = {
                 "num_steps": steps,
                 "frameskip": self.frameskip,
                 "columns": self.column_names,
@@ -171,7 +172,7 @@ class ReplayBuffer(Dataset):
                 "batch_size": batch_size,
                 "recent": None,
             }
-            self._samplers[key] = self._buffer.sampler(json.dumps(wanted), self.seed)
+            self._samplers[key] = self._buffer.sampler(json.dumps(settings), self.seed)
         return dict(self._samplers[key].sample(step))
 
     def _chosen(self, indices: Array, batch_size: int, steps: int) -> dict[str, Array]:
@@ -200,8 +201,8 @@ class ReplayBuffer(Dataset):
     def get_col_data(self, col: str) -> Array:
         if col not in self.column_names:
             raise KeyError(f"there is no column {col!r}; the columns are {', '.join(self.column_names)}")
-        everything = np.arange(self.num_episodes)
-        found = self.engine.read([col], everything, np.zeros_like(everything), self.lengths, 1)
+        all_episodes = np.arange(self.num_episodes)
+        found = self.engine.read([col], all_episodes, np.zeros_like(all_episodes), self.lengths, 1)
         return np.asarray(found[col])
 
     def get_row_data(self, row_idx: Rows) -> dict[str, Array]:

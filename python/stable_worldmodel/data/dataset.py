@@ -152,7 +152,7 @@ class StoredDataset(Dataset):
         transform: A function from the dict of a sample to the sample that the dataset returns.
         keys_to_load: The columns of a sample; all columns for `None`.
         keys_to_cache: Columns whose decoded rows stay in memory.
-        keys_to_merge: Columns to add: see :meth:`merge_col`.
+        keys_to_merge: The columns to add: a dict from target to source, as in :meth:`merge_col`.
         format: The format; `None` detects it from the path.
         backend: `"torch"` or `"numpy"`; `None` selects torch if it is installed.
     """
@@ -207,7 +207,7 @@ class StoredDataset(Dataset):
 
     @property
     def engine(self) -> Any:
-        """The engine's dataset."""
+        """This dataset as an object of the engine."""
         if self._handle is None:
             self._handle = self._open()
         return self._handle
@@ -315,8 +315,8 @@ class StoredDataset(Dataset):
         self._check(col)
         if col in self._merged:
             return self._merged[col]
-        everything = np.arange(self.num_episodes)
-        return self._read([col], everything, np.zeros_like(everything), self.lengths, 1)[col]
+        all_episodes = np.arange(self.num_episodes)
+        return self._read([col], all_episodes, np.zeros_like(all_episodes), self.lengths, 1)[col]
 
     def get_row_data(self, row_idx: Rows) -> dict[str, Array]:
         rows = np.atleast_1d(np.asarray(row_idx, dtype=np.int64))
@@ -383,7 +383,7 @@ class MergeDataset:
 
     @property
     def engine(self) -> Any:
-        """The engine's dataset."""
+        """This dataset as an object of the engine."""
         from .foreign import engine_of
 
         merged = engine_of(self.datasets[0])
@@ -412,23 +412,23 @@ class MergeDataset:
         return [self._picked(items) for items in zip(*parts, strict=True)]
 
     def load_chunk(self, episodes_idx: Any, start: Any, end: Any) -> list[dict[str, Any]]:
-        """As :meth:`Dataset.load_chunk`."""
+        """See :meth:`Dataset.load_chunk`."""
         parts = [dataset.load_chunk(episodes_idx, start, end) for dataset in self.datasets]
         return [self._picked(items) for items in zip(*parts, strict=True)]
 
     def load_episode(self, episode_idx: int) -> dict[str, Any]:
-        """As :meth:`Dataset.load_episode`."""
+        """See :meth:`Dataset.load_episode`."""
         return self._picked(dataset.load_episode(episode_idx) for dataset in self.datasets)
 
     def get_col_data(self, col: str) -> Array:
-        """As :meth:`Dataset.get_col_data`."""
+        """See :meth:`Dataset.get_col_data`."""
         for dataset, keys in zip(self.datasets, self.keys_map, strict=True):
             if col in keys:
                 return np.asarray(dataset.get_col_data(col))
         raise KeyError(f"there is no column {col!r}; the columns are {', '.join(self.column_names)}")
 
     def get_row_data(self, row_idx: Rows) -> dict[str, Any]:
-        """As :meth:`Dataset.get_row_data`."""
+        """See :meth:`Dataset.get_row_data`."""
         return self._picked(dataset.get_row_data(row_idx) for dataset in self.datasets)
 
 
@@ -475,7 +475,7 @@ class ConcatDataset:
 
     @property
     def engine(self) -> Any:
-        """The engine's dataset."""
+        """This dataset as an object of the engine."""
         from .foreign import engine_of
 
         return _engine.Dataset.concat([engine_of(dataset) for dataset in self.datasets])
@@ -503,7 +503,7 @@ class ConcatDataset:
         return self._gathered(parts, lambda part, mask: _items(self.datasets[part], indices_in_part[mask].tolist()))
 
     def load_chunk(self, episodes_idx: Any, start: Any, end: Any) -> list[dict[str, Any]]:
-        """As :meth:`Dataset.load_chunk`."""
+        """See :meth:`Dataset.load_chunk`."""
         parts, episodes = self._locate(self._episodes_before, episodes_idx, "episodes")
         starts, ends = np.asarray(start), np.asarray(end)
         return self._gathered(
@@ -519,19 +519,19 @@ class ConcatDataset:
         return [found[i] for i in range(len(parts))]
 
     def load_episode(self, episode_idx: int) -> dict[str, Any]:
-        """As :meth:`Dataset.load_episode`."""
+        """See :meth:`Dataset.load_episode`."""
         parts, episodes = self._locate(self._episodes_before, [episode_idx], "episodes")
         return dict(self.datasets[int(parts[0])].load_episode(int(episodes[0])))
 
     def get_col_data(self, col: str) -> Array:
-        """As :meth:`Dataset.get_col_data`."""
+        """See :meth:`Dataset.get_col_data`."""
         having = [dataset for dataset in self.datasets if col in dataset.column_names]
         if not having:
             raise KeyError(f"there is no column {col!r}; the columns are {', '.join(self.column_names)}")
         return np.concatenate([np.asarray(dataset.get_col_data(col)) for dataset in having])
 
     def get_row_data(self, row_idx: Rows) -> dict[str, Any]:
-        """As :meth:`Dataset.get_row_data`."""
+        """See :meth:`Dataset.get_row_data`."""
         parts, rows = self._locate(self._rows_before, np.atleast_1d(np.asarray(row_idx)), "rows")
         found = [self.datasets[part].get_row_data(row) for part, row in zip(parts.tolist(), rows.tolist(), strict=True)]
         if np.ndim(row_idx) == 0:
@@ -596,7 +596,7 @@ class GoalDataset:
             later = clips[:, 1] + self._now + dataset.frameskip < np.asarray(dataset.lengths)[clips[:, 0]]
         else:
             later = np.ones(len(clips), dtype=bool)
-        #: The dataset's clips that have a goal.
+        #: The indices of the dataset's clips that have a goal.
         self._indices = np.flatnonzero(later)
         self._clips = clips[later]
 

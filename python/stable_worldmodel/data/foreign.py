@@ -52,8 +52,8 @@ class _Rows:
         if hasattr(self._reader, "_load_slice"):
             found = self._reader._load_slice(episode, start, end)
         else:
-            whole = self._reader.load_episode(episode)
-            found = {name: value if isinstance(value, str) else value[start:end] for name, value in whole.items()}
+            content = self._reader.load_episode(episode)
+            found = {name: value if isinstance(value, str) else value[start:end] for name, value in content.items()}
         # A slice has one action for each row, also for the last row of an episode.
         arrays, _ = _tensors.rows(found)
         with self._lock:

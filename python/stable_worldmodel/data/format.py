@@ -13,7 +13,7 @@
         @classmethod
         def open_writer(cls, path, **kwargs): ...  # a Writer
 
-Afterwards `load_dataset`, `convert`, `Loader` and `World.collect(path, format="zarr")` support it.
+Afterwards `load_dataset`, `convert`, `Loader` and `World.collect(path, format="zarr")` support the format.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ __all__ = [
     "validate_write_mode",
 ]
 
-#: What to do with an existing dataset: append to it (or create one), replace it, or raise an error.
+#: The treatment of an existing dataset: append to it (or create one), replace it, or raise an error.
 WRITE_MODES = ("append", "overwrite", "error")
 
 

@@ -29,7 +29,7 @@ class Goals:
     """The distribution of a goal row for every clip.
 
     A batch has the goal's columns as `NAME_COLUMN` `(B, 1, ...)`. `NAME_offset` `(B,)` is the number of rows from the anchor
-    to the goal, or -1 if the goal is not a later row of the same episode.
+    (a step of the clip) to the goal, or -1 if the goal is not a later row of the same episode.
 
     Attributes:
         columns: The columns to load from the goal row.
@@ -160,7 +160,7 @@ class Loader:
         given = [goals] if isinstance(goals, Goals) else list(goals or [])
         self.num_steps = int(num_steps if num_steps is not None else getattr(dataset, "num_steps", 1))
         self.frameskip = int(frameskip if frameskip is not None else getattr(dataset, "frameskip", 1))
-        wanted = {
+        settings = {
             "num_steps": self.num_steps,
             "frameskip": self.frameskip,
             "columns": [*columns],
@@ -176,20 +176,21 @@ class Loader:
             "cache": bytes_of(cache),
             "cache_dir": None if cache_dir is None else os.fspath(cache_dir),
         }
-        if any(isinstance(value, int) and value < 0 for value in wanted.values()):
-            negative = {name: value for name, value in wanted.items() if isinstance(value, int) and value < 0}
+        if any(isinstance(value, int) and value < 0 for value in settings.values()):
+            negative = {name: value for name, value in settings.items() if isinstance(value, int) and value < 0}
             raise ValueError(f"expected no negative numbers, got {negative}")
-        self._loader = _engine.Loader(engine, json.dumps(wanted))
+        self._loader = _engine.Loader(engine, json.dumps(settings))
         #: The shape of a row of every column: the axes after the batch and the steps.
         self._shapes = {name: tuple(shape[1:]) for name, _, shape in self._loader.schema()}
-        # The dataset returns some scalar columns as lists of one element, so the loader does the same.
+        # The dataset returns some scalar columns as lists of one element, so the loader returns such lists, too.
         for name, (_, shape) in getattr(dataset, "schema", {}).items():
             for column in (name, *(f"{goal.name}_{name}" for goal in given)):
                 if name != "action" and self._shapes.get(column) == () and shape == (1,):
                     self._shapes[column] = shape
         self._action = stored.get("action")
-        #: The epoch and batch at which the next iteration starts, and those of the latest iteration.
+        #: The epoch and batch at which the next iteration starts.
         self._next = (0, 0)
+        #: The epoch and batch that the latest iteration has reached.
         self._at = (0, 0)
 
     def __len__(self) -> int:
@@ -218,12 +219,12 @@ class Loader:
         return {"epoch": epoch, "batch": batch, "seed": self.seed, "batch_size": self.batch_size, "clips": clips}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Continues at a saved position: the next batches equal those that followed the position."""
+        """Continues at a saved position: the next batches equal the batches that followed the position."""
         own = self.state_dict()
         changed = {name: (state[name], own[name]) for name in ("seed", "batch_size", "clips") if state[name] != own[name]}
         if changed:
             changes = ", ".join(f"{name} was {was} and is {now}" for name, (was, now) in changed.items())
-            raise ValueError(f"the state is of another loader: {changes}")
+            raise ValueError(f"the state belongs to another loader: {changes}")
         self._next = self._at = (int(state["epoch"]), int(state["batch"]))
 
     def __iter__(self) -> Iterator[dict[str, Any]]:

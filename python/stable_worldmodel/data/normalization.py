@@ -23,7 +23,7 @@ def _is_tensor(value: Any) -> bool:
 def _like(value: Any, *bounds: Array | None) -> list[Any]:
     """The bounds as arrays, or as tensors with the type and device of `value`."""
     if any(bound is None for bound in bounds):
-        raise ValueError("the scaler is not fitted: call fit first, or give it its bounds")
+        raise ValueError("the scaler is not fitted: call fit first, or pass its parameters to the constructor")
     if not _is_tensor(value):
         return list(bounds)
     import torch
@@ -146,7 +146,7 @@ _SCALERS: dict[str, Any] = {"zscore": ZScoreScaler, "percentile": PercentileScal
 def get_scaler(method: str = "zscore", **kwargs: Any) -> Any:
     """A scaler that is not fitted yet: `"zscore"`, `"percentile"` or `"none"`."""
     if method not in _SCALERS:
-        raise ValueError(f"unknown scaler {method!r}; there are {', '.join(_SCALERS)}")
+        raise ValueError(f"unknown scaler {method!r}; the scalers are {', '.join(_SCALERS)}")
     return _SCALERS[method](**kwargs)
 
 

@@ -95,7 +95,7 @@ def load_dataset(
     }
     if kind is None:
         known = ", ".join(FORMATS)
-        raise ValueError(f"{path} is of no known format ({known}); name one with format=")
+        raise ValueError(f"{path} is of no known format ({known}); name the format with format=")
     if not kind.native:
         # Readers of user-defined formats need not accept every argument.
         defaults = {"num_steps": 1, "frameskip": 1}
@@ -131,14 +131,14 @@ def _options(format: str | None, mode: str, codec: str | None, quality: int | No
     if mode not in ("resume", "append", "overwrite", "error"):
         raise ValueError(f"mode: expected 'resume', 'append', 'overwrite' or 'error', got {mode!r}")
     chosen = codec_json(codec, quality)
-    wanted = {
+    settings = {
         "format": format,
         "mode": mode,
         "codec": None if chosen is None else json.loads(chosen),
         "verify": verify,
         "least_psnr": least_psnr,
     }
-    return json.dumps(wanted)
+    return json.dumps(settings)
 
 
 def convert(
@@ -157,7 +157,7 @@ def convert(
     least_psnr: float = 25.0,
     **kwargs: Any,
 ) -> dict[str, Any]:
-    """Writes a dataset in another format or codec, and compares the decoded content of both.
+    """Writes a dataset in another format or codec, and compares the decoded contents.
 
         convert("pusht.lance", "pusht.h5")
         convert("pusht.lance", "pusht-video", dest_format="video")
@@ -170,9 +170,9 @@ def convert(
         format: Another name for `dest_format`.
         cache_dir: A folder in place of `$STABLEWM_HOME` that contains the source.
         progress: Whether to show a progress bar (with tqdm, if it is installed).
-        mode: What to do with an existing target: `"resume"` continues after its last episode if its content is the
+        mode: The treatment of an existing target: `"resume"` continues after its last episode if its content is the
             beginning of the source, `"append"` adds to it, `"overwrite"` replaces it, `"error"` raises.
-        codec: How images are stored: `"qoi"` (lossless, the default), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
+        codec: The codec of images: `"qoi"` (lossless, the default), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
         jpeg_quality: The quality of the codec `"jpeg"`, as in `codec="jpeg-QUALITY"`.
         verify: Whether to read the target and compare its content with the source.
         least_psnr: The minimum peak signal-to-noise ratio of lossy images, in dB; a lower ratio is an error.
@@ -190,7 +190,7 @@ def convert(
     kind = FORMATS["lance"] if kind is None else kind
     report = _progress_callback(progress)
     if not kind.native:
-        return hand_over(source, kind.open_writer(dest, mode=_plain(mode), **kwargs), report)
+        return write_all(source, kind.open_writer(dest, mode=_plain(mode), **kwargs), report)
     if kwargs:
         raise TypeError(f"convert: the format {kind.name} takes no {', '.join(kwargs)}")
     options = _options(kind.name, mode, codec, jpeg_quality, verify, least_psnr)
@@ -202,7 +202,7 @@ def _plain(mode: str) -> str:
     return validate_write_mode("error" if mode == "resume" else mode)
 
 
-def hand_over(source: Any, writer: Any, report: Callable[[str, int, int], None] | None) -> dict[str, Any]:
+def write_all(source: Any, writer: Any, report: Callable[[str, int, int], None] | None) -> dict[str, Any]:
     """Writes all episodes of a dataset with a writer implemented in Python."""
     engine = engine_of(source)
     lengths = engine.lengths()
@@ -232,7 +232,7 @@ def doctor(
         repair: The location of a repaired copy with only the intact episodes; `None` writes no copy.
         format: The format of the copy.
         progress: Whether to show a progress bar.
-        codec: How images are stored in the copy, as in :func:`convert`.
+        codec: The codec of images in the copy, as in :func:`convert`.
         jpeg_quality: The quality of the codec `"jpeg"`, as in `codec="jpeg-QUALITY"`.
 
     Returns:

@@ -44,7 +44,7 @@ class EpisodeWriter:
         path: A path, a URI, or a name under `$STABLEWM_HOME/datasets`.
         format: The format; `None` detects it from the path, or selects Lance.
         mode: `"append"` continues an existing dataset, `"overwrite"` replaces it, `"error"` raises.
-        codec: How images are stored: `"qoi"` (lossless, the default), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
+        codec: The codec of images: `"qoi"` (lossless, the default), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
         jpeg_quality: The quality of the codec `"jpeg"`, as in `codec="jpeg-QUALITY"`.
         manifest: The provenance of the data, stored in the dataset's manifest under the key `config`.
     """

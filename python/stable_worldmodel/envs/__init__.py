@@ -80,7 +80,7 @@ class NativeEnv(gymnasium.Env):
 
     @property
     def max_episode_steps(self) -> int:
-        """Steps after which `swm.World` truncates an episode (elsewhere: `gymnasium.make(…, max_episode_steps=…)`)."""
+        """Steps after which `swm.World` truncates an episode. In Gymnasium, `make(…, max_episode_steps=…)` sets one."""
         return int(self._described["max_episode_steps"])
 
     @cached_property
@@ -131,7 +131,7 @@ class NativeEnv(gymnasium.Env):
         self._env.sample_goal(seed)
 
     def goal_distance(self) -> float:
-        """The distance of the state from the goal."""
+        """The distance of the state from the goal, in the environment's units."""
         return self._env.goal_distance()
 
     def snapshot(self) -> bytes:
@@ -139,7 +139,7 @@ class NativeEnv(gymnasium.Env):
         return self._env.snapshot()
 
     def restore(self, state: bytes) -> tuple[Any, dict[str, Any]]:
-        """Restores a snapshot. The steps that follow repeat those after the snapshot bit for bit."""
+        """Restores a snapshot. Later steps repeat the steps after the snapshot bit for bit."""
         columns = self._env.restore(state)
         return self._observation(columns), self._info(columns, self._env.is_success())
 

@@ -269,7 +269,7 @@ class ResolutionWrapper(VisualWrapper):
 
 
 def engine_wrappers(factories: Sequence[Callable[..., Any]]) -> list[tuple[str, dict[str, Any]]] | None:
-    """The ids and settings of visual wrappers made by these factories; `None` if one makes another kind of wrapper."""
+    """The ids and settings of visual wrappers made by these factories; `None` if a factory makes another kind."""
     known = []
     for factory in factories:
         values: tuple[Any, ...] = ()

@@ -1,9 +1,9 @@
 """Measures the LeWM of the reference implementation with given weights.
 
-Arguments: the sizes as JSON, and a file of weights and inputs. Requests, one per line: `run WORK COUNT` or
-`outputs WORK`. WORK is `cost` (of the given candidates, with start and goal already encoded), `plan` (encoding, then
-CEM), `encode` (one frame) or `train` (one step, including the optimizer). Answers are lines that start with `SWM `;
-other output of the reference is ignored.
+Arguments: the sizes as JSON, and a file of weights and inputs. Requests, one per line: `run WORK COUNT` or `outputs WORK`.
+`WORK` is `cost` (the costs of the given candidates, with start and goal already encoded), `plan` (encoding, then CEM),
+`encode` (one frame) or `train` (one step, including the optimizer). Answers are lines that start with `SWM `; other
+output of the reference is ignored.
 
 The encoder of the reference is from another package, so this file contains a vision transformer with fused attention.
 """
@@ -23,7 +23,7 @@ from stable_worldmodel.wm.lewm.module import MLP, Embedder, Predictor
 from stable_worldmodel.wm.loss import SIGReg
 from torch import nn
 
-c = json.loads(sys.argv[1])
+c = json.loads(sys.argv[1])  # The sizes of the model and of the benchmark.
 given = torch.load(sys.argv[2], weights_only=True)
 device = torch.device(c["device"])
 

@@ -1,12 +1,12 @@
 //! Tests of the Arcade Learning Environment and of Craftax.
 
 use crate::play::{RecordedEnv, make, play};
-use crate::{config, has};
+use crate::{can_import, config};
 use swm_core::{Action, DType, ResetOptions, Space};
 
 #[test]
-fn pong_observes_its_frames() {
-    let Some(config) = config().filter(|config| has(config, "ale_py")) else { return };
+fn observations_of_pong_are_frames() {
+    let Some(config) = config().filter(|config| can_import(config, "ale_py")) else { return };
     let mut env = RecordedEnv::of(make("ALE/Pong-v5", &config));
     assert_eq!(env.env.spec().action_space, Space::Discrete { n: 6, start: 0 });
     assert!(env.env.libraries().contains_key("ale-py"), "{:?}", env.env.libraries());
@@ -24,7 +24,7 @@ fn pong_observes_its_frames() {
 #[test]
 #[ignore = "JAX compiles for minutes"]
 fn craftax_steps_and_renders() {
-    let Some(config) = config().filter(|config| has(config, "craftax")) else { return };
+    let Some(config) = config().filter(|config| can_import(config, "craftax")) else { return };
     for (id, shape, actions) in [
         ("swm/CraftaxClassicPixels-v1", &[63, 63, 3][..], 17),
         ("swm/CraftaxClassicSymbolic-v1", &[1345], 17),

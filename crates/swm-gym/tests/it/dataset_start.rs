@@ -34,7 +34,7 @@ fn rows() -> Batch {
 }
 
 fn calls(json: &str) -> Vec<Callable> {
-    serde_json::from_str(json).expect("calls")
+    serde_json::from_str(json).expect("valid callables")
 }
 
 fn start(env: &mut dyn Env, options: &ResetOptions, callables: &[Callable]) -> swm_core::Result<()> {
@@ -115,7 +115,7 @@ fn dataset_start_calls_methods_by_name() {
 }
 
 #[test]
-fn environment_may_declare_its_setter() {
+fn environment_can_declare_the_method_that_sets_its_state() {
     let Some(config) = config() else { return };
     let mut declared = RecordedEnv::of(make("tests.it.environments:Declared-v0", &config));
     start(&mut *declared.env, &ResetOptions::default(), &[]).expect("a start");
@@ -135,13 +135,13 @@ fn replays_a_killed_worker_from_the_recorded_state() {
         let id = transport.process_id().expect("a process");
         let mut field = RecordedEnv::of(Box::new(GymEnv::new(FIELD, Box::new(transport), 2).expect("an environment")));
         start(&mut *field.env, &ResetOptions::default(), &[]).expect("a start");
-        let mut outputs = vec![field.everything()];
+        let mut outputs = vec![field.all_outputs()];
         for t in 0..4 {
             if kill == Some(t) {
                 kill_process(id);
             }
             field.env.step(EAST).expect("a step");
-            outputs.push(field.everything());
+            outputs.push(field.all_outputs());
         }
         outputs
     };
@@ -161,7 +161,7 @@ fn snapshot_contains_the_dataset_start() {
     for env in [&mut field, &mut other] {
         env.env.step(EAST).expect("a step");
     }
-    assert!(field.everything() == other.everything());
+    assert!(field.all_outputs() == other.all_outputs());
     let goals = [&mut field, &mut other].map(|env| {
         let mut goal = vec![0; 27];
         env.env.render_goal(FrameMut::new(3, 3, &mut goal)).expect("a goal");

@@ -41,7 +41,7 @@ class IntegerFactor(spaces.Discrete):
 
 
 class Group(spaces.Dict):
-    """A group of factors, or all of them."""
+    """A group of factors, or all factors."""
 
     def leaves(self, prefix=''):
         for key, space in self.spaces.items():
@@ -65,7 +65,7 @@ class Group(spaces.Dict):
 class Room(gymnasium.Env):
     """A point in a room, with every feature of environments that the bridge supports.
 
-    It prints, and it reads standard input, which workers use for requests.
+    The room prints text and reads standard input; workers use the descriptors of both for shared memory and requests.
     """
 
     metadata = {'render_modes': ['rgb_array']}
@@ -94,7 +94,7 @@ class Room(gymnasium.Env):
         super().reset(seed=seed)
         self.variation_space.start(seed, options or {})
         print('a new episode')
-        # The bridge resets the environment once with seed 0 to describe it; no other environment waits then.
+        # The bridge resets the environment once with seed 0 to describe it. At that time no other environment waits.
         self.meets = self.meet and seed
         if self.meets:
             self.wait_for_another('reset-')
@@ -202,7 +202,7 @@ class Field(gymnasium.Env):
 
 
 class Jointed(Field):
-    """Has a `set_state` method with two arguments, which no single column provides."""
+    """An environment whose `set_state` has two arguments, which no single column provides."""
 
     _set_state = None
 
@@ -211,19 +211,19 @@ class Jointed(Field):
 
 
 class Declared(Jointed):
-    """Declares in `swm_callables` which method sets its state."""
+    """An environment whose `swm_callables` names the method that sets its state."""
 
     swm_callables = [{'method': 'place', 'args': {'x': {'value': 'x'}, 'label': {'value': 'ab', 'in_dataset': False}}}]
 
 
 class Choices(gymnasium.Env):
-    """Observes its last action only, and does not render."""
+    """An environment that observes only its last action and does not render."""
 
     SPACES = {
         'discrete': spaces.Discrete(3, start=-1),
         'multi': spaces.MultiDiscrete([2, 3]),
         'binary': spaces.MultiBinary(3),
-        'whole': spaces.Box(0, 2, (2, 2), np.int32),
+        'integer_box': spaces.Box(0, 2, (2, 2), np.int32),
         'tuple': spaces.Tuple([spaces.Discrete(2), spaces.MultiDiscrete([3, 4])]),
         'dict': spaces.Dict({'a': spaces.Box(-1, 1, (2,)), 'b': spaces.Box(0, np.inf, (1,))}),
         'mixed': spaces.Dict({'a': spaces.Box(-1, 1, (2,)), 'b': spaces.Discrete(2)}),
@@ -249,7 +249,7 @@ class Choices(gymnasium.Env):
 
 
 class Coated(gymnasium.Wrapper):
-    """A wrapper that adds factors and rendering to an environment with neither, whatever the render mode."""
+    """A wrapper that adds factors, and rendering in every render mode, to an environment without them."""
 
     def __init__(self):
         super().__init__(Choices('discrete'))

@@ -30,7 +30,7 @@ fn config() -> Option<GymConfig> {
 }
 
 /// Returns whether the Python of the tests can import a module.
-fn has(config: &GymConfig, module: &str) -> bool {
+fn can_import(config: &GymConfig, module: &str) -> bool {
     let program = &config.python.program;
     let status = std::process::Command::new(program).args(["-c", &format!("import {module}")]).output();
     let found = status.expect("$SWM_PYTHON starts").status.success();

@@ -56,7 +56,7 @@ fn a_panic_ends_the_worker() {
     assert!(ends_in_time(id));
 }
 
-/// The kernel ends a child with the thread that started it, so a permanent thread must start the workers.
+/// The kernel kills a child when the thread that started it ends, so a permanent thread must start the workers.
 #[test]
 fn a_worker_outlives_the_thread_that_made_its_environment() {
     if config().is_none() {

@@ -18,7 +18,7 @@ pub fn make(text: &str, config: &GymConfig) -> Box<dyn Env> {
 /// Plays episodes with random actions and returns the bytes of all their outputs, one vector per slot.
 pub fn play(text: &str, config: &GymConfig, episodes: &[u64], workers: usize, steps: usize) -> Vec<Vec<u8>> {
     let envs = episodes.iter().map(|_| make(text, config)).collect();
-    let threads = threads(workers).expect("threads");
+    let threads = threads(workers).expect("a thread pool");
     let mut pool = EnvPool::new(envs, Some((48, 64)), Some(steps), threads).expect("a pool");
     let mut policy = RandomPolicy::new(pool.spec(), episodes.len());
     let mut actions = Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("a schema"), episodes.len());
@@ -70,7 +70,7 @@ impl RecordedEnv {
         self.row.row(0).to_f64(name).expect("a column")
     }
 
-    pub fn everything(&mut self) -> Vec<u8> {
+    pub fn all_outputs(&mut self) -> Vec<u8> {
         self.env.observe(&mut self.row.row_mut(0));
         let mut bytes: Vec<u8> =
             (0..self.row.schema().columns().len()).flat_map(|column| self.row.bytes(column)).copied().collect();
@@ -93,7 +93,7 @@ fn outputs_do_not_depend_on_threads_or_other_environments() {
         assert!(serial == play(text, &config, &[0, 1, 2, 3], 4, 6), "{text}: four threads differ from one");
         assert!(serial[0] != serial[1], "{text}: two seeds give two episodes");
         assert!(serial[..2] == play(text, &config, &[0, 1], 2, 6), "{text}: two environments differ from four");
-        assert!(serial[3] == play(text, &config, &[3], 1, 6)[0], "{text}: one alone differs");
+        assert!(serial[3] == play(text, &config, &[3], 1, 6)[0], "{text}: a single environment differs");
     }
 }
 
@@ -104,7 +104,7 @@ fn environments_run_in_parallel_on_one_thread() {
     // Each environment waits in its reset and in its step for the other environment, except in episodes of seed 0.
     let text = format!("{ROOM},meet={}", folder.path().display());
     let envs = (0..2).map(|_| make(&text, &config)).collect();
-    let mut pool = EnvPool::new(envs, None, None, threads(1).expect("threads")).expect("a pool");
+    let mut pool = EnvPool::new(envs, None, None, threads(1).expect("a thread pool")).expect("a pool");
     let actions = Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("a schema"), 2);
     for seeds in [[0, 0], [1, 2]] {
         let reset = |(slot, seed)| Reset { slot, seed, options: ResetOptions::default() };
@@ -131,26 +131,26 @@ fn a_dispatched_call_runs_once() {
     plain.env.step(push).expect("a step");
     assert!(dispatched.dispatch(PendingCall::Step(push)));
     dispatched.env.step(push).expect("the step");
-    assert!(plain.everything() == dispatched.everything());
+    assert!(plain.all_outputs() == dispatched.all_outputs());
     // Any other call completes the dispatched step first.
     plain.env.step(push).expect("a step");
     assert!(dispatched.dispatch(PendingCall::Step(push)));
     assert!(plain.env.snapshot() == dispatched.env.snapshot());
-    assert!(plain.frame(9, 12) == dispatched.frame(9, 12) && plain.everything() == dispatched.everything());
+    assert!(plain.frame(9, 12) == dispatched.frame(9, 12) && plain.all_outputs() == dispatched.all_outputs());
     plain.env.step(push).and_then(|_| plain.env.step(none)).expect("two steps");
     assert!(dispatched.dispatch(PendingCall::Step(push)));
     dispatched.env.step(none).expect("another step");
-    assert!(plain.everything() == dispatched.everything());
+    assert!(plain.all_outputs() == dispatched.all_outputs());
     // A reset completes the dispatched step first, too.
     assert!(dispatched.dispatch(PendingCall::Step(push)));
     for env in [&mut plain, &mut dispatched] {
         env.env.reset(7, &start).expect("a reset");
     }
-    assert!(plain.everything() == dispatched.everything());
+    assert!(plain.all_outputs() == dispatched.all_outputs());
     // An invalid call is not dispatched; the call itself returns the error and changes nothing.
     assert!(!dispatched.dispatch(PendingCall::Step(Action::Discrete(&[0]))));
     assert!(dispatched.env.step(Action::Discrete(&[0])).is_err());
-    assert!(plain.everything() == dispatched.everything());
+    assert!(plain.all_outputs() == dispatched.all_outputs());
 }
 
 #[test]
@@ -282,7 +282,7 @@ fn restores_snapshot_bit_for_bit() {
         actions
             .flat_map(|action| {
                 room.env.step(Action::Continuous(&action)).expect("a step");
-                room.everything()
+                room.all_outputs()
             })
             .collect::<Vec<u8>>()
     };

@@ -34,7 +34,7 @@ fn outputs_are_the_same_when_a_worker_is_killed() {
                 kill_process(id);
             }
             env.env.step(Action::Discrete(&[i64::from(t % 2)])).expect("a step");
-            outputs.push(env.everything());
+            outputs.push(env.all_outputs());
         }
         outputs
     };
@@ -62,11 +62,11 @@ fn dispatched_calls_are_repeated_in_a_new_worker() {
         };
         dispatch(&mut env, "reset", PendingCall::Reset(4, &options));
         env.env.reset(4, &options).expect("a reset");
-        let mut outputs = env.everything();
+        let mut outputs = env.all_outputs();
         for call in ["first", "second"] {
             dispatch(&mut env, call, PendingCall::Step(Action::Discrete(&[1])));
             env.env.step(Action::Discrete(&[1])).expect("a step");
-            outputs.extend(env.everything());
+            outputs.extend(env.all_outputs());
         }
         outputs
     };
@@ -82,7 +82,7 @@ pub fn kill_process(id: u32) {
 }
 
 #[test]
-fn a_worker_that_always_dies_is_an_error_with_its_output() {
+fn repeated_worker_deaths_are_an_error_with_the_last_output() {
     let Some(config) = config() else { return };
     let mut env = make(&format!("{ROOM},die_at=2"), &config);
     env.reset(0, &ResetOptions::default()).expect("a reset");
@@ -97,7 +97,7 @@ fn a_worker_that_always_dies_is_an_error_with_its_output() {
 }
 
 #[test]
-fn an_exception_is_an_error_without_another_attempt() {
+fn an_exception_is_reported_without_a_retry() {
     let Some(config) = config() else { return };
     let mut env = make(&format!("{ROOM},raise_at=2"), &config);
     env.reset(0, &ResetOptions::default()).expect("a reset");

@@ -12,7 +12,7 @@ fn actions_of_every_space_reach_the_environment() {
         ("discrete", Space::Discrete { n: 3, start: -1 }, &[-1]),
         ("multi", multi(&[2, 3]), &[1, 2]),
         ("binary", multi(&[2, 2, 2]), &[1, 0, 1]),
-        ("whole", multi(&[3, 3, 3, 3]), &[0, 1, 2, 2]),
+        ("integer_box", multi(&[3, 3, 3, 3]), &[0, 1, 2, 2]),
         ("tuple", multi(&[2, 3, 4]), &[1, 2, 3]),
     ];
     for (kind, space, action) in cases {

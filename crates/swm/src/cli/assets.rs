@@ -146,7 +146,7 @@ pub fn assets(args: &AssetsArgs, as_json: bool) -> anyhow::Result<()> {
             }
             emit(&match &names[..] {
                 [] => "nothing is installed\n".to_owned(),
-                names => format!("sound: {}\n", names.join(", ")),
+                names => format!("intact: {}\n", names.join(", ")),
             });
             Ok(())
         }

@@ -24,13 +24,13 @@ pub struct BenchArgs {
 enum BenchCommand {
     /// Measure steps per second of environments, and collecting into Lance
     ///
-    /// The reference implementation is measured in turn where SWM_REFERENCE_PYTHON names a Python that has it.
+    /// The reference implementation is measured in turn where SWM_REFERENCE_PYTHON names a Python with its package.
     #[command(after_help = "Example: swm bench envs swm/PushT-v1")]
     Envs(EnvsArgs),
     /// Measure planning with CEM: the solver alone, then with a LeWM
     ///
-    /// First, iterations per second with a model of no cost, and the fraction of the time that the solver takes next to a
-    /// model; then, with a LeWM of the published size, a plan, the costs of one iteration, and the encoding of an image.
+    /// First, iterations per second with a model that takes no time, and the solver's fraction of the time of a plan;
+    /// then, with a LeWM of the published size, a plan, the costs of one iteration, and the encoding of an image.
     #[command(after_help = "Example: swm bench plan --envs 16")]
     Plan(PlanArgs),
     /// Measure a training step of a LeWM of the published size
@@ -159,18 +159,18 @@ struct PlanArgs {
     /// Pairs of measurements: this engine and the reference implementation
     #[arg(long, default_value_t = 5)]
     pairs: usize,
-    /// Seconds per measurement with a model of no cost
+    /// Seconds per measurement with a model that takes no time
     #[arg(long, default_value_t = 1.0)]
     seconds: f64,
     /// Iterations per plan with a LeWM; 0 skips the LeWM
     #[arg(long, default_value_t = 30)]
     iterations: usize,
-    /// Device of the LeWM: cpu, vulkan, cuda (:1 for the second such GPU) or auto
+    /// Device of the LeWM: cpu, vulkan[:I], cuda[:I] or auto
     #[arg(long, default_value = "cpu")]
     device: String,
 }
 
-/// Measures the solver, then a LeWM that it plans with.
+/// Measures the solver alone, then planning with a LeWM.
 fn plan(args: &PlanArgs, context: &Context) -> anyhow::Result<()> {
     let planner = bench_plan(&PlanBenchConfig {
         envs: args.envs.clone(),
@@ -202,7 +202,7 @@ struct TrainArgs {
     /// Pairs of measurements: this engine and the reference implementation
     #[arg(long, default_value_t = 5)]
     pairs: usize,
-    /// Device: cpu, vulkan, cuda (:1 for the second such GPU) or auto
+    /// Device: cpu, vulkan[:I], cuda[:I] or auto
     #[arg(long, default_value = "cpu")]
     device: String,
 }
@@ -260,7 +260,7 @@ struct EnvsArgs {
     /// Episodes that the reference collects per measurement; 0 skips collecting
     #[arg(long, default_value_t = 8)]
     episodes: usize,
-    /// Steps per collected episode; fewer steps weigh resets more
+    /// Steps per collected episode; resets weigh more in shorter episodes
     #[arg(long, default_value_t = 50)]
     episode_steps: usize,
 }

@@ -44,7 +44,7 @@ enum CheckpointsCommand {
         /// The model: `swm models` lists them
         #[arg(long)]
         model: String,
-        /// The dataset it was trained on, for the scaling of actions and columns
+        /// The training dataset, for the scaling of actions and columns
         #[arg(long, value_name = "DATASET")]
         data: String,
         /// The checkpoint to write: a path or a name
@@ -84,7 +84,7 @@ pub fn checkpoints(args: &CheckpointsArgs, as_json: bool) -> anyhow::Result<()> 
     }
 }
 
-/// Loads a checkpoint by path or name; loading compares the hash of the weights.
+/// Loads a checkpoint by path or name; loading verifies the hash of the weights.
 fn load(given: &str) -> Result<(PathBuf, CheckpointInfo)> {
     let path = home::find_checkpoint(given)?;
     let info = swm_models::load(&path, &Device::flex())?.info()?;

@@ -30,10 +30,10 @@ pub struct CollectArgs {
     /// Number of episodes of the complete dataset
     #[arg(long, default_value_t = 100)]
     episodes: usize,
-    /// Seed; it and the index of an episode determine the episode
+    /// Seed; an episode depends only on the seed and on the episode's index
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Parallel environments; the dataset does not depend on it
+    /// Parallel environments; the dataset does not depend on their number
     #[arg(long, default_value_t = 8)]
     envs: usize,
     /// Frame size in pixels: 64 or HEIGHTxWIDTH
@@ -102,7 +102,7 @@ pub struct Collection<'a> {
     pub config: CollectConfig,
     /// Whether to create, continue or replace the dataset.
     pub mode: WriteMode,
-    /// How frames are encoded.
+    /// The codec of frames.
     pub codec: ImageCodec,
     /// Wrappers of the frames.
     pub wrappers: WrapperArgs,
@@ -163,7 +163,7 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
         collect_target::check(location, collection.mode, &manifest, collection.mix_renderers)?;
     }
     let writer = collection.writer(&world.collect_schema(config.goal)?, manifest)?;
-    // A shard has consecutive episodes, so that the committed dataset has all of them in order.
+    // A shard has consecutive episodes, so that the committed dataset has all episodes in order.
     let episodes = collection.shard.map_or(0..config.episodes, |Shard { index, count }| {
         config.episodes * index / count..config.episodes * (index + 1) / count
     });

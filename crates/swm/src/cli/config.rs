@@ -5,10 +5,10 @@ use std::collections::BTreeMap;
 use swm_core::{Error, Result, VariationRequest};
 use swm_data::ImageCodec;
 
-/// How frames are stored in formats with a choice of codec.
+/// The codec of stored frames, for formats that support several codecs.
 #[derive(Args)]
 pub struct CodecArgs {
-    /// Codec of stored frames, in formats with a choice
+    /// Codec of stored frames, in formats with several codecs
     #[arg(long, value_enum, default_value_t = Codec::Qoi)]
     codec: Codec,
     /// Quality of JPEG frames, 1 to 100
@@ -88,7 +88,7 @@ impl VariationArgs {
 /// Parses a frame size in pixels: `64` or `HEIGHTxWIDTH`.
 ///
 /// # Errors
-/// When it is malformed or a side is not within 4 to 4096.
+/// When the text is malformed or a side is not within 4 to 4096.
 pub fn image_size(given: &str) -> std::result::Result<(usize, usize), String> {
     let parse = |s: &str| s.trim().parse::<usize>().ok().filter(|n| (4..=4096).contains(n));
     let size = match given.split_once('x') {

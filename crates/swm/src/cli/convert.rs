@@ -1,4 +1,4 @@
-//! `swm convert`: writes a dataset in another format or codec, and compares both.
+//! `swm convert`: writes a dataset in another format or codec, and compares the result with the source.
 
 use super::config::CodecArgs;
 use super::datasets::bytes;

@@ -128,7 +128,7 @@ pub fn summary(reader: &dyn Reader) -> Result<Value> {
     }))
 }
 
-/// Writes a video of each previewed episode, and a contact sheet of all.
+/// Writes a video of each previewed episode, and a contact sheet of these episodes.
 pub fn preview(args: &PreviewArgs, as_json: bool) -> anyhow::Result<()> {
     let reader = open(&args.dataset)?;
     let episodes = args.episodes.min(reader.episodes().len());

@@ -38,7 +38,7 @@ pub struct DemoArgs {
     /// Episodes to evaluate per policy and condition
     #[arg(long, default_value_t = 100)]
     eval_episodes: usize,
-    /// Parallel environments of the evaluation; results do not depend on it
+    /// Parallel environments of the evaluation; results do not depend on their number
     #[arg(long, default_value_t = 50)]
     envs: usize,
     /// Training settings, such as schedule.steps=500
@@ -52,7 +52,7 @@ const ENV: &str = "swm/TwoRoom-v1";
 /// The shifted factor: the floor changes from white to pale blue.
 const SHIFT: (&str, [f64; 3]) = ("background.color", [200.0, 220.0, 255.0]);
 
-/// The solver of the demo: a smaller search than the paper's is enough for two rooms.
+/// The solver of the demo: two rooms need a smaller search than the tasks of the paper.
 const SEARCH: Cem = Cem { samples: 128, iterations: 8, elites: 16, sigma: 1.0 };
 const HORIZON: usize = 6;
 const RECEDING_HORIZON: usize = 2;

@@ -1,4 +1,5 @@
-//! `swm doctor`: finds the defects of a dataset and the models it can train, and writes the intact episodes to a new one.
+//! `swm doctor`: finds the defects of a dataset and the models it can train, and writes the intact episodes
+//! to a new dataset.
 
 use super::convert::{self, TargetArgs};
 use super::progress::{control, print_summary};
@@ -76,7 +77,7 @@ fn report(diagnosis: &Diagnosis) -> String {
     if diagnosis.problems() == 0 {
         text += "       no problems\n";
     } else {
-        text += &format!("    sound: {} of {} episodes\n", diagnosis.intact.len(), diagnosis.episodes);
+        text += &format!("   intact: {} of {} episodes\n", diagnosis.intact.len(), diagnosis.episodes);
     }
     let models = diagnosis.models.iter().map(|fit| {
         let answer = if fit.fits() { format!("yes, on {} episodes", fit.episodes) } else { fit.missing.join("; ") };

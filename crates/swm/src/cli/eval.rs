@@ -25,7 +25,7 @@ pub struct EvalArgs {
     /// Several policies are compared from the same starts. `simulator` plans by stepping the environment itself.
     #[arg(required = true)]
     policies: Vec<String>,
-    /// The environment (default: the one the first checkpoint was trained on)
+    /// The environment (default: the training environment of the first checkpoint)
     #[arg(long)]
     env: Option<String>,
     /// Dataset to take starts and goals from
@@ -51,7 +51,7 @@ pub struct EvalArgs {
     /// Time limit, in steps (default: the environment's; 50 with --dataset)
     #[arg(long, value_name = "STEPS")]
     budget: Option<usize>,
-    /// How episodes count: strict, or compat with the reference implementation
+    /// Rule for counting episodes: strict, or compat with the reference
     ///
     /// strict leaves out episodes that are solved at the start.
     #[arg(long, value_enum, default_value_t = Protocol::Strict)]
@@ -61,7 +61,7 @@ pub struct EvalArgs {
     hold: usize,
     /// Parallel environments
     ///
-    /// Results do not depend on it, except with the compat protocol.
+    /// Results do not depend on their number, except with the compat protocol.
     #[arg(long, default_value_t = 16)]
     envs: usize,
     /// Frame size if no checkpoint determines it: 64 or HEIGHTxWIDTH
@@ -92,7 +92,7 @@ pub struct EvalArgs {
     planner: PlannerArgs,
 }
 
-/// How episodes count.
+/// The rule for counting episodes.
 #[derive(Clone, Copy, ValueEnum)]
 enum Protocol {
     /// Starts that are solved already do not count
@@ -140,7 +140,7 @@ impl EvalArgs {
         }
         if self.no_pixels && image.is_some() {
             let problem = "a checkpoint among the policies requires frames";
-            return Err(Error::config("--no-pixels", problem, "leave it out"));
+            return Err(Error::config("--no-pixels", problem, "remove the flag"));
         }
         let image = image.map_or([self.image.0, self.image.1], |side| [side, side]);
         Ok(EvalRequest {

@@ -23,7 +23,7 @@ enum NamedKind {
     Direct(PolicyKind),
     /// Planning by stepping the environment itself.
     Simulator,
-    /// A checkpoint that predicts. If it also acts (`direct`), it plans only where a solver is named.
+    /// A checkpoint that predicts. If it also acts (`direct`), it plans only if the command names a solver.
     Checkpoint { given: String, block: usize, history: usize, direct: Option<PolicyKind> },
 }
 
@@ -77,7 +77,7 @@ impl NamedPolicy {
             }
             NamedKind::Checkpoint { given, block, history, .. } => (Model::Checkpoint(given), block, history),
         };
-        // The names of several solvers contain their settings, as the command line gives them.
+        // With several solvers, each name contains the solver's text from the command line.
         let given = &planner.solvers;
         let requests = planner.solvers(env)?.into_iter().enumerate().map(|(i, solver)| {
             let name = if given.len() > 1 { format!("{name} ({})", given[i]) } else { name.clone() };

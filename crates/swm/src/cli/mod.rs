@@ -39,7 +39,7 @@ pub struct Cli {
     /// Print one JSON document on standard output instead of tables
     #[arg(long, global = true)]
     json: bool,
-    /// Worker threads (default: one per core); results do not depend on it
+    /// Worker threads (default: one per core); results do not depend on their number
     #[arg(long, global = true, default_value_t = 0, hide_default_value = true, value_name = "N")]
     threads: usize,
     /// Renderer of 3-D environments: egl, cpu or auto
@@ -66,7 +66,7 @@ enum Command {
     /// List the visual wrappers and their settings
     #[command(after_help = "Example: swm wrappers")]
     Wrappers,
-    /// List the solvers, the actions they plan, and what they require of a model
+    /// List the solvers, their kinds of actions, and their requirements of a model
     #[command(after_help = "Example: swm solvers --json")]
     Solvers,
     /// Run a policy and store its episodes
@@ -84,7 +84,7 @@ enum Command {
     /// Write videos and a contact sheet of some episodes of a dataset
     #[command(after_help = "Example: swm preview rooms --output preview --episodes 4")]
     Preview(datasets::PreviewArgs),
-    /// Write a dataset in another format or codec, and compare both
+    /// Write a dataset in another format or codec, and verify the result
     #[command(after_help = "Example: swm convert rooms rooms-jpeg --codec jpeg")]
     Convert(convert::ConvertArgs),
     /// Find defects of a dataset and the models it can train; repair it
@@ -122,7 +122,7 @@ enum Command {
     Demo(demo::DemoArgs),
 }
 
-/// The global options, and the interrupt flag, for commands that run long.
+/// The global options and the interrupt flag, for long-running commands.
 pub struct Context {
     /// Whether to print JSON.
     pub json: bool,
@@ -245,7 +245,7 @@ mod tests {
     use super::Cli;
     use clap::{Command, CommandFactory as _};
 
-    /// Columns of the first line of a help text.
+    /// The width, in columns, that the first line of a help text must not reach.
     const MAX_COLUMNS: usize = 80;
 
     fn check(command: &Command, path: &str) {

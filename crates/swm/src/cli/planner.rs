@@ -9,7 +9,7 @@ use swm_plan::ActionKind;
 use swm_plan::objective::ObjectiveConfig;
 use swm_plan::{MpcConfig, SOLVERS};
 
-/// Settings of planning. The defaults are those of the paper's experiments.
+/// Settings of planning. The defaults are those of the experiments in the stable-worldmodel paper.
 #[derive(Args, Clone)]
 #[command(next_help_heading = "Planning")]
 pub struct PlannerArgs {
@@ -29,7 +29,7 @@ pub struct PlannerArgs {
     /// A checkpoint has its own action block.
     #[arg(long, default_value_t = 5, value_name = "STEPS")]
     pub action_block: usize,
-    /// Do not initialise a plan with the rest of the previous plan
+    /// Do not initialise a plan with the remaining steps of the previous plan
     #[arg(long)]
     pub cold_start: bool,
     /// Time limit of a plan; results then depend on the machine
@@ -68,15 +68,15 @@ impl PlannerArgs {
             ActionKind::Continuous => SOLVERS.get("cem")?,
             ActionKind::Discrete => {
                 SOLVERS.rows.iter().find(|row| row.actions == actions && row.needs.is_empty()).ok_or_else(|| {
-                    Error::config("--solver", "none plans discrete actions", "`swm solvers` lists them")
+                    Error::config("--solver", "no solver plans discrete actions", "`swm solvers` lists them")
                 })?
             }
         };
         Ok(vec![Choice { id: first.id.to_owned(), settings: (first.defaults)() }])
     }
 
-    /// Returns the policy that plans in a model with a solver. `block` is the model's count of environment steps per
-    /// model step, `history` its count of observations.
+    /// Returns the policy that plans in a model with a solver. `block` is the number of environment steps in a
+    /// model step, `history` the number of observations that the model gets.
     ///
     /// # Errors
     /// When a setting of planning or of the objective is invalid.

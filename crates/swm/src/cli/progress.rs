@@ -12,7 +12,7 @@ use swm_core::run::{Control, Event, Progress};
 /// The time between plain lines.
 const PLAIN_INTERVAL: Duration = Duration::from_secs(10);
 
-/// How many metrics of a model are shown.
+/// The number of metrics of a model in a progress message.
 const SHOWN_METRICS: usize = 4;
 
 /// Returns a control that shows the stages of a run and stops the run at Ctrl-C.
@@ -54,7 +54,7 @@ pub struct StageDisplay {
     subject: String,
     bar: ProgressBar,
     start: Instant,
-    /// When the last plain line was printed; `None` on a terminal.
+    /// The time of the last plain line; `None` on a terminal.
     last_line: Option<Instant>,
 }
 

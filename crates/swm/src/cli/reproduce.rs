@@ -13,9 +13,9 @@ use std::path::PathBuf;
 /// Arguments of `swm reproduce`.
 #[derive(Args)]
 pub struct ReproduceArgs {
-    /// A results.json, or its folder
+    /// A results.json, or the folder that contains it
     results: PathBuf,
-    /// Parallel environments; results do not depend on it
+    /// Parallel environments; results do not depend on their number
     #[arg(long, default_value_t = 16)]
     envs: usize,
     /// Folder of the new results.json (default: none is written)

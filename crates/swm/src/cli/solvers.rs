@@ -6,7 +6,7 @@ use serde_json::{Map, Value, json};
 use swm_core::{Error, Result};
 use swm_plan::{SOLVERS, SolverEntry};
 
-/// Lists the solvers, their settings, and what they require of a model.
+/// Lists the solvers, their settings, and their requirements of a model.
 pub fn solvers(as_json: bool) -> anyhow::Result<()> {
     if as_json {
         let all: Map<String, Value> = SOLVERS.rows.iter().map(|row| (row.id.to_owned(), describe(row))).collect();
@@ -39,7 +39,7 @@ fn describe(row: &SolverEntry) -> Value {
     })
 }
 
-/// Returns settings as the command line takes them, one per line: `samples=300`, `optimizer.step=0.1`.
+/// Returns settings in the form of the command line, one per line: `samples=300`, `optimizer.step=0.1`.
 fn settings_lines(settings: &Value) -> String {
     let mut lines = vec![];
     flatten("", settings, &mut lines);
@@ -59,7 +59,7 @@ fn flatten<'a>(path: &str, value: &'a Value, lines: &mut Vec<(String, &'a Value)
     }
 }
 
-/// Formats a value as the command line takes it. Floats have the digits of single precision.
+/// Formats a value in the form of the command line. Floats have the digits of single precision.
 fn plain(value: &Value) -> String {
     match value {
         Value::String(text) => text.clone(),

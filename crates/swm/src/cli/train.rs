@@ -61,7 +61,7 @@ pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
     }
     if args.encoder.is_some() && !family.borrows_encoder {
         let problem = format!("{} trains its own encoder", family.id);
-        anyhow::bail!(Error::config("--encoder", problem, "leave it out, or train inverse"));
+        anyhow::bail!(Error::config("--encoder", problem, "remove the flag, or train inverse"));
     }
     let options = TrainOptions {
         resume: args.resume,

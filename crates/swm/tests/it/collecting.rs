@@ -14,7 +14,7 @@ fn with<'a>(args: &[&'a str], more: &[&'a str]) -> Vec<&'a str> {
 fn content(swm: &Swm, name: &str) -> (String, usize) {
     let found = swm.json(&["inspect", name]);
     let hash = found["content_hash"].as_str().expect("the hash is a string").to_owned();
-    (hash, usize::try_from(found["episodes"].as_u64().expect("an integer")).expect("it fits usize"))
+    (hash, usize::try_from(found["episodes"].as_u64().expect("an integer")).expect("the count fits usize"))
 }
 
 #[test]
@@ -48,7 +48,7 @@ fn killed_collection_keeps_committed_episodes_and_resumes() {
             }
         }
     };
-    child.kill().expect("SIGKILL");
+    child.kill().expect("killing the collection");
     child.wait().expect("the process ends");
     let (_, kept) = content(&swm, "rooms");
     assert!(
@@ -79,7 +79,7 @@ fn interrupted_collection_keeps_finished_episodes() {
     }
     std::thread::sleep(Duration::from_millis(300));
     let interrupted =
-        std::process::Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill runs");
+        std::process::Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("starting `kill`");
     assert!(interrupted.success());
     let output = child.wait_with_output().expect("the process ends");
     assert_eq!(output.status.code(), Some(130), "{}", text(&output.stderr));
@@ -141,10 +141,10 @@ fn shards_of_two_renderers_require_mix_renderers() {
     }
     let logs = swm.path("datasets/swings.lance/_shards");
     let second = std::fs::read_dir(logs)
-        .expect("shards")
+        .expect("the folder of shards")
         .map(|entry| entry.expect("a shard").path())
         .max()
-        .expect("at least one result");
+        .expect("two shards");
     let log = second.join("begun.json");
     let changed = std::fs::read_to_string(&log).expect("a log").replace(r#""renderer":"cpu"#, r#""renderer":"egl"#);
     std::fs::write(&log, changed).expect("the file is writable");

@@ -13,7 +13,7 @@ fn converted_dataset_has_the_same_content() {
     collect(&swm, "rooms");
     let report = swm.json(&["convert", "rooms", "copy", "--codec", "png"]);
     assert_eq!((&report["episodes"], &report["kept"]), (&5.into(), &0.into()));
-    let columns = report["columns"].as_array().expect("columns");
+    let columns = report["columns"].as_array().expect("an array of columns");
     assert!(columns.iter().all(|column| column["exact"] == true), "{columns:?}");
     let checksum = |name: &str| swm.json(&["inspect", name, "--checksum"])["checksum"].clone();
     assert_eq!(checksum("rooms"), checksum("copy"));
@@ -49,7 +49,8 @@ fn converted_dataset_has_the_same_content() {
         assert!(inspected.contains(word), "{word}: {inspected}");
     }
     let listed = swm.json(&["datasets"]);
-    let names: Vec<&str> = listed.as_array().expect("datasets").iter().filter_map(|d| d["name"].as_str()).collect();
+    let names: Vec<&str> =
+        listed.as_array().expect("an array of datasets").iter().filter_map(|d| d["name"].as_str()).collect();
     assert_eq!(names, ["copy", "jpeg", "others", "rooms"]);
 }
 
@@ -59,7 +60,12 @@ fn doctor_finds_truncated_files() {
     collect(&swm, "rooms");
     let clean = swm.json(&["doctor", "rooms"]);
     assert_eq!((&clean["problems"], clean["sound"].as_array().map(Vec::len)), (&0.into(), Some(5)));
-    let lewm = clean["models"].as_array().expect("models").iter().find(|fit| fit["model"] == "LeWM").expect("listed");
+    let lewm = clean["models"]
+        .as_array()
+        .expect("an array of models")
+        .iter()
+        .find(|fit| fit["model"] == "LeWM")
+        .expect("the doctor lists LeWM");
     assert_eq!(lewm["missing"].as_array().map(Vec::len), Some(0), "{lewm}");
     let output = text(&swm.run(&["doctor", "rooms"]).stdout);
     assert!(output.contains("no problems") && output.contains("TD-MPC2"), "{output}");

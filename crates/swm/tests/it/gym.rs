@@ -47,8 +47,8 @@ fn gymnasium_environments_are_collected_and_evaluated() {
     assert!(text(&output.stderr).contains("/no/such/python (named by $SWM_PYTHON)"), "{}", text(&output.stderr));
 }
 
-/// An environment whose state grows by a constant speed that depends on the seed and not on the action. An episode that
-/// starts from a recorded state therefore reaches all later recorded states.
+/// An environment whose state grows in every step by a value that depends on the seed and not on the action. An episode
+/// that starts from a recorded state therefore reaches all later recorded states.
 const TRAIN: &str = "
 import gymnasium, numpy as np
 from gymnasium import spaces
@@ -89,7 +89,7 @@ fn environment_with_state_setters_starts_from_a_dataset() {
     let eval = ["eval", "random", "--env", train, "--dataset", "trains", "--goal-offset", "4", "--episodes", "6"];
     let with = |more: &[&str]| swm.json(&eval.iter().chain(more).copied().collect::<Vec<_>>());
     let results = with(&["--no-pixels", "--envs", "2", "-o", "two"]);
-    let episodes = results["runs"][0]["episodes"].as_array().expect("episodes");
+    let episodes = results["runs"][0]["episodes"].as_array().expect("an array of episodes");
     assert_eq!(episodes.len(), 6);
     assert!(episodes.iter().all(|episode| episode["success"] == true && episode["steps"] == 4), "{episodes:?}");
     swm.json(&["collect", "CartPole-v1", "-o", "carts", "--policy", "random", "--episodes", "2", "--no-pixels"]);

@@ -1,9 +1,9 @@
-//! Tests of the listing commands: `envs`, `fovs`, `datasets`, `models`, `checkpoints`, and others.
+//! Tests of the commands that print lists, such as `envs`, `fovs`, `datasets`, `models` and `checkpoints`.
 
 use crate::{Swm, text};
 use serde_json::Value;
 
-/// Spaces of the 2-D environments of the reference implementation, from `reference/envs.json`.
+/// The spaces of the 2-D environments, recorded from the reference implementation.
 const REFERENCE: &str = include_str!("reference_envs.json");
 
 #[test]

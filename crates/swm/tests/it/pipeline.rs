@@ -120,10 +120,11 @@ fn compares_policies_from_the_same_starts_and_reproduces_results() {
         "planning with the true dynamics beats the floor"
     );
     let traces: Value =
-        serde_json::from_slice(&std::fs::read(swm.path("found/traces.json")).expect("traces")).expect("valid JSON");
+        serde_json::from_slice(&std::fs::read(swm.path("found/traces.json")).expect("the file of traces"))
+            .expect("valid JSON");
     assert!(traces[0]["policy"] == "small" && traces[0]["best"].as_array().map(Vec::len) == Some(2), "{}", traces[0]);
 
-    // Solvers that require gradients, latents, terms or constraints get them.
+    // These solvers require gradients, latents, terms or constraints of the checkpoint.
     for planner in [
         &["--solver", "gd,samples=4,iterations=2,optimizer.step=0.2", "--term", "control,weight=0.01"][..],
         &["--solver", "grasp,iterations=4,sync_every=2,sync_iterations=1"],
@@ -141,7 +142,7 @@ fn compares_policies_from_the_same_starts_and_reproduces_results() {
     let again = swm.json(&["reproduce", "found", "--threads", "1", "--envs", "3"]);
     assert_eq!((&again["holds"], &again["differences"]), (&Value::Bool(true), &Value::Array(vec![])));
     // Other weights under the same name are an error before any episode is played.
-    std::fs::remove_dir_all(swm.path("checkpoints/small")).expect("the file is removable");
+    std::fs::remove_dir_all(swm.path("checkpoints/small")).expect("removing the checkpoint");
     let other = ["train", "lewm", "--data", "rooms", "-o", "small", "schedule.steps=7", "data.batch_size=32"];
     swm.json(&other);
     swm.fails(&["reproduce", "found"], 2, &["weights of small", "hash"]);

@@ -6,7 +6,7 @@
 //! | `config.json` | family, configuration, statistics of the dataset |
 //! | `weights.safetensors` | weights under their published names |
 //! | `optimizer.safetensors`, `state.json` | the state of the optimizer and of the run, from which training continues |
-//! | `raw.safetensors` | the trained weights, where `weights.safetensors` holds their moving average |
+//! | `raw.safetensors` | the trained weights, if `weights.safetensors` holds the moving average of the weights |
 //! | `manifest.json` | provenance, and the hashes of the files above |
 //!
 //! A new checkpoint is written to a second folder, which then replaces the old one by renaming, so that a killed
@@ -27,9 +27,9 @@ use swm_core::{Error, Key, Manifest, Result, manifest};
 pub struct Checkpoint<M: Trainable> {
     /// The model.
     pub model: M,
-    /// The configuration of its training.
+    /// The training configuration.
     pub config: TrainConfig<M>,
-    /// Statistics of the dataset it was trained on.
+    /// Statistics of the training dataset.
     pub dataset_info: DatasetInfo,
     /// The provenance of the checkpoint; `hashes["weights"]` identifies the checkpoint.
     pub manifest: Manifest,
@@ -41,7 +41,7 @@ pub(crate) struct TrainState<M> {
     pub state: RunState,
     /// The state of the optimizer.
     pub moments: Named<HostTensor>,
-    /// The trained weights, where the checkpoint holds their moving average.
+    /// The trained weights; `None` if they are the weights of the checkpoint, which are a moving average otherwise.
     pub raw: Option<M>,
 }
 
@@ -72,13 +72,13 @@ impl<M: Trainable> Checkpoint<M> {
         locate(run).is_some()
     }
 
-    /// The hash of the weights.
+    /// Returns the hash of the weights.
     pub fn hash(&self) -> &str {
         self.manifest.hashes.get("weights").map_or("", String::as_str)
     }
 
-    /// The dimension of the actions of one model step: that of an environment action, times the frameskip.
-    pub fn actions(&self) -> usize {
+    /// Returns the action dimension of a model step: the dimension of an environment action times the frameskip.
+    pub fn action_dim(&self) -> usize {
         self.config.data.frameskip * self.dataset_info.action.dim()
     }
 
@@ -140,7 +140,7 @@ impl<M: Trainable> Checkpoint<M> {
     /// Loads the checkpoint and the state from which training continues.
     ///
     /// # Errors
-    /// As [`Checkpoint::load`], and when the checkpoint was saved without the state.
+    /// As [`Checkpoint::load`], and when the checkpoint was saved without the state of training.
     pub(crate) fn load_to_resume(run: &Path, device: &Device) -> Result<(Self, TrainState<M>)> {
         let (checkpoint, folder) = Self::read(run, device)?;
         let path = folder.join(STATE);
@@ -156,7 +156,7 @@ impl<M: Trainable> Checkpoint<M> {
     }
 }
 
-/// The family of the model in a run folder; `None` if the folder holds no checkpoint.
+/// Returns the family of the model in a run folder; `None` if the folder holds no checkpoint.
 pub fn family(run: &Path) -> Option<String> {
     let file: serde_json::Value = serde_json::from_slice(&read(&locate(run)?.join(CONFIG)).ok()?).ok()?;
     Some(file.get("family")?.as_str()?.to_owned())
@@ -201,8 +201,8 @@ impl<C: serde::de::DeserializeOwned> StoredCheckpoint<C> {
     }
 }
 
-/// Writes a checkpoint with additional files to a new folder and replaces the old one with it. Stores the hash of the
-/// weights in the manifest and returns it.
+/// Writes a checkpoint with additional files to a new folder, which then replaces the old checkpoint. Stores the hash
+/// of the weights in the manifest and returns the hash.
 pub(crate) fn write(
     run: &Path,
     config: &impl Serialize,
@@ -230,7 +230,7 @@ pub(crate) fn write(
     Ok(hash)
 }
 
-/// Renames the folder `new` to that of the checkpoint and removes the old checkpoint.
+/// Renames the folder `new` to the name of the checkpoint folder and removes the old checkpoint.
 fn replace(run: &Path, new: &Path) -> Result<()> {
     let (current, old) = (run.join(FOLDER), run.join(format!("{FOLDER}.old")));
     let rename = |from: &Path, to: &Path| {
@@ -262,11 +262,11 @@ pub(crate) fn load_weights<M: burn::module::Module>(model: M, path: &Path, hash:
 }
 
 fn broken(path: &Path, problem: String) -> Error {
-    Error::corrupt(path, problem, "train again, or copy the checkpoint again from where it came")
+    Error::corrupt(path, problem, "train again, or copy the checkpoint again from its source")
 }
 
-/// Returns the folder of a run's checkpoint: `run` itself, its checkpoint folder, or the old checkpoint that a killed
-/// process did not replace.
+/// Returns the folder of a run's checkpoint: `run`, the folder `checkpoint` in `run`, or the old checkpoint, which
+/// remains if a process was killed between the two renamings.
 fn locate(run: &Path) -> Option<PathBuf> {
     [run.to_owned(), run.join(FOLDER), run.join(format!("{FOLDER}.old"))]
         .into_iter()

@@ -1,17 +1,17 @@
-//! The device a model computes on: `cpu`, or a GPU whose backend was built in.
+//! The device on which a model computes: `cpu`, or a GPU whose backend was built in.
 
 use burn::tensor::Device;
 use swm_core::{Error, Result};
 
-/// The backends: the name, and whether this build contains the backend.
+/// The name of each backend, and whether this build contains the backend.
 const BACKENDS: [(&str, bool); 3] =
     [("cpu", true), ("vulkan", cfg!(feature = "vulkan")), ("cuda", cfg!(feature = "cuda"))];
 
-/// Parses the name of a device: `cpu`, `vulkan` or `cuda` (followed by `:1` for the second such GPU), or `auto`, which
-/// is a GPU backend that was built in, or else the CPU.
+/// Parses the name of a device: `cpu`, `vulkan` or `cuda` (optionally followed by a GPU index, such as
+/// `vulkan:1`), or `auto`, which is the last built-in backend of `cpu`, `vulkan`, `cuda`.
 ///
 /// # Errors
-/// When there is no such device, or this program was built without it.
+/// When the name is not that of a backend, the GPU index is no integer, or this build does not contain the backend.
 pub fn parse(name: &str) -> Result<Device> {
     if name == "auto" {
         let found = BACKENDS.iter().rev().find(|(_, built)| *built);
@@ -55,7 +55,7 @@ fn open(backend: &str, index: usize) -> Result<Device> {
     }
 }
 
-/// The name of a device in manifests.
+/// Returns the name of a device in manifests.
 pub fn name(device: &Device) -> String {
     if *device == Device::flex() { "cpu (flex)".to_owned() } else { format!("{device:?}") }
 }

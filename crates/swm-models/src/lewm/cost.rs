@@ -47,7 +47,7 @@ pub(super) struct PlanContext {
 impl LewmCost {
     /// Creates the planning cost of a trained model.
     pub fn new(checkpoint: &Checkpoint<Lewm>) -> Self {
-        Self::of(&checkpoint.model, &checkpoint.config.model, checkpoint.actions())
+        Self::of(&checkpoint.model, &checkpoint.config.model, checkpoint.action_dim())
     }
 
     /// Creates the planning cost of a model with the configuration `config` and actions of `action_dim` elements.

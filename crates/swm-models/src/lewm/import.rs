@@ -41,7 +41,7 @@ pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<Lewm>
 /// # Errors
 /// When the reference implementation has no such encoder, or a file cannot be written.
 pub fn export(checkpoint: &Checkpoint<Lewm>, folder: &Path, naming: Naming) -> Result<()> {
-    let actions = checkpoint.actions();
+    let actions = checkpoint.action_dim();
     let config = tree(&checkpoint.config.model, actions, CLASS, MODULES)?;
     write(folder, &config, &state(&checkpoint.model, naming))
 }

@@ -39,6 +39,6 @@ pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<Pldm>
 /// # Errors
 /// As [`crate::lewm::import::export`].
 pub fn export(checkpoint: &Checkpoint<Pldm>, folder: &Path, naming: Naming) -> Result<()> {
-    let config = tree(&checkpoint.config.model, checkpoint.actions(), CLASS, MODULES)?;
+    let config = tree(&checkpoint.config.model, checkpoint.action_dim(), CLASS, MODULES)?;
     write(folder, &config, &state(&checkpoint.model.model, naming))
 }

@@ -125,8 +125,8 @@ impl<N: ActionNetwork> Policy for FeedForwardPolicy<N> {
         Ok(())
     }
 
-    /// Returns the seconds of each model step, encoding included. The time of a parallel computation is divided equally among its
-    /// environments.
+    /// Returns the seconds of each model step, encoding included. The time of a parallel computation is divided equally
+    /// among its environments.
     fn take_latencies(&mut self) -> Vec<f64> {
         std::mem::take(&mut self.latencies)
     }

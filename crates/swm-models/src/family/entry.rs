@@ -27,7 +27,8 @@ pub struct FamilyEntry {
     pub borrows_encoder: bool,
     /// Loads a configuration from a preset (its name or the path of a TOML file) and `key=value` settings.
     pub config: LoadConfig,
-    /// Returns the dataset requirements of the default preset; `None` for a family that also requires another checkpoint.
+    /// Returns the dataset requirements of the default preset; `None` for a family that also requires another
+    /// checkpoint.
     pub requirements: fn() -> Result<Option<DatasetRequirements>>,
     /// Loads the checkpoint of a run folder.
     pub load: fn(&Path, &Device) -> Result<Box<dyn LoadedModel>>,

@@ -24,8 +24,8 @@ const CLASS: &str = "stable_worldmodel.wm.gcrl.GCRL";
 const MODULE: &str = "stable_worldmodel.wm.gcrl.module";
 
 /// Converts a model of the reference implementation: a folder with `weights.pt` and `config.json`, or a weights file
-/// beside a `config.json`. The files do not store how actions were normalised, so `dataset_info` must describe the model's
-/// training dataset.
+/// beside a `config.json`. The files do not store how actions were normalised, so `dataset_info` must describe the
+/// model's training dataset.
 ///
 /// A published checkpoint has no target networks; the target networks are initialised with the weights of the value
 /// networks and critics.

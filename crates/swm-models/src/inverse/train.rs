@@ -78,8 +78,8 @@ impl InverseConfig {
 /// checkpoint and the logs to `out`.
 ///
 /// # Errors
-/// When the configuration contradicts the data, `out` holds a checkpoint, the loss is not finite, the run is interrupted
-/// (no checkpoint is saved then), or a file cannot be written.
+/// When the configuration contradicts the data, `out` holds a checkpoint, the loss is not finite, the run is
+/// interrupted (no checkpoint is saved then), or a file cannot be written.
 pub fn train(
     config: &InverseConfig,
     world_model: &Checkpoint<Lewm>,

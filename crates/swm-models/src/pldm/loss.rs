@@ -44,7 +44,7 @@ pub struct Terms {
     pub temp_straight: Option<Tensor<1>>,
 }
 
-/// Added to a variance before the square root.
+/// The value that is added to a variance before the square root.
 const VARIANCE_EPSILON: f64 = 1e-4;
 /// The lower bound of the length of a latent difference in the cosine.
 const LENGTH_EPSILON: f64 = 1e-8;

@@ -3,7 +3,7 @@
 use crate::Panels;
 use crate::functions::add_rows;
 
-/// Weight and bias of a linear layer or of a layer normalisation, or their gradients.
+/// Weight and bias of a linear layer or of a layer normalisation, or the gradients of weight and bias.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Affine {
     /// The weight: `[outputs, inputs]` of a linear layer, `[features]` of a normalisation.

@@ -6,7 +6,7 @@ use crate::grown;
 use swm_simd::{Kernel, Level, dispatch};
 
 /// Replaces the query of every head, given in the tokens' space, by the head's attention output: the mean of the tokens
-/// weighted by the softmax of their scalar products with the query. A row attends to its own token and to
+/// weighted by the softmax of the scalar products of tokens and query. A row attends to its own token and to
 /// earlier tokens of its sample.
 ///
 /// # Shapes

@@ -18,7 +18,7 @@ impl<T: Default> ScratchPool<T> {
     }
 }
 
-/// Returns the first `length` elements of a buffer, which grows if it is shorter.
+/// Returns the first `length` elements of a buffer, which grows to `length` elements if necessary.
 pub fn grown(buffer: &mut Vec<f32>, length: usize) -> &mut [f32] {
     if buffer.len() < length {
         buffer.resize(length, 0.0);

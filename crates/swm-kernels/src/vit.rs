@@ -11,7 +11,7 @@ use rayon::prelude::*;
 /// The maximum number of rows of a block.
 const BLOCK: usize = 36;
 
-/// Parameters of a vision transformer, or their gradients.
+/// The parameters of a vision transformer, or the gradients of the parameters.
 #[derive(Clone, Debug)]
 pub struct VitParameters {
     /// The layer from patches to tokens, with a weight of `[dim, 3 * patch * patch]` and a bias of `[dim]`.
@@ -24,7 +24,7 @@ pub struct VitParameters {
     pub norm: Affine,
 }
 
-/// Parameters of one layer of a vision transformer, or their gradients.
+/// The parameters of one layer of a vision transformer, or the gradients of the parameters.
 #[derive(Clone, Debug)]
 pub struct VitLayerParameters {
     /// The normalisation before the attention.
@@ -151,7 +151,7 @@ impl VitEncoder {
         class
     }
 
-    /// Writes the class token and the embedded patches with their positions to `x`, `[tokens, dim]`.
+    /// Writes the class token and the embedded patches, plus position embeddings, to `x`, `[tokens, dim]`.
     fn embed_patches(&self, patches: &[f32], block: usize, x: &mut [f32]) {
         let (dim, inputs) = (self.dim, self.embed.inputs());
         let (class, patch_tokens) = x.split_at_mut(dim);

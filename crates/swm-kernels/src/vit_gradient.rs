@@ -2,7 +2,7 @@
 //!
 //! The backward pass reads the matrix products that the forward pass stored, and recomputes the operations between the
 //! products (normalisations, attention, GELU). The last layer computes only the class token, so no gradient of another
-//! token passes through its feed-forward block.
+//! token passes through the last feed-forward block.
 
 use crate::functions::{add, gelu, gelu_tangent, multiply, multiply_add, softmax, softmax_backward};
 use crate::norm::backward;
@@ -311,7 +311,7 @@ impl VitGradient {
             Affine { weight: cut(&sums.qkv.weight, dim * dim), bias: cut(&sums.qkv.bias, dim) }
         };
         VitLayerParameters {
-            // The forward pass scales the weights of the queries, so their gradients are scaled.
+            // The forward pass scales the weights of the queries, so the gradients are scaled too.
             query: projection(0, query_scale(dim, self.encoder.heads)),
             key: projection(1, 1.0),
             value: projection(2, 1.0),

@@ -1,5 +1,5 @@
-//! [`Checkpoint`]: a folder with a trained model, the statistics of its dataset, and the state from which training
-//! continues.
+//! [`Checkpoint`]: a folder with a trained model, the statistics of the training dataset, and the state from which
+//! training continues.
 //!
 //! | file | content |
 //! | --- | --- |
@@ -41,7 +41,7 @@ pub(crate) struct TrainState<M> {
     pub state: RunState,
     /// The state of the optimizer.
     pub moments: Named<HostTensor>,
-    /// The trained weights; `None` if they are the weights of the checkpoint, which are a moving average otherwise.
+    /// The trained weights, if the weights of the checkpoint are a moving average; else `None`.
     pub raw: Option<M>,
 }
 
@@ -125,7 +125,7 @@ impl<M: Trainable> Checkpoint<M> {
         Ok(Self::read(run, device)?.0)
     }
 
-    /// Loads the checkpoint and returns it with its folder.
+    /// Returns the checkpoint of a run folder, and the folder of the checkpoint's files.
     fn read(run: &Path, device: &Device) -> Result<(Self, PathBuf)> {
         let StoredCheckpoint { folder, file, manifest, config } =
             StoredCheckpoint::<TrainConfig<M>>::read(run, M::FAMILY)?;
@@ -162,7 +162,7 @@ pub fn family(run: &Path) -> Option<String> {
     Some(file.get("family")?.as_str()?.to_owned())
 }
 
-/// The files of a checkpoint other than its weights, of any family.
+/// The files, except the weights, of a checkpoint of any family.
 pub(crate) struct StoredCheckpoint<C> {
     /// The checkpoint's folder.
     pub folder: PathBuf,
@@ -305,7 +305,7 @@ fn unpack(path: &Path, hash: Option<&String>) -> Result<Named<HostTensor>> {
     let broken = |problem: String| broken(path, problem);
     let tensors = SafeTensors::deserialize(&bytes).map_err(|error| broken(format!("is damaged ({error})")))?;
     if hash.is_some_and(|hash| *hash != manifest::hash(&bytes)) {
-        return Err(broken(format!("is not the file that {MANIFEST} describes: its hash differs")));
+        return Err(broken(format!("is not the file that {MANIFEST} describes: the hash differs")));
     }
     tensors
         .iter()

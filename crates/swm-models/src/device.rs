@@ -20,8 +20,9 @@ pub fn parse(name: &str) -> Result<Device> {
     let (backend, index) = match name.split_once(':') {
         None => (name, 0),
         Some((backend, index)) => {
-            let invalid =
-                |_| Error::config("--device", format!("'{index}' is not a GPU index"), "write it like vulkan:0");
+            let invalid = |_| {
+                Error::config("--device", format!("'{index}' is not a GPU index"), "write the device like vulkan:0")
+            };
             (backend, index.parse().map_err(invalid)?)
         }
     };
@@ -31,7 +32,7 @@ pub fn parse(name: &str) -> Result<Device> {
     };
     if !built {
         let problem = format!("this program was built without {backend}");
-        let fix = format!("build it with `--features {backend}` (`make gpu` does for Vulkan), or pass --device cpu");
+        let fix = format!("build it with `--features {backend}` (`make gpu` builds for Vulkan), or pass --device cpu");
         return Err(Error::config("--device", problem, fix));
     }
     open(backend, index)
@@ -66,8 +67,8 @@ mod tests {
 
     #[test]
     fn cpu_is_always_available_and_errors_name_the_fix() {
-        assert_eq!(name(&parse("cpu").expect("the CPU")), "cpu (flex)");
-        let message = |name: &str| parse(name).expect_err("an error").to_string();
+        assert_eq!(name(&parse("cpu").expect("parsing 'cpu'")), "cpu (flex)");
+        let message = |name: &str| parse(name).expect_err("an invalid device is accepted").to_string();
         assert!(message("cdua").contains("did you mean cuda"), "{}", message("cdua"));
         assert!(message("cpu:x").contains("not a GPU index"), "{}", message("cpu:x"));
         if !cfg!(feature = "cuda") {

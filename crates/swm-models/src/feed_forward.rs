@@ -126,7 +126,7 @@ impl<N: ActionNetwork> Policy for FeedForwardPolicy<N> {
     }
 
     /// Returns the seconds of each model step, encoding included. The time of a parallel computation is divided equally
-    /// among its environments.
+    /// among the environments.
     fn take_latencies(&mut self) -> Vec<f64> {
         std::mem::take(&mut self.latencies)
     }

@@ -1,7 +1,7 @@
 //! World models, policies and their training.
 //!
 //! Contracts:
-//! - [`train`](mod@train): the training loop for every [`Trainable`] model, its configuration and logs.
+//! - [`train`](mod@train): the training loop for every [`Trainable`] model, the training configuration and the logs.
 //! - [`family`]: [`ModelFamily`], the contract of a model family; [`registry`]: the families of this build.
 //! - [`online`]: training by acting in environments; [`feed_forward`]: policies without planning.
 //! - [`probe`]: regression of the environment state from frozen latents.

@@ -31,8 +31,7 @@ pub struct DinoWmConfig {
     pub columns: Vec<ColumnConfig>,
     /// The predictor.
     pub predictor: FramePredictorConfig,
-    /// Hidden features of the image decoder, which is trained along with the predictor without influencing it; 0 for no
-    /// decoder.
+    /// Hidden features of the image decoder, whose training does not influence the predictor; 0 for no decoder.
     pub decoder: usize,
 }
 

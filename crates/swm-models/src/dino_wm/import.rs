@@ -1,4 +1,4 @@
-//! Import and export of DINO-WM checkpoints of the reference implementation (its class `PreJEPA`).
+//! Import and export of DINO-WM checkpoints of the reference implementation (class `PreJEPA`).
 
 use super::config::{ACTION, ColumnConfig, DinoWmConfig};
 use super::model::DinoWm;

@@ -32,8 +32,8 @@ pub struct ColumnEncoder {
     pub patch_embed: PointwiseConv,
 }
 
-/// The image decoder, from the features of a patch to its pixels: linear, GELU, and a transposed convolution whose
-/// stride is its kernel size, which is one matrix product.
+/// The image decoder, from the features of a patch to the pixels of the patch: linear, GELU, and a transposed
+/// convolution, which is one matrix product, because the stride equals the kernel size.
 #[derive(Module, Debug)]
 pub struct PatchDecoder {
     /// The layer to the hidden features.

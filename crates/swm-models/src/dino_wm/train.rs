@@ -56,7 +56,7 @@ impl Trainable for DinoWm {
                 return Err(Error::mismatch(
                     format!("reading the column '{}' of model.columns", column.name),
                     spec.dtype.name(),
-                    "float32 (take it out of model.columns, or convert the dataset)",
+                    "float32 (remove the column from model.columns, or convert the dataset)",
                 ));
             }
             columns.push(column.name.clone());

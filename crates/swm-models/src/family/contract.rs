@@ -11,8 +11,8 @@ use swm_core::run::Control;
 use swm_core::{CostModel, EnvPool, EnvSpec, Policy, Predictor, Result};
 use swm_data::Reader;
 
-/// A trainable model and the operations on its checkpoints. A method returns `None` if the family does not support the
-/// operation.
+/// A trainable model and the operations on checkpoints of the model. A method returns `None` if the family does not
+/// support the operation.
 pub trait ModelFamily: Trainable {
     /// Whether a trained model acts without a solver.
     const ACTS: bool = false;

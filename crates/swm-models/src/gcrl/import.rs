@@ -1,4 +1,4 @@
-//! Import and export of goal-conditioned checkpoints of the reference implementation (its class `GCRL`).
+//! Import and export of goal-conditioned checkpoints of the reference implementation (class `GCRL`).
 //!
 //! The published training scripts store the script's settings as `config.json`, while `load_pretrained` requires a tree
 //! of classes. So sizes are read from the weights, and only the number of attention heads is read from `config.json`.
@@ -74,7 +74,8 @@ fn is_optional(name: &str) -> bool {
     ["value_predictor.", "critic_predictor."].iter().any(|part| name.starts_with(part))
 }
 
-/// Removes wrapper prefixes and attention masks, and copies value networks and critics to their target networks.
+/// Removes wrapper prefixes and attention masks, and copies the weights of value networks and critics to the
+/// target networks.
 fn without_wrappers(weights: Named<HostTensor>) -> Named<HostTensor> {
     let mut plain = Named::new();
     for (name, weight) in weights {
@@ -98,7 +99,7 @@ fn without_wrappers(weights: Named<HostTensor>) -> Named<HostTensor> {
     names::to_published(plain, "encoder.")
 }
 
-/// Weights and the path of their file.
+/// Weights and the path of the weights file.
 struct StoredWeights<'a> {
     weights: Named<HostTensor>,
     path: &'a Path,

@@ -20,7 +20,7 @@ pub struct ValueLoss {
     pub expectile: f32,
     /// Inverse temperature of the advantage weights, α.
     pub temperature: f32,
-    /// Fraction of its weights that a target network keeps in a step, ρ.
+    /// Factor of the old weights in the update of a target network, ρ.
     pub target: f32,
     /// Sources of the goals for value learning.
     pub goals: GoalMixture,

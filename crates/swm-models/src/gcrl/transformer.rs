@@ -157,7 +157,7 @@ impl Transformer {
         let mut x = frames;
         for layer in &self.layers {
             let mixed = layer._0.forward(x.clone(), goal, rng);
-            // A pooling layer has no residual connection: its output has another shape than its input.
+            // A pooling layer has no residual connection: the output has another shape than the input.
             if layer._0.role == Role::Pool {
                 x = layer._1.forward(mixed, rng);
             } else {

@@ -2,7 +2,7 @@
 //! vector-Jacobian products of predictions, by Burn's autodiff.
 //!
 //! The state of a solver is the latent of one frame: [`LatentDynamics::predict`] uses a window of one latent, as
-//! training does at the first frame of every clip. The cost and its gradient use the whole window.
+//! training does at the first frame of every clip. The cost and the gradient of the cost use the whole window.
 //!
 //! The rows of each environment are split into chunks separately, so that the results of an environment do not depend
 //! on the other environments.
@@ -111,7 +111,7 @@ impl LewmCost {
                 return Err(Error::mismatch(
                     format!("one step of a LeWM: {what}"),
                     format!("{length} elements"),
-                    format!("{n} rows of {width}, the same number for each of {envs} environments"),
+                    format!("{n} rows of {width} elements, and equally many rows for each of {envs} environments"),
                 ));
             }
         }

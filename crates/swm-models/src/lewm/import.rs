@@ -45,7 +45,8 @@ pub fn export(checkpoint: &Checkpoint<Lewm>, folder: &Path, naming: Naming) -> R
     write(folder, &config, &state(&checkpoint.model, naming))
 }
 
-/// Returns the world model of a checkpoint, its sizes, and the number of environment steps in a model step.
+/// Returns the world model of a checkpoint, the model configuration, and the number of environment steps in a model
+/// step.
 ///
 /// # Errors
 /// As [`import`].

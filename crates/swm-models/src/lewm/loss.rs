@@ -47,7 +47,7 @@ impl Quadrature {
         Self { spacing, target, weights }
     }
 
-    /// Returns the Epps-Pulley statistic of samples and its derivative with respect to each sample.
+    /// Returns the Epps-Pulley statistic of samples and the derivatives of the statistic with respect to the samples.
     fn statistic(&self, samples: impl ExactSizeIterator<Item = f32>) -> (f64, Vec<f32>) {
         let Self { spacing, target, weights } = self;
         let (knots, n) = (target.len(), samples.len() as f32);

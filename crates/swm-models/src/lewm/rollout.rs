@@ -5,7 +5,7 @@
 //! - actions are embedded and converted to modulations once for the whole sequence;
 //! - the normalised tokens of a layer are cached while the window of latents grows, and recomputed only when the window
 //!   slides, because sliding changes the positions of the tokens;
-//! - the last layer and the modules after it compute only the last token;
+//! - the last layer and all later modules compute only the last token;
 //! - keys and values are never computed. A window holds a few tokens of `dim` features, and the heads together have
 //!   many more features. So a query is multiplied by the transposed key matrix, `(W_k y)ᵀq = yᵀ(W_kᵀ q)`, and compared
 //!   with the tokens themselves; the weighted mean of the tokens is multiplied by the value matrix,
@@ -68,7 +68,7 @@ struct Layer {
 /// Memory that is reused between calls.
 #[derive(Default)]
 struct Scratch {
-    /// Actions ordered by step, then their embeddings, `[steps, samples, …]`.
+    /// The actions, later the embeddings of the actions, `[steps, samples, …]`.
     actions: Vec<f32>,
     hidden: Vec<f32>,
     /// The modulations of each layer, `[steps, samples, 6 * dim]`.

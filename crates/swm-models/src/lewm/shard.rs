@@ -1,4 +1,4 @@
-//! [`Shard`]: forward and backward pass of the encoder for one part of the images of a batch.
+//! [`Shard`]: forward and backward pass of the encoder for a range of the images of a batch.
 //!
 //! On the CPU, [`VitGradient`] differentiates vision transformers; Burn differentiates all other encoders.
 
@@ -30,7 +30,7 @@ impl<'a> Differentiation<'a> {
     }
 }
 
-/// Encoded images and the state of their backward pass.
+/// Encoded images and the state that the backward pass reads.
 pub(crate) struct Shard {
     /// The features of the images, `[images, features]`.
     pub features: Tensor<2>,

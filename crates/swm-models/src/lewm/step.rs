@@ -30,7 +30,7 @@ pub struct TrainBatch {
     pub actions: Tensor<3>,
 }
 
-/// The loss of a batch and its terms.
+/// The loss of a batch and the terms of the loss.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Losses {
     /// `prediction + weight * sigreg`.

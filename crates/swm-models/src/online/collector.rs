@@ -48,7 +48,7 @@ struct Running {
     total: f64,
 }
 
-/// The state of a [`Collector`], from which it can continue.
+/// The saved state of a [`Collector`], which [`Collector::restore`] reads.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct CollectorState {
     steps: usize,

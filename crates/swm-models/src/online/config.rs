@@ -24,7 +24,7 @@ pub struct OnlineConfig {
     pub segment: usize,
     /// Optimizer steps between two evaluations; 0 for none.
     pub evaluate_every: usize,
-    /// Episodes of an evaluation, always the same episodes.
+    /// The number of episodes of an evaluation; all evaluations run the same episodes.
     pub evaluate_episodes: usize,
     /// The planner that selects actions; `None` executes the actions of the policy network.
     #[serde(default, skip_serializing_if = "Option::is_none")]

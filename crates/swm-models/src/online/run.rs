@@ -48,7 +48,7 @@ pub struct OnlineSummary {
 /// Trains a model by interaction with environments; the checkpoint, the best checkpoint so far and the logs go to the
 /// folder `out`. `make_pool` creates a pool of the given number of environments.
 ///
-/// `control` is checked before every round. An interrupted run saves its weights and its replay buffer and returns a
+/// `control` is checked before every round. An interrupted run saves the weights and the replay buffer and returns a
 /// summary with `interrupted`; `options.resume` continues the run. The progress events have the metrics of the model,
 /// then `env_steps`, `return` (of the last episodes), `evaluation_return`, `lr`, `gradient_norm`, `clips_per_second`
 /// and `data_wait`, the fraction of the time spent on interaction.
@@ -329,13 +329,13 @@ impl Run<'_> {
         if loss.is_finite() && update.gradient_norm.is_finite() {
             return Ok(update);
         }
-        let what = format!("the loss or its gradient at training step {}", step + 1);
+        let what = format!("the loss or the gradient at training step {}", step + 1);
         let values = format!("{}, gradient norm {}", failed_batch::describe(&update.metrics), update.gradient_norm);
         let fix = "lower optim.lr; the last checkpoint, if any, is kept";
         Err(failed_batch::error(self.out, &batch, what, &values, fix))
     }
 
-    /// Evaluates the present weights, saves them if they are the best so far, and returns the mean return.
+    /// Evaluates the present weights, saves the weights of the best evaluation so far, and returns the mean return.
     fn evaluate(&mut self) -> Result<f64> {
         self.learner.publish();
         let episodes = self.online.evaluate_episodes;

@@ -18,7 +18,7 @@ impl<M: Clone> SharedModel<M> {
         Self(Arc::new(Mutex::new(model)))
     }
 
-    /// Returns the present model without copying its tensors.
+    /// Returns the present model without copying tensors.
     pub fn get(&self) -> M {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }

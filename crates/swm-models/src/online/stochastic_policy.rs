@@ -1,4 +1,4 @@
-//! [`StochasticPolicy`]: a policy that draws its actions from a network's distribution, without planning.
+//! [`StochasticPolicy`]: a policy that draws actions from a network's distribution, without planning.
 
 use super::shared_model::SharedModel;
 use crate::checkpoint::Checkpoint;

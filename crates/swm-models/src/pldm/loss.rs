@@ -31,8 +31,8 @@ pub struct PldmLoss {
 pub struct Terms {
     /// Mean of `max(0, 1 - std)` over latent elements, with the standard deviation over the batch.
     pub std: Tensor<1>,
-    /// Mean of `max(0, 1 - std)` over latent elements, with the standard deviation over time of the latents minus their
-    /// mean over the batch.
+    /// Mean of `max(0, 1 - std)` over latent elements, with the standard deviation over time, of latents centred over
+    /// the batch.
     pub std_t: Tensor<1>,
     /// Mean square of the covariances of two latent elements over the batch.
     pub cov: Tensor<1>,

@@ -1,4 +1,4 @@
-//! [`Pldm`]: a world model, and the inverse-dynamics network of its training loss.
+//! [`Pldm`]: a world model, and the inverse-dynamics network of the training loss.
 
 use crate::lewm::{Lewm, LewmConfig};
 use crate::nn::{Activation, Init, LayerNorm, Linear};

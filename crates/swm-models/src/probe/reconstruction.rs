@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use swm_core::{Error, Key, Result};
 use swm_data::{Part, Reader, RgbImage, contact_sheet};
 
-/// The settings of a decoder and its training.
+/// The settings of a decoder and of the decoder's training.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ReconstructionConfig {
@@ -246,7 +246,7 @@ fn sheet(images: &[u8], decoded: &[f32], image: usize, shown: usize) -> Result<R
                 .iter()
                 .map(|i| decoded[i * bytes..(i + 1) * bytes].iter().map(|v| (v * 255.0).round() as u8).collect()),
         );
-        // Padding aligns the images of an incomplete last row with their reconstructions.
+        // Padding aligns the images of an incomplete last row with the reconstructions.
         if indices.len() < COLUMNS && shown > COLUMNS {
             let blank = vec![u8::MAX; bytes];
             let at = frames.len() - indices.len();

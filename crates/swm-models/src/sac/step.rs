@@ -2,7 +2,7 @@
 //! transitions.
 //!
 //! The losses of Q functions, policy and temperature have separate autodiff graphs. All gradients are computed at the
-//! same weights; the publication updates the Q functions before it computes the policy's loss.
+//! same weights; the publication updates the Q functions before computing the policy's loss.
 
 use super::config::SacLoss;
 use super::model::{Critics, Sac};
@@ -36,7 +36,7 @@ pub struct SacStep {
     pub actor: f64,
     /// The temperature.
     pub temperature: f64,
-    /// The mean entropy of the policy, estimated from its samples.
+    /// The mean entropy of the policy, estimated from sampled actions.
     pub entropy: f64,
     /// The mean value of the policy's actions.
     pub q: f64,

@@ -88,7 +88,7 @@ pub struct Tdmpc2Step {
     pub termination: f64,
     /// The mean value of the policy's actions.
     pub q: f64,
-    /// The mean entropy of the policy, estimated from its samples.
+    /// The mean entropy of the policy, estimated from sampled actions.
     pub entropy: f64,
     /// The running spread of values after the step.
     pub scale: f32,

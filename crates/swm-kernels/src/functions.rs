@@ -91,7 +91,7 @@ pub(crate) fn exp<L: Level>(x: f32) -> f32 {
     series * scale
 }
 
-/// Returns the sum of the elements, accumulated in separate lanes.
+/// Returns the sum of the elements of `x`, accumulated in separate lanes.
 #[inline(always)]
 pub(crate) fn sum(x: &[f32]) -> f32 {
     let mut lanes = [0.0f32; LANES];
@@ -104,7 +104,7 @@ pub(crate) fn sum(x: &[f32]) -> f32 {
     fold(lanes) + rest.iter().sum::<f32>()
 }
 
-/// Returns the scalar product, accumulated in separate lanes.
+/// Returns the scalar product of `a` and `b`, which have the same length, accumulated in separate lanes.
 #[inline(always)]
 pub(crate) fn dot<L: Level>(a: &[f32], b: &[f32]) -> f32 {
     let mut lanes = [0.0f32; LANES];
@@ -130,7 +130,7 @@ fn fold(mut lanes: [f32; LANES]) -> f32 {
     lanes[0]
 }
 
-/// Computes `to += factor * x`.
+/// Computes `to += factor * x` for slices of the same length.
 #[inline(always)]
 pub(crate) fn add_scaled<L: Level>(to: &mut [f32], factor: f32, x: &[f32]) {
     for (to, x) in to.iter_mut().zip(x) {
@@ -222,7 +222,7 @@ pub fn add(x: &mut [f32], y: &[f32]) {
     }
 }
 
-/// Returns the largest element.
+/// Returns the largest element of `x`.
 #[inline(always)]
 fn max(x: &[f32]) -> f32 {
     let mut max = [f32::NEG_INFINITY; LANES];

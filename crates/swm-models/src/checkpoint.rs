@@ -9,8 +9,8 @@
 //! | `raw.safetensors` | the trained weights, if `weights.safetensors` holds the moving average of the weights |
 //! | `manifest.json` | provenance, and the hashes of the files above |
 //!
-//! A new checkpoint is written to a second folder, which then replaces the old one by renaming, so that a killed
-//! process leaves a complete checkpoint.
+//! A new checkpoint is written to a second folder, which is then renamed to replace the old checkpoint, so that a
+//! killed process leaves a complete checkpoint.
 
 use crate::nn::parameters::{self, HostTensor, Named};
 use crate::train::run_state::RunState;
@@ -166,7 +166,7 @@ pub fn family(run: &Path) -> Option<String> {
 pub(crate) struct StoredCheckpoint<C> {
     /// The checkpoint's folder.
     pub folder: PathBuf,
-    /// The whole `config.json`.
+    /// The parsed `config.json`.
     pub file: serde_json::Value,
     /// The field `config` of `config.json`.
     pub config: C,

@@ -73,8 +73,8 @@ impl DinoWmCost {
         // One image per call: features must not depend on the number of images in a call.
         let encode = |rgb: &[u8]| Ok::<_, Error>(self.model.backbone.patches(self.config.image_patches(rgb, &device)?));
         let column = |name: &str, values: &[f32]| normalised(&self.dataset_info, name, values, [1, 1], &device);
-        // The recorded history has images and actions only: if the model reads further
-        // columns, a plan starts from the current frame.
+        // The recorded history has images and actions only: if the model reads further columns, a plan starts from the
+        // current frame.
         let further_columns: Vec<&str> =
             self.config.columns.iter().map(|column| column.name.as_str()).filter(|name| *name != ACTION).collect();
         let (mut frames, mut past) = (vec![encode(row.get::<u8>(PIXELS)?)?], vec![]);

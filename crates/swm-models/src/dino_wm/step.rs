@@ -20,7 +20,7 @@ pub struct TrainBatch {
     pub columns: Vec<Tensor<3>>,
 }
 
-/// Losses and gradients of a part of a batch.
+/// Losses and gradients of a batch.
 pub struct DinoWmStep {
     /// The total loss, then the terms of the loss, by name.
     pub losses: Vec<(&'static str, f64)>,

@@ -26,7 +26,7 @@ impl Trainable for DinoWm {
     const PRESETS: &'static [Preset] = &[
         Preset {
             id: "tiny",
-            summary: "64 px, a small encoder with random weights: to try things out on two CPU cores",
+            summary: "64 px, a small encoder with random weights: for first trials on two CPU cores",
             toml: include_str!("../../presets/dino_wm/tiny.toml"),
         },
         Preset {

@@ -94,7 +94,7 @@ pub struct Attention {
     pub to_kv: Linear,
     /// The output projection; absent for a single head with as many features as a patch.
     pub to_out: Option<AttentionOutput>,
-    /// `[1, frames, dim]`, the learnt tokens of a pooling layer.
+    /// The learnt tokens of a pooling layer, `[1, frames, dim]`.
     pub frame_tokens: Option<Param<Tensor<3>>>,
     #[module(skip)]
     role: Role,

@@ -105,7 +105,7 @@ pub(crate) fn state(model: &Lewm, naming: Naming) -> Named<HostTensor> {
     weights
 }
 
-/// Returns the class tree from which the reference implementation builds a world model.
+/// Returns the tree of classes, as JSON, from which the reference implementation builds a world model.
 ///
 /// # Errors
 /// When the encoder is not a vision transformer.

@@ -154,7 +154,7 @@ impl Rollout {
     }
 
     /// Returns the number of candidates that a thread rolls out at once: an equal fraction of `samples`, within limits
-    /// that keep the matrix products efficient. The result of a candidate does not depend on this number.
+    /// that keep the matrix products efficient. The result of a candidate does not depend on the number.
     pub fn chunk_size(samples: usize) -> usize {
         samples.div_ceil(rayon::current_num_threads()).clamp(24, 160)
     }

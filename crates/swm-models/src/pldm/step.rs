@@ -54,6 +54,6 @@ pub fn step(model: &Pldm, batch: &TrainBatch, weights: &PldmLoss, shards: usize,
     PldmStep { losses, gradients: named, statistics, latents: host }
 }
 
-fn prefixed<T>(part: &str, named: Named<T>) -> Named<T> {
-    named.into_iter().map(|(name, value)| (format!("{part}.{name}"), value)).collect()
+fn prefixed<T>(prefix: &str, named: Named<T>) -> Named<T> {
+    named.into_iter().map(|(name, value)| (format!("{prefix}.{name}"), value)).collect()
 }

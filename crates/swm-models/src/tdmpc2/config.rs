@@ -43,22 +43,22 @@ pub struct Encoding {
 impl Tdmpc2Config {
     /// Returns the latent dimension.
     pub fn latent(&self) -> usize {
-        self.encoding.iter().map(|part| part.latent).sum()
+        self.encoding.iter().map(|encoding| encoding.latent).sum()
     }
 
     /// Returns the encoding of images, if images are observed.
     pub fn image_encoding(&self) -> Option<&Encoding> {
-        self.encoding.iter().find(|part| part.column == PIXELS)
+        self.encoding.iter().find(|encoding| encoding.column == PIXELS)
     }
 
     /// Returns the encodings of the columns other than images.
     pub fn column_encodings(&self) -> impl Iterator<Item = &Encoding> {
-        self.encoding.iter().filter(|part| part.column != PIXELS)
+        self.encoding.iter().filter(|encoding| encoding.column != PIXELS)
     }
 
     /// Returns the names of the observed columns.
     pub fn columns(&self) -> Vec<String> {
-        self.encoding.iter().map(|part| part.column.clone()).collect()
+        self.encoding.iter().map(|encoding| encoding.column.clone()).collect()
     }
 
     /// Checks the configuration.
@@ -77,9 +77,9 @@ impl Tdmpc2Config {
             ("model.bins.count", self.bins.count, 2),
             ("model.critics", self.critics, 2),
         ])?;
-        for (i, part) in self.encoding.iter().enumerate() {
-            if self.encoding[..i].iter().any(|other| other.column == part.column) {
-                let given = format!("'{}' is observed twice", part.column);
+        for (i, encoding) in self.encoding.iter().enumerate() {
+            if self.encoding[..i].iter().any(|other| other.column == encoding.column) {
+                let given = format!("'{}' is observed twice", encoding.column);
                 return Err(Error::config("model.encoding", given, "name every column once"));
             }
         }

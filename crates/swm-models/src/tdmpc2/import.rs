@@ -70,7 +70,9 @@ pub fn export(checkpoint: &Checkpoint<Tdmpc2>, folder: &Path) -> Result<()> {
         extra_dims: widths.collect(),
         image_size: model.image,
         wm: WorldModel {
-            encoding: InOrder(model.encoding.iter().map(|part| (part.column.clone(), part.latent)).collect()),
+            encoding: InOrder(
+                model.encoding.iter().map(|encoding| (encoding.column.clone(), encoding.latent)).collect(),
+            ),
             enc_dim: model.encoder,
             mlp_dim: model.hidden,
             num_bins: model.bins.count,
@@ -207,9 +209,9 @@ impl Published {
         let WorldModel { encoding, enc_dim, mlp_dim, num_bins, vmin, vmax, num_q, simnorm_dim, .. } = &self.wm;
         // Images come first in a latent, whatever the order in the file.
         let (images, columns): (Vec<_>, Vec<_>) = encoding.0.iter().partition(|(column, _)| column == PIXELS);
-        let part = |(column, latent): &(String, usize)| Encoding { column: column.clone(), latent: *latent };
+        let to_encoding = |(column, latent): &(String, usize)| Encoding { column: column.clone(), latent: *latent };
         Tdmpc2Config {
-            encoding: images.into_iter().chain(columns).map(part).collect(),
+            encoding: images.into_iter().chain(columns).map(to_encoding).collect(),
             image: self.image_size,
             encoder: *enc_dim,
             hidden: *mlp_dim,
@@ -243,10 +245,10 @@ impl Published {
     pub fn with(&self, weights: &Named<HostTensor>, device: &Device) -> Result<Tdmpc2> {
         let config = self.model();
         config.check()?;
-        let width = |part: &Encoding| {
-            self.extra_dims.get(&part.column).copied().ok_or_else(|| {
+        let width = |encoding: &Encoding| {
+            self.extra_dims.get(&encoding.column).copied().ok_or_else(|| {
                 let fix = "add the column with its number of elements";
-                Error::config("extra_dims", format!("the column '{}' has no entry", part.column), fix)
+                Error::config("extra_dims", format!("the column '{}' has no entry", encoding.column), fix)
             })
         };
         let widths: Vec<usize> = config.column_encodings().map(width).collect::<Result<_>>()?;

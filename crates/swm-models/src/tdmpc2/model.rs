@@ -73,10 +73,10 @@ impl Observation {
 
     /// Concatenates the rows of several batches.
     #[must_use]
-    pub fn cat(parts: &[Self]) -> Self {
-        let count = parts.first().map_or(0, |part| part.columns.len());
-        let pixels: Option<Vec<_>> = parts.iter().map(|part| part.pixels.clone()).collect();
-        let column = |i: usize| Tensor::cat(parts.iter().map(|part| part.columns[i].clone()).collect(), 0);
+    pub fn cat(batches: &[Self]) -> Self {
+        let count = batches.first().map_or(0, |batch| batch.columns.len());
+        let pixels: Option<Vec<_>> = batches.iter().map(|batch| batch.pixels.clone()).collect();
+        let column = |i: usize| Tensor::cat(batches.iter().map(|batch| batch.columns[i].clone()).collect(), 0);
         Self { pixels: pixels.map(|pixels| Tensor::cat(pixels, 0)), columns: (0..count).map(column).collect() }
     }
 
@@ -126,14 +126,14 @@ impl Tdmpc2 {
     pub fn init(config: &Tdmpc2Config, widths: &[usize], action_dim: usize, key: Key, device: &Device) -> Self {
         let init = Init::new(key, device);
         let (latent, hidden, bins) = (config.latent(), config.hidden, config.bins.count);
-        let encoder = |(part, &width): (&super::Encoding, &usize)| {
-            let init = init.of("extra_encoders").of(&part.column);
+        let encoder = |(encoding, &width): (&super::Encoding, &usize)| {
+            let init = init.of("extra_encoders").of(&encoding.column);
             let encoder = ColumnEncoder {
                 _0: NormalizedLinear::new(&init.of("0"), width, config.encoder),
-                _1: Linear::normal(&init.of("1"), config.encoder, part.latent, 0.02),
-                _2: LayerNorm::new(&init.of("2"), part.latent, 1e-5),
+                _1: Linear::normal(&init.of("1"), config.encoder, encoding.latent, 0.02),
+                _2: LayerNorm::new(&init.of("2"), encoding.latent, 1e-5),
             };
-            (part.column.clone(), encoder)
+            (encoding.column.clone(), encoder)
         };
         let critic = |i| Head::zero_initialized(&init.of("qs").at(i), latent + action_dim, hidden, bins);
         let qs: Vec<Head> = (0..config.critics).map(critic).collect();
@@ -142,7 +142,7 @@ impl Tdmpc2 {
             scale: RunningScale { value: init.buffer([1], 10.0) },
             cnn: images.map(|_| ImageCnn::new(&init.of("cnn"))),
             pixel_encoder: images
-                .map(|part| image_encoder::projection(&init.of("pixel_encoder"), config.image, part.latent)),
+                .map(|encoding| image_encoder::projection(&init.of("pixel_encoder"), config.image, encoding.latent)),
             extra_encoders: ModuleDict(config.column_encodings().zip(widths).map(encoder).collect()),
             dynamics: Dynamics::new(&init.of("dynamics"), latent + action_dim, hidden, latent),
             reward: Head::zero_initialized(&init.of("reward"), latent + action_dim, hidden, bins),

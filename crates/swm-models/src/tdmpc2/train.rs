@@ -62,7 +62,7 @@ impl Trainable for Tdmpc2 {
     }
 
     fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self> {
-        let widths = config.model.column_encodings().map(|part| Ok(dataset_info.column(&part.column)?.dim()));
+        let widths = config.model.column_encodings().map(|encoding| Ok(dataset_info.column(&encoding.column)?.dim()));
         Ok(Self::init(&config.model, &widths.collect::<Result<Vec<_>>>()?, dataset_info.action.dim(), key, device))
     }
 

@@ -3,22 +3,22 @@
 use crate::Panels;
 use crate::functions::add_rows;
 
-/// Weight and bias of a linear layer or of a layer normalisation, or their gradients.
+/// Weight and bias of a linear layer or of a layer normalisation, or the gradients of weight and bias.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Affine {
-    /// `[outputs, inputs]` of a linear layer, `[features]` of a normalisation.
+    /// The weight: `[outputs, inputs]` of a linear layer, `[features]` of a normalisation.
     pub weight: Vec<f32>,
-    /// `[outputs]` of a linear layer, `[features]` of a normalisation.
+    /// The bias: `[outputs]` of a linear layer, `[features]` of a normalisation.
     pub bias: Vec<f32>,
 }
 
 impl Affine {
-    /// Zeros for a linear layer of these sizes; `inputs` is 1 for a normalisation.
+    /// Returns zeros for a linear layer with the given sizes; `inputs` is 1 for a normalisation.
     pub(crate) fn zeros(inputs: usize, outputs: usize) -> Self {
         Self { weight: vec![0.0; inputs * outputs], bias: vec![0.0; outputs] }
     }
 
-    /// Weight and bias as the two destinations of a normalisation's gradients.
+    /// Returns weight and bias, to which the gradients of a normalisation are added.
     pub(crate) fn as_mut(&mut self) -> [&mut [f32]; 2] {
         [&mut self.weight, &mut self.bias]
     }

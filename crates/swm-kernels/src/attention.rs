@@ -1,11 +1,13 @@
-//! Causal attention of a few tokens per sample, whose queries are compared with the tokens themselves instead of keys.
+//! Causal attention to a few tokens per sample. Queries are compared with tokens instead of keys, because the caller
+//! multiplies queries by the transposed key matrix.
 
 use crate::functions::{add_scaled, dot, exp};
 use crate::grown;
 use swm_simd::{Kernel, Level, dispatch};
 
 /// Replaces the query of every head, given in the tokens' space, by the head's attention output: the mean of the tokens
-/// weighted by the softmax of their scalar products with the query. A row attends to its own token and to earlier ones.
+/// weighted by the softmax of the scalar products of tokens and query. A row attends to its own token and to
+/// earlier tokens of its sample.
 ///
 /// # Shapes
 /// `queries` is `[rows, heads, dim]`, `tokens` is `[tokens, samples, dim]`. Row `i` of `queries` belongs to row

@@ -3,9 +3,9 @@
 use crate::panels::LANES;
 use swm_simd::{Kernel, Level, dispatch};
 
-/// Replaces every element by `x Φ(x)`, with an error below 1e-6.
+/// Replaces every element by its GELU, `x Φ(x)` (Hendrycks and Gimpel 2016), with an error below 1e-6.
 ///
-/// GELU (Hendrycks and Gimpel 2016) with the error function, not its approximation by `tanh`.
+/// `Φ` is the standard normal distribution function, computed with the error function, not approximated by `tanh`.
 pub fn gelu(x: &mut [f32]) {
     struct Gelu<'a>(&'a mut [f32]);
     impl Kernel for Gelu<'_> {
@@ -22,7 +22,7 @@ pub fn gelu(x: &mut [f32]) {
 }
 
 /// Computes the tangent of [`gelu`] at every element: replaces `x` by the value of the tangent line at 0, `-x² φ(x)`,
-/// and writes its slope, `Φ(x) + x φ(x)`, to `slopes`.
+/// and writes the slope of the line, `Φ(x) + x φ(x)`, to `slopes`. `φ` is the standard normal density.
 ///
 /// # Shapes
 /// `x` and `slopes` have the same length.
@@ -33,12 +33,12 @@ pub fn gelu_tangent(x: &mut [f32], slopes: &mut [f32]) {
 
         #[inline(always)]
         fn run<L: Level>(self) {
-            /// `1 / √(2π)`.
+            /// The standard normal density at 0, `1 / √(2π)`.
             const HEIGHT: f32 = 0.398_942_3;
             for (x, slope) in self.0.iter_mut().zip(self.1) {
-                let along = *x * HEIGHT * exp::<L>(-0.5 * *x * *x);
-                *slope = 0.5 + half_erf::<L>(*x) + along;
-                *x *= -along;
+                let x_density = *x * HEIGHT * exp::<L>(-0.5 * *x * *x);
+                *slope = 0.5 + half_erf::<L>(*x) + x_density;
+                *x *= -x_density;
             }
         }
     }
@@ -79,7 +79,7 @@ fn half_erf<L: Level>(x: f32) -> f32 {
 /// Returns the exponential of `x <= 0` as a power of two times a polynomial.
 #[inline(always)]
 pub(crate) fn exp<L: Level>(x: f32) -> f32 {
-    /// 1.5 times 2²³: adding it leaves the nearest integer in the low bits.
+    /// 1.5 times 2²³: adding this constant leaves the nearest integer in the low bits.
     const ROUND: f32 = 12_582_912.0;
     let x = x.max(-87.0);
     let shifted = L::fma(x, std::f32::consts::LOG2_E, ROUND);
@@ -91,7 +91,7 @@ pub(crate) fn exp<L: Level>(x: f32) -> f32 {
     series * scale
 }
 
-/// Returns the sum of the elements, accumulated in separate lanes.
+/// Returns the sum of the elements of `x`, accumulated in separate lanes.
 #[inline(always)]
 pub(crate) fn sum(x: &[f32]) -> f32 {
     let mut lanes = [0.0f32; LANES];
@@ -104,7 +104,7 @@ pub(crate) fn sum(x: &[f32]) -> f32 {
     fold(lanes) + rest.iter().sum::<f32>()
 }
 
-/// Returns the scalar product, accumulated in separate lanes.
+/// Returns the scalar product of `a` and `b`, which have the same length, accumulated in separate lanes.
 #[inline(always)]
 pub(crate) fn dot<L: Level>(a: &[f32], b: &[f32]) -> f32 {
     let mut lanes = [0.0f32; LANES];
@@ -117,7 +117,7 @@ pub(crate) fn dot<L: Level>(a: &[f32], b: &[f32]) -> f32 {
     fold(lanes) + a_rest.iter().zip(b_rest).map(|(a, b)| a * b).sum::<f32>()
 }
 
-/// Returns the sum of all lanes, halving their number at each step.
+/// Returns the sum of all lanes, halving the number of lanes at each step.
 #[inline(always)]
 fn fold(mut lanes: [f32; LANES]) -> f32 {
     let mut width = LANES / 2;
@@ -130,7 +130,7 @@ fn fold(mut lanes: [f32; LANES]) -> f32 {
     lanes[0]
 }
 
-/// Computes `to += factor * x`.
+/// Computes `to += factor * x` for slices of the same length.
 #[inline(always)]
 pub(crate) fn add_scaled<L: Level>(to: &mut [f32], factor: f32, x: &[f32]) {
     for (to, x) in to.iter_mut().zip(x) {
@@ -138,7 +138,7 @@ pub(crate) fn add_scaled<L: Level>(to: &mut [f32], factor: f32, x: &[f32]) {
     }
 }
 
-/// Replaces every row by its softmax.
+/// Replaces every row by the softmax of the row.
 ///
 /// # Shapes
 /// `x` is `[rows, width]`.
@@ -164,7 +164,7 @@ pub fn softmax(x: &mut [f32], width: usize) {
     dispatch(Softmax(x, width));
 }
 
-/// Replaces the gradient `d` of a [`softmax`]'s output by that of its input.
+/// Replaces the gradient `d` of the output of a [`softmax`] by the gradient of the input.
 ///
 /// # Shapes
 /// `weights`, the output of the softmax, and `d` are `[rows, width]`.
@@ -186,7 +186,7 @@ pub fn softmax_backward(weights: &[f32], d: &mut [f32], width: usize) {
     dispatch(Backward(weights, d, width));
 }
 
-/// Computes `x *= slope` element by element.
+/// Computes `x *= slopes` element by element.
 ///
 /// # Shapes
 /// `x` and `slopes` have the same shape.
@@ -194,7 +194,7 @@ pub fn multiply(x: &mut [f32], slopes: &[f32]) {
     x.iter_mut().zip(slopes).for_each(|(x, slope)| *x *= slope);
 }
 
-/// Computes `offset += x * slope` element by element.
+/// Computes `offsets += x * slopes` element by element.
 ///
 /// # Shapes
 /// `offsets`, `x` and `slopes` have the same shape.
@@ -222,7 +222,7 @@ pub fn add(x: &mut [f32], y: &[f32]) {
     }
 }
 
-/// Returns the largest element.
+/// Returns the largest element of `x`.
 #[inline(always)]
 fn max(x: &[f32]) -> f32 {
     let mut max = [f32::NEG_INFINITY; LANES];
@@ -260,7 +260,7 @@ mod tests {
             silu(&mut values);
             assert!((values[0] - x / (1.0 + (-x).exp())).abs() < 2e-6, "silu({x})");
         }
-        // Φ by Simpson's rule from 0: the density is smooth enough for 2,000 intervals.
+        // Φ is integrated from 0 by Simpson's rule; the density is smooth enough for 2,000 intervals.
         let density = |x: f64| (-x * x / 2.0).exp() / std::f64::consts::TAU.sqrt();
         for i in -600..=600 {
             let x = f64::from(i) / 50.0;

@@ -1,4 +1,4 @@
-//! CPU kernels of planning and of training vision transformers, on plain row-major `f32` slices.
+//! CPU kernels for planning and for training vision transformers, on plain row-major `f32` slices.
 //!
 //! A tensor library allocates and reads memory once per operation. Here weights are laid out once ([`Panels`]), scratch
 //! memory is reused ([`ScratchPool`]), and every row is computed independently, so no byte of a result depends on the

@@ -13,7 +13,7 @@ pub struct Norm {
 }
 
 impl Norm {
-    /// A normalisation with these parameters, which adds `epsilon` to the variance.
+    /// Creates a normalisation that adds `epsilon` to the variance.
     pub fn new(parameters: Affine, epsilon: f32) -> Self {
         Self { weight: parameters.weight, bias: parameters.bias, epsilon }
     }
@@ -26,10 +26,10 @@ impl Norm {
         dispatch(Normalise { norm: self, modulation: None, x, y });
     }
 
-    /// Standardises the rows of `x`, modulates them, and writes them normalised to `y`.
+    /// Standardises and modulates the rows of `x`, and writes the normalised rows to `y`.
     ///
     /// # Shapes
-    /// As [`Norm::apply`].
+    /// `x` and `y` are `[rows, features]`.
     pub fn apply_modulated(&self, modulation: Modulation<'_>, x: &[f32], y: &mut [f32]) {
         dispatch(Normalise { norm: self, modulation: Some(modulation), x, y });
     }
@@ -42,7 +42,7 @@ impl Norm {
 /// Shift and scale of every row, as parts of a larger array of modulations.
 #[derive(Clone, Copy)]
 pub struct Modulation<'a> {
-    /// `[rows, parts * features]`.
+    /// The modulations, `[rows, parts * features]`.
     pub values: &'a [f32],
     /// Number of parts.
     pub parts: usize,
@@ -98,7 +98,7 @@ fn center<L: Level>(row: &mut [f32], epsilon: f32) -> f32 {
 /// Adds the gradients of a normalisation, whose output has the gradient `dy`, to `dx`, `weight` and `bias`.
 ///
 /// # Shapes
-/// `x`, `dy` and `dx` are `[rows, features]`, `weight` and `bias` `[features]`.
+/// `x`, `dy` and `dx` are `[rows, features]`, `weight` and `bias` are `[features]`.
 pub(crate) fn backward(norm: &Norm, x: &[f32], dy: &[f32], dx: &mut [f32], [weight, bias]: [&mut [f32]; 2]) {
     struct Backward<'a> {
         norm: &'a Norm,
@@ -126,9 +126,9 @@ pub(crate) fn backward(norm: &Norm, x: &[f32], dy: &[f32], dx: &mut [f32], [weig
                     self.bias[i] += dy[i];
                     self.scaled[i] = dy[i] * self.norm.weight[i];
                 }
-                let (mean, along) = (sum(&self.scaled) / n, dot::<L>(&self.scaled, &self.row) / n);
+                let (mean, correlation) = (sum(&self.scaled) / n, dot::<L>(&self.scaled, &self.row) / n);
                 for i in 0..features {
-                    dx[i] = L::fma(factor, self.scaled[i] - mean - along * self.row[i], dx[i]);
+                    dx[i] = L::fma(factor, self.scaled[i] - mean - correlation * self.row[i], dx[i]);
                 }
             }
         }
@@ -137,7 +137,7 @@ pub(crate) fn backward(norm: &Norm, x: &[f32], dy: &[f32], dx: &mut [f32], [weig
     dispatch(Backward { norm, x, dy, dx, weight, bias, row: scratch(), scaled: scratch() });
 }
 
-/// Adds the rows of `y`, each multiplied element by element by part `gate` of its modulation, to `x`.
+/// Adds the rows of `y`, each multiplied element by element by part `gate` of the row's modulation, to `x`.
 ///
 /// # Shapes
 /// `x` and `y` are `[rows, features]`, `modulation` is `[rows, parts * features]`.

@@ -1,21 +1,21 @@
 //! [`Panels`]: products of rows with a matrix that is laid out once and used often.
 //!
-//! The matrix is cut into panels of 32 columns, so that a product reads it in order. A tile of the result, some rows of
-//! a panel, stays in registers while its terms are added one after the other. The result of a row does not depend on
-//! the other rows.
+//! The matrix is cut into panels of 32 columns, so that a product reads the matrix in order. A tile of the result, some
+//! rows of a panel, stays in registers while terms are added to the tile. The result of a row does not depend on the
+//! other rows.
 
 use crate::Affine;
 use swm_simd::{CpuLevel, Kernel, Level, dispatch};
 
-/// Elements of a vector.
+/// The number of elements of a SIMD vector.
 pub(crate) const LANES: usize = 16;
-/// Columns of a panel.
+/// The number of columns of a panel.
 const WIDTH: usize = 2 * LANES;
 
-/// Vectors of the largest tile.
+/// The number of SIMD vectors of the largest tile.
 const TILE: usize = 24;
 
-/// Elements that are computed at once.
+/// A SIMD vector, whose elements are computed at once.
 #[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
 struct Lanes([f32; LANES]);
@@ -29,28 +29,28 @@ const ZERO: Pair = [Lanes([0.0; LANES]); WIDTH / LANES];
 pub struct Panels {
     inputs: usize,
     outputs: usize,
-    /// For each panel, its elements in all rows; columns beyond the matrix are 0.
+    /// The elements of each panel, row by row; columns beyond the matrix are 0.
     elements: Vec<Pair>,
-    /// For each panel, the bias of its columns.
+    /// The bias of the columns of each panel.
     bias: Vec<Pair>,
 }
 
 impl Panels {
-    /// A matrix without bias whose elements are `at(input, output)`.
+    /// Creates a matrix without bias whose elements are `at(input, output)`.
     pub fn new(inputs: usize, outputs: usize, at: impl Fn(usize, usize) -> f32) -> Self {
         let mut panels = Self { inputs, outputs, elements: vec![], bias: vec![ZERO; outputs.div_ceil(WIDTH)] };
         panels.fill(inputs, at);
         panels
     }
 
-    /// A linear layer: `parameters.weight` is `[outputs, inputs]`.
+    /// Creates the matrix and the bias of a linear layer: `parameters.weight` is `[outputs, inputs]`.
     pub fn linear(parameters: &Affine) -> Self {
         let outputs = parameters.bias.len();
         let inputs = parameters.weight.len() / outputs;
         Self::new(inputs, outputs, |i, o| parameters.weight[o * inputs + i]).with_bias(&parameters.bias)
     }
 
-    /// The same matrix with a bias, `[outputs]`.
+    /// Returns the matrix with a bias, `[outputs]`.
     #[must_use]
     pub fn with_bias(mut self, bias: &[f32]) -> Self {
         for (column, value) in bias.iter().enumerate() {
@@ -59,7 +59,7 @@ impl Panels {
         self
     }
 
-    /// Replaces the matrix by one with the same outputs and elements `at(input, output)`, in the same memory.
+    /// Replaces the matrix by a matrix with as many outputs and with elements `at(input, output)`, in the same memory.
     pub fn fill(&mut self, inputs: usize, at: impl Fn(usize, usize) -> f32) {
         self.inputs = inputs;
         self.elements.clear();
@@ -123,7 +123,8 @@ impl Panels {
         dispatch(Product::<false> { rows, x, y, weights: self, tile: &mut tile });
     }
 
-    /// Computes `y += xᵀ W + b`, the product that gradients of weights need. Strides as in [`Panels::apply_strided`].
+    /// Computes `y += xᵀ W + b`, the product in the gradient of weights. Each array is a slice and the distance from
+    /// row to row in elements.
     ///
     /// # Shapes
     /// `x` is `[inputs, rows]`, `y` is `[rows, outputs]`.
@@ -133,13 +134,13 @@ impl Panels {
     }
 }
 
-/// A product to compute; with transposed rows, its result is added.
+/// A product to compute; with `TRANSPOSED`, `x` is transposed and the product is added to `y`.
 struct Product<'a, const TRANSPOSED: bool> {
     rows: usize,
     x: (&'a [f32], usize),
     y: (&'a mut [f32], usize),
     weights: &'a Panels,
-    /// The last tile, in memory outside the kernel: arrays that are indexed at run time do not stay in registers.
+    /// Memory to which a finished tile is copied: an array that is indexed at run time does not stay in registers.
     tile: &'a mut [Lanes; TILE],
 }
 
@@ -152,7 +153,7 @@ impl<const TRANSPOSED: bool> Kernel for Product<'_, TRANSPOSED> {
         for (index, bias) in self.weights.bias.iter().enumerate() {
             let panel =
                 Panel { first: index * WIDTH, elements: &self.weights.elements[index * inputs..][..inputs], bias };
-            // Tiles of as many rows as registers hold, then smaller ones.
+            // The first tiles have as many rows as the registers hold, and smaller tiles compute the remaining rows.
             let mut row = 0;
             if L::CPU == CpuLevel::Avx512 {
                 while rows - row >= 12 {
@@ -177,10 +178,10 @@ impl<const TRANSPOSED: bool> Kernel for Product<'_, TRANSPOSED> {
     }
 }
 
-/// One panel.
+/// One panel of a matrix.
 #[derive(Clone, Copy)]
 struct Panel<'a> {
-    /// The first of its columns.
+    /// The index of the first column.
     first: usize,
     elements: &'a [Pair],
     bias: &'a Pair,
@@ -249,7 +250,7 @@ mod tests {
                     let expected = f64::from(bias[output]) + terms.sum::<f64>();
                     assert!((f64::from(*y) - expected).abs() < 1e-5, "{rows} {inputs} {outputs}: {y} for {expected}");
                 }
-                // The same product from columns, added to the previous result.
+                // The transposed product adds the same values to the previous result.
                 let columns: Vec<f32> = (0..rows * inputs).map(|i| x[i % rows * inputs + i / rows]).collect();
                 let mut sum = y.clone();
                 panels.add_transposed(rows, (&columns, rows), (&mut sum, outputs));

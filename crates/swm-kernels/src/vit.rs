@@ -1,4 +1,4 @@
-//! [`VitEncoder`]: the class token of a vision transformer (Dosovitskiy et al. 2021), one image at a time.
+//! [`VitEncoder`]: a vision transformer (Dosovitskiy et al. 2021) that returns the class token of one image at a time.
 //!
 //! The tokens of an image are split into blocks of rows, which threads compute in parallel; every row is computed
 //! independently, so the result has the same bytes on any number of threads. The last layer computes only the class
@@ -11,12 +11,12 @@ use rayon::prelude::*;
 /// The maximum number of rows of a block.
 const BLOCK: usize = 36;
 
-/// Parameters of a vision transformer, or their gradients.
+/// The parameters of a vision transformer, or the gradients of the parameters.
 #[derive(Clone, Debug)]
 pub struct VitParameters {
-    /// From patches to tokens: `[dim, 3 * patch * patch]`, `[dim]`.
+    /// The layer from patches to tokens, with a weight of `[dim, 3 * patch * patch]` and a bias of `[dim]`.
     pub patches: Affine,
-    /// `[1 + patches, dim]`: the class token plus its position, then the positions of the patches.
+    /// The class token plus its position embedding, then the position embeddings of the patches: `[1 + patches, dim]`.
     pub positions: Vec<f32>,
     /// The layers, first to last.
     pub layers: Vec<VitLayerParameters>,
@@ -24,16 +24,16 @@ pub struct VitParameters {
     pub norm: Affine,
 }
 
-/// Parameters of one layer of a vision transformer, or their gradients.
+/// The parameters of one layer of a vision transformer, or the gradients of the parameters.
 #[derive(Clone, Debug)]
 pub struct VitLayerParameters {
     /// The normalisation before the attention.
     pub norm_before: Affine,
-    /// Queries, `[dim, dim]`.
+    /// The projection to queries, `[dim, dim]`.
     pub query: Affine,
-    /// Keys, `[dim, dim]`.
+    /// The projection to keys, `[dim, dim]`.
     pub key: Affine,
-    /// Values, `[dim, dim]`.
+    /// The projection to values, `[dim, dim]`.
     pub value: Affine,
     /// The output projection of the attention, `[dim, dim]`.
     pub attention_output: Affine,
@@ -49,9 +49,9 @@ pub struct VitLayerParameters {
 pub struct VitEncoder {
     pub(crate) dim: usize,
     pub(crate) heads: usize,
-    /// From patches to tokens.
+    /// The layer from patches to tokens.
     pub(crate) embed: Panels,
-    /// `[tokens, dim]`, as [`VitParameters::positions`].
+    /// The position embeddings, `[tokens, dim]`, as [`VitParameters::positions`].
     pub(crate) positions: Vec<f32>,
     pub(crate) layers: Vec<Layer>,
     pub(crate) norm: Norm,
@@ -61,7 +61,7 @@ pub struct VitEncoder {
 
 pub(crate) struct Layer {
     pub before: Norm,
-    /// Scaled queries, keys and values.
+    /// The projections to scaled queries, keys and values.
     pub qkv: Panels,
     pub out: Panels,
     pub after: Norm,
@@ -72,7 +72,7 @@ pub(crate) struct Layer {
 #[derive(Default)]
 struct Scratch {
     x: Vec<f32>,
-    /// `[tokens, 3 * dim]`.
+    /// Scaled queries, keys and values, `[tokens, 3 * dim]`.
     qkv: Vec<f32>,
     /// The keys of each head as columns, then the values of each head as rows.
     keys_values: Vec<Panels>,
@@ -151,7 +151,7 @@ impl VitEncoder {
         class
     }
 
-    /// Writes the class token and the embedded patches with their positions to `x`, `[tokens, dim]`.
+    /// Writes the class token and the embedded patches, plus position embeddings, to `x`, `[tokens, dim]`.
     fn embed_patches(&self, patches: &[f32], block: usize, x: &mut [f32]) {
         let (dim, inputs) = (self.dim, self.embed.inputs());
         let (class, patch_tokens) = x.split_at_mut(dim);
@@ -183,8 +183,7 @@ impl Layer {
         }
     }
 
-    /// Computes the layer for a block of rows: `x` is `[rows, dim]`, and `qkv`, the part of these rows, is
-    /// `[rows, 3 * dim]`.
+    /// Computes the layer for a block of rows: `x` is `[rows, dim]`, and `qkv` of the same rows is `[rows, 3 * dim]`.
     fn apply(&self, x: &mut [f32], qkv: &[f32], keys_values: &[Panels], scratch: &mut BlockScratch) {
         let dim = self.out.inputs();
         let (rows, heads) = (x.len() / dim, keys_values.len() / 2);
@@ -210,7 +209,7 @@ impl Layer {
     }
 }
 
-/// Returns the factor of the queries, `1 / sqrt(dim / heads)`.
+/// Returns the factor that scales the queries, `1 / sqrt(dim / heads)`.
 pub(crate) fn query_scale(dim: usize, heads: usize) -> f32 {
     1.0 / ((dim / heads) as f32).sqrt()
 }

@@ -1,8 +1,8 @@
 //! [`VitGradient`]: gradients of a vision transformer's parameters, one image after the other.
 //!
-//! The backward pass reads the matrix products that the forward pass stored, and recomputes the operations between them
-//! (normalisations, attention, GELU). The last layer computes only the class token, so no gradient of another token
-//! passes through its feed-forward block.
+//! The backward pass reads the matrix products that the forward pass stored, and recomputes the operations between the
+//! products (normalisations, attention, GELU). The last layer computes only the class token, so no gradient of another
+//! token passes through the last feed-forward block.
 
 use crate::functions::{add, gelu, gelu_tangent, multiply, multiply_add, softmax, softmax_backward};
 use crate::norm::backward;
@@ -45,7 +45,7 @@ struct LayerTape {
 pub struct VitGradientSums {
     layers: Vec<LayerSums>,
     norm: Affine,
-    /// `[tokens, dim]`.
+    /// The gradients of the class token and the position embeddings, `[tokens, dim]`.
     positions: Vec<f32>,
     patches: Affine,
 }
@@ -133,7 +133,7 @@ impl VitGradient {
         }
     }
 
-    /// Returns gradient sums of zero.
+    /// Returns zero-initialised gradient sums.
     pub fn sums(&self) -> VitGradientSums {
         let dim = self.encoder.dim;
         let layer = |layer: &TransposedLayer| LayerSums {
@@ -196,7 +196,7 @@ impl VitGradient {
         (class, tape)
     }
 
-    /// Writes the attention weights of one head, `[queries, tokens]`, to the scores.
+    /// Writes the attention weights of one head, `[queries, tokens]`, to `scratch.scores`.
     fn attention_weights(&self, qkv: &[f32], queries: usize, head: usize, scratch: &mut VitGradientScratch) {
         let (dim, tokens) = (self.encoder.dim, self.tokens());
         let width = dim / self.encoder.heads;
@@ -207,7 +207,7 @@ impl VitGradient {
         softmax(scores, tokens);
     }
 
-    /// Writes the values of one head, weighted by the scores, to the head's columns of `mixed`.
+    /// Writes the values of one head, weighted by `scratch.scores`, to the head's columns of `scratch.mixed`.
     fn mix_values(&self, qkv: &[f32], queries: usize, head: usize, scratch: &mut VitGradientScratch) {
         let (dim, tokens) = (self.encoder.dim, self.tokens());
         let width = dim / self.encoder.heads;
@@ -234,7 +234,7 @@ impl VitGradient {
         let layers = encoder.layers.iter().zip(&self.transposed).zip(&tape.layers).zip(&mut sums.layers);
         for (((layer, transposed), tape), sums) in layers.rev() {
             let queries = tape.middle.len() / dim;
-            // The feed-forward block.
+            // Backward pass of the feed-forward block.
             let activated = grown(&mut scratch.wide, tape.hidden.len());
             let slopes = grown(&mut scratch.slopes, tape.hidden.len());
             activated.copy_from_slice(&tape.hidden);
@@ -249,7 +249,7 @@ impl VitGradient {
             sums.into.add_linear_gradient(&mut scratch.dim, narrow, dhidden);
             transposed.into.apply(dhidden, narrow);
             backward(&layer.after, &tape.middle, narrow, &mut dx, sums.after.as_mut());
-            // The attention.
+            // Backward pass of the attention.
             let dmixed = grown(&mut scratch.dmixed, queries * dim);
             transposed.out.apply(&dx, dmixed);
             grown(&mut scratch.dqkv, tokens * 3 * dim).fill(0.0);
@@ -271,8 +271,8 @@ impl VitGradient {
         sums.patches.add_linear_gradient(&mut scratch.patch, patches, &dx[dim..]);
     }
 
-    /// Adds the gradients of one head's queries, keys and values, `[tokens, 3 * dim]`, to `dqkv`, from `dmixed` and the
-    /// attention weights in the scores.
+    /// Adds the gradients of one head's queries, keys and values, `[tokens, 3 * dim]`, to `scratch.dqkv`, from
+    /// `scratch.dmixed` and the attention weights in `scratch.scores`.
     fn head_backward(&self, qkv: &[f32], queries: usize, head: usize, scratch: &mut VitGradientScratch) {
         let (dim, tokens) = (self.encoder.dim, self.tokens());
         let width = dim / self.encoder.heads;
@@ -304,17 +304,17 @@ impl VitGradient {
 
     fn layer_gradients(&self, sums: LayerSums) -> VitLayerParameters {
         let dim = self.encoder.dim;
-        let part = |index: usize, factor: f32| {
+        let projection = |index: usize, factor: f32| {
             let cut = |all: &[f32], length: usize| -> Vec<f32> {
                 all[index * length..][..length].iter().map(|gradient| gradient * factor).collect()
             };
             Affine { weight: cut(&sums.qkv.weight, dim * dim), bias: cut(&sums.qkv.bias, dim) }
         };
         VitLayerParameters {
-            // The weights of the queries were scaled.
-            query: part(0, query_scale(dim, self.encoder.heads)),
-            key: part(1, 1.0),
-            value: part(2, 1.0),
+            // The forward pass scales the weights of the queries, so the gradients are scaled too.
+            query: projection(0, query_scale(dim, self.encoder.heads)),
+            key: projection(1, 1.0),
+            value: projection(2, 1.0),
             norm_before: sums.before,
             attention_output: sums.out,
             norm_after: sums.after,

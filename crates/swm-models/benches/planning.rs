@@ -33,7 +33,7 @@ fn main() {
     let rollout = Rollout::new(&model);
     let start = vec![0.1; latent];
     let actions: Vec<f32> = (0..SAMPLES * HORIZON * ACTION_DIM).map(|i| (i * 37 % 101) as f32 / 101.0 - 0.5).collect();
-    let chunks = || actions.par_chunks(Rollout::part(SAMPLES) * HORIZON * ACTION_DIM);
+    let chunks = || actions.par_chunks(Rollout::chunk_size(SAMPLES) * HORIZON * ACTION_DIM);
     let (mut fast, mut plain) = (vec![], vec![]);
     for _ in 0..ROUNDS {
         fast.push(milliseconds(|| {

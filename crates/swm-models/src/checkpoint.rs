@@ -1,16 +1,16 @@
-//! [`Checkpoint`]: a folder with a trained model, the statistics of its dataset, and the state from which training
-//! continues.
+//! [`Checkpoint`]: a folder with a trained model, the statistics of the training dataset, and the state from which
+//! training continues.
 //!
 //! | file | content |
 //! | --- | --- |
 //! | `config.json` | family, configuration, statistics of the dataset |
 //! | `weights.safetensors` | weights under their published names |
 //! | `optimizer.safetensors`, `state.json` | the state of the optimizer and of the run, from which training continues |
-//! | `raw.safetensors` | the trained weights, where `weights.safetensors` holds their moving average |
+//! | `raw.safetensors` | the trained weights, if `weights.safetensors` holds the moving average of the weights |
 //! | `manifest.json` | provenance, and the hashes of the files above |
 //!
-//! A new checkpoint is written to a second folder, which then replaces the old one by renaming, so that a killed
-//! process leaves a complete checkpoint.
+//! A new checkpoint is written to a second folder, which is then renamed to replace the old checkpoint, so that a
+//! killed process leaves a complete checkpoint.
 
 use crate::nn::parameters::{self, HostTensor, Named};
 use crate::run_folder::{CHECKPOINT_FILES, CONFIG, FOLDER, MANIFEST, OPTIMIZER, RAW, STATE, WEIGHTS};
@@ -28,9 +28,9 @@ use swm_core::{Error, Key, Manifest, Result, files, manifest};
 pub struct Checkpoint<M: Trainable> {
     /// The model.
     pub model: M,
-    /// The configuration of its training.
+    /// The training configuration.
     pub config: TrainConfig<M>,
-    /// Statistics of the dataset it was trained on.
+    /// Statistics of the training dataset.
     pub dataset_info: DatasetInfo,
     /// The provenance of the checkpoint; `hashes["weights"]` identifies the checkpoint.
     pub manifest: Manifest,
@@ -42,7 +42,7 @@ pub(crate) struct TrainState<M> {
     pub state: RunState,
     /// The state of the optimizer.
     pub moments: Named<HostTensor>,
-    /// The trained weights, where the checkpoint holds their moving average.
+    /// The trained weights, if the weights of the checkpoint are a moving average; else `None`.
     pub raw: Option<M>,
 }
 
@@ -65,13 +65,13 @@ impl<M: Trainable> Checkpoint<M> {
         locate(run).is_some()
     }
 
-    /// The hash of the weights.
+    /// Returns the hash of the weights.
     pub fn hash(&self) -> &str {
         self.manifest.hashes.get("weights").map_or("", String::as_str)
     }
 
-    /// The dimension of the actions of one model step: that of an environment action, times the frameskip.
-    pub fn actions(&self) -> usize {
+    /// Returns the action dimension of a model step: the dimension of an environment action times the frameskip.
+    pub fn action_dim(&self) -> usize {
         self.config.data.frameskip * self.dataset_info.action.dim()
     }
 
@@ -118,7 +118,7 @@ impl<M: Trainable> Checkpoint<M> {
         Ok(Self::read(run, device)?.0)
     }
 
-    /// Loads the checkpoint and returns it with its folder.
+    /// Returns the checkpoint of a run folder, and the folder of the checkpoint's files.
     fn read(run: &Path, device: &Device) -> Result<(Self, PathBuf)> {
         let StoredCheckpoint { folder, file, manifest, config } =
             StoredCheckpoint::<TrainConfig<M>>::read(run, M::FAMILY)?;
@@ -133,7 +133,7 @@ impl<M: Trainable> Checkpoint<M> {
     /// Loads the checkpoint and the state from which training continues.
     ///
     /// # Errors
-    /// As [`Checkpoint::load`], and when the checkpoint was saved without the state.
+    /// As [`Checkpoint::load`], and when the checkpoint was saved without the state of training.
     pub(crate) fn load_to_resume(run: &Path, device: &Device) -> Result<(Self, TrainState<M>)> {
         let (checkpoint, folder) = Self::read(run, device)?;
         let path = folder.join(STATE);
@@ -149,17 +149,17 @@ impl<M: Trainable> Checkpoint<M> {
     }
 }
 
-/// The family of the model in a run folder; `None` if the folder holds no checkpoint.
+/// Returns the family of the model in a run folder; `None` if the folder holds no checkpoint.
 pub fn family(run: &Path) -> Option<String> {
     let file: serde_json::Value = serde_json::from_slice(&read(&locate(run)?.join(CONFIG)).ok()?).ok()?;
     Some(file.get("family")?.as_str()?.to_owned())
 }
 
-/// The files of a checkpoint other than its weights, of any family.
+/// The files, except the weights, of a checkpoint of any family.
 pub(crate) struct StoredCheckpoint<C> {
     /// The checkpoint's folder.
     pub folder: PathBuf,
-    /// The whole `config.json`.
+    /// The parsed `config.json`.
     pub file: serde_json::Value,
     /// The field `config` of `config.json`.
     pub config: C,
@@ -194,8 +194,8 @@ impl<C: serde::de::DeserializeOwned> StoredCheckpoint<C> {
     }
 }
 
-/// Writes a checkpoint with additional files to a new folder and replaces the old one with it. Stores the hash of the
-/// weights in the manifest and returns it.
+/// Writes a checkpoint with additional files to a new folder, which then replaces the old checkpoint. Stores the hash
+/// of the weights in the manifest and returns the hash.
 pub(crate) fn write(
     run: &Path,
     config: &impl Serialize,
@@ -221,8 +221,8 @@ pub(crate) fn write(
     Ok(hash)
 }
 
-/// Renames the folder `new` to that of the checkpoint and deletes the old checkpoint. Other files in the folder of the
-/// old checkpoint move to the new one.
+/// Renames the folder `new` to the name of the checkpoint folder and deletes the old checkpoint. Files of other names in
+/// the old checkpoint's folder move to the new one.
 fn replace(run: &Path, new: &Path) -> Result<()> {
     let (current, old) = (run.join(FOLDER), run.join(format!("{FOLDER}.old")));
     let rename = |from: &Path, to: &Path| {
@@ -262,11 +262,11 @@ pub(crate) fn load_weights<M: burn::module::Module>(model: M, path: &Path, hash:
 }
 
 fn broken(path: &Path, problem: String) -> Error {
-    Error::corrupt(path, problem, "train again, or copy the checkpoint again from where it came")
+    Error::corrupt(path, problem, "train again, or copy the checkpoint again from its source")
 }
 
-/// Returns the folder of a run's checkpoint: `run` itself, its checkpoint folder, or the old checkpoint that a killed
-/// process did not replace.
+/// Returns the folder of a run's checkpoint: `run`, the folder `checkpoint` in `run`, or the old checkpoint, which
+/// remains if a process was killed between the two renamings.
 fn locate(run: &Path) -> Option<PathBuf> {
     [run.to_owned(), run.join(FOLDER), run.join(format!("{FOLDER}.old"))]
         .into_iter()
@@ -305,7 +305,7 @@ fn unpack(path: &Path, hash: Option<&String>) -> Result<Named<HostTensor>> {
     let broken = |problem: String| broken(path, problem);
     let tensors = SafeTensors::deserialize(&bytes).map_err(|error| broken(format!("is damaged ({error})")))?;
     if hash.is_some_and(|hash| *hash != manifest::hash(&bytes)) {
-        return Err(broken(format!("is not the file that {MANIFEST} describes: its hash differs")));
+        return Err(broken(format!("is not the file that {MANIFEST} describes: the hash differs")));
     }
     tensors
         .iter()

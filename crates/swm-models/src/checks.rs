@@ -1,4 +1,4 @@
-//! Checks that several model families share: of settings, and of the inputs of planning costs.
+//! Checks of settings and of the inputs of planning costs, which several model families share.
 
 use crate::pixels;
 use crate::train::at_least;
@@ -22,15 +22,15 @@ pub(crate) fn dropout_rates(rates: &[(&str, f32)]) -> Result<()> {
 /// When a standard deviation is not positive.
 pub(crate) fn pixel_std(std: [f32; 3]) -> Result<()> {
     if std.iter().any(|std| *std <= 0.0) {
-        return Err(Error::config("model.pixel_std", format!("{std:?}"), "give three positive numbers"));
+        return Err(Error::config("model.pixel_std", format!("{std:?}"), "give three positive values"));
     }
     Ok(())
 }
 
-/// Checks that clips of `num_steps` frames contain a window of `history` frames and the frame after it.
+/// Checks that clips of `num_steps` frames contain a window of `history` frames and the frame after the window.
 ///
 /// # Errors
-/// When the clips are shorter.
+/// When `num_steps` is below `history + 1` or below 2.
 pub(crate) fn clip_covers_history(num_steps: usize, history: usize) -> Result<()> {
     at_least(&[("data.num_steps", num_steps, 2)])?;
     if num_steps - 1 < history {
@@ -78,11 +78,11 @@ pub(crate) fn column_shape(schema: &Schema, name: &str, expected: &[usize]) -> R
     ))
 }
 
-/// Checks that candidates and costs have the sizes for `envs` observed environments and actions of `action_dim`
-/// elements.
+/// Checks that candidates and costs fit `envs` observed environments and actions of `action_dim` elements per model
+/// step.
 ///
 /// # Errors
-/// When a size differs.
+/// When the number of environments, of action elements or of costs differs.
 pub(crate) fn candidate_sizes(
     what: &str,
     candidates: &Candidates<'_>,

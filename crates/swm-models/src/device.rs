@@ -1,17 +1,17 @@
-//! The device a model computes on: `cpu`, or a GPU whose backend was built in.
+//! The device on which a model computes: `cpu`, or a GPU whose backend was built in.
 
 use burn::tensor::Device;
 use swm_core::{Error, Result};
 
-/// The backends: the name, and whether this build contains the backend.
+/// The name of each backend, and whether this build contains the backend.
 const BACKENDS: [(&str, bool); 3] =
     [("cpu", true), ("vulkan", cfg!(feature = "vulkan")), ("cuda", cfg!(feature = "cuda"))];
 
-/// Parses the name of a device: `cpu`, `vulkan` or `cuda` (followed by `:1` for the second such GPU), or `auto`, which
-/// is a GPU backend that was built in, or else the CPU.
+/// Parses the name of a device: `cpu`, `vulkan` or `cuda` (optionally followed by a GPU index, such as
+/// `vulkan:1`), or `auto`, which is the last built-in backend of `cpu`, `vulkan`, `cuda`.
 ///
 /// # Errors
-/// When there is no such device, or this program was built without it.
+/// When the name is not that of a backend, the GPU index is no integer, or this build does not contain the backend.
 pub fn parse(name: &str) -> Result<Device> {
     if name == "auto" {
         let found = BACKENDS.iter().rev().find(|(_, built)| *built);
@@ -20,8 +20,9 @@ pub fn parse(name: &str) -> Result<Device> {
     let (backend, index) = match name.split_once(':') {
         None => (name, 0),
         Some((backend, index)) => {
-            let invalid =
-                |_| Error::config("--device", format!("'{index}' is not a GPU index"), "write it like vulkan:0");
+            let invalid = |_| {
+                Error::config("--device", format!("'{index}' is not a GPU index"), "write the device like vulkan:0")
+            };
             (backend, index.parse().map_err(invalid)?)
         }
     };
@@ -31,7 +32,7 @@ pub fn parse(name: &str) -> Result<Device> {
     };
     if !built {
         let problem = format!("this program was built without {backend}");
-        let fix = format!("build it with `--features {backend}` (`make gpu` does for Vulkan), or pass --device cpu");
+        let fix = format!("build it with `--features {backend}` (`make gpu` builds for Vulkan), or pass --device cpu");
         return Err(Error::config("--device", problem, fix));
     }
     open(backend, index)
@@ -55,7 +56,7 @@ fn open(backend: &str, index: usize) -> Result<Device> {
     }
 }
 
-/// The name of a device in manifests.
+/// Returns the name of a device in manifests.
 pub fn name(device: &Device) -> String {
     if *device == Device::flex() { "cpu (flex)".to_owned() } else { format!("{device:?}") }
 }
@@ -66,8 +67,8 @@ mod tests {
 
     #[test]
     fn cpu_is_always_available_and_errors_name_the_fix() {
-        assert_eq!(name(&parse("cpu").expect("the CPU")), "cpu (flex)");
-        let message = |name: &str| parse(name).expect_err("an error").to_string();
+        assert_eq!(name(&parse("cpu").expect("parsing 'cpu'")), "cpu (flex)");
+        let message = |name: &str| parse(name).expect_err("an invalid device is accepted").to_string();
         assert!(message("cdua").contains("did you mean cuda"), "{}", message("cdua"));
         assert!(message("cpu:x").contains("not a GPU index"), "{}", message("cpu:x"));
         if !cfg!(feature = "cuda") {

@@ -5,18 +5,18 @@ use std::time::Instant;
 use swm_core::{Batch, EnvSpec, Error, Key, Policy, Result, RowRef, Schema};
 use swm_plan::ActionScale;
 
-/// A network that returns actions.
+/// A network that computes the actions of a model step.
 pub trait ActionNetwork: Send + Sync {
     /// The state of the network within an episode, such as the encoded goal.
     type EpisodeState: Default + Send;
 
-    /// The scale between the units of environment actions and of network actions.
+    /// Returns the scale between environment units and model units of actions.
     fn scale(&self) -> &ActionScale;
 
     /// Checks that `infos` has the columns that the network reads.
     ///
     /// # Errors
-    /// When a column is missing or of another shape.
+    /// When a column is missing or has another shape.
     fn check(&self, infos: &Schema) -> Result<()>;
 
     /// Computes the actions of the next model step in model units.
@@ -29,7 +29,7 @@ pub trait ActionNetwork: Send + Sync {
     fn next_actions(&self, state: &mut Self::EpisodeState, row: RowRef<'_>) -> Result<Vec<f32>>;
 }
 
-/// Executes the actions of a network, one model step at a time.
+/// A policy that executes the actions of a network, one model step at a time.
 ///
 /// The network processes every environment separately, so the actions of an environment depend neither on the other
 /// environments nor on the number of threads.
@@ -52,7 +52,7 @@ struct Slot<S> {
     done: usize,
     /// Whether the network must compute the next actions.
     due: bool,
-    /// The error of the last model step, until [`Policy::act`] returns it.
+    /// The error of the last model step, until [`Policy::act`] returns the error.
     failed: Option<Error>,
 }
 
@@ -125,8 +125,8 @@ impl<N: ActionNetwork> Policy for FeedForwardPolicy<N> {
         Ok(())
     }
 
-    /// Seconds per model step, encoding included. The time of a parallel computation is divided equally among its
-    /// environments.
+    /// Returns the seconds of each model step, encoding included. The time of a parallel computation is divided equally
+    /// among the environments.
     fn take_latencies(&mut self) -> Vec<f64> {
         std::mem::take(&mut self.latencies)
     }

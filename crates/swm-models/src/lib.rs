@@ -1,18 +1,19 @@
 //! World models, policies and their training.
 //!
 //! Contracts:
-//! - [`train`](mod@train): the training loop for every [`Trainable`] model, its configuration and logs.
+//! - [`train`](mod@train): the training loop for every [`Trainable`] model, the training configuration and the logs.
 //! - [`family`]: [`ModelFamily`], the contract of a model family; [`registry`]: the families of this build.
 //! - [`online`]: training by acting in environments; [`feed_forward`]: policies without planning.
 //! - [`probe`]: regression of the environment state from frozen latents.
-//! - [`checkpoint`]: trained models on disk; [`run_folder`]: the files of a training run; [`weights`]: pretrained weights, and files for PyTorch.
+//! - [`checkpoint`]: trained models on disk; [`run_folder`]: the files of a training run.
+//! - [`weights`]: pretrained weights, and weight files for PyTorch.
 //!
 //! Building blocks: [`nn`], with PyTorch's parameter names; [`pixels`], the normalisation of images; [`device`].
 //!
-//! Families, a folder each:
+//! Model families, one module per group of related families:
 //! - [`lewm`] (LeWM) and [`pldm`] (PLDM): world models with a latent per frame.
-//! - [`dino_wm`] (DINO-WM): a world model in the patches of a frozen encoder.
-//! - [`tdmpc2`] (TD-MPC2): a world model of rewards and values; [`sac`]: soft actor-critic.
+//! - [`dino_wm`] (DINO-WM): a world model that predicts the patch features of a frozen encoder.
+//! - [`tdmpc2`] (TD-MPC2): a world model that predicts rewards and values; [`sac`]: soft actor-critic.
 //! - [`gcrl`] (GCBC, GCIVL, GCIQL): goal-conditioned policies from offline data.
 //! - [`inverse`]: an inverse-dynamics policy on the encoder of another checkpoint.
 

@@ -4,27 +4,27 @@ use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
 use swm_core::{DType, Error, Result, Schema};
 
-/// The size and the normalisation of a model's images: `(byte / 255 - mean) / std` by colour channel.
+/// The size and the normalisation of a model's images: `(byte / 255 - mean) / std` for each colour channel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImageNormalization {
     /// The side of the square images, in pixels.
     pub side: usize,
-    /// The mean by channel, of values from 0 to 1.
+    /// The mean of each channel for pixel values in 0 ..= 1.
     pub mean: [f32; 3],
-    /// The standard deviation by channel, of values from 0 to 1.
+    /// The standard deviation of each channel for pixel values in 0 ..= 1.
     pub std: [f32; 3],
 }
 
 impl ImageNormalization {
-    /// Mean and standard deviation of ImageNet, which published encoders were trained with.
+    /// Mean and standard deviation of the ImageNet pixels, with which published encoders were trained.
     pub const IMAGENET: ([f32; 3], [f32; 3]) = ([0.485, 0.456, 0.406], [0.229, 0.224, 0.225]);
 
-    /// The normalised value of each of the 256 bytes, by channel.
+    /// Returns the normalised values of the 256 byte values, for each channel.
     fn table(&self) -> [[f32; 256]; 3] {
         std::array::from_fn(|c| std::array::from_fn(|byte| (byte as f32 / 255.0 - self.mean[c]) / self.std[c]))
     }
 
-    /// The number of images in `rgb`.
+    /// Returns the number of images in `rgb`.
     fn count(&self, rgb: &[u8]) -> Result<usize> {
         let side = self.side;
         let bytes = side * side * 3;
@@ -64,7 +64,7 @@ pub fn check(side: usize, schema: &Schema, column: &str) -> Result<()> {
 /// Maps `[frames, side, side, 3]` bytes to `[frames, patches, 3 * patch * patch]`.
 ///
 /// # Errors
-/// When the bytes are not whole images of that side.
+/// When `rgb` is not a positive number of images of `images.side`.
 pub fn patches(images: &ImageNormalization, patch: usize, rgb: &[u8], device: &Device) -> Result<Tensor<3>> {
     let side = images.side;
     let (frames, grid) = (images.count(rgb)?, side / patch);
@@ -93,9 +93,9 @@ pub fn patches(images: &ImageNormalization, patch: usize, rgb: &[u8], device: &D
 /// Maps `[frames, side, side, 3]` bytes to `[frames, 3, side, side]`.
 ///
 /// # Errors
-/// When the bytes are not whole images of that side.
+/// When `rgb` is not a positive number of images of `images.side`.
 pub fn planes(images: &ImageNormalization, rgb: &[u8], device: &Device) -> Result<Tensor<4>> {
     let (side, frames) = (images.side, images.count(rgb)?);
-    // An image is one patch of its own size.
+    // A patch as large as the image has the layout of the planes.
     Ok(patches(images, side, rgb, device)?.reshape([frames, 3, side, side]))
 }

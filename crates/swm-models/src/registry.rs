@@ -1,4 +1,4 @@
-//! [`FAMILIES`]: the model families of this build, and loading a checkpoint of any of them.
+//! [`FAMILIES`]: the model families of this build, and [`load`], which loads a checkpoint of any family.
 
 use crate::family::{FamilyEntry, LoadedModel};
 use crate::{checkpoint, dino_wm, gcrl, inverse, lewm, pldm, sac, tdmpc2};
@@ -7,7 +7,7 @@ use std::path::Path;
 use swm_core::requirements::DatasetRequirements;
 use swm_core::{Error, Registry, Result};
 
-/// The families, in the order of listings.
+/// The model families of this build, in the order of listings.
 pub static FAMILIES: Registry<FamilyEntry> = Registry {
     kind: "model",
     hint: "`swm models` lists them",
@@ -24,7 +24,7 @@ pub static FAMILIES: Registry<FamilyEntry> = Registry {
     ],
 };
 
-/// Returns what a dataset must contain to train each family that trains on datasets alone.
+/// Returns the dataset requirements of every family that trains on a dataset alone.
 ///
 /// # Errors
 /// Never for the presets of this build.

@@ -1,4 +1,4 @@
-//! [`DinoWmConfig`]: the sizes of a DINO-WM.
+//! [`DinoWmConfig`]: the model configuration of a DINO-WM.
 
 use super::predictor::FramePredictorConfig;
 use crate::checks;
@@ -9,10 +9,10 @@ use burn::tensor::{Device, Tensor};
 use serde::{Deserialize, Serialize};
 use swm_core::{Error, Result};
 
-/// The column of actions, which is an input of the predictor and not a prediction target.
+/// The name of the action column, which is an input of the predictor and not a prediction target.
 pub const ACTION: &str = "action";
 
-/// The sizes of a DINO-WM.
+/// The model configuration of a DINO-WM.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DinoWmConfig {
@@ -31,8 +31,7 @@ pub struct DinoWmConfig {
     pub columns: Vec<ColumnConfig>,
     /// The predictor.
     pub predictor: FramePredictorConfig,
-    /// Hidden features of the image decoder, which is trained along with the predictor without influencing it; 0 for no
-    /// decoder.
+    /// Hidden features of the image decoder, whose training does not influence the predictor; 0 for no decoder.
     pub decoder: usize,
 }
 
@@ -69,10 +68,10 @@ impl DinoWmConfig {
         pixels::patches(&normalization, self.encoder.patch(), rgb, device)
     }
 
-    /// Checks that the sizes are consistent.
+    /// Checks the configuration.
     ///
     /// # Errors
-    /// When a size is invalid; the error names the first such size.
+    /// When a setting is invalid; the error names the first invalid setting.
     pub fn check(&self) -> Result<()> {
         self.encoder.check("model.encoder", self.image)?;
         let predictor = &self.predictor;

@@ -1,8 +1,8 @@
 //! [`DinoWmCost`]: the planning cost of a DINO-WM, the mean squared distance between the last predicted patches of a
 //! candidate and the patches of the goal image. If the goal of a column is given (`goal_proprio` for `proprio`), the
-//! mean squared distance between the column's features is added.
+//! mean squared distance between the predicted features and the goal features of the column is added.
 //!
-//! As for a LeWM, every environment is evaluated in calls whose shapes do not depend on the other environments, so the
+//! Every environment is evaluated in calls whose shapes do not depend on the other environments, so the
 //! bytes of an environment's plan depend neither on the other environments nor on the number of threads.
 
 use super::config::{ACTION, DinoWmConfig};
@@ -39,8 +39,8 @@ struct PlanContext {
     columns: Vec<(std::ops::Range<usize>, Tensor<2>)>,
 }
 
-/// Candidates of one rollout call. A frame has many tokens, so a few candidates fill a core's cache.
-const PART: usize = 16;
+/// The number of candidates in a rollout call. A frame has many tokens, so a few candidates fill a core's cache.
+const CHUNK_SIZE: usize = 16;
 
 impl DinoWmCost {
     /// Creates the planning cost of a trained model.
@@ -49,7 +49,7 @@ impl DinoWmCost {
             model: checkpoint.model.clone(),
             config: checkpoint.config.model.clone(),
             dataset_info: checkpoint.dataset_info.clone(),
-            action_dim: checkpoint.actions(),
+            action_dim: checkpoint.action_dim(),
             contexts: vec![],
         }
     }
@@ -62,7 +62,7 @@ impl DinoWmCost {
             .try_for_each(|name| checks::column_shape(schema, name, &self.dataset_info.column(name)?.shape))
     }
 
-    /// Checks that candidates and costs have the sizes for the observed environments.
+    /// Checks that the lengths of candidates and costs fit the observed environments.
     fn check_sizes(&self, candidates: &Candidates<'_>, costs: &[f32]) -> Result<()> {
         checks::candidate_sizes("costs of a DINO-WM", candidates, costs, [self.contexts.len(), self.action_dim])
     }
@@ -73,7 +73,8 @@ impl DinoWmCost {
         // One image per call: features must not depend on the number of images in a call.
         let encode = |rgb: &[u8]| Ok::<_, Error>(self.model.backbone.patches(self.config.image_patches(rgb, &device)?));
         let column = |name: &str, values: &[f32]| normalised(&self.dataset_info, name, values, [1, 1], &device);
-        // The recorded history has images and actions only: with further columns, a plan starts from the current frame.
+        // The recorded history has images and actions only: if the model reads further columns, a plan starts from the
+        // current frame.
         let further_columns: Vec<&str> =
             self.config.columns.iter().map(|column| column.name.as_str()).filter(|name| *name != ACTION).collect();
         let (mut frames, mut past) = (vec![encode(row.get::<u8>(PIXELS)?)?], vec![]);
@@ -118,12 +119,12 @@ impl DinoWmCost {
 }
 
 impl PlanContext {
-    /// Returns the costs of candidates, with autodiff if the candidates have it.
+    /// Returns the costs of candidates, in the autodiff graph of the candidates if there is one.
     ///
     /// # Shapes
     /// `candidates` is `[samples, horizon, action_dim]`; returns `[samples]`.
     fn cost(&self, model: &DinoWm, candidates: Tensor<3>) -> Tensor<1> {
-        // If the candidates are differentiated, all operands must be in their graph.
+        // If the candidates are in an autodiff graph, all operands must be in the graph.
         let differentiated = candidates.is_autodiff();
         let [samples, _, elements] = candidates.dims();
         let [_, frames, patches, dim] = self.start.dims();
@@ -140,7 +141,8 @@ impl PlanContext {
         let squared = (end.clone().slice([0..samples, 0..patches, 0..width]) - goal).square();
         let mut cost = squared.reshape([samples, patches * width]).mean_dim(1);
         for (span, goal) in &self.columns {
-            // Every patch of a frame has the same column features, so the first patch suffices, as published.
+            // Every patch of a recorded frame has the same column features, so, as published, only the first patch is
+            // compared.
             let goal = if differentiated { goal.clone().autodiff() } else { goal.clone() };
             let predicted = end.clone().slice([0..samples, 0..1, span.clone()]).reshape([samples, span.len()]);
             cost = cost + (predicted - goal).square().mean_dim(1);
@@ -160,14 +162,16 @@ impl CostModel for DinoWmCost {
     fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
         self.check_sizes(&candidates, costs)?;
         let Candidates { actions, samples, horizon, dim, .. } = candidates;
-        let (model, per) = (&self.model, horizon * dim);
-        let work = costs.par_chunks_mut(samples).zip(actions.par_chunks(samples * per)).zip(&self.contexts);
+        let (model, candidate_len) = (&self.model, horizon * dim);
+        let work = costs.par_chunks_mut(samples).zip(actions.par_chunks(samples * candidate_len)).zip(&self.contexts);
         work.for_each(|((costs, actions), context)| {
-            costs.par_chunks_mut(PART).zip(actions.par_chunks(PART * per)).for_each(|(costs, actions)| {
-                let data = TensorData::new(actions.to_vec(), [costs.len(), horizon, dim]);
-                let found = context.cost(model, Tensor::from_data(data, &Device::flex()));
-                costs.copy_from_slice(&found.into_data().into_f32_vec());
-            });
+            costs.par_chunks_mut(CHUNK_SIZE).zip(actions.par_chunks(CHUNK_SIZE * candidate_len)).for_each(
+                |(costs, actions)| {
+                    let data = TensorData::new(actions.to_vec(), [costs.len(), horizon, dim]);
+                    let found = context.cost(model, Tensor::from_data(data, &Device::flex()));
+                    costs.copy_from_slice(&found.into_data().into_f32_vec());
+                },
+            );
         });
         Ok(())
     }
@@ -188,13 +192,13 @@ impl DifferentiableCost for DinoWmCost {
                 actions.len().to_string(),
             ));
         }
-        // The weights are constants.
-        let (model, per) = (self.model.clone().train().no_grad(), horizon * dim);
-        let envs = costs.par_chunks_mut(samples).zip(gradient.par_chunks_mut(samples * per));
-        envs.zip(actions.par_chunks(samples * per)).zip(&self.contexts).for_each(
+        // Only the candidates are differentiated; the weights are constants.
+        let (model, candidate_len) = (self.model.clone().train().no_grad(), horizon * dim);
+        let envs = costs.par_chunks_mut(samples).zip(gradient.par_chunks_mut(samples * candidate_len));
+        envs.zip(actions.par_chunks(samples * candidate_len)).zip(&self.contexts).for_each(
             |(((costs, gradient), actions), context)| {
-                let parts = costs.par_chunks_mut(PART).zip(gradient.par_chunks_mut(PART * per));
-                parts.zip(actions.par_chunks(PART * per)).for_each(|((costs, gradient), actions)| {
+                let chunks = costs.par_chunks_mut(CHUNK_SIZE).zip(gradient.par_chunks_mut(CHUNK_SIZE * candidate_len));
+                chunks.zip(actions.par_chunks(CHUNK_SIZE * candidate_len)).for_each(|((costs, gradient), actions)| {
                     let data = TensorData::new(actions.to_vec(), [costs.len(), horizon, dim]);
                     let leaf = Tensor::<3>::from_data(data, &Device::flex()).autodiff().require_grad();
                     let found = context.cost(&model, leaf.clone());

@@ -1,4 +1,4 @@
-//! Import and export of DINO-WM checkpoints of the reference implementation (its class `PreJEPA`).
+//! Import and export of DINO-WM checkpoints of the reference implementation (class `PreJEPA`).
 
 use super::config::{ACTION, ColumnConfig, DinoWmConfig};
 use super::model::DinoWm;
@@ -25,17 +25,17 @@ const CLASS: &str = "stable_worldmodel.wm.PreJEPA";
 /// dataset.
 ///
 /// # Errors
-/// When a file is damaged or holds another model, the encoder is not DINOv2, or the columns are not those of
-/// `dataset_info`.
+/// When a file is damaged or holds another model, the encoder is not DINOv2, or a column is missing from
+/// `dataset_info` or has another number of elements.
 pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<DinoWm>> {
     let mut reference = Reference::open(from, "PreJEPA")?;
-    // The wrapper of the frozen encoder adds a prefix.
+    // The reference implementation's wrapper of the frozen encoder adds the prefix `backbone.` to parameter names.
     let weights = std::mem::take(&mut reference.weights);
-    let plain = |name: String| match name.strip_prefix("backbone.backbone.") {
+    let without_wrapper = |name: String| match name.strip_prefix("backbone.backbone.") {
         Some(rest) => format!("backbone.{rest}"),
         None => name,
     };
-    reference.weights = weights.into_iter().map(|(name, tensor)| (plain(name), tensor)).collect();
+    reference.weights = weights.into_iter().map(|(name, tensor)| (without_wrapper(name), tensor)).collect();
     // Attention masks are computed, not loaded.
     reference.weights.retain(|name, weight| !is_mask(name, &weight.shape));
     let dino = reference.dinov2("backbone.")?;
@@ -49,8 +49,8 @@ pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<DinoW
             return Err(reference.wrong(format!("the encoder of '{name}' is not a convolution over time")));
         };
         let expected = if name == ACTION { dataset_info.action.dim() } else { dataset_info.column(&name)?.dim() };
-        let whole = if name == ACTION { given.is_multiple_of(expected.max(1)) } else { given == expected };
-        if !whole {
+        let fits = if name == ACTION { given.is_multiple_of(expected.max(1)) } else { given == expected };
+        if !fits {
             return Err(Error::mismatch(
                 format!("importing the column '{name}'"),
                 format!("{expected} elements in the dataset"),
@@ -106,7 +106,7 @@ pub fn export(checkpoint: &Checkpoint<DinoWm>, folder: &Path, naming: Naming) ->
         _ => {
             return Err(Error::config(
                 "exporting a model",
-                "the reference implementation builds its encoder from a published one, and this encoder is not published",
+                "the reference implementation requires a published DINOv2, and the model has another encoder",
                 "train with DINOv2-small, -base or -large",
             ));
         }
@@ -132,18 +132,19 @@ pub fn export(checkpoint: &Checkpoint<DinoWm>, folder: &Path, naming: Naming) ->
             "mlp_dim": predictor.mlp, "dropout": predictor.dropout, "emb_dropout": predictor.emb_dropout,
         },
     });
-    write(folder, &Tree { rest: config, extra_encoders: encoders }, &state(model, naming))
+    write(folder, &ReferenceConfig { config, extra_encoders: encoders }, &state(model, naming))
 }
 
-/// The content of `config.json`.
+/// The content of the reference implementation's `config.json`.
 #[derive(Serialize)]
-struct Tree {
+struct ReferenceConfig {
+    /// All fields except `extra_encoders`.
     #[serde(flatten)]
-    rest: Value,
+    config: Value,
     extra_encoders: ExtraEncoders,
 }
 
-/// The encoders of columns, in order.
+/// The encoders of columns, in the order of the model's configuration.
 #[derive(Serialize)]
 struct ExtraEncoders {
     _target_: &'static str,

@@ -1,4 +1,5 @@
-//! [`DinoWm`]: a frozen encoder of patches, encoders of columns, the predictor, and an image decoder.
+//! [`DinoWm`]: the network of a DINO-WM, with a frozen encoder of patches, encoders of dataset columns, a predictor and
+//! an image decoder.
 
 use super::config::{ACTION, DinoWmConfig};
 use super::predictor::FramePredictor;
@@ -10,28 +11,29 @@ use std::ops::Range;
 use swm_core::Key;
 use swm_core::columns::PIXELS;
 
-/// A DINO-WM: predicts the patches of the next frame from the patches of frames and the actions between them.
+/// The network of a DINO-WM, which predicts the patch features of the next frame from the patch features of earlier
+/// frames and the actions between the frames.
 #[derive(Module, Debug)]
 pub struct DinoWm {
     /// Maps images to features of patches; frozen.
     pub backbone: Backbone,
-    /// Maps a window of frames to the next frame.
+    /// Maps the features of a window of frames to the features of the next frame.
     pub predictor: FramePredictor,
     /// Maps columns to the features that are appended to every patch.
     pub extra_encoders: ModuleDict<ColumnEncoder>,
-    /// Maps features of patches to their pixels.
+    /// Maps the features of a patch to the pixels of the patch.
     pub decoder: Option<PatchDecoder>,
 }
 
-/// The encoder of a column: a convolution over time with kernel size 1, which is a linear layer.
+/// The encoder of a dataset column: a convolution over time with kernel size 1, which is a linear layer.
 #[derive(Module, Debug)]
 pub struct ColumnEncoder {
-    /// `[dim, elements, 1]`.
+    /// The convolution, with a weight of `[dim, elements, 1]`.
     pub patch_embed: PointwiseConv,
 }
 
-/// The image decoder, from the features of a patch to its pixels: linear, GELU, and a transposed convolution whose
-/// stride is its kernel size, which is one matrix product.
+/// The image decoder, from the features of a patch to the pixels of the patch: linear, GELU, and a transposed
+/// convolution, which is one matrix product, because the stride equals the kernel size.
 #[derive(Module, Debug)]
 pub struct PatchDecoder {
     /// The layer to the hidden features.
@@ -71,8 +73,8 @@ impl PatchDecoder {
 }
 
 impl DinoWm {
-    /// Creates a model with random weights. `widths` are the element counts of the columns per frame, in the order of
-    /// the configuration.
+    /// Creates a model with random weights. `widths` holds the number of elements per frame of each column in
+    /// `config.columns`.
     pub fn init(config: &DinoWmConfig, widths: &[usize], key: Key, device: &Device) -> Self {
         let init = Init::new(key, device);
         let columns = config.columns.iter().zip(widths).map(|(column, width)| {
@@ -144,8 +146,8 @@ impl DinoWm {
         self.predictor.forward(frames.reshape([clips, steps * patches, dim]), rng).reshape([clips, steps, patches, dim])
     }
 
-    /// Rolls the model out: returns the given frames, then one predicted frame after each further action. The action
-    /// features of `given` are replaced; the action features of the last frame have no meaning.
+    /// Rolls the model out: returns the given frames, then one predicted frame after each further action. `actions`
+    /// replace the action features of every returned frame except the last, whose action features have no meaning.
     ///
     /// # Shapes
     /// `given` is `[clips, given, patches, dim]`, `actions` is `[clips, steps, action_dim]` with `steps >= given`;

@@ -11,13 +11,13 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FramePredictorConfig {
-    /// Number of input frames, including the current one.
+    /// Number of input frames, including the current frame.
     pub history: usize,
     /// Number of layers.
     pub depth: usize,
     /// Number of attention heads.
     pub heads: usize,
-    /// Features of a head.
+    /// Features of an attention head.
     pub dim_head: usize,
     /// Hidden features of the feed-forward blocks.
     pub mlp: usize,
@@ -27,10 +27,10 @@ pub struct FramePredictorConfig {
     pub emb_dropout: f32,
 }
 
-/// Predicts the patches of the next frame after each of a window of frames.
+/// A transformer that predicts, for each frame of a window, the patches of the following frame.
 #[derive(Module, Debug)]
 pub struct FramePredictor {
-    /// `[1, history * patches, dim]`.
+    /// Position embeddings of the patches, `[1, history * patches, dim]`.
     pub pos_embedding: Param<Tensor<3>>,
     /// The layers.
     pub transformer: Transformer,
@@ -48,7 +48,8 @@ pub struct Transformer {
     pub layers: Vec<Layer>,
 }
 
-/// One layer: attention, then a feed-forward block, each added to its input. A field `_0` is element 0 of a sequence.
+/// One layer: attention, then a feed-forward block, each with a residual connection. The parameters of field `_0` are
+/// stored under the name `0`.
 #[derive(Module, Debug)]
 pub struct Layer {
     /// Self-attention.
@@ -57,7 +58,7 @@ pub struct Layer {
     pub _1: FeedForward,
 }
 
-/// Added to the variance by the last normalisation.
+/// The value that the last normalisation adds to the variance.
 const EPSILON: f64 = 1e-5;
 
 impl FramePredictorConfig {

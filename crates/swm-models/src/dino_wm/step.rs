@@ -1,6 +1,7 @@
-//! One training step of a DINO-WM (Zhou et al. 2024, section 3): prediction error of patches and its gradients.
+//! One training step of a DINO-WM (Zhou et al. 2024, section 3): the prediction error of patches and the gradients of
+//! the error.
 //!
-//! The loss is a mean over clips, so a batch can be split and its parts computed in parallel.
+//! The loss is a mean over clips, so a batch can be split and the ranges of clips computed in parallel.
 
 use super::config::ACTION;
 use super::model::DinoWm;
@@ -11,26 +12,26 @@ use burn::tensor::Tensor;
 use swm_core::Rng;
 use swm_core::columns::PIXELS;
 
-/// Normalised clips.
+/// A batch of normalised clips.
 pub struct TrainBatch {
-    /// `[clips * steps, patches, 3 * patch * patch]`.
+    /// The pixels of image patches, `[clips * steps, patches, 3 * patch * patch]`.
     pub patches: Tensor<3>,
     /// The columns in the order of the configuration, `[clips, steps, features]` each.
     pub columns: Vec<Tensor<3>>,
 }
 
-/// Losses and gradients of a part of a batch.
+/// Losses and gradients of a batch.
 pub struct DinoWmStep {
-    /// The total loss, then its parts.
+    /// The total loss, then the terms of the loss, by name.
     pub losses: Vec<(&'static str, f64)>,
-    /// Gradients by parameter, flat.
+    /// The flattened gradient of each parameter, by parameter name.
     pub gradients: Named<Tensor<1>>,
 }
 
-/// Computes loss and gradients of clips that are longer than the history. `model` has no autodiff.
+/// Computes the loss and the gradients of clips of at least 2 frames. `model` is outside autodiff.
 pub fn step(model: &DinoWm, batch: &TrainBatch, noise: Option<&mut Rng>) -> DinoWmStep {
     let [clips, steps] = batch.columns.first().map_or([1, 1], |column| [column.dims()[0], column.dims()[1]]);
-    // The encoder is frozen: its features and all targets stay outside the graph.
+    // The encoder is frozen: its features and all targets stay outside the autodiff graph.
     let features = model.backbone.patches(batch.patches.clone());
     let [_, patches, width] = features.dims();
     let frame_features = features.clone().reshape([clips, steps, patches, width]);
@@ -40,7 +41,7 @@ pub fn step(model: &DinoWm, batch: &TrainBatch, noise: Option<&mut Rng>) -> Dino
     let learner = model.clone().train();
     let columns: Vec<Tensor<3>> = batch.columns.iter().map(|column| column.clone().autodiff()).collect();
     let frames = learner.embed(frame_features.autodiff(), &columns);
-    // Every window of the history's length that is followed by a frame, as for a LeWM.
+    // The windows are all runs of `history` frames that a frame follows.
     let history = model.predictor.config().history.min(steps - 1);
     let windows = |x: &Tensor<4>, offset: usize| {
         let part = |s: usize| x.clone().slice([0..clips, s + offset..s + offset + history, 0..patches, 0..dim]);

@@ -15,7 +15,7 @@ use swm_core::columns::PIXELS;
 use swm_core::{Batch, DType, Error, Key, Result, Schema};
 use swm_data::{ClipSpec, LoaderConfig};
 
-/// The loss of a DINO-WM has no settings.
+/// The loss settings of a DINO-WM, an empty table.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DinoWmLoss {}
@@ -26,7 +26,7 @@ impl Trainable for DinoWm {
     const PRESETS: &'static [Preset] = &[
         Preset {
             id: "tiny",
-            summary: "64 px, a small encoder with random weights: to try things out on two CPU cores",
+            summary: "64 px, a small encoder with random weights: for first trials on two CPU cores",
             toml: include_str!("../../presets/dino_wm/tiny.toml"),
         },
         Preset {
@@ -56,7 +56,7 @@ impl Trainable for DinoWm {
                 return Err(Error::mismatch(
                     format!("reading the column '{}' of model.columns", column.name),
                     spec.dtype.name(),
-                    "float32 (take it out of model.columns, or convert the dataset)",
+                    "float32 (remove the column from model.columns, or convert the dataset)",
                 ));
             }
             columns.push(column.name.clone());
@@ -109,7 +109,7 @@ impl Trainable for DinoWm {
         let columns = columns?;
         shards::mean(batch.rows(), config.shards, |range| {
             let bytes = rgb.len() / batch.rows();
-            let part = TrainBatch {
+            let clips = TrainBatch {
                 patches: model.image_patches(&rgb[range.start * bytes..range.end * bytes], device)?,
                 columns: columns
                     .iter()
@@ -120,7 +120,7 @@ impl Trainable for DinoWm {
                     .collect(),
             };
             let mut noise = key.with("dropout").at(range.start as u64).rng();
-            let DinoWmStep { losses, gradients } = step(self, &part, training.then_some(&mut noise));
+            let DinoWmStep { losses, gradients } = step(self, &clips, training.then_some(&mut noise));
             Ok(StepOutput { metrics: losses, gradients, buffers: Named::new() })
         })
     }

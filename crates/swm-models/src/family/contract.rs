@@ -1,4 +1,4 @@
-//! [`ModelFamily`]: the operations on the trained models of a family.
+//! [`ModelFamily`]: the operations that a model family supports.
 
 use crate::checkpoint::Checkpoint;
 use crate::online::OnlineSummary;
@@ -11,16 +11,16 @@ use swm_core::run::Control;
 use swm_core::{CostModel, EnvPool, EnvSpec, Policy, Predictor, Result};
 use swm_data::Reader;
 
-/// A trainable model and the operations on its checkpoints. A method returns `None` if the family does not support the
-/// operation.
+/// A trainable model and the operations on checkpoints of the model. A method returns `None` if the family does not
+/// support the operation.
 pub trait ModelFamily: Trainable {
     /// Whether a trained model acts without a solver.
     const ACTS: bool = false;
 
-    /// Returns what a dataset must contain to train with `config`, the default preset.
+    /// Returns the dataset requirements for training with `config`.
     fn requirements(config: &TrainConfig<Self>) -> DatasetRequirements;
 
-    /// Returns the number of frames a prediction or decision reads.
+    /// Returns the number of frames that a prediction or decision reads.
     fn history(_config: &TrainConfig<Self>) -> usize {
         1
     }
@@ -33,7 +33,7 @@ pub trait ModelFamily: Trainable {
     /// Returns a policy that acts without a solver in `slots` environments of `spec`.
     ///
     /// # Errors
-    /// When the actions of the environment are not those the model was trained for.
+    /// When the model was trained for another action space.
     fn policy(_checkpoint: &Checkpoint<Self>, _spec: &EnvSpec, _slots: usize) -> Option<Result<Box<dyn Policy>>> {
         None
     }
@@ -51,7 +51,7 @@ pub trait ModelFamily: Trainable {
     /// Converts a checkpoint of the reference implementation, which was trained on a dataset with `dataset_info`.
     ///
     /// # Errors
-    /// When the files are damaged or hold another model.
+    /// When a file is damaged or holds another model.
     fn import(_from: &Path, _dataset_info: DatasetInfo) -> Option<Result<Checkpoint<Self>>> {
         None
     }
@@ -81,7 +81,7 @@ pub trait ModelFamily: Trainable {
 pub struct TrainRun<'a> {
     /// The dataset.
     pub reader: Arc<dyn Reader>,
-    /// The checkpoint whose encoder is used, for families that train on the encoder of another model.
+    /// The checkpoint whose encoder is used; `None` for families that train an encoder or have none.
     pub encoder: Option<&'a Path>,
     /// The folder of the checkpoint and the logs.
     pub out: &'a Path,
@@ -91,7 +91,7 @@ pub struct TrainRun<'a> {
 
 /// Inputs and outputs of an online training run.
 pub struct OnlineRun<'a> {
-    /// Makes a pool of the given number of environments.
+    /// Creates a pool of the given number of environments.
     pub environments: &'a dyn Fn(usize) -> Result<EnvPool>,
     /// The folder of the checkpoint and the logs.
     pub out: &'a Path,

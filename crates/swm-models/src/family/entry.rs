@@ -14,7 +14,7 @@ use swm_data::Reader;
 /// Loads a configuration from a preset and `key=value` settings.
 type LoadConfig = fn(&str, &[String]) -> Result<Box<dyn TrainableConfig>>;
 
-/// The row of a model family in a registry.
+/// The entry of a model family in a registry: id, constructors and presets.
 #[derive(Clone, Copy)]
 pub struct FamilyEntry {
     /// The id, such as `lewm`.
@@ -27,19 +27,19 @@ pub struct FamilyEntry {
     pub borrows_encoder: bool,
     /// Loads a configuration from a preset (its name or the path of a TOML file) and `key=value` settings.
     pub config: LoadConfig,
-    /// Returns what a dataset must contain to train the default preset; `None` for a family that also requires another
+    /// Returns the dataset requirements of the default preset; `None` for a family that also requires another
     /// checkpoint.
     pub requirements: fn() -> Result<Option<DatasetRequirements>>,
     /// Loads the checkpoint of a run folder.
     pub load: fn(&Path, &Device) -> Result<Box<dyn LoadedModel>>,
     /// Converts a checkpoint of the reference implementation (`weights.pt` and `config.json` in the first folder),
-    /// which was trained on the given dataset, into a checkpoint in the last folder; returns the hash of its weights.
+    /// which was trained on the given dataset, into a checkpoint in the last folder; returns the hash of the weights.
     /// `None` if the reference implementation has no such family.
     pub import: fn(&Path, &dyn Reader, &Path) -> Option<Result<String>>,
 }
 
 impl FamilyEntry {
-    /// Creates the row of a family.
+    /// Creates the entry of a family.
     pub const fn of<M: ModelFamily>() -> Self {
         Self {
             id: M::FAMILY,

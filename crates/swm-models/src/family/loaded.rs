@@ -51,17 +51,18 @@ pub trait LoadedModel {
     /// Returns a policy that acts without a solver in `slots` environments; `None` for a model that only predicts.
     ///
     /// # Errors
-    /// When the actions of the environment are not those the model was trained for.
+    /// When the model was trained for another action space.
     fn policy(&self, _spec: &EnvSpec, _slots: usize) -> Option<Result<Box<dyn Policy>>> {
         None
     }
 
-    /// Returns a predictor of latents; `None` for a model without a rollout of latents.
+    /// Returns a predictor of latents; `None` for a model that does not predict latents.
     fn predictor(&self) -> Option<Box<dyn Predictor>> {
         None
     }
 
-    /// Writes the files that `load_pretrained` of the reference implementation reads; `None` if it has no such family.
+    /// Writes the files that `load_pretrained` of the reference implementation reads; `None` if the reference
+    /// implementation has no such family.
     ///
     /// # Errors
     /// When the reference implementation has no model of these sizes, or a file cannot be written.

@@ -1,4 +1,4 @@
-//! Model families: the contract of a family, and its type-erased forms for programs that choose a family at run time.
+//! Model families: the contract of a family, and type-erased forms for programs that choose a family at run time.
 //!
 //! A family implements [`ModelFamily`] in its own folder, builds a [`FamilyEntry`] from it, and adds the entry to
 //! [`registry`](crate::registry).

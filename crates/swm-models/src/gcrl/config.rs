@@ -1,4 +1,4 @@
-//! [`GcrlConfig`]: the sizes of a goal-conditioned model.
+//! [`GcrlConfig`]: the configuration of a goal-conditioned model.
 
 use super::transformer::{PatchGrid, TransformerConfig};
 use crate::checks;
@@ -8,7 +8,7 @@ use crate::train::at_least;
 use serde::{Deserialize, Serialize};
 use swm_core::{Error, Result};
 
-/// The sizes of a goal-conditioned model. All heads have the same sizes.
+/// The configuration of a goal-conditioned model. All heads have the same sizes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GcrlConfig {
@@ -18,11 +18,11 @@ pub struct GcrlConfig {
     pub pixel_mean: [f32; 3],
     /// Standard deviation of each colour channel for pixel values in 0 ..= 1.
     pub pixel_std: [f32; 3],
-    /// Number of input frames, including the current one.
+    /// Number of input frames, including the current frame.
     pub history: usize,
     /// Whether the encoder is not trained.
     pub frozen: bool,
-    /// Source of the encoder's initial weights: a file, a checkpoint or a repository; empty for random ones.
+    /// Source of the encoder's initial weights: a file, a checkpoint or a repository; empty for random weights.
     pub weights: String,
     /// The encoder.
     pub encoder: BackboneConfig,
@@ -33,7 +33,7 @@ pub struct GcrlConfig {
     pub critic: usize,
 }
 
-/// The published size.
+/// Returns the published number of hidden features of the critic's head.
 fn critic() -> usize {
     256
 }
@@ -50,10 +50,10 @@ impl GcrlConfig {
         PatchGrid { frames: self.history, patches, dim: self.encoder.dim() }
     }
 
-    /// Checks that the sizes are consistent.
+    /// Checks the configuration.
     ///
     /// # Errors
-    /// When a size is invalid; the error names the first such size.
+    /// When a setting is invalid; the error names the first invalid setting.
     pub fn check(&self) -> Result<()> {
         self.encoder.check("model.encoder", self.image)?;
         let TransformerConfig { depth, heads, dim_head, mlp, dropout, emb_dropout } = self.head;
@@ -77,7 +77,7 @@ impl GcrlConfig {
             return Err(Error::config(
                 "model.weights",
                 "a frozen encoder without weights would keep its random initial values",
-                "name its weights, or say model.frozen=false",
+                "set model.weights, or set model.frozen=false",
             ));
         }
         Ok(())

@@ -27,7 +27,7 @@ macro_rules! goal_conditioned_family {
                     model: $name,
                     observations: RequiredObservations::Images,
                     reward: false,
-                    // A goal is a row after the present one.
+                    // A goal is a later row than the current row.
                     clip_rows: (config.data.num_steps * config.data.frameskip).max(2),
                 }
             }

@@ -1,12 +1,12 @@
-//! The heads of goal-conditioned models on the patches of frames and goal: policies and values ([`Head`]) and critics
-//! ([`Critic`]).
+//! The heads of goal-conditioned models, whose inputs are the patches of frames and of a goal: policies and values
+//! ([`Head`]), and critics ([`Critic`]).
 
 use super::transformer::{PatchGrid, Pool, Transformer, TransformerConfig};
 use crate::nn::{Activation, DropoutRng, Init, Linear};
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
 
-/// Outputs for every frame given the goal: the mean action of a policy, or a value.
+/// A network with one output vector per frame given the goal: the mean action of a policy, or a value.
 #[derive(Module, Debug)]
 pub struct Head {
     /// Position embeddings of the frames' patches, `[1, frames * patches, dim]`.
@@ -20,7 +20,7 @@ pub struct Head {
     emb_dropout: f32,
 }
 
-/// The value of an action given frame and goal.
+/// A network for the value of an action given a frame and the goal.
 #[derive(Module, Debug)]
 pub struct Critic {
     /// Position embeddings of the frames' patches, `[1, frames * patches, dim]`.
@@ -34,7 +34,8 @@ pub struct Critic {
     emb_dropout: f32,
 }
 
-/// Two hidden layers with ReLU. A field `_2` is element 2 of a sequence.
+/// The last layers of a critic: two hidden layers with ReLU, then the output layer. The parameters of field `_2` are
+/// stored under the name `2`.
 #[derive(Module, Debug)]
 pub struct CriticHead {
     /// The layer to the hidden features.
@@ -61,7 +62,7 @@ impl Head {
     /// Computes the outputs of every frame.
     ///
     /// # Shapes
-    /// `frames` is `[rows, frames * patches, dim]` with at most as many frames as the head was made for, `goal` is
+    /// `frames` is `[rows, frames * patches, dim]` with `frames` at most [`PatchGrid::frames`], `goal` is
     /// `[rows, patches, dim]`; returns `[rows, frames, outputs]`.
     pub fn forward(&self, frames: &Tensor<3>, goal: &Tensor<3>, rng: &mut DropoutRng<'_>) -> Tensor<3> {
         let (frames, goal) = add_positions([&self.pos_embedding, &self.pos_embedding_goal], frames, goal);
@@ -98,7 +99,8 @@ impl Critic {
     /// Computes the value of the actions at every frame.
     ///
     /// # Shapes
-    /// As [`Head::forward`]; `actions` is `[rows, frames, action_dim]`; returns `[rows, frames, 1]`.
+    /// `frames` is `[rows, frames * patches, dim]`, `actions` is `[rows, frames, action_dim]`, `goal` is
+    /// `[rows, patches, dim]`; returns `[rows, frames, 1]`.
     pub fn forward(
         &self,
         frames: &Tensor<3>,
@@ -116,8 +118,8 @@ impl Critic {
 }
 
 /// The standard deviation of initial position embeddings. The reference implementation uses 1, the standard
-/// deviation of DINOv2's features. An encoder that is trained from random weights begins with features of a tenth of
-/// that size, which position embeddings with a standard deviation of 1 would dominate.
+/// deviation of DINOv2's features. The features of an encoder with random weights are a tenth as large, and position
+/// embeddings with a standard deviation of 1 would dominate them.
 const POSITION_STD: f32 = 0.02;
 
 /// Draws the position embeddings of frames and goal.

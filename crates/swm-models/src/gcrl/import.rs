@@ -1,7 +1,7 @@
-//! Import and export of goal-conditioned checkpoints of the reference implementation (its class `GCRL`).
+//! Import and export of goal-conditioned checkpoints of the reference implementation (class `GCRL`).
 //!
-//! The published training scripts store their own settings as `config.json`, while `load_pretrained` requires a class
-//! tree. So sizes are read from the weights, and only the number of attention heads is read from the file.
+//! The published training scripts store the script's settings as `config.json`, while `load_pretrained` requires a tree
+//! of classes. So sizes are read from the weights, and only the number of attention heads is read from `config.json`.
 
 use super::config::GcrlConfig;
 use super::loss::LOG_STD;
@@ -24,20 +24,21 @@ const CLASS: &str = "stable_worldmodel.wm.gcrl.GCRL";
 const MODULE: &str = "stable_worldmodel.wm.gcrl.module";
 
 /// Converts a model of the reference implementation: a folder with `weights.pt` and `config.json`, or a weights file
-/// next to such a file. The files do not store how actions were normalised, so `dataset_info` must describe the model's
-/// training dataset.
+/// beside a `config.json`. The files do not store how actions were normalised, so `dataset_info` must describe the
+/// model's training dataset.
 ///
-/// A policy's checkpoint has no target networks; they are initialised with the values' weights.
+/// A published checkpoint has no target networks; the target networks are initialised with the weights of the value
+/// networks and critics.
 ///
 /// # Errors
 /// When a network of the family is missing (policies of GCIQL are stored without the critic: import them as `gcivl`),
-/// the model has inputs other than images, a file is damaged, or the actions are not those of `dataset_info`.
+/// the model has inputs other than images, a file is damaged, or the action dimension does not fit `dataset_info`.
 pub fn import<M>(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<M>>
 where
     M: GoalConditioned<Config = GcrlConfig>,
 {
     let path = if from.is_dir() { from.join("weights.pt") } else { from.to_owned() };
-    let mut found = StoredWeights { weights: plain(weights::read(&path)?), path: &path };
+    let mut found = StoredWeights { weights: without_wrappers(weights::read(&path)?), path: &path };
     let settings = path.with_file_name("config.json");
     let text = std::fs::read(&settings).map_err(|error| Error::io(&settings, "reading a checkpoint", error))?;
     let settings: Value = serde_json::from_slice(&text).map_err(|error| found.wrong(error.to_string()))?;
@@ -46,17 +47,17 @@ where
     }
     let sizes = found.sizes(&settings)?;
     let model = |config: &TrainConfig<M>| M::new(config, &dataset_info, Key::new(0), &Device::flex());
-    let actions = found.shape("log_stds")?[0];
+    let action_dim = found.shape("log_stds")?[0];
     let mut config = TrainConfig::<M>::load("paper", &[])?;
     let dim = dataset_info.action.dim();
-    if dim == 0 || !actions.is_multiple_of(dim) {
+    if dim == 0 || !action_dim.is_multiple_of(dim) {
         return Err(Error::mismatch(
             "importing a policy",
             format!("{dim} action elements in the dataset"),
-            format!("a divisor of {actions}, the action elements of a model step"),
+            format!("a divisor of {action_dim}, the action elements of a model step"),
         ));
     }
-    config.data.frameskip = actions / dim;
+    config.data.frameskip = action_dim / dim;
     config.data.num_steps = config.data.num_steps - config.model.history + sizes.history;
     config.model = GcrlConfig { weights: path.display().to_string(), ..sizes };
     config.check()?;
@@ -73,8 +74,9 @@ fn is_optional(name: &str) -> bool {
     ["value_predictor.", "critic_predictor."].iter().any(|part| name.starts_with(part))
 }
 
-/// Removes wrapper prefixes and attention masks, and copies value networks and critics to their target networks.
-fn plain(weights: Named<HostTensor>) -> Named<HostTensor> {
+/// Removes wrapper prefixes and attention masks, and copies the weights of value networks and critics to the
+/// target networks.
+fn without_wrappers(weights: Named<HostTensor>) -> Named<HostTensor> {
     let mut plain = Named::new();
     for (name, weight) in weights {
         let name = name.replacen(".backbone.", ".", 1);
@@ -97,7 +99,7 @@ fn plain(weights: Named<HostTensor>) -> Named<HostTensor> {
     names::to_published(plain, "encoder.")
 }
 
-/// Weights and the path of their file.
+/// Weights and the path of the weights file.
 struct StoredWeights<'a> {
     weights: Named<HostTensor>,
     path: &'a Path,
@@ -114,13 +116,13 @@ impl StoredWeights<'_> {
     }
 
     /// Returns the size of an axis of a weight.
-    fn side(&self, name: &str, axis: usize) -> Result<usize> {
-        self.shape(name)?.get(axis).copied().ok_or_else(|| self.wrong(format!("'{name}' has another shape")))
+    fn axis_size(&self, name: &str, axis: usize) -> Result<usize> {
+        self.shape(name)?.get(axis).copied().ok_or_else(|| self.wrong(format!("'{name}' has no axis {axis}")))
     }
 
-    /// Counts the weights whose names have this prefix and suffix.
-    fn count(&self, prefix: &str, end: &str) -> usize {
-        self.weights.keys().filter(|name| name.starts_with(prefix) && name.ends_with(end)).count()
+    /// Counts the weights whose names start with `prefix` and end with `suffix`.
+    fn count(&self, prefix: &str, suffix: &str) -> usize {
+        self.weights.keys().filter(|name| name.starts_with(prefix) && name.ends_with(suffix)).count()
     }
 
     fn sizes(&self, settings: &Value) -> Result<GcrlConfig> {
@@ -128,9 +130,9 @@ impl StoredWeights<'_> {
         let encoder = |name: &str| format!("encoder.{name}");
         let (dim, patch) = {
             let name = encoder("embeddings.patch_embeddings.projection.weight");
-            (self.side(&name, 0)?, self.side(&name, 2)?)
+            (self.axis_size(&name, 0)?, self.axis_size(&name, 2)?)
         };
-        // All published models have heads of 64 features.
+        // The attention heads of all published models have 64 features.
         let heads = setting(["encoder", "num_attention_heads"]).unwrap_or((dim / 64).max(1));
         let encoder = if self.weights.contains_key("encoder.encoder.layer.0.layer_scale1.lambda1") {
             BackboneConfig::Dinov2(DinoConfig {
@@ -138,9 +140,9 @@ impl StoredWeights<'_> {
                 dim,
                 depth: self.count("encoder.encoder.layer.", ".norm1.weight"),
                 heads,
-                mlp: self.side(&encoder("encoder.layer.0.mlp.fc1.weight"), 0)?,
-                grid: (self.side(&encoder("embeddings.position_embeddings"), 1)? - 1).isqrt(),
-                registers: self.side(&encoder("embeddings.register_tokens"), 1).unwrap_or(0),
+                mlp: self.axis_size(&encoder("encoder.layer.0.mlp.fc1.weight"), 0)?,
+                grid: (self.axis_size(&encoder("embeddings.position_embeddings"), 1)? - 1).isqrt(),
+                registers: self.axis_size(&encoder("embeddings.register_tokens"), 1).unwrap_or(0),
             })
         } else {
             BackboneConfig::Vit(VitConfig {
@@ -148,23 +150,23 @@ impl StoredWeights<'_> {
                 dim,
                 depth: self.count("encoder.encoder.layer.", ".layernorm_before.weight"),
                 heads,
-                mlp: self.side(&encoder("encoder.layer.0.intermediate.dense.weight"), 0)?,
+                mlp: self.axis_size(&encoder("encoder.layer.0.intermediate.dense.weight"), 0)?,
             })
         };
         let policy = |name: &str| format!("action_predictor.{name}");
-        let patches = self.side(&policy("pos_embedding_goal"), 1)?;
-        let inner = self.side(&policy("transformer.layers.0.0.to_q.weight"), 0)?;
+        let patches = self.axis_size(&policy("pos_embedding_goal"), 1)?;
+        let inner = self.axis_size(&policy("transformer.layers.0.0.to_q.weight"), 0)?;
         let heads = setting(["action_predictor", "heads"]).or(setting(["predictor", "heads"])).unwrap_or(inner / 64);
         if heads == 0 || !inner.is_multiple_of(heads) {
             return Err(self.wrong(format!("{inner} features do not split into {heads} attention heads")));
         }
         let (pixel_mean, pixel_std) = ImageNormalization::IMAGENET;
-        let critic = self.side("critic_predictor.student.q_head.0.bias", 0).unwrap_or(256);
+        let critic = self.axis_size("critic_predictor.student.q_head.0.bias", 0).unwrap_or(256);
         Ok(GcrlConfig {
             image: patches.isqrt() * patch,
             pixel_mean,
             pixel_std,
-            history: self.side(&policy("pos_embedding"), 1)? / patches.max(1),
+            history: self.axis_size(&policy("pos_embedding"), 1)? / patches.max(1),
             frozen: true,
             weights: String::new(),
             encoder,
@@ -172,7 +174,7 @@ impl StoredWeights<'_> {
                 depth: self.count(&policy("transformer.layers."), ".0.norm.weight"),
                 heads,
                 dim_head: inner / heads,
-                mlp: self.side(&policy("transformer.layers.0.1.net.1.weight"), 0)?,
+                mlp: self.axis_size(&policy("transformer.layers.0.1.net.1.weight"), 0)?,
                 dropout: 0.0,
                 emb_dropout: 0.0,
             },
@@ -183,7 +185,7 @@ impl StoredWeights<'_> {
 
 /// A model for which the reference implementation has a class.
 pub trait Exportable: GoalConditioned {
-    /// The networks other than encoder and policy, with their classes.
+    /// The names of the networks besides encoder and policy, and the reference implementation's class of each network.
     const PARTS: &'static [(&'static str, &'static str)];
 }
 
@@ -204,12 +206,12 @@ impl Exportable for Gciql {
 /// target networks.
 ///
 /// # Errors
-/// When the reference implementation has no such encoder, or a file cannot be written.
+/// When the reference implementation has no class for the encoder, or a file cannot be written.
 pub fn export<M>(checkpoint: &Checkpoint<M>, folder: &Path, naming: Naming) -> Result<()>
 where
     M: Exportable<Config = GcrlConfig>,
 {
-    let (sizes, actions) = (&checkpoint.config.model, checkpoint.actions());
+    let (sizes, action_dim) = (&checkpoint.config.model, checkpoint.action_dim());
     let encoder = match &sizes.encoder {
         BackboneConfig::Vit(VitConfig { patch, dim, depth, heads, mlp }) => json!({
             "_target_": "stable_pretraining.backbone.utils.vit_hf",
@@ -227,7 +229,7 @@ where
         _ => {
             return Err(Error::config(
                 "exporting a model",
-                "the reference implementation has no such encoder",
+                "the reference implementation has no class for the model's encoder",
                 "train with model.encoder.vit or a published DINOv2",
             ));
         }
@@ -242,7 +244,7 @@ where
         })
     };
     let mut policy = class("Predictor", "attention");
-    policy["out_dim"] = json!(actions);
+    policy["out_dim"] = json!(action_dim);
     let mut tree = json!({
         "_target_": CLASS, "encoder": encoder, "action_predictor": policy, "history_size": sizes.history,
         "log_std_min": LOG_STD[0], "log_std_max": LOG_STD[1],
@@ -250,7 +252,7 @@ where
     for &(part, kind) in M::PARTS {
         let mut network = class(kind, "mean");
         if kind == "QPredictor" {
-            (network["action_dim"], network["q_hidden_dim"]) = (json!(actions), json!(sizes.critic));
+            (network["action_dim"], network["q_hidden_dim"]) = (json!(action_dim), json!(sizes.critic));
         } else {
             network["out_dim"] = json!(1);
         }

@@ -20,7 +20,7 @@ pub struct ValueLoss {
     pub expectile: f32,
     /// Inverse temperature of the advantage weights, α.
     pub temperature: f32,
-    /// Fraction of its weights that a target network keeps in a step, ρ.
+    /// Factor of the old weights in the update of a target network, ρ.
     pub target: f32,
     /// Sources of the goals for value learning.
     pub goals: GoalMixture,
@@ -58,8 +58,8 @@ pub fn weights<const D: usize>(advantage: Tensor<D>, temperature: f32) -> Tensor
     (advantage * temperature).clamp_max(LARGEST_WEIGHT.ln()).exp()
 }
 
-/// Computes the weighted negative log-likelihood of actions under a normal distribution, without its constant, averaged
-/// over all elements.
+/// Computes the weighted negative log-likelihood of actions under a normal distribution, without the constant term,
+/// averaged over all elements.
 ///
 /// # Shapes
 /// `means` and `actions` are `[rows, frames, action_dim]`, `log_stds` is `[action_dim]`, `weights` is

@@ -9,52 +9,52 @@ use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor};
 use swm_core::Key;
 
-/// Goal-conditioned behavioural cloning.
+/// The networks of goal-conditioned behavioural cloning (GCBC).
 #[derive(Module, Debug)]
 pub struct Gcbc {
     /// Maps images to patches.
     pub encoder: Backbone,
-    /// The mean action.
+    /// The policy head, which computes the mean action.
     pub action_predictor: Head,
-    /// The logarithm of the actions' standard deviation, which cloning does not train.
+    /// The logarithm of the actions' standard deviation, which behavioural cloning does not train.
     pub log_stds: Param<Tensor<1>>,
     #[module(skip)]
     pub(super) config: GcrlConfig,
 }
 
-/// Goal-conditioned implicit value learning.
+/// The networks of goal-conditioned implicit value learning (GCIVL).
 #[derive(Module, Debug)]
 pub struct Gcivl {
     /// Maps images to patches.
     pub encoder: Backbone,
-    /// The mean action.
+    /// The policy head, which computes the mean action.
     pub action_predictor: Head,
     /// The logarithm of the actions' standard deviation.
     pub log_stds: Param<Tensor<1>>,
-    /// The value of a state.
+    /// The value head, which computes the value of a state.
     pub value_predictor: WithTarget<Head>,
     #[module(skip)]
     pub(super) config: GcrlConfig,
 }
 
-/// Goal-conditioned implicit Q-learning.
+/// The networks of goal-conditioned implicit Q-learning (GCIQL).
 #[derive(Module, Debug)]
 pub struct Gciql {
     /// Maps images to patches.
     pub encoder: Backbone,
-    /// The mean action.
+    /// The policy head, which computes the mean action.
     pub action_predictor: Head,
     /// The logarithm of the actions' standard deviation.
     pub log_stds: Param<Tensor<1>>,
-    /// The value of a state.
+    /// The value head, which computes the value of a state.
     pub value_predictor: WithTarget<Head>,
-    /// The value of an action.
+    /// The critic, which computes the value of an action.
     pub critic_predictor: WithTarget<Critic>,
     #[module(skip)]
     pub(super) config: GcrlConfig,
 }
 
-/// A network and its target network, an exponential moving average.
+/// A network and its target network, an exponential moving average of the network.
 #[derive(Module, Debug)]
 pub struct WithTarget<N: Module> {
     /// The trained network.
@@ -68,7 +68,7 @@ impl<N: Module> WithTarget<N> {
         Self { teacher: network.clone().no_grad(), student: network }
     }
 
-    /// Updates the target network, which keeps the fraction `keep` of its weights.
+    /// Updates the target network: every weight becomes `keep * teacher + (1 - keep) * student`.
     #[must_use]
     pub fn update_target(self, keep: f64) -> Self {
         Self { teacher: parameters::blend(self.teacher, &self.student, keep), student: self.student }
@@ -116,11 +116,11 @@ impl<'a> Builder<'a> {
 impl Gcbc {
     /// Creates a model with random weights for actions of `action_dim` elements per model step.
     pub fn init(config: &GcrlConfig, action_dim: usize, key: Key, device: &Device) -> Self {
-        let parts = Builder::new(config, action_dim, key, device);
+        let builder = Builder::new(config, action_dim, key, device);
         Self {
-            encoder: parts.encoder(),
-            action_predictor: parts.policy(),
-            log_stds: parts.log_stds().set_require_grad(false),
+            encoder: builder.encoder(),
+            action_predictor: builder.policy(),
+            log_stds: builder.log_stds().set_require_grad(false),
             config: config.clone(),
         }
     }
@@ -129,12 +129,12 @@ impl Gcbc {
 impl Gcivl {
     /// Creates a model with random weights, as [`Gcbc::init`].
     pub fn init(config: &GcrlConfig, action_dim: usize, key: Key, device: &Device) -> Self {
-        let parts = Builder::new(config, action_dim, key, device);
+        let builder = Builder::new(config, action_dim, key, device);
         Self {
-            encoder: parts.encoder(),
-            action_predictor: parts.policy(),
-            log_stds: parts.log_stds(),
-            value_predictor: parts.value(),
+            encoder: builder.encoder(),
+            action_predictor: builder.policy(),
+            log_stds: builder.log_stds(),
+            value_predictor: builder.value(),
             config: config.clone(),
         }
     }
@@ -143,13 +143,13 @@ impl Gcivl {
 impl Gciql {
     /// Creates a model with random weights, as [`Gcbc::init`].
     pub fn init(config: &GcrlConfig, action_dim: usize, key: Key, device: &Device) -> Self {
-        let parts = Builder::new(config, action_dim, key, device);
+        let builder = Builder::new(config, action_dim, key, device);
         Self {
-            encoder: parts.encoder(),
-            action_predictor: parts.policy(),
-            log_stds: parts.log_stds(),
-            value_predictor: parts.value(),
-            critic_predictor: parts.critic(),
+            encoder: builder.encoder(),
+            action_predictor: builder.policy(),
+            log_stds: builder.log_stds(),
+            value_predictor: builder.value(),
+            critic_predictor: builder.critic(),
             config: config.clone(),
         }
     }

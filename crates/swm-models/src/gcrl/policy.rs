@@ -1,4 +1,5 @@
-//! [`GcrlPolicy`]: acting with the mean action of a goal-conditioned policy, given recent frames and the goal.
+//! [`GcrlPolicy`]: a policy that acts with the mean actions of a goal-conditioned model, given recent frames and the
+//! goal.
 
 use super::config::GcrlConfig;
 use super::heads::Head;
@@ -14,10 +15,10 @@ use swm_core::columns::{GOAL, PIXELS};
 use swm_core::{EnvSpec, Result, RowRef, Schema};
 use swm_plan::ActionScale;
 
-/// Acts with a trained model, one model step at a time.
+/// A policy that acts with the mean actions of a goal-conditioned model, one model step at a time.
 pub type GcrlPolicy = FeedForwardPolicy<Actor>;
 
-/// The encoder and policy head of a model.
+/// The encoder and the policy head of a goal-conditioned model.
 pub struct Actor {
     pub(super) encoder: Backbone,
     pub(super) head: Head,
@@ -25,7 +26,7 @@ pub struct Actor {
     pub(super) scale: ActionScale,
 }
 
-/// Patches of an episode, `[1, patches, dim]` each.
+/// The encoded patches of an episode's images, `[1, patches, dim]` per image.
 #[derive(Default)]
 pub struct EpisodePatches {
     goal: Option<Tensor<3>>,
@@ -37,7 +38,7 @@ impl Actor {
     /// Creates a policy for `slots` environments of `spec`.
     ///
     /// # Errors
-    /// When the model was trained for other actions.
+    /// When the model was trained for another action space.
     pub fn policy(self, spec: &EnvSpec, slots: usize) -> Result<GcrlPolicy> {
         FeedForwardPolicy::new(self, spec, slots)
     }

@@ -1,4 +1,4 @@
-//! Losses and gradients of clips.
+//! The losses of goal-conditioned models on clips, and the gradients of the losses.
 //!
 //! Values and policy are trained together, as by Kostrikov et al. (2021): the policy's loss has no gradient with
 //! respect to values and encoder, so the gradients are those of the two phases of the published algorithms.
@@ -11,7 +11,7 @@ use crate::train::StepOutput;
 use burn::module::Module;
 use burn::tensor::Tensor;
 
-/// Normalised clips; the tensors have no autodiff.
+/// Normalised clips; the tensors are outside the autodiff graph.
 #[derive(Clone, Debug)]
 pub struct Clips {
     /// Image patches, `[clips * steps, patches, 3 * patch * patch]`: the history, and for value learning the next
@@ -23,7 +23,7 @@ pub struct Clips {
     pub actions: Tensor<3>,
 }
 
-/// Additional inputs of value learning.
+/// The inputs of value learning that [`Clips`] does not contain.
 #[derive(Clone, Debug)]
 pub struct Relabelled {
     /// Goals of the policy, `[clips, patches, 3 * patch * patch]`.
@@ -34,18 +34,18 @@ pub struct Relabelled {
 
 /// The inputs of the heads, `[clips, frames * patches, dim]` each.
 struct HeadInputs {
-    /// The history, in the graph of the trained encoder.
+    /// The history, in the autodiff graph.
     now: Tensor<3>,
-    /// The goal, in the same graph.
+    /// The goal of the values, in the autodiff graph.
     goal: Tensor<3>,
-    /// The frames that follow each frame of the history, outside the graph.
+    /// The frame after each frame of the history, outside the autodiff graph.
     next: Tensor<3>,
-    /// The goal of the policy, outside the graph.
+    /// The goal of the policy, outside the autodiff graph.
     policy_goal: Tensor<3>,
 }
 
 impl Gcbc {
-    /// Computes the mean squared error of actions and its gradients.
+    /// Computes the mean squared error of actions and, in training, the gradients of the error.
     pub fn losses(&self, clips: &Clips, rng: &mut DropoutRng<'_>, training: bool) -> StepOutput {
         let model = self.clone().train();
         let [count, _, _] = clips.actions.dims();
@@ -83,8 +83,8 @@ impl Gcivl {
         let state_value =
             |frames: &Tensor<3>| self.value_predictor.student.forward(frames, policy_goal, &mut DropoutRng::disabled());
         let advantage = state_value(next) - state_value(&now.clone().inner());
-        let Policy { loss: policy_loss, weights } =
-            policy(&model.action_predictor, model.log_stds.val(), &inputs, clips, advantage, settings, rng);
+        let PolicyLoss { loss: policy_loss, weights } =
+            policy_loss(&model.action_predictor, model.log_stds.val(), &inputs, clips, advantage, settings, rng);
         let total = value_loss.clone() + policy_loss.clone();
         let metrics = vec![
             ("loss", scalar(&total)),
@@ -127,8 +127,8 @@ impl Gciql {
 
         let state_value = self.value_predictor.student.forward(&frames, policy_goal, &mut DropoutRng::disabled());
         let advantage = evaluate(&self.critic_predictor.student, policy_goal) - state_value;
-        let Policy { loss: policy_loss, weights } =
-            policy(&model.action_predictor, model.log_stds.val(), &inputs, clips, advantage, settings, rng);
+        let PolicyLoss { loss: policy_loss, weights } =
+            policy_loss(&model.action_predictor, model.log_stds.val(), &inputs, clips, advantage, settings, rng);
         let total = value_loss.clone() + critic_loss.clone() + policy_loss.clone();
         let metrics = vec![
             ("loss", scalar(&total)),
@@ -153,7 +153,8 @@ fn embed(encoder: &Backbone, images: Tensor<3>, clips: usize) -> Tensor<3> {
     patches.reshape([clips, frames / clips * count, dim])
 }
 
-/// Encodes the inputs of the heads; only history and goal of the values are encoded in an autodiff graph.
+/// Encodes the inputs of the heads; only the history and the goal of the values are encoded in the autodiff graph.
+/// `plain` is the encoder outside the graph, `trained` is the encoder in the graph.
 fn head_inputs(
     plain: &Backbone,
     trained: &Backbone,
@@ -164,28 +165,28 @@ fn head_inputs(
     let [count, history, _] = clips.actions.dims();
     let [frames, patches, elements] = clips.frames.dims();
     let steps = frames / count;
-    let part = |steps_of: std::ops::Range<usize>| {
-        let length = steps_of.len();
+    let images = |range: std::ops::Range<usize>| {
+        let length = range.len();
         let frames = clips.frames.clone().reshape([count, steps, patches * elements]);
-        frames.slice([0..count, steps_of, 0..patches * elements]).reshape([count * length, patches, elements])
+        frames.slice([0..count, range, 0..patches * elements]).reshape([count * length, patches, elements])
     };
     let encode = |images: Tensor<3>| {
         if frozen { embed(plain, images, count).autodiff() } else { embed(trained, images.autodiff(), count) }
     };
-    let now = encode(part(0..history));
-    let last = embed(plain, part(history..steps), count);
+    let now = encode(images(0..history));
+    let last = embed(plain, images(history..steps), count);
     let [_, tokens, dim] = now.dims();
-    let rest = now.clone().inner().slice([0..count, tokens / history..tokens, 0..dim]);
+    let later = now.clone().inner().slice([0..count, tokens / history..tokens, 0..dim]);
     HeadInputs {
         now,
         goal: encode(clips.goal.clone()),
-        next: if history > 1 { Tensor::cat(vec![rest, last], 1) } else { last },
+        next: if history > 1 { Tensor::cat(vec![later, last], 1) } else { last },
         policy_goal: embed(plain, relabelled.policy_goal.clone(), count),
     }
 }
 
-/// Returns the bootstrapped targets `r + γ m V(s', g)`: the reward is -1 and `m` is 1 until the goal is reached, then
-/// both are 0.
+/// Returns the bootstrapped targets `r + γ m V(s', g)`: the reward `r` is -1 and the mask `m` is 1 until the goal is
+/// reached, and then `r` and `m` are 0.
 ///
 /// # Shapes
 /// Returns `[clips, history, 1]`.
@@ -196,13 +197,13 @@ fn bootstrap(teacher: &Head, inputs: &HeadInputs, relabelled: &Relabelled, setti
 }
 
 /// The loss of a policy and the advantage weights of actions.
-struct Policy {
+struct PolicyLoss {
     loss: Tensor<1>,
     weights: Tensor<3>,
 }
 
 /// Computes advantage-weighted regression on the recorded actions, without a gradient with respect to the encoder.
-fn policy(
+fn policy_loss(
     head: &Head,
     log_stds: Tensor<1>,
     inputs: &HeadInputs,
@@ -210,18 +211,18 @@ fn policy(
     advantage: Tensor<3>,
     settings: &ValueLoss,
     rng: &mut DropoutRng<'_>,
-) -> Policy {
+) -> PolicyLoss {
     let weights = loss::weights(advantage, settings.temperature);
     let means = head.forward(&inputs.now.clone().inner().autodiff(), &inputs.policy_goal.clone().autodiff(), rng);
     let loss = loss::regression(means, log_stds, clips.actions.clone().autodiff(), weights.clone().autodiff());
-    Policy { loss, weights }
+    PolicyLoss { loss, weights }
 }
 
 fn scalar(value: &Tensor<1>) -> f64 {
     f64::from(value.clone().inner().into_scalar::<f32>())
 }
 
-/// Returns the output of a step, with gradients in training only.
+/// Returns the output of a training step; the gradients are empty unless `training`.
 fn finish<M: Module>(model: &M, loss: &Tensor<1>, metrics: Vec<(&'static str, f64)>, training: bool) -> StepOutput {
     let gradients =
         if training { parameters::gradients(model, &loss.clone().backward()) } else { parameters::Named::new() };

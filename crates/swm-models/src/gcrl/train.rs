@@ -16,7 +16,7 @@ use swm_core::columns::{ACTION, PIXELS};
 use swm_core::{Batch, Error, Key, Result, Schema};
 use swm_data::{ClipSpec, GoalMixture, GoalSpec, LoaderConfig};
 
-/// Names of goals, which are prefixes of column names in a batch.
+/// Prefixes of the goals' columns in a batch: `goal_pixels`, `policy_goal_pixels`.
 const GOAL: &str = "goal";
 const POLICY_GOAL: &str = "policy_goal";
 
@@ -36,9 +36,9 @@ macro_rules! presets {
     };
 }
 
-/// A trained goal-conditioned model of any family.
+/// A family of goal-conditioned models.
 pub trait GoalConditioned: Trainable {
-    /// Returns the encoder and the policy head, which compute actions.
+    /// Returns the encoder and the policy head of a checkpoint, which together compute actions.
     fn actor(checkpoint: &Checkpoint<Self>) -> Actor;
 }
 
@@ -97,7 +97,7 @@ impl Trainable for Gcbc {
 
     fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
         let StepContext { config, dataset_info, key, device, training } = context;
-        let read = BatchReader::new(
+        let reader = BatchReader::new(
             &config.model,
             dataset_info,
             (config.data.num_steps, config.data.frameskip),
@@ -107,7 +107,7 @@ impl Trainable for Gcbc {
         shards::mean(batch.rows(), config.shards, |range| {
             let mut rng = key.with("dropout").at(range.start as u64).rng();
             let mut noise = DropoutRng(training.then_some(&mut rng));
-            Ok(self.losses(&read.clips(range)?, &mut noise, *training))
+            Ok(self.losses(&reader.clips(range)?, &mut noise, *training))
         })
     }
 }
@@ -158,11 +158,11 @@ macro_rules! value_learner {
             fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
                 let StepContext { config, dataset_info, key, device, training } = context;
                 let steps = (config.data.num_steps, config.data.frameskip);
-                let read = BatchReader::new(&config.model, dataset_info, steps, batch, device)?;
+                let reader = BatchReader::new(&config.model, dataset_info, steps, batch, device)?;
                 shards::mean(batch.rows(), config.shards, |range| {
                     let mut rng = key.with("dropout").at(range.start as u64).rng();
                     let mut noise = DropoutRng(training.then_some(&mut rng));
-                    let (clips, relabelled) = (read.clips(range.clone())?, read.relabelled(range)?);
+                    let (clips, relabelled) = (reader.clips(range.clone())?, reader.relabelled(range)?);
                     Ok(self.losses(&clips, &relabelled, &config.loss, &mut noise, *training))
                 })
             }
@@ -201,13 +201,14 @@ fn with_weights(encoder: Backbone, from: &str, cache: &Path) -> Result<Backbone>
     let path = weights::locate(from, cache)?;
     let mut found = weights::names::to_published(weights::read(&path)?, "");
     if !parameters::shapes(&encoder).keys().all(|name| found.contains_key(name)) {
-        let inside = |(name, weight): (String, _)| Some((name.strip_prefix("encoder.")?.to_owned(), weight));
-        found = found.into_iter().filter_map(inside).collect();
+        let encoder_weight = |(name, weight): (String, _)| Some((name.strip_prefix("encoder.")?.to_owned(), weight));
+        found = found.into_iter().filter_map(encoder_weight).collect();
     }
     weights::fill(encoder, &found, &path, "model.encoder")
 }
 
-/// Clips every network's gradient separately, as the published scripts have one optimizer per network.
+/// Returns the parameter group of a weight: one group per network, whose gradients are clipped separately, because the
+/// published scripts have one optimizer per network.
 fn parameter_group(name: &str) -> ParameterGroup {
     let clip = match name.split('.').next() {
         Some("action_predictor" | "log_stds") => 1,
@@ -228,7 +229,7 @@ impl ValueLoss {
             }
         }
         if !(self.temperature.is_finite() && self.temperature >= 0.0) {
-            let fix = "give at least 0 (which is behavioural cloning)";
+            let fix = "give at least 0 (0 is behavioural cloning)";
             return Err(Error::config("loss.temperature", self.temperature.to_string(), fix));
         }
         Ok(())
@@ -261,7 +262,7 @@ fn goals(mixture: &GoalMixture, name: &str, model: &GcrlConfig) -> GoalSpec {
     }
 }
 
-/// A batch whose clips are read in ranges.
+/// A batch that is read one range of clips at a time.
 struct BatchReader<'a> {
     config: &'a GcrlConfig,
     device: &'a Device,
@@ -285,7 +286,7 @@ impl<'a> BatchReader<'a> {
     }
 
     /// Returns the images of a range of clips from a column with `per_clip` images per clip.
-    fn part<'b>(&self, images: &'b [u8], per_clip: usize, clips: &Range<usize>) -> &'b [u8] {
+    fn clip_images<'b>(&self, images: &'b [u8], per_clip: usize, clips: &Range<usize>) -> &'b [u8] {
         let bytes = per_clip * self.config.image * self.config.image * 3;
         &images[clips.start * bytes..clips.end * bytes]
     }
@@ -301,15 +302,16 @@ impl<'a> BatchReader<'a> {
     fn clips(&self, clips: Range<usize>) -> Result<Clips> {
         let [_, _, elements] = self.actions.dims();
         Ok(Clips {
-            frames: self.patches(self.part(self.frames, self.steps, &clips))?,
-            goal: self.patches(self.part(self.goals(GOAL)?, 1, &clips))?,
+            frames: self.patches(self.clip_images(self.frames, self.steps, &clips))?,
+            goal: self.patches(self.clip_images(self.goals(GOAL)?, 1, &clips))?,
             actions: self.actions.clone().slice([clips, 0..self.config.history, 0..elements]),
         })
     }
 
     fn relabelled(&self, clips: Range<usize>) -> Result<Relabelled> {
         let bytes = self.config.image * self.config.image * 3;
-        let (frames, goals) = (self.part(self.frames, self.steps, &clips), self.part(self.goals(GOAL)?, 1, &clips));
+        let (frames, goals) =
+            (self.clip_images(self.frames, self.steps, &clips), self.clip_images(self.goals(GOAL)?, 1, &clips));
         // A goal is reached if the frame equals the goal image.
         let reached: Vec<f32> = frames
             .chunks_exact(self.steps * bytes)
@@ -321,7 +323,7 @@ impl<'a> BatchReader<'a> {
             .collect();
         let shape = [clips.len(), self.config.history, 1];
         Ok(Relabelled {
-            policy_goal: self.patches(self.part(self.goals(POLICY_GOAL)?, 1, &clips))?,
+            policy_goal: self.patches(self.clip_images(self.goals(POLICY_GOAL)?, 1, &clips))?,
             reached: Tensor::from_data(TensorData::new(reached, shape), self.device),
         })
     }

@@ -1,8 +1,8 @@
 //! [`Transformer`]: a transformer over the patches of a few frames and of a goal image, with one output per frame.
 //!
 //! Layers alternate between causal attention among the patches of the frames and attention to the patches of the goal.
-//! The output of a frame is pooled at the end: by a last layer in which one learnt token per frame attends to the
-//! patches up to that frame, or as the mean of the frame's patches.
+//! The output of a frame is pooled from patches: either one learnt token per frame attends, in the last layer, to the
+//! patches of that frame and of earlier frames, or the output is the mean of the frame's patches.
 
 use crate::nn::attention::{AttentionOutput, attend, causal_mask};
 use crate::nn::{DropoutRng, FeedForward, Init, LayerNorm, Linear};
@@ -10,7 +10,7 @@ use burn::module::{Module, Param};
 use burn::tensor::Tensor;
 use serde::{Deserialize, Serialize};
 
-/// The configuration of a transformer, and of a head on top of one.
+/// The configuration of a [`Transformer`] and of the heads that contain it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TransformerConfig {
@@ -28,7 +28,7 @@ pub struct TransformerConfig {
     pub emb_dropout: f32,
 }
 
-/// How the patches of a frame are pooled.
+/// The method that pools the patches of a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pool {
     /// In the last layer, a learnt token per frame attends to the patches, as published for policies.
@@ -48,7 +48,7 @@ pub struct PatchGrid {
     pub dim: usize,
 }
 
-/// The transformer.
+/// A transformer over the patches of frames and of a goal.
 #[derive(Module, Debug)]
 pub struct Transformer {
     /// The normalisation after the last layer.
@@ -61,10 +61,10 @@ pub struct Transformer {
     patches: usize,
 }
 
-/// Attention, then a feed-forward block. A field `_0` is element 0 of a sequence.
+/// Attention, then a feed-forward block. The parameters of field `_0` are stored under the name `0`.
 #[derive(Module, Debug)]
 pub struct Layer {
-    /// The attention.
+    /// The attention block.
     pub _0: Attention,
     /// The feed-forward block.
     pub _1: FeedForward,
@@ -86,15 +86,15 @@ enum Role {
 pub struct Attention {
     /// The normalisation of the patches.
     pub norm: LayerNorm,
-    /// The normalisation of the goal's patches, in a layer that attends to them.
+    /// The normalisation of the goal's patches, in a layer that attends to the goal.
     pub norm_c: Option<LayerNorm>,
-    /// Queries.
+    /// The projection to queries.
     pub to_q: Linear,
-    /// Keys, then values, in one layer.
+    /// The projection to keys, then values.
     pub to_kv: Linear,
-    /// The output projection; absent for a single head of the patches' size.
+    /// The output projection; absent for a single head with as many features as a patch.
     pub to_out: Option<AttentionOutput>,
-    /// `[1, frames, dim]`, the learnt tokens of a pooling layer.
+    /// The learnt tokens of a pooling layer, `[1, frames, dim]`.
     pub frame_tokens: Option<Param<Tensor<3>>>,
     #[module(skip)]
     role: Role,
@@ -104,7 +104,7 @@ pub struct Attention {
     config: TransformerConfig,
 }
 
-/// Added to the variance by the normalisations.
+/// The value that the normalisations add to the variance.
 const EPSILON: f64 = 1e-5;
 /// The standard deviation of the learnt tokens' initial values.
 const TOKEN_STD: f32 = 0.02;
@@ -157,7 +157,7 @@ impl Transformer {
         let mut x = frames;
         for layer in &self.layers {
             let mixed = layer._0.forward(x.clone(), goal, rng);
-            // A pooling layer has no residual connection: its output has another shape than its input.
+            // A pooling layer has no residual connection: the output has another shape than the input.
             if layer._0.role == Role::Pool {
                 x = layer._1.forward(mixed, rng);
             } else {

@@ -1,5 +1,6 @@
-//! [`InverseCheckpoint`]: the network and the world model whose encoder it uses, in one run folder. The network's files
-//! have the layout of any checkpoint; the world model's checkpoint is copied to `world/`.
+//! [`InverseCheckpoint`]: an inverse-dynamics network and the world model whose encoder the network uses, in one run
+//! folder. The files of the network have the layout of a [`Checkpoint`]; the world model's checkpoint is copied to
+//! `world/`.
 
 use super::InverseConfig;
 use crate::checkpoint::{self, Checkpoint};
@@ -15,7 +16,7 @@ pub struct InverseCheckpoint {
     /// The world model whose encoder the network uses.
     pub world_model: Checkpoint<Lewm>,
     /// The network: from the concatenated latents of present and goal, `[rows, 2 * latent]`, to the actions of a model
-    /// step in model units, `[rows, frameskip * action]`.
+    /// step in model units, `[rows, action_dim]`.
     pub model: Mlp,
     /// The training configuration.
     pub config: InverseConfig,
@@ -24,7 +25,7 @@ pub struct InverseCheckpoint {
     pub manifest: Manifest,
 }
 
-/// The id of the family.
+/// The family id of inverse dynamics.
 pub(super) const FAMILY: &str = "inverse";
 const WORLD_MODEL: &str = "world";
 
@@ -54,8 +55,8 @@ impl InverseCheckpoint {
         let stored = checkpoint::StoredCheckpoint::<InverseConfig>::read(run, FAMILY)?;
         let world_model = Checkpoint::<Lewm>::load(&run.join(WORLD_MODEL), device)?;
         let config = stored.config;
-        let (latent, actions) = (world_model.config.model.latent, world_model.actions());
-        let model = Mlp::new(&Init::new(Key::new(0), device), 2 * latent, config.hidden, actions);
+        let (latent, action_dim) = (world_model.config.model.latent, world_model.action_dim());
+        let model = Mlp::new(&Init::new(Key::new(0), device), 2 * latent, config.hidden, action_dim);
         let model = checkpoint::load_weights(
             model,
             &stored.folder.join("weights.safetensors"),

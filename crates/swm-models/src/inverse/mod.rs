@@ -4,7 +4,7 @@
 //! the actions between the first frame and the next (mean squared error of normalised actions). The policy reads the
 //! latent of the goal in place of the later frame's latent, so a decision costs one encoding and no search. The policy
 //! is a cheap baseline for planners that use the same latents. Sources: Jordan and Rumelhart 1992 ("distal teacher");
-//! Pathak et al. 2018 (zero-shot visual imitation). PLDM uses inverse dynamics as a term of its loss.
+//! Pathak et al. 2018 (zero-shot visual imitation). The loss of PLDM has an inverse-dynamics term.
 
 mod checkpoint;
 mod family;

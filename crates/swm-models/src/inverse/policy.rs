@@ -1,4 +1,4 @@
-//! [`InversePolicy`]: acting with an inverse-dynamics network.
+//! [`InversePolicy`]: a policy that acts with an inverse-dynamics network.
 
 use super::InverseCheckpoint;
 use crate::feed_forward::{ActionNetwork, FeedForwardPolicy};
@@ -9,7 +9,8 @@ use swm_core::columns::{GOAL, PIXELS};
 use swm_core::{Result, RowRef, Schema};
 use swm_plan::ActionScale;
 
-/// Acts on the network's prediction for the present image and the goal image, one model step at a time.
+/// A policy that takes the actions which an inverse-dynamics network predicts for the present image and the goal image,
+/// one model step at a time.
 pub type InversePolicy = FeedForwardPolicy<InverseCheckpoint>;
 
 impl ActionNetwork for InverseCheckpoint {

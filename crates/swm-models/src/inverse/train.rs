@@ -20,7 +20,7 @@ use swm_core::run::{Control, Progress};
 use swm_core::{Error, Key, Manifest, Result};
 use swm_data::{ClipSpec, Loader, LoaderConfig, Part, Reader};
 
-/// The configuration of a run. With the encoder and the data, it determines the result.
+/// The configuration of an inverse-dynamics training run. Configuration, encoder and dataset determine the result.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct InverseConfig {
@@ -49,7 +49,7 @@ impl InverseConfig {
     /// Loads the built-in configuration, changed by `key=value` settings with dotted keys.
     ///
     /// # Errors
-    /// When a key is unknown (the error names the nearest), or a value is invalid.
+    /// When a key is unknown (the error names the nearest known key), or a value is invalid.
     pub fn load(settings: &[String]) -> Result<Self> {
         let config: Self = presets::parse(Self::PRESET, settings, &[Self::PRESET])?;
         let least = [
@@ -74,12 +74,12 @@ impl InverseConfig {
     }
 }
 
-/// Trains on a dataset with the columns `pixels` and `action`, through the encoder of `world_model`; the checkpoint and
-/// the logs go to `out`.
+/// Trains on a dataset with the columns `pixels` and `action`, on latents of the encoder of `world_model`; writes the
+/// checkpoint and the logs to `out`.
 ///
 /// # Errors
-/// When the configuration contradicts the data, `out` holds a run, the loss is not finite, the run is interrupted
-/// (nothing is saved then), or a file cannot be written.
+/// When the configuration contradicts the data, `out` holds a checkpoint, the loss is not finite, the run is
+/// interrupted (no checkpoint is saved then), or a file cannot be written.
 pub fn train(
     config: &InverseConfig,
     world_model: &Checkpoint<Lewm>,
@@ -106,14 +106,14 @@ fn run(
     out: &Path,
     control: &mut Control<'_>,
 ) -> Result<TrainSummary> {
-    let begun = Instant::now();
+    let started = Instant::now();
     let key = Key::new(config.seed).with(FAMILY);
     let manifest = manifest(config, world_model, &*reader)?;
     std::fs::create_dir_all(out).map_err(|error| Error::io(out, "creating a folder", error))?;
     let mut log = log::Log::new(out, false)?;
     let loader = loader(config, world_model.config.data.frameskip, reader)?;
-    let (latent, actions) = (world_model.config.model.latent, world_model.actions());
-    let mut model = Mlp::new(&Init::new(key.with("init"), &Device::flex()), 2 * latent, config.hidden, actions);
+    let (latent, action_dim) = (world_model.config.model.latent, world_model.action_dim());
+    let mut model = Mlp::new(&Init::new(key.with("init"), &Device::flex()), 2 * latent, config.hidden, action_dim);
     let mut optimizer = AdamW::new(config.optim.clone());
     let (mut step, mut epoch, mut loss) = (0, 0, f64::NAN);
     let (mut waited, mut clips_per_second) = (0.0, 0.0);
@@ -132,7 +132,7 @@ fn run(
         let norm;
         (model, loss, norm) = optimizer_step(model, &mut optimizer, factor, pairs)?;
         step += 1;
-        let (elapsed, lr) = (begun.elapsed().as_secs_f64(), config.optim.lr * factor);
+        let (elapsed, lr) = (started.elapsed().as_secs_f64(), config.optim.lr * factor);
         clips_per_second = (step * config.batch_size) as f64 / elapsed;
         let metrics = [
             ("loss", loss),
@@ -150,7 +150,7 @@ fn run(
     let world_model = world_model.clone();
     let mut checkpoint = InverseCheckpoint { world_model, model, config: config.clone(), manifest };
     let weights = checkpoint.save(out)?;
-    let seconds = begun.elapsed().as_secs_f64();
+    let seconds = started.elapsed().as_secs_f64();
     Ok(TrainSummary {
         checkpoint: out.to_owned(),
         weights,
@@ -191,27 +191,28 @@ fn loader(config: &InverseConfig, frameskip: usize, reader: Arc<dyn Reader>) -> 
     Loader::new(reader, config)
 }
 
-/// The training examples of a step: pairs of present and goal latents, and the actions taken at present in model units.
+/// The training examples of a step: pairs of the latents of a present and a goal frame, and the actions taken at the
+/// present frame.
 struct Pairs {
-    /// `[pairs, 2 * latent]`.
+    /// The latents of the present and the goal frame, `[pairs, 2 * latent]`.
     latents: Vec<f32>,
-    /// `[pairs, action_dim]`.
+    /// The actions of a model step in model units, `[pairs, action_dim]`.
     actions: Vec<f32>,
     count: usize,
 }
 
-/// Frames that are encoded in one call: a constant, so that latents do not depend on the number of threads.
-const FRAMES: usize = 64;
+/// The number of frames encoded in a call: a constant, so that latents do not depend on the number of threads.
+const FRAMES_PER_CALL: usize = 64;
 
 impl Pairs {
     /// Draws one pair for every frame of a clip except the last frame. The goal is a random later frame of the clip.
     fn draw(world_model: &Checkpoint<Lewm>, offset: usize, batch: &swm_core::Batch, key: Key) -> Result<Self> {
         let (config, dim) = (&world_model.config.model, world_model.dataset_info.action.dim());
-        let (latent, actions) = (config.latent, world_model.config.data.frameskip * dim);
+        let (latent, action_dim) = (config.latent, world_model.action_dim());
         let frame = config.image * config.image * 3;
         let encoded: Result<Vec<Vec<f32>>> = batch
             .get::<u8>(PIXELS)?
-            .par_chunks(FRAMES * frame)
+            .par_chunks(FRAMES_PER_CALL * frame)
             .map(|frames| {
                 let patches = pixels::patches(config, frames, &Device::flex())?;
                 Ok(world_model.model.encode(patches).into_data().into_f32_vec())
@@ -221,7 +222,7 @@ impl Pairs {
         let actions_taken = batch.get::<f32>(ACTION)?;
         let count = batch.rows() * offset;
         let mut pairs =
-            Self { latents: Vec::with_capacity(2 * count * latent), actions: vec![0.0; count * actions], count };
+            Self { latents: Vec::with_capacity(2 * count * latent), actions: vec![0.0; count * action_dim], count };
         for clip in 0..batch.rows() {
             let mut rng = key.at(clip as u64).rng();
             for present in 0..offset {
@@ -229,8 +230,8 @@ impl Pairs {
                 for frame in [present, goal] {
                     pairs.latents.extend_from_slice(&encoded[(clip * (offset + 1) + frame) * latent..][..latent]);
                 }
-                let from = &actions_taken[(clip * (offset + 1) + present) * actions..][..actions];
-                let to = &mut pairs.actions[(clip * offset + present) * actions..][..actions];
+                let from = &actions_taken[(clip * (offset + 1) + present) * action_dim..][..action_dim];
+                let to = &mut pairs.actions[(clip * offset + present) * action_dim..][..action_dim];
                 for (to, from) in to.chunks_exact_mut(dim).zip(from.chunks_exact(dim)) {
                     world_model.dataset_info.action.to_model(from, to);
                 }

@@ -1,4 +1,4 @@
-//! [`LewmConfig`]: the sizes of a LeWM.
+//! [`LewmConfig`]: the model configuration of a LeWM.
 
 use crate::checks;
 pub use crate::nn::BackboneConfig as EncoderConfig;
@@ -7,7 +7,7 @@ use crate::train::at_least;
 use serde::{Deserialize, Serialize};
 use swm_core::Result;
 
-/// The sizes of a LeWM.
+/// The model configuration of a LeWM.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LewmConfig {
@@ -31,10 +31,10 @@ pub struct LewmConfig {
 }
 
 impl LewmConfig {
-    /// Checks that the sizes are consistent.
+    /// Checks the configuration.
     ///
     /// # Errors
-    /// When a size is invalid; the error names the first such size.
+    /// When a setting is invalid; the error names the first invalid setting.
     pub fn check(&self) -> Result<()> {
         let predictor = &self.predictor;
         at_least(&[

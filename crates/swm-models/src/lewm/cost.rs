@@ -1,9 +1,9 @@
 //! [`LewmCost`]: the planning cost of a LeWM, the squared distance between the last predicted latent of a candidate and
 //! the latent of the goal image.
 //!
-//! Every environment is evaluated in calls whose shapes do not depend on the other environments, each on one thread of
-//! the current rayon pool. So the bytes of an environment's plan depend neither on the other environments nor on the
-//! number of threads.
+//! Every call evaluates candidates of one environment on one thread of the current rayon pool, and the shape of a call
+//! does not depend on the other environments. So the bytes of an environment's plan depend neither on the other
+//! environments nor on the number of threads.
 
 use super::config::LewmConfig;
 use super::host_encoder::HostEncoder;
@@ -47,7 +47,7 @@ pub(super) struct PlanContext {
 impl LewmCost {
     /// Creates the planning cost of a trained model.
     pub fn new(checkpoint: &Checkpoint<Lewm>) -> Self {
-        Self::of(&checkpoint.model, &checkpoint.config.model, checkpoint.actions())
+        Self::of(&checkpoint.model, &checkpoint.config.model, checkpoint.action_dim())
     }
 
     /// Creates the planning cost of a model with the configuration `config` and actions of `action_dim` elements.
@@ -57,7 +57,7 @@ impl LewmCost {
         Self { model: model.clone(), host, config: config.clone(), action_dim, contexts: vec![] }
     }
 
-    /// Checks that candidates and costs have the sizes for the observed environments.
+    /// Checks that the lengths of candidates and costs fit the observed environments.
     pub(super) fn check_sizes(&self, candidates: &Candidates<'_>, costs: &[f32]) -> Result<()> {
         checks::candidate_sizes("costs of a LeWM", candidates, costs, [self.contexts.len(), self.action_dim])
     }
@@ -119,7 +119,7 @@ impl PlanContext {
     }
 }
 
-/// The implementation of the rollout.
+/// The implementation of rollouts: the CPU kernels, or the tensors of the model.
 enum RolloutModel<'a> {
     Host(&'a Rollout),
     Device(&'a Lewm),
@@ -148,7 +148,7 @@ impl RolloutModel<'_> {
     /// Returns the number of candidates that are rolled out in one call, given `samples` candidates.
     fn chunk_size(&self, samples: usize) -> usize {
         match self {
-            Self::Host(_) => Rollout::part(samples),
+            Self::Host(_) => Rollout::chunk_size(samples),
             Self::Device(_) => samples,
         }
     }
@@ -198,10 +198,11 @@ mod tests {
 
     #[test]
     fn host_and_device_rollouts_give_equal_costs() {
-        let config = TrainConfig::<Lewm>::load("tiny", &["model.predictor.history=3".to_owned()]).expect("a preset");
+        let config =
+            TrainConfig::<Lewm>::load("tiny", &["model.predictor.history=3".to_owned()]).expect("loading the preset");
         let (samples, horizon, dim) = (5, 5, 4);
         let model = Lewm::init(&config.model, dim, Key::new(0), &Device::flex());
-        // Modulations are zero-initialised; without them actions have no effect.
+        // Modulations are zero-initialised, and actions have no effect through zero modulations.
         let mut values = parameters::values(&model);
         for (_, tensor) in values.iter_mut().filter(|(name, _)| name.contains("adaLN")) {
             for (i, value) in tensor.values.iter_mut().enumerate() {
@@ -211,16 +212,16 @@ mod tests {
         let model = parameters::load(model, &values);
         let side = config.model.image;
         let columns = [ColumnSpec::image("pixels", side, side), ColumnSpec::image("goal", side, side)];
-        let mut infos = Batch::zeros(&Schema::new(columns).expect("columns"), 1);
+        let mut infos = Batch::zeros(&Schema::new(columns).expect("creating the schema"), 1);
         infos.row_mut(0).at::<u8>(1).fill(200);
         let actions: Vec<f32> = (0..samples * horizon * dim).map(|i| (i * 29 % 97) as f32 / 50.0 - 1.0).collect();
         let costs = |on_host: bool| {
             let mut cost = LewmCost::of(&model, &config.model, dim);
             cost.host = cost.host.filter(|_| on_host);
-            cost.observe(&infos, &[0]).expect("observed environments");
+            cost.observe(&infos, &[0]).expect("observing the environment");
             let mut costs = vec![0.0; samples];
             let candidates = Candidates { actions: &actions, envs: 1, samples, horizon, dim };
-            cost.cost(candidates, &mut costs).expect("costs");
+            cost.cost(candidates, &mut costs).expect("computing the costs");
             costs
         };
         let (host, device) = (costs(true), costs(false));

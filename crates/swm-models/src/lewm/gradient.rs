@@ -1,8 +1,8 @@
-//! Gradients of [`LewmCost`] with respect to actions, and latent dynamics with vector-Jacobian products, by Burn's
-//! autodiff of [`Lewm::rollout`].
+//! [`DifferentiableCost`] and [`LatentDynamics`] for [`LewmCost`]: gradients with respect to actions, and
+//! vector-Jacobian products of predictions, by Burn's autodiff.
 //!
 //! The state of a solver is the latent of one frame: [`LatentDynamics::predict`] uses a window of one latent, as
-//! training does at the first frame of every clip. The cost and its gradient use the whole window.
+//! training does at the first frame of every clip. The cost and the gradient of the cost use the whole window.
 //!
 //! The rows of each environment are split into chunks separately, so that the results of an environment do not depend
 //! on the other environments.
@@ -47,7 +47,7 @@ fn cost_and_gradient(
     let frames = context.start.len() / latent;
     let start = tensor(model, context.start.repeat(samples), [samples, frames, latent]).autodiff();
     let leaf = tensor(model, actions.to_vec(), [samples, horizon, dim]).autodiff().require_grad();
-    let taken = match past {
+    let all_actions = match past {
         0 => leaf.clone(),
         _ => Tensor::cat(
             vec![tensor(model, context.past.repeat(samples), [samples, past, dim]).autodiff(), leaf.clone()],
@@ -55,7 +55,7 @@ fn cost_and_gradient(
         ),
     };
     let last = frames + horizon - 1;
-    let end = model.rollout(start, taken).slice([0..samples, last..last + 1, 0..latent]);
+    let end = model.rollout(start, all_actions).slice([0..samples, last..last + 1, 0..latent]);
     let goal = tensor(model, context.goal.repeat(samples), [samples, 1, latent]).autodiff();
     let cost = (end - goal).square().sum_dim(2);
     costs.copy_from_slice(&cost.clone().inner().into_data().into_f32_vec());
@@ -84,8 +84,8 @@ impl DifferentiableCost for LewmCost {
         let rows = costs.par_chunks_mut(samples).zip(gradient.par_chunks_mut(samples * width));
         rows.zip(actions.par_chunks(samples * width)).zip(&self.contexts).for_each(
             |(((costs, gradient), actions), context)| {
-                let parts = costs.par_chunks_mut(chunk_size).zip(gradient.par_chunks_mut(chunk_size * width));
-                parts.zip(actions.par_chunks(chunk_size * width)).for_each(|((costs, gradient), actions)| {
+                let chunks = costs.par_chunks_mut(chunk_size).zip(gradient.par_chunks_mut(chunk_size * width));
+                chunks.zip(actions.par_chunks(chunk_size * width)).for_each(|((costs, gradient), actions)| {
                     cost_and_gradient(&model, context, [costs.len(), horizon, dim], actions, costs, gradient);
                 });
             },
@@ -97,7 +97,12 @@ impl DifferentiableCost for LewmCost {
 impl LewmCost {
     /// Checks the lengths of latents, actions and additional arrays, each given as (name, length, width). Returns the
     /// number of rows per environment.
-    fn pairs(&self, latents: &[f32], actions: &[f32], additional: &[(&str, usize, usize)]) -> Result<usize> {
+    fn rows_per_environment(
+        &self,
+        latents: &[f32],
+        actions: &[f32],
+        additional: &[(&str, usize, usize)],
+    ) -> Result<usize> {
         let (latent, envs) = (self.config.latent, self.contexts.len().max(1));
         let n = latents.len() / latent;
         let given = [("latents", latents.len(), latent), ("actions", actions.len(), self.action_dim)];
@@ -106,7 +111,7 @@ impl LewmCost {
                 return Err(Error::mismatch(
                     format!("one step of a LeWM: {what}"),
                     format!("{length} elements"),
-                    format!("{n} rows of {width}, the same number for each of {envs} environments"),
+                    format!("{n} rows of {width} elements, and equally many rows for each of {envs} environments"),
                 ));
             }
         }
@@ -126,7 +131,7 @@ impl LatentDynamics for LewmCost {
             return Err(Error::mismatch(
                 "the latents of start and goal of a LeWM",
                 format!("{} and {} elements", start.len(), goal.len()),
-                format!("{latent} of each for each of {} observed environments", self.contexts.len()),
+                format!("{latent} elements of each per environment, for {} observed environments", self.contexts.len()),
             ));
         }
         for ((start, goal), context) in
@@ -140,9 +145,9 @@ impl LatentDynamics for LewmCost {
 
     fn predict(&mut self, latents: &[f32], actions: &[f32], next: &mut [f32]) -> Result<()> {
         let latent = self.config.latent;
-        let rows = self.pairs(latents, actions, &[("next latents", next.len(), latent)])?;
-        let parts = chunks(latents, rows, latent).zip(chunks(actions, rows, self.action_dim));
-        let mut work: Vec<_> = parts.zip(chunks_mut(next, rows, latent)).collect();
+        let rows = self.rows_per_environment(latents, actions, &[("next latents", next.len(), latent)])?;
+        let inputs = chunks(latents, rows, latent).zip(chunks(actions, rows, self.action_dim));
+        let mut work: Vec<_> = inputs.zip(chunks_mut(next, rows, latent)).collect();
         work.par_iter_mut().for_each(|((latents, actions), next)| {
             let (n, dim) = (latents.len() / latent, self.action_dim);
             let window = tensor(&self.model, latents.to_vec(), [n, 1, latent]);
@@ -166,7 +171,7 @@ impl LatentDynamics for LewmCost {
             ("gradients of latents", latent_gradient.len(), latent),
             ("gradients of actions", action_gradient.len(), dim),
         ];
-        let rows = self.pairs(latents, actions, &additional)?;
+        let rows = self.rows_per_environment(latents, actions, &additional)?;
         let model = differentiable(&self.model);
         let given =
             chunks(latents, rows, latent).zip(chunks(actions, rows, dim)).zip(chunks(next_gradient, rows, latent));
@@ -174,12 +179,12 @@ impl LatentDynamics for LewmCost {
         let mut work: Vec<_> = given.zip(outputs).collect();
         work.par_iter_mut().for_each(|(((latents, actions), cotangent), (latent_gradient, action_gradient))| {
             let n = latents.len() / latent;
-            let from = tensor(&model, latents.to_vec(), [n, 1, latent]).autodiff().require_grad();
-            let by = tensor(&model, actions.to_vec(), [n, 1, dim]).autodiff().require_grad();
-            let next = model.predict(from.clone(), model.embed_actions(by.clone()));
+            let latent_leaf = tensor(&model, latents.to_vec(), [n, 1, latent]).autodiff().require_grad();
+            let action_leaf = tensor(&model, actions.to_vec(), [n, 1, dim]).autodiff().require_grad();
+            let next = model.predict(latent_leaf.clone(), model.embed_actions(action_leaf.clone()));
             let all = (next * tensor(&model, cotangent.to_vec(), [n, 1, latent]).autodiff()).sum().backward();
-            copy_gradient(from.grad(&all), latent_gradient);
-            copy_gradient(by.grad(&all), action_gradient);
+            copy_gradient(latent_leaf.grad(&all), latent_gradient);
+            copy_gradient(action_leaf.grad(&all), action_gradient);
         });
         Ok(())
     }
@@ -191,7 +196,7 @@ fn chunks(values: &[f32], rows: usize, width: usize) -> impl Iterator<Item = &[f
     values.chunks(rows.max(1) * width).flat_map(move |env| env.chunks(chunk_size * width))
 }
 
-/// Splits mutable rows as [`chunks`] does.
+/// Splits mutable rows of `width` elements into chunks; no chunk spans two environments.
 fn chunks_mut(values: &mut [f32], rows: usize, width: usize) -> impl Iterator<Item = &mut [f32]> {
     let chunk_size = chunk_size(rows);
     values.chunks_mut(rows.max(1) * width).flat_map(move |env| env.chunks_mut(chunk_size * width))

@@ -21,7 +21,7 @@ impl HostEncoder {
         Some(Self { vit: vit_encoder(vit, patches)?, projector: projector_panels(&model.projector) })
     }
 
-    /// Returns the latent of one image from its normalised patches.
+    /// Returns the latent of one image, given as normalised patches.
     ///
     /// # Shapes
     /// `patches` is `[patches, 3 * patch * patch]`; returns `[latent]`.

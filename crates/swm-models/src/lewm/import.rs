@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 use std::path::Path;
 use swm_core::{Error, Key, Manifest, Result};
 
-/// The reference implementation's module of building blocks for this family.
+/// The Python module with the building blocks of the reference implementation's LeWM.
 const MODULES: &str = "stable_worldmodel.wm.lewm.module";
 const CLASS: &str = "stable_worldmodel.wm.lewm.LeWM";
 
@@ -39,14 +39,14 @@ pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<Lewm>
 /// Writes the `weights.pt` and `config.json` that `load_pretrained` of the reference implementation reads.
 ///
 /// # Errors
-/// When the reference implementation has no such encoder, or a file cannot be written.
+/// When the encoder is not a vision transformer, or a file cannot be written.
 pub fn export(checkpoint: &Checkpoint<Lewm>, folder: &Path, naming: Naming) -> Result<()> {
-    let actions = checkpoint.actions();
-    let config = tree(&checkpoint.config.model, actions, CLASS, MODULES)?;
+    let config = tree(&checkpoint.config.model, checkpoint.action_dim(), CLASS, MODULES)?;
     write(folder, &config, &state(&checkpoint.model, naming))
 }
 
-/// Returns the world model of a checkpoint, its sizes, and the number of environment steps in a model step.
+/// Returns the world model of a checkpoint, the model configuration, and the number of environment steps in a model
+/// step.
 ///
 /// # Errors
 /// As [`import`].
@@ -55,7 +55,7 @@ pub(crate) fn world_model(mut reference: Reference, dataset_info: &DatasetInfo) 
     for part in ["projector", "pred_proj"] {
         let norm = reference.class(&format!("{part}.norm_fn"));
         if norm != "BatchNorm1d" {
-            return Err(reference.wrong(format!("its {part} has '{norm}' where BatchNorm1d is expected")));
+            return Err(reference.wrong(format!("the module '{part}' has '{norm}' where BatchNorm1d is expected")));
         }
     }
     let size = |path: &str| reference.size(path);
@@ -81,18 +81,18 @@ pub(crate) fn world_model(mut reference: Reference, dataset_info: &DatasetInfo) 
         encoder: EncoderConfig::Vit(vit),
         predictor,
     };
-    let actions = size("action_encoder.input_dim")?;
+    let action_dim = size("action_encoder.input_dim")?;
     let dim = dataset_info.action.dim();
-    if dim == 0 || !actions.is_multiple_of(dim) {
+    if dim == 0 || !action_dim.is_multiple_of(dim) {
         return Err(Error::mismatch(
             "importing a checkpoint",
             format!("{dim} action elements in the dataset"),
-            format!("a divisor of {actions}, the action elements of a model step"),
+            format!("a divisor of {action_dim}, the action elements of a model step"),
         ));
     }
-    let model = Lewm::init(&config, actions, Key::new(0), &Device::flex());
+    let model = Lewm::init(&config, action_dim, Key::new(0), &Device::flex());
     let model = weights::fill(model, &reference.weights, &reference.path, "config.json")?;
-    Ok((model, config, actions / dim))
+    Ok((model, config, action_dim / dim))
 }
 
 /// Returns the state dict of a world model in the layout of the reference implementation.
@@ -105,16 +105,16 @@ pub(crate) fn state(model: &Lewm, naming: Naming) -> Named<HostTensor> {
     weights
 }
 
-/// Returns the class tree from which the reference implementation builds a world model.
+/// Returns the tree of classes, as JSON, from which the reference implementation builds a world model.
 ///
 /// # Errors
-/// When the reference implementation has no such encoder.
-pub(crate) fn tree(config: &LewmConfig, actions: usize, class: &str, modules: &str) -> Result<Value> {
+/// When the encoder is not a vision transformer.
+pub(crate) fn tree(config: &LewmConfig, action_dim: usize, class: &str, modules: &str) -> Result<Value> {
     let EncoderConfig::Vit(VitConfig { patch, dim, depth, heads, mlp }) = &config.encoder else {
         return Err(Error::config(
             "exporting a model",
-            "the reference implementation has no encoder like 'pyramid'",
-            "train with model.encoder.vit, such as the preset `paper` does",
+            "the reference implementation builds this model with a vision transformer only",
+            "train with model.encoder.vit, as the preset `paper` does",
         ));
     };
     let (predictor, latent) = (&config.predictor, config.latent);
@@ -140,8 +140,8 @@ pub(crate) fn tree(config: &LewmConfig, actions: usize, class: &str, modules: &s
         },
         "action_encoder": {
             "_target_": format!("{modules}.Embedder"),
-            "input_dim": actions,
-            "smoothed_dim": if config.smoothed == 0 { actions } else { config.smoothed },
+            "input_dim": action_dim,
+            "smoothed_dim": if config.smoothed == 0 { action_dim } else { config.smoothed },
             "emb_dim": latent,
         },
         "projector": project(*dim),

@@ -1,4 +1,4 @@
-//! The training step that joint-embedding models share, with the regulariser as a parameter.
+//! The training step of joint-embedding models (LeWM, PLDM), with the regulariser as a parameter.
 //!
 //! The encoder processes a fixed number of shards of the batch in parallel; the other modules process the whole batch.
 //! The configuration sets the number of shards, and gradients are summed in the order of the shards, so the result does
@@ -18,7 +18,7 @@ use swm_core::Rng;
 pub(crate) struct JointStep {
     /// Mean squared error of the predicted latents.
     pub prediction: f64,
-    /// Gradients by parameter of the model, flat.
+    /// The flattened gradient of each parameter of the model, by parameter name.
     pub gradients: Named<Tensor<1>>,
     /// All gradients, including the gradients of the regulariser's own parameters.
     pub all: Gradients,
@@ -26,7 +26,7 @@ pub(crate) struct JointStep {
     pub statistics: [BatchStatistics; 2],
 }
 
-/// Returns every window of `history` steps that is followed by a step, shifted by `offset` steps: one window per clip
+/// Returns every window of `history` steps that another step follows, shifted by `offset` steps: one window per clip
 /// if clips are one step longer than the history, as published.
 ///
 /// # Shapes
@@ -38,7 +38,7 @@ fn windows(x: &Tensor<3>, history: usize, offset: usize) -> Tensor<3> {
 }
 
 /// Computes prediction error and gradients of a batch. The loss is the prediction error plus `regularise(latents)`,
-/// where the latents are `[clips, steps, latent]`. `model` has no autodiff; `shards` is at least 1.
+/// where the latents are `[clips, steps, latent]`. `model` is outside autodiff; `shards` is at least 1.
 pub(crate) fn step(
     model: &Lewm,
     batch: &TrainBatch,
@@ -61,7 +61,7 @@ pub(crate) fn step(
         })
         .collect();
 
-    // The modules after the encoder.
+    // The modules after the encoder process the whole batch.
     let head = model.clone().train();
     let features = Tensor::cat(encoded.iter().map(|shard| shard.features.clone()).collect(), 0);
     let features = features.autodiff().require_grad();
@@ -100,7 +100,7 @@ pub(crate) fn step(
     }
 }
 
-/// Adds the gradients of the encoder from one shard to the sums over the shards before it.
+/// Adds the gradients of the encoder on one shard to the sums over the earlier shards.
 fn add_encoder_gradients(sums: &mut Named<Tensor<1>>, shard: Named<Tensor<1>>) {
     for (name, gradient) in shard {
         let name = format!("encoder.{name}");

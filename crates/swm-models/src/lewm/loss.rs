@@ -3,7 +3,7 @@
 //!
 //! The latents of a batch are projected on random directions, and the empirical characteristic function of each
 //! projection is compared with that of a standard normal distribution by the Epps-Pulley statistic, integrated by the
-//! trapezoid rule under a Gaussian window. Value and gradient are computed in one pass on the host. The characteristic
+//! trapezoid rule under a Gaussian window. Value and gradient are computed in one pass on the CPU. The characteristic
 //! functions at equidistant knots are powers of one complex number, so a projection costs one sine and one cosine.
 
 use rand_distr::{Distribution as _, StandardNormal};
@@ -34,7 +34,7 @@ struct Quadrature {
     spacing: f32,
     /// The characteristic function of the standard normal distribution at each knot.
     target: Vec<f32>,
-    /// The weight of each knot, which includes the weight of the knot's negative.
+    /// The weight of each knot: the trapezoidal weights of the knot and of the negated knot, times the Gaussian window.
     weights: Vec<f32>,
 }
 
@@ -47,7 +47,7 @@ impl Quadrature {
         Self { spacing, target, weights }
     }
 
-    /// Returns the Epps-Pulley statistic of samples and its derivative with respect to each sample.
+    /// Returns the Epps-Pulley statistic of samples and the derivatives of the statistic with respect to the samples.
     fn statistic(&self, samples: impl ExactSizeIterator<Item = f32>) -> (f64, Vec<f32>) {
         let Self { spacing, target, weights } = self;
         let (knots, n) = (target.len(), samples.len() as f32);
@@ -90,7 +90,7 @@ impl Quadrature {
 }
 
 /// Computes the Epps-Pulley statistic, `n ∫ |φ_n(t) - exp(-t²/2)|² exp(-t²/2) dt` averaged over steps and directions,
-/// and its gradient with respect to the latents.
+/// and the gradient of the average with respect to the latents.
 ///
 /// # Shapes
 /// `latents` is `[batch, steps, dim]`, `directions` is `[count, dim]`; the gradient has the shape of the latents.
@@ -99,8 +99,8 @@ pub fn sigreg(latents: &[f32], steps: usize, dim: usize, directions: &[f32], kno
     let count = directions.len() / dim;
     let quadrature = Quadrature::new(knots);
 
-    // One task per step and direction returns its statistic and the gradient of its projections, so that the sums below
-    // have the same order on any number of threads.
+    // Every task returns the statistic of one step and direction and the gradient of the projections, so that the sums
+    // below have the same order on any number of threads.
     let tasks: Vec<(f64, Vec<f32>)> = (0..steps * count)
         .into_par_iter()
         .map(|task| {

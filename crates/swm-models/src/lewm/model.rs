@@ -7,7 +7,7 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use swm_core::Key;
 
-/// A LeWM: encodes images to latents, and predicts the next latents from latents and actions.
+/// The networks of a LeWM, which encode images to latents and predict the next latents from latents and actions.
 #[derive(Module, Debug)]
 pub struct Lewm {
     /// Maps images to features.
@@ -78,10 +78,10 @@ impl Lewm {
         self.pred_proj.forward(features.reshape([windows * steps, latent])).reshape([windows, steps, latent])
     }
 
-    /// Predicts as [`Lewm::predict`], with batch statistics and dropout.
+    /// Predicts the latent after each latent of a window, in training: with batch statistics and dropout.
     ///
     /// # Shapes
-    /// As [`Lewm::predict`].
+    /// `latents` and `conditions` are `[windows, steps, latent]`; returns latents of the same shape.
     pub fn predict_train(
         &self,
         latents: Tensor<3>,

@@ -8,7 +8,8 @@ use swm_core::columns::PIXELS;
 use swm_core::{Batch, Error, Predictor, Result};
 use swm_plan::ActionScale;
 
-/// Encodes rows and predicts trajectories one at a time, so that a latent does not depend on the other rows.
+/// A predictor of latents that encodes rows and predicts trajectories one at a time, so that a latent depends on its
+/// own row or trajectory only.
 pub struct LewmPredictor {
     model: Lewm,
     config: LewmConfig,

@@ -4,14 +4,14 @@
 //!
 //! - actions are embedded and converted to modulations once for the whole sequence;
 //! - the normalised tokens of a layer are cached while the window of latents grows, and recomputed only when the window
-//!   slides, because the positions of the tokens change when it slides;
-//! - the last layer and the modules after it compute only the last token;
+//!   slides, because sliding changes the positions of the tokens;
+//! - the last layer and all later modules compute only the last token;
 //! - keys and values are never computed. A window holds a few tokens of `dim` features, and the heads together have
 //!   many more features. So a query is multiplied by the transposed key matrix, `(W_k y)ᵀq = yᵀ(W_kᵀ q)`, and compared
 //!   with the tokens themselves; the weighted mean of the tokens is multiplied by the value matrix,
 //!   `Σ a_j W_v y_j = W_v Σ a_j y_j`. A query costs as much in this form as the key and value of a token cost in the
-//!   usual form, and there are fewer queries than tokens. The first token attends to itself alone, so its value and
-//!   output projections are one matrix;
+//!   usual form, and there are fewer queries than tokens. The first token attends to itself alone, so one matrix
+//!   replaces the value and output projections of that token;
 //! - batch normalisation is folded into the linear layer before it.
 //!
 //! Rows are ordered by token, then by sample, so that tokens are contiguous. Every row is computed separately, so costs
@@ -26,8 +26,8 @@ use burn::module::Param;
 use swm_kernels::functions::{gelu, silu};
 use swm_kernels::{Modulation, Norm, Panels, ScratchPool, add_gated, causal_attention, grown};
 
-/// Rows that a layer processes together: few enough that the activations fit into a core's cache, and as many as
-/// possible, because each block reads all weights.
+/// The number of rows that a layer processes together: few enough that the activations fit into a core's cache, and as
+/// many as possible, because each block reads all weights.
 const BLOCK: usize = 80;
 /// Parts of a modulation: shift, scale and gate of the attention, then of the feed-forward block.
 const PARTS: usize = 6;
@@ -53,13 +53,13 @@ struct Layer {
     norm: Norm,
     /// Value and output projection of a token that attends to itself alone, `[dim, dim]`.
     alone: Panels,
-    /// `[dim, heads * width]`.
+    /// The map from tokens to queries, `[dim, heads * width]`.
     query: Panels,
     /// For each head, the scaled map from queries to the space of tokens, `[width, dim]`.
     key: Vec<Panels>,
     /// For each head, the map from the weighted mean of the tokens to values, `[dim, width]`.
     value: Vec<Panels>,
-    /// `[heads * width, dim]`; absent for a single head of the tokens' size.
+    /// The output projection, `[heads * width, dim]`; absent for a single head with as many features as a token.
     out: Option<Panels>,
     mlp_norm: Norm,
     mlp: [Panels; 2],
@@ -68,10 +68,10 @@ struct Layer {
 /// Memory that is reused between calls.
 #[derive(Default)]
 struct Scratch {
-    /// Actions ordered by step, then their embeddings, `[steps, samples, …]`.
+    /// The actions, later the embeddings of the actions, `[steps, samples, …]`.
     actions: Vec<f32>,
     hidden: Vec<f32>,
-    /// For each layer, `[steps, samples, 6 * dim]`.
+    /// The modulations of each layer, `[steps, samples, 6 * dim]`.
     modulations: Vec<Vec<f32>>,
     /// For each layer, the cached normalised tokens of the window, `[tokens, samples, dim]`.
     cached: Vec<Vec<f32>>,
@@ -100,10 +100,10 @@ impl Layer {
             Some(out) => {
                 let weight = host(out._0.weight.val());
                 let bias = out._0.bias.as_ref().map_or_else(Vec::new, |bias| host(bias.val()));
-                let plain = Panels::new(inner, dim, |i, o| weight[o * inner + i]);
+                let projection = Panels::new(inner, dim, |i, o| weight[o * inner + i]);
                 let mut product = vec![0.0; dim * dim];
-                plain.apply(&values, &mut product);
-                (Panels::new(dim, dim, |i, o| product[i * dim + o]).with_bias(&bias), Some(plain.with_bias(&bias)))
+                projection.apply(&values, &mut product);
+                (Panels::new(dim, dim, |i, o| product[i * dim + o]).with_bias(&bias), Some(projection.with_bias(&bias)))
             }
             None => (Panels::new(dim, dim, |i, o| values[i * dim + o]), None),
         };
@@ -131,7 +131,7 @@ impl Rollout {
         let transformer = &predictor.transformer;
         let [_, _, latent] = predictor.pos_embedding.dims();
         let actions = &model.action_encoder;
-        let tap = Linear {
+        let convolution = Linear {
             weight: Param::from_tensor(actions.patch_embed.weight.val().squeeze_dim::<2>(2)),
             bias: Some(actions.patch_embed.bias.clone()),
         };
@@ -139,7 +139,7 @@ impl Rollout {
             history: config.history,
             latent,
             dim: config.dim,
-            action: [panels(&tap), panels(&actions.embed._0), panels(&actions.embed._2)],
+            action: [panels(&convolution), panels(&actions.embed._0), panels(&actions.embed._2)],
             positions: host(predictor.pos_embedding.val()),
             input: transformer.input_proj.as_ref().map(panels),
             condition: transformer.cond_proj.as_ref().map(panels),
@@ -153,9 +153,9 @@ impl Rollout {
         }
     }
 
-    /// Returns how many of `samples` candidates a thread rolls out at once: an equal part, within limits that keep the
-    /// matrix products efficient. The result of a candidate does not depend on this number.
-    pub fn part(samples: usize) -> usize {
+    /// Returns the number of candidates that a thread rolls out at once: an equal fraction of `samples`, within limits
+    /// that keep the matrix products efficient. The result of a candidate does not depend on the number.
+    pub fn chunk_size(samples: usize) -> usize {
         samples.div_ceil(rayon::current_num_threads()).clamp(24, 160)
     }
 
@@ -180,7 +180,7 @@ impl Rollout {
         let frames = start.len() / self.latent;
         self.modulate(scratch, actions, samples, steps);
         let Scratch { modulations, cached, x, hidden, block, .. } = scratch;
-        let mut latents: Vec<Vec<f32>> = start.chunks_exact(self.latent).map(|one| one.repeat(samples)).collect();
+        let mut latents: Vec<Vec<f32>> = start.chunks_exact(self.latent).map(|latent| latent.repeat(samples)).collect();
         cached.resize_with(self.layers.len(), Vec::new);
         cached.iter_mut().for_each(Vec::clear);
         let mut tokens = 0;
@@ -245,8 +245,8 @@ impl Rollout {
                 x.extend_from_slice(&actions[(sample * steps + step) * width..][..width]);
             }
         }
-        let [tap, into, out] = &self.action;
-        through(Some(tap), x, hidden);
+        let [convolution, into, out] = &self.action;
+        through(Some(convolution), x, hidden);
         through(Some(into), x, hidden);
         silu(x);
         through(Some(out), x, hidden);

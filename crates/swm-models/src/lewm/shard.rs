@@ -1,4 +1,4 @@
-//! [`Shard`]: forward and backward pass of the encoder for one part of the images of a batch.
+//! [`Shard`]: forward and backward pass of the encoder for a range of the images of a batch.
 //!
 //! On the CPU, [`VitGradient`] differentiates vision transformers; Burn differentiates all other encoders.
 
@@ -12,7 +12,8 @@ use swm_kernels::{Tape, VitGradient};
 
 /// The implementation of the encoder's gradient.
 pub(crate) enum Differentiation<'a> {
-    /// Burn's autodiff. Every shard has its own copy of the encoder, so that their graphs are independent.
+    /// Burn's autodiff. Every shard has its own copy of the encoder, so that the autodiff graphs of
+    /// the shards are independent.
     Burn(&'a Encoder),
     /// The CPU kernels.
     Host(Box<VitGradient>),
@@ -29,9 +30,9 @@ impl<'a> Differentiation<'a> {
     }
 }
 
-/// Encoded images and the state of their backward pass.
+/// Encoded images and the state that the backward pass reads.
 pub(crate) struct Shard {
-    /// `[images, features]`.
+    /// The features of the images, `[images, features]`.
     pub features: Tensor<2>,
     state: BackwardState,
 }
@@ -64,7 +65,7 @@ impl Shard {
         }
     }
 
-    /// Returns the gradients of the encoder's parameters, flat.
+    /// Returns the flattened gradients of the encoder's parameters, by parameter name.
     ///
     /// # Shapes
     /// `gradient`, the gradient of the features, is `[images, features]`.

@@ -1,4 +1,5 @@
-//! One training step of a LeWM: prediction error plus SIGReg (Maes et al. 2026, LeWorldModel), and its gradients.
+//! One training step of a LeWM (Maes et al. 2026, LeWorldModel): the loss, prediction error plus SIGReg, and the
+//! gradients of the loss.
 
 use super::joint::{self, JointStep};
 use super::loss;
@@ -15,21 +16,21 @@ use swm_core::Rng;
 pub struct SigregConfig {
     /// The weight of SIGReg in the loss, λ.
     pub weight: f32,
-    /// Random directions per step.
+    /// The number of random directions per training step.
     pub directions: usize,
-    /// Points at which characteristic functions are compared.
+    /// The number of points at which characteristic functions are compared.
     pub knots: usize,
 }
 
-/// A normalised batch.
+/// A batch of normalised clips.
 pub struct TrainBatch {
-    /// `[clips * steps, patches, 3 * patch * patch]`.
+    /// The pixels of image patches, `[clips * steps, patches, 3 * patch * patch]`.
     pub patches: Tensor<3>,
-    /// `[clips, steps, action_dim]`; the actions of the last step are not used.
+    /// The actions, `[clips, steps, action_dim]`; the actions of the last step are not used.
     pub actions: Tensor<3>,
 }
 
-/// The loss of a batch and its terms.
+/// The loss of a batch and the terms of the loss.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Losses {
     /// `prediction + weight * sigreg`.
@@ -44,7 +45,7 @@ pub struct Losses {
 pub struct LewmStep {
     /// The losses.
     pub losses: Losses,
-    /// Gradients by parameter, flat.
+    /// The flattened gradient of each parameter, by parameter name.
     pub gradients: Named<Tensor<1>>,
     /// Batch statistics of the projectors after the encoder and after the predictor.
     pub statistics: [BatchStatistics; 2],
@@ -52,7 +53,7 @@ pub struct LewmStep {
     pub latents: Vec<f32>,
 }
 
-/// Computes loss and gradients of a batch. `model` has no autodiff; `shards` is at least 1.
+/// Computes loss and gradients of a batch. `model` is outside autodiff; `shards` is at least 1.
 ///
 /// # Shapes
 /// `directions` is `[count, latent]`.
@@ -71,7 +72,7 @@ pub fn step(
         let (value, gradient) = loss::sigreg(&host, shape[1], shape[2], directions, config.knots);
         sigreg = value;
         let gradient = Tensor::<3>::from_data(TensorData::new(gradient, shape), &latents.device()).autodiff();
-        // A linear function of the latents whose gradient is that of the statistic.
+        // Autodiff receives a linear function of the latents whose gradient equals the gradient of the statistic.
         (latents.clone() * gradient).sum() * config.weight
     });
     let JointStep { prediction, gradients, statistics, .. } = step;

@@ -64,7 +64,7 @@ impl Trainable for Lewm {
     }
 }
 
-/// Checks that the sizes are consistent with each other and with the clips.
+/// Checks the model configuration, and that the clips cover the predictor's history.
 pub(crate) fn check(model: &LewmConfig, data: &DataConfig) -> Result<()> {
     model.check()?;
     checks::clip_covers_history(data.num_steps, model.predictor.history)
@@ -95,7 +95,7 @@ pub(crate) fn prepare(
 /// The modules with running batch statistics.
 const TRACKED: [&str; 2] = ["projector", "pred_proj"];
 
-/// Stores batch statistics under the names of their modules, for [`Trainable::after_step`].
+/// Returns batch statistics under the names of the modules in [`TRACKED`], for [`Trainable::after_step`].
 pub(crate) fn stored(statistics: [BatchStatistics; 2]) -> Named<Tensor<1>> {
     let mut buffers = Named::new();
     for (name, statistics) in TRACKED.into_iter().zip(statistics) {
@@ -107,9 +107,9 @@ pub(crate) fn stored(statistics: [BatchStatistics; 2]) -> Named<Tensor<1>> {
 impl Lewm {
     /// Updates the running statistics with batch statistics from [`stored`].
     pub(crate) fn track(&mut self, mut buffers: Named<Tensor<1>>) {
-        for (name, part) in TRACKED.into_iter().zip([&mut self.projector, &mut self.pred_proj]) {
+        for (name, projector) in TRACKED.into_iter().zip([&mut self.projector, &mut self.pred_proj]) {
             if let Some(statistics) = BatchStatistics::take(name, &mut buffers) {
-                part.track(statistics);
+                projector.track(statistics);
             }
         }
     }

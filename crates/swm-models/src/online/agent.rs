@@ -9,7 +9,7 @@ use swm_core::{EnvSpec, Error, Policy, Result, Schema};
 /// A model that learns by interaction.
 pub trait Agent: Trainable {
     /// Creates a policy for `slots` environments of `spec` that always acts with the present weights of `model`. With
-    /// `explore`, its actions include exploration noise.
+    /// `explore`, the actions include exploration noise.
     ///
     /// # Errors
     /// When the model does not fit the environment.
@@ -41,7 +41,7 @@ pub(crate) fn check_rewards(schema: &Schema) -> Result<()> {
         None => Ok(()),
         Some(name) => Err(Error::config(
             format!("the column '{name}'"),
-            "the dataset does not have it",
+            "the dataset lacks this column",
             "train on a dataset with rewards, such as `swm collect` writes",
         )),
     }

@@ -1,7 +1,7 @@
-//! [`Collector`]: steps environments with a policy and adds their transitions to the replay buffer, segment by segment.
+//! [`Collector`]: steps environments with a policy and adds the transitions to the replay buffer, segment by segment.
 //!
-//! The last observation of a segment is the first observation of the next segment, so that no transition is lost. Clips
-//! of several steps that would span two segments are lost.
+//! The last observation of a segment is the first observation of the next segment, so that no transition is lost. No
+//! clip of several steps spans two segments.
 
 use serde::{Deserialize, Serialize};
 use swm_core::columns::{ACTION, REWARD, TERMINATED, TRUNCATED};
@@ -9,11 +9,11 @@ use swm_core::pool::Reset;
 use swm_core::{Batch, EnvPool, Error, Key, Policy, ResetOptions, Result, Schema};
 use swm_data::{Constants, ReplayBuffer};
 
-/// Runs episodes in a pool of environments and adds them to a replay buffer.
+/// Runs episodes in a pool of environments and adds the transitions to a replay buffer.
 pub(super) struct Collector {
     pool: EnvPool,
     replay: ReplayBuffer,
-    /// For every recorded column that is an observation: its index in the infos, and in a recorded row.
+    /// The index in the infos and the index in a recorded row of every observation column.
     observed: Vec<(usize, usize)>,
     /// Index of the action column in a recorded row.
     action: usize,
@@ -36,7 +36,8 @@ pub(super) struct Collector {
 
 /// A running episode.
 struct Running {
-    number: u64,
+    /// The index of the episode.
+    episode: u64,
     /// The segment being recorded, with spare rows at the end.
     rows: Batch,
     /// Recorded rows of the segment.
@@ -47,18 +48,18 @@ struct Running {
     total: f64,
 }
 
-/// The state of a [`Collector`], from which it can continue.
+/// The saved state of a [`Collector`], which [`Collector::restore`] reads.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct CollectorState {
     steps: usize,
     next: u64,
-    /// Number and actions of every running episode; the environments are restored by repeating the actions.
+    /// The index and the actions of every running episode; the environments are restored by repeating the actions.
     running: Vec<(u64, Vec<f32>)>,
 }
 
 impl Collector {
-    /// Records the columns of `replay` in the environments of `pool`, in segments of `segment` steps. `key` decides the
-    /// episodes.
+    /// Records the columns of `replay` in the environments of `pool`, in segments of `segment` steps. `key` determines
+    /// the episodes.
     ///
     /// # Errors
     /// When the environments lack a column.
@@ -72,7 +73,7 @@ impl Collector {
         }
         let slots = pool.len();
         let rows = || Batch::zeros(schema, 0);
-        let running = (0..slots).map(|_| Running { number: 0, rows: rows(), length: 0, actions: vec![], total: 0.0 });
+        let running = (0..slots).map(|_| Running { episode: 0, rows: rows(), length: 0, actions: vec![], total: 0.0 });
         Ok(Self {
             replay: replay.clone(),
             observed,
@@ -103,7 +104,7 @@ impl Collector {
     /// Calls `begin` of a new policy for every running episode.
     pub fn begin_policy(&self, policy: &mut dyn Policy) {
         for (slot, running) in self.running.iter().enumerate() {
-            policy.begin(slot, self.key.at(running.number));
+            policy.begin(slot, self.key.at(running.episode));
         }
     }
 
@@ -117,7 +118,7 @@ impl Collector {
         let ended = self.advance(true)?;
         self.begin(&ended)?;
         for &slot in &ended {
-            policy.begin(slot, self.key.at(self.running[slot].number));
+            policy.begin(slot, self.key.at(self.running[slot].episode));
         }
         Ok(())
     }
@@ -144,8 +145,8 @@ impl Collector {
             let mut row = running.rows.row_mut(running.length - 1);
             row.set(self.reward, &[rewards[slot]]);
             row.set(self.terminated, &[terminated[slot]]);
-            let over = terminated[slot] + truncated[slot] > 0;
-            if over || running.length >= self.segment {
+            let episode_ended = terminated[slot] + truncated[slot] > 0;
+            if episode_ended || running.length >= self.segment {
                 running.observe(observed, infos, slot);
                 let mut row = running.rows.row_mut(running.length - 1);
                 row.at::<f32>(self.action).fill(f32::NAN);
@@ -157,7 +158,7 @@ impl Collector {
                 }
                 running.length = 0;
             }
-            if over {
+            if episode_ended {
                 self.returns.push(running.total);
                 ended.push(slot);
             }
@@ -168,7 +169,7 @@ impl Collector {
     /// Starts the next episodes in the slots `slots`.
     fn begin(&mut self, slots: &[usize]) -> Result<()> {
         for &slot in slots {
-            self.running[slot].number = self.next;
+            self.running[slot].episode = self.next;
             self.next += 1;
         }
         self.reset(slots)
@@ -184,7 +185,7 @@ impl Collector {
             let running = &mut self.running[slot];
             (running.length, running.total) = (0, 0.0);
             running.actions.clear();
-            let seed = self.key.at(running.number).seed() >> 1;
+            let seed = self.key.at(running.episode).seed() >> 1;
             resets.push(Reset { slot, seed, options: ResetOptions::default() });
         }
         self.pool.reset(&resets)
@@ -192,21 +193,21 @@ impl Collector {
 
     /// Returns the state from which a collector can continue.
     pub fn state(&self) -> CollectorState {
-        let running = self.running.iter().map(|running| (running.number, running.actions.clone()));
+        let running = self.running.iter().map(|running| (running.episode, running.actions.clone()));
         CollectorState { steps: self.steps, next: self.next, running: running.collect() }
     }
 
     /// Restores the state of a collector with the same key: repeats the actions of the running episodes.
     ///
     /// # Errors
-    /// When the number of environments differs, or an episode now ends earlier than it did.
+    /// When the number of environments differs, or an episode ends earlier than in the saved run.
     pub fn restore(&mut self, state: &CollectorState) -> Result<()> {
         if state.running.len() != self.running.len() {
-            let expected = format!("{}, as before", state.running.len());
+            let expected = format!("{}, as in the saved run", state.running.len());
             return Err(Error::mismatch("continuing", format!("{} environments", self.running.len()), expected));
         }
-        for (running, (number, _)) in self.running.iter_mut().zip(&state.running) {
-            running.number = *number;
+        for (running, (episode, _)) in self.running.iter_mut().zip(&state.running) {
+            running.episode = *episode;
         }
         let slots: Vec<usize> = (0..self.running.len()).collect();
         self.reset(&slots)?;
@@ -223,8 +224,8 @@ impl Collector {
             if !self.advance(false)?.is_empty() {
                 return Err(Error::mismatch(
                     "continuing",
-                    "an episode that ends where it continued before",
-                    "the environments the run began with (the same version of this program)",
+                    "an episode that ends earlier than in the saved run",
+                    "the environments with which the run began, and the same version of this program",
                 ));
             }
         }

@@ -18,15 +18,15 @@ pub struct OnlineConfig {
     pub warmup: usize,
     /// Rows of the replay buffer; the oldest episodes are dropped first.
     pub capacity: usize,
-    /// Steps of a segment, after which the rows of a running episode go to the replay buffer. Clips of several steps
-    /// that would span two segments are lost.
+    /// Steps of a segment, after which the rows of a running episode go to the replay buffer. No clip of
+    /// several steps spans two segments.
     #[serde(rename = "part")]
     pub segment: usize,
     /// Optimizer steps between two evaluations; 0 for none.
     pub evaluate_every: usize,
-    /// Episodes of an evaluation, always the same episodes.
+    /// The number of episodes of an evaluation; all evaluations run the same episodes.
     pub evaluate_episodes: usize,
-    /// The planner that selects actions; without it, the policy network's actions are executed.
+    /// The planner that selects actions; `None` executes the actions of the policy network.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub planner: Option<PlannerConfig>,
 }
@@ -35,7 +35,7 @@ impl OnlineConfig {
     /// Checks the ranges of the settings.
     ///
     /// # Errors
-    /// When a setting is out of range; the error names the first such setting.
+    /// When a setting is out of range; the error names the first invalid setting.
     pub fn check(&self) -> Result<()> {
         at_least(&[
             ("online.envs", self.envs, 1),

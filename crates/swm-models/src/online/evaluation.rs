@@ -1,10 +1,10 @@
-//! Evaluation during online training: whole episodes without exploration, always the same episodes.
+//! Evaluation during online training: whole episodes without exploration, the same episodes in every evaluation.
 
 use swm_core::columns::{REWARD, TERMINATED, TRUNCATED};
 use swm_core::pool::Reset;
 use swm_core::{Batch, EnvPool, Key, Policy, ResetOptions, Result, Schema};
 
-/// Runs `episodes` episodes and returns their undiscounted returns in order. `key` and the index of an episode
+/// Runs `episodes` episodes and returns the undiscounted returns in order. `key` and the index of an episode
 /// determine the episode.
 pub(super) fn returns(pool: &mut EnvPool, policy: &mut dyn Policy, episodes: usize, key: Key) -> Result<Vec<f64>> {
     let slots = pool.len();

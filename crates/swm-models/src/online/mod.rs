@@ -1,10 +1,10 @@
 //! Online training: interaction with environments alternates with optimizer steps, in one process.
 //!
-//! A round is one step of every environment, then [`OnlineConfig::updates`] optimizer steps. Transitions go to
-//! a replay buffer, segment by segment of an episode, and batches are drawn from it uniformly. The seed
-//! determines a run: episode `i` through its index, a batch through the index of its optimizer step and the content of
-//! the buffer.
-//! Results depend neither on the number of threads nor on the speed of the machine.
+//! A round is one step of every environment, then [`OnlineConfig::updates`] optimizer steps. Transitions go to a replay
+//! buffer, segment by segment of an episode, and batches are drawn from the buffer uniformly. The seed determines a
+//! run: the seed and the index of an episode determine the episode; the seed, the index of an optimizer step and the
+//! content of the buffer determine a batch. Results depend neither on the number of threads nor on the speed of the
+//! machine.
 //!
 //! Value targets bootstrap from the next state unless `terminated` is set, also if the time limit truncates the
 //! episode.

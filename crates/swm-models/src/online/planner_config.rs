@@ -4,7 +4,7 @@ use crate::train::at_least;
 use serde::{Deserialize, Serialize};
 use swm_core::{Error, Result};
 
-/// The settings of model-predictive path integral control (Williams et al. 2015) in latents, guided by a policy.
+/// The settings of model-predictive path integral control (Williams et al. 2015) in latent space, guided by a policy.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PlannerConfig {
@@ -12,13 +12,13 @@ pub struct PlannerConfig {
     pub horizon: usize,
     /// Candidates per iteration.
     pub samples: usize,
-    /// Iterations.
+    /// Iterations of a search.
     pub iterations: usize,
-    /// Candidates of which the next mean and standard deviation are weighted averages.
+    /// Candidates of lowest cost, from which the next mean and standard deviation are computed.
     pub elites: usize,
     /// Candidates that are rollouts of the policy.
     pub proposals: usize,
-    /// The smallest standard deviation of the samples, of actions from -1 to 1.
+    /// The smallest standard deviation of the samples, for actions from -1 to 1.
     pub min_std: f32,
     /// The largest standard deviation, with which a search starts.
     pub max_std: f32,
@@ -30,7 +30,7 @@ impl PlannerConfig {
     /// Checks the ranges of the settings.
     ///
     /// # Errors
-    /// When a setting is out of range; the error names the first such setting.
+    /// When a setting is out of range; the error names the first invalid setting.
     pub fn check(&self) -> Result<()> {
         at_least(&[
             ("online.planner.horizon", self.horizon, 1),
@@ -41,7 +41,11 @@ impl PlannerConfig {
         for (name, count) in [("elites", self.elites), ("proposals", self.proposals)] {
             if count > self.samples {
                 let given = format!("{count} of {} candidates", self.samples);
-                return Err(Error::config(format!("online.planner.{name}"), given, "choose at most all of them"));
+                return Err(Error::config(
+                    format!("online.planner.{name}"),
+                    given,
+                    "choose at most online.planner.samples",
+                ));
             }
         }
         if !(self.min_std > 0.0 && self.min_std <= self.max_std && self.max_std.is_finite()) {
@@ -49,7 +53,7 @@ impl PlannerConfig {
             return Err(Error::config("online.planner.min_std", given, "choose 0 < min_std <= max_std"));
         }
         if !(self.temperature.is_finite() && self.temperature > 0.0) {
-            let fix = "choose a positive number";
+            let fix = "choose a positive value";
             return Err(Error::config("online.planner.temperature", self.temperature.to_string(), fix));
         }
         Ok(())

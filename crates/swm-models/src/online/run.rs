@@ -31,7 +31,7 @@ pub struct OnlineSummary {
     pub steps: usize,
     /// Environment steps done.
     pub env_steps: usize,
-    /// Whether the run was interrupted; training again with `resume` continues it.
+    /// Whether the run was interrupted; training again with `resume` continues the run.
     pub interrupted: bool,
     /// The mean return of the last evaluation.
     pub evaluated: Option<f64>,
@@ -49,14 +49,14 @@ pub struct OnlineSummary {
 /// Trains a model by interaction with environments; the checkpoint, the best checkpoint so far and the logs go to the
 /// folder `out`. `make_pool` creates a pool of the given number of environments.
 ///
-/// `control` is checked before every round. An interrupted run saves its weights and its replay buffer and returns a
-/// summary with `interrupted`; `options.resume` continues it. The metrics of the progress events are the model's, then
-/// `env_steps`, `return` (of the last episodes), `evaluation_return`, `lr`, `gradient_norm`, `clips_per_second` and
-/// `data_wait`, the fraction of the time spent on interaction.
+/// `control` is checked before every round. An interrupted run saves the weights and the replay buffer and returns a
+/// summary with `interrupted`; `options.resume` continues the run. The progress events have the metrics of the model,
+/// then `env_steps`, `return` (of the last episodes), `evaluation_return`, `lr`, `gradient_norm`, `clips_per_second`
+/// and `data_wait`, the fraction of the time spent on interaction.
 ///
 /// # Errors
 /// When the configuration contradicts itself or the environments, `out` holds a run that cannot be continued, a loss is
-/// not finite, an environment fails, the caller's poll fails (after saving), or writing fails.
+/// not finite, an environment fails, `control` returns an error (after saving), or writing fails.
 pub fn train_online<M: Agent>(
     config: &TrainConfig<M>,
     make_pool: &dyn Fn(usize) -> Result<EnvPool>,
@@ -66,8 +66,8 @@ pub fn train_online<M: Agent>(
 ) -> Result<OnlineSummary> {
     config.check()?;
     let Some(online) = &config.online else {
-        let fix = "choose a preset that has one (`--print-config` shows it), or train on a dataset with --data";
-        return Err(Error::config("online", "the configuration has no such table", fix));
+        let fix = "choose a preset with this table (`--print-config` shows it), or train on a dataset with --data";
+        return Err(Error::config("online", "the configuration has no table `online`", fix));
     };
     online.check()?;
     if config.data.num_steps > online.segment + 1 {
@@ -120,7 +120,7 @@ fn start<'a, M: Agent>(
         data,
         random: Box::new(RandomPolicy::new(&spec, online.envs)),
         explorer: policy(online.envs, true)?,
-        evaluated: policy(evaluation_pool.len(), false)?,
+        evaluator: policy(evaluation_pool.len(), false)?,
         evaluation_pool,
         log: log::Log::new(out, learner.state().step > 0)?,
         key: Key::new(config.seed).with("online"),
@@ -156,7 +156,7 @@ impl<M: Agent> DynOnlineLearner for OnlineLearner<'_, M> {
     }
 }
 
-/// The source of batches: environments, replay buffer, and the loader that draws from it.
+/// The source of batches: environments, replay buffer, and the loader that draws from the buffer.
 struct Data {
     collector: Collector,
     replay: ReplayBuffer,
@@ -176,7 +176,7 @@ struct Run<'a> {
     explorer: Box<dyn Policy>,
     evaluation_pool: EnvPool,
     /// The policy of evaluations, which does not explore.
-    evaluated: Box<dyn Policy>,
+    evaluator: Box<dyn Policy>,
     log: log::Log,
     key: Key,
 }
@@ -326,18 +326,18 @@ impl Run<'_> {
         if loss.is_finite() && update.gradient_norm.is_finite() {
             return Ok(update);
         }
-        let what = format!("the loss or its gradient at training step {}", step + 1);
+        let what = format!("the loss or the gradient at training step {}", step + 1);
         let values = format!("{}, gradient norm {}", failed_batch::describe(&update.metrics), update.gradient_norm);
         let fix = "lower optim.lr; the last checkpoint, if any, is kept";
         Err(failed_batch::error(self.out, &batch, what, &values, fix))
     }
 
-    /// Evaluates the present weights, saves them if they are the best so far, and returns the mean return.
+    /// Evaluates the present weights, saves the weights of the best evaluation so far, and returns the mean return.
     fn evaluate(&mut self) -> Result<f64> {
         self.learner.publish();
         let episodes = self.online.evaluate_episodes;
         let key = self.key.with("evaluation");
-        let returns = evaluation::returns(&mut self.evaluation_pool, &mut *self.evaluated, episodes, key)?;
+        let returns = evaluation::returns(&mut self.evaluation_pool, &mut *self.evaluator, episodes, key)?;
         let mean = mean(&returns);
         let (lowest, highest) =
             returns.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), &v| (low.min(v), high.max(v)));
@@ -353,7 +353,8 @@ impl Run<'_> {
         Ok(mean)
     }
 
-    /// Saves the replay buffer and the collector, then the checkpoint, so that every checkpoint has its data.
+    /// Saves the replay buffer and the collector, then the checkpoint, so that the data of every checkpoint
+    /// exist.
     /// Returns the hash of the weights.
     fn save(&mut self) -> Result<String> {
         let folder = saved_data(self.out, self.step());
@@ -405,7 +406,7 @@ impl Meter {
     }
 }
 
-/// The folder with the replay buffer and the running episodes of an optimizer step.
+/// Returns the folder with the replay buffer and the running episodes of an optimizer step.
 fn saved_data(out: &Path, step: usize) -> PathBuf {
     out.join(format!("{PLAYED}{step}"))
 }

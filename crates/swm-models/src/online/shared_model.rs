@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// A model whose weights change. All clones share the same weights and are cheap.
+/// A handle to a model whose weights change. All clones of the handle share the weights.
 #[derive(Debug)]
 pub struct SharedModel<M>(Arc<Mutex<M>>);
 
@@ -13,12 +13,12 @@ impl<M> Clone for SharedModel<M> {
 }
 
 impl<M: Clone> SharedModel<M> {
-    /// Shares a model.
+    /// Creates a handle to a model.
     pub fn new(model: M) -> Self {
         Self(Arc::new(Mutex::new(model)))
     }
 
-    /// Returns the present model. Tensors are shared, not copied.
+    /// Returns the present model without copying tensors.
     pub fn get(&self) -> M {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }

@@ -1,4 +1,4 @@
-//! [`StochasticPolicy`]: a policy that draws its actions from a network's distribution, without planning.
+//! [`StochasticPolicy`]: a policy that draws actions from a network's distribution, without planning.
 
 use super::shared_model::SharedModel;
 use crate::checkpoint::Checkpoint;
@@ -14,15 +14,15 @@ pub trait StochasticActor: Trainable {
     /// likely action if `key` is `None`.
     ///
     /// # Shapes
-    /// `[action_dim]`.
+    /// Returns `[action_dim]`.
     ///
     /// # Errors
     /// When the row lacks a column that the model observes.
     fn act(&self, config: &TrainConfig<Self>, row: RowRef<'_>, key: Option<Key>) -> Result<Vec<f32>>;
 }
 
-/// Executes the actions of a network. Every slot is computed separately, so the actions of a slot do not depend on the
-/// other slots.
+/// A policy that executes the actions of a network. Every slot is computed separately, so the actions of a slot do not
+/// depend on the other slots.
 pub struct StochasticPolicy<M: StochasticActor> {
     config: TrainConfig<M>,
     scale: ActionScale,
@@ -37,11 +37,11 @@ pub struct StochasticPolicy<M: StochasticActor> {
 }
 
 impl<M: StochasticActor> StochasticPolicy<M> {
-    /// Creates a policy for `slots` environments of `spec`; with `explore` it draws actions, else it takes the most
-    /// likely ones.
+    /// Creates a policy for `slots` environments of `spec`; with `explore`, the policy draws actions, else the
+    /// policy takes the most likely actions.
     ///
     /// # Errors
-    /// When the model was trained for other actions.
+    /// When the model was trained for another action space.
     pub fn new(
         config: &TrainConfig<M>,
         dataset_info: &DatasetInfo,
@@ -91,7 +91,7 @@ impl<M: StochasticActor> Policy for StochasticPolicy<M> {
             let action = model.act(&self.config, infos.row(slot), key)?;
             if action.len() != env_action.len() {
                 let expected = format!("{}, the dimension of the environment's actions", env_action.len());
-                return Err(Error::mismatch("acting", format!("{} elements an action", action.len()), expected));
+                return Err(Error::mismatch("acting", format!("{} elements per action", action.len()), expected));
             }
             self.scale.to_env(&action, &mut env_action);
             for (value, &(low, high)) in env_action.iter_mut().zip(&self.bounds) {
@@ -107,7 +107,7 @@ impl<M: StochasticActor> Policy for StochasticPolicy<M> {
         false
     }
 
-    /// Seconds per decision.
+    /// Returns the seconds of each decision.
     fn take_latencies(&mut self) -> Vec<f64> {
         std::mem::take(&mut self.latencies)
     }

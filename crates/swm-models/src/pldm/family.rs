@@ -53,7 +53,7 @@ impl ModelFamily for Pldm {
 
 /// Returns the planning cost of a trained PLDM.
 pub fn cost(checkpoint: &Checkpoint<Pldm>) -> LewmCost {
-    LewmCost::of(&checkpoint.model.model, &checkpoint.config.model, checkpoint.actions())
+    LewmCost::of(&checkpoint.model.model, &checkpoint.config.model, checkpoint.action_dim())
 }
 
 impl ImageEncoder for Checkpoint<Pldm> {

@@ -1,5 +1,5 @@
-//! Import and export of PLDM checkpoints of the reference implementation. They hold the world model only; the inverse
-//! dynamics are initialised randomly if training continues.
+//! Import and export of PLDM checkpoints of the reference implementation. These checkpoints hold the world model only;
+//! import initialises the inverse dynamics with random weights.
 
 use super::model::{Idm, Pldm};
 use crate::checkpoint::Checkpoint;
@@ -13,7 +13,7 @@ use serde_json::json;
 use std::path::Path;
 use swm_core::{Key, Manifest, Result};
 
-/// The reference implementation's module of building blocks for this family.
+/// The Python module with the building blocks of the reference implementation's PLDM.
 const MODULES: &str = "stable_worldmodel.wm.pldm.module";
 const CLASS: &str = "stable_worldmodel.wm.pldm.pldm.PLDM";
 
@@ -39,6 +39,6 @@ pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<Pldm>
 /// # Errors
 /// As [`crate::lewm::import::export`].
 pub fn export(checkpoint: &Checkpoint<Pldm>, folder: &Path, naming: Naming) -> Result<()> {
-    let config = tree(&checkpoint.config.model, checkpoint.actions(), CLASS, MODULES)?;
+    let config = tree(&checkpoint.config.model, checkpoint.action_dim(), CLASS, MODULES)?;
     write(folder, &config, &state(&checkpoint.model.model, naming))
 }

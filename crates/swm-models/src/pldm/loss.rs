@@ -31,8 +31,8 @@ pub struct PldmLoss {
 pub struct Terms {
     /// Mean of `max(0, 1 - std)` over latent elements, with the standard deviation over the batch.
     pub std: Tensor<1>,
-    /// Mean of `max(0, 1 - std)` over latent elements, with the standard deviation over time of the latents minus their
-    /// mean over the batch.
+    /// Mean of `max(0, 1 - std)` over latent elements, with the standard deviation over time, of latents centred over
+    /// the batch.
     pub std_t: Tensor<1>,
     /// Mean square of the covariances of two latent elements over the batch.
     pub cov: Tensor<1>,
@@ -44,7 +44,7 @@ pub struct Terms {
     pub temp_straight: Option<Tensor<1>>,
 }
 
-/// Added to a variance before the square root.
+/// The value that is added to a variance before the square root.
 const VARIANCE_EPSILON: f64 = 1e-4;
 /// The lower bound of the length of a latent difference in the cosine.
 const LENGTH_EPSILON: f64 = 1e-8;

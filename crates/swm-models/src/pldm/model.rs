@@ -1,4 +1,4 @@
-//! [`Pldm`]: a world model, and the inverse-dynamics network of its training loss.
+//! [`Pldm`]: a world model, and the inverse-dynamics network of the training loss.
 
 use crate::lewm::{Lewm, LewmConfig};
 use crate::nn::{Activation, Init, LayerNorm, Linear};
@@ -65,7 +65,7 @@ impl Idm {
     pub fn forward(&self, latents: Tensor<3>) -> Tensor<3> {
         let [clips, steps, latent] = latents.dims();
         let range = |from: usize, to: usize| latents.clone().slice([0..clips, from..to, 0..latent]);
-        // As in the published code, the later latent precedes the earlier one.
+        // As in the published code, the later latent of a pair comes first.
         let pairs = Tensor::cat(vec![range(1, steps), range(0, steps - 1)], 2);
         let hidden = self.net._1.forward(self.net._0.forward(pairs));
         self.net._3.forward(Activation::Gelu.forward(hidden))

@@ -1,4 +1,4 @@
-//! One training step of a PLDM: loss and gradients of a batch.
+//! One training step of a PLDM: the loss of a batch and the gradients of the loss.
 
 use super::loss::{PldmLoss, Terms};
 use super::model::Pldm;
@@ -12,9 +12,9 @@ use swm_core::Rng;
 
 /// Losses and gradients of a batch.
 pub struct PldmStep {
-    /// The total loss, then its unweighted terms, by the names of their weights.
+    /// The total loss, then the unweighted terms of the loss, by name.
     pub losses: Vec<(&'static str, f64)>,
-    /// Gradients by parameter, flat.
+    /// The flattened gradient of each parameter, by parameter name.
     pub gradients: Named<Tensor<1>>,
     /// Batch statistics of the projectors after the encoder and after the predictor.
     pub statistics: [BatchStatistics; 2],
@@ -22,7 +22,7 @@ pub struct PldmStep {
     pub latents: Vec<f32>,
 }
 
-/// Computes loss and gradients of a batch. `model` has no autodiff; `shards` is at least 1.
+/// Computes loss and gradients of a batch. `model` is outside autodiff; `shards` is at least 1.
 pub fn step(model: &Pldm, batch: &TrainBatch, weights: &PldmLoss, shards: usize, noise: Option<&mut Rng>) -> PldmStep {
     let idm = model.idm.clone().train();
     let (mut terms, mut host, mut regulariser) = (vec![], vec![], 0.0);
@@ -30,8 +30,8 @@ pub fn step(model: &Pldm, batch: &TrainBatch, weights: &PldmLoss, shards: usize,
     let step = joint::step(&model.model, batch, shards, noise, |latents| {
         host = latents.clone().inner().into_data().into_f32_vec();
         let latent_terms = Terms::of(latents.clone());
-        let [clips, steps, actions] = batch.actions.dims();
-        let taken = batch.actions.clone().slice([0..clips, 0..steps - 1, 0..actions]).autodiff();
+        let [clips, steps, action_dim] = batch.actions.dims();
+        let taken = batch.actions.clone().slice([0..clips, 0..steps - 1, 0..action_dim]).autodiff();
         let inverse = (idm.forward(latents.clone()) - taken).square().mean();
         let sum = latent_terms.sum(weights) + inverse.clone() * weights.idm;
         regulariser = value(&sum);
@@ -54,6 +54,6 @@ pub fn step(model: &Pldm, batch: &TrainBatch, weights: &PldmLoss, shards: usize,
     PldmStep { losses, gradients: named, statistics, latents: host }
 }
 
-fn prefixed<T>(part: &str, named: Named<T>) -> Named<T> {
-    named.into_iter().map(|(name, value)| (format!("{part}.{name}"), value)).collect()
+fn prefixed<T>(prefix: &str, named: Named<T>) -> Named<T> {
+    named.into_iter().map(|(name, value)| (format!("{prefix}.{name}"), value)).collect()
 }

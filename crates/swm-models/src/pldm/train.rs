@@ -51,8 +51,8 @@ impl Trainable for Pldm {
     }
 
     fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self> {
-        let actions = config.data.frameskip * dataset_info.action.dim();
-        Ok(Self::init(&config.model, actions, config.loss.idm_hidden, key, device))
+        let action_dim = config.data.frameskip * dataset_info.action.dim();
+        Ok(Self::init(&config.model, action_dim, config.loss.idm_hidden, key, device))
     }
 
     fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {

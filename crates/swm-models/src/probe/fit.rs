@@ -19,11 +19,11 @@ pub struct FitConfig {
     pub lr: f64,
 }
 
-/// Trains `model`; `step` computes loss and gradients of the samples with the given indices. Returns the model and its
+/// Trains `model`; `step` computes loss and gradients of the samples with the given indices. Returns the model and the
 /// last loss.
 ///
 /// # Errors
-/// When a step fails or its loss is not finite.
+/// When a step fails or a loss is not finite.
 pub(super) fn fit<M: Module>(
     mut model: M,
     config: FitConfig,
@@ -43,19 +43,20 @@ pub(super) fn fit<M: Module>(
     };
     let mut optimizer = AdamW::new(optim);
     let mut loss = f64::NAN;
-    for number in 0..config.steps {
-        let mut rng = key.at(number as u64).rng();
+    for step_index in 0..config.steps {
+        let mut rng = key.at(step_index as u64).rng();
         let indices: Vec<usize> = (0..config.batch_size).map(|_| rng.random_range(0..samples)).collect();
         let output = step(&model, &indices)?;
         loss = output.loss();
         if !loss.is_finite() {
             return Err(Error::NotFinite {
-                what: format!("the loss of a probe at step {}", number + 1),
+                what: format!("the loss of a probe at step {}", step_index + 1),
                 given: loss.to_string(),
-                fix: "lower its learning rate, or check the checkpoint and the dataset".to_owned(),
+                fix: "lower the probe's learning rate, or check the checkpoint and the dataset".to_owned(),
             });
         }
-        (model, _) = optimizer.step(model, schedule.lr_factor(number), output.gradients, |_| ParameterGroup::default());
+        (model, _) =
+            optimizer.step(model, schedule.lr_factor(step_index), output.gradients, |_| ParameterGroup::default());
     }
     Ok((model, loss))
 }

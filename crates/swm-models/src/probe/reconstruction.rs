@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use swm_core::{Error, Key, Result};
 use swm_data::{Part, Reader, RgbImage, contact_sheet};
 
-/// The settings of a decoder and its training.
+/// The settings of a decoder and of the decoder's training.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ReconstructionConfig {
@@ -25,7 +25,7 @@ pub struct ReconstructionConfig {
     pub held_out: usize,
     /// The number of hidden features before the first feature map.
     pub hidden: usize,
-    /// Channels of the feature maps, coarsest first; each has twice the side of the one before.
+    /// Channels of the feature maps, coarsest first; each map has twice the side of the map before.
     pub channels: Vec<usize>,
     /// Shards of a batch, which can run in parallel.
     pub shards: usize,
@@ -52,9 +52,9 @@ pub struct ReconstructionReport {
     pub frames: usize,
     /// Frames that were scored on.
     pub held_out: usize,
-    /// The root mean squared error of a pixel on held-out episodes, of values from 0 to 255.
+    /// The root mean squared error of pixel values from 0 to 255 on held-out episodes.
     pub rmse: f64,
-    /// The same error for the mean of the training images, a baseline without latents.
+    /// The root mean squared error of the mean training image, a baseline without latents.
     pub rmse_of_mean: f64,
     /// The fraction of the pixels' variance that the reconstruction explains.
     pub explained: f64,
@@ -63,9 +63,9 @@ pub struct ReconstructionReport {
 /// The side of the blocks of pixels that the last layer returns, in pixels.
 const BLOCK: usize = 4;
 
-/// A decoder of latents: a small network computes a feature map, then transposed convolutions whose strides equal their
-/// kernel sizes, each one matrix product, enlarge it; the last returns blocks of pixels. The result is the difference
-/// to the mean image.
+/// A decoder from latents to the difference between an image and the mean image. A small network computes a feature
+/// map, which transposed convolutions enlarge; the last layer returns blocks of pixels. The stride of each convolution
+/// equals the kernel size, so each convolution is one matrix product.
 #[derive(Module, Debug)]
 struct Decoder {
     hidden: Linear,
@@ -127,8 +127,8 @@ impl Decoder {
     }
 }
 
-/// Fits a decoder of an encoder's latents. The contact sheet shows held-out images in pairs of rows: the originals and
-/// their reconstructions.
+/// Fits a decoder to an encoder's latents; returns the errors and a contact sheet. The sheet shows held-out images in
+/// pairs of rows: the originals, then the reconstructions.
 ///
 /// # Errors
 /// When the images do not have the encoder's image size, the side is not divisible into the decoder's blocks, no
@@ -192,7 +192,7 @@ pub fn reconstruct_images(
     Ok((report, sheet(&held_out.images, &decoded, image, config.shown)?))
 }
 
-/// The mean image, with values from 0 to 1.
+/// Returns the mean image, with values from 0 to 1.
 ///
 /// # Shapes
 /// Maps `[count, bytes]` to `[bytes]`.
@@ -210,7 +210,7 @@ fn mean_image(images: &[u8], bytes: usize) -> Vec<f32> {
 /// # Shapes
 /// Maps `[count, latent]` to `[count, image, image, 3]`.
 fn decode(decoder: &Decoder, latents: &[f32], latent: usize, mean: &[f32]) -> Vec<f32> {
-    let parts: Vec<Vec<f32>> = latents
+    let images: Vec<Vec<f32>> = latents
         .par_chunks(64 * latent)
         .map(|latents| {
             let x = TensorData::new(latents.to_vec(), [latents.len() / latent, latent]);
@@ -222,21 +222,21 @@ fn decode(decoder: &Decoder, latents: &[f32], latent: usize, mean: &[f32]) -> Ve
             decoded
         })
         .collect();
-    parts.concat()
+    images.concat()
 }
 
-/// The root mean squared error of pixels, of values from 0 to 255.
+/// Returns the root mean squared error of pixel values from 0 to 255; `decoded` has values from 0 to 1.
 fn root_mean_square(decoded: impl Iterator<Item = f32>, images: &[u8]) -> f64 {
     let square: f64 = decoded.zip(images).map(|(a, &b)| (f64::from(a) * 255.0 - f64::from(b)).powi(2)).sum();
     (square / images.len() as f64).sqrt()
 }
 
-/// A contact sheet with rows of images, each above the row of their reconstructions.
+/// Returns a contact sheet in which every row of images is followed by the row of reconstructions.
 fn sheet(images: &[u8], decoded: &[f32], image: usize, shown: usize) -> Result<RgbImage> {
     const COLUMNS: usize = 8;
     let bytes = image * image * 3;
     let count = images.len() / bytes;
-    // Evenly spaced over the episodes.
+    // The images are evenly spaced over the held-out frames.
     let indices: Vec<usize> = (0..shown.min(count)).map(|i| i * count / shown.min(count)).collect();
     let mut frames: Vec<Vec<u8>> = vec![];
     for indices in indices.chunks(COLUMNS) {
@@ -246,7 +246,7 @@ fn sheet(images: &[u8], decoded: &[f32], image: usize, shown: usize) -> Result<R
                 .iter()
                 .map(|i| decoded[i * bytes..(i + 1) * bytes].iter().map(|v| (v * 255.0).round() as u8).collect()),
         );
-        // Padding aligns the images of an incomplete last row with their reconstructions.
+        // Padding aligns the images of an incomplete last row with the reconstructions.
         if indices.len() < COLUMNS && shown > COLUMNS {
             let blank = vec![u8::MAX; bytes];
             let at = frames.len() - indices.len();
@@ -261,11 +261,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn decoder_enlarges_cells_in_place() {
-        // With one channel and weights of 1, every cell of the 2 x 2 map becomes an 8 x 8 square of its value.
+    fn decoder_enlarges_each_cell_to_a_square() {
+        // With one channel and weights of 1, every cell of the 2 x 2 map becomes an 8 x 8 square of the cell's value.
         let config = ReconstructionConfig { hidden: 4, channels: vec![1, 1], ..ReconstructionConfig::default() };
         let init = Init::new(Key::new(0), &Device::flex());
-        let mut decoder = Decoder::new(&init, 4, 16, &config).expect("a decoder");
+        let mut decoder = Decoder::new(&init, 4, 16, &config).expect("creating the decoder");
         let identity: Vec<f32> = (0..16).map(|i| if i % 5 == 0 { 1.0 } else { 0.0 }).collect();
         let layer = |weight: Vec<f32>, [outputs, inputs]: [usize; 2]| {
             let mut layer = Linear::zeros(&init, inputs, outputs);
@@ -290,7 +290,9 @@ mod tests {
     #[test]
     fn unsuitable_image_sizes_are_refused() {
         let init = Init::new(Key::new(0), &Device::flex());
-        let error = Decoder::new(&init, 3, 65, &ReconstructionConfig::default()).expect_err("65 pixels").to_string();
+        let error = Decoder::new(&init, 3, 65, &ReconstructionConfig::default())
+            .expect_err("a side of 65 pixels is accepted")
+            .to_string();
         assert!(error.contains("multiple of 16"), "{error}");
     }
 }

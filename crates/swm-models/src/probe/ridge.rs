@@ -10,15 +10,15 @@ use swm_core::{Error, Result};
 /// The linear map `y = W x + b`.
 #[derive(Clone, Debug)]
 pub struct Ridge {
-    /// `[targets, features]`, for features in their own units.
+    /// The weights `W` of features before standardisation, `[targets, features]`.
     weights: Vec<f64>,
-    /// `[targets]`.
+    /// The intercept `b`, `[targets]`.
     intercept: Vec<f64>,
     features: usize,
 }
 
 impl Ridge {
-    /// Fits the map.
+    /// Fits the ridge regression of `y` on `x` with the penalty λ, `lambda`.
     ///
     /// # Shapes
     /// `x` is `[rows, features]`, `y` is `[rows, targets]`.
@@ -27,7 +27,7 @@ impl Ridge {
     /// When λ is not positive, or a feature or target is not finite.
     pub fn fit(x: &[f32], y: &[f32], rows: usize, lambda: f64) -> Result<Self> {
         if !(lambda.is_finite() && lambda > 0.0) {
-            return Err(Error::config("ridge", lambda.to_string(), "give a positive number"));
+            return Err(Error::config("ridge", lambda.to_string(), "give a positive value"));
         }
         let (features, targets) = (x.len() / rows, y.len() / rows);
         let (mean_x, std) = mean_and_std(x, rows);
@@ -39,13 +39,13 @@ impl Ridge {
         let y: Vec<f64> = y.iter().enumerate().map(|(i, &v)| f64::from(v) - mean_y[i % targets]).collect();
         if !x.iter().chain(&y).all(|v| v.is_finite()) {
             return Err(Error::NotFinite {
-                what: "the latents of a probe or its targets".to_owned(),
+                what: "the latents or the targets of a probe".to_owned(),
                 given: "values that are not finite".to_owned(),
                 fix: "check the checkpoint and the dataset".to_owned(),
             });
         }
         let penalty = lambda * rows as f64;
-        // `[features, targets]`, for centred and scaled features.
+        // The solution is `[features, targets]`, for centred and scaled features.
         let solution = if features <= rows {
             let xt = transpose(&x, rows, features);
             let gram = products(&xt, &xt, rows);
@@ -182,7 +182,7 @@ mod tests {
             .chunks(features)
             .flat_map(|x| [0, 1].map(|t| 3.0 + x.iter().zip(&truth[t * features..]).map(|(x, w)| x * w).sum::<f32>()))
             .collect();
-        let found = Ridge::fit(&x, &y, rows, 1e-9).expect("a fit").predict(&x);
+        let found = Ridge::fit(&x, &y, rows, 1e-9).expect("fitting the ridge regression").predict(&x);
         let worst = found.iter().zip(&y).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()));
         assert!(worst < 1e-4, "{worst}");
     }
@@ -193,10 +193,10 @@ mod tests {
         // rows.
         let (rows, features) = (12, 9);
         let (x, y) = (noise(rows * features, "x"), noise(rows * 3, "y"));
-        let primal = Ridge::fit(&x, &y, rows, 0.1).expect("a fit").predict(&x);
+        let primal = Ridge::fit(&x, &y, rows, 0.1).expect("fitting the ridge regression").predict(&x);
         let twice: Vec<f32> = x.chunks(features).flat_map(|x| [x, x].concat()).collect();
         // Every feature twice with twice the penalty gives the same map, with each weight split in two.
-        let dual = Ridge::fit(&twice, &y, rows, 0.2).expect("a fit").predict(&twice);
+        let dual = Ridge::fit(&twice, &y, rows, 0.2).expect("fitting the ridge regression").predict(&twice);
         let worst = primal.iter().zip(&dual).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()));
         assert!(worst < 1e-5, "{worst}");
     }

@@ -1,4 +1,4 @@
-//! Frames sampled from a dataset, their latents, and the columns to predict.
+//! Frames sampled from a dataset, with the latents of the frames and the columns to predict.
 
 use super::ImageEncoder;
 use crate::pixels;
@@ -8,26 +8,27 @@ use swm_core::columns::PIXELS;
 use swm_core::{Batch, Error, Key, Result};
 use swm_data::{Part, Reader, Split, StepRange};
 
-/// Sampled frames.
+/// Frames sampled from a dataset.
 pub(super) struct Samples {
     /// The number of frames.
     pub count: usize,
-    /// `[count, latent_dim]`.
+    /// The latents of the frames, `[count, latent_dim]`.
     pub latents: Vec<f32>,
-    /// `[count, image_size, image_size, 3]`, or empty if images are not kept.
+    /// The images, `[count, image_size, image_size, 3]`, or empty if images are not kept.
     pub images: Vec<u8>,
-    /// `[count, targets]`: the elements of all columns, concatenated.
+    /// The elements of all columns to predict, concatenated: `[count, targets]`.
     pub targets: Vec<f32>,
 }
 
-/// Frames that are read and encoded together: a constant, so that latents do not depend on the number of threads.
-const FRAMES: usize = 64;
+/// The number of frames that are read and encoded together: a constant, so that latents do not depend on the number of
+/// threads.
+const BLOCK_FRAMES: usize = 64;
 
 /// The largest number of latent elements held in memory: 1 GB in double precision.
 const MAX_ELEMENTS: usize = 1 << 27;
 
-/// Samples up to `count` frames of a part of a dataset (fewer if latents are very large) without replacement, in stored
-/// order. Frames whose columns are not finite are skipped.
+/// Samples up to `count` frames of the split `part` of a dataset (fewer if latents are very large) without replacement,
+/// in stored order. Frames whose columns are not finite are skipped.
 ///
 /// # Errors
 /// When a column is missing, images have another size than the encoder's, or fewer than two frames are left.
@@ -49,15 +50,15 @@ pub(super) fn sample(
     let names: Vec<&str> = std::iter::once(PIXELS).chain(columns.iter().map(String::as_str)).collect();
     let mut samples = Samples { count: 0, latents: vec![], images: vec![], targets: vec![] };
     // Several blocks are read and encoded in parallel.
-    for blocks in rows.chunks(FRAMES * 16) {
-        let parts: Result<Vec<(Vec<f32>, Batch)>> = blocks
-            .par_chunks(FRAMES)
+    for blocks in rows.chunks(BLOCK_FRAMES * 16) {
+        let encoded: Result<Vec<(Vec<f32>, Batch)>> = blocks
+            .par_chunks(BLOCK_FRAMES)
             .map(|rows| {
                 let batch = reader.read(&names, rows)?;
                 Ok((encoder.encode(batch.get::<u8>(PIXELS)?)?, batch))
             })
             .collect();
-        for (latents, batch) in parts? {
+        for (latents, batch) in encoded? {
             samples.add(encoder, columns, keep_images, &latents, &batch)?;
         }
     }

@@ -15,7 +15,7 @@ impl Scale {
         Self { mean, std: std.into_iter().map(|s| if s > 1e-12 { s } else { 1.0 }).collect() }
     }
 
-    /// The number of columns.
+    /// Returns the number of columns.
     pub fn width(&self) -> usize {
         self.mean.len()
     }

@@ -35,14 +35,14 @@ pub struct StateConfig {
 }
 
 impl StateConfig {
-    /// The default settings for these columns.
+    /// Returns the default settings for `columns`.
     pub fn new(columns: Vec<String>) -> Self {
         let fit = FitConfig { steps: 1500, batch_size: 128, lr: 2e-3 };
         Self { seed: 0, columns, frames: 6000, held_out: 2000, ridge: 1e-4, hidden: 128, fit }
     }
 }
 
-/// How well one element of a column is predicted on held-out episodes.
+/// The prediction errors of one element of a column on held-out episodes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Score {
     /// The column.
@@ -144,23 +144,23 @@ impl Network {
     fn predict(&self, latents: &[f32]) -> Vec<f32> {
         let width = self.latents.width();
         let x = self.latents.apply(latents);
-        let parts: Vec<Vec<f32>> = x
+        let chunks: Vec<Vec<f32>> = x
             .par_chunks(256 * width)
             .map(|x| {
                 let x = TensorData::new(x.to_vec(), [x.len() / width, width]);
                 self.model.forward(Tensor::from_data(x, &Device::flex())).into_data().into_f32_vec()
             })
             .collect();
-        let mut predictions = parts.concat();
+        let mut predictions = chunks.concat();
         self.targets.undo(&mut predictions);
         predictions
     }
 }
 
-/// Scores predictions of the elements `names`.
+/// Scores predictions of the elements `names`, given as column and index.
 ///
 /// # Shapes
-/// `predictions` and `targets` are `[rows, names]`.
+/// `predictions` and `targets` are `[rows, names.len()]`.
 fn scores(names: &[(String, usize)], predictions: &[f32], targets: &[f32]) -> Vec<Score> {
     let (width, count) = (names.len(), (targets.len() / names.len()) as f64);
     let (_, spread) = mean_and_std(targets, targets.len() / width);
@@ -179,13 +179,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn scores_have_units_and_constants_have_no_r2() {
+    fn scores_are_in_column_units_and_constants_have_no_r2() {
         let names = vec![("x".to_owned(), 0), ("x".to_owned(), 1)];
         let (predictions, targets) = ([1.0, 5.0, 2.0, 5.0, 6.0, 5.0], [0.0, 5.0, 3.0, 5.0, 6.0, 5.0]);
         let scores = scores(&names, &predictions, &targets);
         assert!((scores[0].mae - 2.0 / 3.0).abs() < 1e-9 && (scores[0].rmse - (2.0f64 / 3.0).sqrt()).abs() < 1e-9);
         // The variance of 0, 3, 6 is 6.
-        assert!((scores[0].r2.expect("a score") - (1.0 - 2.0 / 3.0 / 6.0)).abs() < 1e-9);
+        assert!((scores[0].r2.expect("a coefficient of determination") - (1.0 - 2.0 / 3.0 / 6.0)).abs() < 1e-9);
         assert!(scores[1].r2.is_none() && scores[1].mae == 0.0);
     }
 }

@@ -1,11 +1,11 @@
-//! [`SacConfig`] and [`SacLoss`]: the sizes of a SAC and the settings of its loss.
+//! [`SacConfig`] and [`SacLoss`]: the model configuration of a SAC and the settings of the losses.
 
 use crate::train::at_least;
 use serde::{Deserialize, Serialize};
 use swm_core::columns::PIXELS;
 use swm_core::{Error, Result};
 
-/// The sizes of a [`super::Sac`].
+/// The model configuration of a SAC.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SacConfig {
@@ -16,10 +16,10 @@ pub struct SacConfig {
 }
 
 impl SacConfig {
-    /// Checks the sizes.
+    /// Checks the configuration.
     ///
     /// # Errors
-    /// When a size or column is invalid; the error names the first one.
+    /// When a setting is invalid; the error names the first invalid setting.
     pub fn check(&self) -> Result<()> {
         at_least(&[("model.hidden", self.hidden, 1)])?;
         if self.columns.is_empty() {
@@ -54,18 +54,18 @@ impl SacLoss {
     /// Checks the settings.
     ///
     /// # Errors
-    /// When a setting is invalid; the error names the first such setting.
+    /// When a setting is invalid; the error names the first invalid setting.
     pub fn check(&self) -> Result<()> {
         let positive = [("loss.discount", self.discount, 1.0), ("loss.tau", self.tau, 1.0)];
         let positive = positive.into_iter().chain([("loss.temperature", self.temperature, f64::MAX)]);
         for (what, value, most) in positive {
             if !(value > 0.0 && value <= most) {
-                let fix = if most > 1.0 { "choose a number above 0" } else { "choose a number above 0, at most 1" };
+                let fix = if most > 1.0 { "choose a value above 0" } else { "choose a value above 0 and at most 1" };
                 return Err(Error::config(what, value.to_string(), fix));
             }
         }
         if !self.entropy.is_finite() {
-            return Err(Error::config("loss.entropy", self.entropy.to_string(), "choose a number, such as -1"));
+            return Err(Error::config("loss.entropy", self.entropy.to_string(), "choose a finite value, such as -1"));
         }
         Ok(())
     }

@@ -11,5 +11,5 @@ pub use config::{SacConfig, SacLoss};
 pub use family::ENTRY;
 pub use model::{ActionSample, Actor, Critic, Critics, Hidden, Sac};
 
-/// The policy of a trained SAC. Its action is the `tanh` of the actor's mean.
+/// The policy of a SAC. An action is the `tanh` of the actor's mean, or of a sample with exploration.
 pub type SacPolicy = crate::online::StochasticPolicy<Sac>;

@@ -1,4 +1,4 @@
-//! [`Sac`]: the networks, with the parameter names of Stable-Baselines3.
+//! [`Sac`]: the networks of a SAC, with the parameter names of Stable-Baselines3.
 
 use super::config::{SacConfig, SacLoss};
 use crate::nn::{Activation, Init, Linear};
@@ -6,8 +6,8 @@ use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor};
 use swm_core::Key;
 
-/// A policy, two Q functions, their target networks, and the temperature. A field `_2` is element 2 of a sequence, as
-/// in PyTorch.
+/// The networks of a SAC: a policy, two Q functions with target networks, and the temperature. A field `_i` of a
+/// network is element i of a `torch.nn.Sequential`.
 #[derive(Module, Debug)]
 pub struct Sac {
     /// The policy.
@@ -25,9 +25,9 @@ pub struct Sac {
 pub struct Actor {
     /// Two hidden layers.
     pub latent_pi: Hidden,
-    /// The mean.
+    /// The output layer for the mean.
     pub mu: Linear,
-    /// The logarithm of the standard deviation.
+    /// The output layer for the logarithm of the standard deviation.
     pub log_std: Linear,
 }
 
@@ -49,7 +49,7 @@ pub struct Critics {
     pub qf1: Critic,
 }
 
-/// The value of an action.
+/// A Q function, which computes the value of an action.
 #[derive(Module, Debug)]
 pub struct Critic {
     /// The first hidden layer.
@@ -60,11 +60,11 @@ pub struct Critic {
     pub _4: Linear,
 }
 
-/// Sampled actions and the logarithm of their density.
+/// Sampled actions and the logarithm of the density of the actions.
 pub struct ActionSample {
     /// The actions after `tanh`, `[rows, action_dim]`.
     pub actions: Tensor<2>,
-    /// The logarithm of their density, `[rows]`.
+    /// The logarithm of the density of the actions, `[rows]`.
     pub log_density: Tensor<1>,
 }
 

@@ -1,7 +1,8 @@
-//! One training step (Haarnoja et al. 2018, equations 5, 7 and 18): losses and gradients of a batch of transitions.
+//! One training step of a SAC (Haarnoja et al. 2018, equations 5, 7 and 18): losses and gradients of a batch of
+//! transitions.
 //!
-//! The losses of Q functions, policy and temperature have separate graphs. All gradients are computed at the same
-//! weights; the publication updates the Q functions before it computes the policy's loss.
+//! The losses of Q functions, policy and temperature have separate autodiff graphs. All gradients are computed at the
+//! same weights; the publication updates the Q functions before computing the policy's loss.
 
 use super::config::SacLoss;
 use super::model::{Critics, Sac};
@@ -12,38 +13,38 @@ use burn::tensor::Tensor;
 
 /// A batch of transitions.
 pub struct Transitions {
-    /// `[rows, inputs]`.
+    /// The observations before the actions, `[rows, inputs]`.
     pub observations: Tensor<2>,
-    /// `[rows, action_dim]`, in model units.
+    /// The actions in model units, `[rows, action_dim]`.
     pub actions: Tensor<2>,
-    /// `[rows]`.
+    /// The rewards, `[rows]`.
     pub rewards: Tensor<1>,
-    /// `[rows]`: 1 where the episode terminated.
+    /// 1 where the episode terminated, else 0: `[rows]`.
     pub terminated: Tensor<1>,
-    /// `[rows, inputs]`.
+    /// The observations after the actions, `[rows, inputs]`.
     pub next: Tensor<2>,
-    /// Standard normal, `[rows, action_dim]` each: for the actions at the next observations, and for the actions of the
-    /// policy's loss.
+    /// Standard normal noise of the actions at the next observations, and of the actions in the policy's loss,
+    /// `[rows, action_dim]` each.
     pub noise: [Tensor<2>; 2],
 }
 
 /// Losses and gradients of a batch.
 pub struct SacStep {
-    /// Half the mean squared error of both Q functions.
+    /// Half the sum of the mean squared errors of the two Q functions.
     pub critic: f64,
     /// The policy's loss: temperature times log-density minus value.
     pub actor: f64,
     /// The temperature.
     pub temperature: f64,
-    /// The mean entropy of the policy, estimated from its samples.
+    /// The mean entropy of the policy, estimated from sampled actions.
     pub entropy: f64,
     /// The mean value of the policy's actions.
     pub q: f64,
-    /// Gradients by parameter, flat.
+    /// The flattened gradient of each parameter, by parameter name.
     pub gradients: Named<Tensor<1>>,
 }
 
-/// Computes losses and gradients of a batch. `model` has no autodiff.
+/// Computes losses and gradients of a batch. `model` is outside autodiff.
 pub fn step(model: &Sac, batch: &Transitions, config: &SacLoss) -> SacStep {
     let Transitions { observations, actions, rewards, terminated, next, noise: [next_noise, noise] } = batch;
     let temperature = f64::from(model.log_ent_coef.val().into_scalar::<f32>()).exp();
@@ -73,7 +74,7 @@ pub fn step(model: &Sac, batch: &Transitions, config: &SacLoss) -> SacStep {
     let actor_loss = density.clone() * temperature - q.clone();
     insert("actor", parameters::gradients(&actor, &actor_loss.backward()));
 
-    // The temperature's loss is -ln α (ln π + H), whose gradient needs no graph.
+    // The temperature's loss is -ln α (ln π + H), whose gradient needs no autodiff graph.
     let entropy = -value_of(&density);
     let target_entropy = config.entropy * actions.dims()[1] as f64;
     let gradient = model.log_ent_coef.val().zeros_like() + (entropy - target_entropy);
@@ -88,7 +89,8 @@ pub fn step(model: &Sac, batch: &Transitions, config: &SacLoss) -> SacStep {
     }
 }
 
-/// Returns the Q functions as constants of an autodiff graph: gradients pass through them to their inputs only.
+/// Returns the Q functions as constants of an autodiff graph: gradients reach the inputs of the Q functions, not the
+/// weights.
 fn constants(critics: &Critics) -> Critics {
     critics.clone().train().no_grad()
 }

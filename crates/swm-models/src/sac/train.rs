@@ -44,8 +44,8 @@ impl Trainable for Sac {
             ));
         }
         if config.online.as_ref().is_some_and(|online| online.planner.is_some()) {
-            let fix = "leave the table out: SAC has no model to plan with";
-            return Err(Error::config("online.planner", "it is given to a SAC", fix));
+            let problem = "SAC has no model to plan with";
+            return Err(Error::config("online.planner", problem, "leave the table out"));
         }
         Ok(())
     }
@@ -112,7 +112,8 @@ impl Trainable for Sac {
         self
     }
 
-    /// Clips the gradients of Q functions, policy and temperature separately.
+    /// Returns the parameter group of a weight: the gradients of Q functions, policy and temperature are clipped
+    /// separately.
     fn parameter_group(name: &str) -> ParameterGroup {
         let clip = ["critic.", "actor."].iter().position(|part| name.starts_with(part)).unwrap_or(2);
         ParameterGroup { clip, ..ParameterGroup::default() }

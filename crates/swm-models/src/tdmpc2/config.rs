@@ -1,4 +1,4 @@
-//! [`Tdmpc2Config`] and [`LossConfig`]: the sizes of a TD-MPC2 and the settings of its loss.
+//! [`Tdmpc2Config`] and [`LossConfig`]: the model configuration of a TD-MPC2 and the settings of the loss.
 
 use crate::nn::Bins;
 use crate::train::at_least;
@@ -6,11 +6,11 @@ use serde::{Deserialize, Serialize};
 use swm_core::columns::PIXELS;
 use swm_core::{Error, Result};
 
-/// The sizes of a [`super::Tdmpc2`].
+/// The model configuration of a TD-MPC2.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Tdmpc2Config {
-    /// The observed columns. The parts of a latent have this order; images come first.
+    /// The observed columns, in the order of their encodings in a latent; images come first.
     pub encoding: Vec<Encoding>,
     /// Side of the square input images in pixels; unused by a state-only model.
     pub image: usize,
@@ -26,7 +26,7 @@ pub struct Tdmpc2Config {
     pub critics: usize,
     /// Dropout after the first linear layer of a Q function in training.
     pub dropout: f32,
-    /// Whether terminations are predicted. The published models do not.
+    /// Whether terminations are predicted. The published models predict no terminations.
     pub termination: bool,
 }
 
@@ -43,28 +43,28 @@ pub struct Encoding {
 impl Tdmpc2Config {
     /// Returns the latent dimension.
     pub fn latent(&self) -> usize {
-        self.encoding.iter().map(|part| part.latent).sum()
+        self.encoding.iter().map(|encoding| encoding.latent).sum()
     }
 
     /// Returns the encoding of images, if images are observed.
     pub fn image_encoding(&self) -> Option<&Encoding> {
-        self.encoding.iter().find(|part| part.column == PIXELS)
+        self.encoding.iter().find(|encoding| encoding.column == PIXELS)
     }
 
     /// Returns the encodings of the columns other than images.
     pub fn column_encodings(&self) -> impl Iterator<Item = &Encoding> {
-        self.encoding.iter().filter(|part| part.column != PIXELS)
+        self.encoding.iter().filter(|encoding| encoding.column != PIXELS)
     }
 
     /// Returns the names of the observed columns.
     pub fn columns(&self) -> Vec<String> {
-        self.encoding.iter().map(|part| part.column.clone()).collect()
+        self.encoding.iter().map(|encoding| encoding.column.clone()).collect()
     }
 
-    /// Checks that the sizes are consistent.
+    /// Checks the configuration.
     ///
     /// # Errors
-    /// When a size is invalid; the error names the first such size.
+    /// When a setting is invalid; the error names the first invalid setting.
     pub fn check(&self) -> Result<()> {
         let Some(first) = self.encoding.first() else {
             let fix = "name a column, such as [{ column = \"state\", latent = 64 }]";
@@ -77,25 +77,29 @@ impl Tdmpc2Config {
             ("model.bins.count", self.bins.count, 2),
             ("model.critics", self.critics, 2),
         ])?;
-        for (i, part) in self.encoding.iter().enumerate() {
-            if self.encoding[..i].iter().any(|other| other.column == part.column) {
-                let given = format!("'{}' is observed twice", part.column);
+        for (i, encoding) in self.encoding.iter().enumerate() {
+            if self.encoding[..i].iter().any(|other| other.column == encoding.column) {
+                let given = format!("'{}' is observed twice", encoding.column);
                 return Err(Error::config("model.encoding", given, "name every column once"));
             }
         }
         if self.image_encoding().is_some_and(|images| images != first) {
-            return Err(Error::config("model.encoding", "'pixels' is not its first column", "move it to the front"));
+            return Err(Error::config("model.encoding", "'pixels' is not the first column", "list 'pixels' first"));
         }
         if self.image_encoding().is_some() {
             super::image_encoder::check(self.image)?;
         }
         if self.latent() == 0 || !self.latent().is_multiple_of(self.simplex) {
             let given = format!("latents of {} elements in groups of {}", self.latent(), self.simplex);
-            return Err(Error::config("model.simplex", given, "choose latents that are a multiple of it"));
+            return Err(Error::config(
+                "model.simplex",
+                given,
+                "choose latent dimensions whose sum is a multiple of model.simplex",
+            ));
         }
         if self.bins.low >= self.bins.high {
             let given = format!("from {} to {}", self.bins.low, self.bins.high);
-            return Err(Error::config("model.bins", given, "choose a lower bound below the upper one"));
+            return Err(Error::config("model.bins", given, "choose a lower bound below the upper bound"));
         }
         if !(0.0..1.0).contains(&self.dropout) {
             return Err(Error::config("model.dropout", self.dropout.to_string(), "choose a rate below 1"));
@@ -124,7 +128,7 @@ pub struct LossConfig {
     pub entropy: f64,
     /// Weight of the termination loss, if terminations are predicted.
     pub termination: f64,
-    /// Cost of the Q functions' disagreement in a plan, per unit of value.
+    /// Weight of the Q functions' standard deviation, which lowers the final value of a plan.
     pub uncertainty: f64,
 }
 
@@ -132,12 +136,12 @@ impl LossConfig {
     /// Checks the settings.
     ///
     /// # Errors
-    /// When a setting is invalid; the error names the first such setting.
+    /// When a setting is invalid; the error names the first invalid setting.
     pub fn check(&self) -> Result<()> {
         let fractions = [("loss.discount", self.discount), ("loss.rho", self.rho), ("loss.tau", self.tau)];
         for (what, value) in fractions {
             if !(value > 0.0 && value <= 1.0) {
-                return Err(Error::config(what, value.to_string(), "choose a number above 0, at most 1"));
+                return Err(Error::config(what, value.to_string(), "choose a value above 0 and at most 1"));
             }
         }
         let weights = [
@@ -149,7 +153,7 @@ impl LossConfig {
             ("loss.uncertainty", self.uncertainty),
         ];
         match weights.into_iter().find(|(_, value)| !(value.is_finite() && *value >= 0.0)) {
-            Some((what, value)) => Err(Error::config(what, value.to_string(), "choose a number of at least 0")),
+            Some((what, value)) => Err(Error::config(what, value.to_string(), "choose a value of at least 0")),
             None => Ok(()),
         }
     }

@@ -39,7 +39,7 @@ impl CostModel for Tdmpc2Cost {
     }
 
     fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
-        let sizes = [self.latents.len(), self.rollouts.model().actions()];
+        let sizes = [self.latents.len(), self.rollouts.model().action_dim()];
         checks::candidate_sizes("costs of a TD-MPC2", &candidates, costs, sizes)?;
         let Candidates { actions, samples, horizon, dim, .. } = candidates;
         let rollouts = &self.rollouts;

@@ -13,9 +13,9 @@ const CHANNELS: usize = 32;
 /// A convolution without padding.
 #[derive(Module, Debug)]
 pub struct Convolution {
-    /// `[outputs, inputs, side, side]`.
+    /// The kernels, `[outputs, inputs, side, side]`.
     pub weight: Param<Tensor<4>>,
-    /// `[outputs]`.
+    /// The biases, `[outputs]`.
     pub bias: Param<Tensor<1>>,
 }
 
@@ -34,7 +34,7 @@ impl Convolution {
     }
 }
 
-/// The convolutions, each followed by Mish. A field `_2` is element 2 of a sequence, as in PyTorch.
+/// The convolutions, each followed by Mish. A field `_i` is element i of a `torch.nn.Sequential`.
 #[derive(Module, Debug)]
 pub struct ImageCnn {
     /// The first convolution.
@@ -69,13 +69,14 @@ impl ImageCnn {
     }
 }
 
-/// Returns the linear layer after the convolutions, for images with the given side.
+/// Returns the linear layer after the convolutions, for images with a side of `image` pixels.
 pub fn projection(init: &Init, image: usize, latent: usize) -> Linear {
     let side = side(image).unwrap_or(1);
     Linear::normal(init, CHANNELS * side * side, latent, 0.02)
 }
 
-/// Returns the side of the last convolution's output; `None` if a kernel is larger than its input.
+/// Returns the side of the last convolution's output; `None` if a kernel is larger than the input of the
+/// convolution.
 fn side(image: usize) -> Option<usize> {
     KERNELS.iter().try_fold(image, |side, &[kernel, stride]| Some(side.checked_sub(kernel)? / stride + 1))
 }
@@ -83,7 +84,7 @@ fn side(image: usize) -> Option<usize> {
 /// Checks the side of the input images.
 ///
 /// # Errors
-/// When the side is too small.
+/// When the side is below 39 pixels.
 pub fn check(image: usize) -> Result<()> {
     match side(image) {
         Some(_) => Ok(()),

@@ -1,4 +1,5 @@
-//! Import and export of checkpoints of the reference implementation, whose weights have the same names.
+//! Import and export of TD-MPC2 checkpoints of the reference implementation, whose weights have the names of the
+//! parameters of [`Tdmpc2`].
 
 use super::config::{Encoding, LossConfig, Tdmpc2Config};
 use super::model::Tdmpc2;
@@ -24,7 +25,8 @@ const CLASS: &str = "stable_worldmodel.wm.tdmpc2.TDMPC2";
 /// or the dataset.
 ///
 /// # Errors
-/// When a file is damaged or holds another model, or the model's actions are not those of `dataset_info`.
+/// When a file is damaged or holds another model, or the action dimension differs from
+/// `dataset_info`.
 pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<Tdmpc2>> {
     let reference = Reference::open(from, "TDMPC2")?;
     let folder = if from.is_dir() { from } else { from.parent().unwrap_or(Path::new("")) };
@@ -55,16 +57,22 @@ pub fn export(checkpoint: &Checkpoint<Tdmpc2>, folder: &Path) -> Result<()> {
     let (model, loss) = (&checkpoint.config.model, &checkpoint.config.loss);
     if model.termination {
         let fix = "train with model.termination=false";
-        return Err(Error::config("exporting a model", "the reference does not predict terminations", fix));
+        return Err(Error::config(
+            "exporting a model",
+            "the reference implementation does not predict terminations",
+            fix,
+        ));
     }
     let widths = checkpoint.model.extra_encoders.iter();
     let widths = widths.map(|(column, encoder)| (column.to_owned(), encoder._0.weight.dims()[1]));
     let cfg = Published {
-        action_dim: checkpoint.model.actions(),
+        action_dim: checkpoint.model.action_dim(),
         extra_dims: widths.collect(),
         image_size: model.image,
         wm: WorldModel {
-            encoding: InOrder(model.encoding.iter().map(|part| (part.column.clone(), part.latent)).collect()),
+            encoding: InOrder(
+                model.encoding.iter().map(|encoding| (encoding.column.clone(), encoding.latent)).collect(),
+            ),
             enc_dim: model.encoder,
             mlp_dim: model.hidden,
             num_bins: model.bins.count,
@@ -86,7 +94,7 @@ pub fn export(checkpoint: &Checkpoint<Tdmpc2>, folder: &Path) -> Result<()> {
     write(folder, &Tree { class: CLASS.to_owned(), cfg }, &parameters::values(&checkpoint.model))
 }
 
-/// The class and its arguments.
+/// The content of `config.json`: a class and the configuration of the class.
 #[derive(Serialize, Deserialize)]
 struct Tree {
     #[serde(rename = "_target_")]
@@ -152,7 +160,7 @@ impl Default for WorldModel {
     }
 }
 
-/// The entries of a JSON object in file order, which is the order of a latent's parts.
+/// The latent dimension of each column, in the order of a JSON object.
 struct InOrder(Vec<(String, usize)>);
 
 impl<'de> Deserialize<'de> for InOrder {
@@ -185,25 +193,25 @@ impl Published {
     /// Parses the JSON of a configuration.
     ///
     /// # Errors
-    /// When it is not the configuration of a TD-MPC2.
+    /// When `json` is not the configuration of a TD-MPC2.
     pub fn read(json: &str) -> Result<Self> {
         serde_json::from_str(json).map_err(|error| {
             Error::config(
                 "the configuration of a published TD-MPC2",
                 error.to_string(),
-                "give the reference's config.json",
+                "give the config.json of the reference implementation",
             )
         })
     }
 
-    /// Returns the sizes of the model.
+    /// Returns the model configuration.
     pub fn model(&self) -> Tdmpc2Config {
         let WorldModel { encoding, enc_dim, mlp_dim, num_bins, vmin, vmax, num_q, simnorm_dim, .. } = &self.wm;
-        // Images come first in a latent, wherever the file lists them.
+        // Images come first in a latent, whatever the order in the file.
         let (images, columns): (Vec<_>, Vec<_>) = encoding.0.iter().partition(|(column, _)| column == PIXELS);
-        let part = |(column, latent): &(String, usize)| Encoding { column: column.clone(), latent: *latent };
+        let to_encoding = |(column, latent): &(String, usize)| Encoding { column: column.clone(), latent: *latent };
         Tdmpc2Config {
-            encoding: images.into_iter().chain(columns).map(part).collect(),
+            encoding: images.into_iter().chain(columns).map(to_encoding).collect(),
             image: self.image_size,
             encoder: *enc_dim,
             hidden: *mlp_dim,
@@ -237,10 +245,10 @@ impl Published {
     pub fn with(&self, weights: &Named<HostTensor>, device: &Device) -> Result<Tdmpc2> {
         let config = self.model();
         config.check()?;
-        let width = |part: &Encoding| {
-            self.extra_dims.get(&part.column).copied().ok_or_else(|| {
-                let fix = "add it with its number of elements";
-                Error::config("extra_dims", format!("the column '{}' is not in it", part.column), fix)
+        let width = |encoding: &Encoding| {
+            self.extra_dims.get(&encoding.column).copied().ok_or_else(|| {
+                let fix = "add the column with its number of elements";
+                Error::config("extra_dims", format!("the column '{}' has no entry", encoding.column), fix)
             })
         };
         let widths: Vec<usize> = config.column_encodings().map(width).collect::<Result<_>>()?;
@@ -260,7 +268,7 @@ impl Published {
         match weights.keys().find(|name| !shapes.contains_key(*name)) {
             None => Ok(parameters::load(model, weights)),
             Some(name) => {
-                let expected = "the weights that its configuration describes";
+                let expected = "the weights that config.json describes";
                 Err(Error::mismatch("loading a published TD-MPC2", format!("a weight '{name}'"), expected))
             }
         }

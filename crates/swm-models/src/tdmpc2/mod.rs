@@ -1,5 +1,5 @@
-//! TD-MPC2 (Hansen, Su and Wang 2024, arXiv 2310.16828): a latent world model trained to predict its own latents, rewards
-//! and values, with a policy that initialises plans. See `docs/models/tdmpc2.md`.
+//! TD-MPC2 (Hansen, Su and Wang 2024, arXiv 2310.16828): a latent world model trained to predict future latents,
+//! rewards and values, with a policy that initialises plans. See `docs/models/tdmpc2.md`.
 
 pub mod config;
 mod cost;

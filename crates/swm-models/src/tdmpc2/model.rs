@@ -1,4 +1,4 @@
-//! [`Tdmpc2`]: the networks, with the published parameter names.
+//! [`Tdmpc2`]: the networks of a TD-MPC2, with the published parameter names.
 
 use super::config::Tdmpc2Config;
 use super::image_encoder::{self, ImageCnn};
@@ -7,10 +7,10 @@ use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor};
 use swm_core::Key;
 
-/// An encoder of observations, latent dynamics, rewards, Q functions and a policy.
+/// The networks of a TD-MPC2: encoders of observations, latent dynamics, rewards, Q functions and a policy.
 #[derive(Module, Debug)]
 pub struct Tdmpc2 {
-    /// The running spread of a batch's values.
+    /// The running spread of the values of a batch.
     pub scale: RunningScale,
     /// The convolutions of images; absent in a state-only model.
     pub cnn: Option<ImageCnn>,
@@ -20,11 +20,11 @@ pub struct Tdmpc2 {
     pub extra_encoders: ModuleDict<ColumnEncoder>,
     /// Maps a latent and an action to the next latent.
     pub dynamics: Dynamics,
-    /// Rewards of actions, as logits of bins.
+    /// The reward of an action, as logits of bins.
     pub reward: Head,
     /// The policy: mean and standard deviation of actions before `tanh`.
     pub pi: Head,
-    /// Q functions, as logits of bins.
+    /// The Q functions, as logits of bins.
     pub qs: Vec<Head>,
     /// The target networks: exponential moving averages of the Q functions.
     pub target_qs: Vec<Head>,
@@ -34,30 +34,30 @@ pub struct Tdmpc2 {
     config: Tdmpc2Config,
 }
 
-/// A running spread.
+/// A running average of the spread of values, the distance from the 5th to the 95th percentile.
 #[derive(Module, Debug)]
 pub struct RunningScale {
-    /// `[1]`.
+    /// The average spread, `[1]`.
     pub value: Param<Tensor<1>>,
 }
 
-/// The encoder of a column. A field `_1` is element 1 of a sequence, as in PyTorch.
+/// The encoder of a column. A field `_i` is element i of a `torch.nn.Sequential`.
 #[derive(Module, Debug)]
 pub struct ColumnEncoder {
-    /// Into the hidden features.
+    /// The layer to the hidden features.
     pub _0: NormalizedLinear,
-    /// From the hidden features.
+    /// The layer from the hidden features.
     pub _1: Linear,
-    /// The normalisation.
+    /// The normalisation of the encoded column.
     pub _2: LayerNorm,
 }
 
 /// A batch of observations.
 #[derive(Clone)]
 pub struct Observation {
-    /// `[rows, 3, image, image]`; `None` for a state-only model.
+    /// The images, `[rows, 3, image, image]`; `None` for a state-only model.
     pub pixels: Option<Tensor<4>>,
-    /// `[rows, features]` of every column other than images, in the order of the configuration.
+    /// Every column other than images, `[rows, features]` each, in the order of the configuration.
     pub columns: Vec<Tensor<2>>,
 }
 
@@ -73,10 +73,10 @@ impl Observation {
 
     /// Concatenates the rows of several batches.
     #[must_use]
-    pub fn cat(parts: &[Self]) -> Self {
-        let count = parts.first().map_or(0, |part| part.columns.len());
-        let pixels: Option<Vec<_>> = parts.iter().map(|part| part.pixels.clone()).collect();
-        let column = |i: usize| Tensor::cat(parts.iter().map(|part| part.columns[i].clone()).collect(), 0);
+    pub fn cat(batches: &[Self]) -> Self {
+        let count = batches.first().map_or(0, |batch| batch.columns.len());
+        let pixels: Option<Vec<_>> = batches.iter().map(|batch| batch.pixels.clone()).collect();
+        let column = |i: usize| Tensor::cat(batches.iter().map(|batch| batch.columns[i].clone()).collect(), 0);
         Self { pixels: pixels.map(|pixels| Tensor::cat(pixels, 0)), columns: (0..count).map(column).collect() }
     }
 
@@ -99,7 +99,11 @@ pub struct Gaussian {
 }
 
 impl Gaussian {
-    /// Splits a network's output `[rows, 2 * action_dim]`; the logarithm is mapped to -10 ..= 2.
+    /// Splits the output of a policy network into a mean and the logarithm of a standard deviation, which is mapped to
+    /// -10 ..= 2.
+    ///
+    /// # Shapes
+    /// `raw` is `[rows, 2 * action_dim]`.
     pub fn of(raw: Tensor<2>) -> Self {
         let [rows, both] = raw.dims();
         let half = both / 2;
@@ -117,19 +121,19 @@ impl Gaussian {
 }
 
 impl Tdmpc2 {
-    /// Creates a model with random weights for actions of `action_dim` elements. `widths` are the element counts of the
-    /// observed columns other than images, in the order of the configuration.
+    /// Creates a model with random weights for actions of `action_dim` elements. `widths` holds the number of
+    /// elements of each observed column other than images, in the order of the configuration.
     pub fn init(config: &Tdmpc2Config, widths: &[usize], action_dim: usize, key: Key, device: &Device) -> Self {
         let init = Init::new(key, device);
         let (latent, hidden, bins) = (config.latent(), config.hidden, config.bins.count);
-        let encoder = |(part, &width): (&super::Encoding, &usize)| {
-            let init = init.of("extra_encoders").of(&part.column);
+        let encoder = |(encoding, &width): (&super::Encoding, &usize)| {
+            let init = init.of("extra_encoders").of(&encoding.column);
             let encoder = ColumnEncoder {
                 _0: NormalizedLinear::new(&init.of("0"), width, config.encoder),
-                _1: Linear::normal(&init.of("1"), config.encoder, part.latent, 0.02),
-                _2: LayerNorm::new(&init.of("2"), part.latent, 1e-5),
+                _1: Linear::normal(&init.of("1"), config.encoder, encoding.latent, 0.02),
+                _2: LayerNorm::new(&init.of("2"), encoding.latent, 1e-5),
             };
-            (part.column.clone(), encoder)
+            (encoding.column.clone(), encoder)
         };
         let critic = |i| Head::zero_initialized(&init.of("qs").at(i), latent + action_dim, hidden, bins);
         let qs: Vec<Head> = (0..config.critics).map(critic).collect();
@@ -138,7 +142,7 @@ impl Tdmpc2 {
             scale: RunningScale { value: init.buffer([1], 10.0) },
             cnn: images.map(|_| ImageCnn::new(&init.of("cnn"))),
             pixel_encoder: images
-                .map(|part| image_encoder::projection(&init.of("pixel_encoder"), config.image, part.latent)),
+                .map(|encoding| image_encoder::projection(&init.of("pixel_encoder"), config.image, encoding.latent)),
             extra_encoders: ModuleDict(config.column_encodings().zip(widths).map(encoder).collect()),
             dynamics: Dynamics::new(&init.of("dynamics"), latent + action_dim, hidden, latent),
             reward: Head::zero_initialized(&init.of("reward"), latent + action_dim, hidden, bins),
@@ -161,7 +165,7 @@ impl Tdmpc2 {
     }
 
     /// Returns the number of elements of an action.
-    pub fn actions(&self) -> usize {
+    pub fn action_dim(&self) -> usize {
         self.pi._2.weight.dims()[0] / 2
     }
 

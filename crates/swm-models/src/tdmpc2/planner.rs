@@ -1,5 +1,5 @@
-//! [`Tdmpc2Policy`]: planning as published (section 3.2 and appendix H), by model-predictive path integral control in
-//! latent space.
+//! [`Tdmpc2Policy`]: a policy that plans by model-predictive path integral control in latent space (Hansen et al. 2024,
+//! section 3.2 and appendix H).
 //!
 //! Every iteration evaluates `proposals` rollouts of the policy and samples of a Gaussian. The `elites` with the lowest
 //! cost get the weights `exp(-temperature (cost - lowest cost))` in the next mean and standard deviation. A search
@@ -64,13 +64,14 @@ impl PlannerConfig {
             order.truncate(self.elites);
             result.elites.clear();
             order.iter().for_each(|&i| result.elites.extend_from_slice(&candidates[i * len..][..len]));
-            self.weigh(order.iter().map(|&i| costs[i] - costs[order[0]]), &mut result);
+            self.update_distribution(order.iter().map(|&i| costs[i] - costs[order[0]]), &mut result);
         }
         result
     }
 
-    /// Computes the weights of the elites from their cost above the lowest, and their mean and standard deviation.
-    fn weigh(&self, excess_costs: impl Iterator<Item = f32>, result: &mut SearchResult) {
+    /// Computes the weights of the elites from the costs above the lowest cost, then the weighted mean and standard
+    /// deviation of the elites.
+    fn update_distribution(&self, excess_costs: impl Iterator<Item = f32>, result: &mut SearchResult) {
         let SearchResult { mean, std, elites, weights } = result;
         weights.clear();
         weights.extend(excess_costs.map(|cost| (-self.temperature * cost).exp()));
@@ -118,7 +119,7 @@ impl Tdmpc2Policy {
     /// Creates a policy for `slots` environments of `spec` with the current weights of a shared model.
     ///
     /// # Errors
-    /// When the model was trained for other actions, or a setting is invalid.
+    /// When the model was trained for another action space, or a setting is invalid.
     pub fn new(
         planner: &PlannerConfig,
         config: &TrainConfig<Tdmpc2>,
@@ -189,7 +190,7 @@ impl Policy for Tdmpc2Policy {
 
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
         let column = actions.schema().index(ACTION)?;
-        let begun = Instant::now();
+        let started = Instant::now();
         // The key depends on the step of the episode, so that a policy that starts in mid-episode draws the same
         // samples.
         let steps = infos.get::<i32>(STEP_IDX)?;
@@ -213,7 +214,7 @@ impl Policy for Tdmpc2Policy {
             self.scale.to_env(&slot.action, &mut action);
             actions.row_mut(row).set(column, &action);
         }
-        let seconds = begun.elapsed().as_secs_f64() / count.max(1) as f64;
+        let seconds = started.elapsed().as_secs_f64() / count.max(1) as f64;
         self.latencies.extend(std::iter::repeat_n(seconds, count));
         Ok(())
     }

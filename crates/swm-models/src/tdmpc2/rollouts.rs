@@ -1,4 +1,4 @@
-//! [`Rollouts`]: costs of candidate action sequences, without autodiff.
+//! [`Rollouts`]: rollouts of a TD-MPC2 without autodiff, which evaluate and propose action sequences.
 
 use super::model::Tdmpc2;
 use super::step::expected_values;
@@ -8,8 +8,8 @@ use burn::tensor::{Tensor, TensorData};
 use rayon::prelude::*;
 use swm_core::Key;
 
-/// Candidates that are rolled out together; the parts of a population run in parallel.
-const PART: usize = 128;
+/// The number of candidates that are rolled out together; the chunks of a population run in parallel.
+const CHUNK_SIZE: usize = 128;
 
 /// A model prepared for rollouts.
 pub struct Rollouts {
@@ -20,8 +20,8 @@ pub struct Rollouts {
 }
 
 impl Rollouts {
-    /// Creates rollouts with a `discount` per step; `uncertainty` is the cost of the Q functions' disagreement per unit
-    /// of value.
+    /// Creates rollouts with a `discount` per step; `uncertainty` is the weight of the Q functions'
+    /// standard deviation, which lowers the final value.
     pub fn new(model: &Tdmpc2, discount: f64, uncertainty: f64) -> Self {
         let critics = Ensemble::of(&model.qs.iter().collect::<Vec<_>>());
         Self { model: model.clone(), critics, discount, uncertainty }
@@ -38,14 +38,14 @@ impl Rollouts {
     /// # Shapes
     /// `latent` is `[latent]`, `candidates` is `[samples, horizon, action_dim]`, `costs` is `[samples]`.
     pub fn cost(&self, latent: &[f32], candidates: &[f32], horizon: usize, costs: &mut [f32]) {
-        let width = horizon * self.model.actions();
-        let parts = costs.par_chunks_mut(PART).zip(candidates.par_chunks(PART * width));
-        parts.for_each(|(costs, candidates)| costs.copy_from_slice(&self.part(latent, candidates, horizon)));
+        let width = horizon * self.model.action_dim();
+        let chunks = costs.par_chunks_mut(CHUNK_SIZE).zip(candidates.par_chunks(CHUNK_SIZE * width));
+        chunks.for_each(|(costs, candidates)| costs.copy_from_slice(&self.chunk_costs(latent, candidates, horizon)));
     }
 
-    fn part(&self, latent: &[f32], candidates: &[f32], horizon: usize) -> Vec<f32> {
+    fn chunk_costs(&self, latent: &[f32], candidates: &[f32], horizon: usize) -> Vec<f32> {
         let model = &self.model;
-        let (device, bins, width) = (model.device(), model.config().bins, model.actions());
+        let (device, bins, width) = (model.device(), model.config().bins, model.action_dim());
         let samples = candidates.len() / (horizon * width);
         let candidates =
             Tensor::<3>::from_data(TensorData::new(candidates.to_vec(), [samples, horizon, width]), &device);
@@ -91,7 +91,7 @@ impl Rollouts {
         match keys {
             None => gaussian.mean.tanh(),
             Some(keys) => {
-                let width = self.model.actions();
+                let width = self.model.action_dim();
                 let noise = normal(keys, width);
                 gaussian.sample(Tensor::from_data(TensorData::new(noise, [keys.len(), width]), &self.model.device()))
             }
@@ -99,12 +99,12 @@ impl Rollouts {
     }
 
     /// Writes action sequences that begin with the actions `prefix` and continue with samples of the policy. `key` and
-    /// the index of a sequence determine its samples.
+    /// the index of a sequence determine the samples of the sequence.
     ///
     /// # Shapes
     /// `latent` is `[latent]`, `prefix` is `[steps, action_dim]`, `proposals` is `[samples, horizon, action_dim]`.
     pub fn propose(&self, latent: &[f32], prefix: &[f32], horizon: usize, key: Key, proposals: &mut [f32]) {
-        let (device, width) = (self.model.device(), self.model.actions());
+        let (device, width) = (self.model.device(), self.model.action_dim());
         let samples = proposals.len() / (horizon * width);
         let start = Tensor::<2>::from_data(TensorData::new(latent.to_vec(), [1, latent.len()]), &device);
         let mut latents = start.expand([samples, latent.len()]);

@@ -1,11 +1,11 @@
-//! One training step (Hansen et al. 2024, equations 3 to 6): losses and gradients of a batch of clips.
+//! One training step of a TD-MPC2 (Hansen et al. 2024, equations 3 to 6): losses and gradients of a batch of clips.
 //!
-//! World model (encoder, dynamics, rewards, values) and policy have separate autodiff graphs: latents and Q functions
-//! are constants for the policy. Everything except the dynamics is computed for all steps of a clip at once; the Q
-//! functions are one batched product.
+//! The world model (encoder, dynamics, rewards, values) and the policy have separate autodiff graphs: latents and Q
+//! functions are constants for the policy. Everything except the dynamics is computed for all steps of a clip at once;
+//! the Q functions are one batched product.
 //!
-//! A batch is split into shards of clips that run in parallel. Their gradients are added in order; only the spread of
-//! values, which scales the policy's loss, is computed over all shards.
+//! A batch is split into shards of clips that run in parallel. The gradients of the shards are added in order; only the
+//! spread of values, which scales the policy's loss, is computed over all shards.
 
 use super::config::LossConfig;
 use super::model::{Observation, Tdmpc2};
@@ -20,32 +20,32 @@ use swm_core::Key;
 
 /// A batch of clips. Rows are ordered by step, then by clip.
 pub struct TrainBatch {
-    /// `[(horizon + 1) * clips]` observations.
+    /// The observations, `(horizon + 1) * clips` rows.
     pub observations: Observation,
-    /// `[horizon, clips, action_dim]`, in model units.
+    /// The actions in model units, `[horizon, clips, action_dim]`.
     pub actions: Tensor<3>,
-    /// `[horizon, clips]`.
+    /// The rewards, `[horizon, clips]`.
     pub rewards: Tensor<2>,
-    /// `[horizon, clips]`: 1 where the action terminated the episode.
+    /// 1 where the action terminated the episode, else 0: `[horizon, clips]`.
     pub terminated: Tensor<2>,
 }
 
 /// The random draws of a step.
 pub struct Draws {
-    /// Standard normal, `[horizon, clips, action_dim]`, for the actions at the next frames.
+    /// Standard normal noise of the actions at the next frames, `[horizon, clips, action_dim]`.
     pub target: Tensor<3>,
-    /// Standard normal, `[horizon, clips, action_dim]`, for the actions of the policy's loss.
+    /// Standard normal noise of the actions in the policy's loss, `[horizon, clips, action_dim]`.
     pub policy: Tensor<3>,
     /// The two target Q functions of each step whose minimum is the target.
     pub target_critics: Vec<[usize; 2]>,
     /// The two Q functions of each step whose mean is the value of the policy's actions.
     pub policy_critics: Vec<[usize; 2]>,
-    /// Determines dropout; `None` in validation.
+    /// The key of dropout; `None` in validation.
     pub dropout: Option<Key>,
 }
 
 impl Draws {
-    /// Draws the random values of a step.
+    /// Draws the random values of a step, with noise of shape `[horizon, clips, action_dim]`.
     pub fn new(key: Key, model: &Tdmpc2, shape: [usize; 3], training: bool) -> Self {
         let normal = |purpose: &str| {
             let mut rng = key.with(purpose).rng();
@@ -88,36 +88,36 @@ pub struct Tdmpc2Step {
     pub termination: f64,
     /// The mean value of the policy's actions.
     pub q: f64,
-    /// The mean entropy of the policy, estimated from its samples.
+    /// The mean entropy of the policy, estimated from sampled actions.
     pub entropy: f64,
     /// The running spread of values after the step.
     pub scale: f32,
-    /// Gradients by parameter, flat.
+    /// The flattened gradient of each parameter, by parameter name.
     pub gradients: Named<Tensor<1>>,
 }
 
-/// Computes losses and gradients of a batch. `model` has no autodiff; `shards` is at least 1.
+/// Computes losses and gradients of a batch. `model` is outside autodiff; `shards` is at least 1.
 pub fn step(model: &Tdmpc2, batch: &TrainBatch, config: &LossConfig, draws: &Draws, shards: usize) -> Tdmpc2Step {
     let [horizon, clips, _] = batch.actions.dims();
     let size = clips.div_ceil(shards.max(1));
-    let parts: Vec<Part> = (0..clips)
+    let shards: Vec<Shard> = (0..clips)
         .step_by(size)
         .enumerate()
-        .map(|(i, start)| Part::of(batch, draws, start..(start + size).min(clips), i))
+        .map(|(i, start)| Shard::of(batch, draws, start..(start + size).min(clips), i))
         .collect();
     let world_models: Vec<WorldModelLoss> =
-        parts.par_iter().map(|part| world_model_loss(model, part, config, draws)).collect();
-    let evaluations: Vec<PolicyEvaluation> = (parts.par_iter().zip(&world_models))
-        .map(|(part, world_model)| evaluate_policy(model, part, &world_model.latents, draws))
+        shards.par_iter().map(|shard| world_model_loss(model, shard, config, draws)).collect();
+    let evaluations: Vec<PolicyEvaluation> = (shards.par_iter().zip(&world_models))
+        .map(|(shard, world_model)| evaluate_policy(model, shard, &world_model.latents, draws))
         .collect();
 
-    let first_step: Vec<f32> = (evaluations.iter().zip(&parts))
-        .flat_map(|(evaluation, part)| values(evaluation.q.clone()).into_iter().take(part.clips))
+    let first_step: Vec<f32> = (evaluations.iter().zip(&shards))
+        .flat_map(|(evaluation, shard)| values(evaluation.q.clone()).into_iter().take(shard.clips))
         .collect();
     let old = values(model.scale.value.val())[0];
     let scale = old + (spread(first_step) - old) * config.tau as f32;
-    let policies: Vec<PolicyLoss> = (evaluations.into_par_iter().zip(&parts))
-        .map(|(evaluation, part)| policy_loss(evaluation, part, config, scale))
+    let policies: Vec<PolicyLoss> = (evaluations.into_par_iter().zip(&shards))
+        .map(|(evaluation, shard)| policy_loss(evaluation, shard, config, scale))
         .collect();
 
     let mut step = Tdmpc2Step {
@@ -132,8 +132,8 @@ pub fn step(model: &Tdmpc2, batch: &TrainBatch, config: &LossConfig, draws: &Dra
         scale,
         gradients: Named::new(),
     };
-    for ((part, world_model), policy) in parts.iter().zip(world_models).zip(policies) {
-        let fraction = part.clips as f64 / clips as f64;
+    for ((shard, world_model), policy) in shards.iter().zip(world_models).zip(policies) {
+        let fraction = shard.clips as f64 / clips as f64;
         let [consistency, reward, value, termination] = world_model.losses.map(|loss| loss * fraction);
         step.consistency += consistency;
         step.reward += reward;
@@ -160,8 +160,8 @@ pub fn step(model: &Tdmpc2, batch: &TrainBatch, config: &LossConfig, draws: &Dra
     step
 }
 
-/// One part of the clips of a batch. Rows are ordered by step, then by clip.
-struct Part {
+/// A shard of the clips of a batch. Rows are ordered by step, then by clip.
+struct Shard {
     index: usize,
     clips: usize,
     horizon: usize,
@@ -174,7 +174,7 @@ struct Part {
     policy_noise: Tensor<2>,
 }
 
-impl Part {
+impl Shard {
     fn of(batch: &TrainBatch, draws: &Draws, range: std::ops::Range<usize>, index: usize) -> Self {
         let [horizon, clips, width] = batch.actions.dims();
         let count = range.len();
@@ -202,7 +202,7 @@ impl Part {
         self.horizon * self.clips
     }
 
-    /// Returns the rows of a step.
+    /// Returns the rows of `x` at a step.
     fn at(&self, x: &Tensor<2>, step: usize) -> Tensor<2> {
         x.clone().narrow(0, step * self.clips, self.clips)
     }
@@ -217,7 +217,7 @@ impl Part {
 
 /// Losses and gradients of the world model.
 struct WorldModelLoss {
-    /// Consistency, reward, value, termination.
+    /// The losses of consistency, reward, value and termination.
     losses: [f64; 4],
     gradients: Named<Tensor<1>>,
     /// The latents before every action, `[rows, latent]`.
@@ -225,19 +225,19 @@ struct WorldModelLoss {
 }
 
 /// Computes losses and gradients of all networks except the policy.
-fn world_model_loss(model: &Tdmpc2, part: &Part, config: &LossConfig, draws: &Draws) -> WorldModelLoss {
+fn world_model_loss(model: &Tdmpc2, shard: &Shard, config: &LossConfig, draws: &Draws) -> WorldModelLoss {
     let bins = model.config().bins;
-    let next_latents = model.encode(part.future.clone());
-    let targets = bins.two_hot(targets(model, part, &next_latents, config, draws));
+    let next_latents = model.encode(shard.future.clone());
+    let targets = bins.two_hot(targets(model, shard, &next_latents, config, draws));
 
-    let live = model.clone().train();
-    let weights = part.weights(config.rho);
-    let actions = part.actions.clone().autodiff();
-    let mut latents = live.encode(part.present.clone().autodiff());
+    let learner = model.clone().train();
+    let weights = shard.weights(config.rho);
+    let actions = shard.actions.clone().autodiff();
+    let mut latents = learner.encode(shard.present.clone().autodiff());
     let (mut inputs, mut predicted) = (vec![], vec![]);
-    for step in 0..part.horizon {
-        let input = Tensor::cat(vec![latents, part.at(&actions, step)], 1);
-        latents = live.next(input.clone());
+    for step in 0..shard.horizon {
+        let input = Tensor::cat(vec![latents, shard.at(&actions, step)], 1);
+        latents = learner.next(input.clone());
         inputs.push(input);
         predicted.push(latents.clone());
     }
@@ -245,10 +245,12 @@ fn world_model_loss(model: &Tdmpc2, part: &Part, config: &LossConfig, draws: &Dr
 
     let weighted_sum = |loss: Tensor<1>| (loss * weights.clone().autodiff()).sum();
     let consistency = weighted_sum((predicted.clone() - next_latents.autodiff()).square().mean_dim(1).squeeze_dim(1));
-    let reward =
-        weighted_sum(two_hot::cross_entropy(live.reward.forward(inputs.clone()), bins.two_hot(part.rewards.clone())));
-    let mut rng = draws.dropout.map(|key| key.at(part.index as u64).rng());
-    let critics = Ensemble::of(&live.qs.iter().collect::<Vec<_>>());
+    let reward = weighted_sum(two_hot::cross_entropy(
+        learner.reward.forward(inputs.clone()),
+        bins.two_hot(shard.rewards.clone()),
+    ));
+    let mut rng = draws.dropout.map(|key| key.at(shard.index as u64).rng());
+    let critics = Ensemble::of(&learner.qs.iter().collect::<Vec<_>>());
     let logits = critics.forward(inputs.clone(), model.config().dropout, &mut DropoutRng(rng.as_mut()));
     let [count, rows, width] = logits.dims();
     let targets = targets.unsqueeze_dim::<3>(0).expand([count, rows, width]).reshape([count * rows, width]);
@@ -258,35 +260,35 @@ fn world_model_loss(model: &Tdmpc2, part: &Part, config: &LossConfig, draws: &Dr
     let mut total =
         consistency.clone() * config.consistency + reward.clone() * config.reward + value.clone() * config.value;
     let mut losses = [value_of(&consistency), value_of(&reward), value_of(&value), 0.0];
-    if let Some(head) = &live.termination {
+    if let Some(head) = &learner.termination {
         let logits: Tensor<1> = head.forward(predicted).squeeze_dim(1);
-        // Binary cross-entropy: softplus of the logit, negated for rows that terminate.
-        let signed = logits.clone() * (part.terminated.clone() * -2.0 + 1.0).autodiff();
+        // Binary cross-entropy is the softplus of the logit, which is negated in rows that terminate the episode.
+        let signed = logits.clone() * (shard.terminated.clone() * -2.0 + 1.0).autodiff();
         let termination = weighted_sum(activation::softplus(signed, 1.0));
         losses[3] = value_of(&termination);
         total = total + termination * config.termination;
     }
-    let gradients = parameters::gradients(&live, &total.backward());
+    let gradients = parameters::gradients(&learner, &total.backward());
     let [rows, width] = inputs.dims();
-    let latents = inputs.inner().slice([0..rows, 0..width - part.actions.dims()[1]]);
+    let latents = inputs.inner().slice([0..rows, 0..width - shard.actions.dims()[1]]);
     WorldModelLoss { losses, gradients, latents }
 }
 
 /// Returns the targets of the Q functions, `[rows]`: `r + γ min(Q_i, Q_j)` at the next frames, and `r` where the
 /// episode terminates.
-fn targets(model: &Tdmpc2, part: &Part, next_latents: &Tensor<2>, config: &LossConfig, draws: &Draws) -> Tensor<1> {
-    let next = model.policy(next_latents.clone()).sample(part.target_noise.clone());
+fn targets(model: &Tdmpc2, shard: &Shard, next_latents: &Tensor<2>, config: &LossConfig, draws: &Draws) -> Tensor<1> {
+    let next = model.policy(next_latents.clone()).sample(shard.target_noise.clone());
     let input = Tensor::cat(vec![next_latents.clone(), next], 1);
-    let least = (0..part.horizon).map(|step| {
+    let least = (0..shard.horizon).map(|step| {
         let chosen = chosen(&model.target_qs, draws.target_critics[step]);
         let q = expected_values(
             model.config().bins,
-            Ensemble::of(&chosen).forward(part.at(&input, step), 0.0, &mut DropoutRng::disabled()),
+            Ensemble::of(&chosen).forward(shard.at(&input, step), 0.0, &mut DropoutRng::disabled()),
         );
         q.min_dim(0).squeeze_dim(0)
     });
     let q: Tensor<1> = Tensor::cat(least.collect(), 0);
-    part.rewards.clone() + q * (part.terminated.clone().neg() + 1.0) * config.discount
+    shard.rewards.clone() + q * (shard.terminated.clone().neg() + 1.0) * config.discount
 }
 
 /// Values and entropies of the policy's actions.
@@ -298,20 +300,20 @@ struct PolicyEvaluation {
     entropy: Tensor<1>,
 }
 
-fn evaluate_policy(model: &Tdmpc2, part: &Part, latents: &Tensor<2>, draws: &Draws) -> PolicyEvaluation {
+fn evaluate_policy(model: &Tdmpc2, shard: &Shard, latents: &Tensor<2>, draws: &Draws) -> PolicyEvaluation {
     let policy = model.pi.clone().train();
     let latents = latents.clone().autodiff();
     let gaussian = super::Gaussian::of(policy.forward(latents.clone()));
-    let noise = part.policy_noise.clone();
+    let noise = shard.policy_noise.clone();
     let actions = gaussian.sample(noise.clone().autodiff());
     let [_, width] = actions.dims();
     let normal = (noise.square() * -0.5 - 0.5 * (2.0 * std::f64::consts::PI).ln()).autodiff() - gaussian.log_std;
     let squashed = (activation::relu(actions.clone().square().neg() + 1.0) + 1e-6).log();
     let entropy = (normal - squashed).sum_dim(1).squeeze_dim(1) * -(width as f64);
     let input = Tensor::cat(vec![latents, actions], 1);
-    let means = (0..part.horizon).map(|step| {
+    let means = (0..shard.horizon).map(|step| {
         let critics = Ensemble::of(&chosen(&model.qs, draws.policy_critics[step])).frozen();
-        let logits = critics.forward(part.at(&input, step), 0.0, &mut DropoutRng::disabled());
+        let logits = critics.forward(shard.at(&input, step), 0.0, &mut DropoutRng::disabled());
         expected_values(model.config().bins, logits).mean_dim(0).squeeze_dim(0)
     });
     PolicyEvaluation { policy, q: Tensor::cat(means.collect(), 0), entropy }
@@ -325,13 +327,14 @@ struct PolicyLoss {
     gradients: Named<Tensor<1>>,
 }
 
-/// Computes the policy's loss, negated values in units of their spread minus weighted entropy, and its gradients.
-fn policy_loss(evaluation: PolicyEvaluation, part: &Part, config: &LossConfig, scale: f32) -> PolicyLoss {
+/// Computes the policy's loss and the gradients of the loss. The loss is the negated sum of the values, divided by the
+/// spread `scale`, and of the weighted entropy.
+fn policy_loss(evaluation: PolicyEvaluation, shard: &Shard, config: &LossConfig, scale: f32) -> PolicyLoss {
     let PolicyEvaluation { policy, q, entropy } = evaluation;
-    let width = part.actions.dims()[1] as f64;
+    let width = shard.actions.dims()[1] as f64;
     let means = [&q, &entropy].map(|x| value_of(&x.clone().mean()));
     let gain = q / scale + entropy * config.entropy;
-    let loss = (gain * part.weights(config.rho).autodiff()).sum().neg();
+    let loss = (gain * shard.weights(config.rho).autodiff()).sum().neg();
     let value = value_of(&loss);
     let gradients = parameters::gradients(&policy, &loss.backward());
     PolicyLoss {

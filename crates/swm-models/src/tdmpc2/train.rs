@@ -62,7 +62,7 @@ impl Trainable for Tdmpc2 {
     }
 
     fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self> {
-        let widths = config.model.column_encodings().map(|part| Ok(dataset_info.column(&part.column)?.dim()));
+        let widths = config.model.column_encodings().map(|encoding| Ok(dataset_info.column(&encoding.column)?.dim()));
         Ok(Self::init(&config.model, &widths.collect::<Result<Vec<_>>>()?, dataset_info.action.dim(), key, device))
     }
 
@@ -70,7 +70,7 @@ impl Trainable for Tdmpc2 {
         let StepContext { config, dataset_info, key, device, training } = context;
         let steps = config.data.num_steps;
         let (clips, horizon, width) = (batch.rows(), steps - 1, dataset_info.action.dim());
-        let flat = |name: &str| {
+        let by_step = |name: &str| {
             let column = Tensor::<2>::from_data(TensorData::new(batch.to_f32(name)?, [clips, steps]), context.device);
             Ok::<_, Error>(column.swap_dims(0, 1).narrow(0, 0, horizon))
         };
@@ -78,8 +78,8 @@ impl Trainable for Tdmpc2 {
         let batch = TrainBatch {
             observations: observe_clips(&config.model, batch, steps, device)?,
             actions,
-            rewards: flat(REWARD)?,
-            terminated: flat(TERMINATED)?,
+            rewards: by_step(REWARD)?,
+            terminated: by_step(TERMINATED)?,
         };
         let draws = Draws::new(*key, self, [horizon, clips, width], *training);
         let losses = step(self, &batch, &config.loss, &draws, config.shards);
@@ -109,7 +109,8 @@ impl Trainable for Tdmpc2 {
         self
     }
 
-    /// Clips the gradients of world model and policy separately; encoders have a lower learning rate, as published.
+    /// Returns the parameter group of a weight: the gradients of world model and policy are clipped separately, and
+    /// encoders have a lower learning rate, as published.
     fn parameter_group(name: &str) -> ParameterGroup {
         let encoder = ["cnn.", "pixel_encoder.", "extra_encoders."].iter().any(|part| name.starts_with(part));
         ParameterGroup { clip: usize::from(name.starts_with("pi.")), lr: if encoder { ENCODER_LR } else { 1.0 } }
@@ -123,7 +124,7 @@ const SCALE: &str = "scale.value";
 /// Reads the observations of a batch of clips.
 ///
 /// # Shapes
-/// Rows are ordered by step, then by clip: `[steps * clips, …]`.
+/// Returns `steps * clips` rows, ordered by step, then by clip.
 fn observe_clips(config: &Tdmpc2Config, batch: &Batch, steps: usize, device: &Device) -> Result<Observation> {
     let clips = batch.rows();
     let columns = config.column_encodings().map(|encoding| {
@@ -176,7 +177,7 @@ impl StochasticActor for Tdmpc2 {
         let action = match key {
             None => gaussian.mean.tanh(),
             Some(key) => {
-                let width = self.actions();
+                let width = self.action_dim();
                 let noise = TensorData::new(normal(&[key], width), [1, width]);
                 gaussian.sample(Tensor::from_data(noise, &self.device()))
             }

@@ -33,7 +33,7 @@ fn damaged_checkpoints_are_refused() {
     let mut flipped = valid_weights.clone();
     *flipped.last_mut().expect("bytes") ^= 1;
     std::fs::write(&weights, flipped).expect("a written file");
-    assert!(message(&trained).contains("its hash differs"), "{}", message(&trained));
+    assert!(message(&trained).contains("the hash differs"), "{}", message(&trained));
     std::fs::write(&weights, &valid_weights).expect("a written file");
 
     let config_file = inner.join("config.json");

@@ -74,7 +74,7 @@ fn golden_tdmpc2_checkpoints_round_trip() {
         let (model, published) = golden.tdmpc2();
         let mut config = TrainConfig::<Tdmpc2>::load("paper", &[]).expect("a configuration");
         (config.model, config.loss) = (published.model(), published.loss());
-        let action = ActionScale::identity(model.actions());
+        let action = ActionScale::identity(model.action_dim());
         let dataset_info = DatasetInfo { action, columns: Named::new(), env: None };
         let manifest = swm_core::Manifest::new("test", 0, serde_json::Value::Null);
         let checkpoint = Checkpoint { model, config, dataset_info: dataset_info.clone(), manifest };

@@ -42,7 +42,7 @@ pub struct EvalRequest {
     /// The conditions, one evaluation each.
     pub conditions: Vec<Condition>,
     /// The horizon, in model steps, of prediction errors on the recorded trajectories that the starts are taken from;
-    /// none to omit them.
+    /// `None` to omit prediction errors.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub prediction: Option<usize>,
 }
@@ -53,7 +53,7 @@ pub struct EvalRequest {
 pub struct Choice {
     /// The id in the registry.
     pub id: String,
-    /// The settings, as its registry entry reads them.
+    /// The settings, in the format of the registry entry.
     #[serde(default)]
     pub settings: Value,
 }
@@ -164,7 +164,7 @@ impl EvalRequest {
         }
     }
 
-    /// The request behind some results.
+    /// Reads the request from the manifest of evaluation results.
     ///
     /// # Errors
     /// When the manifest is not an evaluation's manifest, or contains no request of this layout.

@@ -65,7 +65,7 @@ fn row_holds_an_observation_and_the_following_step() {
         let success = episode.get::<u8>("success").expect("success");
         for t in 0..last {
             assert!((state[t] + f64::from(action[t]) - state[t + 1]).abs() < 1e-6, "the action leads to the next row");
-            assert_eq!(reward[t], -(state[t + 1] - goal).abs() as f32, "the reward is that of the step");
+            assert_eq!(reward[t], -(state[t + 1] - goal).abs() as f32, "the reward belongs to the step");
             assert_eq!(terminated[t], u8::from(t + 1 == last));
             assert_eq!(success[t + 1], terminated[t]);
         }
@@ -73,8 +73,8 @@ fn row_holds_an_observation_and_the_following_step() {
         assert_eq!((reward[last], terminated[last]), (0.0, 0));
         let seed = Key::new(11).with("episode").at(number as u64).seed() >> 1;
         for elements in episode.get::<i32>("episode_seed").expect("seed").chunks_exact(3) {
-            let together = elements.iter().rev().fold(0u64, |high, &element| high << 21 | element as u64);
-            assert_eq!(together, seed);
+            let joined = elements.iter().rev().fold(0u64, |high, &element| high << 21 | element as u64);
+            assert_eq!(joined, seed);
             assert!(
                 elements.iter().all(|&element| element as f32 as i32 == element),
                 "float32 represents the element exactly"
@@ -91,21 +91,21 @@ fn row_holds_an_observation_and_the_following_step() {
 }
 
 #[test]
-fn resumed_collection_equals_uninterrupted_one() {
+fn resumed_collection_equals_uninterrupted_collection() {
     let complete = Memory::default();
     collect(4, 2, 15, &complete).expect("the collection succeeds");
-    let parts = Memory::default();
-    collect(3, 1, 4, &parts).expect("the first collection succeeds");
-    let second = collect(2, 2, 15, &parts).expect("the second collection succeeds");
+    let resumed = Memory::default();
+    collect(3, 1, 4, &resumed).expect("the first collection succeeds");
+    let second = collect(2, 2, 15, &resumed).expect("the second collection succeeds");
     assert_eq!((second.episodes, second.added), (15, 11));
-    assert!(parts.bytes() == complete.bytes());
-    assert_eq!(collect(2, 2, 15, &parts).expect("no episodes to add").added, 0);
-    assert_eq!(parts.len(), 15);
+    assert!(resumed.bytes() == complete.bytes());
+    assert_eq!(collect(2, 2, 15, &resumed).expect("no episodes to add").added, 0);
+    assert_eq!(resumed.len(), 15);
 }
 
 #[test]
 fn interruption_keeps_finished_episodes() {
-    let (complete, part) = (Memory::default(), Memory::default());
+    let (complete, interrupted) = (Memory::default(), Memory::default());
     collect(4, 1, 30, &complete).expect("the collection succeeds");
     let stop = Arc::new(AtomicBool::new(false));
     let mut world = world(4, 1);
@@ -117,15 +117,15 @@ fn interruption_keeps_finished_episodes() {
             stop.store(progress.done >= 6, Ordering::Relaxed);
         }
     });
-    let outcome = world.collect(&mut policy, part.writer(), &config(30), &mut control);
+    let outcome = world.collect(&mut policy, interrupted.writer(), &config(30), &mut control);
     drop(control);
     assert!(matches!(outcome, Err(Error::Interrupted)), "{outcome:?}");
-    assert_eq!(*part.finished.lock().expect("no thread has panicked"), 1, "`finish` was called");
-    assert_eq!(reported, part.len(), "the reported episodes are stored");
-    assert!((6..30).contains(&part.len()));
-    assert!(complete.bytes().starts_with(&part.bytes()));
-    collect(2, 1, 30, &part).expect("the resumed collection succeeds");
-    assert!(part.bytes() == complete.bytes());
+    assert_eq!(*interrupted.finished.lock().expect("no thread has panicked"), 1, "`finish` was called");
+    assert_eq!(reported, interrupted.len(), "the reported episodes are stored");
+    assert!((6..30).contains(&interrupted.len()));
+    assert!(complete.bytes().starts_with(&interrupted.bytes()));
+    collect(2, 1, 30, &interrupted).expect("the resumed collection succeeds");
+    assert!(interrupted.bytes() == complete.bytes());
 }
 
 /// A policy that fails after `remaining` steps.

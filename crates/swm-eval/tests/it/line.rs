@@ -1,4 +1,4 @@
-//! An environment small enough to compute by hand: a point on a line that has to reach a goal.
+//! An environment whose outcomes can be computed by hand: a point on a line that has to reach a goal.
 
 use rand::Rng as _;
 use swm_core::policy::write_action;

@@ -79,7 +79,7 @@ impl ActionScale {
     }
 }
 
-/// How many dimensions of an action are scaled: all of a box, none of integers.
+/// Returns the number of scaled dimensions of an action: every dimension of a box, 0 for integers.
 fn scaled_dim(space: &Space) -> usize {
     match space {
         Space::Box { low, .. } => low.len(),

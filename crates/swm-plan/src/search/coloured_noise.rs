@@ -15,7 +15,7 @@ pub struct ColouredNoise {
 }
 
 impl ColouredNoise {
-    /// The filter with the exponent β over `horizon` steps.
+    /// Creates the filter with the exponent β for `horizon` steps.
     pub fn new(beta: f32, horizon: usize) -> Self {
         let weight = |f: usize| (f.min(horizon - f).max(1) as f64 / horizon as f64).powf(-f64::from(beta) / 2.0);
         let phase = |f: usize, t: usize| TAU * (f * t % horizon) as f64 / horizon as f64;
@@ -25,7 +25,8 @@ impl ColouredNoise {
         Self { kernel: kernel.iter().map(|k| (k / norm) as f32).collect() }
     }
 
-    /// Filters the white noise of one candidate along the steps, in place. `scratch` keeps its memory between calls.
+    /// Filters the white noise of one candidate along the steps, in place. `scratch` is memory that is
+    /// reused between calls.
     ///
     /// # Shapes
     /// `noise` is `[horizon, dim]`.

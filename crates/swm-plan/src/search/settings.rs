@@ -27,7 +27,7 @@ impl Settings<'_> {
         self.check((least..=samples).contains(&elites), "elites", format!("{elites} of {samples} samples"), fix)
     }
 
-    /// Checks that a count is at most `most`, the number of `of`.
+    /// Checks that a count is at most `most`. `of` names the items whose number is `most`.
     ///
     /// # Errors
     /// When it is greater.

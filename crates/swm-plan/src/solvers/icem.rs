@@ -6,8 +6,7 @@
 //! and by momentum on both moments. Candidates are `[envs, samples, horizon, dim]` and clipped to the bounds. The
 //! defaults are those of the reference (`solver/icem.py`); the paper gives none.
 //!
-//! The noise is coloured along the model steps. The actions of an action block are dimensions of one step, with
-//! independent noise, as in the reference.
+//! The actions of an action block are dimensions of one step, with independent noise, as in the reference.
 //!
 //! The stable-worldmodel paper omits three features of the original publication, and so does this solver: a population
 //! that shrinks from iteration to iteration, elites that are reused after a replan, and executing the best action ever

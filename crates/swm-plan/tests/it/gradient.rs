@@ -45,7 +45,7 @@ struct Augmented {
 }
 
 fn golden() -> Golden {
-    serde_json::from_str(include_str!("../golden/gradient_solvers.json")).expect("the recorded file")
+    serde_json::from_str(include_str!("../golden/gradient_solvers.json")).expect("gradient_solvers.json is valid")
 }
 
 #[track_caller]
@@ -55,7 +55,7 @@ fn assert_near(given: &[f32], expected: &[f32], tolerance: f32) {
     assert!(near, "{given:?}\n{expected:?}");
 }
 
-/// Half the scaled squared distance to a target, as `Bowl` and `Choice` of the exporter.
+/// Half the scaled squared distance to a target, the cost of `Bowl` and `Choice` in `export_gradient_solvers.py`.
 struct Bowl {
     scale: &'static [f32],
     target: &'static [f32],
@@ -161,7 +161,7 @@ fn gradient_descent_equals_the_reference() {
     let plan = solve(&mut gd, &mut { BOWL }, &[Key::new(0)]).expect("the solver returns a plan");
     assert_near(&plan.actions, &golden.actions, 1e-5);
     assert_near(&plan.trace[0].best[..4], &golden.costs, 1e-5);
-    assert_eq!(plan.trace[0].best[4..], plan.costs, "the last entry is that of the plan");
+    assert_eq!(plan.trace[0].best[4..], plan.costs, "the last entry of the trace is the cost of the plan");
 }
 
 #[test]
@@ -180,7 +180,7 @@ fn projected_gradient_descent_equals_the_reference() {
     { CHOICE }
         .cost(Candidates { actions: &chosen, envs: 1, samples: 1, horizon: 2, dim: 3 }, &mut cost)
         .expect("the model computes a cost");
-    assert_eq!(plan.costs, cost, "the cost is that of the choices, not of probabilities");
+    assert_eq!(plan.costs, cost, "the plan's cost is the cost of the chosen options, not of their probabilities");
 }
 
 #[test]

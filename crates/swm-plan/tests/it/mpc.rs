@@ -1,4 +1,4 @@
-//! The MPC policy: when it replans, initial guesses, executed actions, history, and errors.
+//! Tests of the MPC policy: replanning, initial guesses, executed actions, history, and errors.
 
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -133,7 +133,7 @@ fn replans_due_slots_in_one_call_with_warm_starts() {
     let (keys, init) = &calls[1];
     let key = |seed, plan| Key::new(seed).with("plan").at(plan);
     assert_eq!(keys[..], [key(0, 1), key(7, 0), key(2, 0)]);
-    assert_eq!(init[..6], [104.0, 105.0, 0.0, 0.0, 0.0, 0.0], "the part that was not executed, moved forward");
+    assert_eq!(init[..6], [104.0, 105.0, 0.0, 0.0, 0.0, 0.0], "the part of the last plan that was not executed");
     assert_eq!(init[6..], [0.0; 12], "new episodes start from zeros");
     assert_eq!(fixture.policy.take_latencies().len(), 5);
     assert!(fixture.policy.take_latencies().is_empty());

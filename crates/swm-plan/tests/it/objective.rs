@@ -43,7 +43,7 @@ impl System {
         self.push[0].len()
     }
 
-    /// `M z + B a`.
+    /// Returns the argument of f, `M z + B a`.
     fn before(&self, z: &[f32], a: &[f32]) -> Vec<f32> {
         let dot = |row: &[f32], v: &[f32]| row.iter().zip(v).map(|(w, v)| w * v).sum::<f32>();
         self.mix.iter().zip(&self.push).map(|(mix, push)| dot(mix, z) + dot(push, a)).collect()
@@ -490,5 +490,5 @@ fn errors_name_the_mismatch() {
     let mut cost = ObjectiveCost::new(Box::new(nonlinear()), Box::new(goal()), vec![]).expect("a valid model");
     let actions = random(ENVS.len() * SAMPLES * HORIZON * 4);
     let message = cost.cost(candidates(&actions, HORIZON), &mut [0.0; 6]).expect_err("nothing observed").to_string();
-    assert!(message.contains("got 2, expected 0, the number of observed ones"), "{message}");
+    assert!(message.contains("got 2, expected 0, the number of observed environments"), "{message}");
 }

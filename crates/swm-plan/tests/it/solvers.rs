@@ -12,13 +12,13 @@ pub struct Trial {
     pub settings: &'static str,
     /// The settings of the short search that golden files record.
     pub short: &'static str,
-    /// For each toy it can solve: the allowed excess of the cost over the lowest one, and the allowed distance of any
+    /// For each toy that the solver can solve: the allowed excess of the cost over the lowest one, and the allowed distance of any
     /// value of the plan from the best plan.
     pub near: &'static [(&'static str, f64, f64)],
 }
 
 pub const TRIALS: &[Trial] = &[
-    // A single round of samples is only approximate.
+    // One population of samples finds the optimum only approximately.
     Trial {
         solver: "predictive_sampling",
         settings: r#"{"samples": 200000, "sigma": 0.7}"#,

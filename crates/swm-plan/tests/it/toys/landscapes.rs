@@ -172,7 +172,7 @@ impl Landscape for Reach {
     }
 
     fn is_unique(&self) -> bool {
-        // A goal within reach can be reached by many plans.
+        // Many plans end at a goal that is within reach.
         self.cost(&self.optimum()) > 1e-12
     }
 

@@ -1,8 +1,8 @@
 //! A CPU renderer of small frames of simple 3-D scenes.
 //!
 //! A [`Scene`] holds planes, ellipsoids, capsules, cylinders, boxes and meshes with materials, lights and a camera.
-//! [`Assets`] hold textures and meshes, prepared once. A [`Canvas`] draws them: anti-aliased colours, depths, or
-//! labels.
+//! [`Assets`] hold textures and meshes, prepared once. A [`Canvas`] draws scenes: anti-aliased colours, depths,
+//! or labels.
 //!
 //! ```
 //! use swm_raster::{Assets, Camera, Canvas, Geom, IDENTITY, Scene, Shape, Target};
@@ -35,7 +35,7 @@
 //!
 //! **Method.** In small frames the triangles of a finely divided sphere would be smaller than pixels. So primitives are
 //! ray cast, a row of rays at a time (`cast`), and only meshes are rasterised, at the coarsest detail level whose
-//! difference is not visible (`mesh`). Both write a depth buffer (`layers`). Shading runs once per pixel and geom, for
+//! difference is not visible (`mesh`). Primitives and meshes share one depth buffer (`layers`). Shading runs once per pixel and geom, for
 //! many fragments at a time (`paint`). Shadow maps are drawn in the same way from the light (`shadow`).
 //!
 //! **Model.** The fixed pipeline of OpenGL as MuJoCo uses it, including where lighting is interpolated (planes and
@@ -45,7 +45,7 @@
 //! draw shadow maps.
 //!
 //! **Caches.** Static geometry is drawn once per view; later frames begin with a copy of its depth buffer
-//! (`geometry_cache`). The same holds for shadow maps. The sky is looked up once per camera direction (`sky`).
+//! (`geometry_cache`). Shadow maps are cached in the same way. The sky is looked up once per camera direction (`sky`).
 //!
 //! **Determinism.** The bytes of a frame depend on the scene alone, not on the number of threads nor on earlier
 //! frames. Arithmetic is single precision without fused operations.

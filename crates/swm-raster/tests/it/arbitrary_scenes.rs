@@ -9,11 +9,11 @@ use swm_raster::{Assets, Camera, Canvas, Scene, Target};
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(2000))]
     #[test]
-    fn a_used_canvas_draws_like_a_new_one(first in scene(), second in scene()) {
+    fn used_canvas_draws_like_a_new_canvas(first in scene(), second in scene()) {
         let assets = assets();
         let mut canvas = Canvas::new();
         drawn(&mut canvas, &first, &assets);
-        // Earlier frames do not affect later ones.
+        // Earlier frames do not affect later frames.
         prop_assert_eq!(drawn(&mut canvas, &second, &assets), drawn(&mut Canvas::new(), &second, &assets));
     }
 }

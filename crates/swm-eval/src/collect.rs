@@ -18,8 +18,8 @@
 //! | `variation.<key>` | every factor of variation, constant over the episode |
 //! | `episode_seed` | the reset seed, constant over the episode: three `int32` of 21 bits each, the lowest first |
 //!
-//! The seed is split because datasets store values as `float32`, which represents integers up to 2^24. It is not called
-//! `seed`, because the reference implementation resets environments with a column of that name.
+//! The seed is split because datasets store values as `float32`, which represents integers up to 2^24. The column is
+//! not called `seed`, because the reference implementation resets environments with a column of that name.
 
 use crate::seeding::{episode_key, reset, reset_seed};
 use crate::world::{Play, World};
@@ -161,8 +161,8 @@ pub fn check_continues(stored: &Manifest, wanted: &Manifest) -> Result<()> {
     Ok(())
 }
 
-/// Writes the received episodes and sends their batches back for reuse. Encoding runs on the world's threads, so that one setting
-/// limits all threads.
+/// Writes the received episodes and sends their batches back for reuse. Encoding runs on the world's threads, so that
+/// one setting limits all threads.
 fn write_all(
     mut writer: Box<dyn Writer>,
     episodes: &Receiver<Finished>,
@@ -310,8 +310,8 @@ impl Collection<'_> {
         self.finished[index] = Some(Finished { rows, constants });
         while let Some(Some(_)) = self.finished.front() {
             let episode = self.finished.pop_front().flatten();
-            // The channel closes only if the writer failed; `close` then returns the writer's error instead of this
-            // one.
+            // The channel closes only if the writer failed; `close` then returns the writer's error instead of
+            // this error.
             let received = episode.is_none_or(|episode| self.to_writer.send(episode).is_ok());
             if !received {
                 return Err(Error::Interrupted);

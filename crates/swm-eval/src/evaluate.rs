@@ -101,7 +101,7 @@ fn check_counting(counting: Counting, budget: usize, slots: Option<usize>) -> Re
         (Counting::Compat { envs }, Some(slots)) if envs != slots => Err(Error::config(
             "compat counting",
             format!("it counts the first episodes to finish among {envs} environments, and the world has {slots}"),
-            "give the world as many environments, or use strict counting, which does not depend on the number of environments",
+            "give the world as many environments, or use strict counting, which accepts any number",
         )),
         _ => Ok(()),
     }

@@ -182,7 +182,7 @@ fn summaries(results: &Results) -> BTreeMap<String, String> {
 }
 
 fn json(value: &impl Serialize) -> String {
-    // These types always serialise.
+    // The serialisation of these types cannot fail.
     serde_json::to_string(value).unwrap_or_default()
 }
 

@@ -135,7 +135,7 @@ pub enum PolicyKind {
 pub enum Model {
     /// A trained world model: its name or path.
     Checkpoint(String),
-    /// The environment itself, restored and stepped: an upper bound for every model.
+    /// The environment, restored and stepped in place of a model: an upper bound for every model.
     Simulator {
         /// The name of the score of a plan, as the simulator model defines it.
         score: String,

@@ -93,8 +93,8 @@ impl EvalRequest {
     /// `success_rate`, `successes` and `episodes` (the number of episodes that count).
     ///
     /// # Errors
-    /// When the request is invalid or names an unknown environment, dataset, policy or factor, a policy or an environment
-    /// fails, or the run is stopped.
+    /// When the request is invalid or names an unknown environment, dataset, policy or factor, a policy or an
+    /// environment fails, or the run is stopped.
     #[allow(clippy::too_many_lines, reason = "one loop over conditions and policies, which share all state")]
     pub fn run(&self, resolver: &dyn Resolver, options: &RunOptions, control: &mut Control<'_>) -> Result<Results> {
         self.check()?;

@@ -113,7 +113,8 @@ impl Starts {
         Self::choose_among(reader, &all, n, goal_offset, seed)
     }
 
-    /// Chooses starts as [`Starts::choose`] does, but only in `episodes`, such as those of a held-out [`swm_data::Split`].
+    /// Chooses starts as [`Starts::choose`] does, but only in `episodes`, such as those of a held-out
+    /// [`swm_data::Split`].
     ///
     /// # Errors
     /// When the episodes have fewer than `n` starts, or an episode does not exist.

@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use swm_core::columns::{GOAL, PIXELS};
 use swm_core::{EnvPool, Error, Result};
 
-/// Options of the videos of the first episodes. A video has the frame of the agent on the left and the frame of the goal
-/// on the right.
+/// Options of the videos of the first episodes. A video has the frame of the agent on the left and the frame of the
+/// goal on the right.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Videos {
     /// The folder of the results file; paths in results are relative to it.

@@ -48,8 +48,8 @@ impl Canvas {
     /// Draws a scene at `width` × `height` pixels, colours with 1, 2 or 4 samples per pixel. As on graphics cards,
     /// labels are sampled at the centre of every pixel and depths at its first sample.
     ///
-    /// Invalid input draws nothing and never panics: targets that are too small stay unchanged, and geoms with
-    /// unknown assets or values that are not finite are left out. A camera with values that are not finite gives an empty
+    /// Invalid input draws nothing and never panics: targets that are too small stay unchanged, and geoms with unknown
+    /// assets or values that are not finite are left out. A camera with values that are not finite gives an empty
     /// frame.
     pub fn draw(
         &mut self,

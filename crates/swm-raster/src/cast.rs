@@ -46,8 +46,8 @@ pub(crate) struct PosedShape {
 }
 
 /// The rays through a row of pixels. At `x` pixels from the left and `y` from the upper edge of the row, a ray reaches
-/// the depth of its [`PosedShape`] at `position + x * positions[0] + y * positions[1]`; its direction is the same sum of
-/// `direction` and `directions`.
+/// the depth of its [`PosedShape`] at `position + x * positions[0] + y * positions[1]`; its direction is the same sum
+/// of `direction` and `directions`.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Row {
     base: f32,

@@ -1,10 +1,10 @@
 //! [`GeometryCache`]: caches the depth buffer after the first, static geoms of a scene, so that later frames start
 //! from a copy.
 //!
-//! Scenes list static geometry first (floors and walls, in the order of their bodies), and cameras and lights often
-//! do not move. The depth buffer depends only on the view, the far plane and the sequence of geoms drawn so far. If
-//! these inputs equal, bit for bit, the inputs of the copy, drawing continues from the copy. The frame has the same bytes
-//! as without the cache.
+//! Scenes list static geometry first (floors and walls, in the order of their bodies), and cameras and lights often do
+//! not move. The depth buffer depends only on the view, the far plane and the sequence of geoms drawn so far. If these
+//! inputs equal, bit for bit, the inputs of the copy, drawing continues from the copy. The frame has the same bytes as
+//! without the cache.
 
 use crate::layers::{Layers, LayersSnapshot};
 use crate::mesh::Mesh;
@@ -149,8 +149,8 @@ impl CachedView {
         same.unwrap_or(count)
     }
 
-    /// Returns the number of leading geoms to cache, given that `same` leading geoms did not change. The cache shrinks at
-    /// once and grows only after [`FRAMES_BEFORE_GROWTH`] frames.
+    /// Returns the number of leading geoms to cache, given that `same` leading geoms did not change. The cache shrinks
+    /// at once and grows only after [`FRAMES_BEFORE_GROWTH`] frames.
     fn cacheable(&mut self, same: usize) -> usize {
         if same <= self.count || self.count == 0 {
             self.waiting = 0;

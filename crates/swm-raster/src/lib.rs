@@ -35,11 +35,12 @@
 //!
 //! **Method.** In small frames the triangles of a finely divided sphere would be smaller than pixels. So primitives are
 //! ray cast, a row of rays at a time (`cast`), and only meshes are rasterised, at the coarsest detail level whose
-//! difference is not visible (`mesh`). Primitives and meshes share one depth buffer (`layers`). Shading runs once per pixel and geom, for
-//! many fragments at a time (`paint`). Shadow maps are drawn in the same way from the light (`shadow`).
+//! difference is not visible (`mesh`). Primitives and meshes share one depth buffer (`layers`). Shading runs once per
+//! pixel and geom, for many fragments at a time (`paint`). Shadow maps are drawn in the same way from the light
+//! (`shadow`).
 //!
-//! **Model.** The fixed pipeline of OpenGL as MuJoCo uses it, including where lighting is interpolated (planes and
-//! boxes) and how textures are filtered. Frames equal those of MuJoCo's renderer except at some edges.
+//! **Model.** The fixed pipeline of OpenGL as MuJoCo uses it, including the interpolated lighting of planes and
+//! boxes and the filtering of textures. Frames equal those of MuJoCo's renderer except at some edges.
 //!
 //! **Threads.** A large frame is split into strips of rows (`split`), one thread each (`strip`), while other threads
 //! draw shadow maps.

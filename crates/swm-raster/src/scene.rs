@@ -61,8 +61,8 @@ pub struct Camera {
 /// The shape of a geom, relative to the geom's origin.
 #[derive(Clone, Copy, Debug)]
 pub enum Shape {
-    /// A rectangle at z = 0, visible from both sides and more transparent from behind. It is lit at the corners of a
-    /// grid, whose axes are x and y, and colours are interpolated between them.
+    /// A rectangle at z = 0, visible from both sides and more transparent from behind. Light is computed at the corners
+    /// of a grid, whose axes are x and y, and colours are interpolated between them.
     Plane(Axis, Axis),
     /// An ellipsoid with these radii.
     Ellipsoid(V3),

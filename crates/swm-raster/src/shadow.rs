@@ -1,7 +1,7 @@
 //! Shadow maps: the depth buffer of the scene, seen from a light.
 //!
-//! A map covers only the geoms that cast shadows, so that a small map is sharp. A convex shape shadows
-//! itself only where it faces away from the light; only meshes need a margin against rounding.
+//! A map covers only the geoms that cast shadows, so that a small map is sharp. The parts of a convex
+//! shape that lie in the shape's own shadow face away from the light. So only meshes are tested for their own shadow.
 
 use crate::geometry_cache::{DrawSettings, GeometryCache};
 use crate::layers::{Layers, NOTHING, pattern, touched};

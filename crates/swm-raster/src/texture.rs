@@ -147,8 +147,8 @@ impl Texture {
         (change[0] * self.width as f32).max(change[1] * self.height as f32)
     }
 
-    /// Returns the face that a direction meets, the coordinates on this face, and the texels per pixel. `right` and `down`
-    /// are the change of the direction to the neighbouring pixels. The faces are those of OpenGL's table.
+    /// Returns the face that a direction meets, the coordinates on this face, and the texels per pixel. `right` and
+    /// `down` are the change of the direction to the neighbouring pixels. The faces are those of OpenGL's table.
     #[inline(always)]
     pub(crate) fn face_in(&self, d: [f32; 3], right: [f32; 3], down: [f32; 3]) -> (u32, [f32; 2], f32) {
         let [x, y, z] = [d[0].abs(), d[1].abs(), d[2].abs()];

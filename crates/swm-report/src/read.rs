@@ -81,8 +81,8 @@ pub struct Series {
     pub points: Vec<(f64, f64)>,
 }
 
-/// Reads a `train.jsonl`: one JSON object per line. Every number in an object is a metric. An incomplete last line, left by
-/// an interrupted training, is ignored.
+/// Reads a `train.jsonl`: one JSON object per line. Every number in an object is a metric. An incomplete last line,
+/// left by an interrupted training, is ignored.
 ///
 /// # Errors
 /// When the file cannot be read or a complete line is not a JSON object.

@@ -57,12 +57,12 @@ fn row_holds_an_observation_and_the_following_step() {
     for (number, episode) in memory.episodes.lock().expect("no thread has panicked").iter().enumerate() {
         assert_eq!(*episode.schema(), schema);
         let last = episode.rows() - 1;
-        let state = episode.get::<f64>("state").expect("state");
-        let goal = episode.get::<f64>("goal_state").expect("goal")[0];
-        let action = episode.get::<f32>("action").expect("action");
-        let reward = episode.get::<f32>("reward").expect("reward");
-        let terminated = episode.get::<u8>("terminated").expect("terminated");
-        let success = episode.get::<u8>("success").expect("success");
+        let state = episode.get::<f64>("state").expect("the column of states");
+        let goal = episode.get::<f64>("goal_state").expect("the column of goals")[0];
+        let action = episode.get::<f32>("action").expect("the column of actions");
+        let reward = episode.get::<f32>("reward").expect("the column of rewards");
+        let terminated = episode.get::<u8>("terminated").expect("the column of terminations");
+        let success = episode.get::<u8>("success").expect("the column of successes");
         for t in 0..last {
             assert!((state[t] + f64::from(action[t]) - state[t + 1]).abs() < 1e-6, "the action leads to the next row");
             assert_eq!(reward[t], -(state[t + 1] - goal).abs() as f32, "the reward belongs to the step");
@@ -72,7 +72,7 @@ fn row_holds_an_observation_and_the_following_step() {
         assert!(action[last].is_nan());
         assert_eq!((reward[last], terminated[last]), (0.0, 0));
         let seed = Key::new(11).with("episode").at(number as u64).seed() >> 1;
-        for elements in episode.get::<i32>("episode_seed").expect("seed").chunks_exact(3) {
+        for elements in episode.get::<i32>("episode_seed").expect("the column of seeds").chunks_exact(3) {
             let joined = elements.iter().rev().fold(0u64, |high, &element| high << 21 | element as u64);
             assert_eq!(joined, seed);
             assert!(
@@ -80,12 +80,12 @@ fn row_holds_an_observation_and_the_following_step() {
                 "float32 represents the element exactly"
             );
         }
-        let start = episode.get::<f32>("variation.agent.x").expect("factor");
+        let start = episode.get::<f32>("variation.agent.x").expect("the column of the factor");
         assert!(start.iter().all(|&x| f64::from(x) == state[0]), "constant, and equal to the initial position");
-        let color = episode.get::<u8>("variation.agent.color").expect("factor");
-        assert_eq!(color[..2], episode.get::<u8>("pixels").expect("pixels")[..2]);
+        let color = episode.get::<u8>("variation.agent.color").expect("the column of the factor");
+        assert_eq!(color[..2], episode.get::<u8>("pixels").expect("the column of frames")[..2]);
     }
-    let column = |name: &str| schema.column(name).expect("column").clone();
+    let column = |name: &str| schema.column(name).expect("the column exists").clone();
     assert_eq!(column("variation.goal.x").dtype, DType::Float64);
     assert!(schema.find("goal").is_none() && schema.find("step_idx").is_none());
 }

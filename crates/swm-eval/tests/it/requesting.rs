@@ -97,7 +97,8 @@ fn repeat(old: &Results, resolver: &TestResolver) -> Result<swm_eval::Reproducti
 
 /// Serialises results to JSON and back.
 fn round_trip(results: &Results) -> Results {
-    serde_json::from_str(&serde_json::to_string_pretty(results).expect("valid JSON")).expect("results")
+    serde_json::from_str(&serde_json::to_string_pretty(results).expect("valid JSON"))
+        .expect("the JSON contains results")
 }
 
 fn without_timing(mut results: Results) -> String {

@@ -1,4 +1,5 @@
-//! Plays episodes with planners that have perfect dynamics. Counting is strict: a start that is already solved is not played.
+//! Plays episodes with planners that have perfect dynamics. Counting is strict: a start that is already solved is not
+//! played.
 
 use rand::seq::index::sample;
 use std::time::Instant;

@@ -21,14 +21,14 @@ pub static TASKS: [Task; 2] = [
 
 pub const SOLVERS: [&str; 3] = ["cem", "icem", "mppi"];
 
-/// The settings for `TwoRoom`. A third of the paper's candidates suffices for every solver, because candidates are scored
-/// by the time to the goal.
+/// The settings for `TwoRoom`. A third of the paper's candidates suffices for every solver, because candidates are
+/// scored by the time to the goal.
 fn two_room(_: &str) -> Value {
     json!({ "score": "reach", "solver": { "samples": 100, "iterations": 10, "elites": 10 } })
 }
 
-/// The settings for `PushT`. The horizon is the paper's 25 steps, planned individually, so that noise can be coloured along
-/// these steps.
+/// The settings for `PushT`. The horizon is the paper's 25 steps, planned individually, so that noise can be coloured
+/// along these steps.
 ///
 /// The search is hard because most candidates do not touch the block, and those that do rarely push it in the right
 /// direction. Frequent replanning helps every solver more than a long search, because the spread of CEM collapses

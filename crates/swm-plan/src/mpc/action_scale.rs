@@ -44,8 +44,8 @@ impl ActionScale {
     /// Checks the scale against an environment.
     ///
     /// # Errors
-    /// When the scale does not have one mean and one standard deviation for each dimension of a box (none for integers), a
-    /// value is not finite, or a standard deviation is not above 0.
+    /// When the scale does not have one mean and one standard deviation for each dimension of a box (none for
+    /// integers), a value is not finite, or a standard deviation is not above 0.
     pub fn check(&self, spec: &EnvSpec) -> Result<()> {
         let dim = scaled_dim(&spec.action_space);
         if self.mean.len() != dim || self.std.len() != dim {

@@ -1,8 +1,8 @@
 //! [`MpcPolicy`]: a policy that plans with a solver and a model.
 //!
-//! Slots that have executed the first `receding_horizon` steps of their plans replan together, in one [`Solver::solve`] call; other slots continue
-//! their plans. A plan is keyed by (episode, replan), so the plans of an episode do not depend on its slot or on other
-//! episodes.
+//! Slots that have executed the first `receding_horizon` steps of their plans replan together, in one [`Solver::solve`]
+//! call; other slots continue their plans. A plan is keyed by (episode, replan), so the plans of an episode do not
+//! depend on its slot or on other episodes.
 //!
 //! # Actions
 //! Points of a box are planned in model units ([`ActionScale`]) and clipped to the box when they are executed. Integers
@@ -11,13 +11,13 @@
 //!
 //! # Inputs of the model
 //! [`CostModel::observe_env`] receives the environments that are about to be planned for, [`CostModel::observe`] their
-//! info columns. With `history` above 1 there are these additional columns, oldest step first:
+//! info columns. With `history` above 1, these columns are added, oldest step first:
 //!
 //! | column | shape | |
 //! | --- | --- | --- |
 //! | `history.length` | one `int32` | the number of past model steps that are filled; earlier steps are zero |
 //! | `history.action` | `[history - 1, action_block * action_dim]` `float32` | executed actions, in plan values |
-//! | `history.pixels` | `[history - 1, H, W, 3]` `uint8` | the frame at the beginning of each model step; only for environments with frames |
+//! | `history.pixels` | `[history - 1, H, W, 3]` `uint8` | the frame at the beginning of each model step, if frames are rendered |
 
 use super::action_codec::{ActionCodec, Decoded};
 use super::action_scale::ActionScale;

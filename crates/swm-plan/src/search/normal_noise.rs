@@ -2,9 +2,9 @@
 //!
 //! The Box–Muller transform turns two uniform values into two independent normal values,
 //! `√(-2 ln u) (cos 2πv, sin 2πv)`. The uniform values are the words of a key's ChaCha stream, in order, so a run of
-//! the noise can be generated without the runs before it. `ln`, `cos` and `sin` are polynomials (minimax fits, relative error
-//! below 3e-7) because the system's functions differ between platforms, while additions, multiplications and square
-//! roots are defined to the last bit. The polynomials are also vectorised.
+//! the noise can be generated without the runs before it. `ln`, `cos` and `sin` are polynomials (minimax fits, relative
+//! error below 3e-7) because the system's functions differ between platforms, while additions, multiplications and
+//! square roots are defined to the last bit. The polynomials are also vectorised.
 
 use rand::RngCore as _;
 use swm_core::{Key, Rng};

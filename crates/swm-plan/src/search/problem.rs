@@ -32,7 +32,7 @@ impl Bounds<'_> {
 /// Checks a problem with continuous actions; returns its bounds.
 ///
 /// # Errors
-/// When the solver cannot solve such a problem with such a model, the horizon is 0, or the bounds or the initial guess
+/// When the solver does not fit the problem or the model, the horizon is 0, or the bounds or the initial guess
 /// are invalid.
 pub fn continuous<'a>(solver: &SolverEntry, cost: &mut dyn CostModel, problem: &PlanProblem<'a>) -> Result<Bounds<'a>> {
     check_fit(solver, cost, problem)?;
@@ -62,11 +62,11 @@ pub fn continuous<'a>(solver: &SolverEntry, cost: &mut dyn CostModel, problem: &
 
 /// Checks a problem with discrete actions; returns the number of options of every choice of a model step.
 ///
-/// An initial guess weighs the options of every choice: one-hot vectors, probabilities, or zeros where there is no
-/// preference.
+/// An initial guess weighs the options of every choice: one-hot vectors, probabilities, or zeros for a choice
+/// without preference.
 ///
 /// # Errors
-/// When the solver cannot solve such a problem with such a model, the horizon is 0, or the choices or the initial guess
+/// When the solver does not fit the problem or the model, the horizon is 0, or the choices or the initial guess
 /// are invalid.
 pub fn discrete<'a>(solver: &SolverEntry, cost: &mut dyn CostModel, problem: &PlanProblem<'a>) -> Result<&'a [usize]> {
     check_fit(solver, cost, problem)?;

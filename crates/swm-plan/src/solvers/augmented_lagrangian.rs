@@ -2,8 +2,8 @@
 //!
 //! Algorithm "Lagrangian Solver" of the stable-worldmodel paper. Several candidates (the initial guess, and random
 //! candidates around the guess) descend `J(A) + λ·g(A) + ρ ‖[g(A)]₊‖²` for K steps with fixed multipliers λ and penalty
-//! ρ. Then `λ ← [λ + ρ ḡ]₊`, with ḡ the mean over the candidates, and ρ grows up to a limit. This is repeated L
-//! times. Candidates are `[envs, samples, horizon, dim]`, values of constraints `[envs, samples, constraints]`, and
+//! ρ. Then `λ ← [λ + ρ ḡ]₊`, with ḡ the mean over the candidates, and ρ grows up to a limit. Both steps are repeated
+//! L times. Candidates are `[envs, samples, horizon, dim]`, values of constraints `[envs, samples, constraints]`, and
 //! every environment has its own multipliers, `[envs, constraints]`.
 //!
 //! Outer iterations, penalties, standard deviation and noise are those of the reference (`solver/lagrangian.py`). The

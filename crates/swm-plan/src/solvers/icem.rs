@@ -1,7 +1,7 @@
 //! [`ICem`]: the improved cross-entropy method.
 //!
 //! Pinneri et al., *Sample-efficient Cross-Entropy Method for Real-time Planning* (CoRL 2020), as algorithm "Improved
-//! Cross-Entropy Method Solver" of the stable-worldmodel paper. It extends [`Cem`](crate::Cem) by noise that is
+//! Cross-Entropy Method Solver" of the stable-worldmodel paper. The method extends [`Cem`](crate::Cem) by noise that is
 //! coloured along the model steps ([`ColouredNoise`]), by elites that stay among the candidates of the next iteration,
 //! and by momentum on both moments. Candidates are `[envs, samples, horizon, dim]` and clipped to the bounds. The
 //! defaults are those of the reference (`solver/icem.py`); the paper gives none.

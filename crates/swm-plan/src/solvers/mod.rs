@@ -1,7 +1,7 @@
 //! The solvers, one file each, and their list, [`SOLVERS`].
 //!
-//! Each file holds the settings of the algorithm, its `solve`, and its registry row as `pub const ENTRY`. A new solver is a
-//! new file and one line in the list below.
+//! Each file holds the settings of the algorithm, its `solve`, and its registry row as `pub const ENTRY`. A new solver
+//! is a new file and one line in the list below.
 
 pub mod augmented_lagrangian;
 pub mod categorical_cem;

@@ -4,8 +4,8 @@ Run with the Python package `stable-worldmodel` 0.1.1 (and torch) installed:
 
     python export_updates.py > updates.json
 
-The script records every random draw, every population with its costs, and the distribution after each update. It does not
-change the solvers. The minimum of the toy cost is within the bounds in some dimensions and outside the bounds in others.
+The script records every random draw, every population with its costs, and the distribution after each update. It does
+not change the solvers. The minimum of the toy cost is within the bounds in some dimensions and outside in others.
 """
 
 import contextlib

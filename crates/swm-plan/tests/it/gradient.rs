@@ -265,8 +265,8 @@ fn noisy_plans_do_not_depend_on_batches_or_threads() {
 
 #[test]
 fn noisy_searches_are_pinned() {
-    // Published results depend on these values: changing them is a breaking change. They are rounded, because `exp` and
-    // `ln` may differ in the last bit between platforms.
+    // Published results depend on these values: changing them is a breaking change. The values are rounded, because
+    // `exp` and `ln` may differ in the last bit between platforms.
     for (&(solver, name, settings), expected) in NOISY.iter().zip(PINNED) {
         let toy = toy(name);
         let settings = serde_json::from_str(settings).expect("valid settings");
@@ -303,7 +303,8 @@ fn gradient_descent_requires_a_gradient() {
     let quadratic = toy("quadratic");
     let mut model = Model::new(quadratic, &[0]).opaque();
     let mut gd = GradientDescent::default();
-    let message = crate::toys::solve(&mut gd, &mut model, quadratic, &[0]).expect_err("no gradient").to_string();
+    let message =
+        crate::toys::solve(&mut gd, &mut model, quadratic, &[0]).expect_err("a model without gradient").to_string();
     assert!(message.starts_with("solver gd: it needs the gradient of the cost"), "{message}");
     assert!(message.contains("choose another solver"), "{message}");
 }

@@ -149,5 +149,5 @@ fn rejects_environments_of_another_kind_and_wrong_shapes() {
     let wide = Candidates { actions: &[0.0; 6], envs: 1, samples: 1, horizon: 1, dim: 6 };
     assert!(simulator.cost(wide, &mut [0.0]).expect_err("too many action values").to_string().contains("6 values"));
     let none = SimulatorCost::new(|| two_room::ENTRY.env(), ActionScale::identity(2), 0, Score::Terminal);
-    assert!(none.err().expect("no actions").to_string().contains("action block"));
+    assert!(none.err().expect("a block without actions is an error").to_string().contains("action block"));
 }

@@ -36,8 +36,8 @@ pub(crate) fn pattern(samples: usize) -> &'static [[f32; 2]] {
     }
 }
 
-/// Returns the mean position of covered samples; `covered` has a bit per sample. The mean lies inside a convex shape even
-/// at the shape's edge. For a fully covered pixel, the function returns the pixel's centre.
+/// Returns the mean position of covered samples; `covered` has a bit per sample. The mean lies inside a convex shape
+/// even at the shape's edge. For a fully covered pixel, the function returns the pixel's centre.
 fn centre_of(pattern: &[[f32; 2]], covered: usize) -> [f32; 2] {
     let count = covered.count_ones() as usize;
     if count == 0 || count >= pattern.len() {
@@ -58,7 +58,8 @@ pub(crate) struct Layers {
     /// The rows of the frame that are drawn.
     pub rows: Range<usize>,
     pub samples: usize,
-    /// The number of samples from one row to the next: the samples of a row's pixels, and [`LANES`] more for the last vector.
+    /// The number of samples from one row to the next: the samples of a row's pixels, and [`LANES`] more for the last
+    /// vector.
     stride: usize,
     /// Positions of samples within a pixel.
     pub pattern: &'static [[f32; 2]],
@@ -172,9 +173,9 @@ impl Layers {
         [x0, y0, x1, y1.clamp(y0, self.rows.end)]
     }
 
-    /// Draws a geom in the samples in which it is nearer than the content and farther than `floor`, if given. Geoms in shadow maps
-    /// (`caster`) are drawn with less detail and with both sides of open meshes. Returns the region of the frame that
-    /// the geom can touch.
+    /// Draws a geom in the samples in which it is nearer than the content and farther than `floor`, if given. Geoms in
+    /// shadow maps (`caster`) are drawn with less detail and with both sides of open meshes. Returns the region of the
+    /// frame that the geom can touch.
     pub fn draw(
         &mut self,
         index: u32,

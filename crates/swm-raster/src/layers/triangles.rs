@@ -105,7 +105,8 @@ impl Layers {
     /// Draws a triangle that crosses the near plane.
     #[cold]
     fn near_triangle(&mut self, index: (u32, u32, u32), corners: [[f32; 4]; 3], rules: &DrawRules<'_>) {
-        // A weight divided by w is linear on the screen. Its coefficients are a row of the inverse matrix of the corners.
+        // A weight divided by w is linear on the screen. Its coefficients are a row of the inverse matrix of the
+        // corners.
         let [a, b, c] =
             corners.map(|[x, y, w, _]| [f64::from(x) * f64::from(w), f64::from(y) * f64::from(w), f64::from(w)]);
         let wedge = |a: [f64; 3], b: [f64; 3]| {

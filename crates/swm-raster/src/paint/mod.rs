@@ -16,8 +16,8 @@ use light_grid::LightGrids;
 use std::ops::Range;
 use swm_simd::LANES;
 
-/// The number of rows that are gathered together, counted from the top of the frame. Lighting may depend on the fragments
-/// that are gathered together, so strips begin at multiples of this number.
+/// The number of rows that are gathered together, counted from the top of the frame. Lighting may depend on the
+/// fragments that are gathered together, so strips begin at multiples of this number.
 pub(crate) const BAND: usize = 64;
 
 /// One value per fragment, with room for a last vector that is not full.

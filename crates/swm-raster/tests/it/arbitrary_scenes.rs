@@ -21,7 +21,7 @@ proptest! {
 #[test]
 fn large_scenes_give_the_same_bytes_on_any_thread() {
     let mut runner = proptest::test_runner::TestRunner::deterministic();
-    let tree = prop::collection::vec(geom(), 4000).new_tree(&mut runner).expect("geoms");
+    let tree = prop::collection::vec(geom(), 4000).new_tree(&mut runner).expect("the strategy generates geoms");
     let camera = Camera { position: [0.0, -6.0, 0.0], ..CAMERA };
     let scene = Scene { camera, geoms: tree.current(), shadows: true, reflections: true, ..Scene::default() };
     let assets = assets();

@@ -133,8 +133,8 @@ pub fn scene() -> impl Strategy<Value = Scene> {
     )
 }
 
-/// Three meshes (a tetrahedron, triangles that are degenerate or not finite, no triangles) and three textures (flat, cube,
-/// white).
+/// Three meshes (a tetrahedron, triangles that are degenerate or not finite, no triangles) and three textures (flat,
+/// cube, white).
 pub fn assets() -> Assets {
     let corner = |position: V3| Corner { position, normal: position, coordinates: [0.5, 2.5] };
     let [a, b, c, d] = [[1.0, 1.0, 1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, -1.0], [1.0, -1.0, -1.0]].map(corner);

@@ -18,8 +18,8 @@
 //! | `variation.<key>` | every factor of variation, constant over the episode |
 //! | `episode_seed` | the reset seed, constant over the episode: three `int32` of 21 bits each, the lowest first |
 //!
-//! The seed is split because datasets store values as `float32`, which represents integers up to 2^24. It is not called
-//! `seed`, because the reference implementation resets environments with a column of that name.
+//! The seed is split because datasets store values as `float32`, which represents integers up to 2^24. The column is
+//! not called `seed`, because the reference implementation resets environments with a column of that name.
 
 use crate::seeding::{episode_key, reset, reset_seed};
 use crate::world::{Play, World};
@@ -64,7 +64,7 @@ pub struct Collected {
     pub steps: usize,
 }
 
-/// The number of episodes per slot that may wait in memory for an earlier, unfinished one.
+/// The number of episodes per slot that may wait in memory for an earlier, unfinished episode.
 const AHEAD: usize = 2;
 
 /// The capacity of the queue to the writer, in episodes.
@@ -74,7 +74,7 @@ impl World {
     /// The columns of a dataset collected in this world.
     ///
     /// # Errors
-    /// When a column of the environment has the name of a collected one.
+    /// When a column of the environment has the name of a collected column.
     pub fn collect_schema(&self, goal: bool) -> Result<Schema> {
         Layout::of(&self.pool().infos().schema().clone(), self.spec(), goal).map(|layout| layout.schema)
     }
@@ -96,12 +96,12 @@ impl World {
     }
 
     /// Plays episodes until the dataset behind `writer` has `config.episodes`. The writer must have the columns of
-    /// [`World::collect_schema`]; its existing episodes are assumed to be the first ones of the same collection.
+    /// [`World::collect_schema`]; its existing episodes must be the first episodes of the same collection.
     ///
     /// # Errors
     /// When the policy, an environment or the writer fails, or the run is stopped ([`Error::Interrupted`]). The
-    /// episodes up to the first unfinished one stay in the dataset; a resumed collection plays the rest again, to the
-    /// same bytes.
+    /// episodes up to the first unfinished one stay in the dataset; a resumed collection plays the later episodes
+    /// again and stores the same bytes.
     pub fn collect(
         &mut self,
         policy: &mut dyn Policy,
@@ -136,11 +136,11 @@ impl World {
     }
 }
 
-/// Checks that a collection may be continued: environment, policy, seed and settings must be the same; the number of
+/// Checks that a collection may be continued: environment, policy, seed and settings must be equal; the number of
 /// episodes may differ.
 ///
 /// # Errors
-/// When something differs; the message names it.
+/// When a setting differs; the message names the setting.
 pub fn check_continues(stored: &Manifest, wanted: &Manifest) -> Result<()> {
     let differs = |what: &str, stored: String, wanted: String| {
         Err(Error::config(
@@ -161,8 +161,8 @@ pub fn check_continues(stored: &Manifest, wanted: &Manifest) -> Result<()> {
     Ok(())
 }
 
-/// Writes the episodes it receives and returns their batches. Encoding runs on the world's threads, so that one setting
-/// limits all threads.
+/// Writes the received episodes and sends their batches back for reuse. Encoding runs on the world's threads, so that
+/// one setting limits all threads.
 fn write_all(
     mut writer: Box<dyn Writer>,
     episodes: &Receiver<Finished>,
@@ -247,7 +247,7 @@ impl Layout {
 
 /// Writes a value to all rows of a column, converted to the column's type.
 fn fill(batch: &mut Batch, column: usize, value: &[f64]) {
-    fn put<T: bytemuck::Pod>(bytes: &mut [u8], value: &[f64], convert: impl Fn(f64) -> T) {
+    fn write_converted<T: bytemuck::Pod>(bytes: &mut [u8], value: &[f64], convert: impl Fn(f64) -> T) {
         let size = size_of::<T>();
         for (to, &from) in bytes.chunks_exact_mut(size).zip(value.iter().cycle()) {
             to.copy_from_slice(bytemuck::bytes_of(&convert(from)));
@@ -256,16 +256,16 @@ fn fill(batch: &mut Batch, column: usize, value: &[f64]) {
     let dtype = batch.schema().columns()[column].dtype;
     let bytes = batch.bytes_mut(column);
     match dtype {
-        DType::Bool | DType::U8 => put(bytes, value, |v| v as u8),
-        DType::Int32 => put(bytes, value, |v| v as i32),
-        DType::Int64 => put(bytes, value, |v| v as i64),
-        DType::Float32 => put(bytes, value, |v| v as f32),
-        DType::Float64 => put(bytes, value, |v| v),
+        DType::Bool | DType::U8 => write_converted(bytes, value, |v| v as u8),
+        DType::Int32 => write_converted(bytes, value, |v| v as i32),
+        DType::Int64 => write_converted(bytes, value, |v| v as i64),
+        DType::Float32 => write_converted(bytes, value, |v| v as f32),
+        DType::Float64 => write_converted(bytes, value, |v| v),
     }
 }
 
 /// An episode in progress. The batch may contain rows of an older episode, which are overwritten one by one, because
-/// clearing the batch would take as long as recording.
+/// clearing the batch first would take as long as recording the episode.
 struct Recording {
     number: usize,
     /// The number of recorded rows; the batch may have more until the episode is finished.
@@ -310,8 +310,8 @@ impl Collection<'_> {
         self.finished[index] = Some(Finished { rows, constants });
         while let Some(Some(_)) = self.finished.front() {
             let episode = self.finished.pop_front().flatten();
-            // The channel closes only if the writer failed; `close` then returns the writer's error instead of this
-            // one.
+            // The channel closes only if the writer failed; `close` then returns the writer's error instead of
+            // this error.
             let received = episode.is_none_or(|episode| self.to_writer.send(episode).is_ok());
             if !received {
                 return Err(Error::Interrupted);

@@ -35,11 +35,11 @@ pub struct EvalConfig {
 impl World {
     /// Plays every start once. A free slot takes the next start; the result of an episode depends only on its start.
     ///
-    /// Compat counting of episodic starts continues beyond the last start until as many episodes as there are starts
-    /// have finished, like the reference implementation.
+    /// Compat counting of episodic starts continues beyond the last start, until the number of finished episodes equals
+    /// the number of starts, as in the reference implementation.
     ///
     /// # Errors
-    /// When the budget exceeds the world's time limit, the counting contradicts itself or the world, videos are
+    /// When the budget exceeds the world's time limit, the counting is invalid for the budget or the world, videos are
     /// requested of a world without frames, the policy or an environment fails, or the run is stopped.
     pub fn evaluate(
         &mut self,
@@ -83,13 +83,14 @@ impl World {
         let episodes: Vec<EpisodeResult> = finished.iter().map(|&i| std::mem::take(&mut episodes[i])).collect();
         let run = Run::new(&config.condition, &config.policy, config.counting, episodes, timing);
         // Episodic compat counting selects episodes that strict counting would not have selected.
-        let both = matches!(config.counting, Counting::Compat { .. }) && !episodic;
-        let strict = both.then(|| Proportion::wilson(satisfied, run.episodes.len() - run.solved_at_start));
+        let has_strict_rate = matches!(config.counting, Counting::Compat { .. }) && !episodic;
+        let strict = has_strict_rate.then(|| Proportion::wilson(satisfied, run.episodes.len() - run.solved_at_start));
         Ok(Run { strict, videos, ..run })
     }
 }
 
-/// Rejects a counting that contradicts itself, the budget, or the world; `slots` is given for episodic evaluations.
+/// Rejects a counting that is invalid for the budget or the world. `slots`, the number of environments of the world, is
+/// given for episodic evaluations.
 fn check_counting(counting: Counting, budget: usize, slots: Option<usize>) -> Result<()> {
     match (counting, slots) {
         (Counting::Strict { hold }, _) if hold == 0 || hold > budget => Err(Error::config(
@@ -99,8 +100,8 @@ fn check_counting(counting: Counting, budget: usize, slots: Option<usize>) -> Re
         )),
         (Counting::Compat { envs }, Some(slots)) if envs != slots => Err(Error::config(
             "compat counting",
-            format!("it counts the first to finish among {envs} environments, and the world has {slots}"),
-            "give the world as many environments, or count strictly, which does not depend on their number",
+            format!("it counts the first episodes to finish among {envs} environments, and the world has {slots}"),
+            "give the world as many environments, or use strict counting, which accepts any number",
         )),
         _ => Ok(()),
     }
@@ -112,11 +113,11 @@ struct Evaluation<'a> {
     /// Whether episodes start until enough episodes have finished, instead of one episode for each start.
     first_to_finish: bool,
     columns: ColumnIndices,
-    /// The episode of each slot, and its success criterion.
+    /// The episode and the success criterion of each slot.
     slots: Vec<(usize, SuccessCriterion)>,
     /// Every started episode.
     episodes: Vec<EpisodeResult>,
-    /// The finished episodes, in the order in which they finished.
+    /// The indices of the finished episodes, in the order in which the episodes finished.
     finished: Vec<usize>,
     /// The number of episodes that were not solved at the start and whose goal was satisfied at some step.
     satisfied: usize,

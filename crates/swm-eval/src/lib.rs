@@ -1,10 +1,10 @@
-//! Collecting episodes with policies and evaluating policies.
+//! Collection of episodes with policies, and evaluation of policies.
 //!
 //! - [`world`]: [`World`], many environments of one kind and the loop that plays a policy in them.
 //! - [`collect`]: writes every episode to a dataset.
 //! - [`starts`] and [`evaluate`]: initial states and goals, and the success rate of a policy from them.
-//! - [`request`], [`runner`] and [`reproduce`]: all settings of an evaluation as one value, running it for several
-//!   policies on the same starts, and repeating it from its results.
+//! - [`request`]: all settings of an evaluation as one value. [`runner`] evaluates the policies of a request on the
+//!   same starts, and [`reproduce`] repeats an evaluation from its results.
 //! - [`prediction`]: the prediction errors of a model on recorded trajectories.
 //!
 //! An episode depends only on its key: neither on the number of environments or threads, nor on earlier episodes in the

@@ -16,8 +16,8 @@ pub use swm_core::Predictor;
 /// The number of trajectories that are read and predicted at once.
 const CHUNK: usize = 16;
 
-/// Predicts `horizon` model steps from each pick `[episode, step]`. `success` returns the outcome of a pick; `None` if
-/// it is unknown.
+/// Predicts `horizon` model steps from each pick `[episode, step]`. `success` returns the outcome of the pick with
+/// an index, or `None` if the outcome is unknown.
 ///
 /// # Errors
 /// When there are no picks, a trajectory reaches beyond its episode, the dataset lacks a column the model encodes, a
@@ -31,24 +31,24 @@ pub fn predict(
 ) -> Result<Prediction> {
     if picks.is_empty() || horizon == 0 {
         let given = format!("{} trajectories of {horizon} model steps", picks.len());
-        return Err(Error::config("prediction errors", given, "ask for at least one of each"));
+        return Err(Error::config("prediction errors", given, "request at least 1 trajectory and 1 model step"));
     }
     let frames = horizon + 1;
     let mut spread = Spread::new(predictor.latent_dim());
     let mut trajectories = Vec::with_capacity(picks.len());
     let (mut latents, mut predicted, mut starts) = (vec![], vec![], vec![]);
     for first in (0..picks.len()).step_by(CHUNK) {
-        let part = first..picks.len().min(first + CHUNK);
-        let (rows, actions) = read(predictor, reader, &picks[part.clone()], horizon)?;
+        let chunk = first..picks.len().min(first + CHUNK);
+        let (rows, actions) = read(predictor, reader, &picks[chunk.clone()], horizon)?;
         let dim = predictor.latent_dim();
-        latents.resize(part.len() * frames * dim, 0.0);
+        latents.resize(chunk.len() * frames * dim, 0.0);
         predictor.encode(&rows, &mut latents)?;
         starts.clear();
         starts.extend(latents.chunks_exact(frames * dim).flat_map(|frames| &frames[..dim]));
-        predicted.resize(part.len() * horizon * dim, 0.0);
+        predicted.resize(chunk.len() * horizon * dim, 0.0);
         predictor.rollout(&starts, &actions, horizon, &mut predicted)?;
-        let both = latents.chunks_exact(frames * dim).zip(predicted.chunks_exact(horizon * dim));
-        for (i, (recorded, predicted)) in part.zip(both) {
+        let pairs = latents.chunks_exact(frames * dim).zip(predicted.chunks_exact(horizon * dim));
+        for (i, (recorded, predicted)) in chunk.zip(pairs) {
             let steps = recorded[dim..].chunks_exact(dim).zip(predicted.chunks_exact(dim));
             let errors: Vec<f64> = steps
                 .map(|(recorded, predicted)| {
@@ -129,7 +129,7 @@ pub fn predict_run(
 }
 
 /// Reads the observations at every model step of some trajectories, `[trajectories, horizon + 1]` rows, and the actions
-/// between them, `[trajectories, horizon, frameskip * action]`.
+/// between them, `[trajectories, horizon, frameskip * action_dim]`.
 fn read(
     predictor: &dyn Predictor,
     reader: &dyn Reader,
@@ -145,7 +145,7 @@ fn read(
             return Err(Error::mismatch(
                 format!("predicting {horizon} model steps of {frameskip} from step {start} of episode {episode}"),
                 format!("{length} rows"),
-                format!("more than {}: predict fewer steps, or from earlier starts", start + span),
+                format!("more than {}; predict fewer steps, or choose earlier starts", start + span),
             ));
         }
         frames.extend((0..=span).step_by(frameskip).map(|at| StepRange::new(episode, start + at, 1)));

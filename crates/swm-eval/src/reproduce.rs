@@ -28,7 +28,7 @@ pub struct Reproduction {
 pub struct Difference {
     /// The kind of difference.
     pub kind: Kind,
-    /// What differs, such as `episode 7 of lewm, in distribution`.
+    /// The differing item, such as `episode 7 of lewm, in distribution`.
     pub what: String,
     /// The old value.
     pub was: String,
@@ -40,7 +40,7 @@ pub struct Difference {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Kind {
-    /// A version or a device, which may explain differences but does not count as one.
+    /// A version or a device. It may explain other differences, and [`Reproduction::holds`] ignores it.
     Version,
     /// An input: the request, or the hash of starts, goals, data or weights.
     Input,
@@ -61,7 +61,7 @@ impl fmt::Display for Difference {
     }
 }
 
-/// Repeats the evaluation behind some results and compares.
+/// Repeats the evaluation that gave `old` and lists the differences between the old and the new results.
 ///
 /// # Errors
 /// When the results contain no request that this version reads, a dataset or a checkpoint has a different hash, and as
@@ -77,7 +77,7 @@ pub fn reproduce(
     Ok(Reproduction { differences: differences(old, &results), results })
 }
 
-/// A resolver that rejects data and weights with other hashes than in the old results.
+/// A resolver that rejects data and weights whose hashes differ from the hashes in the old results.
 struct Checked<'a> {
     resolver: &'a dyn Resolver,
     manifest: &'a Manifest,
@@ -121,7 +121,7 @@ impl Resolver for Checked<'_> {
     }
 }
 
-/// The differences between two results, times and videos aside.
+/// Lists the differences between two results, except times and videos.
 pub fn differences(old: &Results, new: &Results) -> Vec<Difference> {
     let mut found = vec![];
     let (then, now) = (&old.manifest, &new.manifest);
@@ -132,10 +132,10 @@ pub fn differences(old: &Results, new: &Results) -> Vec<Difference> {
     };
     compare(Kind::Version, "stable-worldmodel", &then.swm_version, &now.swm_version);
     compare(Kind::Version, "device", &then.device, &now.device);
-    for (what, was, is) in both(&then.libraries, &now.libraries) {
+    for (what, was, is) in pair_values(&then.libraries, &now.libraries) {
         compare(Kind::Version, what, was, is);
     }
-    for (what, was, is) in both(&then.hashes, &now.hashes) {
+    for (what, was, is) in pair_values(&then.hashes, &now.hashes) {
         compare(Kind::Input, &format!("hash of {what}"), was, is);
     }
     let [was, is] = [then, now].map(|manifest| {
@@ -143,20 +143,20 @@ pub fn differences(old: &Results, new: &Results) -> Vec<Difference> {
         flatten("", &manifest.config, &mut leaves);
         leaves
     });
-    for (what, was, is) in both(&was, &is) {
+    for (what, was, is) in pair_values(&was, &is) {
         compare(Kind::Input, &format!("request, {what}"), was, is);
     }
-    for ((run, episode), was, is) in both(&outcomes(old), &outcomes(new)) {
+    for ((run, episode), was, is) in pair_values(&outcomes(old), &outcomes(new)) {
         compare(Kind::Finding, &format!("episode {episode} of {run}"), was, is);
     }
-    for (run, was, is) in both(&rest(old), &rest(new)) {
+    for (run, was, is) in pair_values(&summaries(old), &summaries(new)) {
         compare(Kind::Finding, run, was, is);
     }
     found
 }
 
 /// The values of both maps for every key; a missing value is `nothing`.
-fn both<'a, K: Ord>(
+fn pair_values<'a, K: Ord>(
     was: &'a BTreeMap<K, String>,
     is: &'a BTreeMap<K, String>,
 ) -> impl Iterator<Item = (&'a K, &'a str, &'a str)> {
@@ -169,19 +169,20 @@ fn name(run: &Run) -> String {
     format!("{}, {}", run.policy, run.condition)
 }
 
-/// Every episode as JSON, by its run and index.
+/// Every episode as JSON, by the name of its run and its index.
 fn outcomes(results: &Results) -> BTreeMap<(String, usize), String> {
     let episodes = results.runs.iter().flat_map(|run| run.episodes.iter().enumerate().map(move |(i, e)| (run, i, e)));
     episodes.map(|(run, i, episode)| ((name(run), i), json(episode))).collect()
 }
 
-/// The other results of every run, as JSON. Searches are left out, because tracing them is optional.
-fn rest(results: &Results) -> BTreeMap<String, String> {
+/// The success rates and the prediction errors of every run, as JSON. Searches are omitted, because tracing them is
+/// optional.
+fn summaries(results: &Results) -> BTreeMap<String, String> {
     results.runs.iter().map(|run| (name(run), json(&(run.success, run.strict, &run.prediction)))).collect()
 }
 
 fn json(value: &impl Serialize) -> String {
-    // These types always serialise.
+    // The serialisation of these types cannot fail.
     serde_json::to_string(value).unwrap_or_default()
 }
 

@@ -42,7 +42,7 @@ pub struct EvalRequest {
     /// The conditions, one evaluation each.
     pub conditions: Vec<Condition>,
     /// The horizon, in model steps, of prediction errors on the recorded trajectories that the starts are taken from;
-    /// none to omit them.
+    /// `None` to omit prediction errors.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub prediction: Option<usize>,
 }
@@ -53,7 +53,7 @@ pub struct EvalRequest {
 pub struct Choice {
     /// The id in the registry.
     pub id: String,
-    /// The settings, as its registry entry reads them.
+    /// The settings, in the format of the registry entry.
     #[serde(default)]
     pub settings: Value,
 }
@@ -135,7 +135,7 @@ pub enum PolicyKind {
 pub enum Model {
     /// A trained world model: its name or path.
     Checkpoint(String),
-    /// The environment itself, restored and stepped: an upper bound for every model.
+    /// The environment, restored and stepped in place of a model: an upper bound for every model.
     Simulator {
         /// The name of the score of a plan, as the simulator model defines it.
         score: String,
@@ -164,7 +164,7 @@ impl EvalRequest {
         }
     }
 
-    /// The request behind some results.
+    /// Reads the request from the manifest of evaluation results.
     ///
     /// # Errors
     /// When the manifest is not an evaluation's manifest, or contains no request of this layout.

@@ -32,10 +32,10 @@ pub trait Resolver {
     /// Opens a dataset by its name or path.
     ///
     /// # Errors
-    /// When it does not exist or is damaged.
+    /// When the dataset does not exist or is damaged.
     fn dataset(&self, name: &str) -> Result<Arc<dyn Reader>>;
 
-    /// Makes a policy for all environments of a world. It is not called for the random-policy floor.
+    /// Makes a policy for all environments of a world. The runner makes the random-policy floor itself.
     ///
     /// # Errors
     /// When a checkpoint, an expert or a solver does not exist or does not fit the world.
@@ -55,13 +55,13 @@ pub trait Resolver {
 pub struct ResolvedPolicy {
     /// The policy.
     pub policy: Box<dyn Policy>,
-    /// The hash of its weights, if it has any.
+    /// The hash of the policy's weights; `None` without weights.
     pub weights: Option<String>,
-    /// The versions of the libraries that determine its actions.
+    /// The versions of the libraries that determine the policy's actions.
     pub libraries: BTreeMap<String, String>,
-    /// The device it computes on, such as `cpu (flex)`, if it differs from the default.
+    /// The device that computes the actions, such as `cpu (flex)`; `None` for the default device.
     pub device: Option<String>,
-    /// Returns the searches of all plans since the last call, where they are traced.
+    /// Returns the searches of all plans since the last call; `None` if searches are not traced.
     pub searches: Option<TakeSearches>,
 }
 
@@ -77,7 +77,8 @@ impl From<Box<dyn Policy>> for ResolvedPolicy {
 /// Options of a run that do not change its results.
 #[derive(Clone, Debug, Default)]
 pub struct RunOptions {
-    /// Environments played and planned for at the same time. Compat counting of episodic starts overrides it.
+    /// Environments played and planned for at the same time. Compat counting of episodic starts overrides
+    /// this number.
     pub envs: usize,
     /// Worker threads; 0 for the number of cores.
     pub threads: usize,
@@ -89,11 +90,11 @@ impl EvalRequest {
     /// Evaluates every policy, and the random-policy floor, from the same starts under every condition.
     ///
     /// Each policy and condition is a stage `evaluate` with the subject `[policy, condition]`; its metrics are
-    /// `success_rate`, `successes` and `episodes` (those that count).
+    /// `success_rate`, `successes` and `episodes` (the number of episodes that count).
     ///
     /// # Errors
-    /// When the request contradicts itself or names something unknown, a policy or an environment fails, or the run is
-    /// stopped.
+    /// When the request is invalid or names an unknown environment, dataset, policy or factor, a policy or an
+    /// environment fails, or the run is stopped.
     #[allow(clippy::too_many_lines, reason = "one loop over conditions and policies, which share all state")]
     pub fn run(&self, resolver: &dyn Resolver, options: &RunOptions, control: &mut Control<'_>) -> Result<Results> {
         self.check()?;
@@ -118,7 +119,7 @@ impl EvalRequest {
         if let Some(reader) = &dataset {
             manifest.hashes.insert("dataset".to_owned(), reader.content_hash()?);
         }
-        // Policies that do not exist or do not fit fail before the first episode.
+        // Makes every policy once, so that a policy that does not exist or does not fit fails before the first episode.
         for policy in request.policies.iter().filter(|policy| policy.kind != PolicyKind::Random) {
             resolver.policy(policy, &world)?;
         }
@@ -233,7 +234,7 @@ impl EvalRequest {
     /// Adds the provenance of a policy to the manifest.
     fn record_provenance(&self, manifest: &mut Manifest, policy: &PolicyRequest, resolved: &ResolvedPolicy) {
         if let Some(weights) = &resolved.weights {
-            // Two policies are the random-policy floor and one other policy.
+            // The random-policy floor has no weights, so at most one of two policies has weights.
             let single = self.policies.len() <= 2;
             let key = if single { "weights".to_owned() } else { format!("weights of {}", policy.name) };
             manifest.hashes.insert(key, weights.clone());

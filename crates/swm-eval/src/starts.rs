@@ -32,7 +32,7 @@ struct Rows {
     goal_offset: usize,
     /// The start row and the goal row of every pick, alternating.
     rows: Batch,
-    /// The methods that set a state of an environment which columns cannot restore.
+    /// The methods that set the part of an environment's state that columns cannot restore.
     calls: Vec<Callable>,
 }
 
@@ -59,11 +59,11 @@ impl Starts {
     /// The dataset protocol (of DINO-WM and LeWM): each pick `[episode, step]` of a dataset is a start, and the
     /// observation `goal_offset` steps later in the same episode is its goal, which is therefore reachable.
     ///
-    /// Factors are those of the recorded episode, except those that `variation` samples or pins, which applies a shift
-    /// to recorded starts.
+    /// Factors have the values of the recorded episode, except the factors that `variation` samples or pins. Such a
+    /// `variation` applies a shift to recorded starts.
     ///
-    /// `env` is one of the environments to be played; `calls` are the methods that set a state of `env` which columns
-    /// cannot restore.
+    /// `env` is one of the environments to be played; `calls` are the methods that set the part of its state that
+    /// columns cannot restore.
     ///
     /// # Errors
     /// When there is no pick, a pick or its goal lies outside its episode, the dataset lacks columns that the
@@ -113,7 +113,8 @@ impl Starts {
         Self::choose_among(reader, &all, n, goal_offset, seed)
     }
 
-    /// As [`Starts::choose`], among these episodes only, such as the episodes of a held-out [`swm_data::Split`].
+    /// Chooses starts as [`Starts::choose`] does, but only in `episodes`, such as those of a held-out
+    /// [`swm_data::Split`].
     ///
     /// # Errors
     /// When the episodes have fewer than `n` starts, or an episode does not exist.
@@ -137,7 +138,7 @@ impl Starts {
             return Err(Error::config(
                 "number of evaluation starts",
                 format!(
-                    "{n}, but the dataset's {} episodes have {total} steps that are followed by {goal_offset} others",
+                    "{n}, but the dataset's {} episodes have {total} steps with a goal {goal_offset} steps later",
                     episodes.len()
                 ),
                 "ask for fewer, lower the goal offset, or collect more episodes",
@@ -248,7 +249,7 @@ fn unshifted(columns: Vec<String>, env: &dyn Env, variation: &VariationRequest) 
     Ok(columns.into_iter().filter(|name| !shifted.contains(&flat(name))).collect())
 }
 
-/// Renames columns to their flat names, which environments expect for every format.
+/// Renames columns to their flat names, because environments expect flat names for every dataset format.
 fn renamed(rows: Batch) -> Result<Batch> {
     let columns: Vec<ColumnSpec> =
         rows.schema().columns().iter().map(|c| ColumnSpec { name: flat(&c.name), ..c.clone() }).collect();

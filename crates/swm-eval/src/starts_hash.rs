@@ -47,10 +47,10 @@ impl StartsHash {
         Ok(())
     }
 
-    /// The BLAKE3 hashes for a manifest: `starts`, and `goals` where the environment has goal columns.
+    /// The BLAKE3 hashes for a manifest: `starts`, and `goals` if the environment has goal columns.
     pub fn hashes(&self) -> BTreeMap<String, String> {
-        let both = [("starts", &self.starts), ("goals", &self.goals)];
-        let present = both.into_iter().filter(|(_, bytes)| !bytes.is_empty());
+        let named = [("starts", &self.starts), ("goals", &self.goals)];
+        let present = named.into_iter().filter(|(_, bytes)| !bytes.is_empty());
         present.map(|(name, bytes)| (name.to_owned(), manifest::hash(bytes))).collect()
     }
 }

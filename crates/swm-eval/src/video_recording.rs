@@ -4,14 +4,15 @@ use std::path::{Path, PathBuf};
 use swm_core::columns::{GOAL, PIXELS};
 use swm_core::{EnvPool, Error, Result};
 
-/// Options of the videos of the first episodes: the agent on the left, its goal on the right.
+/// Options of the videos of the first episodes. A video has the frame of the agent on the left and the frame of the
+/// goal on the right.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Videos {
     /// The folder of the results file; paths in results are relative to it.
     pub root: PathBuf,
     /// The prefix of the file names, below `root`: `videos/random` gives `videos/random-0.mp4`.
     pub prefix: String,
-    /// The number of episodes.
+    /// The number of recorded episodes.
     pub count: usize,
     /// Frames per second; there is one frame for each step.
     pub fps: u32,
@@ -20,7 +21,7 @@ pub struct Videos {
 /// The side length that small frames are enlarged to, in pixels.
 const MIN_SIDE: usize = 256;
 
-/// Collects the frames of the first episodes and writes them as videos in the end.
+/// Collects the frames of the first episodes and writes them as videos after the evaluation.
 pub(crate) struct VideoRecording {
     videos: Videos,
     /// The `(height, width)` of a frame, in pixels.

@@ -1,6 +1,6 @@
 //! [`World`]: a pool of environments of one kind and the loop that plays a policy in them.
 //!
-//! Collecting and evaluating implement [`Play`], which selects the episodes and consumes their steps.
+//! Collections and evaluations implement [`Play`], which selects the episodes and consumes their steps.
 
 use crate::seeding::{episode_key, reset};
 use std::collections::BTreeMap;
@@ -74,7 +74,7 @@ impl World {
         Ok(Self { pool, actions })
     }
 
-    /// The environments.
+    /// The pool of environments.
     pub fn pool(&self) -> &EnvPool {
         &self.pool
     }
@@ -125,7 +125,7 @@ impl World {
         self.pool.step(&self.actions, active)
     }
 
-    /// The environments, for changes between steps.
+    /// The pool of environments, for changes between steps.
     pub(crate) fn pool_mut(&mut self) -> &mut EnvPool {
         &mut self.pool
     }

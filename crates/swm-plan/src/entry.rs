@@ -18,7 +18,7 @@ pub struct SolverEntry {
     pub family: Family,
     /// The kind of actions that the solver plans.
     pub actions: ActionKind,
-    /// The capabilities that it requires of a model in addition to a cost.
+    /// The capabilities that the solver requires of a model in addition to a cost.
     pub needs: &'static [Need],
     /// The publication of the algorithm.
     pub paper: &'static str,
@@ -72,8 +72,8 @@ impl SolverEntry {
     pub fn obstacle(&self, actions: ActionKind, offers: &[Need]) -> Option<String> {
         if self.actions != actions {
             return Some(match actions {
-                ActionKind::Continuous => "it plans discrete actions; these are continuous".to_owned(),
-                ActionKind::Discrete => "it plans continuous actions; these are discrete".to_owned(),
+                ActionKind::Continuous => "it plans discrete actions; the given actions are continuous".to_owned(),
+                ActionKind::Discrete => "it plans continuous actions; the given actions are discrete".to_owned(),
             });
         }
         if let Some(need) = self.needs.iter().find(|need| !offers.contains(need)) {
@@ -111,12 +111,12 @@ impl Need {
     }
 }
 
-/// The default settings of a solver, as JSON: [`SolverEntry::defaults`].
+/// Returns the default settings of a solver as JSON, for [`SolverEntry::defaults`].
 pub fn defaults<S: Default + Serialize>() -> serde_json::Value {
     serde_json::to_value(S::default()).unwrap_or_default()
 }
 
-/// Makes a solver from JSON settings: [`SolverEntry::make`].
+/// Creates a solver from JSON settings, for [`SolverEntry::make`].
 ///
 /// # Errors
 /// When a setting is unknown or has the wrong type.

@@ -23,8 +23,8 @@ pub enum Score {
     Terminal,
     /// The sum of the distances after every environment step.
     Running,
-    /// For a candidate that reaches the goal, minus the fraction of steps that remain then (0 at most); otherwise the
-    /// distance to the goal at the end.
+    /// For a candidate that succeeds, minus the fraction of its steps after the first success (from -1 to 0); for any
+    /// other candidate, the distance to the goal at the end.
     Reach,
 }
 
@@ -34,7 +34,7 @@ pub struct SimulatorCost {
     id: String,
     codec: ActionCodec,
     score: Score,
-    /// Snapshots of the environments passed to `observe_env` since they were last observed, by slot.
+    /// Snapshots of the environments passed to `observe_env`, by slot; `observe` removes them.
     received: Vec<Option<Snapshot>>,
     /// Snapshots of the environments to plan from.
     present: Vec<Snapshot>,
@@ -52,8 +52,8 @@ struct Simulator {
 const GROUP: usize = 8;
 
 impl SimulatorCost {
-    /// A model of the environments that `make` creates, such as [`swm_core::EnvChoice::env`]. Scale and block are those
-    /// of the policy; [`ActionScale::unscaled`] fits any simulator.
+    /// Creates a model of the environments that `make` creates, such as [`swm_core::EnvChoice::env`]. `scale` and
+    /// `action_block` must be the policy's; [`ActionScale::unscaled`] is a valid scale for every environment.
     ///
     /// # Errors
     /// When the scale does not fit the environment, a model step has no action, or `make` fails.

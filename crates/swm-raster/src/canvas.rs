@@ -14,13 +14,13 @@ use std::ops::Range;
 pub enum Target<'a> {
     /// Red, green and blue, `[height, width, 3]`.
     Rgb(&'a mut [u8]),
-    /// Depth along the camera's direction, `[height, width]`.
+    /// Depth along the camera's direction, in the scene's unit of length, `[height, width]`.
     Depth(&'a mut [f32]),
-    /// Labels of geoms, `[height, width]`; -1 where there is none.
+    /// Labels of geoms, `[height, width]`; -1 for pixels without a labelled geom.
     Labels(&'a mut [i32]),
 }
 
-/// Draws scenes. One canvas serves any scenes and sizes; after the first frames of a kind, it does not allocate.
+/// Draws scenes of any content and size. After the first frames of a scene, the canvas does not allocate memory.
 ///
 /// A sample takes 8 bytes in each layer that a frame needs (main, mirrored, transparent), and 8 bytes for each of at
 /// most 4 views with cached static geometry. A texel of a shadow map takes 8 bytes as well.
@@ -39,8 +39,8 @@ impl Canvas {
         Self::default()
     }
 
-    /// Sets the number of threads of the next frames: the calling thread and others of its `rayon` pool. Frames with
-    /// too little work are not split; the bytes of a frame do not depend on the number.
+    /// Sets the number of threads of the next frames: the calling thread and further threads of its `rayon` pool.
+    /// Frames with too little work are not split; the bytes of a frame do not depend on the number of threads.
     pub fn set_threads(&mut self, threads: usize) {
         self.threads = threads;
     }
@@ -48,8 +48,9 @@ impl Canvas {
     /// Draws a scene at `width` × `height` pixels, colours with 1, 2 or 4 samples per pixel. As on graphics cards,
     /// labels are sampled at the centre of every pixel and depths at its first sample.
     ///
-    /// Invalid input draws nothing and never panics: targets that are too small stay unchanged, and geoms with
-    /// unknown assets or values that are not finite are left out. A camera with such values gives an empty frame.
+    /// Invalid input draws nothing and never panics: targets that are too small stay unchanged, and geoms with unknown
+    /// assets or values that are not finite are left out. A camera with values that are not finite gives an empty
+    /// frame.
     pub fn draw(
         &mut self,
         scene: &Scene,
@@ -61,7 +62,7 @@ impl Canvas {
         let view = View::of(&scene.camera, width, height);
         let size = match &target {
             Target::Rgb(bytes) => bytes.len() / 3,
-            Target::Depth(metres) => metres.len(),
+            Target::Depth(depths) => depths.len(),
             Target::Labels(labels) => labels.len(),
         };
         if width == 0 || height == 0 || width > 1 << 14 || height > 1 << 14 || size < width * height {
@@ -70,7 +71,7 @@ impl Canvas {
         if !is_valid(&view) {
             match target {
                 Target::Rgb(bytes) => bytes.fill(0),
-                Target::Depth(metres) => metres.fill(scene.camera.far),
+                Target::Depth(depths) => depths.fill(scene.camera.far),
                 Target::Labels(labels) => labels.fill(-1),
             }
             return;
@@ -85,7 +86,7 @@ impl Canvas {
         self.paint(&frame, target);
     }
 
-    /// Draws a frame in the strips it was split into.
+    /// Draws a frame in the strips of `self.split`.
     fn paint(&mut self, frame: &Frame<'_>, target: Target<'_>) {
         let &Frame { scene, assets, view, .. } = frame;
         let opaque = |geom: usize| !is_transparent(scene, geom, view);
@@ -123,9 +124,9 @@ impl Canvas {
                     strip.write_colours(frame, lights, unshaded, bytes);
                 });
             }
-            Target::Depth(metres) => for_each_strip(strips, ends, 0, (metres, view.width), &|strip, rows, metres| {
+            Target::Depth(depths) => for_each_strip(strips, ends, 0, (depths, view.width), &|strip, rows, depths| {
                 strip.draw_geoms(frame, rows, opaque);
-                strip.write_depths(frame, metres);
+                strip.write_depths(frame, depths);
             }),
             Target::Labels(labels) => for_each_strip(strips, ends, 0, (labels, view.width), &|strip, rows, labels| {
                 strip.draw_geoms(frame, rows, |geom| scene.geoms[geom].label.is_some());
@@ -211,7 +212,7 @@ fn cast_shadows(
     }
 }
 
-/// Whether a camera's values are finite and make a frame.
+/// Whether a camera's values are finite and its frame has a positive size.
 fn is_valid(view: &View) -> bool {
     let values = [view.position, view.right, view.up, view.forward];
     let density = view.pixels_per_unit[0] * view.pixels_per_unit[1];
@@ -252,9 +253,9 @@ mod tests {
         #[test]
         fn strips_equal_the_whole_frame(scene in scene()) {
             let mut canvas = Canvas::new();
-            let whole = draw_in_strips(&mut canvas, &scene, &[150]);
+            let unsplit = draw_in_strips(&mut canvas, &scene, &[150]);
             for ends in [&[64, 150][..], &[128, 150], &[64, 128, 150], &[150]] {
-                prop_assert_eq!(&draw_in_strips(&mut canvas, &scene, ends), &whole, "{:?}", ends);
+                prop_assert_eq!(&draw_in_strips(&mut canvas, &scene, ends), &unsplit, "{:?}", ends);
             }
         }
     }

@@ -1,6 +1,6 @@
-//! Ray casting: where a row of rays enters a shape, and the surface there.
+//! Ray casting: the points at which a row of rays enters a shape, and the surface at these points.
 //!
-//! Shapes are scaled to unit size ([`PosedShape`]), so that few kernels serve all. The kernels are loops without
+//! Shapes are scaled to unit size ([`PosedShape`]), so that a few kernels suffice. The kernels are loops without
 //! branches over the rays of a row. Rays begin near the shape and not at the camera, because rounding would lose
 //! small shapes far away.
 
@@ -29,7 +29,7 @@ const SMALLEST: f32 = 1e-6;
 
 /// A shape of unit size, and the rays of a view in its coordinates.
 ///
-/// The ray of pixel (x, y) passes depth `depth` at `position + (x - base[0]) * positions[0] + (y - base[1]) *
+/// The ray of pixel (x, y) reaches depth `depth` at `position + (x - base[0]) * positions[0] + (y - base[1]) *
 /// positions[1]`; its direction is the same sum of `direction` and `directions`.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct PosedShape {
@@ -45,8 +45,9 @@ pub(crate) struct PosedShape {
     pub directions: [V3; 2],
 }
 
-/// The rays through a row of pixels. At `x` pixels from the left and `y` from the upper edge of the row, a ray passes
-/// the depth of its [`PosedShape`] at `position + x * positions[0] + y * positions[1]`; directions likewise.
+/// The rays through a row of pixels. At `x` pixels from the left and `y` from the upper edge of the row, a ray reaches
+/// the depth of its [`PosedShape`] at `position + x * positions[0] + y * positions[1]`; its direction is the same sum
+/// of `direction` and `directions`.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Row {
     base: f32,
@@ -102,7 +103,7 @@ impl PosedShape {
         let (unit, sizes) = geom.shape.unit()?;
         let rays = view.rays();
         let ([x, y, w], depth) = view.project(geom.position);
-        // The pixel and depth near the shape, clamped to the frame where the shape is behind the camera.
+        // The pixel and depth near the shape, clamped to the frame if the shape is behind the camera.
         let inside = |at: f32, most: usize| {
             let most = most as f32;
             if at.is_finite() { at.clamp(0.0, most) } else { 0.5 * most }
@@ -144,7 +145,7 @@ impl PosedShape {
         }
     }
 
-    /// Writes the shape as `id` to the samples where it is the nearest.
+    /// Writes the shape as `id` to the samples in which it is the nearest shape.
     pub fn enter(&self, row: &Row, id: u32, samples: Samples<'_>) {
         let Samples { at: [x, y], floor, depths, ids } = samples;
         match self.unit {
@@ -160,9 +161,9 @@ impl PosedShape {
         Rectangle(halves, self.near - self.depth)
     }
 
-    /// Computes the visible surface at pixel positions: depths relative to that of the pose, unit coordinates, and
-    /// normals in unit coordinates, which are not normalised. Rays that miss the shape get the nearest point of its
-    /// outline.
+    /// Computes the visible surface at pixel positions: depths relative to the depth of the pose, unit coordinates, and
+    /// normals in unit coordinates, which are not normalised. Rays that miss the shape get the nearest point of the
+    /// shape's outline.
     pub fn surface(
         &self,
         x: &[f32],
@@ -209,7 +210,7 @@ impl PosedShape {
     }
 }
 
-/// Returns `x`, or a small value where `x` is too close to 0 for a division.
+/// Returns `x`, or a small value if `x` is too close to 0 for a division.
 #[inline(always)]
 fn nonzero(x: f32) -> f32 {
     if x.abs() > 1e-12 { x } else { 1e-12 }
@@ -254,7 +255,8 @@ trait Solid {
     /// Returns the ray parameter of the entry, and whether the ray hits.
     fn enter(&self, ray: Ray) -> (f32, bool);
 
-    /// Returns the ray parameter of the entry, or of the closest approach for a miss, with position and normal there.
+    /// Returns the ray parameter of the entry, or of the closest approach for a miss, and the position and normal
+    /// at this parameter.
     fn surface(&self, ray: Ray) -> (f32, V3, V3);
 }
 
@@ -276,9 +278,9 @@ impl Solid for Rectangle {
     #[inline(always)]
     fn surface(&self, Ray { p, d }: Ray) -> (f32, V3, V3) {
         // A pixel whose centre lies past the horizon or the edge takes a point far away on the plane.
-        let way = -p[2] / nonzero(d[2]);
-        let way = if way > self.1 { way } else { 1e6 };
-        (way, [p[0] + way * d[0], p[1] + way * d[1], 0.0], [0.0, 0.0, 1.0])
+        let parameter = -p[2] / nonzero(d[2]);
+        let parameter = if parameter > self.1 { parameter } else { 1e6 };
+        (parameter, [p[0] + parameter * d[0], p[1] + parameter * d[1], 0.0], [0.0, 0.0, 1.0])
     }
 }
 
@@ -291,9 +293,9 @@ impl Solid for Sphere {
 
     #[inline(always)]
     fn surface(&self, ray: Ray) -> (f32, V3, V3) {
-        let (way, _) = ball(ray, 0.0);
-        let at = add(ray.p, scale(ray.d, way));
-        (way, at, at)
+        let (parameter, _) = ball(ray, 0.0);
+        let at = add(ray.p, scale(ray.d, parameter));
+        (parameter, at, at)
     }
 }
 
@@ -313,13 +315,13 @@ impl Solid for Capsule {
     #[inline(always)]
     fn surface(&self, ray: Ray) -> (f32, V3, V3) {
         let (hit, is_hit) = self.enter(ray);
-        // For a miss: the point closest to the axis or to the nearer end.
+        // A ray that misses gets the point closest to the axis or to the nearer end.
         let (body, _, _) = tube(ray);
         let end = (ray.p[2] + body * ray.d[2]).clamp(-self.0, self.0);
         let (rim, _) = ball(ray, end);
-        let way = if is_hit { hit } else { rim };
-        let at = add(ray.p, scale(ray.d, way));
-        (way, at, [at[0], at[1], at[2] - at[2].clamp(-self.0, self.0)])
+        let parameter = if is_hit { hit } else { rim };
+        let at = add(ray.p, scale(ray.d, parameter));
+        (parameter, at, [at[0], at[1], at[2] - at[2].clamp(-self.0, self.0)])
     }
 }
 
@@ -336,11 +338,11 @@ impl Solid for Cylinder {
     fn surface(&self, ray: Ray) -> (f32, V3, V3) {
         let (enter, _, _) = tube(ray);
         let (low, _) = slab(ray.p[2], ray.d[2]);
-        let way = enter.max(low);
-        let at = add(ray.p, scale(ray.d, way));
+        let parameter = enter.max(low);
+        let at = add(ray.p, scale(ray.d, parameter));
         let end = low > enter;
         let up = if ray.d[2] > 0.0 { -1.0 } else { 1.0 };
-        (way, at, [if end { 0.0 } else { at[0] }, if end { 0.0 } else { at[1] }, if end { up } else { 0.0 }])
+        (parameter, at, [if end { 0.0 } else { at[0] }, if end { 0.0 } else { at[1] }, if end { up } else { 0.0 }])
     }
 }
 
@@ -355,7 +357,7 @@ impl Solid for Cube {
     #[inline(always)]
     fn surface(&self, Ray { p, d }: Ray) -> (f32, V3, V3) {
         let ((a, _), (b, _), (c, _)) = (slab(p[0], d[0]), slab(p[1], d[1]), slab(p[2], d[2]));
-        let way = a.max(b).max(c);
+        let parameter = a.max(b).max(c);
         let against = |d: f32| if d > 0.0 { -1.0 } else { 1.0 };
         let (on_x, on_y) = ((a >= b) & (a >= c), b >= c);
         let normal = [
@@ -363,11 +365,11 @@ impl Solid for Cube {
             if !on_x & on_y { against(d[1]) } else { 0.0 },
             if on_x | on_y { 0.0 } else { against(d[2]) },
         ];
-        (way, [p[0] + way * d[0], p[1] + way * d[1], p[2] + way * d[2]], normal)
+        (parameter, [p[0] + parameter * d[0], p[1] + parameter * d[1], p[2] + parameter * d[2]], normal)
     }
 }
 
-/// Writes a solid to the samples where it is the nearest.
+/// Writes a solid to the samples in which it is the nearest shape.
 #[inline(always)]
 #[allow(clippy::too_many_arguments, reason = "references that do not alias let the compiler vectorise the loops")]
 fn enter(
@@ -383,8 +385,8 @@ fn enter(
     let (row, n) = (*row, depths.len());
     let (x, y, floor, depths, ids) = (&x[..n], &y[..n], &floor[..n], &mut depths[..n], &mut ids[..n]);
     for i in 0..n {
-        let (way, hit) = solid.enter(row.ray(x[i], y[i]));
-        let depth = row.depth + way;
+        let (parameter, hit) = solid.enter(row.ray(x[i], y[i]));
+        let depth = row.depth + parameter;
         let closer = hit & (depth > row.near) & (depth <= depths[i]) & (depth > floor[i]);
         depths[i] = if closer { depth } else { depths[i] };
         ids[i] = if closer { id } else { ids[i] };
@@ -393,7 +395,7 @@ fn enter(
 
 /// Computes the visible surface of a solid at many pixel positions.
 #[inline(always)]
-#[allow(clippy::too_many_arguments, reason = "as above")]
+#[allow(clippy::too_many_arguments, reason = "references that do not alias let the compiler vectorise the loops")]
 fn surfaces(
     solid: &impl Solid,
     pose: &PosedShape,
@@ -411,8 +413,8 @@ fn surfaces(
     let (y, t, px, py, pz) = (&y[..n], &mut t[..n], &mut px[..n], &mut py[..n], &mut pz[..n]);
     let (nx, ny, nz) = (&mut nx[..n], &mut ny[..n], &mut nz[..n]);
     for i in 0..n {
-        let (way, position, normal) = solid.surface(pose.ray(x[i], y[i]));
-        t[i] = way;
+        let (parameter, position, normal) = solid.surface(pose.ray(x[i], y[i]));
+        t[i] = parameter;
         (px[i], py[i], pz[i]) = (position[0], position[1], position[2]);
         (nx[i], ny[i], nz[i]) = (normal[0], normal[1], normal[2]);
     }

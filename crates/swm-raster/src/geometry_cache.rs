@@ -1,10 +1,10 @@
 //! [`GeometryCache`]: caches the depth buffer after the first, static geoms of a scene, so that later frames start
 //! from a copy.
 //!
-//! Scenes list static geometry first (floors and walls, in the order of their bodies), and cameras and lights often
-//! do not move. The depth buffer depends only on the view, the far plane and the sequence of geoms drawn so far.
-//! Where all of these equal the last frame's, bit for bit, drawing continues from the copy and gives the same bytes
-//! as drawing everything.
+//! Scenes list static geometry first (floors and walls, in the order of their bodies), and cameras and lights often do
+//! not move. The depth buffer depends only on the view, the far plane and the sequence of geoms drawn so far. If these
+//! inputs equal, bit for bit, the inputs of the copy, drawing continues from the copy. The frame has the same bytes as
+//! without the cache.
 
 use crate::layers::{Layers, LayersSnapshot};
 use crate::mesh::Mesh;
@@ -12,7 +12,7 @@ use crate::scene::{Assets, Geom, Shape};
 use crate::view::View;
 use std::sync::Arc;
 
-/// Number of cached views; a new one replaces the least recently used. A thread may draw several environments in
+/// Number of cached views; a new view replaces the least recently used view. A thread may draw several environments in
 /// turn, each with its own view.
 const VIEWS: usize = 4;
 
@@ -25,7 +25,7 @@ type Key = [u32; 26];
 /// The properties of a geom that affect the depth buffer, as bits: shape and pose, but not colours.
 type Pose = [u32; 17];
 
-/// The caches of some views.
+/// The caches of up to [`VIEWS`] views.
 #[derive(Default)]
 pub(crate) struct GeometryCache {
     views: Vec<CachedView>,
@@ -42,11 +42,12 @@ struct CachedView {
     poses: Vec<Pose>,
     /// The number of leading geoms that are in the snapshot.
     count: usize,
-    save: LayersSnapshot,
-    /// Consecutive frames that shared more geoms than are cached, and the smallest number they shared.
+    snapshot: LayersSnapshot,
+    /// The number of consecutive frames that shared more leading geoms with the previous frame than are cached.
     waiting: usize,
+    /// The smallest number of leading geoms that these frames shared.
     common: usize,
-    /// The last frame that used this cache.
+    /// The number of the last frame that used this cache.
     used: u64,
 }
 
@@ -62,7 +63,7 @@ pub(crate) struct DrawSettings<'a> {
 }
 
 impl GeometryCache {
-    /// Draws geoms, given with their indices, on started layers, beginning with a cached copy where there is one.
+    /// Draws geoms with their indices on started layers, starting from a cached copy if there is one.
     pub fn draw<'a>(
         &mut self,
         layers: &mut Layers,
@@ -73,9 +74,9 @@ impl GeometryCache {
         let cached = self.cached(key(layers, settings), &settings.assets.meshes);
         let same = cached.update_poses(geoms.clone());
         let keep = cached.cacheable(same);
-        let known = cached.count == keep;
-        if known && keep > 0 {
-            layers.restore(&cached.save);
+        let is_cached = cached.count == keep;
+        if is_cached && keep > 0 {
+            layers.restore(&cached.snapshot);
         } else {
             layers.clear(settings.far);
         }
@@ -83,11 +84,11 @@ impl GeometryCache {
             layers.draw(index, geom, (settings.assets, settings.view), None, settings.casting);
         };
         let (first, rest) = (geoms.clone().take(keep), geoms.skip(keep));
-        if !known {
+        if !is_cached {
             first.for_each(|geom| draw(layers, geom));
             cached.count = keep;
             if keep > 0 {
-                layers.save(&mut cached.save);
+                layers.save(&mut cached.snapshot);
             }
         }
         rest.for_each(|geom| draw(layers, geom));
@@ -95,19 +96,19 @@ impl GeometryCache {
 
     /// Returns the cache of a view, which is empty for a new view.
     fn cached(&mut self, key: Key, meshes: &[Arc<Mesh>]) -> &mut CachedView {
-        let alike = |cached: &CachedView| {
+        let matches = |cached: &CachedView| {
             cached.key == key
                 && cached.meshes.len() == meshes.len()
                 && cached.meshes.iter().zip(meshes).all(|(a, b)| Arc::ptr_eq(a, b))
         };
-        let slot = match self.views.iter().position(alike) {
+        let slot = match self.views.iter().position(matches) {
             Some(slot) => slot,
             None => {
                 let slot = match self.views.len() {
                     VIEWS => (0..VIEWS).min_by_key(|&slot| self.views[slot].used).unwrap_or(0),
-                    room => {
+                    count => {
                         self.views.push(CachedView::default());
-                        room
+                        count
                     }
                 };
                 let cached = &mut self.views[slot];
@@ -126,7 +127,7 @@ impl GeometryCache {
 }
 
 impl CachedView {
-    /// Stores the poses of a frame's geoms. Returns how many of the first geoms equal those of the last frame.
+    /// Stores the poses of a frame's geoms. Returns the number of leading geoms that equal those of the last frame.
     fn update_poses<'a>(&mut self, geoms: impl Iterator<Item = (u32, &'a Geom)>) -> usize {
         let (mut same, mut count) = (None, 0);
         for (slot, (index, geom)) in geoms.enumerate() {
@@ -148,8 +149,8 @@ impl CachedView {
         same.unwrap_or(count)
     }
 
-    /// Returns how many of the first geoms to cache when `same` of them did not change: the cache shrinks at once and
-    /// grows only after [`FRAMES_BEFORE_GROWTH`] frames.
+    /// Returns the number of leading geoms to cache, given that `same` leading geoms did not change. The cache shrinks
+    /// at once and grows only after [`FRAMES_BEFORE_GROWTH`] frames.
     fn cacheable(&mut self, same: usize) -> usize {
         if same <= self.count || self.count == 0 {
             self.waiting = 0;
@@ -165,7 +166,7 @@ impl CachedView {
     }
 }
 
-/// Collects words into an array.
+/// Collects the first `N` words into an array.
 fn bits<const N: usize>(values: impl IntoIterator<Item = u32>) -> [u32; N] {
     let mut values = values.into_iter();
     std::array::from_fn(|_| values.next().unwrap_or_default())

@@ -1,8 +1,8 @@
 //! A CPU renderer of small frames of simple 3-D scenes.
 //!
 //! A [`Scene`] holds planes, ellipsoids, capsules, cylinders, boxes and meshes with materials, lights and a camera.
-//! [`Assets`] hold textures and meshes, prepared once. A [`Canvas`] draws them: anti-aliased colours, depths, or
-//! labels.
+//! [`Assets`] hold textures and meshes, prepared once. A [`Canvas`] draws scenes: anti-aliased colours, depths,
+//! or labels.
 //!
 //! ```
 //! use swm_raster::{Assets, Camera, Canvas, Geom, IDENTITY, Scene, Shape, Target};
@@ -35,17 +35,18 @@
 //!
 //! **Method.** In small frames the triangles of a finely divided sphere would be smaller than pixels. So primitives are
 //! ray cast, a row of rays at a time (`cast`), and only meshes are rasterised, at the coarsest detail level whose
-//! difference is not visible (`mesh`). Both write a depth buffer (`layers`). Shading runs once per pixel and geom, for
-//! many fragments at a time (`paint`). Shadow maps are drawn in the same way from the light (`shadow`).
+//! difference is not visible (`mesh`). Primitives and meshes share one depth buffer (`layers`). Shading runs once per
+//! pixel and geom, for many fragments at a time (`paint`). Shadow maps are drawn in the same way from the light
+//! (`shadow`).
 //!
-//! **Model.** The fixed pipeline of OpenGL as MuJoCo uses it, including where lighting is interpolated (planes and
-//! boxes) and how textures are filtered. Frames equal those of MuJoCo's renderer except at some edges.
+//! **Model.** The fixed pipeline of OpenGL as MuJoCo uses it, including the interpolated lighting of planes and
+//! boxes and the filtering of textures. Frames equal those of MuJoCo's renderer except at some edges.
 //!
 //! **Threads.** A large frame is split into strips of rows (`split`), one thread each (`strip`), while other threads
 //! draw shadow maps.
 //!
 //! **Caches.** Static geometry is drawn once per view; later frames begin with a copy of its depth buffer
-//! (`geometry_cache`). The same holds for shadow maps. The sky is looked up once per camera direction (`sky`).
+//! (`geometry_cache`). Shadow maps are cached in the same way. The sky is looked up once per camera direction (`sky`).
 //!
 //! **Determinism.** The bytes of a frame depend on the scene alone, not on the number of threads nor on earlier
 //! frames. Arithmetic is single precision without fused operations.

@@ -35,15 +35,15 @@ pub(crate) struct Material {
 
 impl ShadingLight {
     pub fn new(light: &Light) -> Self {
-        // OpenGL ignores angles between 90 and 180 degrees; a cutoff above 90 stands for a light in all directions.
-        let everywhere = light.directional || light.cutoff > 90.0;
+        // OpenGL ignores angles between 90 and 180 degrees; a cutoff above 90 means a light in all directions.
+        let omnidirectional = light.directional || light.cutoff > 90.0;
         Self {
             directional: light.directional,
             position: light.position,
             direction: unit(light.direction),
             attenuation: light.attenuation,
-            edge: if everywhere { -2.0 } else { light.cutoff.to_radians().cos() },
-            exponent: if everywhere { 0.0 } else { light.exponent },
+            edge: if omnidirectional { -2.0 } else { light.cutoff.to_radians().cos() },
+            exponent: if omnidirectional { 0.0 } else { light.exponent },
             ambient: light.ambient,
             diffuse: light.diffuse,
             specular: light.specular,
@@ -53,9 +53,9 @@ impl ShadingLight {
     /// Returns the unit direction from a position to the light.
     #[inline(always)]
     pub fn direction_from(&self, position: V3) -> V3 {
-        let way = sub(self.position, position);
-        let by = 1.0 / dot(way, way).max(1e-20).sqrt();
-        if self.directional { scale(self.direction, -1.0) } else { scale(way, by) }
+        let offset = sub(self.position, position);
+        let by = 1.0 / dot(offset, offset).max(1e-20).sqrt();
+        if self.directional { scale(self.direction, -1.0) } else { scale(offset, by) }
     }
 
     /// Returns the light that a surface reflects to the eye.
@@ -64,9 +64,9 @@ impl ShadingLight {
         let (to, strength) = if DIRECTIONAL {
             (scale(self.direction, -1.0), 1.0)
         } else {
-            let way = sub(self.position, position);
-            let distance = dot(way, way).max(1e-20).sqrt();
-            let to = scale(way, 1.0 / distance);
+            let offset = sub(self.position, position);
+            let distance = dot(offset, offset).max(1e-20).sqrt();
+            let to = scale(offset, 1.0 / distance);
             let [a, b, c] = self.attenuation;
             let fading = 1.0 / (a + distance * (b + distance * c)).max(1e-20);
             let along = -dot(to, self.direction);
@@ -118,15 +118,15 @@ impl Material {
             rgb,
             emission: scale(rgb, geom.emission),
             specular: geom.specular,
-            // OpenGL's limits.
+            // OpenGL limits exponents to this range.
             exponent: (geom.shininess * 128.0).clamp(0.0, 128.0),
         }
     }
 
     /// Returns the colour without any light: emission, and dim ambient light in a scene without lights.
     pub fn base_colour(&self, scene: &Scene) -> V3 {
-        let everywhere = if scene.lights.is_empty() { 0.3 } else { 0.0 };
-        [0, 1, 2].map(|k| self.emission[k] + everywhere * self.rgb[k])
+        let ambient = if scene.lights.is_empty() { 0.3 } else { 0.0 };
+        [0, 1, 2].map(|k| self.emission[k] + ambient * self.rgb[k])
     }
 }
 

@@ -12,8 +12,8 @@ const FINEST: f32 = 512.0;
 /// Cells along the longest side at the coarsest level.
 const COARSEST: f32 = 7.0;
 
-/// Largest ratio of unmatched edges to triangles of a mesh that counts as closed: parts of robots have holes where
-/// the next part begins.
+/// Largest ratio of unmatched edges to triangles of a mesh that counts as closed: meshes of robot parts have holes
+/// at the joints.
 const OPEN: f32 = 0.1;
 
 /// A mesh, prepared once.
@@ -30,7 +30,7 @@ pub struct Mesh {
 /// One detail level.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct DetailLevel {
-    /// Side of the cells whose vertices were merged; 0 for the original.
+    /// Side of the cells whose vertices were merged, in local units; 0 for the mesh without merging.
     pub cell: f32,
     /// Positions of vertices.
     pub positions: Vec<V3>,
@@ -104,7 +104,7 @@ impl Mesh {
         Self { levels, closed, low, high }
     }
 
-    /// Whether the back of its triangles is visible only from inside or through small holes.
+    /// Whether the back sides of the triangles are visible only from inside or through small holes.
     pub(crate) fn is_closed(&self) -> bool {
         self.closed
     }
@@ -143,7 +143,7 @@ impl DetailLevel {
         open as f32 <= OPEN * self.faces.len() as f32
     }
 
-    /// Merges the vertices in each cell of this side into their mean. Normals are merged only with those that point
+    /// Merges the vertices in each cell of side `cell` into their mean. Normals are merged only with normals that point
     /// in a similar direction, so that thin plates keep both sides.
     fn merged(&self, low: V3, cell: f32) -> Self {
         let index = |i: usize| u32::try_from(i).unwrap_or(u32::MAX);
@@ -175,8 +175,8 @@ impl DetailLevel {
                 continue;
             }
             let first = (0..3).min_by_key(|&k| face[k]).unwrap_or(0);
-            let turned = [face[first], face[(first + 1) % 3], face[(first + 2) % 3]];
-            if !seen.insert(turned) {
+            let rotated = [face[first], face[(first + 1) % 3], face[(first + 2) % 3]];
+            if !seen.insert(rotated) {
                 continue;
             }
             new.faces.push(face);
@@ -220,11 +220,14 @@ mod tests {
         let mesh = Mesh::new(triangles);
         let counts: Vec<usize> = mesh.triangles().collect();
         assert_eq!(counts[0], 20_000);
-        assert!(counts.windows(2).all(|pair| pair[1] < pair[0]) && *counts.last().expect("one") < 300, "{counts:?}");
+        assert!(
+            counts.windows(2).all(|pair| pair[1] < pair[0]) && *counts.last().expect("a mesh has a level") < 300,
+            "{counts:?}"
+        );
         assert_eq!(mesh.level_for(0.0), 0);
         assert!(mesh.level_for(100.0) == counts.len() - 1);
-        for number in 0..counts.len() {
-            let level = mesh.level(number);
+        for index in 0..counts.len() {
+            let level = mesh.level(index);
             assert!(level.faces.iter().flatten().all(|&i| (i as usize) < level.positions.len()));
             assert!(level.corners.iter().flatten().all(|&i| (i as usize) < level.normals.len()));
         }

@@ -58,11 +58,11 @@ pub struct Camera {
     pub orthographic: bool,
 }
 
-/// The shape of a geom, around its own origin.
+/// The shape of a geom, relative to the geom's origin.
 #[derive(Clone, Copy, Debug)]
 pub enum Shape {
-    /// A rectangle at z = 0, visible from both sides and more transparent from behind. It is lit at the corners of a
-    /// grid, whose axes are x and y, and colours are interpolated between them.
+    /// A rectangle at z = 0, visible from both sides and more transparent from behind. Light is computed at the corners
+    /// of a grid, whose axes are x and y, and colours are interpolated between them.
     Plane(Axis, Axis),
     /// An ellipsoid with these radii.
     Ellipsoid(V3),
@@ -83,7 +83,7 @@ pub struct Axis {
     pub half: f32,
     /// Width of the first and the last cell.
     pub pad: f32,
-    /// Width of the other cells.
+    /// Width of the inner cells.
     pub step: f32,
     /// Number of cells, at least 1.
     pub cells: usize,
@@ -141,9 +141,9 @@ pub struct Geom {
     pub reflectance: f32,
     /// The texture that multiplies the colour.
     pub paint: Option<Paint>,
-    /// Label in label images; `None` leaves the geom out of them.
+    /// The label; a geom without a label is not drawn in label images.
     pub label: Option<i32>,
-    /// Whether it casts shadows.
+    /// Whether the geom casts shadows.
     pub casts: bool,
 }
 
@@ -152,40 +152,41 @@ pub struct Geom {
 pub struct Paint {
     /// Index of the texture in [`Assets`].
     pub texture: usize,
-    /// How the texture is mapped.
+    /// The mapping of the texture to the geom.
     pub mapping: Mapping,
 }
 
-/// How a texture is mapped to a geom.
+/// The mapping of a texture to a geom.
 #[derive(Clone, Copy, Debug)]
 pub enum Mapping {
-    /// Projected along z: texture coordinates are `scale * (x, y) + offset`.
+    /// A projection along z: texture coordinates are `scale * (x, y) + offset`.
     Flat {
         /// Factor of the local coordinates.
         scale: [f32; 2],
-        /// Added to the product.
+        /// The offset.
         offset: [f32; 2],
     },
-    /// On each side of a box, repeated along both axes.
+    /// The texture on each side of a box, repeated this number of times along each axis.
     Sides([f32; 2]),
     /// A cube texture, by the direction from the geom's origin, with a factor per axis.
     Cube(V3),
-    /// By the texture coordinates of the mesh.
+    /// The texture coordinates of the mesh.
     Own,
 }
 
 /// A light.
 #[derive(Clone, Copy, Debug)]
 pub struct Light {
-    /// Position; for a directional light, where its shadow map is drawn from.
+    /// Position; for a directional light, the position from which its shadow map is drawn.
     pub position: V3,
     /// Direction, a unit vector.
     pub direction: V3,
-    /// Whether all rays are parallel. Otherwise it is a spot light.
+    /// Whether all rays are parallel. A light that is not directional is a spot light.
     pub directional: bool,
     /// Constant, linear and quadratic attenuation with distance, of spot lights.
     pub attenuation: V3,
-    /// Half opening angle of a spot light in degrees, at most 90; above, it shines in all directions.
+    /// Half opening angle of a spot light in degrees, at most 90; a light with a larger angle shines in all
+    /// directions.
     pub cutoff: f32,
     /// Exponent of a spot light's falloff towards its edge.
     pub exponent: f32,
@@ -195,7 +196,7 @@ pub struct Light {
     pub diffuse: V3,
     /// Specular colour.
     pub specular: V3,
-    /// Whether it casts shadows.
+    /// Whether the light casts shadows.
     pub shadows: bool,
 }
 
@@ -204,6 +205,6 @@ pub struct Light {
 pub struct Haze {
     /// Colour.
     pub rgb: V3,
-    /// How far it extends towards the camera, relative to the distance of the sky.
+    /// Extent towards the camera, relative to the distance of the sky.
     pub depth: f32,
 }

@@ -1,7 +1,7 @@
 //! Shadow maps: the depth buffer of the scene, seen from a light.
 //!
-//! A map covers only the geoms that cast shadows, so that it is sharp although it is small. A convex shape shadows
-//! itself only where it faces away from the light; only meshes need a margin against rounding.
+//! A map covers only the geoms that cast shadows, so that a small map is sharp. The parts of a convex
+//! shape that lie in the shape's own shadow face away from the light. So only meshes are tested for their own shadow.
 
 use crate::geometry_cache::{DrawSettings, GeometryCache};
 use crate::layers::{Layers, NOTHING, pattern, touched};
@@ -25,13 +25,13 @@ pub(crate) struct Shadow {
     layers: Layers,
     cache: GeometryCache,
     view: Option<View>,
-    /// By geom: whether it can shadow itself.
+    /// Whether each geom can shadow itself.
     shadows_itself: Vec<bool>,
 }
 
 impl Shadow {
-    /// Draws the map of a light, with at most `side` texels along a side. Geoms nearer to it than `scene.camera.near`
-    /// cast no shadow.
+    /// Draws the map of a light, with at most `side` texels along a side. Geoms nearer to the light than
+    /// `scene.camera.near` cast no shadow.
     #[allow(clippy::too_many_lines, reason = "one setup of the view and its crop")]
     pub fn cast(&mut self, scene: &Scene, assets: &Assets, light: &Light, side: usize) {
         self.view = None;
@@ -48,7 +48,7 @@ impl Shadow {
             return;
         }
         let pixels_per_unit = FINEST as f32 / (2.0 * reach);
-        let whole = View {
+        let full = View {
             position: light.position,
             right: cross(forward, up),
             up,
@@ -65,7 +65,7 @@ impl Shadow {
         let casts = |geom: &Geom| geom.casts && !matches!(geom.shape, Shape::Plane(..));
         let casters = || (0u32..).zip(&scene.geoms).filter(|(_, geom)| casts(geom));
         let mut region = [usize::MAX, usize::MAX, 0, 0];
-        for [x0, y0, x1, y1] in casters().filter_map(|(_, geom)| touched(geom, assets, &whole)) {
+        for [x0, y0, x1, y1] in casters().filter_map(|(_, geom)| touched(geom, assets, &full)) {
             region = [region[0].min(x0), region[1].min(y0), region[2].max(x1), region[3].max(y1)];
         }
         let [x0, y0, x1, y1] = region;
@@ -79,15 +79,15 @@ impl Shadow {
             false => (wide, high),
         };
         let view = View {
-            left: whole.left + x0 as f32 / pixels_per_unit,
-            top: whole.top - y0 as f32 / pixels_per_unit,
+            left: full.left + x0 as f32 / pixels_per_unit,
+            top: full.top - y0 as f32 / pixels_per_unit,
             pixels_per_unit: [
                 pixels_per_unit * width as f32 / wide as f32,
                 pixels_per_unit * height as f32 / high as f32,
             ],
             width,
             height,
-            ..whole
+            ..full
         };
         self.layers.start(width, 0..height, pattern(1));
         self.shadows_itself.clear();
@@ -97,7 +97,7 @@ impl Shadow {
         self.view = Some(view);
     }
 
-    /// Writes 1 where a light reaches positions on the surface of a geom, and 0 in its shadow.
+    /// Writes 1 for positions on the surface of a geom that a light reaches, and 0 for positions in its shadow.
     pub fn write_lit(
         &self,
         geom: u32,
@@ -115,7 +115,8 @@ impl Shadow {
         project(view, positions, &mut texels);
         let [x, y, depths] = &texels;
         for (from, lit) in (0..).step_by(LANES).zip(lit.chunks_mut(LANES)) {
-            // Surfaces that face away are in their own shadow; ambient light passes along edge-on surfaces.
+            // Surfaces that face away from the light are in their own shadow. Edge-on surfaces count as lit, so that
+            // they receive the light's ambient part.
             let (mut cosines, mut count) = ([0.0; LANES], 0);
             for ((cosine, lit), x) in cosines.iter_mut().zip(lit.iter_mut()).zip(&x[from..]) {
                 *cosine = *lit;
@@ -134,7 +135,7 @@ impl Shadow {
         }
     }
 
-    /// Whether something lies between the light and a position on the map.
+    /// Whether a geom lies between the light and a position on the map.
     #[inline]
     fn is_shadowed(&self, view: &View, geom: u32, [x, y, depth]: V3, facing: f32) -> bool {
         let at = self.layers.span(y as usize, x as usize, x as usize).start;
@@ -154,7 +155,7 @@ impl Shadow {
 }
 
 vectorize! {
-    /// Projects positions onto the map. x is -1 outside of it.
+    /// Projects positions onto the map. The x of a position outside the map is -1.
     fn project(view: &View, positions: [&[f32]; 3], texels: &mut [[f32; MANY]; 3]) {
         let n = positions[0].len().min(MANY);
         let [px, py, pz] = positions.map(|lane| &lane[..n]);

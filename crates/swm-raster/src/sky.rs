@@ -9,7 +9,7 @@ use std::ops::Range;
 use std::sync::Arc;
 use swm_simd::vectorize;
 
-/// Distance of the sky relative to the far plane: small enough that the far plane cuts nothing off its cylinder.
+/// Distance of the sky relative to the far plane: small enough that the far plane does not cut the sky's cylinder.
 const DISTANCE: f32 = 0.7;
 
 /// Returns the radius of the sky's cylinder, which is also half its height.
@@ -24,25 +24,27 @@ pub(crate) fn depth(radius: f32, direction: V3) -> f32 {
     radius / (x * x + y * y).sqrt().max(z.abs()).max(1e-12)
 }
 
-/// The colours of the sky in the last frame. The sky does not move with the camera's position, so they stay valid
-/// until the camera turns.
+/// The colours of the sky in the last frame. The sky does not depend on the camera's position, so its colours
+/// stay valid until the camera turns.
 #[derive(Default)]
 pub(crate) struct SkyCache {
     /// The texture, and the rays along which it was looked up for `colours`.
     source: Option<(Arc<Texture>, V3, [V3; 2])>,
     width: usize,
     rows: Range<usize>,
-    /// Red, green and blue of pixels. `known` is set for the rows that were looked up.
+    /// Red, green and blue of pixels.
     colours: [Vec<f32>; 3],
+    /// Whether the colours of each row were looked up.
     known: Vec<bool>,
     sampler: Sampler,
-    /// Scratch: the uncovered part of each pixel of a row, and the depth of the sky there.
+    /// Scratch: the uncovered part of each pixel of a row.
     open: Vec<f32>,
+    /// Scratch: the depth of the sky at each pixel of a row.
     far: Vec<f32>,
 }
 
 impl SkyCache {
-    /// Draws the sky where nothing covers it, and black elsewhere, in the rows of the layers.
+    /// Writes the colours of the sky in the rows of the layers, weighted by the uncovered part of each pixel.
     pub fn paint(
         &mut self,
         scene: &Scene,
@@ -97,20 +99,20 @@ impl SkyCache {
     }
 }
 
-/// Looks up the sky's colours along the rays of a row: direction of the first ray, and its change to the right and
-/// down.
+/// Looks up the sky's colours along the rays of a row. `row` is the direction of the first ray; `right` and `down` are
+/// its changes per pixel.
 fn look_up(texture: &Texture, sampler: &mut Sampler, row: V3, [right, down]: [V3; 2], [r, g, b]: [&mut [f32]; 3]) {
     // The texture's y axis points upwards.
     let turn = |[x, y, z]: V3| [x, z, -y];
     let (row, right, down) = (turn(row), turn(right), turn(down));
     let ([mut s, mut t, mut texels_per_pixel], mut faces) = ([[0.0; MANY]; 3], [0; MANY]);
     for from in (0..r.len()).step_by(MANY) {
-        let part = from..r.len().min(from + MANY);
-        let n = part.len();
+        let chunk = from..r.len().min(from + MANY);
+        let n = chunk.len();
         find(texture, &row, &right, &down, from, &mut s, &mut t, &mut texels_per_pixel, &mut faces);
         let lookup =
             TextureLookup { s: &s[..n], t: &t[..n], texels_per_pixel: &texels_per_pixel[..n], faces: &faces[..n] };
-        texture.colours(&lookup, sampler, [&mut r[part.clone()], &mut g[part.clone()], &mut b[part]]);
+        texture.colours(&lookup, sampler, [&mut r[chunk.clone()], &mut g[chunk.clone()], &mut b[chunk]]);
     }
 }
 
@@ -176,7 +178,8 @@ vectorize! {
 }
 
 /// Haze above an infinite plane: a cone from a circle on the plane, inside the sky's cylinder, to the cylinder at the
-/// height of the eye. Its opacity is greatest where it crosses the line of sight to the horizon.
+/// height of the eye. The opacity of the cone is greatest at an
+/// intermediate height, `thickest`.
 pub(crate) struct HazeCone {
     rotation: [f32; 9],
     elevation: f32,
@@ -194,7 +197,7 @@ impl HazeCone {
         let normal = [plane.rotation[2], plane.rotation[5], plane.rotation[8]];
         let elevation = dot(sub(eye, plane.position), normal) / radius(scene);
         let inner = haze.depth;
-        // Where a line from an eye at height 1, at 45 degrees, meets the cone.
+        // The relative height at which a line from an eye at height 1, inclined by 45 degrees, meets the cone.
         let alpha = 1f32.atan2(inner);
         let beta = 0.75 * std::f32::consts::PI - alpha;
         let thickest = 0.5f32.sqrt() * inner * alpha.sin() / beta.sin();
@@ -208,13 +211,13 @@ impl HazeCone {
         })
     }
 
-    /// Returns the opacity along a ray, and the depth of the haze there.
+    /// Returns the opacity and the depth of the haze along a ray; `None` if the ray misses the haze.
     #[inline]
     pub fn at(&self, direction: V3) -> Option<(f32, f32)> {
         let local = unrotate(&self.rotation, direction);
         let across = (local[0] * local[0] + local[1] * local[1]).sqrt();
         let slope = local[2] / across.max(1e-12);
-        // Relative height between eye and plane: on the cone, the radius is 1 - inner * part.
+        // The relative drop from the eye (0) to the plane (1); the radius of the cone there is 1 - inner * part.
         let part = slope / (slope * self.inner - self.elevation);
         if !(0.0..=1.0).contains(&part) {
             return None;

@@ -8,9 +8,11 @@ use crate::paint::BAND;
 use crate::scene::Shape;
 use crate::strip::Frame;
 
-/// Estimated work in nanoseconds on one thread: per pixel, per sample of a primitive, per triangle.
+/// Estimated work per pixel, in nanoseconds on one thread.
 const PER_PIXEL: f32 = 30.0;
+/// Estimated work per sample of a primitive, in nanoseconds on one thread.
 const PER_SAMPLE: f32 = 0.6;
+/// Estimated work per triangle, in nanoseconds on one thread.
 const PER_TRIANGLE: f32 = 35.0;
 
 /// The least work for which another thread is used, in nanoseconds.
@@ -19,11 +21,11 @@ const MIN_WORK: f32 = 250_000.0;
 /// The ends of strips, and scratch memory.
 #[derive(Default)]
 pub(crate) struct Split {
-    /// The row after the last one of each strip.
+    /// The row after the last row of each strip.
     pub ends: Vec<usize>,
     /// Whether there is enough work for more than one thread.
     pub parallel: bool,
-    /// By band: its estimated work.
+    /// The estimated work of each band, in nanoseconds.
     work: Vec<f32>,
 }
 
@@ -34,20 +36,20 @@ impl Split {
         self.parallel = false;
         if threads > 1 {
             self.estimate(frame);
-            let whole: f32 = self.work.iter().sum();
-            let strips = threads.min((whole / MIN_WORK) as usize);
+            let total: f32 = self.work.iter().sum();
+            let strips = threads.min((total / MIN_WORK) as usize);
             self.parallel = strips > 1;
-            self.cut_into(strips, whole);
+            self.cut_into(strips, total);
         }
         self.ends.push(frame.view.height);
     }
 
     /// Splits the bands into at most `strips` strips of equal work.
-    fn cut_into(&mut self, strips: usize, whole: f32) {
+    fn cut_into(&mut self, strips: usize, total: f32) {
         let mut done = 0.0;
         for (band, work) in self.work.iter().enumerate() {
-            // A band belongs to the strip that contains the middle of the work done up to it.
-            let share = whole * (self.ends.len() + 1) as f32 / strips as f32;
+            // A band belongs to the strip that contains the middle of the band's work.
+            let share = total * (self.ends.len() + 1) as f32 / strips as f32;
             if band > 0 && self.ends.len() + 1 < strips && done + 0.5 * work > share {
                 self.ends.push(band * BAND);
             }

@@ -44,30 +44,30 @@ const BACK_OPACITY: f32 = 0.3;
 
 impl Strip {
     /// Draws the selected geoms into the depth buffer of some rows.
-    pub fn draw_geoms(&mut self, frame: &Frame<'_>, rows: Range<usize>, counts: impl Fn(usize) -> bool) {
+    pub fn draw_geoms(&mut self, frame: &Frame<'_>, rows: Range<usize>, selected: impl Fn(usize) -> bool) {
         let Frame { scene, assets, view, pattern } = *frame;
         self.main.start(view.width, rows, pattern);
-        let geoms = (0u32..).zip(&scene.geoms).filter(|(index, _)| counts(*index as usize));
+        let geoms = (0u32..).zip(&scene.geoms).filter(|(index, _)| selected(*index as usize));
         let settings = DrawSettings { assets, view, far: scene.camera.far, casting: false };
         self.cache.draw(&mut self.main, settings, geoms);
     }
 
-    /// Writes depths; where nothing was drawn, that of the sky or the far plane.
-    pub fn write_depths(&self, &Frame { scene, view, .. }: &Frame<'_>, metres: &mut [f32]) {
+    /// Writes depths, limited to the depth of the sky or of the far plane.
+    pub fn write_depths(&self, &Frame { scene, view, .. }: &Frame<'_>, target_depths: &mut [f32]) {
         let (rays, radius) = (view.rays(), sky::radius(scene));
         let [dx, dy] = self.main.pattern[0];
-        for (y, metres) in self.main.rows.clone().zip(metres.chunks_exact_mut(view.width)) {
+        for (y, target_depths) in self.main.rows.clone().zip(target_depths.chunks_exact_mut(view.width)) {
             let row = add(rays.direction, scale(rays.directions[1], y as f32 + dy));
-            for (x, (metre, &depth)) in
-                metres.iter_mut().zip(&self.main.depths[self.main.span(y, 0, view.width)]).enumerate()
+            for (x, (target, &depth)) in
+                target_depths.iter_mut().zip(&self.main.depths[self.main.span(y, 0, view.width)]).enumerate()
             {
                 let direction = add(row, scale(rays.directions[0], x as f32 + dx));
-                *metre = if scene.sky.is_some() { depth.min(sky::depth(radius, direction)) } else { depth };
+                *target = if scene.sky.is_some() { depth.min(sky::depth(radius, direction)) } else { depth };
             }
         }
     }
 
-    /// Writes labels.
+    /// Writes the labels of the visible geoms; -1 for pixels without a labelled geom.
     pub fn write_labels(&self, &Frame { scene, view, .. }: &Frame<'_>, labels: &mut [i32]) {
         for (y, labels) in self.main.rows.clone().zip(labels.chunks_exact_mut(view.width)) {
             for (label, &id) in labels.iter_mut().zip(&self.main.ids[self.main.span(y, 0, view.width)]) {
@@ -79,7 +79,7 @@ impl Strip {
         }
     }
 
-    /// Writes colours. `unshaded` are the lights without shadows, for mirrored and transparent geoms.
+    /// Writes colours. `unshaded` are all lights without their shadows, for mirrored and transparent geoms.
     pub fn write_colours(&mut self, frame: &Frame<'_>, lights: Lighting<'_>, unshaded: Lighting<'_>, bytes: &mut [u8]) {
         let Frame { scene, assets, view, .. } = *frame;
         self.painter.start(scene.geoms.len());
@@ -93,8 +93,8 @@ impl Strip {
         }
         let Self { main, painter, colours, .. } = self;
         let context = ShadingContext { scene, assets, view, lights, dimmed: 1.0 };
-        let whole = [0, 0, view.width, view.height];
-        painter.paint(main, &context, whole, |pixels, part, light| add_part(colours, pixels, part, light));
+        let full = [0, 0, view.width, view.height];
+        painter.paint(main, &context, full, |pixels, part, light| add_part(colours, pixels, part, light));
         draw_haze(scene, view, main, colours);
         self.draw_transparent(frame, unshaded);
         let [r, g, b] = &self.colours;
@@ -122,7 +122,7 @@ impl Strip {
         let Self { main, mirror, painter, colours, .. } = self;
         mirror.start(view.width, main.rows.clone(), main.pattern);
         mirror.ids.fill(NOTHING);
-        // Only the pixels of the mirror, and only what lies in front of it.
+        // Restricts drawing to the pixels of the mirror and to geoms in front of the mirror.
         let own = u32::try_from(index).unwrap_or(NOTHING);
         select_mirror(own, scene.camera.far, &main.ids, &mut mirror.depths);
         let mut visible = [usize::MAX, usize::MAX, 0, 0];
@@ -133,7 +133,7 @@ impl Strip {
             }
         }
         let visible = intersection(visible, region);
-        // Mirrored lights on mirrored geoms give the same light as the originals.
+        // Only the view is mirrored: mirroring geoms and lights together does not change the lighting.
         let context = ShadingContext { scene, assets, view: &mirrored, lights, dimmed: geom.reflectance };
         painter.paint(mirror, &context, visible, |pixels, part, light| add_part(colours, pixels, part, light));
     }
@@ -147,8 +147,8 @@ impl Strip {
                 Shape::Plane(..) => 1e10,
                 shape => {
                     let (_, halves) = shape.bounds();
-                    let way = sub(geom.position, view.position);
-                    dot(way, way).sqrt() - dot(halves, halves).sqrt()
+                    let offset = sub(geom.position, view.position);
+                    dot(offset, offset).sqrt() - dot(halves, halves).sqrt()
                 }
             };
             transparent_geoms.push((distance, index));
@@ -163,7 +163,7 @@ impl Strip {
         for &(_, index) in transparent_geoms.iter().chain(transparent_geoms.iter().rev()) {
             let geom = &scene.geoms[index];
             let Some(region) = touched(geom, assets, view) else { continue };
-            let [x0, y0, x1, y1] = main.part(region);
+            let [x0, y0, x1, y1] = main.clip_to_rows(region);
             for row in (y0..y1).map(|y| main.span(y, x0, x1)) {
                 transparent.depths[row.clone()].copy_from_slice(&main.depths[row.clone()]);
                 transparent.ids[row].fill(NOTHING);
@@ -200,7 +200,7 @@ fn union(a: Region, b: Region) -> Region {
     [a[0].min(b[0]), a[1].min(b[1]), a[2].max(b[2]), a[3].max(b[3])]
 }
 
-/// Returns the intersection of two regions; it is empty where they lie apart.
+/// Returns the intersection of two regions; it is empty if they do not overlap.
 fn intersection(a: Region, b: Region) -> Region {
     let [x, y] = [a[0].max(b[0]), a[1].max(b[1])];
     [x, y, a[2].min(b[2]).max(x), a[3].min(b[3]).max(y)]
@@ -220,7 +220,7 @@ pub(crate) fn is_transparent(scene: &Scene, index: usize, view: &View) -> bool {
 
 /// Draws haze over the sky and the far ends of planes.
 fn draw_haze(scene: &Scene, view: &View, main: &Layers, colours: &mut [Vec<f32>; 3]) {
-    let Some(veil) =
+    let Some(cone) =
         scene.haze.filter(|_| scene.sky.is_some()).and_then(|haze| HazeCone::new(scene, &haze, view.position))
     else {
         return;
@@ -230,18 +230,18 @@ fn draw_haze(scene: &Scene, view: &View, main: &Layers, colours: &mut [Vec<f32>;
     for (line, y) in main.rows.clone().enumerate() {
         let row = add(rays.direction, scale(rays.directions[1], y as f32 + 0.5));
         for x in 0..view.width {
-            let Some((opacity, depth)) = veil.at(add(row, scale(rays.directions[0], x as f32 + 0.5))) else { continue };
+            let Some((opacity, depth)) = cone.at(add(row, scale(rays.directions[0], x as f32 + 0.5))) else { continue };
             let open = main.depths[main.span(y, x, x + 1)].iter().filter(|far| **far > depth).count();
-            for (colours, veil) in colours.iter_mut().zip(veil.rgb) {
+            for (colours, haze) in colours.iter_mut().zip(cone.rgb) {
                 let colour = &mut colours[line * view.width + x];
-                *colour = sky::over(veil, opacity * open as f32 * share, *colour);
+                *colour = sky::over(haze, opacity * open as f32 * share, *colour);
             }
         }
     }
 }
 
 vectorize! {
-    /// Sets depths to the far plane where the mirror is visible, and excludes all other samples.
+    /// Sets the depths of samples that show the mirror to the far plane, and excludes all other samples.
     fn select_mirror(own: u32, far: f32, ids: &[u32], depths: &mut [f32]) {
         for (depth, id) in depths.iter_mut().zip(ids) {
             *depth = if *id == own { far } else { f32::NEG_INFINITY };

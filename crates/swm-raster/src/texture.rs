@@ -1,7 +1,7 @@
 //! [`Texture`]: images with mip levels, sampled with trilinear interpolation.
 //!
 //! Mip levels are chosen as in Mesa's software rasteriser, whose frames are the reference: by the larger derivative
-//! of the coordinates, and two levels blend only in the second half of the way from one to the next.
+//! of the coordinates, and two levels blend only in the second half of the interval between them.
 
 use crate::scalar::{nearest, rounded};
 use swm_simd::vectorize;
@@ -53,7 +53,7 @@ fn weighted<const N: usize>(words: [u32; N], weights: [u32; N]) -> u32 {
 }
 
 impl MipLevel {
-    /// Reads an image of 3 or 4 `channels`. `None` where the sizes do not match.
+    /// Reads an image of 3 or 4 `channels`; `None` if the sizes do not match.
     fn new(width: usize, height: usize, channels: usize, bytes: &[u8]) -> Option<Self> {
         let texels = width.checked_mul(height)?;
         // Coordinates are counted in 256ths of texels.
@@ -90,12 +90,12 @@ impl MipLevel {
 }
 
 impl Texture {
-    /// Makes a flat texture of 3 or 4 `channels`. `None` where the sizes do not match.
+    /// Makes a flat texture of 3 or 4 `channels`; `None` if the sizes do not match.
     pub fn flat(width: usize, height: usize, channels: usize, bytes: &[u8]) -> Option<Self> {
         Some(Self::new(vec![MipLevel::new(width, height, channels, bytes)?], true))
     }
 
-    /// Makes a cube texture of six square images in sequence, or of one for all faces. `None` where the sizes do not
+    /// Makes a cube texture of six square images in sequence, or of one image for all faces; `None` if the sizes do not
     /// match.
     pub fn cube(side: usize, channels: usize, bytes: &[u8]) -> Option<Self> {
         let face = side.checked_mul(side)?.checked_mul(channels)?;
@@ -147,8 +147,8 @@ impl Texture {
         (change[0] * self.width as f32).max(change[1] * self.height as f32)
     }
 
-    /// Returns the face that a direction meets, the coordinates there, and the texels per pixel. `right` and `down`
-    /// are the change of the direction to the neighbouring pixels. The faces are those of OpenGL's table.
+    /// Returns the face that a direction meets, the coordinates on this face, and the texels per pixel. `right` and
+    /// `down` are the change of the direction to the neighbouring pixels. The faces are those of OpenGL's table.
     #[inline(always)]
     pub(crate) fn face_in(&self, d: [f32; 3], right: [f32; 3], down: [f32; 3]) -> (u32, [f32; 2], f32) {
         let [x, y, z] = [d[0].abs(), d[1].abs(), d[2].abs()];
@@ -215,7 +215,7 @@ impl Texture {
         [r[0], g[0], b[0]]
     }
 
-    /// Returns two neighbouring texels of two rows.
+    /// Returns four texels: two neighbours at `at`, and the two texels below them.
     #[inline(always)]
     fn four(&self, at: usize, stride: usize) -> [u32; 4] {
         let two = |at: usize| self.texels.get(at..at + 2).map_or([0; 2], |two| [two[0], two[1]]);
@@ -231,18 +231,22 @@ pub(crate) struct Sampler {
     next: LevelSample,
 }
 
-/// Samples of one mip level each.
+/// Texture samples, each of one mip level.
 struct LevelSample {
     s: [f32; MANY],
     t: [f32; MANY],
     faces: [u32; MANY],
-    /// The mip level, and the weight of the next one in 256ths.
+    /// The mip level.
     levels: [u32; MANY],
+    /// The weight of the next mip level, in 256ths.
     shares: [u32; MANY],
-    /// The upper left of four texels, counted from the border, and the position between their centres in 256ths.
+    /// The index of the upper left of four texels, within the level and its border.
     indices: [u32; MANY],
+    /// The number of texels per row of the level, including its border.
     strides: [u32; MANY],
+    /// The horizontal position between the centres of the four texels, in 256ths.
     right: [u32; MANY],
+    /// The vertical position between the centres of the four texels, in 256ths.
     below: [u32; MANY],
     four: [[u32; MANY]; 4],
     words: [u32; MANY],
@@ -281,11 +285,11 @@ impl LevelSample {
         between(&right[..n], &below[..n], a, b, c, d, words);
     }
 
-    /// Blends in the next mip levels where they have weight.
+    /// Blends every sample with the next mip level, if this level has weight.
     fn mix(&mut self, next: &mut Self, texture: &Texture, n: usize) {
         let (mut count, mut from) = (0, [0; MANY]);
         for i in 0..n {
-            // Always written, and counted only if it has weight.
+            // The entry is always written, but counted only if the next level has weight.
             (next.s[count], next.t[count], next.faces[count]) = (self.s[i], self.t[i], self.faces[i]);
             (next.levels[count], from[count]) = (self.levels[i] + 1, i);
             count += usize::from(self.shares[i] > 0);
@@ -304,11 +308,11 @@ vectorize! {
         let (s, t, texels_per_pixel) = (&s[..n], &t[..n], &texels_per_pixel[..n]);
         let LevelSample { s: inside_s, t: inside_t, levels, shares, .. } = level;
         let last = texture.levels.len() as i32 - 1;
-        let whole = |x: f32| {
-            let part = x - rounded(x);
-            let part = if part < 0.0 { part + 1.0 } else { part };
+        let wrap = |x: f32| {
+            let fraction = x - rounded(x);
+            let fraction = if fraction < 0.0 { fraction + 1.0 } else { fraction };
             // NaN, and values too large to have a fraction, become 0.
-            if part <= 1.0 { part } else { 0.0 }
+            if fraction <= 1.0 { fraction } else { 0.0 }
         };
         for i in 0..n {
             // 3.5 / sqrt(8): one texel per pixel still gives the finest level.
@@ -319,7 +323,7 @@ vectorize! {
             // Within a few 256ths of a level, that level alone is used.
             levels[i] = (exponent.min(last) + i32::from(between > 240.0)) as u32;
             shares[i] = nearest(if (between > 16.0) & (between <= 240.0) { between } else { 0.0 });
-            (inside_s[i], inside_t[i]) = (whole(s[i]), whole(t[i]));
+            (inside_s[i], inside_t[i]) = (wrap(s[i]), wrap(t[i]));
         }
     }
 
@@ -332,7 +336,7 @@ vectorize! {
         let (s, t, levels) = (&s[..n], &t[..n], &levels[..n]);
         for i in 0..n {
             let (w, h) = ((width >> levels[i]).max(1), (height >> levels[i]).max(1));
-            // In 256ths, from the centre of the first texel of the border.
+            // Coordinates in 256ths of a texel, from the centre of the first texel of the border.
             let x = nearest(s[i] * (256 * w) as i32 as f32) + 128;
             let y = nearest(t[i] * (256 * h) as i32 as f32) + 128;
             strides[i] = w + 2;
@@ -350,7 +354,7 @@ vectorize! {
         let (right, below) = (&right[..n], &below[..n]);
         for i in 0..n {
             let both = right[i] * below[i];
-            // Rounded so that the weights still sum to 256.
+            // The weights are rounded such that they sum to 256.
             let q = (256 * right[i] - both + 128) >> 8;
             let r = (256 * below[i] - both + 128) >> 8;
             let s = (both + 128) >> 8;

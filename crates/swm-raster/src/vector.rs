@@ -30,7 +30,7 @@ pub(crate) fn length(a: V3) -> f32 {
     dot(a, a).sqrt()
 }
 
-/// Returns a vector of length 1, or zero for zero.
+/// Scales a vector to length 1; the zero vector stays zero.
 pub(crate) fn unit(a: V3) -> V3 {
     let length = length(a);
     if length > 0.0 { scale(a, 1.0 / length) } else { [0.0; 3] }

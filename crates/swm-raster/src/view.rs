@@ -13,10 +13,11 @@ pub(crate) struct View {
     pub right: V3,
     pub up: V3,
     pub forward: V3,
-    /// Left and upper edge of the frame at depth 1, or at any depth of an orthographic view.
+    /// Left edge of the frame at depth 1, or at any depth of an orthographic view.
     pub left: f32,
+    /// Upper edge of the frame at depth 1, or at any depth of an orthographic view.
     pub top: f32,
-    /// Pixels per unit there.
+    /// Pixels per unit of length at depth 1 (at any depth of an orthographic view), along x and y.
     pub pixels_per_unit: [f32; 2],
     pub near: f32,
     pub orthographic: bool,
@@ -26,8 +27,8 @@ pub(crate) struct View {
     pub mirrored: bool,
 }
 
-/// A bundle of rays. The ray of pixel coordinates (x, y) starts at `origin + x * origins[0] + y * origins[1]`;
-/// directions likewise.
+/// The rays of a view. The ray of pixel coordinates (x, y) starts at `origin + x * origins[0] + y * origins[1]`; its
+/// direction is the same sum of `direction` and `directions`.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Rays {
     pub origin: V3,
@@ -91,8 +92,8 @@ impl View {
         }
     }
 
-    /// Projects a position: pixel coordinates times `w` and `w`, and the depth. `w` is the depth, or 1 in an
-    /// orthographic view.
+    /// Projects a position. Returns `[x * w, y * w, w]` for the pixel coordinates (x, y), and the depth. `w` is the
+    /// depth, or 1 in an orthographic view.
     #[inline(always)]
     pub fn project(&self, position: V3) -> (V3, f32) {
         let from = sub(position, self.position);
@@ -109,8 +110,8 @@ impl View {
         if self.orthographic { pixels_per_unit } else { pixels_per_unit / depth.max(self.near) }
     }
 
-    /// Returns the region of pixels that a box can touch, or `None` when it is out of sight. The box is given by its
-    /// centre and the vectors from there to three of its sides.
+    /// Returns the region of pixels that a box can touch, or `None` if it is out of sight. The box is given by its
+    /// centre `middle` and the vectors from the centre to the centres of three sides.
     pub fn touched(&self, middle: V3, halves: [V3; 3]) -> Option<[usize; 4]> {
         let mut bounds = [f32::INFINITY, f32::INFINITY, f32::NEG_INFINITY, f32::NEG_INFINITY];
         let (mut behind, mut before) = (false, false);

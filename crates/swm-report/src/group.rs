@@ -63,11 +63,11 @@ impl<'a> Group<'a> {
                     "random" => "floor".to_owned(),
                     "expert" => "expert".to_owned(),
                     name => {
-                        let known = learned.iter().position(|&other| other == name).unwrap_or_else(|| {
+                        let colour = learned.iter().position(|&other| other == name).unwrap_or_else(|| {
                             learned.push(name);
                             learned.len() - 1
                         });
-                        format!("c{}", known % COLOURS)
+                        format!("c{}", colour % COLOURS)
                     }
                 };
                 let rows = &mut conditions[at].rows;

@@ -1,11 +1,13 @@
 //! One self-contained HTML page from result files: tables, charts, videos and provenance.
 //!
-//! [`read_results`] reads a results file of an evaluation, [`write_report`] turns any number of them into a page without
-//! scripts, network access or other files, so it can be mailed, archived and printed. Equal results give equal bytes.
+//! [`read_results`] reads a results file of an evaluation. [`write_report`] writes a page of any number of results. The
+//! page needs no scripts, network access or other files, so it can be mailed, archived and printed. Equal results give
+//! equal bytes.
 //!
-//! - `page` writes the page; `sections` has a file for each section; `charts` has a file for each chart, drawn with the SVG
-//!   primitives of `charts/svg.rs`; `style.css` is the style sheet.
-//! - `group` groups runs by environment, protocol and counting; `read` reads files; `text` formats numbers and escapes text.
+//! - `page` writes the page; `sections` has a file for each section; `charts` has a file for each chart, drawn with the
+//!   SVG primitives of `charts/svg.rs`; `style.css` is the style sheet.
+//! - `group` groups runs by environment, protocol and counting; `read` reads files; `text` formats numbers and escapes
+//!   text.
 
 mod charts;
 mod group;

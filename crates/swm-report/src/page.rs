@@ -16,14 +16,14 @@ const STYLE: &str = include_str!("style.css");
 pub struct ReportOptions {
     /// The title; by default, it contains the environments' ids.
     pub title: Option<String>,
-    /// A training log (`train.jsonl`) whose metrics are shown.
+    /// The training log (`train.jsonl`) whose metrics the page shows.
     pub metrics: Option<PathBuf>,
     /// The command that reproduces the results; by default, the command in the manifest, if there is one.
     pub command: Option<String>,
 }
 
-/// Writes the page of these result files to `out_dir/index.html` and returns its path. Paths of videos are relative to
-/// their results file.
+/// Writes a page of results to `out_dir/index.html` and returns the path of the page. `results` are pairs of a results
+/// file and its content; paths of videos are relative to the folder of the results file.
 ///
 /// # Errors
 /// When there are no results, or the page cannot be written.
@@ -31,7 +31,7 @@ pub fn write_report(results: &[(PathBuf, Results)], out_dir: &Path) -> Result<Pa
     write_report_with(results, &ReportOptions::default(), out_dir)
 }
 
-/// As [`write_report`], with a title, training metrics, or a command.
+/// Writes a page as [`write_report`] does, with a title, training metrics, or a command.
 ///
 /// # Errors
 /// As [`write_report`], and when the training log cannot be read.

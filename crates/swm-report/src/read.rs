@@ -81,11 +81,11 @@ pub struct Series {
     pub points: Vec<(f64, f64)>,
 }
 
-/// Reads a `train.jsonl`: one JSON object per line, of which every number is a metric. An incomplete last line, left by an
-/// interrupted training, is ignored.
+/// Reads a `train.jsonl`: one JSON object per line. Every number in an object is a metric. An incomplete last line,
+/// left by an interrupted training, is ignored.
 ///
 /// # Errors
-/// When the file cannot be read or another line is not a JSON object.
+/// When the file cannot be read or a complete line is not a JSON object.
 pub fn read_metrics(path: &Path) -> Result<Metrics> {
     let text = std::fs::read_to_string(path).map_err(|source| Error::io(path, "reading metrics", source))?;
     let lines: Vec<&str> = text.lines().collect();

@@ -55,7 +55,7 @@ pub(crate) fn p_value(p: f64) -> String {
     if p < 0.001 { "p\u{a0}<\u{a0}0.001".to_owned() } else { format!("p\u{a0}=\u{a0}{p:.3}") }
 }
 
-/// A number with about four significant digits and no trailing zeros.
+/// Formats a number with about four significant digits and no trailing zeros.
 pub(crate) fn number(value: f64) -> String {
     let size = value.abs();
     if !value.is_finite() {

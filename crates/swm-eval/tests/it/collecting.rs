@@ -57,55 +57,55 @@ fn row_holds_an_observation_and_the_following_step() {
     for (number, episode) in memory.episodes.lock().expect("no thread has panicked").iter().enumerate() {
         assert_eq!(*episode.schema(), schema);
         let last = episode.rows() - 1;
-        let state = episode.get::<f64>("state").expect("state");
-        let goal = episode.get::<f64>("goal_state").expect("goal")[0];
-        let action = episode.get::<f32>("action").expect("action");
-        let reward = episode.get::<f32>("reward").expect("reward");
-        let terminated = episode.get::<u8>("terminated").expect("terminated");
-        let success = episode.get::<u8>("success").expect("success");
+        let state = episode.get::<f64>("state").expect("the column of states");
+        let goal = episode.get::<f64>("goal_state").expect("the column of goals")[0];
+        let action = episode.get::<f32>("action").expect("the column of actions");
+        let reward = episode.get::<f32>("reward").expect("the column of rewards");
+        let terminated = episode.get::<u8>("terminated").expect("the column of terminations");
+        let success = episode.get::<u8>("success").expect("the column of successes");
         for t in 0..last {
             assert!((state[t] + f64::from(action[t]) - state[t + 1]).abs() < 1e-6, "the action leads to the next row");
-            assert_eq!(reward[t], -(state[t + 1] - goal).abs() as f32, "the reward is that of the step");
+            assert_eq!(reward[t], -(state[t + 1] - goal).abs() as f32, "the reward belongs to the step");
             assert_eq!(terminated[t], u8::from(t + 1 == last));
             assert_eq!(success[t + 1], terminated[t]);
         }
         assert!(action[last].is_nan());
         assert_eq!((reward[last], terminated[last]), (0.0, 0));
         let seed = Key::new(11).with("episode").at(number as u64).seed() >> 1;
-        for elements in episode.get::<i32>("episode_seed").expect("seed").chunks_exact(3) {
-            let together = elements.iter().rev().fold(0u64, |high, &element| high << 21 | element as u64);
-            assert_eq!(together, seed);
+        for elements in episode.get::<i32>("episode_seed").expect("the column of seeds").chunks_exact(3) {
+            let joined = elements.iter().rev().fold(0u64, |high, &element| high << 21 | element as u64);
+            assert_eq!(joined, seed);
             assert!(
                 elements.iter().all(|&element| element as f32 as i32 == element),
                 "float32 represents the element exactly"
             );
         }
-        let start = episode.get::<f32>("variation.agent.x").expect("factor");
+        let start = episode.get::<f32>("variation.agent.x").expect("the column of the factor");
         assert!(start.iter().all(|&x| f64::from(x) == state[0]), "constant, and equal to the initial position");
-        let color = episode.get::<u8>("variation.agent.color").expect("factor");
-        assert_eq!(color[..2], episode.get::<u8>("pixels").expect("pixels")[..2]);
+        let color = episode.get::<u8>("variation.agent.color").expect("the column of the factor");
+        assert_eq!(color[..2], episode.get::<u8>("pixels").expect("the column of frames")[..2]);
     }
-    let column = |name: &str| schema.column(name).expect("column").clone();
+    let column = |name: &str| schema.column(name).expect("the column exists").clone();
     assert_eq!(column("variation.goal.x").dtype, DType::Float64);
     assert!(schema.find("goal").is_none() && schema.find("step_idx").is_none());
 }
 
 #[test]
-fn resumed_collection_equals_uninterrupted_one() {
+fn resumed_collection_equals_uninterrupted_collection() {
     let complete = Memory::default();
     collect(4, 2, 15, &complete).expect("the collection succeeds");
-    let parts = Memory::default();
-    collect(3, 1, 4, &parts).expect("the first collection succeeds");
-    let second = collect(2, 2, 15, &parts).expect("the second collection succeeds");
+    let resumed = Memory::default();
+    collect(3, 1, 4, &resumed).expect("the first collection succeeds");
+    let second = collect(2, 2, 15, &resumed).expect("the second collection succeeds");
     assert_eq!((second.episodes, second.added), (15, 11));
-    assert!(parts.bytes() == complete.bytes());
-    assert_eq!(collect(2, 2, 15, &parts).expect("no episodes to add").added, 0);
-    assert_eq!(parts.len(), 15);
+    assert!(resumed.bytes() == complete.bytes());
+    assert_eq!(collect(2, 2, 15, &resumed).expect("no episodes to add").added, 0);
+    assert_eq!(resumed.len(), 15);
 }
 
 #[test]
 fn interruption_keeps_finished_episodes() {
-    let (complete, part) = (Memory::default(), Memory::default());
+    let (complete, interrupted) = (Memory::default(), Memory::default());
     collect(4, 1, 30, &complete).expect("the collection succeeds");
     let stop = Arc::new(AtomicBool::new(false));
     let mut world = world(4, 1);
@@ -117,15 +117,15 @@ fn interruption_keeps_finished_episodes() {
             stop.store(progress.done >= 6, Ordering::Relaxed);
         }
     });
-    let outcome = world.collect(&mut policy, part.writer(), &config(30), &mut control);
+    let outcome = world.collect(&mut policy, interrupted.writer(), &config(30), &mut control);
     drop(control);
     assert!(matches!(outcome, Err(Error::Interrupted)), "{outcome:?}");
-    assert_eq!(*part.finished.lock().expect("no thread has panicked"), 1, "`finish` was called");
-    assert_eq!(reported, part.len(), "the reported episodes are stored");
-    assert!((6..30).contains(&part.len()));
-    assert!(complete.bytes().starts_with(&part.bytes()));
-    collect(2, 1, 30, &part).expect("the resumed collection succeeds");
-    assert!(part.bytes() == complete.bytes());
+    assert_eq!(*interrupted.finished.lock().expect("no thread has panicked"), 1, "`finish` was called");
+    assert_eq!(reported, interrupted.len(), "the reported episodes are stored");
+    assert!((6..30).contains(&interrupted.len()));
+    assert!(complete.bytes().starts_with(&interrupted.bytes()));
+    collect(2, 1, 30, &interrupted).expect("the resumed collection succeeds");
+    assert!(interrupted.bytes() == complete.bytes());
 }
 
 /// A policy that fails after `remaining` steps.

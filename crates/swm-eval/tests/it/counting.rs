@@ -72,7 +72,7 @@ fn compat_counting_plays_solved_starts_and_reports_the_strict_rate() {
 }
 
 #[test]
-fn episodic_compat_counting_counts_the_first_to_finish() {
+fn episodic_compat_counting_counts_the_first_finished_episodes() {
     let all = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
     let play = |envs, threads| -> Run {
         let starts = Starts::sequential(20, 100, all.clone()).expect("valid starts");

@@ -48,7 +48,7 @@ fn solved_starts_are_counted_separately() {
         assert_eq!(episode.solved_at_start, episode.steps == 0);
         assert!(!(episode.solved_at_start && episode.success));
     }
-    let time = found.time_to_goal.expect("successes");
+    let time = found.time_to_goal.expect("some episodes succeed");
     assert!((1.0..=6.0).contains(&time.median), "{time:?}");
 }
 
@@ -227,7 +227,10 @@ fn recorded_factors_apply_unless_they_are_shifted() {
     };
     let range = swm_data::StepRange { episode: picks[0][0], start: 0, length: 1 };
     let row = reader.read(&["variation.agent.color"], &[range]).expect("a row");
-    assert_eq!(color(VariationRequest::default()), row.get::<u8>("variation.agent.color").expect("colour")[..2]);
+    assert_eq!(
+        color(VariationRequest::default()),
+        row.get::<u8>("variation.agent.color").expect("the column of colours")[..2]
+    );
     let green = VariationRequest {
         variation: None,
         variation_values: [("agent.color".to_owned(), vec![1.0, 254.0, 0.0])].into(),
@@ -254,7 +257,8 @@ fn errors_name_invalid_requests() {
     let config = EvalConfig { videos: Some(videos), ..EvalConfig::default() };
     let starts = Starts::episodic(1, 0, VariationRequest::default()).expect("valid starts");
     let mut world = World::new(&ENTRY, no_frames).expect("a valid world");
-    let error = world.evaluate(&mut Walker, &starts, &config, &mut Control::default()).expect_err("no frames");
+    let error =
+        world.evaluate(&mut Walker, &starts, &config, &mut Control::default()).expect_err("a world without frames");
     assert!(matches!(error, Error::Config { .. }), "{error}");
 }
 

@@ -1,4 +1,4 @@
-//! An environment small enough to compute by hand: a point on a line that has to reach a goal.
+//! An environment whose outcomes can be computed by hand: a point on a line that has to reach a goal.
 
 use rand::Rng as _;
 use swm_core::policy::write_action;
@@ -38,7 +38,7 @@ impl Line {
             ],
             &["agent.x", "goal.x"],
         );
-        let factors = variation_space.resolve(&Default::default(), Key::new(0)).expect("defaults");
+        let factors = variation_space.resolve(&Default::default(), Key::new(0)).expect("the default factors are valid");
         let spec = EnvSpec {
             id: ENTRY.id.to_owned(),
             action_space: Space::uniform_box([1], DType::Float32, -1.0, 1.0),

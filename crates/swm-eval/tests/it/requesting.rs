@@ -91,13 +91,14 @@ fn run(request: &EvalRequest, envs: usize, threads: usize) -> Results {
     request.run(&TestResolver::new(), &options, &mut Control::new()).expect("the evaluation succeeds")
 }
 
-fn again(old: &Results, known: &TestResolver) -> Result<swm_eval::Reproduction> {
-    reproduce(old, known, &RunOptions { envs: 3, threads: 2, ..RunOptions::default() }, &mut Control::new())
+fn repeat(old: &Results, resolver: &TestResolver) -> Result<swm_eval::Reproduction> {
+    reproduce(old, resolver, &RunOptions { envs: 3, threads: 2, ..RunOptions::default() }, &mut Control::new())
 }
 
 /// Serialises results to JSON and back.
 fn round_trip(results: &Results) -> Results {
-    serde_json::from_str(&serde_json::to_string_pretty(results).expect("valid JSON")).expect("results")
+    serde_json::from_str(&serde_json::to_string_pretty(results).expect("valid JSON"))
+        .expect("the JSON contains results")
 }
 
 fn without_timing(mut results: Results) -> String {
@@ -170,7 +171,7 @@ fn results_do_not_depend_on_run_options() {
 
 #[test]
 fn held_out_starts_come_from_held_out_episodes() {
-    let known = TestResolver::new();
+    let resolver = TestResolver::new();
     let mut hashes = vec![];
     for part in [Part::Train, Part::Validation, Part::Test] {
         let request = EvalRequest { starts: held_out(part), ..request() };
@@ -180,7 +181,7 @@ fn held_out_starts_come_from_held_out_episodes() {
         let split = Split { validation: 0.3, test: 0.3, seed: 1 };
         for episode in &found.runs[1].episodes {
             let [position, _] = episode.start.expect("a start");
-            assert_eq!(split.part(known.data.episodes()[position].index), part);
+            assert_eq!(split.part(resolver.data.episodes()[position].index), part);
         }
         hashes.push(found.manifest.hashes["starts"].clone());
     }
@@ -190,14 +191,14 @@ fn held_out_starts_come_from_held_out_episodes() {
     let empty = HeldOut { part: Part::Test, split: Split { test: 0.0, ..Split::default() } };
     let starts = StartsRequest::Dataset { dataset: "line".to_owned(), goal_offset: 3, held_out: Some(empty) };
     let error = EvalRequest { starts, ..request() }
-        .run(&known, &RunOptions::default(), &mut Control::new())
+        .run(&resolver, &RunOptions::default(), &mut Control::new())
         .expect_err("the split has no episodes");
     assert!(error.to_string().contains("the test split") && error.to_string().contains("60 episodes"), "{error}");
 }
 
 #[test]
 fn results_can_be_reproduced() {
-    let known = TestResolver::new();
+    let resolver = TestResolver::new();
     let mut requests = vec![request(); 2];
     requests[1].starts = held_out(Part::Test);
     requests[1].counting = Counting::Compat { envs: 2 };
@@ -206,7 +207,7 @@ fn results_can_be_reproduced() {
         let mut expected = request.clone();
         expected.policies.insert(0, PolicyRequest { name: "random".to_owned(), kind: PolicyKind::Random });
         assert_eq!(EvalRequest::of(&first.manifest).expect("a valid request"), expected, "the request with the floor");
-        let second = again(&first, &known).expect("the reproduction succeeds");
+        let second = repeat(&first, &resolver).expect("the reproduction succeeds");
         assert_eq!(second.differences, []);
         assert!(second.holds());
     }
@@ -227,7 +228,7 @@ fn prediction_errors_are_grouped_by_the_outcome_of_the_episode() {
         let grouped: usize = prediction.groups[1..].iter().map(|group| group.trajectory.n).sum();
         assert_eq!((prediction.groups[0].trajectory.n, grouped), (24, run.success.n));
     }
-    assert_eq!(again(&round_trip(&found), &TestResolver::new()).expect("the reproduction succeeds").differences, []);
+    assert_eq!(repeat(&round_trip(&found), &TestResolver::new()).expect("the reproduction succeeds").differences, []);
     let error = EvalRequest { prediction: Some(2), ..request() }.run(
         &TestResolver::new(),
         &RunOptions::default(),
@@ -238,12 +239,12 @@ fn prediction_errors_are_grouped_by_the_outcome_of_the_episode() {
 
 #[test]
 fn differences_are_listed() {
-    let known = TestResolver::new();
+    let resolver = TestResolver::new();
     let mut first = round_trip(&run(&request(), 4, 1));
     first.runs[3].episodes[7].steps += 1;
     first.manifest.swm_version = "0.0.9".to_owned();
     first.manifest.hashes.insert("goals".to_owned(), "other".to_owned());
-    let second = again(&first, &known).expect("the reproduction succeeds");
+    let second = repeat(&first, &resolver).expect("the reproduction succeeds");
     let listed: Vec<(Kind, &str)> = second.differences.iter().map(|d| (d.kind, d.what.as_str())).collect();
     let expected = [
         (Kind::Version, "stable-worldmodel"),
@@ -279,12 +280,12 @@ fn other_weights_are_rejected_before_the_first_episode() {
 
 #[test]
 fn malformed_requests_are_errors() {
-    let known = TestResolver::new();
+    let resolver = TestResolver::new();
     let first = run(&request(), 4, 1);
     let rejected = |change: &dyn Fn(&mut Results)| {
         let mut old = first.clone();
         change(&mut old);
-        again(&old, &known).map(|_| ()).expect_err("the request is rejected").to_string()
+        repeat(&old, &resolver).map(|_| ()).expect_err("the request is rejected").to_string()
     };
     let message = rejected(&|old| old.manifest.config["version"] = json!(99));
     assert!(message.contains("layout 99; this version reads 1"), "{message}");

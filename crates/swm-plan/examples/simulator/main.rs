@@ -18,14 +18,14 @@ const STARTS: usize = 100;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let part = |i: usize| arguments.get(i).map_or(String::new(), |part| part.to_lowercase());
-    let (env, solver) = (part(0), part(1));
-    let n = arguments.get(2).map_or(Ok(STARTS), |number| number.parse())?;
+    let filter = |i: usize| arguments.get(i).map_or(String::new(), |text| text.to_lowercase());
+    let (env, solver) = (filter(0), filter(1));
+    let n = arguments.get(2).map_or(Ok(STARTS), |text| text.parse())?;
     let changes: Value = arguments.get(3).map_or(Ok(Value::Null), |text| serde_json::from_str(text))?;
     let mut out = std::io::stdout();
     writeln!(
         out,
-        "| environment | starts | solver | solved at start | success | 95 % | steps, median | a plan, median | all |"
+        "| environment | starts | solver | solved at start | success | 95 % | median steps | median time per plan | total time |"
     )?;
     writeln!(out, "| --- | --- | --- | --- | --- | --- | --- | --- | --- |")?;
     for task in rows::TASKS.iter().filter(|task| task.entry.id.to_lowercase().contains(&env)) {

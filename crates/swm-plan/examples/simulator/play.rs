@@ -1,4 +1,5 @@
-//! Plays planners with perfect dynamics. Counting is strict: a start that is already solved is not played.
+//! Plays episodes with planners that have perfect dynamics. Counting is strict: a start that is already solved is not
+//! played.
 
 use rand::seq::index::sample;
 use std::time::Instant;
@@ -28,15 +29,15 @@ pub enum Protocol {
 pub struct Planner {
     /// The solver's id.
     pub solver: &'static str,
-    /// Its settings.
+    /// The settings of the solver.
     pub settings: serde_json::Value,
-    /// Horizons and action block.
+    /// The horizons and the action block.
     pub mpc: MpcConfig,
     /// The cost of a candidate.
     pub score: Score,
 }
 
-/// The result of playing.
+/// The result of playing all starts with one planner.
 pub struct Outcome {
     /// The number of starts that were already solved.
     pub solved_at_start: usize,
@@ -46,7 +47,7 @@ pub struct Outcome {
     pub steps: Option<Summary>,
     /// Seconds per plan, while the plans of other environments are computed on the same cores.
     pub plan: Option<Summary>,
-    /// Seconds in total.
+    /// The total time, in seconds.
     pub seconds: f64,
 }
 

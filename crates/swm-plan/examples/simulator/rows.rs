@@ -21,12 +21,14 @@ pub static TASKS: [Task; 2] = [
 
 pub const SOLVERS: [&str; 3] = ["cem", "icem", "mppi"];
 
-/// Any solver finds a plan with a third of the paper's candidates, scored by the time to the goal.
+/// The settings for `TwoRoom`. A third of the paper's candidates suffices for every solver, because candidates are
+/// scored by the time to the goal.
 fn two_room(_: &str) -> Value {
     json!({ "score": "reach", "solver": { "samples": 100, "iterations": 10, "elites": 10 } })
 }
 
-/// The horizon is the paper's 25 steps, planned individually, so that noise can be coloured along them.
+/// The settings for `PushT`. The horizon is the paper's 25 steps, planned individually, so that noise can be coloured
+/// along these steps.
 ///
 /// The search is hard because most candidates do not touch the block, and those that do rarely push it in the right
 /// direction. Frequent replanning helps every solver more than a long search, because the spread of CEM collapses
@@ -46,13 +48,13 @@ fn push_t(solver: &str) -> Value {
 pub fn planner(task: &Task, solver: &'static str, changes: &Value) -> Result<Planner> {
     let mut settings = (task.settings)(solver);
     merge(&mut settings, changes);
-    let wrong = |error: serde_json::Error| Error::config("settings", error.to_string(), "see the example's rows");
-    let part = |name: &str| settings.get(name).cloned().filter(|value| !value.is_null());
+    let wrong = |error: serde_json::Error| Error::config("settings", error.to_string(), "see `rows.rs` of the example");
+    let section = |name: &str| settings.get(name).cloned().filter(|value| !value.is_null());
     Ok(Planner {
         solver,
-        settings: part("solver").unwrap_or_else(|| json!({})),
-        mpc: part("mpc").map_or(Ok(MpcConfig::default()), |mpc| serde_json::from_value(mpc).map_err(wrong))?,
-        score: part("score").map_or(Ok(Score::default()), |score| serde_json::from_value(score).map_err(wrong))?,
+        settings: section("solver").unwrap_or_else(|| json!({})),
+        mpc: section("mpc").map_or(Ok(MpcConfig::default()), |mpc| serde_json::from_value(mpc).map_err(wrong))?,
+        score: section("score").map_or(Ok(Score::default()), |score| serde_json::from_value(score).map_err(wrong))?,
     })
 }
 

@@ -35,7 +35,7 @@ pub(crate) struct Decoded {
 }
 
 impl ActionCodec {
-    /// The codec of an environment, with `block` actions in a model step.
+    /// Creates the codec of an environment, with `block` actions in a model step.
     ///
     /// # Errors
     /// When the scale does not fit the action space, or actions of this space cannot be planned.
@@ -55,7 +55,7 @@ impl ActionCodec {
                 return Err(Error::config(
                     format!("planning in {}", spec.id),
                     given,
-                    "plan in boxes or among integers",
+                    "choose an environment whose action space is a box or consists of integers",
                 ));
             }
         };
@@ -64,7 +64,7 @@ impl ActionCodec {
         Ok(Self::Discrete { choices: options.repeat(block), start })
     }
 
-    /// The space of a model step of a plan.
+    /// Returns the space of one model step of a plan.
     pub fn space(&self) -> PlanSpace<'_> {
         match self {
             Self::Continuous { low, high, .. } => PlanSpace::Continuous { low, high },
@@ -80,8 +80,8 @@ impl ActionCodec {
         }
     }
 
-    /// Decodes one action from `planned`, `[width]`: a point clipped to its box, or for every integer the option with
-    /// the largest value, the first of equals.
+    /// Decodes one action from `planned`, `[width]`. A point is clipped to its box. An integer is the option with the
+    /// largest value; of several such options, the first.
     pub fn decode<'a>(&self, planned: &[f32], decoded: &'a mut Decoded) -> Action<'a> {
         match self {
             Self::Continuous { scale, bounds, .. } => {
@@ -123,7 +123,7 @@ impl ActionCodec {
     }
 }
 
-/// The index of the largest weight, the first of equals.
+/// Returns the index of the first of the largest weights.
 fn largest(weights: &[f32]) -> usize {
     let best = (0..weights.len()).reduce(|best, i| if weights[i] > weights[best] { i } else { best });
     best.unwrap_or(0)

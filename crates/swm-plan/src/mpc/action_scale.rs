@@ -44,8 +44,8 @@ impl ActionScale {
     /// Checks the scale against an environment.
     ///
     /// # Errors
-    /// When the scale does not have one mean and one standard deviation for each dimension of a box (none for integers), a
-    /// value is not finite, or a standard deviation is not above 0.
+    /// When the scale does not have one mean and one standard deviation for each dimension of a box (none for
+    /// integers), a value is not finite, or a standard deviation is not above 0.
     pub fn check(&self, spec: &EnvSpec) -> Result<()> {
         let dim = scaled_dim(&spec.action_space);
         if self.mean.len() != dim || self.std.len() != dim {
@@ -79,7 +79,7 @@ impl ActionScale {
     }
 }
 
-/// How many dimensions of an action are scaled: all of a box, none of integers.
+/// Returns the number of scaled dimensions of an action: every dimension of a box, 0 for integers.
 fn scaled_dim(space: &Space) -> usize {
     match space {
         Space::Box { low, .. } => low.len(),

@@ -11,19 +11,19 @@ use swm_core::{Error, Result};
 pub struct MpcConfig {
     /// Model steps to plan, H.
     pub horizon: usize,
-    /// Model steps to execute before planning again; the whole horizon is open loop.
+    /// Model steps to execute before planning again; with the value of `horizon`, execution is open loop.
     pub receding_horizon: usize,
     /// Environment steps in one model step (the frameskip the model was trained with). The actions of these steps are
     /// concatenated in a model step's action.
     pub action_block: usize,
-    /// Whether a plan starts from the part of the last plan that was not executed, moved forward and filled with zeros
-    /// (the mean action in model units; no preference among choices).
+    /// Whether the initial guess of a plan is the part of the last plan that was not executed, moved to the first step
+    /// and filled up with zeros (the mean action in model units; no preference among choices).
     pub warm_start: bool,
     /// Model steps the model conditions on, the present one included.
     pub history: usize,
-    /// Seconds after which solvers stop searching and return the best plan so far. The time counts from the observation
-    /// of the present, for all environments that are planned together; the first iteration is always finished. With a
-    /// budget, results depend on the machine's speed and load.
+    /// Seconds after which solvers stop searching and return the best plan so far. One budget covers the encoding of
+    /// the present observation and the search for all environments that are planned together. The first iteration is
+    /// always finished. With a budget, results depend on the machine's speed and load.
     pub latency_budget: Option<f64>,
 }
 
@@ -35,10 +35,10 @@ impl Default for MpcConfig {
 }
 
 impl MpcConfig {
-    /// Checks that the settings fit each other.
+    /// Checks the settings.
     ///
     /// # Errors
-    /// When a count is 0, more would be executed than planned, or the latency budget is not a positive time.
+    /// When a count is 0, the receding horizon exceeds the horizon, or the latency budget is not a positive time.
     pub fn check(&self) -> Result<()> {
         let settings = Settings("MPC");
         settings.at_least_one("horizon", self.horizon)?;
@@ -49,7 +49,7 @@ impl MpcConfig {
             self.receding_horizon <= self.horizon,
             "receding horizon",
             format!("{} model steps to execute, {} planned", self.receding_horizon, self.horizon),
-            "execute at most what is planned",
+            "choose a receding horizon of at most the horizon",
         )?;
         if let Some(seconds) = self.latency_budget.filter(|seconds| !(seconds.is_finite() && *seconds > 0.0)) {
             return Err(Error::config(
@@ -61,7 +61,8 @@ impl MpcConfig {
         Ok(())
     }
 
-    /// The time at which a search that starts now has to stop; none for a budget that exceeds the range of the clock.
+    /// The time at which a search that starts at `now` has to stop; `None` without a budget, or if the budget exceeds
+    /// the range of the clock.
     pub(super) fn deadline(&self, now: Instant) -> Option<Instant> {
         let budget = Duration::try_from_secs_f64(self.latency_budget?).ok()?;
         now.checked_add(budget)

@@ -1,7 +1,7 @@
 //! [`GuardedModel`]: the model as the policy passes it to a solver.
 //!
-//! The wrapper measures the time spent in the model, so that the planner's own time is known, and turns a panic into an
-//! error that names its source.
+//! The wrapper measures the time spent in the model, so that the planner's own time is known, and turns a panic of the
+//! model into an error.
 
 use std::any::Any;
 use std::cell::RefCell;
@@ -11,8 +11,8 @@ use swm_core::{Batch, Candidates, Constrained, CostModel, DifferentiableCost, En
 
 /// Measures the time of a model's methods and converts panics to errors.
 pub(crate) struct GuardedModel<'m> {
-    /// In a cell, because [`LatentDynamics`] and [`Constrained`] return their sizes through shared references, and the
-    /// model gives access to these traits through exclusive references only.
+    /// A cell, because [`LatentDynamics::latent_dim`] and [`Constrained::constraints`] take `&self`, but
+    /// [`CostModel::latent`] and [`CostModel::constrained`] take `&mut self`.
     model: RefCell<&'m mut dyn CostModel>,
     /// Seconds spent in the model.
     pub seconds: f64,
@@ -27,11 +27,11 @@ pub(crate) fn catch_panic<T>(who: &str, doing: &str, work: impl FnOnce() -> Resu
 
 fn message(panic: &(dyn Any + Send)) -> &str {
     let text = panic.downcast_ref::<&str>().copied();
-    text.or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("it left no message")
+    text.or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("the panic has no message")
 }
 
 fn not_offered(what: &str) -> Error {
-    Error::external("calling the model", format!("it returned {what} earlier and returns none now"))
+    Error::external("calling the model", format!("the model offered {what} earlier and no longer does"))
 }
 
 impl<'m> GuardedModel<'m> {

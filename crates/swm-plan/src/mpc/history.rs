@@ -21,9 +21,9 @@ pub(crate) struct History {
 
 struct Infos {
     batch: Batch,
-    /// The index of the frames among the observed columns, if there are any.
+    /// The index of the column of frames; `None` if the observations have no frames.
     pixels: Option<usize>,
-    /// The number of observed columns; the columns of the history follow.
+    /// The number of observed columns. The history's columns follow them.
     observed: usize,
 }
 
@@ -37,7 +37,7 @@ struct Slot {
     present: Vec<u8>,
     /// Past frames, oldest first.
     frames: Vec<u8>,
-    /// Past actions in model units, oldest first; the last block is the one being executed.
+    /// The last `past * action_block` executed actions in model units, oldest first.
     actions: Vec<f32>,
 }
 
@@ -88,7 +88,7 @@ impl History {
         slot.steps += 1;
     }
 
-    /// Returns the observed columns extended by the history, for `slots`; the rows of other slots are stale.
+    /// Returns the observed columns and the history's columns. Only the rows of `slots` are up to date.
     pub fn extend(&mut self, observed: &Batch, slots: &[usize]) -> Result<&Batch> {
         let infos = match &mut self.infos {
             Some(infos) => infos,
@@ -128,11 +128,11 @@ impl Infos {
     }
 }
 
-/// Drops the first `n` items and appends `item`.
-fn shift_in<T: Copy>(items: &mut [T], item: &[T], n: usize) {
+/// Drops the first `n` items and appends the `n` items of `added`.
+fn shift_in<T: Copy>(items: &mut [T], added: &[T], n: usize) {
     if items.len() >= n && n > 0 {
         items.copy_within(n.., 0);
         let end = items.len() - n;
-        items[end..].copy_from_slice(item);
+        items[end..].copy_from_slice(added);
     }
 }

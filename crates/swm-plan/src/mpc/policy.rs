@@ -1,8 +1,8 @@
 //! [`MpcPolicy`]: a policy that plans with a solver and a model.
 //!
-//! Slots that have executed their part of a plan replan together, in one [`Solver::solve`] call; other slots continue
-//! their plans. A plan is keyed by (episode, replan), so the plans of an episode do not depend on its slot or on other
-//! episodes.
+//! Slots that have executed the first `receding_horizon` steps of their plans replan together, in one [`Solver::solve`]
+//! call; other slots continue their plans. A plan is keyed by (episode, replan), so the plans of an episode do not
+//! depend on its slot or on other episodes.
 //!
 //! # Actions
 //! Points of a box are planned in model units ([`ActionScale`]) and clipped to the box when they are executed. Integers
@@ -11,13 +11,13 @@
 //!
 //! # Inputs of the model
 //! [`CostModel::observe_env`] receives the environments that are about to be planned for, [`CostModel::observe`] their
-//! info columns. With `history` above 1 there are these additional columns, oldest step first:
+//! info columns. With `history` above 1, these columns are added, oldest step first:
 //!
 //! | column | shape | |
 //! | --- | --- | --- |
-//! | `history.length` | one `int32` | the number of past model steps that are filled; earlier ones are zero |
-//! | `history.action` | `[history - 1, action_block * action]` `float32` | executed actions, in plan values |
-//! | `history.pixels` | `[history - 1, H, W, 3]` `uint8` | the frame at the beginning of each model step, where there are frames |
+//! | `history.length` | one `int32` | the number of past model steps that are filled; earlier steps are zero |
+//! | `history.action` | `[history - 1, action_block * action_dim]` `float32` | executed actions, in plan values |
+//! | `history.pixels` | `[history - 1, H, W, 3]` `uint8` | the frame at the beginning of each model step, if frames are rendered |
 
 use super::action_codec::{ActionCodec, Decoded};
 use super::action_scale::ActionScale;
@@ -29,7 +29,7 @@ use std::time::Instant;
 use swm_core::{Action, Batch, ColumnSpec, CostModel, EnvPool, EnvSpec, Error, Key, Plan, PlanProblem};
 use swm_core::{Policy, Result, Solver};
 
-/// A policy that plans.
+/// A policy that plans with a solver and a model.
 pub struct MpcPolicy {
     solver: Box<dyn Solver>,
     cost: Box<dyn CostModel>,
@@ -52,7 +52,7 @@ struct Slot {
     plans: u64,
     /// The part of the plan to execute, `[receding horizon, dim]`.
     plan: Vec<f32>,
-    /// The number of values of `plan` that are executed.
+    /// The number of values of `plan` that have been executed.
     done: usize,
     /// The initial guess of the next plan, `[horizon, dim]`.
     warm: Vec<f32>,
@@ -209,7 +209,7 @@ fn check_plan(plan: &Plan, envs: usize, horizon: usize, dim: usize) -> Result<()
     Err(Error::NotFinite {
         what: format!("the plan a solver returned for planned environment {env}"),
         given,
-        fix: "its settings let the search diverge, or the solver has a bug".to_owned(),
+        fix: "the search diverged, or the solver has a bug; check the settings of the solver".to_owned(),
     })
 }
 

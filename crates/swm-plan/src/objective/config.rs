@@ -10,8 +10,8 @@ use swm_core::{CostModel, Result};
 
 /// The terms and constraints of a plan.
 ///
-/// Without a goal term, the terms are added to the model's own cost. With one, the terms are the whole cost, computed
-/// on a rollout of the model's latent dynamics; only then can latents be constrained.
+/// Without a goal term, the terms are added to the model's own cost. With a goal term, the terms are the whole cost,
+/// computed on a rollout of the model's latent dynamics. Constraints on latents require a goal term.
 ///
 /// ```
 /// use swm_plan::objective::ObjectiveConfig;

@@ -5,9 +5,9 @@ use swm_core::{Error, Result};
 /// One candidate and its predicted latents.
 #[derive(Clone, Copy, Debug)]
 pub struct Trajectory<'a> {
-    /// The latents, the present first, `[horizon + 1, latent]`; empty where the model has none.
+    /// The latents, the present first, `[horizon + 1, latent]`; empty for a model without latents.
     pub latents: &'a [f32],
-    /// The latent of the goal, `[latent]`; empty where the model has none.
+    /// The latent of the goal, `[latent]`; empty for a model without latents.
     pub goal: &'a [f32],
     /// The actions, `[horizon, dim]`.
     pub actions: &'a [f32],
@@ -18,10 +18,10 @@ pub struct Trajectory<'a> {
 /// The gradient of a cost with respect to a trajectory, to which terms add.
 #[derive(Debug)]
 pub struct Slope<'a> {
-    /// With respect to the latents, `[horizon + 1, latent]`; the gradient with respect to the present latent is
-    /// discarded.
+    /// The gradient with respect to the latents, `[horizon + 1, latent]`. The gradient with respect to the present
+    /// latent is discarded.
     pub latents: &'a mut [f32],
-    /// With respect to the actions, `[horizon, dim]`.
+    /// The gradient with respect to the actions, `[horizon, dim]`.
     pub actions: &'a mut [f32],
 }
 
@@ -30,7 +30,7 @@ pub struct Slope<'a> {
 pub struct Shape {
     /// Model steps.
     pub horizon: usize,
-    /// The dimension of a latent; 0 where the model has none.
+    /// The dimension of a latent; 0 for a model without latents.
     pub latent: usize,
     /// The action dimension of one model step.
     pub dim: usize,
@@ -38,7 +38,7 @@ pub struct Shape {
 
 /// A differentiable cost of trajectories.
 pub trait Objective: Send + Sync {
-    /// Whether the cost or the constraint uses latents.
+    /// Whether the cost uses latents.
     fn needs_latents(&self) -> bool;
 
     /// Checks the settings for trajectories of this shape.
@@ -47,16 +47,16 @@ pub trait Objective: Send + Sync {
     /// When the settings contradict each other or the shape.
     fn check(&self, shape: Shape) -> Result<()>;
 
-    /// The cost.
+    /// Returns the cost of a trajectory.
     fn cost(&self, trajectory: Trajectory<'_>) -> f32;
 
-    /// Adds the gradient of the cost.
+    /// Adds the gradient of the cost to `slope`.
     fn add_gradient(&self, trajectory: Trajectory<'_>, slope: &mut Slope<'_>);
 }
 
 /// Differentiable inequalities; each is satisfied when its value is at most 0.
 pub trait Constraint: Send + Sync {
-    /// Whether the cost or the constraint uses latents.
+    /// Whether the constraint uses latents.
     fn needs_latents(&self) -> bool;
 
     /// Checks the settings for trajectories of this shape.
@@ -65,13 +65,13 @@ pub trait Constraint: Send + Sync {
     /// When the settings contradict each other or the shape.
     fn check(&self, shape: Shape) -> Result<()>;
 
-    /// The number of values for `horizon` model steps and a latent dimension.
+    /// Returns the number of values for `horizon` model steps and the latent dimension `latent`.
     fn count(&self, horizon: usize, latent: usize) -> usize;
 
     /// Writes the values, `[count]`.
     fn values(&self, trajectory: Trajectory<'_>, values: &mut [f32]);
 
-    /// Adds the gradient of the weighted sum of the values; `weights` is `[count]`.
+    /// Adds the gradient of the weighted sum of the values to `slope`; `weights` is `[count]`.
     fn add_gradient(&self, trajectory: Trajectory<'_>, weights: &[f32], slope: &mut Slope<'_>);
 }
 

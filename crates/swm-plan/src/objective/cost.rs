@@ -49,7 +49,7 @@ impl ObjectiveCost {
     fn roll_out(&mut self, candidates: Candidates<'_>) -> Result<()> {
         let Candidates { actions, envs, samples, horizon, dim } = candidates;
         if envs * self.latent != self.start.len() {
-            let observed = format!("{}, the number of observed ones", self.start.len() / self.latent);
+            let observed = format!("{}, the number of observed environments", self.start.len() / self.latent);
             return Err(Error::mismatch("the environments of an objective", envs.to_string(), observed));
         }
         check_len("the candidates of an objective", actions.len(), envs * samples * horizon * dim)?;

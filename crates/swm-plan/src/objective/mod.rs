@@ -1,10 +1,11 @@
 //! Objectives and constraints that compose, over the latents and actions of a candidate.
 //!
-//! An [`Objective`] is the cost of one [`Trajectory`] and its gradient; a list of objectives is their sum. A [`Constraint`] is
-//! an inequality, satisfied when its value is at most 0. Two models apply them: [`ObjectiveCost`] rolls out any latent
-//! dynamics and replaces the model's cost, with the gradient by back-propagation through time; [`Regularised`] keeps the cost
-//! of a model and adds terms on actions. [`Penalised`] turns constraints into a cost. [`ObjectiveConfig`] describes terms and
-//! constraints in a file.
+//! An [`Objective`] computes the cost of one [`Trajectory`] and the gradient of the cost; the cost of a list of
+//! objectives is the sum of their costs. A [`Constraint`] is an inequality, satisfied when its value is at most 0. Two
+//! wrappers apply objectives and constraints to a model: [`ObjectiveCost`] rolls out the latent dynamics and replaces
+//! the model's cost, with the gradient by back-propagation through time; [`Regularised`] adds terms on actions to the
+//! model's cost. [`Penalised`] turns constraints into a cost. [`ObjectiveConfig`] describes terms and constraints in a
+//! file.
 //!
 //! Actions and latents are in the model's (normalised) units throughout.
 

@@ -6,8 +6,8 @@ use swm_core::{Batch, Candidates, CostModel, Env, Error, Result};
 /// Adds `weight` times the sum of all violations, `Σ max(0, g)`, to the cost of a candidate.
 ///
 /// The penalty is exact: with a weight above the largest Lagrange multiplier of the optimum, the cheapest candidate is
-/// the optimum itself, not a point near it. In return, the cost has a kink at the boundary. Sampling solvers are not
-/// affected; gradient solvers are, and should handle constraints themselves
+/// the optimum itself, not a point near it. However, the gradient of the cost jumps at the boundary of the feasible
+/// set. Use this cost with sampling solvers; for gradient methods, choose a solver that handles constraints
 /// ([`Need::Constraints`](crate::Need::Constraints)).
 pub struct Penalised {
     model: Box<dyn CostModel>,

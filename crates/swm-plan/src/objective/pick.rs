@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 use std::ops::Range;
 use swm_core::{Error, Result};
 
-/// Some dimensions of a latent: one, or a half-open range. In a file, `3` or `[8, 16]`.
+/// One dimension of a latent, or a half-open range of dimensions. A file contains `3` or `[8, 16]`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum Pick {

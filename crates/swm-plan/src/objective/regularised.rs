@@ -4,8 +4,8 @@ use super::contracts::{Constraint, Objective, Shape};
 use super::trajectories::{Trajectories, check_all, check_len};
 use swm_core::{Batch, Candidates, Constrained, CostModel, DifferentiableCost, Env, Error, LatentDynamics, Result};
 
-/// A model with terms on actions added to its cost, and with constraints on actions. It is differentiable if the model
-/// is, and gives access to the model's latents.
+/// A model with terms on actions added to its cost, and with constraints on actions. The sum is differentiable if the
+/// model is differentiable. The model's latents stay accessible.
 pub struct Regularised {
     model: Box<dyn CostModel>,
     objective: Box<dyn Objective>,

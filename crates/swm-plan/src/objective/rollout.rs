@@ -30,8 +30,7 @@ impl Rollout {
         self.shape = [0; 4];
     }
 
-    /// Predicts the latents of all candidates, step by step, unless the cached latents are those of the same
-    /// candidates.
+    /// Predicts the latents of all candidates, step by step, unless the latents of these candidates are cached.
     ///
     /// # Shapes
     /// `start` is `[envs, latent]`.
@@ -116,9 +115,9 @@ fn gather(rows: &[f32], row: usize, at: usize, width: usize, to: &mut Vec<f32>) 
     rows.chunks_exact(row).for_each(|values| to.extend_from_slice(&values[at..at + width]));
 }
 
-/// Adds `what` to `width` values of every row, from index `at` on.
-fn add(rows: &mut [f32], row: usize, at: usize, width: usize, what: &[f32]) {
-    for (values, what) in rows.chunks_exact_mut(row).zip(what.chunks_exact(width)) {
-        values[at..at + width].iter_mut().zip(what).for_each(|(value, what)| *value += what);
+/// Adds `terms` to `width` values of every row, from index `at` on.
+fn add(rows: &mut [f32], row: usize, at: usize, width: usize, terms: &[f32]) {
+    for (values, terms) in rows.chunks_exact_mut(row).zip(terms.chunks_exact(width)) {
+        values[at..at + width].iter_mut().zip(terms).for_each(|(value, term)| *value += term);
     }
 }

@@ -17,13 +17,13 @@ pub enum When {
 }
 
 /// The squared distance of latents to the goal's latent: `w Σ_t γ^(t-1) Σ_i (z_t,i - g_i)²`, over the last latent or
-/// over all predicted ones. The defaults give the cost of the reference's models.
+/// over all predicted ones. The defaults give the cost of the reference implementation's models.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Goal {
     /// The weight, w.
     pub weight: f32,
-    /// The latents that are compared.
+    /// The steps after which latents are compared.
     pub when: When,
     /// The discount factor of later latents, γ, for a running term.
     pub discount: f32,

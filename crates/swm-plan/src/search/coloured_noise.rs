@@ -2,20 +2,21 @@
 
 use std::f64::consts::TAU;
 
-/// A filter that turns white Gaussian noise into noise whose power falls with the frequency as `f^-β`: β = 0 is white, 1
-/// pink, 2 red (a random walk).
+/// A filter that turns white Gaussian noise into noise whose power falls with the frequency as `f^-β`: β = 0 is white,
+/// 1 pink, 2 red (a random walk).
 ///
 /// White noise of H steps is weighted by `f^(-β/2)` in the frequency domain; frequency 0 has the weight of the lowest
-/// frequency above it, `1/H` (Timmer and König, *On generating power law noise*, 1995, as in Pinneri et al., 2021). Weights in
-/// the frequency domain are a circular convolution in time, whose kernel is computed once: for the short horizons of a plan
-/// this is faster than a Fourier transform. The squares of the kernel add up to 1, so the variance stays 1.
+/// frequency above it, `1/H` (Timmer and König, *On generating power law noise*, 1995, as in Pinneri et al., 2021).
+/// Weights in the frequency domain are a circular convolution in time, whose kernel is computed once: for the short
+/// horizons of a plan this is faster than a Fourier transform. The squares of the kernel add up to 1, so the variance
+/// stays 1.
 pub struct ColouredNoise {
     /// The weight of the white noise t steps earlier (circular), `[horizon]`.
     kernel: Vec<f32>,
 }
 
 impl ColouredNoise {
-    /// The filter with the exponent β over `horizon` steps.
+    /// Creates the filter with the exponent β for `horizon` steps.
     pub fn new(beta: f32, horizon: usize) -> Self {
         let weight = |f: usize| (f.min(horizon - f).max(1) as f64 / horizon as f64).powf(-f64::from(beta) / 2.0);
         let phase = |f: usize, t: usize| TAU * (f * t % horizon) as f64 / horizon as f64;
@@ -25,7 +26,8 @@ impl ColouredNoise {
         Self { kernel: kernel.iter().map(|k| (k / norm) as f32).collect() }
     }
 
-    /// Filters the white noise of one candidate along the steps, in place. `scratch` keeps its memory between calls.
+    /// Filters the white noise of one candidate along the steps, in place. `scratch` is memory that is
+    /// reused between calls.
     ///
     /// # Shapes
     /// `noise` is `[horizon, dim]`.

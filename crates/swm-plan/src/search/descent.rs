@@ -8,7 +8,7 @@ use super::population::Population;
 use super::problem::{UNWRITTEN, check_costs, differentiable};
 use swm_core::{CostModel, Error, Plan, PlanProblem, PlanTrace, Result};
 
-/// How one step moves the candidates.
+/// The optimizer and the noise of one step.
 #[derive(Clone, Copy)]
 pub struct Step<'a> {
     /// Turns a gradient into a step.

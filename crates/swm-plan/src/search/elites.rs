@@ -83,7 +83,7 @@ impl<'a> Elites<'a> {
     }
 
     /// Sums `term(elite, lane, action)` over the elites, for every value of one block of a plan. The order is always
-    /// from the cheapest elite to the most expensive, so that the rounding is the same everywhere.
+    /// from the cheapest elite to the most expensive, so that the rounding does not depend on the selection algorithm.
     fn sum(self, block: usize, term: impl Fn(usize, usize, f64) -> f64) -> [f64; LANES] {
         let mut sums = [0.0; LANES];
         for (elite, actions) in self.actions().enumerate() {

@@ -32,8 +32,8 @@ impl Gaussian {
         (0..problem.keys.len()).map(initial).collect()
     }
 
-    /// Draws the population of an iteration: `clip(mean + std ξ)` with standard normal ξ, coloured where a colour is
-    /// given. The first candidate of every environment is the mean.
+    /// Draws the population of an iteration: `clip(mean + std ξ)` with standard normal ξ, filtered by `colour` if
+    /// it is given. The first candidate of every environment is the mean.
     ///
     /// The noise of an environment and an iteration is one keyed sequence, in which every candidate has a fixed
     /// position: it does not depend on threads or on other environments.

@@ -1,16 +1,16 @@
 //! Standard normal noise for the sampling solvers, identical on every platform.
 //!
 //! The Box–Muller transform turns two uniform values into two independent normal values,
-//! `√(-2 ln u) (cos 2πv, sin 2πv)`. The uniform values are the words of a key's ChaCha stream, in order, so any part of
-//! the noise can be generated without the rest. `ln`, `cos` and `sin` are polynomials (minimax fits, relative error
-//! below 3e-7) because the system's functions differ between platforms, while additions, multiplications and square
-//! roots are defined to the last bit. The polynomials are also vectorised.
+//! `√(-2 ln u) (cos 2πv, sin 2πv)`. The uniform values are the words of a key's ChaCha stream, in order, so a run of
+//! the noise can be generated without the runs before it. `ln`, `cos` and `sin` are polynomials (minimax fits, relative
+//! error below 3e-7) because the system's functions differ between platforms, while additions, multiplications and
+//! square roots are defined to the last bit. The polynomials are also vectorised.
 
 use rand::RngCore as _;
 use swm_core::{Key, Rng};
 use swm_simd::{Kernel, Level, dispatch};
 
-/// The length of a run: values that are generated together. The noise of a key is a sequence of runs.
+/// The number of values in a run. The noise of a key is a sequence of runs, each generated as a whole.
 pub const RUN: usize = 32;
 
 /// Fills `noise` with the normal values of `key`, from run `first` on.
@@ -153,12 +153,12 @@ mod tests {
     }
 
     #[test]
-    fn parts_equal_the_whole_for_every_vector_width() {
+    fn noise_from_any_run_equals_the_full_sequence() {
         let all = noise(10 * RUN + 7);
         for (first, n) in [(0, 1), (3, RUN), (7, 3 * RUN + 7), (10, 7)] {
-            let mut part = vec![0.0; n];
-            fill(Key::new(3), first, &mut part);
-            assert_eq!(part, all[first * RUN..][..n]);
+            let mut noise = vec![0.0; n];
+            fill(Key::new(3), first, &mut noise);
+            assert_eq!(noise, all[first * RUN..][..n]);
         }
         let mut words = vec![[0.0; RUN]; 10];
         Key::new(3).rng().fill_bytes(bytemuck::cast_slice_mut(words.as_flattened_mut()));

@@ -32,12 +32,16 @@ impl Bounds<'_> {
 /// Checks a problem with continuous actions; returns its bounds.
 ///
 /// # Errors
-/// When the solver cannot solve such a problem with such a model, the horizon is 0, or the bounds or the initial guess
+/// When the solver does not fit the problem or the model, the horizon is 0, or the bounds or the initial guess
 /// are invalid.
 pub fn continuous<'a>(solver: &SolverEntry, cost: &mut dyn CostModel, problem: &PlanProblem<'a>) -> Result<Bounds<'a>> {
     check_fit(solver, cost, problem)?;
     let PlanSpace::Continuous { low, high } = problem.space else {
-        return Err(misfit(solver.id, "these actions are not continuous", "correct the `actions` of its entry"));
+        return Err(misfit(
+            solver.id,
+            "the given actions are not continuous",
+            "correct `actions` in the solver's `ENTRY`",
+        ));
     };
     if low.len() != high.len() {
         let given = format!("{} lower and {} upper", low.len(), high.len());
@@ -58,16 +62,20 @@ pub fn continuous<'a>(solver: &SolverEntry, cost: &mut dyn CostModel, problem: &
 
 /// Checks a problem with discrete actions; returns the number of options of every choice of a model step.
 ///
-/// An initial guess weighs the options of every choice: one-hot vectors, probabilities, or zeros where there is no
-/// preference.
+/// An initial guess weighs the options of every choice: one-hot vectors, probabilities, or zeros for a choice
+/// without preference.
 ///
 /// # Errors
-/// When the solver cannot solve such a problem with such a model, the horizon is 0, or the choices or the initial guess
+/// When the solver does not fit the problem or the model, the horizon is 0, or the choices or the initial guess
 /// are invalid.
 pub fn discrete<'a>(solver: &SolverEntry, cost: &mut dyn CostModel, problem: &PlanProblem<'a>) -> Result<&'a [usize]> {
     check_fit(solver, cost, problem)?;
     let PlanSpace::Discrete { choices } = problem.space else {
-        return Err(misfit(solver.id, "these actions are not discrete", "correct the `actions` of its entry"));
+        return Err(misfit(
+            solver.id,
+            "the given actions are not discrete",
+            "correct `actions` in the solver's `ENTRY`",
+        ));
     };
     if let Some(j) = choices.iter().position(|&options| options == 0) {
         return Err(Error::config(
@@ -122,7 +130,7 @@ pub fn offers(cost: &mut dyn CostModel) -> Vec<Need> {
     offered.into_iter().filter_map(|(need, offered)| offered.then_some(need)).collect()
 }
 
-/// The error of a solver that does not fit a problem or a model.
+/// Creates the error of a solver that does not fit a problem or a model.
 pub fn misfit(solver: &str, obstacle: &str, fix: &str) -> Error {
     Error::config(format!("solver {solver}"), obstacle, fix)
 }

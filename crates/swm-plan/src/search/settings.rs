@@ -10,15 +10,15 @@ impl Settings<'_> {
     /// Checks that a count is at least 1.
     ///
     /// # Errors
-    /// When it is 0.
+    /// When the count is 0.
     pub fn at_least_one(self, name: &str, value: usize) -> Result<()> {
         self.check(value > 0, name, value, "ask for at least 1")
     }
 
-    /// Checks that there are at least `least` elites and at most as many as samples.
+    /// Checks that the number of elites is at least `least` and at most the number of samples.
     ///
     /// # Errors
-    /// When there are fewer or more.
+    /// When the number of elites is outside this range.
     pub fn elites(self, elites: usize, least: usize, samples: usize) -> Result<()> {
         let fix = match least {
             1 => "choose at least 1 and at most the number of samples",
@@ -27,10 +27,10 @@ impl Settings<'_> {
         self.check((least..=samples).contains(&elites), "elites", format!("{elites} of {samples} samples"), fix)
     }
 
-    /// Checks that a count is at most `most`, the number of `of`.
+    /// Checks that a count is at most `most`. `of` names the items whose number is `most`.
     ///
     /// # Errors
-    /// When it is greater.
+    /// When the count is greater.
     pub fn at_most(self, name: &str, value: usize, most: usize, of: &str) -> Result<()> {
         self.check(value <= most, name, value, &format!("choose at most {most}, the number of {of}"))
     }
@@ -38,7 +38,7 @@ impl Settings<'_> {
     /// Checks that a value is finite and above 0.
     ///
     /// # Errors
-    /// When it is not.
+    /// When the value is outside this range.
     pub fn positive(self, name: &str, value: f32) -> Result<()> {
         self.check(value.is_finite() && value > 0.0, name, value, "choose a finite number above 0")
     }
@@ -46,7 +46,7 @@ impl Settings<'_> {
     /// Checks that a value is finite and not below `least`.
     ///
     /// # Errors
-    /// When it is not.
+    /// When the value is outside this range.
     pub fn at_least(self, name: &str, value: f32, least: f32) -> Result<()> {
         let fix = format!("choose a finite number of at least {least}");
         self.check(value.is_finite() && value >= least, name, value, &fix)
@@ -55,7 +55,7 @@ impl Settings<'_> {
     /// Checks that a value is finite and not below 0.
     ///
     /// # Errors
-    /// When it is not.
+    /// When the value is outside this range.
     pub fn not_negative(self, name: &str, value: f32) -> Result<()> {
         self.at_least(name, value, 0.0)
     }
@@ -63,7 +63,7 @@ impl Settings<'_> {
     /// Checks that the weight of an exponential average is at least 0 and below 1.
     ///
     /// # Errors
-    /// When it is not.
+    /// When the value is outside this range.
     pub fn momentum(self, name: &str, value: f32) -> Result<()> {
         self.check((0.0..1.0).contains(&value), name, value, "choose a number of at least 0 and below 1")
     }
@@ -71,7 +71,7 @@ impl Settings<'_> {
     /// Checks any condition on the setting `name`.
     ///
     /// # Errors
-    /// When the condition does not hold; the message names the owner, the setting, what was given and the fix.
+    /// When the condition does not hold; the message names the owner, the setting, the given value and the fix.
     pub fn check(self, holds: bool, name: &str, given: impl ToString, fix: &str) -> Result<()> {
         if holds { Ok(()) } else { Err(Error::config(format!("{} {name}", self.0), given.to_string(), fix)) }
     }

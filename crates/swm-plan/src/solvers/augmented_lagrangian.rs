@@ -1,9 +1,9 @@
 //! [`AugmentedLagrangian`]: gradient descent under differentiable inequality constraints `g_j(A) ≤ 0`.
 //!
-//! Algorithm "Lagrangian Solver" of the stable-worldmodel paper. Several candidates, the first at the initial guess and
-//! the others at random around it, descend `J(A) + λ·g(A) + ρ ‖[g(A)]₊‖²` for K steps with fixed multipliers λ and
-//! penalty ρ. Then `λ ← [λ + ρ ḡ]₊`, with ḡ the mean over the candidates, and ρ grows up to a limit. This is repeated L
-//! times. Candidates are `[envs, samples, horizon, dim]`, values of constraints `[envs, samples, constraints]`, and
+//! Algorithm "Lagrangian Solver" of the stable-worldmodel paper. Several candidates (the initial guess, and random
+//! candidates around the guess) descend `J(A) + λ·g(A) + ρ ‖[g(A)]₊‖²` for K steps with fixed multipliers λ and penalty
+//! ρ. Then `λ ← [λ + ρ ḡ]₊`, with ḡ the mean over the candidates, and ρ grows up to a limit. Both steps are repeated
+//! L times. Candidates are `[envs, samples, horizon, dim]`, values of constraints `[envs, samples, constraints]`, and
 //! every environment has its own multipliers, `[envs, constraints]`.
 //!
 //! Outer iterations, penalties, standard deviation and noise are those of the reference (`solver/lagrangian.py`). The
@@ -13,14 +13,14 @@
 //! that is too large for the step size makes plans worse.
 //!
 //! Intended differences from the paper and the reference:
-//! - The plan is the cheapest candidate among those whose constraints all hold within `tolerance`. If there is none, it
-//!   is the candidate with the smallest largest violation, and the last entry of
+//! - The plan is the cheapest candidate among those whose constraints all hold within `tolerance`. If there is no
+//!   such candidate, the plan is the candidate whose largest violation is smallest, and the last entry of
 //!   [`PlanTrace::violation`](swm_core::PlanTrace::violation) exceeds the tolerance. The paper and the reference return
 //!   the cheapest candidate, feasible or not.
 //! - Candidates are clipped to the bounds of the problem after every step; with infinite bounds, the algorithm is that
 //!   of the paper.
-//! - Multipliers start at zero for every plan. The reference can carry them to the next plan; here a plan depends on
-//!   its problem and its key only.
+//! - Multipliers start at zero for every plan. The reference can reuse the multipliers for the next plan; here a
+//!   plan depends on its problem and its key only.
 //! - Every candidate draws from its own stream, keyed by (plan key, candidate), and noise by (plan key, step,
 //!   candidate); values that are not finite are errors.
 //!
@@ -37,7 +37,7 @@ const ID: &str = "lagrangian";
 /// The row of this solver in the registry.
 pub const ENTRY: SolverEntry = SolverEntry {
     id: ID,
-    summary: "follows the gradient and prices violated constraints ever higher",
+    summary: "follows the gradient, with growing penalties on violated constraints",
     family: Family::Gradient,
     actions: ActionKind::Continuous,
     needs: &[Need::Gradient, Need::Constraints],
@@ -140,7 +140,7 @@ impl Duals {
         let constraints = constrained(ID, cost)?.constraints(problem.horizon);
         if constraints == 0 {
             let obstacle = format!("the model has no constraints on {} model steps", problem.horizon);
-            return Err(misfit(ID, &obstacle, "choose gd"));
+            return Err(misfit(ID, &obstacle, "choose the solver gd"));
         }
         let len = problem.keys.len() * samples * constraints;
         let multipliers = vec![0.0; problem.keys.len() * constraints];

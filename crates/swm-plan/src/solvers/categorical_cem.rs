@@ -180,7 +180,7 @@ fn draw(probabilities: &[f32], choices: &[usize], key: Key, sample: usize, candi
     }
 }
 
-/// Writes the most probable option of every choice, the first of equals, as one-hot vectors `[horizon, dim]`.
+/// Writes the first of the most probable options of every choice, as one-hot vectors `[horizon, dim]`.
 fn write_mode(probabilities: &[f32], choices: &[usize], mode: &mut [f32]) {
     mode.fill(0.0);
     for choice in ranges(choices, probabilities.len()) {

@@ -1,8 +1,8 @@
 //! [`GradientDescent`]: gradient descent on the cost.
 //!
-//! Algorithm "Gradient Descent Solver" of the stable-worldmodel paper. Several candidates, the first at the initial
-//! guess and the others at random around it, each take K steps against the gradient of their own cost; the cheapest
-//! after the last step is the plan. Candidates and gradients are `[envs, samples, horizon, dim]`.
+//! Algorithm "Gradient Descent Solver" of the stable-worldmodel paper. Several candidates (the initial guess, and
+//! random candidates around the guess) each take K steps against the gradient of their own cost; the candidate that is
+//! cheapest after the last step is the plan. Candidates and gradients are `[envs, samples, horizon, dim]`.
 //!
 //! The paper gives no settings. The defaults are those of the reference's scripts (`scripts/eval` and `scripts/plan`):
 //! 30 steps, 100 candidates, Adam with the step size 0.1. (The default of the reference's class, gradient descent with
@@ -14,7 +14,7 @@
 //! - The plan is the candidate that is cheapest after its last step, as in the paper; the reference compares the costs
 //!   from before that step.
 //! - The norm of gradients is clipped for each candidate. The reference clips by the norm over all candidates of all
-//!   environments, so its plans depend on the other environments.
+//!   environments, so a plan depends on the environments planned in the same call.
 //! - Every candidate draws from its own stream, keyed by (plan key, candidate), and noise by (plan key, step,
 //!   candidate).
 //! - Costs and gradients that are not finite are errors.

@@ -1,13 +1,12 @@
 //! [`ICem`]: the improved cross-entropy method.
 //!
 //! Pinneri et al., *Sample-efficient Cross-Entropy Method for Real-time Planning* (CoRL 2020), as algorithm "Improved
-//! Cross-Entropy Method Solver" of the stable-worldmodel paper. It extends [`Cem`](crate::Cem) by noise that is
+//! Cross-Entropy Method Solver" of the stable-worldmodel paper. The method extends [`Cem`](crate::Cem) by noise that is
 //! coloured along the model steps ([`ColouredNoise`]), by elites that stay among the candidates of the next iteration,
 //! and by momentum on both moments. Candidates are `[envs, samples, horizon, dim]` and clipped to the bounds. The
 //! defaults are those of the reference (`solver/icem.py`); the paper gives none.
 //!
-//! The noise is coloured along the model steps. The actions of an action block are dimensions of one step, with
-//! independent noise, as in the reference.
+//! The actions of an action block are dimensions of one step, with independent noise, as in the reference.
 //!
 //! The stable-worldmodel paper omits three features of the original publication, and so does this solver: a population
 //! that shrinks from iteration to iteration, elites that are reused after a replan, and executing the best action ever

@@ -1,7 +1,7 @@
-//! The solvers, a file each, and [`SOLVERS`], the list of them.
+//! The solvers, one file each, and their list, [`SOLVERS`].
 //!
-//! Each file holds the settings of the algorithm, its `solve`, and its registry row as `pub const ENTRY`. A new solver is a
-//! new file and one line in the list below.
+//! Each file holds the settings of the algorithm, its `solve`, and its registry row as `pub const ENTRY`. A new solver
+//! is a new file and one line in the list below.
 
 pub mod augmented_lagrangian;
 pub mod categorical_cem;
@@ -44,10 +44,10 @@ pub static SOLVERS: Registry<SolverEntry> = Registry {
     ],
 };
 
-/// Checks that the solver `id` can plan such actions with such a model.
+/// Checks that the solver `id` can plan actions of the kind `actions` with the model `cost`.
 ///
 /// # Errors
-/// When the id is unknown, or the solver cannot; the error names the solvers that can.
+/// When the id is unknown, or the solver does not fit; the error names the solvers that fit.
 pub fn pairing(id: &str, cost: &mut dyn CostModel, actions: ActionKind) -> Result<()> {
     let offers = offers(cost);
     let Some(obstacle) = SOLVERS.get(id)?.obstacle(actions, &offers) else {

@@ -1,17 +1,17 @@
 //! [`Mppi`]: model-predictive path integral control.
 //!
 //! Williams et al., *Aggressive Driving with Model Predictive Path Integral Control* (ICRA 2016), as algorithm "Model
-//! Predictive Path Integral Solver" of the stable-worldmodel paper. The new mean is the weighted mean of the candidates, with
-//! the weights `exp(-(cost - lowest cost) / λ)`; the standard deviation of the samples stays constant. Only the cheapest
-//! `elites` are averaged; as many elites as samples give the original method. Candidates are `[envs, samples, horizon, dim]`.
-//! The defaults are those of the reference (`solver/mppi.py`); the paper gives none.
+//! Predictive Path Integral Solver" of the stable-worldmodel paper. The new mean is the weighted mean of the
+//! candidates, with the weights `exp(-(cost - lowest cost) / λ)`; the standard deviation of the samples stays constant.
+//! Only the cheapest `elites` are averaged; as many elites as samples give the original method. Candidates are
+//! `[envs, samples, horizon, dim]`. The defaults are those of the reference (`solver/mppi.py`); the paper gives none.
 //!
-//! λ is in units of the cost: far below the differences of the costs, the cheapest candidate dominates; far above them, the
-//! mean hardly moves.
+//! λ is in units of the cost. If λ is far below the differences of the costs, the cheapest candidate dominates the
+//! mean; if λ is far above them, the mean hardly moves.
 //!
 //! Intended differences from the paper and the reference, all as in [`Cem`](crate::Cem): candidates are clipped to the
-//! bounds, draws are keyed, equal costs are ordered by index, costs that are not finite are errors, and [`Plan::costs`] is
-//! the lowest cost of the last iteration.
+//! bounds, draws are keyed, equal costs are ordered by index, costs that are not finite are errors, and [`Plan::costs`]
+//! is the lowest cost of the last iteration.
 
 use crate::entry::{ActionKind, Family, SolverEntry, defaults, make};
 use crate::search::{Elites, Gaussian, Population, Settings, average, continuous, iterate};
@@ -24,7 +24,7 @@ const ID: &str = "mppi";
 /// The row of this solver in the registry.
 pub const ENTRY: SolverEntry = SolverEntry {
     id: ID,
-    summary: "moves a mean by the weights that samples get from their costs",
+    summary: "averages the cheapest samples with weights that fall with the cost",
     family: Family::Sampling,
     actions: ActionKind::Continuous,
     needs: &[],

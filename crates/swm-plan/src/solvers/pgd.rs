@@ -2,7 +2,7 @@
 //!
 //! Algorithm "Projected Gradient Descent Solver" of the stable-worldmodel paper, after Henaff, Whitney and `LeCun`,
 //! *Model-Based Planning with Discrete and Continuous Actions* (2017). A choice among n options is relaxed to n
-//! probabilities. Several candidates, the first at the initial guess and the others at random around it, take K steps
+//! probabilities. Several candidates (the initial guess, and random candidates around the guess) take K steps
 //! against the gradient of their cost. After each step, every choice is projected onto its simplex (Duchi et al.,
 //! *Efficient Projections onto the ℓ₁-Ball for Learning in High Dimensions*, 2008, figure 1). In the end the most
 //! probable options are chosen. Candidates are `[envs, samples, horizon, dim]`, where `dim` is the number of options of
@@ -102,7 +102,7 @@ fn project(actions: &mut [f32], choices: &[usize]) {
         sorted.clear();
         sorted.extend(options.iter().map(|&v| f64::from(v)));
         sorted.sort_unstable_by(|a, b| b.total_cmp(a));
-        // The ρ largest values stay positive when θ is subtracted so that they add up to 1.
+        // θ is the shift with which the values that stay positive after the subtraction add up to 1.
         let (mut sum, mut theta) = (0.0, 0.0);
         for (j, &largest) in sorted.iter().enumerate() {
             sum += largest;
@@ -115,7 +115,7 @@ fn project(actions: &mut [f32], choices: &[usize]) {
     });
 }
 
-/// Replaces the probabilities of every choice by a one-hot vector at the most probable option, the first of equals.
+/// Replaces the probabilities of every choice by a one-hot vector at the first of the most probable options.
 fn choose(actions: &mut [f32], choices: &[usize]) {
     for_each_choice(actions, choices, |options| {
         let best = (1..options.len()).fold(0, |best, i| if options[i] > options[best] { i } else { best });

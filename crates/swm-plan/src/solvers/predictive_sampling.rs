@@ -1,12 +1,13 @@
-//! [`PredictiveSampling`]: the cheapest of many random candidates.
+//! [`PredictiveSampling`]: evaluates many random candidates once and returns the cheapest.
 //!
 //! Howell et al., *Predictive Sampling: Real-time Behaviour Synthesis with `MuJoCo`* (2022), as algorithm "Predictive
-//! Sampling Solver" of the stable-worldmodel paper: the nominal plan and N - 1 random candidates around it are evaluated once,
-//! and the cheapest is the plan. Plans improve because each replan starts from the last plan. Candidates are `[envs, samples,
-//! horizon, dim]`. The defaults are those of the reference (`solver/predictive_sampling.py`); the paper gives none.
+//! Sampling Solver" of the stable-worldmodel paper: the nominal plan and N - 1 random candidates around it are
+//! evaluated once, and the cheapest candidate is the plan. Plans improve because each replan starts from the last plan.
+//! Candidates are `[envs, samples, horizon, dim]`. The defaults are those of the reference
+//! (`solver/predictive_sampling.py`); the paper gives none.
 //!
 //! Intended differences from the paper and the reference, all as in [`Cem`](crate::Cem): candidates are clipped to the
-//! bounds, draws are keyed, the first of equal costs wins, and costs that are not finite are errors.
+//! bounds, draws are keyed, of equal costs the first is chosen, and costs that are not finite are errors.
 
 use crate::entry::{ActionKind, Family, SolverEntry, defaults, make};
 use crate::search::{Gaussian, Population, Settings, continuous, iterate};

@@ -4,8 +4,8 @@ Run with the Python package `stable-worldmodel` 0.1.1 (and torch) installed:
 
     python export_updates.py > updates.json
 
-The script records every random draw, every population with its costs, and the distribution after each update. It does not
-change the solvers. The minimum of the toy cost is within the bounds in some dimensions and outside the bounds in others.
+The script records every random draw, every population with its costs, and the distribution after each update. It does
+not change the solvers. The minimum of the toy cost is within the bounds in some dimensions and outside in others.
 """
 
 import contextlib
@@ -99,12 +99,13 @@ def main():
     for name, arguments in solvers.items():
         torch.manual_seed(0)
         recorded, states, noise, plan = run(*arguments)
-        if name == "mppi":  # MPPI has no callbacks. Its mean is the first candidate of the next iteration, and the plan.
+        if name == "mppi":
+            # MPPI has no callbacks. Its mean is the first candidate of the next iteration; its last mean is the plan.
             states = [{"mean": plans[0]} for plans, _ in recorded[1:]] + [{"mean": plan}]
         out[name] = [
             {"candidates": flat(plans), "costs": flat(costs)}
             | {key: flat(value) for key, value in state.items()}
-            # iCEM draws its noise with the steps last.
+            # iCEM draws its noise as [envs, samples, dim, horizon].
             | ({"noise": flat(noise[i][0].transpose(-1, -2) if name == "icem" else noise[i][0])} if noise else {})
             for i, ((plans, costs), state) in enumerate(zip(recorded, states, strict=True))
         ]

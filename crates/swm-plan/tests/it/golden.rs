@@ -11,7 +11,7 @@ use std::path::Path;
 use swm_core::Plan;
 use swm_plan::{SOLVERS, SolverEntry};
 
-/// The plan of one environment and its search, in six digits.
+/// The plan of one environment and the trace of its search, rounded to six digits.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct Golden {
     toy: String,
@@ -33,7 +33,8 @@ fn short_search(row: &SolverEntry) -> Golden {
     let mut solver = (row.make)(&settings).expect("valid settings");
     let plan = solve(&mut *solver, &mut Model::new(toy, &[ENV]), toy, &[ENV]).expect("the solver returns a plan");
     let Plan { actions, trace, .. } = plan;
-    let round = |values: &[f32]| values.iter().map(|v| format!("{v:.5e}").parse().expect("a number")).collect();
+    let round =
+        |values: &[f32]| values.iter().map(|v| format!("{v:.5e}").parse().expect("parsing a rounded value")).collect();
     Golden {
         toy: toy.name.to_owned(),
         actions: round(&actions),

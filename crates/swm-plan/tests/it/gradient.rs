@@ -45,7 +45,7 @@ struct Augmented {
 }
 
 fn golden() -> Golden {
-    serde_json::from_str(include_str!("../golden/gradient_solvers.json")).expect("the recorded file")
+    serde_json::from_str(include_str!("../golden/gradient_solvers.json")).expect("gradient_solvers.json is valid")
 }
 
 #[track_caller]
@@ -55,7 +55,7 @@ fn assert_near(given: &[f32], expected: &[f32], tolerance: f32) {
     assert!(near, "{given:?}\n{expected:?}");
 }
 
-/// Half the scaled squared distance to a target, as `Bowl` and `Choice` of the exporter.
+/// Half the scaled squared distance to a target, the cost of `Bowl` and `Choice` in `export_gradient_solvers.py`.
 struct Bowl {
     scale: &'static [f32],
     target: &'static [f32],
@@ -161,7 +161,7 @@ fn gradient_descent_equals_the_reference() {
     let plan = solve(&mut gd, &mut { BOWL }, &[Key::new(0)]).expect("the solver returns a plan");
     assert_near(&plan.actions, &golden.actions, 1e-5);
     assert_near(&plan.trace[0].best[..4], &golden.costs, 1e-5);
-    assert_eq!(plan.trace[0].best[4..], plan.costs, "the last entry is that of the plan");
+    assert_eq!(plan.trace[0].best[4..], plan.costs, "the last entry of the trace is the cost of the plan");
 }
 
 #[test]
@@ -180,7 +180,7 @@ fn projected_gradient_descent_equals_the_reference() {
     { CHOICE }
         .cost(Candidates { actions: &chosen, envs: 1, samples: 1, horizon: 2, dim: 3 }, &mut cost)
         .expect("the model computes a cost");
-    assert_eq!(plan.costs, cost, "the cost is that of the choices, not of probabilities");
+    assert_eq!(plan.costs, cost, "the plan's cost is the cost of the chosen options, not of their probabilities");
 }
 
 #[test]
@@ -265,8 +265,8 @@ fn noisy_plans_do_not_depend_on_batches_or_threads() {
 
 #[test]
 fn noisy_searches_are_pinned() {
-    // Published results depend on these values: changing them is a breaking change. They are rounded, because `exp` and
-    // `ln` may differ in the last bit between platforms.
+    // Published results depend on these values: changing them is a breaking change. The values are rounded, because
+    // `exp` and `ln` may differ in the last bit between platforms.
     for (&(solver, name, settings), expected) in NOISY.iter().zip(PINNED) {
         let toy = toy(name);
         let settings = serde_json::from_str(settings).expect("valid settings");
@@ -303,7 +303,8 @@ fn gradient_descent_requires_a_gradient() {
     let quadratic = toy("quadratic");
     let mut model = Model::new(quadratic, &[0]).opaque();
     let mut gd = GradientDescent::default();
-    let message = crate::toys::solve(&mut gd, &mut model, quadratic, &[0]).expect_err("no gradient").to_string();
+    let message =
+        crate::toys::solve(&mut gd, &mut model, quadratic, &[0]).expect_err("a model without gradient").to_string();
     assert!(message.starts_with("solver gd: it needs the gradient of the cost"), "{message}");
     assert!(message.contains("choose another solver"), "{message}");
 }

@@ -1,4 +1,4 @@
-//! The MPC policy: when it replans, initial guesses, executed actions, history, and errors.
+//! Tests of the MPC policy: replanning, initial guesses, executed actions, history, and errors.
 
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -104,8 +104,8 @@ impl Fixture {
     }
 
     fn act(&mut self, active: &[bool]) -> Vec<f32> {
-        self.policy.act(&self.infos, active, &mut self.actions).expect("actions");
-        self.actions.get::<f32>("action").expect("actions").to_vec()
+        self.policy.act(&self.infos, active, &mut self.actions).expect("the policy acts");
+        self.actions.get::<f32>("action").expect("the column of actions").to_vec()
     }
 
     fn observed(&self) -> Vec<Vec<usize>> {
@@ -133,7 +133,7 @@ fn replans_due_slots_in_one_call_with_warm_starts() {
     let (keys, init) = &calls[1];
     let key = |seed, plan| Key::new(seed).with("plan").at(plan);
     assert_eq!(keys[..], [key(0, 1), key(7, 0), key(2, 0)]);
-    assert_eq!(init[..6], [104.0, 105.0, 0.0, 0.0, 0.0, 0.0], "the part that was not executed, moved forward");
+    assert_eq!(init[..6], [104.0, 105.0, 0.0, 0.0, 0.0, 0.0], "the part of the last plan that was not executed");
     assert_eq!(init[6..], [0.0; 12], "new episodes start from zeros");
     assert_eq!(fixture.policy.take_latencies().len(), 5);
     assert!(fixture.policy.take_latencies().is_empty());
@@ -172,7 +172,7 @@ fn history_contains_past_frames_and_actions() {
     let mut fixture = Fixture::new(config, 1e6, 2);
     fixture.policy.begin(1, Key::new(0));
     for step in 0..7u8 {
-        fixture.infos.get_mut::<u8>("pixels").expect("pixels").fill(10 + step);
+        fixture.infos.get_mut::<u8>("pixels").expect("the column of frames").fill(10 + step);
         fixture.act(&[false, true]);
     }
     let past = fixture.past.lock().expect("no thread has panicked");
@@ -240,8 +240,8 @@ fn integers_are_planned_as_one_hot_vectors() {
     let infos = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("a valid schema"), 1);
     let mut actions = Batch::zeros(&Schema::new([spec.action_column()]).expect("a valid schema"), 1);
     for expected in [[2, 5], [1, 6], [2, 5]] {
-        policy.act(&infos, &[true], &mut actions).expect("actions");
-        assert_eq!(actions.get::<i64>("action").expect("integers"), expected);
+        policy.act(&infos, &[true], &mut actions).expect("the policy acts");
+        assert_eq!(actions.get::<i64>("action").expect("the column holds integers"), expected);
     }
     let past = past.lock().expect("no thread has panicked");
     assert_eq!(past[1].actions, [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0]);
@@ -272,7 +272,7 @@ fn latency_budget_sets_the_deadline() {
         let policy = MpcPolicy::new(Box::new(solver), Box::new(model), config, ActionScale::identity(1), &spec(1.0), 1);
         let infos = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("a valid schema"), 1);
         let mut actions = Batch::zeros(&Schema::new([spec(1.0).action_column()]).expect("a valid schema"), 1);
-        policy.expect("a valid policy").act(&infos, &[true], &mut actions).expect("actions");
+        policy.expect("a valid policy").act(&infos, &[true], &mut actions).expect("the policy acts");
         *deadline.lock().expect("no thread has panicked")
     };
     let (before, budget) = (Instant::now(), Duration::from_secs(5));

@@ -43,7 +43,7 @@ impl System {
         self.push[0].len()
     }
 
-    /// `M z + B a`.
+    /// Returns the argument of f, `M z + B a`.
     fn before(&self, z: &[f32], a: &[f32]) -> Vec<f32> {
         let dot = |row: &[f32], v: &[f32]| row.iter().zip(v).map(|(w, v)| w * v).sum::<f32>();
         self.mix.iter().zip(&self.push).map(|(mix, push)| dot(mix, z) + dot(push, a)).collect()
@@ -121,7 +121,9 @@ impl LatentDynamics for System {
 
 /// Calls `observe` with the indices of environments and a batch without columns.
 fn observe(model: &mut dyn CostModel, envs: &[usize]) {
-    model.observe(&Batch::zeros(&Schema::new([]).expect("no columns"), 0), envs).expect("no columns are read");
+    model
+        .observe(&Batch::zeros(&Schema::new([]).expect("an empty schema is valid"), 0), envs)
+        .expect("the model reads no columns");
 }
 
 const HORIZON: usize = 4;
@@ -468,12 +470,12 @@ fn errors_name_the_mismatch() {
     assert!(message(&ActionNorm { limit: -1.0, block: 1 }).contains("action norm limit: -1"));
     assert!(message(&LatentBox::default()).contains("give a finite lower bound"));
     assert!(message(&LatentBox { low: Some(1.0), high: Some(0.0), ..LatentBox::default() }).contains("Some(1.0)"));
-    let error = Goal::default().check(Shape { latent: 0, ..shape }).expect_err("no latents").to_string();
+    let error = Goal::default().check(Shape { latent: 0, ..shape }).expect_err("a model without latents").to_string();
     assert!(error.contains("this model has none"), "{error}");
 
     let read = |json: &str| serde_json::from_str::<ObjectiveConfig>(json);
     assert!(read(r#"{"terms": [{"term": "goal", "wieght": 1}]}"#).expect_err("a typo").to_string().contains("wieght"));
-    assert!(read(r#"{"terms": [{"term": "joy"}]}"#).expect_err("unknown").to_string().contains("joy"));
+    assert!(read(r#"{"terms": [{"term": "joy"}]}"#).expect_err("an unknown term").to_string().contains("joy"));
     let model = |name| Box::new(Model::new(toy(name), &ENVS));
     let reject = |json: &str, name| {
         read(json).expect("a valid objective").apply(model(name)).err().expect("invalid input").to_string()
@@ -490,5 +492,5 @@ fn errors_name_the_mismatch() {
     let mut cost = ObjectiveCost::new(Box::new(nonlinear()), Box::new(goal()), vec![]).expect("a valid model");
     let actions = random(ENVS.len() * SAMPLES * HORIZON * 4);
     let message = cost.cost(candidates(&actions, HORIZON), &mut [0.0; 6]).expect_err("nothing observed").to_string();
-    assert!(message.contains("got 2, expected 0, the number of observed ones"), "{message}");
+    assert!(message.contains("got 2, expected 0, the number of observed environments"), "{message}");
 }

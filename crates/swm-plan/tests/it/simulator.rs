@@ -107,8 +107,10 @@ fn costs_do_not_depend_on_other_environments_or_threads() {
         let pool = pool(entry, envs);
         let space = &pool.spec().action_space;
         let width: usize = match space {
-            Space::MultiDiscrete { nvec, .. } => nvec.iter().map(|&n| usize::try_from(n).expect("a number")).sum(),
-            Space::Discrete { n, .. } => usize::try_from(*n).expect("a number"),
+            Space::MultiDiscrete { nvec, .. } => {
+                nvec.iter().map(|&n| usize::try_from(n).expect("a count of options")).sum()
+            }
+            Space::Discrete { n, .. } => usize::try_from(*n).expect("a count of options"),
             _ => space.len(),
         };
         let own = samples * HORIZON * BLOCK * width;
@@ -137,7 +139,7 @@ fn costs_do_not_depend_on_other_environments_or_threads() {
 }
 
 #[test]
-fn rejects_other_environments_and_wrong_shapes() {
+fn rejects_environments_of_another_kind_and_wrong_shapes() {
     let (two_room_pool, push_t_pool) = (pool(&two_room::ENTRY, 1), pool(&push_t::ENTRY, 1));
     let mut simulator = simulator(&two_room::ENTRY, &two_room_pool, &[0], Score::Terminal);
     let message = simulator.observe_env(0, push_t_pool.env(0)).expect_err("another environment").to_string();
@@ -147,5 +149,5 @@ fn rejects_other_environments_and_wrong_shapes() {
     let wide = Candidates { actions: &[0.0; 6], envs: 1, samples: 1, horizon: 1, dim: 6 };
     assert!(simulator.cost(wide, &mut [0.0]).expect_err("too many action values").to_string().contains("6 values"));
     let none = SimulatorCost::new(|| two_room::ENTRY.env(), ActionScale::identity(2), 0, Score::Terminal);
-    assert!(none.err().expect("no actions").to_string().contains("action block"));
+    assert!(none.err().expect("a block without actions is an error").to_string().contains("action block"));
 }

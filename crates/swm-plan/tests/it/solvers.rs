@@ -12,13 +12,13 @@ pub struct Trial {
     pub settings: &'static str,
     /// The settings of the short search that golden files record.
     pub short: &'static str,
-    /// For each toy it can solve: the allowed excess of the cost over the lowest one, and the allowed distance of any
-    /// value of the plan from the best plan.
+    /// For each toy that the solver can solve: the allowed excess of the cost over the lowest one, and the allowed
+    /// distance of any value of the plan from the best plan.
     pub near: &'static [(&'static str, f64, f64)],
 }
 
 pub const TRIALS: &[Trial] = &[
-    // A single round of samples is only approximate.
+    // One population of samples finds the optimum only approximately.
     Trial {
         solver: "predictive_sampling",
         settings: r#"{"samples": 200000, "sigma": 0.7}"#,
@@ -120,7 +120,7 @@ const SKIPPED: &[(&str, &str, &str)] = &[];
 /// The environments that every toy is solved for in one call.
 const ENVS: [usize; 3] = [0, 1, 2];
 
-/// The weight of the penalty. It exceeds the multipliers of the constrained toy, which are below 2.
+/// The weight of the penalty, which exceeds the multipliers of the constrained toy (below 2).
 const PENALTY: f32 = 4.0;
 
 pub fn trial(solver: &str) -> &'static Trial {
@@ -164,7 +164,7 @@ fn solvers_find_the_optima_of_toys() {
             let mut solver = (row.make)(&settings).expect("valid settings");
             let mut model = Model::new(toy, &ENVS);
             let plan = if penalised {
-                let mut model = Penalised::new(Box::new(model), PENALTY).expect("constraints");
+                let mut model = Penalised::new(Box::new(model), PENALTY).expect("the toy has constraints");
                 solve(&mut *solver, &mut model, toy, &ENVS)
             } else {
                 solve(&mut *solver, &mut model, toy, &ENVS)

@@ -21,7 +21,7 @@ pub(crate) fn mesh_cell(mesh: &Mesh, geom: &Geom, view: &View, caster: bool) -> 
     (if caster { SHADOW_MAP_CELL } else { FRAME_CELL }) / view.pixels_at(nearest)
 }
 
-/// Returns the region of a frame that a geom can touch, or `None` when it is out of sight or invalid.
+/// Returns the region of a frame that a geom can touch, or `None` if the geom is out of sight or invalid.
 pub(crate) fn touched(geom: &Geom, assets: &Assets, view: &View) -> Option<Region> {
     if !geom.position.iter().chain(&geom.rotation).all(|x| x.is_finite()) {
         return None;

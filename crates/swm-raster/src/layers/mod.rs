@@ -22,7 +22,7 @@ pub(crate) fn pattern(samples: usize) -> &'static [[f32; 2]] {
     const EIGHTHS: f32 = 0.125;
     const ONE: [[f32; 2]; 1] = [[0.5, 0.5]];
     const TWO: [[f32; 2]; 2] = [[6.0 * EIGHTHS, 6.0 * EIGHTHS], [2.0 * EIGHTHS, 2.0 * EIGHTHS]];
-    // The rotated square that graphics cards use; their rows begin at the bottom.
+    // The rotated square of graphics cards, flipped vertically, because their rows begin at the bottom.
     const FOUR: [[f32; 2]; 4] = [
         [3.0 * EIGHTHS, 7.0 * EIGHTHS],
         [7.0 * EIGHTHS, 5.0 * EIGHTHS],
@@ -36,8 +36,8 @@ pub(crate) fn pattern(samples: usize) -> &'static [[f32; 2]] {
     }
 }
 
-/// Returns the mean position of covered samples; `covered` has a bit per sample. It lies inside a convex shape even at
-/// the shape's edge. For a fully covered pixel it is the pixel's centre.
+/// Returns the mean position of covered samples; `covered` has a bit per sample. The mean lies inside a convex shape
+/// even at the shape's edge. For a fully covered pixel, the function returns the pixel's centre.
 fn centre_of(pattern: &[[f32; 2]], covered: usize) -> [f32; 2] {
     let count = covered.count_ones() as usize;
     if count == 0 || count >= pattern.len() {
@@ -58,29 +58,30 @@ pub(crate) struct Layers {
     /// The rows of the frame that are drawn.
     pub rows: Range<usize>,
     pub samples: usize,
-    /// Samples from one row to the next: those of its pixels, and [`LANES`] more for the last vector.
+    /// The number of samples from one row to the next: the samples of a row's pixels, and [`LANES`] more for the last
+    /// vector.
     stride: usize,
     /// Positions of samples within a pixel.
     pub pattern: &'static [[f32; 2]],
     /// The smallest and largest coordinates in `pattern`.
     reach: [[f32; 2]; 2],
-    /// Depths; the far plane where nothing was drawn.
+    /// The depth of each sample; the far plane if no geom covers the sample.
     pub depths: Vec<f32>,
-    /// Indices of geoms, or [`TRIANGLE`] plus the index of a triangle.
+    /// The id of each sample: the index of a geom, [`TRIANGLE`] plus the index of a triangle, or [`NOTHING`].
     pub ids: Vec<u32>,
     /// Triangles that were drawn.
     pub triangles: Vec<Triangle>,
     /// The geom of each triangle.
     owners: Vec<u32>,
-    /// By sample of a row: x from the left of the frame, and y from the upper edge of the row.
+    /// The coordinates of every sample of a row: x from the left of the frame, y from the upper edge of the row.
     at: [Vec<f32>; 2],
     /// The first [`LANES`] of `at`.
     lanes: [[f32; LANES]; 2],
-    /// By mask of covered samples: their mean position within the pixel.
+    /// For every mask of covered samples, the mean position of these samples within the pixel.
     pub centres: [[f32; 2]; 16],
-    /// For every sample of a row, a floor depth in front of all geoms, which excludes none of them.
+    /// A floor depth in front of all geoms for every sample of a row, used if no floor is given.
     free: Vec<f32>,
-    /// Scratch: how far a shape reaches to the left and right in each row.
+    /// Scratch: the leftmost and rightmost x of a shape in each row.
     outline: [Vec<f32>; 2],
     /// Scratch: vertices of a mesh in pixels, with `w` and depth.
     vertices: Vec<[f32; 4]>,
@@ -166,15 +167,15 @@ impl Layers {
         first + x0 * self.samples..first + x1 * self.samples
     }
 
-    /// Returns the part of a region within the rows; it is empty where they do not overlap.
-    pub fn part(&self, [x0, y0, x1, y1]: Region) -> Region {
+    /// Returns the part of a region within the rows; it is empty if the region does not overlap the rows.
+    pub fn clip_to_rows(&self, [x0, y0, x1, y1]: Region) -> Region {
         let y0 = y0.clamp(self.rows.start, self.rows.end);
         [x0, y0, x1, y1.clamp(y0, self.rows.end)]
     }
 
-    /// Draws a geom where it is nearer than the content and farther than `floor`, if given. Geoms in shadow maps
-    /// (`caster`) are drawn with less detail and with both sides of open meshes. Returns the region of the frame that
-    /// the geom can touch.
+    /// Draws a geom in the samples in which it is nearer than the content and farther than `floor`, if given. Geoms in
+    /// shadow maps (`caster`) are drawn with less detail and with both sides of open meshes. Returns the region of the
+    /// frame that the geom can touch.
     pub fn draw(
         &mut self,
         index: u32,
@@ -184,23 +185,23 @@ impl Layers {
         caster: bool,
     ) -> Option<Region> {
         let region = touched(geom, assets, view)?;
-        let part = self.part(region);
-        if part[1] == part[3] {
+        let clipped = self.clip_to_rows(region);
+        if clipped[1] == clipped[3] {
             return Some(region);
         }
         match geom.shape {
             Shape::Mesh(mesh) => {
                 let mesh = assets.meshes.get(mesh)?;
-                let number_of_level = mesh.level_for(mesh_cell(mesh, geom, view, caster));
-                let level = mesh.level(number_of_level);
-                let position = u32::try_from(number_of_level).unwrap_or(0);
+                let level_index = mesh.level_for(mesh_cell(mesh, geom, view, caster));
+                let level = mesh.level(level_index);
+                let level_id = u32::try_from(level_index).unwrap_or(0);
                 let both_sides = caster && !mesh.is_closed();
-                self.draw_mesh((index, position), geom, level, (view, part[1]..part[3]), floor, both_sides);
+                self.draw_mesh((index, level_id), geom, level, (view, clipped[1]..clipped[3]), floor, both_sides);
             }
             shape => {
                 let (_, halves) = shape.bounds();
                 let outline = Outline::new(geom, halves, view);
-                self.draw_shape(index, &PosedShape::new(geom, view)?, part, &outline, floor);
+                self.draw_shape(index, &PosedShape::new(geom, view)?, clipped, &outline, floor);
             }
         }
         Some(region)
@@ -217,7 +218,7 @@ impl Layers {
         let [mut lows, mut highs] = std::mem::take(&mut self.outline);
         outline.reach(y0..y1, &mut lows, &mut highs);
         for (y, (&low, &high)) in (y0..y1).zip(lows.iter().zip(&highs)) {
-            // A margin against rounding.
+            // The margin of 0.01 pixels covers rounding errors.
             let (low, high) = ((low - 0.01).max(left as f32), (high + 0.01).min(right as f32));
             if low >= high {
                 continue;

@@ -1,4 +1,4 @@
-//! [`Outline`]: how far a geom reaches to the left and right in each row, from the box around it.
+//! [`Outline`]: the leftmost and rightmost x of a geom's bounding box in each row.
 
 use crate::scene::Geom;
 use crate::vector::{V3, add, rotate};
@@ -11,7 +11,7 @@ const EDGES: usize = 12;
 
 /// The outline of a geom's bounding box on the screen.
 pub(super) struct Outline {
-    /// The edges, or `None` when a corner is behind the camera.
+    /// The edges, or `None` if a corner is behind the camera.
     edges: Option<Edges>,
 }
 
@@ -22,9 +22,11 @@ struct Edges {
     right: [f32; EDGES],
     top: [f32; EDGES],
     bottom: [f32; EDGES],
-    /// A point on each edge, and the edge's change of x per row.
+    /// The x of one end of each edge.
     x: [f32; EDGES],
+    /// The y of the same end.
     y: [f32; EDGES],
+    /// The change of x per row along each edge.
     slope: [f32; EDGES],
 }
 
@@ -83,7 +85,7 @@ vectorize! {
                 if x < right { x } else { right }
             };
             for i in 0..n {
-                // The part of the edge within the row.
+                // The x range of the edge within the row.
                 let above = top as f32 + i as u32 as i32 as f32;
                 let (p, q) = (at(above), at(above + 1.0));
                 let (low, high) = if p < q { (p, q) } else { (q, p) };

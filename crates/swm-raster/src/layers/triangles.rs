@@ -17,14 +17,15 @@ const ENLARGEMENT: f32 = 1e-5;
 /// A triangle on the screen.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Triangle {
-    /// Detail level of the mesh, and index of the triangle there.
+    /// The detail level of the mesh.
     pub level: u32,
+    /// The index of the triangle in the detail level.
     pub face: u32,
     /// The pixel that the following equations are relative to.
     base: [f32; 2],
-    /// `[by x, by y, constant]` of each barycentric weight, divided by `w`.
+    /// The coefficients `[of x, of y, constant]` of each barycentric weight divided by `w`.
     shares: [[f32; 3]; 3],
-    /// The equation of the depth divided by `w`, in the same form.
+    /// The coefficients `[of x, of y, constant]` of the depth divided by `w`.
     depth: [f32; 3],
 }
 
@@ -44,7 +45,7 @@ impl Triangle {
 impl Layers {
     pub(super) fn draw_mesh(
         &mut self,
-        (index, position): (u32, u32),
+        index: (u32, u32),
         geom: &Geom,
         level: &DetailLevel,
         (view, rows): (&View, Range<usize>),
@@ -66,7 +67,7 @@ impl Layers {
         let front = if view.mirrored { 1.0 } else { -1.0 };
         let front = if both_sides { 0.0 } else { front };
         let rules = DrawRules { front, near: view.near, floor, rows };
-        dispatch_avx2(MeshTriangles { layers: self, index: (index, position), level, vertices: &vertices, rules });
+        dispatch_avx2(MeshTriangles { layers: self, index, level, vertices: &vertices, rules });
         self.vertices = vertices;
     }
 
@@ -77,7 +78,7 @@ impl Layers {
         if area * rules.front < 0.0 || area.abs() <= 1e-12 || !area.is_finite() {
             return;
         }
-        // Pixels whose samples may be inside.
+        // The range of pixels whose samples may be inside the triangle.
         let [first, last] = self.reach;
         let low = |k: usize| (a[k].min(b[k]).min(c[k]) - last[k] + 1.0) as i32;
         let high = |k: usize| (a[k].max(b[k]).max(c[k]) - first[k] + 1.0) as i32;
@@ -87,7 +88,7 @@ impl Layers {
         if x0 >= x1 || first >= last {
             return;
         }
-        // Relative to the frame, not to the rows, so that rounding does not depend on where the rows begin.
+        // The base is relative to the frame, not to the rows, so that rounding does not depend on the first row.
         let base = [x0 as f32, y0 as f32];
         let by = 1.0 / area;
         let corner = |p: [f32; 4]| (p[0] - base[0], p[1] - base[1], by / p[2]);
@@ -104,7 +105,8 @@ impl Layers {
     /// Draws a triangle that crosses the near plane.
     #[cold]
     fn near_triangle(&mut self, index: (u32, u32, u32), corners: [[f32; 4]; 3], rules: &DrawRules<'_>) {
-        // A weight divided by w is linear on the screen: the inverse of the matrix of the corners.
+        // A weight divided by w is linear on the screen. Its coefficients are a row of the inverse matrix of the
+        // corners.
         let [a, b, c] =
             corners.map(|[x, y, w, _]| [f64::from(x) * f64::from(w), f64::from(y) * f64::from(w), f64::from(w)]);
         let wedge = |a: [f64; 3], b: [f64; 3]| {
@@ -156,10 +158,10 @@ impl Layers {
             let lanes = simd.add(simd.mul(slopes[k], across), simd.mul(simd.splat(y), down));
             corner[k] = simd.add(simd.splat(constant), lanes);
         }
-        let (none, near, pixels) = (simd.splat(0.0), simd.splat(rules.near), simd.splat((LANES / self.samples) as f32));
+        let (zero, near, pixels) = (simd.splat(0.0), simd.splat(rules.near), simd.splat((LANES / self.samples) as f32));
         let id = TRIANGLE | self.triangles.len() as u32;
         let wide = ((x1 - x0) * self.samples).next_multiple_of(LANES);
-        let mut drawn = simd.gt(none, none);
+        let mut drawn = simd.gt(zero, zero);
         for y in y0..y1 {
             let begin = self.span(y, x0, x0).start;
             let row = begin..begin + wide;
@@ -171,15 +173,15 @@ impl Layers {
             for (left, line) in left.iter_mut().zip(&lines) {
                 *left = simd.add(*left, simd.splat(line[1] * rows));
             }
-            let mut column = none;
+            let mut column = zero;
             for ((depths, ids), floor) in depths.iter_mut().zip(ids).zip(floor) {
                 let mut at = left;
                 for (at, slope) in at.iter_mut().zip(slopes) {
                     *at = simd.add(*at, simd.mul(slope, column));
                 }
                 let [p, q, r, depth] = at;
-                let inside = simd.ge(simd.min(simd.min(p, q), r), none);
-                // Where all weights are 0, the result is NaN, and the comparison with `near` is false.
+                let inside = simd.ge(simd.min(simd.min(p, q), r), zero);
+                // If all weights are 0, the result is NaN, and the comparison with `near` is false.
                 let far = simd.div(depth, simd.add(simd.add(p, q), r));
                 let nearer = simd.and(simd.ge(simd.load(depths), far), simd.gt(far, near));
                 let nearer = simd.and(inside, simd.and(nearer, simd.gt(far, simd.load(floor))));
@@ -206,12 +208,13 @@ struct MeshTriangles<'a> {
     rules: DrawRules<'a>,
 }
 
-/// Which triangles and samples are drawn.
+/// The conditions under which triangles and samples are drawn.
 struct DrawRules<'a> {
     /// Sign of the screen area of triangles to draw; 0 for both sides.
     front: f32,
-    /// Samples must be farther than the near plane and, if given, farther than the floor.
+    /// The near plane; samples must be farther.
     near: f32,
+    /// A depth for each sample, if given; samples must be farther.
     floor: Option<&'a [f32]>,
     /// The rows to draw.
     rows: Range<usize>,

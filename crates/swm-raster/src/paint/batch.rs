@@ -18,24 +18,27 @@ pub(super) struct Batch {
     pub n: usize,
     pub x: Lane,
     pub y: Lane,
-    /// Depths along the rays; scratch afterwards.
+    /// Depths along the rays, relative to the depth of the pose.
     pub depth: Lane,
     pub position: [Lane; 3],
     pub local: [Lane; 3],
     pub normal: [Lane; 3],
     pub coordinates: [Lane; 2],
-    /// For planes and boxes: the grid cell, and the position within it.
+    /// The grid cell, for planes and boxes.
     pub cell: [u32; MANY],
+    /// The position within the grid cell, from 0 to 1.
     pub within: [Lane; 2],
-    /// For textures: texels per pixel, and the face.
+    /// The texels per pixel of a texture.
     pub texels_per_pixel: Lane,
+    /// The face of a cube texture.
     pub face: [u32; MANY],
     pub sampler: Sampler,
-    /// 1 where the current light reaches, 0 in its shadow.
+    /// 1 for fragments that the current light reaches, 0 for fragments in its shadow.
     pub lit: Lane,
     pub tint: [Lane; 3],
     /// The light of one pass.
     pub pass: [Lane; 3],
+    /// The light of all passes so far; the colours in the end.
     pub sum: [Lane; 3],
 }
 
@@ -70,8 +73,9 @@ impl Default for Batch {
 pub(crate) struct Lighting<'a> {
     /// Lights without shadows.
     pub plain: &'a [ShadingLight],
-    /// Lights with shadows, and their shadow maps.
+    /// Lights with shadows.
     pub shadowed: &'a [ShadingLight],
+    /// The shadow maps of the lights with shadows.
     pub shadows: &'a [Shadow],
 }
 
@@ -150,14 +154,14 @@ impl Batch {
         }
     }
 
-    /// Passes the colours of runs to `show`.
+    /// Calls `show` with the pixels, the covered fraction and the colours of each run.
     pub fn show(&self, runs: &[Run], layers: &Layers, show: &mut impl FnMut(Range<usize>, f32, [&[f32]; 3])) {
         let mut begin = 0;
         for run in runs {
             let row = usize::from(run.y) - layers.rows.start;
             let (pixel, count) = (row * layers.width + usize::from(run.x), usize::from(run.count));
-            let part = run.samples.count_ones() as f32 / layers.samples as f32;
-            show(pixel..pixel + count, part, self.sum.each_ref().map(|lane| &lane[begin..begin + count]));
+            let covered = run.samples.count_ones() as f32 / layers.samples as f32;
+            show(pixel..pixel + count, covered, self.sum.each_ref().map(|lane| &lane[begin..begin + count]));
             begin += count;
         }
     }
@@ -193,7 +197,7 @@ impl Batch {
             let triangle = &layers.triangles[(id & !TRIANGLE) as usize];
             let level = mesh.level(triangle.level as usize);
             let (face, corners) = (level.faces[triangle.face as usize], level.corners[triangle.face as usize]);
-            // The centre of the pixel may be outside the triangle: a point on its edge is taken then.
+            // If the centre of the pixel is outside the triangle, a point on the triangle's edge is shaded.
             let (shares, _) = triangle.at(self.x[i], self.y[i]);
             let shares = shares.map(|share| share.clamp(0.0, 1.0));
             let sum = shares[0] + shares[1] + shares[2];
@@ -249,14 +253,14 @@ vectorize! {
         }
     }
 
-    /// Adds light where it reaches.
+    /// Adds light multiplied by `lit`.
     fn add_lit(sums: &mut [f32], light: &[f32], lit: &[f32]) {
         for ((sum, light), lit) in sums.iter_mut().zip(light).zip(lit) {
             *sum += light * lit;
         }
     }
 
-    /// Converts unit coordinates to local and world coordinates, and normals to unit normals in the world.
+    /// Converts unit coordinates to local and world coordinates, and normals to unit normals in world coordinates.
     fn to_world(
         geom: &Geom, sizes: V3, n: usize, local: &mut [Lane; 3], normal: &mut [Lane; 3], position: &mut [Lane; 3],
     ) {

@@ -13,16 +13,17 @@ use swm_simd::{F32x8, Kernel, LANES, dispatch_avx2, vectorize};
 /// Cells along the side of a box, at whose corners lighting is computed.
 const QUADS: usize = 4;
 
-/// Cells up to this size in pixels are lit per fragment instead, which looks the same.
+/// Cells up to this size, in pixels, are lit per fragment, because interpolation would look the same.
 const COARSE: f32 = 6.0;
 
 /// Light at the corners of the grids of planes and boxes, computed at first use.
 #[derive(Default)]
 pub(super) struct LightGrids {
-    /// By geom: index of its first corner; `u32::MAX` before its first use.
+    /// The index of each geom's first corner; `u32::MAX` before the first use.
     pub starts: Vec<u32>,
-    /// By corner and pass.
+    /// The colour of each corner and pass.
     pub colours: Vec<V3>,
+    /// Whether each colour has been computed.
     pub known: Vec<bool>,
 }
 
@@ -74,7 +75,7 @@ impl Batch {
         };
         let mut begin = 0;
         while begin < self.n {
-            // Neighbours are mostly in the same cell.
+            // Neighbouring fragments are mostly in the same cell, so each run in one cell is interpolated at once.
             let cell = self.cell[begin];
             let same = self.cell[begin..self.n].iter().take_while(|other| **other == cell).count();
             let mut corners = [[0.0; 3]; 4];
@@ -82,8 +83,8 @@ impl Batch {
                 let corner = start + (cell as usize + step) * passes + pass;
                 if !grids.known[corner] {
                     grids.known[corner] = true;
-                    let corner_there = self.grid(geom, begin).corner(geom, step);
-                    grids.colours[corner] = corner_light(corner_there, pass, material, context);
+                    let corner_pose = self.grid(geom, begin).corner(geom, step);
+                    grids.colours[corner] = corner_light(corner_pose, pass, material, context);
                 }
                 *colour = grids.colours[corner];
             }
@@ -121,7 +122,7 @@ struct GridCell {
 }
 
 impl GridCell {
-    /// Returns the cell of a local position on a plane or a box, where the surface has a normal in the world.
+    /// Returns the cell of a local position on a plane or a box; `normal` is the surface normal in world coordinates.
     #[inline]
     fn at(geom: &Geom, position: V3, normal: V3) -> Self {
         let (axes, side, at, begin) = match geom.shape {
@@ -186,7 +187,7 @@ impl LightGrids {
     }
 }
 
-/// Bilinear interpolation between the colours of four corners, for the fragments of a run. Lanes behind the run may
+/// Bilinear interpolation between the colours of four corners, for the fragments of a run. Lanes after the run may
 /// be overwritten.
 struct Interpolation<'a> {
     corners: [V3; 4],

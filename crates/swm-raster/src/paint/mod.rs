@@ -16,23 +16,23 @@ use light_grid::LightGrids;
 use std::ops::Range;
 use swm_simd::LANES;
 
-/// Rows that are gathered together, counted from the top of the frame. Lighting may depend on which fragments are
-/// gathered together, so strips of rows begin at multiples of it.
+/// The number of rows that are gathered together, counted from the top of the frame. Lighting may depend on the
+/// fragments that are gathered together, so strips begin at multiples of this number.
 pub(crate) const BAND: usize = 64;
 
 /// One value per fragment, with room for a last vector that is not full.
 type Lane = [f32; MANY + LANES];
 
-/// Neighbouring pixels of a row that show a geom with all samples, or one pixel that shows it with some.
+/// Neighbouring pixels of a row whose samples all show one geom, or one pixel of which some samples show the geom.
 #[derive(Clone, Copy, Debug, Default)]
 struct Run {
     geom: u32,
-    /// Id of the first of the samples.
+    /// The id of the first sample that shows the geom.
     id: u32,
     x: u16,
     y: u16,
     count: u16,
-    /// Mask of the samples.
+    /// The mask of the samples that show the geom.
     samples: u8,
 }
 
@@ -44,8 +44,9 @@ pub(crate) struct Painter {
     sorted: Vec<Run>,
     /// The runs that are being shaded.
     lit: Vec<Run>,
-    /// By geom: number of runs, and then the index after its last sorted run.
+    /// The number of runs of each geom; after sorting, the index after the geom's last sorted run.
     counts: Vec<usize>,
+    /// The geoms that have runs.
     present: Vec<u32>,
     batch: Box<Batch>,
     grids: LightGrids,
@@ -63,7 +64,7 @@ impl Painter {
     }
 
     /// Shades the content of layers within a region. Calls `show` with neighbouring pixels (counted from the first
-    /// row of the layers), the covered part of each, and their red, green and blue.
+    /// row of the layers), the covered fraction of each pixel, and their red, green and blue.
     pub fn paint(
         &mut self,
         layers: &Layers,
@@ -71,7 +72,7 @@ impl Painter {
         region: Region,
         mut show: impl FnMut(Range<usize>, f32, [&[f32]; 3]),
     ) {
-        let [x0, mut y, x1, y1] = layers.part(region);
+        let [x0, mut y, x1, y1] = layers.clip_to_rows(region);
         while y < y1 {
             let next = (y / BAND * BAND + BAND).min(y1);
             self.gather(layers, [x0, y, x1, next]);
@@ -95,7 +96,7 @@ impl Painter {
         }
     }
 
-    /// Adds a run, merging it with the last one where it continues it.
+    /// Adds a run, or extends the last run if the new run continues it.
     #[inline]
     fn push(&mut self, run: Run, all: u8) {
         if run.samples == all
@@ -107,11 +108,11 @@ impl Painter {
             return;
         }
         self.runs.push(run);
-        let known = &mut self.counts[run.geom as usize];
-        if *known == 0 {
+        let count = &mut self.counts[run.geom as usize];
+        if *count == 0 {
             self.present.push(run.geom);
         }
-        *known += 1;
+        *count += 1;
     }
 
     /// Gathers the runs of a region, sorted by geom.
@@ -156,7 +157,7 @@ impl Painter {
                 at += count;
                 continue;
             }
-            // A pixel shows a geom once, whatever triangles of it are visible.
+            // A geom has one run in a pixel, even if several triangles of the geom are visible in the pixel.
             let geoms = pixel.map(|id| if id == NOTHING { NOTHING } else { layers.geom(id) });
             for (sample, (&geom, &id)) in geoms.iter().zip(pixel).enumerate() {
                 if geom == NOTHING || geoms[..sample].contains(&geom) {
@@ -171,7 +172,7 @@ impl Painter {
     }
 }
 
-/// Takes the next runs, up to [`MANY`] pixels. Returns the rest of the last run.
+/// Moves runs to `lit`, up to [`MANY`] pixels. Returns the next run, which may be the rest of a split run.
 fn fill(lit: &mut Vec<Run>, first: Option<Run>, more: &mut impl Iterator<Item = Run>) -> Option<Run> {
     lit.clear();
     let (mut room, mut next) = (MANY as u16, first);

@@ -1,4 +1,4 @@
-//! Texture coordinates of fragments, and how many texels a pixel covers there.
+//! Texture coordinates of fragments, and the number of texels that a pixel covers.
 
 use super::batch::{Batch, ShadingContext};
 use crate::scene::{Geom, Mapping};
@@ -71,7 +71,7 @@ impl Batch {
             let (s, t);
             match mapping {
                 Mapping::Sides(repeat) => {
-                    // The axes that run to the right and down on this side.
+                    // The axes that run to the right and up on this side of the box.
                     let [u, v] = side_axes(unrotate(&geom.rotation, normal));
                     let (_, halves) = geom.shape.bounds();
                     let by = [0.5 * repeat[0] / halves[u].max(1e-6), 0.5 * repeat[1] / halves[v].max(1e-6)];
@@ -80,7 +80,7 @@ impl Batch {
                     (s, t) = (by[0] * position[u] + 0.5 * repeat[0], 0.5 * repeat[1] - by[1] * position[v]);
                     self.texels_per_pixel[i] = texture.texels_per_pixel(change);
                 }
-                // Coordinates of meshes are used as they are: their triangles are small.
+                // The texture coordinates of a mesh are used unchanged, with the finest mip level.
                 Mapping::Own | Mapping::Flat { .. } | Mapping::Cube(_) => {
                     [s, t] = self.coordinates.each_ref().map(|lane| lane[i]);
                     self.texels_per_pixel[i] = 0.0;
@@ -133,8 +133,8 @@ impl LocalRays {
         }
     }
 
-    /// Returns the change of a position on its surface, whose normal is in world coordinates, from this pixel to its
-    /// right and its lower neighbour.
+    /// Returns the change of a position along its surface from this pixel to the right and to the lower neighbour.
+    /// `normal` is in world coordinates.
     #[inline(always)]
     fn screen_derivatives(&self, x: f32, y: f32, position: V3, normal: V3) -> [V3; 2] {
         let normal = unrotate(&self.rotation, normal);
@@ -148,7 +148,7 @@ impl LocalRays {
         ]
     }
 
-    /// Returns the change towards one neighbour.
+    /// Returns the change towards the right neighbour (`side` 0) or the lower neighbour (`side` 1).
     #[inline(always)]
     fn screen_derivative(&self, side: usize, depth: f32, direction: V3, normal: V3, facing: f32) -> V3 {
         let free = add(self.origins[side], scale(self.directions[side], depth));
@@ -175,7 +175,7 @@ vectorize! {
         }
     }
 
-    /// Computes faces of a cube texture, coordinates there, and the texels per pixel.
+    /// Computes faces of a cube texture, coordinates on these faces, and the texels per pixel.
     fn cube_coordinates(
         texture: &Texture, rays: &LocalRays, by: V3, x: &[f32], y: &[f32], positions: [&[f32]; 3], normals: [&[f32]; 3],
         s: &mut [f32], t: &mut [f32], texels_per_pixel: &mut [f32], faces: &mut [u32],

@@ -9,11 +9,11 @@ use swm_raster::{Assets, Camera, Canvas, Scene, Target};
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(2000))]
     #[test]
-    fn a_used_canvas_draws_like_a_new_one(first in scene(), second in scene()) {
+    fn used_canvas_draws_like_a_new_canvas(first in scene(), second in scene()) {
         let assets = assets();
         let mut canvas = Canvas::new();
         drawn(&mut canvas, &first, &assets);
-        // Earlier frames do not affect later ones.
+        // Earlier frames do not affect later frames.
         prop_assert_eq!(drawn(&mut canvas, &second, &assets), drawn(&mut Canvas::new(), &second, &assets));
     }
 }
@@ -21,7 +21,7 @@ proptest! {
 #[test]
 fn large_scenes_give_the_same_bytes_on_any_thread() {
     let mut runner = proptest::test_runner::TestRunner::deterministic();
-    let tree = prop::collection::vec(geom(), 4000).new_tree(&mut runner).expect("geoms");
+    let tree = prop::collection::vec(geom(), 4000).new_tree(&mut runner).expect("the strategy generates geoms");
     let camera = Camera { position: [0.0, -6.0, 0.0], ..CAMERA };
     let scene = Scene { camera, geoms: tree.current(), shadows: true, reflections: true, ..Scene::default() };
     let assets = assets();

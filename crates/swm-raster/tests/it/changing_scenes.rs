@@ -8,18 +8,23 @@ use swm_raster::{Camera, Canvas, Geom, IDENTITY, Scene, Shape};
 #[derive(Clone, Debug)]
 enum Change {
     Nothing,
-    /// Replaces a geom, or only its pose or its appearance.
+    /// Replaces a geom.
     Geom(usize, Geom),
+    /// Replaces the pose of a geom.
     Pose(usize, Geom),
+    /// Replaces the appearance of a geom.
     Appearance(usize, Geom),
-    /// Changes one value, of a geom's pose and shape or of the camera.
+    /// Changes one value of a geom's pose or shape.
     GeomValue(usize, usize, f32),
+    /// Changes one value of the camera.
     CameraValue(usize, f32),
-    /// Adds or removes a geom.
+    /// Adds a geom.
     Add(Geom),
+    /// Removes a geom.
     Remove(usize),
-    /// Takes everything but the geoms, or the camera, from another scene.
+    /// Takes the lights, the sky and the settings of shadows and reflections from another scene.
     Lights(Scene),
+    /// Takes the camera from another scene.
     Camera(Scene),
 }
 
@@ -141,11 +146,11 @@ fn replaced_meshes_are_drawn() {
         casts: true,
     };
     let scene = Scene { camera, geoms: vec![geom; 2], ..Scene::default() };
-    let (some, mut others) = (assets(), assets());
-    others.meshes.reverse();
+    let (original, mut reversed) = (assets(), assets());
+    reversed.meshes.reverse();
     let mut canvas = Canvas::new();
     for _ in 0..3 {
-        assert!(drawn(&mut canvas, &scene, &some).2.contains(&3));
+        assert!(drawn(&mut canvas, &scene, &original).2.contains(&3));
     }
-    assert!(!drawn(&mut canvas, &scene, &others).2.contains(&3), "the mesh of that index is now empty");
+    assert!(!drawn(&mut canvas, &scene, &reversed).2.contains(&3), "mesh 0 of the reversed list is empty");
 }

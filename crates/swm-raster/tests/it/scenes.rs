@@ -1,6 +1,6 @@
 //! Random scenes of every kind, including invalid ones: sizes of zero, positions that are NaN, cameras inside of
 //! geoms.
-#![allow(clippy::expect_used, reason = "for tests")]
+#![allow(clippy::expect_used, reason = "tests may panic")]
 
 use proptest::prelude::*;
 use std::sync::Arc;
@@ -21,7 +21,7 @@ pub const CAMERA: Camera = Camera {
 };
 
 /// Values, including infinities, NaN and extremes.
-fn number() -> impl Strategy<Value = f32> {
+fn value() -> impl Strategy<Value = f32> {
     prop_oneof![
         8 => -3.0..3.0f32,
         1 => prop::sample::select(vec![
@@ -31,35 +31,39 @@ fn number() -> impl Strategy<Value = f32> {
 }
 
 fn vector() -> impl Strategy<Value = V3> {
-    prop::array::uniform3(number())
+    prop::array::uniform3(value())
 }
 
 fn shape() -> impl Strategy<Value = Shape> {
-    let axis =
-        || {
-            (number(), number(), number(), 1..50usize, any::<bool>())
-                .prop_map(|(half, pad, step, cells, infinite)| Axis { half, pad, step, cells, infinite })
-        };
+    let axis = || {
+        (value(), value(), value(), 1..50usize, any::<bool>()).prop_map(|(half, pad, step, cells, infinite)| Axis {
+            half,
+            pad,
+            step,
+            cells,
+            infinite,
+        })
+    };
     prop_oneof![
         (axis(), axis()).prop_map(|(x, y)| Shape::Plane(x, y)),
         vector().prop_map(Shape::Ellipsoid),
-        (number(), number()).prop_map(|(radius, half)| Shape::Capsule(radius, half)),
-        (number(), number()).prop_map(|(radius, half)| Shape::Cylinder(radius, half)),
+        (value(), value()).prop_map(|(radius, half)| Shape::Capsule(radius, half)),
+        (value(), value()).prop_map(|(radius, half)| Shape::Cylinder(radius, half)),
         vector().prop_map(Shape::Box),
         (0..4usize).prop_map(Shape::Mesh),
     ]
 }
 
 fn rotation() -> impl Strategy<Value = [f32; 9]> {
-    prop_oneof![3 => Just(IDENTITY), 1 => prop::array::uniform9(number())]
+    prop_oneof![3 => Just(IDENTITY), 1 => prop::array::uniform9(value())]
 }
 
 fn paint() -> impl Strategy<Value = Option<Paint>> {
     let mapping = prop_oneof![
-        (prop::array::uniform2(number()), prop::array::uniform2(number()))
+        (prop::array::uniform2(value()), prop::array::uniform2(value()))
             .prop_map(|(scale, offset)| Mapping::Flat { scale, offset }),
         vector().prop_map(Mapping::Cube),
-        prop::array::uniform2(number()).prop_map(Mapping::Sides),
+        prop::array::uniform2(value()).prop_map(Mapping::Sides),
         Just(Mapping::Own),
     ];
     prop::option::of((0..4usize, mapping).prop_map(|(texture, mapping)| Paint { texture, mapping }))
@@ -67,7 +71,7 @@ fn paint() -> impl Strategy<Value = Option<Paint>> {
 
 /// A random geom.
 pub fn geom() -> impl Strategy<Value = Geom> {
-    let material = (prop::array::uniform4(number()), number(), number(), number(), number(), paint());
+    let material = (prop::array::uniform4(value()), value(), value(), value(), value(), paint());
     (shape(), vector(), rotation(), material, any::<bool>()).prop_map(|(shape, position, rotation, material, casts)| {
         let (rgba, emission, specular, shininess, reflectance, paint) = material;
         let label = Some(1);
@@ -77,7 +81,7 @@ pub fn geom() -> impl Strategy<Value = Geom> {
 
 fn light() -> impl Strategy<Value = Light> {
     let colours = (vector(), vector(), vector());
-    (vector(), vector(), any::<bool>(), vector(), (number(), number()), colours, any::<bool>()).prop_map(
+    (vector(), vector(), any::<bool>(), vector(), (value(), value()), colours, any::<bool>()).prop_map(
         |(position, direction, directional, attenuation, (cutoff, exponent), (ambient, diffuse, specular), shadows)| {
             Light {
                 position,
@@ -97,8 +101,8 @@ fn light() -> impl Strategy<Value = Light> {
 
 fn camera() -> impl Strategy<Value = Camera> {
     let usual = vector().prop_map(|position| Camera { position, ..CAMERA });
-    let odd = (vector(), vector(), vector(), prop::array::uniform4(number()), number(), number(), any::<bool>())
-        .prop_map(|(position, forward, up, frustum, near, far, orthographic)| Camera {
+    let odd = (vector(), vector(), vector(), prop::array::uniform4(value()), value(), value(), any::<bool>()).prop_map(
+        |(position, forward, up, frustum, near, far, orthographic)| Camera {
             position,
             forward,
             up,
@@ -106,13 +110,14 @@ fn camera() -> impl Strategy<Value = Camera> {
             near,
             far,
             orthographic,
-        });
+        },
+    );
     prop_oneof![3 => usual, 1 => odd]
 }
 
 /// A random scene.
 pub fn scene() -> impl Strategy<Value = Scene> {
-    let more = (prop::option::of(0..4usize), any::<bool>(), any::<bool>(), number(), number());
+    let more = (prop::option::of(0..4usize), any::<bool>(), any::<bool>(), value(), value());
     (camera(), prop::collection::vec(geom(), 0..12), prop::collection::vec(light(), 0..4), more).prop_map(
         |(camera, geoms, lights, (sky, shadows, reflections, shadow_reach, shadow_angle))| Scene {
             camera,
@@ -128,7 +133,8 @@ pub fn scene() -> impl Strategy<Value = Scene> {
     )
 }
 
-/// A tetrahedron, triangles that are degenerate or not finite, an empty mesh; a flat, a cube and a white texture.
+/// Three meshes (a tetrahedron, triangles that are degenerate or not finite, no triangles) and three textures (flat,
+/// cube, white).
 pub fn assets() -> Assets {
     let corner = |position: V3| Corner { position, normal: position, coordinates: [0.5, 2.5] };
     let [a, b, c, d] = [[1.0, 1.0, 1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, -1.0], [1.0, -1.0, -1.0]].map(corner);
@@ -145,7 +151,7 @@ pub fn assets() -> Assets {
 
 const SIZE: (usize, usize) = (13, 9);
 
-/// Colours, depths and labels.
+/// Draws a scene; returns its colours, the bits of its depths, and its labels.
 pub fn drawn(canvas: &mut Canvas, scene: &Scene, assets: &Assets) -> (Vec<u8>, Vec<u32>, Vec<i32>) {
     let n = SIZE.0 * SIZE.1;
     let (mut rgb, mut depths, mut labels) = (vec![0; 3 * n], vec![0.0; n], vec![0; n]);

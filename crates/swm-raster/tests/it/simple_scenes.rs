@@ -20,7 +20,7 @@ fn geom(shape: Shape, position: V3) -> Geom {
     }
 }
 
-/// Light from above.
+/// A directional light from above.
 fn light(shadows: bool) -> Light {
     Light {
         position: [0.0, 5.0, 9.0],
@@ -50,7 +50,7 @@ fn depths(scene: &Scene, assets: &Assets) -> Vec<f32> {
     depths
 }
 
-/// The value at the centre of a frame.
+/// The first channel of the pixel at the centre of a frame.
 fn middle<T: Copy>(frame: &[T]) -> T {
     let channels = frame.len() / (SIDE * SIDE);
     frame[(SIDE / 2 * SIDE + SIDE / 2) * channels]
@@ -58,7 +58,7 @@ fn middle<T: Copy>(frame: &[T]) -> T {
 
 #[test]
 fn depths_of_shapes_are_exact() {
-    let half_turn = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0, 0.0];
+    let quarter_turn = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0, 0.0];
     for (shape, nearest) in [
         (Shape::Ellipsoid([1.0, 2.0, 1.0]), 8.0),
         (Shape::Capsule(0.5, 2.0), 9.5),
@@ -68,7 +68,7 @@ fn depths_of_shapes_are_exact() {
         let scene = Scene { camera: CAMERA, geoms: vec![geom(shape, [0.0, 10.0, 0.0])], ..Scene::default() };
         let depth = middle(&depths(&scene, &Assets::default()));
         assert!((depth - nearest).abs() < 0.05, "{shape:?}: {depth}");
-        // Far away and small: rounding must not lose it.
+        // A shape that is far away and small must not be lost by rounding.
         let mut far = scene.clone();
         far.camera.far = 2e4;
         far.geoms[0].position[1] += 1e4;
@@ -76,14 +76,14 @@ fn depths_of_shapes_are_exact() {
         let depth = middle(&depths(&far, &Assets::default()));
         assert!((depth - nearest - 1e4).abs() < 0.05, "{shape:?}: {depth}");
     }
-    // A rotated geom.
+    // A capsule along the viewing direction.
     let mut lying = geom(Shape::Capsule(0.5, 2.0), [0.0, 10.0, 0.0]);
-    lying.rotation = half_turn;
+    lying.rotation = quarter_turn;
     let scene = Scene { camera: CAMERA, geoms: vec![lying], ..Scene::default() };
     assert!((middle(&depths(&scene, &Assets::default())) - 7.5).abs() < 0.05);
 }
 
-/// A plane below the camera, and a sphere above it.
+/// A plane below the camera, and a sphere above the plane.
 fn sphere_over_plane(shadows: bool) -> Scene {
     let floor = Shape::Plane(Axis::even(20.0, 40), Axis::even(20.0, 40));
     Scene {
@@ -144,7 +144,7 @@ fn transparent_geoms_are_blended_twice() {
 #[test]
 fn mesh_of_a_box_equals_the_box() {
     let corner = |i: usize| -> V3 { std::array::from_fn(|k| if i >> k & 1 == 1 { 1.0 } else { -1.0 }) };
-    // Sides by their corners, counterclockwise from outside.
+    // The corners of each side, counterclockwise seen from outside, and its normal.
     let sides = [
         ([1, 3, 7, 5], [1.0, 0.0, 0.0]),
         ([0, 4, 6, 2], [-1.0, 0.0, 0.0]),

@@ -29,5 +29,5 @@ pub(crate) fn chart(group: &Group<'_>) -> String {
             top += used + 11.0;
         }
     }
-    svg.finish("Every episode as a square: filled if it was solved, empty if it was not")
+    svg.finish("Every episode as a square: filled if solved, empty if not solved")
 }

@@ -12,7 +12,7 @@ const LABELS: f64 = 340.0;
 /// Draws differences of success rates with their confidence intervals, one row for each pair; `None` if no two policies
 /// played the same starts.
 pub(crate) fn chart(group: &Group<'_>) -> Option<String> {
-    let pairs = all(group);
+    let pairs = pairs_by_condition(group);
     let rows: usize = pairs.iter().map(|(_, pairs)| pairs.len()).sum();
     if rows == 0 {
         return None;
@@ -51,17 +51,17 @@ pub(crate) fn chart(group: &Group<'_>) -> Option<String> {
     Some(svg.finish(&format!("Differences on the same starts: {}", descriptions.collect::<Vec<_>>().join("; "))))
 }
 
-/// The table of the counts behind the differences.
+/// The table of the counts from which the differences are computed.
 pub(crate) fn table(group: &Group<'_>) -> String {
     let mut html = "<div class=\"wide\" role=\"region\" aria-label=\"Paired comparisons\" tabindex=\"0\">\n<table>\n\
-         <caption>Starts by the policies that solved them. Only starts that exactly one of the two solved distinguish \
-         them.</caption>\n<thead>\n<tr>\
+         <caption>The number of starts that both, one or neither of the policies solved. Only starts that exactly one \
+         policy solved show a difference between the policies.</caption>\n<thead>\n<tr>\
          <th scope=\"col\">Condition</th><th scope=\"col\">Policy A</th><th scope=\"col\">Policy B</th>\
          <th scope=\"col\" class=\"n\">Both</th><th scope=\"col\" class=\"n\">Only A</th>\
          <th scope=\"col\" class=\"n\">Only B</th><th scope=\"col\" class=\"n\">Neither</th>\
          <th scope=\"col\" class=\"n\">McNemar’s p</th></tr>\n</thead>\n"
         .to_owned();
-    for (condition, pairs) in all(group) {
+    for (condition, pairs) in pairs_by_condition(group) {
         html.push_str("<tbody>\n");
         for (i, (a, b, table)) in pairs.iter().enumerate() {
             html.push_str("<tr>");
@@ -91,8 +91,8 @@ pub(crate) fn table(group: &Group<'_>) -> String {
 /// The name of a condition and its pairs.
 type Pairs<'g, 'a> = (&'a str, Vec<(&'g Row<'a>, &'g Row<'a>, Paired)>);
 
-/// Every pair, by condition; conditions without pairs are left out.
-fn all<'g, 'a>(group: &'g Group<'a>) -> Vec<Pairs<'g, 'a>> {
+/// Every pair of policies, by condition, without conditions that have no pairs.
+fn pairs_by_condition<'g, 'a>(group: &'g Group<'a>) -> Vec<Pairs<'g, 'a>> {
     let pairs = group.conditions.iter().map(|condition| (condition.name, condition.pairs(group.counting)));
     pairs.filter(|(_, pairs)| !pairs.is_empty()).collect()
 }

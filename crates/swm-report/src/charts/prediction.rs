@@ -69,7 +69,7 @@ fn trajectories(row: &Row<'_>, prediction: &Prediction, title: &str) -> String {
     svg.text(
         "tick middle",
         [(left + right) / 2.0, bottom + 36.0],
-        "mean over its steps, in units of the latents' variance",
+        "mean over the steps, in units of the latents' variance",
     );
     for (i, group) in prediction.groups.iter().enumerate() {
         let (name, class) = label(group);

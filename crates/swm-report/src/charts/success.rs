@@ -5,8 +5,8 @@ use crate::group::Group;
 use crate::text::{percent, shorten};
 use std::fmt::Write as _;
 
-/// Success rates with their 95 % confidence intervals, one row for each run. The interval of the random-policy floor is a band
-/// across its condition.
+/// Success rates with their 95 % confidence intervals, one row for each run. The interval of the random-policy floor is
+/// a band across its condition.
 pub(crate) fn chart(group: &Group<'_>) -> String {
     const HEAD: f64 = 34.0;
     let rows = group.rows().count();

@@ -14,7 +14,7 @@ pub(crate) const NAME: usize = 23;
 /// The height of a labelled row, in pixels.
 pub(crate) const ROW: f64 = 30.0;
 
-/// A linear scale from values to pixels.
+/// A linear scale that maps the values `low..=high` to the pixels `from..=to`.
 #[derive(Clone, Copy)]
 pub(crate) struct Scale {
     pub low: f64,
@@ -35,7 +35,7 @@ impl Scale {
         (Self { low: first * step, high: last * step, from, to }, ticks)
     }
 
-    /// The pixel of a value.
+    /// Returns the pixel of a value.
     pub(crate) fn at(self, value: f64) -> f64 {
         self.from + (value - self.low) / (self.high - self.low) * (self.to - self.from)
     }
@@ -53,12 +53,12 @@ impl Svg {
         Self { body: String::new(), width, height }
     }
 
-    /// A line of a class between two points.
+    /// Adds a line of a CSS class between two points.
     pub(crate) fn line(&mut self, class: &str, [x1, y1]: [f64; 2], [x2, y2]: [f64; 2]) {
         let _ = writeln!(self.body, r#"<line class="{class}" x1="{x1:.1}" y1="{y1:.1}" x2="{x2:.1}" y2="{y2:.1}"/>"#);
     }
 
-    /// A rectangle with a corner and a size.
+    /// Adds a rectangle with a top left corner, a size and a tooltip.
     pub(crate) fn rect(&mut self, class: &str, [x, y]: [f64; 2], [width, height]: [f64; 2], tip: &str) {
         let _ = writeln!(
             self.body,
@@ -67,7 +67,7 @@ impl Svg {
         );
     }
 
-    /// A circle.
+    /// Adds a filled circle with a tooltip.
     pub(crate) fn dot(&mut self, class: &str, [x, y]: [f64; 2], radius: f64, tip: &str) {
         let _ = writeln!(
             self.body,
@@ -76,7 +76,7 @@ impl Svg {
         );
     }
 
-    /// A line through points.
+    /// Adds a line through points.
     pub(crate) fn path(&mut self, class: &str, points: impl IntoIterator<Item = [f64; 2]>) {
         self.outline("polyline", class, points);
     }
@@ -89,17 +89,17 @@ impl Svg {
         self.body.push_str("\"/>\n");
     }
 
-    /// A filled polygon.
+    /// Adds a filled polygon.
     pub(crate) fn area(&mut self, class: &str, points: impl IntoIterator<Item = [f64; 2]>) {
         self.outline("polygon", class, points);
     }
 
-    /// A text; `class` defines its anchor and colour.
+    /// Adds a text; `class` defines its anchor and colour.
     pub(crate) fn text(&mut self, class: &str, [x, y]: [f64; 2], words: &str) {
         let _ = writeln!(self.body, r#"<text class="{class}" x="{x:.1}" y="{y:.1}">{}</text>"#, escape(words));
     }
 
-    /// Vertical grid lines with tick labels below.
+    /// Adds vertical grid lines with tick labels below them.
     pub(crate) fn x_axis(&mut self, scale: Scale, ticks: &[f64], [top, bottom]: [f64; 2], unit: &str) {
         for &tick in ticks {
             let x = scale.at(tick);
@@ -108,7 +108,7 @@ impl Svg {
         }
     }
 
-    /// Horizontal grid lines with tick labels to the left.
+    /// Adds horizontal grid lines with tick labels to their left.
     pub(crate) fn y_axis(&mut self, scale: Scale, ticks: &[f64], [left, right]: [f64; 2], unit: &str) {
         for &tick in ticks {
             let y = scale.at(tick);
@@ -117,7 +117,7 @@ impl Svg {
         }
     }
 
-    /// The SVG element; `description` is the text for screen readers.
+    /// Returns the SVG element; `description` is the text for screen readers.
     pub(crate) fn finish(self, description: &str) -> String {
         format!(
             "<svg role=\"img\" aria-label=\"{}\" viewBox=\"0 0 {:.0} {:.0}\" style=\"max-width:{:.0}px\" \

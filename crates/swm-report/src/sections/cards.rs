@@ -16,8 +16,8 @@ pub(super) fn write(html: &mut String, group: &Group<'_>) {
     html.push_str("</div>\n");
 }
 
-/// Writes the card of one policy under one condition: its success rate, compared with the random-policy floor by a paired test
-/// on the same starts, or else by the confidence intervals.
+/// Writes the card of one policy under one condition: its success rate, compared with the random-policy floor by a
+/// paired test on the same starts, or else by the confidence intervals.
 fn card(html: &mut String, group: &Group<'_>, condition: &Condition<'_>, row: &Row<'_>) {
     let p = row.run.success;
     let floor = condition.floor_of(row);

@@ -42,8 +42,8 @@ fn success(html: &mut String, group: &Group<'_>) {
             html,
             "On the same starts",
             "Points are differences of success rates over starts that both policies played, whiskers their 95 % \
-             confidence intervals (Newcombe’s square-and-add), p-values those of McNemar’s exact test. They are not \
-             corrected for the number of pairs.",
+             confidence intervals (Newcombe’s square-and-add), p-values those of McNemar’s exact test. The p-values \
+             are not corrected for the number of pairs.",
             &chart,
         );
         html.push_str(&charts::paired::table(group));
@@ -90,7 +90,8 @@ fn planning(html: &mut String, group: &Group<'_>) {
             html,
             "Searches",
             "Lines are medians over all plans of a run, bands reach from the 10th to the 90th percentile. If the cost \
-             still falls at the end, more iterations would help; if the spread vanishes long before, fewer would do.",
+             still falls at the end, more iterations would help; if the spread vanishes long before, fewer \
+             iterations suffice.",
             &format!("<div class=\"pair\">\n{searches}</div>\n"),
         );
     }
@@ -104,8 +105,8 @@ fn prediction_errors(html: &mut String, group: &Group<'_>) {
             html,
             "Prediction errors",
             "Mean squared errors of latents predicted open loop along recorded trajectories, in units of the latents’ \
-             variance: always predicting the mean has the error 1. Starts that were solved and starts that were not are \
-             shown separately; dots are medians.",
+             variance: always predicting the mean has the error 1. Solved and unsolved starts are shown \
+             separately; dots are medians.",
             &format!("<div class=\"pair\">\n{errors}</div>\n"),
         );
     }

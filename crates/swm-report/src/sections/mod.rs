@@ -1,4 +1,4 @@
-//! The sections of the page, a file each.
+//! The sections of the page, one file each.
 
 mod cards;
 pub(crate) mod group;

@@ -22,7 +22,7 @@ pub(crate) fn write(html: &mut String, results: &[(PathBuf, Results)], command: 
             (Some(command), None) => {
                 let _ = write!(
                     html,
-                    "<p>The command that reproduces them and lists all differences:</p>\n<pre>{}</pre>\n",
+                    "<p>The command that reproduces the results and lists all differences:</p>\n<pre>{}</pre>\n",
                     escape(&command)
                 );
             }

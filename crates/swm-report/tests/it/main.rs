@@ -100,7 +100,7 @@ fn well_formed(page: &str) {
         let text = &rest[..start];
         assert!(!text.contains('>') || open.last() == Some(&"style"), "a stray > in {text}");
         for (i, _) in text.match_indices('&') {
-            let entity = text[i + 1..].split(';').next().expect("a part");
+            let entity = text[i + 1..].split(';').next().expect("`split` returns at least one part");
             assert!(["amp", "lt", "gt", "quot", "#39"].contains(&entity), "&{entity}");
         }
         let end = start + rest[start..].find('>').expect("a tag ends");
@@ -328,7 +328,9 @@ fn training_metrics_become_charts() {
     assert!(!page.contains("seconds over step"), "metrics of speed are left out");
 
     std::fs::write(&log, "{\"step\": 1}\nloss = 3\n{\"step\": 2}\n").expect("the log is written");
-    assert!(read_metrics(&log).expect_err("no JSON").to_string().contains("line 2 is not a JSON object"));
+    assert!(
+        read_metrics(&log).expect_err("a line that is not JSON").to_string().contains("line 2 is not a JSON object")
+    );
 }
 
 #[test]
@@ -367,7 +369,7 @@ fn results_are_read_and_errors_name_the_problem() {
     assert_eq!((older.counting, older.runs, older.comparisons), (Counting::default(), results().runs, vec![]));
 
     std::fs::write(&path, "{\"manifest\": ").expect("the file is written");
-    assert!(read_results(&path).expect_err("incomplete").to_string().contains("not a JSON document"));
+    assert!(read_results(&path).expect_err("an incomplete document").to_string().contains("not a JSON document"));
     let missing = read_results(&folder.path().join("lost.json")).expect_err("a missing file").to_string();
     assert!(missing.contains("reading results"), "{missing}");
 }

@@ -12,11 +12,11 @@
 //! rollout's cost; no other gradient passes through more than one prediction. States are `[envs, horizon + 1, latent]`,
 //! start and goal included; actions are `[envs, horizon, dim]`, one candidate for each environment.
 //!
-//! The solver is not in the published package. Values that the paper does not give are those of a later reference
-//! version (`solver/grasp.py`): 200 iterations, Adam, the step size 0.1 for states, a synchronisation of 10 steps of
-//! 0.01 every 50 iterations, and goal weight and noise that fall linearly from 2 and 0.1 to 0 between synchronisations.
-//! Only the step size of actions is ten times larger here: with the reference's 0.001, Adam moves no value by more than
-//! 0.2 in 200 iterations, which is less than plans in normalised units need.
+//! The published Python package does not contain this solver. Values that the paper does not give are those of a later
+//! reference version (`solver/grasp.py`): 200 iterations, Adam, the step size 0.1 for states, a synchronisation of 10
+//! steps of 0.01 every 50 iterations, and goal weight and noise that fall linearly from 2 and 0.1 to 0 between
+//! synchronisations. Only the step size of actions is ten times larger here: with the reference's 0.001, Adam moves no
+//! value by more than 0.2 in 200 iterations, which is less than plans in normalised units need.
 //!
 //! Intended differences from the paper:
 //! - Actions are clipped to the bounds of the problem after every step. The paper's table of solvers states this, but
@@ -30,9 +30,9 @@
 //!
 //! Because the gradient stops at `z_t`, an action only receives a gradient for its effect within one step. Where an
 //! effect takes two steps, as from a force to a position, the lifted loss has no gradient, and only the synchronisation
-//! finds the plan. With plain gradient steps, one step size works for horizons at which gradient descent on the rollout
-//! requires a different one each (`tests/it/objective.rs`); with Adam on linear systems, gradient descent is as good or
-//! better.
+//! finds the plan. With plain gradient steps, one step size works for all tested horizons, while gradient descent on
+//! the rollout requires a different step size for each horizon (`tests/it/objective.rs`); with Adam on linear systems,
+//! gradient descent is as good or better.
 //!
 //! The cost of a plan is only known after a rollout. So the trace has an entry before every step of a synchronisation,
 //! and one for the plan.
@@ -50,7 +50,7 @@ const ID: &str = "grasp";
 /// The row of this solver in the registry.
 pub const ENTRY: SolverEntry = SolverEntry {
     id: ID,
-    summary: "optimises states and actions together, every model step by itself",
+    summary: "optimises states and actions together, every model step independently",
     family: Family::Gradient,
     actions: ActionKind::Continuous,
     needs: &[Need::Gradient, Need::Latent],

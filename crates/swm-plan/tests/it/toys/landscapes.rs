@@ -29,7 +29,8 @@ impl Landscape for Bowl {
     }
 }
 
-/// A double well in every value, `(a² - 1)² + tilt a`: 2ⁿ minima, the deepest where all signs are opposite to the tilts.
+/// A double well in every value, `(a² - 1)² + tilt a`: 2ⁿ minima. In the deepest minimum, all signs are opposite to the
+/// tilts.
 pub struct Wells {
     pub tilt: Vec<f64>,
 }
@@ -52,8 +53,8 @@ impl Landscape for Wells {
     }
 }
 
-/// The squared distance to a target outside the unit ball, constrained to the ball: the optimum is on the sphere. A second
-/// constraint, that the first value is at most 3, is never active.
+/// The squared distance to a target outside the unit ball, constrained to the ball: the optimum is on the sphere. A
+/// second constraint, that the first value is at most 3, is never active.
 pub struct Ball {
     pub target: Vec<f64>,
 }
@@ -83,8 +84,8 @@ impl Landscape for Ball {
     }
 }
 
-/// Two choices in each step, with a cost for every option and for every pair of options in neighbouring steps, so that the
-/// best option depends on the following steps.
+/// Two choices in each step, with a cost for every option and for every pair of options in neighbouring steps, so that
+/// the best option depends on the following steps.
 pub struct Chain {
     /// `[horizon, dim]`.
     price: Vec<f64>,
@@ -172,7 +173,7 @@ impl Landscape for Reach {
     }
 
     fn is_unique(&self) -> bool {
-        // A goal within reach can be reached by many plans.
+        // Many plans end at a goal that is within reach.
         self.cost(&self.optimum()) > 1e-12
     }
 

@@ -166,7 +166,9 @@ fn optima_are_optimal_and_gradients_equal_finite_differences() {
                     let mut rest = &mut plan[..];
                     for &options in choices.iter().cycle() {
                         let Some((choice, tail)) = rest.split_at_mut_checked(options) else { break };
-                        let chosen = (0..options).max_by(|&i, &j| choice[i].total_cmp(&choice[j])).expect("options");
+                        let chosen = (0..options)
+                            .max_by(|&i, &j| choice[i].total_cmp(&choice[j]))
+                            .expect("a choice has options");
                         (0..options).for_each(|i| choice[i] = f64::from(u8::from(i == chosen)));
                         rest = tail;
                     }

@@ -10,7 +10,7 @@ pub struct Model {
     landscapes: Vec<Box<dyn Landscape>>,
     /// Whether the model offers a gradient and latent dynamics.
     gradient: bool,
-    /// Replaces the cost of one candidate: environment, sample, and the cost; `None` leaves it unwritten.
+    /// Replaces the cost of one candidate: environment, sample, and cost. Without a cost, the model writes none.
     wrong: Option<(usize, usize, Option<f32>)>,
 }
 
@@ -26,7 +26,7 @@ impl Model {
         Self { gradient: false, ..self }
     }
 
-    /// This model with a wrong cost for one candidate; `None` leaves it unwritten.
+    /// This model with a wrong cost for one candidate; with `None`, the model does not write the cost.
     pub fn with_wrong_cost(self, env: usize, sample: usize, cost: Option<f32>) -> Self {
         Self { wrong: Some((env, sample, cost)), ..self }
     }

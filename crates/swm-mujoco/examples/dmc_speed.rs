@@ -20,10 +20,8 @@ fn cpu_time() -> std::io::Result<Duration> {
 }
 
 /// Environment ids, model files, steps per round, and physics time steps per step.
-const TASKS: [(&str, &str, u32, u32); 2] = [
-    ("swm/CheetahDMControl-v0", "cheetah.xml", 10_000, 2),
-    ("swm/HumanoidDMControl-v0", "humanoid.xml", 400, 10),
-];
+const TASKS: [(&str, &str, u32, u32); 2] =
+    [("swm/CheetahDMControl-v0", "cheetah.xml", 10_000, 2), ("swm/HumanoidDMControl-v0", "humanoid.xml", 400, 10)];
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let suite = assets::path("dm_control")?.join("dm_control/suite");

@@ -67,7 +67,7 @@ fn commits_all_shards_as_one_version() {
 }
 
 #[test]
-fn interrupted_shard_is_continued_or_restarted() {
+fn interrupted_shard_is_continued_and_finished_shard_is_overwritten() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write_shard(&path, 1, 2, 4..6);

@@ -51,9 +51,9 @@ fn arrow(tail: [f64; 2], length: f64, angle: f64, pixels: &mut Pixels<'_>) {
         pixels.polygon(&dot, COLOR, OPACITY);
         return;
     }
-    // An arrow shorter than a head is a head scaled down, without a shaft.
-    let (shaft, size) = if length < HEAD { (HEAD, length / HEAD) } else { (length, 1.0) };
-    let half = [[0.0, 0.5], [shaft - HEAD_AXIS, 0.5], [shaft - HEAD, HEAD_WIDTH / 2.0], [shaft, 0.0]];
+    // An arrow shorter than a head is drawn as a head, scaled down to the arrow's length.
+    let (total, size) = if length < HEAD { (HEAD, length / HEAD) } else { (length, 1.0) };
+    let half = [[0.0, 0.5], [total - HEAD_AXIS, 0.5], [total - HEAD, HEAD_WIDTH / 2.0], [total, 0.0]];
     let [a, b, c, tip] = half.map(|p| p.map(|v| v * size));
     let flip = |[x, y]: [f64; 2]| [x, -y];
     pixels.polygon(&[a, b, c, tip, flip(c), flip(b), flip(a)].map(at), COLOR, OPACITY);

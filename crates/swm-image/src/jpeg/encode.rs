@@ -19,10 +19,15 @@ const LINE: usize = MCU * 3;
 /// `out`.
 ///
 /// # Panics
-/// When `rgb` has another length, which the caller checks.
+/// When the length of `rgb` is not `height * width * 3`; the caller checks it.
 pub fn encode(rgb: &[u8], height: u16, width: u16, quality: u8, out: &mut Vec<u8>) {
     let (h, w) = (usize::from(height), usize::from(width));
-    assert!(rgb.len() == h * w * 3 && !rgb.is_empty(), "an RGB image of {h} x {w}");
+    assert!(
+        rgb.len() == h * w * 3 && !rgb.is_empty(),
+        "an RGB image of {h} x {w} has {} bytes, not {}",
+        h * w * 3,
+        rgb.len()
+    );
     let tables = [scaled(&LUMA, quality), scaled(&CHROMA, quality)];
     write_headers(height, width, &tables, out);
     let mut scan =
@@ -249,16 +254,16 @@ fn reciprocals(table: &[u8; 64]) -> [f32; 64] {
     })
 }
 
-/// Returns the nearest multiples of the quantisation steps, in scan order.
+/// Divides coefficients by their quantisation steps and rounds them. Returns them in zigzag order.
 fn quantise(transformed: &Block, reciprocals: &[f32; 64]) -> [i32; 64] {
-    let mut steps = [0; 64];
-    for ((step, value), reciprocal) in steps.iter_mut().zip(transformed.as_flattened()).zip(reciprocals) {
-        *step = round(value * reciprocal);
+    let mut quantised = [0; 64];
+    for ((level, value), reciprocal) in quantised.iter_mut().zip(transformed.as_flattened()).zip(reciprocals) {
+        *level = round(value * reciprocal);
     }
     // The transform leaves coefficients transposed.
     std::array::from_fn(|k| {
         let position = usize::from(ZIGZAG[k]);
-        steps[position % 8 * 8 + position / 8]
+        quantised[position % 8 * 8 + position / 8]
     })
 }
 

@@ -1,5 +1,5 @@
-//! Cheetah: a planar cheetah runs (`dm_control/suite/cheetah.py`), stands, jumps and flips (added by TD-MPC2 and Newt,
-//! Hansen et al. 2024).
+//! Cheetah: a planar cheetah runs (`dm_control/suite/cheetah.py`), stands, jumps and flips (added by TD-MPC2,
+//! Hansen et al. 2024, and Newt, Hansen et al. 2025).
 
 use super::domain::{Domain, InfoColumn, RewardFn, TaskTable, tasks};
 use super::measures::{forward_spin, height};

@@ -1,5 +1,5 @@
 //! Hopper: a planar one-legged hopper stands and hops (`dm_control/suite/hopper.py`), hops backward and flips (added by
-//! TD-MPC2 and Newt, Hansen et al. 2024).
+//! TD-MPC2, Hansen et al. 2024, and Newt, Hansen et al. 2025).
 
 use super::domain::{Domain, InfoColumn, RewardFn, TaskTable, tasks};
 use super::measures::forward_spin;

@@ -1,9 +1,9 @@
-//! The DeepMind Control suite (Tassa et al. 2018, arXiv:1801.00690), with the tasks and factors of variation that the
-//! reference adds.
+//! Twelve domains of the DeepMind Control suite (Tassa et al. 2018, arXiv:1801.00690), with the tasks and factors of
+//! variation that the reference adds.
 //!
-//! Each domain is one file: a [`Domain`](domain::Domain) with its tasks, factors, start, observation and rewards.
-//! `suite_env` runs a domain as an environment. Constants and formulas are those of `dm_control` 1.0.50
-//! (`dm_control/suite/`) and, for the added tasks, of TD-MPC2 and Newt (Hansen et al. 2024).
+//! Each domain is one module: a [`Domain`](domain::Domain) with its tasks, factors, initial states, observation and
+//! rewards. `suite_env` runs a domain as an environment. Constants and formulas are those of `dm_control` 1.0.50
+//! (`dm_control/suite/`) and, for the added tasks, of TD-MPC2 (Hansen et al. 2024) and Newt (Hansen et al. 2025).
 
 mod acrobot;
 mod ball_in_cup;
@@ -34,7 +34,7 @@ mod walker;
 
 use swm_core::EnvEntry;
 
-/// Every domain of the suite.
+/// The domains of the suite that this crate implements.
 pub const ENTRIES: [EnvEntry; 12] = [
     acrobot::ENTRY,
     ball_in_cup::ENTRY,

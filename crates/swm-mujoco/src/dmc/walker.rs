@@ -1,5 +1,5 @@
-//! Walker: a planar walker stands, walks and runs (`dm_control/suite/walker.py`), and strikes poses (added by TD-MPC2
-//! and Newt, Hansen et al. 2024).
+//! Walker: a planar walker stands, walks and runs (`dm_control/suite/walker.py`), and strikes poses (added by TD-MPC2,
+//! Hansen et al. 2024, and Newt, Hansen et al. 2025).
 
 use super::domain::{Domain, InfoColumn, RewardFn, TaskTable, tasks};
 use super::measures::{height, uprightness};

@@ -1,4 +1,4 @@
-//! The simulator as a cost model: its costs are computed for the actions that the policy executes.
+//! Tests of the simulator as a cost model: it steps each candidate with the actions that the policy would execute.
 
 use rand::Rng as _;
 use swm_core::pool::{Reset, threads};

@@ -22,7 +22,8 @@ const COARSE: Candidates<'_> = Candidates { spacing: 40.0, angles: &[0.0], stren
 const DETOURS: usize = 40;
 /// The least reduction of the error that a push must achieve, in pixels.
 const MIN_PROGRESS: f64 = 0.5;
-/// The least reduction of the error per step that a push must achieve, in pixels.
+/// The least rate that a push must achieve: the reduction of the error (pixels) divided by the number of steps, including
+/// the overhead of a push ([`super::push_model`]).
 const MIN_RATE: f64 = 0.1;
 /// The distance of the block from its goal (pixels, radians) below which the block is not pushed any more.
 const IN_PLACE: (f64, f64) = (12.0, 0.28);
@@ -62,7 +63,7 @@ impl From<Push> for Plan {
 }
 
 impl Plan {
-    /// Makes a plan that only walks.
+    /// Makes a plan of a path without a push.
     fn walk(waypoints: Vec<Vec2>) -> Self {
         Self { waypoints, patience: PATIENCE, ..Self::default() }
     }
@@ -138,7 +139,7 @@ fn next_plan(model: &mut PushModel, now: &Observation, goal: &State, rng: &mut R
     }
     match model.best_detour(now, goal, DETOURS, &COARSE, rng) {
         Some(push) => push.into(),
-        // No starting point is reachable. A starting point may be reachable from the centre of the table.
+        // No push is possible, not even after a random push. One may be possible from the centre of the table.
         None => Plan::walk(vec![Vec2::new(TABLE / 2.0, TABLE / 2.0)]),
     }
 }

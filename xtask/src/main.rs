@@ -8,6 +8,7 @@
 
 mod columns;
 mod cycles;
+mod deletes;
 mod features;
 mod graph;
 mod layers;
@@ -33,6 +34,9 @@ const CHECKS: &[Check] = &[
     ("sizes", "no file of more than 500 lines", || verdict("sizes", &sizes::violations(&sources()?))),
     ("cycles", "no import cycle of more than four files", || verdict("cycles", &cycles::violations(&sources()?))),
     ("columns", "only swm-core spells the standard columns", || verdict("columns", &columns::violations(&sources()?))),
+    ("deletes", "only swm_core::files deletes files and folders", || {
+        verdict("deletes", &deletes::violations(&source::files(&root(), &[".rs", ".py"])?))
+    }),
     ("registries", "every ENTRY is in a registry list", || verdict("registries", &registries::violations(&sources()?))),
     ("layers", "no crate depends on a package that its layer forbids", || {
         verdict("layers", &layers::violations(&graph()?, layers::RULES))

@@ -4,6 +4,11 @@
 //! - [`open`] and [`read`] accept regular files only. A pipe or a device could block forever or never end.
 //! - [`write`] replaces a file whole: readers and killed processes see the old content or the new.
 //! - [`delete`] removes the regular files of a folder whose names are the program's own, and nothing else.
+//! - [`Lock`] keeps a second writer away from a file or folder.
+
+mod lock;
+
+pub use lock::Lock;
 
 use crate::{Error, Result};
 use std::fs::File;

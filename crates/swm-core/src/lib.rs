@@ -12,7 +12,8 @@
 //! 5. [`plan`]: costs of candidate action sequences, and the solvers that minimise them. [`predictor`]: models that
 //!    predict latents. [`requirements`]: columns that a model family requires of a dataset.
 //! 6. [`run`]: progress and interruption of long commands. [`registry`], [`manifest`], [`results`], [`error`]: names,
-//!    provenance, evaluation results and errors. [`files`]: reading, replacing and deleting files.
+//!    provenance, evaluation results and errors. [`files`]: reading, replacing and deleting files. [`text`]: text
+//!    from files, made safe to print.
 
 pub mod batch;
 pub mod camera_view;
@@ -35,6 +36,7 @@ pub mod requirements;
 pub mod results;
 pub mod run;
 pub mod space;
+pub mod text;
 pub mod thread_budget;
 pub mod variation;
 

@@ -3,6 +3,7 @@
 //! The manifest determines everything except [`Run::timing`], so two evaluations with equal manifests write results
 //! that differ in their timing only.
 
+mod consistency;
 mod counting;
 mod paired;
 mod prediction;
@@ -10,7 +11,7 @@ mod searches;
 mod statistics;
 
 pub use counting::Counting;
-pub use paired::{Comparison, Paired};
+pub use paired::{Comparison, MAX_ALL_PAIRS, Paired, pairs};
 pub use prediction::{Group, Prediction, Trajectory};
 pub use searches::{Band, Searches};
 pub use statistics::{Proportion, Summary};
@@ -108,21 +109,28 @@ impl Run {
         episodes: Vec<EpisodeResult>,
         timing: Timing,
     ) -> Self {
-        let counted = || episodes.iter().filter(|episode| counting.counts(episode));
-        let steps: Vec<f64> = counted().filter_map(EpisodeResult::time_to_goal).map(|steps| steps as f64).collect();
+        let (solved_at_start, success, time_to_goal) = Self::statistics(counting, &episodes);
         Self {
             condition: condition.to_owned(),
             policy: policy.to_owned(),
-            solved_at_start: episodes.iter().filter(|episode| episode.solved_at_start).count(),
-            success: counting.rate(&episodes),
+            solved_at_start,
+            success,
             strict: None,
             searches: None,
             prediction: None,
-            time_to_goal: Summary::of(&steps),
+            time_to_goal,
             timing,
             videos: vec![],
             episodes,
         }
+    }
+
+    /// Returns the statistics that episodes determine: the number solved at start, the success rate, the time to goal.
+    fn statistics(counting: Counting, episodes: &[EpisodeResult]) -> (usize, Proportion, Option<Summary>) {
+        let counted = episodes.iter().filter(|episode| counting.counts(episode));
+        let steps: Vec<f64> = counted.filter_map(EpisodeResult::time_to_goal).map(|steps| steps as f64).collect();
+        let solved_at_start = episodes.iter().filter(|episode| episode.solved_at_start).count();
+        (solved_at_start, counting.rate(episodes), Summary::of(&steps))
     }
 }
 

@@ -54,7 +54,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             }
         }
     }
-    std::fs::remove_file(background)?;
+    swm_core::files::delete_file(&background)?;
     write_png(&out, width, height, &sheet)
 }
 

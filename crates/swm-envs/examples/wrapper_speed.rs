@@ -30,7 +30,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let name = text.split(",key_color").next().unwrap_or_default();
         writeln!(out, "| `{name}` | {small:.0} | {large:.0} | {noisy:.0} |")?;
     }
-    std::fs::remove_file(background)?;
+    swm_core::files::delete_file(&background)?;
     Ok(())
 }
 

@@ -3,7 +3,7 @@
 use crate::text::escape;
 use std::path::PathBuf;
 use swm_core::Results;
-use swm_core::results::{Comparison, Counting, Paired, Run};
+use swm_core::results::{Comparison, Counting, Paired, Run, pairs};
 
 /// The number of different colours of policies.
 const COLOURS: usize = 6;
@@ -112,11 +112,11 @@ impl<'a> Condition<'a> {
         self.rows.iter().find(|row| row.is_floor() && row.file == run.file).or_else(|| self.floor())
     }
 
-    /// Every pair of runs that played the same starts, the later run first: usually a model, then the random-policy
-    /// floor.
+    /// The compared pairs of runs that played the same starts, the later run first: usually a model, then the
+    /// random-policy floor.
     pub(crate) fn pairs(&self, counting: Counting) -> Vec<(&Row<'a>, &Row<'a>, Paired)> {
-        let later = self.rows.iter().enumerate();
-        let pairs = later.flat_map(|(i, row)| self.rows[..i].iter().map(move |other| (row, other)));
+        let runs: Vec<&Run> = self.rows.iter().map(|row| row.run).collect();
+        let pairs = pairs(&runs).map(|(later, earlier)| (&self.rows[later], &self.rows[earlier]));
         pairs.filter_map(|(a, b)| Some((a, b, Comparison::of(a.run, b.run, counting)?.table))).collect()
     }
 }

@@ -4,17 +4,20 @@
 //! page needs no scripts, network access or other files, so it can be mailed, archived and printed. Equal results give
 //! equal bytes.
 //!
-//! - `page` writes the page; `sections` has a file for each section; `charts` has a file for each chart, drawn with the
-//!   SVG primitives of `charts/svg.rs`; `style.css` is the style sheet.
-//! - `group` groups runs by environment, protocol and counting; `read` reads files; `text` formats numbers and escapes
-//!   text.
+//! - `page` writes the page; `sections` has a file for each section; `charts` has a file for each chart, drawn with the SVG
+//!   primitives of `charts/svg.rs`; `style.css` is the style sheet.
+//! - `group` groups runs by environment, protocol and counting; `read` and `training_log` read files, within the `limits`;
+//!   `text` formats numbers and escapes text.
 
 mod charts;
 mod group;
+mod limits;
 mod page;
 mod read;
 mod sections;
 mod text;
+mod training_log;
 
 pub use page::{ReportOptions, render, write_report, write_report_with};
-pub use read::{Metrics, Series, read_metrics, read_results};
+pub use read::read_results;
+pub use training_log::{Metrics, Series, read_metrics};

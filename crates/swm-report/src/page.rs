@@ -1,12 +1,13 @@
 //! The page: renders all sections in reading order and writes the file.
 
 use crate::group::Group;
-use crate::read::{Metrics, read_metrics};
+use crate::limits;
 use crate::sections;
 use crate::text::escape;
+use crate::training_log::{Metrics, read_metrics};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
-use swm_core::{Error, Result, Results};
+use swm_core::{Error, Result, Results, files};
 
 /// The style sheet, for light and dark screens and for print.
 const STYLE: &str = include_str!("style.css");
@@ -26,7 +27,7 @@ pub struct ReportOptions {
 /// file and its content; paths of videos are relative to the folder of the results file.
 ///
 /// # Errors
-/// When there are no results, or the page cannot be written.
+/// When there are no results or too many, or the page cannot be written.
 pub fn write_report(results: &[(PathBuf, Results)], out_dir: &Path) -> Result<PathBuf> {
     write_report_with(results, &ReportOptions::default(), out_dir)
 }
@@ -39,17 +40,16 @@ pub fn write_report_with(results: &[(PathBuf, Results)], options: &ReportOptions
     if results.is_empty() {
         return Err(Error::config("report", "there are no results to report", "give at least one results.json"));
     }
+    let runs: usize = results.iter().map(|(_, results)| results.runs.len()).sum();
+    if runs > limits::RUNS {
+        let problem = format!("the files have {runs} runs, more than {}", limits::RUNS);
+        return Err(Error::config("report", problem, "give fewer results files"));
+    }
     let metrics = options.metrics.as_deref().map(read_metrics).transpose()?;
     let page = render(results, options, metrics.as_ref());
     std::fs::create_dir_all(out_dir).map_err(|source| Error::io(out_dir, "creating the report's folder", source))?;
     let path = out_dir.join("index.html");
-    let partial = out_dir.join(format!(".index.html.{}.partial", std::process::id()));
-    let written = std::fs::write(&partial, page).and_then(|()| std::fs::rename(&partial, &path));
-    written.map_err(|source| {
-        // Only the first error is reported; an error during the clean-up is ignored.
-        let _ = std::fs::remove_file(&partial);
-        Error::io(&path, "writing the report", source)
-    })?;
+    files::write(&path, page.as_bytes())?;
     Ok(path)
 }
 
@@ -74,8 +74,9 @@ pub fn render(results: &[(PathBuf, Results)], options: &ReportOptions, metrics: 
         summary(results),
         title = escape(&title),
     );
+    let mut videos = sections::videos::Videos::default();
     for group in &groups {
-        sections::group::write(&mut html, group, results, groups.len() > 1);
+        sections::group::write(&mut html, group, (results, &mut videos), groups.len() > 1);
     }
     if let Some(metrics) = metrics {
         sections::training::write(&mut html, metrics);

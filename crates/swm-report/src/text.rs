@@ -2,7 +2,8 @@
 
 use swm_core::results::EpisodeResult;
 
-/// Escapes a text for HTML and quoted attributes. Control characters, which XML forbids, become spaces.
+/// Escapes a text for HTML and quoted attributes. Control characters, which XML forbids, become spaces, and so do
+/// overrides and isolates of bidirectional text, which would reorder the rest of a line.
 pub(crate) fn escape(words: &str) -> String {
     let mut safe = String::with_capacity(words.len());
     for c in words.chars() {
@@ -13,6 +14,7 @@ pub(crate) fn escape(words: &str) -> String {
             '"' => safe.push_str("&quot;"),
             '\'' => safe.push_str("&#39;"),
             '\n' | '\t' => safe.push(c),
+            '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => safe.push(' '),
             c if c.is_control() => safe.push(' '),
             c => safe.push(c),
         }
@@ -102,7 +104,7 @@ mod tests {
 
     #[test]
     fn text_is_escaped_and_truncated() {
-        assert_eq!(escape("<b a=\"1\" c='2'>&\u{1}é"), "&lt;b a=&quot;1&quot; c=&#39;2&#39;&gt;&amp; é");
+        assert_eq!(escape("<b a=\"1\" c='2'>&\u{1}\u{202e}é"), "&lt;b a=&quot;1&quot; c=&#39;2&#39;&gt;&amp;  é");
         assert_eq!((shorten("éclair", 6), shorten("éclairs", 6)), ("éclair".to_owned(), "éclai…".to_owned()));
     }
 

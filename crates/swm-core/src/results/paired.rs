@@ -5,6 +5,7 @@
 
 use super::{Counting, Proportion, Run};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// A paired comparison of two policies under one condition.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -63,11 +64,37 @@ impl Comparison {
     }
 
     /// Compares every run with each earlier run of the same condition, so that a learned policy is compared with the
-    /// random-policy floor as `learned` minus `random`.
+    /// random-policy floor as `learned` minus `random`. A condition with many runs is limited as [`pairs`] says.
     pub fn all(runs: &[Run], counting: Counting) -> Vec<Self> {
-        let later = runs.iter().enumerate();
-        later.flat_map(|(i, run)| runs[..i].iter().filter_map(move |other| Self::of(run, other, counting))).collect()
+        let mut conditions: BTreeMap<&str, Vec<usize>> = BTreeMap::new();
+        for (i, run) in runs.iter().enumerate() {
+            conditions.entry(&run.condition).or_default().push(i);
+        }
+        let mut found: Vec<(usize, usize)> = vec![];
+        for indices in conditions.values() {
+            let members: Vec<&Run> = indices.iter().map(|&i| &runs[i]).collect();
+            found.extend(pairs(&members).map(|(later, earlier)| (indices[later], indices[earlier])));
+        }
+        found.sort_unstable();
+        found.into_iter().filter_map(|(later, earlier)| Self::of(&runs[later], &runs[earlier], counting)).collect()
     }
+}
+
+/// The largest number of runs of one condition whose pairs are all compared.
+pub const MAX_ALL_PAIRS: usize = 20;
+
+/// Returns the indices of the runs of one condition to compare, the later run first: every pair of at most
+/// [`MAX_ALL_PAIRS`] runs. The pairs of more runs are too many to read or to store, so each of these runs is compared
+/// with the random-policy floor and with the run of the highest success rate only.
+pub fn pairs(runs: &[&Run]) -> impl Iterator<Item = (usize, usize)> {
+    let floor = runs.iter().position(|run| run.policy == "random");
+    let rate = |i: &usize| runs[*i].success.rate;
+    // `max_by` returns the last maximum; the order is reversed so that the first of equal runs is the best.
+    let best = (0..runs.len()).rev().filter(|i| Some(*i) != floor).max_by(|a, b| rate(a).total_cmp(&rate(b)));
+    let every = runs.len() <= MAX_ALL_PAIRS;
+    let is_reference = move |i: usize| every || Some(i) == floor || Some(i) == best;
+    let all = (0..runs.len()).flat_map(|later| (0..later).map(move |earlier| (later, earlier)));
+    all.filter(move |&(later, earlier)| is_reference(later) || is_reference(earlier))
 }
 
 impl Paired {
@@ -189,5 +216,17 @@ mod tests {
         assert!(Comparison::of(&other, &floor, Counting::default()).is_none(), "other starts");
         other = Run { condition: "shifted colours".to_owned(), ..model };
         assert!(Comparison::of(&other, &floor, Counting::default()).is_none(), "another condition");
+    }
+
+    #[test]
+    fn many_runs_are_compared_with_the_floor_and_the_best() {
+        let outcomes = |solved: u64| (0..8).map(|seed| (seed, seed < solved, false)).collect::<Vec<_>>();
+        let mut runs = vec![run("random", &outcomes(1))];
+        runs.extend((0..30).map(|i| run(&format!("model-{i}"), &outcomes(if i == 7 { 6 } else { 2 + i % 3 }))));
+        let found = Comparison::all(&runs, Counting::default());
+        // 30 with the floor, and 29 others with model-7.
+        assert_eq!(found.len(), 59);
+        assert!(found.iter().all(|c| [c.a.as_str(), c.b.as_str()].iter().any(|p| ["random", "model-7"].contains(p))));
+        assert_eq!(Comparison::all(&runs[..MAX_ALL_PAIRS], Counting::default()).len(), 190, "all pairs");
     }
 }

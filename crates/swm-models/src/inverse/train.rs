@@ -16,6 +16,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 use swm_core::columns::{ACTION, PIXELS};
+use swm_core::files::Lock;
 use swm_core::run::{Control, Progress};
 use swm_core::{Error, Key, Manifest, Result};
 use swm_data::{ClipSpec, Loader, LoaderConfig, Part, Reader};
@@ -88,6 +89,7 @@ pub fn train(
     threads: usize,
     control: &mut Control<'_>,
 ) -> Result<TrainSummary> {
+    let _lock = Lock::folder(out)?;
     if Checkpoint::<Lewm>::exists(out) {
         return Err(Error::config(
             out.display().to_string(),
@@ -109,7 +111,6 @@ fn run(
     let started = Instant::now();
     let key = Key::new(config.seed).with(FAMILY);
     let manifest = manifest(config, world_model, &*reader)?;
-    std::fs::create_dir_all(out).map_err(|error| Error::io(out, "creating a folder", error))?;
     let mut log = log::Log::new(out, false)?;
     let loader = loader(config, world_model.config.data.frameskip, reader)?;
     let (latent, action_dim) = (world_model.config.model.latent, world_model.action_dim());

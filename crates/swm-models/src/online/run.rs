@@ -16,8 +16,9 @@ use serde::Serialize;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
+use swm_core::files::{self, Lock};
 use swm_core::run::{Control, Event, Progress, Stage};
-use swm_core::{ColumnSpec, EnvPool, Error, Key, Policy, RandomPolicy, Result, Schema, files};
+use swm_core::{ColumnSpec, EnvPool, Error, Key, Policy, RandomPolicy, Result, Schema};
 use swm_data::{LoaderConfig, ReplayBuffer, ReplayConfig, ReplayLoader, WriteOptions};
 
 /// The result of an online run.
@@ -78,6 +79,7 @@ pub fn train_online<M: Agent>(
     let evaluation_pool = make_pool(online.envs.min(online.evaluate_episodes))?;
     let threads = swm_core::pool::threads(options.threads)?;
     // A pool of environments cannot be shared between threads, but can be moved to a compute thread.
+    let _lock = Lock::folder(out)?;
     threads.install(|| start(config, online, pool, evaluation_pool, out, options)?(control))
 }
 
@@ -109,7 +111,7 @@ fn start<'a, M: Agent>(
     let data = Data::new(&config.loop_config(), online, loader_config, pool, &recorded, saved)?;
     let learner = match resumed {
         Some(learner) => learner,
-        None => Learner::start(config, dataset_info, manifest, out, &options.device)?,
+        None => Learner::start(config, dataset_info, manifest, &options.device)?,
     };
     let shared = SharedModel::new(learner.model().clone());
     let policy = |slots, explore| M::policy(config, learner.dataset_info(), shared.clone(), &spec, slots, explore);

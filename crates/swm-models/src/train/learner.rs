@@ -16,7 +16,7 @@ use crate::checkpoint::{Checkpoint, TrainState};
 use crate::nn::parameters;
 use burn::tensor::Device;
 use std::path::Path;
-use swm_core::{Batch, Error, Key, Manifest, Result};
+use swm_core::{Batch, Key, Manifest, Result};
 
 /// The operations of a training loop on a model of any family.
 pub(crate) trait DynLearner {
@@ -109,18 +109,16 @@ impl<'a, M: Trainable> Learner<'a, M> {
         Ok(Some(Self { config, device, model, average, dataset_info, manifest, optimizer, state: stored.state }))
     }
 
-    /// Creates a model with initial weights, and the folder `out`.
+    /// Creates a model with initial weights.
     ///
     /// # Errors
-    /// When the data do not fit the configuration, or writing fails.
+    /// When the data do not fit the configuration.
     pub fn start(
         config: &'a TrainConfig<M>,
         dataset_info: DatasetInfo,
         manifest: Manifest,
-        out: &Path,
         device: &'a Device,
     ) -> Result<Self> {
-        std::fs::create_dir_all(out).map_err(|error| Error::io(out, "creating a folder", error))?;
         let model = M::new(config, &dataset_info, Key::new(config.seed).with("init"), device)?;
         let (optimizer, state) = (AdamW::new(config.optim.clone()), RunState::default());
         Ok(Self { config, device, model, average: None, dataset_info, manifest, optimizer, state })

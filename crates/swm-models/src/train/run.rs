@@ -14,6 +14,7 @@ use super::trainable::Trainable;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
+use swm_core::files::Lock;
 use swm_core::run::{Control, Event, Progress, Stage};
 use swm_core::{Batch, Error, Key, Result};
 use swm_data::{Epoch, Loader, LoaderConfig, Part, Reader};
@@ -29,7 +30,8 @@ pub(crate) const STAGE: &str = "train";
 /// for data.
 ///
 /// # Errors
-/// When the configuration contradicts itself or the data, `out` holds a run that cannot be continued, the loss or its
+/// When the configuration contradicts itself or the data, `out` holds a run that cannot be continued, another process
+/// trains in `out`, the loss or its
 /// gradient is not finite (the batch is saved), the caller's poll fails (after saving), or writing fails.
 pub fn train<M: Trainable>(
     config: &TrainConfig<M>,
@@ -46,9 +48,10 @@ pub fn train<M: Trainable>(
         let columns: Vec<String> = loader_config.clip.columns.iter().chain(goals).cloned().collect();
         let dataset_info = DatasetInfo::from_reader(&*reader, &columns, M::BOUNDED_ACTIONS)?;
         let manifest = learner::manifest(config, reader.content_hash()?, &options.device);
+        let _lock = Lock::folder(out)?;
         let mut learner = match Learner::resume(config, &dataset_info, &manifest, out, options)? {
             Some(learner) => learner,
-            None => Learner::start(config, dataset_info, manifest, out, &options.device)?
+            None => Learner::start(config, dataset_info, manifest, &options.device)?
                 .with_pretrained_weights(&options.cache)?,
         };
         let run = Run::new(config.loop_config(), loader_config, &reader, out, options, &mut learner)?;

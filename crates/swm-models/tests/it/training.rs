@@ -5,6 +5,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use swm_core::Result;
+use swm_core::files::Lock;
 use swm_core::run::{Control, Event};
 use swm_models::lewm::Lewm;
 use swm_models::{TrainConfig, TrainOptions, TrainSummary, train};
@@ -79,6 +80,18 @@ fn resumed_run_gives_the_same_bytes() {
         .map(|line| serde_json::from_str::<serde_json::Value>(line).expect("JSON")["step"].as_u64().expect("a step"))
         .collect();
     assert_eq!(steps, [5, 10]);
+}
+
+#[test]
+fn second_training_into_a_folder_is_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let out = folder.path().join("run");
+    let first = Lock::folder(&out).expect("a run of another process");
+    let error = run(&config(&[]), &out, &TrainOptions::default(), 0).expect_err("a second run");
+    assert!(error.is_usage() && error.to_string().contains(&out.display().to_string()), "{error}");
+    assert_eq!(out.read_dir().expect("the folder").count(), 0, "the second run writes nothing");
+    drop(first);
+    assert!(run(&config(&[]), &out, &TrainOptions::default(), 1).expect("a run").interrupted);
 }
 
 #[test]

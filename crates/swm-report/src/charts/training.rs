@@ -1,8 +1,9 @@
 //! The charts of training metrics.
 
 use super::svg::{HALF, Scale, Svg};
-use crate::read::{Metrics, Series};
+
 use crate::text::{number, shorten};
+use crate::training_log::{Metrics, Series};
 
 /// Draws the curve of one metric of a training log; `None` for fewer than two points.
 pub(crate) fn chart(metrics: &Metrics, series: &Series) -> Option<String> {

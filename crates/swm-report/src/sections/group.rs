@@ -1,17 +1,23 @@
 //! The section of a group: success rates, comparisons, time to goal, latency, searches, prediction errors and videos.
 
 use super::figure;
-use super::{cards, runs_table, videos};
+use super::videos::Videos;
+use super::{cards, runs_table};
 use crate::charts;
 use crate::group::Group;
 use crate::text::escape;
 use std::fmt::Write as _;
 use std::path::PathBuf;
 use swm_core::Results;
-use swm_core::results::Counting;
+use swm_core::results::{Counting, MAX_ALL_PAIRS};
 
-/// Writes the section; its heading names the group if there are `several`.
-pub(crate) fn write(html: &mut String, group: &Group<'_>, results: &[(PathBuf, Results)], several: bool) {
+/// Writes the section; its heading names the group if there are `several`. `videos` are those of the page.
+pub(crate) fn write(
+    html: &mut String,
+    group: &Group<'_>,
+    (results, videos): (&[(PathBuf, Results)], &mut Videos),
+    several: bool,
+) {
     let _ = write!(html, "<section>\n<h2>{}</h2>\n", if several { group.title() } else { "Success".to_owned() });
     if group.rows().next().is_none() {
         html.push_str("<p class=\"note\">These results contain no runs.</p>\n</section>\n");
@@ -23,7 +29,7 @@ pub(crate) fn write(html: &mut String, group: &Group<'_>, results: &[(PathBuf, R
     time_to_goal(html, group);
     planning(html, group);
     prediction_errors(html, group);
-    videos::write(html, group, results);
+    videos.write(html, group, results);
     html.push_str("</section>\n");
 }
 
@@ -38,14 +44,18 @@ fn success(html: &mut String, group: &Group<'_>) {
     );
     runs_table::write(html, group);
     if let Some(chart) = charts::paired::chart(group) {
-        figure(
-            html,
-            "On the same starts",
-            "Points are differences of success rates over starts that both policies played, whiskers their 95 % \
-             confidence intervals (Newcombe’s square-and-add), p-values those of McNemar’s exact test. The p-values \
-             are not corrected for the number of pairs.",
-            &chart,
+        let limited = group.conditions.iter().any(|condition| condition.rows.len() > MAX_ALL_PAIRS);
+        let limit = format!(
+            " With more than {MAX_ALL_PAIRS} runs, each is compared with the random-policy floor and with the run of the \
+             highest success rate only."
         );
+        let caption = format!(
+            "Points are differences of success rates over starts that both policies played, whiskers their 95 % \
+             confidence intervals (Newcombe’s square-and-add), p-values those of McNemar’s exact test. The p-values are not \
+             corrected for the number of pairs.{}",
+            if limited { limit.as_str() } else { "" }
+        );
+        figure(html, "On the same starts", &caption, &chart);
         html.push_str(&charts::paired::table(group));
     }
 }

@@ -2,7 +2,7 @@
 
 use super::figure;
 use crate::charts;
-use crate::read::Metrics;
+use crate::training_log::Metrics;
 
 /// The largest number of metrics that are shown; losses come first.
 const CURVES: usize = 8;

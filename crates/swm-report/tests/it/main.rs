@@ -1,5 +1,7 @@
 //! Tests of the whole page, from synthetic results.
 
+mod hostile;
+
 use std::path::{Path, PathBuf};
 use swm_core::results::{Comparison, Counting, EpisodeResult, Prediction, Run, Searches, Summary, Timing, Trajectory};
 use swm_core::{Manifest, PlanTrace, Results};
@@ -371,5 +373,5 @@ fn results_are_read_and_errors_name_the_problem() {
     std::fs::write(&path, "{\"manifest\": ").expect("the file is written");
     assert!(read_results(&path).expect_err("an incomplete document").to_string().contains("not a JSON document"));
     let missing = read_results(&folder.path().join("lost.json")).expect_err("a missing file").to_string();
-    assert!(missing.contains("reading results"), "{missing}");
+    assert!(missing.contains("lost.json: opening the file"), "{missing}");
 }

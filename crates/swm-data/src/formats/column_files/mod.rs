@@ -26,7 +26,7 @@ mod reader;
 mod writer;
 
 pub(crate) use reader::ColumnFiles;
-pub(crate) use writer::{ColumnFilesWriter, lock_folder, remove_dataset};
+pub(crate) use writer::{ColumnFilesWriter, remove_dataset};
 
 use crate::dataset::Constants;
 use serde::{Deserialize, Serialize};

@@ -8,10 +8,10 @@ use super::{
 use crate::dataset::episodes::{self, EpisodeRows};
 use crate::dataset::{CommitPolicy, Constants, StepRange, WriteMode, WriteOptions};
 use std::collections::{BTreeMap, HashMap};
-use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
+use swm_core::files::Lock;
 use swm_core::{Batch, ColumnSpec, DType, Error, Result, Schema};
 
 /// Bounds, in bytes, of the journal size at which the journal is merged: half the size of the column files, clamped to
@@ -22,8 +22,7 @@ const MERGE_BYTES: std::ops::RangeInclusive<usize> = 16 << 20..=256 << 20;
 /// [`ColumnFilesWriter::write`].
 pub(crate) struct ColumnFilesWriter {
     folder: PathBuf,
-    /// The open folder. Its lock excludes other writers.
-    _lock: File,
+    _lock: Lock,
     journal: Option<Journal>,
     schema: Schema,
     /// The numeric columns.
@@ -85,8 +84,7 @@ impl ColumnFilesWriter {
                 WriteMode::Append => {}
             }
         }
-        std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, "creating the folder", e))?;
-        let lock = lock_folder(folder)?;
+        let lock = Lock::folder(folder)?;
         let columns = schema.columns().iter().filter(|c| !c.is_image()).cloned().collect::<Vec<_>>();
         let mut writer = Self {
             folder: folder.to_owned(),
@@ -315,22 +313,9 @@ impl Drop for ColumnFilesWriter {
     }
 }
 
-/// Locks a folder against other writers, until the returned file is dropped or the process ends.
-pub(crate) fn lock_folder(folder: &Path) -> Result<File> {
-    let file = File::open(folder).map_err(|e| Error::io(folder, "opening the folder", e))?;
-    match file.try_lock() {
-        Ok(()) => Ok(file),
-        Err(std::fs::TryLockError::WouldBlock) => {
-            let problem = format!("another process writes to {}", folder.display());
-            Err(Error::config("dataset", problem, "wait until it is done, or choose another path"))
-        }
-        Err(std::fs::TryLockError::Error(e)) => Err(Error::io(folder, "locking the folder", e)),
-    }
-}
-
 /// Removes a dataset. Renames the folder first, so that no partly removed dataset exists under the original name.
 pub(crate) fn remove_dataset(folder: &Path) -> Result<()> {
-    let _lock = lock_folder(folder)?;
+    let _lock = Lock::folder(folder)?;
     let mut aside = folder.as_os_str().to_owned();
     aside.push(format!(".replaced-{}", uuid::Uuid::new_v4().simple()));
     std::fs::rename(folder, &aside).map_err(|e| Error::io(folder, "replacing the dataset", e))?;

@@ -8,12 +8,13 @@ use super::table::{Space, TableWriter};
 use crate::dataset::Location;
 use crate::dataset::episodes::{self, EpisodeRows};
 use crate::dataset::{CommitPolicy, Constants, Reader as _, StepRange, WriteMode, WriteOptions, Writer};
-use std::fs::{File, OpenOptions, TryLockError};
+use std::fs::File;
 use std::io;
 use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
+use swm_core::files::Lock;
 use swm_core::{Batch, Error, Manifest, Result, Schema};
 
 /// Creates, continues or replaces a file.
@@ -28,20 +29,20 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
     }
     let manifest = options.manifest.as_ref();
     let mut writer = match (options.mode, is_complete_file(path)?) {
-        (_, false) => Hdf5Writer::begin(path, lock(path)?, schema, manifest)?,
+        (_, false) => Hdf5Writer::begin(path, Lock::file(path)?, schema, manifest)?,
         (WriteMode::Create, true) => {
             let problem = format!("{} exists already", path.display());
             let fix = "choose another path, append to it, or overwrite it";
             return Err(Error::config("dataset", problem, fix));
         }
         (WriteMode::Overwrite, true) => {
-            let _old = lock(path)?;
+            let _old = Lock::file(path)?;
             let temporary = temporary_path(path);
-            let writer = Hdf5Writer::begin(&temporary, lock(&temporary)?, schema, manifest)?;
+            let writer = Hdf5Writer::begin(&temporary, Lock::file(&temporary)?, schema, manifest)?;
             replace_file(writer, &temporary, path)?
         }
         (WriteMode::Append, true) => {
-            let old = lock(path)?;
+            let old = Lock::file(path)?;
             let reader =
                 Hdf5Reader::of(Source::of(old.try_clone().map_err(|e| Error::io(path, "opening it", e))?, path)?)?;
             episodes::check_appendable(&location, schema, reader.schema())?;
@@ -78,24 +79,6 @@ fn is_complete_file(path: &Path) -> Result<bool> {
     }
 }
 
-/// Opens or creates a file and locks it against other writers, until it is closed or the process ends.
-fn lock(path: &Path) -> Result<File> {
-    if let Some(folder) = path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
-        std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, "creating the folder", e))?;
-    }
-    let mut open = OpenOptions::new();
-    let file = open.read(true).write(true).create(true).truncate(false).open(path);
-    let file = file.map_err(|e| Error::io(path, "opening the file to write", e))?;
-    match file.try_lock() {
-        Ok(()) => Ok(file),
-        Err(TryLockError::WouldBlock) => {
-            let problem = format!("another process writes to {}", path.display());
-            Err(Error::config("dataset", problem, "wait until that process has finished, or choose another path"))
-        }
-        Err(TryLockError::Error(e)) => Err(Error::io(path, "locking the file", e)),
-    }
-}
-
 /// A temporary path in the folder of `path`.
 fn temporary_path(path: &Path) -> PathBuf {
     let name = format!(".{}.tmp", uuid::Uuid::new_v4().simple());
@@ -118,7 +101,7 @@ fn copy_to_this_layout(path: &Path, reader: &Hdf5Reader) -> Result<Hdf5Writer> {
     let schema = Schema::new(reader.stored())?;
     let temporary = temporary_path(path);
     let copy = || {
-        let mut writer = Hdf5Writer::begin(&temporary, lock(&temporary)?, &schema, reader.manifest().as_ref())?;
+        let mut writer = Hdf5Writer::begin(&temporary, Lock::file(&temporary)?, &schema, reader.manifest().as_ref())?;
         let names: Vec<&str> = schema.columns().iter().map(|column| &*column.name).collect();
         for (position, episode) in reader.episodes().iter().enumerate() {
             let batch = reader.read(&names, &[StepRange::new(position, 0, episode.length)])?;
@@ -135,7 +118,7 @@ fn copy_to_this_layout(path: &Path, reader: &Hdf5Reader) -> Result<Hdf5Writer> {
 
 struct Hdf5Writer {
     path: PathBuf,
-    file: File,
+    file: Lock,
     space: Space,
     /// The record, lengths and first rows of episodes, then the columns.
     tables: Vec<TableWriter>,
@@ -167,7 +150,7 @@ const COLUMNS: usize = 3;
 
 impl Hdf5Writer {
     /// Creates a file without episodes.
-    fn begin(path: &Path, file: File, schema: &Schema, manifest: Option<&Manifest>) -> Result<Self> {
+    fn begin(path: &Path, file: Lock, schema: &Schema, manifest: Option<&Manifest>) -> Result<Self> {
         let layout = Layout::new(schema.columns())?;
         let io = |e| Error::io(path, "creating the file", e);
         let (signature, rest) = layout.bytes.split_at(SIGNATURE.len());
@@ -187,7 +170,7 @@ impl Hdf5Writer {
     }
 
     /// Continues a file with this layout; returns any other file unchanged.
-    fn resume(path: &Path, reader: &Hdf5Reader, file: File) -> Result<Result<Self, File>> {
+    fn resume(path: &Path, reader: &Hdf5Reader, file: Lock) -> Result<Result<Self, Lock>> {
         let Some(schema) = &reader.record().schema else { return Ok(Err(file)) };
         let layout = Layout::new(schema.columns())?;
         let mut start = vec![0; layout.bytes.len()];
@@ -217,7 +200,7 @@ impl Hdf5Writer {
         Ok(Ok(writer))
     }
 
-    fn of(path: &Path, file: File, space: Space, tables: Vec<TableWriter>, schema: &Schema) -> Self {
+    fn of(path: &Path, file: Lock, space: Space, tables: Vec<TableWriter>, schema: &Schema) -> Self {
         Self {
             path: path.to_owned(),
             file,

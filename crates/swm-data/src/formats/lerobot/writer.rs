@@ -11,7 +11,7 @@ use super::{CONSTANTS, NO_TASK, TASK, values};
 use crate::dataset::Location;
 use crate::dataset::episodes;
 use crate::dataset::{Constants, Reader as _, WriteMode, WriteOptions, Writer};
-use crate::formats::column_files::{lock_folder, remove_dataset};
+use crate::formats::column_files::remove_dataset;
 use arrow_array::builder::{ListBuilder, StringBuilder};
 use arrow_array::{ArrayRef, Float64Array, Int64Array, RecordBatch, StringArray};
 use arrow_schema::{DataType, Field, Schema as ArrowSchema};
@@ -22,6 +22,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 use swm_core::columns::ACTION;
+use swm_core::files::Lock;
 use swm_core::{Batch, ColumnSpec, DType, Error, Result, Schema};
 use swm_video::{Encoder, Encoding};
 
@@ -32,8 +33,7 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
 
 struct LerobotWriter {
     root: PathBuf,
-    /// The open folder. Its lock excludes other writers.
-    _lock: std::fs::File,
+    _lock: Lock,
     options: WriteOptions,
     encoding: Encoding,
     schema: Schema,
@@ -85,8 +85,7 @@ impl LerobotWriter {
         if exists && options.mode == WriteMode::Overwrite {
             remove_dataset(root)?;
         }
-        std::fs::create_dir_all(root).map_err(|e| Error::io(root, "creating the folder", e))?;
-        let lock = lock_folder(root)?;
+        let lock = Lock::folder(root)?;
         let mut writer = Self {
             root: root.to_owned(),
             _lock: lock,

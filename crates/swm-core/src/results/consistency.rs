@@ -1,0 +1,112 @@
+//! Checks that the statistics in [`Results`] are those of the episodes in them.
+//!
+//! A results file may be edited or damaged. Its rates, intervals and comparisons are therefore never shown as they
+//! stand: they must equal the values that are computed again from the episodes.
+
+use super::{Comparison, Counting, Prediction, Proportion, Results, Run, Summary};
+use std::collections::BTreeMap;
+
+impl Results {
+    /// Checks that every statistic equals the statistic of the episodes.
+    ///
+    /// # Errors
+    /// When a value differs; the text names the run, the stated value and the value of its episodes.
+    pub fn check(&self) -> Result<(), String> {
+        self.runs.iter().try_for_each(|run| check_run(run, self.counting))?;
+        let mut runs: BTreeMap<(&str, &str), &Run> = BTreeMap::new();
+        for run in &self.runs {
+            runs.entry((&run.condition, &run.policy)).or_insert(run);
+        }
+        let mut seen: BTreeMap<(&str, &str, &str), ()> = BTreeMap::new();
+        for stated in &self.comparisons {
+            let [condition, a, b] = [&stated.condition, &stated.a, &stated.b].map(String::as_str);
+            let wrong = |problem: &str| Err(format!("the comparison of {a} and {b} {problem} ({condition})"));
+            // Without this check, one comparison stated a million times would be computed a million times.
+            if seen.insert((condition, a, b), ()).is_some() {
+                return wrong("is stated twice");
+            }
+            let pair = runs.get(&(condition, a)).zip(runs.get(&(condition, b)));
+            let computed = pair.and_then(|(a, b)| Comparison::of(a, b, self.counting));
+            let Some(computed) = computed else { return wrong("does not match the episodes") };
+            let (stated, computed) = (&stated.table, &computed.table);
+            let counts = |table: &super::Paired| [table.both, table.only_a, table.only_b, table.neither];
+            let values = |table: &super::Paired| [table.p, table.difference, table.low, table.high];
+            if counts(stated) != counts(computed) || !close(&values(stated), &values(computed)) {
+                return wrong("does not match the episodes");
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Checks the statistics of one run.
+fn check_run(run: &Run, counting: Counting) -> Result<(), String> {
+    let wrong = |problem: String| Err(format!("{} ({}) {problem}", run.policy, run.condition));
+    let rates = |p: &Proportion| [p.rate, p.low, p.high];
+    let (solved_at_start, computed, time_to_goal) = Run::statistics(counting, &run.episodes);
+    let stated = &run.success;
+    if (stated.successes, stated.n) != (computed.successes, computed.n) {
+        return wrong(format!(
+            "states {} successes in {}, its episodes have {} in {}",
+            stated.successes, stated.n, computed.successes, computed.n
+        ));
+    }
+    if !close(&rates(stated), &rates(&computed)) {
+        let percent = |p: &Proportion| rates(p).map(|rate| format!("{:.1} %", 100.0 * rate));
+        let ([rate, low, high], [new_rate, new_low, new_high]) = (percent(stated), percent(&computed));
+        return wrong(format!(
+            "states a success rate of {rate} ({low} to {high}), its episodes have {new_rate} ({new_low} to {new_high})"
+        ));
+    }
+    if run.solved_at_start != solved_at_start {
+        let stated = run.solved_at_start;
+        return wrong(format!("states {stated} episodes solved at start, its episodes have {solved_at_start}"));
+    }
+    if let Some(strict) = &run.strict {
+        // The episodes do not determine the strict successes of an evaluation with another counting.
+        let n = run.episodes.len() - solved_at_start;
+        if strict.n != n || strict.successes > n {
+            return wrong(format!("states {} strict successes in {}, of {n} episodes", strict.successes, strict.n));
+        }
+        if !close(&rates(strict), &rates(&Proportion::wilson(strict.successes, n))) {
+            return wrong("states a strict success rate that its strict successes do not have".to_owned());
+        }
+    }
+    if !same_summary(run.time_to_goal.as_ref(), time_to_goal.as_ref()) {
+        return wrong("states a time to goal that its episodes do not have".to_owned());
+    }
+    if run.prediction.as_ref().is_some_and(|prediction| !is_consistent(prediction)) {
+        return wrong("states prediction errors that its trajectories do not have".to_owned());
+    }
+    Ok(())
+}
+
+/// Whether the groups of a prediction are those of its trajectories.
+fn is_consistent(stated: &Prediction) -> bool {
+    let mut lengths = stated.trajectories.iter().map(|trajectory| trajectory.errors.len());
+    let horizon = lengths.next().unwrap_or(1);
+    if horizon == 0 || lengths.any(|length| length != horizon) {
+        return false;
+    }
+    let computed = Prediction::new(stated.frameskip, stated.variance, stated.trajectories.clone());
+    stated.groups.len() == computed.groups.len()
+        && stated.groups.iter().zip(&computed.groups).all(|(a, b)| {
+            a.success == b.success
+                && a.steps.len() == b.steps.len()
+                && same_summary(Some(&a.trajectory), Some(&b.trajectory))
+                && a.steps.iter().zip(&b.steps).all(|(a, b)| same_summary(Some(a), Some(b)))
+        })
+}
+
+fn same_summary(a: Option<&Summary>, b: Option<&Summary>) -> bool {
+    match (a, b) {
+        (None, None) => true,
+        (Some(a), Some(b)) => a.n == b.n && close(&[a.mean, a.median, a.p95], &[b.mean, b.median, b.p95]),
+        _ => false,
+    }
+}
+
+/// Whether values are equal up to the rounding of another order of operations.
+fn close(stated: &[f64], computed: &[f64]) -> bool {
+    stated.iter().zip(computed).all(|(a, b)| a == b || (a - b).abs() <= 1e-9 * a.abs().max(b.abs()).max(1.0))
+}

@@ -1,0 +1,50 @@
+//! Text from files, made safe to print.
+
+use std::borrow::Cow;
+
+/// Returns `text` with its control characters escaped, so that a name from a file cannot move the cursor, change
+/// colours, or reorder the line of a terminal. Line feeds and tabs stay; text without control characters is borrowed.
+pub fn printable(text: &str) -> Cow<'_, str> {
+    if !text.chars().any(is_control) {
+        return Cow::Borrowed(text);
+    }
+    let mut out = String::with_capacity(text.len() + 16);
+    for c in text.chars() {
+        if is_control(c) {
+            out.extend(c.escape_default());
+        } else {
+            out.push(c);
+        }
+    }
+    Cow::Owned(out)
+}
+
+/// Returns whether a character controls a terminal instead of appearing on it: C0 and C1 controls except line feed and
+/// tab, separators of lines and paragraphs, and the marks, embeddings, overrides and isolates of bidirectional text.
+fn is_control(c: char) -> bool {
+    match c {
+        '\n' | '\t' => false,
+        '\u{061c}' | '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => true,
+        _ => c.is_control(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn escapes_what_controls_a_terminal() {
+        let title = "a\u{1b}]0;owned\u{7}b\r\u{9b}31m\u{7f}\u{202e}\u{2066}";
+        let expected = "a\\u{1b}]0;owned\\u{7}b\\r\\u{9b}31m\\u{7f}\\u{202e}\\u{2066}";
+        assert_eq!(printable(title), expected);
+        assert!(printable(&printable(title)) == expected, "escaped text stays as it is");
+    }
+
+    #[test]
+    fn borrows_other_text() {
+        for text in ["", "pixels", "two\nlines\tof text", "größe 大きさ 🙂 e\u{301}"] {
+            assert!(matches!(printable(text), Cow::Borrowed(same) if same == text));
+        }
+    }
+}

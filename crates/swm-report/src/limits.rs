@@ -1,0 +1,42 @@
+//! Limits of the files that a report reads and of the page that it writes.
+//!
+//! Results files and training logs may come from a stranger. With these limits they cost bounded time and memory, and the
+//! page stays small enough for a browser. Real results are far below them.
+
+/// The largest results file, in bytes: about 600 000 episodes.
+pub(crate) const RESULTS_BYTES: u64 = 128 << 20;
+
+/// The largest number of runs of one page.
+pub(crate) const RUNS: usize = 5000;
+
+/// The longest name of an environment, a condition, a policy or a video, in bytes.
+pub(crate) const NAME_BYTES: usize = 1000;
+
+/// The largest training log, in bytes.
+pub(crate) const LOG_BYTES: u64 = 256 << 20;
+
+/// The largest number of metrics of a training log.
+pub(crate) const METRICS: usize = 1000;
+
+/// The longest name of a metric, in bytes.
+pub(crate) const METRIC_NAME_BYTES: usize = 200;
+
+/// The largest video that is embedded, in bytes; base64 makes it a third larger.
+pub(crate) const VIDEO_BYTES: u64 = 8 << 20;
+
+/// The size of all embedded videos together, in bytes.
+pub(crate) const ALL_VIDEOS_BYTES: u64 = 48 << 20;
+
+/// The largest number of videos that are embedded or listed with a reason.
+pub(crate) const VIDEOS: usize = 200;
+
+/// The size of one chart, in bytes.
+pub(crate) const CHART_BYTES: usize = 8 << 20;
+
+/// The size of a page beyond which further charts are left out, in bytes.
+pub(crate) const PAGE_BYTES: usize = 96 << 20;
+
+/// A size in mebibytes, as a text.
+pub(crate) fn mebibytes(bytes: u64) -> String {
+    format!("{:.1} MiB", bytes as f64 / f64::from(1 << 20))
+}

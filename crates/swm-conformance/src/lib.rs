@@ -34,9 +34,10 @@ pub struct Suite {
     pub values: usize,
     /// The number of contexts with random values, besides the context of all defaults.
     pub contexts: u64,
-    /// Resets per factor and group that request the factor or group.
+    /// The number of resets that vary one factor, for each factor, and that vary one group of factors, for each group. A
+    /// group is the factors whose names have the same first part, such as `agent`.
     pub requests: usize,
-    /// The number of resets with all factors varied.
+    /// The number of resets per environment with all factors varied.
     pub resets: u64,
     /// Factors without effect: environment, factor, reason.
     pub inert_factors: &'static [(&'static str, &'static str, &'static str)],
@@ -74,7 +75,7 @@ macro_rules! tests {
             observations_and_frames_are_fully_written,
             invalid_actions_are_errors_without_effect,
             restores_snapshot_bit_for_bit,
-            sampled_goals_are_new_and_reachable,
+            sampled_goals_differ_and_are_unsolved_and_restorable,
             dataset_rows_restore_state_and_factors,
             every_factor_has_an_effect,
             any_requested_factors_can_be_sampled,

@@ -14,7 +14,7 @@ mod restore;
 pub use effects::every_factor_has_an_effect;
 pub use entries::entries_are_complete;
 pub use experts::experts_are_valid_and_deterministic;
-pub use goals::{goal_distance_decreases_to_the_goal, sampled_goals_are_new_and_reachable};
+pub use goals::{goal_distance_decreases_to_the_goal, sampled_goals_differ_and_are_unsolved_and_restorable};
 pub use independence::{environments_are_independent, results_are_independent_of_threads_and_slots};
 pub use outputs::{invalid_actions_are_errors_without_effect, observations_and_frames_are_fully_written};
 pub use resets::{

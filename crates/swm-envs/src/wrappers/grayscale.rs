@@ -1,4 +1,4 @@
-//! Luma in all three channels: `Y = 0.299 R + 0.587 G + 0.114 B`.
+//! Replaces each channel by the luma: `Y = 0.299 R + 0.587 G + 0.114 B`.
 //!
 //! The wrapper has no parameters. Source: `GrayscaleWrapper` of the reference, which calls OpenCV; the result is equal
 //! bit for bit (weights in units of 2⁻¹⁵). Deviation: frames always have three channels, so there is no

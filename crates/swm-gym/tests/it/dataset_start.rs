@@ -75,7 +75,7 @@ fn environment_with_setters_starts_at_the_recorded_state() {
 }
 
 #[test]
-fn shifted_factors_are_sampled_from_a_new_seed() {
+fn start_with_requested_variation_takes_random_values_from_the_reset_seed() {
     let Some(config) = config() else { return };
     let mut field = RecordedEnv::of(make(FIELD, &config));
     let variation = VariationRequest { variation: Some(vec!["agent".to_owned()]), ..VariationRequest::default() };

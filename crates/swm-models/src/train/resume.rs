@@ -4,7 +4,7 @@ use serde_json::Value;
 use std::path::Path;
 use swm_core::{Error, Manifest, Result};
 
-/// Returns the error for an output folder that holds a run, if `resume` is not set.
+/// Returns the error for a new run whose output folder holds an earlier run.
 pub(crate) fn refuse_existing(out: &Path) -> Error {
     Error::config(
         out.display().to_string(),
@@ -16,7 +16,7 @@ pub(crate) fn refuse_existing(out: &Path) -> Error {
 /// Checks that a stored run has the configuration and the data of the requested run.
 ///
 /// # Errors
-/// When the configuration or the data differ; the error names the settings that differ.
+/// When the configuration differs, with the settings that differ and their values, or else when the data differ.
 pub(crate) fn check_same_run(path: &Path, stored: &Manifest, requested: &Manifest) -> Result<()> {
     let problem = if stored.config != requested.config {
         let differing = differences("", &stored.config, &requested.config);

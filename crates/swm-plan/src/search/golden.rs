@@ -18,9 +18,11 @@ pub struct Update {
     pub noise: Vec<f32>,
     pub candidates: Vec<f32>,
     pub costs: Vec<f32>,
-    /// The distribution after the iteration.
+    /// The mean of the sampling distribution after the iteration.
     pub mean: Vec<f32>,
+    /// The standard deviation after the iteration, which the reference calls `var`.
     pub var: Vec<f32>,
+    /// The probabilities of discrete actions after the iteration.
     pub probs: Vec<f32>,
 }
 

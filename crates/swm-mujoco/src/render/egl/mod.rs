@@ -1,8 +1,8 @@
 //! MuJoCo's OpenGL renderer without a window, in contexts that EGL creates on a device.
 //!
-//! OpenGL requires that each context is used by one thread, while environments run on any thread. Contexts therefore
-//! belong to render threads of this module, which render the jobs of a queue while the callers wait. Graphics cards are
-//! preferred; Mesa renders in software. `MUJOCO_EGL_DEVICE_ID` selects a device by index, as in MuJoCo's Python
+//! An OpenGL context is current in one thread at a time, while environments run on any thread. Contexts therefore belong
+//! to render threads of this module, which render the jobs of a queue while the callers wait. Graphics cards are
+//! preferred to Mesa's software renderer. `MUJOCO_EGL_DEVICE_ID` selects a device by index, as in MuJoCo's Python
 //! packages.
 #![allow(
     unsafe_code,
@@ -20,13 +20,13 @@ use std::sync::mpsc::{self, Sender};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use swm_core::{Error, Result};
 
-/// The maximal number of render threads: each holds contexts and their device memory.
+/// The maximal number of render threads of a software renderer; each thread holds contexts and their memory.
 const MAX_THREADS: usize = 8;
 
 /// The maximal number of render threads on a graphics card; more threads do not increase the utilisation of the card.
 const MAX_HARDWARE_THREADS: usize = 4;
 
-/// Whether there is a usable graphics card. EGL is loaded only if the system has a device file of a card; otherwise EGL
+/// Whether EGL renders on a graphics card. EGL is loaded only if the system has a device file of a card; otherwise EGL
 /// would load Mesa with the LLVM compiler, whose symbols conflict with those that PyTorch's Triton loads into the same
 /// process.
 pub(crate) fn has_hardware() -> bool {

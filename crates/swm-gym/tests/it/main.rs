@@ -5,6 +5,7 @@
 
 mod atari;
 mod dataset_start;
+mod describing;
 mod parents;
 mod play;
 mod robust;

@@ -14,7 +14,7 @@
 
 use crate::nn::Init;
 use crate::nn::parameters::{self, HostTensor, Named};
-use crate::run_folder::{CHECKPOINT_FILES, CONFIG, FOLDER, MANIFEST, OPTIMIZER, RAW, STATE, WEIGHTS};
+use crate::run_folder::{CHECKPOINT_FILES, CONFIG, FOLDER, MANIFEST, OPTIMIZER, RAW, STATE, WEIGHTS, WORLD_MODEL};
 use crate::train::run_state::RunState;
 use crate::train::{DatasetInfo, TrainConfig, Trainable, limits};
 use crate::weights;
@@ -319,6 +319,10 @@ pub fn faults(run: &Path) -> Result<Vec<String>> {
             None if path.exists() => faults.push(format!("{MANIFEST} holds no hash of {file}")),
             _ => {}
         }
+    }
+    let world_model = run.join(WORLD_MODEL);
+    if locate(&world_model).is_some() {
+        faults.extend(self::faults(&world_model)?.into_iter().map(|fault| format!("{WORLD_MODEL}: {fault}")));
     }
     Ok(faults)
 }

@@ -6,7 +6,7 @@ use super::InverseConfig;
 use crate::checkpoint::{self, Checkpoint};
 use crate::lewm::Lewm;
 use crate::nn::{Init, Mlp, parameters};
-use crate::run_folder::WEIGHTS;
+use crate::run_folder::{WEIGHTS, WORLD_MODEL};
 use burn::tensor::Device;
 use std::path::Path;
 use swm_core::{Manifest, Result};
@@ -28,7 +28,6 @@ pub struct InverseCheckpoint {
 
 /// The family id of inverse dynamics.
 pub(super) const FAMILY: &str = "inverse";
-const WORLD_MODEL: &str = "world";
 
 impl InverseCheckpoint {
     /// Returns the hash of the network's weights.

@@ -192,7 +192,7 @@ fn hostile_config_inverse() {
         let world_model = model::<Lewm>(&[SMALL, SMALL_PREDICTOR]);
         let config = InverseConfig::load(&["hidden=4".to_owned()]).expect("a configuration");
         let init = Init::new(Key::new(0), &Device::flex());
-        let network = Mlp::new(&init, 2 * world_model.config.model.latent, 4, world_model.actions());
+        let network = Mlp::new(&init, 2 * world_model.config.model.latent, 4, world_model.action_dim());
         let manifest = Manifest::new("train", 0, Value::Null);
         InverseCheckpoint { world_model, model: network, config, manifest }.save(folder).expect("a checkpoint");
     });
@@ -324,6 +324,6 @@ fn a_pytorch_tensor_cannot_repeat_its_elements_without_limit() {
     for count in [1 << 31, 1 << 40, 1 << 60] {
         repeated(&path, count);
         let error = weights::read(&path).expect_err("too large").to_string();
-        assert!(error.contains("larger than the file") || error.contains("overflow"), "{error}");
+        assert!(["larger than the file", "limit", "overflow"].iter().any(|word| error.contains(word)), "{error}");
     }
 }

@@ -180,11 +180,17 @@ fn verify(given: &[String], as_json: bool) -> anyhow::Result<()> {
     } else {
         for (name, Findings { weights, faults }) in &found {
             if faults.is_empty() {
-                emit(&format!("{name}: valid, weights {weights}
-"));
+                emit(&format!(
+                    "{name}: valid, weights {weights}
+"
+                ));
             }
-            faults.iter().for_each(|fault| emit(&format!("{name}: {fault}
-")));
+            faults.iter().for_each(|fault| {
+                emit(&format!(
+                    "{name}: {fault}
+"
+                ))
+            });
         }
     }
     if damaged > 0 {

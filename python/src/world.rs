@@ -16,7 +16,7 @@ use swm::core::columns::{TERMINATED, TRUNCATED};
 use swm::core::pool::Reset;
 use swm::core::results::Counting;
 use swm::core::run::{Control, Event};
-use swm::core::{Callable, CameraView, Env, Error, Key, ResetOptions, Snapshot, VariationRequest};
+use swm::core::{Callable, CameraView, Env, Error, Key, Origin, ResetOptions, Snapshot, VariationRequest};
 use swm::data::{ImageCodec, WriteMode, WriteOptions};
 use swm::envs::wrappers::{GoalFrame, Stack, WRAPPERS};
 use swm::eval::{CollectConfig, EvalConfig, Starts, Videos, WorldConfig, episode_key, reset_seed};
@@ -80,7 +80,7 @@ impl World {
         let views: swm::core::Result<Vec<CameraView>> = views.iter().map(|text| CameraView::parse(text)).collect();
         let config = WorldConfig { envs, image, views: views.map_err(to_py_err)?, max_episode_steps, threads };
         let world = py.detach(|| {
-            let chosen = swm::env(&env)?;
+            let chosen = swm::env(&env, &Origin::User)?;
             swm::eval::World::of(|| Ok(stack.wrap(chosen.env()?, goal)), config)
         });
         Ok(Self { world: Mutex::new(world.map_err(to_py_err)?), envs })

@@ -13,7 +13,7 @@
 //!    predict latents. [`requirements`]: columns that a model family requires of a dataset.
 //! 6. [`run`]: progress and interruption of long commands. [`registry`], [`manifest`], [`results`], [`error`]: names,
 //!    provenance, evaluation results and errors. [`files`]: reading, replacing and deleting files. [`text`]: text
-//!    from files, made safe to print.
+//!    from files, made safe to print. [`origin`]: names that only the user may choose.
 
 pub mod batch;
 pub mod camera_view;
@@ -26,6 +26,7 @@ pub mod factors;
 pub mod files;
 pub mod key;
 pub mod manifest;
+pub mod origin;
 mod parallelism;
 pub mod plan;
 pub mod policy;
@@ -49,6 +50,7 @@ pub use env::{Action, Env, EnvSpec, FrameMut, ResetOptions, Snapshot, Transition
 pub use error::{Error, Result};
 pub use key::{Key, Rng};
 pub use manifest::Manifest;
+pub use origin::Origin;
 pub use plan::{
     Candidates, Constrained, CostModel, DifferentiableCost, LatentDynamics, Plan, PlanProblem, PlanSpace, PlanTrace,
     Solver,

@@ -8,6 +8,13 @@ A request is one byte for its kind, the length of its payload (4 bytes, little-e
 the same form. The first request carries the sources of the other modules and the environment to make.
 """
 
+import sys
+
+# `python -c` puts the current folder first, where a stranger's `json.py` would replace a module of the standard library.
+# Modules that this statement has not removed from the path come from the installation and from PYTHONPATH.
+if sys.path[:1] == ['']:
+    del sys.path[0]
+
 import ctypes
 import importlib.abc
 import importlib.util
@@ -17,7 +24,6 @@ import os
 import signal
 import socket
 import struct
-import sys
 import traceback
 
 HEADER = struct.Struct('<BI')
@@ -77,6 +83,9 @@ class Connection:
 def make(connection, memory):
     """Makes the environment of the first request and answers with its description, or with the reason for a failure."""
     request = json.loads(connection.request()[1])
+    if ':' in request['id']:
+        # The user named a module, which may be in the current folder. All other modules are found elsewhere first.
+        sys.path.append(os.getcwd())
     sys.meta_path.append(Sources(request['modules']))
     try:
         import gymnasium

@@ -89,10 +89,11 @@ pub fn install(package: &Package) -> Result<PathBuf> {
     let folder = virtual_environment();
     if !python().is_file() {
         let mut make = Command::new("python3");
-        run("making a Python environment with `python3 -m venv`", make.args(["-m", "venv"]).arg(&folder))?;
+        run("making a Python environment with `python3 -m venv`", make.args(["-I", "-m", "venv"]).arg(&folder))?;
     }
     let mut pip = Command::new(python());
-    pip.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check"]);
+    // `-I` keeps modules of the current folder from replacing those of the installation.
+    pip.args(["-I", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]);
     pip.args(GYMNASIUM).args(package.requirements);
     run(&format!("installing {} {} with pip", package.name, package.version), &mut pip)?;
     Ok(folder)
@@ -111,7 +112,7 @@ pub fn verify(package: &Package) -> Result<()> {
     let mut pip = Command::new(python());
     run(
         &format!("checking {} ({})", package.name, fix()),
-        pip.args(["-m", "pip", "check", "--disable-pip-version-check"]),
+        pip.args(["-I", "-m", "pip", "check", "--disable-pip-version-check"]),
     )
 }
 

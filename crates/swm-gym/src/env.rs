@@ -432,6 +432,7 @@ impl Env for GymEnv {
                 "a snapshot of an episode of this environment",
             ));
         };
+        start::check_methods(&self.layout, &reset)?;
         self.finish_dispatched()?;
         let is_prefix = |now: &&Episode| now.reset == reset && now.goal == goal && actions.starts_with(&now.actions);
         let prefix = self.episode.as_ref().filter(is_prefix);

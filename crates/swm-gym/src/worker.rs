@@ -6,7 +6,7 @@
 //! socket closes, and, on Linux, when this process ends in any way.
 
 use crate::config::{GymConfig, Python};
-use crate::{BRIDGE, CRAFTAX, Description, Failure, Request, Transport, WORKER, assets};
+use crate::{BRIDGE, CRAFTAX, Description, Failure, Request, Transport, TrustedId, WORKER, assets};
 use memmap2::MmapMut;
 use std::collections::{BTreeMap, VecDeque};
 use std::fs::File;
@@ -28,8 +28,7 @@ const EXIT_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// A Python process with one environment.
 pub struct WorkerTransport {
-    id: String,
-    options: BTreeMap<String, String>,
+    id: TrustedId,
     config: GymConfig,
     process: Option<Process>,
 }
@@ -49,8 +48,8 @@ impl WorkerTransport {
     ///
     /// # Errors
     /// When Python cannot be started.
-    pub fn new(id: &str, options: BTreeMap<String, String>, config: GymConfig) -> swm_core::Result<Self> {
-        let mut made = Self { id: id.to_owned(), options, config, process: None };
+    pub fn new(id: &TrustedId, config: GymConfig) -> swm_core::Result<Self> {
+        let mut made = Self { id: id.clone(), config, process: None };
         match made.restart() {
             Ok(()) => Ok(made),
             Err(Failure::Refused(error)) => Err(error),
@@ -95,7 +94,7 @@ impl WorkerTransport {
     /// Converts an answer that reports a failure into a [`Failure`].
     fn failure(&self, kind: u8, text: Vec<u8>) -> Failure {
         let text = String::from_utf8_lossy(&text).into_owned();
-        let (id, python) = (&self.id, &self.config.python);
+        let (id, python) = (self.id.id(), &self.config.python);
         let refused = match kind {
             b'x' => return Failure::Raised(text),
             b'u' => {
@@ -126,11 +125,11 @@ impl Transport for WorkerTransport {
     fn restart(&mut self) -> Result<(), Failure> {
         self.process = None;
         let modules = BTreeMap::from([("swm_bridge", BRIDGE), ("swm_craftax", CRAFTAX)]);
-        let request = serde_json::json!({"id": self.id, "options": self.options, "modules": modules});
-        let mut process = Process::start(&self.id, &self.config.python).map_err(Failure::Refused)?;
+        let request = serde_json::json!({"id": self.id.id(), "options": self.id.options(), "modules": modules});
+        let mut process = Process::start(self.id.id(), &self.config.python).map_err(Failure::Refused)?;
         // If the process does not receive the request, `describe` returns the error.
         if let Err(problem) = process.send(b'm', request.to_string().as_bytes()) {
-            tracing::debug!("{}: its worker did not receive the first request: {problem}", self.id);
+            tracing::debug!("{}: its worker did not receive the first request: {problem}", self.id.id());
         }
         self.process = Some(process);
         Ok(())
@@ -143,7 +142,7 @@ impl Transport for WorkerTransport {
         let (kind, text) = answer.map_err(|problem| match self.lose(&problem, limit) {
             // A new worker would exceed the same timeout.
             Failure::Lost(how) if problem.kind() == std::io::ErrorKind::WouldBlock => {
-                Failure::Refused(Error::external(format!("making {}", self.id), how))
+                Failure::Refused(Error::external(format!("making {}", self.id.id()), how))
             }
             failure => failure,
         })?;

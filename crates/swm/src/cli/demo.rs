@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 use swm_core::results::Counting;
-use swm_core::{Error, Result, VariationRequest, files};
+use swm_core::{Error, Origin, Result, VariationRequest, files};
 use swm_data::{ImageCodec, Location, WriteMode};
 use swm_eval::{
     Choice, CollectConfig, Condition, EvalRequest, Model, PolicyKind, PolicyRequest, StartsRequest, WorldConfig,
@@ -80,7 +80,7 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
     train::run(&config, swm_models::TrainRun { reader, encoder: None, out: &model, options }, context)?;
 
     eprint("3/4 plan and evaluate: CEM with the model, compared with the random-policy floor\n");
-    let resolver = HomeResolver::tracing();
+    let resolver = HomeResolver::new(Origin::User).tracing();
     let request = request(args, &model, side, &resolver)?;
     let (found, file) = eval::run(&request, &resolver, args.envs, (&results, 3), context)?;
 

@@ -9,12 +9,22 @@ use crate::resolver::HomeResolver;
 use clap::Args;
 use serde_json::json;
 use std::path::PathBuf;
+use swm_core::{Error, Origin};
+use swm_eval::EvalRequest;
 
 /// Arguments of `swm reproduce`.
 #[derive(Args)]
 pub struct ReproduceArgs {
     /// A results.json, or the folder that contains it
     results: PathBuf,
+    /// The environment, if the results may not choose it
+    ///
+    /// A results file may choose built-in environments and those registered with Gymnasium (docs/security.md).
+    #[arg(long)]
+    env: Option<String>,
+    /// Allow the results to choose any environment, wrapper and dataset
+    #[arg(long)]
+    trust: bool,
     /// Parallel environments; results do not depend on their number
     #[arg(long, default_value_t = 16)]
     envs: usize,
@@ -28,7 +38,16 @@ pub fn reproduce(args: &ReproduceArgs, context: &Context) -> anyhow::Result<()> 
     let file = if args.results.is_dir() { args.results.join("results.json") } else { args.results.clone() };
     let old = swm_report::read_results(&file)?;
     let options = run_options(args.envs, None, context);
-    let repeated = swm_eval::reproduce::reproduce(&old, &HomeResolver::default(), &options, &mut control(context))?;
+    let mut resolver = HomeResolver::new(Origin::file(&file, args.trust));
+    if let Some(env) = &args.env {
+        let named = EvalRequest::of(&old.manifest)?.env;
+        if *env != named {
+            let problem = format!("the results are of {named}");
+            return Err(Error::config(format!("--env {env}"), problem, "name the environment of the results").into());
+        }
+        resolver = resolver.with_env(env);
+    }
+    let repeated = swm_eval::reproduce::reproduce(&old, &resolver, &options, &mut control(context))?;
     if let Some(output) = &args.output {
         write_json(&create_folder(output)?.join("results.json"), &repeated.results)?;
     }

@@ -8,6 +8,7 @@ mod gym;
 mod listing;
 mod pipeline;
 mod python;
+mod trust;
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

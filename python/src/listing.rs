@@ -15,7 +15,7 @@ pub fn envs() -> Vec<&'static str> {
 #[pyfunction]
 pub fn spec(py: Python<'_>, id: &str) -> PyResult<String> {
     let described = py.detach(|| {
-        let chosen = swm::env(id, &Origin::User)?;
+        let chosen = swm::env(id, &swm::core::Origin::User)?;
         let env = chosen.env()?;
         Ok(swm::describe::env(&chosen.entry, env.spec()).to_string())
     });

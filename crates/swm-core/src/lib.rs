@@ -13,7 +13,8 @@
 //!    predict latents. [`requirements`]: columns that a model family requires of a dataset.
 //! 6. [`run`]: progress and interruption of long commands. [`registry`], [`manifest`], [`results`], [`error`]: names,
 //!    provenance, evaluation results and errors. [`files`]: reading, replacing and deleting files. [`text`]: text
-//!    from files, made safe to print. [`origin`]: names that only the user may choose.
+//!    from files, made safe to print. [`origin`]: names that only the user may choose. [`finite`]: counts of NaN and infinite
+//!    values.
 
 pub mod batch;
 pub mod camera_view;
@@ -24,6 +25,7 @@ pub mod env;
 pub mod error;
 pub mod factors;
 pub mod files;
+pub mod finite;
 pub mod key;
 pub mod manifest;
 pub mod origin;

@@ -61,6 +61,15 @@ class Connection:
 
     def __init__(self, descriptor):
         self.socket = socket.socket(fileno=descriptor)
+        self.process = os.getpid()
+        # Otherwise a forked process would keep the connection open after its parent ends.
+        os.register_at_fork(after_in_child=self.socket.close)
+
+    def check_process(self):
+        """Ends a process that the environment forked: only the worker itself talks to the parent."""
+        if os.getpid() != self.process:
+            print(f'process {os.getpid()}, forked by the environment, ended: it is not the worker', file=sys.stderr)
+            os._exit(1)
 
     def read(self, n):
         data = b''
@@ -72,10 +81,12 @@ class Connection:
         return data
 
     def request(self):
+        self.check_process()
         op, n = HEADER.unpack(self.read(HEADER.size))
         return op, self.read(n) if n else b''
 
     def answer(self, kind, text=''):
+        self.check_process()
         data = text.encode('utf-8', 'replace')
         self.socket.sendall(HEADER.pack(kind, len(data)) + data)
 

@@ -1,6 +1,7 @@
 //! [`Description`]: the bridge's description of an environment. [`EnvLayout`]: the spec and the memory layout that are
 //! derived from the description.
 
+use crate::finite::FiniteCheck;
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -32,11 +33,19 @@ impl Description {
     /// Parses the JSON of `Bridge.describe()`.
     ///
     /// # Errors
-    /// When the text is not the JSON of a description.
+    /// When the text is not the JSON of a description, or the buffer exceeds [`MAX_MEMORY`].
     pub fn parse(json: &str) -> Result<Self> {
-        serde_json::from_str(json).map_err(|error| Error::external("parsing the description of an environment", error))
+        const WHAT: &str = "parsing the description of an environment";
+        let parsed: Self = serde_json::from_str(json).map_err(|error| Error::external(WHAT, error))?;
+        if parsed.size > MAX_MEMORY {
+            return Err(Error::mismatch(WHAT, format!("{} bytes", parsed.size), format!("at most {MAX_MEMORY}")));
+        }
+        Ok(parsed)
     }
 }
+
+/// The maximum size of the buffer of an environment, in bytes: one observation, one frame and one goal frame.
+const MAX_MEMORY: usize = 4 << 30;
 
 /// A column and its offset in the buffer.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
@@ -173,6 +182,8 @@ pub struct EnvLayout {
     pub(crate) columns: Vec<Range<usize>>,
     /// The byte range of the action.
     pub(crate) action: Range<usize>,
+    /// The warnings of NaN and infinite values.
+    pub(crate) finite: FiniteCheck,
 }
 
 /// Offsets in bytes in the header of the buffer: reward and goal distance (doubles), then three flags.
@@ -182,7 +193,9 @@ pub(crate) mod header {
     pub const TERMINATED: usize = 16;
     pub const TRUNCATED: usize = 17;
     pub const SUCCESS: usize = 18;
-    pub const END: usize = 19;
+    /// A flag that a process sets that the environment forked and that returned from a call.
+    pub const FORKED: usize = 19;
+    pub const END: usize = 20;
 }
 
 impl EnvLayout {
@@ -223,7 +236,8 @@ impl EnvLayout {
         };
         let column = spec.action_column();
         let action = description.action_offset..description.action_offset.saturating_add(column.row_bytes());
-        let layout = Self { columns: ranges, action, spec, description };
+        let finite = FiniteCheck::new(ranges.len());
+        let layout = Self { columns: ranges, action, spec, description, finite };
         let frames = layout.frame().into_iter().chain(layout.goal()).map(FrameRegion::range);
         let all = layout.columns.iter().cloned().chain(frames).chain([layout.action.clone(), layout.factors()]);
         let end = all.map(|range| range.end).max().unwrap_or(0).max(header::END);

@@ -14,6 +14,7 @@ mod dataset_start;
 mod describe;
 mod env;
 mod episode;
+mod finite;
 mod id;
 mod interned;
 mod reset_arguments;

@@ -6,6 +6,7 @@
 mod atari;
 mod dataset_start;
 mod describing;
+mod hostile;
 mod parents;
 mod play;
 mod robust;

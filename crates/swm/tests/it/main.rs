@@ -4,6 +4,7 @@
 mod collecting;
 mod data;
 mod deletion;
+mod finite;
 mod gym;
 mod listing;
 mod pipeline;

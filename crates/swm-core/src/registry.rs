@@ -149,10 +149,12 @@ impl Registry<EnvEntry> {
     /// Parses `ID` or `ID,option=value,…`.
     ///
     /// # Errors
-    /// When there is no such environment, option or value; the error suggests similar names.
+    /// When there is no such environment, option or value, in which case the error suggests similar names, or an option
+    /// is given twice.
     pub fn choose(&self, text: &str) -> Result<EnvChoice> {
         let mut parts = text.split(',');
         let mut chosen = EnvChoice::from(self.get(parts.next().unwrap_or_default())?);
+        let mut given: Vec<Option<&str>> = vec![None; chosen.entry.options.len()];
         for part in parts {
             let (key, value) = part.split_once('=').unwrap_or((part, ""));
             let options = chosen.entry.options;
@@ -161,6 +163,9 @@ impl Registry<EnvEntry> {
                 let hint = if options.is_empty() { "this environment has no options" } else { "write ID,option=value" };
                 Error::unknown("option of the environment", key, keys(), format!("{}: {hint}", chosen.entry.id))
             })?;
+            if let Some(first) = given[index].replace(part) {
+                return Err(Error::twice(format!("option of {}", chosen.entry.id), first, part));
+            }
             let values = options[index].values;
             let value = values.iter().find(|known| **known == value).ok_or_else(|| {
                 Error::unknown(

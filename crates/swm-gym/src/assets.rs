@@ -3,7 +3,7 @@
 //! The virtual environment is the folder `python-gym` in the folder of all assets: `$SWM_ASSETS`, else
 //! `$STABLEWM_HOME/assets`, else `~/.stable_worldmodel/assets`.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::Command;
 use swm_core::{Error, Result};
 
@@ -65,9 +65,7 @@ impl Package {
 
 /// The folder of assets, which `swm-mujoco` shares.
 pub(crate) fn folder() -> PathBuf {
-    let variable = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
-    let home = || Path::new(&std::env::var_os("HOME").unwrap_or_default()).join(".stable_worldmodel");
-    variable("SWM_ASSETS").unwrap_or_else(|| variable("STABLEWM_HOME").unwrap_or_else(home).join("assets"))
+    swm_core::home::installed_assets()
 }
 
 /// The folder of the virtual environment.
@@ -86,6 +84,7 @@ pub(crate) fn python() -> PathBuf {
 /// # Errors
 /// When Python or pip fails.
 pub fn install(package: &Package) -> Result<PathBuf> {
+    swm_core::home::assets()?;
     let folder = virtual_environment();
     if !python().is_file() {
         let mut make = Command::new("python3");

@@ -243,7 +243,7 @@ fn with_provenance(policy: ResolvedPolicy, info: CheckpointInfo) -> ResolvedPoli
 /// requires a solver.
 pub fn policy_by_name(entry: &EnvEntry, name: &str, world: &World) -> Result<(Box<dyn Policy>, Option<String>)> {
     let is_scripted = ["random", "expert"].contains(&name) || entry.experts.iter().any(|expert| expert.id == name);
-    if is_scripted || !home::checkpoint(name).exists() {
+    if is_scripted || !home::checkpoint(name)?.exists() {
         return Ok((scripted(entry, name, world)?, None));
     }
     let (policy, info) = checkpoint_policy(name, world.spec(), world.pool().len())?;

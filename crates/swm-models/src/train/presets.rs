@@ -5,6 +5,7 @@ use figment::Figment;
 use figment::providers::{Format as _, Serialized, Toml};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use std::collections::BTreeMap;
 use std::path::Path;
 use swm_core::{Error, Result, files};
 
@@ -69,11 +70,15 @@ fn merge(text: &str, settings: &[String], known: &[String]) -> Result<Figment> {
     keys.iter().try_for_each(|key| check(key))?;
 
     let mut figment = Figment::from(Toml::string(text));
+    let mut given: BTreeMap<&str, &str> = BTreeMap::new();
     for setting in settings {
         let Some((key, value)) = setting.split_once('=') else {
             return Err(Error::config(setting, "is not a setting", "write key=value, such as optim.lr=3e-4"));
         };
         check(key)?;
+        if let Some(first) = given.insert(key, setting) {
+            return Err(Error::twice(format!("setting {key}"), first, setting));
+        }
         // A value that is not valid TOML is a string.
         let value = toml::from_str::<toml::Table>(&format!("value = {value}"))
             .ok()

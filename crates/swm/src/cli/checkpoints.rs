@@ -111,7 +111,7 @@ fn show(given: &str, as_json: bool) -> anyhow::Result<()> {
 }
 
 fn list(as_json: bool) -> anyhow::Result<()> {
-    let folder = home::checkpoints();
+    let folder = home::checkpoints()?;
     let summaries: Vec<Value> = names_in(&folder)
         .into_iter()
         .map(|name| match load(&name) {
@@ -164,7 +164,7 @@ fn examine(given: &str) -> Findings {
 }
 
 fn verify(given: &[String], as_json: bool) -> anyhow::Result<()> {
-    let all = names_in(&home::checkpoints());
+    let all = if given.is_empty() { names_in(&home::checkpoints()?) } else { vec![] };
     let given = if given.is_empty() { &all } else { given };
     let found: Vec<(&String, Findings)> = given.iter().map(|name| (name, examine(name))).collect();
     let damaged = found.iter().filter(|(_, found)| !found.faults.is_empty()).count();

@@ -7,9 +7,8 @@ use crate::resolver::policy_by_name;
 use crate::{collect_target, home};
 use clap::Args;
 use serde_json::json;
-use std::path::{Path, PathBuf};
 use std::time::Instant;
-use swm_core::{CameraView, EnvChoice, Error, Manifest, Origin, Result, Schema};
+use swm_core::{CameraView, EnvChoice, Manifest, Origin, Result, Schema};
 use swm_data::lance::{Shard, create_shard};
 use swm_data::{FORMATS, ImageCodec, Location, WriteMode, WriteOptions, Writer};
 use swm_eval::{CollectConfig, Collected, World, WorldConfig};
@@ -218,10 +217,4 @@ impl Collection<'_> {
             (None, None) => swm_data::create(self.location.clone(), schema, options),
         }
     }
-}
-
-/// Creates a folder.
-pub fn create_folder(path: &Path) -> Result<PathBuf> {
-    std::fs::create_dir_all(path).map_err(|e| Error::io(path, "creating the folder", e))?;
-    Ok(path.to_owned())
 }

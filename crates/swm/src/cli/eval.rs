@@ -1,8 +1,8 @@
 //! `swm eval`: evaluates policies and the random-policy floor from the same starts.
 
-use super::collect::create_folder;
 use super::config::{VariationArgs, image_size};
 use super::eval_policy::NamedPolicy;
+use super::output_folder;
 use super::planner::PlannerArgs;
 use super::progress::control;
 use super::results_tables::summary;
@@ -13,7 +13,7 @@ use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use swm_core::results::Counting;
-use swm_core::{Error, Origin, Result, Results};
+use swm_core::{Error, Origin, Result, Results, files};
 use swm_data::{Part, Split};
 use swm_eval::{Condition, EvalRequest, HeldOut, RunOptions, StartsRequest};
 
@@ -198,7 +198,7 @@ pub fn run(
     (output, videos): (&Path, usize),
     context: &Context,
 ) -> Result<(Results, PathBuf)> {
-    create_folder(output)?;
+    let _lock = output_folder::claim(output, &["results.json", "traces.json"])?;
     let videos = (videos > 0).then(|| (output.to_owned(), videos));
     let results = request.run(resolver, &run_options(envs, videos, context), &mut control(context))?;
     let file = output.join("results.json");
@@ -215,7 +215,7 @@ pub fn run_options(envs: usize, videos: Option<(PathBuf, usize)>, context: &Cont
 /// Writes indented JSON to a file.
 pub fn write_json(file: &Path, value: &impl serde::Serialize) -> Result<()> {
     let text = serde_json::to_string_pretty(value).map_err(|e| Error::external("writing JSON", e))?;
-    std::fs::write(file, text + "\n").map_err(|e| Error::io(file, "writing results", e))
+    files::write(file, (text + "\n").as_bytes())
 }
 
 /// Returns every traced plan as one object.

@@ -58,7 +58,8 @@ impl NamedPolicy {
             None => NamedKind::Direct(direct),
         };
         let name = Path::new(given).file_name().map_or(given.to_owned(), |name| name.to_string_lossy().into_owned());
-        let env = info.dataset_info.env.map(|env| (env, home::checkpoint(given)));
+        let path = home::checkpoint(given)?;
+        let env = info.dataset_info.env.map(|env| (env, path));
         Ok(Self { name, kind, env, image: info.image_size })
     }
 

@@ -67,7 +67,7 @@ pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
         resume: args.resume,
         device: device::parse(&args.device)?,
         threads: context.threads,
-        cache: home::weights(),
+        cache: home::weights()?,
         ..TrainOptions::default()
     };
     if let Some(env) = &args.env {

@@ -7,6 +7,7 @@ mod deletion;
 mod finite;
 mod gym;
 mod listing;
+mod output;
 mod pipeline;
 mod python;
 mod trust;

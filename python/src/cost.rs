@@ -8,7 +8,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use std::cell::RefCell;
 use swm::core::{
-    Batch, Candidates, Constrained, CostModel, DifferentiableCost, EnvSpec, Error, LatentDynamics, Result,
+    Batch, Candidates, Constrained, CostModel, DifferentiableCost, EnvSpec, Error, LatentDynamics, Origin, Result,
 };
 use swm::plan::{ActionScale, Score, SimulatorCost};
 
@@ -34,7 +34,8 @@ pub fn planning_model(
     action_block: usize,
 ) -> PyResult<PlanningModel> {
     let Some(given) = given else {
-        let env = swm::env(&spec.id).map_err(to_py_err)?;
+        // The world already runs this environment.
+        let env = swm::env(&spec.id, &Origin::User).map_err(to_py_err)?;
         let scale = ActionScale::unscaled(spec);
         let cost = SimulatorCost::new(move || env.env(), scale.clone(), action_block, Score::default());
         return Ok(PlanningModel {

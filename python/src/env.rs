@@ -9,7 +9,7 @@ use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 use std::sync::{Mutex, MutexGuard, PoisonError};
-use swm::core::{Action, Batch, CameraView, DType, Env, Error, FrameMut, Key, Schema, Snapshot, thread_budget};
+use swm::core::{Action, Batch, CameraView, DType, Env, Error, FrameMut, Key, Origin, Schema, Snapshot, thread_budget};
 
 /// A single native environment.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
@@ -45,7 +45,7 @@ impl NativeEnv {
     fn new(py: Python<'_>, id: &str, wrappers: &str, wrap_goal: bool) -> PyResult<Self> {
         let (stack, goal) = stack(wrappers, wrap_goal)?;
         let made = py.detach(|| {
-            let env = stack.wrap(swm::env(id)?.env()?, goal);
+            let env = stack.wrap(swm::env(id, &Origin::User)?.env()?, goal);
             let row = Batch::zeros(&Schema::new(env.spec().columns.clone())?, 1);
             Ok(State { env, row })
         });

@@ -1,7 +1,6 @@
 //! The engine's registries as JSON, and the command line.
 
 use crate::errors::to_py_err;
-use clap::Parser as _;
 use pyo3::prelude::*;
 use serde_json::{Map, Value};
 
@@ -15,7 +14,7 @@ pub fn envs() -> Vec<&'static str> {
 #[pyfunction]
 pub fn spec(py: Python<'_>, id: &str) -> PyResult<String> {
     let described = py.detach(|| {
-        let chosen = swm::env(id)?;
+        let chosen = swm::env(id, &swm::core::Origin::User)?;
         let env = chosen.env()?;
         Ok(swm::describe::env(&chosen.entry, env.spec()).to_string())
     });
@@ -46,19 +45,12 @@ pub fn formats() -> Vec<&'static str> {
 
 /// The home folder, which holds the datasets and checkpoints that are given by name.
 #[pyfunction]
-pub fn home() -> String {
-    swm::home::home().display().to_string()
+pub fn home() -> PyResult<String> {
+    Ok(swm::home::home().map_err(to_py_err)?.display().to_string())
 }
 
 /// Runs the command line with these arguments (the program's name first) and returns its exit code.
 #[pyfunction]
 pub fn command(py: Python<'_>, arguments: Vec<String>) -> u8 {
-    py.detach(|| match swm::cli::Cli::try_parse_from(arguments) {
-        Ok(cli) => cli.run(),
-        Err(error) => {
-            // Prints help and versions to stdout, and errors to stderr. A failure to print cannot be reported anywhere.
-            let _ = error.print();
-            u8::try_from(error.exit_code()).unwrap_or(2)
-        }
-    })
+    py.detach(|| swm::cli::run(arguments))
 }

@@ -7,7 +7,7 @@ use pyo3::types::PyDict;
 use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
-use swm::core::{Batch, Candidates, CostModel, Error, Key, Policy, Schema};
+use swm::core::{Batch, Candidates, CostModel, Error, Key, Origin, Policy, Schema};
 use swm::models::Device;
 use swm::models::{CheckpointInfo, load};
 use swm::plan::ActionScale;
@@ -30,6 +30,8 @@ pub struct Model {
     policy: Mutex<Option<(Box<dyn Policy>, usize)>>,
     /// The id of the training environment; `None` if the manifest does not name one.
     env: Option<String>,
+    /// The checkpoint, or the user if the user trusts it.
+    origin: Origin,
 }
 
 impl Model {
@@ -54,7 +56,7 @@ impl Model {
 #[pymethods]
 impl Model {
     #[new]
-    fn new(py: Python<'_>, name: &str, device: &str, objective: &str) -> PyResult<Self> {
+    fn new(py: Python<'_>, name: &str, device: &str, objective: &str, trust: bool) -> PyResult<Self> {
         let device = swm::models::device::parse(device).map_err(to_py_err)?;
         let objective: Value = json("objective", objective)?;
         let (path, info) = py
@@ -77,6 +79,7 @@ impl Model {
             "action_std": dataset_info.action.std,
         });
         Ok(Self {
+            origin: Origin::file(&path, trust),
             path,
             device,
             objective,
@@ -115,7 +118,7 @@ impl Model {
             let Some(id) = &self.env else {
                 return Err(Error::config(what(), "its manifest does not name an environment", "train it again"));
             };
-            let spec = swm::env(id)?.env()?.spec().clone();
+            let spec = swm::env(id, &self.origin)?.env()?.spec().clone();
             if cached.as_ref().is_none_or(|(_, slots)| *slots != rows) {
                 let policy = load(&self.path, &self.device)?.policy(&spec, rows).ok_or_else(|| {
                     Error::config(what(), "it predicts and does not act", "plan with it: get_cost, MPCPolicy")

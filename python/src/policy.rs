@@ -48,7 +48,7 @@ impl Actor {
     #[staticmethod]
     fn expert(world: &World, name: &str, seed: Option<u64>) -> PyResult<Self> {
         let world = world.lock()?;
-        let entry = swm::env(&world.spec().id).map_err(to_py_err)?.entry;
+        let entry = swm::env(&world.spec().id, &swm::core::Origin::User).map_err(to_py_err)?.entry;
         Ok(Self::new(swm::resolver::scripted(&entry, name, &world).map_err(to_py_err)?, seed))
     }
 
@@ -110,7 +110,13 @@ impl Actor {
     /// The names of an environment's experts.
     #[staticmethod]
     fn experts(env: &str) -> PyResult<Vec<&'static str>> {
-        Ok(swm::env(env).map_err(to_py_err)?.entry.experts.iter().map(|expert| expert.id()).collect())
+        Ok(swm::env(env, &swm::core::Origin::User)
+            .map_err(to_py_err)?
+            .entry
+            .experts
+            .iter()
+            .map(|expert| expert.id())
+            .collect())
     }
 }
 

@@ -12,12 +12,13 @@ use serde_json::{Map, Value};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
 use std::time::{Duration, Instant};
+use swm::collect_target;
 use swm::core::columns::{TERMINATED, TRUNCATED};
 use swm::core::pool::Reset;
 use swm::core::results::Counting;
 use swm::core::run::{Control, Event};
-use swm::core::{Callable, CameraView, Env, Error, Key, ResetOptions, Snapshot, VariationRequest};
-use swm::data::{ImageCodec, WriteMode, WriteOptions};
+use swm::core::{Callable, CameraView, Env, Error, Key, Origin, ResetOptions, Snapshot, VariationRequest};
+use swm::data::{ImageCodec, Location, WriteMode, WriteOptions};
 use swm::envs::wrappers::{GoalFrame, Stack, WRAPPERS};
 use swm::eval::{CollectConfig, EvalConfig, Starts, Videos, WorldConfig, episode_key, reset_seed};
 use swm::gym::GymEnv;
@@ -80,7 +81,7 @@ impl World {
         let views: swm::core::Result<Vec<CameraView>> = views.iter().map(|text| CameraView::parse(text)).collect();
         let config = WorldConfig { envs, image, views: views.map_err(to_py_err)?, max_episode_steps, threads };
         let world = py.detach(|| {
-            let chosen = swm::env(&env)?;
+            let chosen = swm::env(&env, &Origin::User)?;
             swm::eval::World::of(|| Ok(stack.wrap(chosen.env()?, goal)), config)
         });
         Ok(Self { world: Mutex::new(world.map_err(to_py_err)?), envs })
@@ -258,7 +259,7 @@ impl World {
     }
 
     /// Collects episodes into a dataset at `path`, or into `writer`, an object with `write_episode`. Returns
-    /// `(episodes, added, steps)`.
+    /// `(episodes, added, steps, warning)`; the warning lists the columns with NaN or infinite values, if there are any.
     #[allow(clippy::too_many_arguments, reason = "one argument for each option in Python")]
     fn collect(
         &self,
@@ -271,7 +272,7 @@ impl World {
         codec: Option<&str>,
         config: &str,
         progress: Option<Py<PyAny>>,
-    ) -> PyResult<(usize, usize, usize)> {
+    ) -> PyResult<(usize, usize, usize, Option<String>)> {
         let settings: Collection = json("collection", config)?;
         let mode = match mode {
             "append" => WriteMode::Append,
@@ -289,6 +290,7 @@ impl World {
                 policy: settings.policy,
                 goal: settings.goal,
                 first: settings.first,
+                strict_finite: settings.strict_finite,
             };
             let mut manifest = world.collect_manifest(&config);
             if let Some(weights) = &actor.weights {
@@ -296,23 +298,36 @@ impl World {
             }
             manifest.config["codec"] = serde_json::json!(codec);
             manifest.config["wrappers"] = settings.wrappers;
-            let writer: Box<dyn swm::data::Writer> = match (writer, path) {
-                (Some(writer), _) => Box::new(ForeignWriter::new(writer, 0)),
-                (None, path) => {
-                    let location = swm::home::target(&path.unwrap_or_default(), format.as_deref())?;
-                    swm::collect_target::check(&location, mode, &manifest, false)?;
-                    let schema = world.collect_schema(config.goal)?;
-                    let options = WriteOptions { mode, codec, manifest: Some(manifest), ..WriteOptions::default() };
-                    match &format {
-                        Some(format) => swm::data::FORMATS.get(format)?.create(&location, &schema, options)?,
-                        None => swm::data::create(location, &schema, options)?,
-                    }
+            let schema = world.collect_schema(config.goal)?;
+            let create = |location: &Location, mode, manifest| {
+                let options = WriteOptions { mode, codec, manifest: Some(manifest), ..WriteOptions::default() };
+                match &format {
+                    Some(format) => swm::data::FORMATS.get(format)?.create(location, &schema, options),
+                    None => swm::data::create(location.clone(), &schema, options),
                 }
             };
-            world.collect(policy, writer, &config, &mut control(progress))
+            let location = match &writer {
+                Some(_) => None,
+                None => Some(swm::home::target(&path.unwrap_or_default(), format.as_deref())?),
+            };
+            if let Some(location) = &location {
+                manifest.not_finite = collect_target::check(location, mode, &manifest, false)?;
+            }
+            let writer: Box<dyn swm::data::Writer> = match (writer, &location) {
+                (Some(writer), _) => Box::new(ForeignWriter::new(writer, 0)),
+                (None, Some(location)) => create(location, mode, manifest.clone())?,
+                (None, None) => return Err(Error::config("World.collect", "no target is given", "give a path")),
+            };
+            let collected = world.collect(policy, writer, &config, &mut control(progress));
+            let warning = collect_target::describe_not_finite(world.not_finite());
+            if let (Some(_), Some(location)) = (&warning, &location) {
+                collect_target::add_not_finite(&mut manifest, world.not_finite());
+                create(location, WriteMode::Append, manifest)?.finish()?;
+            }
+            Ok((collected?, warning))
         });
-        let collected = collected.map_err(to_py_err)?;
-        Ok((collected.episodes, collected.added, collected.steps))
+        let (collected, warning) = collected.map_err(to_py_err)?;
+        Ok((collected.episodes, collected.added, collected.steps, warning))
     }
 
     /// Evaluates a policy and returns the run as JSON.
@@ -392,6 +407,7 @@ struct Collection {
     policy: String,
     goal: bool,
     first: usize,
+    strict_finite: bool,
     wrappers: Value,
 }
 

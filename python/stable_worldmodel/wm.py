@@ -34,10 +34,13 @@ class Model:
         device: `cpu`, or a GPU if the engine was built with GPU support.
         objective: The planning objective, a dict with `terms` and `constraints`, such as
             `{"terms": [{"term": "control", "weight": 0.01}]}`; `None` for the model's own cost.
+        trust: Whether the checkpoint may choose an environment that imports a Python module, which `get_action` makes.
     """
 
-    def __init__(self, name: str, device: str = "cpu", objective: dict[str, Any] | None = None) -> None:
-        self._engine_model = _engine.Model(str(name), device, json.dumps(objective))
+    def __init__(
+        self, name: str, device: str = "cpu", objective: dict[str, Any] | None = None, *, trust: bool = False
+    ) -> None:
+        self._engine_model = _engine.Model(str(name), device, json.dumps(objective), bool(trust))
         #: The checkpoint info: `family`, `env`, `image`, `action_block`, `history`, `config`, `weights`, `action_mean` and
         #: `action_std`.
         self.card: dict[str, Any] = json.loads(self._engine_model.info)
@@ -145,9 +148,15 @@ def train(
 
 #: A program that runs the command line and interrupts itself, as Ctrl-C does, when its standard input ends.
 _CHILD = """
-import os, signal, sys, threading
+import sys
 
+# `python -c` puts the current folder first, where a file may have the name of a module.
+if sys.path[:1] == [""]:
+    del sys.path[0]
 sys.path.insert(0, sys.argv[1])
+
+import os, signal, threading
+
 from stable_worldmodel import _engine
 
 

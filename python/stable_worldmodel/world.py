@@ -364,6 +364,7 @@ class World:
         mode: str = "error",
         codec: str | None = None,
         goal: bool = False,
+        strict_finite: bool = False,
     ) -> dict[str, int]:
         """Collects episodes with the policy into a dataset.
 
@@ -381,6 +382,8 @@ class World:
                 more, `"resume"` continues until the dataset has `episodes`.
             codec: The codec of frames: `"qoi"` (lossless), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
             goal: Whether to store the frame of the goal in every row.
+            strict_finite: Whether NaN and infinite values raise an error. Otherwise they are stored and counted in the
+                manifest, and a warning lists the columns.
 
         Returns:
             A dict with the counts `episodes` (in the dataset), `added` (episodes) and `steps`. After an interrupt or an error
@@ -407,6 +410,7 @@ class World:
             "policy": _name(policy),
             "goal": bool(goal),
             "first": 0,
+            "strict_finite": bool(strict_finite),
             "wrappers": [{"id": id, "settings": settings} for id, settings in self._wrapping],
         }
         if writer is not None:
@@ -435,7 +439,10 @@ class World:
                 self._playing(policy), path, writer, format, mode, codec_json(codec), json.dumps(config), bar
             )
         self._end_interactive_loop()
-        return dict(zip(("episodes", "added", "steps"), outcome, strict=True))
+        *counts, warning = outcome
+        if warning is not None:
+            warnings.warn(warning, stacklevel=3)
+        return dict(zip(("episodes", "added", "steps"), counts, strict=True))
 
     def evaluate(
         self,

@@ -144,6 +144,11 @@ impl Error {
         Self::External { context: context.into(), message: message.to_string() }
     }
 
+    /// An [`Error::Config`] for a setting that is given twice.
+    pub fn twice(what: impl Into<String>, first: impl std::fmt::Display, second: impl std::fmt::Display) -> Self {
+        Self::config(what, format!("is given twice: '{first}' and '{second}'"), "leave one of them out")
+    }
+
     /// An [`Error::UnknownName`] that suggests the most similar names of `known`.
     pub fn unknown<'a>(
         kind: &'static str,

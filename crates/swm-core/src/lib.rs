@@ -12,8 +12,9 @@
 //! 5. [`plan`]: costs of candidate action sequences, and the solvers that minimise them. [`predictor`]: models that
 //!    predict latents. [`requirements`]: columns that a model family requires of a dataset.
 //! 6. [`run`]: progress and interruption of long commands. [`registry`], [`manifest`], [`results`], [`error`]: names,
-//!    provenance, evaluation results and errors. [`files`]: reading, replacing and deleting files. [`text`]: text
-//!    from files, made safe to print.
+//!    provenance, evaluation results and errors. [`files`]: reading, replacing and deleting files. [`home`]: the home
+//!    folder. [`text`]: text from files, made safe to print. [`origin`]: names that only the user may choose.
+//!    [`finite`]: counts of NaN and infinite values.
 
 pub mod batch;
 pub mod camera_view;
@@ -24,8 +25,11 @@ pub mod env;
 pub mod error;
 pub mod factors;
 pub mod files;
+pub mod finite;
+pub mod home;
 pub mod key;
 pub mod manifest;
+pub mod origin;
 mod parallelism;
 pub mod plan;
 pub mod policy;
@@ -49,6 +53,7 @@ pub use env::{Action, Env, EnvSpec, FrameMut, ResetOptions, Snapshot, Transition
 pub use error::{Error, Result};
 pub use key::{Key, Rng};
 pub use manifest::Manifest;
+pub use origin::Origin;
 pub use plan::{
     Candidates, Constrained, CostModel, DifferentiableCost, LatentDynamics, Plan, PlanProblem, PlanSpace, PlanTrace,
     Solver,

@@ -20,6 +20,10 @@ pub struct Manifest {
     pub hashes: BTreeMap<String, String>,
     /// The device of the computation, such as `cpu (flex)`.
     pub device: String,
+    /// The number of NaN and infinite values of each column of a collected dataset that has any, the actions of final
+    /// rows excepted.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub not_finite: BTreeMap<String, u64>,
 }
 
 impl Manifest {

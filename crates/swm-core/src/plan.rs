@@ -233,4 +233,12 @@ pub trait Solver: Send {
     /// When the solver's settings are invalid or do not fit the action space or the model, or the model fails or
     /// returns costs that are not finite.
     fn solve(&mut self, cost: &mut dyn CostModel, problem: PlanProblem<'_>) -> Result<Plan>;
+
+    /// Checks the settings, so that invalid ones are found before any problem is solved.
+    ///
+    /// # Errors
+    /// When a setting is out of bounds or contradicts another.
+    fn check(&self) -> Result<()> {
+        Ok(())
+    }
 }

@@ -152,10 +152,12 @@ impl Registry<EnvEntry> {
     /// Parses `ID` or `ID,option=value,…`.
     ///
     /// # Errors
-    /// When there is no such environment, option or value; the error lists the valid names.
+    /// When there is no such environment, option or value (the error lists the valid names), or an option is given
+    /// twice.
     pub fn choose(&self, text: &str) -> Result<EnvChoice> {
         let mut parts = text.split(',');
         let mut chosen = EnvChoice::from(self.get(parts.next().unwrap_or_default())?);
+        let mut given: Vec<Option<&str>> = vec![None; chosen.entry.options.len()];
         for part in parts {
             let (key, value) = part.split_once('=').unwrap_or((part, ""));
             let options = chosen.entry.options;
@@ -169,6 +171,9 @@ impl Registry<EnvEntry> {
                 };
                 Error::unknown("environment option", key, keys(), hint)
             })?;
+            if let Some(first) = given[index].replace(part) {
+                return Err(Error::twice(format!("option of {}", chosen.entry.id), first, part));
+            }
             let values = options[index].values;
             let value = values.iter().find(|known| **known == value).ok_or_else(|| {
                 let hint = format!("{key} of {} is one of {}", chosen.entry.id, values.join(", "));

@@ -125,6 +125,28 @@ impl VariationSpace {
         Ok(chosen)
     }
 
+    /// Checks the keys and the pinned values of a request, so that errors are found before any episode is played.
+    ///
+    /// # Errors
+    /// When a key is unknown, or a pinned value is out of bounds. Constraints depend on the episode:
+    /// [`VariationSpace::resolve`] checks them.
+    pub fn check(&self, request: &VariationRequest) -> Result<()> {
+        for name in request.variation.iter().flatten() {
+            self.select(name)?;
+        }
+        request.variation_values.iter().try_for_each(|(name, value)| self.pinned(name, value).map(|_| ()))
+    }
+
+    /// Returns the index of a pinned factor whose value is within bounds.
+    fn pinned(&self, name: &str, value: &[f64]) -> Result<usize> {
+        let Some(i) = self.find(name) else {
+            let known = self.factors.iter().map(|f| f.key.as_str());
+            return Err(Error::unknown("factor of variation", name, known, "`swm fovs ENV` lists them"));
+        };
+        self.factors[i].space.check(name, value)?;
+        Ok(i)
+    }
+
     /// The factor values of an episode. A pinned factor has its pinned value, a varied factor a sample, any other
     /// factor its default.
     ///
@@ -144,11 +166,7 @@ impl VariationSpace {
         };
         let mut pinned = vec![false; self.factors.len()];
         for (name, value) in &request.variation_values {
-            let Some(i) = self.find(name) else {
-                let known = self.factors.iter().map(|f| f.key.as_str());
-                return Err(Error::unknown("factor of variation", name, known, "`swm fovs ENV` lists them"));
-            };
-            self.factors[i].space.check(name, value)?;
+            let i = self.pinned(name, value)?;
             values.values[i] = value.iter().map(|&v| self.factors[i].space.round(v)).collect();
             (pinned[i], varied[i]) = (true, false);
         }

@@ -25,10 +25,11 @@ use crate::seeding::{episode_key, reset, reset_seed};
 use crate::world::{Play, World};
 use serde::Serialize;
 use serde_json::json;
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
 use std::thread::{ScopedJoinHandle, scope};
 use swm_core::columns::{self, ColumnIndices};
+use swm_core::finite::not_finite;
 use swm_core::pool::Reset;
 use swm_core::run::{Control, Progress};
 use swm_core::{
@@ -51,6 +52,8 @@ pub struct CollectConfig {
     pub goal: bool,
     /// The number of the first episode; above 0 if several machines collect one part each.
     pub first: usize,
+    /// Whether NaN and infinite values end the collection; they are stored and counted otherwise.
+    pub strict_finite: bool,
 }
 
 /// The result of a collection.
@@ -112,10 +115,12 @@ impl World {
         let layout = Layout::of(self.pool().infos().schema(), self.spec(), config.goal)?;
         let first = writer.episodes();
         let threads = self.pool().threads().clone();
-        scope(|scope| {
+        let mut check = FiniteCheck::new(&layout, config);
+        let collected = scope(|scope| {
             let (to_writer, from_world) = sync_channel::<Finished>(QUEUE);
             let (back, written) = channel();
-            let writing = scope.spawn(move || write_all(writer, &from_world, &back, &threads));
+            let check = &mut check;
+            let writing = scope.spawn(move || write_all(writer, check, &from_world, &back, &threads));
             let mut collection = Collection {
                 layout,
                 config,
@@ -132,7 +137,9 @@ impl World {
             };
             let played = self.play(policy, &mut collection, control);
             collection.close(writing, control).and_then(|collected| played.map(|()| collected))
-        })
+        });
+        self.set_not_finite(check.counts);
+        collected
     }
 }
 
@@ -165,16 +172,56 @@ pub fn check_continues(stored: &Manifest, wanted: &Manifest) -> Result<()> {
 /// one setting limits all threads.
 fn write_all(
     mut writer: Box<dyn Writer>,
+    check: &mut FiniteCheck,
     episodes: &Receiver<Finished>,
     back: &Sender<Batch>,
     threads: &rayon::ThreadPool,
 ) -> Result<()> {
     for Finished { rows: episode, constants } in episodes {
+        check.episode(&episode, writer.episodes())?;
         threads.install(|| writer.write_episode_with(&episode, &constants))?;
         // The receiver is dropped if the world fails. The episodes that are already finished are stored nevertheless.
         let _ = back.send(episode);
     }
     writer.finish()
+}
+
+/// Counts the NaN and infinite values of the stored episodes.
+struct FiniteCheck {
+    /// The indices of the columns that should be finite: all but the action, which is NaN in the last row. Policies'
+    /// actions are checked when the environment receives them.
+    columns: Vec<usize>,
+    /// Whether such values are errors.
+    strict: bool,
+    /// The counts of the columns that have any.
+    counts: BTreeMap<String, u64>,
+}
+
+impl FiniteCheck {
+    fn new(layout: &Layout, config: &CollectConfig) -> Self {
+        let columns = (0..layout.schema.columns().len()).filter(|&column| column != layout.action).collect();
+        Self { columns, strict: config.strict_finite, counts: BTreeMap::new() }
+    }
+
+    /// Counts the values of an episode.
+    fn episode(&mut self, rows: &Batch, number: usize) -> Result<()> {
+        for &index in &self.columns {
+            let column = &rows.schema().columns()[index];
+            let count = not_finite(column.dtype, rows.bytes(index));
+            if count == 0 {
+                continue;
+            }
+            if self.strict {
+                return Err(Error::NotFinite {
+                    what: format!("column '{}' of episode {number}", column.name),
+                    given: format!("{count} of {} values", rows.rows() * column.len()),
+                    fix: "fix the environment, or collect without --strict-finite (strict_finite=True)".to_owned(),
+                });
+            }
+            *self.counts.entry(column.name.clone()).or_default() += count as u64;
+        }
+        Ok(())
+    }
 }
 
 /// The columns of an episode and their sources.

@@ -128,6 +128,29 @@ pub fn predict_run(
     })
 }
 
+/// Checks that a dataset has all rows of the predicted trajectories.
+///
+/// # Errors
+/// When there is no step to predict, or an episode is too short.
+pub fn check(predictor: &dyn Predictor, reader: &dyn Reader, picks: &[[usize; 2]], horizon: usize) -> Result<()> {
+    let frameskip = predictor.frameskip();
+    if horizon == 0 {
+        return Err(Error::config("model steps to predict", "0", "predict at least 1"));
+    }
+    for &[episode, start] in picks {
+        let length = reader.episodes().get(episode).map_or(0, |episode| episode.length);
+        let last = start.saturating_add(horizon.saturating_mul(frameskip));
+        if last >= length {
+            return Err(Error::mismatch(
+                format!("predicting {horizon} model steps of {frameskip} from step {start} of episode {episode}"),
+                format!("{length} rows"),
+                format!("more than {last}; predict fewer steps, or choose earlier starts"),
+            ));
+        }
+    }
+    Ok(())
+}
+
 /// Reads the observations at every model step of some trajectories, `[trajectories, horizon + 1]` rows, and the actions
 /// between them, `[trajectories, horizon, frameskip * action_dim]`.
 fn read(
@@ -139,15 +162,8 @@ fn read(
     let (frameskip, columns) = (predictor.frameskip(), predictor.columns());
     let span = horizon * frameskip;
     let (mut frames, mut between) = (vec![], vec![]);
+    check(predictor, reader, picks, horizon)?;
     for &[episode, start] in picks {
-        let length = reader.episodes().get(episode).map_or(0, |episode| episode.length);
-        if start + span >= length {
-            return Err(Error::mismatch(
-                format!("predicting {horizon} model steps of {frameskip} from step {start} of episode {episode}"),
-                format!("{length} rows"),
-                format!("more than {}; predict fewer steps, or choose earlier starts", start + span),
-            ));
-        }
         frames.extend((0..=span).step_by(frameskip).map(|at| StepRange::new(episode, start + at, 1)));
         between.push(StepRange::new(episode, start, span));
     }

@@ -64,7 +64,7 @@ impl fmt::Display for Difference {
 /// Repeats the evaluation that gave `old` and lists the differences between the old and the new results.
 ///
 /// # Errors
-/// When the results contain no request that this version reads, a dataset or a checkpoint has a different hash, and as
+/// When the results contain no request that this version reads or another number of episodes than it requests, a dataset or a checkpoint has a different hash, and as
 /// [`EvalRequest::run`].
 pub fn reproduce(
     old: &Results,
@@ -73,6 +73,11 @@ pub fn reproduce(
     control: &mut Control<'_>,
 ) -> Result<Reproduction> {
     let request = EvalRequest::of(&old.manifest)?;
+    if let Some(run) = old.runs.iter().find(|run| run.episodes.len() != request.episodes) {
+        let [found, requested] = [run.episodes.len(), request.episodes];
+        let problem = format!("its request has {requested} episodes, its run '{}' has {found}", run.policy);
+        return Err(Error::config("the results' manifest", problem, "evaluate again (`swm eval`)"));
+    }
     let results = request.run(&Checked { resolver, manifest: &old.manifest }, options, control)?;
     Ok(Reproduction { differences: differences(old, &results), results })
 }

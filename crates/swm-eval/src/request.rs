@@ -47,6 +47,9 @@ pub struct EvalRequest {
     pub prediction: Option<usize>,
 }
 
+/// The longest side of a frame, in pixels.
+pub const MAX_SIDE: usize = 4096;
+
 /// A solver or a wrapper, with settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -188,8 +191,8 @@ impl EvalRequest {
     /// Checks the request before anything is loaded.
     ///
     /// # Errors
-    /// When there is no condition, two policies or conditions share a name, or prediction errors are requested without
-    /// a dataset.
+    /// When there is no condition, two policies or conditions share a name, frames are larger than [`MAX_SIDE`], or
+    /// prediction errors are requested without a dataset.
     pub fn check(&self) -> Result<()> {
         if self.conditions.is_empty() {
             return Err(Error::config("conditions of an evaluation", "there are none", "name at least one"));
@@ -200,6 +203,12 @@ impl EvalRequest {
                 "they require recorded trajectories, and the environment draws the starts",
                 "take starts from a dataset",
             ));
+        }
+        if let Some([height, width]) =
+            self.image.filter(|sides| sides.iter().any(|side| !(1..=MAX_SIDE).contains(side)))
+        {
+            let problem = format!("{height} x {width} pixels");
+            return Err(Error::config("frame size of an evaluation", problem, format!("choose 1 to {MAX_SIDE}")));
         }
         unique("policy", self.policies.iter().map(|policy| policy.name.as_str()))?;
         unique("condition", self.conditions.iter().map(|condition| condition.name.as_str()))

@@ -1,7 +1,7 @@
 //! Runs an [`EvalRequest`]: condition by condition, every policy on the same starts, the random-policy floor first.
 
 use crate::evaluate::EvalConfig;
-use crate::prediction::{Predictor, predict_run};
+use crate::prediction::{self, Predictor, predict_run};
 use crate::request::{Condition, EvalRequest, HeldOut, PolicyKind, PolicyRequest, StartsRequest};
 use crate::starts::Starts;
 use crate::starts_hash::StartsHash;
@@ -119,13 +119,24 @@ impl EvalRequest {
         if let Some(reader) = &dataset {
             manifest.hashes.insert("dataset".to_owned(), reader.content_hash()?);
         }
-        // Makes every policy once, so that a policy that does not exist or does not fit fails before the first episode.
+        // Checks every factor and makes every policy once, so that what does not exist or does not fit fails before the first
+        // episode.
+        for condition in &request.conditions {
+            world.spec().variation_space.check(&condition.variation)?;
+        }
         for policy in request.policies.iter().filter(|policy| policy.kind != PolicyKind::Random) {
             resolver.policy(policy, &world)?;
         }
         let (mut starts_hash, mut runs) = (StartsHash::default(), vec![]);
         for condition in &request.conditions {
             let starts = request.starts(dataset.as_deref(), world.pool().env(0), condition.variation.clone())?;
+            if let Some((horizon, reader)) = request.prediction.zip(dataset.as_deref()) {
+                let picks: Vec<[usize; 2]> = (0..starts.len()).filter_map(|i| starts.pick(i)).collect();
+                for policy in &request.policies {
+                    let Some(predictor) = resolver.predictor(policy)? else { continue };
+                    prediction::check(&*predictor, reader, &picks, horizon)?;
+                }
+            }
             starts_hash.add(&mut world, &starts)?;
             for policy in &request.policies {
                 let mut resolved = match policy.kind {

@@ -37,6 +37,8 @@ pub struct World {
     pool: EnvPool,
     /// One row of actions for each slot.
     actions: Batch,
+    /// The NaN and infinite values of the last collection, by column.
+    not_finite: BTreeMap<String, u64>,
 }
 
 impl World {
@@ -71,7 +73,7 @@ impl World {
         let pool =
             EnvPool::with_views(envs?, config.image, config.views, config.max_episode_steps, threads(config.threads)?)?;
         let actions = Batch::zeros(&Schema::new([pool.spec().action_column()])?, pool.len());
-        Ok(Self { pool, actions })
+        Ok(Self { pool, actions, not_finite: BTreeMap::new() })
     }
 
     /// The pool of environments.
@@ -91,6 +93,16 @@ impl World {
             libraries.remove("renderer");
         }
         libraries
+    }
+
+    /// The number of NaN and infinite values that the last collection stored, by column, also if it was interrupted.
+    /// Empty if all values were finite.
+    pub fn not_finite(&self) -> &BTreeMap<String, u64> {
+        &self.not_finite
+    }
+
+    pub(crate) fn set_not_finite(&mut self, counts: BTreeMap<String, u64>) {
+        self.not_finite = counts;
     }
 
     /// Starts an episode in every slot, keyed by the slot, for custom loops.

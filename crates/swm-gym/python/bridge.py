@@ -22,6 +22,7 @@ import importlib.metadata
 import inspect
 import json
 import math
+import os
 import struct
 
 import gymnasium
@@ -31,6 +32,8 @@ from gymnasium import spaces
 ALIGN = 64
 # The header of the buffer: reward, goal distance; terminated, truncated, success.
 HEAD = struct.Struct('<dd???')
+# The index of the flag that a forked process sets, behind the header.
+FORKED_AT = HEAD.size
 # Columns that the engine adds itself.
 RESERVED = frozenset(
     'action reward terminated truncated success step_idx episode_idx episode_seed ep_len ep_offset pixels goal'.split()
@@ -52,6 +55,10 @@ class InvalidRequest(ValueError):
 
     def __str__(self):
         return '; '.join(self.args)
+
+
+class Forked(BaseException):
+    """Raised in a child process that the environment forked and that returned from a call of the environment."""
 
 
 # ---- spaces ----
@@ -306,7 +313,7 @@ class Bridge:
         env.action_space.seed(0)
         _, _, _, _, second = env.step(env.action_space.sample())
         names = set()
-        self.size = HEAD.size
+        self.size = FORKED_AT + 1
         self.action_at = self.allocate(self.actions.len * self.actions.dtype.itemsize)
         self.columns, self.observed, self.informed = [], [], []
         for name, path, space in leaves(env.observation_space, 'observation'):
@@ -418,6 +425,17 @@ class Bridge:
         # Values of goal columns that stay the same throughout the episode.
         self.held = []
 
+    def call(self, function, *arguments, **keywords):
+        """Calls the environment. A child process that the environment forked does not continue: it would write into the
+        buffer that it shares with its parent."""
+        process = os.getpid()
+        try:
+            return function(*arguments, **keywords)
+        finally:
+            if os.getpid() != process:
+                self.buffer[FORKED_AT] = 1
+                raise Forked(f'process {process} forked process {os.getpid()}, which returned to the caller')
+
     def handle(self, op, payload):
         """Handles a request: its kind, and for a reset its arguments as JSON."""
         if op == STEP:
@@ -440,7 +458,7 @@ class Bridge:
             options['variation'] = variation
         if variation_values:
             options['variation_values'] = {key: self.value(key, value) for key, value in variation_values.items()}
-        observation, info = self.env.reset(seed=seed, options=options or None)
+        observation, info = self.call(self.env.reset, seed=seed, options=options or None)
         for view in self.informed_views.values():
             view[...] = 0
         for leaf, view in self.factor_views:
@@ -457,7 +475,7 @@ class Bridge:
         """Sets a recorded state: calls methods of the environment, and writes the recorded values `shown` and `held` into
         the columns. The values `held` are written again after every step."""
         for call in calls:
-            self.method(call['method'])(**{key: argument(value) for key, value in call['args'].items()})
+            self.call(self.method(call['method']), **{key: argument(value) for key, value in call['args'].items()})
         shown, self.held = ([(self.views[name], argument(value)) for name, value in part.items()] for part in (shown, held))
         for view, value in [*shown, *self.held]:
             view[...] = np.reshape(value, view.shape)
@@ -490,7 +508,7 @@ class Bridge:
 
     def step(self):
         """Takes the action in the buffer."""
-        self.write(*self.env.step(self.actions.read(self.action)))
+        self.write(*self.call(self.env.step, self.actions.read(self.action)))
 
     def write(self, observation, reward, terminated, truncated, info):
         for path, view in self.observed_views:
@@ -522,7 +540,7 @@ class Bridge:
         if self.frame_index is not None:
             self.frame[...] = self.observed_views[self.frame_index][1]
             return
-        frame = self.env.render()
+        frame = self.call(self.env.render)
         if not is_frame(frame) or frame.shape[:2] != self.render_shape:
             raise ValueError(
                 f'render() gave {getattr(frame, "shape", type(frame).__name__)}, and {(*self.render_shape, 3)}'

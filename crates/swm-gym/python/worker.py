@@ -8,6 +8,13 @@ A request is one byte for its kind, the length of its payload (4 bytes, little-e
 the same form. The first request carries the sources of the other modules and the environment to make.
 """
 
+import sys
+
+# `python -c` puts the current folder first, where a stranger's `json.py` would replace a module of the standard library.
+# Modules that this statement has not removed from the path come from the installation and from PYTHONPATH.
+if sys.path[:1] == ['']:
+    del sys.path[0]
+
 import ctypes
 import importlib.abc
 import importlib.util
@@ -17,7 +24,6 @@ import os
 import signal
 import socket
 import struct
-import sys
 import traceback
 
 HEADER = struct.Struct('<BI')
@@ -55,6 +61,15 @@ class Connection:
 
     def __init__(self, descriptor):
         self.socket = socket.socket(fileno=descriptor)
+        self.process = os.getpid()
+        # Otherwise a forked process would keep the connection open after its parent ends.
+        os.register_at_fork(after_in_child=self.socket.close)
+
+    def check_process(self):
+        """Ends a process that the environment forked: only the worker itself talks to the parent."""
+        if os.getpid() != self.process:
+            print(f'process {os.getpid()}, forked by the environment, ended: it is not the worker', file=sys.stderr)
+            os._exit(1)
 
     def read(self, n):
         data = b''
@@ -66,10 +81,12 @@ class Connection:
         return data
 
     def request(self):
+        self.check_process()
         op, n = HEADER.unpack(self.read(HEADER.size))
         return op, self.read(n) if n else b''
 
     def answer(self, kind, text=''):
+        self.check_process()
         data = text.encode('utf-8', 'replace')
         self.socket.sendall(HEADER.pack(kind, len(data)) + data)
 
@@ -77,6 +94,9 @@ class Connection:
 def make(connection, memory):
     """Makes the environment of the first request and answers with its description, or with the reason for a failure."""
     request = json.loads(connection.request()[1])
+    if ':' in request['id']:
+        # The user named a module, which may be in the current folder. All other modules are found elsewhere first.
+        sys.path.append(os.getcwd())
     sys.meta_path.append(Sources(request['modules']))
     try:
         import gymnasium

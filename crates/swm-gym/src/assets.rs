@@ -3,7 +3,7 @@
 //! The virtual environment is the folder `python-gym` in the folder of all assets: `$SWM_ASSETS`, else
 //! `$STABLEWM_HOME/assets`, else `~/.stable_worldmodel/assets`.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::Command;
 use swm_core::{Error, Result};
 
@@ -65,9 +65,7 @@ impl Package {
 
 /// The folder of assets, which `swm-mujoco` shares.
 pub(crate) fn folder() -> PathBuf {
-    let variable = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
-    let home = || Path::new(&std::env::var_os("HOME").unwrap_or_default()).join(".stable_worldmodel");
-    variable("SWM_ASSETS").unwrap_or_else(|| variable("STABLEWM_HOME").unwrap_or_else(home).join("assets"))
+    swm_core::home::installed_assets()
 }
 
 /// The folder of the virtual environment.
@@ -86,13 +84,15 @@ pub(crate) fn python() -> PathBuf {
 /// # Errors
 /// When Python or pip fails.
 pub fn install(package: &Package) -> Result<PathBuf> {
+    swm_core::home::assets()?;
     let folder = virtual_environment();
     if !python().is_file() {
         let mut make = Command::new("python3");
-        run("making a Python environment with `python3 -m venv`", make.args(["-m", "venv"]).arg(&folder))?;
+        run("making a Python environment with `python3 -m venv`", make.args(["-I", "-m", "venv"]).arg(&folder))?;
     }
     let mut pip = Command::new(python());
-    pip.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check"]);
+    // `-I` keeps modules of the current folder from replacing those of the installation.
+    pip.args(["-I", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]);
     pip.args(GYMNASIUM).args(package.requirements);
     run(&format!("installing {} {} with pip", package.name, package.version), &mut pip)?;
     Ok(folder)
@@ -111,7 +111,7 @@ pub fn verify(package: &Package) -> Result<()> {
     let mut pip = Command::new(python());
     run(
         &format!("checking {} ({})", package.name, fix()),
-        pip.args(["-m", "pip", "check", "--disable-pip-version-check"]),
+        pip.args(["-I", "-m", "pip", "check", "--disable-pip-version-check"]),
     )
 }
 

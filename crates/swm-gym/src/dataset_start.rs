@@ -7,8 +7,32 @@
 
 use crate::EnvLayout;
 use serde_json::{Value, json};
+use std::collections::BTreeSet;
+use std::sync::{Mutex, PoisonError};
 use swm_core::columns::{EPISODE_SEED, PIXELS, SEED, flat, flat_factor, goal_source, is_flat_factor, join_seed};
 use swm_core::{Callable, CallableArgument, DType, DatasetStart, Error, ResetOptions, Result, RowRef, Schema};
+
+/// The names of the methods that the callers of this process have named. A snapshot may call only these and the methods
+/// of the environment's description, because a snapshot may come from a file.
+static NAMED_METHODS: Mutex<BTreeSet<String>> = Mutex::new(BTreeSet::new());
+
+/// Checks that the arguments of a reset, which come from a snapshot, call no other methods than the environment or a
+/// caller in this process has named.
+pub fn check_methods(layout: &EnvLayout, arguments: &str) -> Result<()> {
+    let parsed: Value = serde_json::from_str(arguments).unwrap_or_default();
+    let known = NAMED_METHODS.lock().unwrap_or_else(PoisonError::into_inner);
+    for call in parsed["recorded"]["calls"].as_array().into_iter().flatten() {
+        let method = call["method"].as_str().unwrap_or_default();
+        if !known.contains(method) && !layout.callables().iter().any(|own| own.method == method) {
+            return Err(Error::config(
+                format!("restoring a snapshot of {}", layout.spec.id),
+                format!("it calls the method '{method}', which sets no state here"),
+                "restore snapshots of this process, or start an episode with this method in `callables` first",
+            ));
+        }
+    }
+    Ok(())
+}
 
 /// Returns the methods to call: `named`, or else the methods in the environment's description.
 pub fn callables<'a>(layout: &'a EnvLayout, named: &'a [Callable]) -> Result<&'a [Callable]> {
@@ -127,7 +151,11 @@ pub fn json(layout: &EnvLayout, from: &DatasetStart<'_>) -> Result<Value> {
         row.schema().find(name).map(|index| array(row, index))
     };
     let mut made = vec![];
+    let mut named = NAMED_METHODS.lock().unwrap_or_else(PoisonError::into_inner);
     for call in callables(layout, from.callables)? {
+        if !named.contains(&call.method) {
+            named.insert(call.method.clone());
+        }
         let mut arguments = serde_json::Map::new();
         for (key, argument) in &call.args {
             let given = match argument_column(argument)? {

@@ -1,6 +1,7 @@
 //! [`Description`]: the bridge's description of an environment. [`EnvLayout`]: the spec and the memory layout that are
 //! derived from the description.
 
+use crate::finite::FiniteCheck;
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -32,11 +33,19 @@ impl Description {
     /// Parses the JSON of `Bridge.describe()`.
     ///
     /// # Errors
-    /// When the text is not the JSON of a description.
+    /// When the text is not the JSON of a description, or the buffer exceeds [`MAX_MEMORY`].
     pub fn parse(json: &str) -> Result<Self> {
-        serde_json::from_str(json).map_err(|error| Error::external("parsing the description of an environment", error))
+        const WHAT: &str = "parsing the description of an environment";
+        let parsed: Self = serde_json::from_str(json).map_err(|error| Error::external(WHAT, error))?;
+        if parsed.size > MAX_MEMORY {
+            return Err(Error::mismatch(WHAT, format!("{} bytes", parsed.size), format!("at most {MAX_MEMORY}")));
+        }
+        Ok(parsed)
     }
 }
+
+/// The maximum size of the buffer of an environment, in bytes: one observation, one frame and one goal frame.
+const MAX_MEMORY: usize = 4 << 30;
 
 /// A column and its offset in the buffer.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
@@ -56,7 +65,8 @@ pub(crate) struct FrameRegion {
 
 impl FrameRegion {
     pub fn range(&self) -> Range<usize> {
-        self.offset..self.offset + self.size[0] * self.size[1] * 3
+        let bytes = self.size[0].saturating_mul(self.size[1]).saturating_mul(3);
+        self.offset..self.offset.saturating_add(bytes)
     }
 }
 
@@ -90,10 +100,28 @@ enum SpaceJson {
 }
 
 impl SpaceJson {
-    fn space(&self) -> Result<Space> {
+    /// Returns the space, one value of which has at most `most` elements.
+    fn space(&self, most: usize) -> Result<Space> {
+        let space = self.unchecked(most)?;
+        let holds_values = match &space {
+            Space::Box { low, high, .. } => low.iter().zip(high).all(|(low, high)| low <= high),
+            Space::Discrete { n, start } => *n > 0 && start.checked_add(*n).is_some(),
+            Space::MultiDiscrete { nvec, start } => {
+                let mut ranges = nvec.iter().zip(start);
+                nvec.len() == start.len() && ranges.all(|(n, start)| *n > 0 && start.checked_add(*n).is_some())
+            }
+            Space::Rgb => true,
+        };
+        match holds_values {
+            true => Ok(space),
+            false => Err(Error::mismatch("reading a space", format!("{self:?}"), "bounds with values between them")),
+        }
+    }
+
+    fn unchecked(&self, most: usize) -> Result<Space> {
         Ok(match self {
             Self::Box { shape, dtype, low, high } => {
-                let n = shape.iter().product();
+                let n = elements(shape, most)?;
                 let all = |bounds: &[Option<f64>], none: f64| -> Vec<f64> {
                     (0..n).map(|i| bounds[if bounds.len() == 1 { 0 } else { i }].unwrap_or(none)).collect()
                 };
@@ -115,12 +143,35 @@ impl SpaceJson {
     }
 }
 
+/// Returns the number of elements of a shape, which is at most `most`.
+fn elements(shape: &[usize], most: usize) -> Result<usize> {
+    let n = shape.iter().try_fold(1_usize, |n, &side| n.checked_mul(side)).filter(|n| *n <= most);
+    n.ok_or_else(|| {
+        Error::mismatch(DESCRIBING, format!("shape {shape:?}"), format!("at most {most} elements, the buffer's bytes"))
+    })
+}
+
+/// The operation in errors.
+const DESCRIBING: &str = "describing an environment";
+
 /// Returns the element type that a NumPy name denotes.
 fn dtype_of(name: &str) -> Result<DType> {
     const ALL: [DType; 6] = [DType::Bool, DType::U8, DType::Int32, DType::Int64, DType::Float32, DType::Float64];
     let known = || ALL.iter().map(|dtype| dtype.name());
     let found = ALL.iter().find(|dtype| dtype.name() == name);
     found.copied().ok_or_else(|| Error::unknown("element type", name, known(), "columns hold these types"))
+}
+
+/// Checks that a space is one of those that actions have.
+fn action_space(space: &Space) -> Result<Space> {
+    match space {
+        Space::Box { dtype: DType::Float32, .. } | Space::Discrete { .. } | Space::MultiDiscrete { .. }
+            if !space.is_empty() =>
+        {
+            Ok(space.clone())
+        }
+        other => Err(Error::mismatch(DESCRIBING, format!("actions: {}", other.describe()), "float32 or integers")),
+    }
 }
 
 /// The spec and the memory layout of all environments of one id.
@@ -131,6 +182,8 @@ pub struct EnvLayout {
     pub(crate) columns: Vec<Range<usize>>,
     /// The byte range of the action.
     pub(crate) action: Range<usize>,
+    /// The warnings of NaN and infinite values.
+    pub(crate) finite: FiniteCheck,
 }
 
 /// Offsets in bytes in the header of the buffer: reward and goal distance (doubles), then three flags.
@@ -140,7 +193,9 @@ pub(crate) mod header {
     pub const TERMINATED: usize = 16;
     pub const TRUNCATED: usize = 17;
     pub const SUCCESS: usize = 18;
-    pub const END: usize = 19;
+    /// A flag that a process sets that the environment forked and that returned from a call.
+    pub const FORKED: usize = 19;
+    pub const END: usize = 20;
 }
 
 impl EnvLayout {
@@ -149,28 +204,30 @@ impl EnvLayout {
     /// # Errors
     /// When a factor's default is outside its own space, or the description contradicts itself.
     pub fn new(id: &str, description: Description) -> Result<Self> {
+        let size = description.size;
         let mut factors = vec![];
         for FactorJson { key, space, init } in &description.factors {
-            let factor = Factor::new(key, space.space()?, init.clone());
+            let factor = Factor::new(key, space.space(size)?, init.clone());
             factor.space.check(&format!("the default of '{key}' of {id}"), init)?;
             factors.push(factor);
         }
         let mut columns = vec![];
         let mut ranges = vec![];
         for ColumnJson { name, dtype, shape, offset } in &description.columns {
+            elements(shape, size)?;
             let column = ColumnSpec::new(name, dtype_of(dtype)?, shape.clone());
-            ranges.push(*offset..offset + column.row_bytes());
+            ranges.push(*offset..offset.saturating_add(column.row_bytes()));
             columns.push(column);
         }
         Schema::new(columns.clone())?;
         let mut observation_space = vec![];
         for (name, space) in &description.observation {
             // Leaks once per name: the names in a spec are static.
-            observation_space.push((crate::interned::interned(name), space.space()?));
+            observation_space.push((crate::interned::interned(name), space.space(size)?));
         }
         let spec = EnvSpec {
             id: id.to_owned(),
-            action_space: description.action.space()?,
+            action_space: action_space(&description.action.space(size)?)?,
             columns,
             observation_space,
             variation_space: VariationSpace::new(factors, &[]),
@@ -178,17 +235,17 @@ impl EnvLayout {
             cameras: vec![],
         };
         let column = spec.action_column();
-        let action = description.action_offset..description.action_offset + column.row_bytes();
-        let layout = Self { columns: ranges, action, spec, description };
+        let action = description.action_offset..description.action_offset.saturating_add(column.row_bytes());
+        let finite = FiniteCheck::new(ranges.len());
+        let layout = Self { columns: ranges, action, spec, description, finite };
         let frames = layout.frame().into_iter().chain(layout.goal()).map(FrameRegion::range);
         let all = layout.columns.iter().cloned().chain(frames).chain([layout.action.clone(), layout.factors()]);
         let end = all.map(|range| range.end).max().unwrap_or(0).max(header::END);
-        if end > layout.description.size {
-            return Err(Error::mismatch(
-                "describing an environment",
-                format!("{end} bytes"),
-                layout.description.size.to_string(),
-            ));
+        if end > size {
+            return Err(Error::mismatch(DESCRIBING, format!("{end} bytes"), size.to_string()));
+        }
+        if let Some(empty) = layout.frame().into_iter().chain(layout.goal()).find(|frame| frame.size.contains(&0)) {
+            return Err(Error::mismatch(DESCRIBING, format!("frames of {:?} pixels", empty.size), "at least 1 x 1"));
         }
         Ok(layout)
     }
@@ -235,6 +292,7 @@ impl EnvLayout {
     /// The byte range of the factor values, doubles in sampling order.
     pub(crate) fn factors(&self) -> Range<usize> {
         let n: usize = self.spec.variation_space.factors().iter().map(|factor| factor.space.len()).sum();
-        self.description.factors_offset..self.description.factors_offset + n * size_of::<f64>()
+        let (start, bytes) = (self.description.factors_offset, n.saturating_mul(size_of::<f64>()));
+        start..start.saturating_add(bytes)
     }
 }

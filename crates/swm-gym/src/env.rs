@@ -199,6 +199,13 @@ impl GymEnv {
         };
         self.dispatched = None;
         self.transport.call(request)?;
+        if self.flag(header::FORKED) {
+            return Err(Failure::Refused(Error::external(
+                &self.layout.spec.id,
+                "it forked a process that returned from its call, so two processes play one episode; \
+                 end the child with os._exit in the environment",
+            )));
+        }
         self.frame_is_current = matches!(request, Request::Render | Request::StepAndRender);
         Ok(())
     }
@@ -228,6 +235,7 @@ impl GymEnv {
     /// Makes the reset call of the episode and reads its factors.
     fn run_reset(&mut self) -> Result<()> {
         self.env_call(EnvCall::Reset)?;
+        self.layout.finite.check(&self.layout, self.transport.memory());
         let doubles = self.transport.memory()[self.layout.factors()].chunks_exact(size_of::<f64>());
         let values: Vec<f64> = doubles.map(bytemuck::pod_read_unaligned).collect();
         let space = &self.layout.spec.variation_space;
@@ -245,7 +253,9 @@ impl GymEnv {
     /// Makes the step call of the last action of the episode.
     fn run_step(&mut self) -> Result<()> {
         self.frame_is_current = false;
-        self.env_call(EnvCall::Step)
+        self.env_call(EnvCall::Step)?;
+        self.layout.finite.check(&self.layout, self.transport.memory());
+        Ok(())
     }
 
     /// Reads a double in the header of the buffer; 0 before the buffer exists.
@@ -432,6 +442,7 @@ impl Env for GymEnv {
                 "a snapshot of an episode of this environment",
             ));
         };
+        start::check_methods(&self.layout, &reset)?;
         self.finish_dispatched()?;
         let is_prefix = |now: &&Episode| now.reset == reset && now.goal == goal && actions.starts_with(&now.actions);
         let prefix = self.episode.as_ref().filter(is_prefix);

@@ -14,6 +14,8 @@ mod dataset_start;
 mod describe;
 mod env;
 mod episode;
+mod finite;
+mod id;
 mod interned;
 mod reset_arguments;
 mod transport;
@@ -23,6 +25,7 @@ pub use choose::{EXAMPLES, choose, is_gymnasium_id, make};
 pub use config::{GymConfig, Python};
 pub use describe::{Description, EnvLayout};
 pub use env::GymEnv;
+pub use id::TrustedId;
 pub use transport::{Failure, Request, Transport};
 pub use worker::WorkerTransport;
 

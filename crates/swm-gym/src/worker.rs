@@ -6,8 +6,8 @@
 //! socket closes, and, on Linux, when this process ends in any way.
 
 use crate::config::{GymConfig, Python};
-use crate::{BRIDGE, CRAFTAX, Description, Failure, Request, Transport, WORKER, assets};
-use memmap2::MmapMut;
+use crate::{BRIDGE, CRAFTAX, Description, Failure, Request, Transport, TrustedId, WORKER, assets};
+use memmap2::{MmapMut, MmapOptions};
 use std::collections::{BTreeMap, VecDeque};
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Write};
@@ -23,13 +23,18 @@ use swm_core::Error;
 
 /// The number of last lines of a worker's standard error in error messages.
 const LINES: usize = 20;
+/// The kinds of answers: done; an exception; an unknown id; a missing package; unsupported; an invalid request.
+const ANSWERS: &[u8] = b".xumfw";
+/// The maximum length of an answer: a description of an environment, or a traceback.
+const MAX_ANSWER: usize = 64 << 20;
+/// The maximum length of a line of a worker's standard error; the rest of a longer line counts as another line.
+const MAX_LINE: u64 = 4096;
 /// The time that a worker process gets to end by itself.
 const EXIT_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// A Python process with one environment.
 pub struct WorkerTransport {
-    id: String,
-    options: BTreeMap<String, String>,
+    id: TrustedId,
     config: GymConfig,
     process: Option<Process>,
 }
@@ -49,8 +54,8 @@ impl WorkerTransport {
     ///
     /// # Errors
     /// When Python cannot be started.
-    pub fn new(id: &str, options: BTreeMap<String, String>, config: GymConfig) -> swm_core::Result<Self> {
-        let mut made = Self { id: id.to_owned(), options, config, process: None };
+    pub fn new(id: &TrustedId, config: GymConfig) -> swm_core::Result<Self> {
+        let mut made = Self { id: id.clone(), config, process: None };
         match made.restart() {
             Ok(()) => Ok(made),
             Err(Failure::Refused(error)) => Err(error),
@@ -65,11 +70,13 @@ impl WorkerTransport {
 
     /// Ends a process that violates the protocol or a timeout. The failure contains its exit status and last output.
     fn lose(&mut self, problem: &std::io::Error, limit: Duration) -> Failure {
-        use std::io::ErrorKind::{TimedOut, WouldBlock};
+        use std::io::ErrorKind::{InvalidData, TimedOut, WouldBlock};
         let Some(mut process) = self.process.take() else { return Failure::Lost("its worker process is gone".into()) };
         let id = process.child.id();
         let mut how = if matches!(problem.kind(), TimedOut | WouldBlock) {
             format!("worker process {id} did not answer within {limit:?} and was stopped")
+        } else if problem.kind() == InvalidData {
+            format!("worker process {id} violated the protocol ({problem}) and was stopped")
         } else {
             match process.exit_status() {
                 Some(status) => format!("worker process {id} ended with {status}"),
@@ -95,7 +102,7 @@ impl WorkerTransport {
     /// Converts an answer that reports a failure into a [`Failure`].
     fn failure(&self, kind: u8, text: Vec<u8>) -> Failure {
         let text = String::from_utf8_lossy(&text).into_owned();
-        let (id, python) = (&self.id, &self.config.python);
+        let (id, python) = (self.id.id(), &self.config.python);
         let refused = match kind {
             b'x' => return Failure::Raised(text),
             b'u' => {
@@ -126,11 +133,11 @@ impl Transport for WorkerTransport {
     fn restart(&mut self) -> Result<(), Failure> {
         self.process = None;
         let modules = BTreeMap::from([("swm_bridge", BRIDGE), ("swm_craftax", CRAFTAX)]);
-        let request = serde_json::json!({"id": self.id, "options": self.options, "modules": modules});
-        let mut process = Process::start(&self.id, &self.config.python).map_err(Failure::Refused)?;
+        let request = serde_json::json!({"id": self.id.id(), "options": self.id.options(), "modules": modules});
+        let mut process = Process::start(self.id.id(), &self.config.python).map_err(Failure::Refused)?;
         // If the process does not receive the request, `describe` returns the error.
         if let Err(problem) = process.send(b'm', request.to_string().as_bytes()) {
-            tracing::debug!("{}: its worker did not receive the first request: {problem}", self.id);
+            tracing::debug!("{}: its worker did not receive the first request: {problem}", self.id.id());
         }
         self.process = Some(process);
         Ok(())
@@ -143,7 +150,7 @@ impl Transport for WorkerTransport {
         let (kind, text) = answer.map_err(|problem| match self.lose(&problem, limit) {
             // A new worker would exceed the same timeout.
             Failure::Lost(how) if problem.kind() == std::io::ErrorKind::WouldBlock => {
-                Failure::Refused(Error::external(format!("making {}", self.id), how))
+                Failure::Refused(Error::external(format!("making {}", self.id.id()), how))
             }
             failure => failure,
         })?;
@@ -241,8 +248,16 @@ impl Process {
         let mut head = [0; 5];
         self.socket.read_exact(&mut head)?;
         let [kind, n @ ..] = head;
+        let n = u32::from_le_bytes(n) as usize;
+        if !ANSWERS.contains(&kind) {
+            return Err(violation(format!("an answer of unknown kind {kind}")));
+        }
+        // An environment can write to the connection, so the length may be any.
+        if n > MAX_ANSWER {
+            return Err(violation(format!("its answer has {n} bytes, more than {MAX_ANSWER}")));
+        }
         // Most answers are empty, and an empty vector allocates nothing.
-        let mut text = vec![0; u32::from_le_bytes(n) as usize];
+        let mut text = vec![0; n];
         self.socket.read_exact(&mut text)?;
         Ok((kind, text))
     }
@@ -250,11 +265,12 @@ impl Process {
     /// Maps the memory that the worker allocated.
     fn open(&mut self, size: usize, answer: Duration) -> std::io::Result<()> {
         self.socket.set_read_timeout(Some(answer))?;
+        self.socket.set_write_timeout(Some(answer))?;
         let allocated = self.file.metadata()?.len();
         if allocated < size as u64 {
             return Err(std::io::Error::other(format!("the shared file has {allocated} bytes of {size}")));
         }
-        self.memory = Some(map(&self.file)?);
+        self.memory = Some(map(&self.file, size)?);
         Ok(())
     }
 
@@ -291,14 +307,19 @@ impl Drop for Process {
     }
 }
 
+/// The error of a worker that violates the protocol.
+fn violation(problem: String) -> std::io::Error {
+    std::io::Error::new(std::io::ErrorKind::InvalidData, problem)
+}
+
 #[allow(unsafe_code, reason = "shared memory is mapped from a file")]
-fn map(file: &File) -> std::io::Result<MmapMut> {
+fn map(file: &File, size: usize) -> std::io::Result<MmapMut> {
     // SAFETY: the file is anonymous; only this process and its worker hold a descriptor of it, and the worker never
     // changes its size. The worker writes to it only between a request and its answer, when this process holds no
     // reference: `Transport::dispatch` and `call` borrow the transport mutably, and between the two calls the
     // transport returns no reference to the memory. A worker that does not answer in time is killed before the memory
     // is accessed again.
-    unsafe { MmapMut::map_mut(file) }
+    unsafe { MmapOptions::new().len(size).map_mut(file) }
 }
 
 /// The last lines of a worker's standard error.
@@ -318,7 +339,7 @@ impl Tail {
             let mut pipe = pipe.map(BufReader::new);
             let mut line = vec![];
             while let Some(pipe) = &mut pipe
-                && let Ok(1..) = pipe.read_until(b'\n', &mut line)
+                && let Ok(1..) = pipe.take(MAX_LINE).read_until(b'\n', &mut line)
             {
                 let text = String::from_utf8_lossy(&line).trim_end().to_owned();
                 tracing::debug!("{id}: {text}");

@@ -9,6 +9,7 @@ use std::time::Instant;
 use swm_core::Key;
 use swm_models::TrainConfig;
 use swm_models::lewm::{Lewm, Rollout};
+use swm_models::nn::Init;
 
 const SAMPLES: usize = 300;
 const HORIZON: usize = 5;
@@ -29,7 +30,7 @@ fn median(mut times: Vec<f64>) -> f64 {
 fn main() {
     let config = TrainConfig::<Lewm>::load("paper", &[]).expect("loading the preset");
     let latent = config.model.latent;
-    let model = Lewm::init(&config.model, ACTION_DIM, Key::new(0), &Device::flex());
+    let model = Lewm::init(&config.model, ACTION_DIM, &Init::new(Key::new(0), &Device::flex()));
     let rollout = Rollout::new(&model);
     let start = vec![0.1; latent];
     let actions: Vec<f32> = (0..SAMPLES * HORIZON * ACTION_DIM).map(|i| (i * 37 % 101) as f32 / 101.0 - 0.5).collect();

@@ -12,16 +12,18 @@
 //! A new checkpoint is written to a second folder, which is then renamed to replace the old checkpoint, so that a
 //! killed process leaves a complete checkpoint.
 
+use crate::nn::Init;
 use crate::nn::parameters::{self, HostTensor, Named};
-use crate::run_folder::{CHECKPOINT_FILES, CONFIG, FOLDER, MANIFEST, OPTIMIZER, RAW, STATE, WEIGHTS};
+use crate::run_folder::{CHECKPOINT_FILES, CONFIG, FOLDER, MANIFEST, OPTIMIZER, RAW, STATE, WEIGHTS, WORLD_MODEL};
 use crate::train::run_state::RunState;
-use crate::train::{DatasetInfo, TrainConfig, Trainable};
+use crate::train::{DatasetInfo, TrainConfig, Trainable, limits};
 use crate::weights;
+use burn::module::Module;
 use burn::tensor::Device;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
-use swm_core::{Error, Key, Manifest, Result, files, manifest};
+use swm_core::{Error, Manifest, Result, files, manifest};
 
 /// A trained model, its configuration and its provenance.
 #[derive(Clone, Debug)]
@@ -122,11 +124,19 @@ impl<M: Trainable> Checkpoint<M> {
     fn read(run: &Path, device: &Device) -> Result<(Self, PathBuf)> {
         let StoredCheckpoint { folder, file, manifest, config } =
             StoredCheckpoint::<TrainConfig<M>>::read(run, M::FAMILY)?;
-        config.check()?;
-        let ConfigFile { dataset_info, .. } =
-            serde_json::from_value(file).map_err(|error| broken(&folder.join(CONFIG), error.to_string()))?;
-        let model = M::new(&config, &dataset_info, Key::new(0), device)?;
-        let model = load_weights(model, &folder.join(WEIGHTS), manifest.hashes.get("weights"))?;
+        let path = folder.join(CONFIG);
+        let invalid = |error: Error| broken(&path, error.to_string());
+        let ConfigFile { dataset_info, image, action_block, .. } =
+            serde_json::from_value(file).map_err(|error| broken(&path, error.to_string()))?;
+        config.check().and_then(|()| dataset_info.check()).map_err(invalid)?;
+        let expected = (M::image_size(&config.model), config.data.frameskip);
+        if (image, action_block) != expected {
+            let given =
+                format!("image and action_block are {:?}, its config gives {expected:?}", (image, action_block));
+            return Err(broken(&path, given));
+        }
+        let create = |init: &Init| M::new(&config, &dataset_info, init).map_err(invalid);
+        let model = load_weights(create, &folder.join(WEIGHTS), manifest.hashes.get("weights"), device)?;
         Ok((Self { model, config, dataset_info, manifest }, folder))
     }
 
@@ -137,12 +147,28 @@ impl<M: Trainable> Checkpoint<M> {
     pub(crate) fn load_to_resume(run: &Path, device: &Device) -> Result<(Self, TrainState<M>)> {
         let (checkpoint, folder) = Self::read(run, device)?;
         let path = folder.join(STATE);
-        let state = serde_json::from_slice(&read(&path)?)
-            .map_err(|error| Error::corrupt(&path, error.to_string(), "train again from the beginning"))?;
+        let unusable = |problem: String| Error::corrupt(&path, problem, "train again from the beginning");
+        let state: RunState =
+            serde_json::from_slice(&read_text(&path)?).map_err(|error| unusable(error.to_string()))?;
+        if state.step > checkpoint.config.schedule.steps {
+            return Err(unusable(format!("it is at step {} of {}", state.step, checkpoint.config.schedule.steps)));
+        }
         let hashes = &checkpoint.manifest.hashes;
-        let moments = unpack(&folder.join(OPTIMIZER), hashes.get("optimizer"))?;
+        let path = folder.join(OPTIMIZER);
+        let moments = unpack(&path, hashes.get("optimizer"))?;
+        let shapes = parameters::shapes(&checkpoint.model);
+        let fits = |name: &str, tensor: &HostTensor| {
+            let shape = name.split_once('.').and_then(|(_, parameter)| shapes.get(parameter));
+            shape.is_some_and(|shape| shape.iter().product::<usize>() == tensor.values.len())
+        };
+        if let Some((name, _)) = moments.iter().find(|(name, tensor)| !fits(name, tensor)) {
+            return Err(broken(&path, format!("'{name}' does not fit the model")));
+        }
         let raw = match checkpoint.config.optim.ema > 0.0 {
-            true => Some(load_weights(checkpoint.model.clone(), &folder.join(RAW), hashes.get("raw"))?),
+            true => {
+                let path = folder.join(RAW);
+                Some(with_weights(checkpoint.model.clone(), &unpack(&path, hashes.get("raw"))?, &path)?)
+            }
             false => None,
         };
         Ok((checkpoint, TrainState { state, moments, raw }))
@@ -151,7 +177,7 @@ impl<M: Trainable> Checkpoint<M> {
 
 /// Returns the family of the model in a run folder; `None` if the folder holds no checkpoint.
 pub fn family(run: &Path) -> Option<String> {
-    let file: serde_json::Value = serde_json::from_slice(&read(&locate(run)?.join(CONFIG)).ok()?).ok()?;
+    let file: serde_json::Value = serde_json::from_slice(&read_text(&locate(run)?.join(CONFIG)).ok()?).ok()?;
     Some(file.get("family")?.as_str()?.to_owned())
 }
 
@@ -173,12 +199,10 @@ impl<C: serde::de::DeserializeOwned> StoredCheckpoint<C> {
     /// # Errors
     /// When the folder holds no checkpoint, or the checkpoint is of another family or is damaged.
     pub fn read(run: &Path, family: &str) -> Result<Self> {
-        let folder = locate(run).ok_or_else(|| {
-            Error::corrupt(run, "there is no checkpoint", "give the folder that `swm train` wrote to")
-        })?;
+        let folder = locate(run).ok_or_else(|| missing(run))?;
         let path = folder.join(CONFIG);
         let invalid = |error: serde_json::Error| broken(&path, error.to_string());
-        let file: serde_json::Value = serde_json::from_slice(&read(&path)?).map_err(invalid)?;
+        let file: serde_json::Value = serde_json::from_slice(&read_text(&path)?).map_err(invalid)?;
         let found = file.get("family").and_then(|family| family.as_str()).unwrap_or("unknown");
         if found != family {
             return Err(Error::corrupt(
@@ -189,7 +213,7 @@ impl<C: serde::de::DeserializeOwned> StoredCheckpoint<C> {
         }
         let config = serde_json::from_value(file["config"].clone()).map_err(invalid)?;
         let path = folder.join(MANIFEST);
-        let manifest = serde_json::from_slice(&read(&path)?).map_err(|error| broken(&path, error.to_string()))?;
+        let manifest = serde_json::from_slice(&read_text(&path)?).map_err(|error| broken(&path, error.to_string()))?;
         Ok(Self { folder, file, config, manifest })
     }
 }
@@ -249,16 +273,62 @@ fn move_other_files(old: &Path, current: &Path) -> Result<()> {
     if old.exists() { files::remove_empty_folder(old) } else { Ok(()) }
 }
 
-/// Loads the weights file of a checkpoint into a model, after checking the hash of the file if `hash` is given.
+/// Creates a model, which may be little larger than the weights of a checkpoint, and loads the weights into it, after
+/// checking the hash of their file if `hash` is given.
 ///
 /// # Errors
 /// When the file is damaged, or the names or shapes of the weights differ from the model's.
-pub(crate) fn load_weights<M: burn::module::Module>(model: M, path: &Path, hash: Option<&String>) -> Result<M> {
+pub(crate) fn load_weights<M: Module>(
+    create: impl FnOnce(&Init) -> Result<M>,
+    path: &Path,
+    hash: Option<&String>,
+    device: &Device,
+) -> Result<M> {
     let weights = unpack(path, hash)?;
-    match weights::mismatch(&parameters::shapes(&model), &weights, CONFIG) {
+    let init = Init::for_weights(&weights, device);
+    let model = create(&init)?;
+    init.check().map_err(|_| broken(path, format!("{CONFIG} describes a larger model than these weights")))?;
+    with_weights(model, &weights, path)
+}
+
+/// Replaces the weights of a model by those of the file `path`.
+fn with_weights<M: Module>(model: M, weights: &Named<HostTensor>, path: &Path) -> Result<M> {
+    match weights::mismatch(&parameters::shapes(&model), weights, CONFIG) {
         Some(problem) => Err(broken(path, problem)),
-        None => Ok(parameters::load(model, &weights)),
+        None => Ok(parameters::load(model, weights)),
     }
+}
+
+/// Returns the faults of a checkpoint that loading does not find: files of tensors without a hash in the manifest, and
+/// a training state whose hash differs.
+///
+/// # Errors
+/// When the folder holds no checkpoint, or a file cannot be read.
+pub fn faults(run: &Path) -> Result<Vec<String>> {
+    let folder = locate(run).ok_or_else(|| missing(run))?;
+    let path = folder.join(MANIFEST);
+    let manifest: Manifest =
+        serde_json::from_slice(&read_text(&path)?).map_err(|error| broken(&path, error.to_string()))?;
+    let mut faults = vec![];
+    for (name, file) in [("weights", WEIGHTS), ("optimizer", OPTIMIZER), ("raw", RAW)] {
+        let path = folder.join(file);
+        match manifest.hashes.get(name) {
+            Some(hash) if *hash != manifest::hash(&files::read(&path, u64::MAX)?) => {
+                faults.push(format!("{file} is not the file that {MANIFEST} describes: its hash differs"));
+            }
+            None if path.exists() => faults.push(format!("{MANIFEST} holds no hash of {file}")),
+            _ => {}
+        }
+    }
+    let world_model = run.join(WORLD_MODEL);
+    if locate(&world_model).is_some() {
+        faults.extend(self::faults(&world_model)?.into_iter().map(|fault| format!("{WORLD_MODEL}: {fault}")));
+    }
+    Ok(faults)
+}
+
+fn missing(run: &Path) -> Error {
+    Error::corrupt(run, "there is no checkpoint", "give the folder that `swm train` wrote to")
 }
 
 fn broken(path: &Path, problem: String) -> Error {
@@ -273,8 +343,9 @@ fn locate(run: &Path) -> Option<PathBuf> {
         .find(|folder| folder.join(CONFIG).is_file())
 }
 
-fn read(path: &Path) -> Result<Vec<u8>> {
-    std::fs::read(path).map_err(|error| Error::io(path, "reading a checkpoint", error))
+/// Reads a JSON file.
+fn read_text(path: &Path) -> Result<Vec<u8>> {
+    files::read(path, limits::JSON_BYTES)
 }
 
 fn json<T: Serialize>(value: &T) -> Result<serde_json::Value> {
@@ -301,7 +372,7 @@ fn pack(tensors: &Named<HostTensor>) -> Result<Vec<u8>> {
 
 /// Reads the tensors of a safetensors file, after checking the hash of the file if `hash` is given.
 fn unpack(path: &Path, hash: Option<&String>) -> Result<Named<HostTensor>> {
-    let bytes = read(path)?;
+    let bytes = files::read(path, u64::MAX)?;
     let broken = |problem: String| broken(path, problem);
     let tensors = SafeTensors::deserialize(&bytes).map_err(|error| broken(format!("is damaged ({error})")))?;
     if hash.is_some_and(|hash| *hash != manifest::hash(&bytes)) {
@@ -313,7 +384,11 @@ fn unpack(path: &Path, hash: Option<&String>) -> Result<Named<HostTensor>> {
             if view.dtype() != Dtype::F32 {
                 return Err(broken(format!("'{name}' holds {:?}, not single precision", view.dtype())));
             }
-            let values = view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+            let values: Vec<f32> =
+                view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+            if let Some(value) = values.iter().find(|value| !value.is_finite()) {
+                return Err(broken(format!("'{name}' holds the value {value}, which is not finite")));
+            }
             Ok((name.to_owned(), HostTensor { shape: view.shape().to_vec(), values }))
         })
         .collect()

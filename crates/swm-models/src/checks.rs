@@ -1,7 +1,7 @@
 //! Checks of settings and of the inputs of planning costs, which several model families share.
 
 use crate::pixels;
-use crate::train::at_least;
+use crate::train::{check_sizes, limits};
 use swm_core::columns::{GOAL, PIXELS};
 use swm_core::{Candidates, Error, Result, Schema};
 
@@ -32,7 +32,7 @@ pub(crate) fn pixel_std(std: [f32; 3]) -> Result<()> {
 /// # Errors
 /// When `num_steps` is below `history + 1` or below 2.
 pub(crate) fn clip_covers_history(num_steps: usize, history: usize) -> Result<()> {
-    at_least(&[("data.num_steps", num_steps, 2)])?;
+    check_sizes(&[("data.num_steps", num_steps, 2, limits::FRAMES)])?;
     if num_steps - 1 < history {
         return Err(Error::config(
             "data.num_steps",

@@ -17,6 +17,8 @@ pub(crate) const RAW: &str = "raw.safetensors";
 pub(crate) const OPTIMIZER: &str = "optimizer.safetensors";
 /// The state of the run.
 pub(crate) const STATE: &str = "state.json";
+/// The folder of the world model inside the folder of an inverse-dynamics run.
+pub(crate) const WORLD_MODEL: &str = "world";
 /// The files of a checkpoint.
 pub(crate) const CHECKPOINT_FILES: &[&str] = &[CONFIG, MANIFEST, WEIGHTS, RAW, OPTIMIZER, STATE];
 
@@ -47,6 +49,9 @@ const CHECKPOINT_FOLDERS: &[&str] = &[
     "best/checkpoint/",
     "best/checkpoint.new/",
     "best/checkpoint.old/",
+    "world/checkpoint/",
+    "world/checkpoint.new/",
+    "world/checkpoint.old/",
 ];
 
 /// Deletes the checkpoints, logs and replay data in the folder of a run; files with other names stay. Returns the entries

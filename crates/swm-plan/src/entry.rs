@@ -119,10 +119,10 @@ pub fn defaults<S: Default + Serialize>() -> serde_json::Value {
 /// Creates a solver from JSON settings, for [`SolverEntry::make`].
 ///
 /// # Errors
-/// When a setting is unknown or has the wrong type.
+/// When a setting is unknown, has the wrong type, or is invalid ([`Solver::check`]).
 pub fn make<S: Solver + DeserializeOwned + 'static>(settings: &serde_json::Value) -> Result<Box<dyn Solver>> {
-    match S::deserialize(settings) {
-        Ok(solver) => Ok(Box::new(solver)),
-        Err(error) => Err(Error::config("solver settings", error.to_string(), "`swm solvers` lists the settings")),
-    }
+    let solver = S::deserialize(settings)
+        .map_err(|error| Error::config("solver settings", error.to_string(), "`swm solvers` lists the settings"))?;
+    solver.check()?;
+    Ok(Box::new(solver))
 }

@@ -1,34 +1,42 @@
 //! Checks that a collection may write to an existing dataset, and that all frames of a dataset come from one renderer.
 
+use std::collections::BTreeMap;
 use swm_core::{Error, Manifest, Result};
 use swm_data::lance::shard_manifests;
 use swm_data::{Location, WriteMode};
 use swm_eval::collect::check_continues;
 
 /// Checks, before any episode is played, that a collection with this manifest may be written to a location.
-/// `mix_renderers` permits frames of another renderer than the renderer of the stored frames.
+/// `mix_renderers` permits frames of another renderer than the renderer of the stored frames. Returns the numbers of NaN
+/// and infinite values of the episodes that remain in the dataset, by column.
 ///
 /// # Errors
 /// When a dataset exists and `mode` is [`WriteMode::Create`], or the dataset cannot be continued with this manifest.
-pub fn check(location: &Location, mode: WriteMode, new: &Manifest, mix_renderers: bool) -> Result<()> {
+pub fn check(
+    location: &Location,
+    mode: WriteMode,
+    new: &Manifest,
+    mix_renderers: bool,
+) -> Result<BTreeMap<String, u64>> {
     let exists = match location.path() {
         Some(path) => path.exists(),
         None => swm_data::open(location.clone()).is_ok(),
     };
     if !exists {
-        return Ok(());
+        return Ok(BTreeMap::new());
     }
     match mode {
-        WriteMode::Overwrite => Ok(()),
+        WriteMode::Overwrite => Ok(BTreeMap::new()),
         WriteMode::Append => {
-            let Some(stored) = swm_data::open(location.clone())?.manifest() else { return Ok(()) };
+            let Some(mut stored) = swm_data::open(location.clone())?.manifest() else { return Ok(BTreeMap::new()) };
+            let not_finite = std::mem::take(&mut stored.not_finite);
             check_continues(&stored, new)?;
             if !mix_renderers {
                 check_renderer("continuing a collection", &stored, new)?;
             }
             let (stored, new) = (&stored.config["codec"], &new.config["codec"]);
             if stored == new {
-                return Ok(());
+                return Ok(not_finite);
             }
             Err(Error::config(
                 "codec (--codec)",
@@ -42,6 +50,20 @@ pub fn check(location: &Location, mode: WriteMode, new: &Manifest, mix_renderers
             "continue it (--resume, mode=\"append\"), replace it (--overwrite, mode=\"overwrite\"), or choose another name",
         )),
     }
+}
+
+/// Adds the NaN and infinite values of a collection to those in its manifest.
+pub fn add_not_finite(manifest: &mut Manifest, counts: &BTreeMap<String, u64>) {
+    for (column, count) in counts {
+        *manifest.not_finite.entry(column.clone()).or_default() += count;
+    }
+}
+
+/// Returns a warning of the NaN and infinite values of a collection; `None` if all values were finite.
+pub fn describe_not_finite(counts: &BTreeMap<String, u64>) -> Option<String> {
+    let columns: Vec<String> = counts.iter().map(|(column, count)| format!("{count} in '{column}'")).collect();
+    let hint = "the dataset's manifest counts them; --strict-finite (strict_finite=True) refuses them";
+    (!columns.is_empty()).then(|| format!("NaN or infinite values were stored: {}; {hint}", columns.join(", ")))
 }
 
 /// Checks that all uncommitted shards of a dataset, and its committed episodes, have frames of the same renderer.

@@ -11,26 +11,35 @@ use swm_data::{FORMATS, Location, Reader};
 const DEFAULT_FORMAT: &str = "lance";
 
 /// Returns the folder of all named datasets, checkpoints and weights.
-pub fn home() -> PathBuf {
-    match std::env::var_os("STABLEWM_HOME") {
-        Some(home) if !home.is_empty() => home.into(),
-        _ => Path::new(&std::env::var_os("HOME").unwrap_or_default()).join(".stable_worldmodel"),
-    }
+///
+/// # Errors
+/// When neither `STABLEWM_HOME` nor `HOME` is set, as of all functions below that read a name.
+pub fn home() -> Result<PathBuf> {
+    swm_core::home::folder()
 }
 
 /// Returns the folder of named datasets.
-pub fn datasets() -> PathBuf {
-    home().join("datasets")
+///
+/// # Errors
+/// As [`home`].
+pub fn datasets() -> Result<PathBuf> {
+    Ok(home()?.join("datasets"))
 }
 
 /// Returns the folder of named checkpoints.
-pub fn checkpoints() -> PathBuf {
-    home().join("checkpoints")
+///
+/// # Errors
+/// As [`home`].
+pub fn checkpoints() -> Result<PathBuf> {
+    Ok(home()?.join("checkpoints"))
 }
 
 /// Returns the folder of downloaded pretrained weights.
-pub fn weights() -> PathBuf {
-    home().join("weights")
+///
+/// # Errors
+/// As [`home`].
+pub fn weights() -> Result<PathBuf> {
+    Ok(home()?.join("weights"))
 }
 
 /// The file name suffixes of all dataset formats. A named dataset is found without its suffix.
@@ -40,11 +49,17 @@ fn suffixes() -> impl Iterator<Item = &'static str> {
 
 /// Returns the path of a dataset given as a path or as a name in [`datasets`]. If no such dataset exists, the path has
 /// the suffix of the default format.
-pub fn dataset(given: &str) -> PathBuf {
-    let folder = datasets();
-    let mut existing =
-        once(DEFAULT_FORMAT).chain(suffixes()).chain(once("")).map(|suffix| named(given, &folder, suffix));
-    existing.find(|path| path.exists()).unwrap_or_else(|| named(given, &folder, DEFAULT_FORMAT))
+///
+/// # Errors
+/// As [`home`], if it is a name.
+pub fn dataset(given: &str) -> Result<PathBuf> {
+    for suffix in once(DEFAULT_FORMAT).chain(suffixes()).chain(once("")) {
+        let path = named(given, datasets, suffix)?;
+        if path.exists() {
+            return Ok(path);
+        }
+    }
+    named(given, datasets, DEFAULT_FORMAT)
 }
 
 /// Returns the location of a dataset given as a path, as a URI, or as a name in [`datasets`].
@@ -53,12 +68,15 @@ pub fn dataset(given: &str) -> PathBuf {
 /// When the text is empty, or a URI of an unknown scheme.
 pub fn location(given: &str) -> Result<Location> {
     check_name("dataset", given)?;
-    if given.contains("://") { Location::parse(given) } else { Ok(dataset(given).into()) }
+    if given.contains("://") { Location::parse(given) } else { Ok(dataset(given)?.into()) }
 }
 
 /// Returns the path of a checkpoint given as a path or as a name in [`checkpoints`].
-pub fn checkpoint(given: &str) -> PathBuf {
-    named(given, &checkpoints(), "")
+///
+/// # Errors
+/// As [`home`], if it is a name.
+pub fn checkpoint(given: &str) -> Result<PathBuf> {
+    named(given, checkpoints, "")
 }
 
 /// Returns the path of a checkpoint to write, given as a path or as a name in [`checkpoints`].
@@ -67,7 +85,7 @@ pub fn checkpoint(given: &str) -> PathBuf {
 /// When the text is empty.
 pub fn new_checkpoint(given: &str) -> Result<PathBuf> {
     check_name("checkpoint", given)?;
-    Ok(checkpoint(given))
+    checkpoint(given)
 }
 
 /// Opens a dataset given as a path, as a URI, or as a name in [`datasets`].
@@ -85,7 +103,7 @@ pub fn open_dataset(given: &str) -> Result<Arc<dyn Reader>> {
 pub fn find_dataset(given: &str) -> Result<Location> {
     let location = location(given)?;
     match location.path() {
-        Some(path) if !path.exists() => Err(unknown("dataset", given, path, &datasets())),
+        Some(path) if !path.exists() => Err(unknown("dataset", given, path, datasets())),
         _ => Ok(location),
     }
 }
@@ -96,8 +114,8 @@ pub fn find_dataset(given: &str) -> Result<Location> {
 /// When the checkpoint does not exist; the message names the closest name.
 pub fn find_checkpoint(given: &str) -> Result<PathBuf> {
     check_name("checkpoint", given)?;
-    let path = checkpoint(given);
-    if path.exists() { Ok(path) } else { Err(unknown("checkpoint", given, &path, &checkpoints())) }
+    let path = checkpoint(given)?;
+    if path.exists() { Ok(path) } else { Err(unknown("checkpoint", given, &path, checkpoints())) }
 }
 
 /// Returns an error for an empty name: the path that it stands for is the folder of all names.
@@ -113,8 +131,8 @@ fn check_name(kind: &str, given: &str) -> Result<()> {
 }
 
 /// Returns the error for a name that does not exist, with the closest name in `folder`.
-fn unknown(kind: &'static str, given: &str, path: &Path, folder: &Path) -> Error {
-    let names = names_in(folder);
+fn unknown(kind: &'static str, given: &str, path: &Path, folder: Result<PathBuf>) -> Error {
+    let names = folder.map_or(vec![], |folder| names_in(&folder));
     let hint = format!("{} does not exist; `swm {kind}s` lists the known {kind}s", path.display());
     Error::unknown(kind, given, names.iter().map(String::as_str), hint)
 }
@@ -144,7 +162,7 @@ pub fn target(given: &str, format: Option<&str>) -> Result<Location> {
         Some(format) if !given.contains("://") => {
             check_name("dataset", given)?;
             let suffix = FORMATS.get(format)?.suffixes.first().copied().unwrap_or(format);
-            Ok(named(given, &datasets(), suffix).into())
+            Ok(named(given, datasets, suffix)?.into())
         }
         _ => location(given),
     }
@@ -152,12 +170,15 @@ pub fn target(given: &str, format: Option<&str>) -> Result<Location> {
 
 /// Returns `given` unchanged if it is a path, and the entry of `folder` with this suffix if it is a name. A text is a
 /// path if it contains a folder or an extension, or if a file of this name exists.
-fn named(given: &str, folder: &Path, suffix: &str) -> PathBuf {
+///
+/// # Errors
+/// When it is a name and there is no folder.
+fn named(given: &str, folder: fn() -> Result<PathBuf>, suffix: &str) -> Result<PathBuf> {
     let path = Path::new(given);
     if path.components().count() > 1 || path.extension().is_some() || path.exists() {
-        return path.to_owned();
+        return Ok(path.to_owned());
     }
-    folder.join(given).with_extension(suffix)
+    Ok(folder()?.join(given).with_extension(suffix))
 }
 
 #[cfg(test)]
@@ -166,14 +187,17 @@ mod tests {
 
     #[test]
     fn names_are_in_the_home_folder_and_paths_are_unchanged() {
+        let datasets = datasets().expect("a home folder");
+        let dataset = |given| dataset(given).expect("a path");
         assert_eq!(dataset("a/b.lance"), Path::new("a/b.lance"));
         assert_eq!(dataset("./b"), Path::new("./b"));
-        assert_eq!(dataset("rooms"), datasets().join("rooms.lance"));
+        assert_eq!(dataset("rooms"), datasets.join("rooms.lance"));
         let target = |name, format| target(name, format).expect("a location").to_string();
-        assert_eq!(target("rooms", Some("hdf5")), datasets().join("rooms.h5").to_string_lossy());
+        assert_eq!(target("rooms", Some("hdf5")), datasets.join("rooms.h5").to_string_lossy());
         assert_eq!(target("a/rooms", Some("video")), "a/rooms");
-        assert_eq!(target("rooms", None), datasets().join("rooms.lance").to_string_lossy());
-        assert_eq!(checkpoint("lewm-rooms"), checkpoints().join("lewm-rooms"));
+        assert_eq!(target("rooms", None), datasets.join("rooms.lance").to_string_lossy());
+        let folder = checkpoints().expect("a home folder");
+        assert_eq!(checkpoint("lewm-rooms").expect("a path"), folder.join("lewm-rooms"));
     }
 
     #[test]

@@ -22,7 +22,7 @@ pub mod resolver;
 pub mod subject;
 
 use swm_core::registry::{Registry, concat};
-use swm_core::{EnvChoice, EnvEntry, Result};
+use swm_core::{EnvChoice, EnvEntry, Origin, Result};
 
 /// The built-in environments: first the 2-D environments, then the MuJoCo environments.
 pub static ENVS: Registry<EnvEntry> = Registry { rows: &ROWS, ..swm_envs::ENVS };
@@ -31,16 +31,17 @@ const ROWS: [EnvEntry; swm_envs::ENVS.rows.len() + swm_mujoco::ENVS.rows.len()] 
     concat(swm_envs::ENVS.rows, swm_mujoco::ENVS.rows);
 
 /// Returns the environment that `ID` or `ID,option=value,…` names: one of [`ENVS`], else a third-party environment of
-/// Gymnasium (`docs/gymnasium.md`).
+/// Gymnasium (`docs/gymnasium.md`). `origin` is who chose the text.
 ///
 /// # Errors
-/// When no built-in environment has the id and the id does not have Gymnasium's form. An id that is not
-/// registered with Gymnasium is an error only when the environment is made.
-pub fn env(text: &str) -> Result<EnvChoice> {
+/// When no built-in environment has the id and the id does not have Gymnasium's form, or a file chose an id that only
+/// the user may choose ([`swm_gym::TrustedId`]). An id that is not registered with Gymnasium is an error only when the
+/// environment is made.
+pub fn env(text: &str, origin: &Origin) -> Result<EnvChoice> {
     let id = text.split(',').next().unwrap_or_default();
     let is_builtin = |id: &str| ENVS.get(id).is_ok();
     if !is_builtin(id) && !is_builtin(&format!("swm/{id}")) && swm_gym::is_gymnasium_id(text) {
-        return swm_gym::choose(text);
+        return swm_gym::choose(text, origin);
     }
     ENVS.choose(text)
 }
@@ -52,7 +53,7 @@ mod tests {
     #[test]
     fn ids_that_are_not_built_in_go_to_gymnasium() -> Result<()> {
         for text in ["swm/PushT-v1", "swm/OGBCube-v0,env_type=double", "ALE/Pong-v5,frameskip=2", "CartPole-v1"] {
-            assert_eq!(env(text)?.id(), text);
+            assert_eq!(env(text, &Origin::User)?.id(), text);
         }
         for (text, message) in [
             ("swm/PusT-v1", "did you mean swm/PushT-v1"),
@@ -60,7 +61,7 @@ mod tests {
             ("swm/OGBCube-v0,env_type=dubble", "did you mean double"),
             ("pong", "`swm envs` lists them"),
         ] {
-            let error = env(text).map(|chosen| chosen.id()).expect_err(text).to_string();
+            let error = env(text, &Origin::User).map(|chosen| chosen.id()).expect_err(text).to_string();
             assert!(error.contains(message), "{error}");
         }
         Ok(())

@@ -1,7 +1,5 @@
 //! The `swm` command.
 
-use clap::Parser as _;
-
 fn main() -> std::process::ExitCode {
-    swm::cli::Cli::parse().run().into()
+    swm::cli::run(std::env::args_os()).into()
 }

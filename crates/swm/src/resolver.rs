@@ -10,7 +10,9 @@ use std::path::PathBuf;
 use std::rc::Rc;
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::policy::ExpertPolicy;
-use swm_core::{CostModel, Env, EnvEntry, EnvSpec, Error, Named as _, Policy, RandomPolicy, Result, Solver};
+use swm_core::{
+    CostModel, Env, EnvChoice, EnvEntry, EnvSpec, Error, Named as _, Origin, Policy, RandomPolicy, Result, Solver,
+};
 use swm_data::Reader;
 use swm_envs::wrappers::{GoalFrame, Stack, WRAPPERS};
 use swm_eval::{Choice, EvalRequest, Model, PolicyKind, PolicyRequest, Predictor, ResolvedPolicy, Resolver, World};
@@ -21,8 +23,14 @@ use swm_plan::{
 };
 
 /// A [`Resolver`] of names in this build and in the home folder. It loads every checkpoint once.
-#[derive(Default)]
+///
+/// A request that comes from a file may name built-in and registered environments, local datasets and checkpoints, and
+/// wrappers that read no files. Other names are refused.
 pub struct HomeResolver {
+    /// Who chose the names in the requests.
+    origin: Origin,
+    /// The environment that the user named, besides a request that comes from a file.
+    env: Option<String>,
     /// The wrappers of the last request. All environments share the wrappers and the files that the wrappers read.
     wrapping: RefCell<Option<Wrapping>>,
     /// The loaded checkpoints, by path.
@@ -43,9 +51,25 @@ struct Wrapping {
 type Traces = Arc<Mutex<Vec<(String, PlanRecord)>>>;
 
 impl HomeResolver {
-    /// A resolver that traces the plans of its policies.
-    pub fn tracing() -> Self {
-        Self { traces: Some(Traces::default()), ..Self::default() }
+    /// Creates a resolver of requests whose names `origin` chose.
+    pub fn new(origin: Origin) -> Self {
+        Self { origin, env: None, wrapping: RefCell::default(), checkpoints: RefCell::default(), traces: None }
+    }
+
+    /// Traces the plans of policies.
+    pub fn tracing(self) -> Self {
+        Self { traces: Some(Traces::default()), ..self }
+    }
+
+    /// Accepts requests for the environment with this id, because the user named it.
+    pub fn with_env(self, id: &str) -> Self {
+        Self { env: Some(id.to_owned()), ..self }
+    }
+
+    /// Returns the environment that a request names.
+    fn choose_env(&self, id: &str) -> Result<EnvChoice> {
+        let origin = if self.env.as_deref() == Some(id) { &Origin::User } else { &self.origin };
+        crate::env(id, origin)
     }
 
     /// Returns the plans since the last call, in order, each with the name of its policy.
@@ -78,7 +102,11 @@ impl HomeResolver {
         }
         let wrappers = request.wrappers.iter().map(|choice| {
             let settings = choice.settings.as_object().cloned().unwrap_or_default();
-            WRAPPERS.get(&choice.id)?.make(&settings.into_iter().collect())
+            let entry = WRAPPERS.get(&choice.id)?;
+            if entry.reads_files() {
+                self.origin.check_user(&format!("the wrapper '{}'", choice.id), "which reads files", None)?;
+            }
+            entry.make(&settings.into_iter().collect())
         });
         let stack = Arc::new(Stack::new(wrappers.collect::<Result<_>>()?));
         let wrapping = Wrapping { choices: request.wrappers.clone(), stack, goal };
@@ -89,7 +117,7 @@ impl HomeResolver {
     /// Makes a policy that plans by restoring and stepping the environment itself.
     fn simulator_policy(&self, name: &str, score: &str, planner: Planner, world: &World) -> Result<ResolvedPolicy> {
         let (spec, score) = (world.spec(), parse_score(score)?);
-        let (env, wrapping) = (crate::env(&spec.id)?, self.wrapping.borrow().clone());
+        let (env, wrapping) = (self.choose_env(&spec.id)?, self.wrapping.borrow().clone());
         let make = move || match &wrapping {
             Some(Wrapping { stack, goal, .. }) => Ok(stack.wrap(env.env()?, *goal)),
             None => env.env(),
@@ -130,11 +158,14 @@ impl HomeResolver {
 
 impl Resolver for HomeResolver {
     fn env(&self, request: &EvalRequest) -> Result<Box<dyn Env>> {
-        let (env, wrapping) = (crate::env(&request.env)?.env()?, self.wrapping(request)?);
+        let (env, wrapping) = (self.choose_env(&request.env)?.env()?, self.wrapping(request)?);
         Ok(wrapping.stack.wrap(env, wrapping.goal))
     }
 
     fn dataset(&self, name: &str) -> Result<Arc<dyn Reader>> {
+        if name.contains("://") {
+            self.origin.check_user(&format!("the dataset '{name}'"), "which opens a network connection", None)?;
+        }
         home::open_dataset(name)
     }
 
@@ -142,7 +173,9 @@ impl Resolver for HomeResolver {
         let (spec, slots) = (world.spec(), world.pool().len());
         match &request.kind {
             PolicyKind::Random => Ok(ResolvedPolicy::from(Box::new(RandomPolicy::new(spec, slots)) as Box<dyn Policy>)),
-            PolicyKind::Expert { id } => scripted(&crate::env(&spec.id)?.entry, id, world).map(ResolvedPolicy::from),
+            PolicyKind::Expert { id } => {
+                scripted(&self.choose_env(&spec.id)?.entry, id, world).map(ResolvedPolicy::from)
+            }
             PolicyKind::Direct { checkpoint: given, .. } => {
                 let (policy, info) = direct(&*self.checkpoint(given)?, given, spec, slots)?;
                 Ok(with_provenance(ResolvedPolicy::from(policy), info))
@@ -210,7 +243,7 @@ fn with_provenance(policy: ResolvedPolicy, info: CheckpointInfo) -> ResolvedPoli
 /// requires a solver.
 pub fn policy_by_name(entry: &EnvEntry, name: &str, world: &World) -> Result<(Box<dyn Policy>, Option<String>)> {
     let is_scripted = ["random", "expert"].contains(&name) || entry.experts.iter().any(|expert| expert.id == name);
-    if is_scripted || !home::checkpoint(name).exists() {
+    if is_scripted || !home::checkpoint(name)?.exists() {
         return Ok((scripted(entry, name, world)?, None));
     }
     let (policy, info) = checkpoint_policy(name, world.spec(), world.pool().len())?;
@@ -222,7 +255,7 @@ pub fn policy_by_name(entry: &EnvEntry, name: &str, world: &World) -> Result<(Bo
 /// # Errors
 /// When the checkpoint does not exist, was trained on another environment, or requires a solver.
 pub fn checkpoint_policy(given: &str, spec: &EnvSpec, slots: usize) -> Result<(Box<dyn Policy>, CheckpointInfo)> {
-    direct(&*HomeResolver::default().checkpoint(given)?, given, spec, slots)
+    direct(&*HomeResolver::new(Origin::User).checkpoint(given)?, given, spec, slots)
 }
 
 fn direct(

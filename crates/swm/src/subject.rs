@@ -9,8 +9,8 @@ use swm_core::{
     Batch, Candidates, ColumnSpec, CostModel as _, DType, Key, PlanProblem, PlanSpace, Result, Schema, Solver as _,
 };
 use swm_models::lewm::{EncoderConfig, Lewm, LewmCost, pixels};
-use swm_models::nn::Named;
 use swm_models::nn::parameters::{self, HostTensor};
+use swm_models::nn::{Init, Named};
 use swm_models::train::{AdamW, DatasetInfo, StepContext};
 use swm_models::{Device, TrainConfig, Trainable as _, weights};
 use swm_plan::{ActionScale, Cem};
@@ -52,7 +52,7 @@ impl LewmSubject {
         let settings = [format!("data.batch_size={clips}"), format!("shards={}", rayon::current_num_threads())];
         let config = TrainConfig::<Lewm>::load("paper", &settings)?;
         let action_dim = config.data.frameskip * ACTION_DIM;
-        let model = with_modulations(Lewm::init(&config.model, action_dim, Key::new(0), device));
+        let model = with_modulations(Lewm::init(&config.model, action_dim, &Init::new(Key::new(0), device)));
         let mut cost = LewmCost::of(&model, &config.model, action_dim);
         let side = config.model.image;
         let columns = [ColumnSpec::image(PIXELS, side, side), ColumnSpec::image(GOAL, side, side)];

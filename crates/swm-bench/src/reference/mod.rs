@@ -84,11 +84,13 @@ impl Reference {
     }
 
     fn spawn(python: &Path, script: &str, arguments: &[String]) -> Result<Self> {
+        // `python -c` puts the current folder first, where a file may have the name of a module.
+        const ISOLATED_PATH: &str = "import sys\nif sys.path[:1] == ['']:\n    del sys.path[0]\n";
         let log =
             tempfile::tempfile().map_err(|e| Error::io("a temporary file", "creating the log of the reference", e))?;
         let errors = log.try_clone().map_err(|e| Error::io("a temporary file", "duplicating the handle", e))?;
         let mut process = Command::new(python)
-            .args(["-u", "-c", script])
+            .args(["-u", "-c", &format!("{ISOLATED_PATH}{script}")])
             .args(arguments)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())

@@ -1,6 +1,11 @@
-//! [`lock`]: locks a mutex and ignores poisoning.
+//! The primitives of the loader's queue, and [`lock`], which ignores poisoning.
+//!
+//! `loom/` compiles the queue with other primitives of the same names, which run it under all interleavings of its
+//! threads.
 
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::PoisonError;
+pub use std::sync::{Condvar, Mutex, MutexGuard};
+pub use std::thread;
 
 /// Locks a mutex, even if another thread panicked while that thread held the lock.
 ///

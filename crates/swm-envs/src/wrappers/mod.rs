@@ -128,6 +128,11 @@ impl WrapperEntry {
         (self.build)(settings::complete(self.id, self.parameters, settings)?.into())
     }
 
+    /// Whether a parameter names a file that the wrapper reads.
+    pub fn reads_files(&self) -> bool {
+        self.parameters.iter().any(|parameter| matches!(parameter.domain, Domain::Path))
+    }
+
     /// Returns summary and parameters as JSON: allowed values and defaults (null: required).
     pub fn describe(&self) -> Value {
         let parameters: Settings = self

@@ -181,9 +181,8 @@ pub(super) fn read(wrapper: &str, table: &'static [Parameter], text: &str) -> Re
             return Err(Error::config(format!("wrapper '{wrapper}'"), problem, "write it as NAME=VALUE"));
         };
         let value = find(wrapper, table, name)?.domain.read(value);
-        if settings.insert(name.to_owned(), value).is_some() {
-            let problem = format!("'{name}' is given twice");
-            return Err(Error::config(format!("wrapper '{wrapper}'"), problem, "leave one of them out"));
+        if let Some(first) = settings.insert(name.to_owned(), value) {
+            return Err(Error::twice(format!("wrapper '{wrapper}'"), format!("{name}={}", formatted(&first)), part));
         }
     }
     Ok(settings)

@@ -20,8 +20,7 @@ fn config(episodes: usize) -> CollectConfig {
         seed: 11,
         variation: VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() },
         policy: "random".to_owned(),
-        goal: false,
-        first: 0,
+        ..CollectConfig::default()
     }
 }
 

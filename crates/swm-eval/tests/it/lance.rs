@@ -21,7 +21,8 @@ fn expert(world: &World) -> ExpertPolicy {
 fn collect(path: &Path, mode: WriteMode, envs: usize, episodes: usize) -> Collected {
     let mut world = world(envs, 2);
     let variation = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
-    let config = CollectConfig { episodes, seed: 4, variation, policy: "expert".to_owned(), goal: false, first: 0 };
+    let config =
+        CollectConfig { episodes, seed: 4, variation, policy: "expert".to_owned(), ..CollectConfig::default() };
     let manifest = Some(world.collect_manifest(&config));
     let options = WriteOptions { mode, manifest, ..WriteOptions::default() };
     let schema = world.collect_schema(config.goal).expect("a valid schema");

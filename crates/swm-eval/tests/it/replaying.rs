@@ -15,7 +15,7 @@ fn world() -> World {
 
 fn config(episodes: usize) -> CollectConfig {
     let variation = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
-    CollectConfig { episodes, seed: 11, variation, policy: "random".to_owned(), goal: false, first: 0 }
+    CollectConfig { episodes, seed: 11, variation, policy: "random".to_owned(), ..CollectConfig::default() }
 }
 
 #[test]

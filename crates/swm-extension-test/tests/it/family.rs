@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use swm::core::requirements::{DatasetRequirements, RequiredObservations};
 use swm::core::{Batch, Candidates, CostModel, Key, Result, Schema};
 use swm::data::dataset::{ClipSpec, LoaderConfig};
-use swm::models::nn::parameters;
+use swm::models::nn::{Init, parameters};
 use swm::models::train::{DatasetInfo, Preset, StepContext, StepOutput};
 use swm::models::{Checkpoint, FamilyEntry, ModelFamily, TrainConfig, Trainable};
 
@@ -70,8 +70,8 @@ impl Trainable for Line {
         Ok(LoaderConfig { clip, ..LoaderConfig::default() })
     }
 
-    fn new(_: &TrainConfig<Self>, _: &DatasetInfo, _: Key, device: &Device) -> Result<Self> {
-        Ok(Self { gain: Param::from_tensor(Tensor::zeros([1], device)) })
+    fn new(_: &TrainConfig<Self>, _: &DatasetInfo, init: &Init) -> Result<Self> {
+        Ok(Self { gain: init.constant([1], 0.0) })
     }
 
     fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {

@@ -1,10 +1,12 @@
 //! Tests of episodes that start at a row of a dataset.
 
-use crate::config;
 use crate::play::{RecordedEnv, make};
 use crate::robust::kill_process;
+use crate::{config, id};
 use swm_core::batch::{Batch, ColumnSpec, DType, Schema};
-use swm_core::{Action, Callable, DatasetStart, Env, FrameMut, ResetOptions, VariationRequest, dataset_start};
+use swm_core::{
+    Action, Callable, DatasetStart, Env, FrameMut, ResetOptions, Snapshot, VariationRequest, dataset_start,
+};
 use swm_gym::{GymEnv, WorkerTransport};
 
 const FIELD: &str = "tests.it.environments:Field-v0";
@@ -131,7 +133,7 @@ fn environment_can_declare_the_method_that_sets_its_state() {
 fn replays_a_killed_worker_from_the_recorded_state() {
     let Some(config) = config() else { return };
     let run = |kill: Option<usize>| {
-        let transport = WorkerTransport::new(FIELD, [].into(), config.clone()).expect("a worker");
+        let transport = WorkerTransport::new(&id(FIELD), config.clone()).expect("a worker");
         let id = transport.process_id().expect("a process");
         let mut field = RecordedEnv::of(Box::new(GymEnv::new(FIELD, Box::new(transport), 2).expect("an environment")));
         start(&mut *field.env, &ResetOptions::default(), &[]).expect("a start");
@@ -168,4 +170,20 @@ fn snapshot_contains_the_dataset_start() {
         goal
     });
     assert_eq!(goals, [[200; 27], [200; 27]]);
+}
+
+#[test]
+fn snapshot_calls_only_methods_that_set_a_state() {
+    let Some(config) = config() else { return };
+    let mut field = make(FIELD, &config);
+    start(&mut *field, &ResetOptions::default(), &[]).expect("a start");
+    let hostile = replace(&field.snapshot().0, b"_set_state", b"seed_evil_");
+    let error = field.restore(&Snapshot(hostile)).expect_err("another method").to_string();
+    assert!(error.contains("calls the method 'seed_evil_'"), "{error}");
+}
+
+/// Replaces the first occurrence of `from` by a text of the same length.
+fn replace(bytes: &[u8], from: &[u8], to: &[u8]) -> Vec<u8> {
+    let at = bytes.windows(from.len()).position(|part| part == from).expect("the text occurs");
+    [&bytes[..at], to, &bytes[at + from.len()..]].concat()
 }

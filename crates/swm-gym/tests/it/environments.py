@@ -263,6 +263,59 @@ class Coated(gymnasium.Wrapper):
         return np.broadcast_to(self.variation_space['coat'].value, (2, 2, 3))
 
 
+class Counter(gymnasium.Env):
+    """Observes the number of its steps. `fault` happens in step 2."""
+
+    action_space = spaces.Discrete(2)
+    observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float32)
+
+    def __init__(self, fault=None):
+        self.fault, self.t = fault, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return np.float32([0]), {}
+
+    def step(self, action):
+        self.t += 1
+        # The bridge takes one step to describe the environment.
+        fault = getattr(self, self.fault) if self.fault and self.t == 2 else None
+        if fault is not None:
+            fault()
+        return np.float32([self.t]), 0.0, False, False, {}
+
+    def fork(self):
+        os.fork()
+
+    def fork_and_raise(self):
+        if os.fork() == 0:
+            raise ValueError('an exception in a child process')
+
+    def fork_and_end(self):
+        if os.fork():
+            os._exit(3)
+
+    def close_descriptors(self):
+        os.closerange(3, 64)
+
+    def exec(self):
+        os.execlp('sleep', 'sleep', '100')
+
+    def answer(self, head=b'.\xff\xff\xff\xff'):
+        """Writes bytes to every socket, as a process that violates the protocol."""
+        for descriptor in range(3, 64):
+            try:
+                if os.readlink(f'/proc/self/fd/{descriptor}').startswith('socket:'):
+                    os.write(descriptor, head)
+            except OSError:
+                pass
+
+    def answer_unknown(self):
+        self.answer(b'\x00\x05\x00\x00\x00abc\xff\xfe')
+
+
+gymnasium.register('Counter-v0', Counter, max_episode_steps=1_000_000)
 gymnasium.register('Room-v0', Room, max_episode_steps=30)
 gymnasium.register('Coated-v0', Coated)
 gymnasium.register('Field-v0', Field, max_episode_steps=20)

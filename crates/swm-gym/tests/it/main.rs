@@ -5,6 +5,8 @@
 
 mod atari;
 mod dataset_start;
+mod describing;
+mod hostile;
 mod parents;
 mod play;
 mod robust;
@@ -12,7 +14,8 @@ mod spaces;
 
 use std::path::PathBuf;
 use std::time::Duration;
-use swm_gym::{GymConfig, Python};
+use swm_core::Origin;
+use swm_gym::{GymConfig, Python, TrustedId};
 
 /// The configuration of the tests; `None` skips the test.
 fn config() -> Option<GymConfig> {
@@ -27,6 +30,11 @@ fn config() -> Option<GymConfig> {
         call_timeout: Duration::from_secs(60),
         restarts: 2,
     })
+}
+
+/// An id that the user chose.
+fn id(text: &str) -> TrustedId {
+    TrustedId::new(text, &Origin::User).expect(text)
 }
 
 /// Returns whether the Python of the tests can import a module.

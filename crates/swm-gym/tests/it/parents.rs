@@ -1,8 +1,8 @@
 //! Tests that a worker process ends when its parent process ends in any way.
 
-use crate::config;
 use crate::play::ROOM;
 use crate::robust::kill_process;
+use crate::{config, id};
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -30,8 +30,7 @@ fn ends_in_time(id: u32) -> bool {
 
 /// Makes an environment whose fourth step hangs, and returns it with the id of its process.
 fn hanging_env() -> Option<(GymEnv, u32)> {
-    let options = [("hang_at".to_owned(), "4".to_owned())];
-    let transport = WorkerTransport::new(ROOM, options.into(), config()?).expect("a worker");
+    let transport = WorkerTransport::new(&id(&format!("{ROOM},hang_at=4")), config()?).expect("a worker");
     let id = transport.process_id().expect("a process");
     Some((GymEnv::new(ROOM, Box::new(transport), 2).expect("an environment"), id))
 }

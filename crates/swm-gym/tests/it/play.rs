@@ -1,6 +1,6 @@
 //! Tests that the outputs of an environment depend only on its seed and actions, not on threads or other environments.
 
-use crate::config;
+use crate::{config, id};
 use swm_core::batch::{Batch, DType, Schema};
 use swm_core::pool::{Reset, threads};
 use swm_core::{
@@ -12,7 +12,7 @@ use swm_gym::GymConfig;
 pub const ROOM: &str = "tests.it.environments:Room-v0";
 
 pub fn make(text: &str, config: &GymConfig) -> Box<dyn Env> {
-    swm_gym::make(text, config.clone()).unwrap_or_else(|error| panic!("{text}: {error}"))
+    swm_gym::make(&id(text), config.clone()).unwrap_or_else(|error| panic!("{text}: {error}"))
 }
 
 /// Plays episodes with random actions and returns the bytes of all their outputs, one vector per slot.
@@ -318,13 +318,13 @@ fn unsupported_requests_are_errors() {
     assert!(env.env.step(Action::Continuous(&[0.0])).is_err(), "an action of another kind");
     env.env.step(Action::Discrete(&[1])).expect("a step after invalid actions");
 
-    let unknown = swm_gym::make("CartPoel-v1", config.clone()).err().expect("an unknown id").to_string();
+    let unknown = swm_gym::make(&id("CartPoel-v1"), config.clone()).err().expect("an unknown id").to_string();
     assert!(unknown.contains("did you mean CartPole-v1"), "{unknown}");
-    let wrong = swm_gym::make("CartPole-v1,sutton=1", config.clone()).err().expect("no such argument").to_string();
+    let wrong = swm_gym::make(&id("CartPole-v1,sutton=1"), config.clone()).err().expect("no such argument").to_string();
     assert!(wrong.contains("sutton") && wrong.contains("CartPole-v1"), "{wrong}");
-    let module = swm_gym::make("no_such_module:Maze-v0", config.clone()).err().expect("no module").to_string();
+    let module = swm_gym::make(&id("no_such_module:Maze-v0"), config.clone()).err().expect("no module").to_string();
     assert!(module.contains("no_such_module"), "{module}");
     let python = swm_gym::Python { program: "/no/such/python".into(), origin: "named by a test" };
-    let none = swm_gym::make("CartPole-v1", GymConfig { python, ..config }).err().expect("no Python").to_string();
+    let none = swm_gym::make(&id("CartPole-v1"), GymConfig { python, ..config }).err().expect("no Python").to_string();
     assert!(none.contains("/no/such/python (named by a test)") && none.contains("SWM_PYTHON"), "{none}");
 }

@@ -1,7 +1,7 @@
 //! Tests of workers that die, hang, raise exceptions and print.
 
-use crate::config;
 use crate::play::{ROOM, RecordedEnv, make, play};
+use crate::{config, id};
 use std::time::Duration;
 use swm_core::{Action, PendingCall, ResetOptions};
 use swm_gym::{GymConfig, GymEnv, WorkerTransport};
@@ -23,7 +23,7 @@ fn outputs_are_the_same_when_a_worker_dies_in_an_episode() {
 fn outputs_are_the_same_when_a_worker_is_killed() {
     let Some(config) = config() else { return };
     let run = |kill: Option<u32>| {
-        let transport = WorkerTransport::new("CartPole-v1", [].into(), config.clone()).expect("a worker");
+        let transport = WorkerTransport::new(&id("CartPole-v1"), config.clone()).expect("a worker");
         let id = transport.process_id().expect("a process");
         let mut env =
             RecordedEnv::of(Box::new(GymEnv::new("CartPole-v1", Box::new(transport), 2).expect("an environment")));
@@ -47,7 +47,7 @@ fn dispatched_calls_are_repeated_in_a_new_worker() {
     let Some(config) = config() else { return };
     let options = ResetOptions::default();
     let run = |kill: Option<(&str, bool)>| {
-        let transport = WorkerTransport::new("CartPole-v1", [].into(), config.clone()).expect("a worker");
+        let transport = WorkerTransport::new(&id("CartPole-v1"), config.clone()).expect("a worker");
         let id = transport.process_id().expect("a process");
         let mut env =
             RecordedEnv::of(Box::new(GymEnv::new("CartPole-v1", Box::new(transport), 2).expect("an environment")));

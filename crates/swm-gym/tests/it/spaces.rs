@@ -1,7 +1,7 @@
 //! Tests that actions of every kind of space reach the environment unchanged.
 
-use crate::config;
 use crate::play::{RecordedEnv, make};
+use crate::{config, id};
 use swm_core::{Action, DType, ResetOptions, Space};
 
 #[test]
@@ -31,7 +31,8 @@ fn actions_of_every_space_reach_the_environment() {
     env.env.reset(0, &ResetOptions::default()).expect("a reset");
     env.env.step(Action::Continuous(&[0.5, -0.25, 3.0])).expect("a step");
     assert_eq!(env.column("observation")[..3], [0.5, -0.25, 3.0]);
-    let error = swm_gym::make("tests.it.environments:Choices-v0,kind=mixed", config.clone()).err().expect("an error");
+    let error =
+        swm_gym::make(&id("tests.it.environments:Choices-v0,kind=mixed"), config.clone()).err().expect("an error");
     assert!(error.to_string().contains("wrap the environment"), "{error}");
     let rgb = &mut [0; 3];
     let error = env.env.render(swm_core::FrameMut::new(1, 1, rgb)).expect_err("no rendering").to_string();

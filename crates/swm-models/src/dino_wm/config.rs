@@ -4,7 +4,7 @@ use super::predictor::FramePredictorConfig;
 use crate::checks;
 use crate::nn::BackboneConfig;
 use crate::pixels::{self, ImageNormalization};
-use crate::train::at_least;
+use crate::train::{check_sizes, limits};
 use burn::tensor::{Device, Tensor};
 use serde::{Deserialize, Serialize};
 use swm_core::{Error, Result};
@@ -75,12 +75,13 @@ impl DinoWmConfig {
     pub fn check(&self) -> Result<()> {
         self.encoder.check("model.encoder", self.image)?;
         let predictor = &self.predictor;
-        at_least(&[
-            ("model.predictor.history", predictor.history, 1),
-            ("model.predictor.depth", predictor.depth, 1),
-            ("model.predictor.heads", predictor.heads, 1),
-            ("model.predictor.dim_head", predictor.dim_head, 1),
-            ("model.predictor.mlp", predictor.mlp, 1),
+        check_sizes(&[
+            ("model.decoder", self.decoder, 0, limits::FEATURES),
+            ("model.predictor.history", predictor.history, 1, limits::FRAMES),
+            ("model.predictor.depth", predictor.depth, 1, limits::LAYERS),
+            ("model.predictor.heads", predictor.heads, 1, limits::FEATURES),
+            ("model.predictor.dim_head", predictor.dim_head, 1, limits::FEATURES),
+            ("model.predictor.mlp", predictor.mlp, 1, limits::FEATURES),
         ])?;
         checks::dropout_rates(&[
             ("model.predictor.dropout", predictor.dropout),
@@ -92,9 +93,7 @@ impl DinoWmConfig {
             return invalid("no action".to_owned(), "add { name = \"action\", dim = 10 }");
         }
         for (index, column) in self.columns.iter().enumerate() {
-            if column.dim == 0 {
-                return invalid(format!("'{}' has no features", column.name), "give at least 1");
-            }
+            check_sizes(&[("model.columns.dim", column.dim, 1, limits::FEATURES)])?;
             if self.columns[..index].iter().any(|other| other.name == column.name) {
                 return invalid(format!("'{}' is listed twice", column.name), "list it once");
             }

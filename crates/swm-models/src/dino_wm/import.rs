@@ -4,8 +4,8 @@ use super::config::{ACTION, ColumnConfig, DinoWmConfig};
 use super::model::DinoWm;
 use super::predictor::FramePredictorConfig;
 use crate::checkpoint::Checkpoint;
-use crate::nn::BackboneConfig;
 use crate::nn::parameters::{self, HostTensor, Named};
+use crate::nn::{BackboneConfig, Init};
 use crate::pixels::ImageNormalization;
 use crate::train::{DatasetInfo, TrainConfig};
 use crate::weights::keys::InOrder;
@@ -15,7 +15,7 @@ use burn::tensor::Device;
 use serde::Serialize;
 use serde_json::{Value, json};
 use std::path::Path;
-use swm_core::{Error, Key, Manifest, Result};
+use swm_core::{Error, Manifest, Result};
 
 const MODULES: &str = "stable_worldmodel.wm.prejepa.module";
 const CLASS: &str = "stable_worldmodel.wm.PreJEPA";
@@ -41,6 +41,49 @@ pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<DinoW
     let dino = reference.dinov2("backbone.")?;
 
     let size = |path: &str| reference.size(path);
+    let Columns { columns, widths, frameskip } = columns(&reference, &dataset_info)?;
+    let (mean, std) = ImageNormalization::IMAGENET;
+    let sizes = DinoWmConfig {
+        image: size("predictor.num_patches")?.isqrt().saturating_mul(dino.patch),
+        pixel_mean: mean,
+        pixel_std: std,
+        weights: String::new(),
+        encoder: BackboneConfig::Dinov2(dino),
+        columns,
+        predictor: FramePredictorConfig {
+            history: size("predictor.num_frames")?,
+            depth: size("predictor.depth")?,
+            heads: size("predictor.heads")?,
+            dim_head: reference.size_or("predictor.dim_head", Some(64))?,
+            mlp: size("predictor.mlp_dim")?,
+            dropout: reference.rate("predictor.dropout"),
+            emb_dropout: reference.rate("predictor.emb_dropout"),
+        },
+        decoder: 0,
+    };
+    sizes.check()?;
+    let init = Init::for_weights(&reference.weights, &Device::flex());
+    let model = DinoWm::init(&sizes, &widths, &init);
+    init.check()?;
+    let model = weights::fill(model, &reference.weights, &reference.path, "config.json")?;
+    let mut config = TrainConfig::<DinoWm>::load("paper", &[])?;
+    config.data.num_steps = sizes.predictor.history + 1;
+    config.data.frameskip = frameskip;
+    config.model = sizes;
+    config.check()?;
+    let manifest = Manifest::new("import", 0, json!({ "from": from.display().to_string() }));
+    Ok(Checkpoint { model, config, dataset_info, manifest })
+}
+
+/// The columns of a checkpoint, their element counts, and the number of environment steps in a model step.
+struct Columns {
+    columns: Vec<ColumnConfig>,
+    widths: Vec<usize>,
+    frameskip: usize,
+}
+
+/// Reads the columns in the order of the checkpoint, and compares them with the dataset.
+fn columns(reference: &Reference, dataset_info: &DatasetInfo) -> Result<Columns> {
     let (mut columns, mut widths, mut frameskip) = (vec![], vec![], 1);
     let listed = reference.keys.at("extra_encoders.modules").map_or(&[][..], |keys| &keys.0);
     for name in listed.iter().map(|(name, _)| name.clone()) {
@@ -63,34 +106,7 @@ pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<DinoW
         columns.push(ColumnConfig { name, dim });
         widths.push(given);
     }
-    let (mean, std) = ImageNormalization::IMAGENET;
-    let sizes = DinoWmConfig {
-        image: size("predictor.num_patches")?.isqrt() * dino.patch,
-        pixel_mean: mean,
-        pixel_std: std,
-        weights: String::new(),
-        encoder: BackboneConfig::Dinov2(dino),
-        columns,
-        predictor: FramePredictorConfig {
-            history: size("predictor.num_frames")?,
-            depth: size("predictor.depth")?,
-            heads: size("predictor.heads")?,
-            dim_head: reference.size_or("predictor.dim_head", Some(64))?,
-            mlp: size("predictor.mlp_dim")?,
-            dropout: reference.rate("predictor.dropout"),
-            emb_dropout: reference.rate("predictor.emb_dropout"),
-        },
-        decoder: 0,
-    };
-    let model = DinoWm::init(&sizes, &widths, Key::new(0), &Device::flex());
-    let model = weights::fill(model, &reference.weights, &reference.path, "config.json")?;
-    let mut config = TrainConfig::<DinoWm>::load("paper", &[])?;
-    config.data.num_steps = sizes.predictor.history + 1;
-    config.data.frameskip = frameskip;
-    config.model = sizes;
-    config.check()?;
-    let manifest = Manifest::new("import", 0, json!({ "from": from.display().to_string() }));
-    Ok(Checkpoint { model, config, dataset_info, manifest })
+    Ok(Columns { columns, widths, frameskip })
 }
 
 /// Writes the `weights.pt` and `config.json` that `load_pretrained` of the reference implementation reads.

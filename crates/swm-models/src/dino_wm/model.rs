@@ -6,9 +6,8 @@ use super::predictor::FramePredictor;
 use crate::nn::mlp::PointwiseConv;
 use crate::nn::{Activation, Backbone, DropoutRng, Init, Linear, ModuleDict};
 use burn::module::Module;
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Tensor;
 use std::ops::Range;
-use swm_core::Key;
 use swm_core::columns::PIXELS;
 
 /// The network of a DINO-WM, which predicts the patch features of the next frame from the patch features of earlier
@@ -75,8 +74,7 @@ impl PatchDecoder {
 impl DinoWm {
     /// Creates a model with random weights. `widths` holds the number of elements per frame of each column in
     /// `config.columns`.
-    pub fn init(config: &DinoWmConfig, widths: &[usize], key: Key, device: &Device) -> Self {
-        let init = Init::new(key, device);
+    pub fn init(config: &DinoWmConfig, widths: &[usize], init: &Init) -> Self {
         let columns = config.columns.iter().zip(widths).map(|(column, width)| {
             let init = init.of("extra_encoders").of(&column.name);
             (column.name.clone(), ColumnEncoder::new(&init, *width, column.dim))

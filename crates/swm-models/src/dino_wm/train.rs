@@ -4,7 +4,7 @@ use super::config::{ACTION, DinoWmConfig};
 use super::model::DinoWm;
 use super::step::{DinoWmStep, TrainBatch, step};
 use crate::checks;
-use crate::nn::{Backbone, Named};
+use crate::nn::{Backbone, Init, Named};
 use crate::pixels;
 use crate::train::{DatasetInfo, Preset, StepContext, StepOutput, TrainConfig, Trainable, shards};
 use crate::weights;
@@ -12,7 +12,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use swm_core::columns::PIXELS;
-use swm_core::{Batch, DType, Error, Key, Result, Schema};
+use swm_core::{Batch, DType, Error, Result, Schema};
 use swm_data::{ClipSpec, LoaderConfig};
 
 /// The loss settings of a DINO-WM, an empty table.
@@ -65,7 +65,7 @@ impl Trainable for DinoWm {
         Ok(LoaderConfig { clip, ..LoaderConfig::default() })
     }
 
-    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self> {
+    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, init: &Init) -> Result<Self> {
         let widths: Result<Vec<usize>> = config
             .model
             .columns
@@ -75,7 +75,7 @@ impl Trainable for DinoWm {
                 name => Ok(dataset_info.column(name)?.dim()),
             })
             .collect();
-        Ok(Self::init(&config.model, &widths?, key, device))
+        Ok(Self::init(&config.model, &widths?, init))
     }
 
     fn with_pretrained_weights(mut self, config: &TrainConfig<Self>, cache: &Path) -> Result<Self> {

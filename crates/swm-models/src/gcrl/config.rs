@@ -4,7 +4,7 @@ use super::transformer::{PatchGrid, TransformerConfig};
 use crate::checks;
 use crate::nn::BackboneConfig;
 use crate::pixels::ImageNormalization;
-use crate::train::at_least;
+use crate::train::{check_sizes, limits};
 use serde::{Deserialize, Serialize};
 use swm_core::{Error, Result};
 
@@ -57,12 +57,13 @@ impl GcrlConfig {
     pub fn check(&self) -> Result<()> {
         self.encoder.check("model.encoder", self.image)?;
         let TransformerConfig { depth, heads, dim_head, mlp, dropout, emb_dropout } = self.head;
-        at_least(&[
-            ("model.history", self.history, 1),
-            ("model.head.heads", heads, 1),
-            ("model.head.dim_head", dim_head, 1),
-            ("model.head.mlp", mlp, 1),
-            ("model.critic", self.critic, 1),
+        check_sizes(&[
+            ("model.head.depth", depth, 1, limits::LAYERS),
+            ("model.history", self.history, 1, limits::FRAMES),
+            ("model.head.heads", heads, 1, limits::FEATURES),
+            ("model.head.dim_head", dim_head, 1, limits::FEATURES),
+            ("model.head.mlp", mlp, 1, limits::FEATURES),
+            ("model.critic", self.critic, 1, limits::FEATURES),
         ])?;
         if depth < 3 {
             return Err(Error::config(

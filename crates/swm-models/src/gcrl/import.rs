@@ -10,15 +10,15 @@ use super::train::GoalConditioned;
 use super::transformer::TransformerConfig;
 use crate::checkpoint::Checkpoint;
 use crate::nn::parameters::{self, HostTensor, Named};
-use crate::nn::{BackboneConfig, DinoConfig, VitConfig};
+use crate::nn::{BackboneConfig, DinoConfig, Init, VitConfig};
 use crate::pixels::ImageNormalization;
-use crate::train::{DatasetInfo, TrainConfig};
+use crate::train::{DatasetInfo, TrainConfig, limits};
 use crate::weights::reference::write;
 use crate::weights::{self, Naming, names};
 use burn::tensor::Device;
 use serde_json::{Value, json};
 use std::path::Path;
-use swm_core::{Error, Key, Manifest, Result};
+use swm_core::{Error, Manifest, Result, files};
 
 const CLASS: &str = "stable_worldmodel.wm.gcrl.GCRL";
 const MODULE: &str = "stable_worldmodel.wm.gcrl.module";
@@ -40,13 +40,12 @@ where
     let path = if from.is_dir() { from.join("weights.pt") } else { from.to_owned() };
     let mut found = StoredWeights { weights: without_wrappers(weights::read(&path)?), path: &path };
     let settings = path.with_file_name("config.json");
-    let text = std::fs::read(&settings).map_err(|error| Error::io(&settings, "reading a checkpoint", error))?;
+    let text = files::read(&settings, limits::JSON_BYTES)?;
     let settings: Value = serde_json::from_slice(&text).map_err(|error| found.wrong(error.to_string()))?;
     if found.weights.keys().any(|name| name.starts_with("extra_encoders.")) {
         return Err(found.wrong("it has inputs other than images".to_owned()));
     }
     let sizes = found.sizes(&settings)?;
-    let model = |config: &TrainConfig<M>| M::new(config, &dataset_info, Key::new(0), &Device::flex());
     let action_dim = found.shape("log_stds")?[0];
     let mut config = TrainConfig::<M>::load("paper", &[])?;
     let dim = dataset_info.action.dim();
@@ -61,7 +60,9 @@ where
     config.data.num_steps = config.data.num_steps - config.model.history + sizes.history;
     config.model = GcrlConfig { weights: path.display().to_string(), ..sizes };
     config.check()?;
-    let initial = model(&config)?;
+    let init = Init::for_weights(&found.weights, &Device::flex());
+    let initial = M::new(&config, &dataset_info, &init)?;
+    init.check()?;
     let expected = parameters::shapes(&initial);
     found.weights.retain(|name, _| expected.contains_key(name) || !is_optional(name));
     let model = weights::fill(initial, &found.weights, &path, &format!("a {}", M::FAMILY))?;
@@ -141,7 +142,7 @@ impl StoredWeights<'_> {
                 depth: self.count("encoder.encoder.layer.", ".norm1.weight"),
                 heads,
                 mlp: self.axis_size(&encoder("encoder.layer.0.mlp.fc1.weight"), 0)?,
-                grid: (self.axis_size(&encoder("embeddings.position_embeddings"), 1)? - 1).isqrt(),
+                grid: self.axis_size(&encoder("embeddings.position_embeddings"), 1)?.saturating_sub(1).isqrt(),
                 registers: self.axis_size(&encoder("embeddings.register_tokens"), 1).unwrap_or(0),
             })
         } else {
@@ -163,7 +164,7 @@ impl StoredWeights<'_> {
         let (pixel_mean, pixel_std) = ImageNormalization::IMAGENET;
         let critic = self.axis_size("critic_predictor.student.q_head.0.bias", 0).unwrap_or(256);
         Ok(GcrlConfig {
-            image: patches.isqrt() * patch,
+            image: patches.isqrt().saturating_mul(patch),
             pixel_mean,
             pixel_std,
             history: self.axis_size(&policy("pos_embedding"), 1)? / patches.max(1),

@@ -6,8 +6,7 @@ use super::heads::{Critic, Head};
 use super::transformer::Pool;
 use crate::nn::{Backbone, Init, parameters};
 use burn::module::{Module, Param};
-use burn::tensor::{Device, Tensor};
-use swm_core::Key;
+use burn::tensor::Tensor;
 
 /// The networks of goal-conditioned behavioural cloning (GCBC).
 #[derive(Module, Debug)]
@@ -83,8 +82,8 @@ struct Builder<'a> {
 }
 
 impl<'a> Builder<'a> {
-    fn new(config: &'a GcrlConfig, action_dim: usize, key: Key, device: &Device) -> Self {
-        Self { config, action_dim, init: Init::new(key, device) }
+    fn new(config: &'a GcrlConfig, action_dim: usize, init: &Init) -> Self {
+        Self { config, action_dim, init: init.clone() }
     }
 
     fn encoder(&self) -> Backbone {
@@ -115,8 +114,8 @@ impl<'a> Builder<'a> {
 
 impl Gcbc {
     /// Creates a model with random weights for actions of `action_dim` elements per model step.
-    pub fn init(config: &GcrlConfig, action_dim: usize, key: Key, device: &Device) -> Self {
-        let builder = Builder::new(config, action_dim, key, device);
+    pub fn init(config: &GcrlConfig, action_dim: usize, init: &Init) -> Self {
+        let builder = Builder::new(config, action_dim, init);
         Self {
             encoder: builder.encoder(),
             action_predictor: builder.policy(),
@@ -128,8 +127,8 @@ impl Gcbc {
 
 impl Gcivl {
     /// Creates a model with random weights, as [`Gcbc::init`].
-    pub fn init(config: &GcrlConfig, action_dim: usize, key: Key, device: &Device) -> Self {
-        let builder = Builder::new(config, action_dim, key, device);
+    pub fn init(config: &GcrlConfig, action_dim: usize, init: &Init) -> Self {
+        let builder = Builder::new(config, action_dim, init);
         Self {
             encoder: builder.encoder(),
             action_predictor: builder.policy(),
@@ -142,8 +141,8 @@ impl Gcivl {
 
 impl Gciql {
     /// Creates a model with random weights, as [`Gcbc::init`].
-    pub fn init(config: &GcrlConfig, action_dim: usize, key: Key, device: &Device) -> Self {
-        let builder = Builder::new(config, action_dim, key, device);
+    pub fn init(config: &GcrlConfig, action_dim: usize, init: &Init) -> Self {
+        let builder = Builder::new(config, action_dim, init);
         Self {
             encoder: builder.encoder(),
             action_predictor: builder.policy(),

@@ -6,14 +6,14 @@ use super::model::{Gcbc, Gciql, Gcivl};
 use super::policy::Actor;
 use super::step::{Clips, Relabelled};
 use crate::checkpoint::Checkpoint;
-use crate::nn::{Backbone, DropoutRng, Named, parameters};
+use crate::nn::{Backbone, DropoutRng, Init, Named, parameters};
 use crate::train::{DatasetInfo, ParameterGroup, Preset, StepContext, StepOutput, TrainConfig, Trainable, shards};
 use crate::{pixels, weights};
 use burn::tensor::{Device, Tensor, TensorData};
 use std::ops::Range;
 use std::path::Path;
 use swm_core::columns::{ACTION, PIXELS};
-use swm_core::{Batch, Error, Key, Result, Schema};
+use swm_core::{Batch, Error, Result, Schema};
 use swm_data::{ClipSpec, GoalMixture, GoalSpec, LoaderConfig};
 
 /// Prefixes of the goals' columns in a batch: `goal_pixels`, `policy_goal_pixels`.
@@ -86,8 +86,8 @@ impl Trainable for Gcbc {
         })
     }
 
-    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self> {
-        Ok(Self::init(&config.model, config.data.frameskip * dataset_info.action.dim(), key, device))
+    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, init: &Init) -> Result<Self> {
+        Ok(Self::init(&config.model, config.data.frameskip * dataset_info.action.dim(), init))
     }
 
     fn with_pretrained_weights(mut self, config: &TrainConfig<Self>, cache: &Path) -> Result<Self> {
@@ -146,8 +146,8 @@ macro_rules! value_learner {
                 })
             }
 
-            fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self> {
-                Ok(Self::init(&config.model, config.data.frameskip * dataset_info.action.dim(), key, device))
+            fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, init: &Init) -> Result<Self> {
+                Ok(Self::init(&config.model, config.data.frameskip * dataset_info.action.dim(), init))
             }
 
             fn with_pretrained_weights(mut self, config: &TrainConfig<Self>, cache: &Path) -> Result<Self> {

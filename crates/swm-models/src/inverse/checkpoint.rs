@@ -6,9 +6,10 @@ use super::InverseConfig;
 use crate::checkpoint::{self, Checkpoint};
 use crate::lewm::Lewm;
 use crate::nn::{Init, Mlp, parameters};
+use crate::run_folder::{WEIGHTS, WORLD_MODEL};
 use burn::tensor::Device;
 use std::path::Path;
-use swm_core::{Key, Manifest, Result};
+use swm_core::{Manifest, Result};
 
 /// A trained inverse-dynamics policy.
 #[derive(Clone, Debug)]
@@ -27,7 +28,6 @@ pub struct InverseCheckpoint {
 
 /// The family id of inverse dynamics.
 pub(super) const FAMILY: &str = "inverse";
-const WORLD_MODEL: &str = "world";
 
 impl InverseCheckpoint {
     /// Returns the hash of the network's weights.
@@ -55,13 +55,11 @@ impl InverseCheckpoint {
         let stored = checkpoint::StoredCheckpoint::<InverseConfig>::read(run, FAMILY)?;
         let world_model = Checkpoint::<Lewm>::load(&run.join(WORLD_MODEL), device)?;
         let config = stored.config;
+        config.check()?;
         let (latent, action_dim) = (world_model.config.model.latent, world_model.action_dim());
-        let model = Mlp::new(&Init::new(Key::new(0), device), 2 * latent, config.hidden, action_dim);
-        let model = checkpoint::load_weights(
-            model,
-            &stored.folder.join("weights.safetensors"),
-            stored.manifest.hashes.get("weights"),
-        )?;
+        let path = stored.folder.join(WEIGHTS);
+        let create = |init: &Init| Ok(Mlp::new(init, 2 * latent, config.hidden, action_dim));
+        let model = checkpoint::load_weights(create, &path, stored.manifest.hashes.get("weights"), device)?;
         Ok(Self { world_model, model, config, manifest: stored.manifest })
     }
 }

@@ -6,7 +6,9 @@ use crate::checkpoint::Checkpoint;
 use crate::lewm::{Lewm, pixels};
 use crate::nn::parameters::{self, IntoF32};
 use crate::nn::{Init, Mlp};
-use crate::train::{AdamW, OptimConfig, ParameterGroup, ScheduleConfig, TrainSummary, log, presets};
+use crate::train::{
+    AdamW, OptimConfig, ParameterGroup, ScheduleConfig, TrainSummary, check_finite, check_sizes, limits, log, presets,
+};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::Rng as _;
@@ -53,17 +55,28 @@ impl InverseConfig {
     /// When a key is unknown (the error names the nearest known key), or a value is invalid.
     pub fn load(settings: &[String]) -> Result<Self> {
         let config: Self = presets::parse(Self::PRESET, settings, &[Self::PRESET])?;
-        let least = [
-            ("offset", config.offset),
-            ("hidden", config.hidden),
-            ("batch_size", config.batch_size),
-            ("log_every", config.log_every),
-            ("schedule.steps", config.schedule.steps),
-        ];
-        match least.into_iter().find(|&(_, value)| value == 0) {
-            Some((what, _)) => Err(Error::config(what, "0", "give at least 1")),
-            None => Ok(config),
+        config.check()?;
+        Ok(config)
+    }
+
+    /// Checks the ranges of the settings.
+    ///
+    /// # Errors
+    /// When a setting is out of range; the error names the first such setting.
+    pub fn check(&self) -> Result<()> {
+        check_finite(self)?;
+        let OptimConfig { accumulate, ema, .. } = self.optim;
+        if (accumulate, ema) != (1, 0.0) {
+            let given = format!("accumulate={accumulate}, ema={ema}");
+            return Err(Error::config("optim", given, "give 1 and 0: this training has neither"));
         }
+        check_sizes(&[
+            ("offset", self.offset, 1, limits::FRAMES),
+            ("hidden", self.hidden, 1, limits::FEATURES),
+            ("batch_size", self.batch_size, 1, limits::BATCH),
+            ("log_every", self.log_every, 1, limits::STEPS),
+            ("schedule.steps", self.schedule.steps, 1, limits::STEPS),
+        ])
     }
 
     /// Returns the configuration as TOML.
@@ -114,7 +127,9 @@ fn run(
     let mut log = log::Log::new(out, false)?;
     let loader = loader(config, world_model.config.data.frameskip, reader)?;
     let (latent, action_dim) = (world_model.config.model.latent, world_model.action_dim());
-    let mut model = Mlp::new(&Init::new(key.with("init"), &Device::flex()), 2 * latent, config.hidden, action_dim);
+    let init = Init::new(key.with("init"), &Device::flex());
+    let mut model = Mlp::new(&init, 2 * latent, config.hidden, action_dim);
+    init.check()?;
     let mut optimizer = AdamW::new(config.optim.clone());
     let (mut step, mut epoch, mut loss) = (0, 0, f64::NAN);
     let (mut waited, mut clips_per_second) = (0.0, 0.0);

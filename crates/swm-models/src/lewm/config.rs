@@ -3,7 +3,7 @@
 use crate::checks;
 pub use crate::nn::BackboneConfig as EncoderConfig;
 use crate::nn::PredictorConfig;
-use crate::train::at_least;
+use crate::train::{check_sizes, limits};
 use serde::{Deserialize, Serialize};
 use swm_core::Result;
 
@@ -37,16 +37,17 @@ impl LewmConfig {
     /// When a setting is invalid; the error names the first invalid setting.
     pub fn check(&self) -> Result<()> {
         let predictor = &self.predictor;
-        at_least(&[
-            ("model.image", self.image, 1),
-            ("model.latent", self.latent, 1),
-            ("model.projector", self.projector, 1),
-            ("model.predictor.history", predictor.history, 1),
-            ("model.predictor.dim", predictor.dim, 1),
-            ("model.predictor.depth", predictor.depth, 1),
-            ("model.predictor.heads", predictor.heads, 1),
-            ("model.predictor.dim_head", predictor.dim_head, 1),
-            ("model.predictor.mlp", predictor.mlp, 1),
+        check_sizes(&[
+            ("model.image", self.image, 1, limits::SIDE),
+            ("model.latent", self.latent, 1, limits::FEATURES),
+            ("model.smoothed", self.smoothed, 0, limits::FEATURES),
+            ("model.projector", self.projector, 1, limits::FEATURES),
+            ("model.predictor.history", predictor.history, 1, limits::FRAMES),
+            ("model.predictor.dim", predictor.dim, 1, limits::FEATURES),
+            ("model.predictor.depth", predictor.depth, 1, limits::LAYERS),
+            ("model.predictor.heads", predictor.heads, 1, limits::FEATURES),
+            ("model.predictor.dim_head", predictor.dim_head, 1, limits::FEATURES),
+            ("model.predictor.mlp", predictor.mlp, 1, limits::FEATURES),
         ])?;
         checks::dropout_rates(&[
             ("model.predictor.dropout", predictor.dropout),

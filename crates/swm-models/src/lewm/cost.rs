@@ -193,7 +193,7 @@ impl CostModel for LewmCost {
 mod tests {
     use super::*;
     use crate::TrainConfig;
-    use crate::nn::parameters;
+    use crate::nn::{Init, parameters};
     use swm_core::{ColumnSpec, Key, Schema};
 
     #[test]
@@ -201,7 +201,7 @@ mod tests {
         let config =
             TrainConfig::<Lewm>::load("tiny", &["model.predictor.history=3".to_owned()]).expect("loading the preset");
         let (samples, horizon, dim) = (5, 5, 4);
-        let model = Lewm::init(&config.model, dim, Key::new(0), &Device::flex());
+        let model = Lewm::init(&config.model, dim, &Init::new(Key::new(0), &Device::flex()));
         // Modulations are zero-initialised, and actions have no effect through zero modulations.
         let mut values = parameters::values(&model);
         for (_, tensor) in values.iter_mut().filter(|(name, _)| name.contains("adaLN")) {

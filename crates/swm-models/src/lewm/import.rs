@@ -4,15 +4,15 @@ use super::config::{EncoderConfig, LewmConfig};
 use super::model::Lewm;
 use crate::checkpoint::Checkpoint;
 use crate::nn::parameters::{self, HostTensor, Named};
-use crate::nn::{PredictorConfig, VitConfig};
+use crate::nn::{Init, PredictorConfig, VitConfig};
 use crate::pixels::ImageNormalization;
-use crate::train::{DatasetInfo, TrainConfig};
+use crate::train::{DatasetInfo, TrainConfig, check_sizes, limits};
 use crate::weights::reference::{Reference, write};
 use crate::weights::{self, BATCHES_TRACKED, Naming, names};
 use burn::tensor::Device;
 use serde_json::{Value, json};
 use std::path::Path;
-use swm_core::{Error, Key, Manifest, Result};
+use swm_core::{Error, Manifest, Result};
 
 /// The Python module with the building blocks of the reference implementation's LeWM.
 const MODULES: &str = "stable_worldmodel.wm.lewm.module";
@@ -90,7 +90,11 @@ pub(crate) fn world_model(mut reference: Reference, dataset_info: &DatasetInfo) 
             format!("a divisor of {action_dim}, the action elements of a model step"),
         ));
     }
-    let model = Lewm::init(&config, action_dim, Key::new(0), &Device::flex());
+    config.check()?;
+    let init = Init::for_weights(&reference.weights, &Device::flex());
+    check_sizes(&[("action_encoder.input_dim", action_dim, 1, limits::FEATURES)])?;
+    let model = Lewm::init(&config, action_dim, &init);
+    init.check()?;
     let model = weights::fill(model, &reference.weights, &reference.path, "config.json")?;
     Ok((model, config, action_dim / dim))
 }

@@ -5,7 +5,6 @@ pub use crate::nn::Backbone as Encoder;
 use crate::nn::{BatchStatistics, DropoutRng, Embedder, Init, Predictor, Projector};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
-use swm_core::Key;
 
 /// The networks of a LeWM, which encode images to latents and predict the next latents from latents and actions.
 #[derive(Module, Debug)]
@@ -24,8 +23,7 @@ pub struct Lewm {
 
 impl Lewm {
     /// Creates a model with random weights for actions of `action_dim` elements per model step.
-    pub fn init(config: &LewmConfig, action_dim: usize, key: Key, device: &Device) -> Self {
-        let init = Init::new(key, device);
+    pub fn init(config: &LewmConfig, action_dim: usize, init: &Init) -> Self {
         let features = config.encoder.dim();
         let project = |name| Projector::new(&init.of(name), features, config.projector, config.latent);
         let smoothed = if config.smoothed == 0 { action_dim } else { config.smoothed };

@@ -3,11 +3,13 @@
 use super::step::{self, LewmStep, SigregConfig, TrainBatch};
 use super::{Lewm, LewmConfig, loss, pixels};
 use crate::checks;
-use crate::nn::{BatchStatistics, Named};
-use crate::train::{DataConfig, DatasetInfo, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least};
+use crate::nn::{BatchStatistics, Init, Named};
+use crate::train::{
+    DataConfig, DatasetInfo, Preset, StepContext, StepOutput, TrainConfig, Trainable, check_sizes, limits,
+};
 use burn::tensor::{Device, Tensor};
 use swm_core::columns::{ACTION, PIXELS};
-use swm_core::{Batch, Key, Result, Schema};
+use swm_core::{Batch, Result, Schema};
 use swm_data::{ClipSpec, LoaderConfig};
 
 impl Trainable for Lewm {
@@ -30,7 +32,10 @@ impl Trainable for Lewm {
 
     fn check(config: &TrainConfig<Self>) -> Result<()> {
         check(&config.model, &config.data)?;
-        at_least(&[("loss.directions", config.loss.directions, 1), ("loss.knots", config.loss.knots, 2)])
+        check_sizes(&[
+            ("loss.directions", config.loss.directions, 1, limits::FEATURES),
+            ("loss.knots", config.loss.knots, 2, limits::FEATURES),
+        ])
     }
 
     fn image_size(config: &LewmConfig) -> Option<usize> {
@@ -41,8 +46,8 @@ impl Trainable for Lewm {
         loader_config(&config.model, &config.data, schema)
     }
 
-    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self> {
-        Ok(Self::init(&config.model, config.data.frameskip * dataset_info.action.dim(), key, device))
+    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, init: &Init) -> Result<Self> {
+        Ok(Self::init(&config.model, config.data.frameskip * dataset_info.action.dim(), init))
     }
 
     fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {

@@ -1,6 +1,7 @@
 //! [`Backbone`]: an image encoder of one of three kinds.
 
 use super::{Dino, DinoConfig, Init, PatchCnn, PatchCnnConfig, Vit, VitConfig};
+use crate::train::{check_sizes, limits};
 use burn::module::Module;
 use burn::tensor::Tensor;
 use serde::{Deserialize, Serialize};
@@ -69,8 +70,9 @@ impl BackboneConfig {
     pub fn check(&self, at: &str, image: usize) -> Result<()> {
         let invalid = |what: &str, problem: String, fix: &str| Err(Error::config(format!("{at}.{what}"), problem, fix));
         let transformer = |name: &str, sizes: [(&str, usize); 5], dim: usize, heads: usize| {
-            if let Some((what, _)) = sizes.iter().find(|(_, size)| *size == 0) {
-                return invalid(&format!("{name}.{what}"), "0".to_owned(), "give at least 1");
+            for (what, size) in sizes {
+                let most = if what == "depth" { limits::LAYERS } else { limits::FEATURES };
+                check_sizes(&[(&format!("{at}.{name}.{what}"), size, 1, most)])?;
             }
             if !dim.is_multiple_of(heads) {
                 let problem = format!("{dim} features do not split into {heads} heads");
@@ -84,24 +86,27 @@ impl BackboneConfig {
                 transformer("vit", sizes, *dim, *heads)?;
                 vec![*patch]
             }
-            Self::Dinov2(DinoConfig { patch, dim, depth, heads, mlp, grid, .. }) => {
+            Self::Dinov2(DinoConfig { patch, dim, depth, heads, mlp, grid, registers }) => {
                 let sizes = [("patch", *patch), ("dim", *dim), ("depth", *depth), ("heads", *heads), ("mlp", *mlp)];
                 transformer("dinov2", sizes, *dim, *heads)?;
-                if *grid == 0 {
-                    return invalid("dinov2.grid", "0".to_owned(), "give at least 1");
-                }
+                check_sizes(&[
+                    (&format!("{at}.dinov2.grid"), *grid, 1, limits::SIDE),
+                    (&format!("{at}.dinov2.registers"), *registers, 0, limits::LAYERS),
+                ])?;
                 vec![*patch]
             }
             Self::PatchCnn(cnn) => {
-                if cnn.hidden == 0 || cnn.dim == 0 || cnn.stages.iter().any(|stage| stage.channels == 0) {
-                    return invalid("pyramid", "a size is 0".to_owned(), "give at least 1");
-                }
                 if cnn.stages.is_empty() {
                     return invalid("pyramid.stages", "none".to_owned(), "give at least one");
+                }
+                let channels = cnn.stages.iter().map(|stage| ("stages.channels", stage.channels));
+                for (what, size) in [("hidden", cnn.hidden), ("dim", cnn.dim)].into_iter().chain(channels) {
+                    check_sizes(&[(&format!("{at}.pyramid.{what}"), size, 1, limits::FEATURES)])?;
                 }
                 cnn.stages.iter().map(|stage| stage.patch).collect()
             }
         };
+        check_sizes(&[("model.image", image, 1, limits::SIDE)])?;
         let mut side = image;
         for patch in patches {
             if patch == 0 || !side.is_multiple_of(patch) || side == 0 {

@@ -1,7 +1,7 @@
 //! [`OnlineConfig`]: the settings of online training.
 
 use super::planner_config::PlannerConfig;
-use crate::train::at_least;
+use crate::train::{check_sizes, limits};
 use serde::{Deserialize, Serialize};
 use swm_core::Result;
 
@@ -37,12 +37,12 @@ impl OnlineConfig {
     /// # Errors
     /// When a setting is out of range; the error names the first invalid setting.
     pub fn check(&self) -> Result<()> {
-        at_least(&[
-            ("online.envs", self.envs, 1),
-            ("online.updates", self.updates, 1),
-            ("online.part", self.segment, 1),
-            ("online.capacity", self.capacity, self.segment + 1),
-            ("online.evaluate_episodes", self.evaluate_episodes, 1),
+        check_sizes(&[
+            ("online.envs", self.envs, 1, limits::ENVS),
+            ("online.updates", self.updates, 1, limits::BATCH),
+            ("online.part", self.segment, 1, limits::STEPS),
+            ("online.capacity", self.capacity, self.segment.saturating_add(1), limits::STEPS),
+            ("online.evaluate_episodes", self.evaluate_episodes, 1, limits::BATCH),
         ])?;
         self.planner.as_ref().map_or(Ok(()), PlannerConfig::check)
     }

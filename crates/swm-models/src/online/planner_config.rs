@@ -1,6 +1,6 @@
 //! [`PlannerConfig`]: the settings of a planner that selects actions during online training.
 
-use crate::train::at_least;
+use crate::train::{check_sizes, limits};
 use serde::{Deserialize, Serialize};
 use swm_core::{Error, Result};
 
@@ -32,11 +32,11 @@ impl PlannerConfig {
     /// # Errors
     /// When a setting is out of range; the error names the first invalid setting.
     pub fn check(&self) -> Result<()> {
-        at_least(&[
-            ("online.planner.horizon", self.horizon, 1),
-            ("online.planner.samples", self.samples, 1),
-            ("online.planner.iterations", self.iterations, 1),
-            ("online.planner.elites", self.elites, 1),
+        check_sizes(&[
+            ("online.planner.horizon", self.horizon, 1, limits::FRAMES),
+            ("online.planner.samples", self.samples, 1, limits::BATCH),
+            ("online.planner.iterations", self.iterations, 1, limits::BATCH),
+            ("online.planner.elites", self.elites, 1, limits::BATCH),
         ])?;
         for (name, count) in [("elites", self.elites), ("proposals", self.proposals)] {
             if count > self.samples {

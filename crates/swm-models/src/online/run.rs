@@ -413,9 +413,12 @@ fn saved_data(out: &Path, step: usize) -> PathBuf {
     out.join(format!("{PLAYED}{step}"))
 }
 
+/// The limit of the size of the file with the running episodes, in bytes.
+const LARGEST_STATE: u64 = 1 << 30;
+
 fn read_collector(folder: &Path) -> Result<CollectorState> {
     let path = folder.join(COLLECTOR);
-    let text = std::fs::read(&path).map_err(|error| Error::io(&path, "reading the state of the episodes", error))?;
+    let text = files::read(&path, LARGEST_STATE)?;
     serde_json::from_slice(&text)
         .map_err(|error| Error::corrupt(&path, error.to_string(), "train again from the beginning"))
 }

@@ -3,8 +3,7 @@
 use crate::lewm::{Lewm, LewmConfig};
 use crate::nn::{Activation, Init, LayerNorm, Linear};
 use burn::module::Module;
-use burn::tensor::{Device, Tensor};
-use swm_core::Key;
+use burn::tensor::Tensor;
 
 /// The networks of a PLDM. Planning uses the world model only; the inverse dynamics are part of the loss.
 #[derive(Module, Debug)]
@@ -39,10 +38,9 @@ const EPSILON: f64 = 1e-5;
 impl Pldm {
     /// Creates a model with random weights. A model step has an action of dimension `action_dim`; the inverse dynamics
     /// have `hidden` hidden features.
-    pub fn init(config: &LewmConfig, action_dim: usize, hidden: usize, key: Key, device: &Device) -> Self {
-        let init = Init::new(key, device).of("idm");
-        let model = Lewm::init(config, action_dim, key, device);
-        Self { model, idm: Idm::new(&init, config.latent, hidden, action_dim) }
+    pub fn init(config: &LewmConfig, action_dim: usize, hidden: usize, init: &Init) -> Self {
+        let model = Lewm::init(config, action_dim, init);
+        Self { model, idm: Idm::new(&init.of("idm"), config.latent, hidden, action_dim) }
     }
 }
 

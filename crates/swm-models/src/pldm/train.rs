@@ -4,10 +4,10 @@ use super::loss::PldmLoss;
 use super::model::Pldm;
 use super::step::{PldmStep, step};
 use crate::lewm::{LewmConfig, train as lewm};
-use crate::nn::Named;
-use crate::train::{DatasetInfo, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least};
-use burn::tensor::{Device, Tensor};
-use swm_core::{Batch, Error, Key, Result, Schema};
+use crate::nn::{Init, Named};
+use crate::train::{DatasetInfo, Preset, StepContext, StepOutput, TrainConfig, Trainable, check_sizes, limits};
+use burn::tensor::Tensor;
+use swm_core::{Batch, Error, Result, Schema};
 use swm_data::LoaderConfig;
 
 impl Trainable for Pldm {
@@ -31,7 +31,10 @@ impl Trainable for Pldm {
 
     fn check(config: &TrainConfig<Self>) -> Result<()> {
         lewm::check(&config.model, &config.data)?;
-        at_least(&[("model.latent", config.model.latent, 2), ("loss.idm_hidden", config.loss.idm_hidden, 1)])?;
+        check_sizes(&[
+            ("model.latent", config.model.latent, 2, limits::FEATURES),
+            ("loss.idm_hidden", config.loss.idm_hidden, 1, limits::FEATURES),
+        ])?;
         if config.loss.temp_straight != 0.0 && config.data.num_steps < 3 {
             return Err(Error::config(
                 "loss.temp_straight",
@@ -50,9 +53,9 @@ impl Trainable for Pldm {
         lewm::loader_config(&config.model, &config.data, schema)
     }
 
-    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self> {
+    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, init: &Init) -> Result<Self> {
         let action_dim = config.data.frameskip * dataset_info.action.dim();
-        Ok(Self::init(&config.model, action_dim, config.loss.idm_hidden, key, device))
+        Ok(Self::init(&config.model, action_dim, config.loss.idm_hidden, init))
     }
 
     fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {

@@ -5,7 +5,7 @@ use super::scale::Scale;
 use super::{ImageEncoder, samples};
 use crate::nn::parameters::{self, IntoF32};
 use crate::nn::{Activation, Init, Linear};
-use crate::train::{StepOutput, at_least, shards};
+use crate::train::{StepOutput, check_sizes, limits, shards};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
@@ -138,16 +138,16 @@ pub fn reconstruct_images(
     reader: &dyn Reader,
     config: &ReconstructionConfig,
 ) -> Result<(ReconstructionReport, RgbImage)> {
-    at_least(&[
-        ("frames", config.frames, 2),
-        ("held_out", config.held_out, 2),
-        ("hidden", config.hidden, 1),
-        ("channels", config.channels.len(), 2),
-        ("channels", config.channels.iter().copied().min().unwrap_or(0), 1),
-        ("shards", config.shards, 1),
-        ("shown", config.shown, 1),
-        ("fit.steps", config.fit.steps, 1),
-        ("fit.batch_size", config.fit.batch_size, 1),
+    check_sizes(&[
+        ("frames", config.frames, 2, limits::BATCH),
+        ("held_out", config.held_out, 2, limits::BATCH),
+        ("hidden", config.hidden, 1, limits::FEATURES),
+        ("channels", config.channels.len(), 2, limits::FEATURES),
+        ("channels", config.channels.iter().copied().min().unwrap_or(0), 1, limits::FEATURES),
+        ("shards", config.shards, 1, limits::LAYERS),
+        ("shown", config.shown, 1, limits::BATCH),
+        ("fit.steps", config.fit.steps, 1, limits::STEPS),
+        ("fit.batch_size", config.fit.batch_size, 1, limits::BATCH),
     ])?;
     let key = Key::new(config.seed).with("probe");
     let sample = |part, count| samples::sample(encoder, reader, part, &[], true, (count, key.with("frames")));

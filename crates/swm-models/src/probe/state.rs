@@ -6,7 +6,7 @@ use super::scale::Scale;
 use super::{ImageEncoder, samples};
 use crate::nn::parameters::{self, IntoF32};
 use crate::nn::{Init, Mlp};
-use crate::train::{StepOutput, at_least};
+use crate::train::{StepOutput, check_sizes, limits};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
@@ -81,13 +81,13 @@ pub struct StateReport {
 /// When a column is missing or holds images, the images have another size than the encoder's, no episode is held out,
 /// or a setting is out of range.
 pub fn read_state(encoder: &dyn ImageEncoder, reader: &dyn Reader, config: &StateConfig) -> Result<StateReport> {
-    at_least(&[
-        ("columns", config.columns.len(), 1),
-        ("frames", config.frames, 2),
-        ("held_out", config.held_out, 2),
-        ("hidden", config.hidden, 1),
-        ("fit.steps", config.fit.steps, 1),
-        ("fit.batch_size", config.fit.batch_size, 1),
+    check_sizes(&[
+        ("columns", config.columns.len(), 1, limits::FEATURES),
+        ("frames", config.frames, 2, limits::BATCH),
+        ("held_out", config.held_out, 2, limits::BATCH),
+        ("hidden", config.hidden, 1, limits::FEATURES),
+        ("fit.steps", config.fit.steps, 1, limits::STEPS),
+        ("fit.batch_size", config.fit.batch_size, 1, limits::BATCH),
     ])?;
     let mut names = vec![];
     for name in &config.columns {

@@ -1,6 +1,6 @@
 //! [`SacConfig`] and [`SacLoss`]: the model configuration of a SAC and the settings of the losses.
 
-use crate::train::at_least;
+use crate::train::{check_sizes, limits};
 use serde::{Deserialize, Serialize};
 use swm_core::columns::PIXELS;
 use swm_core::{Error, Result};
@@ -21,7 +21,7 @@ impl SacConfig {
     /// # Errors
     /// When a setting is invalid; the error names the first invalid setting.
     pub fn check(&self) -> Result<()> {
-        at_least(&[("model.hidden", self.hidden, 1)])?;
+        check_sizes(&[("model.hidden", self.hidden, 1, limits::FEATURES)])?;
         if self.columns.is_empty() {
             return Err(Error::config("model.columns", "nothing is observed", "name a column, such as [\"state\"]"));
         }

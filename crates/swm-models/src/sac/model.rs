@@ -3,8 +3,7 @@
 use super::config::{SacConfig, SacLoss};
 use crate::nn::{Activation, Init, Linear};
 use burn::module::{Module, Param};
-use burn::tensor::{Device, Tensor};
-use swm_core::Key;
+use burn::tensor::Tensor;
 
 /// The networks of a SAC: a policy, two Q functions with target networks, and the temperature. A field `_i` of a
 /// network is element i of a `torch.nn.Sequential`.
@@ -70,15 +69,7 @@ pub struct ActionSample {
 
 impl Sac {
     /// Creates networks with random weights for observations of `inputs` elements and actions of `action_dim` elements.
-    pub fn init(
-        config: &SacConfig,
-        loss: &SacLoss,
-        inputs: usize,
-        action_dim: usize,
-        key: Key,
-        device: &Device,
-    ) -> Self {
-        let init = Init::new(key, device);
+    pub fn init(config: &SacConfig, loss: &SacLoss, inputs: usize, action_dim: usize, init: &Init) -> Self {
         let hidden = config.hidden;
         let actor = init.of("actor");
         let critic = |name: &str| {

@@ -4,10 +4,10 @@ use super::config::{SacConfig, SacLoss};
 use super::model::Sac;
 use super::step::{Transitions, step};
 use crate::nn::parameters::{self, IntoF32 as _};
-use crate::nn::{Named, normal};
+use crate::nn::{Init, Named, normal};
 use crate::online::{Agent, SharedModel, StochasticActor, StochasticPolicy};
 use crate::train::{DatasetInfo, ParameterGroup, Preset, StepContext, StepOutput, TrainConfig, Trainable};
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Tensor, TensorData};
 use swm_core::columns::{ACTION, REWARD, TERMINATED};
 use swm_core::{Batch, EnvSpec, Error, Key, Policy, Result, RowRef, Schema};
 use swm_data::{ClipSpec, LoaderConfig};
@@ -62,10 +62,10 @@ impl Trainable for Sac {
         Ok(LoaderConfig { clip, ..LoaderConfig::default() })
     }
 
-    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self> {
+    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, init: &Init) -> Result<Self> {
         let widths: Result<Vec<usize>> =
             config.model.columns.iter().map(|column| Ok(dataset_info.column(column)?.dim())).collect();
-        Ok(Self::init(&config.model, &config.loss, widths?.iter().sum(), dataset_info.action.dim(), key, device))
+        Ok(Self::init(&config.model, &config.loss, widths?.iter().sum(), dataset_info.action.dim(), init))
     }
 
     fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {

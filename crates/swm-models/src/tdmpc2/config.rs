@@ -1,7 +1,7 @@
 //! [`Tdmpc2Config`] and [`LossConfig`]: the model configuration of a TD-MPC2 and the settings of the loss.
 
 use crate::nn::Bins;
-use crate::train::at_least;
+use crate::train::{check_sizes, limits};
 use serde::{Deserialize, Serialize};
 use swm_core::columns::PIXELS;
 use swm_core::{Error, Result};
@@ -70,14 +70,16 @@ impl Tdmpc2Config {
             let fix = "name a column, such as [{ column = \"state\", latent = 64 }]";
             return Err(Error::config("model.encoding", "nothing is observed", fix));
         };
-        at_least(&[
-            ("model.encoder", self.encoder, 1),
-            ("model.hidden", self.hidden, 1),
-            ("model.simplex", self.simplex, 1),
-            ("model.bins.count", self.bins.count, 2),
-            ("model.critics", self.critics, 2),
+        check_sizes(&[
+            ("model.image", self.image, 0, limits::SIDE),
+            ("model.encoder", self.encoder, 1, limits::FEATURES),
+            ("model.hidden", self.hidden, 1, limits::FEATURES),
+            ("model.simplex", self.simplex, 1, limits::FEATURES),
+            ("model.bins.count", self.bins.count, 2, limits::FEATURES),
+            ("model.critics", self.critics, 2, limits::LAYERS),
         ])?;
         for (i, encoding) in self.encoding.iter().enumerate() {
+            check_sizes(&[("model.encoding.latent", encoding.latent, 1, limits::FEATURES)])?;
             if self.encoding[..i].iter().any(|other| other.column == encoding.column) {
                 let given = format!("'{}' is observed twice", encoding.column);
                 return Err(Error::config("model.encoding", given, "name every column once"));

@@ -5,8 +5,8 @@ use super::config::{Encoding, LossConfig, Tdmpc2Config};
 use super::model::Tdmpc2;
 use crate::Checkpoint;
 use crate::nn::parameters::{self, HostTensor};
-use crate::nn::{Bins, Named};
-use crate::train::{DatasetInfo, TrainConfig};
+use crate::nn::{Bins, Init, Named};
+use crate::train::{DatasetInfo, TrainConfig, check_sizes, limits};
 use crate::weights::reference::{Reference, write};
 use burn::tensor::Device;
 use serde::de::{Deserializer, MapAccess, Visitor};
@@ -16,7 +16,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::path::Path;
 use swm_core::columns::PIXELS;
-use swm_core::{Error, Key, Manifest, Result};
+use swm_core::{Error, Manifest, Result, files};
 
 const CLASS: &str = "stable_worldmodel.wm.tdmpc2.TDMPC2";
 
@@ -31,8 +31,8 @@ pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<Tdmpc
     let reference = Reference::open(from, "TDMPC2")?;
     let folder = if from.is_dir() { from } else { from.parent().unwrap_or(Path::new("")) };
     let path = folder.join("config.json");
-    let text = std::fs::read_to_string(&path).map_err(|error| Error::io(&path, "reading a checkpoint", error))?;
-    let published = serde_json::from_str::<Tree>(&text).map_err(|error| reference.wrong(error.to_string()))?.cfg;
+    let text = files::read(&path, limits::JSON_BYTES)?;
+    let published = serde_json::from_slice::<Tree>(&text).map_err(|error| reference.wrong(error.to_string()))?.cfg;
     if published.action_dim != dataset_info.action.dim() {
         return Err(Error::mismatch(
             "importing a checkpoint",
@@ -43,7 +43,7 @@ pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<Tdmpc
     let model = published.with(&reference.weights, &Device::flex())?;
     let mut config = TrainConfig::<Tdmpc2>::load("paper", &[])?;
     (config.model, config.loss) = (published.model(), published.loss());
-    config.data.num_steps = published.wm.horizon + 1;
+    config.data.num_steps = published.wm.horizon.saturating_add(1);
     config.check()?;
     let manifest = Manifest::new("import", 0, json!({ "from": from.display().to_string() }));
     Ok(Checkpoint { model, config, dataset_info, manifest })
@@ -252,7 +252,12 @@ impl Published {
             })
         };
         let widths: Vec<usize> = config.column_encodings().map(width).collect::<Result<_>>()?;
-        let model = Tdmpc2::init(&config, &widths, self.action_dim, Key::new(0), device);
+        let columns = widths.iter().map(|width| ("extra_dims", *width, 1, limits::FEATURES));
+        let sizes: Vec<_> = columns.chain([("action_dim", self.action_dim, 1, limits::FEATURES)]).collect();
+        check_sizes(&sizes)?;
+        let init = Init::for_weights(weights, device);
+        let model = Tdmpc2::init(&config, &widths, self.action_dim, &init);
+        init.check()?;
         let shapes = parameters::shapes(&model);
         for (name, shape) in &shapes {
             let given = weights.get(name).map(|weight| &weight.shape);

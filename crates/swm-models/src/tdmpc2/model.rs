@@ -5,7 +5,6 @@ use super::image_encoder::{self, ImageCnn};
 use crate::nn::{Dynamics, Head, Init, LayerNorm, Linear, ModuleDict, NormalizedLinear, normalized_mlp};
 use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor};
-use swm_core::Key;
 
 /// The networks of a TD-MPC2: encoders of observations, latent dynamics, rewards, Q functions and a policy.
 #[derive(Module, Debug)]
@@ -123,8 +122,7 @@ impl Gaussian {
 impl Tdmpc2 {
     /// Creates a model with random weights for actions of `action_dim` elements. `widths` holds the number of
     /// elements of each observed column other than images, in the order of the configuration.
-    pub fn init(config: &Tdmpc2Config, widths: &[usize], action_dim: usize, key: Key, device: &Device) -> Self {
-        let init = Init::new(key, device);
+    pub fn init(config: &Tdmpc2Config, widths: &[usize], action_dim: usize, init: &Init) -> Self {
         let (latent, hidden, bins) = (config.latent(), config.hidden, config.bins.count);
         let encoder = |(encoding, &width): (&super::Encoding, &usize)| {
             let init = init.of("extra_encoders").of(&encoding.column);

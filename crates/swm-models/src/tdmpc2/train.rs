@@ -5,10 +5,12 @@ use super::model::{Observation, Tdmpc2};
 use super::planner::Tdmpc2Policy;
 use super::step::{Draws, TrainBatch, step};
 use crate::nn::parameters::{self, IntoF32 as _};
-use crate::nn::{Named, normal};
+use crate::nn::{Init, Named, normal};
 use crate::online::{Agent, SharedModel, StochasticActor, StochasticPolicy};
 use crate::pixels::{self, ImageNormalization};
-use crate::train::{DatasetInfo, ParameterGroup, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least};
+use crate::train::{
+    DatasetInfo, ParameterGroup, Preset, StepContext, StepOutput, TrainConfig, Trainable, check_sizes, limits,
+};
 use burn::module::Param;
 use burn::tensor::{Device, Tensor, TensorData};
 use swm_core::columns::{ACTION, PIXELS, REWARD, TERMINATED};
@@ -38,7 +40,7 @@ impl Trainable for Tdmpc2 {
     fn check(config: &TrainConfig<Self>) -> Result<()> {
         config.model.check()?;
         config.loss.check()?;
-        at_least(&[("data.num_steps", config.data.num_steps, 2)])?;
+        check_sizes(&[("data.num_steps", config.data.num_steps, 2, limits::FRAMES)])?;
         if config.data.frameskip != 1 {
             let fix = "choose 1: rewards between two frames would be lost";
             return Err(Error::config("data.frameskip", config.data.frameskip.to_string(), fix));
@@ -61,9 +63,9 @@ impl Trainable for Tdmpc2 {
         Ok(LoaderConfig { clip, ..LoaderConfig::default() })
     }
 
-    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self> {
+    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, init: &Init) -> Result<Self> {
         let widths = config.model.column_encodings().map(|encoding| Ok(dataset_info.column(&encoding.column)?.dim()));
-        Ok(Self::init(&config.model, &widths.collect::<Result<Vec<_>>>()?, dataset_info.action.dim(), key, device))
+        Ok(Self::init(&config.model, &widths.collect::<Result<Vec<_>>>()?, dataset_info.action.dim(), init))
     }
 
     fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {

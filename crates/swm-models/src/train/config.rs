@@ -1,6 +1,6 @@
 //! [`TrainConfig`]: all settings that a training run's results depend on.
 
-use super::checks::at_least;
+use super::checks::{check_finite, check_sizes, limits};
 use super::optim::OptimConfig;
 use super::presets::{parse, preset_text};
 use super::schedule::ScheduleConfig;
@@ -83,7 +83,7 @@ pub struct DataConfig {
 
 /// Validation on held-out episodes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(default, deny_unknown_fields)]
 pub struct ValidationConfig {
     /// The number of steps between two validations; 0 disables validation.
     pub every: usize,
@@ -111,9 +111,6 @@ pub(crate) struct LoopConfig {
     pub save_every: usize,
 }
 
-/// The settings that a preset may omit, with their defaults.
-const OPTIONAL: &str = "optim.accumulate = 1\noptim.ema = 0.0\nvalidation = { every = 0, batches = 8, patience = 0 }\n";
-
 impl<M: Trainable> TrainConfig<M> {
     /// Loads a preset (its name, or the path of a TOML file), overridden by `key=value` settings with dotted keys, such
     /// as `optim.lr=3e-4`.
@@ -122,7 +119,7 @@ impl<M: Trainable> TrainConfig<M> {
     /// When there is no such preset or key (the error names the nearest), or a value has the wrong type.
     pub fn load(preset: &str, settings: &[String]) -> Result<Self> {
         let text = preset_text(M::PRESETS, preset)?;
-        let presets: Vec<&str> = M::PRESETS.iter().map(|preset| preset.toml).chain([OPTIONAL]).collect();
+        let presets: Vec<&str> = M::PRESETS.iter().map(|preset| preset.toml).collect();
         let config: Self = parse(&text, settings, &presets)?;
         config.check()?;
         Ok(config)
@@ -141,17 +138,19 @@ impl<M: Trainable> TrainConfig<M> {
     /// # Errors
     /// When a setting does not fit; the error names the first such setting.
     pub fn check(&self) -> Result<()> {
-        at_least(&[
-            ("data.num_steps", self.data.num_steps, 1),
-            ("data.frameskip", self.data.frameskip, 1),
-            ("data.batch_size", self.data.batch_size, 2),
-            ("optim.accumulate", self.optim.accumulate, 1),
-            ("schedule.steps", self.schedule.steps, 1),
-            ("validation.batches", self.validation.batches, 1),
-            ("shards", self.shards, 1),
-            ("log_every", self.log_every, 1),
+        check_sizes(&[
+            ("data.num_steps", self.data.num_steps, 1, limits::FRAMES),
+            ("data.frameskip", self.data.frameskip, 1, limits::FRAMES),
+            ("data.batch_size", self.data.batch_size, 2, limits::BATCH),
+            ("optim.accumulate", self.optim.accumulate, 1, limits::BATCH),
+            ("schedule.steps", self.schedule.steps, 1, limits::STEPS),
+            ("validation.batches", self.validation.batches, 1, limits::STEPS),
+            ("shards", self.shards, 1, limits::LAYERS),
+            ("log_every", self.log_every, 1, limits::STEPS),
         ])?;
+        check_finite(self)?;
         self.loop_config().check()?;
+        self.online.as_ref().map_or(Ok(()), OnlineConfig::check)?;
         M::check(self)
     }
 

@@ -58,6 +58,36 @@ impl ColumnInfo {
 }
 
 impl DatasetInfo {
+    /// Checks the statistics of a stored model.
+    ///
+    /// # Errors
+    /// When the number of values differs between the statistics of a column, there are none, or an action cannot be
+    /// scaled.
+    pub fn check(&self) -> Result<()> {
+        let ActionScale { mean, std } = &self.action;
+        if mean.is_empty() || mean.len() != std.len() {
+            let given = format!("{} means and {} standard deviations", mean.len(), std.len());
+            return Err(Error::config("facts.action", given, "give one of each for every action element"));
+        }
+        if !mean.iter().all(|mean| mean.is_finite()) || !std.iter().all(|std| std.is_finite() && *std > 0.0) {
+            let given = format!("means {mean:?}, standard deviations {std:?}");
+            return Err(Error::config("facts.action", given, "give finite means and positive standard deviations"));
+        }
+        for (name, column) in &self.columns {
+            let elements = column.shape.iter().try_fold(1_usize, |count, side| count.checked_mul(*side)).unwrap_or(0);
+            let counts = [&column.mean, &column.std, &column.min, &column.max].map(Vec::len);
+            if elements == 0 || counts != [elements; 4] {
+                let given = format!("shape {:?} with {counts:?} means, deviations, minima, maxima", column.shape);
+                return Err(Error::config(
+                    format!("facts.columns.{name}"),
+                    given,
+                    "give one of each for every element",
+                ));
+            }
+        }
+        Ok(())
+    }
+
     /// Computes the statistics of a dataset. `columns` names the columns that the model observes; images are
     /// skipped. Actions are standardised, or, if `bounded`, mapped from their range in the data to -1 ..= 1.
     ///

@@ -13,7 +13,7 @@ use super::step_output::StepOutput;
 use super::trainable::{StepContext, Trainable};
 use super::{metrics::Metrics, resume};
 use crate::checkpoint::{Checkpoint, TrainState};
-use crate::nn::parameters;
+use crate::nn::{Init, parameters};
 use burn::tensor::Device;
 use std::path::Path;
 use swm_core::{Batch, Key, Manifest, Result};
@@ -119,7 +119,9 @@ impl<'a, M: Trainable> Learner<'a, M> {
         manifest: Manifest,
         device: &'a Device,
     ) -> Result<Self> {
-        let model = M::new(config, &dataset_info, Key::new(config.seed).with("init"), device)?;
+        let init = Init::new(Key::new(config.seed).with("init"), device);
+        let model = M::new(config, &dataset_info, &init)?;
+        init.check()?;
         let (optimizer, state) = (AdamW::new(config.optim.clone()), RunState::default());
         Ok(Self { config, device, model, average: None, dataset_info, manifest, optimizer, state })
     }

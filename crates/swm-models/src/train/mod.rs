@@ -25,7 +25,8 @@ mod split;
 mod step_output;
 mod trainable;
 
-pub use checks::at_least;
+pub(crate) use checks::check_finite;
+pub use checks::{check_sizes, limits};
 pub use config::{DataConfig, TrainConfig, ValidationConfig};
 pub use dataset_info::{ColumnInfo, DatasetInfo};
 pub use optim::{AdamW, OptimConfig, ParameterGroup};

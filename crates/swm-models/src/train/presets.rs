@@ -1,10 +1,13 @@
 //! Configurations from presets, TOML files and `key=value` settings.
 
+use super::checks::limits;
 use figment::Figment;
 use figment::providers::{Format as _, Serialized, Toml};
+use serde::Serialize;
 use serde::de::DeserializeOwned;
+use std::collections::BTreeMap;
 use std::path::Path;
-use swm_core::{Error, Result};
+use swm_core::{Error, Result, files};
 
 /// A named configuration.
 #[derive(Debug)]
@@ -25,7 +28,8 @@ pub(crate) fn preset_text(presets: &[Preset], preset: &str) -> Result<String> {
     match presets.iter().find(|row| row.id == preset) {
         Some(row) => Ok(row.toml.to_owned()),
         None if Path::new(preset).extension().is_some_and(|end| end == "toml") => {
-            std::fs::read_to_string(preset).map_err(|error| Error::io(preset, "reading a configuration", error))
+            let text = files::read(Path::new(preset), limits::JSON_BYTES)?;
+            String::from_utf8(text).map_err(|error| Error::corrupt(preset, error.to_string(), "give a TOML file"))
         }
         None => {
             let hint = "or give the path of a .toml file";
@@ -35,12 +39,12 @@ pub(crate) fn preset_text(presets: &[Preset], preset: &str) -> Result<String> {
 }
 
 /// Parses a configuration from TOML, overridden by `key=value` settings with dotted keys. The valid keys are those of
-/// `presets`.
+/// `presets`, and those that a preset may leave out because they have a default.
 ///
 /// # Errors
 /// When there is no such key (the error names the nearest), or a value has the wrong type.
-pub(crate) fn parse<C: DeserializeOwned>(text: &str, settings: &[String], presets: &[&str]) -> Result<C> {
-    merge(text, settings, presets)?.extract().map_err(|error| {
+pub(crate) fn parse<C: DeserializeOwned + Serialize>(text: &str, settings: &[String], presets: &[&str]) -> Result<C> {
+    merge(text, settings, &known_keys::<C>(presets))?.extract().map_err(|error| {
         let key = if error.path.is_empty() { "configuration".to_owned() } else { error.path.join(".") };
         Error::config(
             key,
@@ -51,8 +55,7 @@ pub(crate) fn parse<C: DeserializeOwned>(text: &str, settings: &[String], preset
 }
 
 /// Merges the TOML and the settings, and checks the keys.
-fn merge(text: &str, settings: &[String], presets: &[&str]) -> Result<Figment> {
-    let known = known_keys(presets);
+fn merge(text: &str, settings: &[String], known: &[String]) -> Result<Figment> {
     let check = |key: &str| {
         if known.iter().any(|name| name == key || name.starts_with(&format!("{key}."))) {
             return Ok(());
@@ -67,11 +70,15 @@ fn merge(text: &str, settings: &[String], presets: &[&str]) -> Result<Figment> {
     keys.iter().try_for_each(|key| check(key))?;
 
     let mut figment = Figment::from(Toml::string(text));
+    let mut given: BTreeMap<&str, &str> = BTreeMap::new();
     for setting in settings {
         let Some((key, value)) = setting.split_once('=') else {
             return Err(Error::config(setting, "is not a setting", "write key=value, such as optim.lr=3e-4"));
         };
         check(key)?;
+        if let Some(first) = given.insert(key, setting) {
+            return Err(Error::twice(format!("setting {key}"), first, setting));
+        }
         // A value that is not valid TOML is a string.
         let value = toml::from_str::<toml::Table>(&format!("value = {value}"))
             .ok()
@@ -82,12 +89,13 @@ fn merge(text: &str, settings: &[String], presets: &[&str]) -> Result<Figment> {
     Ok(figment)
 }
 
-/// The dotted keys of all presets.
-fn known_keys(presets: &[&str]) -> Vec<String> {
+/// The dotted keys of all presets, with the settings that have defaults.
+fn known_keys<C: DeserializeOwned + Serialize>(presets: &[&str]) -> Vec<String> {
     let mut keys = vec![];
     for preset in presets {
-        if let Ok(table) = toml::from_str(preset) {
-            flatten("", &toml::Value::Table(table), &mut keys);
+        let complete = toml::from_str::<C>(preset).ok().and_then(|config| toml::Value::try_from(&config).ok());
+        if let Some(table) = complete {
+            flatten("", &table, &mut keys);
         }
     }
     keys.sort();

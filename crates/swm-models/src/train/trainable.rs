@@ -5,6 +5,7 @@ use super::dataset_info::DatasetInfo;
 use super::optim::ParameterGroup;
 use super::presets::Preset;
 use super::step_output::StepOutput;
+use crate::nn::Init;
 use crate::nn::parameters::Named;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
@@ -48,11 +49,11 @@ pub trait Trainable: Module + Sync + 'static {
     /// When the dataset lacks a column, or a column has another shape.
     fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig>;
 
-    /// Creates a model whose initial values `key` determines.
+    /// Creates a model whose initial values come from `init`.
     ///
     /// # Errors
     /// When the data do not fit the configuration.
-    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self>;
+    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, init: &Init) -> Result<Self>;
 
     /// Loads pretrained weights, such as the weights of an encoder, into a new model. `cache` is the folder for
     /// downloads.

@@ -25,7 +25,7 @@ use half::{bf16, f16};
 use pytorch_reader::{DType as Torch, PytorchError, PytorchReader};
 use safetensors::{Dtype, SafeTensors};
 use std::path::Path;
-use swm_core::{Error, Result};
+use swm_core::{Error, Result, files};
 
 /// Reads the tensors of a file in single precision; half precision is widened, integers and doubles are converted.
 ///
@@ -52,7 +52,7 @@ pub fn read(path: &Path) -> Result<Named<HostTensor>> {
 
 /// The tensors of a safetensors file.
 fn safetensors(path: &Path) -> Result<Named<HostTensor>> {
-    let bytes = std::fs::read(path).map_err(|error| Error::io(path, "reading weights", error))?;
+    let bytes = files::read(path, u64::MAX)?;
     let file = SafeTensors::deserialize(&bytes).map_err(|error| damaged(path, error.to_string()))?;
     file.iter()
         .map(|(name, view)| {
@@ -74,18 +74,27 @@ fn safetensors(path: &Path) -> Result<Named<HostTensor>> {
         .collect()
 }
 
+/// How much larger than their file the tensors of a PyTorch file may be, for tensors that share their elements.
+const LARGEST_EXPANSION: u64 = 8;
+
 /// The tensors of a file that `torch.save` wrote.
 fn pickled(path: &Path) -> Result<Named<HostTensor>> {
+    let length = files::open(path)?.metadata().map_err(|error| Error::io(path, "reading weights", error))?.len();
     let reader = PytorchReader::new(path).map_err(|error| match error {
         PytorchError::Io(error) if error.kind() != std::io::ErrorKind::InvalidData => {
             Error::io(path, "reading weights", error)
         }
         other => damaged(path, other.to_string()),
     })?;
+    // A tensor can repeat the elements of its storage, so its shape alone does not limit its size.
+    let mut left = length.saturating_mul(LARGEST_EXPANSION).saturating_add(1 << 20);
     reader
         .into_tensors()
         .into_iter()
         .map(|(name, tensor)| {
+            left = left.checked_sub(tensor.byte_len() as u64).ok_or_else(|| {
+                damaged(path, format!("its tensors are more than {LARGEST_EXPANSION} times larger than the file"))
+            })?;
             let bytes = tensor.read().map_err(|error| damaged(path, error.to_string()))?;
             Ok((name, HostTensor { shape: tensor.shape().to_vec(), values: widen(tensor.dtype(), &bytes) }))
         })

@@ -5,10 +5,11 @@ use super::keys::Keys;
 use super::{BATCHES_TRACKED, names, read, torch};
 use crate::nn::parameters::{HostTensor, Named};
 use crate::nn::{DinoConfig, VitConfig};
+use crate::train::limits;
 use serde::Serialize;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
-use swm_core::{Error, Result};
+use swm_core::{Error, Result, files};
 
 /// A checkpoint of the reference implementation.
 pub(crate) struct Reference {
@@ -39,8 +40,7 @@ impl Reference {
         let folder = if from.is_dir() { from } else { from.parent().unwrap_or(Path::new("")) };
         let path = if from.is_dir() { only_weights(folder)? } else { from.to_owned() };
         let config_path = folder.join(CONFIG);
-        let text =
-            std::fs::read(&config_path).map_err(|error| Error::io(&config_path, "reading a checkpoint", error))?;
+        let text = files::read(&config_path, limits::JSON_BYTES)?;
         let invalid = |problem: String| {
             Error::corrupt(&config_path, problem, format!("give a checkpoint of the reference's class {class}"))
         };
@@ -154,8 +154,8 @@ impl Reference {
         let [dim, _, patch, _] = *projection else {
             return Err(self.wrong("the encoder does not begin with a convolution".to_owned()));
         };
-        let mlp = of("encoder.layer.0.mlp.fc1.weight")?[0];
-        let grid = (of("embeddings.position_embeddings")?.get(1).copied().unwrap_or(1) - 1).isqrt();
+        let mlp = of("encoder.layer.0.mlp.fc1.weight")?.first().copied().unwrap_or(0);
+        let grid = of("embeddings.position_embeddings")?.get(1).map_or(0, |tokens| tokens.saturating_sub(1).isqrt());
         let registers = of("embeddings.register_tokens").map_or(0, |shape| shape.get(1).copied().unwrap_or(0));
         let layer = |name: &String| name.strip_prefix(prefix).is_some_and(|name| name.ends_with(".norm1.weight"));
         let depth = self.weights.keys().filter(|name| layer(name)).count();

@@ -1,7 +1,7 @@
 //! Configurations from presets and `key=value` settings, and errors that name the setting.
 
 use swm_models::lewm::Lewm;
-use swm_models::{TrainConfig, Trainable as _};
+use swm_models::{FAMILIES, TrainConfig, Trainable as _};
 
 type Config = TrainConfig<Lewm>;
 
@@ -28,4 +28,47 @@ fn errors_name_invalid_settings() {
     assert!(message("model.image=60").contains("patches"), "{}", message("model.image=60"));
     assert!(message("data.num_steps=1").contains("at least 2"));
     assert!(Config::load("tniy", &[]).expect_err("no such preset").to_string().contains("did you mean tiny"));
+}
+
+/// Appends the dotted keys of a table, with their values.
+fn settings(prefix: &str, table: &toml::Table, out: &mut Vec<(String, toml::Value)>) {
+    for (key, value) in table {
+        let key = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
+        match value {
+            toml::Value::Table(table) => settings(&key, table, out),
+            value => out.push((key, value.clone())),
+        }
+    }
+}
+
+#[test]
+fn every_setting_can_be_given_alone() {
+    for family in FAMILIES.rows {
+        for preset in family.presets {
+            let load = |settings: &[String]| (family.config)(preset.id, settings).and_then(|config| config.to_toml());
+            let text = load(&[]).expect("a preset");
+            let mut found = vec![];
+            settings("", &text.parse().expect("TOML"), &mut found);
+            assert!(found.len() > 10, "{}", family.id);
+            for (key, value) in found {
+                let given = format!("{key}={value}");
+                match load(std::slice::from_ref(&given)) {
+                    Ok(again) => assert_eq!(again, text, "{} {}: {given}", family.id, preset.id),
+                    Err(error) => panic!("{} {}: {given}: {error}", family.id, preset.id),
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn validation_needs_no_other_setting_of_its_table() {
+    for family in FAMILIES.rows.iter().filter(|family| !family.borrows_encoder) {
+        for setting in ["validation.every=10", "validation.batches=2"] {
+            let settings = [setting.to_owned(), "data.hold_out=true".to_owned()];
+            if let Err(error) = (family.config)(family.presets[0].id, &settings) {
+                panic!("{}: {setting}: {error}", family.id);
+            }
+        }
+    }
 }

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use swm_core::run::Control;
 use swm_core::{Batch, Candidates, ColumnSpec, CostModel, DType, Key, Manifest, Result, Schema};
 use swm_models::dino_wm::{DinoWm, DinoWmCost};
-use swm_models::nn::parameters;
+use swm_models::nn::{Init, parameters};
 use swm_models::train::DatasetInfo;
 use swm_models::{Checkpoint, TrainConfig, TrainOptions, TrainSummary, Trainable, train};
 
@@ -63,8 +63,8 @@ fn results_do_not_depend_on_threads_and_the_encoder_is_frozen() {
     let two = run(&config, &folder.path().join("2"), 2).expect("a trained model");
     assert_eq!(one.weights, two.weights);
     let loaded = Checkpoint::<DinoWm>::load(&folder.path().join("1"), &Device::flex()).expect("a checkpoint");
-    let key = Key::new(config.seed).with("init");
-    let fresh = DinoWm::new(&config, &loaded.dataset_info, key, &Device::flex()).expect("a model");
+    let init = Init::new(Key::new(config.seed).with("init"), &Device::flex());
+    let fresh = DinoWm::new(&config, &loaded.dataset_info, &init).expect("a model");
     let (before, after) = (parameters::values(&fresh), parameters::values(&loaded.model));
     for (name, value) in &before {
         assert_eq!(name.starts_with("backbone."), after[name] == *value, "{name}");
@@ -114,7 +114,7 @@ fn invalid_settings_and_data_are_refused() {
 fn checkpoint(overrides: &[&str]) -> Checkpoint<DinoWm> {
     let config = config(overrides).expect("a configuration");
     let dataset_info = dataset_info(&config);
-    let model = DinoWm::new(&config, &dataset_info, Key::new(3), &Device::flex()).expect("a model");
+    let model = DinoWm::new(&config, &dataset_info, &Init::new(Key::new(3), &Device::flex())).expect("a model");
     Checkpoint { model, config, dataset_info, manifest: Manifest::new("train", 0, serde_json::Value::Null) }
 }
 

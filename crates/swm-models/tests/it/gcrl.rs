@@ -7,7 +7,7 @@ use swm_core::run::Control;
 use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Key, Policy as _, Result, Schema, Space, VariationSpace};
 use swm_models::feed_forward::FeedForwardPolicy;
 use swm_models::gcrl::{Actor, Gcbc, Gciql, Gcivl, GcrlConfig, GoalConditioned};
-use swm_models::nn::parameters;
+use swm_models::nn::{Init, parameters};
 use swm_models::probe::{self, ImageEncoder, ReconstructionConfig, StateConfig};
 use swm_models::train::DatasetInfo;
 use swm_models::{Checkpoint, Device, TrainConfig, TrainOptions, TrainSummary, Trainable, train};
@@ -142,8 +142,8 @@ fn target_networks_lag_and_frozen_encoders_do_not_change() {
     let folder = tempfile::tempdir().expect("a folder");
     let config = config::<Gcivl>(&["loss.target=0.5"]);
     let dataset_info = DatasetInfo { action: ActionScale::identity(2), columns: Default::default(), env: None };
-    let first =
-        Gcivl::new(&config, &dataset_info, Key::new(config.seed).with("init"), &Device::flex()).expect("a model");
+    let init = Init::new(Key::new(config.seed).with("init"), &Device::flex());
+    let first = Gcivl::new(&config, &dataset_info, &init).expect("a model");
     let last = trained(&config, folder.path()).model;
     let (first, last) = (parameters::values(&first), parameters::values(&last));
     let name = "out_proj.weight";

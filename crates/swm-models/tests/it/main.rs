@@ -8,6 +8,7 @@ mod dino_wm;
 mod dots;
 mod gcrl;
 mod golden;
+mod hostile;
 mod hub;
 mod online;
 mod planning;

@@ -16,7 +16,7 @@ const DIM: usize = 4;
 
 fn checkpoint() -> Checkpoint<Lewm> {
     let config = config(&[]);
-    let model = Lewm::init(&config.model, DIM, Key::new(3), &Device::flex());
+    let model = Lewm::init(&config.model, DIM, &swm_models::nn::Init::new(Key::new(3), &Device::flex()));
     // Modulations are zero-initialised, so actions have no effect before training.
     let mut values = swm_models::nn::parameters::values(&model);
     for (name, tensor) in &mut values {

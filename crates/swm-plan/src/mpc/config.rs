@@ -34,17 +34,25 @@ impl Default for MpcConfig {
     }
 }
 
+/// The largest number of steps of a setting. Plans of more steps would not fit into memory.
+const MAX_STEPS: usize = 10_000;
+
 impl MpcConfig {
     /// Checks the settings.
     ///
     /// # Errors
-    /// When a count is 0, the receding horizon exceeds the horizon, or the latency budget is not a positive time.
+    /// When a count is 0 or above 10 000, the receding horizon exceeds the horizon, or the latency budget is not a
+    /// positive time.
     pub fn check(&self) -> Result<()> {
         let settings = Settings("MPC");
-        settings.at_least_one("horizon", self.horizon)?;
-        settings.at_least_one("receding horizon", self.receding_horizon)?;
-        settings.at_least_one("action block", self.action_block)?;
-        settings.at_least_one("history", self.history)?;
+        for (name, steps) in [
+            ("horizon", self.horizon),
+            ("receding horizon", self.receding_horizon),
+            ("action block", self.action_block),
+            ("history", self.history),
+        ] {
+            settings.check((1..=MAX_STEPS).contains(&steps), name, steps, &format!("choose 1 to {MAX_STEPS}"))?;
+        }
         settings.check(
             self.receding_horizon <= self.horizon,
             "receding horizon",

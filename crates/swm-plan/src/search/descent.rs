@@ -40,16 +40,19 @@ impl<'p> Descent<'p> {
     /// Creates `samples` candidates for each environment: the initial guess, and random candidates around the guess
     /// with the standard deviation `sigma`. `project` moves actions to the nearest allowed actions, now and after every
     /// step.
+    ///
+    /// # Errors
+    /// As [`Population::new`].
     pub fn new(
         solver: &'static str,
         problem: &PlanProblem<'p>,
         samples: usize,
         sigma: f32,
         project: impl Fn(&mut [f32]) + 'p,
-    ) -> Self {
-        let mut population = Population::around(solver, problem, samples, sigma);
+    ) -> Result<Self> {
+        let mut population = Population::around(solver, problem, samples, sigma)?;
         project(&mut population.actions);
-        Self {
+        Ok(Self {
             gradient: vec![0.0; population.actions.len()],
             trace: vec![PlanTrace::default(); problem.keys.len()],
             steps: 0,
@@ -58,7 +61,7 @@ impl<'p> Descent<'p> {
             population,
             problem: *problem,
             project: Box::new(project),
-        }
+        })
     }
 
     /// Takes up to `steps` steps; returns whether time is left before the deadline.

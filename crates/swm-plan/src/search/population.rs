@@ -6,7 +6,7 @@ use super::problem::evaluate;
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 use rayon::prelude::*;
-use swm_core::{Candidates, CostModel, Key, Plan, PlanProblem, PlanTrace, Result};
+use swm_core::{Candidates, CostModel, Error, Key, Plan, PlanProblem, PlanTrace, Result};
 
 /// Candidate action sequences of several environments, and their costs.
 pub struct Population {
@@ -21,19 +21,38 @@ pub struct Population {
     dim: usize,
 }
 
+/// The largest number of values of all candidates of one iteration: 4 GiB.
+pub const MAX_VALUES: usize = 1 << 30;
+
 impl Population {
     /// Creates a population of zeros with `samples` candidates for each environment. Draws are keyed by `solver`, so
     /// they differ from the draws of other solvers.
-    pub fn new(solver: &str, problem: &PlanProblem<'_>, samples: usize) -> Self {
+    ///
+    /// # Errors
+    /// When the candidates have more than [`MAX_VALUES`] values.
+    pub fn new(solver: &str, problem: &PlanProblem<'_>, samples: usize) -> Result<Self> {
         let keys: Vec<Key> = problem.keys.iter().map(|key| key.with(solver)).collect();
-        let (horizon, dim, count) = (problem.horizon, problem.space.dim(), keys.len() * samples);
-        Self { keys, samples, horizon, dim, actions: vec![0.0; count * horizon * dim], costs: vec![0.0; count] }
+        let (envs, horizon, dim) = (keys.len(), problem.horizon, problem.space.dim());
+        let values = [samples, horizon, dim].into_iter().try_fold(envs, usize::checked_mul);
+        let Some(values) = values.filter(|values| *values <= MAX_VALUES) else {
+            return Err(Error::config(
+                format!("candidates of {solver}"),
+                format!(
+                    "{envs} environments x {samples} samples x {horizon} steps x {dim} values do not fit into memory"
+                ),
+                "plan with fewer samples, steps or parallel environments",
+            ));
+        };
+        Ok(Self { keys, samples, horizon, dim, actions: vec![0.0; values], costs: vec![0.0; envs * samples] })
     }
 
     /// Creates a population around the initial guess: the first candidate is the guess, and every other candidate is
     /// drawn around the guess with the standard deviation `sigma` and its own key.
-    pub fn around(solver: &str, problem: &PlanProblem<'_>, samples: usize, sigma: f32) -> Self {
-        let mut population = Self::new(solver, problem, samples);
+    ///
+    /// # Errors
+    /// As [`Population::new`].
+    pub fn around(solver: &str, problem: &PlanProblem<'_>, samples: usize, sigma: f32) -> Result<Self> {
+        let mut population = Self::new(solver, problem, samples)?;
         let (len, keys) = (population.len(), &population.keys);
         population.actions.par_chunks_exact_mut(len).enumerate().for_each(|(i, candidate)| {
             let (env, sample) = (i / samples, i % samples);
@@ -44,7 +63,7 @@ impl Population {
                 add_noise(candidate, sigma, keys[env].with("start").at(sample as u64));
             }
         });
-        population
+        Ok(population)
     }
 
     /// The number of values of one candidate, `horizon * dim`.

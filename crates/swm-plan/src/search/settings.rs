@@ -2,6 +2,9 @@
 
 use swm_core::{Error, Result};
 
+/// The largest number of candidates of a solver.
+const MAX_SAMPLES: usize = 1_000_000;
+
 /// Checks the settings of one owner (a solver, a term, the policy). Error messages begin with the owner's name.
 #[derive(Clone, Copy)]
 pub struct Settings<'a>(pub &'a str);
@@ -13,6 +16,14 @@ impl Settings<'_> {
     /// When the count is 0.
     pub fn at_least_one(self, name: &str, value: usize) -> Result<()> {
         self.check(value > 0, name, value, "ask for at least 1")
+    }
+
+    /// Checks that a number of candidates is at least 1 and fits into memory.
+    ///
+    /// # Errors
+    /// When it is 0 or above a million.
+    pub fn samples(self, samples: usize) -> Result<()> {
+        self.check((1..=MAX_SAMPLES).contains(&samples), "samples", samples, &format!("choose 1 to {MAX_SAMPLES}"))
     }
 
     /// Checks that the number of elites is at least `least` and at most the number of samples.

@@ -96,7 +96,7 @@ impl Solver for AugmentedLagrangian {
         if problem.keys.is_empty() {
             return Ok(Plan::default());
         }
-        let mut descent = Descent::new(ID, &problem, self.samples, self.sigma, move |actions| bounds.clip(actions));
+        let mut descent = Descent::new(ID, &problem, self.samples, self.sigma, move |actions| bounds.clip(actions))?;
         let step = Step { optimizer: &self.optimizer, action_noise: self.action_noise };
         let mut duals = Duals::new(cost, self.samples, &problem)?;
 
@@ -120,6 +120,25 @@ impl Solver for AugmentedLagrangian {
         duals.evaluate(cost, &descent)?;
         let best = duals.record(&mut descent, self.tolerance);
         Ok(descent.population.plan(&best, descent.trace))
+    }
+
+    fn check(&self) -> Result<()> {
+        let settings = Settings(ID);
+        settings.samples(self.samples)?;
+        settings.at_least_one("outer_iterations", self.outer_iterations)?;
+        settings.at_least_one("iterations", self.iterations)?;
+        settings.not_negative("sigma", self.sigma)?;
+        settings.not_negative("action_noise", self.action_noise)?;
+        settings.not_negative("tolerance", self.tolerance)?;
+        settings.positive("penalty", self.penalty)?;
+        settings.at_least("penalty_growth", self.penalty_growth, 1.0)?;
+        settings.check(
+            self.penalty_limit.is_finite() && self.penalty_limit >= self.penalty,
+            "penalty_limit",
+            format!("{}, below the first penalty {}", self.penalty_limit, self.penalty),
+            "choose a finite number, at least the first penalty",
+        )?;
+        self.optimizer.check(ID)
     }
 }
 
@@ -215,26 +234,5 @@ impl Duals {
             trace.violation.push(violation(env * self.samples + best));
         }
         best
-    }
-}
-
-impl AugmentedLagrangian {
-    fn check(&self) -> Result<()> {
-        let settings = Settings(ID);
-        settings.at_least_one("samples", self.samples)?;
-        settings.at_least_one("outer_iterations", self.outer_iterations)?;
-        settings.at_least_one("iterations", self.iterations)?;
-        settings.not_negative("sigma", self.sigma)?;
-        settings.not_negative("action_noise", self.action_noise)?;
-        settings.not_negative("tolerance", self.tolerance)?;
-        settings.positive("penalty", self.penalty)?;
-        settings.at_least("penalty_growth", self.penalty_growth, 1.0)?;
-        settings.check(
-            self.penalty_limit.is_finite() && self.penalty_limit >= self.penalty,
-            "penalty_limit",
-            format!("{}, below the first penalty {}", self.penalty_limit, self.penalty),
-            "choose a finite number, at least the first penalty",
-        )?;
-        self.optimizer.check(ID)
     }
 }

@@ -84,7 +84,7 @@ impl Solver for CategoricalCem {
         self.check()?;
         let choices = discrete(&ENTRY, cost, &problem)?;
         let mut distributions = Categorical::initial(&problem, choices);
-        let mut population = Population::new(ID, &problem, self.samples);
+        let mut population = Population::new(ID, &problem, self.samples)?;
 
         iterate(self.iterations, &problem, |iteration| {
             population.write(iteration, |env, sample, key, candidate| match sample {
@@ -105,6 +105,15 @@ impl Solver for CategoricalCem {
         let costs = trace.iter().filter_map(|trace| trace.best.last().copied()).collect();
         Ok(Plan { actions: modes.concat(), costs, trace })
     }
+
+    fn check(&self) -> Result<()> {
+        let settings = Settings(ID);
+        settings.at_least_one("iterations", self.iterations)?;
+        settings.samples(self.samples)?;
+        settings.elites(self.elites, 1, self.samples)?;
+        settings.not_negative("smoothing", self.smoothing)?;
+        settings.momentum("momentum", self.momentum)
+    }
 }
 
 impl CategoricalCem {
@@ -119,14 +128,6 @@ impl CategoricalCem {
                 probabilities[j] = self.momentum * probabilities[j] + (1.0 - self.momentum) * smoothed;
             }
         }
-    }
-
-    fn check(&self) -> Result<()> {
-        let settings = Settings(ID);
-        settings.at_least_one("iterations", self.iterations)?;
-        settings.elites(self.elites, 1, self.samples)?;
-        settings.not_negative("smoothing", self.smoothing)?;
-        settings.momentum("momentum", self.momentum)
     }
 }
 

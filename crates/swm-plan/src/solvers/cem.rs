@@ -67,7 +67,7 @@ impl Solver for Cem {
         self.check()?;
         let bounds = continuous(&ENTRY, cost, &problem)?;
         let mut gaussians = Gaussian::initial(&problem, bounds, self.sigma);
-        let mut population = Population::new(ID, &problem, self.samples);
+        let mut population = Population::new(ID, &problem, self.samples)?;
 
         iterate(self.iterations, &problem, |iteration| {
             Gaussian::draw(&gaussians, iteration, bounds, None, &mut population);
@@ -81,12 +81,11 @@ impl Solver for Cem {
         })?;
         Ok(Gaussian::into_plan(gaussians))
     }
-}
 
-impl Cem {
     fn check(&self) -> Result<()> {
         let settings = Settings(ID);
         settings.at_least_one("iterations", self.iterations)?;
+        settings.samples(self.samples)?;
         settings.elites(self.elites, 2, self.samples)?;
         settings.positive("sigma", self.sigma)
     }

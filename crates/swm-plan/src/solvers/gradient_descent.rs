@@ -72,7 +72,7 @@ impl Solver for GradientDescent {
         if problem.keys.is_empty() {
             return Ok(Plan::default());
         }
-        let mut descent = Descent::new(ID, &problem, self.samples, self.sigma, move |actions| bounds.clip(actions));
+        let mut descent = Descent::new(ID, &problem, self.samples, self.sigma, move |actions| bounds.clip(actions))?;
         let step = Step { optimizer: &self.optimizer, action_noise: self.action_noise };
         descent.run(cost, self.iterations, step, |descent, _| {
             descent.record();
@@ -83,12 +83,10 @@ impl Solver for GradientDescent {
         })?;
         descent.finish(cost)
     }
-}
 
-impl GradientDescent {
     fn check(&self) -> Result<()> {
         let settings = Settings(ID);
-        settings.at_least_one("samples", self.samples)?;
+        settings.samples(self.samples)?;
         settings.at_least_one("iterations", self.iterations)?;
         settings.not_negative("sigma", self.sigma)?;
         settings.not_negative("action_noise", self.action_noise)?;

@@ -70,7 +70,7 @@ impl Solver for ICem {
         let bounds = continuous(&ENTRY, cost, &problem)?;
         let colour = ColouredNoise::new(self.beta, problem.horizon);
         let mut gaussians = Gaussian::initial(&problem, bounds, self.sigma);
-        let mut population = Population::new(ID, &problem, self.samples);
+        let mut population = Population::new(ID, &problem, self.samples)?;
         let mut kept = vec![vec![]; gaussians.len()];
 
         iterate(self.iterations, &problem, |iteration| {
@@ -89,12 +89,11 @@ impl Solver for ICem {
         })?;
         Ok(Gaussian::into_plan(gaussians))
     }
-}
 
-impl ICem {
     fn check(&self) -> Result<()> {
         let settings = Settings(ID);
         settings.at_least_one("iterations", self.iterations)?;
+        settings.samples(self.samples)?;
         settings.elites(self.elites, 2, self.samples)?;
         settings.positive("sigma", self.sigma)?;
         settings.not_negative("beta", self.beta)?;

@@ -60,7 +60,7 @@ impl Solver for Mppi {
         self.check()?;
         let bounds = continuous(&ENTRY, cost, &problem)?;
         let mut gaussians = Gaussian::initial(&problem, bounds, self.sigma);
-        let mut population = Population::new(ID, &problem, self.samples);
+        let mut population = Population::new(ID, &problem, self.samples)?;
         let mut weights = vec![vec![]; gaussians.len()];
 
         iterate(self.iterations, &problem, |iteration| {
@@ -77,6 +77,15 @@ impl Solver for Mppi {
         })?;
         Ok(Gaussian::into_plan(gaussians))
     }
+
+    fn check(&self) -> Result<()> {
+        let settings = Settings(ID);
+        settings.at_least_one("iterations", self.iterations)?;
+        settings.samples(self.samples)?;
+        settings.elites(self.elites, 1, self.samples)?;
+        settings.positive("sigma", self.sigma)?;
+        settings.positive("temperature", self.temperature)
+    }
 }
 
 impl Mppi {
@@ -87,14 +96,6 @@ impl Mppi {
         weights.extend((0..elites.count()).map(|i| (-(cost(i) - cost(0)) / f64::from(self.temperature)).exp()));
         let sum: f64 = weights.iter().sum();
         weights.iter_mut().for_each(|weight| *weight /= sum);
-    }
-
-    fn check(&self) -> Result<()> {
-        let settings = Settings(ID);
-        settings.at_least_one("iterations", self.iterations)?;
-        settings.elites(self.elites, 1, self.samples)?;
-        settings.positive("sigma", self.sigma)?;
-        settings.positive("temperature", self.temperature)
     }
 }
 

@@ -66,15 +66,14 @@ impl Default for Pgd {
 
 impl Solver for Pgd {
     fn solve(&mut self, cost: &mut dyn CostModel, problem: PlanProblem<'_>) -> Result<Plan> {
-        let optimizer = Optimizer::Sgd(Sgd { step: self.step, momentum: 0.0 });
         self.check()?;
-        optimizer.check(ID)?;
+        let optimizer = self.optimizer();
         let choices = discrete(&ENTRY, cost, &problem)?;
         if problem.keys.is_empty() {
             return Ok(Plan::default());
         }
         let mut descent =
-            Descent::new(ID, &problem, self.samples, self.sigma, move |actions| project(actions, choices));
+            Descent::new(ID, &problem, self.samples, self.sigma, move |actions| project(actions, choices))?;
         let step = Step { optimizer: &optimizer, action_noise: self.action_noise };
         descent.run(cost, self.iterations, step, |descent, _| {
             descent.record();
@@ -83,15 +82,20 @@ impl Solver for Pgd {
         choose(&mut descent.population.actions, choices);
         descent.finish(cost)
     }
+
+    fn check(&self) -> Result<()> {
+        let settings = Settings(ID);
+        settings.samples(self.samples)?;
+        settings.at_least_one("iterations", self.iterations)?;
+        settings.not_negative("sigma", self.sigma)?;
+        settings.not_negative("action_noise", self.action_noise)?;
+        self.optimizer().check(ID)
+    }
 }
 
 impl Pgd {
-    fn check(&self) -> Result<()> {
-        let settings = Settings(ID);
-        settings.at_least_one("samples", self.samples)?;
-        settings.at_least_one("iterations", self.iterations)?;
-        settings.not_negative("sigma", self.sigma)?;
-        settings.not_negative("action_noise", self.action_noise)
+    fn optimizer(&self) -> Optimizer {
+        Optimizer::Sgd(Sgd { step: self.step, momentum: 0.0 })
     }
 }
 

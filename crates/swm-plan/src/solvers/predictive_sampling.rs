@@ -47,12 +47,10 @@ impl Default for PredictiveSampling {
 
 impl Solver for PredictiveSampling {
     fn solve(&mut self, cost: &mut dyn CostModel, problem: PlanProblem<'_>) -> Result<Plan> {
-        let settings = Settings(ID);
-        settings.at_least_one("samples", self.samples)?;
-        settings.positive("sigma", self.sigma)?;
+        self.check()?;
         let bounds = continuous(&ENTRY, cost, &problem)?;
         let mut gaussians = Gaussian::initial(&problem, bounds, self.sigma);
-        let mut population = Population::new(ID, &problem, self.samples);
+        let mut population = Population::new(ID, &problem, self.samples)?;
 
         iterate(1, &problem, |iteration| {
             Gaussian::draw(&gaussians, iteration, bounds, None, &mut population);
@@ -65,5 +63,11 @@ impl Solver for PredictiveSampling {
             Ok(())
         })?;
         Ok(Gaussian::into_plan(gaussians))
+    }
+
+    fn check(&self) -> Result<()> {
+        let settings = Settings(ID);
+        settings.samples(self.samples)?;
+        settings.positive("sigma", self.sigma)
     }
 }

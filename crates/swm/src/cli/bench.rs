@@ -8,7 +8,7 @@ use swm_bench::{
     BenchConfig, DataBenchConfig, Drawing, ModelBenchConfig, ModelBenchReport, PlanBenchConfig, RenderBenchConfig,
     Work, bench_data, bench_envs, bench_model, bench_plan, bench_render,
 };
-use swm_core::EnvChoice;
+use swm_core::{EnvChoice, Origin};
 use swm_data::Location;
 use swm_models::device;
 use swm_mujoco::render::{Choice as Renderer, name, with};
@@ -65,7 +65,7 @@ struct RenderArgs {
 fn render(args: &RenderArgs, context: &Context) -> anyhow::Result<()> {
     let envs: Vec<EnvChoice> = match &args.envs[..] {
         [] => swm_mujoco::ENVS.rows.iter().map(EnvChoice::from).collect(),
-        ids => ids.iter().map(|id| crate::env(id)).collect::<swm_core::Result<_>>()?,
+        ids => ids.iter().map(|id| crate::env(id, &Origin::User)).collect::<swm_core::Result<_>>()?,
     };
     let cpu = |work: &mut dyn FnMut() -> swm_core::Result<()>| with(Renderer::Cpu, work);
     let egl = |work: &mut dyn FnMut() -> swm_core::Result<()>| with(Renderer::Egl, work);
@@ -129,7 +129,7 @@ struct DataArgs {
 /// Measures loading and converting.
 fn data(args: &DataArgs, context: &Context) -> anyhow::Result<()> {
     let report = bench_data(
-        &crate::env(&args.env)?,
+        &crate::env(&args.env, &Origin::User)?,
         &DataBenchConfig {
             episodes: args.episodes,
             steps: args.steps,
@@ -280,7 +280,7 @@ pub fn bench(args: &BenchArgs, context: &Context) -> anyhow::Result<()> {
 fn envs(args: &EnvsArgs, context: &Context) -> anyhow::Result<()> {
     let entries: Vec<EnvChoice> = match &args.envs[..] {
         [] => ENVS.rows.iter().map(EnvChoice::from).collect(),
-        ids => ids.iter().map(|id| crate::env(id)).collect::<swm_core::Result<_>>()?,
+        ids => ids.iter().map(|id| crate::env(id, &Origin::User)).collect::<swm_core::Result<_>>()?,
     };
     let report = bench_envs(
         &entries,

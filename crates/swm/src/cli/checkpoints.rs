@@ -111,7 +111,7 @@ fn show(given: &str, as_json: bool) -> anyhow::Result<()> {
 }
 
 fn list(as_json: bool) -> anyhow::Result<()> {
-    let folder = home::checkpoints();
+    let folder = home::checkpoints()?;
     let summaries: Vec<Value> = names_in(&folder)
         .into_iter()
         .map(|name| match load(&name) {
@@ -147,27 +147,50 @@ fn list(as_json: bool) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// The result of examining a checkpoint.
+struct Findings {
+    /// The hash of the weights; empty if the checkpoint cannot be loaded.
+    weights: String,
+    faults: Vec<String>,
+}
+
+/// Loads a checkpoint and looks for faults that loading does not find.
+fn examine(given: &str) -> Findings {
+    let loaded = load(given).and_then(|(path, info)| Ok((checkpoint::faults(&path)?, info.weights)));
+    match loaded {
+        Ok((faults, weights)) => Findings { weights, faults },
+        Err(error) => Findings { weights: String::new(), faults: vec![error.to_string()] },
+    }
+}
+
 fn verify(given: &[String], as_json: bool) -> anyhow::Result<()> {
-    let all = names_in(&home::checkpoints());
+    let all = if given.is_empty() { names_in(&home::checkpoints()?) } else { vec![] };
     let given = if given.is_empty() { &all } else { given };
-    let found: Vec<(&String, Result<(PathBuf, CheckpointInfo)>)> =
-        given.iter().map(|name| (name, load(name))).collect();
-    let damaged = found.iter().filter(|(_, info)| info.is_err()).count();
+    let found: Vec<(&String, Findings)> = given.iter().map(|name| (name, examine(name))).collect();
+    let damaged = found.iter().filter(|(_, found)| !found.faults.is_empty()).count();
     if as_json {
         let rows: Vec<Value> = found
             .iter()
-            .map(|(name, info)| match info {
-                Ok((_, info)) => json!({"name": name, "whole": true, "weights": info.weights}),
-                Err(error) => json!({"name": name, "whole": false, "error": error.to_string()}),
+            .map(|(name, Findings { weights, faults })| match faults.is_empty() {
+                true => json!({"name": name, "whole": true, "weights": weights}),
+                false => json!({"name": name, "whole": false, "error": faults.join("; ")}),
             })
             .collect();
         emit_json(&rows)?;
     } else {
-        for (name, info) in &found {
-            match info {
-                Ok((_, info)) => emit(&format!("{name}: valid, weights {}\n", info.weights)),
-                Err(error) => emit(&format!("{name}: {error}\n")),
+        for (name, Findings { weights, faults }) in &found {
+            if faults.is_empty() {
+                emit(&format!(
+                    "{name}: valid, weights {weights}
+"
+                ));
             }
+            faults.iter().for_each(|fault| {
+                emit(&format!(
+                    "{name}: {fault}
+"
+                ))
+            });
         }
     }
     if damaged > 0 {

@@ -2,14 +2,13 @@
 
 use super::config::{CodecArgs, VariationArgs, image_size};
 use super::wrappers::WrapperArgs;
-use super::{Context, emit, emit_json, progress};
+use super::{Context, emit, emit_json, eprint, progress};
 use crate::resolver::policy_by_name;
 use crate::{collect_target, home};
 use clap::Args;
 use serde_json::json;
-use std::path::{Path, PathBuf};
 use std::time::Instant;
-use swm_core::{CameraView, EnvChoice, Error, Manifest, Result, Schema};
+use swm_core::{CameraView, EnvChoice, Manifest, Origin, Result, Schema};
 use swm_data::lance::{Shard, create_shard};
 use swm_data::{FORMATS, ImageCodec, Location, WriteMode, WriteOptions, Writer};
 use swm_eval::{CollectConfig, Collected, World, WorldConfig};
@@ -58,6 +57,11 @@ pub struct CollectArgs {
     /// `swm datasets commit` commits the shards of all machines.
     #[arg(long, value_name = "I/N", value_parser = shard, conflicts_with = "format")]
     shard: Option<Shard>,
+    /// Stop at NaN and infinite values instead of counting them
+    ///
+    /// Without it they are stored, and the manifest contains their number in each column.
+    #[arg(long)]
+    strict_finite: bool,
     /// Continue a dataset whose frames come from another renderer
     #[arg(long, requires = "resume")]
     mix_renderers: bool,
@@ -114,7 +118,7 @@ pub struct Collection<'a> {
 pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
     let location = home::target(&args.output, args.format.as_deref())?;
     let collection = Collection {
-        env: crate::env(&args.env)?,
+        env: crate::env(&args.env, &Origin::User)?,
         location: &location,
         format: args.format.as_deref(),
         shard: args.shard,
@@ -131,6 +135,7 @@ pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
             seed: args.seed,
             variation: args.variation.request()?,
             policy: args.policy.clone(),
+            strict_finite: args.strict_finite,
             ..CollectConfig::default()
         },
         mode: match (args.resume, args.overwrite) {
@@ -158,18 +163,26 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
     let (mut policy, weights) = policy_by_name(&env.entry, collection.policy, &world)?;
     // An invalid factor fails before an older dataset is replaced.
     world.spec().variation_space.resolve(&config.variation, swm_core::Key::new(config.seed))?;
-    let manifest = collection.manifest(&world, weights)?;
+    let mut manifest = collection.manifest(&world, weights)?;
     if collection.shard.is_none() {
-        collect_target::check(location, collection.mode, &manifest, collection.mix_renderers)?;
+        manifest.not_finite = collect_target::check(location, collection.mode, &manifest, collection.mix_renderers)?;
     }
-    let writer = collection.writer(&world.collect_schema(config.goal)?, manifest)?;
+    let writer = collection.writer(&world.collect_schema(config.goal)?, collection.mode, manifest.clone())?;
     // A shard has consecutive episodes, so that the committed dataset has all episodes in order.
     let episodes = collection.shard.map_or(0..config.episodes, |Shard { index, count }| {
         config.episodes * index / count..config.episodes * (index + 1) / count
     });
     let config = &CollectConfig { episodes: episodes.len(), first: episodes.start, ..config.clone() };
     let start = Instant::now();
-    let collected = world.collect(&mut *policy, writer, config, &mut progress::control(context))?;
+    let collected = world.collect(&mut *policy, writer, config, &mut progress::control(context));
+    if let Some(warning) = collect_target::describe_not_finite(world.not_finite()) {
+        eprint(&format!("warning: {warning}\n"));
+        if collection.shard.is_none() {
+            collect_target::add_not_finite(&mut manifest, world.not_finite());
+            collection.writer(&world.collect_schema(config.goal)?, WriteMode::Append, manifest)?.finish()?;
+        }
+    }
+    let collected = collected?;
     let message = format!(
         "{} episodes in {location} ({} new, {} steps, {})",
         collected.episodes,
@@ -196,19 +209,12 @@ impl Collection<'_> {
         Ok(manifest)
     }
 
-    fn writer(&self, schema: &Schema, manifest: Manifest) -> Result<Box<dyn Writer>> {
-        let options =
-            WriteOptions { mode: self.mode, codec: self.codec, manifest: Some(manifest), ..WriteOptions::default() };
+    fn writer(&self, schema: &Schema, mode: WriteMode, manifest: Manifest) -> Result<Box<dyn Writer>> {
+        let options = WriteOptions { mode, codec: self.codec, manifest: Some(manifest), ..WriteOptions::default() };
         match (self.shard, self.format) {
             (Some(shard), _) => create_shard(self.location, schema, options, shard),
             (None, Some(format)) => FORMATS.get(format)?.create(self.location, schema, options),
             (None, None) => swm_data::create(self.location.clone(), schema, options),
         }
     }
-}
-
-/// Creates a folder.
-pub fn create_folder(path: &Path) -> Result<PathBuf> {
-    std::fs::create_dir_all(path).map_err(|e| Error::io(path, "creating the folder", e))?;
-    Ok(path.to_owned())
 }

@@ -55,7 +55,7 @@ impl VariationArgs {
     /// Returns the factors of variation for every reset.
     ///
     /// # Errors
-    /// When a pinned value is not `KEY=NUMBER[,NUMBER…]`.
+    /// When a pinned value is not `KEY=NUMBER[,NUMBER…]`, or a factor is pinned twice.
     pub fn request(&self) -> Result<VariationRequest> {
         let mut variation_values = BTreeMap::new();
         for pin in &self.pin {
@@ -68,7 +68,12 @@ impl VariationArgs {
             };
             let (key, values) = pin.split_once('=').ok_or_else(wrong)?;
             let values: std::result::Result<Vec<f64>, _> = values.split(',').map(|v| v.trim().parse()).collect();
-            variation_values.insert(key.to_owned(), values.map_err(|_| wrong())?);
+            let values = values.map_err(|_| wrong())?;
+            if variation_values.insert(key.to_owned(), values).is_some() {
+                let is_first = |other: &&String| other.split_once('=').is_some_and(|(other, _)| other == key);
+                let first = self.pin.iter().find(is_first).unwrap_or(pin);
+                return Err(Error::twice(format!("--pin {key}"), first, pin));
+            }
         }
         let variation = self.variation.as_ref().map(|keys| match &keys[..] {
             [none] if none == "none" => vec![],
@@ -113,6 +118,9 @@ mod tests {
         assert_eq!(args.describe(), "agent sampled, background.color=1, 2,3");
         let none = VariationArgs { variation: Some(vec!["none".to_owned()]), pin: vec![] };
         assert_eq!(none.request().expect("a valid request").variation, Some(vec![]));
+        let twice = ["agent.x=1", "agent.y=1", "agent.x=2"].map(str::to_owned).to_vec();
+        let twice = VariationArgs { variation: None, pin: twice }.request().expect_err("a factor twice").to_string();
+        assert!(twice.contains("--pin agent.x: is given twice: 'agent.x=1' and 'agent.x=2'"), "{twice}");
         let wrong = VariationArgs { variation: None, pin: vec!["background.color".to_owned()] };
         assert!(wrong.request().expect_err("no value").to_string().contains("background.color=200"));
         assert_eq!(image_size("64x96"), Ok((64, 96)));

@@ -74,7 +74,7 @@ fn commit(dataset: &str, mix_renderers: bool, as_json: bool) -> anyhow::Result<(
 
 /// Lists the datasets in the home folder.
 fn list(as_json: bool) -> anyhow::Result<()> {
-    let folder = home::datasets();
+    let folder = home::datasets()?;
     let summaries: Vec<Value> = names_in(&folder)
         .into_iter()
         .map(|name| match open(&name).and_then(|reader| summary(&*reader)) {

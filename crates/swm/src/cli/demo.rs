@@ -1,6 +1,7 @@
 //! `swm demo`: collects, trains, plans, evaluates and reports within minutes on a laptop CPU.
 
-use super::collect::{self, Collection, create_folder};
+use super::collect::{self, Collection};
+use super::output_folder;
 use super::results_tables::summary;
 use super::wrappers::WrapperArgs;
 use super::{Context, emit, emit_json, eprint, eval, train};
@@ -10,8 +11,9 @@ use clap::Args;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
+use swm_core::files::{self, Lock};
 use swm_core::results::Counting;
-use swm_core::{Error, Result, VariationRequest, files};
+use swm_core::{Error, Origin, Result, VariationRequest};
 use swm_data::{ImageCodec, Location, WriteMode};
 use swm_eval::{
     Choice, CollectConfig, Condition, EvalRequest, Model, PolicyKind, PolicyRequest, StartsRequest, WorldConfig,
@@ -63,12 +65,15 @@ const TIME_LIMIT: usize = 100;
 /// Runs `swm demo`.
 pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
     let start = Instant::now();
-    let output = args.output.clone().unwrap_or_else(|| home::home().join("demo"));
+    let output = match &args.output {
+        Some(folder) => folder.clone(),
+        None => home::home()?.join("demo"),
+    };
     let (data, model, results) = (output.join("rooms.lance"), output.join("lewm-rooms"), output.join("results"));
     let mut config = TrainConfig::<Lewm>::load("tiny", &args.settings)?;
     config.seed = args.seed;
     let side = config.model.image;
-    claim(&output)?;
+    let _lock = claim(&output)?;
     // The other steps replace the files of an earlier demo themselves; training refuses the folder of another run.
     let _ = run_folder::remove(&model)?;
     eprint("1/4 collect: an exploring policy moves through two rooms\n");
@@ -80,7 +85,7 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
     train::run(&config, swm_models::TrainRun { reader, encoder: None, out: &model, options }, context)?;
 
     eprint("3/4 plan and evaluate: CEM with the model, compared with the random-policy floor\n");
-    let resolver = HomeResolver::tracing();
+    let resolver = HomeResolver::new(Origin::User).tracing();
     let request = request(args, &model, side, &resolver)?;
     let (found, file) = eval::run(&request, &resolver, args.envs, (&results, 3), context)?;
 
@@ -107,19 +112,20 @@ const MARK: &str = ".swm-demo";
 const MARK_TEXT: &str =
     "`swm demo` made this folder, and replaces rooms.lance, lewm-rooms, results and index.html in it.\n";
 
-/// Creates the folder of the demo and marks it.
+/// Creates the folder of the demo, keeps other writers away, and marks the folder.
 ///
 /// # Errors
-/// When the folder has contents and no mark: its files may be the user's.
-fn claim(folder: &Path) -> Result<()> {
-    create_folder(folder)?;
+/// When another process writes to the folder, or it has contents and no mark: its files may be the user's.
+fn claim(folder: &Path) -> Result<Lock> {
+    let lock = output_folder::claim(folder, &["index.html"])?;
     let mark = folder.join(MARK);
     let io = |error| Error::io(folder, "listing the folder", error);
     if !mark.is_file() && std::fs::read_dir(folder).map_err(io)?.next().is_some() {
         let fix = "give an empty folder with --output, or move its contents away";
         return Err(Error::config(folder.display().to_string(), "has files that `swm demo` did not write", fix));
     }
-    files::write(&mark, MARK_TEXT.as_bytes())
+    files::write(&mark, MARK_TEXT.as_bytes())?;
+    Ok(lock)
 }
 
 /// Collects the dataset of the demo.

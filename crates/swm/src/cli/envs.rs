@@ -5,7 +5,7 @@ use crate::{ENVS, describe, gym};
 use clap::Args;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeSet;
-use swm_core::EnvChoice;
+use swm_core::{EnvChoice, Origin};
 
 /// Arguments of `swm envs`.
 #[derive(Args)]
@@ -24,7 +24,7 @@ pub struct FovsArgs {
 /// Lists the environments.
 pub fn envs(args: &EnvsArgs, as_json: bool) -> anyhow::Result<()> {
     if let Some(id) = &args.env {
-        return show(&crate::env(id)?, as_json);
+        return show(&crate::env(id, &Origin::User)?, as_json);
     }
     if as_json {
         let all = ENVS.rows.iter().map(|row| match row.env() {
@@ -99,7 +99,7 @@ fn show(choice: &EnvChoice, as_json: bool) -> anyhow::Result<()> {
 
 /// Lists the factors of variation of one environment.
 pub fn fovs(args: &FovsArgs, as_json: bool) -> anyhow::Result<()> {
-    let env = crate::env(&args.env)?.env()?;
+    let env = crate::env(&args.env, &Origin::User)?.env()?;
     let space = &env.spec().variation_space;
     if as_json {
         return emit_json(&json!({

@@ -1,8 +1,8 @@
 //! `swm eval`: evaluates policies and the random-policy floor from the same starts.
 
-use super::collect::create_folder;
 use super::config::{VariationArgs, image_size};
 use super::eval_policy::NamedPolicy;
+use super::output_folder;
 use super::planner::PlannerArgs;
 use super::progress::control;
 use super::results_tables::summary;
@@ -13,7 +13,7 @@ use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use swm_core::results::Counting;
-use swm_core::{Error, Result, Results};
+use swm_core::{Error, Origin, Result, Results, files};
 use swm_data::{Part, Split};
 use swm_eval::{Condition, EvalRequest, HeldOut, RunOptions, StartsRequest};
 
@@ -28,6 +28,11 @@ pub struct EvalArgs {
     /// The environment (default: the training environment of the first checkpoint)
     #[arg(long)]
     env: Option<String>,
+    /// Allow checkpoints to choose an environment that imports a Python module
+    ///
+    /// docs/security.md says what files may do without it.
+    #[arg(long)]
+    trust: bool,
     /// Dataset to take starts and goals from
     #[arg(long, value_name = "DATASET")]
     dataset: Option<String>,
@@ -109,7 +114,9 @@ const IN_DISTRIBUTION: &str = "in distribution";
 
 /// Runs `swm eval`.
 pub fn eval(args: &EvalArgs, context: &Context) -> anyhow::Result<()> {
-    let resolver = if args.trace { HomeResolver::tracing() } else { HomeResolver::default() };
+    // The request checks the one name that a checkpoint chooses: its environment.
+    let resolver = HomeResolver::new(Origin::User);
+    let resolver = if args.trace { resolver.tracing() } else { resolver };
     let request = args.request(&resolver)?;
     let (results, file) = run(&request, &resolver, args.envs, (&args.output, args.videos), context)?;
     if args.trace {
@@ -129,10 +136,12 @@ impl EvalArgs {
         let find = |given: &String| NamedPolicy::find(given, self.env.as_deref(), resolver);
         let named: Vec<NamedPolicy> = self.policies.iter().map(find).collect::<Result<_>>()?;
         let trained_on = named.iter().find_map(|policy| policy.env.clone());
-        let Some(env) = self.env.clone().or(trained_on) else {
+        let given = self.env.clone().map(|env| (env, Origin::User));
+        let from_file = || trained_on.map(|(env, path)| (env, Origin::file(path, self.trust)));
+        let Some((env, origin)) = given.or_else(from_file) else {
             return Err(Error::config("--env", "no environment is given", "name one (`swm envs` lists them)"));
         };
-        let env = crate::env(&env)?;
+        let env = crate::env(&env, &origin)?;
         let image = named.iter().find_map(|policy| policy.image);
         let mut policies = vec![];
         for policy in named {
@@ -189,7 +198,7 @@ pub fn run(
     (output, videos): (&Path, usize),
     context: &Context,
 ) -> Result<(Results, PathBuf)> {
-    create_folder(output)?;
+    let _lock = output_folder::claim(output, &["results.json", "traces.json"])?;
     let videos = (videos > 0).then(|| (output.to_owned(), videos));
     let results = request.run(resolver, &run_options(envs, videos, context), &mut control(context))?;
     let file = output.join("results.json");
@@ -206,7 +215,7 @@ pub fn run_options(envs: usize, videos: Option<(PathBuf, usize)>, context: &Cont
 /// Writes indented JSON to a file.
 pub fn write_json(file: &Path, value: &impl serde::Serialize) -> Result<()> {
     let text = serde_json::to_string_pretty(value).map_err(|e| Error::external("writing JSON", e))?;
-    std::fs::write(file, text + "\n").map_err(|e| Error::io(file, "writing results", e))
+    files::write(file, (text + "\n").as_bytes())
 }
 
 /// Returns every traced plan as one object.

@@ -1,18 +1,19 @@
 //! The policies that `swm eval` accepts by name, and their requests for the evaluation.
 
 use super::planner::PlannerArgs;
+use crate::home;
 use crate::resolver::{HomeResolver, parse_score};
 use serde_json::Value;
-use std::path::Path;
-use swm_core::{EnvChoice, Result};
+use std::path::{Path, PathBuf};
+use swm_core::{EnvChoice, Origin, Result};
 use swm_eval::{Model, PolicyKind, PolicyRequest};
 
 /// A policy that the command line names.
 pub struct NamedPolicy {
     name: String,
     kind: NamedKind,
-    /// The environment that the checkpoint was trained on.
-    pub env: Option<String>,
+    /// The environment that the checkpoint was trained on, and the path of the checkpoint.
+    pub env: Option<(String, PathBuf)>,
     /// The side of the images that the checkpoint was trained on, in pixels.
     pub image: Option<usize>,
 }
@@ -34,7 +35,7 @@ impl NamedPolicy {
     /// When the environment or the checkpoint does not exist, or the checkpoint is damaged.
     pub fn find(given: &str, env: Option<&str>, resolver: &HomeResolver) -> Result<Self> {
         let without_checkpoint = |kind| Self { name: given.to_owned(), kind, env: None, image: None };
-        let env = env.map(crate::env).transpose()?;
+        let env = env.map(|env| crate::env(env, &Origin::User)).transpose()?;
         if given == "random" {
             return Ok(without_checkpoint(NamedKind::Direct(PolicyKind::Random)));
         }
@@ -57,7 +58,9 @@ impl NamedPolicy {
             None => NamedKind::Direct(direct),
         };
         let name = Path::new(given).file_name().map_or(given.to_owned(), |name| name.to_string_lossy().into_owned());
-        Ok(Self { name, kind, env: info.dataset_info.env, image: info.image_size })
+        let path = home::checkpoint(given)?;
+        let env = info.dataset_info.env.map(|env| (env, path));
+        Ok(Self { name, kind, env, image: info.image_size })
     }
 
     /// Returns the requests: one policy, or one per solver.

@@ -14,6 +14,8 @@ mod eval;
 mod eval_policy;
 mod inspect;
 mod models;
+mod output;
+mod output_folder;
 mod planner;
 mod probe;
 mod progress;
@@ -26,6 +28,8 @@ mod train;
 mod wrappers;
 
 use clap::{Parser, Subcommand};
+use output::{emit, emit_json, eprint, table};
+use std::ffi::OsString;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -132,10 +136,41 @@ pub struct Context {
     pub interrupt: Arc<AtomicBool>,
 }
 
+/// Runs the command line with these arguments, the program's name first. Returns the exit code: 0 for success, 1 for a
+/// failure or lost output, 2 for wrong usage, 130 for an interrupted run.
+pub fn run(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) -> u8 {
+    let code = match Cli::try_parse_from(arguments) {
+        Ok(cli) => cli.run(),
+        Err(error) => print_usage(&error),
+    };
+    match output::take_failure() {
+        None => code,
+        Some(failure) => {
+            eprint(&format!("error: standard output: writing: {failure}; the output is lost\n"));
+            code.max(1)
+        }
+    }
+}
+
+/// Prints help, a version, or an error in the arguments.
+fn print_usage(error: &clap::Error) -> u8 {
+    use std::io::Write as _;
+    let text = error.render().to_string();
+    if error.use_stderr() && matches!(swm_core::text::printable(&text), std::borrow::Cow::Owned(_)) {
+        // Arguments with control characters, such as names of files, are printed without clap's colours.
+        eprint(&text);
+    } else {
+        let printed = error.print();
+        if !error.use_stderr() {
+            output::check(printed.and_then(|()| std::io::stdout().flush()));
+        }
+    }
+    u8::try_from(error.exit_code()).unwrap_or(2)
+}
+
 impl Cli {
-    /// Runs the command. Returns the exit code: 0 for success, 1 for a failure, 2 for wrong usage, 130 for an
-    /// interrupted run.
-    pub fn run(self) -> u8 {
+    /// Runs the command and returns its exit code.
+    fn run(self) -> u8 {
         // If an embedding program has already set up logging, `try_init` fails and that setup stays in place.
         let _ = tracing_subscriber::fmt()
             .with_writer(std::io::stderr)
@@ -205,39 +240,6 @@ impl Context {
         .ok();
         Self { json, threads, interrupt }
     }
-}
-
-/// Prints to standard output. A closed pipe is not an error.
-fn emit(text: &str) {
-    use std::io::Write as _;
-    let mut out = std::io::stdout().lock();
-    out.write_all(text.as_bytes()).and_then(|()| out.flush()).ok();
-}
-
-/// Prints one JSON document to standard output.
-fn emit_json(value: &impl serde::Serialize) -> anyhow::Result<()> {
-    emit(&(serde_json::to_string_pretty(value)? + "\n"));
-    Ok(())
-}
-
-/// Prints to standard error.
-fn eprint(text: &str) {
-    use std::io::Write as _;
-    std::io::stderr().write_all(text.as_bytes()).ok();
-}
-
-/// Formats rows as a table with a header.
-fn table(header: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> String {
-    let mut table = comfy_table::Table::new();
-    table.load_preset(comfy_table::presets::NOTHING);
-    table.set_style(comfy_table::TableComponent::HeaderLines, '─');
-    table.set_style(comfy_table::TableComponent::MiddleHeaderIntersections, '─');
-    table.set_content_arrangement(comfy_table::ContentArrangement::Dynamic);
-    table.set_header(header.to_vec());
-    for row in rows {
-        table.add_row(row);
-    }
-    format!("{table}\n")
 }
 
 #[cfg(test)]

@@ -123,7 +123,7 @@ impl PlannerArgs {
 /// Parses `NAME,KEY=VALUE,…`. Values are JSON where they parse as JSON, else strings.
 ///
 /// # Errors
-/// When a setting has no value.
+/// When a setting has no value, or is given twice.
 pub fn named<'a>(flag: &str, text: &'a str) -> Result<(&'a str, Map<String, Value>)> {
     let (name, rest) = text.split_once(',').unwrap_or((text, ""));
     let mut settings = Map::new();
@@ -132,8 +132,11 @@ pub fn named<'a>(flag: &str, text: &'a str) -> Result<(&'a str, Map<String, Valu
             let (problem, fix) = (format!("'{pair}' is not KEY=VALUE"), "write it like NAME,KEY=VALUE,KEY=VALUE");
             return Err(Error::config(format!("{flag} {text}"), problem, fix));
         };
-        let value = serde_json::from_str(value).unwrap_or_else(|_| Value::String(value.to_owned()));
-        settings.insert(key.to_owned(), value);
+        let parsed = serde_json::from_str(value).unwrap_or_else(|_| Value::String(value.to_owned()));
+        if let Some(first) = settings.insert(key.to_owned(), parsed) {
+            let first = first.as_str().map_or_else(|| first.to_string(), str::to_owned);
+            return Err(Error::twice(format!("{flag} {text}"), format!("{key}={first}"), pair));
+        }
     }
     Ok((name, settings))
 }

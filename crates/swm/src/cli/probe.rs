@@ -1,6 +1,6 @@
 //! `swm probe`: predicts columns and reconstructs images from a checkpoint's latents.
 
-use super::{Context, emit, emit_json, table};
+use super::{Context, emit, emit_json, output_folder, table};
 use crate::home;
 use clap::Args;
 use serde_json::json;
@@ -47,6 +47,9 @@ pub fn probe(args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
     if args.columns.is_empty() && args.images.is_none() {
         let fix = "name columns with --columns (`swm inspect` lists them), or a file with --images";
         return Err(Error::config("swm probe", "no columns and no images are requested", fix).into());
+    }
+    if let Some(file) = &args.images {
+        output_folder::check_file(file)?;
     }
     let reader = home::open_dataset(&args.data)?;
     let threads = swm_core::pool::threads(context.threads)?;

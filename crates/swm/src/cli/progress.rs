@@ -8,6 +8,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use swm_core::results::Proportion;
 use swm_core::run::{Control, Event, Progress};
+use swm_core::text::printable;
 
 /// The time between plain lines.
 const PLAIN_INTERVAL: Duration = Duration::from_secs(10);
@@ -84,7 +85,7 @@ impl StageDisplay {
             eprint(&format!("{}: {done}/{total} {message}\n", self.name));
         }
         self.bar.set_position(done as u64);
-        self.bar.set_message(message);
+        self.bar.set_message(printable(&message).into_owned());
     }
 
     fn message(&self, progress: &Progress<'_>) -> String {

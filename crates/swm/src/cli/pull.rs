@@ -17,7 +17,7 @@ pub struct PullArgs {
 
 /// Downloads files that are not in the cache, and prints their paths.
 pub fn pull(args: &PullArgs, as_json: bool) -> anyhow::Result<()> {
-    let cache = home::weights();
+    let cache = home::weights()?;
     let paths = if args.files.is_empty() {
         vec![locate(&args.repository, &cache)?]
     } else {

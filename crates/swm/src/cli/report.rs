@@ -1,5 +1,6 @@
 //! `swm report`: writes one self-contained HTML page of results.
 
+use super::output_folder;
 use super::train::log_of;
 use super::{emit, emit_json};
 use crate::home;
@@ -38,9 +39,10 @@ pub fn report(args: &ReportArgs, as_json: bool) -> anyhow::Result<()> {
         .collect();
     let options = ReportOptions {
         title: args.title.clone(),
-        metrics: args.training.as_deref().map(|name| log_of(&home::checkpoint(name))),
+        metrics: args.training.as_deref().map(home::find_checkpoint).transpose()?.as_deref().map(log_of),
         command: None,
     };
+    let _lock = output_folder::claim(&args.output, &["index.html"])?;
     let page = swm_report::write_report_with(&read?, &options, &args.output)?;
     if as_json {
         return emit_json(&json!({"report": page}));

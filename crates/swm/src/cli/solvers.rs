@@ -116,6 +116,9 @@ mod tests {
             ("cem,samples", "KEY=VALUE"),
             ("cem,samples=many", "samples"),
             ("gd,optimizer.stepp=1", "did you mean optimizer.step"),
+            ("cem,samples=64,samples=65", "is given twice: 'samples=64' and 'samples=65'"),
+            ("cem,samples=8,elites=9", "9 of 8 samples"),
+            ("cem,samples=1152921504606846976", "choose 1 to 1000000"),
         ] {
             let error = parse(text).err().expect(text).to_string();
             assert!(error.contains(message), "{text}: {error}");

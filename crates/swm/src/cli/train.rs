@@ -6,7 +6,7 @@ use crate::home;
 use clap::Args;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use swm_core::{EnvPool, Error, Result};
+use swm_core::{EnvPool, Error, Origin, Result};
 use swm_data::Reader;
 use swm_models::{FAMILIES, OnlineRun, TrainOptions, TrainRun, TrainSummary, TrainableConfig, device};
 
@@ -67,7 +67,7 @@ pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
         resume: args.resume,
         device: device::parse(&args.device)?,
         threads: context.threads,
-        cache: home::weights(),
+        cache: home::weights()?,
         ..TrainOptions::default()
     };
     if let Some(env) = &args.env {
@@ -92,7 +92,7 @@ fn train_online(
     options: TrainOptions,
     context: &Context,
 ) -> anyhow::Result<()> {
-    let choice = crate::env(env)?;
+    let choice = crate::env(env, &Origin::User)?;
     let threads = swm_core::pool::threads(context.threads)?;
     let environments = |count: usize| {
         let envs = (0..count).map(|_| choice.env()).collect::<Result<Vec<_>>>()?;

@@ -4,7 +4,7 @@
 use crate::{Swm, text};
 
 /// Whether `$SWM_PYTHON` is set and has a module. Gymnasium is required; other modules may be missing.
-fn python(module: &str) -> bool {
+pub fn python(module: &str) -> bool {
     let Some(program) = std::env::var_os("SWM_PYTHON").filter(|value| !value.is_empty()) else {
         println!("SKIPPED: set SWM_PYTHON to a Python with Gymnasium, as `make test` does");
         return false;

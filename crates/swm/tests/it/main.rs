@@ -4,10 +4,13 @@
 mod collecting;
 mod data;
 mod deletion;
+mod finite;
 mod gym;
 mod listing;
+mod output;
 mod pipeline;
 mod python;
+mod trust;
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

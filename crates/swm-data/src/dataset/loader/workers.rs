@@ -1,11 +1,10 @@
 //! Worker threads that prefetch batches in the order of their indices, a limited number of batches ahead.
 
-use crate::dataset::sync::lock;
+use crate::dataset::sync::{Condvar, Mutex, MutexGuard, lock, thread};
 use std::collections::VecDeque;
 use std::ops::{Deref, DerefMut, Range};
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::thread::JoinHandle;
+use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 use swm_core::{Batch, Error, Result, Schema};
 
@@ -76,7 +75,7 @@ impl BatchPool {
 /// The threads of a loader.
 pub(crate) struct Workers {
     shared: Arc<Shared>,
-    threads: Vec<JoinHandle<()>>,
+    threads: Vec<thread::JoinHandle<()>>,
 }
 
 #[derive(Default)]
@@ -149,10 +148,10 @@ impl Shared {
 impl Workers {
     pub fn new(threads: usize) -> Result<Arc<Self>> {
         let shared = Arc::<Shared>::default();
-        let threads: std::io::Result<Vec<JoinHandle<()>>> = (0..threads)
+        let threads: std::io::Result<Vec<thread::JoinHandle<()>>> = (0..threads)
             .map(|_| {
                 let shared = Arc::clone(&shared);
-                std::thread::Builder::new().name("swm-load".to_owned()).spawn(move || shared.work())
+                thread::Builder::new().name("swm-load".to_owned()).spawn(move || shared.work())
             })
             .collect();
         let threads = threads.map_err(|error| Error::external("starting the loader's threads", error))?;

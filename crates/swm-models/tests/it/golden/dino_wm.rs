@@ -81,7 +81,7 @@ impl Golden {
 
     fn dino_wm(&self) -> DinoWm {
         let dims: Vec<usize> = self.columns().iter().map(|(_, dim, _)| *dim).collect();
-        let model = DinoWm::init(&self.dino_wm_config(), &dims, Key::new(0), &Device::flex());
+        let model = DinoWm::init(&self.dino_wm_config(), &dims, &Init::new(Key::new(0), &Device::flex()));
         let weights = without_masks(self.group("w."));
         let published: Named<Vec<usize>> =
             weights.iter().map(|(name, weight)| (name.clone(), weight.shape.clone())).collect();

@@ -148,7 +148,7 @@ fn golden_gcbc() {
     for file in files("gcbc") {
         println!("{}", file.display());
         let golden = Golden::read(&file);
-        let model = Gcbc::init(&golden.gcrl(), golden.size("action_dim"), Key::new(0), &Device::flex());
+        let model = Gcbc::init(&golden.gcrl(), golden.size("action_dim"), &Init::new(Key::new(0), &Device::flex()));
         let model = golden.fill("w.", model);
         golden.compare(&model.losses(&golden.clips(), &mut DropoutRng::disabled(), true));
     }
@@ -159,7 +159,7 @@ fn golden_gcivl() {
     for file in files("gcivl") {
         println!("{}", file.display());
         let golden = Golden::read(&file);
-        let model = Gcivl::init(&golden.gcrl(), golden.size("action_dim"), Key::new(0), &Device::flex());
+        let model = Gcivl::init(&golden.gcrl(), golden.size("action_dim"), &Init::new(Key::new(0), &Device::flex()));
         let model = golden.fill("w.", model);
         let (clips, relabelled, settings) = (golden.clips(), golden.relabelled(), golden.value_loss());
         golden.compare(&model.losses(&clips, &relabelled, &settings, &mut DropoutRng::disabled(), true));
@@ -171,7 +171,7 @@ fn golden_gciql() {
     for file in files("gciql") {
         println!("{}", file.display());
         let golden = Golden::read(&file);
-        let model = Gciql::init(&golden.gcrl(), golden.size("action_dim"), Key::new(0), &Device::flex());
+        let model = Gciql::init(&golden.gcrl(), golden.size("action_dim"), &Init::new(Key::new(0), &Device::flex()));
         let model = golden.fill("w.", model);
         let (clips, relabelled, settings) = (golden.clips(), golden.relabelled(), golden.value_loss());
         golden.compare(&model.losses(&clips, &relabelled, &settings, &mut DropoutRng::disabled(), true));

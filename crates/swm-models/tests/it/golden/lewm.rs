@@ -7,7 +7,7 @@ use swm_models::lewm::host_encoder::HostEncoder;
 use swm_models::lewm::step::{SigregConfig, TrainBatch, step};
 use swm_models::lewm::{EncoderConfig, Lewm, LewmConfig, Rollout};
 use swm_models::nn::parameters;
-use swm_models::nn::{PredictorConfig, VitConfig};
+use swm_models::nn::{Init, PredictorConfig, VitConfig};
 
 impl Golden {
     fn config(&self) -> LewmConfig {
@@ -40,7 +40,7 @@ impl Golden {
     }
 
     fn model(&self) -> Lewm {
-        let model = Lewm::init(&self.config(), self.size("action_dim"), Key::new(0), &Device::flex());
+        let model = Lewm::init(&self.config(), self.size("action_dim"), &Init::new(Key::new(0), &Device::flex()));
         let weights = self.group("w.");
         for (name, shape) in parameters::shapes(&model) {
             assert_eq!(weights.get(&name).map(|w| &w.shape), Some(&shape), "the shape of the published weight {name}");

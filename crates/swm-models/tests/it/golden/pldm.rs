@@ -6,7 +6,7 @@ use swm_core::Key;
 use swm_models::lewm::step::TrainBatch;
 use swm_models::lewm::{EncoderConfig, LewmConfig, Rollout};
 use swm_models::nn::parameters::{self, Named};
-use swm_models::nn::{PredictorConfig, VitConfig};
+use swm_models::nn::{Init, PredictorConfig, VitConfig};
 use swm_models::pldm::step::step;
 use swm_models::pldm::{Pldm, PldmLoss, Terms};
 
@@ -69,7 +69,8 @@ impl Golden {
 
     fn pldm(&self) -> Pldm {
         let (action_dim, hidden) = (self.size("action_dim"), self.size("idm_hidden"));
-        let model = Pldm::init(&self.world_model_config(), action_dim, hidden, Key::new(0), &Device::flex());
+        let model =
+            Pldm::init(&self.world_model_config(), action_dim, hidden, &Init::new(Key::new(0), &Device::flex()));
         let weights = self.group("w.");
         let published: Named<Vec<usize>> =
             weights.iter().map(|(name, weight)| (name.clone(), weight.shape.clone())).collect();

@@ -121,7 +121,7 @@ impl Solver for Grasp {
         if problem.keys.is_empty() {
             return Ok(Plan::default());
         }
-        let mut descent = Descent::new(ID, &problem, 1, 0.0, move |actions| bounds.clip(actions));
+        let mut descent = Descent::new(ID, &problem, 1, 0.0, move |actions| bounds.clip(actions))?;
         let mut states = VirtualStates::straight(cost, &problem)?;
         let mut state_memory = Memory::new(states.values.len());
         let action_step = Step { optimizer: &self.action_optimizer, action_noise: 0.0 };
@@ -149,9 +149,7 @@ impl Solver for Grasp {
         }
         descent.finish(cost)
     }
-}
 
-impl Grasp {
     fn check(&self) -> Result<()> {
         let settings = Settings(ID);
         settings.at_least_one("iterations", self.iterations)?;

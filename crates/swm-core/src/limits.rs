@@ -1,0 +1,73 @@
+//! [`Limit`]: the largest counts that a command accepts, checked before any work starts.
+//!
+//! The limits are far above useful values; they turn a mistyped or hostile count into an error instead of a machine
+//! without memory.
+
+use crate::{Error, Result};
+
+/// The largest value of a count.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Limit {
+    /// The count, for errors, such as `number of environments`.
+    pub what: &'static str,
+    /// The largest value.
+    pub max: usize,
+}
+
+impl Limit {
+    const fn new(what: &'static str, max: usize) -> Self {
+        Self { what, max }
+    }
+
+    /// Checks a count.
+    ///
+    /// # Errors
+    /// When it is too large.
+    pub fn check(self, given: usize) -> Result<()> {
+        self.check_as(self.what, given)
+    }
+
+    /// Checks a count that has a name of its own.
+    ///
+    /// # Errors
+    /// When it is too large.
+    pub fn check_as(self, what: &str, given: usize) -> Result<()> {
+        if given <= self.max {
+            return Ok(());
+        }
+        Err(Error::config(what, format!("{given} is too large"), format!("choose at most {}", self.max)))
+    }
+}
+
+/// Environments that are stepped together.
+pub const ENVS: Limit = Limit::new("number of environments", 16_384);
+/// Worker processes of third-party environments.
+pub const WORKERS: Limit = Limit::new("number of worker processes", 1024);
+/// Worker threads.
+pub const THREADS: Limit = Limit::new("number of threads", 1024);
+/// The height and the width of a frame, in pixels.
+pub const IMAGE_SIDE: Limit = Limit::new("side of a frame in pixels", 4096);
+/// Episodes of a collected dataset.
+pub const EPISODES: Limit = Limit::new("number of episodes", 1_000_000_000);
+/// Episodes of an evaluation, whose outcomes are held in memory.
+pub const EVALUATED_EPISODES: Limit = Limit::new("number of evaluated episodes", 1_000_000);
+/// Steps of an episode, and between a start and its goal.
+pub const STEPS: Limit = Limit::new("number of steps", 1_000_000_000);
+/// Shards of a dataset.
+pub const SHARDS: Limit = Limit::new("number of shards", 1_000_000);
+/// A count of a solver or of model-predictive control: samples, iterations, steps of the horizon.
+pub const SEARCH: Limit = Limit::new("setting of the search", 1_000_000);
+/// Bytes of the observations and frames of all environments, and of the candidate plans of a search.
+pub const BATCH_BYTES: Limit = Limit::new("bytes of a batch", 16 << 30);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn larger_counts_are_errors() {
+        assert!(ENVS.check(ENVS.max).is_ok());
+        let error = ENVS.check(1_000_000).expect_err("too many").to_string();
+        assert_eq!(error, "number of environments: 1000000 is too large; choose at most 16384");
+    }
+}

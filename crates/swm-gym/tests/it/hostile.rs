@@ -1,0 +1,62 @@
+//! Tests of environments that fork, close descriptors, replace their process or write to the connection.
+
+use crate::config;
+use crate::play::make;
+use std::time::{Duration, Instant};
+use swm_core::batch::{Batch, Schema};
+use swm_core::{Action, Env, ResetOptions};
+use swm_gym::GymConfig;
+
+/// Returns the error of an environment that fails in its second step or later. All observations before it are right.
+fn error_of(fault: &str) -> Option<String> {
+    let config = GymConfig { call_timeout: Duration::from_millis(1000), restarts: 0, ..config()? };
+    let mut env = make(&format!("tests.it.environments:Counter-v0,fault={fault}"), &config);
+    env.reset(0, &ResetOptions::default()).expect("a reset");
+    let start = Instant::now();
+    for t in 1.. {
+        if let Err(error) = env.step(Action::Discrete(&[0])) {
+            assert!(t > 1, "{fault}: {error}");
+            env.reset(0, &ResetOptions::default()).expect("a reset after an error");
+            return Some(error.to_string());
+        }
+        assert_eq!(observation(&*env), t as f32, "{fault}");
+        assert!(start.elapsed() < Duration::from_secs(20), "{fault}: no error");
+    }
+    None
+}
+
+fn observation(env: &dyn Env) -> f32 {
+    let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("a schema"), 1);
+    env.observe(&mut row.row_mut(0));
+    row.get::<f32>("observation").expect("a column")[0]
+}
+
+fn check(fault: &str, words: &[&str]) {
+    let Some(error) = error_of(fault) else { return };
+    for part in words {
+        assert!(error.contains(part), "{fault}: no '{part}' in {error}");
+    }
+}
+
+#[test]
+fn forked_process_that_returns_is_an_error_and_doubles_no_row() {
+    check("fork", &["tests.it.environments:Counter-v0", "forked a process"]);
+    check("fork_and_raise", &["forked a process"]);
+}
+
+#[test]
+fn process_that_leaves_its_work_to_a_child_is_lost() {
+    check("fork_and_end", &["ended with exit status: 3"]);
+}
+
+#[test]
+fn closed_connection_is_an_error() {
+    check("close_descriptors", &["worker process"]);
+    check("exec", &["worker process"]);
+}
+
+#[test]
+fn malformed_answers_are_errors() {
+    check("answer", &["4294967295 bytes"]);
+    check("answer_unknown", &["an answer of unknown kind 0"]);
+}

@@ -1,0 +1,97 @@
+//! Printing: the only module that writes to standard output and standard error.
+//!
+//! Names that come from files are printed with [`printable`], so that they cannot control the terminal. A write to
+//! standard output that fails is remembered; the command finishes its work and then exits with an error, because its
+//! output is lost. A closed pipe is not an error: `swm envs | head` has all that it needs.
+
+use std::borrow::Cow;
+use std::fmt::Write as _;
+use std::io::{Error, ErrorKind, Write};
+use std::sync::{Mutex, PoisonError};
+use swm_core::text::printable;
+
+/// The first failure of a write to standard output.
+static FAILURE: Mutex<Option<Error>> = Mutex::new(None);
+
+/// Prints to standard output.
+pub fn emit(text: &str) {
+    write_out(&printable(text));
+}
+
+/// Prints one JSON document to standard output. JSON has its own escapes for control characters.
+pub fn emit_json(value: &impl serde::Serialize) -> anyhow::Result<()> {
+    write_out(&escaped_json(&serde_json::to_string_pretty(value)?));
+    write_out("\n");
+    Ok(())
+}
+
+/// Prints to standard error. There is no other stream to report a failure to.
+pub fn eprint(text: &str) {
+    std::io::stderr().write_all(printable(text).as_bytes()).ok();
+}
+
+/// Returns the failure of standard output, if its content is lost: none after a closed pipe.
+pub fn take_failure() -> Option<Error> {
+    let failure = FAILURE.lock().unwrap_or_else(PoisonError::into_inner).take();
+    failure.filter(|error| error.kind() != ErrorKind::BrokenPipe)
+}
+
+/// Remembers the first failure of standard output.
+pub fn check(written: std::io::Result<()>) {
+    if let Err(error) = written {
+        FAILURE.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
+    }
+}
+
+fn write_out(text: &str) {
+    let mut out = std::io::stdout().lock();
+    check(out.write_all(text.as_bytes()).and_then(|()| out.flush()));
+}
+
+/// Escapes the characters that [`printable`] escapes as JSON does. They occur within strings only, as serde_json writes
+/// no others between values.
+fn escaped_json(json: &str) -> Cow<'_, str> {
+    if matches!(printable(json), Cow::Borrowed(_)) {
+        return Cow::Borrowed(json);
+    }
+    let mut escaped = String::with_capacity(json.len());
+    for c in json.chars() {
+        match printable(c.encode_utf8(&mut [0; 4])) {
+            Cow::Borrowed(same) => escaped.push_str(same),
+            Cow::Owned(_) => {
+                let _ = write!(escaped, "\\u{:04x}", u32::from(c));
+            }
+        }
+    }
+    Cow::Owned(escaped)
+}
+
+/// Formats rows as a table with a header.
+pub fn table(header: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> String {
+    let mut table = comfy_table::Table::new();
+    table.load_preset(comfy_table::presets::NOTHING);
+    table.set_style(comfy_table::TableComponent::HeaderLines, '─');
+    table.set_style(comfy_table::TableComponent::MiddleHeaderIntersections, '─');
+    table.set_content_arrangement(comfy_table::ContentArrangement::Dynamic);
+    table.set_header(header.to_vec());
+    for row in rows {
+        // Escaped here and not in the finished table, so that columns have the widths of the escaped cells.
+        table.add_row(row.iter().map(|cell| printable(cell)));
+    }
+    format!("{table}\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn json_with_control_characters_stays_the_same_document() {
+        let value = serde_json::json!({"name\u{9b}": ["a\u{7f}\u{202e}b", "\u{1b}[31m", "größe"]});
+        let text = serde_json::to_string_pretty(&value).expect("a document");
+        let escaped = escaped_json(&text);
+        assert!(escaped.contains("name\\u009b") && escaped.contains("a\\u007f\\u202eb"), "{escaped}");
+        assert!(escaped.contains("größe"));
+        assert_eq!(serde_json::from_str::<serde_json::Value>(&escaped).expect("a document"), value);
+    }
+}

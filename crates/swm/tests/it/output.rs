@@ -1,0 +1,173 @@
+//! Tests of lost output, of output folders, and of text from files on the terminal (docs/security.md).
+
+use crate::{Swm, text};
+use std::fs;
+use std::process::{Command, Output, Stdio};
+
+/// Evaluates two short episodes in the folder `found`.
+const EVAL: &[&str] = &["eval", "expert", "--env", "swm/TwoRoom-v1", "--episodes", "2", "--budget", "3", "-o", "found"];
+
+/// Runs the command with this file as standard output.
+fn run_into(swm: &Swm, args: &[&str], out: &str) -> Output {
+    let out = fs::OpenOptions::new().write(true).open(out).expect("the file opens");
+    swm.command(args).stdout(out).stderr(Stdio::piped()).output().expect("swm starts")
+}
+
+#[test]
+fn lost_output_is_an_error() {
+    let swm = Swm::new();
+    for args in [
+        &["formats"][..],
+        &["formats", "--json"],
+        &["envs", "swm/TwoRoom-v1"],
+        &["models", "--json"],
+        &["datasets"],
+        &["--help"],
+        &["collect", "--help"],
+        &["help", "eval"],
+        &["--version"],
+    ] {
+        let output = run_into(&swm, args, "/dev/full");
+        let error = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{args:?}: {error}");
+        assert!(error.contains("standard output") && error.contains("the output is lost"), "{args:?}: {error}");
+        assert_eq!(run_into(&swm, args, "/dev/null").status.code(), Some(0), "{args:?}");
+    }
+    // The results of a long command are written to its files all the same.
+    assert_eq!(run_into(&swm, EVAL, "/dev/full").status.code(), Some(1));
+    assert!(swm.path("found/results.json").is_file());
+    // Another failure keeps its exit code.
+    assert_eq!(run_into(&swm, &["inspect", "nothing"], "/dev/full").status.code(), Some(2));
+}
+
+#[test]
+fn closed_pipe_ends_quietly() {
+    let swm = Swm::new();
+    let mut child =
+        swm.command(&["envs", "--json"]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("swm starts");
+    drop(child.stdout.take());
+    let output = child.wait_with_output().expect("swm ends");
+    assert_eq!((output.status.code(), text(&output.stderr)), (Some(0), String::new()));
+}
+
+#[test]
+fn output_folders_are_checked_before_the_work() {
+    let swm = Swm::new();
+    fs::write(swm.path("file"), "").expect("a file");
+    fs::create_dir_all(swm.path("occupied/results.json")).expect("a folder");
+    let other = |folder: &'static str| [&EVAL[..EVAL.len() - 1], &[folder]].concat();
+    let no_work = |folder: &'static str, code: i32, parts: &[&str]| {
+        let output = swm.run(&other(folder));
+        let error = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(code), "{folder}: {error}");
+        assert!(parts.iter().all(|part| error.contains(part)), "{folder}: {error}");
+        assert!(!error.contains("evaluate: random"), "{folder}: the floor was played: {error}");
+    };
+    no_work("", 2, &["--output", "a value is required"]);
+    no_work("file", 2, &["is not a folder"]);
+    no_work("file/below", 1, &["file/below"]);
+    no_work("occupied", 2, &["results.json", "is a folder"]);
+    no_work("/proc/swm", 1, &["/proc/swm"]);
+
+    swm.json(EVAL);
+    swm.fails(&["reproduce", "found", "-o", "found"], 2, &["would be replaced"]);
+    swm.fails(&["report", "found", "-o", "file"], 2, &["is not a folder"]);
+
+    let lock = fs::File::open(swm.path("found")).expect("the folder");
+    lock.lock().expect("the lock");
+    for args in [EVAL, &["report", "found", "-o", "found"], &["demo", "-o", "found"]] {
+        swm.fails(args, 2, &["another process writes to it"]);
+    }
+}
+
+#[test]
+fn requests_are_checked_before_the_floor_is_played() {
+    let swm = Swm::new();
+    let simulator = ["eval", "simulator", "--env", "swm/TwoRoom-v1", "--episodes", "2", "--budget", "3"];
+    let solver = |text: &'static str| [&simulator[..], &["--solver", text]].concat();
+    for (args, parts) in [
+        (solver("cem,samples=8,elites=20"), &["cem elites", "20 of 8"][..]),
+        (solver("cem,iterations=0"), &["cem iterations"]),
+        (solver("mppi,temperature=0"), &["mppi temperature"]),
+        (solver("cem,samples=1152921504606846976"), &["samples", "1000000"]),
+        (solver("cem,samples=8,samples=9"), &["given twice", "samples=8", "samples=9"]),
+        ([&simulator[..], &["--horizon", "1152921504606846976"]].concat(), &["MPC horizon", "10000"]),
+        ([&simulator[..], &["--pin", "agent.speed=1", "--pin", "agent.speed=2"]].concat(), &["agent.speed", "twice"]),
+        ([&simulator[..], &["--pin", "agent.sped=1"]].concat(), &["did you mean agent.speed"]),
+        ([&simulator[..], &["--wrapper", "noise,std=1,std=2"]].concat(), &["std=1", "std=2", "twice"]),
+        ([&simulator[..], &["--term", "control,weight=1,weight=2"]].concat(), &["weight=1", "weight=2", "twice"]),
+    ] {
+        let output = swm.run(&args);
+        let error = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{args:?}: {error}");
+        assert!(parts.iter().all(|part| error.contains(part)), "{args:?}: {error}");
+        assert!(!error.contains("evaluate: random") && !error.contains("panicked"), "{args:?}: {error}");
+    }
+    swm.fails(&["train", "lewm", "--data", "x", "seed=1", "seed=2"], 2, &["'seed=1' and 'seed=2'"]);
+    let twice = "swm/OGBCube-v0,env_type=double,env_type=single";
+    swm.fails(&["envs", twice], 2, &["'env_type=double' and 'env_type=single'"]);
+}
+
+#[test]
+fn results_that_request_other_episodes_are_not_repeated() {
+    let swm = Swm::new();
+    swm.json(EVAL);
+    let file = swm.path("found/results.json");
+    let good: serde_json::Value =
+        serde_json::from_slice(&fs::read(&file).expect("the results")).expect("a JSON document");
+    for (pointer, value, parts) in [
+        ("/manifest/config/episodes", (1u64 << 60).into(), &["1152921504606846976 episodes", "has 2"][..]),
+        ("/manifest/config/image", serde_json::json!([1u64 << 40, 1u64 << 40]), &["frame size", "4096"]),
+    ] {
+        let mut bad = good.clone();
+        *bad.pointer_mut(pointer).expect(pointer) = value;
+        fs::write(&file, bad.to_string()).expect("the file is written");
+        swm.fails(&["reproduce", "found"], 2, parts);
+    }
+}
+
+#[test]
+fn without_a_home_folder_nothing_goes_to_the_current_folder() {
+    let swm = Swm::new();
+    let run = |args: &[&str]| {
+        let mut command: Command = swm.command(args);
+        command.env_remove("STABLEWM_HOME").env_remove("HOME").env_remove("SWM_ASSETS").output().expect("swm starts")
+    };
+    let collect = ["collect", "swm/TwoRoom-v1", "--episodes", "1", "--no-pixels", "-o"];
+    for args in
+        [&[&collect[..], &["rooms"]].concat()[..], &["datasets"], &["checkpoints"], &["demo"], &["assets", "install"]]
+    {
+        let output = run(args);
+        let error = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{args:?}: {error}");
+        assert!(error.contains("set STABLEWM_HOME"), "{args:?}: {error}");
+    }
+    assert_eq!(fs::read_dir(swm.home()).expect("the folder").count(), 0);
+    assert!(run(&[&collect[..], &["./rooms.lance"]].concat()).status.success(), "paths need no home folder");
+}
+
+#[test]
+fn text_from_files_does_not_control_the_terminal() {
+    let swm = Swm::new();
+    let name = "\u{1b}]0;owned\u{7}\u{9b}31m\u{202e}evil";
+    fs::create_dir_all(swm.path("checkpoints").join(name)).expect("a folder");
+    fs::create_dir_all(swm.path("datasets").join(format!("{name}.lance"))).expect("a folder");
+    for args in [
+        &["checkpoints"][..],
+        &["checkpoints", "--json"],
+        &["checkpoints", "verify"],
+        &["datasets"],
+        &["datasets", "--json"],
+        &["inspect", name],
+        &["checkpoints", "show", name],
+        &[name],
+        &["fovs", name],
+    ] {
+        let output = swm.run(args);
+        let printed = text(&output.stdout) + &text(&output.stderr);
+        assert!(printed.contains("evil"), "{args:?}: {printed:?}");
+        let raw = |c: char| c != '\n' && (c.is_control() || c == '\u{202e}');
+        assert!(!printed.contains(raw), "{args:?}: {printed:?}");
+    }
+    assert!(swm.json(&["checkpoints"])[0]["name"] == name, "JSON keeps the name");
+}

@@ -39,7 +39,10 @@ impl<T: Named> Registry<T> {
 /// # Panics
 /// When `N` differs from the total length, or the first list is empty.
 pub const fn concat<T: Copy, const N: usize>(first: &[T], second: &[T]) -> [T; N] {
-    assert!(first.len() + second.len() == N && !first.is_empty(), "N is the total length of the two lists");
+    assert!(
+        first.len() + second.len() == N && !first.is_empty(),
+        "N must be the total length of the two lists, and the first must not be empty"
+    );
     let mut all = [first[0]; N];
     let mut i = 0;
     while i < N {
@@ -71,7 +74,7 @@ impl Choices {
     /// When the environment has no such option.
     pub fn get(&self, key: &str) -> &'static str {
         let chosen = self.0.iter().find(|(known, _)| *known == key);
-        chosen.unwrap_or_else(|| panic!("{key} is an option of the environment")).1
+        chosen.unwrap_or_else(|| panic!("the environment has no option '{key}'")).1
     }
 }
 
@@ -158,17 +161,17 @@ impl Registry<EnvEntry> {
             let options = chosen.entry.options;
             let keys = || options.iter().map(|option| option.key);
             let index = keys().position(|known| known == key).ok_or_else(|| {
-                let hint = if options.is_empty() { "this environment has no options" } else { "write ID,option=value" };
-                Error::unknown("option of the environment", key, keys(), format!("{}: {hint}", chosen.entry.id))
+                let (id, known) = (chosen.entry.id, keys().collect::<Vec<_>>().join(", "));
+                let hint = match options {
+                    [] => format!("{id} has no options"),
+                    _ => format!("{id} has the options {known}, which are written as {id},OPTION=VALUE"),
+                };
+                Error::unknown("environment option", key, keys(), hint)
             })?;
             let values = options[index].values;
             let value = values.iter().find(|known| **known == value).ok_or_else(|| {
-                Error::unknown(
-                    "value of the option",
-                    value,
-                    values.iter().copied(),
-                    format!("{key} of {}", chosen.entry.id),
-                )
+                let hint = format!("the option {key} of {} has the values {}", chosen.entry.id, values.join(", "));
+                Error::unknown("option value", value, values.iter().copied(), hint)
             })?;
             chosen.choices.0[index].1 = value;
         }

@@ -100,7 +100,11 @@ impl WorkerTransport {
             b'x' => return Failure::Raised(text),
             b'u' => {
                 let known: Vec<String> = serde_json::from_str(&text).unwrap_or_default();
-                let hint = format!("it is not among the {} registered with Gymnasium in {python}", known.len());
+                let hint = format!(
+                    "it is not among the {} environments registered with Gymnasium in {python}; check the spelling, or install \
+                     the package that registers it",
+                    known.len()
+                );
                 Error::unknown("environment", id, known.iter().map(String::as_str), hint)
             }
             b'm' => {

@@ -30,7 +30,7 @@ macro_rules! trampolines {
         const NAMES: &[&CStr] = &[$(
             match CStr::from_bytes_with_nul(concat!(stringify!($name), "\0").as_bytes()) {
                 Ok(name) => name,
-                Err(_) => panic!("a name contains a zero byte"),
+                Err(_) => panic!("a name for MuJoCo must not contain a zero byte"),
             }
         ),*];
 

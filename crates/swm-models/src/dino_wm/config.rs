@@ -89,11 +89,11 @@ impl DinoWmConfig {
         checks::pixel_std(self.pixel_std)?;
         let invalid = |problem: String, fix: &str| Err(Error::config("model.columns", problem, fix));
         if !self.columns.iter().any(|column| column.name == ACTION) {
-            return invalid("no action".to_owned(), "add { name = \"action\", dim = 10 }");
+            return invalid("the list lacks the action".to_owned(), "add { name = \"action\", dim = 10 }");
         }
         for (index, column) in self.columns.iter().enumerate() {
             if column.dim == 0 {
-                return invalid(format!("'{}' has no features", column.name), "give at least 1");
+                return invalid(format!("the dim of '{}' is 0", column.name), "give at least 1");
             }
             if self.columns[..index].iter().any(|other| other.name == column.name) {
                 return invalid(format!("'{}' is listed twice", column.name), "list it once");

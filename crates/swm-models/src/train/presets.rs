@@ -28,8 +28,9 @@ pub(crate) fn preset_text(presets: &[Preset], preset: &str) -> Result<String> {
             std::fs::read_to_string(preset).map_err(|error| Error::io(preset, "reading a configuration", error))
         }
         None => {
-            let hint = "or give the path of a .toml file";
-            Err(Error::unknown("preset", preset, presets.iter().map(|row| row.id), hint))
+            let known: Vec<&str> = presets.iter().map(|row| row.id).collect();
+            let hint = format!("choose {}, or give the path of a .toml file", known.join(", "));
+            Err(Error::unknown("preset", preset, known, hint))
         }
     }
 }

@@ -27,7 +27,7 @@ impl std::str::FromStr for Choice {
             "auto" => Ok(Self::Auto),
             "egl" => Ok(Self::Egl),
             "cpu" => Ok(Self::Cpu),
-            _ => Err(Error::config("the renderer", word, "choose auto, egl or cpu")),
+            _ => Err(Error::config("the renderer", format!("there is no '{word}'"), "choose auto, egl or cpu")),
         }
     }
 }

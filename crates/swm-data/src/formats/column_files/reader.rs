@@ -170,7 +170,9 @@ impl ColumnFiles {
 
     fn column(&self, name: &str) -> Result<&Column> {
         self.columns.iter().find(|column| column.spec.name == name).ok_or_else(|| {
-            Error::unknown("column", name, self.columns().map(|c| c.name.as_str()), "there is no such numeric column")
+            let known: Vec<&str> = self.columns().map(|column| column.name.as_str()).collect();
+            let hint = format!("the numeric columns are {}", known.join(", "));
+            Error::unknown("column", name, known, hint)
         })
     }
 

@@ -45,7 +45,7 @@ impl Hdf5Reader {
         let names = catch_panic("listing its datasets", || file.root().datasets()).map_err(damaged)?;
         let record = layout::record(&source).map_err(damaged)?;
         let record = record.map(|found| table::read_all(&found, &source)).transpose();
-        let record = record.map_err(|e| damaged(format!("its record: {e}")))?;
+        let record = record.map_err(|e| damaged(format!("the record of the dataset is unreadable: {e}")))?;
         let column = |name: &str| {
             let dataset = catch_panic("its header", || file.dataset(name));
             let column = dataset.and_then(|dataset| Column::new(name, dataset, source.size()));

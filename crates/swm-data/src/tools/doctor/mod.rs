@@ -158,7 +158,7 @@ pub fn repair(
     control: &mut Control<'_>,
 ) -> Result<Converted> {
     if diagnosis.intact.is_empty() {
-        let problem = format!("none of its {} episodes is intact", diagnosis.episodes);
+        let problem = format!("none of the dataset's {} episodes is intact", diagnosis.episodes);
         return Err(Error::config(
             "repair",
             problem,

@@ -58,7 +58,7 @@ impl ColumnFiles {
         } else if lengths_file.is_plain() {
             Metadata::default()
         } else {
-            return Err(damaged(format!("{LENGTHS}.npz has unknown members")));
+            return Err(damaged(format!("{LENGTHS}.npz has members that this version does not know")));
         };
         let in_files = usize::try_from(rows.total()).map_err(|e| damaged(e.to_string()))?;
         let (mut columns, skipped) = columns(folder, &recorded, in_files)?;

@@ -148,7 +148,7 @@ pub(crate) fn guard<T>(doing: &str, call: impl FnOnce() -> T) -> Result<T> {
     let outcome = catch_unwind(AssertUnwindSafe(call));
     GUARDED.set(was_guarded);
     outcome.map_err(|payload| match payload.downcast::<Fault>() {
-        Ok(fault) => Error::external(format!("MuJoCo, {doing}"), fault.0),
+        Ok(fault) => Error::external(format!("MuJoCo failed while {doing}"), fault.0),
         Err(other) => resume_unwind(other),
     })
 }

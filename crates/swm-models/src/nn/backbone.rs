@@ -94,10 +94,14 @@ impl BackboneConfig {
             }
             Self::PatchCnn(cnn) => {
                 if cnn.hidden == 0 || cnn.dim == 0 || cnn.stages.iter().any(|stage| stage.channels == 0) {
-                    return invalid("pyramid", "a size is 0".to_owned(), "give at least 1");
+                    return invalid(
+                        "pyramid",
+                        "hidden, dim or the channels of a stage are 0".to_owned(),
+                        "give at least 1",
+                    );
                 }
                 if cnn.stages.is_empty() {
-                    return invalid("pyramid.stages", "none".to_owned(), "give at least one");
+                    return invalid("pyramid.stages", "the list is empty".to_owned(), "give at least one stage");
                 }
                 cnn.stages.iter().map(|stage| stage.patch).collect()
             }

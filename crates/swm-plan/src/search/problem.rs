@@ -88,9 +88,9 @@ pub fn discrete<'a>(solver: &SolverEntry, cost: &mut dyn CostModel, problem: &Pl
     check_init(problem)?;
     if let Some(weight) = problem.init.unwrap_or_default().iter().find(|&&weight| weight < 0.0) {
         return Err(Error::OutOfSpace {
-            what: "an option in the initial guess of a plan".to_owned(),
+            what: "the weight of an option in the initial guess of a plan".to_owned(),
             given: weight.to_string(),
-            expected: "weights of the options, none below 0".to_owned(),
+            expected: "at least 0".to_owned(),
         });
     }
     Ok(choices)

@@ -149,5 +149,5 @@ fn errors_name_invalid_problems() {
     assert!(message("categorical_cem", 3, none, None).contains("choice 1 of a model step: it has no options"));
     let choices = PlanSpace::Discrete { choices: &[2] };
     let negative = [1.0, -1.0, 0.0, 0.0];
-    assert!(message("categorical_cem", 1, choices, Some(&negative)).contains("none below 0"));
+    assert!(message("categorical_cem", 1, choices, Some(&negative)).contains("at least 0"));
 }

@@ -47,7 +47,7 @@ impl Hdf5Reader {
         let record = record.map(|found| table::read_all(&found, &source)).transpose();
         let record = record.map_err(|e| damaged(format!("the record of the dataset is unreadable: {e}")))?;
         let column = |name: &str| {
-            let dataset = catch_panic("its header", || file.dataset(name));
+            let dataset = catch_panic("reading its header", || file.dataset(name));
             let column = dataset.and_then(|dataset| Column::new(name, dataset, source.size()));
             let mut column = column.map_err(|problem| damaged(format!("column '{name}': {problem}")))?;
             column.iter_mut().for_each(|column| column.written_here = record.is_some());

@@ -147,7 +147,7 @@ impl Transport for WorkerTransport {
         let (kind, text) = answer.map_err(|problem| match self.lose(&problem, limit) {
             // A new worker would exceed the same timeout.
             Failure::Lost(how) if problem.kind() == std::io::ErrorKind::WouldBlock => {
-                Failure::Refused(Error::external(format!("making {}", self.id), how))
+                Failure::Refused(Error::external(format!("making the environment {}", self.id), how))
             }
             failure => failure,
         })?;

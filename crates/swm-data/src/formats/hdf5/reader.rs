@@ -41,7 +41,7 @@ impl Hdf5Reader {
     pub fn of(source: Source) -> Result<Self> {
         let damaged = |problem: String| damaged(&source, problem);
         let file =
-            catch_panic("opening it as HDF5", || hdf5_pure::File::from_source(source.clone())).map_err(damaged)?;
+            catch_panic("opening the file as HDF5", || hdf5_pure::File::from_source(source.clone())).map_err(damaged)?;
         let names = catch_panic("listing its datasets", || file.root().datasets()).map_err(damaged)?;
         let record = layout::record(&source).map_err(damaged)?;
         let record = record.map(|found| table::read_all(&found, &source)).transpose();

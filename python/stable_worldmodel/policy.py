@@ -61,7 +61,8 @@ class PlanConfig:
                 raise ValueError(f"PlanConfig.{name}: {getattr(self, name)}; expected at least 1")
         if self.receding_horizon > self.horizon:
             raise ValueError(
-                f"PlanConfig: receding_horizon={self.receding_horizon} steps to execute exceed horizon={self.horizon}"
+                f"PlanConfig: receding_horizon={self.receding_horizon} steps to execute exceed the {self.horizon} planned "
+                "steps (horizon); lower receding_horizon or raise horizon"
             )
 
     @property
@@ -103,7 +104,7 @@ class _EnginePolicy(BasePolicy):
     def get_action(self, obs: Any, **kwargs: Any) -> np.ndarray:
         """The actions for the current infos of the world; `obs` is ignored."""
         if self.env is None:
-            raise RuntimeError(f"{type(self).__name__}: world.set_policy(policy) first")
+            raise RuntimeError(f"{type(self).__name__}: it belongs to no world; call world.set_policy(policy) first")
         return self.env._world._engine_actions(self)
 
 
@@ -175,7 +176,7 @@ class FeedForwardPolicy(BasePolicy):
     def get_action(self, obs: Any, **kwargs: Any) -> Any:
         if isinstance(self.model, str) or hasattr(self.model, "_engine_policy"):
             if self.env is None:
-                raise RuntimeError("FeedForwardPolicy: world.set_policy(policy) first")
+                raise RuntimeError("FeedForwardPolicy: it belongs to no world; call world.set_policy(policy) first")
             return self.env._world._engine_actions(self)
         infos = prepared({key: value for key, value in obs.items() if key[0] != "_"}, self.process, self.transform)
         if "goal" in infos:
@@ -261,7 +262,7 @@ class MPCPolicy(BasePolicy):
     def get_action(self, obs: Any, **kwargs: Any) -> np.ndarray:
         """The actions `(num_envs, ..)` for infos `(num_envs, T, ..)`."""
         if self.env is None:
-            raise RuntimeError("MPCPolicy: world.set_policy(policy) first")
+            raise RuntimeError("MPCPolicy: it belongs to no world; call world.set_policy(policy) first")
         if self.cfg.history_len > 1:
             raise ValueError(
                 f"history_len: {self.cfg.history_len}; only the engine's solvers get past frames, and only if actions are "

@@ -322,7 +322,7 @@ def optimizer(kind: Any, settings: Mapping[str, Any]) -> dict[str, Any]:
         betas = given.pop("betas", (0.9, 0.999))
         out |= {"beta1": float(betas[0]), "beta2": float(betas[1]), "epsilon": float(given.pop("eps", 1e-8))}
     if given:
-        raise ValueError(f"optimizer_kwargs: the engine's {kind} has no {', '.join(given)}")
+        raise ValueError(f"optimizer_kwargs: the engine's {kind} does not support {', '.join(given)}; remove them")
     return out
 
 

@@ -210,7 +210,7 @@ class Dict(spaces.Dict):
         space: Any = self
         for part in key.split("."):
             if not isinstance(space, Dict) or part not in space.spaces:
-                raise ValueError(f"no factor is called {key!r}; the factors are {self.names()}")
+                raise ValueError(f"there is no factor {key!r}; the factors are {self.names()}")
             space = space.spaces[part]
         return space
 
@@ -233,7 +233,8 @@ class Dict(spaces.Dict):
         if debug and wrong:
             import warnings
 
-            warnings.warn(f"not allowed: {', '.join(wrong)}", stacklevel=2)
+            names = ", ".join(wrong)
+            warnings.warn(f"the values of {names} are outside their spaces or violate a constrain_fn", stacklevel=2)
         return not wrong and (self.constrain_fn is None or bool(self.constrain_fn(self.value)))
 
     def sample(
@@ -248,7 +249,7 @@ class Dict(spaces.Dict):
             }
             if self.constrain_fn is None or self.constrain_fn(value):
                 return {key: value[key] for key in self.spaces}
-        raise RuntimeError(f"the factors' common constrain_fn did not hold in {max_tries} tries")
+        raise RuntimeError(f"the factors' common constrain_fn did not hold in {max_tries} tries; relax it or narrow the spaces")
 
     def update(self, keys: Iterable[str]) -> None:
         """Samples these factors and groups in sampling order; `all` selects every factor."""
@@ -315,7 +316,7 @@ def reset_variation_space(
     variation_space.update([names] if isinstance(names, str) else names)
     variation_space.set_value(options.get("variation_values") or {})
     if not variation_space.check():
-        raise ValueError(f"these factors are not allowed together: {variation_space.value}")
+        raise ValueError(f"some factors are outside their spaces or violate a constrain_fn: {variation_space.value}")
 
 
 def from_description(described: Mapping[str, Any]) -> spaces.Space:

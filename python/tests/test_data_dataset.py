@@ -104,11 +104,11 @@ def test_wrong_arguments_raise_clear_errors(stored, tmp_path, monkeypatch):
     with pytest.raises(KeyError, match="no column 'pixel'.*the columns are .*pixels"):
         data.load_dataset(path, keys_to_load=["pixel"])
     dataset = data.load_dataset(path, num_steps=2)
-    with pytest.raises(IndexError, match="of a dataset of 67"):
+    with pytest.raises(IndexError, match="clip 67 is outside the dataset, which has 67 clips"):
         dataset[67]
-    with pytest.raises(IndexError, match="rows 5 .. 13 of episode 0, which has 12"):
+    with pytest.raises(IndexError, match="rows 5 .. 13 are outside episode 0, which has 12 rows"):
         dataset.load_chunk([0], [5], [13])
-    with pytest.raises(IndexError, match="episode 4 of a dataset of 4"):
+    with pytest.raises(IndexError, match="episode 4 is outside the dataset, which has 4 episodes"):
         dataset.load_chunk([4], [0], [1])
     with pytest.raises(ValueError, match="at least 1, got 0"):
         data.load_dataset(path, frameskip=0)

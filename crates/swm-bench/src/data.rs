@@ -389,7 +389,8 @@ impl Endless {
     fn measure(&mut self, config: &DataBenchConfig) -> Result<f64> {
         self.epoch += 1;
         let mut batches = (self.epoch..).flat_map(|epoch| self.loader.epoch(epoch, 0));
-        let mut next = || batches.next().unwrap_or_else(|| Err(Error::external("loading", "an epoch has no batch")));
+        let mut next =
+            || batches.next().unwrap_or_else(|| Err(Error::external("loading batches", "the epoch has no batch")));
         next()?;
         let (begun, mut clips) = (Instant::now(), 0);
         while begun.elapsed().as_secs_f64() < config.seconds {

@@ -150,7 +150,8 @@ pub fn bench_model(config: &ModelBenchConfig, weights: &Path, subject: &mut dyn 
 /// The largest difference, relative to the largest output of the reference.
 fn difference(ours: &[f32], theirs: &[f32]) -> Result<f32> {
     if ours.len() != theirs.len() {
-        let (given, expected) = (format!("{} values", ours.len()), format!("{}, as the reference", theirs.len()));
+        let (given, expected) =
+            (format!("{} values", ours.len()), format!("{}, the number of values of the reference", theirs.len()));
         return Err(Error::mismatch("comparing with the reference", given, expected));
     }
     let largest = theirs.iter().fold(f32::MIN_POSITIVE, |most, value| value.abs().max(most));

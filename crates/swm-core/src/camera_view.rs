@@ -51,8 +51,10 @@ impl CameraView {
             Some((camera, name)) => match modality(name) {
                 Some(modality) => Ok(Self { camera: Some(camera.to_owned()), modality }),
                 None => {
-                    let known = Modality::ALL.iter().map(|(_, name)| *name);
-                    Err(Error::unknown("modality of a camera view", name, known, "write CAMERA:MODALITY"))
+                    let known = Modality::ALL.map(|(_, name)| name);
+                    let hint =
+                        format!("write a camera view as CAMERA:MODALITY; the modalities are {}", known.join(", "));
+                    Err(Error::unknown("camera modality", name, known, hint))
                 }
             },
         }
@@ -74,7 +76,7 @@ impl CameraView {
         match (&self.camera, spec.cameras.is_empty()) {
             (Some(camera), false) => {
                 let known = spec.cameras.iter().map(String::as_str);
-                Error::unknown("camera", camera, known, format!("{id} has {}", spec.cameras.join(", ")))
+                Error::unknown("camera", camera, known, format!("the cameras of {id} are {}", spec.cameras.join(", ")))
             }
             _ => Error::config(
                 "camera view",

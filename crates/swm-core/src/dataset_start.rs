@@ -85,7 +85,7 @@ pub fn required_columns(env: &dyn Env, stored: &Schema, callables: &[Callable]) 
         return Err(Error::mismatch(
             format!("starting {} from a dataset", spec.id),
             format!("states of shape {:?}", state.shape),
-            format!("{:?}; was the dataset collected in this environment?", own.shape),
+            format!("states of shape {:?}; choose a dataset that was collected in this environment", own.shape),
         ));
     }
     let read = stored.columns().iter().filter(|column| !column.is_image());

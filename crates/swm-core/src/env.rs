@@ -116,10 +116,16 @@ impl<'a> Action<'a> {
             {
                 Ok(choice)
             }
-            Self::Discrete(choice) => Err(Error::mismatch("stepping", format!("action {choice:?}"), expected())),
-            Self::Continuous(values) => {
-                Err(Error::mismatch("stepping", format!("{values:?}"), format!("integers in {}", expected())))
-            }
+            Self::Discrete(choice) => Err(Error::mismatch(
+                "stepping",
+                format!("discrete action {choice:?}"),
+                format!("integers in {}", expected()),
+            )),
+            Self::Continuous(values) => Err(Error::mismatch(
+                "stepping",
+                format!("continuous action {values:?}"),
+                format!("integers in {}", expected()),
+            )),
         }
     }
 }
@@ -155,7 +161,7 @@ impl<'a> FrameMut<'a> {
     /// # Panics
     /// When the size of `rgb` differs from `height * width * 3`.
     pub fn new(width: usize, height: usize, rgb: &'a mut [u8]) -> Self {
-        assert_eq!(rgb.len(), width * height * 3, "the buffer has the size of a {width} x {height} RGB frame");
+        assert_eq!(rgb.len(), width * height * 3, "the buffer must have the size of a {width} x {height} RGB frame");
         Self { width, height, rgb }
     }
 }

@@ -38,7 +38,7 @@ pub fn read(path: &Path, limit: u64) -> Result<Vec<u8>> {
     let io = |error| Error::io(path, "reading the file", error);
     let length = file.metadata().map_err(io)?.len();
     let too_long =
-        || Error::corrupt(path, format!("is longer than {limit} bytes"), "give the file that this program wrote");
+        || Error::corrupt(path, format!("is longer than {limit} bytes"), "give a file that this program wrote");
     if length > limit {
         return Err(too_long());
     }
@@ -59,8 +59,9 @@ pub fn read(path: &Path, limit: u64) -> Result<Vec<u8>> {
 /// When writing fails; the old file is unchanged and the temporary file is removed.
 pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
     let io = |error| Error::io(path, "writing the file", error);
-    let name =
-        path.file_name().ok_or_else(|| Error::config(path.display().to_string(), "has no file name", "give one"))?;
+    let name = path
+        .file_name()
+        .ok_or_else(|| Error::config(path.display().to_string(), "has no file name", "give the path of a file"))?;
     let temporary = path.with_file_name(format!(".{}.{}.tmp", name.to_string_lossy(), std::process::id()));
     let written = File::create(&temporary)
         .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_data()))
@@ -139,7 +140,7 @@ pub fn delete_file(path: &Path) -> Result<()> {
     match std::fs::symlink_metadata(path) {
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(()),
         Err(error) => Err(io(error)),
-        Ok(found) if !found.is_file() => Err(Error::corrupt(path, "is not a regular file", "remove it yourself")),
+        Ok(found) if !found.is_file() => Err(Error::corrupt(path, "is not a regular file", "remove it by hand")),
         Ok(_) => unlink(path).map_err(io),
     }
 }

@@ -132,7 +132,7 @@ impl EnvPool {
         threads: Arc<rayon::ThreadPool>,
     ) -> Result<Self> {
         if image.is_none() && !views.is_empty() {
-            return Err(Error::config("camera views", "no frame size is set", "set the frame size"));
+            return Err(Error::config("camera views", "no frame size is set", "set the frame size or omit the views"));
         }
         let Some(first) = envs.first() else {
             return Err(Error::config("number of environments", "0", "choose at least 1"));
@@ -245,8 +245,8 @@ impl EnvPool {
         if actions.rows() != self.len() || active.len() != self.len() {
             return Err(Error::mismatch(
                 "stepping a pool",
-                format!("{} actions, {} flags", actions.rows(), active.len()),
-                format!("{0} actions, {0} flags", self.len()),
+                format!("{} actions and {} active flags", actions.rows(), active.len()),
+                format!("{0} of each, one for each environment", self.len()),
             ));
         }
         let column = actions.schema().index(columns::ACTION)?;

@@ -197,7 +197,7 @@ impl VariationSpace {
                 return Err(Error::OutOfSpace {
                     what: factor.key.clone(),
                     given: format!("{:?}", values.values[constraint.factor]),
-                    expected: constraint.description.to_owned(),
+                    expected: format!("a value with which {}", constraint.description),
                 });
             }
         }

@@ -152,7 +152,7 @@ pub fn check_continues(stored: &Manifest, wanted: &Manifest) -> Result<()> {
     let differs = |what: &str, stored: String, wanted: String| {
         Err(Error::config(
             format!("continuing a collection with {what} {wanted}"),
-            format!("its episodes were collected with {stored}"),
+            format!("its episodes were collected with {what} {stored}"),
             "use the same settings, or collect into another dataset",
         ))
     };

@@ -93,7 +93,7 @@ impl Checked<'_> {
         match keys.iter().find_map(|&key| self.manifest.hashes.get(key)) {
             Some(first) if first != hash => Err(Error::config(
                 what,
-                format!("its hash is {hash}; the results were made with {first}"),
+                format!("its hash is {hash}, but the results were made with {first}"),
                 "restore the data or weights that the results were made with",
             )),
             _ => Ok(()),

@@ -195,7 +195,7 @@ impl EvalRequest {
     /// prediction errors are requested without a dataset.
     pub fn check(&self) -> Result<()> {
         if self.conditions.is_empty() {
-            return Err(Error::config("conditions of an evaluation", "there are none", "name at least one"));
+            return Err(Error::config("conditions of an evaluation", "the list is empty", "name at least one"));
         }
         if self.prediction.is_some() && self.starts == StartsRequest::Episodic {
             return Err(Error::config(

@@ -141,7 +141,7 @@ impl Starts {
                     "{n}, but the dataset's {} episodes have {total} steps with a goal {goal_offset} steps later",
                     episodes.len()
                 ),
-                "ask for fewer, lower the goal offset, or collect more episodes",
+                "choose fewer, lower the goal offset, or collect more episodes",
             ));
         }
         let mut rng = Key::new(seed).with("starts").rng();
@@ -234,7 +234,7 @@ fn check_count(n: usize) -> Result<()> {
     if n > 0 {
         return Ok(());
     }
-    Err(Error::config("number of evaluation episodes", "0", "ask for at least 1"))
+    Err(Error::config("number of evaluation episodes", "0", "choose at least 1"))
 }
 
 /// Removes the columns of factors that are sampled or pinned.

@@ -42,7 +42,7 @@ impl VideoRecording {
             return Err(Error::config(
                 "videos",
                 "the world renders no frames",
-                "give the world a frame size or ask for no videos",
+                "give the world a frame size, or request no videos",
             ));
         };
         let schema = pool.infos().schema();

@@ -63,11 +63,11 @@ impl World {
             return Err(Error::config(
                 "frame size",
                 given,
-                "ask for at least one pixel in each dimension, or for no frames",
+                "choose at least one pixel in each dimension, or no frames",
             ));
         }
         if config.max_episode_steps == Some(0) {
-            return Err(Error::config("steps of an episode", "0", "ask for at least 1"));
+            return Err(Error::config("steps of an episode", "0", "choose at least 1"));
         }
         let envs: Result<Vec<Box<dyn Env>>> = std::iter::repeat_with(make).take(config.envs).collect();
         let pool =

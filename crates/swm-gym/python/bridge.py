@@ -47,7 +47,12 @@ RESET, STEP, STEP_AND_RENDER, RENDER = b'rsdp'
 
 
 class Unsupported(Exception):
-    """Raised when columns or actions cannot represent a space of the environment."""
+    """Raised when columns or actions cannot represent a space of the environment. The argument is the problem."""
+
+    FIX = 'wrap the environment to change the space, or choose another environment'
+
+    def __str__(self):
+        return f'{self.args[0]}; {self.FIX}'
 
 
 class InvalidRequest(ValueError):
@@ -84,7 +89,7 @@ def column_dtype(dtype):
         return np.dtype(np.int32 if small else np.int64)
     if dtype.kind == 'f':
         return np.dtype(np.float32 if dtype.itemsize <= 4 else np.float64)
-    raise Unsupported(f'values of type {dtype}')
+    raise Unsupported(f'values of type {dtype} cannot be stored in a column')
 
 
 def box(low, high, shape, dtype):
@@ -147,7 +152,7 @@ class Actions:
                 self.json = multi(np.concatenate(nvec), np.concatenate(start))
         self.len = sum(math.prod(part.shape or (1,)) for part in parts)
         if not self.len:
-            raise Unsupported(f'actions of {space}: the space is empty')
+            raise Unsupported(f'the action space {space} has no elements')
 
     @staticmethod
     def choices(part):
@@ -162,7 +167,7 @@ class Actions:
         if isinstance(part, spaces.Box) and part.dtype.kind in 'iub':
             low, high = (np.asarray(v, np.int64).reshape(-1) for v in (part.low, part.high))
             return high - low + 1, low
-        raise Unsupported(f'actions of {part} (or a mix of continuous and discrete spaces): wrap the environment')
+        raise Unsupported(f'actions of {part}, alone or mixed with other spaces, are not supported')
 
     def read(self, values):
         """The action in the environment's action space; a copy, not a view of the buffer."""
@@ -322,7 +327,7 @@ class Bridge:
                 name = self.column(names, name, 'obs_', dtype, shape)
                 self.observed.append((path, name, form, dtype, shape, self.columns[-1]['offset']))
         if not self.observed:
-            raise Unsupported(f'observations of {env.observation_space}: none of them is an array of fixed shape')
+            raise Unsupported(f'no observation of {env.observation_space} is an array of fixed shape')
         # Entries of `info`, sorted by name, because their order may vary.
         for key in sorted(key for key in {**first, **second} if isinstance(key, str)):
             values = [value for value in (numeric(info.get(key)) for info in (first, second)) if value is not None]
@@ -495,8 +500,8 @@ class Bridge:
         own = type(self.env.unwrapped)
         known = sorted(key for key in dir(own) if not hasattr(gymnasium.Env, key) and callable(getattr(own, key, None)))
         near = difflib.get_close_matches(name, known, 1)
-        meant = f', did you mean {near[0]}' if near else ''
-        fix = f'it has {", ".join(known)}' if known else 'it has none but those of gymnasium.Env'
+        meant = f' (did you mean {near[0]}?)' if near else ''
+        fix = f'its methods are {", ".join(known)}' if known else 'it has only the methods of gymnasium.Env'
         raise InvalidRequest(f"{own.__name__} has no method '{name}'{meant}", fix)
 
     def value(self, key, value):

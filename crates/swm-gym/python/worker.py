@@ -116,7 +116,9 @@ def make(connection, memory):
         connection.answer(MISSING, json.dumps({'asset': asset, 'message': message}))
     except gymnasium.error.UnregisteredEnv:
         connection.answer(UNKNOWN, json.dumps(sorted(gymnasium.registry)))
-    except (swm_bridge.Unsupported, gymnasium.error.DependencyNotInstalled, gymnasium.error.DeprecatedEnv) as error:
+    except swm_bridge.Unsupported as error:
+        connection.answer(INVALID, json.dumps([error.args[0], error.FIX]))
+    except (gymnasium.error.DependencyNotInstalled, gymnasium.error.DeprecatedEnv) as error:
         connection.answer(UNSUPPORTED, str(error))
     except BaseException:
         connection.answer(RAISED, traceback.format_exc())

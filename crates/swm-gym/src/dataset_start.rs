@@ -42,7 +42,7 @@ pub fn callables<'a>(layout: &'a EnvLayout, named: &'a [Callable]) -> Result<&'a
     }
     Err(Error::config(
         format!("starting {} from a row of a dataset", layout.spec.id),
-        "it has no method known to set a state",
+        "the environment has no method known to set a state",
         "give it a method `set_state(state)`, or name one of its methods in Python: \
          World.evaluate(callables=[{'method': 'set_state', 'args': {'state': {'value': 'state'}}}])",
     ))
@@ -64,7 +64,8 @@ pub fn columns(layout: &EnvLayout, stored: &Schema, named: &[Callable]) -> Resul
                     let known = stored.columns().iter().map(|column| column.name.as_str());
                     let known: Vec<&str> = known.filter(|name| source(name).0 == Source::Start).collect();
                     let hint = format!(
-                        "{}() takes it, and the dataset has {}; the prefix `goal_` denotes the value at the goal",
+                        "an argument of {}() names it, but the columns of the dataset are {}; the prefix `goal_` \
+                         denotes the value at the goal",
                         call.method,
                         known.join(", ")
                     );

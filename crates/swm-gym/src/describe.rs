@@ -127,7 +127,12 @@ impl SpaceJson {
                 };
                 let fits = |bounds: &[Option<f64>]| bounds.len() == n || bounds.len() == 1;
                 if !fits(low) || !fits(high) {
-                    return Err(Error::mismatch("reading a space", format!("{} bounds", low.len()), format!("{n}")));
+                    let given = format!("{} lower and {} upper bounds", low.len(), high.len());
+                    return Err(Error::mismatch(
+                        "reading a space",
+                        given,
+                        format!("{n} of each, one for each element"),
+                    ));
                 }
                 Space::Box {
                     shape: shape.clone(),
@@ -159,7 +164,10 @@ fn dtype_of(name: &str) -> Result<DType> {
     const ALL: [DType; 6] = [DType::Bool, DType::U8, DType::Int32, DType::Int64, DType::Float32, DType::Float64];
     let known = || ALL.iter().map(|dtype| dtype.name());
     let found = ALL.iter().find(|dtype| dtype.name() == name);
-    found.copied().ok_or_else(|| Error::unknown("element type", name, known(), "columns hold these types"))
+    found.copied().ok_or_else(|| {
+        let hint = format!("columns hold {}", known().collect::<Vec<_>>().join(", "));
+        Error::unknown("element type", name, known(), hint)
+    })
 }
 
 /// Checks that a space is one of those that actions have.

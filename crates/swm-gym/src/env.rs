@@ -70,9 +70,9 @@ impl GymEnv {
                 Err(Failure::Lost(how)) if lost < restarts => {
                     lost += 1;
                     tracing::warn!("{id}: {how}; starting another worker ({lost} of {restarts})");
-                    transport.restart().map_err(|failure| failure.explain(id, "making it", 0))?;
+                    transport.restart().map_err(|failure| failure.explain(id, "making the environment", 0))?;
                 }
-                Err(failure) => return Err(failure.explain(id, "making it", lost)),
+                Err(failure) => return Err(failure.explain(id, "making the environment", lost)),
             }
         };
         let mut env = Self::with_layout(Arc::new(EnvLayout::new(id, description)?), transport, restarts)?;
@@ -350,7 +350,11 @@ impl Env for GymEnv {
         if !dispatched || self.episode.as_ref().is_none_or(|episode| !episode.actions.ends_with(bytes)) {
             self.finish_dispatched()?;
             let Some(episode) = &mut self.episode else {
-                return Err(Error::config(&self.layout.spec.id, "stepped outside an episode", "reset it first"));
+                return Err(Error::config(
+                    &self.layout.spec.id,
+                    "the environment was stepped outside an episode",
+                    "reset it first",
+                ));
             };
             episode.actions.extend_from_slice(bytes);
         }
@@ -385,7 +389,11 @@ impl Env for GymEnv {
         self.renders_steps = true;
         if !self.frame_is_current {
             if self.episode.is_none() {
-                return Err(Error::config(&layout.spec.id, "rendered outside an episode", "reset it first"));
+                return Err(Error::config(
+                    &layout.spec.id,
+                    "the environment was rendered outside an episode",
+                    "reset it first",
+                ));
             }
             self.env_call(EnvCall::Render)?;
         }
@@ -468,7 +476,7 @@ impl Env for GymEnv {
     fn restore_from(&mut self, _: RowRef<'_>, _: RowRef<'_>) -> Result<()> {
         Err(Error::config(
             format!("starting {} from a row of a dataset", self.layout.spec.id),
-            "it sets a state at a reset only",
+            "the environment sets a state at a reset only",
             "start an episode at the row with `swm_core::dataset_start::reset`",
         ))
     }

@@ -21,7 +21,7 @@ pub fn reset_arguments(layout: &EnvLayout, seed: u64, options: &ResetOptions) ->
     let VariationRequest { variation, variation_values } = &options.variation;
     let requested = !variation_values.is_empty() || variation.as_ref().is_some_and(|keys| !keys.is_empty());
     if requested && space.factors().is_empty() {
-        let problem = "it has none: neither the environment nor a wrapper has a `variation_space`";
+        let problem = "there are none: neither the environment nor a wrapper has a `variation_space`";
         return Err(Error::config(format!("factors of variation of {id}"), problem, "request no factors"));
     }
     let mut arguments = json!({"seed": fold_seed(seed)});

@@ -61,7 +61,7 @@ impl Failure {
                 let end = &lines[lines.len().saturating_sub(LINES)..];
                 Error::external(format!("{id}: {what} raised"), end.join("\n"))
             }
-            Self::Lost(how) if lost == 0 => Error::external(format!("{id}: {what}"), how),
+            Self::Lost(how) if lost == 0 => Error::external(format!("{id}: {what} failed"), how),
             Self::Lost(how) => Error::external(format!("{id}: {what} failed in {} workers in a row", lost + 1), how),
         }
     }

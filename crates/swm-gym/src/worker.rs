@@ -107,7 +107,11 @@ impl WorkerTransport {
             b'x' => return Failure::Raised(text),
             b'u' => {
                 let known: Vec<String> = serde_json::from_str(&text).unwrap_or_default();
-                let hint = format!("it is not among the {} registered with Gymnasium in {python}", known.len());
+                let hint = format!(
+                    "it is not among the {} environments registered with Gymnasium in {python}; check the spelling, or install \
+                     the package that registers it",
+                    known.len()
+                );
                 Error::unknown("environment", id, known.iter().map(String::as_str), hint)
             }
             b'm' => {
@@ -150,7 +154,7 @@ impl Transport for WorkerTransport {
         let (kind, text) = answer.map_err(|problem| match self.lose(&problem, limit) {
             // A new worker would exceed the same timeout.
             Failure::Lost(how) if problem.kind() == std::io::ErrorKind::WouldBlock => {
-                Failure::Refused(Error::external(format!("making {}", self.id.id()), how))
+                Failure::Refused(Error::external(format!("making the environment {}", self.id.id()), how))
             }
             failure => failure,
         })?;

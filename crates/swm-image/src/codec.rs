@@ -42,13 +42,17 @@ impl ImageCodec {
     /// When a side is 0 or above 65535, or `rgb` has another length.
     pub fn encode(self, rgb: &[u8], height: usize, width: usize, out: &mut Vec<u8>) -> Result<()> {
         let (Ok(h), Ok(w)) = (u16::try_from(height), u16::try_from(width)) else {
-            return Err(Error::mismatch("encoding an image", format!("{height} x {width}"), "sides below 65536"));
+            return Err(Error::mismatch(
+                "encoding an image",
+                format!("{height} x {width} pixels"),
+                "sides below 65536",
+            ));
         };
         if rgb.len() != height * width * 3 || rgb.is_empty() {
             return Err(Error::mismatch(
                 "encoding an image",
                 format!("{} bytes", rgb.len()),
-                format!("{height} x {width} x 3"),
+                format!("{height} x {width} x 3 bytes"),
             ));
         }
         match self {
@@ -119,7 +123,11 @@ pub fn decode(bytes: &[u8], height: usize, width: usize, out: &mut [u8]) -> Resu
         if given == (height, width) && length == height * width * 3 {
             return Ok(());
         }
-        Err(Error::mismatch("decoding an image", format!("{} x {}", given.0, given.1), format!("{height} x {width}")))
+        Err(Error::mismatch(
+            "decoding an image",
+            format!("an image of {} x {}", given.0, given.1),
+            format!("{height} x {width}"),
+        ))
     };
     match FileFormat::of(bytes)? {
         FileFormat::Jpeg => {

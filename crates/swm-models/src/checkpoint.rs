@@ -382,7 +382,10 @@ fn unpack(path: &Path, hash: Option<&String>) -> Result<Named<HostTensor>> {
         .iter()
         .map(|(name, view)| {
             if view.dtype() != Dtype::F32 {
-                return Err(broken(format!("'{name}' holds {:?}, not single precision", view.dtype())));
+                return Err(broken(format!(
+                    "'{name}' holds {:?} elements instead of single precision (F32)",
+                    view.dtype()
+                )));
             }
             let values: Vec<f32> =
                 view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();

@@ -73,7 +73,7 @@ pub(crate) fn column_shape(schema: &Schema, name: &str, expected: &[usize]) -> R
     }
     Err(Error::mismatch(
         format!("reading '{name}'"),
-        format!("{given:?}"),
+        format!("shape {given:?}"),
         format!("{expected:?}, as the model was trained"),
     ))
 }

@@ -27,8 +27,9 @@ pub fn parse(name: &str) -> Result<Device> {
         }
     };
     let Some((_, built)) = BACKENDS.iter().find(|(known, _)| *known == backend) else {
-        let known = BACKENDS.iter().map(|(known, _)| *known).chain(["auto"]);
-        return Err(Error::unknown("device", backend, known, "a GPU index follows a colon, such as vulkan:0"));
+        let known: Vec<&str> = BACKENDS.iter().map(|(known, _)| *known).chain(["auto"]).collect();
+        let hint = format!("choose {}; a GPU index follows a colon, such as vulkan:0", known.join(", "));
+        return Err(Error::unknown("device", backend, known, hint));
     };
     if !built {
         let problem = format!("this program was built without {backend}");

@@ -51,7 +51,7 @@ pub fn load_from(families: &[FamilyEntry], run: &Path, device: &Device) -> Resul
     };
     let Some(row) = families.iter().find(|row| row.id == family) else {
         let problem = format!("it holds a model of the family '{family}', which this program does not support");
-        return Err(Error::corrupt(run, problem, "give another checkpoint; `swm models` lists the families"));
+        return Err(Error::corrupt(run, problem, "give another checkpoint; `swm models` lists the supported families"));
     };
     (row.load)(run, device)
 }

@@ -30,7 +30,7 @@ macro_rules! trampolines {
         const NAMES: &[&CStr] = &[$(
             match CStr::from_bytes_with_nul(concat!(stringify!($name), "\0").as_bytes()) {
                 Ok(name) => name,
-                Err(_) => panic!("a name contains a zero byte"),
+                Err(_) => panic!("a name for MuJoCo must not contain a zero byte"),
             }
         ),*];
 
@@ -148,7 +148,7 @@ pub(crate) fn guard<T>(doing: &str, call: impl FnOnce() -> T) -> Result<T> {
     let outcome = catch_unwind(AssertUnwindSafe(call));
     GUARDED.set(was_guarded);
     outcome.map_err(|payload| match payload.downcast::<Fault>() {
-        Ok(fault) => Error::external(format!("MuJoCo, {doing}"), fault.0),
+        Ok(fault) => Error::external(format!("MuJoCo failed while {doing}"), fault.0),
         Err(other) => resume_unwind(other),
     })
 }

@@ -72,8 +72,8 @@ impl SolverEntry {
     pub fn obstacle(&self, actions: ActionKind, offers: &[Need]) -> Option<String> {
         if self.actions != actions {
             return Some(match actions {
-                ActionKind::Continuous => "it plans discrete actions; the given actions are continuous".to_owned(),
-                ActionKind::Discrete => "it plans continuous actions; the given actions are discrete".to_owned(),
+                ActionKind::Continuous => "it plans discrete actions, but the given actions are continuous".to_owned(),
+                ActionKind::Discrete => "it plans continuous actions, but the given actions are discrete".to_owned(),
             });
         }
         if let Some(need) = self.needs.iter().find(|need| !offers.contains(need)) {

@@ -276,7 +276,7 @@ impl Decoder {
         let Some(found) = named.or_else(|| decoder::find(id)) else {
             return Err(Error::external(
                 "opening a video decoder",
-                format!("this machine's FFmpeg has no decoder for {:?}; install one with it", index.codec),
+                format!("this machine's FFmpeg has no decoder for {:?}; install an FFmpeg that has one", index.codec),
             ));
         };
         let mut context = codec::Context::new_with_codec(found);

@@ -136,7 +136,7 @@ impl Encoder {
         let even = width.is_multiple_of(2) && height.is_multiple_of(2);
         let (name, pixels, settings) = encoding.settings(even);
         let Some(codec) = encoder::find_by_name(name) else {
-            let problem = format!("this machine's FFmpeg has no encoder {name}; install one built with it");
+            let problem = format!("this machine's FFmpeg has no encoder {name}; install an FFmpeg that has it");
             return Err(Error::external("encoding a video", problem));
         };
         let side = |n: usize| {

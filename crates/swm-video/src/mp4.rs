@@ -81,7 +81,7 @@ impl Index {
             }
             let mut body = |limit: u64| -> Result<Vec<u8>> {
                 if size - begin > limit {
-                    return Err(format!("its box '{}' is larger than {limit} bytes", kind.escape_ascii()));
+                    return Err(format!("has a box '{}' of more than {limit} bytes", kind.escape_ascii()));
                 }
                 let mut bytes = vec![0; usize::try_from(size - begin).map_err(|e| e.to_string())?];
                 read(at + begin, &mut bytes)?;
@@ -110,7 +110,7 @@ impl Index {
         if let Some(seal) = seal {
             let mut sums = seal.chunks_exact(4).map(|b| u32::from_be_bytes([b[0], b[1], b[2], b[3]]));
             if sums.next() != Some(sum(&moov)) || seal.len() != 4 * (index.samples.len() + 1) {
-                return Err("its sample tables do not match their checksum".to_owned());
+                return Err("has sample tables that do not match their checksum".to_owned());
             }
             index.sums = Some(sums.collect());
         }
@@ -118,7 +118,7 @@ impl Index {
     }
 
     fn of_moov(moov: &[u8], length: u64) -> Result<Self> {
-        let movie_scale = timescale(find(moov, b"mvhd")?.ok_or("its movie has no header")?)?;
+        let movie_scale = timescale(find(moov, b"mvhd")?.ok_or("has no movie header")?)?;
         if find(moov, b"mvex")?.is_some() {
             return Err("is cut into fragments".to_owned());
         }
@@ -137,10 +137,11 @@ impl Index {
     }
 
     fn of_track(trak: &[u8], mdia: &[u8], movie_scale: u32, length: u64) -> Result<Self> {
-        let timescale = timescale(find(mdia, b"mdhd")?.ok_or("its video has no header")?)?;
-        let minf = find(mdia, b"minf")?.ok_or("its video has no tables")?;
-        let stbl = find(minf, b"stbl")?.ok_or("its video has no tables")?;
-        let (codec, extradata, width, height) = description(find(stbl, b"stsd")?.ok_or("its video has no codec")?)?;
+        let timescale = timescale(find(mdia, b"mdhd")?.ok_or("has a track without a header")?)?;
+        let minf = find(mdia, b"minf")?.ok_or("has a track without tables")?;
+        let stbl = find(minf, b"stbl")?.ok_or("has a track without tables")?;
+        let (codec, extradata, width, height) =
+            description(find(stbl, b"stsd")?.ok_or("has a track without a codec")?)?;
         let samples = samples(stbl, length)?;
         let edit = edit(trak, movie_scale, timescale)?;
         let mut frames: Vec<u32> = (0..u32::try_from(samples.len()).map_err(|e| e.to_string())?).collect();
@@ -255,7 +256,7 @@ impl<'a> Iterator for Boxes<'a> {
 impl<'a> Boxes<'a> {
     fn cut(&mut self, kind: [u8; 4]) -> Option<Result<([u8; 4], &'a [u8])>> {
         self.0 = &[];
-        Some(Err(format!("its box '{}' is cut short", kind.escape_ascii())))
+        Some(Err(format!("has a box '{}' that is cut short", kind.escape_ascii())))
     }
 }
 
@@ -275,7 +276,7 @@ struct Integers<'a>(&'a [u8]);
 
 impl Integers<'_> {
     fn bytes<const N: usize>(&mut self) -> Result<[u8; N]> {
-        let (first, rest) = self.0.split_first_chunk::<N>().ok_or("one of its tables is cut short")?;
+        let (first, rest) = self.0.split_first_chunk::<N>().ok_or("has a table that is cut short")?;
         self.0 = rest;
         Ok(*first)
     }
@@ -300,7 +301,7 @@ impl Integers<'_> {
     fn count(&mut self, size: usize) -> Result<usize> {
         let count = self.u32()? as usize;
         if count.checked_mul(size).is_none_or(|bytes| bytes > self.0.len()) {
-            return Err("one of its tables is cut short".to_owned());
+            return Err("has a table that is cut short".to_owned());
         }
         Ok(count)
     }
@@ -319,7 +320,7 @@ fn timescale(header: &[u8]) -> Result<u32> {
     // Skips the creation time and the modification time.
     if version == 1 { integers.bytes::<16>().map(drop) } else { integers.bytes::<8>().map(drop) }?;
     match integers.u32()? {
-        0 => Err("its time unit is 0".to_owned()),
+        0 => Err("has a time unit of 0".to_owned()),
         timescale => Ok(timescale),
     }
 }
@@ -332,7 +333,7 @@ fn description(stsd: &[u8]) -> Result<(Codec, Arc<[u8]>, usize, usize)> {
     const SIZE: usize = 24;
     let (_, integers) = versioned(stsd)?;
     let entries = integers.0.get(4..).unwrap_or_default();
-    let (kind, entry) = Boxes(entries).next().ok_or("its video has no codec")??;
+    let (kind, entry) = Boxes(entries).next().ok_or("has a track without a codec")??;
     let (codec, record) = match &kind {
         b"avc1" | b"avc3" => (Codec::H264, b"avcC"),
         b"hvc1" | b"hev1" => (Codec::Hevc, b"hvcC"),
@@ -342,7 +343,7 @@ fn description(stsd: &[u8]) -> Result<(Codec, Arc<[u8]>, usize, usize)> {
             return Err(format!("has the codec '{}', which is none of H.264, H.265, VP9, AV1", other.escape_ascii()));
         }
     };
-    let (fixed, boxes) = entry.split_at_checked(ENTRY).ok_or("the description of its codec is cut short")?;
+    let (fixed, boxes) = entry.split_at_checked(ENTRY).ok_or("has a codec description that is cut short")?;
     let size = |at: usize| usize::from(u16::from_be_bytes([fixed[at], fixed[at + 1]]));
     // Ignores malformed boxes, because vendors add boxes in unknown forms.
     let record = Boxes(boxes).flatten().find(|(kind, _)| kind == record).map_or(&[][..], |(_, body)| body);
@@ -350,7 +351,7 @@ fn description(stsd: &[u8]) -> Result<(Codec, Arc<[u8]>, usize, usize)> {
     let extradata = if codec == Codec::Vp9 { &[] } else { record };
     let (width, height) = (size(SIZE), size(SIZE + 2));
     if width == 0 || height == 0 {
-        return Err("its frames have no size".to_owned());
+        return Err("has frames without a size".to_owned());
     }
     Ok((codec, extradata.into(), width, height))
 }
@@ -393,7 +394,7 @@ fn edit(trak: &[u8], movie_scale: u32, timescale: u32) -> Result<Edit> {
 /// Reads all samples, in decoding order.
 #[allow(clippy::too_many_lines, reason = "reads the six tables of samples in sequence")]
 fn samples(stbl: &[u8], length: u64) -> Result<Vec<Sample>> {
-    let table = |kind: &[u8; 4]| find(stbl, kind)?.ok_or(format!("its table '{}' is missing", kind.escape_ascii()));
+    let table = |kind: &[u8; 4]| find(stbl, kind)?.ok_or(format!("lacks its table '{}'", kind.escape_ascii()));
     // Reads the sizes.
     let (_, mut sizes) = versioned(table(b"stsz")?)?;
     let common_size = sizes.u32()?;
@@ -419,7 +420,7 @@ fn samples(stbl: &[u8], length: u64) -> Result<Vec<Sample>> {
         at = at.saturating_add(n);
     }
     if at < count {
-        return Err("some of its frames have no time".to_owned());
+        return Err("has frames without a time".to_owned());
     }
     if let Some(ctts) = find(stbl, b"ctts")? {
         let (_, mut shifts) = versioned(ctts)?;
@@ -471,7 +472,7 @@ fn samples(stbl: &[u8], length: u64) -> Result<Vec<Sample>> {
         let mut offset = if wide { chunks.u64()? } else { chunks.u32()?.into() };
         for sample in samples.iter_mut().skip(at).take(per_chunk) {
             sample.offset = offset;
-            offset = offset.checked_add(sample.size.into()).ok_or("a frame lies beyond its end")?;
+            offset = offset.checked_add(sample.size.into()).ok_or("has a frame beyond its end")?;
             if offset > length {
                 return Err("ends before its last frame".to_owned());
             }
@@ -479,7 +480,7 @@ fn samples(stbl: &[u8], length: u64) -> Result<Vec<Sample>> {
         at = at.saturating_add(per_chunk);
     }
     if at < count {
-        return Err("some of its frames have no position".to_owned());
+        return Err("has frames without a position".to_owned());
     }
     Ok(samples)
 }

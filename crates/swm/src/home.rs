@@ -123,7 +123,7 @@ fn check_name(kind: &str, given: &str) -> Result<()> {
     if given.trim().is_empty() {
         return Err(Error::config(
             format!("the name of a {kind}"),
-            "is empty",
+            "it is empty",
             format!("`swm {kind}s` lists the names"),
         ));
     }

@@ -301,8 +301,9 @@ pub fn scripted(entry: &EnvEntry, name: &str, world: &World) -> Result<Box<dyn P
 /// # Errors
 /// When no score has the name.
 pub fn parse_score(name: &str) -> Result<Score> {
-    serde_json::from_value(name.into())
-        .map_err(|_| Error::config("the simulator's score", format!("'{name}'"), "choose terminal, running or reach"))
+    serde_json::from_value(name.into()).map_err(|_| {
+        Error::config("the simulator's score", format!("there is no '{name}'"), "choose terminal, running or reach")
+    })
 }
 
 /// Fails if a checkpoint was trained on another environment.

@@ -87,7 +87,7 @@ class Dataset:
         total = int(self._clips_before[-1])
         wrong = (indices < -total) | (indices >= total)
         if wrong.any():
-            raise IndexError(f"clip {int(indices[wrong][0])} of a dataset of {total}")
+            raise IndexError(f"clip {int(indices[wrong][0])} is outside the dataset, which has {total} clips")
         indices = np.where(indices < 0, indices + total, indices)
         episodes = np.searchsorted(self._clips_before, indices, side="right") - 1
         return episodes, indices - self._clips_before[episodes]
@@ -259,9 +259,9 @@ class StoredDataset(Dataset):
     def _check_runs(self, episodes: Array, starts: Array, ends: Array) -> None:
         for episode, start, end in zip(episodes, starts, ends, strict=True):
             if not 0 <= episode < self.num_episodes:
-                raise IndexError(f"episode {episode} of a dataset of {self.num_episodes}")
+                raise IndexError(f"episode {episode} is outside the dataset, which has {self.num_episodes} episodes")
             if not 0 <= start <= end <= self.lengths[episode]:
-                raise IndexError(f"rows {start} .. {end} of episode {episode}, which has {self.lengths[episode]}")
+                raise IndexError(f"rows {start} .. {end} are outside episode {episode}, which has {self.lengths[episode]} rows")
 
     def _slices(self, episodes: Array, starts: Array, ends: Array) -> list[dict[str, Any]]:
         """One dict for each run of rows, read in one call of the engine."""
@@ -322,7 +322,7 @@ class StoredDataset(Dataset):
         rows = np.atleast_1d(np.asarray(row_idx, dtype=np.int64))
         total = int(self.lengths.sum())
         if ((rows < -total) | (rows >= total)).any():
-            raise IndexError(f"rows {rows.tolist()} of a dataset of {total}")
+            raise IndexError(f"some of the rows {rows.tolist()} are outside the dataset, which has {total} rows")
         rows = np.where(rows < 0, rows + total, rows)
         episodes = np.searchsorted(self.offsets, rows, side="right") - 1
         # An episode without rows has the offset of the next episode; `side="right"` selects the later of the two.
@@ -492,7 +492,7 @@ class ConcatDataset:
         indices = np.asarray(indices, dtype=np.int64)
         total = int(before[-1])
         if ((indices < -total) | (indices >= total)).any():
-            raise IndexError(f"{what} {indices.tolist()} of {total}")
+            raise IndexError(f"some of the {what} {indices.tolist()} are outside the dataset, which has {total} {what}")
         indices = np.where(indices < 0, indices + total, indices)
         parts = np.searchsorted(before, indices, side="right") - 1
         return parts, indices - before[parts]
@@ -654,7 +654,7 @@ class GoalDataset:
         """The samples of a batch."""
         wrong = [i for i in indices if not -len(self) <= i < len(self)]
         if wrong:
-            raise IndexError(f"clip {wrong[0]} of a dataset of {len(self)}")
+            raise IndexError(f"clip {wrong[0]} is outside the dataset, which has {len(self)} clips")
         indices = [i % len(self) for i in indices]
         samples = [dict(sample) for sample in _items(self.dataset, self._indices[indices].tolist())]
         if not self.goal_keys:

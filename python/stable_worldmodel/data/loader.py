@@ -72,7 +72,7 @@ def bytes_of(given: int | str) -> int:
     try:
         return int(float(number) * units[unit])
     except (KeyError, ValueError) as error:
-        raise ValueError(f"expected bytes, such as 536870912 or '512MB', got {given!r}") from error
+        raise ValueError(f"expected a number of bytes, such as 536870912 or '512MB', got {given!r}") from error
 
 
 class Loader:
@@ -137,7 +137,7 @@ class Loader:
         if isinstance(dataset, (str, os.PathLike)):
             dataset = load_dataset(dataset, format=format)
         elif format is not None:
-            raise TypeError("format: the dataset is open already")
+            raise TypeError("format: it selects how a path is opened, and the given dataset is open already; omit it")
         self.dataset = dataset
         self.backend = _tensors.backend(backend if backend is not None else getattr(dataset, "backend", None))
         if device is not None and self.backend == "numpy":
@@ -224,7 +224,7 @@ class Loader:
         changed = {name: (state[name], own[name]) for name in ("seed", "batch_size", "clips") if state[name] != own[name]}
         if changed:
             changes = ", ".join(f"{name} was {was} and is {now}" for name, (was, now) in changed.items())
-            raise ValueError(f"the state belongs to another loader: {changes}")
+            raise ValueError(f"the state belongs to a loader with other settings ({changes}); create the loader with the saved settings")
         self._next = self._at = (int(state["epoch"]), int(state["batch"]))
 
     def __iter__(self) -> Iterator[dict[str, Any]]:

@@ -131,9 +131,11 @@ class EpisodeWriter:
             if array.shape[1:] != shape and array[:1].size == int(np.prod(shape)) and max(array.ndim - 1, len(shape)) <= 1:
                 array = array.reshape(len(array), *shape)
             if array.shape[1:] != shape:
-                raise ValueError(f"{self.path}: column {name!r} has steps of shape {array.shape[1:]}, the dataset's of {shape}")
+                raise ValueError(
+                    f"{self.path}: column {name!r} has steps of shape {array.shape[1:]}, expected {shape} as in the dataset"
+                )
             if array.dtype.name != dtype and not np.can_cast(array.dtype, dtype, "same_kind"):
-                raise TypeError(f"{self.path}: column {name!r} is {array.dtype.name}, the dataset's {dtype}")
+                raise TypeError(f"{self.path}: column {name!r} is {array.dtype.name}, expected {dtype} as in the dataset")
             fitted[name] = np.ascontiguousarray(array, dtype=dtype)
         return fitted
 

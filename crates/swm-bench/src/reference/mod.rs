@@ -163,7 +163,7 @@ impl Reference {
     fn rate(&mut self, request: &str) -> Result<f64> {
         let words = self.request(request)?;
         if let Some(("error", why)) = words.split_first().map(|(first, why)| (first.as_str(), why)) {
-            return Err(Error::external("the reference", why.join(" ")));
+            return Err(Error::external("running the reference", why.join(" ")));
         }
         let values: Vec<f64> = words.iter().filter_map(|word| word.parse().ok()).collect();
         match values[..] {

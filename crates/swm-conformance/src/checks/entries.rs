@@ -10,22 +10,26 @@ pub fn entries_are_complete(suite: &Suite) {
         let (env, id) = (entry.env().expect("an environment"), entry.id);
         let spec = env.spec();
         assert_eq!(spec.id, id);
-        assert_eq!(suite.rows.iter().filter(|other| other.id == id).count(), 1, "{id} is listed once");
-        assert!(!entry.summary.is_empty(), "{id} has a summary");
-        assert!(spec.max_episode_steps > 0, "{id}");
+        assert_eq!(suite.rows.iter().filter(|other| other.id == id).count(), 1, "{id} must be listed once");
+        assert!(!entry.summary.is_empty(), "{id} must have a summary");
+        assert!(spec.max_episode_steps > 0, "{id} must have a time limit of at least 1 step");
         let schema = Schema::new(spec.columns.clone()).unwrap_or_else(|error| panic!("{id}: {error}"));
-        assert!(schema.find(STATE).is_some(), "{id} observes its state");
+        assert!(schema.find(STATE).is_some(), "{id} must observe its state");
         let supported = match spec.action_space {
             Space::Box { dtype, .. } => dtype == DType::Float32,
             Space::Discrete { .. } | Space::MultiDiscrete { .. } => true,
             Space::Rgb => false,
         };
-        assert!(supported, "{id}: actions are a float32 box, discrete or multi-discrete");
-        assert!(!suite.require_experts || !entry.experts.is_empty(), "{id} has an expert");
+        assert!(supported, "{id}: the action space must be a float32 box, discrete or multi-discrete");
+        assert!(!suite.require_experts || !entry.experts.is_empty(), "{id} must have an expert");
         for (i, expert) in entry.experts.iter().enumerate() {
-            assert!(entry.experts[..i].iter().all(|other| other.id != expert.id), "{id}: two experts '{}'", expert.id);
-            assert!(!expert.summary.is_empty(), "{id}: {} has a summary", expert.id);
+            assert!(
+                entry.experts[..i].iter().all(|other| other.id != expert.id),
+                "{id} has two experts '{}'",
+                expert.id
+            );
+            assert!(!expert.summary.is_empty(), "{id}: the expert '{}' must have a summary", expert.id);
         }
-        assert!(!spec.variation_space.factors().is_empty(), "{id} has factors of variation");
+        assert!(!spec.variation_space.factors().is_empty(), "{id} must have factors of variation");
     }
 }

@@ -63,7 +63,7 @@ pub fn invalid_actions_are_errors_without_effect(suite: &Suite) {
         };
         for action in invalid {
             let error = probe.env.step(action).expect_err("an invalid action").to_string();
-            assert!(error.len() > 10, "{}: {error}", entry.id);
+            assert!(error.len() > 10, "{}: the error '{error}' is too short", entry.id);
             assert!(probe.env.snapshot() == before, "{}: {action:?} changed the state", entry.id);
         }
         if let Space::Box { .. } = probe.env.spec().action_space {

@@ -97,7 +97,7 @@ impl Probe {
 
 /// The mean absolute difference of two frames, in units of 1/255.
 pub(super) fn frame_difference(a: &[u8], b: &[u8]) -> f64 {
-    assert_eq!(a.len(), b.len(), "the frames have equal sizes");
+    assert_eq!(a.len(), b.len(), "the frames must have equal sizes");
     a.iter().zip(b).map(|(&a, &b)| f64::from(a.abs_diff(b))).sum::<f64>() / a.len() as f64
 }
 

@@ -90,7 +90,7 @@ pub fn groups_factors_and_pinned_values_combine(suite: &Suite) {
             probe.env.reset(seed, &options).unwrap_or_else(|error| panic!("{label}: {error}"));
             for (factor, (key, value)) in factors.iter().zip(probe.env.factors().iter()) {
                 if let Some(expected) = request.variation_values.get(key) {
-                    assert_eq!(value, expected, "{label}: {key} is pinned");
+                    assert_eq!(value, expected, "{label}: {key} does not have its pinned value");
                 } else if !inside(&factor) && other.is_none_or(|other| other.key != key) {
                     assert_eq!(value, factor.init_value, "{label}: {key} varies without being requested");
                 }

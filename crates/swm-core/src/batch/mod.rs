@@ -115,7 +115,7 @@ impl Batch {
     /// # Panics
     /// When there is no such row.
     pub fn row(&self, row: usize) -> RowRef<'_> {
-        assert!(row < self.rows, "row {row} of a batch of {} rows", self.rows);
+        assert!(row < self.rows, "row {row} is outside a batch of {} rows", self.rows);
         RowRef::new(self, row)
     }
 
@@ -142,7 +142,7 @@ impl Batch {
     /// When the number of items differs from the number of rows.
     pub fn par_zip_mut<T: Send>(&mut self, items: &mut [T], f: impl Fn(usize, RowMut<'_>, &mut T) + Sync) {
         use rayon::prelude::*;
-        assert_eq!(items.len(), self.rows, "one item per row");
+        assert_eq!(items.len(), self.rows, "the number of items must equal the number of rows");
         let shared = self.rows_mut();
         items.par_iter_mut().with_max_len(1).enumerate().for_each(|(row, item)| f(row, shared.row(row), item));
     }
@@ -181,8 +181,8 @@ impl Batch {
         }
         Err(Error::mismatch(
             format!("reading column '{}'", column.name),
-            std::any::type_name::<T>(),
-            column.dtype.name(),
+            format!("a request for {}", std::any::type_name::<T>()),
+            format!("{}, the type of the column", column.dtype.name()),
         ))
     }
 

@@ -23,7 +23,13 @@ impl<'a> RowRef<'a> {
     /// When the column holds another type: indices come from a schema, so another type is a bug of the caller.
     pub fn at<T: Element>(self, index: usize) -> &'a [T] {
         let column = &self.schema().columns()[index];
-        assert!(T::is(column.dtype), "column '{}' holds {}", column.name, column.dtype.name());
+        assert!(
+            T::is(column.dtype),
+            "column '{}' holds {}, which was read as {}",
+            column.name,
+            column.dtype.name(),
+            std::any::type_name::<T>()
+        );
         let n = column.row_bytes();
         bytemuck::cast_slice(&self.batch.bytes(index)[self.row * n..(self.row + 1) * n])
     }
@@ -102,7 +108,7 @@ mod shared {
         /// # Panics
         /// When the row does not exist.
         pub fn row(&self, row: usize) -> RowMut<'a> {
-            assert!(row < self.rows, "row {row} of a batch of {} rows", self.rows);
+            assert!(row < self.rows, "row {row} is outside a batch of {} rows", self.rows);
             RowMut { schema: self.schema, starts: self.starts, row }
         }
     }
@@ -126,7 +132,13 @@ mod shared {
         /// When the column holds another type: indices come from a schema, so another type is a bug of the caller.
         pub fn at<T: Element>(&mut self, index: usize) -> &mut [T] {
             let column = &self.schema.columns()[index];
-            assert!(T::is(column.dtype), "column '{}' holds {}", column.name, column.dtype.name());
+            assert!(
+                T::is(column.dtype),
+                "column '{}' holds {}, which was read as {}",
+                column.name,
+                column.dtype.name(),
+                std::any::type_name::<T>()
+            );
             bytemuck::cast_slice_mut(self.bytes(index))
         }
 

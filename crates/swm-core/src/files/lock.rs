@@ -44,7 +44,7 @@ impl Lock {
     }
 
     fn acquire(path: &Path, open: impl Fn() -> io::Result<File>) -> Result<Self> {
-        let io = |error| Error::io(path, "locking it against other writers", error);
+        let io = |error| Error::io(path, "taking the lock against other writers", error);
         loop {
             let file = open().map_err(io)?;
             match file.try_lock() {

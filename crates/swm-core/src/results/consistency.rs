@@ -47,7 +47,7 @@ fn check_run(run: &Run, counting: Counting) -> Result<(), String> {
     let stated = &run.success;
     if (stated.successes, stated.n) != (computed.successes, computed.n) {
         return wrong(format!(
-            "states {} successes in {}, its episodes have {} in {}",
+            "states {} successes in {}, but its episodes have {} in {}",
             stated.successes, stated.n, computed.successes, computed.n
         ));
     }
@@ -55,18 +55,21 @@ fn check_run(run: &Run, counting: Counting) -> Result<(), String> {
         let percent = |p: &Proportion| rates(p).map(|rate| format!("{:.1} %", 100.0 * rate));
         let ([rate, low, high], [new_rate, new_low, new_high]) = (percent(stated), percent(&computed));
         return wrong(format!(
-            "states a success rate of {rate} ({low} to {high}), its episodes have {new_rate} ({new_low} to {new_high})"
+            "states a success rate of {rate} ({low} to {high}), but its episodes have {new_rate} ({new_low} to {new_high})"
         ));
     }
     if run.solved_at_start != solved_at_start {
         let stated = run.solved_at_start;
-        return wrong(format!("states {stated} episodes solved at start, its episodes have {solved_at_start}"));
+        return wrong(format!("states {stated} episodes solved at start, but its episodes have {solved_at_start}"));
     }
     if let Some(strict) = &run.strict {
         // The episodes do not determine the strict successes of an evaluation with another counting.
         let n = run.episodes.len() - solved_at_start;
         if strict.n != n || strict.successes > n {
-            return wrong(format!("states {} strict successes in {}, of {n} episodes", strict.successes, strict.n));
+            return wrong(format!(
+                "states {} strict successes in {} episodes, but {n} of its episodes were not solved at start",
+                strict.successes, strict.n
+            ));
         }
         if !close(&rates(strict), &rates(&Proportion::wilson(strict.successes, n))) {
             return wrong("states a strict success rate that its strict successes do not have".to_owned());

@@ -36,7 +36,7 @@ impl ClipSpec {
     pub fn schema(&self, dataset: &Schema) -> Result<Schema> {
         for (name, value) in [("num_steps", self.num_steps), ("frameskip", self.frameskip)] {
             if value == 0 {
-                return Err(Error::config(name, "it is 0", "use a value of at least 1"));
+                return Err(Error::config(name, "0", "choose at least 1"));
             }
         }
         let columns: Result<Vec<ColumnSpec>> = self
@@ -101,7 +101,7 @@ impl Clips {
             return Err(Error::config(
                 "clips",
                 format!(
-                    "none of the {} episodes is long enough for {} steps with frameskip {} ({reach} rows); the longest has {longest}",
+                    "none of the {} episodes is long enough for {} steps with frameskip {} ({reach} rows); the longest has {longest} rows",
                     positions.len(),
                     spec.num_steps,
                     spec.frameskip
@@ -127,7 +127,7 @@ impl Clips {
     /// # Panics
     /// If `clip` is not below [`Clips::len`].
     pub fn get(&self, clip: usize) -> StepRange {
-        assert!(clip < self.total, "clip {clip} of {}", self.total);
+        assert!(clip < self.total, "clip {clip} is outside a list of {} clips", self.total);
         let at = self.episodes.partition_point(|&(_, before)| before <= clip) - 1;
         let (episode, before) = self.episodes[at];
         StepRange::new(episode, clip - before, self.span)

@@ -176,8 +176,11 @@ impl ObjectFile {
         let (store, path) = store(location)?;
         let label = location.label();
         let (request_store, request_path) = (Arc::clone(&store), path.clone());
-        let meta =
-            Self::finish(&label, "opening it", block_on(async move { request_store.head(&request_path).await })?)?;
+        let meta = Self::finish(
+            &label,
+            "opening the file",
+            block_on(async move { request_store.head(&request_path).await })?,
+        )?;
         Ok(Self { store, path, label, len: meta.size })
     }
 

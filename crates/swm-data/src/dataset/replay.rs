@@ -193,7 +193,7 @@ impl ReplayBuffer {
     /// If a column does not exist, a size in `config` is 0, or a goal's probabilities are invalid.
     pub fn loader(&self, config: ReplayConfig) -> Result<ReplayLoader> {
         if config.batch_size == 0 {
-            return Err(Error::config("batch_size", "it is 0", "a batch needs at least one clip"));
+            return Err(Error::config("batch_size", "0", "choose at least 1"));
         }
         let filler = BatchFiller::new(&self.0.dataset_schema, config.clip, config.goals)?;
         let prefetch = window(filler.schema(), config.batch_size, config.prefetch, config.prefetch_bytes);
@@ -278,7 +278,7 @@ impl Reader for Snapshot {
                 |episode: &Episode| range.start.checked_add(range.length).is_some_and(|end| end <= episode.length);
             if !self.episodes.get(range.episode).is_some_and(fits) {
                 let given = format!("{} rows from row {} of episode {}", range.length, range.start, range.episode);
-                return Err(Error::mismatch("reading rows", given, "rows of the snapshot"));
+                return Err(Error::mismatch("reading rows", given, "rows inside an episode of the snapshot"));
             }
             let (target, after) = rest.split_at_mut(range.length * n);
             rest = after;

@@ -165,8 +165,8 @@ fn find(wrapper: &str, table: &'static [Parameter], name: &str) -> Result<&'stat
     table.iter().find(|parameter| parameter.name == name).ok_or_else(|| {
         let names: Vec<&str> = table.iter().map(|parameter| parameter.name).collect();
         let hint = match names[..] {
-            [] => format!("'{wrapper}' takes none"),
-            _ => format!("'{wrapper}' takes {}", names.join(", ")),
+            [] => format!("the wrapper '{wrapper}' has no parameters"),
+            _ => format!("the parameters of the wrapper '{wrapper}' are {}", names.join(", ")),
         };
         Error::unknown("wrapper parameter", name, names, hint)
     })

@@ -126,7 +126,7 @@ fn environment_can_declare_the_method_that_sets_its_state() {
     // A `set_state` with other arguments is not used.
     let mut jointed = make("tests.it.environments:Jointed-v0", &config);
     let error = start(&mut *jointed, &ResetOptions::default(), &[]).expect_err("two arguments").to_string();
-    assert!(error.contains("it has no method known to set a state"), "{error}");
+    assert!(error.contains("the environment has no method known to set a state"), "{error}");
 }
 
 #[test]

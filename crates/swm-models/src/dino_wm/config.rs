@@ -90,7 +90,7 @@ impl DinoWmConfig {
         checks::pixel_std(self.pixel_std)?;
         let invalid = |problem: String, fix: &str| Err(Error::config("model.columns", problem, fix));
         if !self.columns.iter().any(|column| column.name == ACTION) {
-            return invalid("no action".to_owned(), "add { name = \"action\", dim = 10 }");
+            return invalid("the list lacks the action".to_owned(), "add { name = \"action\", dim = 10 }");
         }
         for (index, column) in self.columns.iter().enumerate() {
             check_sizes(&[("model.columns.dim", column.dim, 1, limits::FEATURES)])?;

@@ -187,7 +187,7 @@ impl DifferentiableCost for DinoWmCost {
         let Candidates { actions, samples, horizon, dim, .. } = candidates;
         if gradient.len() != actions.len() {
             return Err(Error::mismatch(
-                "gradients of a DINO-WM",
+                "the number of elements in the gradient of a DINO-WM's cost",
                 gradient.len().to_string(),
                 actions.len().to_string(),
             ));

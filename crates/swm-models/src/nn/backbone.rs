@@ -97,7 +97,7 @@ impl BackboneConfig {
             }
             Self::PatchCnn(cnn) => {
                 if cnn.stages.is_empty() {
-                    return invalid("pyramid.stages", "none".to_owned(), "give at least one");
+                    return invalid("pyramid.stages", "the list is empty".to_owned(), "give at least one stage");
                 }
                 let channels = cnn.stages.iter().map(|stage| ("stages.channels", stage.channels));
                 for (what, size) in [("hidden", cnn.hidden), ("dim", cnn.dim)].into_iter().chain(channels) {

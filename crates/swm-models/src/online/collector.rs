@@ -204,7 +204,11 @@ impl Collector {
     pub fn restore(&mut self, state: &CollectorState) -> Result<()> {
         if state.running.len() != self.running.len() {
             let expected = format!("{}, as in the saved run", state.running.len());
-            return Err(Error::mismatch("continuing", format!("{} environments", self.running.len()), expected));
+            return Err(Error::mismatch(
+                "continuing a training run",
+                format!("{} environments", self.running.len()),
+                expected,
+            ));
         }
         for (running, (episode, _)) in self.running.iter_mut().zip(&state.running) {
             running.episode = *episode;
@@ -223,7 +227,7 @@ impl Collector {
             }
             if !self.advance(false)?.is_empty() {
                 return Err(Error::mismatch(
-                    "continuing",
+                    "continuing a training run",
                     "an episode that ends earlier than in the saved run",
                     "the environments with which the run began, and the same version of this program",
                 ));

@@ -73,7 +73,7 @@ pub fn train_online<M: Agent>(
     online.check()?;
     if config.data.num_steps > online.segment + 1 {
         let given = format!("segments of {} steps hold no clip of {} frames", online.segment, config.data.num_steps);
-        return Err(Error::config("online.part", given, "choose longer segments, or lower data.num_steps"));
+        return Err(Error::config("online.part", given, "raise online.part, or lower data.num_steps"));
     }
     let pool = make_pool(online.envs)?;
     let evaluation_pool = make_pool(online.envs.min(online.evaluate_episodes))?;

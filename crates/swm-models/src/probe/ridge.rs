@@ -37,10 +37,10 @@ impl Ridge {
         let x: Vec<f64> =
             x.iter().enumerate().map(|(i, &v)| (f64::from(v) - mean_x[i % features]) * scale[i % features]).collect();
         let y: Vec<f64> = y.iter().enumerate().map(|(i, &v)| f64::from(v) - mean_y[i % targets]).collect();
-        if !x.iter().chain(&y).all(|v| v.is_finite()) {
+        if let Some(bad) = x.iter().chain(&y).find(|v| !v.is_finite()) {
             return Err(Error::NotFinite {
-                what: "the latents or the targets of a probe".to_owned(),
-                given: "values that are not finite".to_owned(),
+                what: "a latent or a target of a probe".to_owned(),
+                given: format!("{bad} after centring"),
                 fix: "check the checkpoint and the dataset".to_owned(),
             });
         }

@@ -262,7 +262,7 @@ impl Published {
         for (name, shape) in &shapes {
             let given = weights.get(name).map(|weight| &weight.shape);
             if given != Some(shape) {
-                let given = given.map_or("nothing".to_owned(), |shape| format!("{shape:?}"));
+                let given = given.map_or("no such weight".to_owned(), |shape| format!("{shape:?}"));
                 return Err(Error::mismatch(
                     format!("loading '{name}' of a published TD-MPC2"),
                     given,

@@ -127,7 +127,7 @@ impl DatasetInfo {
             let column = spec.columns.iter().find(|column| column.name == *name).ok_or_else(|| {
                 let names: Vec<&str> = spec.columns.iter().map(|column| column.name.as_str()).collect();
                 Error::unknown(
-                    "column of the environment",
+                    "observation column",
                     name,
                     names.iter().copied(),
                     format!("{} observes {}", spec.id, names.join(", ")),
@@ -149,7 +149,7 @@ impl DatasetInfo {
         self.columns.get(name).ok_or_else(|| {
             let names: Vec<&str> = self.columns.keys().map(String::as_str).collect();
             let hint = format!("the model was trained on {}", names.join(", "));
-            Error::unknown("column of the model", name, names, hint)
+            Error::unknown("model column", name, names, hint)
         })
     }
 

@@ -32,8 +32,9 @@ pub(crate) fn preset_text(presets: &[Preset], preset: &str) -> Result<String> {
             String::from_utf8(text).map_err(|error| Error::corrupt(preset, error.to_string(), "give a TOML file"))
         }
         None => {
-            let hint = "or give the path of a .toml file";
-            Err(Error::unknown("preset", preset, presets.iter().map(|row| row.id), hint))
+            let known: Vec<&str> = presets.iter().map(|row| row.id).collect();
+            let hint = format!("choose {}, or give the path of a .toml file", known.join(", "));
+            Err(Error::unknown("preset", preset, known, hint))
         }
     }
 }

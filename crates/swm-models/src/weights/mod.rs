@@ -67,7 +67,7 @@ fn safetensors(path: &Path) -> Result<Named<HostTensor>> {
                 Dtype::I8 => Torch::I8,
                 Dtype::U8 => Torch::U8,
                 Dtype::BOOL => Torch::Bool,
-                other => return Err(damaged(path, format!("'{name}' holds {other:?}"))),
+                other => return Err(damaged(path, format!("'{name}' has the type {other:?}, which is not supported"))),
             };
             Ok((name.to_owned(), HostTensor { shape: view.shape().to_vec(), values: widen(dtype, view.data()) }))
         })

@@ -53,7 +53,7 @@ impl Reference {
         }
         let found = config[TARGET].as_str().unwrap_or("an object without _target_").to_owned();
         if found.rsplit('.').next() != Some(class) {
-            return Err(invalid(format!("the file describes {found}")));
+            return Err(invalid(format!("the file describes {found} instead of {class}")));
         }
         let mut weights = read(&path)?;
         weights.retain(|name, _| !name.ends_with(BATCHES_TRACKED));

@@ -12,9 +12,12 @@ pub struct ModelEdit<'a> {
     factors: &'a FactorValues,
 }
 
+/// The expectation of errors about the files of dm_control.
+const PINNED: &str = "the pinned files (`swm assets verify dm_control` checks them)";
+
 /// The error for an element that the model lacks.
 fn missing(what: &str, name: &str) -> Error {
-    Error::mismatch("editing a dm_control suite model", format!("no {what} '{name}'"), "the pinned files")
+    Error::mismatch("editing a dm_control suite model", format!("a file without the {what} '{name}'"), PINNED)
 }
 
 /// Converts an RGB colour and an opacity to MuJoCo's RGBA.

@@ -12,8 +12,8 @@ impl ModelIndex<'_> {
         self.0.name_to_id(kind, name).ok_or_else(|| {
             Error::mismatch(
                 "loading a dm_control suite model",
-                format!("no {kind_name} '{name}'"),
-                format!("a {kind_name} '{name}': `swm assets verify dm_control` checks the files"),
+                format!("a file without the {kind_name} '{name}'"),
+                "the pinned files (`swm assets verify dm_control` checks them)",
             )
         })
     }

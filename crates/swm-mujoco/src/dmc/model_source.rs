@@ -57,8 +57,11 @@ impl ModelSource {
 /// # Errors
 /// When there is no such element.
 pub fn without_element(text: &str, tag: &str, name: &str) -> Result<String> {
-    let missing =
-        || Error::mismatch("preparing a dm_control suite model", format!("no {tag} '{name}'"), "the pinned files");
+    let missing = || {
+        let given = format!("a file without the {tag} '{name}'");
+        let expected = "the pinned files (`swm assets verify dm_control` checks them)";
+        Error::mismatch("preparing a dm_control suite model", given, expected)
+    };
     let begin = text.find(&format!("<{tag} name=\"{name}\"")).ok_or_else(missing)?;
     let (open, close) = (format!("<{tag} "), format!("</{tag}>"));
     let head = begin + text[begin..].find('>').ok_or_else(missing)?;

@@ -56,7 +56,10 @@ impl Expert for Controller {
                     goal,
                 }
             }
-            n => return Err(Error::mismatch("controlling a Fetch robot", format!("{n} values"), "a `proprio` column")),
+            n => {
+                let expected = format!("{} or, with an object, {}", proprio_len(false), proprio_len(true));
+                return Err(Error::mismatch("controlling a Fetch robot", format!("{n} values in `proprio`"), expected));
+            }
         };
         action.copy_from_slice(&(self.0)(&inputs).map(|value| value.clamp(-1.0, 1.0)));
         Ok(())

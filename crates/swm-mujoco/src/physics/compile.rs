@@ -66,6 +66,6 @@ pub(crate) fn edit_welds(model: &mut MjModel, edit: impl Fn(&mut [f64; mjNEQDATA
 pub fn index_of(model: &MjModel, kind: MjtObjBase, name: &str) -> Result<usize> {
     model.name_to_id(kind, name).ok_or_else(|| {
         let known = (0..).map_while(|i| model.id_to_name(kind, i));
-        Error::unknown("element of a MuJoCo model", name, known, "`swm assets verify` checks the installed model files")
+        Error::unknown("MuJoCo model element", name, known, "`swm assets verify` checks the installed model files")
     })
 }

@@ -34,7 +34,7 @@ impl Physics {
     /// Sets the state without the derived quantities.
     fn write_state(&mut self, state: &[f64]) -> Result<()> {
         if state.len() != self.state_len() {
-            let (given, expected) = (state.len().to_string(), format!("{} values", self.state_len()));
+            let (given, expected) = (format!("{} values", state.len()), self.state_len().to_string());
             return Err(Error::mismatch("restoring a MuJoCo state", given, expected));
         }
         check_finite("a MuJoCo state", state)?;

@@ -27,7 +27,7 @@ impl std::str::FromStr for Choice {
             "auto" => Ok(Self::Auto),
             "egl" => Ok(Self::Egl),
             "cpu" => Ok(Self::Cpu),
-            _ => Err(Error::config("the renderer", word, "choose auto, egl or cpu")),
+            _ => Err(Error::config("the renderer", format!("there is no '{word}'"), "choose auto, egl or cpu")),
         }
     }
 }
@@ -97,7 +97,7 @@ pub(super) fn renderer() -> Result<&'static dyn Renderer> {
         let started = egl::EglRenderer::new().map_err(|error| error.to_string());
         match &started {
             Ok(renderer) => tracing::info!("MuJoCo environments are rendered by {}", renderer.name()),
-            Err(problem) => tracing::warn!("EGL is not available: {problem}"),
+            Err(problem) => tracing::warn!("MuJoCo environments cannot be rendered with EGL: {problem}"),
         }
         started
     });

@@ -181,7 +181,7 @@ impl MpcPolicy {
             return Ok(());
         }
         let expected = format!("{} of each, the number of slots of this policy", self.slots.len());
-        Err(Error::mismatch("planning", format!("environments, flags or actions: {given:?}"), expected))
+        Err(Error::mismatch("planning", format!("{given:?} environments, flags or actions"), expected))
     }
 }
 

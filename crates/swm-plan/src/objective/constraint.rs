@@ -95,7 +95,8 @@ impl Constraint for LatentBox {
         if bounds && (self.low.is_some() || self.high.is_some()) {
             return Ok(());
         }
-        let given = format!("{:?} to {:?}", self.low, self.high);
+        let shown = |bound: Option<f32>| bound.map_or("none".to_owned(), |bound| bound.to_string());
+        let given = format!("lower bound {}, upper bound {}", shown(self.low), shown(self.high));
         Err(Error::config("latent box", given, "give a finite lower bound, a finite upper bound not below it, or both"))
     }
 

@@ -43,7 +43,11 @@ pub(super) fn check_picks(what: &str, picks: &[Pick], latent: usize) -> Result<(
         }
         for i in range {
             if std::mem::replace(&mut seen[i], true) {
-                return Err(Error::config(format!("{what} latents"), format!("{i} is named twice"), "name it once"));
+                return Err(Error::config(
+                    format!("{what} latents"),
+                    format!("dimension {i} is named twice"),
+                    "name it once",
+                ));
             }
         }
     }

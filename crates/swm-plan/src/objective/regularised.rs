@@ -83,7 +83,7 @@ impl DifferentiableCost for Regularised {
         check_len("the gradient of a cost", gradient.len(), candidates.actions.len())?;
         let Some(model) = self.model.differentiable() else {
             let fix = "choose a sampling solver";
-            return Err(Error::config("objective", "the model it is added to has no gradient", fix));
+            return Err(Error::config("objective", "the model to which it is added has no gradient", fix));
         };
         model.cost_and_gradient(candidates, costs, gradient)?;
         trajectories.add_costs(&*self.objective, costs);

@@ -39,12 +39,12 @@ pub fn continuous<'a>(solver: &SolverEntry, cost: &mut dyn CostModel, problem: &
     let PlanSpace::Continuous { low, high } = problem.space else {
         return Err(misfit(
             solver.id,
-            "the given actions are not continuous",
+            "the actions of the problem are not continuous",
             "correct `actions` in the solver's `ENTRY`",
         ));
     };
     if low.len() != high.len() {
-        let given = format!("{} lower and {} upper", low.len(), high.len());
+        let given = format!("{} lower and {} upper bounds", low.len(), high.len());
         return Err(Error::mismatch("the action bounds of a plan", given, "equally many of each"));
     }
     let invalid = |(low, high): (&f32, &f32)| low.is_nan() || high.is_nan() || low > high;
@@ -73,7 +73,7 @@ pub fn discrete<'a>(solver: &SolverEntry, cost: &mut dyn CostModel, problem: &Pl
     let PlanSpace::Discrete { choices } = problem.space else {
         return Err(misfit(
             solver.id,
-            "the given actions are not discrete",
+            "the actions of the problem are not discrete",
             "correct `actions` in the solver's `ENTRY`",
         ));
     };
@@ -88,9 +88,9 @@ pub fn discrete<'a>(solver: &SolverEntry, cost: &mut dyn CostModel, problem: &Pl
     check_init(problem)?;
     if let Some(weight) = problem.init.unwrap_or_default().iter().find(|&&weight| weight < 0.0) {
         return Err(Error::OutOfSpace {
-            what: "an option in the initial guess of a plan".to_owned(),
+            what: "the weight of an option in the initial guess of a plan".to_owned(),
             given: weight.to_string(),
-            expected: "weights of the options, none below 0".to_owned(),
+            expected: "at least 0".to_owned(),
         });
     }
     Ok(choices)
@@ -136,7 +136,7 @@ pub fn misfit(solver: &str, obstacle: &str, fix: &str) -> Error {
 }
 
 /// The suggestion of errors that do not list suitable solvers; [`pairing`](crate::pairing) lists them.
-const OTHER_SOLVER: &str = "choose another solver; `swm solvers` lists what each one needs";
+const OTHER_SOLVER: &str = "choose another solver; `swm solvers` lists the requirements of each";
 
 /// Checks that a solver can plan the actions of a problem with a model.
 fn check_fit(solver: &SolverEntry, cost: &mut dyn CostModel, problem: &PlanProblem<'_>) -> Result<()> {
@@ -203,7 +203,7 @@ fn check_size(problem: &PlanProblem<'_>) -> Result<()> {
     Err(Error::config(
         "planning horizon",
         format!("{horizon} model steps of dimension {dim}"),
-        "plan at least 1 step of at least 1 dimension",
+        "plan at least 1 model step with actions of at least 1 dimension",
     ))
 }
 

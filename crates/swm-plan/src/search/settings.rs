@@ -15,7 +15,7 @@ impl Settings<'_> {
     /// # Errors
     /// When the count is 0.
     pub fn at_least_one(self, name: &str, value: usize) -> Result<()> {
-        self.check(value > 0, name, value, "ask for at least 1")
+        self.check(value > 0, name, value, "choose at least 1")
     }
 
     /// Checks that a number of candidates is at least 1 and fits into memory.

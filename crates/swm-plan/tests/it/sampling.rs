@@ -98,7 +98,7 @@ fn errors_name_invalid_settings() {
     let wrong = [
         ("predictive_sampling", json!({"samples": 0}), "predictive_sampling samples: 0"),
         ("predictive_sampling", json!({"sigma": 0}), "predictive_sampling sigma: 0"),
-        ("cem", json!({"iterations": 0}), "cem iterations: 0; ask for at least 1"),
+        ("cem", json!({"iterations": 0}), "cem iterations: 0; choose at least 1"),
         ("cem", json!({"samples": 64, "elites": 65}), "cem elites: 65 of 64 samples"),
         ("cem", json!({"elites": 1}), "at least 2 (a standard deviation needs two)"),
         ("cem", json!({"sigma": -1}), "cem sigma: -1; choose a finite number above 0"),
@@ -149,5 +149,5 @@ fn errors_name_invalid_problems() {
     assert!(message("categorical_cem", 3, none, None).contains("choice 1 of a model step: it has no options"));
     let choices = PlanSpace::Discrete { choices: &[2] };
     let negative = [1.0, -1.0, 0.0, 0.0];
-    assert!(message("categorical_cem", 1, choices, Some(&negative)).contains("none below 0"));
+    assert!(message("categorical_cem", 1, choices, Some(&negative)).contains("at least 0"));
 }

@@ -74,7 +74,7 @@ impl DiskRowCache {
             budget,
         };
         // Rows that are already cached count towards the budget.
-        let count = cache.count_marks().map_err(|e| Error::io(&folder, "reading the cache's marks", e))?;
+        let count = cache.count_marks().map_err(|e| Error::io(&folder, "reading the list of cached rows", e))?;
         for _ in 0..count {
             cache.budget.take(row_bytes);
         }

@@ -87,7 +87,7 @@ impl Loader {
     pub fn new(reader: Arc<dyn Reader>, config: LoaderConfig) -> Result<Self> {
         let filler = BatchFiller::new(reader.schema(), config.clip, config.goals)?;
         if config.batch_size == 0 {
-            return Err(Error::config("batch_size", "it is 0", "a batch needs at least one clip"));
+            return Err(Error::config("batch_size", "0", "choose at least 1"));
         }
         let positions = match config.episodes {
             Some(positions) => positions,

@@ -16,7 +16,7 @@ use swm_core::{ColumnSpec, Error, Manifest, Result, Schema};
 /// differing columns.
 pub fn concat(parts: Vec<Arc<dyn Reader>>) -> Result<Arc<dyn Reader>> {
     let Some(first) = parts.first() else {
-        return Err(Error::config("concatenation", "there is no dataset", "name at least one"));
+        return Err(Error::config("concatenation", "the list of datasets is empty", "name at least one dataset"));
     };
     let data = |reader: &Arc<dyn Reader>| -> Vec<ColumnSpec> {
         reader.schema().columns().iter().filter(|c| c.name != EPISODE_IDX && c.name != STEP_IDX).cloned().collect()
@@ -32,11 +32,13 @@ pub fn concat(parts: Vec<Arc<dyn Reader>>) -> Result<Arc<dyn Reader>> {
         if missing.is_some() || extra.is_some() {
             return Err(Error::mismatch(
                 format!("concatenating dataset {} to the first", i + 1),
-                format!("columns that the first lacks: {}", extra.as_deref().unwrap_or("nothing")),
                 format!(
-                    "columns that only the first has: {}; select the common columns",
-                    missing.as_deref().unwrap_or("nothing")
+                    "other columns (only in the first: {}; only in dataset {}: {})",
+                    missing.as_deref().unwrap_or("none"),
+                    i + 1,
+                    extra.as_deref().unwrap_or("none")
                 ),
+                "the columns of the first; select the common columns",
             ));
         }
     }

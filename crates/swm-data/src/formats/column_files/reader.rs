@@ -58,7 +58,7 @@ impl ColumnFiles {
         } else if lengths_file.is_plain() {
             Metadata::default()
         } else {
-            return Err(damaged(format!("{LENGTHS}.npz has unknown members")));
+            return Err(damaged(format!("{LENGTHS}.npz has members that this version does not know")));
         };
         let in_files = usize::try_from(rows.total()).map_err(|e| damaged(e.to_string()))?;
         let (mut columns, skipped) = columns(folder, &recorded, in_files)?;
@@ -170,7 +170,9 @@ impl ColumnFiles {
 
     fn column(&self, name: &str) -> Result<&Column> {
         self.columns.iter().find(|column| column.spec.name == name).ok_or_else(|| {
-            Error::unknown("column", name, self.columns().map(|c| c.name.as_str()), "there is no such numeric column")
+            let known: Vec<&str> = self.columns().map(|column| column.name.as_str()).collect();
+            let hint = format!("the numeric columns are {}", known.join(", "));
+            Error::unknown("column", name, known, hint)
         })
     }
 

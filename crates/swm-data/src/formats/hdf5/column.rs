@@ -69,9 +69,11 @@ impl Column {
     /// If the dataset is damaged, or its layout or filters are not supported.
     #[allow(clippy::too_many_lines, reason = "one case per storage layout")]
     pub fn new(name: &str, dataset: Dataset, file_size: u64) -> Result<Option<Self>, String> {
-        let Some(stored) = scalar_type(&catch_panic("its type", || dataset.datatype())?) else { return Ok(None) };
+        let Some(stored) = scalar_type(&catch_panic("reading its type", || dataset.datatype())?) else {
+            return Ok(None);
+        };
         let Some(dtype) = stored.dtype() else { return Ok(None) };
-        let shape = catch_panic("its shape", || dataset.shape())?;
+        let shape = catch_panic("reading its shape", || dataset.shape())?;
         let Some((&rows, sides)) = shape.split_first() else { return Ok(None) };
         let sides: Vec<usize> = sides.iter().map(|&side| side as usize).collect();
         let row_bytes = sides.iter().try_fold(dtype.size() as u64, |n, &side| n.checked_mul(side as u64));
@@ -81,7 +83,7 @@ impl Column {
         if row_bytes.is_none_or(|n| n > MAX_CHUNK_BYTES) {
             return Err(format!("its rows have the shape {sides:?}, which is too large"));
         }
-        let layout = catch_panic("its layout", || dataset.layout()).map_err(|problem| match problem {
+        let layout = catch_panic("reading its layout", || dataset.layout()).map_err(|problem| match problem {
             newest if newest.contains("layout version: 5") => {
                 format!("{newest} (HDF5 2 with libver='latest'; `h5repack --high=3` makes it readable)")
             }
@@ -98,7 +100,7 @@ impl Column {
             }
             Layout::Compact { .. } => Storage::Compact,
             Layout::Chunked { chunk_shape, .. } => {
-                let filters = catch_panic("its filters", || Ok::<_, String>(dataset.filter_pipeline()))?;
+                let filters = catch_panic("reading its filters", || Ok::<_, String>(dataset.filter_pipeline()))?;
                 let pipeline = Pipeline::new(&filters, stored.size)?;
                 let bytes = chunk_shape.iter().try_fold(stored.size as u64, |n, &side| n.checked_mul(side));
                 let block = row_bytes.and_then(|n| n.checked_mul(*chunk_shape.first()?));
@@ -177,7 +179,7 @@ impl Column {
     ) -> Result<(), String> {
         match &self.storage {
             Storage::Compact => {
-                let all = catch_panic("its data", || self.dataset.read_raw())?;
+                let all = catch_panic("reading its data", || self.dataset.read_raw())?;
                 self.copy_rows(&all, 0, slots, &row_of)
             }
             Storage::Contiguous(None) => {
@@ -327,7 +329,7 @@ impl Column {
     }
 
     fn read_index(&self, source: &Source, pipeline: &Pipeline, grid: &Grid) -> Result<Index, String> {
-        let listed = catch_panic("the list of its chunks", || self.dataset.chunks())?;
+        let listed = catch_panic("listing its chunks", || self.dataset.chunks())?;
         let mut chunks = Vec::with_capacity(listed.len());
         for chunk in listed {
             let wrong_size = pipeline.is_empty() && chunk.storage_size != grid.chunk_bytes as u64;

@@ -85,10 +85,10 @@ fn file(location: &Location) -> Result<Location> {
     let Some(folder) = location.path().filter(|path| path.is_dir()) else { return Ok(location.clone()) };
     match &files(folder)[..] {
         [file] => Ok(Location::from(file)),
-        [] => Err(Error::corrupt(folder, "it is a folder without .h5 files", "name the file")),
+        [] => Err(Error::corrupt(folder, "it is a folder without .h5 files", "give the path of an .h5 file")),
         many => {
             let problem = format!("it holds {} .h5 files", many.len());
-            Err(Error::corrupt(folder, problem, "name one of them"))
+            Err(Error::corrupt(folder, problem, "give the path of one of them"))
         }
     }
 }

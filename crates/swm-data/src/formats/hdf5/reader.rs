@@ -40,14 +40,14 @@ impl Hdf5Reader {
     /// Reads the structure of a file.
     pub fn of(source: Source) -> Result<Self> {
         let damaged = |problem: String| damaged(&source, problem);
-        let file =
-            catch_panic("opening it as HDF5", || hdf5_pure::File::from_source(source.clone())).map_err(damaged)?;
+        let file = catch_panic("opening the file as HDF5", || hdf5_pure::File::from_source(source.clone()))
+            .map_err(damaged)?;
         let names = catch_panic("listing its datasets", || file.root().datasets()).map_err(damaged)?;
         let record = layout::record(&source).map_err(damaged)?;
         let record = record.map(|found| table::read_all(&found, &source)).transpose();
-        let record = record.map_err(|e| damaged(format!("its record: {e}")))?;
+        let record = record.map_err(|e| damaged(format!("the record of the dataset is unreadable: {e}")))?;
         let column = |name: &str| {
-            let dataset = catch_panic("its header", || file.dataset(name));
+            let dataset = catch_panic("reading its header", || file.dataset(name));
             let column = dataset.and_then(|dataset| Column::new(name, dataset, source.size()));
             let mut column = column.map_err(|problem| damaged(format!("column '{name}': {problem}")))?;
             column.iter_mut().for_each(|column| column.written_here = record.is_some());

@@ -49,7 +49,8 @@ impl Record {
         let mut record = Self::default();
         let mut at = 0;
         while let Some(length) = bytes[at..].iter().position(|&byte| byte == b'\n') {
-            let line = serde_json::from_slice(&bytes[at..at + length]).map_err(|e| format!("its record: {e}"))?;
+            let line =
+                serde_json::from_slice(&bytes[at..at + length]).map_err(|e| format!("a line cannot be parsed: {e}"))?;
             at += length + 1;
             match line {
                 Line::Schema(schema) => record.schema = Some(schema),

@@ -43,8 +43,10 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
         }
         (WriteMode::Append, true) => {
             let old = Lock::file(path)?;
-            let reader =
-                Hdf5Reader::of(Source::of(old.try_clone().map_err(|e| Error::io(path, "opening it", e))?, path)?)?;
+            let reader = Hdf5Reader::of(Source::of(
+                old.try_clone().map_err(|e| Error::io(path, "opening the file again", e))?,
+                path,
+            )?)?;
             episodes::check_appendable(&location, schema, reader.schema())?;
             let mut writer = match Hdf5Writer::resume(path, &reader, old)? {
                 Ok(writer) => writer,
@@ -174,7 +176,7 @@ impl Hdf5Writer {
         let Some(schema) = &reader.record().schema else { return Ok(Err(file)) };
         let layout = Layout::new(schema.columns())?;
         let mut start = vec![0; layout.bytes.len()];
-        let source = Source::of(file.try_clone().map_err(|e| Error::io(path, "opening it", e))?, path)?;
+        let source = Source::of(file.try_clone().map_err(|e| Error::io(path, "opening the file again", e))?, path)?;
         if source.size() < start.len() as u64 {
             return Ok(Err(file));
         }

@@ -30,12 +30,16 @@ pub fn convert(values: &ArrayRef, n: usize, dtype: DType, out: &mut [u8]) -> Res
             lists.values().slice(lists.value_offset(0) as usize, lists.len() * n)
         }
         Some(lists) => {
-            return Err(format!("lists of {} elements, {} of them null", lists.value_length(), lists.null_count()));
+            return Err(format!(
+                "it has lists of {} elements ({} of them null) instead of {n}",
+                lists.value_length(),
+                lists.null_count()
+            ));
         }
         None => Arc::clone(values),
     };
     if elements.len() * dtype.size() != out.len() {
-        return Err(format!("{} values for {} bytes", elements.len(), out.len()));
+        return Err(format!("it has {} values for {} bytes", elements.len(), out.len()));
     }
     match elements.data_type() {
         DataType::Float32 => cast_all::<Float32Type, f64>(&elements, dtype, out),
@@ -105,7 +109,9 @@ where
         cast(values.values().iter().map(|&v| N::from(v)), dtype, out);
         return Ok(());
     }
-    let Some(missing) = N::MISSING else { return Err(format!("{} nulls", values.null_count())) };
+    let Some(missing) = N::MISSING else {
+        return Err(format!("it has {} null values, which its type does not allow", values.null_count()));
+    };
     cast(values.iter().map(|v| v.map_or(missing, N::from)), dtype, out);
     Ok(())
 }
@@ -127,6 +133,7 @@ pub fn cast<N: Scalar>(values: impl Iterator<Item = N>, dtype: DType, out: &mut 
 
 /// Converts integers of any width to 64 bits.
 pub fn integers(values: &ArrayRef, out: &mut [i64]) -> Result<()> {
-    convert(values, 1, DType::Int64, bytemuck::cast_slice_mut(out))
-        .map_err(|problem| Error::mismatch("reading index columns", problem, "integers"))
+    convert(values, 1, DType::Int64, bytemuck::cast_slice_mut(out)).map_err(|problem| {
+        Error::mismatch("reading an index column", format!("invalid values ({problem})"), "integers")
+    })
 }

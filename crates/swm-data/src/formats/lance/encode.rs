@@ -111,7 +111,7 @@ fn encode_values(episode: &Batch, index: usize, precision: Precision) -> Result<
         return Err(Error::OutOfSpace {
             what: format!("a value of column '{}'", spec.name),
             given: value.to_string(),
-            expected: "integers within ±2^24, because the table stores float32; split larger values into two columns"
+            expected: "integers within ±2^24, because the table stores float32; store larger values in two columns"
                 .to_owned(),
         });
     }

@@ -90,7 +90,7 @@ pub fn columns_to_write(schema: &Schema) -> Result<Vec<StoredColumn>> {
         columns.push(StoredColumn { spec: spec.clone(), name, kind });
     }
     if columns.is_empty() {
-        return Err(Error::config("schema", "it has no columns", "an episode needs at least one"));
+        return Err(Error::config("schema", "it has no columns", "give every episode at least one column"));
     }
     Ok(columns)
 }

@@ -82,7 +82,7 @@ pub fn create_shard(
     options.codec.check()?;
     if shard.index >= shard.count {
         let problem = format!("there is no shard {} of {}", shard.index, shard.count);
-        return Err(Error::config("shard", problem, "shards are counted from 0"));
+        return Err(Error::config("shard", problem, "choose an index from 0 up to the number of shards minus 1"));
     }
     let store = Store::new(location)?;
     store.check_writable()?;
@@ -101,7 +101,7 @@ pub fn create_shard(
         match options.mode {
             WriteMode::Create => {
                 let problem = format!("shard {} of {} already exists", shard.index, shard.count);
-                return Err(Error::config("shard", problem, "append to the shard or overwrite it"));
+                return Err(Error::config("shard", problem, "append to the shard, or overwrite it"));
             }
             WriteMode::Overwrite => shard_log.remove(&store, shard),
             WriteMode::Append => {

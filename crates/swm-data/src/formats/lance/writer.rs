@@ -95,7 +95,7 @@ fn prepare(store: &Store, schema: &Schema, options: &WriteOptions) -> Result<Opt
             return Err(Error::config(
                 "dataset",
                 format!("{} exists already", store.label.display()),
-                "choose another path, or say whether to append to it or to overwrite it",
+                "choose another path, append to it, or overwrite it",
             ));
         }
         (WriteMode::Overwrite, Some(old)) => {

@@ -31,7 +31,7 @@ pub fn stored_columns(schema: &Schema) -> Result<Vec<(usize, String)>> {
         columns.push((index, native));
     }
     if columns.is_empty() {
-        return Err(Error::config("schema", "it has no columns", "an episode needs at least one"));
+        return Err(Error::config("schema", "it has no columns", "give every episode at least one column"));
     }
     Ok(columns)
 }

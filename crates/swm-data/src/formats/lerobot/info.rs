@@ -151,7 +151,7 @@ impl Info {
             return Err(Error::corrupt(&path, problem, "convert it with LeRobot's own tools to v2.1 or v3.0"));
         }
         if info.chunks_size == 0 || info.fps().is_none() {
-            return Err(damaged(&path, "chunks_size or fps is invalid".to_owned()));
+            return Err(damaged(&path, "its chunks_size or fps is invalid".to_owned()));
         }
         Ok(info)
     }
@@ -184,7 +184,10 @@ impl Info {
             let camera = feature.dtype == "video" || feature.dtype == "image";
             let (spec, kind) = if camera {
                 let (height, width) = feature.size().ok_or_else(|| {
-                    damaged(root, format!("the camera '{native}' has images of shape {:?}", feature.shape))
+                    damaged(
+                        root,
+                        format!("the shape {:?} of the camera '{native}' is not that of an RGB image", feature.shape),
+                    )
                 })?;
                 let name = if std::mem::take(&mut primary) { PIXELS } else { native };
                 let kind = if feature.dtype == "video" { Kind::Video(videos) } else { Kind::Images };
@@ -206,7 +209,10 @@ impl Info {
             let too_large =
                 spec.shape.iter().try_fold(1_usize, |n, &side| n.checked_mul(side)).is_none_or(|n| n > 1 << 28);
             if too_large {
-                return Err(damaged(root, format!("the feature '{native}' has the shape {:?}", feature.shape)));
+                return Err(damaged(
+                    root,
+                    format!("the shape {:?} of the feature '{native}' is too large", feature.shape),
+                ));
             }
             if !is_index && !spec.is_empty() {
                 columns.push(Column { spec, native: native.clone(), kind });
@@ -229,7 +235,7 @@ impl Info {
         if inside {
             Ok(root.join(name))
         } else {
-            Err(damaged(root, format!("'{name}' is outside of the dataset's folder")))
+            Err(damaged(root, format!("the path '{name}' leads outside the dataset's folder")))
         }
     }
 }

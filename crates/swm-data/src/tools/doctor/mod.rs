@@ -158,7 +158,7 @@ pub fn repair(
     control: &mut Control<'_>,
 ) -> Result<Converted> {
     if diagnosis.intact.is_empty() {
-        let problem = format!("none of its {} episodes is intact", diagnosis.episodes);
+        let problem = format!("none of the dataset's {} episodes is intact", diagnosis.episodes);
         return Err(Error::config(
             "repair",
             problem,
@@ -200,7 +200,7 @@ fn examine_column(rows: &Batch, column: &str, position: usize, found: &mut Findi
         STEP_IDX => {
             let steps = rows.to_f32(STEP_IDX)?;
             if let Some(row) = (0..count.min(1 << 24)).find(|&row| steps[row] != row as f32) {
-                found.problem(Some(position), format!("row {row} holds step {}", steps[row]));
+                found.problem(Some(position), format!("row {row} holds step {} instead of step {row}", steps[row]));
             }
         }
         ACTION if spec.dtype != DType::U8 && spec.dtype != DType::Bool => {

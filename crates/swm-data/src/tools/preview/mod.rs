@@ -90,7 +90,11 @@ fn chosen(reader: &dyn Reader, count: usize) -> Result<Vec<usize>> {
     let all: Vec<usize> = (0..reader.episodes().len()).filter(|&i| reader.episodes()[i].length > 0).collect();
     let count = count.min(all.len());
     if count == 0 {
-        return Err(Error::config("preview", "there is no episode to show", "collect some, or request at least one"));
+        return Err(Error::config(
+            "preview",
+            "there is no episode to show",
+            "collect episodes, or request at least one",
+        ));
     }
     Ok((0..count).map(|i| all[i * all.len() / count]).collect())
 }

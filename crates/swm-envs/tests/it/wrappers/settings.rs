@@ -48,7 +48,7 @@ fn invalid_settings_are_errors_that_name_the_setting() {
     error_contains("nose", &["wrapper", "'nose'", "noise", "swm wrappers"]);
     error_contains("noise,sdt=8", &["'sdt'", "std", "takes kind, std, amount"]);
     error_contains("chroma-key,color=1/2/3", &["'color'", "key_color"]);
-    error_contains("grayscale,keep=1", &["'keep'", "takes none"]);
+    error_contains("grayscale,keep=1", &["'keep'", "has no parameters"]);
     error_contains("noise,8", &["'8'", "NAME=VALUE"]);
     error_contains("noise,std=1,std=2", &["'std=1'", "'std=2'", "twice"]);
     error_contains("chroma-key,key_color=1/2/3", &["'media' is missing", "PNG"]);

@@ -49,7 +49,10 @@ const LINKS: [(&str, &str); JOINTS] = [
 /// # Errors
 /// When the model has no such element: its files are not those of the pinned version.
 pub fn find(model: &MjModel, kind: MjtObjBase, name: &str) -> Result<usize> {
-    model.name_to_id(kind, name).ok_or_else(|| Error::external("searching OGBench's model", format!("no '{name}'")))
+    model.name_to_id(kind, name).ok_or_else(|| {
+        let problem = format!("it has no element '{name}'; `swm assets verify` checks the installed model files");
+        Error::external("searching OGBench's model", problem)
+    })
 }
 
 /// The arm in a model. Its joints and actuators have the first indices in `qpos`, `qvel` and `ctrl`.

@@ -112,7 +112,10 @@ impl Files {
 }
 
 fn missing(name: &str) -> Error {
-    Error::external("reading OGBench's descriptions", format!("there is no '{name}'"))
+    Error::external(
+        "reading OGBench's descriptions",
+        format!("there is no element '{name}'; `swm assets verify` checks the installed files"),
+    )
 }
 
 fn body<'a>(spec: &'a mut MjSpec, name: &str) -> Result<&'a mut MjsBody> {

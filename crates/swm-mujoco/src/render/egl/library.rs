@@ -108,11 +108,11 @@ impl Library {
             Some(text) => {
                 let chosen = text.parse().ok().and_then(|index: usize| devices.get(index).copied());
                 devices = vec![chosen.ok_or_else(|| {
-                    let problem = format!("'{text}' is not the index of a device: there are {}", devices.len());
+                    let problem = format!("'{text}' is not the index of one of the {} EGL devices", devices.len());
                     Error::config(
                         "MUJOCO_EGL_DEVICE_ID",
                         problem,
-                        "give an index from 0 on, or leave the variable unset",
+                        "give an index, counted from 0, or leave the variable unset",
                     )
                 })?];
             }

@@ -161,7 +161,7 @@ impl Solver for Grasp {
             self.sync_every == 0 || self.sync_iterations > 0,
             "synchronisation",
             format!("{} steps every {} iterations", self.sync_iterations, self.sync_every),
-            "ask for at least 1 step, or for no synchronisation with sync_every = 0",
+            "choose at least 1 step, or no synchronisation with sync_every = 0",
         )?;
         [&self.action_optimizer, &self.state_optimizer, &self.sync_optimizer].iter().try_for_each(|it| it.check(ID))
     }

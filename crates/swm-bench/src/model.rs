@@ -212,7 +212,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn times_and_outputs_are_compared() {
+    fn times_and_outputs_are_compared_with_the_reference() {
         use std::os::unix::fs::PermissionsExt as _;
         let folder = tempfile::tempdir().expect("a temporary folder");
         let python = folder.path().join("python");
@@ -234,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn nan_is_a_difference() {
+    fn nan_output_gives_a_nan_difference() {
         assert!(difference(&[f32::NAN, 1.0], &[1.0, 1.0]).expect("two outputs of equal length").is_nan());
         assert!(difference(&[1.0], &[1.0, 1.0]).is_err());
     }

@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn delete_keeps_links_folders_and_other_names() {
+    fn delete_keeps_links_folders_and_names_that_match_no_pattern() {
         let root = folder("delete");
         let (run, outside) = (root.join("run"), root.join("outside.txt"));
         fs::create_dir_all(run.join("weights.bin.d")).expect("creating a folder");

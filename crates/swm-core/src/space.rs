@@ -172,7 +172,7 @@ mod tests {
     use crate::Key;
 
     #[test]
-    fn samples_are_inside_the_space() {
+    fn samples_are_inside_the_space_and_other_values_are_errors() {
         let spaces = [
             Space::uniform_box([2], DType::Float32, -1.0, 1.0),
             Space::uniform_box([], DType::Float64, 0.0, 1e-3),

@@ -39,7 +39,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn budget_is_restored_after_the_work() {
+    fn thread_budget_is_restored_after_a_return_and_after_a_panic() {
         let budgets = with(3, || (threads(), with(2, threads), threads()));
         assert_eq!((budgets, threads()), ((3, 2, 3), 1));
         assert!(std::panic::catch_unwind(|| with(5, || panic!("the work fails"))).is_err());

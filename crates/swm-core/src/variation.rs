@@ -293,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn invalid_requests_are_errors() {
+    fn invalid_variation_requests_are_errors() {
         let space = space();
         let pin = |key: &str, value: &[f64]| VariationRequest {
             variation: None,

@@ -119,7 +119,7 @@ mod tests {
     }
 
     #[test]
-    fn compat_counting_counts_every_termination() {
+    fn compat_counting_counts_every_termination_as_a_success() {
         let compat = Counting::Compat { envs: 1 };
         assert_eq!(result_of(compat, 9, "..s.g"), (true, 5, Some(5)), "success without termination does not count");
         assert_eq!(result_of(compat, 9, "..f"), (true, 3, Some(3)), "any termination is a success");

@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn id_contains_its_arguments() -> Result<()> {
+    fn chosen_id_contains_its_arguments() -> Result<()> {
         let text = "ALE/Pong-v5,frameskip=2";
         assert_eq!(choose(text)?.id(), text);
         assert!(std::ptr::eq(choose(text)?.entry.id, choose(text)?.entry.id), "equal texts share one copy");

@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn damaged_images_and_other_sizes_are_errors() {
+    fn truncated_images_and_wrong_sizes_are_errors() {
         let rgb = test_image(40, 40);
         let mut out = vec![0; rgb.len()];
         for codec in [ImageCodec::Jpeg { quality: 95 }, ImageCodec::Png, ImageCodec::Qoi] {

@@ -130,7 +130,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn written_files_are_read_back() {
+    fn written_png_files_are_read_back() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("a.png");
         let rgb: Vec<u8> = (0..5 * 4 * 3).collect();

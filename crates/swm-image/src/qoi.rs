@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn encodes_operations_of_the_specification() {
+    fn encoder_chooses_the_qoi_operations_of_the_specification() {
         // Two pixels of the colour of `START`, a pixel with a small difference, a pixel with a larger difference, an
         // unrelated pixel, an earlier pixel, a new pixel, and 63 repetitions of the new pixel.
         let mut pixels = vec![[0, 0, 0], [0, 0, 0], [1, 255, 1], [11, 9, 9], [200, 0, 7], [1, 255, 1]];
@@ -235,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn files_with_four_channels_decode() {
+    fn qoi_files_with_four_channels_decode() {
         let mut bytes = [&b"qoif"[..], &2_u32.to_be_bytes(), &1_u32.to_be_bytes(), &[4, 1]].concat();
         bytes.extend([RGBA, 10, 20, 30, 40, DIFF | 0b11_10_01]);
         bytes.extend(END);
@@ -245,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn operations_must_fill_the_image_exactly() {
+    fn qoi_files_with_missing_or_extra_bytes_or_pixels_are_rejected() {
         let rgb: Vec<u8> = (0..300_u32).map(|i| (i * i / 7) as u8).collect();
         let bytes = round_trip(&rgb, 10, 10);
         let fails = |bytes: &[u8], pixels: usize| decode(bytes, &mut vec![0; 3 * pixels]).is_err();
@@ -258,7 +258,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn every_image_survives_a_round_trip(
+        fn qoi_round_trip_restores_every_image(
             seed in prop::collection::vec((any::<[u8; 3]>(), 1_usize..150), 1..40),
             noise in prop::collection::vec((0_usize..2000, any::<u8>()), 0..200),
             width in 1_u16..90,

@@ -402,7 +402,7 @@ mod tests {
     }
 
     #[test]
-    fn mismatched_sizes_are_refused() {
+    fn textures_of_mismatched_sizes_are_refused() {
         assert!(Texture::flat(2, 2, 3, &[0; 11]).is_none());
         assert!(Texture::flat(0, 2, 3, &[]).is_none());
         assert!(Texture::cube(2, 3, &[0; 13]).is_none());

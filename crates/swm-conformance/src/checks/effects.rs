@@ -61,7 +61,7 @@ fn effects(suite: &Suite, entry: &EnvEntry, factor: &Factor, context: &Variation
 }
 
 /// Checks that every factor changes an output, and that colours change frames only.
-pub fn every_factor_has_an_effect(suite: &Suite) {
+pub fn every_factor_changes_an_output(suite: &Suite) {
     for entry in suite.rows {
         let space = entry.env().expect("an environment").spec().variation_space.clone();
         let defaults = all_visible(&space);

@@ -23,7 +23,7 @@ pub(super) fn follow_expert(entry: &EnvEntry, probe: &mut Probe, seed: u64) -> b
 }
 
 /// Checks that actions of experts are in the action space and do not depend on other slots.
-pub fn experts_are_valid_and_deterministic(suite: &Suite) {
+pub fn expert_actions_are_in_the_action_space_and_independent_of_other_slots(suite: &Suite) {
     for entry in suite.rows {
         for expert in entry.experts {
             let run = |slots: usize| {

@@ -8,7 +8,7 @@ use swm_core::{Batch, ColumnSpec, DType, Key, ResetOptions, Schema};
 
 /// Checks that a sampled goal is not reached yet, depends on the key only, and matches the goal frame, and that the
 /// goal state is a success.
-pub fn sampled_goals_are_new_and_reachable(suite: &Suite) {
+pub fn sampled_goals_are_not_reached_yet_and_goal_states_succeed(suite: &Suite) {
     for entry in suite.rows {
         let mut distinct = 0;
         for seed in 0..suite.goals {

@@ -64,7 +64,7 @@ pub fn results_are_independent_of_threads_and_slots(suite: &Suite) {
 
 /// Checks that environments that are stepped alternately, after earlier episodes, give the same results as new
 /// environments.
-pub fn environments_are_independent(suite: &Suite) {
+pub fn environments_do_not_affect_each_other(suite: &Suite) {
     for entry in suite.rows {
         let key = Key::new(7);
         let new_env = |seed| {

@@ -6,7 +6,7 @@ use swm_core::columns::STATE;
 use swm_core::{EnvEntry, Factor, Key, ResetOptions};
 
 /// Checks that every factor, every group, and all factors together can be sampled.
-pub fn any_requested_factors_can_be_sampled(suite: &Suite) {
+pub fn every_factor_and_group_can_be_sampled(suite: &Suite) {
     for entry in suite.rows {
         let mut probe = Probe::new(suite, entry);
         let space = probe.env.spec().variation_space.clone();
@@ -64,7 +64,7 @@ pub fn resets_with_all_factors_varied_succeed(suite: &Suite) {
 }
 
 /// Checks that a request may combine groups, factors and pinned values.
-pub fn groups_factors_and_pinned_values_combine(suite: &Suite) {
+pub fn requests_combine_groups_factors_and_pinned_values(suite: &Suite) {
     for entry in suite.rows {
         let mut probe = Probe::new(suite, entry);
         let space = probe.env.spec().variation_space.clone();

@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn threads_write_rows_in_place() {
+    fn par_rows_mut_writes_rows_into_aligned_columns() {
         let mut batch = Batch::zeros(&schema(), 100);
         batch.par_rows_mut(|i, mut row| {
             row.set(0, &[i as f64, 0.5, -1.0]);
@@ -223,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_grown_after_shrinking_are_zero() {
+    fn resizing_fills_new_rows_with_zeros() {
         let mut batch = Batch::zeros(&schema(), 2);
         batch.get_mut::<f64>("state").expect("the column `state`").fill(1.0);
         batch.resize(1);
@@ -232,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn wrong_column_and_wrong_type_are_errors() {
+    fn unknown_columns_and_wrong_element_types_are_errors() {
         let batch = Batch::zeros(&schema(), 1);
         let missing = batch.get::<f64>("stat").expect_err("no such column").to_string();
         assert!(missing.contains("did you mean state?"), "{missing}");

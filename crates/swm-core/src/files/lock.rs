@@ -99,7 +99,7 @@ mod tests {
     use std::fs;
 
     #[test]
-    fn second_writer_is_refused_until_the_first_is_done() {
+    fn second_lock_is_refused_until_the_first_is_dropped() {
         let root = std::env::temp_dir().join(format!("swm-lock-{}", std::process::id()));
         let (folder, file) = (root.join("run"), root.join("new/data.h5"));
         let held = (Lock::folder(&folder).expect("a new folder"), Lock::file(&file).expect("a new file"));

@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn intervals_match_published_values() {
+    fn paired_intervals_match_published_values() {
         // Newcombe 1998, table of examples: (36, 12, 2, 0) gives 0.0569 to 0.3404. Altman et al., "Statistics with
         // confidence", table 6.2: (14, 5, 0, 22) gives 0.011 to 0.226. Fagerland, Lydersen and Laake 2014:
         // (1, 1, 7, 12) gives -0.507 to -0.026, and p = 0.0703.
@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn runs_are_compared_on_equal_counted_starts() {
+    fn runs_with_equal_starts_and_conditions_are_compared() {
         let floor = run("random", &[(1, false, false), (2, true, false), (3, false, true), (4, false, false)]);
         let model = run("model", &[(1, true, false), (2, true, false), (3, false, true), (4, false, false)]);
         let found = Comparison::all(&[floor.clone(), model.clone()], Counting::default());
@@ -219,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn many_runs_are_compared_with_the_floor_and_the_best() {
+    fn many_runs_are_compared_only_with_the_random_floor_and_the_best_run() {
         let outcomes = |solved: u64| (0..8).map(|seed| (seed, seed < solved, false)).collect::<Vec<_>>();
         let mut runs = vec![run("random", &outcomes(1))];
         runs.extend((0..30).map(|i| run(&format!("model-{i}"), &outcomes(if i == 7 { 6 } else { 2 + i % 3 }))));

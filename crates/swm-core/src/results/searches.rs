@@ -60,7 +60,7 @@ mod tests {
     }
 
     #[test]
-    fn bands_do_not_depend_on_the_order_of_plans() {
+    fn cost_bands_do_not_depend_on_the_order_of_plans() {
         let mut traces: Vec<PlanTrace> = (0..10u8).map(|i| trace(&[f32::from(i), 0.5])).collect();
         traces.push(trace(&[10.0]));
         let found = Searches::of(&traces).expect("aggregating eleven traces");

@@ -142,7 +142,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn lists_all_windows_within_episodes(
+        fn clips_are_all_windows_within_the_selected_episodes(
             lengths in prop::collection::vec(1usize..40, 1..12),
             num_steps in 1usize..5,
             frameskip in 1usize..6,
@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn concatenates_the_actions_of_a_step() {
+    fn clip_schema_joins_the_actions_of_frameskip_rows() {
         let dataset = Schema::new([
             ColumnSpec::image("pixels", 4, 5),
             ColumnSpec::new("action", DType::Float32, [2]),

@@ -269,7 +269,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn returns_ranges_in_the_requested_order() -> Result<()> {
+    fn reads_byte_ranges_in_the_requested_order() -> Result<()> {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("file");
         let content: Vec<u8> = (0..3_000_000_u32).map(|i| ((i * i) >> 7) as u8).collect();
@@ -286,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn block_on_works_inside_another_runtime_and_reports_panics() -> Result<()> {
+    fn block_on_runs_inside_another_runtime_and_returns_none_after_a_panic() -> Result<()> {
         let outer = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
         assert_eq!(outer.block_on(async { block_on(async { 7 }) })?, Some(7));
         let panics = block_on::<()>(async { std::panic::resume_unwind(Box::new("damaged")) })?;

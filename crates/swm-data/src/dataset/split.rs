@@ -106,7 +106,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn parts_have_approximate_fractions_and_depend_on_the_seed() {
+    fn split_parts_have_the_requested_fractions_and_depend_on_the_seed() {
         let split = Split { validation: 0.2, test: 0.1, seed: 3 };
         let parts: Vec<Part> = (0..10_000).map(|episode| split.part(episode)).collect();
         let count = |expected| parts.iter().filter(|&&part| part == expected).count();

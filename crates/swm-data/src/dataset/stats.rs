@@ -149,7 +149,7 @@ mod tests {
     use swm_core::{Batch, ColumnSpec, DType, Schema};
 
     #[test]
-    fn interpolates_quantiles() {
+    fn quantiles_interpolate_and_ignore_missing_values() {
         let schema = Schema::new([ColumnSpec::new("state", DType::Float32, [2])]).expect("schema");
         let buffer = ReplayBuffer::new(&schema, 1000).expect("a buffer");
         let mut episode = Batch::zeros(&schema, 6);

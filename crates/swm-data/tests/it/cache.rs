@@ -74,7 +74,7 @@ fn dataset(folder: &Path) -> (PathBuf, usize) {
 }
 
 #[test]
-fn decodes_cached_rows_once_within_the_limit() {
+fn cached_rows_are_decoded_once_within_the_byte_limit() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let (path, rows) = dataset(folder.path());
     let reader = Counting::open(&path);
@@ -103,7 +103,7 @@ fn decodes_cached_rows_once_within_the_limit() {
 }
 
 #[test]
-fn disk_cache_serves_later_runs_and_other_processes() {
+fn disk_cache_serves_later_and_concurrent_readers_of_the_same_content() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let (path, _) = dataset(folder.path());
     let cache = CacheConfig::Disk { folder: folder.path().join("cache"), bytes: 1 << 30 };
@@ -126,7 +126,7 @@ fn disk_cache_serves_later_runs_and_other_processes() {
 }
 
 #[test]
-fn damaged_cache_is_decoded_again() {
+fn damaged_cache_rows_are_decoded_again() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let (path, rows) = dataset(folder.path());
     let cache = CacheConfig::Disk { folder: folder.path().join("cache"), bytes: 1 << 30 };

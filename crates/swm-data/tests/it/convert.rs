@@ -89,7 +89,7 @@ fn lossy_images_must_reach_the_minimum_psnr() {
 }
 
 #[test]
-fn resumes_a_stopped_conversion_and_rejects_other_targets() {
+fn interrupted_conversion_resumes_and_targets_with_other_data_are_rejected() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = source(folder.path());
     let target = folder.path().join("target.lance");
@@ -231,7 +231,7 @@ impl Reader for ThirdParty {
 }
 
 #[test]
-fn omits_and_counts_actions_of_last_rows() {
+fn conversion_omits_and_counts_actions_in_last_rows() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let target = folder.path().join("target.lance");
     let schema = Schema::new([ColumnSpec::new("action", DType::Float32, [1])]).expect("a valid schema");
@@ -246,7 +246,7 @@ fn omits_and_counts_actions_of_last_rows() {
 }
 
 #[test]
-fn preserves_doubles_or_reports_rounding() {
+fn conversion_preserves_doubles_or_reports_the_rounding_error() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("fine.lance");
     let schema = Schema::new([ColumnSpec::new("state", DType::Float64, [1])]).expect("a valid schema");

@@ -244,7 +244,7 @@ fn reports_the_episodes_of_each_defect() {
 }
 
 #[test]
-fn unusual_but_intact_data_gives_a_note() {
+fn unusual_but_intact_data_gives_notes_and_no_problems() {
     let notes = |broken: Broken| -> Vec<String> {
         let diagnosis = diagnose(&broken);
         assert_eq!(diagnosis.problems(), 0, "{diagnosis:?}");

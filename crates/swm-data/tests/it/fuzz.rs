@@ -292,7 +292,7 @@ unsafe impl GlobalAlloc for RecordingAllocator {
 static ALLOCATOR: RecordingAllocator = RecordingAllocator;
 
 #[test]
-fn damage_is_reproducible_and_effective() {
+fn damage_is_reproducible_and_changes_most_inputs() {
     let intact: Vec<u8> = (0..200).collect();
     let mut same = 0;
     for case in 0..500 {

@@ -27,7 +27,7 @@ fn config(goals: &[(&str, GoalMixture)]) -> LoaderConfig {
 }
 
 #[test]
-fn goals_are_rows_of_the_dataset_with_offsets() {
+fn goals_are_rows_at_the_reported_offsets() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..9);

@@ -52,7 +52,7 @@ fn rejects_files_damaged_in_10000_ways() {
 }
 
 #[test]
-fn many_chunks_form_b_trees_of_several_levels() {
+fn datasets_with_b_trees_of_several_levels_round_trip() {
     // A leaf holds 64 chunks and a node of the second level 4096, so the tree has three levels. Each commit ends at
     // another position in the tree.
     let schema = Schema::new([ColumnSpec::new("large", DType::U8, [2048]), ColumnSpec::new("small", DType::Int64, [])]);
@@ -190,7 +190,7 @@ fn decodes_every_filter_of_h5py_and_hdf5plugin() {
 }
 
 #[test]
-fn reads_every_layout() {
+fn reads_every_hdf5_layout_and_element_type() {
     let reader = open(interop("hdf5-layouts.h5")).expect("opening the dataset");
     for name in ["contiguous", "one chunk", "fixed", "growing", "growing blocks"] {
         has_images(&*reader, name);

@@ -180,7 +180,7 @@ fn killed_replacement_leaves_the_old_or_new_dataset() {
 }
 
 #[test]
-fn killed_shard_is_continued() {
+fn killed_shards_are_continued() {
     killed_shards(4);
 }
 

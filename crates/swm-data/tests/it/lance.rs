@@ -33,7 +33,7 @@ fn written_episodes_round_trip() {
 }
 
 #[test]
-fn reads_ranges_in_the_requested_order() {
+fn reads_row_ranges_in_the_requested_order() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..12);
@@ -84,7 +84,7 @@ fn invalid_columns_and_rows_are_explained() {
 }
 
 #[test]
-fn follows_the_write_mode() {
+fn writer_follows_the_create_append_and_overwrite_modes() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Append, 100, 0..3);
@@ -126,7 +126,7 @@ fn opens_an_empty_dataset() {
 }
 
 #[test]
-fn does_not_append_another_schema() {
+fn appending_requires_the_schema_of_the_dataset() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 100, 0..2);
@@ -192,7 +192,7 @@ fn rejects_episodes_that_break_the_time_convention() {
 }
 
 #[test]
-fn content_hash_does_not_depend_on_files() {
+fn content_hash_depends_on_the_episodes_but_not_on_the_data_files() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = |name: &str| folder.path().join(name);
     write(&path("a.lance"), WriteMode::Create, 1, 0..5);
@@ -205,7 +205,7 @@ fn content_hash_does_not_depend_on_files() {
 }
 
 #[test]
-fn stores_lossless_images() {
+fn png_and_qoi_images_are_stored_exactly() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     for (position, codec) in [ImageCodec::Png, ImageCodec::Qoi].into_iter().enumerate() {
@@ -223,7 +223,7 @@ fn stores_lossless_images() {
 }
 
 #[test]
-fn several_threads_read_at_once() {
+fn several_threads_read_concurrently() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 2, 0..12);
@@ -323,7 +323,7 @@ fn stores_doubles_exactly_but_keeps_the_precision_of_older_tables() {
 }
 
 #[test]
-fn reads_constants() {
+fn constants_round_trip_and_are_part_of_the_content_hash() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     let scene = |e: usize| {
@@ -354,7 +354,7 @@ fn reads_constants() {
 }
 
 #[test]
-fn old_versions_are_removed() {
+fn old_table_versions_are_removed() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 1, 0..30);

@@ -25,7 +25,7 @@ fn failure(path: &Path) -> String {
 }
 
 #[test]
-fn commits_all_shards_as_one_version() {
+fn committed_shards_equal_the_dataset_of_one_writer() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     assert!(failure(&path).contains("no shards to commit"));
@@ -98,7 +98,7 @@ fn interrupted_shard_is_continued_and_finished_shard_is_overwritten() {
 }
 
 #[test]
-fn commit_killed_before_cleanup_is_not_repeated() {
+fn commit_after_a_commit_killed_before_cleanup_adds_no_episodes() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("d.lance");
     write_shard(&path, 0, 1, 0..3);

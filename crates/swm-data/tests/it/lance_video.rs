@@ -23,7 +23,7 @@ fn write(path: &std::path::Path, mode: WriteMode, codec: ImageCodec, episodes: s
 }
 
 #[test]
-fn reads_episodes_with_their_images() {
+fn written_episodes_are_read_with_their_images() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     for (name, codec) in [("a", ImageCodec::Png), ("b", ImageCodec::Jpeg { quality: 95 })] {
         let path = folder.path().join(format!("{name}.lance-video"));

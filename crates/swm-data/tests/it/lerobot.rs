@@ -69,7 +69,7 @@ fn reads_datasets_of_lerobot() {
 }
 
 #[test]
-fn reads_images_in_tables() {
+fn reads_images_that_are_stored_in_tables() {
     let reader = open(interop().join("lerobot-v30-h264")).expect("opening the dataset");
     let name = "observation.images.still";
     let ranges = [StepRange::new(2, 3, 2), StepRange::new(0, 10, 1), StepRange::new(2, 3, 1)];

@@ -88,7 +88,7 @@ fn yields_every_clip_once_with_its_rows() {
 }
 
 #[test]
-fn order_depends_only_on_seed_and_epoch() {
+fn batch_order_depends_only_on_seed_and_epoch() {
     let (_folder, path) = dataset(2);
     let (_other_folder, other_path) = dataset(100);
     let reader = open(&path).expect("opening the dataset");
@@ -113,7 +113,7 @@ fn order_depends_only_on_seed_and_epoch() {
 }
 
 #[test]
-fn follows_the_configuration_of_episodes_batches_and_cache() {
+fn loader_follows_the_episode_selection_drop_last_and_the_first_batch() {
     let (_folder, path) = dataset(2);
     let reader = open(&path).expect("opening the dataset");
     let cache = CacheConfig::Memory { bytes: 1 << 30 };
@@ -135,7 +135,7 @@ fn follows_the_configuration_of_episodes_batches_and_cache() {
 }
 
 #[test]
-fn reuses_memory_and_reads_two_epochs_at_once() {
+fn loader_reuses_batch_memory_and_reads_two_epochs_concurrently() {
     let (_folder, path) = dataset(2);
     let reader = open(&path).expect("opening the dataset");
     let loader = Loader::new(Arc::clone(&reader), config(1, 1)).expect("a loader");
@@ -163,7 +163,7 @@ fn reuses_memory_and_reads_two_epochs_at_once() {
 }
 
 #[test]
-fn prefetching_respects_its_budget() {
+fn prefetch_count_respects_the_byte_budget() {
     let (_folder, path) = dataset(2);
     let reader = open(&path).expect("opening the dataset");
     let ahead = |prefetch_bytes| {

@@ -27,7 +27,7 @@ fn first_rows(batch: &Batch) -> Vec<(usize, usize)> {
 }
 
 #[test]
-fn evicts_the_oldest_episodes_but_keeps_snapshots() {
+fn evicts_the_oldest_episodes_and_snapshots_stay_unchanged() {
     let buffer = filled(0..6, 30);
     // Episodes have 5, 6, 7, 8, 9 and 10 rows.
     assert_eq!((buffer.rows(), buffer.episodes(), buffer.added()), (27, 3, 6));
@@ -122,7 +122,7 @@ fn samples_while_the_buffer_grows() {
 }
 
 #[test]
-fn saves_and_restores() {
+fn restored_buffer_equals_the_saved_buffer() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("buffer.lance");
     let buffer = filled(0..6, 30);

@@ -69,7 +69,7 @@ fn merge_adds_columns_of_another_dataset() {
 }
 
 #[test]
-fn splits_keep_episode_indices() {
+fn views_of_splits_keep_episode_indices_and_rows() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let all = dataset(&folder.path().join("d.lance"), 0..40);
     let parts = [Part::Train, Part::Validation, Part::Test].map(|part| {

@@ -32,7 +32,7 @@ fn collect(envs: usize, threads: usize, episodes: usize, memory: &Memory) -> Res
 }
 
 #[test]
-fn datasets_do_not_depend_on_environments_or_threads() {
+fn datasets_do_not_depend_on_environment_and_thread_counts() {
     let single = Memory::default();
     let collected = collect(1, 1, 23, &single).expect("the collection succeeds");
     assert_eq!((collected.episodes, collected.added), (23, 23));
@@ -48,7 +48,7 @@ fn datasets_do_not_depend_on_environments_or_threads() {
 }
 
 #[test]
-fn row_holds_an_observation_and_the_following_step() {
+fn row_holds_an_observation_and_the_transition_after_it() {
     let memory = Memory::default();
     let mut world = world(3, 1);
     let schema = world.collect_schema(false).expect("a valid schema");
@@ -144,7 +144,7 @@ impl Policy for Failing {
 }
 
 #[test]
-fn failures_keep_finished_episodes() {
+fn failing_policies_and_writers_keep_finished_episodes() {
     let memory = Memory::default();
     let mut failing = Failing { walker: Walker, remaining: 20 };
     let error = world(3, 1).collect(&mut failing, memory.writer(), &config(50), &mut Control::default());

@@ -21,7 +21,7 @@ impl Policy for MoveRight {
 }
 
 #[test]
-fn hold_rejects_episodes_that_pass_the_goal() {
+fn hold_rejects_episodes_that_move_past_the_goal() {
     // From -2 to 2 in steps of 1: at the goal after 4 steps, beyond it after 5.
     let starts = Starts::episodic(2, 0, pinned(&[("agent.x", -2.0), ("goal.x", 2.0)])).expect("valid starts");
     let play = |policy: &mut dyn Policy, hold| {

@@ -53,7 +53,7 @@ fn solved_starts_are_counted_separately() {
 }
 
 #[test]
-fn budget_ends_an_episode() {
+fn step_budget_ends_an_episode() {
     let starts = Starts::episodic(3, 0, pinned(&[("agent.x", -3.0), ("goal.x", 3.0)])).expect("valid starts");
     let steps = |budget| {
         let found = run(&mut world(2, 1), &mut Walker, &starts, budget);
@@ -100,7 +100,7 @@ fn planner(world: &World) -> MpcPolicy {
 }
 
 #[test]
-fn results_do_not_depend_on_environments_or_threads() {
+fn results_do_not_depend_on_environment_and_thread_counts() {
     let starts = Starts::episodic(20, 5, VariationRequest::default()).expect("valid starts");
     let mut single = world(1, 1);
     let mut policy = planner(&single);
@@ -215,7 +215,7 @@ impl Policy for FirstColor {
 }
 
 #[test]
-fn recorded_factors_apply_unless_they_are_shifted() {
+fn recorded_factors_apply_unless_the_request_pins_them() {
     let reader = recorded(12);
     let picks = Starts::choose(&reader, 1, 6, 0).expect("the dataset has enough starts");
     let color = |variation: VariationRequest| {

@@ -61,7 +61,7 @@ fn recorded_positions(reader: &MemoryReader, picks: &[[usize; 2]], horizon: usiz
 }
 
 #[test]
-fn errors_equal_the_closed_form() {
+fn prediction_errors_equal_the_closed_form() {
     let reader = recorded(40);
     let picks = Starts::choose(&reader, 50, 6, 2).expect("the dataset has enough starts");
     let (_, variance) = recorded_positions(&reader, &picks, 3);
@@ -110,7 +110,7 @@ impl Predictor for Constant {
 }
 
 #[test]
-fn predicting_the_mean_has_the_error_one() {
+fn predicting_the_mean_latent_has_the_error_one() {
     let reader = recorded(40);
     let picks = Starts::choose(&reader, 33, 4, 0).expect("the dataset has enough starts");
     let (x, _) = recorded_positions(&reader, &picks, 2);

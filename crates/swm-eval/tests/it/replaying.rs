@@ -19,7 +19,7 @@ fn config(episodes: usize) -> CollectConfig {
 }
 
 #[test]
-fn collecting_and_reading_run_concurrently() {
+fn replay_buffer_is_read_while_episodes_are_collected() {
     let mut world = world();
     let mut policy = RandomPolicy::new(world.spec(), 3);
     let buffer = ReplayBuffer::new(&world.collect_schema(false).expect("a valid schema"), 120).expect("a valid buffer");

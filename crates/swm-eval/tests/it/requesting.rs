@@ -137,7 +137,7 @@ fn policies_are_compared_with_the_random_floor() {
 }
 
 #[test]
-fn every_policy_and_condition_is_a_stage() {
+fn every_policy_and_condition_starts_and_finishes_a_stage() {
     let mut stages = vec![];
     let mut control = Control::new().with_events(|event| match event {
         Event::Started(stage) => stages.push(format!("{} {}", stage.subject.join(", "), stage.total)),
@@ -238,7 +238,7 @@ fn prediction_errors_are_grouped_by_the_outcome_of_the_episode() {
 }
 
 #[test]
-fn differences_are_listed() {
+fn reproduction_lists_differences() {
     let resolver = TestResolver::new();
     let mut first = round_trip(&run(&request(), 4, 1));
     first.runs[3].episodes[7].steps += 1;
@@ -265,7 +265,7 @@ fn differences_are_listed() {
 }
 
 #[test]
-fn other_weights_are_rejected_before_the_first_episode() {
+fn reproduction_with_other_weights_is_rejected_before_the_first_episode() {
     let first = run(&request(), 4, 1);
     let other = TestResolver { weights: "w1".to_owned(), ..TestResolver::new() };
     let mut stages = 0;
@@ -279,7 +279,7 @@ fn other_weights_are_rejected_before_the_first_episode() {
 }
 
 #[test]
-fn malformed_requests_are_errors() {
+fn results_without_a_valid_request_are_not_reproduced() {
     let resolver = TestResolver::new();
     let first = run(&request(), 4, 1);
     let rejected = |change: &dyn Fn(&mut Results)| {

@@ -5,7 +5,7 @@ use crate::{can_import, config};
 use swm_core::{Action, DType, ResetOptions, Space};
 
 #[test]
-fn observations_of_pong_are_frames() {
+fn frame_of_pong_equals_its_observation() {
     let Some(config) = config().filter(|config| can_import(config, "ale_py")) else { return };
     let mut env = RecordedEnv::of(make("ALE/Pong-v5", &config));
     assert_eq!(env.env.spec().action_space, Space::Discrete { n: 6, start: 0 });

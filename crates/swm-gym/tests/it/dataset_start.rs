@@ -75,7 +75,7 @@ fn environment_with_setters_starts_at_the_recorded_state() {
 }
 
 #[test]
-fn shifted_factors_are_sampled_from_a_new_seed() {
+fn varied_factors_start_the_episode_with_the_seed_of_the_evaluation() {
     let Some(config) = config() else { return };
     let mut field = RecordedEnv::of(make(FIELD, &config));
     let variation = VariationRequest { variation: Some(vec!["agent".to_owned()]), ..VariationRequest::default() };
@@ -86,7 +86,7 @@ fn shifted_factors_are_sampled_from_a_new_seed() {
 }
 
 #[test]
-fn dataset_start_calls_methods_by_name() {
+fn dataset_start_calls_the_methods_that_callables_name() {
     let Some(config) = config() else { return };
     let mut field = RecordedEnv::of(make(FIELD, &config));
     let place =
@@ -128,7 +128,7 @@ fn environment_can_declare_the_method_that_sets_its_state() {
 }
 
 #[test]
-fn replays_a_killed_worker_from_the_recorded_state() {
+fn killed_worker_is_replayed_from_the_recorded_state() {
     let Some(config) = config() else { return };
     let run = |kill: Option<usize>| {
         let transport = WorkerTransport::new(FIELD, [].into(), config.clone()).expect("a worker");
@@ -150,7 +150,7 @@ fn replays_a_killed_worker_from_the_recorded_state() {
 }
 
 #[test]
-fn snapshot_contains_the_dataset_start() {
+fn restored_snapshot_continues_from_the_dataset_start() {
     let Some(config) = config() else { return };
     let mut field = RecordedEnv::of(make(FIELD, &config));
     start(&mut *field.env, &ResetOptions::default(), &[]).expect("a start");

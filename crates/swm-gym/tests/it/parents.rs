@@ -45,7 +45,7 @@ fn dropping_an_environment_ends_its_worker() {
 }
 
 #[test]
-fn a_panic_ends_the_worker() {
+fn panic_of_the_owning_thread_ends_the_worker() {
     let Some((mut env, id)) = hanging_env() else { return };
     let panicked = std::thread::spawn(move || {
         env.reset(0, &ResetOptions::default()).expect("a reset");
@@ -74,7 +74,7 @@ fn killing_the_process_ends_busy_workers() {
     }
     let program = std::env::current_exe().expect("the path of the test program");
     let mut child = Command::new(program)
-        .args(["--exact", "parents::hang_with_a_worker", "--nocapture"])
+        .args(["--exact", "parents::child_that_hangs_with_a_worker", "--nocapture"])
         .env(HANG, "1")
         .stdout(Stdio::piped())
         .stderr(Stdio::null())
@@ -95,7 +95,7 @@ const HANG: &str = "SWM_TEST_HANG";
 /// The program of the child process of [`killing_the_process_ends_busy_workers`]; does nothing unless [`HANG`] is set.
 #[test]
 #[expect(clippy::print_stdout, reason = "the parent test reads the id of the worker from standard output")]
-fn hang_with_a_worker() {
+fn child_that_hangs_with_a_worker() {
     if std::env::var_os(HANG).is_none() {
         return;
     }

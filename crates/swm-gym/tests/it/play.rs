@@ -115,7 +115,7 @@ fn environments_run_in_parallel_on_one_thread() {
 }
 
 #[test]
-fn a_dispatched_call_runs_once() {
+fn dispatched_calls_run_once_and_before_later_calls() {
     let Some(config) = config() else { return };
     let push = Action::Continuous(&[0.1, -0.2]);
     let (start, none) = (ResetOptions::default(), Action::Continuous(&[0.0, 0.0]));
@@ -260,7 +260,7 @@ fn factors_are_sampled_pinned_and_read_back() {
 }
 
 #[test]
-fn a_wrapper_may_provide_factors_and_frames() {
+fn gymnasium_wrapper_provides_factors_and_frames() {
     let Some(config) = config() else { return };
     let mut coated = RecordedEnv::of(make("tests.it.environments:Coated-v0", &config));
     coated.env.reset(1, &ResetOptions::default()).expect("a reset");

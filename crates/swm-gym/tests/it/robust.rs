@@ -111,7 +111,7 @@ fn an_exception_is_reported_without_a_retry() {
 }
 
 #[test]
-fn a_hanging_environment_is_stopped() {
+fn environment_that_exceeds_the_call_timeout_is_an_error() {
     let Some(config) = config() else { return };
     let config = GymConfig { call_timeout: Duration::from_millis(1500), restarts: 1, ..config };
     let mut env = make(&format!("{ROOM},hang_at=2"), &config);

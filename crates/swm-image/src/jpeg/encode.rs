@@ -342,7 +342,7 @@ mod tests {
     }
 
     #[test]
-    fn largest_coefficients_have_codes() {
+    fn noise_with_the_largest_coefficients_is_encoded() {
         // Black and white noise with the finest steps has the largest coefficients and most bytes 0xff.
         let noise = image(64, 48, |y, x| [if (x * 7919 + y * 104_729 + x * y * 31) % 5 < 2 { 255 } else { 0 }; 3]);
         assert!(psnr(&decoded(&noise, 64, 48, 100), &noise) > 40.0);

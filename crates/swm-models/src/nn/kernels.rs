@@ -132,7 +132,7 @@ mod tests {
     use swm_core::Key;
 
     #[test]
-    fn vit_encoder_matches_module_on_any_number_of_threads() {
+    fn cpu_vit_encoder_matches_the_module_for_one_and_three_threads() {
         let sizes = VitConfig { patch: 2, dim: 24, depth: 2, heads: 3, mlp: 40 };
         // The 50 tokens need two blocks of the kernel. The image has more patches than there are learnt positions, so
         // the positions are resampled.

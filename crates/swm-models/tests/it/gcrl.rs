@@ -75,7 +75,7 @@ fn actions(envs: usize) -> Batch {
 }
 
 #[test]
-fn presets_load() {
+fn presets_have_the_steps_and_frozen_encoder_of_their_family() {
     fn check<M: GoalConditioned<Config = GcrlConfig>>() {
         for preset in M::PRESETS {
             let config = TrainConfig::<M>::load(preset.id, &[]).expect(preset.id);

@@ -114,7 +114,7 @@ fn online_results_do_not_depend_on_threads() {
 }
 
 #[test]
-fn resumed_online_run_gives_the_same_bytes() {
+fn resumed_online_run_gives_the_files_of_an_uninterrupted_run() {
     let folder = tempfile::tempdir().expect("a folder");
     let (complete, resumed) = (folder.path().join("complete"), folder.path().join("resumed"));
     let config = config::<Sac>(&[]);

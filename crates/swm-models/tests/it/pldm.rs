@@ -53,7 +53,7 @@ fn results_do_not_depend_on_threads() {
 }
 
 #[test]
-fn every_term_is_logged_and_the_loss_decreases() {
+fn every_loss_term_is_logged_and_the_loss_decreases() {
     let folder = tempfile::tempdir().expect("a folder");
     let overrides = ["schedule.steps=300", "log_every=20", "model.predictor.dropout=0", "optim.lr=3e-3", "loss.idm=10"];
     run(&config(&overrides).expect("a configuration"), folder.path(), 2);

@@ -42,14 +42,14 @@ fn check_world_model(golden: &Golden, model: &Lewm) {
 }
 
 #[test]
-fn lewm_checkpoints_load() {
+fn lewm_checkpoint_of_the_reference_gives_its_outputs() {
     let checkpoint = lewm::import::import(&folder("lewm"), dataset_info(2)).expect("a checkpoint");
     assert_eq!((checkpoint.config.data.frameskip, checkpoint.config.model.image), (2, 8));
     check_world_model(&recorded("lewm"), &checkpoint.model);
 }
 
 #[test]
-fn pldm_checkpoints_load() {
+fn pldm_checkpoint_of_the_reference_gives_its_outputs() {
     // `import` accepts the path of the weights file as well as the folder.
     let checkpoint = pldm::import::import(&folder("pldm").join("weights.pt"), dataset_info(4)).expect("a checkpoint");
     assert_eq!((checkpoint.config.data.frameskip, checkpoint.config.model.predictor.history), (1, 3));
@@ -61,7 +61,7 @@ fn dino_wm_checkpoint() -> swm_models::Checkpoint<DinoWm> {
 }
 
 #[test]
-fn dino_wm_checkpoints_load() {
+fn dino_wm_checkpoint_of_the_reference_gives_its_outputs() {
     let (golden, checkpoint) = (recorded("prejepa"), dino_wm_checkpoint());
     let names: Vec<&str> = checkpoint.config.model.columns.iter().map(|column| column.name.as_str()).collect();
     assert_eq!((names, checkpoint.config.data.frameskip), (vec!["proprio", "action"], 2));
@@ -75,7 +75,7 @@ fn dino_wm_checkpoints_load() {
 }
 
 #[test]
-fn exported_checkpoints_load_again() {
+fn exported_checkpoints_round_trip() {
     let out = tempfile::tempdir().expect("a folder");
     for naming in [Naming::Published, Naming::Transformers5] {
         let exported_folder = out.path().join(format!("lewm-{naming:?}"));

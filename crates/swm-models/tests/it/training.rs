@@ -57,7 +57,7 @@ fn files(run: &Path) -> Vec<Vec<u8>> {
 }
 
 #[test]
-fn resumed_run_gives_the_same_bytes() {
+fn resumed_run_gives_the_files_of_an_uninterrupted_run() {
     let folder = tempfile::tempdir().expect("a folder");
     let (complete, resumed) = (folder.path().join("complete"), folder.path().join("resumed"));
     // 6 episodes of 17 clips give 6 batches of 16 clips. The first epoch therefore ends after step 6, which the resumed

@@ -86,7 +86,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn tolerances_equal_those_of_the_suite() {
+    fn tolerances_equal_those_of_dm_control() {
         let bell = Tolerance::at_least(1.2).gaussian(0.6);
         assert_eq!([bell.of(1.2), bell.of(9.0)], [1.0, 1.0]);
         assert!((bell.of(0.6) - 0.1).abs() < 1e-15 && (bell.of(0.9) - 0.1f64.powf(0.25)).abs() < 1e-15);

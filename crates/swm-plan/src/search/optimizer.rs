@@ -170,7 +170,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn errors_name_the_setting() {
+    fn optimizer_errors_name_the_invalid_setting() {
         let read = |json: &str| serde_json::from_str::<Optimizer>(json);
         let adam = read(r#"{"kind": "adam", "step": 0.2}"#).expect("a valid optimizer");
         assert_eq!(adam, Optimizer::Adam(Adam { step: 0.2, ..Adam::default() }));
@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn clip_norm_scales_each_row() {
+    fn clip_norm_scales_rows_above_the_limit() {
         let mut gradient = [3.0, 4.0, 0.3, 0.4];
         clip_norm(&mut gradient, 2, 1.0);
         assert_eq!(gradient, [0.6, 0.8, 0.3, 0.4]);

@@ -264,7 +264,7 @@ fn noisy_plans_do_not_depend_on_batches_or_threads() {
 }
 
 #[test]
-fn noisy_searches_are_pinned() {
+fn noisy_searches_have_the_pinned_costs() {
     // Published results depend on these values: changing them is a breaking change. The values are rounded, because
     // `exp` and `ln` may differ in the last bit between platforms.
     for (&(solver, name, settings), expected) in NOISY.iter().zip(PINNED) {

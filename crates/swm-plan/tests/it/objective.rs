@@ -379,7 +379,7 @@ fn cart() -> ObjectiveCost {
 }
 
 #[test]
-fn gradient_solvers_find_the_plan_of_the_regulator() {
+fn gradient_solvers_find_the_plan_of_the_linear_quadratic_regulator() {
     let envs = [0, 1, 2];
     let gd = GradientDescent { samples: 4, iterations: 400, ..GradientDescent::default() };
     // The lifted loss of GRASP is not the regulator's cost, so only the synchronisation finds the plan.
@@ -411,7 +411,7 @@ fn unstable(growth: f32) -> ObjectiveCost {
 }
 
 #[test]
-fn one_step_size_of_grasp_works_for_all_horizons() {
+fn grasp_finds_the_optimum_with_one_step_size_for_several_horizons() {
     // The curvature of a rollout's cost grows with the horizon; the curvature of the lifted problem does not. The test
     // uses plain gradient steps, because Adam rescales every value and hides the difference.
     let plain = |step| Optimizer::Sgd(Sgd { step, momentum: 0.0 });
@@ -455,7 +455,7 @@ fn one_step_size_of_grasp_works_for_all_horizons() {
 }
 
 #[test]
-fn errors_name_the_mismatch() {
+fn errors_name_invalid_objectives_and_unsuitable_models() {
     let shape = Shape { horizon: 2, latent: 3, dim: 4 };
     let message = |objective: &dyn Objective| objective.check(shape).expect_err("invalid input").to_string();
     let goal = Goal::default;

@@ -46,7 +46,7 @@ fn deadline_ends_the_search() {
 }
 
 #[test]
-fn traces_are_consistent() {
+fn trace_best_cost_is_at_most_the_mean_cost_and_spread_shrinks() {
     for (row, toy) in sampling_solvers() {
         let trace = &plan(row.id, toy, None, None).trace[0];
         let n = trace.best.len();

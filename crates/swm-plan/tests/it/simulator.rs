@@ -77,7 +77,7 @@ fn costs_equal_distances_in_the_environment() {
 }
 
 #[test]
-fn reaching_the_goal_early_is_cheapest() {
+fn reach_score_counts_remaining_steps_or_the_final_distance() {
     let entry = &two_room::ENTRY;
     let mut pool = pool(entry, 1);
     // The goal is within 16 pixels after 3 steps of 5 pixels to the right.

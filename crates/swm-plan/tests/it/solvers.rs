@@ -192,7 +192,7 @@ fn solvers_find_the_optima_of_toys() {
 }
 
 #[test]
-fn pairing_names_the_solvers_that_fit() {
+fn pairing_errors_name_the_solvers_that_fit() {
     let message = |row: &SolverEntry, toy: &Toy, model: &mut Model| {
         let mut solver = (row.make)(&serde_json::json!({})).expect("a solver");
         let rejected = solve(&mut *solver, model, toy, &ENVS).expect_err(row.id).to_string();
@@ -223,7 +223,7 @@ fn pairing_names_the_solvers_that_fit() {
 }
 
 #[test]
-fn skipped_trials_exist_and_have_reasons() {
+fn trials_and_skipped_trials_name_existing_solvers_and_toys() {
     for &(solver, name, why) in SKIPPED {
         assert!(SOLVERS.get(solver).is_ok() && TOYS.iter().any(|toy| toy.name == name) && why.len() > 10, "{solver}");
     }

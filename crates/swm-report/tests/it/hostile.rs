@@ -48,7 +48,7 @@ fn pipes_and_folders_are_not_read_as_videos() {
 }
 
 #[test]
-fn a_video_is_embedded_once_and_all_videos_have_a_budget() {
+fn each_video_is_embedded_once_within_a_total_budget() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     fs::write(folder.path().join("one.mp4"), "one video").expect("a file");
     let again = page_with_videos(folder.path(), &["one.mp4"; 60]);
@@ -72,7 +72,7 @@ fn a_video_is_embedded_once_and_all_videos_have_a_budget() {
 }
 
 #[test]
-fn many_policies_give_a_small_page() {
+fn many_policies_give_a_bounded_page_and_too_many_runs_are_refused() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let mut many = results();
     many.runs = vec![run("in distribution", "random", 40, 2, None)];
@@ -139,7 +139,7 @@ fn statistics_that_contradict_the_episodes_are_refused() {
 }
 
 #[test]
-fn absurd_values_never_panic() {
+fn extreme_values_are_accepted_and_values_outside_the_layout_are_refused() {
     for (pointer, value) in [
         (
             "/runs/2/timing",

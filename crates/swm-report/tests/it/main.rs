@@ -208,7 +208,7 @@ fn compat_counting_is_described_with_the_strict_rate() {
 }
 
 #[test]
-fn equal_results_give_equal_bytes() {
+fn equal_results_give_equal_pages() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let results = [(PathBuf::from("a/results.json"), results())];
     let pages = ["x", "y"].map(|name| page(&results, &folder.path().join(name)));
@@ -336,7 +336,7 @@ fn training_metrics_become_charts() {
 }
 
 #[test]
-fn results_are_read_and_errors_name_the_problem() {
+fn valid_results_are_read_and_invalid_files_are_refused() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("results.json");
     let good = serde_json::to_value(results()).expect("valid JSON");

@@ -18,7 +18,7 @@ fn content(swm: &Swm, name: &str) -> (String, usize) {
 }
 
 #[test]
-fn dataset_does_not_depend_on_threads_or_environments() {
+fn dataset_does_not_depend_on_thread_and_environment_counts() {
     let swm = Swm::new();
     let hashes = [("1", "1"), ("2", "3"), ("2", "8")].map(|(threads, envs)| {
         let more = ["--episodes", "9", "--overwrite", "--threads", threads, "--envs", envs];

@@ -20,7 +20,7 @@ fn demo(swm: &Swm, more: &[&str]) -> (Value, Value) {
 }
 
 #[test]
-fn demo_does_not_depend_on_threads_and_environments() {
+fn demo_does_not_depend_on_thread_and_environment_counts() {
     let swm = Swm::new();
     let first = demo(&swm, &["--threads", "1", "--envs", "1"]);
     let page = std::fs::read_to_string(swm.path("demo/index.html")).expect("the report");
@@ -149,7 +149,7 @@ fn compares_policies_from_the_same_starts_and_reproduces_results() {
 }
 
 #[test]
-fn checks_protocols_splits_and_settings() {
+fn eval_records_protocol_split_and_hold_and_rejects_unknown_settings() {
     let swm = Swm::new();
     swm.json(&["collect", "swm/TwoRoom-v1", "-o", "rooms", "--no-pixels", "--episodes", "40", "--max-steps", "40"]);
     let expert = ["eval", "expert", "--env", "swm/TwoRoom-v1", "--episodes", "6", "-o", "found"];

@@ -207,7 +207,7 @@ mod tests {
     use swm_core::Key;
 
     #[test]
-    fn reads_ranges_within_the_capacity() {
+    fn block_cache_reads_byte_ranges_within_its_capacity() {
         let runtime = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
         runtime.block_on(async {
             let store = InMemory::new();

@@ -245,7 +245,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn arrays_and_members_round_trip() {
+    fn npz_arrays_and_members_round_trip() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("a.npz");
         let mut writer = NpzWriter::create(&path).expect("creating the archive");
@@ -263,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn parses_headers_of_text_scalars_and_invalid_arrays() {
+    fn array_headers_are_parsed_or_rejected() {
         let array = |text: &str| {
             let mut bytes = b"\x93NUMPY\x02\x00".to_vec();
             bytes.extend((text.len() as u32).to_le_bytes());

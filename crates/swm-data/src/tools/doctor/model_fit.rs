@@ -65,7 +65,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lists_unmet_requirements() {
+    fn model_fit_lists_the_requirements_that_a_dataset_does_not_meet() {
         let world_model = DatasetRequirements {
             model: "world model",
             observations: RequiredObservations::Images,

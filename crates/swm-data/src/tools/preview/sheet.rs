@@ -60,7 +60,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn frames_are_laid_out_in_reading_order() {
+    fn contact_sheet_places_frames_in_reading_order() {
         let frames: Vec<Vec<u8>> = (1..=3).map(|v| vec![v; 2 * 3]).collect();
         let sheet = contact_sheet(2, 1, &frames, 2, 3).expect("a contact sheet");
         assert_eq!((sheet.width, sheet.height), (GAP + 2 * (6 + GAP), GAP + 2 * (3 + GAP)));

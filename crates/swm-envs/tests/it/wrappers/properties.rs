@@ -116,7 +116,7 @@ fn restored_snapshot_continues_bit_for_bit() {
 }
 
 #[test]
-fn everything_but_the_frames_is_unchanged() {
+fn wrappers_change_only_frames() {
     for entry in ENVS.rows {
         let stack = Stack::parse(&["noise", "occlusion"]).expect("parsing the wrappers");
         let (mut env, mut bare) = (
@@ -155,7 +155,7 @@ fn everything_but_the_frames_is_unchanged() {
 }
 
 #[test]
-fn wrapped_goal_has_the_appearance_of_the_episode() {
+fn wrapped_goal_frame_has_the_values_sampled_for_the_episode() {
     let mut env = wrapped(&["color-jitter,hue=0.5", "noise"], GoalFrame::Wrapped);
     let mut clean = wrapped(&["color-jitter,hue=0.5"], GoalFrame::Wrapped);
     let at_goal =
@@ -171,7 +171,7 @@ fn wrapped_goal_has_the_appearance_of_the_episode() {
 }
 
 #[test]
-fn dataset_row_starts_an_episode_of_the_last_seed() {
+fn restored_dataset_row_starts_at_step_0_with_the_seed_of_the_last_reset() {
     let texts = ["noise", "occlusion,num_patches=3"];
     let (mut env, mut other) = (wrapped(&texts, GoalFrame::Clean), wrapped(&texts, GoalFrame::Clean));
     env.reset(6, &fixed_factors()).expect("resetting the environment");

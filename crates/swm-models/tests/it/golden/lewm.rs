@@ -50,7 +50,7 @@ impl Golden {
 }
 
 #[test]
-fn golden_evaluation() {
+fn latents_predictions_rollouts_and_costs_equal_the_reference() {
     for file in files("lewm") {
         println!("{}", file.display());
         let golden = Golden::read(&file);
@@ -117,7 +117,7 @@ fn golden_evaluation() {
 }
 
 #[test]
-fn golden_training() {
+fn training_losses_and_gradients_equal_the_reference() {
     for file in files("lewm") {
         println!("{}", file.display());
         let golden = Golden::read(&file);

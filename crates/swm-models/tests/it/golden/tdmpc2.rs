@@ -25,7 +25,7 @@ fn forward_files() -> impl Iterator<Item = Golden> {
 }
 
 #[test]
-fn golden_tdmpc2_forward() {
+fn network_outputs_and_costs_equal_the_reference() {
     for golden in forward_files() {
         let (model, published) = golden.tdmpc2();
         let config = published.model();
@@ -68,7 +68,7 @@ fn golden_tdmpc2_forward() {
 }
 
 #[test]
-fn golden_tdmpc2_checkpoints_round_trip() {
+fn exported_checkpoints_round_trip() {
     let folder = tempfile::tempdir().expect("a folder");
     for golden in forward_files() {
         let (model, published) = golden.tdmpc2();
@@ -90,7 +90,7 @@ fn golden_tdmpc2_checkpoints_round_trip() {
 }
 
 #[test]
-fn golden_tdmpc2_training() {
+fn training_losses_and_gradients_equal_the_reference() {
     let mut checked_files = 0;
     for file in files("tdmpc2") {
         let golden = Golden::read(&file);

@@ -40,7 +40,7 @@ fn state_dicts_round_trip() {
 }
 
 #[test]
-fn invalid_files_are_refused() {
+fn invalid_weight_files_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     let message = |name: &str, bytes: &[u8]| {
         let path = folder.path().join(name);

@@ -18,7 +18,7 @@ def test_every_engine_solver_has_a_python_class():
 
 
 @pytest.mark.parametrize("id", SOLVERS)
-def test_engine_solvers_accept_the_settings_of_python_classes(id):
+def test_python_classes_accept_the_settings_of_engine_solvers(id):
     kind, defaults = SOLVERS[id], json.loads(_engine.solvers())[id]
     assert set(kind._names.values()) <= set(defaults)
     # The engine's defaults are valid settings of the class.

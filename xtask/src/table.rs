@@ -81,7 +81,7 @@ mod tests {
         | `swm` | all | `swm-core`, `swm-plan`, `clap` |\n\nMore text.\n";
 
     fn check(text: &str, packages: &[(&str, &[&str])]) -> Vec<String> {
-        violations(&Graph::synthetic(packages), &parse(text).expect("a valid table"))
+        violations(&Graph::synthetic(packages), &parse(text).expect("parsing the table"))
     }
 
     const WORKSPACE: &[(&str, &[&str])] =

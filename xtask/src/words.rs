@@ -166,7 +166,7 @@ mod tests {
     fn check(path: &str, text: &str) -> Vec<String> {
         let used = File { path: "a/b.rs".to_owned(), text: "a column named picture".to_owned() };
         let file = File { path: path.to_owned(), text: text.to_owned() };
-        Words::parse(LIST).expect("a valid list").violations(&[used, file])
+        Words::parse(LIST).expect("parsing the list").violations(&[used, file])
     }
 
     #[test]
@@ -189,7 +189,7 @@ mod tests {
 
     #[test]
     fn allow_list_row_without_a_match_is_reported() {
-        let found = Words::parse(LIST).expect("a valid list").violations(&[]);
+        let found = Words::parse(LIST).expect("parsing the list").violations(&[]);
         assert!(found[0].contains("delete the row"), "{found:?}");
     }
 }

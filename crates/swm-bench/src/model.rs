@@ -214,7 +214,7 @@ mod tests {
     #[test]
     fn times_and_outputs_are_compared_with_the_reference() {
         use std::os::unix::fs::PermissionsExt as _;
-        let folder = tempfile::tempdir().expect("a temporary folder");
+        let folder = tempfile::tempdir().expect("creating a temporary folder");
         let python = folder.path().join("python");
         // A fake reference: two repetitions per second, and an output that differs by a fifth of the largest output.
         let script = "#!/bin/sh\necho SWM ready 1.2.3\nwhile read what rest; do\n\

@@ -187,7 +187,8 @@ mod tests {
                 space.check("value", &value).expect("a sample is in its space");
             }
         }
-        let error = spaces[4].check("agent.color", &[0.0, 256.0, 3.0]).expect_err("out of bounds").to_string();
+        let error =
+            spaces[4].check("agent.color", &[0.0, 256.0, 3.0]).expect_err("a value outside the space").to_string();
         assert_eq!(
             error,
             "agent.color = [0.0, 256.0, 3.0] is outside its space: expected a colour: 3 integers in 0 ..= 255"

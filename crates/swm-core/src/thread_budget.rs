@@ -48,7 +48,7 @@ mod tests {
 
     #[test]
     fn all_sets_the_budget_to_the_thread_count_of_the_pool() {
-        let pool = crate::pool::threads(3).expect("starting three threads");
+        let pool = crate::pool::threads(3).expect("creating the thread pool");
         assert_eq!(pool.install(|| all(threads)), 3);
     }
 }

@@ -215,7 +215,7 @@ mod tests {
         assert_eq!(bytes.remove(0), 7, "the encoder appends to the vector");
         assert_eq!(size(&bytes).expect("a header"), (height.into(), width.into()));
         let mut back = vec![0; rgb.len()];
-        decode(&bytes, &mut back).expect("a decoded image");
+        decode(&bytes, &mut back).expect("decoding the image");
         assert!(back == rgb, "{height} x {width} differs after a round trip");
         bytes
     }
@@ -240,7 +240,7 @@ mod tests {
         bytes.extend([RGBA, 10, 20, 30, 40, DIFF | 0b11_10_01]);
         bytes.extend(END);
         let mut out = [0; 6];
-        decode(&bytes, &mut out).expect("a decoded image");
+        decode(&bytes, &mut out).expect("decoding the image");
         assert_eq!(out, [10, 20, 30, 11, 20, 29]);
     }
 

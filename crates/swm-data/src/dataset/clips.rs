@@ -180,14 +180,19 @@ mod tests {
             ColumnSpec::new("action", DType::Float32, [2]),
             ColumnSpec::new("reward", DType::Float64, []),
         ])
-        .expect("schema");
+        .expect("creating the schema");
         let mut spec = ClipSpec {
             num_steps: 3,
             frameskip: 4,
             columns: ["action", "pixels", "reward"].map(str::to_owned).to_vec(),
         };
-        let shapes: Vec<Vec<usize>> =
-            spec.schema(&dataset).expect("clips").columns().iter().map(|c| c.shape.clone()).collect();
+        let shapes: Vec<Vec<usize>> = spec
+            .schema(&dataset)
+            .expect("creating the schema of clips")
+            .columns()
+            .iter()
+            .map(|c| c.shape.clone())
+            .collect();
         assert_eq!(shapes, [vec![3, 8], vec![3, 4, 5, 3], vec![3]]);
         spec.columns.push("stat".to_owned());
         assert!(spec.schema(&dataset).expect_err("no such column").to_string().contains("unknown column 'stat'"));

@@ -10,7 +10,7 @@ use swm_eval::{CollectConfig, World, WorldConfig};
 
 fn world() -> World {
     let config = WorldConfig { envs: 3, image: Some((2, 3)), threads: 1, ..WorldConfig::default() };
-    World::new(&ENTRY, config).expect("a valid world")
+    World::new(&ENTRY, config).expect("creating the world")
 }
 
 fn config(episodes: usize) -> CollectConfig {
@@ -22,7 +22,9 @@ fn config(episodes: usize) -> CollectConfig {
 fn replay_buffer_is_read_while_episodes_are_collected() {
     let mut world = world();
     let mut policy = RandomPolicy::new(world.spec(), 3);
-    let buffer = ReplayBuffer::new(&world.collect_schema(false).expect("a valid schema"), 120).expect("a valid buffer");
+    let buffer =
+        ReplayBuffer::new(&world.collect_schema(false).expect("creating the schema of collected episodes"), 120)
+            .expect("creating the replay buffer");
     let collect_into_buffer = |world: &mut World, policy: &mut RandomPolicy, episodes| {
         world
             .collect(policy, buffer.writer(), &config(episodes), &mut Control::default())
@@ -32,7 +34,7 @@ fn replay_buffer_is_read_while_episodes_are_collected() {
     let columns = ["state", "action", "reward"].map(str::to_owned).to_vec();
     let clip = ClipSpec { num_steps: 2, frameskip: 1, columns };
     let loader =
-        buffer.loader(ReplayConfig { clip, batch_size: 16, ..ReplayConfig::default() }).expect("a valid loader");
+        buffer.loader(ReplayConfig { clip, batch_size: 16, ..ReplayConfig::default() }).expect("creating the loader");
     scope(|scope| {
         let reading = scope.spawn(|| {
             // Reads until new episodes have replaced the first episodes.
@@ -57,7 +59,11 @@ fn replay_buffer_is_read_while_episodes_are_collected() {
         let read = snapshot.read(&["state", "reward"], &all_rows).expect("the buffer is readable");
         let recorded = &expected[episode.index as usize];
         for (i, name) in ["state", "reward"].into_iter().enumerate() {
-            assert_eq!(read.bytes(i), recorded.bytes(recorded.schema().index(name).expect("a column")), "{name}");
+            assert_eq!(
+                read.bytes(i),
+                recorded.bytes(recorded.schema().index(name).expect("finding the column")),
+                "{name}"
+            );
         }
     }
 }

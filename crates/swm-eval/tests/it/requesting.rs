@@ -97,13 +97,13 @@ fn repeat(old: &Results, resolver: &TestResolver) -> Result<swm_eval::Reproducti
 
 /// Serialises results to JSON and back.
 fn round_trip(results: &Results) -> Results {
-    serde_json::from_str(&serde_json::to_string_pretty(results).expect("valid JSON"))
+    serde_json::from_str(&serde_json::to_string_pretty(results).expect("serialising to JSON"))
         .expect("the JSON contains results")
 }
 
 fn without_timing(mut results: Results) -> String {
     results.runs.iter_mut().for_each(|run: &mut Run| run.timing = Default::default());
-    serde_json::to_string(&results).expect("valid JSON")
+    serde_json::to_string(&results).expect("serialising to JSON")
 }
 
 #[test]
@@ -180,7 +180,7 @@ fn held_out_starts_come_from_held_out_episodes() {
         assert_eq!(found.manifest.hashes["dataset"], "memory");
         let split = Split { validation: 0.3, test: 0.3, seed: 1 };
         for episode in &found.runs[1].episodes {
-            let [position, _] = episode.start.expect("a start");
+            let [position, _] = episode.start.expect("the episode has a start");
             assert_eq!(split.part(resolver.data.episodes()[position].index), part);
         }
         hashes.push(found.manifest.hashes["starts"].clone());
@@ -206,7 +206,11 @@ fn results_can_be_reproduced() {
         let first = round_trip(&run(&request, 4, 1));
         let mut expected = request.clone();
         expected.policies.insert(0, PolicyRequest { name: "random".to_owned(), kind: PolicyKind::Random });
-        assert_eq!(EvalRequest::of(&first.manifest).expect("a valid request"), expected, "the request with the floor");
+        assert_eq!(
+            EvalRequest::of(&first.manifest).expect("reading the request"),
+            expected,
+            "the request with the floor"
+        );
         let second = repeat(&first, &resolver).expect("the reproduction succeeds");
         assert_eq!(second.differences, []);
         assert!(second.holds());
@@ -273,7 +277,7 @@ fn reproduction_with_other_weights_is_rejected_before_the_first_episode() {
     let mut control = Control::new().with_events(|event| stages += usize::from(matches!(event, Event::Started(_))));
     let error = reproduce(&first, &other, &options, &mut control);
     drop(control);
-    let error = error.expect_err("other weights").to_string();
+    let error = error.expect_err("reproducing with other weights").to_string();
     assert!(error.contains("w1") && error.contains("made with w0"), "{error}");
     assert_eq!(stages, 0);
 }

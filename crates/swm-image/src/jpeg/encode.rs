@@ -301,7 +301,7 @@ mod tests {
         assert_eq!(bytes[0], 7, "the encoder appends to the vector");
         let options = DecoderOptions::default().jpeg_set_out_colorspace(ColorSpace::RGB).set_strict_mode(true);
         let mut decoder = zune_jpeg::JpegDecoder::new_with_options(ZCursor::new(&bytes[1..]), options);
-        let pixels = decoder.decode().expect("a JPEG image");
+        let pixels = decoder.decode().expect("decoding the JPEG image");
         let info = decoder.info().expect("a header");
         assert_eq!((info.height, info.width), (height, width));
         pixels

@@ -138,9 +138,11 @@ mod tests {
         // the positions are resampled.
         let (patches, elements) = (49, 12);
         let vit = sizes.init(&Init::new(Key::new(1), &Device::flex()), 12);
-        let encoder = vit_encoder(&vit, patches).expect("a transformer with layers");
+        let encoder = vit_encoder(&vit, patches).expect("creating the CPU encoder");
         let image: Vec<f32> = (0..patches * elements).map(|i| (i * 37 % 101) as f32 / 50.0 - 1.0).collect();
-        let on = |threads: usize| swm_core::pool::threads(threads).expect("threads").install(|| encoder.encode(&image));
+        let on = |threads: usize| {
+            swm_core::pool::threads(threads).expect("creating the thread pool").install(|| encoder.encode(&image))
+        };
         let class = on(1);
         assert_eq!(class, on(3));
         let input = Tensor::from_data(TensorData::new(image.clone(), [1, patches, elements]), &Device::flex());

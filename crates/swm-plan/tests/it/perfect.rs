@@ -11,8 +11,8 @@ use rows::Task;
 use serde_json::Value;
 
 fn run(task: &Task, solver: &'static str, n: usize) -> Outcome {
-    let starts = starts(task.entry, task.protocol, n).expect("valid starts");
-    let planner = rows::planner(task, solver, &Value::Null).expect("valid settings");
+    let starts = starts(task.entry, task.protocol, n).expect("creating the starts");
+    let planner = rows::planner(task, solver, &Value::Null).expect("creating the planner");
     play(task.entry, &starts, &planner, task.budget).expect("the planner plays the starts")
 }
 

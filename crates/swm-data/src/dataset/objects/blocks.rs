@@ -208,7 +208,7 @@ mod tests {
 
     #[test]
     fn block_cache_reads_byte_ranges_within_its_capacity() {
-        let runtime = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
+        let runtime = tokio::runtime::Builder::new_current_thread().build().expect("creating the runtime");
         runtime.block_on(async {
             let store = InMemory::new();
             let contents: Vec<Vec<u8>> = [1000, 37, 256].map(|n| (0..n).map(|i| (i * i / 3) as u8).collect()).into();

@@ -479,7 +479,7 @@ mod tests {
         let plain = plain.concat();
         assert!(verify_checksum(&plain).is_ok(), "a manifest of another writer has no checksum");
         let intact = with_checksum(&plain).expect("adding a checksum");
-        assert_eq!(&intact[message_start(&intact).expect("a message")..][4..11], b"message");
+        assert_eq!(&intact[message_start(&intact).expect("finding the message")..][4..11], b"message");
         assert!(verify_checksum(&intact).is_ok());
         for at in (0..intact.len()).filter(|at| !(11..19).contains(at)) {
             let mut damaged = intact.clone();

@@ -192,7 +192,7 @@ fn gcivl_checkpoint_of_the_reference_round_trips() {
     assert_eq!(actual, golden.group("w."));
 
     // Exported weights have the names and shapes of the reference's class, without the target networks.
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     import::export(&checkpoint, folder.path(), Naming::Published).expect("exporting a checkpoint");
     let written = weights::read(&folder.path().join("weights.pt")).expect("reading the exported weights");
     let expected =

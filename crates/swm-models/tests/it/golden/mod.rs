@@ -30,9 +30,9 @@ pub struct Golden {
 impl Golden {
     pub fn read(path: &std::path::Path) -> Self {
         let bytes = std::fs::read(path).expect("reading a golden file");
-        let (_, metadata) = SafeTensors::read_metadata(&bytes).expect("a safetensors file");
+        let (_, metadata) = SafeTensors::read_metadata(&bytes).expect("parsing the safetensors file");
         let config = &metadata.metadata().as_ref().expect("the metadata of a golden file")["config"];
-        let tensors = SafeTensors::deserialize(&bytes).expect("a safetensors file");
+        let tensors = SafeTensors::deserialize(&bytes).expect("parsing the safetensors file");
         let tensors = tensors
             .iter()
             .filter(|(_, view)| view.dtype() == safetensors::Dtype::F32)
@@ -136,7 +136,7 @@ fn files(model: &str) -> Vec<PathBuf> {
         .iter()
         .filter_map(|folder| std::fs::read_dir(folder).ok())
         .flatten()
-        .map(|entry| entry.expect("a folder entry").path())
+        .map(|entry| entry.expect("reading the folder entry").path())
         .filter(|path| {
             let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
             name.starts_with(&format!("{model}-")) && name.ends_with(".safetensors")

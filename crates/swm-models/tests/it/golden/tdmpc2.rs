@@ -15,7 +15,7 @@ impl Golden {
     }
 
     fn tdmpc2(&self) -> (Tdmpc2, Published) {
-        let published = Published::read(&self.text).expect("a configuration");
+        let published = Published::read(&self.text).expect("reading the published configuration");
         (published.with(&self.group("w."), &Device::flex()).expect("published weights"), published)
     }
 }
@@ -69,17 +69,17 @@ fn network_outputs_and_costs_equal_the_reference() {
 
 #[test]
 fn exported_checkpoints_round_trip() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     for golden in forward_files() {
         let (model, published) = golden.tdmpc2();
-        let mut config = TrainConfig::<Tdmpc2>::load("paper", &[]).expect("a configuration");
+        let mut config = TrainConfig::<Tdmpc2>::load("paper", &[]).expect("loading the configuration");
         (config.model, config.loss) = (published.model(), published.loss());
         let action = ActionScale::identity(model.action_dim());
         let dataset_info = DatasetInfo { action, columns: Named::new(), env: None };
         let manifest = swm_core::Manifest::new("test", 0, serde_json::Value::Null);
         let checkpoint = Checkpoint { model, config, dataset_info: dataset_info.clone(), manifest };
-        export(&checkpoint, folder.path()).expect("an exported checkpoint");
-        let again = import(folder.path(), dataset_info).expect("a checkpoint");
+        export(&checkpoint, folder.path()).expect("exporting the checkpoint");
+        let again = import(folder.path(), dataset_info).expect("importing the checkpoint");
         assert_eq!(parameters::values(&again.model), parameters::values(&checkpoint.model));
         assert_eq!((&again.config.model, &again.config.loss), (&checkpoint.config.model, &checkpoint.config.loss));
         let other = DatasetInfo { action: ActionScale::identity(1), columns: Named::new(), env: None };

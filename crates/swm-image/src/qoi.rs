@@ -253,7 +253,7 @@ mod tests {
         assert!(fails(&bytes, 99) && fails(&bytes, 101) && !fails(&bytes, 100));
         assert!(fails(&[&bytes[..], &[0]].concat(), 100));
         let flat = round_trip(&[7; 300], 10, 10);
-        assert!(fails(&flat, 40), "a run beyond the end");
+        assert!(fails(&flat, 40), "a run beyond the end must be an error");
     }
 
     proptest! {

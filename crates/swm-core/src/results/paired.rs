@@ -213,9 +213,15 @@ mod tests {
         assert!((table.difference - 1.0 / 3.0).abs() < 1e-12);
         let mut other = model.clone();
         other.episodes[3].seed = 5;
-        assert!(Comparison::of(&other, &floor, Counting::default()).is_none(), "other starts");
+        assert!(
+            Comparison::of(&other, &floor, Counting::default()).is_none(),
+            "runs with other starts are not compared"
+        );
         other = Run { condition: "shifted colours".to_owned(), ..model };
-        assert!(Comparison::of(&other, &floor, Counting::default()).is_none(), "another condition");
+        assert!(
+            Comparison::of(&other, &floor, Counting::default()).is_none(),
+            "runs with other conditions are not compared"
+        );
     }
 
     #[test]
@@ -227,6 +233,10 @@ mod tests {
         // 30 with the floor, and 29 others with model-7.
         assert_eq!(found.len(), 59);
         assert!(found.iter().all(|c| [c.a.as_str(), c.b.as_str()].iter().any(|p| ["random", "model-7"].contains(p))));
-        assert_eq!(Comparison::all(&runs[..MAX_ALL_PAIRS], Counting::default()).len(), 190, "all pairs");
+        assert_eq!(
+            Comparison::all(&runs[..MAX_ALL_PAIRS], Counting::default()).len(),
+            190,
+            "at most MAX_ALL_PAIRS runs are compared in all pairs"
+        );
     }
 }

@@ -69,6 +69,6 @@ mod tests {
         assert_eq!((found.plans, found.mean.len(), found.spread.len()), (11, 1, 0));
         traces.reverse();
         assert_eq!(Searches::of(&traces), Some(found));
-        assert_eq!(Searches::of(&[PlanTrace::default()]), None, "an empty trace");
+        assert_eq!(Searches::of(&[PlanTrace::default()]), None, "an empty trace gives no statistics");
     }
 }

@@ -169,6 +169,6 @@ mod tests {
                 .to_string()
                 .contains("0 ..= 1")
         );
-        assert!(column_quantiles(&*reader, "state", Some(&[3]), &[0.5]).is_err(), "no such episode");
+        assert!(column_quantiles(&*reader, "state", Some(&[3]), &[0.5]).is_err(), "episode 3 does not exist");
     }
 }

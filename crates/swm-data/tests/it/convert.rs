@@ -107,7 +107,7 @@ fn interrupted_conversion_resumes_and_targets_with_other_data_are_rejected() {
         let stopped = convert(&reader, &Location::from(&target), &options, &mut control);
         drop(control);
         assert!(matches!(stopped, Err(Error::Interrupted)), "{stopped:?}");
-        assert_eq!(open(&target).expect("opening the dataset").episodes().len(), stop, "written episodes remain");
+        assert_eq!(open(&target).expect("opening the dataset").episodes().len(), stop, "the written episodes remain");
         assert_eq!(stages.contains(&"compare"), stop > 1);
     }
     let report = run(&path, &target, &lossless(ConvertMode::Resume)).expect("comparing the datasets");

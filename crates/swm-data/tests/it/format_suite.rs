@@ -64,7 +64,7 @@ pub fn all(name: &str) {
     rejects_a_second_writer(&other("busy-"));
     reads_committed_episodes_during_writing(&other("growing-"));
     numeric_types_round_trip(&other("types-"));
-    assert!(open(folder.path().join(format!("none-{name}"))).is_err(), "a missing dataset");
+    assert!(open(folder.path().join(format!("none-{name}"))).is_err(), "opening a missing dataset must fail");
 }
 
 fn check_write_modes(path: &Path) {
@@ -75,7 +75,7 @@ fn check_write_modes(path: &Path) {
     assert_eq!(
         reader.schema().column("step_idx").expect("finding the column").dtype,
         DType::Int64,
-        "the declared type"
+        "`step_idx` has the declared type"
     );
     let data_columns = |columns: &[ColumnSpec]| -> Vec<ColumnSpec> {
         columns.iter().filter(|column| !column.name.ends_with("_idx")).cloned().collect()

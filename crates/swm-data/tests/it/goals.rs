@@ -78,7 +78,7 @@ fn goals_are_reproducible_and_differ_between_epochs() {
     let base = states(config(&goals), 4, 0);
     let other = LoaderConfig { threads: 0, cache: CacheConfig::Off, batch_size: 7, ..config(&goals) };
     assert_eq!(states(other, 4, 0), base, "goals depend neither on threads nor on the batch size");
-    assert_eq!(states(config(&goals), 4, 2), base[2 * 5 * 3..], "resumed");
+    assert_eq!(states(config(&goals), 4, 2), base[2 * 5 * 3..], "a resumed epoch has the same goals");
     assert_ne!(states(config(&goals), 5, 0), base);
     // With one selected episode, all goals belong to the selected episode.
     let selected = LoaderConfig { episodes: Some(vec![6]), ..config(&[("goal", GoalMixture::RANDOM)]) };

@@ -57,9 +57,9 @@ fn written_episodes_are_read_with_their_images() {
         assert!(error.contains("exists already"), "{error}");
         let few = Schema::new(schema().columns()[..4].to_vec()).expect("creating the schema");
         let options = WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() };
-        assert!(create(&path, &few, options).is_err(), "other columns");
+        assert!(create(&path, &few, options).is_err(), "appending other columns must fail");
     }
-    assert!(open(folder.path().join("none.lance-video")).is_err(), "a missing dataset");
+    assert!(open(folder.path().join("none.lance-video")).is_err(), "opening a missing dataset must fail");
     let images = Schema::new(schema().columns()[..1].to_vec()).expect("creating the schema");
     let path = folder.path().join("images.lance-video");
     let error = create(&path, &images, WriteOptions::default())

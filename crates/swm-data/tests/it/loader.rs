@@ -59,7 +59,7 @@ fn yields_every_clip_once_with_its_rows() {
     let mut expected: Vec<(usize, usize)> =
         (0..EPISODES).flat_map(|e| (0..(rows(e) + 1).saturating_sub(steps * skip)).map(move |s| (e, s))).collect();
     let mut found = clips(&batches);
-    assert_ne!(found, expected, "shuffled");
+    assert_ne!(found, expected, "the clips are shuffled");
     found.sort_unstable();
     expected.sort_unstable();
     assert_eq!(found, expected);
@@ -102,8 +102,14 @@ fn batch_order_depends_only_on_seed_and_epoch() {
             {
                 let config = LoaderConfig { threads, prefetch, cache, ..config(3, 1) };
                 assert!(bytes(&load(&reader, config.clone(), 5, 0)) == bytes(&base), "{threads} {prefetch}");
-                assert!(bytes(&load(&other, config.clone(), 5, 0)) == bytes(&base), "other files");
-                assert!(bytes(&load(&reader, config, 5, 4)) == bytes(&base[4..]), "resumed");
+                assert!(
+                    bytes(&load(&other, config.clone(), 5, 0)) == bytes(&base),
+                    "batches do not depend on the data files"
+                );
+                assert!(
+                    bytes(&load(&reader, config, 5, 4)) == bytes(&base[4..]),
+                    "a resumed epoch has the same batches"
+                );
             }
         }
     }

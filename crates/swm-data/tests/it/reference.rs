@@ -178,7 +178,7 @@ fn reference_reads_datasets_written_here() {
     }
     for seen in &seen[2..4] {
         for (i, mean) in elements(&seen["pixel_means"]).into_iter().enumerate() {
-            assert!((mean.expect("a mean") - means[i]).abs() < 1e-9, "lossless");
+            assert!((mean.expect("a mean") - means[i]).abs() < 1e-9, "lossless images have the same mean");
         }
     }
     assert_eq!(seen[4], seen[0], "committed shards equal the dataset of one writer");

@@ -147,5 +147,5 @@ fn restored_buffer_equals_the_saved_buffer() {
     };
     assert!(drawn(&restored) == drawn(&plain), "the restored buffer draws the same samples");
     let smaller = ReplayBuffer::restore(&*reader, 20).expect("restoring the buffer");
-    assert_eq!(state(&smaller), (19, 2, 6), "the latest episodes that fit");
+    assert_eq!(state(&smaller), (19, 2, 6), "the smaller buffer holds the latest episodes");
 }

@@ -103,7 +103,7 @@ fn views_of_splits_keep_episode_indices_and_rows() {
         );
         assert_eq!(read.bytes(0), episode(e).bytes(2));
     }
-    assert!(held_out.read(&["pixels"], &[StepRange::new(0, 0, 1)]).is_err(), "an unselected column");
+    assert!(held_out.read(&["pixels"], &[StepRange::new(0, 0, 1)]).is_err(), "reading an unselected column must fail");
     for (positions, words) in [(vec![], "at least one"), (vec![40], "below 40"), (vec![1, 1], "twice")] {
         assert!(subset(Arc::clone(&all), positions).err().expect("the call must fail").to_string().contains(words));
     }

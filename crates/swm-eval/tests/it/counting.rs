@@ -32,7 +32,7 @@ fn hold_rejects_episodes_that_move_past_the_goal() {
     assert_eq!(play(&mut Walker, 1), (2, 4, Some(4)));
     assert_eq!(play(&mut Walker, 3), (2, 6, Some(4)), "held from the fourth step on");
     assert_eq!(play(&mut MoveRight, 1), (2, 4, Some(4)));
-    assert_eq!(play(&mut MoveRight, 2), (0, 12, None), "plays until the budget ends");
+    assert_eq!(play(&mut MoveRight, 2), (0, 12, None), "the episode lasts until the budget ends");
 }
 
 #[test]
@@ -87,7 +87,7 @@ fn episodic_compat_counting_counts_the_first_finished_episodes() {
         let expected: Vec<u64> = (100..=118).chain([last]).collect();
         assert_eq!(seeds, expected, "{envs} environments");
         assert_eq!((found.success.successes, found.success.n), (successes, 20));
-        assert_eq!(found.episodes, play(envs, 1).episodes, "independent of threads");
+        assert_eq!(found.episodes, play(envs, 1).episodes, "results do not depend on threads");
         assert_eq!(found.strict, None, "strict counting selects other episodes");
     }
     let starts = Starts::sequential(2, 0, all).expect("creating the starts");

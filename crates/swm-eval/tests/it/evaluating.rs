@@ -169,7 +169,7 @@ fn replaying_actions_reaches_the_recorded_goal() {
     assert_eq!(
         picks,
         Starts::choose(&reader, 30, 4, 8).expect("the dataset has enough starts"),
-        "determined by the seed"
+        "the seed determines the starts"
     );
     assert_ne!(picks, Starts::choose(&reader, 30, 4, 9).expect("the dataset has enough starts"));
     let starts =

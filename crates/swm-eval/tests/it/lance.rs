@@ -74,7 +74,7 @@ fn expert_reaches_recorded_goals() {
     let random = evaluate(&mut world, true, VariationRequest::default());
     assert!(expert.success.rate > 0.8, "{:?}", expert.success);
     assert!(expert.success.low > random.success.high, "{:?} and {:?}", expert.success, random.success);
-    assert_eq!(expert.solved_at_start, random.solved_at_start, "the same starts");
+    assert_eq!(expert.solved_at_start, random.solved_at_start, "both policies have the same starts");
     let color = VariationRequest { variation: Some(vec!["agent.color".to_owned()]), ..VariationRequest::default() };
     assert_eq!(evaluate(&mut world, false, color).success, expert.success, "the expert does not depend on colours");
 }

@@ -127,7 +127,7 @@ fn trajectories_are_grouped_by_recorded_success() {
         predict_recorded(&mut Drifting { drift: 0.1 }, &reader, &episodes, 40, 2, 9).expect("the prediction succeeds")
     };
     let found = predict();
-    assert_eq!(found, predict(), "determined by the seed");
+    assert_eq!(found, predict(), "the seed determines the trajectories");
     let succeeded = |episode: usize| {
         let length = reader.episodes()[episode].length;
         let rows = reader.read(&["success"], &[StepRange::new(episode, 0, length)]).expect("the dataset is readable");
@@ -137,7 +137,7 @@ fn trajectories_are_grouped_by_recorded_success() {
         assert!(trajectory.start[0] >= 10, "the trajectory is in one of the chosen episodes");
         assert_eq!(trajectory.success, Some(succeeded(trajectory.start[0])));
     }
-    assert_eq!(found.groups.len(), 3, "all, successful and failed trajectories");
+    assert_eq!(found.groups.len(), 3, "groups of all, successful and failed trajectories");
 }
 
 #[test]

@@ -41,7 +41,11 @@ fn replay_buffer_is_read_while_episodes_are_collected() {
             loader.batches(0).take(100_000).take_while(|batch| batch.is_ok() && buffer.added() < 60).count()
         });
         let collected = collect_into_buffer(&mut world, &mut policy, 60);
-        assert_eq!((collected.episodes, collected.added), (60, 55), "continues after the first five");
+        assert_eq!(
+            (collected.episodes, collected.added),
+            (60, 55),
+            "the collection continues after the first five episodes"
+        );
         assert!(reading.join().is_ok());
     });
     // The buffer holds the last episodes of the same collection into a dataset.

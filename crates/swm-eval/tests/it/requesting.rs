@@ -117,7 +117,7 @@ fn policies_are_compared_with_the_random_floor() {
         ("goal near", "walker"),
     ];
     assert_eq!(names, expected);
-    assert_eq!(found.comparisons.len(), 2, "one for each condition");
+    assert_eq!(found.comparisons.len(), 2, "one comparison for each condition");
     for (comparison, runs) in found.comparisons.iter().zip(found.runs.chunks(2)) {
         assert_eq!((&*comparison.a, &*comparison.b), ("walker", "random"));
         assert_eq!(comparison.table.n(), runs[0].success.n);
@@ -209,7 +209,7 @@ fn results_can_be_reproduced() {
         assert_eq!(
             EvalRequest::of(&first.manifest).expect("reading the request"),
             expected,
-            "the request with the floor"
+            "the manifest has the request with the random floor"
         );
         let second = repeat(&first, &resolver).expect("the reproduction succeeds");
         assert_eq!(second.differences, []);

@@ -52,7 +52,7 @@ fn environment_with_setters_starts_at_the_recorded_state() {
     assert_eq!(field.column("state"), [-0.3, 0.25, 7.0]);
     assert_eq!(field.column("observation"), [-0.3, 0.25]);
     assert_eq!(field.column("goal_state"), [1.2, 0.25, 7.0]);
-    assert_eq!(field.env.factors().scalar("agent.size"), 1.5, "factors are the recorded ones");
+    assert_eq!(field.env.factors().scalar("agent.size"), 1.5, "the factors have the recorded values");
     assert!(!field.env.is_success() && field.env.goal_distance().is_infinite());
     let wind = field.column("wind");
     let frame = field.frame(16, 16);

@@ -128,7 +128,7 @@ fn dispatched_calls_run_once_and_before_later_calls() {
     }
     plain.env.reset(4, &start).expect("resetting the environment");
     assert!(dispatched.dispatch(PendingCall::Reset(4, &start)));
-    assert!(!dispatched.dispatch(PendingCall::Step(push)), "one call at a time");
+    assert!(!dispatched.dispatch(PendingCall::Step(push)), "only one call is dispatched at a time");
     dispatched.env.reset(4, &start).expect("resetting the environment");
     plain.env.step(push).expect("stepping the environment");
     assert!(dispatched.dispatch(PendingCall::Step(push)));
@@ -194,7 +194,7 @@ fn spec_describes_the_environment() {
 fn info_goals_and_frames_become_outputs() {
     let Some(config) = config() else { return };
     let mut room = RecordedEnv::of(make(ROOM, &config));
-    assert_eq!(room.env.goal_distance(), f64::INFINITY, "infinite before the first episode");
+    assert_eq!(room.env.goal_distance(), f64::INFINITY, "the distance is infinite before the first episode");
     room.env.reset(3, &ResetOptions::default()).expect("resetting the environment");
     assert_eq!((room.column("noise"), room.column("steps")), (vec![0.5], vec![0.0]));
     let mut goal = vec![0; 5 * 7 * 3];
@@ -329,7 +329,7 @@ fn unsupported_requests_are_errors() {
     );
     env.env.reset(0, &ResetOptions::default()).expect("resetting the environment");
     assert!(env.env.step(Action::Discrete(&[2])).is_err(), "there are two actions");
-    assert!(env.env.step(Action::Continuous(&[0.0])).is_err(), "an action of another kind");
+    assert!(env.env.step(Action::Continuous(&[0.0])).is_err(), "an action of another kind must be an error");
     env.env.step(Action::Discrete(&[1])).expect("stepping the environment after invalid actions");
 
     let unknown =

@@ -57,7 +57,7 @@ fn files_are_downloaded_once() {
     assert!(path.ends_with("models--owner--name/snapshots/main/model.safetensors"), "{}", path.display());
     let before = requests.load(Ordering::Relaxed);
     assert_eq!(hub.fetch("owner/name", "model.safetensors").expect("finding the cached file"), path);
-    assert_eq!(requests.load(Ordering::Relaxed), before, "no further request");
+    assert_eq!(requests.load(Ordering::Relaxed), before, "a cached file needs no further request");
     let missing = hub.fetch("owner/name", "other.safetensors").expect_err("a missing file").to_string();
     assert!(missing.contains("no such object"), "{missing}");
 }

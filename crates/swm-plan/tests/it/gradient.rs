@@ -50,7 +50,7 @@ fn golden() -> Golden {
 
 #[track_caller]
 fn assert_near(given: &[f32], expected: &[f32], tolerance: f32) {
-    assert_eq!(given.len(), expected.len(), "length");
+    assert_eq!(given.len(), expected.len(), "the numbers of values differ");
     let near = given.iter().zip(expected).all(|(a, b)| (a - b).abs() <= tolerance);
     assert!(near, "{given:?}\n{expected:?}");
 }

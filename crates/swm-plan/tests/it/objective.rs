@@ -488,7 +488,7 @@ fn errors_name_invalid_objectives_and_unsuitable_models() {
     let message = reject(r#"{"terms": [{"term": "control"}]}"#, "constrained");
     assert!(message.contains("the model has constraints of its own"), "{message}");
     assert!(ObjectiveConfig::default().is_empty());
-    assert!(ObjectiveConfig::default().apply(model("constrained")).is_ok(), "an empty objective");
+    assert!(ObjectiveConfig::default().apply(model("constrained")).is_ok(), "an empty objective fits");
 
     let mut cost = ObjectiveCost::new(Box::new(nonlinear()), Box::new(goal()), vec![]).expect("creating the model");
     let actions = random(ENVS.len() * SAMPLES * HORIZON * 4);

@@ -31,7 +31,7 @@ fn videos_outside_the_folder_are_not_embedded() {
         &["../secret.mp4", absolute, "videos/link.mp4", "up/secret.mp4", "videos/../inside.mp4"],
     );
     assert_eq!(page.matches("is outside the folder of its results file").count(), 4);
-    assert_eq!(page.matches("data:video/").count(), 1, "the video inside is embedded");
+    assert_eq!(page.matches("data:video/").count(), 1, "the video inside the folder is embedded");
 }
 
 #[test]

@@ -107,7 +107,7 @@ mod tests {
         let (entry, settings) = parse("cem,samples=64,sigma=0.5").expect("parsing the solver");
         assert_eq!(entry.id, "cem");
         assert_eq!((&settings["samples"], &settings["sigma"]), (&json!(64), &json!(0.5)));
-        assert_eq!(settings["iterations"], json!(30), "the default");
+        assert_eq!(settings["iterations"], json!(30), "unset settings have their defaults");
         let (_, settings) = parse("gd,optimizer.step=0.5").expect("parsing the solver");
         assert_eq!((&settings["optimizer"]["step"], &settings["optimizer"]["kind"]), (&json!(0.5), &json!("adam")));
         for (text, message) in [

@@ -26,8 +26,8 @@ fn demo_does_not_depend_on_thread_and_environment_counts() {
     let page = std::fs::read_to_string(swm.path("demo/index.html")).expect("reading the report");
     assert!(page.contains("Two rooms") && page.contains("data:video/mp4"));
     let second = demo(&swm, &["--threads", "2", "--envs", "5"]);
-    assert_eq!(first.0, second.0, "datasets");
-    assert_eq!(first.1, second.1, "results");
+    assert_eq!(first.0, second.0, "the datasets differ");
+    assert_eq!(first.1, second.1, "the results differ");
     let other = demo(&swm, &["--seed", "1"]);
     assert_ne!(first.0, other.0, "the seed changes the data");
 }

@@ -83,7 +83,11 @@ impl Golden {
         println!("worst gradient: {:.1e} ({})", worst.0, worst.1);
         assert!(worst.0 < TOLERANCE, "gradient of {} differs by {:.1e}", worst.1, worst.0);
         let names = |all: Vec<&String>| all.into_iter().cloned().collect::<Vec<_>>();
-        assert_eq!(names(actual.keys().collect()), names(expected.keys().collect()), "parameters with gradients");
+        assert_eq!(
+            names(actual.keys().collect()),
+            names(expected.keys().collect()),
+            "names of the parameters with gradients"
+        );
     }
 
     /// Normalised images of the configured size as patches.

@@ -78,7 +78,7 @@ def test_cached_and_merged_columns_have_the_stored_values(stored):
     assert dataset.get_dim("both") == 6
 
 
-def test_transform_gets_rows_before_actions_are_grouped(stored):
+def test_transform_gets_rows_before_frameskip_joins_actions(stored):
     path, _, _ = stored
     seen = []
 
@@ -99,7 +99,7 @@ def test_dataset_can_be_pickled(stored):
     same(dataset[20], clips(written, 3, 1)[20], lists)
 
 
-def test_wrong_arguments_raise_clear_errors(stored, tmp_path, monkeypatch):
+def test_wrong_arguments_raise_errors_with_the_reason(stored, tmp_path, monkeypatch):
     path, _, _ = stored
     with pytest.raises(KeyError, match="no column 'pixel'.*the columns are .*pixels"):
         data.load_dataset(path, keys_to_load=["pixel"])
@@ -128,7 +128,7 @@ def test_wrong_arguments_raise_clear_errors(stored, tmp_path, monkeypatch):
         data.load_dataset(tmp_path / "notes")
 
 
-def test_names_are_resolved_in_the_home_folder(tmp_path, monkeypatch):
+def test_dataset_names_are_resolved_in_the_home_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("STABLEWM_HOME", str(tmp_path))
     write("rooms", (5,))
     assert (tmp_path / "datasets" / "rooms.lance").exists()
@@ -179,7 +179,7 @@ def test_concatenated_and_merged_datasets_have_all_clips_and_columns(tmp_path):
         np.testing.assert_array_equal(found, [dataset[i]["state"] for i in range(len(dataset))])
 
 
-def test_goals_are_sampled_from_the_requested_steps(tmp_path):
+def test_goal_probabilities_choose_current_later_and_random_steps(tmp_path):
     write(tmp_path / "a.lance")
     dataset = data.load_dataset(tmp_path / "a.lance", num_steps=2, frameskip=2, backend="numpy")
     keys = {"reward": "goal"}

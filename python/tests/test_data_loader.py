@@ -118,7 +118,7 @@ def test_batches_outlive_the_loader(stored):
         np.testing.assert_array_equal(array, copy)
 
 
-def test_wrong_arguments_raise_clear_errors(stored, tmp_path):
+def test_wrong_arguments_raise_errors_with_the_reason(stored, tmp_path):
     path, _ = stored
     with pytest.raises(KeyError, match="no column 'pixel'"):
         loader(path, columns=["pixel"])

@@ -7,7 +7,7 @@ from data_helpers import episode, episodes
 from stable_worldmodel import data
 
 
-def test_oldest_episodes_are_removed():
+def test_full_buffer_removes_the_oldest_episodes():
     buffer = data.ReplayBuffer(max_steps=50, history_len=3, frameskip=2)
     assert len(buffer) == 0 and buffer.num_steps_stored == 0
     with buffer as writer:

@@ -188,7 +188,7 @@ def test_user_defined_format_is_read_written_and_converted(tmp_path, numpy_forma
     )
 
 
-def test_registered_names_are_unique(numpy_format):
+def test_format_names_are_unique_and_native_formats_are_registered(numpy_format):
     with pytest.raises(ValueError, match="registered already"):
         data.register_format(type("Lance", (data.Format,), {"name": "lance"}))
     with pytest.raises(ValueError, match="needs a `name`"):
@@ -202,7 +202,7 @@ def test_registered_names_are_unique(numpy_format):
     assert isinstance(data.open_writer("never.lance"), data.Writer)
 
 
-def test_convert_between_native_formats(tmp_path):
+def test_conversion_between_native_formats_keeps_the_content(tmp_path):
     write(tmp_path / "a.lance")
     sums = set()
     for target, kwargs in (("b.h5", {}), ("c", {"format": "folder", "codec": "png"}), ("d.lance", {"codec": "png"})):
@@ -221,7 +221,7 @@ def test_convert_between_native_formats(tmp_path):
         data.convert(tmp_path / "a.lance", tmp_path / "f.lance", colour="red", progress=False)
 
 
-def test_doctor_repairs_and_inspect_describes(tmp_path):
+def test_doctor_keeps_intact_episodes_and_inspect_reports_sizes_and_columns(tmp_path):
     write(tmp_path / "a.lance")
     assert data.doctor(tmp_path / "a.lance", progress=False)["problems"] == 0
     broken = episodes((6, 6))

@@ -92,7 +92,7 @@ def test_vector_environments_match_single_environments(name, mode):
         envs.close()
 
 
-def test_options_choose_factors_start_and_goal():
+def test_reset_options_choose_factors_and_the_initial_state():
     env = gymnasium.make("swm/PushT-v1", render_mode="rgb_array", image_shape=(32, 32))
     _, info = env.reset(seed=0, options={"variation": ["agent.color"], "variation_values": {"block.scale": 40}})
     value = env.unwrapped.variation_space.value
@@ -107,7 +107,7 @@ def test_options_choose_factors_start_and_goal():
         env.reset(options={"variation": ["agent.colour"]})
 
 
-def test_keyword_arguments_are_options_of_the_environment():
+def test_unknown_keyword_arguments_and_render_modes_raise():
     with pytest.raises(ValueError, match="no_such_option"):
         gymnasium.make("swm/PushT-v1", no_such_option=3)
     with pytest.raises(ValueError, match="rgb_array"):
@@ -140,7 +140,7 @@ def test_copy_continues_from_the_same_state(name, copied):
     same(env.reset(), twin.reset())
 
 
-def test_wrong_actions_get_clear_errors():
+def test_wrong_actions_raise_errors_with_the_reason():
     env = swm.envs.NativeEnv("swm/TwoRoom-v1")
     env.reset(seed=0)
     with pytest.raises(ValueError, match="2"):
@@ -164,7 +164,7 @@ IMPORTS = [
 ]
 
 
-def test_registration_in_any_import_order():
+def test_environments_are_registered_in_any_import_order():
     check = "gymnasium.make('swm/TwoRoom-v1').reset(seed=0)"
     children = [
         subprocess.Popen([sys.executable, "-W", "error", "-c", f"{line}; {check}"], stderr=subprocess.PIPE, text=True)

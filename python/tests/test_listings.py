@@ -31,7 +31,7 @@ class MyWorldModel(torch.nn.Module):
         return ((reached - goal) ** 2).sum(-1)
 
 
-def test_listing_of_the_full_loop(tmp_path, monkeypatch):
+def test_listing_collects_trains_and_evaluates(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # 1] Create the world
     world = swm.World(env_name="swm/PushT-v1", num_envs=8, max_episode_steps=12, image_shape=(64, 64))
@@ -67,7 +67,7 @@ def test_infos_have_one_row_per_environment():
     assert world.infos["pixels"].shape == (8, 1, 64, 64, 3)
 
 
-def test_collected_factors_are_sampled_and_pinned(tmp_path):
+def test_collected_episodes_have_sampled_and_pinned_factors(tmp_path):
     world = swm.World("swm/PushT-v1", num_envs=2, image_shape=(32, 32), max_episode_steps=5)
     your_policy = swm.policy.RandomPolicy(seed=0)
     world.set_policy(your_policy)

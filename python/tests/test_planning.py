@@ -290,7 +290,7 @@ WRONG = [
 
 @pytest.mark.parametrize(("defect", "error", "words"), WRONG, ids=[defect for defect, _, _ in WRONG])
 @pytest.mark.parametrize("solver", [solvers.CEMSolver, solvers.MPPISolver, solvers.GradientSolver])
-def test_wrong_model_raises_a_clear_error(solver, defect, error, words):
+def test_wrong_model_raises_an_error_with_the_reason(solver, defect, error, words):
     with pytest.raises(error, match=words):
         plan(few(solver, Wrong(defect)))
 
@@ -327,7 +327,7 @@ def test_wrong_model_stops_an_evaluation(defect, error, words):
         (lambda: swm.policy.MPCPolicy(object()), TypeError, "configure"),
     ],
 )
-def test_wrong_arguments_raise_clear_errors(make, error, words):
+def test_wrong_arguments_raise_errors_with_the_reason(make, error, words):
     with pytest.raises(error, match=words):
         make()
 
@@ -379,7 +379,7 @@ def played(policy, steps=18, envs=2):
 
 @pytest.mark.parametrize("warm", [True, False])
 @pytest.mark.parametrize("process", [False, True])
-def test_engine_and_python_execute_plans_equally(warm, process):
+def test_engine_and_user_defined_solvers_execute_the_same_plans(warm, process):
     # Without noise, a search depends only on its initial actions: on warm starts and on the start of an episode.
     config = swm.PlanConfig(horizon=3, receding_horizon=2, action_block=2, warm_start=warm)
     scaler = swm.data.ZScoreScaler(np.array([0.1, -0.1], np.float32), np.array([0.5, 0.8], np.float32))
@@ -399,7 +399,7 @@ def test_engine_and_python_execute_plans_equally(warm, process):
     assert np.nanstd(ours[0]) > 1e-4 and (np.diff(ours[2], axis=0) < 0).any()
 
 
-def test_plans_do_not_depend_on_the_slot():
+def test_plans_do_not_depend_on_other_environments():
     def policy(**more):
         return swm.policy.MPCPolicy(few(solvers.CEMSolver, ToGoal(), seed=1, **more), swm.PlanConfig(3, 2))
 
@@ -518,7 +518,7 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.parametrize("where", ["solve", "evaluate"])
-def test_ctrl_c_interrupts_a_slow_model_at_once(where):
+def test_ctrl_c_interrupts_a_slow_model_within_seconds(where):
     child = subprocess.Popen([sys.executable, "-c", SLOW, where], stdout=subprocess.PIPE, text=True)
     try:
         assert child.stdout.readline().strip() == "planning"

@@ -191,7 +191,7 @@ def test_worker_killed_between_steps_is_replaced(fields, recorded):
 
 
 @pytest.mark.parametrize("workers", [False, True])
-def test_wrong_callables_raise_clear_errors(fields, recorded, workers):
+def test_wrong_callables_raise_errors_with_the_reason(fields, recorded, workers):
     def error(callables, name="Quiet", kind=ValueError):
         world = swm.World(fields(name), num_envs=2, image_shape=(32, 32), workers=workers)
         with pytest.raises(kind) as caught:
@@ -213,7 +213,7 @@ def test_wrong_callables_raise_clear_errors(fields, recorded, workers):
     assert "where" in error(call("teleport", scale={"value": 1, "in_dataset": False}), kind=raised)
 
 
-def test_native_environments_restore_recorded_states(tmp_path):
+def test_native_environments_restore_recorded_states_without_callables(tmp_path):
     world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(32, 32))
     world.set_policy(swm.policy.ExpertPolicy())
     world.collect(tmp_path / "rooms.lance", episodes=3, seed=1, progress=False)

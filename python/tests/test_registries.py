@@ -13,19 +13,19 @@ SOLVERS = {kind.id: kind for name in solver.__all__ if hasattr(kind := getattr(s
 WRAPPERS = {kind.id: kind for name in visual.__all__ if hasattr(kind := getattr(visual, name), "id")}
 
 
-def test_every_solver_has_a_class():
+def test_every_engine_solver_has_a_python_class():
     assert set(SOLVERS) == set(json.loads(_engine.solvers()))
 
 
 @pytest.mark.parametrize("id", SOLVERS)
-def test_solver_settings_equal_the_engine_settings(id):
+def test_python_classes_accept_the_settings_of_engine_solvers(id):
     kind, defaults = SOLVERS[id], json.loads(_engine.solvers())[id]
     assert set(kind._names.values()) <= set(defaults)
     # The engine's defaults are valid settings of the class.
     assert kind("simulator", **defaults).settings == defaults
 
 
-def test_every_visual_wrapper_has_a_class():
+def test_every_engine_wrapper_has_a_python_class():
     assert set(WRAPPERS) == set(json.loads(_engine.wrappers()))
 
 
@@ -35,7 +35,7 @@ def test_positional_settings_of_wrappers_exist_in_the_engine(id):
     assert set(WRAPPERS[id].positional) <= set(parameters)
 
 
-def test_every_format_is_registered():
+def test_every_engine_format_is_registered():
     native = {name for name, kind in swm.data.FORMATS.items() if kind.native}
     assert native == set(_engine.formats())
     assert set(formats._READERS) <= native

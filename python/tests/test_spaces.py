@@ -21,7 +21,7 @@ def factors():
     )
 
 
-def test_space_has_a_default_a_value_and_a_condition():
+def test_sampled_values_satisfy_the_condition_and_reset_restores_defaults():
     space = factors()
     assert space.names() == ["agent.color", "agent.x", "shape"]
     assert space.sampling_order == ["agent", "agent.color", "agent.x", "shape"]
@@ -57,7 +57,7 @@ def test_all_factors_of_a_group_are_sampled_and_values_pinned():
         (lambda s: s.set_init_value({"shape": 9}), "9"),
     ],
 )
-def test_invalid_values_raise_clear_errors(change, words):
+def test_invalid_values_raise_errors_with_the_reason(change, words):
     with pytest.raises(ValueError, match=words):
         change(factors())
 

@@ -45,7 +45,7 @@ def test_every_step_overwrites_the_arrays_of_infos():
     assert world.infos["step_idx"].ravel().tolist() == [1, 1, 1]
 
 
-def test_episode_does_not_depend_on_slot_or_threads():
+def test_episode_does_not_depend_on_other_environments_or_threads():
     def played(envs, threads):
         world = rooms(num_envs=envs, threads=threads)
         world.set_policy(swm.policy.RandomPolicy(seed=5))
@@ -90,7 +90,7 @@ def test_factors_are_sampled_and_pinned():
         world.reset(options={"variations": ["all"]})
 
 
-def test_python_policy_collects(tmp_path):
+def test_python_policy_collects_new_and_appended_episodes(tmp_path):
     world = rooms(max_episode_steps=6)
     policy = Zero(0.5)
     world.set_policy(policy)
@@ -139,7 +139,7 @@ def test_evaluation_starts_at_rows_of_a_dataset(tmp_path):
         world.evaluate(dataset=dataset, episodes_idx=[0], start_steps=[9999], goal_offset=5, progress=False)
 
 
-def test_visual_wrappers_run_in_the_engine():
+def test_visual_wrappers_change_frames_but_not_the_goal():
     plain, noisy = (
         rooms(extra_wrappers=wrappers) for wrappers in ([], [partial(NoiseWrapper, std=linear(8, 30, 10)), GrayscaleWrapper])
     )
@@ -154,7 +154,7 @@ def test_visual_wrappers_run_in_the_engine():
         rooms(extra_wrappers=[partial(NoiseWrapper, std=lambda step: "loud")])
 
 
-def test_function_of_the_step_is_a_schedule():
+def test_python_function_and_schedule_give_equal_frames():
     scheduled, tabulated = (
         rooms(extra_wrappers=[partial(NoiseWrapper, std=schedule)])
         for schedule in (linear(8, 28, 10), lambda step: 8 + 2 * min(step, 10))
@@ -204,7 +204,7 @@ def test_restored_snapshot_repeats_the_next_step():
         (lambda: rooms().evaluate(policy=Zero(np.nan), episodes=1, seed=0), ValueError, "finite actions"),
     ],
 )
-def test_wrong_arguments_raise_clear_errors(make, error, words):
+def test_wrong_arguments_raise_errors_with_the_reason(make, error, words):
     with pytest.raises(error, match=words):
         make()
 

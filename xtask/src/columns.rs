@@ -32,7 +32,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn literals_outside_the_definition_are_violations() {
+    fn column_name_literals_outside_the_columns_module_are_violations() {
         let file = |path: &str, text: &str| File { path: path.to_owned(), text: text.to_owned() };
         let text = "let a = \"pixels\";\n// \"pixels\"\n#[cfg(test)]\nmod tests { const A: &str = \"pixels\"; }";
         assert_eq!(violations(&[file("crates/swm-core/src/columns.rs", text)]), Vec::<String>::new());

@@ -61,7 +61,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn deleting_outside_the_module_is_a_violation() {
+    fn deleting_outside_the_files_module_is_a_violation() {
         let file = |path: &str, text: &str| File { path: path.to_owned(), text: text.to_owned() };
         let text = "// remove_file(a)\nfn a() { std::fs::remove_file(b) }\n#[cfg(test)]\nmod tests { fn c() { fs::remove_dir_all(d) } }";
         let files = [

@@ -79,7 +79,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn members_and_macros_are_left_out() {
+    fn features_of_members_and_procedural_macros_are_left_out() {
         let features = parse(
             "swm v0.1.0 (/w/swm)\t\nserde v1.0.1\tderive,std\nserde v1.0.1\tderive,std (*)\nm v1 (proc-macro)\tx\n",
         );

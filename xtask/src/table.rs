@@ -81,19 +81,19 @@ mod tests {
         | `swm` | all | `swm-core`, `swm-plan`, `clap` |\n\nMore text.\n";
 
     fn check(text: &str, packages: &[(&str, &[&str])]) -> Vec<String> {
-        violations(&Graph::synthetic(packages), &parse(text).expect("a valid table"))
+        violations(&Graph::synthetic(packages), &parse(text).expect("parsing the table"))
     }
 
     const WORKSPACE: &[(&str, &[&str])] =
         &[("swm-core", &["serde"]), ("swm-plan", &["swm-core"]), ("swm", &["swm-plan"]), ("serde", &[])];
 
     #[test]
-    fn a_correct_table_passes() {
+    fn a_table_that_matches_the_workspace_passes() {
         assert_eq!(check(TEXT, WORKSPACE), Vec::<String>::new());
     }
 
     #[test]
-    fn every_difference_is_reported() {
+    fn differences_between_table_and_workspace_are_reported() {
         let reports = |text: &str, packages: &[(&str, &[&str])], words: &str| {
             let found = check(text, packages);
             assert!(found.len() == 1 && found[0].contains(words), "{words}: {found:?}");

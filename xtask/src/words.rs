@@ -166,11 +166,11 @@ mod tests {
     fn check(path: &str, text: &str) -> Vec<String> {
         let used = File { path: "a/b.rs".to_owned(), text: "a column named picture".to_owned() };
         let file = File { path: path.to_owned(), text: text.to_owned() };
-        Words::parse(LIST).expect("a valid list").violations(&[used, file])
+        Words::parse(LIST).expect("parsing the list").violations(&[used, file])
     }
 
     #[test]
-    fn words_are_found_in_names_and_prose() {
+    fn forbidden_words_are_found_in_names_and_prose() {
         for text in ["fn read_pictures()", "struct GoalPicture;", "// A Picture.", "assets of others", "let ofOthers"] {
             let found = check("c.rs", &format!("\n{text}"));
             assert!(found.len() == 1 && found[0].starts_with("c.rs:2: "), "{text}: {found:?}");
@@ -181,15 +181,15 @@ mod tests {
     }
 
     #[test]
-    fn reserved_types_are_refused_elsewhere() {
+    fn reserved_type_outside_its_file_is_a_violation() {
         assert_eq!(check("a/world.rs", "pub struct World {"), Vec::<String>::new());
         assert_eq!(check("c.rs", "pub struct WorldConfig {"), Vec::<String>::new());
         assert!(check("c.rs", "struct World<T> {")[0].contains("only the class"));
     }
 
     #[test]
-    fn allowed_row_without_a_match_is_reported() {
-        let found = Words::parse(LIST).expect("a valid list").violations(&[]);
+    fn allow_list_row_without_a_match_is_reported() {
+        let found = Words::parse(LIST).expect("parsing the list").violations(&[]);
         assert!(found[0].contains("delete the row"), "{found:?}");
     }
 }

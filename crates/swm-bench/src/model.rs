@@ -213,9 +213,9 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn times_and_outputs_are_compared() {
+    fn times_and_outputs_are_compared_with_the_reference() {
         use std::os::unix::fs::PermissionsExt as _;
-        let folder = tempfile::tempdir().expect("a temporary folder");
+        let folder = tempfile::tempdir().expect("creating a temporary folder");
         let python = folder.path().join("python");
         // A fake reference: two repetitions per second, and an output that differs by a fifth of the largest output.
         let script = "#!/bin/sh\necho SWM ready 1.2.3\nwhile read what rest; do\n\
@@ -235,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn nan_is_a_difference() {
+    fn nan_output_gives_a_nan_difference() {
         assert!(difference(&[f32::NAN, 1.0], &[1.0, 1.0]).expect("two outputs of equal length").is_nan());
         assert!(difference(&[1.0], &[1.0, 1.0]).is_err());
     }

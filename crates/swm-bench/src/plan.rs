@@ -274,7 +274,7 @@ mod tests {
     #[test]
     fn ratio_is_the_median_over_measurement_pairs() {
         use std::os::unix::fs::PermissionsExt as _;
-        let folder = tempfile::tempdir().expect("a temporary folder");
+        let folder = tempfile::tempdir().expect("creating a temporary folder");
         let python = folder.path().join("python");
         // A fake reference: prints other text, then answers every request with 10 iterations in 2 seconds.
         let script = "#!/bin/sh\necho hello\necho SWM ready 1.2.3\nwhile read line; do echo SWM 10 2.0; done\n";

@@ -83,10 +83,11 @@ pub fn steps_and_frames_allocate_nothing(rows: &[EnvEntry], sides: &[usize]) {
         for (seed, variation) in
             [None, Some(vec!["all".to_owned()]), Some(vec!["all".to_owned()])].into_iter().enumerate()
         {
-            let mut env = entry.env().expect("an environment");
+            let mut env = entry.env().expect("creating the environment");
             let variation = VariationRequest { variation, ..VariationRequest::default() };
-            env.reset(seed as u64, &ResetOptions { variation, ..ResetOptions::default() }).expect("a reset");
-            let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("a schema"), 1);
+            env.reset(seed as u64, &ResetOptions { variation, ..ResetOptions::default() })
+                .expect("resetting the environment");
+            let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("creating the schema"), 1);
             let mut frames: Vec<_> = sides.iter().map(|&side| (side, vec![0; side * side * 3])).collect();
             let mut worst = 0;
             for t in 0..2 * WARM_UP {
@@ -98,11 +99,11 @@ pub fn steps_and_frames_allocate_nothing(rows: &[EnvEntry], sides: &[usize]) {
                     _ => Action::Discrete(&choice),
                 };
                 let count = allocations(|| {
-                    env.step(action).expect("an action of the action space");
+                    env.step(action).expect("stepping the environment");
                     env.observe(&mut row.row_mut(0));
                     for (side, rgb) in &mut frames {
-                        env.render(FrameMut::new(*side, *side, rgb)).expect("a frame");
-                        env.render_goal(FrameMut::new(*side, *side, rgb)).expect("a frame");
+                        env.render(FrameMut::new(*side, *side, rgb)).expect("rendering a frame");
+                        env.render_goal(FrameMut::new(*side, *side, rgb)).expect("rendering the goal");
                     }
                     std::hint::black_box((env.is_success(), env.goal_distance()));
                 });

@@ -49,7 +49,7 @@ impl Golden {
     }
 
     fn array<'a>(&'a mut self, name: &str) -> npyz::NpyFile<impl std::io::Read + 'a> {
-        self.0.by_name(name).expect("a readable archive").unwrap_or_else(|| panic!("no array '{name}'"))
+        self.0.by_name(name).expect("reading the archive").unwrap_or_else(|| panic!("no array '{name}'"))
     }
 
     /// Returns all elements of an array of type `T`, in row-major order.

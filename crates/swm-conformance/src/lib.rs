@@ -69,21 +69,21 @@ macro_rules! tests {
     ($suite:expr) => {
         $crate::tests!(
             $suite,
-            entries_are_complete,
+            entries_are_complete_and_have_unique_ids,
             results_are_independent_of_threads_and_slots,
-            environments_are_independent,
+            environments_do_not_affect_each_other,
             observations_and_frames_are_fully_written,
             invalid_actions_are_errors_without_effect,
             restores_snapshot_bit_for_bit,
-            sampled_goals_differ_and_are_unsolved_and_restorable,
+            sampled_goals_are_not_reached_yet_and_goal_states_succeed,
             dataset_rows_restore_state_and_factors,
-            every_factor_has_an_effect,
-            any_requested_factors_can_be_sampled,
+            every_factor_changes_an_output,
+            every_factor_and_group_can_be_sampled,
             resets_with_all_factors_varied_succeed,
-            groups_factors_and_pinned_values_combine,
+            requests_combine_groups_factors_and_pinned_values,
             goal_distance_decreases_to_the_goal,
             invalid_resets_are_errors,
-            experts_are_valid_and_deterministic
+            expert_actions_are_in_the_action_space_and_independent_of_other_slots
         );
     };
     ($suite:expr, $($check:ident),+) => {

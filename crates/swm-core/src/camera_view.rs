@@ -98,7 +98,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn parses_camera_modality_or_both() -> Result<()> {
+    fn parses_views_of_a_camera_a_modality_or_both() -> Result<()> {
         assert_eq!(CameraView::parse("pixels")?, CameraView::default());
         assert_eq!(CameraView::parse("depth")?, CameraView { camera: None, modality: Modality::Depth });
         let wrist = CameraView { camera: Some("wrist".to_owned()), modality: Modality::Rgb };

@@ -158,7 +158,7 @@ mod tests {
     use crate::{ColumnSpec, DType};
 
     #[test]
-    fn indices_follow_the_schema() -> Result<()> {
+    fn column_indices_are_those_of_the_schema() -> Result<()> {
         let names = [STATE, REWARD, TERMINATED, TRUNCATED, SUCCESS, STEP_IDX, PIXELS];
         let schema = Schema::new(names.map(|name| ColumnSpec::new(name, DType::U8, [])))?;
         let found = ColumnIndices::of(&schema)?;
@@ -170,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn names_are_encoded_and_decoded() {
+    fn column_names_are_encoded_and_decoded() {
         assert_eq!(flat_factor("agent.color"), "variation_agent_color");
         assert_eq!(factor("agent.color"), "variation.agent.color");
         assert!(is_flat_factor("variation_agent_color") && !is_flat_factor("variation.agent.color"));

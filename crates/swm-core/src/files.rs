@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn delete_keeps_links_folders_and_other_names() {
+    fn delete_keeps_links_folders_and_names_that_match_no_pattern() {
         let root = folder("delete");
         let (run, outside) = (root.join("run"), root.join("outside.txt"));
         fs::create_dir_all(run.join("weights.bin.d")).expect("creating a folder");
@@ -188,11 +188,11 @@ mod tests {
         fs::write(run.join("logs/run-1.log"), "").expect("writing a file");
         let patterns = ["config.json", "weights.bin", "weights.bin.d", "logs/run-*.log", "outside/*"];
 
-        let remaining = delete(&run, &patterns).expect("deleting");
+        let remaining = delete(&run, &patterns).expect("deleting the files");
         assert_eq!(remaining, ["logs", "thesis.tex", "weights.bin", "weights.bin.d"].map(|name| run.join(name)));
         assert!(!run.join("config.json").exists() && !run.join("logs/run-1.log").exists());
         assert!(run.join("logs/old").is_dir(), "a folder without a deleted file stays");
-        assert_eq!(fs::read_to_string(&outside).expect("the file outside"), "thesis");
+        assert_eq!(fs::read_to_string(&outside).expect("reading the file outside the folder"), "thesis");
 
         std::os::unix::fs::symlink(&run, root.join("link")).expect("making a link");
         assert!(delete(&root.join("link"), &["*"]).is_err());
@@ -205,21 +205,23 @@ mod tests {
         let root = folder("empty");
         fs::create_dir_all(root.join("a/b")).expect("creating folders");
         fs::write(root.join("a/b/c.txt"), "").expect("writing a file");
-        assert!(delete(&root, &["a/*/c.txt"]).expect("deleting").is_empty());
+        assert!(delete(&root, &["a/*/c.txt"]).expect("deleting the files").is_empty());
         assert!(!root.exists());
-        assert!(delete(&root, &["a"]).expect("a missing folder").is_empty());
+        assert!(delete(&root, &["a"]).expect("deleting in a missing folder").is_empty());
     }
 
     #[test]
     fn reads_regular_files_up_to_the_limit() {
         let root = folder("read");
         let path = root.join("file");
-        write(&path, b"four").expect("writing");
-        assert_eq!(read(&path, 4).expect("reading"), b"four");
+        write(&path, b"four").expect("writing the file");
+        assert_eq!(read(&path, 4).expect("reading the file"), b"four");
         assert!(read(&path, 3).expect_err("a longer file").to_string().contains("longer than 3 bytes"));
-        assert!(read(Path::new("/dev/zero"), 10).expect_err("a device").to_string().contains("not a regular file"));
-        assert!(read(&root, 10).expect_err("a folder").to_string().contains("is a folder"));
-        delete_file(&path).expect("deleting");
-        fs::remove_dir(&root).expect("an empty folder");
+        assert!(
+            read(Path::new("/dev/zero"), 10).expect_err("reading a device").to_string().contains("not a regular file")
+        );
+        assert!(read(&root, 10).expect_err("reading a folder").to_string().contains("is a folder"));
+        delete_file(&path).expect("deleting the file");
+        fs::remove_dir(&root).expect("removing the empty folder");
     }
 }

@@ -142,7 +142,7 @@ mod tests {
         Progress { stage: "train", done: 3, total: 5, unit: "steps", metrics: &[("loss", 0.5), ("lr", 1e-3)] };
 
     #[test]
-    fn default_control_never_stops() {
+    fn default_control_continues_and_drops_events() {
         let mut control = Control::new();
         control.emit(Event::Log("dropped"));
         assert!(control.check().is_ok());
@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn metrics_are_found_by_name() {
+    fn progress_finds_metrics_by_name_and_is_done_at_the_total() {
         assert_eq!((PROGRESS.metric("lr"), PROGRESS.metric("norm")), (Some(1e-3), None));
         assert!(!PROGRESS.is_done() && Progress { done: 5, ..PROGRESS }.is_done());
     }

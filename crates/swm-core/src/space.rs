@@ -172,7 +172,7 @@ mod tests {
     use crate::Key;
 
     #[test]
-    fn samples_are_inside_the_space() {
+    fn samples_are_inside_the_space_and_other_values_are_errors() {
         let spaces = [
             Space::uniform_box([2], DType::Float32, -1.0, 1.0),
             Space::uniform_box([], DType::Float64, 0.0, 1e-3),
@@ -187,7 +187,8 @@ mod tests {
                 space.check("value", &value).expect("a sample is in its space");
             }
         }
-        let error = spaces[4].check("agent.color", &[0.0, 256.0, 3.0]).expect_err("out of bounds").to_string();
+        let error =
+            spaces[4].check("agent.color", &[0.0, 256.0, 3.0]).expect_err("a value outside the space").to_string();
         assert_eq!(
             error,
             "agent.color = [0.0, 256.0, 3.0] is outside its space: expected a colour: 3 integers in 0 ..= 255"

@@ -34,7 +34,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn escapes_what_controls_a_terminal() {
+    fn escapes_control_and_bidirectional_characters() {
         let title = "a\u{1b}]0;owned\u{7}b\r\u{9b}31m\u{7f}\u{202e}\u{2066}";
         let expected = "a\\u{1b}]0;owned\\u{7}b\\r\\u{9b}31m\\u{7f}\\u{202e}\\u{2066}";
         assert_eq!(printable(title), expected);
@@ -42,7 +42,7 @@ mod tests {
     }
 
     #[test]
-    fn borrows_other_text() {
+    fn returns_printable_text_borrowed() {
         for text in ["", "pixels", "two\nlines\tof text", "größe 大きさ 🙂 e\u{301}"] {
             assert!(matches!(printable(text), Cow::Borrowed(same) if same == text));
         }

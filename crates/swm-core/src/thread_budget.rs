@@ -39,7 +39,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn budget_is_restored_after_the_work() {
+    fn thread_budget_is_restored_after_a_return_and_after_a_panic() {
         let budgets = with(3, || (threads(), with(2, threads), threads()));
         assert_eq!((budgets, threads()), ((3, 2, 3), 1));
         assert!(std::panic::catch_unwind(|| with(5, || panic!("the work fails"))).is_err());
@@ -48,7 +48,7 @@ mod tests {
 
     #[test]
     fn all_sets_the_budget_to_the_thread_count_of_the_pool() {
-        let pool = crate::pool::threads(3).expect("starting three threads");
+        let pool = crate::pool::threads(3).expect("creating the thread pool");
         assert_eq!(pool.install(|| all(threads)), 3);
     }
 }

@@ -297,21 +297,22 @@ mod tests {
     fn varying_one_factor_leaves_other_factors_unchanged() {
         let space = space();
         let key = Key::new(5);
-        let none = space.resolve(&request(&[]), key).expect("no varied factor");
+        let none = space.resolve(&request(&[]), key).expect("resolving a request with no varied factor");
         assert_eq!(none.get("agent.color"), [255.0, 0.0, 0.0]);
-        let one = space.resolve(&request(&["agent.color"]), key).expect("one varied factor");
-        let group = space.resolve(&request(&["agent"]), key).expect("a varied group");
+        let one = space.resolve(&request(&["agent.color"]), key).expect("resolving a request with one varied factor");
+        let group = space.resolve(&request(&["agent"]), key).expect("resolving a request with a varied group");
         assert_eq!(one.get("agent.color"), group.get("agent.color"));
         assert_eq!(one.get("agent.x"), [0.25]);
         assert_ne!(group.get("agent.x"), [0.25]);
         for seed in 0..100 {
-            let all = space.resolve(&request(&["all"]), Key::new(seed)).expect("all factors varied");
+            let all =
+                space.resolve(&request(&["all"]), Key::new(seed)).expect("resolving a request with all factors varied");
             assert!(all.scalar("target.x") > all.scalar("agent.x"));
         }
     }
 
     #[test]
-    fn invalid_requests_are_errors() {
+    fn invalid_variation_requests_are_errors() {
         let space = space();
         let pin = |key: &str, value: &[f64]| VariationRequest {
             variation: None,

@@ -102,16 +102,16 @@ mod tests {
         let strict = Counting::Strict { hold: 1 };
         assert_eq!(result_of(strict, 9, "..g"), (true, 3, Some(3)));
         assert_eq!(result_of(strict, 9, "..s."), (true, 3, Some(3)));
-        assert_eq!(result_of(strict, 9, "..f."), (false, 3, None), "terminating without success");
-        assert_eq!(result_of(strict, 9, "..cs"), (false, 3, None), "the time limit");
-        assert_eq!(result_of(strict, 2, "..s"), (false, 2, None), "the budget");
+        assert_eq!(result_of(strict, 9, "..f."), (false, 3, None), "a termination without success is a failure");
+        assert_eq!(result_of(strict, 9, "..cs"), (false, 3, None), "the time limit ends the episode");
+        assert_eq!(result_of(strict, 2, "..s"), (false, 2, None), "the budget ends the episode");
         assert_eq!(result_of(strict, 3, "..s"), (true, 3, Some(3)), "the last step of the budget counts");
     }
 
     #[test]
     fn hold_requires_consecutive_steps() {
         let held = Counting::Strict { hold: 3 };
-        assert_eq!(result_of(held, 9, ".ggg."), (true, 4, Some(2)), "continues after termination");
+        assert_eq!(result_of(held, 9, ".ggg."), (true, 4, Some(2)), "the episode continues after a termination");
         assert_eq!(result_of(held, 9, ".ss.sss."), (true, 7, Some(5)), "an interruption resets the count");
         assert_eq!(result_of(held, 9, ".ss.s.ss."), (false, 9, None));
         assert_eq!(result_of(held, 3, ".ss"), (false, 3, None), "the budget ends the episode");
@@ -119,7 +119,7 @@ mod tests {
     }
 
     #[test]
-    fn compat_counting_counts_every_termination() {
+    fn compat_counting_counts_every_termination_as_a_success() {
         let compat = Counting::Compat { envs: 1 };
         assert_eq!(result_of(compat, 9, "..s.g"), (true, 5, Some(5)), "success without termination does not count");
         assert_eq!(result_of(compat, 9, "..f"), (true, 3, Some(3)), "any termination is a success");

@@ -77,7 +77,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn id_contains_its_arguments() -> Result<()> {
+    fn chosen_id_contains_its_arguments() -> Result<()> {
         let text = "ALE/Pong-v5,frameskip=2";
         let choose = || choose(text, &Origin::User);
         assert_eq!(choose()?.id(), text);

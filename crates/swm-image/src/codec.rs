@@ -172,10 +172,10 @@ mod tests {
     fn round_trip(codec: ImageCodec, height: usize, width: usize) -> (Vec<u8>, Vec<u8>) {
         let rgb = test_image(height, width);
         let mut bytes = vec![];
-        codec.encode(&rgb, height, width, &mut bytes).expect("an encoded image");
+        codec.encode(&rgb, height, width, &mut bytes).expect("encoding the image");
         assert_eq!(image_size(&bytes).expect("an image size"), (height, width));
         let mut decoded = vec![0; rgb.len()];
-        decode(&bytes, height, width, &mut decoded).expect("a decoded image");
+        decode(&bytes, height, width, &mut decoded).expect("decoding the image");
         (rgb, decoded)
     }
 
@@ -193,16 +193,16 @@ mod tests {
     }
 
     #[test]
-    fn damaged_images_and_other_sizes_are_errors() {
+    fn truncated_images_and_wrong_sizes_are_errors() {
         let rgb = test_image(40, 40);
         let mut out = vec![0; rgb.len()];
         for codec in [ImageCodec::Jpeg { quality: 95 }, ImageCodec::Png, ImageCodec::Qoi] {
             let mut bytes = vec![];
-            codec.encode(&rgb, 40, 40, &mut bytes).expect("an encoded image");
+            codec.encode(&rgb, 40, 40, &mut bytes).expect("encoding the image");
             for cut in (0..bytes.len() * 9 / 10).step_by(7) {
                 assert!(decode(&bytes[..cut], 40, 40, &mut out).is_err(), "{codec:?} cut at {cut}");
             }
-            let other = decode(&bytes, 20, 80, &mut out).expect_err("another size").to_string();
+            let other = decode(&bytes, 20, 80, &mut out).expect_err("decoding with another size").to_string();
             assert!(other.contains("40 x 40") && other.contains("20 x 80"), "{other}");
         }
         assert!(decode(b"GIF89a", 40, 40, &mut out).expect_err("GIF bytes").to_string().contains("JPEG, PNG or QOI"));

@@ -130,12 +130,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn written_files_are_read_back() {
-        let folder = tempfile::tempdir().expect("a folder");
+    fn written_png_files_are_read_back() {
+        let folder = tempfile::tempdir().expect("creating a temporary folder");
         let path = folder.path().join("a.png");
         let rgb: Vec<u8> = (0..5 * 4 * 3).collect();
-        write_png(&path, 5, 4, &rgb).expect("a written file");
-        assert_eq!(read_png(&path).expect("a readable file"), RgbImage { width: 5, height: 4, rgb: rgb.clone() });
+        write_png(&path, 5, 4, &rgb).expect("writing the PNG file");
+        assert_eq!(read_png(&path).expect("reading the PNG file"), RgbImage { width: 5, height: 4, rgb: rgb.clone() });
         assert!(write_png(&path, 4, 4, &rgb).is_err());
         let missing =
             write_png(&folder.path().join("missing/a.png"), 5, 4, &rgb).expect_err("a missing folder").to_string();

@@ -215,13 +215,13 @@ mod tests {
         assert_eq!(bytes.remove(0), 7, "the encoder appends to the vector");
         assert_eq!(size(&bytes).expect("a header"), (height.into(), width.into()));
         let mut back = vec![0; rgb.len()];
-        decode(&bytes, &mut back).expect("a decoded image");
+        decode(&bytes, &mut back).expect("decoding the image");
         assert!(back == rgb, "{height} x {width} differs after a round trip");
         bytes
     }
 
     #[test]
-    fn encodes_operations_of_the_specification() {
+    fn encoder_chooses_the_qoi_operations_of_the_specification() {
         // Two pixels of the colour of `START`, a pixel with a small difference, a pixel with a larger difference, an
         // unrelated pixel, an earlier pixel, a new pixel, and 63 repetitions of the new pixel.
         let mut pixels = vec![[0, 0, 0], [0, 0, 0], [1, 255, 1], [11, 9, 9], [200, 0, 7], [1, 255, 1]];
@@ -235,17 +235,17 @@ mod tests {
     }
 
     #[test]
-    fn files_with_four_channels_decode() {
+    fn qoi_files_with_four_channels_decode() {
         let mut bytes = [&b"qoif"[..], &2_u32.to_be_bytes(), &1_u32.to_be_bytes(), &[4, 1]].concat();
         bytes.extend([RGBA, 10, 20, 30, 40, DIFF | 0b11_10_01]);
         bytes.extend(END);
         let mut out = [0; 6];
-        decode(&bytes, &mut out).expect("a decoded image");
+        decode(&bytes, &mut out).expect("decoding the image");
         assert_eq!(out, [10, 20, 30, 11, 20, 29]);
     }
 
     #[test]
-    fn operations_must_fill_the_image_exactly() {
+    fn qoi_files_with_missing_or_extra_bytes_or_pixels_are_rejected() {
         let rgb: Vec<u8> = (0..300_u32).map(|i| (i * i / 7) as u8).collect();
         let bytes = round_trip(&rgb, 10, 10);
         let fails = |bytes: &[u8], pixels: usize| decode(bytes, &mut vec![0; 3 * pixels]).is_err();
@@ -253,12 +253,12 @@ mod tests {
         assert!(fails(&bytes, 99) && fails(&bytes, 101) && !fails(&bytes, 100));
         assert!(fails(&[&bytes[..], &[0]].concat(), 100));
         let flat = round_trip(&[7; 300], 10, 10);
-        assert!(fails(&flat, 40), "a run beyond the end");
+        assert!(fails(&flat, 40), "a run beyond the end must be an error");
     }
 
     proptest! {
         #[test]
-        fn every_image_survives_a_round_trip(
+        fn qoi_round_trip_restores_every_image(
             seed in prop::collection::vec((any::<[u8; 3]>(), 1_usize..150), 1..40),
             noise in prop::collection::vec((0_usize..2000, any::<u8>()), 0..200),
             width in 1_u16..90,

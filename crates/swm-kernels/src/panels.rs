@@ -234,7 +234,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn products_match_the_definition_for_all_sizes() {
+    fn panel_products_match_the_definition_of_the_matrix_product() {
         let value = |i: usize| (i * 37 % 101) as f32 / 101.0 - 0.5;
         for rows in [1, 2, 5, 12, 31] {
             for (inputs, outputs) in [(1, 1), (3, 5), (17, 16), (40, 33), (64, 80)] {

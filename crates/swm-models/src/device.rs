@@ -67,7 +67,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn cpu_is_always_available_and_errors_name_the_fix() {
+    fn cpu_is_available_and_invalid_device_names_are_errors() {
         assert_eq!(name(&parse("cpu").expect("parsing 'cpu'")), "cpu (flex)");
         let message = |name: &str| parse(name).expect_err("an invalid device is accepted").to_string();
         assert!(message("cdua").contains("did you mean cuda"), "{}", message("cdua"));

@@ -99,8 +99,8 @@ mod tests {
     #[test]
     fn strips_begin_at_bands_and_have_similar_work() {
         let mut scene = Scene { camera: CAMERA, ..Scene::default() };
-        assert_eq!(ends(&scene, 16, 4), [16], "too little work");
-        assert_eq!(ends(&scene, 256, 1), [256], "only one thread");
+        assert_eq!(ends(&scene, 16, 4), [16], "a small scene is not split");
+        assert_eq!(ends(&scene, 256, 1), [256], "one thread draws one strip");
         assert_eq!(ends(&scene, 256, 2), [128, 256]);
         assert_eq!(ends(&scene, 256, 4), [64, 128, 192, 256]);
         assert_eq!(ends(&scene, 1024, 100).len(), 16, "no strip is less than a band");

@@ -379,7 +379,7 @@ mod tests {
 
     #[test]
     fn texels_are_at_their_coordinates() {
-        let texture = Texture::flat(2, 1, 3, &[255, 0, 0, 0, 0, 255]).expect("a texture");
+        let texture = Texture::flat(2, 1, 3, &[255, 0, 0, 0, 0, 255]).expect("creating the texture");
         let mut sampler = Sampler::default();
         assert_eq!(texture.colour(&mut sampler, (0, [0.25, 0.5], 0.0)), [1.0, 0.0, 0.0]);
         assert_eq!(texture.colour(&mut sampler, (0, [1.75, 0.5], 0.0)), [0.0, 0.0, 1.0]);
@@ -391,7 +391,7 @@ mod tests {
     #[test]
     fn cube_directions_select_faces() {
         let bytes: Vec<u8> = (0..6u8).flat_map(|face| [face * 40, 0, 0]).collect();
-        let texture = Texture::cube(1, 3, &bytes).expect("a texture");
+        let texture = Texture::cube(1, 3, &bytes).expect("creating the texture");
         let directions =
             [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]];
         let mut sampler = Sampler::default();
@@ -402,7 +402,7 @@ mod tests {
     }
 
     #[test]
-    fn mismatched_sizes_are_refused() {
+    fn textures_of_mismatched_sizes_are_refused() {
         assert!(Texture::flat(2, 2, 3, &[0; 11]).is_none());
         assert!(Texture::flat(0, 2, 3, &[]).is_none());
         assert!(Texture::cube(2, 3, &[0; 13]).is_none());

@@ -79,7 +79,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn layout_depends_on_major_and_minor_version() {
+    fn results_layout_is_the_major_and_minor_version() {
         assert_eq!(
             [series("0.1.0"), series("0.1.7-rc.1"), series("1"), series("")],
             [Some("0.1"), Some("0.1"), None, None]

@@ -109,7 +109,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_are_formatted() {
+    fn numbers_durations_percentages_and_p_values_are_formatted() {
         let numbers = [0.0, 1.0, -2.5, 0.123_456, 12_345.6, 1e-9, 150.0, f64::NAN].map(number);
         assert_eq!(numbers, ["0", "1", "-2.5", "0.1235", "12346", "1.00e-9", "150", "–"]);
         let times = [0.000_84, 0.012, 0.9996, 1.417, 59.96, 200.0, 7500.0, -1.0].map(duration);

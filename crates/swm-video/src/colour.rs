@@ -277,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn red_converts_as_in_the_standards() {
+    fn red_converts_as_in_bt601_and_bt709() {
         // Red in BT.601 and BT.709, 16 to 235: ITU-R BT.601-7 and BT.709-6.
         for (space, [y, u, v]) in [(Space::Unspecified, [81, 90, 240]), (Space::BT709, [63, 102, 240])] {
             let mut frame = frame::Video::new(Pixel::YUV444P, 2, 1);

@@ -434,8 +434,8 @@ mod tests {
     /// Returns the frames of `tests/interop/odd-NAME.mp4`, as PyAV decoded them, and the video.
     fn odd(name: &str) -> (Vec<u8>, Video) {
         let stem = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop").join(format!("odd-{name}"));
-        let expected = swm_image::read_png(&stem.with_extension("png")).expect("a PNG").rgb;
-        (expected, Video::open(Source::File(stem.with_extension("mp4"))).expect("a readable video"))
+        let expected = swm_image::read_png(&stem.with_extension("png")).expect("reading the PNG file").rgb;
+        (expected, Video::open(Source::File(stem.with_extension("mp4"))).expect("opening the video"))
     }
 
     #[test]
@@ -446,8 +446,8 @@ mod tests {
             let (expected, video) = odd(name);
             assert_eq!((video.frames(), video.size()), (14, (32, 48)), "{name}");
             let size = 32 * 48 * 3;
-            let bytes: Arc<[u8]> = std::fs::read(video.source.label()).expect("a readable file").into();
-            let in_memory = Video::open(Source::Memory("a blob".into(), bytes)).expect("a readable video");
+            let bytes: Arc<[u8]> = std::fs::read(video.source.label()).expect("reading the file").into();
+            let in_memory = Video::open(Source::Memory("a blob".into(), bytes)).expect("opening the video");
             // Frames one by one from the file, then all frames in reverse order from memory, then frames with
             // repetitions.
             let orders: [Vec<usize>; 3] = [(0..14).collect(), (0..14).rev().collect(), vec![9, 3, 9, 13, 0, 3]];
@@ -458,9 +458,9 @@ mod tests {
                 let wanted: Vec<FrameRequest<'_>> =
                     frames.map(|(&frame, out)| FrameRequest { video, frame, out }).collect();
                 if i == 0 {
-                    wanted.into_iter().for_each(|wanted| decoders.read(vec![wanted]).expect("decoded frames"));
+                    wanted.into_iter().for_each(|wanted| decoders.read(vec![wanted]).expect("decoding the frames"));
                 } else {
-                    decoders.read(wanted).expect("decoded frames");
+                    decoders.read(wanted).expect("decoding the frames");
                 }
                 for (&frame, found) in order.iter().zip(out.chunks_exact(size)) {
                     let off: usize =
@@ -476,7 +476,7 @@ mod tests {
         let (_, video) = odd("times");
         for t in 0..14 {
             let time = f64::from(350 + 40 * t + 11 * t * t) / 1000.0;
-            let (frame, distance) = video.frame_at(time + 0.004).expect("a frame");
+            let (frame, distance) = video.frame_at(time + 0.004).expect("finding the frame");
             assert_eq!(frame, t as usize);
             assert!((distance - 0.004).abs() < 1e-3, "{distance}");
         }
@@ -490,11 +490,11 @@ mod tests {
         let mut out = vec![0; 32 * 48 * 3];
         let error = |frame, out: &mut [u8]| {
             let wanted = vec![FrameRequest { video: &video, frame, out }];
-            DecoderPool::default().read(wanted).expect_err("an error").to_string()
+            DecoderPool::default().read(wanted).expect_err("the call must fail").to_string()
         };
         assert!(error(14, &mut out).contains("14 frames"));
         assert!(error(0, &mut out[1..]).contains("48 x 32"));
         let png = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop/odd-times.png");
-        assert!(Video::open(Source::File(png)).expect_err("an image").to_string().contains("no MP4"));
+        assert!(Video::open(Source::File(png)).expect_err("a PNG file").to_string().contains("no MP4"));
     }
 }

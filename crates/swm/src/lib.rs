@@ -51,7 +51,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ids_that_are_not_built_in_go_to_gymnasium() -> Result<()> {
+    fn ids_choose_built_in_or_gymnasium_environments() -> Result<()> {
         for text in ["swm/PushT-v1", "swm/OGBCube-v0,env_type=double", "ALE/Pong-v5,frameskip=2", "CartPole-v1"] {
             assert_eq!(env(text, &Origin::User)?.id(), text);
         }

@@ -43,7 +43,7 @@ fn report_states_that_the_reference_is_missing() {
 #[test]
 fn ratio_is_the_median_over_measurement_pairs() {
     use std::os::unix::fs::PermissionsExt as _;
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let python = folder.path().join("python");
     // A fake reference: prints other text, then answers every request with 10 steps in 2 seconds.
     let script = "#!/bin/sh\necho hello\necho SWM ready 1.2.3\nwhile read line; do echo SWM 10 2.0; done\n";

@@ -61,16 +61,16 @@ fn effects(suite: &Suite, entry: &EnvEntry, factor: &Factor, context: &Variation
 }
 
 /// Checks that every factor changes an output, and that colours change frames only.
-pub fn every_factor_has_an_effect(suite: &Suite) {
+pub fn every_factor_changes_an_output(suite: &Suite) {
     for entry in suite.rows {
-        let space = entry.env().expect("an environment").spec().variation_space.clone();
+        let space = entry.env().expect("creating the environment").spec().variation_space.clone();
         let defaults = all_visible(&space);
         // Some factors have an effect only for certain values of another factor. For example, the angle of a shape
         // changes nothing while the shape has its default, a circle.
         let mut contexts = vec![defaults.clone()];
         for seed in 0..suite.contexts {
             let mut request = all_visible(&space);
-            for (key, value) in space.resolve(&vary(&["all"]), Key::new(seed)).expect("a sample").iter() {
+            for (key, value) in space.resolve(&vary(&["all"]), Key::new(seed)).expect("sampling the factors").iter() {
                 request.variation_values.entry(key.to_owned()).or_insert_with(|| value.to_vec());
             }
             contexts.push(request);

@@ -5,9 +5,9 @@ use swm_core::columns::STATE;
 use swm_core::{DType, Schema, Space};
 
 /// Checks that entries have unique ids and complete specs: actions, columns, factors, experts.
-pub fn entries_are_complete(suite: &Suite) {
+pub fn entries_are_complete_and_have_unique_ids(suite: &Suite) {
     for entry in suite.rows {
-        let (env, id) = (entry.env().expect("an environment"), entry.id);
+        let (env, id) = (entry.env().expect("creating the environment"), entry.id);
         let spec = env.spec();
         assert_eq!(spec.id, id);
         assert_eq!(suite.rows.iter().filter(|other| other.id == id).count(), 1, "{id} must be listed once");

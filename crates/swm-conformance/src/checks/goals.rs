@@ -8,7 +8,7 @@ use swm_core::{Batch, ColumnSpec, DType, Key, ResetOptions, Schema};
 
 /// Checks that a sampled goal is not reached yet, depends on the key only, and matches the goal frame, and that the
 /// goal state is a success.
-pub fn sampled_goals_differ_and_are_unsolved_and_restorable(suite: &Suite) {
+pub fn sampled_goals_are_not_reached_yet_and_goal_states_succeed(suite: &Suite) {
     for entry in suite.rows {
         let mut distinct = 0;
         for seed in 0..suite.goals {
@@ -31,10 +31,11 @@ pub fn sampled_goals_differ_and_are_unsolved_and_restorable(suite: &Suite) {
             let options = ResetOptions { state: Some(goal.clone()), goal_state: Some(goal.clone()), ..options };
             let mut at_goal = Probe::reset(suite, entry, seed, &options);
             assert!(at_goal.env.is_success(), "{id}, seed {seed}: a reset to the goal does not succeed");
-            let schema = Schema::new([ColumnSpec::new(STATE, DType::Float64, [goal.len()])]).expect("a schema");
+            let schema =
+                Schema::new([ColumnSpec::new(STATE, DType::Float64, [goal.len()])]).expect("creating the schema");
             let mut row = Batch::zeros(&schema, 1);
-            row.get_mut(STATE).expect("the state").copy_from_slice(&goal);
-            at_goal.env.restore_from(row.row(0), row.row(0)).expect("a row");
+            row.get_mut(STATE).expect("accessing the state").copy_from_slice(&goal);
+            at_goal.env.restore_from(row.row(0), row.row(0)).expect("restoring the row");
             assert!(at_goal.env.is_success(), "{id}, seed {seed}: a restore to the goal does not succeed");
             let difference = frame_difference(&at_goal.frame(), &goal_frame);
             assert!(difference < 1.0, "{id}, seed {seed}: the goal frame differs by {difference} of 255");

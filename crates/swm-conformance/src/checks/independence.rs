@@ -7,11 +7,13 @@ use swm_core::{Batch, EnvEntry, EnvPool, Key, Policy, RandomPolicy, ResetOptions
 
 /// Plays episodes with random actions in a pool and returns all infos of each episode as bytes.
 fn play(suite: &Suite, entry: &EnvEntry, episodes: &[u64], workers: usize, steps: usize) -> Vec<Vec<u8>> {
-    let envs = episodes.iter().map(|_| entry.env().expect("an environment")).collect();
+    let envs = episodes.iter().map(|_| entry.env().expect("creating the environment")).collect();
     let mut pool =
-        EnvPool::new(envs, Some(suite.frame_size), Some(steps), threads(workers).expect("threads")).expect("a pool");
+        EnvPool::new(envs, Some(suite.frame_size), Some(steps), threads(workers).expect("creating the thread pool"))
+            .expect("creating the environment pool");
     let mut policy = RandomPolicy::new(pool.spec(), episodes.len());
-    let mut actions = Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("a schema"), episodes.len());
+    let mut actions =
+        Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("creating the schema"), episodes.len());
     let resets: Vec<Reset> = episodes
         .iter()
         .enumerate()
@@ -22,7 +24,7 @@ fn play(suite: &Suite, entry: &EnvEntry, episodes: &[u64], workers: usize, steps
             Reset { slot, seed: episode, options }
         })
         .collect();
-    pool.reset(&resets).expect("a reset");
+    pool.reset(&resets).expect("resetting the environment");
     let mut recorded = vec![vec![]; episodes.len()];
     let mut record = |pool: &EnvPool| {
         for (slot, bytes) in recorded.iter_mut().enumerate() {
@@ -35,8 +37,8 @@ fn play(suite: &Suite, entry: &EnvEntry, episodes: &[u64], workers: usize, steps
     record(&pool);
     for _ in 0..steps {
         let active = vec![true; episodes.len()];
-        policy.act(pool.infos(), &active, &mut actions).expect("random actions");
-        pool.step(&actions, &active).expect("a step");
+        policy.act(pool.infos(), &active, &mut actions).expect("choosing random actions");
+        pool.step(&actions, &active).expect("stepping the environment");
         record(&pool);
     }
     recorded
@@ -64,7 +66,7 @@ pub fn results_are_independent_of_threads_and_slots(suite: &Suite) {
 
 /// Checks that environments that are stepped alternately, after earlier episodes, give the same results as new
 /// environments.
-pub fn environments_are_independent(suite: &Suite) {
+pub fn environments_do_not_affect_each_other(suite: &Suite) {
     for entry in suite.rows {
         let key = Key::new(7);
         let new_env = |seed| {
@@ -84,7 +86,7 @@ pub fn environments_are_independent(suite: &Suite) {
                 probe.step(key, 100 + t);
             });
             probe.frame();
-            probe.env.reset(i as u64 + 1, &all_varied()).expect("a reset");
+            probe.env.reset(i as u64 + 1, &all_varied()).expect("resetting the environment");
         }
         for t in 0..6 {
             for (probe, expected) in pair.iter_mut().zip(&expected) {

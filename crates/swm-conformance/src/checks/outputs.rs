@@ -21,9 +21,9 @@ pub fn observations_and_frames_are_fully_written(suite: &Suite) {
                 let mut rgb = vec![fill; height * width * 3];
                 let frame = FrameMut::new(width, height, &mut rgb);
                 if goal {
-                    probe.env.render_goal(frame).expect("a frame")
+                    probe.env.render_goal(frame).expect("rendering the goal")
                 } else {
-                    probe.env.render(frame).expect("a frame")
+                    probe.env.render(frame).expect("rendering a frame")
                 }
                 rgb
             };

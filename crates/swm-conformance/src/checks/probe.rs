@@ -30,7 +30,7 @@ impl Probe {
     /// Creates the environment of `entry`, not yet reset.
     pub fn new(suite: &Suite, entry: &EnvEntry) -> Self {
         let env = entry.env().unwrap_or_else(|error| panic!("{}: {error}", entry.id));
-        let schema = Schema::new(env.spec().columns.clone()).expect("column names are unique");
+        let schema = Schema::new(env.spec().columns.clone()).expect("creating the schema");
         Self { env, row: Batch::zeros(&schema, 1), size: suite.frame_size }
     }
 
@@ -57,7 +57,7 @@ impl Probe {
     pub fn frame(&mut self) -> Vec<u8> {
         let (height, width) = self.size;
         let mut rgb = vec![0; height * width * 3];
-        self.env.render(FrameMut::new(width, height, &mut rgb)).expect("a frame");
+        self.env.render(FrameMut::new(width, height, &mut rgb)).expect("rendering a frame");
         rgb
     }
 
@@ -65,7 +65,7 @@ impl Probe {
     pub fn goal_frame(&mut self) -> Vec<u8> {
         let (height, width) = self.size;
         let mut rgb = vec![0; height * width * 3];
-        self.env.render_goal(FrameMut::new(width, height, &mut rgb)).expect("a frame");
+        self.env.render_goal(FrameMut::new(width, height, &mut rgb)).expect("rendering the goal");
         rgb
     }
 
@@ -82,7 +82,7 @@ impl Probe {
             Space::Box { .. } => Action::Continuous(&values),
             _ => Action::Discrete(&integers),
         };
-        self.env.step(action).expect("an action of the action space")
+        self.env.step(action).expect("stepping the environment")
     }
 
     /// The observation, the frame, the goal frame and the success flag, as bytes.
@@ -109,7 +109,7 @@ pub(super) fn bytes_of(batch: &Batch) -> Vec<u8> {
 /// Asserts that the first row is finite; `label` names the row in the message.
 pub(super) fn assert_finite(batch: &Batch, label: &str) {
     for column in batch.schema().columns() {
-        let value = batch.row(0).to_f64(&column.name).expect("a column");
+        let value = batch.row(0).to_f64(&column.name).expect("reading the column");
         assert!(value.iter().all(|v| v.is_finite()), "{label}: {} = {value:?}", column.name);
     }
 }

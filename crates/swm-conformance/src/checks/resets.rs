@@ -6,7 +6,7 @@ use swm_core::columns::STATE;
 use swm_core::{EnvEntry, Factor, Key, ResetOptions};
 
 /// Checks that every factor, every group, and all factors together can be sampled.
-pub fn any_requested_factors_can_be_sampled(suite: &Suite) {
+pub fn every_factor_and_group_can_be_sampled(suite: &Suite) {
     for entry in suite.rows {
         let mut probe = Probe::new(suite, entry);
         let space = probe.env.spec().variation_space.clone();
@@ -23,7 +23,7 @@ pub fn any_requested_factors_can_be_sampled(suite: &Suite) {
             let options = ResetOptions { variation: vary(&[key]), ..ResetOptions::default() };
             let label = format!("{}, '{key}', seed {seed}", entry.id);
             probe.env.reset(seed, &options).unwrap_or_else(|error| panic!("{label}: {error}"));
-            let chosen = space.select(key).expect("a known key");
+            let chosen = space.select(key).expect("selecting the factors");
             for (i, (factor, (_, value))) in space.factors().iter().zip(probe.env.factors().iter()).enumerate() {
                 factor.space.check(&factor.key, value).unwrap_or_else(|error| panic!("{label}: {error}"));
                 assert!(
@@ -64,7 +64,7 @@ pub fn resets_with_all_factors_varied_succeed(suite: &Suite) {
 }
 
 /// Checks that a request may combine groups, factors and pinned values.
-pub fn groups_factors_and_pinned_values_combine(suite: &Suite) {
+pub fn requests_combine_groups_factors_and_pinned_values(suite: &Suite) {
     for entry in suite.rows {
         let mut probe = Probe::new(suite, entry);
         let space = probe.env.spec().variation_space.clone();
@@ -74,7 +74,7 @@ pub fn groups_factors_and_pinned_values_combine(suite: &Suite) {
             // A group and one factor of another group vary; a colour is pinned to the sample of another seed.
             let inside = |factor: &&Factor| factor.key.starts_with(&format!("{group}."));
             let other = factors.iter().find(|factor| !inside(factor));
-            let sampled = space.resolve(&vary(&["all"]), Key::new(1000 + seed)).expect("a sample");
+            let sampled = space.resolve(&vary(&["all"]), Key::new(1000 + seed)).expect("sampling the factors");
             let mut request = vary(&[group]);
             request.variation.iter_mut().for_each(|keys| keys.extend(other.map(|factor| factor.key.clone())));
             let pinned = factors
@@ -111,7 +111,7 @@ pub fn invalid_resets_are_errors(suite: &Suite) {
             ResetOptions { variation: vary(&["no.such.factor"]), ..ResetOptions::default() },
             "no.such.factor",
         );
-        let space = entry.env().expect("an environment").spec().variation_space.clone();
+        let space = entry.env().expect("creating the environment").spec().variation_space.clone();
         for factor in space.factors() {
             let low = factor.space.bounds(0).0 - 1.0;
             for value in [vec![low; factor.space.len()], vec![f64::NAN; factor.space.len()], vec![]] {

@@ -14,7 +14,7 @@ pub fn restores_snapshot_bit_for_bit(suite: &Suite) {
             (0..5).for_each(|t| {
                 probe.step(key, t);
             });
-            probe.env.sample_goal(key).expect("a goal");
+            probe.env.sample_goal(key).expect("sampling a goal");
             let snapshot = probe.env.snapshot();
             let follow = |probe: &mut Probe| {
                 let mut outputs = probe.all_outputs();
@@ -31,7 +31,7 @@ pub fn restores_snapshot_bit_for_bit(suite: &Suite) {
             for (probe, name) in
                 [(&mut probe, "the same"), (&mut other, "another"), (&mut Probe::new(suite, entry), "a new")]
             {
-                probe.env.restore(&snapshot).expect("a snapshot of this environment");
+                probe.env.restore(&snapshot).expect("restoring the snapshot");
                 assert!(
                     probe.env.snapshot() == snapshot,
                     "{}: {name} environment has another snapshot after the restore",
@@ -56,13 +56,13 @@ fn dataset_row(probe: &mut Probe, dtype: DType) -> Batch {
     values.extend(probe.env.factors().iter().map(|(key, value)| (flat_factor(key), value.to_vec())));
     let columns: Vec<ColumnSpec> =
         values.iter().map(|(name, value)| ColumnSpec::new(name.clone(), dtype, [value.len()])).collect();
-    let mut row = Batch::zeros(&Schema::new(columns).expect("a schema"), 1);
+    let mut row = Batch::zeros(&Schema::new(columns).expect("creating the schema"), 1);
     for (name, value) in &values {
         if dtype == DType::Float64 {
-            row.get_mut(name).expect("a column").copy_from_slice(value);
+            row.get_mut(name).expect("accessing the column").copy_from_slice(value);
         } else {
             let value: Vec<f32> = value.iter().map(|&v| v as f32).collect();
-            row.get_mut(name).expect("a column").copy_from_slice(&value);
+            row.get_mut(name).expect("accessing the column").copy_from_slice(&value);
         }
     }
     row
@@ -101,8 +101,10 @@ pub fn dataset_rows_restore_state_and_factors(suite: &Suite) {
                 }
             }
         }
-        let no_state =
-            Batch::zeros(&Schema::new([ColumnSpec::new("position", DType::Float64, [2])]).expect("a schema"), 1);
+        let no_state = Batch::zeros(
+            &Schema::new([ColumnSpec::new("position", DType::Float64, [2])]).expect("creating the schema"),
+            1,
+        );
         let error = Probe::new(suite, entry)
             .env
             .restore_from(no_state.row(0), no_state.row(0))

@@ -206,37 +206,37 @@ mod tests {
 
     fn schema() -> Schema {
         Schema::new([ColumnSpec::new("state", DType::Float64, [3]), ColumnSpec::image("pixels", 2, 2)])
-            .expect("a valid schema")
+            .expect("creating the schema")
     }
 
     #[test]
-    fn threads_write_rows_in_place() {
+    fn par_rows_mut_writes_rows_into_aligned_columns() {
         let mut batch = Batch::zeros(&schema(), 100);
         batch.par_rows_mut(|i, mut row| {
             row.set(0, &[i as f64, 0.5, -1.0]);
             row.at::<u8>(1).fill(i as u8);
         });
         assert_eq!(batch.row(7).at::<f64>(0), [7.0, 0.5, -1.0]);
-        assert_eq!(batch.row(99).get::<u8>("pixels").expect("the column `pixels`"), [99; 12]);
-        assert_eq!(batch.get::<f64>("state").expect("the column `state`").len(), 300);
+        assert_eq!(batch.row(99).get::<u8>("pixels").expect("reading the column `pixels`"), [99; 12]);
+        assert_eq!(batch.get::<f64>("state").expect("reading the column `state`").len(), 300);
         assert_eq!(batch.bytes(1).as_ptr() as usize % 64, 0);
     }
 
     #[test]
-    fn rows_grown_after_shrinking_are_zero() {
+    fn resizing_fills_new_rows_with_zeros() {
         let mut batch = Batch::zeros(&schema(), 2);
-        batch.get_mut::<f64>("state").expect("the column `state`").fill(1.0);
+        batch.get_mut::<f64>("state").expect("accessing the column `state`").fill(1.0);
         batch.resize(1);
         batch.resize(2);
-        assert_eq!(batch.get::<f64>("state").expect("the column `state`"), [1.0, 1.0, 1.0, 0.0, 0.0, 0.0]);
+        assert_eq!(batch.get::<f64>("state").expect("reading the column `state`"), [1.0, 1.0, 1.0, 0.0, 0.0, 0.0]);
     }
 
     #[test]
-    fn wrong_column_and_wrong_type_are_errors() {
+    fn unknown_columns_and_wrong_element_types_are_errors() {
         let batch = Batch::zeros(&schema(), 1);
         let missing = batch.get::<f64>("stat").expect_err("no such column").to_string();
         assert!(missing.contains("did you mean state?"), "{missing}");
-        let wrong = batch.get::<f32>("state").expect_err("wrong type").to_string();
+        let wrong = batch.get::<f32>("state").expect_err("reading with a wrong element type").to_string();
         assert!(wrong.contains("f32") && wrong.contains("float64"), "{wrong}");
     }
 }

@@ -99,19 +99,26 @@ mod tests {
     use std::fs;
 
     #[test]
-    fn second_writer_is_refused_until_the_first_is_done() {
+    fn second_lock_is_refused_until_the_first_is_dropped() {
         let root = std::env::temp_dir().join(format!("swm-lock-{}", std::process::id()));
         let (folder, file) = (root.join("run"), root.join("new/data.h5"));
-        let held = (Lock::folder(&folder).expect("a new folder"), Lock::file(&file).expect("a new file"));
-        for error in [Lock::folder(&folder).expect_err("locked"), Lock::file(&file).expect_err("locked")] {
+        let held =
+            (Lock::folder(&folder).expect("locking a new folder"), Lock::file(&file).expect("locking a new file"));
+        for error in [
+            Lock::folder(&folder).expect_err("locking a locked path"),
+            Lock::file(&file).expect_err("locking a locked path"),
+        ] {
             assert!(error.is_usage() && error.to_string().contains("another process writes to it"), "{error}");
         }
         // A file that replaces the locked one has its own lock.
         fs::write(root.join("other"), "other").expect("writing a file");
         fs::rename(root.join("other"), &file).expect("replacing the file");
-        assert_eq!(Lock::file(&file).expect("another file").metadata().expect("its length").len(), 5);
+        assert_eq!(
+            Lock::file(&file).expect("locking another file").metadata().expect("reading the length of the file").len(),
+            5
+        );
         drop(held);
-        Lock::folder(&folder).expect("unlocked");
+        Lock::folder(&folder).expect("locking a folder without a writer");
         Lock::file(&folder).expect_err("a folder is not a file");
         fs::remove_dir_all(&root).expect("removing the folder of the test");
     }

@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn intervals_match_published_values() {
+    fn paired_intervals_match_published_values() {
         // Newcombe 1998, table of examples: (36, 12, 2, 0) gives 0.0569 to 0.3404. Altman et al., "Statistics with
         // confidence", table 6.2: (14, 5, 0, 22) gives 0.011 to 0.226. Fagerland, Lydersen and Laake 2014:
         // (1, 1, 7, 12) gives -0.507 to -0.026, and p = 0.0703.
@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn runs_are_compared_on_equal_counted_starts() {
+    fn runs_with_equal_starts_and_conditions_are_compared() {
         let floor = run("random", &[(1, false, false), (2, true, false), (3, false, true), (4, false, false)]);
         let model = run("model", &[(1, true, false), (2, true, false), (3, false, true), (4, false, false)]);
         let found = Comparison::all(&[floor.clone(), model.clone()], Counting::default());
@@ -213,13 +213,19 @@ mod tests {
         assert!((table.difference - 1.0 / 3.0).abs() < 1e-12);
         let mut other = model.clone();
         other.episodes[3].seed = 5;
-        assert!(Comparison::of(&other, &floor, Counting::default()).is_none(), "other starts");
+        assert!(
+            Comparison::of(&other, &floor, Counting::default()).is_none(),
+            "runs with other starts are not compared"
+        );
         other = Run { condition: "shifted colours".to_owned(), ..model };
-        assert!(Comparison::of(&other, &floor, Counting::default()).is_none(), "another condition");
+        assert!(
+            Comparison::of(&other, &floor, Counting::default()).is_none(),
+            "runs with other conditions are not compared"
+        );
     }
 
     #[test]
-    fn many_runs_are_compared_with_the_floor_and_the_best() {
+    fn many_runs_are_compared_only_with_the_random_floor_and_the_best_run() {
         let outcomes = |solved: u64| (0..8).map(|seed| (seed, seed < solved, false)).collect::<Vec<_>>();
         let mut runs = vec![run("random", &outcomes(1))];
         runs.extend((0..30).map(|i| run(&format!("model-{i}"), &outcomes(if i == 7 { 6 } else { 2 + i % 3 }))));
@@ -227,6 +233,10 @@ mod tests {
         // 30 with the floor, and 29 others with model-7.
         assert_eq!(found.len(), 59);
         assert!(found.iter().all(|c| [c.a.as_str(), c.b.as_str()].iter().any(|p| ["random", "model-7"].contains(p))));
-        assert_eq!(Comparison::all(&runs[..MAX_ALL_PAIRS], Counting::default()).len(), 190, "all pairs");
+        assert_eq!(
+            Comparison::all(&runs[..MAX_ALL_PAIRS], Counting::default()).len(),
+            190,
+            "at most MAX_ALL_PAIRS runs are compared in all pairs"
+        );
     }
 }

@@ -75,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn errors_are_grouped_by_success() {
+    fn prediction_errors_are_grouped_by_success() {
         let trajectory = |success, errors: &[f64]| Trajectory { start: [0, 0], success, errors: errors.to_vec() };
         let found = Prediction::new(
             5,

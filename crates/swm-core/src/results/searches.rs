@@ -60,7 +60,7 @@ mod tests {
     }
 
     #[test]
-    fn bands_do_not_depend_on_the_order_of_plans() {
+    fn cost_bands_do_not_depend_on_the_order_of_plans() {
         let mut traces: Vec<PlanTrace> = (0..10u8).map(|i| trace(&[f32::from(i), 0.5])).collect();
         traces.push(trace(&[10.0]));
         let found = Searches::of(&traces).expect("aggregating eleven traces");
@@ -69,6 +69,6 @@ mod tests {
         assert_eq!((found.plans, found.mean.len(), found.spread.len()), (11, 1, 0));
         traces.reverse();
         assert_eq!(Searches::of(&traces), Some(found));
-        assert_eq!(Searches::of(&[PlanTrace::default()]), None, "an empty trace");
+        assert_eq!(Searches::of(&[PlanTrace::default()]), None, "an empty trace gives no statistics");
     }
 }

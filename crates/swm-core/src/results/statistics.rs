@@ -72,7 +72,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn wilson_matches_published_values() {
+    fn wilson_intervals_match_published_values() {
         // Newcombe 1998, table I: 81 of 263 gives 0.2553 to 0.3662; 15 of 148 gives 0.0624 to 0.1605; 0 of
         // 20 gives 0.0000 to 0.1611.
         for (successes, n, low, high) in [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611)] {
@@ -82,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn summary_of_an_even_number_of_values() {
+    fn summary_has_the_mean_the_median_and_the_95th_percentile() {
         let summary = Summary::of(&[3.0, 1.0, 2.0, 10.0]).expect("a summary of four values");
         assert_eq!((summary.mean, summary.median, summary.p95), (4.0, 2.5, 10.0));
         assert!(Summary::of(&[]).is_none());

@@ -142,7 +142,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn lists_all_windows_within_episodes(
+        fn clips_are_all_windows_within_the_selected_episodes(
             lengths in prop::collection::vec(1usize..40, 1..12),
             num_steps in 1usize..5,
             frameskip in 1usize..6,
@@ -174,20 +174,25 @@ mod tests {
     }
 
     #[test]
-    fn concatenates_the_actions_of_a_step() {
+    fn clip_schema_joins_the_actions_of_frameskip_rows() {
         let dataset = Schema::new([
             ColumnSpec::image("pixels", 4, 5),
             ColumnSpec::new("action", DType::Float32, [2]),
             ColumnSpec::new("reward", DType::Float64, []),
         ])
-        .expect("schema");
+        .expect("creating the schema");
         let mut spec = ClipSpec {
             num_steps: 3,
             frameskip: 4,
             columns: ["action", "pixels", "reward"].map(str::to_owned).to_vec(),
         };
-        let shapes: Vec<Vec<usize>> =
-            spec.schema(&dataset).expect("clips").columns().iter().map(|c| c.shape.clone()).collect();
+        let shapes: Vec<Vec<usize>> = spec
+            .schema(&dataset)
+            .expect("creating the schema of clips")
+            .columns()
+            .iter()
+            .map(|c| c.shape.clone())
+            .collect();
         assert_eq!(shapes, [vec![3, 8], vec![3, 4, 5, 3], vec![3]]);
         spec.columns.push("stat".to_owned());
         assert!(spec.schema(&dataset).expect_err("no such column").to_string().contains("unknown column 'stat'"));

@@ -215,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn draws_from_each_distribution() {
+    fn last_current_future_and_random_goals_have_the_expected_rows() {
         // The anchor is row 4 + 2 * 2 = 8 of 40, so 15 steps follow it: rows 10, 12 .. 38.
         assert!(drawn(GoalMixture::LAST).iter().all(|goal| (goal.episode, goal.row, goal.offset) == (1, 39, 31)));
         let current = GoalMixture { random: 0.0, geometric: 0.0, current: 1.0, ..GoalMixture::default() };
@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn draws_the_default_mixture_and_different_names_independently() {
+    fn default_mixture_draws_the_anchor_and_goals_of_two_names_differ() {
         let goals = drawn(GoalMixture::default());
         let current = goals.iter().filter(|goal| goal.offset == 0).count() as f64;
         // A fifth of the goals are the anchor, and so are some of the random goals.
@@ -270,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn reserves_rows_for_the_goal_and_rejects_invalid_specs() {
+    fn future_goals_require_rows_after_the_clip_and_invalid_specs_are_rejected() {
         let spec = spec();
         assert_eq!(goal(GoalMixture::LAST, None).reach(&spec), 5);
         assert_eq!(goal(GoalMixture::FUTURE, None).reach(&spec), 7);

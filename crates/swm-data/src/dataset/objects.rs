@@ -272,8 +272,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn returns_ranges_in_the_requested_order() -> Result<()> {
-        let folder = tempfile::tempdir().expect("a folder");
+    fn reads_byte_ranges_in_the_requested_order() -> Result<()> {
+        let folder = tempfile::tempdir().expect("creating a temporary folder");
         let path = folder.path().join("file");
         let content: Vec<u8> = (0..3_000_000_u32).map(|i| ((i * i) >> 7) as u8).collect();
         std::fs::write(&path, &content).expect("writing the file");
@@ -289,8 +289,8 @@ mod tests {
     }
 
     #[test]
-    fn block_on_works_inside_another_runtime_and_reports_panics() -> Result<()> {
-        let outer = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
+    fn block_on_runs_inside_another_runtime_and_returns_none_after_a_panic() -> Result<()> {
+        let outer = tokio::runtime::Builder::new_current_thread().build().expect("creating the runtime");
         assert_eq!(outer.block_on(async { block_on(async { 7 }) })?, Some(7));
         let panics = block_on::<()>(async { std::panic::resume_unwind(Box::new("damaged")) })?;
         assert_eq!(panics, None);

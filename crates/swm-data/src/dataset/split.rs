@@ -106,7 +106,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn parts_have_approximate_fractions_and_depend_on_the_seed() {
+    fn split_parts_have_the_requested_fractions_and_depend_on_the_seed() {
         let split = Split { validation: 0.2, test: 0.1, seed: 3 };
         let parts: Vec<Part> = (0..10_000).map(|episode| split.part(episode)).collect();
         let count = |expected| parts.iter().filter(|&&part| part == expected).count();
@@ -125,7 +125,7 @@ mod tests {
     fn validation_fraction_does_not_change_the_test_part() {
         let [few, many] = [0.1, 0.4].map(|validation| Split { validation, ..Split::default() });
         assert!((0..1000).all(|i| (few.part(i) == Part::Test) == (many.part(i) == Part::Test)));
-        assert_eq!("validation".parse::<Part>().expect("a part"), Part::Validation);
+        assert_eq!("validation".parse::<Part>().expect("parsing the part"), Part::Validation);
         assert!("tset".parse::<Part>().expect_err("an unknown part").to_string().contains("did you mean test"));
     }
 }

@@ -149,16 +149,16 @@ mod tests {
     use swm_core::{Batch, ColumnSpec, DType, Schema};
 
     #[test]
-    fn interpolates_quantiles() {
-        let schema = Schema::new([ColumnSpec::new("state", DType::Float32, [2])]).expect("schema");
-        let buffer = ReplayBuffer::new(&schema, 1000).expect("a buffer");
+    fn quantiles_interpolate_and_ignore_missing_values() {
+        let schema = Schema::new([ColumnSpec::new("state", DType::Float32, [2])]).expect("creating the schema");
+        let buffer = ReplayBuffer::new(&schema, 1000).expect("creating the replay buffer");
         let mut episode = Batch::zeros(&schema, 6);
         // The values are unsorted, and one value is missing (NaN).
         let values = [[4.0, 0.5], [1.0, f32::NAN], [3.0, 0.1], [0.0, 0.4], [2.0, 0.2], [5.0, 0.3]];
-        episode.get_mut::<f32>("state").expect("states").copy_from_slice(values.as_flattened());
+        episode.get_mut::<f32>("state").expect("accessing the states").copy_from_slice(values.as_flattened());
         buffer.add(&episode, &Constants::new()).expect("adding an episode");
         let reader = buffer.snapshot();
-        let found = column_quantiles(&*reader, "state", None, &[0.0, 0.01, 0.5, 1.0]).expect("quantiles");
+        let found = column_quantiles(&*reader, "state", None, &[0.0, 0.01, 0.5, 1.0]).expect("computing the quantiles");
         let expected = [[0.0, 0.1], [0.05, 0.104], [2.5, 0.3], [5.0, 0.5]];
         for (found, expected) in found.iter().flatten().zip(expected.as_flattened()) {
             assert!((found - expected).abs() < 1e-6, "{found} {expected}");
@@ -169,6 +169,6 @@ mod tests {
                 .to_string()
                 .contains("0 ..= 1")
         );
-        assert!(column_quantiles(&*reader, "state", Some(&[3]), &[0.5]).is_err(), "no such episode");
+        assert!(column_quantiles(&*reader, "state", Some(&[3]), &[0.5]).is_err(), "episode 3 does not exist");
     }
 }

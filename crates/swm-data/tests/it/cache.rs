@@ -74,8 +74,8 @@ fn dataset(folder: &Path) -> (PathBuf, usize) {
 }
 
 #[test]
-fn decodes_cached_rows_once_within_the_limit() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn cached_rows_are_decoded_once_within_the_byte_limit() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let (path, rows) = dataset(folder.path());
     let reader = Counting::open(&path);
     let expected = read_all(&*reader);
@@ -103,8 +103,8 @@ fn decodes_cached_rows_once_within_the_limit() {
 }
 
 #[test]
-fn disk_cache_serves_later_runs_and_other_processes() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn disk_cache_serves_later_and_concurrent_readers_of_the_same_content() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let (path, _) = dataset(folder.path());
     let cache = CacheConfig::Disk { folder: folder.path().join("cache"), bytes: 1 << 30 };
     let reader = Counting::open(&path);
@@ -126,8 +126,8 @@ fn disk_cache_serves_later_runs_and_other_processes() {
 }
 
 #[test]
-fn damaged_cache_is_decoded_again() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn damaged_cache_rows_are_decoded_again() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let (path, rows) = dataset(folder.path());
     let cache = CacheConfig::Disk { folder: folder.path().join("cache"), bytes: 1 << 30 };
     let reader = Counting::open(&path);
@@ -142,7 +142,10 @@ fn damaged_cache_is_decoded_again() {
         }
         found
     };
-    let rows_file = files().into_iter().find(|file| file.extension().is_some_and(|end| end == "rows")).expect("rows");
+    let rows_file = files()
+        .into_iter()
+        .find(|file| file.extension().is_some_and(|end| end == "rows"))
+        .expect("finding the rows file");
     // Flips a bit of the third row.
     let mut bytes = std::fs::read(&rows_file).expect("reading a file");
     bytes[2 * IMAGE + 7] ^= 1;

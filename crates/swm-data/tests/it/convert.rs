@@ -43,10 +43,10 @@ fn target_path(folder: &Path, format: &str) -> PathBuf {
 
 #[test]
 fn every_format_preserves_the_content() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = source(folder.path());
     let from = open(&path).expect("opening the dataset");
-    let sum = checksum(&*from).expect("a checksum");
+    let sum = checksum(&*from).expect("computing the checksum");
     for format in FORMATS.rows.iter().filter(|format| format.is_available()) {
         let target = target_path(folder.path(), format.id);
         let convert_options = ConvertOptions { format: Some(format.id.to_owned()), ..lossless(ConvertMode::Create) };
@@ -62,7 +62,7 @@ fn every_format_preserves_the_content() {
             assert!(preserved, "{}: {column:?}", format.id);
         }
         if report.columns.iter().all(|column| column.exact) {
-            assert_eq!(checksum(&*to).expect("a checksum"), sum, "{}", format.id);
+            assert_eq!(checksum(&*to).expect("computing the checksum"), sum, "{}", format.id);
         }
         // Converts back to the source's format.
         let back = folder.path().join(format!("back-{}.lance", format.id));
@@ -73,10 +73,10 @@ fn every_format_preserves_the_content() {
 
 #[test]
 fn lossy_images_must_reach_the_minimum_psnr() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = source(folder.path());
     let jpeg = ConvertOptions { codec: ImageCodec::Jpeg { quality: 95 }, ..ConvertOptions::default() };
-    let report = run(&path, &folder.path().join("fine.lance"), &jpeg).expect("a sufficient PSNR");
+    let report = run(&path, &folder.path().join("fine.lance"), &jpeg).expect("converting with a sufficient PSNR");
     let images = report.columns.iter().find(|column| column.column == "pixels").expect("images");
     assert!(!images.exact && images.max_error >= 1.0 && images.psnr.is_some_and(|psnr| psnr > 30.0), "{images:?}");
     assert!(report.columns.iter().filter(|column| column.column == "state").all(|column| column.exact));
@@ -89,8 +89,8 @@ fn lossy_images_must_reach_the_minimum_psnr() {
 }
 
 #[test]
-fn resumes_a_stopped_conversion_and_rejects_other_targets() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn interrupted_conversion_resumes_and_targets_with_other_data_are_rejected() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = source(folder.path());
     let target = folder.path().join("target.lance");
     for stop in [1, 4, 9] {
@@ -107,7 +107,7 @@ fn resumes_a_stopped_conversion_and_rejects_other_targets() {
         let stopped = convert(&reader, &Location::from(&target), &options, &mut control);
         drop(control);
         assert!(matches!(stopped, Err(Error::Interrupted)), "{stopped:?}");
-        assert_eq!(open(&target).expect("opening the dataset").episodes().len(), stop, "written episodes remain");
+        assert_eq!(open(&target).expect("opening the dataset").episodes().len(), stop, "the written episodes remain");
         assert_eq!(stages.contains(&"compare"), stop > 1);
     }
     let report = run(&path, &target, &lossless(ConvertMode::Resume)).expect("comparing the datasets");
@@ -122,7 +122,7 @@ fn resumes_a_stopped_conversion_and_rejects_other_targets() {
 
     let other = folder.path().join("other.lance");
     write(&other, WriteMode::Create, 2, 1..3);
-    let error = run(&path, &other, &lossless(ConvertMode::Resume)).expect_err("other data");
+    let error = run(&path, &other, &lossless(ConvertMode::Resume)).expect_err("a target with other data");
     assert!(error.is_usage() && error.to_string().contains("not the beginning of the source"), "{error}");
     assert!(run(&path, &other, &lossless(ConvertMode::Create)).is_err());
     let longer = folder.path().join("longer.lance");
@@ -152,20 +152,20 @@ fn child_that_converts() {
         }
     });
     let report = convert(&source, &Location::from(&target), &options, &mut control).expect("converting the dataset");
-    println!("done {}", report.checksum.expect("a checksum"));
+    println!("done {}", report.checksum.expect("the report has a checksum"));
 }
 
 #[test]
 fn resumes_a_killed_conversion() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("source.lance");
     write(&path, WriteMode::Create, 40, 0..40);
-    let expected = checksum(&*open(&path).expect("opening the dataset")).expect("a checksum");
+    let expected = checksum(&*open(&path).expect("opening the dataset")).expect("computing the checksum");
     let target = folder.path().join("target.lance");
     let mut rng = Key::new(7).rng();
     let (mut kills, mut finished, mut continued) = (0, 0, false);
     while kills < 50 || finished == 0 {
-        let mut command = Command::new(std::env::current_exe().expect("the test executable"));
+        let mut command = Command::new(std::env::current_exe().expect("finding the test executable"));
         command.args(["--exact", "convert::child_that_converts", "--nocapture"]).env(TARGET, &target);
         let mut child =
             command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().expect("starting the child process");
@@ -178,7 +178,7 @@ fn resumes_a_killed_conversion() {
             done = line.split_once("done ").map(|(_, checksum)| checksum.trim().to_owned()).or(done);
         }
         let _ = child.kill();
-        child.wait().expect("an exit status");
+        child.wait().expect("waiting for the child process");
         kills += usize::from(done.is_none());
         if target.exists() {
             // The target always holds complete episodes, in order.
@@ -231,28 +231,28 @@ impl Reader for ThirdParty {
 }
 
 #[test]
-fn omits_and_counts_actions_of_last_rows() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn conversion_omits_and_counts_actions_in_last_rows() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let target = folder.path().join("target.lance");
-    let schema = Schema::new([ColumnSpec::new("action", DType::Float32, [1])]).expect("a valid schema");
+    let schema = Schema::new([ColumnSpec::new("action", DType::Float32, [1])]).expect("creating the schema");
     let reader: Arc<dyn Reader> = Arc::new(ThirdParty(schema));
     let report = convert(&reader, &Location::from(&target), &ConvertOptions::default(), &mut Control::new())
         .expect("converting the dataset");
     assert_eq!((report.episodes, report.last_actions), (2, 2));
     let read = open(&target).expect("opening the dataset");
     let batch: Batch = read.read(&["action"], &[swm_data::StepRange::new(0, 0, 3)]).expect("reading rows");
-    let actions = batch.get::<f32>("action").expect("actions");
+    let actions = batch.get::<f32>("action").expect("reading the actions");
     assert!(actions[..2] == [0.5, 1.5] && actions[2].is_nan());
 }
 
 #[test]
-fn preserves_doubles_or_reports_rounding() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn conversion_preserves_doubles_or_reports_the_rounding_error() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("fine.lance");
-    let schema = Schema::new([ColumnSpec::new("state", DType::Float64, [1])]).expect("a valid schema");
+    let schema = Schema::new([ColumnSpec::new("state", DType::Float64, [1])]).expect("creating the schema");
     let mut batch = Batch::zeros(&schema, 4);
-    batch.get_mut::<f64>("state").expect("states").copy_from_slice(&[0.1, -1.0 / 3.0, 1e-9, 7.0]);
-    let buffer = swm_data::ReplayBuffer::new(&schema, 10).expect("a buffer");
+    batch.get_mut::<f64>("state").expect("accessing the states").copy_from_slice(&[0.1, -1.0 / 3.0, 1e-9, 7.0]);
+    let buffer = swm_data::ReplayBuffer::new(&schema, 10).expect("creating the replay buffer");
     buffer.add(&batch, &swm_data::Constants::new()).expect("adding an episode");
     let report = convert(&buffer.snapshot(), &Location::from(&path), &ConvertOptions::default(), &mut Control::new())
         .expect("converting the dataset");

@@ -10,7 +10,7 @@ use swm_data::{ImageCodec, WriteMode, image, open};
 
 /// Damages copies of a Lance dataset: manifests and data files.
 fn damaged_datasets(cases: u64) {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 2, 0..4);
     let report = fuzz::dataset("lance", &path, cases, fuzz::read_everything);
@@ -34,7 +34,7 @@ fn rejects_ten_thousand_damaged_datasets() {
 
 #[test]
 fn missing_data_files_are_reported() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 2, 0..4);
     for file in fuzz::files(&path.join("data")) {

@@ -108,7 +108,7 @@ fn problem(diagnosis: &Diagnosis) -> (String, Vec<usize>) {
 
 #[test]
 fn collected_dataset_has_no_findings() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 2, 0..8);
     let diagnosis = diagnose(&*open(&path).expect("opening the dataset"));
@@ -148,7 +148,7 @@ fn finds_restarting_steps_and_shared_rows_in_an_hdf5_file() {
 
 #[test]
 fn repairs_the_readable_part_of_a_table() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 2, 0..8);
     // One of the four data files is truncated, so the table does not open.
@@ -159,7 +159,7 @@ fn repairs_the_readable_part_of_a_table() {
     std::fs::write(&files[1], &bytes[..bytes.len() / 2]).expect("writing a file");
     let location = Location::from(&path);
     assert!(open(&location).is_err());
-    let (reader, lost) = open_damaged(&location).expect("the readable part");
+    let (reader, lost) = open_damaged(&location).expect("opening the readable part");
     assert!(lost.len() == 1 && lost[0].contains("are lost"), "{lost:?}");
     let mut diagnosis = diagnose(&*reader);
     assert_eq!((diagnosis.episodes, diagnosis.problems()), (6, 0));
@@ -183,32 +183,32 @@ fn reports_the_episodes_of_each_defect() {
     let breaks: [(&str, Breaking); 7] = [
         ("'reward' has a value that is not finite", |e, rows| {
             if e == 2 {
-                rows.get_mut::<f32>("reward").expect("rewards")[1] = f32::NAN;
+                rows.get_mut::<f32>("reward").expect("accessing the rewards")[1] = f32::NAN;
             }
         }),
         ("'state' has a value that is not finite", |e, rows| {
             if e == 2 {
-                rows.get_mut::<f64>("state").expect("states")[4] = f64::INFINITY;
+                rows.get_mut::<f64>("state").expect("accessing the states")[4] = f64::INFINITY;
             }
         }),
         ("no action in a row that is not the last", |e, rows| {
             if e == 2 {
-                rows.get_mut::<f32>("action").expect("actions")[2..4].fill(f32::NAN);
+                rows.get_mut::<f32>("action").expect("accessing the actions")[2..4].fill(f32::NAN);
             }
         }),
         ("an action is not finite", |e, rows| {
             if e == 2 {
-                rows.get_mut::<f32>("action").expect("actions")[3] = f32::NAN;
+                rows.get_mut::<f32>("action").expect("accessing the actions")[3] = f32::NAN;
             }
         }),
         ("row 2 holds step 1", |e, rows| {
             if e == 2 {
-                rows.get_mut::<i64>("step_idx").expect("steps")[2] = 1;
+                rows.get_mut::<i64>("step_idx").expect("accessing the steps")[2] = 1;
             }
         }),
         ("row 0 holds step 3", |e, rows| {
             if e == 2 {
-                rows.get_mut::<i64>("step_idx").expect("steps").iter_mut().for_each(|step| *step += 3);
+                rows.get_mut::<i64>("step_idx").expect("accessing the steps").iter_mut().for_each(|step| *step += 3);
             }
         }),
         ("it has no rows", |e, rows| {
@@ -244,24 +244,24 @@ fn reports_the_episodes_of_each_defect() {
 }
 
 #[test]
-fn unusual_but_intact_data_gives_a_note() {
+fn unusual_but_intact_data_gives_notes_and_no_problems() {
     let notes = |broken: Broken| -> Vec<String> {
         let diagnosis = diagnose(&broken);
         assert_eq!(diagnosis.problems(), 0, "{diagnosis:?}");
         diagnosis.findings.into_iter().map(|found| found.what).collect()
     };
-    let acting = Broken::new(3, |_, rows| rows.get_mut::<f32>("action").expect("actions").fill(0.5));
+    let acting = Broken::new(3, |_, rows| rows.get_mut::<f32>("action").expect("accessing the actions").fill(0.5));
     assert!(notes(acting)[0].contains("the last row has an action"));
     let single = Broken::new(3, |e, rows| {
         if e == 1 {
             *rows = Batch::zeros(&schema(), 1);
-            rows.get_mut::<f32>("action").expect("actions").fill(f32::NAN);
+            rows.get_mut::<f32>("action").expect("accessing the actions").fill(f32::NAN);
         }
     });
     assert!(notes(single)[0].contains("no step"));
     let mut without = Broken::new(3, |_, _| {});
     let columns: Vec<ColumnSpec> = schema().columns().iter().filter(|c| c.name != "reward").cloned().collect();
-    let schema = Schema::new(columns).expect("a valid schema");
+    let schema = Schema::new(columns).expect("creating the schema");
     without.rows = without.rows.iter().map(|rows| without_reward(&schema, rows)).collect();
     without.schema = Some(schema);
     let diagnosis = diagnose(&without);
@@ -273,7 +273,7 @@ fn unusual_but_intact_data_gives_a_note() {
 fn without_reward(schema: &Schema, rows: &Batch) -> Batch {
     let mut batch = Batch::zeros(schema, rows.rows());
     for (i, column) in schema.columns().iter().enumerate() {
-        let from = rows.schema().index(&column.name).expect("a column");
+        let from = rows.schema().index(&column.name).expect("finding the column");
         batch.bytes_mut(i).copy_from_slice(rows.bytes(from));
     }
     batch
@@ -281,15 +281,15 @@ fn without_reward(schema: &Schema, rows: &Batch) -> Batch {
 
 #[test]
 fn repair_writes_the_intact_episodes() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let target = folder.path().join("repaired.lance");
     let broken = Broken::new(6, |e, rows| {
         if e == 1 {
-            rows.get_mut::<f32>("reward").expect("rewards").fill(f32::NAN);
+            rows.get_mut::<f32>("reward").expect("accessing the rewards").fill(f32::NAN);
         }
         if e == 4 {
             // Repeated step indices, as if two writers had used the same episode index.
-            rows.get_mut::<i64>("step_idx").expect("steps").fill(0);
+            rows.get_mut::<i64>("step_idx").expect("accessing the steps").fill(0);
         }
     });
     let mut broken = Plain(broken);
@@ -310,7 +310,7 @@ fn repair_writes_the_intact_episodes() {
     let unrepairable: Arc<dyn Reader> = Arc::new(Broken::new(2, |_, rows| rows.resize(0)));
     let diagnosis = diagnose(&*unrepairable);
     let refused = repair(&unrepairable, &diagnosis, &to, &ConvertOptions::default(), &mut Control::new());
-    assert!(refused.expect_err("no intact episode").to_string().contains("none of its 2 episodes"));
+    assert!(refused.expect_err("repairing without an intact episode").to_string().contains("none of its 2 episodes"));
     let mut control = Control::new().with_interrupt(Arc::new(AtomicBool::new(true)));
     let stopped = examine(&*repaired, &MODELS, &mut control);
     assert!(matches!(stopped, Err(Error::Interrupted)));

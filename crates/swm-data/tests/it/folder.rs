@@ -28,7 +28,7 @@ fn writer_killed_50_times_keeps_committed_episodes() {
 }
 
 fn damaged(cases: u64) {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.folder");
     format_suite::write(&path, WriteMode::Create, 0..3);
     let report = fuzz::dataset("folder", &path, cases, fuzz::read_everything);
@@ -52,11 +52,11 @@ fn rejects_folders_damaged_in_10000_ways() {
 #[test]
 fn rejects_damaged_journals() {
     // The unfinished writer leaves a journal, and column files without rows.
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.folder");
     let mut writer = format_suite::writer(&path, WriteMode::Create).expect("creating the dataset");
     (0..4).for_each(|e| writer.write_episode(&sample::episode(e)).expect("writing an episode"));
-    let journal = std::fs::read(path.join("ep_len.journal")).expect("a journal");
+    let journal = std::fs::read(path.join("ep_len.journal")).expect("reading the journal");
     assert_eq!(open(&path).expect("opening the dataset").episodes().len(), 4);
     let copy = folder.path().join("copy.folder");
     fuzz::copy_all(&path, &copy);
@@ -69,7 +69,7 @@ fn rejects_damaged_journals() {
     assert!(report.refused > 30, "{report:?}");
     for length in (0..journal.len()).step_by(journal.len() / 40) {
         std::fs::write(copy.join("ep_len.journal"), &journal[..length]).expect("writing a file");
-        let reader = open(&copy).expect("the complete records");
+        let reader = open(&copy).expect("opening the dataset with its complete records");
         assert!(reader.episodes().len() < 4);
         format_suite::check(&*reader, 0);
     }
@@ -91,28 +91,28 @@ fn reads_but_does_not_append_to_a_folder_of_the_reference() {
     let read = reader.read(&names, &all).expect("reading rows");
     for t in 0..5 {
         let row = read.row(t);
-        let values = |name: &str| row.to_f64(name).expect("values");
+        let values = |name: &str| row.to_f64(name).expect("reading the values");
         let last = t == 1 || t == 4;
         assert!(if last { values("action")[0].is_nan() } else { values("action") == [t as f64 / 4.0, -(t as f64)] });
         assert_eq!(values("reward"), [t as f64 * 0.5]);
         assert_eq!(values("small"), [t as f64 - 3.0]);
         assert_eq!(values("variation.agent"), [t as f64; 3]);
         let mut off = 0.0;
-        for (i, rgb) in row.get::<u8>("pixels").expect("images").chunks(3).enumerate() {
+        for (i, rgb) in row.get::<u8>("pixels").expect("reading the images").chunks(3).enumerate() {
             let expected = [(8 * (i / 24) + t) as u8, (4 * (i % 24) + 7 * t) as u8, 90];
             off += rgb.iter().zip(expected).map(|(&a, b)| f64::from(a.abs_diff(b))).sum::<f64>();
         }
         // The first image is a PNG.
         assert!(if t == 0 { off == 0.0 } else { off / 1152.0 < 6.0 }, "row {t}: {off}");
     }
-    assert!(reader.manifest().is_none() && reader.constants(1).expect("constants").is_empty());
+    assert!(reader.manifest().is_none() && reader.constants(1).expect("reading constants").is_empty());
 
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let copy = folder.path().join("copy.folder");
     fuzz::copy_all(&path, &copy);
-    let schema = Schema::new(reader.schema().columns()[2..].to_vec()).expect("a valid schema");
+    let schema = Schema::new(reader.schema().columns()[2..].to_vec()).expect("creating the schema");
     let options = || WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() };
-    let error = create(&copy, &schema, options()).err().expect("a text column").to_string();
+    let error = create(&copy, &schema, options()).err().expect("a text column must be an error").to_string();
     assert!(error.contains("'task'"), "{error}");
     std::fs::remove_file(copy.join("task.npz")).expect("removing a file");
     let mut writer = create(&copy, &schema, options()).expect("continuing the dataset");
@@ -137,14 +137,14 @@ fn reference_reads_folders_written_here() {
         println!("SKIPPED: set SWM_REFERENCE_PYTHON to a Python with stable-worldmodel");
         return;
     };
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("ours.folder");
     format_suite::write(&path, WriteMode::Create, 0..5);
     format_suite::write(&path, WriteMode::Append, 5..8);
     let output =
         Command::new(python).arg("-B").arg(interop("folder_check.py")).arg(&path).output().expect("running Python");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let seen: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    let seen: Value = serde_json::from_slice(&output.stdout).expect("parsing the JSON");
     assert_eq!(seen["lengths"], serde_json::json!((0..8).map(sample::rows).collect::<Vec<_>>()));
     assert_eq!(seen["clips"], (0..8).map(|e| sample::rows(e) - 3).sum::<usize>());
     let mut names: Vec<String> = sample::schema().columns().iter().map(|column| column.name.clone()).collect();
@@ -155,7 +155,7 @@ fn reference_reads_folders_written_here() {
     assert_eq!(seen["state"], serde_json::json!([[7.0, first as f64, -0.5], [7.0, first as f64 + 2.0, -0.5]]));
     let last = sample::episode(7);
     for step in 0..2 {
-        let frame = last.row(first + 2 * step).get::<u8>("pixels").expect("images");
+        let frame = last.row(first + 2 * step).get::<u8>("pixels").expect("reading the images");
         let mean = frame.iter().map(|&value| f64::from(value)).sum::<f64>() / frame.len() as f64;
         let reference_mean = seen["pixels"][step].as_f64().expect("a mean");
         assert!((mean - reference_mean).abs() < 1e-9, "lossless: {mean} {reference_mean}");

@@ -55,7 +55,7 @@ fn check_constants(reader: &dyn Reader, first: usize) {
 
 /// Runs all tests except the tests that kill processes.
 pub fn all(name: &str) {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join(name);
     check_write_modes(&path);
     reads_rows_in_any_order(&path);
@@ -64,7 +64,7 @@ pub fn all(name: &str) {
     rejects_a_second_writer(&other("busy-"));
     reads_committed_episodes_during_writing(&other("growing-"));
     numeric_types_round_trip(&other("types-"));
-    assert!(open(folder.path().join(format!("none-{name}"))).is_err(), "a missing dataset");
+    assert!(open(folder.path().join(format!("none-{name}"))).is_err(), "opening a missing dataset must fail");
 }
 
 fn check_write_modes(path: &Path) {
@@ -72,7 +72,11 @@ fn check_write_modes(path: &Path) {
     let reader = open(path).expect("opening the dataset");
     assert_eq!(reader.episodes().len(), 5);
     assert_eq!(reader.schema().columns()[0], ColumnSpec::new("episode_idx", DType::Int32, []));
-    assert_eq!(reader.schema().column("step_idx").expect("a column").dtype, DType::Int64, "the declared type");
+    assert_eq!(
+        reader.schema().column("step_idx").expect("finding the column").dtype,
+        DType::Int64,
+        "`step_idx` has the declared type"
+    );
     let data_columns = |columns: &[ColumnSpec]| -> Vec<ColumnSpec> {
         columns.iter().filter(|column| !column.name.ends_with("_idx")).cloned().collect()
     };
@@ -84,7 +88,8 @@ fn check_write_modes(path: &Path) {
     assert!(parts.iter().any(|(part, size)| part == "pixels" && *size > 0), "{parts:?}");
     let hash = reader.content_hash().expect("hashing the content");
 
-    let error = writer(path, WriteMode::Create).err().expect("an existing dataset").to_string();
+    let error =
+        writer(path, WriteMode::Create).err().expect("creating an existing dataset must be an error").to_string();
     assert!(error.contains("exists already") && error.contains("append"), "{error}");
     write(path, WriteMode::Append, 5..9);
     let reader = open(path).expect("opening the dataset");
@@ -93,9 +98,9 @@ fn check_write_modes(path: &Path) {
     check_constants(&*reader, 0);
     assert_ne!(reader.content_hash().expect("hashing the content"), hash);
 
-    let few = Schema::new(schema().columns()[..3].to_vec()).expect("a valid schema");
+    let few = Schema::new(schema().columns()[..3].to_vec()).expect("creating the schema");
     let options = WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() };
-    let error = create(path, &few, options).err().expect("other columns").to_string();
+    let error = create(path, &few, options).err().expect("a schema with other columns must be an error").to_string();
     assert!(error.contains("variation.agent.color") && error.contains("the columns it has"), "{error}");
 
     write(path, WriteMode::Overwrite, 3..5);
@@ -131,9 +136,9 @@ fn reads_rows_in_any_order(path: &Path) {
             let (a, b) = (read.row(row).get::<u8>(name), expected.row(t).get::<u8>(name));
             assert!(a.expect("bytes") == b.expect("bytes"), "{name} of row {row}");
         }
-        assert_eq!(read.row(row).get::<f64>("state").expect("values"), [e as f64, t as f64, -0.5]);
-        assert_eq!(read.row(row).get::<i32>("episode_idx").expect("a value"), [e as i32]);
-        assert_eq!(read.row(row).get::<i64>("step_idx").expect("a value"), [t as i64]);
+        assert_eq!(read.row(row).get::<f64>("state").expect("reading the values"), [e as f64, t as f64, -0.5]);
+        assert_eq!(read.row(row).get::<i32>("episode_idx").expect("reading the value"), [e as i32]);
+        assert_eq!(read.row(row).get::<i64>("step_idx").expect("reading the value"), [t as i64]);
     }
     let error = |name: &str, range| reader.read(&[name], &[range]).expect_err("a missing column or row").to_string();
     assert!(error("pixels", StepRange::new(1, 4, 3)).contains("rows below 6"));
@@ -155,7 +160,7 @@ fn rejects_invalid_episodes(path: &Path) {
     );
     let empty = Batch::zeros(&schema(), 0);
     assert!(writer.write_episode(&empty).expect_err("an episode without rows").to_string().contains("without rows"));
-    let few = Batch::zeros(&Schema::new(schema().columns()[1..].to_vec()).expect("a valid schema"), 3);
+    let few = Batch::zeros(&Schema::new(schema().columns()[1..].to_vec()).expect("creating the schema"), 3);
     assert!(writer.write_episode(&few).expect_err("an episode without pixels").to_string().contains("pixels"));
     assert_eq!(writer.episodes(), 5, "the writer stores no invalid episode");
     writer.finish().expect("finishing the dataset");
@@ -165,7 +170,7 @@ fn rejects_invalid_episodes(path: &Path) {
 fn rejects_a_second_writer(path: &Path) {
     let first = writer(path, WriteMode::Create).expect("creating the dataset");
     for mode in [WriteMode::Append, WriteMode::Overwrite] {
-        let error = writer(path, mode).err().expect("another writer").to_string();
+        let error = writer(path, mode).err().expect("a second writer must be an error").to_string();
         assert!(error.contains("another process writes"), "{error}");
     }
     drop(first);
@@ -198,7 +203,7 @@ fn numeric_types_round_trip(path: &Path) {
             shapes.map(|shape| ColumnSpec::new(format!("{}{}", dtype.name(), shape.len()), *dtype, shape))
         })
         .collect();
-    let schema = Schema::new(specs).expect("a valid schema");
+    let schema = Schema::new(specs).expect("creating the schema");
     let mut batch = Batch::zeros(&schema, 300);
     for (index, column) in schema.columns().iter().enumerate() {
         let limit = if column.dtype == DType::Bool { 2 } else { 251 };
@@ -218,7 +223,7 @@ fn numeric_types_round_trip(path: &Path) {
 /// Kills `kills` writers at random times, drawn with a fixed key. All committed episodes must be readable, and the next
 /// writer continues.
 pub fn killed(name: &str, kills: u64) {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join(name);
     let mut stored = 0;
     for kill in 0..kills {
@@ -236,7 +241,7 @@ pub fn killed(name: &str, kills: u64) {
             std::hint::spin_loop();
         }
         child.kill().expect("killing the child process");
-        child.wait().expect("an exit status");
+        child.wait().expect("waiting for the child process");
         let now = match open(&path) {
             Ok(reader) => {
                 // Compares with a tolerance, because the child stores JPEG in formats that encode images.
@@ -267,7 +272,7 @@ pub fn killed(name: &str, kills: u64) {
 
 /// The command of a child process that writes episodes until it is killed.
 fn child(path: &Path) -> Command {
-    let program: PathBuf = std::env::current_exe().expect("the test executable");
+    let program: PathBuf = std::env::current_exe().expect("finding the test executable");
     let mut command = Command::new(program);
     command.args(["--exact", "interruption::child_that_writes", "--nocapture"]);
     command.env("SWM_TEST_CHILD_TARGET", path).stdout(Stdio::piped()).stderr(Stdio::null());

@@ -47,7 +47,7 @@ fn selected_case() -> Option<u64> {
 /// Damages one file of a copy of a dataset (a file or a folder) per case. Every kind of file (by folder and suffix)
 /// gets an equal number of cases. `read` opens a dataset and returns the content, as [`read_everything`] does.
 pub fn dataset<T: PartialEq>(name: &str, intact: &Path, cases: u64, read: impl Fn(&Path) -> Result<T>) -> Report {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let copy = folder.path().join(intact.file_name().expect("a name"));
     copy_all(intact, &copy);
     let kinds = kinds(&copy);
@@ -237,7 +237,8 @@ pub fn files(path: &Path) -> Vec<PathBuf> {
         return vec![path.to_owned()];
     }
     let entries = std::fs::read_dir(path).expect("listing a folder");
-    let mut found: Vec<PathBuf> = entries.flat_map(|entry| files(&entry.expect("an entry").path())).collect();
+    let mut found: Vec<PathBuf> =
+        entries.flat_map(|entry| files(&entry.expect("reading the folder entry").path())).collect();
     found.sort();
     found
 }
@@ -249,7 +250,7 @@ pub fn copy_all(from: &Path, to: &Path) {
             Ok(rest) if !rest.as_os_str().is_empty() => to.join(rest),
             _ => to.to_owned(),
         };
-        std::fs::create_dir_all(target.parent().expect("a folder")).expect("creating a folder");
+        std::fs::create_dir_all(target.parent().expect("the path has a parent folder")).expect("creating a folder");
         std::fs::copy(&file, &target).expect("copying a file");
     }
 }
@@ -292,7 +293,7 @@ unsafe impl GlobalAlloc for RecordingAllocator {
 static ALLOCATOR: RecordingAllocator = RecordingAllocator;
 
 #[test]
-fn damage_is_reproducible_and_effective() {
+fn damage_is_reproducible_and_changes_most_inputs() {
     let intact: Vec<u8> = (0..200).collect();
     let mut same = 0;
     for case in 0..500 {
@@ -308,7 +309,7 @@ fn damage_is_reproducible_and_effective() {
 fn detects_panics_and_excessive_allocations() {
     let failure = |read: fn(&[u8]) -> Result<usize>| {
         let run = || bytes("the harness", &[7; 100], 200, read);
-        let panic = catch_unwind(run).expect_err("a panic");
+        let panic = catch_unwind(run).expect_err("reading must panic");
         panic.downcast_ref::<String>().cloned().unwrap_or_default()
     };
     let allocates = |bytes: &[u8]| Ok(Vec::<u8>::with_capacity(usize::from(bytes.last() != Some(&7)) << 29).capacity());

@@ -6,8 +6,8 @@ use swm_core::Batch;
 use swm_data::{CacheConfig, ClipSpec, GoalMixture, GoalSpec, Loader, LoaderConfig, Reader, WriteMode, open};
 
 fn load(reader: &Arc<dyn Reader>, config: LoaderConfig, epoch: u64, first: usize) -> Vec<Batch> {
-    let loader = Loader::new(Arc::clone(reader), config).expect("a loader");
-    loader.epoch(epoch, first).map(|batch| batch.expect("a batch").into_batch()).collect()
+    let loader = Loader::new(Arc::clone(reader), config).expect("creating the loader");
+    loader.epoch(epoch, first).map(|batch| batch.expect("reading the batch").into_batch()).collect()
 }
 
 fn config(goals: &[(&str, GoalMixture)]) -> LoaderConfig {
@@ -27,8 +27,8 @@ fn config(goals: &[(&str, GoalMixture)]) -> LoaderConfig {
 }
 
 #[test]
-fn goals_are_rows_of_the_dataset_with_offsets() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn goals_are_rows_at_the_reported_offsets() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..9);
     let reader = open(&path).expect("opening the dataset");
@@ -41,17 +41,17 @@ fn goals_are_rows_of_the_dataset_with_offsets() {
     assert_eq!(shapes, [&[1, 3][..], &[1, 16, 24, 3], &[]]);
     for batch in &batches {
         for row in (0..batch.rows()).map(|row| batch.row(row)) {
-            let state = row.get::<f64>("state").expect("states");
+            let state = row.get::<f64>("state").expect("reading the states");
             let (e, now) = (state[0], state[4]);
             for name in ["goal", "end", "later"] {
-                let goal = row.get::<f64>(&format!("{name}_state")).expect("a goal");
-                let offset = row.get::<i64>(&format!("{name}_offset")).expect("an offset")[0];
+                let goal = row.get::<f64>(&format!("{name}_state")).expect("reading the goal");
+                let offset = row.get::<i64>(&format!("{name}_offset")).expect("reading the offset")[0];
                 if offset >= 0 {
                     assert_eq!((goal[0], goal[1]), (e, now + offset as f64), "{name}");
                 } else {
                     assert!(name == "goal" && (goal[0] != e || goal[1] < now));
                 }
-                let pixel = f64::from(row.get::<u8>(&format!("{name}_pixels")).expect("an image")[0]);
+                let pixel = f64::from(row.get::<u8>(&format!("{name}_pixels")).expect("reading the image")[0]);
                 let drawn = (3.0 * goal[1] + 20.0 * goal[0]) % 256.0;
                 assert!((pixel - drawn).abs() < 40.0, "the goal image belongs to another row: {pixel} {drawn}");
                 match name {
@@ -66,23 +66,23 @@ fn goals_are_rows_of_the_dataset_with_offsets() {
 
 #[test]
 fn goals_are_reproducible_and_differ_between_epochs() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..9);
     let reader = open(&path).expect("opening the dataset");
     let goals = [("goal", GoalMixture::default())];
     let states = |config: LoaderConfig, epoch, first| -> Vec<f64> {
         let batches = load(&reader, config, epoch, first);
-        batches.iter().flat_map(|batch| batch.get::<f64>("goal_state").expect("goals").to_vec()).collect()
+        batches.iter().flat_map(|batch| batch.get::<f64>("goal_state").expect("reading the goals").to_vec()).collect()
     };
     let base = states(config(&goals), 4, 0);
     let other = LoaderConfig { threads: 0, cache: CacheConfig::Off, batch_size: 7, ..config(&goals) };
     assert_eq!(states(other, 4, 0), base, "goals depend neither on threads nor on the batch size");
-    assert_eq!(states(config(&goals), 4, 2), base[2 * 5 * 3..], "resumed");
+    assert_eq!(states(config(&goals), 4, 2), base[2 * 5 * 3..], "a resumed epoch has the same goals");
     assert_ne!(states(config(&goals), 5, 0), base);
     // With one selected episode, all goals belong to the selected episode.
     let selected = LoaderConfig { episodes: Some(vec![6]), ..config(&[("goal", GoalMixture::RANDOM)]) };
     assert!(states(selected, 0, 0).chunks(3).all(|state| state[0] == 6.0));
     let refused = Loader::new(reader, config(&[("goal", GoalMixture { last: 0.5, ..GoalMixture::RANDOM })]));
-    assert!(refused.err().expect("an error").to_string().contains("add up to 1"));
+    assert!(refused.err().expect("the call must fail").to_string().contains("add up to 1"));
 }

@@ -28,7 +28,7 @@ fn writer_killed_50_times_keeps_committed_episodes() {
 }
 
 fn damaged(cases: u64) {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.h5");
     format_suite::write(&path, WriteMode::Create, 0..3);
     let report = fuzz::dataset("hdf5", &path, cases, fuzz::read_everything);
@@ -52,12 +52,12 @@ fn rejects_files_damaged_in_10000_ways() {
 }
 
 #[test]
-fn many_chunks_form_b_trees_of_several_levels() {
+fn datasets_with_b_trees_of_several_levels_round_trip() {
     // A leaf holds 64 chunks and a node of the second level 4096, so the tree has three levels. Each commit ends at
     // another position in the tree.
     let schema = Schema::new([ColumnSpec::new("large", DType::U8, [2048]), ColumnSpec::new("small", DType::Int64, [])]);
-    let schema = schema.expect("a valid schema");
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let schema = schema.expect("creating the schema");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.h5");
     let commit = CommitPolicy { episodes: 3, ..CommitPolicy::default() };
     let mut total = 0_usize;
@@ -83,8 +83,14 @@ fn many_chunks_form_b_trees_of_several_levels() {
         let read =
             reader.read(&["large", "small"], &[StepRange::new(position, 0, episode.length)]).expect("reading rows");
         for t in 0..episode.length {
-            assert_eq!(read.row(t).get::<i64>("small").expect("a value"), [row as i64]);
-            assert!(read.row(t).get::<u8>("large").expect("bytes").iter().all(|&byte| byte == (row % 251) as u8));
+            assert_eq!(read.row(t).get::<i64>("small").expect("reading the value"), [row as i64]);
+            assert!(
+                read.row(t)
+                    .get::<u8>("large")
+                    .expect("reading the bytes")
+                    .iter()
+                    .all(|&byte| byte == (row % 251) as u8)
+            );
             row += 1;
         }
     }
@@ -132,14 +138,16 @@ fn column(reader: &dyn Reader, name: &str) -> Batch {
 
 fn has_images(reader: &dyn Reader, name: &str) {
     let read = column(reader, name);
-    (0..21).for_each(|t| assert_eq!(read.row(t).get::<u8>(name).expect("images"), image(t), "{name}, row {t}"));
+    (0..21).for_each(|t| {
+        assert_eq!(read.row(t).get::<u8>(name).expect("reading the images"), image(t), "{name}, row {t}")
+    });
 }
 
 fn has_values(reader: &dyn Reader, name: &str) {
     let read = column(reader, name);
     for t in 0..21 {
         let expected = values(t).map(|value| value as f64);
-        assert_eq!(read.row(t).to_f64(name).expect("values"), expected, "{name}, row {t}");
+        assert_eq!(read.row(t).to_f64(name).expect("reading the values"), expected, "{name}, row {t}");
     }
 }
 
@@ -151,18 +159,18 @@ fn reads_a_file_of_the_reference() {
     let types =
         [("pixels", DType::U8), ("action", DType::Float32), ("reward", DType::Float64), ("step_idx", DType::Int64)];
     for (name, dtype) in types {
-        assert_eq!(reader.schema().column(name).expect("a column").dtype, dtype);
+        assert_eq!(reader.schema().column(name).expect("finding the column").dtype, dtype);
     }
     let ends = [5, 12, 20];
     let (action, reward, step) = (column(&*reader, "action"), column(&*reader, "reward"), column(&*reader, "step_idx"));
     for t in 0..21 {
-        let given = action.row(t).to_f64("action").expect("values");
+        let given = action.row(t).to_f64("action").expect("reading the values");
         if ends.contains(&t) {
             assert!(given.iter().all(|value| value.is_nan()));
         } else {
             assert_eq!(given, [values(t)[0] as f64, values(t)[1] as f64]);
         }
-        assert_eq!(reward.row(t).to_f64("reward").expect("a value"), [values(t)[0] as f64]);
+        assert_eq!(reward.row(t).to_f64("reward").expect("reading the value"), [values(t)[0] as f64]);
         let first = if t < 6 {
             0
         } else if t < 13 {
@@ -170,12 +178,12 @@ fn reads_a_file_of_the_reference() {
         } else {
             13
         };
-        assert_eq!(step.row(t).to_f64("step_idx").expect("a value"), [(t - first) as f64]);
+        assert_eq!(step.row(t).to_f64("step_idx").expect("reading the value"), [(t - first) as f64]);
     }
     for k in 0..5 {
         let name = format!("variation.{k}");
         let read = column(&*reader, &name);
-        (0..21).for_each(|t| assert_eq!(read.row(t).get::<i64>(&name).expect("a value"), [values(t)[k]]));
+        (0..21).for_each(|t| assert_eq!(read.row(t).get::<i64>(&name).expect("reading the value"), [values(t)[k]]));
     }
 }
 
@@ -190,7 +198,7 @@ fn decodes_every_filter_of_h5py_and_hdf5plugin() {
 }
 
 #[test]
-fn reads_every_layout() {
+fn reads_every_hdf5_layout_and_element_type() {
     let reader = open(interop("hdf5-layouts.h5")).expect("opening the dataset");
     for name in ["contiguous", "one chunk", "fixed", "growing", "growing blocks"] {
         has_images(&*reader, name);
@@ -199,13 +207,17 @@ fn reads_every_layout() {
         has_values(&*reader, &format!("numbers {dtype}"));
     }
     let read = column(&*reader, "numbers i1");
-    (0..21)
-        .for_each(|t| assert_eq!(read.row(t).get::<i32>("numbers i1").expect("values")[3], values(t)[3] as i32 % 100));
+    (0..21).for_each(|t| {
+        assert_eq!(read.row(t).get::<i32>("numbers i1").expect("reading the values")[3], values(t)[3] as i32 % 100)
+    });
     let read = column(&*reader, "numbers f2");
     // Half precision represents integers up to 2048 exactly.
-    (0..20).for_each(|t| assert_eq!(read.row(t).get::<f32>("numbers f2").expect("values")[0], (t * 100) as f32));
+    (0..20).for_each(|t| {
+        assert_eq!(read.row(t).get::<f32>("numbers f2").expect("reading the values")[0], (t * 100) as f32)
+    });
     let read = column(&*reader, "truth");
-    (0..21).for_each(|t| assert_eq!(read.row(t).get::<u8>("truth").expect("a boolean"), [u8::from(t % 3 == 0)]));
+    (0..21)
+        .for_each(|t| assert_eq!(read.row(t).get::<u8>("truth").expect("reading the boolean"), [u8::from(t % 3 == 0)]));
     assert!(reader.schema().column("text").is_err(), "text columns are skipped");
 
     let reader = open(interop("hdf5-trees.h5")).expect("opening the dataset");
@@ -214,7 +226,7 @@ fn reads_every_layout() {
     let read = column(&*reader, "partly written");
     for t in 0..21 {
         let expected = if t < 16 { values(t).map(|value| value as f64) } else { [0.0; 5] };
-        assert_eq!(read.row(t).to_f64("partly written").expect("values"), expected, "row {t}");
+        assert_eq!(read.row(t).to_f64("partly written").expect("reading the values"), expected, "row {t}");
     }
 }
 
@@ -247,7 +259,7 @@ fn reference_episode() -> Batch {
 
 #[test]
 fn appends_to_a_file_of_the_reference() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("continued.h5");
     std::fs::copy(interop("hdf5-reference.h5"), &path).expect("copying a file");
     let episode = reference_episode();
@@ -279,7 +291,7 @@ fn check(mode: &str, path: &Path) -> Option<Value> {
         return None;
     }
     assert!(output.status.success(), "{errors}");
-    Some(serde_json::from_slice(&output.stdout).expect("JSON"))
+    Some(serde_json::from_slice(&output.stdout).expect("parsing the JSON"))
 }
 
 /// Compares the columns that h5py reads with the columns that this crate reads.
@@ -295,8 +307,13 @@ fn check_columns(path: &Path, seen: &Value) {
         assert_eq!(seen["shape"][0], read.rows(), "{}", column.name);
         let (mut sum, mut weighted) = (0.0, 0.0);
         for t in 0..read.rows() {
-            let row: f64 =
-                read.row(t).to_f64(&column.name).expect("values").iter().filter(|value| !value.is_nan()).sum();
+            let row: f64 = read
+                .row(t)
+                .to_f64(&column.name)
+                .expect("reading the values")
+                .iter()
+                .filter(|value| !value.is_nan())
+                .sum();
             sum += row;
             weighted += row * (t % 1000 + 1) as f64;
         }
@@ -309,7 +326,7 @@ fn check_columns(path: &Path, seen: &Value) {
 
 #[test]
 fn files_round_trip_through_h5py() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("ours.h5");
     format_suite::write(&path, WriteMode::Create, 0..40);
     format_suite::write(&path, WriteMode::Append, 40..77);

@@ -5,13 +5,13 @@ use swm_data::{Location, StepRange, WriteMode, open};
 
 #[test]
 fn reads_files_in_a_bucket_and_on_a_web_server() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     std::fs::create_dir(folder.path().join("bucket")).expect("creating a bucket");
     let path = folder.path().join("bucket/d.h5");
     format_suite::write(&path, WriteMode::Create, 0..30);
 
     let web = objects::serve(folder.path(), false);
-    let location = Location::parse(&format!("{web}/bucket/d.h5")).expect("a location");
+    let location = Location::parse(&format!("{web}/bucket/d.h5")).expect("parsing the location");
     let reader = open(&location).expect("opening the dataset");
     assert_eq!(reader.episodes().len(), 30);
     format_suite::check(&*reader, 0);
@@ -38,7 +38,7 @@ fn reads_files_in_a_bucket_and_on_a_web_server() {
 
 #[test]
 fn does_not_write_to_a_web_server() {
-    let location = Location::parse("http://127.0.0.1:9/d.h5").expect("a location");
-    let error = format_suite::writer(&location, WriteMode::Create).err().expect("an error").to_string();
+    let location = Location::parse("http://127.0.0.1:9/d.h5").expect("parsing the location");
+    let error = format_suite::writer(&location, WriteMode::Create).err().expect("the call must fail").to_string();
     assert!(error.contains("hdf5") && error.contains("copy the dataset"), "{error}");
 }

@@ -31,7 +31,7 @@ fn child_that_writes() {
 /// The command that runs a child test after `shell` has set the limits of the process.
 fn run_child(test: &str, path: &Path, shell: &str) -> Command {
     let mut command = Command::new("sh");
-    let program = std::env::current_exe().expect("the test executable");
+    let program = std::env::current_exe().expect("finding the test executable");
     command.args(["-c", &format!("{shell} exec \"$0\" --exact interruption::{test} --nocapture")]).arg(program);
     command.env(TARGET, path).stdout(Stdio::piped()).stderr(Stdio::null());
     command
@@ -48,7 +48,7 @@ fn child_that_reads() {
 
 #[test]
 fn opens_many_fragments_with_few_file_descriptors() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 1, 0..170);
     let output = run_child("child_that_reads", &path, "ulimit -n 160;").output().expect("running the child process");
@@ -58,7 +58,7 @@ fn opens_many_fragments_with_few_file_descriptors() {
 
 #[test]
 fn killed_writer_keeps_committed_episodes() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     let mut stored = 0;
     for written in [7, 20, 33] {
@@ -70,7 +70,7 @@ fn killed_writer_keeps_committed_episodes() {
             seen += usize::from(line.contains("episode "));
         }
         child.kill().expect("killing the child process");
-        child.wait().expect("an exit status");
+        child.wait().expect("waiting for the child process");
         let reader = open(&path).expect("opening the dataset");
         // A commit has three episodes; two more may wait for the committing thread, and three may be in progress.
         let now = reader.episodes().len();
@@ -98,7 +98,7 @@ fn write_until_failure(path: &Path, shell: &str, expected: &str) {
 
 #[test]
 fn file_size_limit_keeps_committed_episodes() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 1, 0..4);
     // A fragment of three episodes is larger than 8 blocks; the existing manifests are smaller.
@@ -108,7 +108,7 @@ fn file_size_limit_keeps_committed_episodes() {
 
 #[test]
 fn full_disk_keeps_committed_episodes() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let mount = Command::new("mount").args(["-t", "tmpfs", "-o", "size=1m", "tmpfs"]).arg(folder.path()).output();
     if !mount.is_ok_and(|output| output.status.success()) {
         println!("SKIPPED: mounting a small file system needs more rights than this test has");

@@ -25,7 +25,7 @@ struct Running {
 
 /// Starts a child test below and waits until the child begins to write.
 fn start(test: &str, path: &Path) -> Running {
-    let mut command = Command::new(std::env::current_exe().expect("the test executable"));
+    let mut command = Command::new(std::env::current_exe().expect("finding the test executable"));
     command.args(["--exact", &format!("kill::{test}"), "--nocapture"]).env(TARGET, path);
     let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().expect("starting the child process");
     let mut output = BufReader::new(child.stdout.take().expect("the output of the child process")).lines();
@@ -42,7 +42,7 @@ fn kill(mut running: Running, key: Key, longest: Duration) -> bool {
         std::hint::spin_loop();
     }
     running.child.kill().expect("killing the child process");
-    !running.child.wait().expect("an exit status").success()
+    !running.child.wait().expect("waiting for the child process").success()
 }
 
 fn target() -> Option<PathBuf> {
@@ -112,7 +112,7 @@ fn check_all(path: &Path, constants: bool) -> usize {
 }
 
 fn killed_appends(kills: u64) {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     let mut stored = 0;
     for index in 0..kills {
@@ -135,7 +135,7 @@ fn killed_appends(kills: u64) {
 }
 
 fn killed_replacements(kills: u64) {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     for index in 0..kills {
         let child = start("child_that_replaces", &path);
@@ -148,7 +148,7 @@ fn killed_replacements(kills: u64) {
 }
 
 fn killed_shards(kills: u64) {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     for index in 0..kills {
         let path = folder.path().join(format!("{index}.lance"));
         let child = start("child_that_writes_shards", &path);
@@ -180,7 +180,7 @@ fn killed_replacement_leaves_the_old_or_new_dataset() {
 }
 
 #[test]
-fn killed_shard_is_continued() {
+fn killed_shards_are_continued() {
     killed_shards(4);
 }
 

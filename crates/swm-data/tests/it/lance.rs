@@ -15,7 +15,7 @@ fn failure(path: &Path, schema: &Schema, mode: WriteMode) -> String {
 
 #[test]
 fn written_episodes_round_trip() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("with space ü%20.lance");
     write(&path, WriteMode::Create, 2, 0..9);
     let reader = open(&path).expect("opening the dataset");
@@ -33,8 +33,8 @@ fn written_episodes_round_trip() {
 }
 
 #[test]
-fn reads_ranges_in_the_requested_order() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn reads_row_ranges_in_the_requested_order() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..12);
     let reader = open(&path).expect("opening the dataset");
@@ -66,7 +66,7 @@ fn reads_ranges_in_the_requested_order() {
 
 #[test]
 fn invalid_columns_and_rows_are_explained() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..2);
     let reader = open(&path).expect("opening the dataset");
@@ -77,15 +77,17 @@ fn invalid_columns_and_rows_are_explained() {
     let short =
         reader.read_column("state", &[StepRange::new(0, 0, 1)], &mut [0; 5]).expect_err("a buffer that is too small");
     assert!(short.to_string().contains("24 for 1 rows"), "{short}");
-    let missing = open(folder.path().join("none.lance")).err().expect("no dataset").to_string();
+    let missing =
+        open(folder.path().join("none.lance")).err().expect("opening a missing dataset must be an error").to_string();
     assert!(missing.contains("there is no such dataset"), "{missing}");
-    let unknown = open(Path::new("/nowhere/at.all")).err().expect("no dataset").to_string();
+    let unknown =
+        open(Path::new("/nowhere/at.all")).err().expect("opening a missing dataset must be an error").to_string();
     assert!(unknown.contains("no such dataset") && unknown.contains("lance"), "{unknown}");
 }
 
 #[test]
-fn follows_the_write_mode() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn writer_follows_the_create_append_and_overwrite_modes() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Append, 100, 0..3);
     assert!(failure(&path, &schema(), WriteMode::Create).contains("exists already"));
@@ -114,7 +116,7 @@ fn follows_the_write_mode() {
 
 #[test]
 fn opens_an_empty_dataset() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 1, 0..0);
     let reader = open(&path).expect("opening the dataset");
@@ -126,14 +128,14 @@ fn opens_an_empty_dataset() {
 }
 
 #[test]
-fn does_not_append_another_schema() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn appending_requires_the_schema_of_the_dataset() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 100, 0..2);
     let with = |change: &dyn Fn(&mut Vec<ColumnSpec>)| {
         let mut columns = schema().columns().to_vec();
         change(&mut columns);
-        failure(&path, &Schema::new(columns).expect("a valid schema"), WriteMode::Append)
+        failure(&path, &Schema::new(columns).expect("creating the schema"), WriteMode::Append)
     };
     assert!(with(&|columns| columns[1].shape = vec![3]).contains("appending to"));
     assert!(with(&|columns| columns[0].shape = vec![16, 16, 3]).contains("[16, 24, 3]"));
@@ -143,10 +145,10 @@ fn does_not_append_another_schema() {
     // The order of columns does not matter.
     let mut columns = schema().columns().to_vec();
     columns.reverse();
-    let reordered = Schema::new(columns).expect("a valid schema");
+    let reordered = Schema::new(columns).expect("creating the schema");
     let mut other = Batch::zeros(&reordered, rows(2));
     for (i, column) in reordered.columns().iter().enumerate() {
-        other.bytes_mut(i).copy_from_slice(episode(2).bytes(schema().index(&column.name).expect("a column")));
+        other.bytes_mut(i).copy_from_slice(episode(2).bytes(schema().index(&column.name).expect("finding the column")));
     }
     let mut writer = create(&path, &reordered, options(WriteMode::Append)).expect("continuing the dataset");
     assert!(
@@ -163,37 +165,37 @@ fn does_not_append_another_schema() {
 
 #[test]
 fn rejects_episodes_that_break_the_time_convention() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let mut writer =
         create(folder.path().join("d.lance"), &schema(), options(WriteMode::Create)).expect("creating the dataset");
     let mut refuse = |change: &dyn Fn(&mut Batch), expected: &str| {
         let mut bad = episode(2);
         change(&mut bad);
-        let error = writer.write_episode(&bad).expect_err("an error").to_string();
+        let error = writer.write_episode(&bad).expect_err("writing the episode must fail").to_string();
         assert!(error.contains(expected), "{error}");
     };
-    refuse(&|e| e.get_mut::<f32>("action").expect("actions")[3] = f32::NAN, "row 1 of 7");
-    refuse(&|e| e.get_mut::<f32>("action").expect("actions")[13] = 0.0, "final observation");
-    refuse(&|e| e.get_mut::<i64>("variation.agent.color").expect("colours")[4] = 1 << 30, "within ±2^24");
+    refuse(&|e| e.get_mut::<f32>("action").expect("accessing the actions")[3] = f32::NAN, "row 1 of 7");
+    refuse(&|e| e.get_mut::<f32>("action").expect("accessing the actions")[13] = 0.0, "final observation");
+    refuse(&|e| e.get_mut::<i64>("variation.agent.color").expect("accessing the colours")[4] = 1 << 30, "within ±2^24");
     refuse(&|e| e.resize(0), "without rows");
     assert_eq!(writer.episodes(), 0);
-    writer.write_episode(&episode(0)).expect("a valid episode");
+    writer.write_episode(&episode(0)).expect("writing a valid episode");
     writer.finish().expect("finishing the dataset");
 
-    let discrete = Schema::new([ColumnSpec::new("action", DType::Int64, [])]).expect("a valid schema");
+    let discrete = Schema::new([ColumnSpec::new("action", DType::Int64, [])]).expect("creating the schema");
     let mut writer =
         create(folder.path().join("i.lance"), &discrete, options(WriteMode::Create)).expect("creating the dataset");
     let mut batch = Batch::zeros(&discrete, 3);
-    assert!(writer.write_episode(&batch).expect_err("an error").to_string().contains("-1"));
-    batch.get_mut::<i64>("action").expect("actions")[2] = -1;
+    assert!(writer.write_episode(&batch).expect_err("writing the episode must fail").to_string().contains("-1"));
+    batch.get_mut::<i64>("action").expect("accessing the actions")[2] = -1;
     writer.write_episode(&batch).expect("writing an episode");
-    batch.get_mut::<i64>("action").expect("actions")[0] = -1;
+    batch.get_mut::<i64>("action").expect("accessing the actions")[0] = -1;
     assert!(writer.write_episode(&batch).is_err());
 }
 
 #[test]
-fn content_hash_does_not_depend_on_files() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn content_hash_depends_on_the_episodes_but_not_on_the_data_files() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = |name: &str| folder.path().join(name);
     write(&path("a.lance"), WriteMode::Create, 1, 0..5);
     write(&path("b.lance"), WriteMode::Create, 100, 0..3);
@@ -205,8 +207,8 @@ fn content_hash_does_not_depend_on_files() {
 }
 
 #[test]
-fn stores_lossless_images() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn png_and_qoi_images_are_stored_exactly() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     for (position, codec) in [ImageCodec::Png, ImageCodec::Qoi].into_iter().enumerate() {
         let lossless = WriteOptions { codec, ..options(WriteMode::Append) };
@@ -218,13 +220,13 @@ fn stores_lossless_images() {
         assert_eq!(read.bytes(0), episode(1).bytes(0));
     }
     let invalid = WriteOptions { codec: ImageCodec::Jpeg { quality: 0 }, ..options(WriteMode::Create) };
-    let error = create(folder.path().join("e.lance"), &schema(), invalid).err().expect("an error");
+    let error = create(folder.path().join("e.lance"), &schema(), invalid).err().expect("the call must fail");
     assert!(error.is_usage());
 }
 
 #[test]
-fn several_threads_read_at_once() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn several_threads_read_concurrently() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 2, 0..12);
     let reader = open(&path).expect("opening the dataset");
@@ -241,7 +243,7 @@ fn several_threads_read_at_once() {
 
 #[test]
 fn concurrent_writers_both_append() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     let threads = 4;
     let episodes_per_thread = 25;
@@ -265,7 +267,8 @@ fn concurrent_writers_both_append() {
     // The state identifies the episode.
     let firsts: Vec<StepRange> = (0..threads * episodes_per_thread).map(|at| StepRange::new(at, 0, 1)).collect();
     let read = reader.read(&["state"], &firsts).expect("reading rows");
-    let mut found: Vec<usize> = read.get::<f64>("state").expect("states").chunks(3).map(|s| s[0] as usize).collect();
+    let mut found: Vec<usize> =
+        read.get::<f64>("state").expect("reading the states").chunks(3).map(|s| s[0] as usize).collect();
     for thread in 0..threads {
         let own: Vec<usize> = found.iter().copied().filter(|e| e / episodes_per_thread == thread).collect();
         assert!(own.is_sorted(), "episodes of one writer keep their order");
@@ -281,10 +284,10 @@ fn concurrent_writers_both_append() {
 
 #[test]
 fn writer_of_a_replaced_dataset_fails() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     let mut first = create(&path, &schema(), options(WriteMode::Append)).expect("creating the dataset");
-    let other = Schema::new([ColumnSpec::new("other", DType::Float32, [])]).expect("a valid schema");
+    let other = Schema::new([ColumnSpec::new("other", DType::Float32, [])]).expect("creating the schema");
     create(&path, &other, options(WriteMode::Overwrite))
         .expect("replacing the dataset")
         .finish()
@@ -297,19 +300,19 @@ fn writer_of_a_replaced_dataset_fails() {
 
 #[test]
 fn stores_doubles_exactly_but_keeps_the_precision_of_older_tables() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
-    let schema = Schema::new([ColumnSpec::new("state", DType::Float64, [2])]).expect("a valid schema");
+    let schema = Schema::new([ColumnSpec::new("state", DType::Float64, [2])]).expect("creating the schema");
     let mut batch = Batch::zeros(&schema, 3);
     let values = [0.1, 1e300, f64::MIN_POSITIVE, -7.0, f64::NAN, 1.0 / 3.0];
-    batch.get_mut::<f64>("state").expect("states").copy_from_slice(&values);
+    batch.get_mut::<f64>("state").expect("accessing the states").copy_from_slice(&values);
     let mut writer = create(&path, &schema, options(WriteMode::Create)).expect("creating the dataset");
     writer.write_episode(&batch).expect("writing an episode");
     writer.finish().expect("finishing the dataset");
     let all = [StepRange::new(0, 0, 3)];
     let bits = |reader: &dyn swm_data::Reader| -> Vec<u64> {
         let read = reader.read(&["state"], &all).expect("reading rows");
-        read.get::<f64>("state").expect("states").iter().map(|v| v.to_bits()).collect()
+        read.get::<f64>("state").expect("reading the states").iter().map(|v| v.to_bits()).collect()
     };
     assert_eq!(bits(&*open(&path).expect("opening the dataset")), values.map(f64::to_bits));
     // A table of the first version stored all numeric columns in single precision; appending keeps this precision.
@@ -323,8 +326,8 @@ fn stores_doubles_exactly_but_keeps_the_precision_of_older_tables() {
 }
 
 #[test]
-fn reads_constants() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn constants_round_trip_and_are_part_of_the_content_hash() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     let scene = |e: usize| {
         let xml = format!("<mujoco><body pos=\"{}\"/></mujoco>", e / 2).repeat(50).into_bytes();
@@ -354,8 +357,8 @@ fn reads_constants() {
 }
 
 #[test]
-fn old_versions_are_removed() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn old_table_versions_are_removed() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 1, 0..30);
     let versions = std::fs::read_dir(path.join("_versions")).expect("listing a folder").count();
@@ -365,7 +368,7 @@ fn old_versions_are_removed() {
 
 #[test]
 fn unwritable_locations_are_explained() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let file = folder.path().join("file");
     std::fs::write(&file, "not a folder").expect("writing a file");
     let error = failure(&file.join("d.lance"), &schema(), WriteMode::Create);
@@ -374,7 +377,8 @@ fn unwritable_locations_are_explained() {
         failure(&folder.path().join("name"), &schema(), WriteMode::Create).contains("use a name that ends in .lance")
     );
     // Not even root can create a folder in `/proc`.
-    let error = create(Path::new("/proc/d.lance"), &schema(), options(WriteMode::Create)).err().expect("an error");
+    let error =
+        create(Path::new("/proc/d.lance"), &schema(), options(WriteMode::Create)).err().expect("the call must fail");
     assert!(matches!(error, Error::Io { .. }), "{error}");
     // A folder with other files is left unchanged.
     let other = folder.path().join("other.lance");
@@ -383,16 +387,22 @@ fn unwritable_locations_are_explained() {
     for mode in [WriteMode::Create, WriteMode::Append, WriteMode::Overwrite] {
         assert!(failure(&other, &schema(), mode).contains("notes.txt"));
     }
-    assert!(open(&other).err().expect("no dataset").to_string().contains("not a Lance table"));
+    assert!(
+        open(&other)
+            .err()
+            .expect("opening a missing dataset must be an error")
+            .to_string()
+            .contains("not a Lance table")
+    );
 }
 
 #[test]
 fn statistics_ignore_missing_values() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..4);
     let reader = open(&path).expect("opening the dataset");
-    let stats = column_stats(&*reader, "action", Some(&[1, 3])).expect("statistics");
+    let stats = column_stats(&*reader, "action", Some(&[1, 3])).expect("computing the statistics");
     let first: Vec<f64> = [1.0; 5].into_iter().chain([3.0; 7]).collect();
     let mean = first.iter().sum::<f64>() / 12.0;
     let std = (first.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / 12.0).sqrt();

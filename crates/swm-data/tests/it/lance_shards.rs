@@ -21,12 +21,12 @@ fn write_shard(path: &Path, index: usize, count: usize, episodes: std::ops::Rang
 }
 
 fn failure(path: &Path) -> String {
-    commit_shards(&Location::from(path)).expect_err("an error").to_string()
+    commit_shards(&Location::from(path)).expect_err("the call must fail").to_string()
 }
 
 #[test]
-fn commits_all_shards_as_one_version() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn committed_shards_equal_the_dataset_of_one_writer() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     assert!(failure(&path).contains("no shards to commit"));
     // Two threads, in place of two machines, write shards in any order.
@@ -68,7 +68,7 @@ fn commits_all_shards_as_one_version() {
 
 #[test]
 fn interrupted_shard_is_continued_and_finished_shard_is_overwritten() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     write_shard(&path, 1, 2, 4..6);
     let mut writer = shard_writer(&path, WriteMode::Create, 0, 2).expect("creating the shard");
@@ -78,7 +78,11 @@ fn interrupted_shard_is_continued_and_finished_shard_is_overwritten() {
     drop(writer);
     assert!(failure(&path).contains("shard 0 of 2 is not finished"));
     assert!(
-        shard_writer(&path, WriteMode::Create, 0, 2).err().expect("an error").to_string().contains("already exists")
+        shard_writer(&path, WriteMode::Create, 0, 2)
+            .err()
+            .expect("the call must fail")
+            .to_string()
+            .contains("already exists")
     );
     let mut writer = shard_writer(&path, WriteMode::Append, 0, 2).expect("continuing the shard");
     assert_eq!(writer.episodes(), 2);
@@ -98,8 +102,8 @@ fn interrupted_shard_is_continued_and_finished_shard_is_overwritten() {
 }
 
 #[test]
-fn commit_killed_before_cleanup_is_not_repeated() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn commit_after_a_commit_killed_before_cleanup_adds_no_episodes() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     write_shard(&path, 0, 1, 0..3);
     crate::fuzz::copy_all(&path.join("_shards"), &folder.path().join("kept"));
@@ -112,18 +116,22 @@ fn commit_killed_before_cleanup_is_not_repeated() {
 
 #[test]
 fn rejects_inconsistent_shards() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     let location = Location::from(&path);
     assert!(
-        shard_writer(&path, WriteMode::Create, 3, 3).err().expect("an error").to_string().contains("no shard 3 of 3")
+        shard_writer(&path, WriteMode::Create, 3, 3)
+            .err()
+            .expect("the call must fail")
+            .to_string()
+            .contains("no shard 3 of 3")
     );
     write_shard(&path, 0, 2, 0..2);
     write_shard(&path, 0, 3, 0..2);
     assert!(failure(&path).contains("there are shards of"));
     drop(shard_writer(&path, WriteMode::Overwrite, 0, 3).expect("overwriting the shard"));
     std::fs::remove_dir_all(path.join("_shards/0-of-3")).expect("removing a folder");
-    let other = Schema::new([ColumnSpec::new("other", DType::Float32, [])]).expect("a valid schema");
+    let other = Schema::new([ColumnSpec::new("other", DType::Float32, [])]).expect("creating the schema");
     let shard = Shard { index: 1, count: 2 };
     create_shard(&location, &other, options(WriteMode::Create), shard)
         .expect("creating the shard")

@@ -23,8 +23,8 @@ fn write(path: &std::path::Path, mode: WriteMode, codec: ImageCodec, episodes: s
 }
 
 #[test]
-fn reads_episodes_with_their_images() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn written_episodes_are_read_with_their_images() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     for (name, codec) in [("a", ImageCodec::Png), ("b", ImageCodec::Jpeg { quality: 95 })] {
         let path = folder.path().join(format!("{name}.lance-video"));
         write(&path, WriteMode::Create, codec, 0..5);
@@ -50,27 +50,33 @@ fn reads_episodes_with_their_images() {
         assert_eq!(reader.episodes().len(), 2);
         check(&*reader, 3);
         assert_ne!(reader.content_hash().expect("hashing the content"), hash);
-        let error = create(&path, &schema(), WriteOptions::default()).err().expect("an existing dataset").to_string();
+        let error = create(&path, &schema(), WriteOptions::default())
+            .err()
+            .expect("creating an existing dataset must be an error")
+            .to_string();
         assert!(error.contains("exists already"), "{error}");
-        let few = Schema::new(schema().columns()[..4].to_vec()).expect("a valid schema");
+        let few = Schema::new(schema().columns()[..4].to_vec()).expect("creating the schema");
         let options = WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() };
-        assert!(create(&path, &few, options).is_err(), "other columns");
+        assert!(create(&path, &few, options).is_err(), "appending other columns must fail");
     }
-    assert!(open(folder.path().join("none.lance-video")).is_err(), "a missing dataset");
-    let images = Schema::new(schema().columns()[..1].to_vec()).expect("a valid schema");
+    assert!(open(folder.path().join("none.lance-video")).is_err(), "opening a missing dataset must fail");
+    let images = Schema::new(schema().columns()[..1].to_vec()).expect("creating the schema");
     let path = folder.path().join("images.lance-video");
-    let error = create(&path, &images, WriteOptions::default()).err().expect("no numeric column").to_string();
+    let error = create(&path, &images, WriteOptions::default())
+        .err()
+        .expect("a schema without a numeric column must be an error")
+        .to_string();
     assert!(error.contains("format video"), "{error}");
 }
 
 /// Kills a writer after some episodes. Committed episodes must be readable, and the next writer continues.
 fn killed(kills: usize) {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance-video");
     write(&path, WriteMode::Create, ImageCodec::Jpeg { quality: 95 }, 0..2);
     let mut stored = 2;
     for kill in 0..kills {
-        let mut command = Command::new(std::env::current_exe().expect("the test executable"));
+        let mut command = Command::new(std::env::current_exe().expect("finding the test executable"));
         command.args(["--exact", "interruption::child_that_writes", "--nocapture"]);
         command.env("SWM_TEST_CHILD_TARGET", &path).stdout(Stdio::piped()).stderr(Stdio::null());
         let mut child = command.spawn().expect("starting the child process");
@@ -80,7 +86,7 @@ fn killed(kills: usize) {
             seen += usize::from(lines.next().expect("another line").expect("a line of text").contains("episode "));
         }
         child.kill().expect("killing the child process");
-        child.wait().expect("an exit status");
+        child.wait().expect("waiting for the child process");
         let reader = open(&path).expect("opening the dataset");
         check(&*reader, 0);
         // A commit has three episodes; more may wait for the committing thread.
@@ -106,7 +112,7 @@ fn writer_killed_50_times_keeps_committed_episodes() {
 }
 
 fn damaged(cases: u64) {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance-video");
     write(&path, WriteMode::Create, ImageCodec::Png, 0..3);
     let report = fuzz::dataset("lance-video", &path, cases, fuzz::read_everything);

@@ -37,19 +37,22 @@ fn reads_datasets_of_lerobot() {
         let schema = reader.schema();
         assert_eq!(schema.column("pixels").expect("a camera"), &ColumnSpec::image("pixels", 48, 64));
         assert_eq!(schema.column("proprio").expect("the state"), &ColumnSpec::new("proprio", DType::Float32, [3]));
-        assert_eq!(schema.column("next.done").expect("a flag"), &ColumnSpec::new("next.done", DType::Bool, []));
+        assert_eq!(
+            schema.column("next.done").expect("finding the column"),
+            &ColumnSpec::new("next.done", DType::Bool, [])
+        );
         let tasks = ["push the block", "open the drawer", "push the block"];
         for (e, &length) in THIRD_PARTY_LENGTHS.iter().enumerate() {
             let names = ["observation.state", "action", "next.reward", "next.done", "task_index", "frame_index"];
             let read = reader.read(&names, &[StepRange::new(e, 0, length)]).expect("reading rows");
             for t in 0..length {
                 let (row, time) = (read.row(t), t as f32);
-                assert_eq!(row.get::<f32>("observation.state").expect("values"), [e as f32, time, -0.5]);
-                assert_eq!(row.get::<f32>("action").expect("values"), [e as f32 + time / 4.0, -time]);
-                assert_eq!(row.get::<f32>("next.reward").expect("a value"), [time / 2.0]);
-                assert_eq!(row.get::<u8>("next.done").expect("a flag"), [u8::from(t + 1 == length)]);
-                assert_eq!(row.get::<i64>("task_index").expect("a value"), [(e % 2) as i64]);
-                assert_eq!(row.get::<i32>("frame_index").expect("a value"), [t as i32]);
+                assert_eq!(row.get::<f32>("observation.state").expect("reading the values"), [e as f32, time, -0.5]);
+                assert_eq!(row.get::<f32>("action").expect("reading the values"), [e as f32 + time / 4.0, -time]);
+                assert_eq!(row.get::<f32>("next.reward").expect("reading the value"), [time / 2.0]);
+                assert_eq!(row.get::<u8>("next.done").expect("reading the flag"), [u8::from(t + 1 == length)]);
+                assert_eq!(row.get::<i64>("task_index").expect("reading the value"), [(e % 2) as i64]);
+                assert_eq!(row.get::<i32>("frame_index").expect("reading the value"), [t as i32]);
             }
             let task = Constants::from([("task".to_owned(), tasks[e].as_bytes().to_vec())]);
             assert_eq!(reader.constants(e).expect("reading constants"), task);
@@ -61,21 +64,29 @@ fn reads_datasets_of_lerobot() {
         );
         let mut writer = create(
             interop().join(name),
-            &swm_core::Schema::new(schema.columns()[2..].to_vec()).expect("a valid schema"),
+            &swm_core::Schema::new(schema.columns()[2..].to_vec()).expect("creating the schema"),
             WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() },
         );
-        assert!(writer.as_mut().err().expect("a third-party dataset").to_string().contains("convert it"), "{name}");
+        assert!(
+            writer
+                .as_mut()
+                .err()
+                .expect("appending to a third-party dataset must be an error")
+                .to_string()
+                .contains("convert it"),
+            "{name}"
+        );
     }
 }
 
 #[test]
-fn reads_images_in_tables() {
+fn reads_images_that_are_stored_in_tables() {
     let reader = open(interop().join("lerobot-v30-h264")).expect("opening the dataset");
     let name = "observation.images.still";
     let ranges = [StepRange::new(2, 3, 2), StepRange::new(0, 10, 1), StepRange::new(2, 3, 1)];
     let read = reader.read(&[name], &ranges).expect("reading rows");
     for (row, (e, t)) in [(2, 3), (2, 4), (0, 10), (2, 3)].into_iter().enumerate() {
-        let frame = read.row(row).get::<u8>(name).expect("an image").to_vec();
+        let frame = read.row(row).get::<u8>(name).expect("reading the image").to_vec();
         for y in 0..24 {
             for x in 0..32 {
                 let block = (4 + t..12 + t).contains(&y) && (8 + 2 * t..20 + 2 * t).contains(&x);
@@ -109,7 +120,7 @@ fn lerobot_reads_datasets_written_here() {
         println!("SKIPPED: set SWM_LEROBOT_PYTHON to a Python with lerobot 0.4");
         return;
     };
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     for (name, codec, tolerance) in
         [("lossless.lerobot", ImageCodec::Png, 0.51), ("lossy.lerobot", ImageCodec::Jpeg { quality: 95 }, 5.0)]
     {
@@ -128,9 +139,9 @@ fn lerobot_reads_datasets_written_here() {
         let output =
             command.arg("-B").arg(interop().join("lerobot_check.py")).arg(&path).output().expect("running Python");
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-        let seen: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+        let seen: serde_json::Value = serde_json::from_slice(&output.stdout).expect("parsing the JSON");
         assert_eq!(seen["episodes"], 5);
-        let rows = seen["rows"].as_array().expect("rows");
+        let rows = seen["rows"].as_array().expect("the rows are an array");
         let mut next = 0;
         for e in 0..5 {
             let episode = sample::episode(e);
@@ -142,7 +153,7 @@ fn lerobot_reads_datasets_written_here() {
                 assert_eq!(row["task"], format!("task {}", e % 2));
                 assert_eq!((&row["episode_index"], &row["frame_index"]), (&e.into(), &t.into()));
                 for column in ["pixels", "goal"] {
-                    let ours = episode.row(t).get::<u8>(column).expect("images").to_vec();
+                    let ours = episode.row(t).get::<u8>(column).expect("reading the images").to_vec();
                     let theirs = row[column].as_array().expect("bytes");
                     assert_eq!(theirs.len(), ours.len());
                     let off: f64 = theirs

@@ -9,7 +9,7 @@ use swm_data::{CacheConfig, ClipSpec, LoadedBatch, Loader, LoaderConfig, Reader,
 const EPISODES: usize = 9;
 
 fn dataset(group: usize) -> (tempfile::TempDir, PathBuf) {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, group, 0..EPISODES);
     (folder, path)
@@ -27,8 +27,9 @@ fn config(num_steps: usize, frameskip: usize) -> LoaderConfig {
 }
 
 fn load(reader: &Arc<dyn Reader>, config: LoaderConfig, epoch: u64, first: usize) -> Vec<Batch> {
-    let loader = Loader::new(Arc::clone(reader), config).expect("a loader");
-    let batches: Vec<Batch> = loader.epoch(epoch, first).map(|batch| batch.expect("a batch").into_batch()).collect();
+    let loader = Loader::new(Arc::clone(reader), config).expect("creating the loader");
+    let batches: Vec<Batch> =
+        loader.epoch(epoch, first).map(|batch| batch.expect("reading the batch").into_batch()).collect();
     assert_eq!(batches.len(), loader.batches_per_epoch() - first);
     batches
 }
@@ -38,7 +39,7 @@ fn clips(batches: &[Batch]) -> Vec<(usize, usize)> {
     let mut found = vec![];
     for batch in batches {
         for row in 0..batch.rows() {
-            let state = batch.row(row).get::<f64>("state").expect("states");
+            let state = batch.row(row).get::<f64>("state").expect("reading the states");
             found.push((state[0] as usize, state[1] as usize));
         }
     }
@@ -58,24 +59,24 @@ fn yields_every_clip_once_with_its_rows() {
     let mut expected: Vec<(usize, usize)> =
         (0..EPISODES).flat_map(|e| (0..(rows(e) + 1).saturating_sub(steps * skip)).map(move |s| (e, s))).collect();
     let mut found = clips(&batches);
-    assert_ne!(found, expected, "shuffled");
+    assert_ne!(found, expected, "the clips are shuffled");
     found.sort_unstable();
     expected.sort_unstable();
     assert_eq!(found, expected);
     for batch in &batches {
         assert_eq!(batch.schema().columns()[1].shape, [steps, 2 * skip]);
         for row in 0..batch.rows() {
-            let state = batch.row(row).get::<f64>("state").expect("states");
+            let state = batch.row(row).get::<f64>("state").expect("reading the states");
             let (e, start) = (state[0] as usize, state[1] as usize);
             for k in 0..steps {
                 assert_eq!(state[3 * k..3 * k + 2], [e as f64, (start + k * skip) as f64]);
-                let frame = batch.row(row).get::<u8>("pixels").expect("images");
+                let frame = batch.row(row).get::<u8>("pixels").expect("reading the images");
                 let frame = &frame[k * 16 * 24 * 3..(k + 1) * 16 * 24 * 3];
                 let first = ((3 * (start + k * skip) + 20 * e) % 256) as u8;
                 assert!(frame[0].abs_diff(first) < 40, "{} {first}", frame[0]);
             }
             // Actions of skipped rows are included, in order; only the action of an episode's last row is missing.
-            let action = batch.row(row).get::<f32>("action").expect("actions");
+            let action = batch.row(row).get::<f32>("action").expect("reading the actions");
             for (i, pair) in action.chunks_exact(2).enumerate() {
                 if start + i + 1 == rows(e) {
                     assert!(pair.iter().all(|v| v.is_nan()) && i + 1 == steps * skip);
@@ -88,7 +89,7 @@ fn yields_every_clip_once_with_its_rows() {
 }
 
 #[test]
-fn order_depends_only_on_seed_and_epoch() {
+fn batch_order_depends_only_on_seed_and_epoch() {
     let (_folder, path) = dataset(2);
     let (_other_folder, other_path) = dataset(100);
     let reader = open(&path).expect("opening the dataset");
@@ -101,8 +102,14 @@ fn order_depends_only_on_seed_and_epoch() {
             {
                 let config = LoaderConfig { threads, prefetch, cache, ..config(3, 1) };
                 assert!(bytes(&load(&reader, config.clone(), 5, 0)) == bytes(&base), "{threads} {prefetch}");
-                assert!(bytes(&load(&other, config.clone(), 5, 0)) == bytes(&base), "other files");
-                assert!(bytes(&load(&reader, config, 5, 4)) == bytes(&base[4..]), "resumed");
+                assert!(
+                    bytes(&load(&other, config.clone(), 5, 0)) == bytes(&base),
+                    "batches do not depend on the data files"
+                );
+                assert!(
+                    bytes(&load(&reader, config, 5, 4)) == bytes(&base[4..]),
+                    "a resumed epoch has the same batches"
+                );
             }
         }
     }
@@ -113,12 +120,12 @@ fn order_depends_only_on_seed_and_epoch() {
 }
 
 #[test]
-fn follows_the_configuration_of_episodes_batches_and_cache() {
+fn loader_follows_the_episode_selection_drop_last_and_the_first_batch() {
     let (_folder, path) = dataset(2);
     let reader = open(&path).expect("opening the dataset");
     let cache = CacheConfig::Memory { bytes: 1 << 30 };
     let some = LoaderConfig { episodes: Some(vec![7, 2]), cache, ..config(2, 1) };
-    let loader = Loader::new(Arc::clone(&reader), some.clone()).expect("a loader");
+    let loader = Loader::new(Arc::clone(&reader), some.clone()).expect("creating the loader");
     assert_eq!(loader.clips(), rows(2) + rows(7) - 2);
     let mut episodes: Vec<usize> = clips(&load(&reader, some.clone(), 0, 0)).iter().map(|c| c.0).collect();
     episodes.sort_unstable();
@@ -127,7 +134,7 @@ fn follows_the_configuration_of_episodes_batches_and_cache() {
     let full = load(&reader, LoaderConfig { drop_last: true, ..some }, 0, 0);
     assert!(full.iter().all(|batch| batch.rows() == 4));
     // An epoch may be dropped early. An epoch that starts after the last batch is empty.
-    let loader = Loader::new(Arc::clone(&reader), config(1, 1)).expect("a loader");
+    let loader = Loader::new(Arc::clone(&reader), config(1, 1)).expect("creating the loader");
     assert_eq!(loader.epoch(0, 0).take(2).count(), 2);
     assert_eq!(loader.epoch(0, loader.batches_per_epoch()).count(), 0);
     assert_eq!(loader.schema().columns()[0].shape, [1, 16, 24, 3]);
@@ -135,18 +142,18 @@ fn follows_the_configuration_of_episodes_batches_and_cache() {
 }
 
 #[test]
-fn reuses_memory_and_reads_two_epochs_at_once() {
+fn loader_reuses_batch_memory_and_reads_two_epochs_concurrently() {
     let (_folder, path) = dataset(2);
     let reader = open(&path).expect("opening the dataset");
-    let loader = Loader::new(Arc::clone(&reader), config(1, 1)).expect("a loader");
+    let loader = Loader::new(Arc::clone(&reader), config(1, 1)).expect("creating the loader");
     let read = |epoch: u64| -> Vec<Batch> {
-        loader.epoch(epoch, 0).map(|batch| batch.expect("a batch").into_batch()).collect()
+        loader.epoch(epoch, 0).map(|batch| batch.expect("reading the batch").into_batch()).collect()
     };
     let (first, second) = (read(1), read(2));
     // The memory of dropped batches is reused, and resized to the rows of the next batch.
     let addresses = || -> Vec<(usize, Vec<u8>)> {
         let address_and_bytes = |batch: LoadedBatch| (batch.bytes(0).as_ptr() as usize, batch.bytes(0).to_vec());
-        loader.epoch(1, 0).map(|batch| address_and_bytes(batch.expect("a batch"))).collect()
+        loader.epoch(1, 0).map(|batch| address_and_bytes(batch.expect("reading the batch"))).collect()
     };
     let (once, twice) = (addresses(), addresses());
     assert!(once.iter().chain(&twice).zip(first.iter().chain(&first)).all(|((_, a), b)| a == b.bytes(0)));
@@ -154,8 +161,11 @@ fn reuses_memory_and_reads_two_epochs_at_once() {
     buffers.sort_unstable();
     buffers.dedup();
     assert!(buffers.len() <= loader.prefetch() + 3, "{} buffers for {} batches", buffers.len(), 2 * once.len());
-    let both: Vec<(LoadedBatch, LoadedBatch)> =
-        loader.epoch(1, 0).zip(loader.epoch(2, 0)).map(|(a, b)| (a.expect("a batch"), b.expect("a batch"))).collect();
+    let both: Vec<(LoadedBatch, LoadedBatch)> = loader
+        .epoch(1, 0)
+        .zip(loader.epoch(2, 0))
+        .map(|(a, b)| (a.expect("reading the batch"), b.expect("reading the batch")))
+        .collect();
     let split = |pick: fn(&(LoadedBatch, LoadedBatch)) -> &LoadedBatch| {
         both.iter().map(|pair| Batch::clone(pick(pair))).collect::<Vec<_>>()
     };
@@ -163,12 +173,12 @@ fn reuses_memory_and_reads_two_epochs_at_once() {
 }
 
 #[test]
-fn prefetching_respects_its_budget() {
+fn prefetch_count_respects_the_byte_budget() {
     let (_folder, path) = dataset(2);
     let reader = open(&path).expect("opening the dataset");
     let ahead = |prefetch_bytes| {
         let config = LoaderConfig { prefetch: 8, prefetch_bytes, ..config(2, 1) };
-        Loader::new(Arc::clone(&reader), config).expect("a loader").prefetch()
+        Loader::new(Arc::clone(&reader), config).expect("creating the loader").prefetch()
     };
     // Four clips of two images, actions and states.
     let batch = 4 * 2 * (16 * 24 * 3 + 8 + 24);
@@ -179,7 +189,7 @@ fn prefetching_respects_its_budget() {
 fn invalid_settings_are_explained() {
     let (_folder, path) = dataset(100);
     let reader = open(&path).expect("opening the dataset");
-    let wrong = |config| Loader::new(Arc::clone(&reader), config).err().expect("an error").to_string();
+    let wrong = |config| Loader::new(Arc::clone(&reader), config).err().expect("the call must fail").to_string();
     let columns = |name: &str| ClipSpec { columns: vec![name.to_owned()], ..config(1, 1).clip };
     assert!(wrong(LoaderConfig { clip: columns("actions"), ..config(1, 1) }).contains("did you mean action"));
     assert!(wrong(config(4, 4)).contains("the longest has 11"));
@@ -193,10 +203,11 @@ fn damaged_dataset_ends_the_epoch_with_an_error() {
     let (_folder, path) = dataset(2);
     let reader = open(&path).expect("opening the dataset");
     for entry in std::fs::read_dir(path.join("data")).expect("listing a folder") {
-        std::fs::File::create(entry.expect("an entry").path()).expect("emptying a file");
+        std::fs::File::create(entry.expect("reading the folder entry").path()).expect("emptying a file");
     }
     for threads in [0, 2] {
-        let loader = Loader::new(Arc::clone(&reader), LoaderConfig { threads, ..config(2, 1) }).expect("a loader");
+        let loader =
+            Loader::new(Arc::clone(&reader), LoaderConfig { threads, ..config(2, 1) }).expect("creating the loader");
         let results: Vec<_> = loader.epoch(0, 0).collect();
         assert!(results.last().is_some_and(Result::is_err), "{threads} threads");
     }

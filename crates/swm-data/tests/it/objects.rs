@@ -21,19 +21,20 @@ const KEYS: [&str; 2] = ["AKEXAMPLE", "secret/example"];
 /// Returns the server's address. Unlike S3, this server checks for an existing object and writes in two steps, so
 /// writes are serialised.
 pub fn serve(root: &Path, keys: bool) -> String {
-    let mut service = S3ServiceBuilder::new(s3s_fs::FileSystem::new(root).expect("a root"));
+    let mut service =
+        S3ServiceBuilder::new(s3s_fs::FileSystem::new(root).expect("creating the file system of the server"));
     if keys {
         service.set_auth(SimpleAuth::from_single(KEYS[0], KEYS[1]));
     }
     let service = service.build();
     let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("binding a port");
-    let address = listener.local_addr().expect("an address");
-    listener.set_nonblocking(true).expect("a non-blocking listener");
+    let address = listener.local_addr().expect("reading the local address");
+    listener.set_nonblocking(true).expect("making the listener non-blocking");
     std::thread::spawn(move || {
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
         let writing = Arc::new(tokio::sync::Mutex::new(()));
         runtime.expect("a runtime").block_on(async move {
-            let listener = tokio::net::TcpListener::from_std(listener).expect("a TCP listener");
+            let listener = tokio::net::TcpListener::from_std(listener).expect("creating the TCP listener");
             while let Ok((socket, _)) = listener.accept().await {
                 let server = hyper_util::server::conn::auto::Builder::new(TokioExecutor::new());
                 let (service, writing) = (service.clone(), Arc::clone(&writing));
@@ -56,7 +57,7 @@ pub fn serve(root: &Path, keys: bool) -> String {
 
 /// A process that runs one of the child tests below.
 pub fn child(test: &str, endpoint: &str, target: &str) -> Command {
-    let mut command = Command::new(std::env::current_exe().expect("the test executable"));
+    let mut command = Command::new(std::env::current_exe().expect("finding the test executable"));
     command.args(["--exact", &format!("objects::{test}"), "--nocapture"]).env(TARGET, target);
     command.env("AWS_ENDPOINT_URL", endpoint).env("AWS_REGION", "us-east-1");
     command.env("AWS_ACCESS_KEY_ID", KEYS[0]).env("AWS_SECRET_ACCESS_KEY", KEYS[1]);
@@ -71,7 +72,7 @@ pub fn finished(output: &Output) -> String {
 }
 
 fn target() -> Option<Location> {
-    Some(Location::parse(&std::env::var(TARGET).ok()?).expect("a location"))
+    Some(Location::parse(&std::env::var(TARGET).ok()?).expect("parsing the location"))
 }
 
 fn write_to(location: &Location, mode: WriteMode, episodes: std::ops::Range<usize>) {
@@ -91,7 +92,7 @@ fn child_that_writes_and_reads() {
     let Some(location) = target() else { return };
     assert!(open(&location).is_err(), "no dataset exists yet");
     write_to(&location, WriteMode::Create, 0..5);
-    let error = create(&location, &schema(), options(WriteMode::Create)).err().expect("an error").to_string();
+    let error = create(&location, &schema(), options(WriteMode::Create)).err().expect("the call must fail").to_string();
     assert!(error.contains("exists already"), "{error}");
     write_to(&location, WriteMode::Append, 5..9);
     let reader = open(&location).expect("opening the dataset");
@@ -120,7 +121,7 @@ fn child_that_writes_and_reads() {
 
 #[test]
 fn stores_datasets_in_a_bucket() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     std::fs::create_dir(folder.path().join("bucket")).expect("creating a bucket");
     let endpoint = serve(folder.path(), true);
     let output = child("child_that_writes_and_reads", &endpoint, "s3://bucket/runs/d.lance")
@@ -171,7 +172,7 @@ fn child_that_appends() {
 
 #[test]
 fn concurrent_processes_append_to_a_bucket() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     std::fs::create_dir(folder.path().join("bucket")).expect("creating a bucket");
     let endpoint = serve(folder.path(), true);
     let children: Vec<_> = (0..3)
@@ -187,29 +188,29 @@ fn concurrent_processes_append_to_a_bucket() {
     assert_eq!(indices, (0..36).collect::<Vec<_>>());
     let firsts: Vec<StepRange> = (0..36).map(|at| StepRange::new(at, 0, 1)).collect();
     let states = reader.read(&["state"], &firsts).expect("reading rows");
-    let mut found: Vec<f64> = states.get::<f64>("state").expect("states").chunks(3).map(|s| s[0]).collect();
+    let mut found: Vec<f64> = states.get::<f64>("state").expect("reading the states").chunks(3).map(|s| s[0]).collect();
     found.sort_by(f64::total_cmp);
     assert_eq!(found, (0..36).map(|at| f64::from(at / 3)).collect::<Vec<_>>());
 }
 
 #[test]
 fn reads_from_but_does_not_write_to_a_web_server() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     write(&folder.path().join("bucket/d.lance"), WriteMode::Create, 2, 0..5);
     let endpoint = serve(folder.path(), false);
-    let location = Location::parse(&format!("{endpoint}/bucket/d.lance")).expect("a location");
+    let location = Location::parse(&format!("{endpoint}/bucket/d.lance")).expect("parsing the location");
     let reader = open(&location).expect("opening the dataset");
     assert_eq!(reader.episodes().len(), 5);
     check(&*reader, 0);
     assert!(reader.footprint().is_ok_and(|parts| !parts.is_empty()), "a web server lists no files");
-    let error = create(&location, &schema(), options(WriteMode::Append)).err().expect("an error").to_string();
+    let error = create(&location, &schema(), options(WriteMode::Append)).err().expect("the call must fail").to_string();
     assert!(error.contains("cannot be written"), "{error}");
-    let missing = Location::parse(&format!("{endpoint}/bucket/none.lance")).expect("a location");
+    let missing = Location::parse(&format!("{endpoint}/bucket/none.lance")).expect("parsing the location");
     assert!(open(&missing).is_err());
 
     let bytes: Vec<u8> = (0..400_000_u32).map(|i| ((i * i) >> 5) as u8).collect();
     std::fs::write(folder.path().join("bucket/file.h5"), &bytes).expect("writing a file");
-    let file = Location::parse(&format!("{endpoint}/bucket/file.h5")).expect("a location");
+    let file = Location::parse(&format!("{endpoint}/bucket/file.h5")).expect("parsing the location");
     let file = ObjectFile::open(&file).expect("opening a file");
     assert_eq!(file.len(), 400_000);
     let parts = file.read(&[300_000..400_000, 5..9]).expect("reading byte ranges");
@@ -218,9 +219,11 @@ fn reads_from_but_does_not_write_to_a_web_server() {
 
 #[test]
 fn unreachable_store_is_not_reported_as_damage() {
-    let unused_address =
-        std::net::TcpListener::bind("127.0.0.1:0").expect("binding a port").local_addr().expect("an address");
-    let location = Location::parse(&format!("http://{unused_address}/d.lance")).expect("a location");
-    let error = open(&location).err().expect("no server").to_string();
+    let unused_address = std::net::TcpListener::bind("127.0.0.1:0")
+        .expect("binding a port")
+        .local_addr()
+        .expect("reading the local address");
+    let location = Location::parse(&format!("http://{unused_address}/d.lance")).expect("parsing the location");
+    let error = open(&location).err().expect("opening without a server must be an error").to_string();
     assert!(!error.contains("damaged") && error.contains(&unused_address.to_string()), "{error}");
 }

@@ -6,7 +6,7 @@ use swm_data::{PreviewOptions, WriteMode, create, open, preview};
 
 #[test]
 fn previews_show_every_camera() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     for name in ["d.lance", "d.video", "d.lance-video"] {
         let path = folder.path().join(name);
         let mut writer = create(&path, &schema(), options(WriteMode::Create)).expect("creating the dataset");
@@ -22,7 +22,7 @@ fn previews_show_every_camera() {
         assert_eq!(progress, [1, 2, 3]);
         assert_eq!(fuzz::files(&out).len(), 4, "no other file remains");
         let png = std::io::BufReader::new(std::fs::File::open(&written[3]).expect("opening a file"));
-        let png = png::Decoder::new(png).read_info().expect("an image");
+        let png = png::Decoder::new(png).read_info().expect("reading the PNG header");
         // Each of the eight frames in a row has two lines of text above two images. The title is wider than the images.
         let frame = (22 * 4 + 1, 16 + 2 * 7);
         assert_eq!((png.info().width, png.info().height), (8 * (frame.0 + 2) + 2, 3 * (frame.1 + 2) + 2));

@@ -21,7 +21,7 @@ fn reference_schema() -> Schema {
         ColumnSpec::new("reward", DType::Float32, [1]),
         ColumnSpec::new("variation_agent_color", DType::Float32, [3]),
     ])
-    .expect("a valid schema")
+    .expect("creating the schema")
 }
 
 /// Episode `e` of `export.py`. The third episode ends with action 0.
@@ -78,7 +78,7 @@ fn reads_a_dataset_of_the_reference() {
 fn copy(from: &Path, to: &Path) {
     std::fs::create_dir_all(to).expect("creating a folder");
     for entry in std::fs::read_dir(from).expect("listing a folder") {
-        let entry = entry.expect("an entry");
+        let entry = entry.expect("reading the folder entry");
         let target = to.join(entry.file_name());
         if entry.path().is_dir() {
             copy(&entry.path(), &target);
@@ -102,7 +102,7 @@ fn append_to_reference(folder: &Path) -> PathBuf {
 
 #[test]
 fn appends_to_a_dataset_of_the_reference() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     check_reference(&append_to_reference(folder.path()), 5);
 }
 
@@ -113,7 +113,7 @@ fn reference_reads_datasets_written_here() {
         println!("SKIPPED: set SWM_REFERENCE_PYTHON to a Python with stable-worldmodel and pylance");
         return;
     };
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let ours = folder.path().join("ours.lance");
     write(&ours, WriteMode::Create, 2, 0..5);
     write(&ours, WriteMode::Append, 100, 5..8);
@@ -145,7 +145,7 @@ fn reference_reads_datasets_written_here() {
     let output = command.output().expect("running Python");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let text = String::from_utf8(output.stdout).expect("text");
-    let seen: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).expect("JSON")).collect();
+    let seen: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).expect("parsing the JSON")).collect();
 
     let lengths = |value: &Value| -> Vec<u64> {
         value["lengths"].as_array().expect("a list").iter().map(|v| v.as_u64().expect("a number")).collect()
@@ -158,7 +158,7 @@ fn reference_reads_datasets_written_here() {
         let batch = episode(e);
         for t in 0..rows(e) {
             expected.push((e as i64, t as i64));
-            let frame = batch.row(t).get::<u8>("pixels").expect("images");
+            let frame = batch.row(t).get::<u8>("pixels").expect("reading the images");
             means.push(frame.iter().map(|&v| f64::from(v)).sum::<f64>() / frame.len() as f64);
         }
     }
@@ -178,7 +178,7 @@ fn reference_reads_datasets_written_here() {
     }
     for seen in &seen[2..4] {
         for (i, mean) in elements(&seen["pixel_means"]).into_iter().enumerate() {
-            assert!((mean.expect("a mean") - means[i]).abs() < 1e-9, "lossless");
+            assert!((mean.expect("a mean") - means[i]).abs() < 1e-9, "lossless images have the same mean");
         }
     }
     assert_eq!(seen[4], seen[0], "committed shards equal the dataset of one writer");

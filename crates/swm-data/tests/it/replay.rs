@@ -10,7 +10,7 @@ fn config(num_steps: usize) -> ReplayConfig {
 }
 
 fn filled(episodes: std::ops::Range<usize>, capacity: usize) -> ReplayBuffer {
-    let buffer = ReplayBuffer::new(&schema(), capacity).expect("a buffer");
+    let buffer = ReplayBuffer::new(&schema(), capacity).expect("creating the replay buffer");
     let mut writer = buffer.writer();
     for e in episodes {
         let constants = Constants::from([("scene".to_owned(), vec![e as u8])]);
@@ -22,19 +22,19 @@ fn filled(episodes: std::ops::Range<usize>, capacity: usize) -> ReplayBuffer {
 
 /// The episode and the row of the first step of every clip.
 fn first_rows(batch: &Batch) -> Vec<(usize, usize)> {
-    let state = |row| batch.row(row).get::<f64>("state").expect("states").to_vec();
+    let state = |row| batch.row(row).get::<f64>("state").expect("reading the states").to_vec();
     (0..batch.rows()).map(|row| (state(row)[0] as usize, state(row)[1] as usize)).collect()
 }
 
 #[test]
-fn evicts_the_oldest_episodes_but_keeps_snapshots() {
+fn evicts_the_oldest_episodes_and_snapshots_stay_unchanged() {
     let buffer = filled(0..6, 30);
     // Episodes have 5, 6, 7, 8, 9 and 10 rows.
     assert_eq!((buffer.rows(), buffer.episodes(), buffer.added()), (27, 3, 6));
     let before = buffer.snapshot();
     check(&*before, 3);
     assert_eq!(before.episodes()[0].index, 3);
-    assert_eq!(before.constants(1).expect("constants")["scene"], [4]);
+    assert_eq!(before.constants(1).expect("reading constants")["scene"], [4]);
     buffer.add(&episode(6), &Constants::new()).expect("adding an episode");
     assert_eq!((buffer.rows(), buffer.episodes(), buffer.snapshot().episodes()[0].index), (30, 3, 4));
     check(&*before, 3);
@@ -44,7 +44,7 @@ fn evicts_the_oldest_episodes_but_keeps_snapshots() {
     );
     assert_eq!(buffer.writer().episodes(), 7, "a resumed collection continues after the evicted episodes");
 
-    let small = ReplayBuffer::new(&schema(), 6).expect("a buffer");
+    let small = ReplayBuffer::new(&schema(), 6).expect("creating the replay buffer");
     assert!(
         small
             .add(&episode(2), &Constants::new())
@@ -53,7 +53,7 @@ fn evicts_the_oldest_episodes_but_keeps_snapshots() {
             .contains("capacity")
     );
     let mut broken = episode(0);
-    broken.get_mut::<f32>("action").expect("actions").fill(0.5);
+    broken.get_mut::<f32>("action").expect("accessing the actions").fill(0.5);
     assert!(small.add(&broken, &Constants::new()).expect_err("an action in the last row").to_string().contains("NaN"));
     assert!(ReplayBuffer::new(&schema(), 0).is_err());
 }
@@ -61,7 +61,7 @@ fn evicts_the_oldest_episodes_but_keeps_snapshots() {
 #[test]
 fn samples_windows_uniformly_and_reproducibly() {
     let buffer = filled(0..6, 100);
-    let loader = buffer.loader(ReplayConfig { batch_size: 9000, ..config(3) }).expect("a loader");
+    let loader = buffer.loader(ReplayConfig { batch_size: 9000, ..config(3) }).expect("creating the loader");
     let batch = loader.sample(Key::new(1)).expect("sampling a batch");
     assert_eq!(first_rows(&batch), first_rows(&loader.sample(Key::new(1)).expect("sampling a batch")));
     let mut count = vec![[0_i32; 10]; 6];
@@ -74,14 +74,14 @@ fn samples_windows_uniformly_and_reproducibly() {
     assert_eq!(counts.clone().count(), 33);
     assert!(counts.clone().all(|n| n.abs_diff(273) < 82), "{count:?}");
     // The latest twelve rows belong to the last two episodes.
-    let recent = buffer.loader(ReplayConfig { recent: Some(12), ..config(1) }).expect("a loader");
+    let recent = buffer.loader(ReplayConfig { recent: Some(12), ..config(1) }).expect("creating the loader");
     assert!(first_rows(&recent.sample(Key::new(2)).expect("sampling a batch")).iter().all(|&(e, _)| e >= 4));
     let goal =
         GoalSpec { name: "goal".into(), columns: vec!["state".into()], anchor: None, mixture: GoalMixture::LAST };
-    let goals = buffer.loader(ReplayConfig { goals: vec![goal], ..config(1) }).expect("a loader");
+    let goals = buffer.loader(ReplayConfig { goals: vec![goal], ..config(1) }).expect("creating the loader");
     let batch = goals.sample(Key::new(0)).expect("sampling a batch");
     for (row, (e, _)) in first_rows(&batch).into_iter().enumerate() {
-        let goal = batch.row(row).get::<f64>("goal_state").expect("goals");
+        let goal = batch.row(row).get::<f64>("goal_state").expect("reading the goals");
         assert_eq!((goal[0] as usize, goal[1] as usize + 1), (e, rows(e)));
     }
 }
@@ -89,7 +89,7 @@ fn samples_windows_uniformly_and_reproducibly() {
 #[test]
 fn samples_while_the_buffer_grows() {
     let buffer = filled(0..2, 200);
-    let loader = buffer.loader(ReplayConfig { threads: 2, ..config(2) }).expect("a loader");
+    let loader = buffer.loader(ReplayConfig { threads: 2, ..config(2) }).expect("creating the loader");
     let writer = buffer.clone();
     let writing = std::thread::spawn(move || {
         for e in 2..300 {
@@ -98,13 +98,13 @@ fn samples_while_the_buffer_grows() {
     });
     let mut latest = 0;
     for batch in loader.batches(0) {
-        let batch = batch.expect("a batch");
+        let batch = batch.expect("reading the batch");
         let first_steps = first_rows(&batch);
         // Every window is complete, even if episodes are evicted in the meantime.
         for (row, &(e, start)) in first_steps.iter().enumerate() {
-            let state = batch.row(row).get::<f64>("state").expect("states");
+            let state = batch.row(row).get::<f64>("state").expect("reading the states");
             assert_eq!([state[3], state[4]], [e as f64, start as f64 + 1.0]);
-            let pixel = batch.row(row).get::<u8>("pixels").expect("images")[0];
+            let pixel = batch.row(row).get::<u8>("pixels").expect("reading the images")[0];
             assert_eq!(usize::from(pixel), (3 * start + 20 * e) % 256);
         }
         let oldest = first_steps.iter().map(|first| first.0).min().unwrap_or(0);
@@ -116,19 +116,22 @@ fn samples_while_the_buffer_grows() {
     assert!(latest > 250, "the loader samples added episodes");
     writing.join().expect("joining the writer");
     // Without a window, sampling fails and the stream ends.
-    let empty = ReplayBuffer::new(&schema(), 10).expect("a buffer").loader(config(1)).expect("a loader");
+    let empty = ReplayBuffer::new(&schema(), 10)
+        .expect("creating the replay buffer")
+        .loader(config(1))
+        .expect("creating the loader");
     let mut batches = empty.batches(0);
     assert!(batches.next().is_some_and(|batch| batch.is_err()) && batches.next().is_none());
 }
 
 #[test]
-fn saves_and_restores() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn restored_buffer_equals_the_saved_buffer() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("buffer.lance");
     let buffer = filled(0..6, 30);
     let state = |buffer: &ReplayBuffer| (buffer.rows(), buffer.episodes(), buffer.added());
     // The same episodes, without constants.
-    let plain = ReplayBuffer::new(&schema(), 30).expect("a buffer");
+    let plain = ReplayBuffer::new(&schema(), 30).expect("creating the replay buffer");
     (0..6).for_each(|e| plain.add(&episode(e), &Constants::new()).expect("adding an episode"));
     assert_eq!(state(&plain), state(&buffer));
     let options = WriteOptions { mode: WriteMode::Create, ..WriteOptions::default() };
@@ -138,10 +141,11 @@ fn saves_and_restores() {
     assert_eq!(state(&restored), state(&plain));
     assert_eq!(restored.snapshot().episodes(), plain.snapshot().episodes());
     let drawn = |buffer: &ReplayBuffer| {
-        let batch = buffer.loader(config(2)).expect("a loader").sample(Key::new(5)).expect("sampling a batch");
+        let batch =
+            buffer.loader(config(2)).expect("creating the loader").sample(Key::new(5)).expect("sampling a batch");
         (batch.bytes(0).to_vec(), batch.bytes(1).to_vec(), batch.bytes(2).to_vec())
     };
     assert!(drawn(&restored) == drawn(&plain), "the restored buffer draws the same samples");
     let smaller = ReplayBuffer::restore(&*reader, 20).expect("restoring the buffer");
-    assert_eq!(state(&smaller), (19, 2, 6), "the latest episodes that fit");
+    assert_eq!(state(&smaller), (19, 2, 6), "the smaller buffer holds the latest episodes");
 }

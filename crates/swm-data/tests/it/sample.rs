@@ -18,7 +18,7 @@ pub fn schema() -> Schema {
         ColumnSpec::new("variation.agent.color", DType::Int64, [3]),
         ColumnSpec::image("goal", 16, 24),
     ])
-    .expect("a valid schema")
+    .expect("creating the schema")
 }
 
 /// Number of rows of episode `e`.

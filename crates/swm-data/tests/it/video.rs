@@ -26,7 +26,7 @@ fn writer_killed_50_times_keeps_committed_episodes() {
 }
 
 fn damaged(cases: u64) {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.video");
     format_suite::write(&path, WriteMode::Create, 0..3);
     let report = fuzz::dataset("video", &path, cases, fuzz::read_everything);
@@ -66,10 +66,11 @@ fn reads_or_rejects_third_party_videos_damaged_in_10000_ways() {
 
 #[test]
 fn reports_videos_with_wrong_frame_counts() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.video");
     format_suite::write(&path, WriteMode::Create, 0..4);
-    let found = |path: &Path| open(path).expect("opening the dataset").irregularities().expect("irregularities");
+    let found =
+        |path: &Path| open(path).expect("opening the dataset").irregularities().expect("finding the irregularities");
     assert_eq!(found(&path), []);
     std::fs::copy(path.join("pixels/ep_3.mp4"), path.join("pixels/ep_1.mp4")).expect("copying a file");
     std::fs::remove_file(path.join("goal/ep_2.mp4")).expect("removing a file");
@@ -95,9 +96,9 @@ pub const THIRD_PARTY_LENGTHS: [usize; 3] = [11, 14, 9];
 /// holds these frames one below the other.
 pub fn check_frames(reader: &dyn Reader, column: &str, png: &str, tolerance: u8) {
     let file = std::io::BufReader::new(std::fs::File::open(interop().join(png)).expect("opening a file"));
-    let mut decoder = png::Decoder::new(file).read_info().expect("a PNG");
+    let mut decoder = png::Decoder::new(file).read_info().expect("reading the PNG header");
     let mut expected = vec![0; decoder.output_buffer_size().expect("a size")];
-    decoder.next_frame(&mut expected).expect("an image");
+    decoder.next_frame(&mut expected).expect("reading the PNG image");
     let ranges: Vec<StepRange> = THIRD_PARTY_LENGTHS
         .iter()
         .enumerate()
@@ -125,21 +126,21 @@ fn reads_videos_of_the_reference() {
     for (e, &length) in THIRD_PARTY_LENGTHS.iter().enumerate() {
         let read = reader.read(&["state", "action", "success"], &[StepRange::new(e, 0, length)]).expect("reading rows");
         for t in 0..length {
-            assert_eq!(read.row(t).get::<f64>("state").expect("values"), [e as f64, t as f64, -0.5]);
-            let action = read.row(t).get::<f32>("action").expect("values").to_vec();
+            assert_eq!(read.row(t).get::<f64>("state").expect("reading the values"), [e as f64, t as f64, -0.5]);
+            let action = read.row(t).get::<f32>("action").expect("reading the values").to_vec();
             assert!(if t + 1 == length { action[0].is_nan() } else { action == [e as f32, t as f32 / 4.0] });
-            assert_eq!(read.row(t).get::<u8>("success").expect("a flag"), [u8::from(t % 3 == 0)]);
+            assert_eq!(read.row(t).get::<u8>("success").expect("reading the flag"), [u8::from(t % 3 == 0)]);
         }
     }
 }
 
 #[test]
 fn appends_to_a_dataset_of_the_reference() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("reference-video");
     fuzz::copy_all(&interop().join("reference-video"), &path);
     let theirs = open(&path).expect("opening the dataset");
-    let schema = swm_core::Schema::new(theirs.schema().columns()[2..].to_vec()).expect("a valid schema");
+    let schema = swm_core::Schema::new(theirs.schema().columns()[2..].to_vec()).expect("creating the schema");
     let names: Vec<&str> = schema.columns().iter().map(|column| &*column.name).collect();
     let episode = theirs.read(&names, &[StepRange::new(1, 0, THIRD_PARTY_LENGTHS[1])]).expect("reading rows");
     let options = WriteOptions { mode: WriteMode::Append, codec: ImageCodec::Png, ..WriteOptions::default() };
@@ -159,9 +160,9 @@ fn reference_reads_videos_written_here() {
         println!("SKIPPED: set SWM_VIDEO_PYTHON to a Python with stable-worldmodel and decord");
         return;
     };
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let theirs = open(interop().join("reference-video")).expect("opening the dataset");
-    let schema = swm_core::Schema::new(theirs.schema().columns()[2..].to_vec()).expect("a valid schema");
+    let schema = swm_core::Schema::new(theirs.schema().columns()[2..].to_vec()).expect("creating the schema");
     let names: Vec<&str> = schema.columns().iter().map(|column| &*column.name).collect();
     for (name, codec, tolerance) in
         [("lossless.video", ImageCodec::Png, 0.0), ("lossy.video", ImageCodec::Jpeg { quality: 95 }, 3.0)]
@@ -178,9 +179,9 @@ fn reference_reads_videos_written_here() {
         let output = Command::new(&python).arg("-B").arg(interop().join("video_check.py")).arg(&path).output();
         let output = output.expect("running Python");
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-        let seen: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+        let seen: serde_json::Value = serde_json::from_slice(&output.stdout).expect("parsing the JSON");
         for (e, episode) in episodes.iter().enumerate() {
-            let bytes = episode.bytes(episode.schema().index("pixels").expect("a column"));
+            let bytes = episode.bytes(episode.schema().index("pixels").expect("finding the column"));
             let here = ours.read(&["pixels"], &[StepRange::new(e, 0, episode.rows())]).expect("reading rows");
             let there: Vec<u8> = seen[e]["pixels"]
                 .as_array()

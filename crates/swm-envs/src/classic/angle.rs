@@ -51,7 +51,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn observed_angles_are_restored_to_the_same_observation() {
+    fn angles_restored_from_cosine_and_sine_give_the_same_observation() {
         for i in -20_000..=20_000 {
             let angle = f64::from(i) / 20_000.0 * PI;
             let observed = |angle: f64| [angle.cos() as f32, angle.sin() as f32];

@@ -77,7 +77,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn values_are_updated_once_and_the_oldest_size_is_dropped() {
+    fn values_are_updated_once_after_invalidation_and_the_oldest_size_is_dropped() {
         let mut cache = BySize::<u32>::default();
         let get = |cache: &mut BySize<u32>, width| {
             let slot = cache.slot(width, 1, || 0, |value| *value += 1);

@@ -379,7 +379,7 @@ mod tests {
     }
 
     #[test]
-    fn polygons_cover_the_pixels_of_pygame() {
+    fn filled_polygon_equals_that_of_pygame() {
         // pygame.draw.polygon(surface, 1, [(1, 1), (11, 4), (8, 14), (-2, 11)]), moved by 4 columns.
         let mut canvas = Canvas::new(18);
         canvas.fill_polygon(&[Point::new(5, 1), Point::new(15, 4), Point::new(12, 14), Point::new(2, 11)], 1);

@@ -61,7 +61,7 @@ mod tests {
     use crate::draw::Point;
 
     #[test]
-    fn images_equal_those_of_opencv() {
+    fn resampled_images_equal_those_of_opencv() {
         let mut canvas = Canvas::new(8);
         canvas.fill_polygon(&[Point::new(0, 0), Point::new(3, 0), Point::new(3, 5), Point::new(0, 5)], 1);
         let palette = Palette::new(&[[0, 0, 0], [200, 100, 50]]);

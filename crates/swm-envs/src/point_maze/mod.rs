@@ -199,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn resets_and_sampled_goals_never_fail() {
+    fn resets_and_goal_sampling_succeed_for_10000_seeds() {
         let mut env = PointAgentEnv::<PointMaze>::new();
         for seed in 0..10_000 {
             env.reset(seed, &vary(&["all"])).expect("resetting the environment");
@@ -225,7 +225,7 @@ mod tests {
     #[test]
     fn goal_distance_decreases_along_the_expert_path() {
         let mut env = PointAgentEnv::<PointMaze>::new();
-        let mut row = Batch::zeros(&Schema::new(env.spec.columns.clone()).expect("building the schema"), 1);
+        let mut row = Batch::zeros(&Schema::new(env.spec.columns.clone()).expect("creating the schema"), 1);
         let mut detours = 0;
         for seed in 0..200 {
             env.reset(seed, &vary(&["all"])).expect("resetting the environment");
@@ -238,7 +238,7 @@ mod tests {
             while !env.is_success() {
                 env.observe(&mut row.row_mut(0));
                 let mut action = [0.0; 2];
-                expert.act(row.row(0), &mut action).expect("the expert's action");
+                expert.act(row.row(0), &mut action).expect("choosing the expert's action");
                 let before = env.agent;
                 env.step(Action::Continuous(&action.map(|v| v as f32))).expect("stepping the environment");
                 let walked = f64::from(distance(before, env.agent));

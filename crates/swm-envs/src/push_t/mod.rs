@@ -299,7 +299,7 @@ mod tests {
     #[test]
     fn expert_reaches_most_goals() {
         let mut env = PushT::new();
-        let schema = swm_core::Schema::new(env.spec.columns.clone()).expect("building the schema");
+        let schema = swm_core::Schema::new(env.spec.columns.clone()).expect("creating the schema");
         let mut row = swm_core::Batch::zeros(&schema, 1);
         let mut reaches = |seed: u64, options: &ResetOptions| {
             let mut expert = (EXPERTS[0].make)();
@@ -308,7 +308,7 @@ mod tests {
             (0..env.spec.max_episode_steps).any(|_| {
                 env.observe(&mut row.row_mut(0));
                 let mut action = [0.0; 2];
-                expert.act(row.row(0), &mut action).expect("the expert's action");
+                expert.act(row.row(0), &mut action).expect("choosing the expert's action");
                 env.step(Action::Continuous(&action.map(|v| v as f32))).expect("stepping the environment").terminated
             })
         };

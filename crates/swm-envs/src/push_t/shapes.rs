@@ -133,7 +133,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn long_t_has_the_moment_and_centre_of_the_reference() {
+    fn long_t_has_the_inertia_and_centre_of_mass_of_the_reference() {
         let long_t = BodyShape::new(2, 30.0);
         assert_eq!(long_t.cog, Vec2::new(0.0, 45.0));
         // Two moments of a 120 x 30 bar about the middle of its long side.

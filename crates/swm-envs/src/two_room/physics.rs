@@ -114,10 +114,18 @@ mod tests {
         for (across, flip) in [(0, false), (1, true)] {
             let at = |x: f32, y: f32| if flip { [y, x] } else { [x, y] };
             let layout = layout(across);
-            assert_eq!(layout.advance(at(98.0, 150.0), at(1.0, 0.0)), at(99.5, 150.0), "pushed back from the left");
-            assert_eq!(layout.advance(at(126.0, 150.0), at(-1.0, 0.0)), at(124.5, 150.0), "pushed back from the right");
-            assert_eq!(layout.advance(at(98.0, 49.0), at(1.0, 0.0)), at(103.0, 49.0), "through the door");
-            assert_eq!(layout.advance(at(22.0, 150.0), at(-1.0, 0.0)), at(21.0, 150.0), "held by the border");
+            assert_eq!(
+                layout.advance(at(98.0, 150.0), at(1.0, 0.0)),
+                at(99.5, 150.0),
+                "the wall stops the agent from the left"
+            );
+            assert_eq!(
+                layout.advance(at(126.0, 150.0), at(-1.0, 0.0)),
+                at(124.5, 150.0),
+                "the wall stops the agent from the right"
+            );
+            assert_eq!(layout.advance(at(98.0, 49.0), at(1.0, 0.0)), at(103.0, 49.0), "the agent passes the door");
+            assert_eq!(layout.advance(at(22.0, 150.0), at(-1.0, 0.0)), at(21.0, 150.0), "the border stops the agent");
         }
     }
 

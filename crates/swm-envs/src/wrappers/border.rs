@@ -15,7 +15,7 @@ pub fn mirror(i: isize, n: usize) -> usize {
 #[cfg(test)]
 mod tests {
     #[test]
-    fn lines_are_mirrored_at_any_distance() {
+    fn mirrored_indices_stay_inside_at_any_distance() {
         let mirrored = |n| (-5..6).map(|i| super::mirror(i, n)).collect::<Vec<_>>();
         assert_eq!(mirrored(3), [1, 0, 1, 2, 1, 0, 1, 2, 1, 0, 1]);
         assert_eq!(mirrored(1), [0; 11]);

@@ -47,7 +47,7 @@ mod tests {
     use super::quantile;
 
     #[test]
-    fn quantiles_equal_tabulated_values() {
+    fn normal_quantiles_equal_tabulated_values() {
         let known = [(0.5, 0.0), (0.975, 1.959963984540054), (0.1, -1.2815515655446004), (0.001, -3.090232306167813)];
         for (p, z) in known {
             assert!((quantile(p) - z).abs() < 1e-8, "quantile({p}) = {}, not {z}", quantile(p));

@@ -56,7 +56,7 @@ fn tolerance(id: &str) -> (f64, u8) {
 
 #[test]
 #[allow(clippy::too_many_lines, reason = "one match over the wrappers of the golden file")]
-fn wrappers_equal_the_reference() {
+fn wrapped_frames_equal_those_of_the_reference() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/golden/wrappers.npz");
     let mut golden = Golden(NpzArchive::open(path).expect("opening the golden file"));
     let original = golden.image("frame");

@@ -171,7 +171,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn reads_all_complete_images_of_a_stream() {
+    fn reads_all_complete_ppm_images_of_a_stream() {
         let frames = read_ppm(b"P6\n1 2\n255\nabcdefP6\n2 1\n255\nABCDEFP6\n9 9\n255\ncut off");
         let found: Vec<_> = frames.iter().map(|f| (f.width, f.height, &f.rgb[..])).collect();
         assert_eq!(found, [(1, 2, &b"abcdef"[..]), (2, 1, b"ABCDEF")]);
@@ -191,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_are_resized_once_per_size_and_repeat() {
+    fn background_frames_are_resized_once_per_size_and_repeat() {
         let frame = |v| RgbImage { width: 2, height: 1, rgb: vec![v; 6] };
         let media = Media::new(vec![frame(1), frame(2)]);
         let sized = media.sized([3, 3]);

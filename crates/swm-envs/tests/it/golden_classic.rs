@@ -17,7 +17,7 @@ fn follow(id: &str, size: (usize, usize)) {
         let mut golden = Golden::open(&file);
         let name = file.display();
         let mut env = swm_envs::ENVS.get(id).expect("finding the environment").env().expect("creating the environment");
-        let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("building the schema"), 1);
+        let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("creating the schema"), 1);
         let states = golden.read::<f64>("info.state");
         // Some files contain the start state in double precision.
         let exact = golden.has("start");

@@ -28,7 +28,7 @@ fn follow(entry: &EnvEntry, files: usize, columns: &[(&str, &str)], options: fn(
         env.reset(0, &options).expect("resetting to the recorded start");
         let first = frame_difference(&mut *env, &mut golden, "frame_first");
 
-        let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("building the schema"), 1);
+        let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("creating the schema"), 1);
         let mut compare = |env: &dyn Env, t: usize| {
             env.observe(&mut row.row_mut(0));
             for ((column, _), expected) in columns.iter().zip(&expected) {

@@ -14,7 +14,7 @@ impl Probe {
     fn new(entry: &EnvEntry, options: &ResetOptions) -> Self {
         let mut env = entry.env().expect("creating the environment");
         env.reset(0, options).expect("resetting to the recorded start");
-        let schema = Schema::new(env.spec().columns.clone()).expect("building the schema");
+        let schema = Schema::new(env.spec().columns.clone()).expect("creating the schema");
         Self { env, row: Batch::zeros(&schema, 1) }
     }
 

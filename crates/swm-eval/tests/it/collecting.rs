@@ -11,7 +11,7 @@ use swm_eval::{CollectConfig, Collected, World, WorldConfig};
 
 fn world(envs: usize, threads: usize) -> World {
     let config = WorldConfig { envs, image: Some((2, 3)), views: vec![], max_episode_steps: None, threads };
-    World::new(&ENTRY, config).expect("a valid world")
+    World::new(&ENTRY, config).expect("creating the world")
 }
 
 fn config(episodes: usize) -> CollectConfig {
@@ -31,7 +31,7 @@ fn collect(envs: usize, threads: usize, episodes: usize, memory: &Memory) -> Res
 }
 
 #[test]
-fn datasets_do_not_depend_on_environments_or_threads() {
+fn datasets_do_not_depend_on_environment_and_thread_counts() {
     let single = Memory::default();
     let collected = collect(1, 1, 23, &single).expect("the collection succeeds");
     assert_eq!((collected.episodes, collected.added), (23, 23));
@@ -47,21 +47,24 @@ fn datasets_do_not_depend_on_environments_or_threads() {
 }
 
 #[test]
-fn row_holds_an_observation_and_the_following_step() {
+fn row_holds_an_observation_and_the_transition_after_it() {
     let memory = Memory::default();
     let mut world = world(3, 1);
-    let schema = world.collect_schema(false).expect("a valid schema");
-    assert_eq!(world.collect_schema(true).expect("a valid schema").columns().len(), schema.columns().len() + 1);
+    let schema = world.collect_schema(false).expect("creating the schema of collected episodes");
+    assert_eq!(
+        world.collect_schema(true).expect("creating the schema of collected episodes").columns().len(),
+        schema.columns().len() + 1
+    );
     world.collect(&mut Walker, memory.writer(), &config(6), &mut Control::default()).expect("the collection succeeds");
     for (number, episode) in memory.episodes.lock().expect("no thread has panicked").iter().enumerate() {
         assert_eq!(*episode.schema(), schema);
         let last = episode.rows() - 1;
-        let state = episode.get::<f64>("state").expect("the column of states");
-        let goal = episode.get::<f64>("goal_state").expect("the column of goals")[0];
-        let action = episode.get::<f32>("action").expect("the column of actions");
-        let reward = episode.get::<f32>("reward").expect("the column of rewards");
-        let terminated = episode.get::<u8>("terminated").expect("the column of terminations");
-        let success = episode.get::<u8>("success").expect("the column of successes");
+        let state = episode.get::<f64>("state").expect("reading the column of states");
+        let goal = episode.get::<f64>("goal_state").expect("reading the column of goals")[0];
+        let action = episode.get::<f32>("action").expect("reading the column of actions");
+        let reward = episode.get::<f32>("reward").expect("reading the column of rewards");
+        let terminated = episode.get::<u8>("terminated").expect("reading the column of terminations");
+        let success = episode.get::<u8>("success").expect("reading the column of successes");
         for t in 0..last {
             assert!((state[t] + f64::from(action[t]) - state[t + 1]).abs() < 1e-6, "the action leads to the next row");
             assert_eq!(reward[t], -(state[t + 1] - goal).abs() as f32, "the reward belongs to the step");
@@ -71,7 +74,7 @@ fn row_holds_an_observation_and_the_following_step() {
         assert!(action[last].is_nan());
         assert_eq!((reward[last], terminated[last]), (0.0, 0));
         let seed = Key::new(11).with("episode").at(number as u64).seed() >> 1;
-        for elements in episode.get::<i32>("episode_seed").expect("the column of seeds").chunks_exact(3) {
+        for elements in episode.get::<i32>("episode_seed").expect("reading the column of seeds").chunks_exact(3) {
             let joined = elements.iter().rev().fold(0u64, |high, &element| high << 21 | element as u64);
             assert_eq!(joined, seed);
             assert!(
@@ -79,10 +82,10 @@ fn row_holds_an_observation_and_the_following_step() {
                 "float32 represents the element exactly"
             );
         }
-        let start = episode.get::<f32>("variation.agent.x").expect("the column of the factor");
+        let start = episode.get::<f32>("variation.agent.x").expect("reading the column of the factor");
         assert!(start.iter().all(|&x| f64::from(x) == state[0]), "constant, and equal to the initial position");
-        let color = episode.get::<u8>("variation.agent.color").expect("the column of the factor");
-        assert_eq!(color[..2], episode.get::<u8>("pixels").expect("the column of frames")[..2]);
+        let color = episode.get::<u8>("variation.agent.color").expect("reading the column of the factor");
+        assert_eq!(color[..2], episode.get::<u8>("pixels").expect("reading the column of frames")[..2]);
     }
     let column = |name: &str| schema.column(name).expect("the column exists").clone();
     assert_eq!(column("variation.goal.x").dtype, DType::Float64);
@@ -143,7 +146,7 @@ impl Policy for Failing {
 }
 
 #[test]
-fn failures_keep_finished_episodes() {
+fn failing_policies_and_writers_keep_finished_episodes() {
     let memory = Memory::default();
     let mut failing = Failing { walker: Walker, remaining: 20 };
     let error = world(3, 1).collect(&mut failing, memory.writer(), &config(50), &mut Control::default());
@@ -159,7 +162,7 @@ fn failures_keep_finished_episodes() {
 
 #[test]
 fn errors_name_invalid_requests() {
-    let made = |config| World::new(&ENTRY, config).err().expect("invalid input").to_string();
+    let made = |config| World::new(&ENTRY, config).err().expect("the input is invalid").to_string();
     assert!(made(WorldConfig { envs: 0, ..WorldConfig::default() }).contains("at least 1"));
     assert!(made(WorldConfig { image: Some((0, 3)), ..WorldConfig::default() }).contains("0 x 3"));
     let unknown = VariationRequest { variation: Some(vec!["agent.colour".to_owned()]), ..Default::default() };
@@ -178,8 +181,9 @@ fn manifest_contains_settings_but_no_run_options() {
     assert_eq!(manifest.config["image"], serde_json::json!([2, 3]));
     let other = |config: CollectConfig| check_continues(&manifest, &world(1, 1).collect_manifest(&config));
     other(config(500)).expect("a larger number of episodes is compatible");
-    let seed = other(CollectConfig { seed: 12, ..config(9) }).expect_err("another seed").to_string();
+    let seed = other(CollectConfig { seed: 12, ..config(9) }).expect_err("resuming with another seed").to_string();
     assert!(seed.contains("seed 12") && seed.contains("11"), "{seed}");
-    let policy = other(CollectConfig { policy: "expert".to_owned(), ..config(9) }).expect_err("another policy");
+    let policy =
+        other(CollectConfig { policy: "expert".to_owned(), ..config(9) }).expect_err("resuming with another policy");
     assert!(policy.to_string().contains("\"expert\""), "{policy}");
 }

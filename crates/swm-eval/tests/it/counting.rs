@@ -21,9 +21,9 @@ impl Policy for MoveRight {
 }
 
 #[test]
-fn hold_rejects_episodes_that_pass_the_goal() {
+fn hold_rejects_episodes_that_move_past_the_goal() {
     // From -2 to 2 in steps of 1: at the goal after 4 steps, beyond it after 5.
-    let starts = Starts::episodic(2, 0, pinned(&[("agent.x", -2.0), ("goal.x", 2.0)])).expect("valid starts");
+    let starts = Starts::episodic(2, 0, pinned(&[("agent.x", -2.0), ("goal.x", 2.0)])).expect("creating the starts");
     let play = |policy: &mut dyn Policy, hold| {
         let found = run_counted(&mut world(2, 1), policy, &starts, Counting::Strict { hold });
         let first = &found.episodes[0];
@@ -32,16 +32,17 @@ fn hold_rejects_episodes_that_pass_the_goal() {
     assert_eq!(play(&mut Walker, 1), (2, 4, Some(4)));
     assert_eq!(play(&mut Walker, 3), (2, 6, Some(4)), "held from the fourth step on");
     assert_eq!(play(&mut MoveRight, 1), (2, 4, Some(4)));
-    assert_eq!(play(&mut MoveRight, 2), (0, 12, None), "plays until the budget ends");
+    assert_eq!(play(&mut MoveRight, 2), (0, 12, None), "the episode lasts until the budget ends");
 }
 
 #[test]
 fn hold_beyond_the_budget_is_an_error() {
-    let starts = Starts::episodic(1, 0, VariationRequest::default()).expect("valid starts");
+    let starts = Starts::episodic(1, 0, VariationRequest::default()).expect("creating the starts");
     for hold in [0, 13] {
         let config = EvalConfig { counting: Counting::Strict { hold }, ..EvalConfig::default() };
-        let error =
-            world(1, 1).evaluate(&mut Walker, &starts, &config, &mut Control::default()).expect_err("invalid input");
+        let error = world(1, 1)
+            .evaluate(&mut Walker, &starts, &config, &mut Control::default())
+            .expect_err("the input is invalid");
         assert!(error.to_string().contains(&format!("{hold} in a budget of 12")), "{error}");
     }
 }
@@ -53,7 +54,7 @@ fn compat_counting_plays_solved_starts_and_reports_the_strict_rate() {
     let picks = Starts::choose(&reader, 40, 1, 3).expect("the dataset has enough starts");
     let starts =
         Starts::from_dataset(&reader, world(1, 1).pool().env(0), picks, 1, 3, VariationRequest::default(), &[])
-            .expect("valid starts");
+            .expect("creating the starts");
     let mut random = RandomPolicy::new(&spec, 5);
     let strict = run_counted(&mut world(5, 1), &mut random, &starts, Counting::Strict { hold: 1 });
     let compat = run_counted(&mut world(5, 2), &mut random, &starts, Counting::Compat { envs: 40 });
@@ -75,7 +76,7 @@ fn compat_counting_plays_solved_starts_and_reports_the_strict_rate() {
 fn episodic_compat_counting_counts_the_first_finished_episodes() {
     let all = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
     let play = |envs, threads| -> Run {
-        let starts = Starts::sequential(20, 100, all.clone()).expect("valid starts");
+        let starts = Starts::sequential(20, 100, all.clone()).expect("creating the starts");
         run_counted(&mut world(envs, threads), &mut MoveRight, &starts, Counting::Compat { envs })
     };
     // The expected values were computed by `World.evaluate(episodes=20, seed=100)` of stable-worldmodel 0.1.1, for
@@ -86,10 +87,10 @@ fn episodic_compat_counting_counts_the_first_finished_episodes() {
         let expected: Vec<u64> = (100..=118).chain([last]).collect();
         assert_eq!(seeds, expected, "{envs} environments");
         assert_eq!((found.success.successes, found.success.n), (successes, 20));
-        assert_eq!(found.episodes, play(envs, 1).episodes, "independent of threads");
+        assert_eq!(found.episodes, play(envs, 1).episodes, "results do not depend on threads");
         assert_eq!(found.strict, None, "strict counting selects other episodes");
     }
-    let starts = Starts::sequential(2, 0, all).expect("valid starts");
+    let starts = Starts::sequential(2, 0, all).expect("creating the starts");
     let config = EvalConfig { counting: Counting::Compat { envs: 2 }, ..EvalConfig::default() };
     let error = world(3, 1)
         .evaluate(&mut MoveRight, &starts, &config, &mut Control::default())

@@ -11,7 +11,7 @@ use swm_plan::{ActionScale, Cem, MpcConfig, MpcPolicy};
 
 pub fn world(envs: usize, threads: usize) -> World {
     let config = WorldConfig { envs, image: Some((4, 4)), views: vec![], max_episode_steps: Some(12), threads };
-    World::new(&ENTRY, config).expect("a valid world")
+    World::new(&ENTRY, config).expect("creating the world")
 }
 
 pub fn pinned(values: &[(&str, f64)]) -> VariationRequest {
@@ -32,14 +32,14 @@ pub fn run_counted(world: &mut World, policy: &mut dyn Policy, starts: &Starts, 
 
 /// The run without its timing, as JSON.
 fn without_timing(run: &Run) -> String {
-    serde_json::to_string(&Run { timing: Default::default(), ..run.clone() }).expect("valid JSON")
+    serde_json::to_string(&Run { timing: Default::default(), ..run.clone() }).expect("serialising to JSON")
 }
 
 #[test]
 fn solved_starts_are_counted_separately() {
     // Some episodes are solved at the start: the goal is at 2, the start anywhere in -4 ..= 4.
     let variation = VariationRequest { variation: Some(vec!["agent.x".to_owned()]), ..pinned(&[("goal.x", 2.0)]) };
-    let starts = Starts::episodic(200, 3, variation).expect("valid starts");
+    let starts = Starts::episodic(200, 3, variation).expect("creating the starts");
     let found = run(&mut world(16, 2), &mut Walker, &starts, None);
     assert!(found.solved_at_start > 0, "some starts are solved");
     assert_eq!(found.success.n + found.solved_at_start, 200);
@@ -53,8 +53,8 @@ fn solved_starts_are_counted_separately() {
 }
 
 #[test]
-fn budget_ends_an_episode() {
-    let starts = Starts::episodic(3, 0, pinned(&[("agent.x", -3.0), ("goal.x", 3.0)])).expect("valid starts");
+fn step_budget_ends_an_episode() {
+    let starts = Starts::episodic(3, 0, pinned(&[("agent.x", -3.0), ("goal.x", 3.0)])).expect("creating the starts");
     let steps = |budget| {
         let found = run(&mut world(2, 1), &mut Walker, &starts, budget);
         (found.success.successes, found.episodes[0].steps)
@@ -96,12 +96,12 @@ fn planner(world: &World) -> MpcPolicy {
     let config = MpcConfig { horizon: 3, receding_horizon: 2, action_block: 2, ..MpcConfig::default() };
     let (scale, slots) = (ActionScale::identity(1), world.pool().len());
     MpcPolicy::new(Box::new(cem), Box::new(PerfectModel::default()), config, scale, world.spec(), slots)
-        .expect("a valid policy")
+        .expect("creating the policy")
 }
 
 #[test]
-fn results_do_not_depend_on_environments_or_threads() {
-    let starts = Starts::episodic(20, 5, VariationRequest::default()).expect("valid starts");
+fn results_do_not_depend_on_environment_and_thread_counts() {
+    let starts = Starts::episodic(20, 5, VariationRequest::default()).expect("creating the starts");
     let mut single = world(1, 1);
     let mut policy = planner(&single);
     let planned = run(&mut single, &mut policy, &starts, None);
@@ -169,12 +169,12 @@ fn replaying_actions_reaches_the_recorded_goal() {
     assert_eq!(
         picks,
         Starts::choose(&reader, 30, 4, 8).expect("the dataset has enough starts"),
-        "determined by the seed"
+        "the seed determines the starts"
     );
     assert_ne!(picks, Starts::choose(&reader, 30, 4, 9).expect("the dataset has enough starts"));
     let starts =
         Starts::from_dataset(&reader, world(1, 1).pool().env(0), picks, 4, 8, VariationRequest::default(), &[])
-            .expect("valid starts");
+            .expect("creating the starts");
     let keys = (0..30).map(|i| (Key::new(8).with("episode").at(i as u64), i)).collect();
     let mut replay = Replay { reader: &reader, starts: &starts, keys, playing: vec![[0; 2]; 5] };
     let found = run(&mut world(5, 2), &mut replay, &starts, Some(4));
@@ -215,21 +215,21 @@ impl Policy for FirstColor {
 }
 
 #[test]
-fn recorded_factors_apply_unless_they_are_shifted() {
+fn recorded_factors_apply_unless_the_request_pins_them() {
     let reader = recorded(12);
     let picks = Starts::choose(&reader, 1, 6, 0).expect("the dataset has enough starts");
     let color = |variation: VariationRequest| {
         let starts = Starts::from_dataset(&reader, world(1, 1).pool().env(0), picks.clone(), 6, 0, variation, &[])
-            .expect("valid starts");
+            .expect("creating the starts");
         let mut policy = FirstColor::default();
         run(&mut world(1, 1), &mut policy, &starts, None);
         policy.color
     };
     let range = swm_data::StepRange { episode: picks[0][0], start: 0, length: 1 };
-    let row = reader.read(&["variation.agent.color"], &[range]).expect("a row");
+    let row = reader.read(&["variation.agent.color"], &[range]).expect("reading the row");
     assert_eq!(
         color(VariationRequest::default()),
-        row.get::<u8>("variation.agent.color").expect("the column of colours")[..2]
+        row.get::<u8>("variation.agent.color").expect("reading the column of colours")[..2]
     );
     let green = VariationRequest {
         variation: None,
@@ -243,7 +243,7 @@ fn errors_name_invalid_requests() {
     let reader = recorded(3);
     let starts = |picks, offset, variation| {
         Starts::from_dataset(&reader, world(1, 1).pool().env(0), picks, offset, 0, variation, &[])
-            .expect_err("invalid input")
+            .expect_err("the input is invalid")
             .to_string()
     };
     assert!(starts(vec![], 1, VariationRequest::default()).contains("at least 1"));
@@ -255,8 +255,8 @@ fn errors_name_invalid_requests() {
     let no_frames = WorldConfig { envs: 1, image: None, views: vec![], max_episode_steps: None, threads: 1 };
     let videos = Videos { root: "nowhere".into(), prefix: "v".to_owned(), count: 1, fps: 10 };
     let config = EvalConfig { videos: Some(videos), ..EvalConfig::default() };
-    let starts = Starts::episodic(1, 0, VariationRequest::default()).expect("valid starts");
-    let mut world = World::new(&ENTRY, no_frames).expect("a valid world");
+    let starts = Starts::episodic(1, 0, VariationRequest::default()).expect("creating the starts");
+    let mut world = World::new(&ENTRY, no_frames).expect("creating the world");
     let error =
         world.evaluate(&mut Walker, &starts, &config, &mut Control::default()).expect_err("a world without frames");
     assert!(matches!(error, Error::Config { .. }), "{error}");
@@ -264,10 +264,10 @@ fn errors_name_invalid_requests() {
 
 #[test]
 fn videos_of_the_first_episodes_are_written() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let videos = Videos { root: folder.path().to_owned(), prefix: "videos/walker".to_owned(), count: 2, fps: 10 };
     let config = EvalConfig { videos: Some(videos), ..EvalConfig::default() };
-    let starts = Starts::episodic(4, 2, VariationRequest::default()).expect("valid starts");
+    let starts = Starts::episodic(4, 2, VariationRequest::default()).expect("creating the starts");
     let found =
         world(3, 1).evaluate(&mut Walker, &starts, &config, &mut Control::default()).expect("the evaluation succeeds");
     assert_eq!(found.videos, ["videos/walker-0.mp4", "videos/walker-1.mp4"]);

@@ -10,7 +10,7 @@ use swm_eval::{CollectConfig, Collected, EvalConfig, Starts, World, WorldConfig}
 
 fn world(envs: usize, threads: usize) -> World {
     World::new(&ENTRY, WorldConfig { envs, image: Some((28, 28)), views: vec![], max_episode_steps: Some(60), threads })
-        .expect("a valid world")
+        .expect("creating the world")
 }
 
 fn expert(world: &World) -> ExpertPolicy {
@@ -25,38 +25,41 @@ fn collect(path: &Path, mode: WriteMode, envs: usize, episodes: usize) -> Collec
         CollectConfig { episodes, seed: 4, variation, policy: "expert".to_owned(), ..CollectConfig::default() };
     let manifest = Some(world.collect_manifest(&config));
     let options = WriteOptions { mode, manifest, ..WriteOptions::default() };
-    let schema = world.collect_schema(config.goal).expect("a valid schema");
-    let writer = swm_data::create(path, &schema, options).expect("a valid dataset");
+    let schema = world.collect_schema(config.goal).expect("creating the schema of collected episodes");
+    let writer = swm_data::create(path, &schema, options).expect("creating the dataset");
     let mut policy = expert(&world);
     world.collect(&mut policy, writer, &config, &mut Control::default()).expect("the collection succeeds")
 }
 
 #[test]
 fn resumed_dataset_has_the_same_content() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let [complete, parts] = ["whole.lance", "parts.lance"].map(|name| folder.path().join(name));
     collect(&complete, WriteMode::Create, 8, 12);
     collect(&parts, WriteMode::Create, 3, 5);
     let resumed = collect(&parts, WriteMode::Append, 1, 12);
     assert_eq!((resumed.episodes, resumed.added), (12, 7));
-    let [complete, parts] = [complete, parts].map(|path| swm_data::open(&path).expect("a valid dataset"));
-    assert_eq!(complete.content_hash().expect("a content hash"), parts.content_hash().expect("a content hash"));
+    let [complete, parts] = [complete, parts].map(|path| swm_data::open(&path).expect("opening the dataset"));
+    assert_eq!(
+        complete.content_hash().expect("hashing the content"),
+        parts.content_hash().expect("hashing the content")
+    );
     assert_eq!(complete.manifest(), parts.manifest());
     assert_eq!(complete.manifest().expect("a manifest").config["env"], "swm/TwoRoom-v1");
 }
 
 #[test]
 fn expert_reaches_recorded_goals() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("rooms.lance");
     collect(&path, WriteMode::Create, 4, 10);
-    let reader = swm_data::open(&path).expect("a valid dataset");
+    let reader = swm_data::open(&path).expect("opening the dataset");
     let picks = Starts::choose(&*reader, 20, 6, 0).expect("the dataset has enough starts");
     let mut world = world(5, 2);
     let spec = world.spec().clone();
     let evaluate = |world: &mut World, random: bool, variation: VariationRequest| {
         let starts = Starts::from_dataset(&*reader, world.pool().env(0), picks.clone(), 6, 0, variation, &[])
-            .expect("valid starts");
+            .expect("creating the starts");
         let config = EvalConfig { budget: Some(30), ..EvalConfig::default() };
         let control = &mut Control::default();
         if random {
@@ -72,22 +75,26 @@ fn expert_reaches_recorded_goals() {
     let random = evaluate(&mut world, true, VariationRequest::default());
     assert!(expert.success.rate > 0.8, "{:?}", expert.success);
     assert!(expert.success.low > random.success.high, "{:?} and {:?}", expert.success, random.success);
-    assert_eq!(expert.solved_at_start, random.solved_at_start, "the same starts");
+    assert_eq!(expert.solved_at_start, random.solved_at_start, "both policies have the same starts");
     let color = VariationRequest { variation: Some(vec!["agent.color".to_owned()]), ..VariationRequest::default() };
     assert_eq!(evaluate(&mut world, false, color).success, expert.success, "the expert does not depend on colours");
 }
 
 #[test]
 fn dataset_of_another_environment_is_an_error() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("line.lance");
     let line = WorldConfig { envs: 1, image: None, views: vec![], max_episode_steps: None, threads: 1 };
-    let mut line = World::new(&crate::line::ENTRY, line).expect("a valid world");
+    let mut line = World::new(&crate::line::ENTRY, line).expect("creating the world");
     let config = CollectConfig { episodes: 1, ..CollectConfig::default() };
-    let writer = swm_data::create(&path, &line.collect_schema(false).expect("a valid schema"), WriteOptions::default());
-    let writer = writer.expect("a valid dataset");
+    let writer = swm_data::create(
+        &path,
+        &line.collect_schema(false).expect("creating the schema of collected episodes"),
+        WriteOptions::default(),
+    );
+    let writer = writer.expect("creating the dataset");
     line.collect(&mut crate::line::Walker, writer, &config, &mut Control::default()).expect("the collection succeeds");
-    let reader = swm_data::open(&path).expect("a valid dataset");
+    let reader = swm_data::open(&path).expect("opening the dataset");
     let starts =
         Starts::from_dataset(&*reader, world(1, 1).pool().env(0), vec![[0, 0]], 1, 0, VariationRequest::default(), &[]);
     let error = starts.expect_err("another environment");

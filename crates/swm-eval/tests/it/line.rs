@@ -38,7 +38,7 @@ impl Line {
             ],
             &["agent.x", "goal.x"],
         );
-        let factors = variation_space.resolve(&Default::default(), Key::new(0)).expect("the default factors are valid");
+        let factors = variation_space.resolve(&Default::default(), Key::new(0)).expect("resolving the default factors");
         let spec = EnvSpec {
             id: ENTRY.id.to_owned(),
             action_space: Space::uniform_box([1], DType::Float32, -1.0, 1.0),

@@ -36,7 +36,7 @@ impl Memory {
         let episodes = batches.iter().enumerate().map(|(i, b)| Episode { index: i as i64, length: b.rows() }).collect();
         let mut columns = vec![ColumnSpec::new("episode_idx", DType::Int64, [])];
         columns.extend(batches[0].schema().columns().iter().cloned());
-        MemoryReader { schema: Schema::new(columns).expect("a valid schema"), batches, episodes }
+        MemoryReader { schema: Schema::new(columns).expect("creating the schema"), batches, episodes }
     }
 }
 

@@ -61,7 +61,7 @@ fn recorded_positions(reader: &MemoryReader, picks: &[[usize; 2]], horizon: usiz
 }
 
 #[test]
-fn errors_equal_the_closed_form() {
+fn prediction_errors_equal_the_closed_form() {
     let reader = recorded(40);
     let picks = Starts::choose(&reader, 50, 6, 2).expect("the dataset has enough starts");
     let (_, variance) = recorded_positions(&reader, &picks, 3);
@@ -110,7 +110,7 @@ impl Predictor for Constant {
 }
 
 #[test]
-fn predicting_the_mean_has_the_error_one() {
+fn predicting_the_mean_latent_has_the_error_one() {
     let reader = recorded(40);
     let picks = Starts::choose(&reader, 33, 4, 0).expect("the dataset has enough starts");
     let (x, _) = recorded_positions(&reader, &picks, 2);
@@ -127,7 +127,7 @@ fn trajectories_are_grouped_by_recorded_success() {
         predict_recorded(&mut Drifting { drift: 0.1 }, &reader, &episodes, 40, 2, 9).expect("the prediction succeeds")
     };
     let found = predict();
-    assert_eq!(found, predict(), "determined by the seed");
+    assert_eq!(found, predict(), "the seed determines the trajectories");
     let succeeded = |episode: usize| {
         let length = reader.episodes()[episode].length;
         let rows = reader.read(&["success"], &[StepRange::new(episode, 0, length)]).expect("the dataset is readable");
@@ -137,7 +137,7 @@ fn trajectories_are_grouped_by_recorded_success() {
         assert!(trajectory.start[0] >= 10, "the trajectory is in one of the chosen episodes");
         assert_eq!(trajectory.success, Some(succeeded(trajectory.start[0])));
     }
-    assert_eq!(found.groups.len(), 3, "all, successful and failed trajectories");
+    assert_eq!(found.groups.len(), 3, "groups of all, successful and failed trajectories");
 }
 
 #[test]

@@ -10,7 +10,7 @@ use swm_eval::{CollectConfig, World, WorldConfig};
 
 fn world() -> World {
     let config = WorldConfig { envs: 3, image: Some((2, 3)), threads: 1, ..WorldConfig::default() };
-    World::new(&ENTRY, config).expect("a valid world")
+    World::new(&ENTRY, config).expect("creating the world")
 }
 
 fn config(episodes: usize) -> CollectConfig {
@@ -19,10 +19,12 @@ fn config(episodes: usize) -> CollectConfig {
 }
 
 #[test]
-fn collecting_and_reading_run_concurrently() {
+fn replay_buffer_is_read_while_episodes_are_collected() {
     let mut world = world();
     let mut policy = RandomPolicy::new(world.spec(), 3);
-    let buffer = ReplayBuffer::new(&world.collect_schema(false).expect("a valid schema"), 120).expect("a valid buffer");
+    let buffer =
+        ReplayBuffer::new(&world.collect_schema(false).expect("creating the schema of collected episodes"), 120)
+            .expect("creating the replay buffer");
     let collect_into_buffer = |world: &mut World, policy: &mut RandomPolicy, episodes| {
         world
             .collect(policy, buffer.writer(), &config(episodes), &mut Control::default())
@@ -32,14 +34,18 @@ fn collecting_and_reading_run_concurrently() {
     let columns = ["state", "action", "reward"].map(str::to_owned).to_vec();
     let clip = ClipSpec { num_steps: 2, frameskip: 1, columns };
     let loader =
-        buffer.loader(ReplayConfig { clip, batch_size: 16, ..ReplayConfig::default() }).expect("a valid loader");
+        buffer.loader(ReplayConfig { clip, batch_size: 16, ..ReplayConfig::default() }).expect("creating the loader");
     scope(|scope| {
         let reading = scope.spawn(|| {
             // Reads until new episodes have replaced the first episodes.
             loader.batches(0).take(100_000).take_while(|batch| batch.is_ok() && buffer.added() < 60).count()
         });
         let collected = collect_into_buffer(&mut world, &mut policy, 60);
-        assert_eq!((collected.episodes, collected.added), (60, 55), "continues after the first five");
+        assert_eq!(
+            (collected.episodes, collected.added),
+            (60, 55),
+            "the collection continues after the first five episodes"
+        );
         assert!(reading.join().is_ok());
     });
     // The buffer holds the last episodes of the same collection into a dataset.
@@ -57,7 +63,11 @@ fn collecting_and_reading_run_concurrently() {
         let read = snapshot.read(&["state", "reward"], &all_rows).expect("the buffer is readable");
         let recorded = &expected[episode.index as usize];
         for (i, name) in ["state", "reward"].into_iter().enumerate() {
-            assert_eq!(read.bytes(i), recorded.bytes(recorded.schema().index(name).expect("a column")), "{name}");
+            assert_eq!(
+                read.bytes(i),
+                recorded.bytes(recorded.schema().index(name).expect("finding the column")),
+                "{name}"
+            );
         }
     }
 }

@@ -97,13 +97,13 @@ fn repeat(old: &Results, resolver: &TestResolver) -> Result<swm_eval::Reproducti
 
 /// Serialises results to JSON and back.
 fn round_trip(results: &Results) -> Results {
-    serde_json::from_str(&serde_json::to_string_pretty(results).expect("valid JSON"))
+    serde_json::from_str(&serde_json::to_string_pretty(results).expect("serialising to JSON"))
         .expect("the JSON contains results")
 }
 
 fn without_timing(mut results: Results) -> String {
     results.runs.iter_mut().for_each(|run: &mut Run| run.timing = Default::default());
-    serde_json::to_string(&results).expect("valid JSON")
+    serde_json::to_string(&results).expect("serialising to JSON")
 }
 
 #[test]
@@ -117,7 +117,7 @@ fn policies_are_compared_with_the_random_floor() {
         ("goal near", "walker"),
     ];
     assert_eq!(names, expected);
-    assert_eq!(found.comparisons.len(), 2, "one for each condition");
+    assert_eq!(found.comparisons.len(), 2, "one comparison for each condition");
     for (comparison, runs) in found.comparisons.iter().zip(found.runs.chunks(2)) {
         assert_eq!((&*comparison.a, &*comparison.b), ("walker", "random"));
         assert_eq!(comparison.table.n(), runs[0].success.n);
@@ -137,7 +137,7 @@ fn policies_are_compared_with_the_random_floor() {
 }
 
 #[test]
-fn every_policy_and_condition_is_a_stage() {
+fn every_policy_and_condition_starts_and_finishes_a_stage() {
     let mut stages = vec![];
     let mut control = Control::new().with_events(|event| match event {
         Event::Started(stage) => stages.push(format!("{} {}", stage.subject.join(", "), stage.total)),
@@ -180,7 +180,7 @@ fn held_out_starts_come_from_held_out_episodes() {
         assert_eq!(found.manifest.hashes["dataset"], "memory");
         let split = Split { validation: 0.3, test: 0.3, seed: 1 };
         for episode in &found.runs[1].episodes {
-            let [position, _] = episode.start.expect("a start");
+            let [position, _] = episode.start.expect("the episode has a start");
             assert_eq!(split.part(resolver.data.episodes()[position].index), part);
         }
         hashes.push(found.manifest.hashes["starts"].clone());
@@ -206,7 +206,11 @@ fn results_can_be_reproduced() {
         let first = round_trip(&run(&request, 4, 1));
         let mut expected = request.clone();
         expected.policies.insert(0, PolicyRequest { name: "random".to_owned(), kind: PolicyKind::Random });
-        assert_eq!(EvalRequest::of(&first.manifest).expect("a valid request"), expected, "the request with the floor");
+        assert_eq!(
+            EvalRequest::of(&first.manifest).expect("reading the request"),
+            expected,
+            "the manifest has the request with the random floor"
+        );
         let second = repeat(&first, &resolver).expect("the reproduction succeeds");
         assert_eq!(second.differences, []);
         assert!(second.holds());
@@ -238,7 +242,7 @@ fn prediction_errors_are_grouped_by_the_outcome_of_the_episode() {
 }
 
 #[test]
-fn differences_are_listed() {
+fn reproduction_lists_differences() {
     let resolver = TestResolver::new();
     let mut first = round_trip(&run(&request(), 4, 1));
     first.runs[3].episodes[7].steps += 1;
@@ -265,7 +269,7 @@ fn differences_are_listed() {
 }
 
 #[test]
-fn other_weights_are_rejected_before_the_first_episode() {
+fn reproduction_with_other_weights_is_rejected_before_the_first_episode() {
     let first = run(&request(), 4, 1);
     let other = TestResolver { weights: "w1".to_owned(), ..TestResolver::new() };
     let mut stages = 0;
@@ -273,13 +277,13 @@ fn other_weights_are_rejected_before_the_first_episode() {
     let mut control = Control::new().with_events(|event| stages += usize::from(matches!(event, Event::Started(_))));
     let error = reproduce(&first, &other, &options, &mut control);
     drop(control);
-    let error = error.expect_err("other weights").to_string();
+    let error = error.expect_err("reproducing with other weights").to_string();
     assert!(error.contains("w1") && error.contains("made with w0"), "{error}");
     assert_eq!(stages, 0);
 }
 
 #[test]
-fn malformed_requests_are_errors() {
+fn results_without_a_valid_request_are_not_reproduced() {
     let resolver = TestResolver::new();
     let first = run(&request(), 4, 1);
     let rejected = |change: &dyn Fn(&mut Results)| {

@@ -1,10 +1,10 @@
 //! The model family `line`: a world model of `ext/Line-v0`, `next = position + gain * action`.
 
 use burn::module::{Module, Param};
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use swm::core::requirements::{DatasetRequirements, RequiredObservations};
-use swm::core::{Batch, Candidates, CostModel, Key, Result, Schema};
+use swm::core::{Batch, Candidates, CostModel, Result, Schema};
 use swm::data::dataset::{ClipSpec, LoaderConfig};
 use swm::models::nn::{Init, parameters};
 use swm::models::train::{DatasetInfo, Preset, StepContext, StepOutput};

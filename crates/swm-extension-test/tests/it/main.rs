@@ -23,7 +23,7 @@ static SOLVERS: Registry<SolverEntry> = Registry { kind: "solver", hint: "", row
 static FAMILIES: Registry<FamilyEntry> = Registry { kind: "model", hint: "", rows: &[family::ENTRY] };
 
 #[test]
-fn extensions_work_together() {
+fn registered_extensions_collect_train_plan_and_evaluate() {
     let folder = tempfile::tempdir().unwrap();
     let env = ENVS.choose("ext/Line-v0").unwrap();
     let config =

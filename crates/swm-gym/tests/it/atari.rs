@@ -5,14 +5,14 @@ use crate::{can_import, config};
 use swm_core::{Action, DType, ResetOptions, Space};
 
 #[test]
-fn observations_of_pong_are_frames() {
+fn frame_of_pong_equals_its_observation() {
     let Some(config) = config().filter(|config| can_import(config, "ale_py")) else { return };
     let mut env = RecordedEnv::of(make("ALE/Pong-v5", &config));
     assert_eq!(env.env.spec().action_space, Space::Discrete { n: 6, start: 0 });
     assert!(env.env.libraries().contains_key("ale-py"), "{:?}", env.env.libraries());
-    env.env.reset(1, &ResetOptions::default()).expect("a reset");
+    env.env.reset(1, &ResetOptions::default()).expect("resetting the environment");
     for _ in 0..30 {
-        env.env.step(Action::Discrete(&[2])).expect("a step");
+        env.env.step(Action::Discrete(&[2])).expect("stepping the environment");
     }
     let observed = env.column("observation");
     let frame = env.frame(210, 160);
@@ -36,9 +36,9 @@ fn craftax_steps_and_renders() {
         assert_eq!(spec.action_space, Space::Discrete { n: actions, start: 0 }, "{id}");
         let observation = &spec.columns[0];
         assert_eq!((&observation.shape[..], observation.dtype), (shape, DType::Float32), "{id}");
-        env.env.reset(0, &ResetOptions::default()).expect("a reset");
+        env.env.reset(0, &ResetOptions::default()).expect("resetting the environment");
         for action in [1, 2, 3, 4, 5] {
-            env.env.step(Action::Discrete(&[action])).expect("a step");
+            env.env.step(Action::Discrete(&[action])).expect("stepping the environment");
         }
         assert!(env.env.libraries().contains_key("craftax"), "{id}");
         let frame = env.frame(64, 64);

@@ -22,7 +22,7 @@ fn rows() -> Batch {
         ColumnSpec::new("episode_seed", DType::Int32, [3]),
         ColumnSpec::image("pixels", 2, 2),
     ]);
-    let mut rows = Batch::zeros(&schema.expect("a schema"), 2);
+    let mut rows = Batch::zeros(&schema.expect("creating the schema"), 2);
     for (row, x) in [(0, -0.3), (1, 1.2)] {
         let mut row = rows.row_mut(row);
         row.set(0, &[x, 0.25, 7.0]);
@@ -36,7 +36,7 @@ fn rows() -> Batch {
 }
 
 fn calls(json: &str) -> Vec<Callable> {
-    serde_json::from_str(json).expect("valid callables")
+    serde_json::from_str(json).expect("parsing the callables")
 }
 
 fn start(env: &mut dyn Env, options: &ResetOptions, callables: &[Callable]) -> swm_core::Result<()> {
@@ -50,29 +50,29 @@ fn start(env: &mut dyn Env, options: &ResetOptions, callables: &[Callable]) -> s
 fn environment_with_setters_starts_at_the_recorded_state() {
     let Some(config) = config() else { return };
     let mut field = RecordedEnv::of(make(FIELD, &config));
-    start(&mut *field.env, &ResetOptions::default(), &[]).expect("a start");
+    start(&mut *field.env, &ResetOptions::default(), &[]).expect("starting the episode at the dataset row");
     assert_eq!(field.column("state"), [-0.3, 0.25, 7.0]);
     assert_eq!(field.column("observation"), [-0.3, 0.25]);
     assert_eq!(field.column("goal_state"), [1.2, 0.25, 7.0]);
-    assert_eq!(field.env.factors().scalar("agent.size"), 1.5, "factors are the recorded ones");
+    assert_eq!(field.env.factors().scalar("agent.size"), 1.5, "the factors have the recorded values");
     assert!(!field.env.is_success() && field.env.goal_distance().is_infinite());
     let wind = field.column("wind");
     let frame = field.frame(16, 16);
     assert_eq!(frame[3 * (9 * 16 + 6)], 255, "the frame shows the recorded position");
     let mut goal = vec![0; 12];
-    field.env.render_goal(FrameMut::new(2, 2, &mut goal)).expect("a goal");
+    field.env.render_goal(FrameMut::new(2, 2, &mut goal)).expect("rendering the goal");
     assert_eq!(goal, [200; 12]);
-    let transition = field.env.step(EAST).expect("a step");
+    let transition = field.env.step(EAST).expect("stepping the environment");
     let state = field.column("state");
     assert!((state[0] - (-0.3 + 0.75 + wind[0])).abs() < 1e-12 && state[2] == 8.0, "{state:?}");
     assert!(!transition.terminated);
     assert_eq!(field.column("goal_state"), [1.2, 0.25, 7.0], "the goal stays after a step");
     // Values that are not part of the state follow from the seed of the recorded episode.
     let mut other = RecordedEnv::of(make(FIELD, &config));
-    other.env.reset(11, &ResetOptions::default()).expect("a reset");
+    other.env.reset(11, &ResetOptions::default()).expect("resetting the environment");
     assert_eq!(other.column("wind"), wind);
     // A plain reset discards the recorded state.
-    field.env.reset(11, &ResetOptions::default()).expect("a reset");
+    field.env.reset(11, &ResetOptions::default()).expect("resetting the environment");
     assert_eq!(field.column("goal_state"), other.column("goal_state"));
 }
 
@@ -81,20 +81,21 @@ fn start_with_requested_variation_takes_random_values_from_the_reset_seed() {
     let Some(config) = config() else { return };
     let mut field = RecordedEnv::of(make(FIELD, &config));
     let variation = VariationRequest { variation: Some(vec!["agent".to_owned()]), ..VariationRequest::default() };
-    start(&mut *field.env, &ResetOptions { variation, ..ResetOptions::default() }, &[]).expect("a start");
+    start(&mut *field.env, &ResetOptions { variation, ..ResetOptions::default() }, &[])
+        .expect("starting the episode at the dataset row");
     let wind = field.column("wind");
-    field.env.reset(5, &ResetOptions::default()).expect("a reset");
+    field.env.reset(5, &ResetOptions::default()).expect("resetting the environment");
     assert_eq!(field.column("wind"), wind);
 }
 
 #[test]
-fn dataset_start_calls_methods_by_name() {
+fn dataset_start_calls_the_methods_that_callables_name() {
     let Some(config) = config() else { return };
     let mut field = RecordedEnv::of(make(FIELD, &config));
     let place =
         r#"[{"method": "place", "args": {"x": {"value": "goal_x"}, "label": {"value": "abc", "in_dataset": false}}}]"#;
-    start(&mut *field.env, &ResetOptions::default(), &calls(place)).expect("a start");
-    field.env.step(Action::Continuous(&[0.0, 0.0])).expect("a step");
+    start(&mut *field.env, &ResetOptions::default(), &calls(place)).expect("starting the episode at the dataset row");
+    field.env.step(Action::Continuous(&[0.0, 0.0])).expect("stepping the environment");
     let (position, wind) = (field.column("observation"), field.column("wind"));
     assert!((position[0] - f64::from(1.2f32) - wind[0]).abs() < 1e-12 && position[1] == wind[1], "{position:?}");
     assert_eq!(field.column("set"), [3.0]);
@@ -110,9 +111,10 @@ fn dataset_start_calls_methods_by_name() {
     assert!(error.contains("a column's name"), "{error}");
     let error = wrong(r#"[{"method": "place", "args": {"z": {"value": "x"}}}]"#);
     assert!(error.contains("its reset raised") && error.contains("'z'"), "{error}");
-    start(&mut *field.env, &ResetOptions::default(), &[]).expect("a start after errors");
-    let error =
-        start(&mut *make("CartPole-v1", &config), &ResetOptions::default(), &[]).expect_err("no setter").to_string();
+    start(&mut *field.env, &ResetOptions::default(), &[]).expect("starting the episode after errors");
+    let error = start(&mut *make("CartPole-v1", &config), &ResetOptions::default(), &[])
+        .expect_err("an environment without a state setter")
+        .to_string();
     assert!(error.contains("CartPole-v1") && error.contains("set_state(state)"), "{error}");
 }
 
@@ -120,29 +122,31 @@ fn dataset_start_calls_methods_by_name() {
 fn environment_can_declare_the_method_that_sets_its_state() {
     let Some(config) = config() else { return };
     let mut declared = RecordedEnv::of(make("tests.it.environments:Declared-v0", &config));
-    start(&mut *declared.env, &ResetOptions::default(), &[]).expect("a start");
-    declared.env.step(EAST).expect("a step");
+    start(&mut *declared.env, &ResetOptions::default(), &[]).expect("starting the episode at the dataset row");
+    declared.env.step(EAST).expect("stepping the environment");
     assert_eq!(declared.column("set"), [2.0]);
     // A `set_state` with other arguments is not used.
     let mut jointed = make("tests.it.environments:Jointed-v0", &config);
-    let error = start(&mut *jointed, &ResetOptions::default(), &[]).expect_err("two arguments").to_string();
+    let error =
+        start(&mut *jointed, &ResetOptions::default(), &[]).expect_err("a setter with two arguments").to_string();
     assert!(error.contains("the environment has no method known to set a state"), "{error}");
 }
 
 #[test]
-fn replays_a_killed_worker_from_the_recorded_state() {
+fn killed_worker_is_replayed_from_the_recorded_state() {
     let Some(config) = config() else { return };
     let run = |kill: Option<usize>| {
-        let transport = WorkerTransport::new(&id(FIELD), config.clone()).expect("a worker");
-        let id = transport.process_id().expect("a process");
-        let mut field = RecordedEnv::of(Box::new(GymEnv::new(FIELD, Box::new(transport), 2).expect("an environment")));
-        start(&mut *field.env, &ResetOptions::default(), &[]).expect("a start");
+        let transport = WorkerTransport::new(&id(FIELD), config.clone()).expect("starting the worker");
+        let id = transport.process_id().expect("the worker has a process id");
+        let mut field =
+            RecordedEnv::of(Box::new(GymEnv::new(FIELD, Box::new(transport), 2).expect("creating the environment")));
+        start(&mut *field.env, &ResetOptions::default(), &[]).expect("starting the episode at the dataset row");
         let mut outputs = vec![field.all_outputs()];
         for t in 0..4 {
             if kill == Some(t) {
                 kill_process(id);
             }
-            field.env.step(EAST).expect("a step");
+            field.env.step(EAST).expect("stepping the environment");
             outputs.push(field.all_outputs());
         }
         outputs
@@ -152,21 +156,21 @@ fn replays_a_killed_worker_from_the_recorded_state() {
 }
 
 #[test]
-fn snapshot_contains_the_dataset_start() {
+fn restored_snapshot_continues_from_the_dataset_start() {
     let Some(config) = config() else { return };
     let mut field = RecordedEnv::of(make(FIELD, &config));
-    start(&mut *field.env, &ResetOptions::default(), &[]).expect("a start");
-    field.env.step(EAST).expect("a step");
+    start(&mut *field.env, &ResetOptions::default(), &[]).expect("starting the episode at the dataset row");
+    field.env.step(EAST).expect("stepping the environment");
     let snapshot = field.env.snapshot();
     let mut other = RecordedEnv::of(make(FIELD, &config));
-    other.env.restore(&snapshot).expect("a restored episode");
+    other.env.restore(&snapshot).expect("restoring the snapshot");
     for env in [&mut field, &mut other] {
-        env.env.step(EAST).expect("a step");
+        env.env.step(EAST).expect("stepping the environment");
     }
     assert!(field.all_outputs() == other.all_outputs());
     let goals = [&mut field, &mut other].map(|env| {
         let mut goal = vec![0; 27];
-        env.env.render_goal(FrameMut::new(3, 3, &mut goal)).expect("a goal");
+        env.env.render_goal(FrameMut::new(3, 3, &mut goal)).expect("rendering the goal");
         goal
     });
     assert_eq!(goals, [[200; 27], [200; 27]]);

@@ -30,9 +30,9 @@ fn ends_in_time(id: u32) -> bool {
 
 /// Makes an environment whose fourth step hangs, and returns it with the id of its process.
 fn hanging_env() -> Option<(GymEnv, u32)> {
-    let transport = WorkerTransport::new(&id(&format!("{ROOM},hang_at=4")), config()?).expect("a worker");
-    let id = transport.process_id().expect("a process");
-    Some((GymEnv::new(ROOM, Box::new(transport), 2).expect("an environment"), id))
+    let transport = WorkerTransport::new(&id(&format!("{ROOM},hang_at=4")), config()?).expect("starting the worker");
+    let id = transport.process_id().expect("the worker has a process id");
+    Some((GymEnv::new(ROOM, Box::new(transport), 2).expect("creating the environment"), id))
 }
 
 #[test]
@@ -44,10 +44,10 @@ fn dropping_an_environment_ends_its_worker() {
 }
 
 #[test]
-fn a_panic_ends_the_worker() {
+fn panic_of_the_owning_thread_ends_the_worker() {
     let Some((mut env, id)) = hanging_env() else { return };
     let panicked = std::thread::spawn(move || {
-        env.reset(0, &ResetOptions::default()).expect("a reset");
+        env.reset(0, &ResetOptions::default()).expect("resetting the environment");
         // `panic!` would print a message that looks like a failed test.
         std::panic::resume_unwind(Box::new("a panic"));
     });
@@ -61,8 +61,10 @@ fn a_worker_outlives_the_thread_that_made_its_environment() {
     if config().is_none() {
         return;
     }
-    let (mut env, id) = std::thread::spawn(|| hanging_env().expect("an environment")).join().expect("no panic");
-    env.reset(0, &ResetOptions::default()).expect("a reset");
+    let (mut env, id) = std::thread::spawn(|| hanging_env().expect("starting the hanging environment"))
+        .join()
+        .expect("joining the thread");
+    env.reset(0, &ResetOptions::default()).expect("resetting the environment");
     assert!(is_running(id));
 }
 
@@ -71,20 +73,20 @@ fn killing_the_process_ends_busy_workers() {
     if config().is_none() {
         return;
     }
-    let program = std::env::current_exe().expect("the path of the test program");
+    let program = std::env::current_exe().expect("finding the test executable");
     let mut child = Command::new(program)
-        .args(["--exact", "parents::hang_with_a_worker", "--nocapture"])
+        .args(["--exact", "parents::child_that_hangs_with_a_worker", "--nocapture"])
         .env(HANG, "1")
         .stdout(Stdio::piped())
         .stderr(Stdio::null())
         .spawn()
-        .expect("a child");
+        .expect("starting the child process");
     let lines = BufReader::new(child.stdout.take().expect("standard output of the child")).lines();
     let worker = lines.map_while(Result::ok).find_map(|line| line.split("worker=").nth(1)?.trim().parse().ok());
     let worker = worker.expect("the child prints the id of its worker");
     assert!(is_running(worker));
     kill_process(child.id());
-    child.wait().expect("an exit status");
+    child.wait().expect("waiting for the child process");
     assert!(ends_in_time(worker), "worker process {worker} still runs");
 }
 
@@ -94,16 +96,16 @@ const HANG: &str = "SWM_TEST_HANG";
 /// The program of the child process of [`killing_the_process_ends_busy_workers`]; does nothing unless [`HANG`] is set.
 #[test]
 #[expect(clippy::print_stdout, reason = "the parent test reads the id of the worker from standard output")]
-fn hang_with_a_worker() {
+fn child_that_hangs_with_a_worker() {
     if std::env::var_os(HANG).is_none() {
         return;
     }
-    let (mut env, id) = hanging_env().expect("an environment");
-    env.reset(0, &ResetOptions::default()).expect("a reset");
+    let (mut env, id) = hanging_env().expect("starting the hanging environment");
+    env.reset(0, &ResetOptions::default()).expect("resetting the environment");
     for t in 0..4 {
         if t == 3 {
             println!("worker={id}");
         }
-        env.step(Action::Continuous(&[0.0, 0.0])).expect("a step");
+        env.step(Action::Continuous(&[0.0, 0.0])).expect("stepping the environment");
     }
 }

@@ -18,10 +18,11 @@ pub fn make(text: &str, config: &GymConfig) -> Box<dyn Env> {
 /// Plays episodes with random actions and returns the bytes of all their outputs, one vector per slot.
 pub fn play(text: &str, config: &GymConfig, episodes: &[u64], workers: usize, steps: usize) -> Vec<Vec<u8>> {
     let envs = episodes.iter().map(|_| make(text, config)).collect();
-    let threads = threads(workers).expect("a thread pool");
-    let mut pool = EnvPool::new(envs, Some((48, 64)), Some(steps), threads).expect("a pool");
+    let threads = threads(workers).expect("creating the thread pool");
+    let mut pool = EnvPool::new(envs, Some((48, 64)), Some(steps), threads).expect("creating the environment pool");
     let mut policy = RandomPolicy::new(pool.spec(), episodes.len());
-    let mut actions = Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("a schema"), episodes.len());
+    let mut actions =
+        Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("creating the schema"), episodes.len());
     let resets: Vec<Reset> = (0..)
         .zip(episodes)
         .map(|(slot, &episode)| {
@@ -29,7 +30,7 @@ pub fn play(text: &str, config: &GymConfig, episodes: &[u64], workers: usize, st
             Reset { slot, seed: Key::new(episode).seed(), options: ResetOptions::default() }
         })
         .collect();
-    pool.reset(&resets).expect("a reset");
+    pool.reset(&resets).expect("resetting the environment");
     let mut outputs = vec![vec![]; episodes.len()];
     let mut record = |pool: &EnvPool| {
         for (slot, output) in outputs.iter_mut().enumerate() {
@@ -42,8 +43,8 @@ pub fn play(text: &str, config: &GymConfig, episodes: &[u64], workers: usize, st
     record(&pool);
     let active = vec![true; episodes.len()];
     for _ in 0..steps {
-        policy.act(pool.infos(), &active, &mut actions).expect("random actions");
-        pool.step(&actions, &active).expect("a step");
+        policy.act(pool.infos(), &active, &mut actions).expect("choosing random actions");
+        pool.step(&actions, &active).expect("stepping the environment");
         record(&pool);
     }
     outputs
@@ -57,7 +58,7 @@ pub struct RecordedEnv {
 
 impl RecordedEnv {
     pub fn of(env: Box<dyn Env>) -> Self {
-        let schema = Schema::new(env.spec().columns.clone()).expect("column names are unique");
+        let schema = Schema::new(env.spec().columns.clone()).expect("creating the schema");
         Self { env, row: Batch::zeros(&schema, 1) }
     }
 
@@ -67,7 +68,7 @@ impl RecordedEnv {
 
     pub fn column(&mut self, name: &str) -> Vec<f64> {
         self.env.observe(&mut self.row.row_mut(0));
-        self.row.row(0).to_f64(name).expect("a column")
+        self.row.row(0).to_f64(name).expect("reading the column")
     }
 
     pub fn all_outputs(&mut self) -> Vec<u8> {
@@ -80,7 +81,7 @@ impl RecordedEnv {
 
     pub fn frame(&mut self, height: usize, width: usize) -> Vec<u8> {
         let mut rgb = vec![7; height * width * 3];
-        self.env.render(FrameMut::new(width, height, &mut rgb)).expect("a frame");
+        self.env.render(FrameMut::new(width, height, &mut rgb)).expect("rendering a frame");
         rgb
     }
 }
@@ -100,51 +101,52 @@ fn outputs_do_not_depend_on_threads_or_other_environments() {
 #[test]
 fn environments_run_in_parallel_on_one_thread() {
     let Some(config) = config() else { return };
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     // Each environment waits in its reset and in its step for the other environment, except in episodes of seed 0.
     let text = format!("{ROOM},meet={}", folder.path().display());
     let envs = (0..2).map(|_| make(&text, &config)).collect();
-    let mut pool = EnvPool::new(envs, None, None, threads(1).expect("a thread pool")).expect("a pool");
-    let actions = Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("a schema"), 2);
+    let mut pool = EnvPool::new(envs, None, None, threads(1).expect("creating the thread pool"))
+        .expect("creating the environment pool");
+    let actions = Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("creating the schema"), 2);
     for seeds in [[0, 0], [1, 2]] {
         let reset = |(slot, seed)| Reset { slot, seed, options: ResetOptions::default() };
-        pool.reset(&(0..).zip(seeds).map(reset).collect::<Vec<_>>()).expect("a reset");
-        pool.step(&actions, &[true, true]).expect("a step");
+        pool.reset(&(0..).zip(seeds).map(reset).collect::<Vec<_>>()).expect("resetting the environment");
+        pool.step(&actions, &[true, true]).expect("stepping the environment");
     }
-    assert_eq!(pool.infos().get::<i64>("steps").expect("a column"), [1, 1]);
+    assert_eq!(pool.infos().get::<i64>("steps").expect("reading the column"), [1, 1]);
 }
 
 #[test]
-fn a_dispatched_call_runs_once() {
+fn dispatched_calls_run_once_and_before_later_calls() {
     let Some(config) = config() else { return };
     let push = Action::Continuous(&[0.1, -0.2]);
     let (start, none) = (ResetOptions::default(), Action::Continuous(&[0.0, 0.0]));
     let mut plain = RecordedEnv::of(make(ROOM, &config));
     let mut dispatched = RecordedEnv::of(make(ROOM, &config));
     for env in [&mut plain, &mut dispatched] {
-        env.env.reset(1, &start).expect("a reset");
+        env.env.reset(1, &start).expect("resetting the environment");
     }
-    plain.env.reset(4, &start).expect("a reset");
+    plain.env.reset(4, &start).expect("resetting the environment");
     assert!(dispatched.dispatch(PendingCall::Reset(4, &start)));
-    assert!(!dispatched.dispatch(PendingCall::Step(push)), "one call at a time");
-    dispatched.env.reset(4, &start).expect("the reset");
-    plain.env.step(push).expect("a step");
+    assert!(!dispatched.dispatch(PendingCall::Step(push)), "only one call is dispatched at a time");
+    dispatched.env.reset(4, &start).expect("resetting the environment");
+    plain.env.step(push).expect("stepping the environment");
     assert!(dispatched.dispatch(PendingCall::Step(push)));
-    dispatched.env.step(push).expect("the step");
+    dispatched.env.step(push).expect("stepping the environment");
     assert!(plain.all_outputs() == dispatched.all_outputs());
     // Any other call completes the dispatched step first.
-    plain.env.step(push).expect("a step");
+    plain.env.step(push).expect("stepping the environment");
     assert!(dispatched.dispatch(PendingCall::Step(push)));
     assert!(plain.env.snapshot() == dispatched.env.snapshot());
     assert!(plain.frame(9, 12) == dispatched.frame(9, 12) && plain.all_outputs() == dispatched.all_outputs());
-    plain.env.step(push).and_then(|_| plain.env.step(none)).expect("two steps");
+    plain.env.step(push).and_then(|_| plain.env.step(none)).expect("stepping the environment twice");
     assert!(dispatched.dispatch(PendingCall::Step(push)));
-    dispatched.env.step(none).expect("another step");
+    dispatched.env.step(none).expect("stepping the environment");
     assert!(plain.all_outputs() == dispatched.all_outputs());
     // A reset completes the dispatched step first, too.
     assert!(dispatched.dispatch(PendingCall::Step(push)));
     for env in [&mut plain, &mut dispatched] {
-        env.env.reset(7, &start).expect("a reset");
+        env.env.reset(7, &start).expect("resetting the environment");
     }
     assert!(plain.all_outputs() == dispatched.all_outputs());
     // An invalid call is not dispatched; the call itself returns the error and changes nothing.
@@ -192,16 +194,16 @@ fn spec_describes_the_environment() {
 fn info_goals_and_frames_become_outputs() {
     let Some(config) = config() else { return };
     let mut room = RecordedEnv::of(make(ROOM, &config));
-    assert_eq!(room.env.goal_distance(), f64::INFINITY, "infinite before the first episode");
-    room.env.reset(3, &ResetOptions::default()).expect("a reset");
+    assert_eq!(room.env.goal_distance(), f64::INFINITY, "the distance is infinite before the first episode");
+    room.env.reset(3, &ResetOptions::default()).expect("resetting the environment");
     assert_eq!((room.column("noise"), room.column("steps")), (vec![0.5], vec![0.0]));
     let mut goal = vec![0; 5 * 7 * 3];
-    room.env.render_goal(FrameMut::new(7, 5, &mut goal)).expect("a goal");
+    room.env.render_goal(FrameMut::new(7, 5, &mut goal)).expect("rendering the goal");
     assert_eq!((goal[0], goal[2]), (40, 40));
     let (mut noises, mut steps) = (vec![], 0);
     let terminated = loop {
         // The bridge converts the bound in single precision to the bound in double precision.
-        let transition = room.env.step(Action::Continuous(&[0.4, -0.4])).expect("a step");
+        let transition = room.env.step(Action::Continuous(&[0.4, -0.4])).expect("stepping the environment");
         steps += 1;
         assert_eq!(transition.reward, -1.5);
         assert_eq!(room.env.is_success(), steps >= 6);
@@ -221,7 +223,7 @@ fn info_goals_and_frames_become_outputs() {
     let half = room.frame(6, 8);
     assert_eq!((half[2], half[half.len() - 1]), (140, 0));
     // The next episode starts with new values.
-    room.env.reset(3, &ResetOptions::default()).expect("a reset");
+    room.env.reset(3, &ResetOptions::default()).expect("resetting the environment");
     assert_eq!((room.column("noise"), room.column("steps")), (vec![0.5], vec![0.0]));
 }
 
@@ -240,15 +242,15 @@ fn factors_are_sampled_pinned_and_read_back() {
         let factors = room.factors();
         Ok::<_, Error>((factors.scalar("agent.size"), factors.rgb("agent.color"), factors.integer("door.number")))
     };
-    let plain = reset(Some(&[]), &[]).expect("no varied factor");
+    let plain = reset(Some(&[]), &[]).expect("resetting with no varied factor");
     assert_eq!(plain, (1.0, [255, 0, 10], 1));
-    let default = reset(None, &[]).expect("the default factors");
+    let default = reset(None, &[]).expect("resetting with the default factors");
     assert!(default.0 != 1.0 && default.1 == plain.1, "{default:?}");
-    assert_ne!(reset(Some(&["agent"]), &[]).expect("a varied group").1, plain.1);
-    assert_ne!(reset(Some(&["all"]), &[]).expect("all factors varied").1, plain.1);
+    assert_ne!(reset(Some(&["agent"]), &[]).expect("resetting with a varied group").1, plain.1);
+    assert_ne!(reset(Some(&["all"]), &[]).expect("resetting with all factors varied").1, plain.1);
     let pinned: &[(&str, &[f64])] =
         &[("door.number", &[3.0]), ("agent.color", &[1.0, 2.0, 3.0]), ("agent.size", &[0.75])];
-    assert_eq!(reset(Some(&["all"]), pinned).expect("all factors pinned"), (0.75, [1, 2, 3], 3));
+    assert_eq!(reset(Some(&["all"]), pinned).expect("resetting with all factors pinned"), (0.75, [1, 2, 3], 3));
     for (variation, pinned, words) in [
         (Some(&["agent.colour"][..]), &[][..], "did you mean agent.color"),
         (None, &[("agent.size", &[9.0][..])][..], "0.5 ..= 2"),
@@ -260,14 +262,14 @@ fn factors_are_sampled_pinned_and_read_back() {
 }
 
 #[test]
-fn a_wrapper_may_provide_factors_and_frames() {
+fn gymnasium_wrapper_provides_factors_and_frames() {
     let Some(config) = config() else { return };
     let mut coated = RecordedEnv::of(make("tests.it.environments:Coated-v0", &config));
-    coated.env.reset(1, &ResetOptions::default()).expect("a reset");
+    coated.env.reset(1, &ResetOptions::default()).expect("resetting the environment");
     assert_eq!(coated.frame(2, 2), [9; 12]);
     let pinned = [("coat".to_owned(), vec![1.0, 2.0, 3.0])].into();
     let variation = VariationRequest { variation: None, variation_values: pinned };
-    coated.env.reset(1, &ResetOptions { variation, ..ResetOptions::default() }).expect("a reset");
+    coated.env.reset(1, &ResetOptions { variation, ..ResetOptions::default() }).expect("resetting the environment");
     assert_eq!(coated.env.factors().rgb("coat"), [1, 2, 3]);
     assert_eq!(coated.frame(1, 1), [1, 2, 3]);
 }
@@ -276,12 +278,12 @@ fn a_wrapper_may_provide_factors_and_frames() {
 fn restores_snapshot_bit_for_bit() {
     let Some(config) = config() else { return };
     let mut room = RecordedEnv::of(make(ROOM, &config));
-    room.env.reset(5, &ResetOptions::default()).expect("a reset");
+    room.env.reset(5, &ResetOptions::default()).expect("resetting the environment");
     let outputs_of_steps = |room: &mut RecordedEnv, n: i16| {
         let actions = (0..n).map(|i| [0.1 * f32::from(i % 3), -0.2]);
         actions
             .flat_map(|action| {
-                room.env.step(Action::Continuous(&action)).expect("a step");
+                room.env.step(Action::Continuous(&action)).expect("stepping the environment");
                 room.all_outputs()
             })
             .collect::<Vec<u8>>()
@@ -289,10 +291,10 @@ fn restores_snapshot_bit_for_bit() {
     outputs_of_steps(&mut room, 2);
     let snapshot = room.env.snapshot();
     let expected = outputs_of_steps(&mut room, 3);
-    room.env.restore(&snapshot).expect("a restored episode");
+    room.env.restore(&snapshot).expect("restoring the snapshot");
     assert!(outputs_of_steps(&mut room, 3) == expected, "the same environment differs after a restore");
     let mut other = RecordedEnv::of(make(ROOM, &config));
-    other.env.restore(&snapshot).expect("a restored episode");
+    other.env.restore(&snapshot).expect("restoring the snapshot");
     assert!(outputs_of_steps(&mut other, 3) == expected, "another environment differs after a restore");
     let error =
         make("CartPole-v1", &config).restore(&snapshot).expect_err("a snapshot of another environment").to_string();
@@ -303,28 +305,50 @@ fn restores_snapshot_bit_for_bit() {
 fn unsupported_requests_are_errors() {
     let Some(config) = config() else { return };
     let mut env = RecordedEnv::of(make("CartPole-v1", &config));
-    let early = env.env.step(Action::Discrete(&[0])).expect_err("before a reset").to_string();
+    let early = env.env.step(Action::Discrete(&[0])).expect_err("stepping before a reset").to_string();
     assert!(early.contains("reset it first"), "{early}");
-    assert!(env.env.sample_goal(Key::new(0)).expect_err("no goals").to_string().contains("another seed"));
+    assert!(
+        env.env
+            .sample_goal(Key::new(0))
+            .expect_err("an environment without goals")
+            .to_string()
+            .contains("another seed")
+    );
     let state = ResetOptions { state: Some(vec![0.0; 4]), ..ResetOptions::default() };
     assert!(
-        env.env.reset(0, &state).expect_err("no states").to_string().contains("the seed decides the initial state")
+        env.env
+            .reset(0, &state)
+            .expect_err("an environment without states")
+            .to_string()
+            .contains("the seed decides the initial state")
     );
     let variation = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
     let varied = ResetOptions { variation, ..ResetOptions::default() };
-    assert!(env.env.reset(0, &varied).expect_err("no factors").to_string().contains("variation_space"));
-    env.env.reset(0, &ResetOptions::default()).expect("a reset");
+    assert!(
+        env.env.reset(0, &varied).expect_err("an environment without factors").to_string().contains("variation_space")
+    );
+    env.env.reset(0, &ResetOptions::default()).expect("resetting the environment");
     assert!(env.env.step(Action::Discrete(&[2])).is_err(), "there are two actions");
-    assert!(env.env.step(Action::Continuous(&[0.0])).is_err(), "an action of another kind");
-    env.env.step(Action::Discrete(&[1])).expect("a step after invalid actions");
+    assert!(env.env.step(Action::Continuous(&[0.0])).is_err(), "an action of another kind must be an error");
+    env.env.step(Action::Discrete(&[1])).expect("stepping the environment after invalid actions");
 
-    let unknown = swm_gym::make(&id("CartPoel-v1"), config.clone()).err().expect("an unknown id").to_string();
+    let unknown =
+        swm_gym::make(&id("CartPoel-v1"), config.clone()).err().expect("an unknown id must be an error").to_string();
     assert!(unknown.contains("did you mean CartPole-v1"), "{unknown}");
-    let wrong = swm_gym::make(&id("CartPole-v1,sutton=1"), config.clone()).err().expect("no such argument").to_string();
+    let wrong = swm_gym::make(&id("CartPole-v1,sutton=1"), config.clone())
+        .err()
+        .expect("an unknown argument must be an error")
+        .to_string();
     assert!(wrong.contains("sutton") && wrong.contains("CartPole-v1"), "{wrong}");
-    let module = swm_gym::make(&id("no_such_module:Maze-v0"), config.clone()).err().expect("no module").to_string();
+    let module = swm_gym::make(&id("no_such_module:Maze-v0"), config.clone())
+        .err()
+        .expect("a missing module must be an error")
+        .to_string();
     assert!(module.contains("no_such_module"), "{module}");
     let python = swm_gym::Python { program: "/no/such/python".into(), origin: "named by a test" };
-    let none = swm_gym::make(&id("CartPole-v1"), GymConfig { python, ..config }).err().expect("no Python").to_string();
+    let none = swm_gym::make(&id("CartPole-v1"), GymConfig { python, ..config })
+        .err()
+        .expect("a missing Python interpreter must be an error")
+        .to_string();
     assert!(none.contains("/no/such/python (named by a test)") && none.contains("SWM_PYTHON"), "{none}");
 }

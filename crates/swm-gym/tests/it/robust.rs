@@ -11,7 +11,7 @@ const PUSH: Action<'static> = Action::Continuous(&[0.1, -0.2]);
 #[test]
 fn outputs_are_the_same_when_a_worker_dies_in_an_episode() {
     let Some(config) = config() else { return };
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let marker = folder.path().join("died");
     let expected = play(ROOM, &config, &[1], 1, 6);
     let dying = format!("{ROOM},die_at=4,marker={}", marker.display());
@@ -23,17 +23,18 @@ fn outputs_are_the_same_when_a_worker_dies_in_an_episode() {
 fn outputs_are_the_same_when_a_worker_is_killed() {
     let Some(config) = config() else { return };
     let run = |kill: Option<u32>| {
-        let transport = WorkerTransport::new(&id("CartPole-v1"), config.clone()).expect("a worker");
-        let id = transport.process_id().expect("a process");
-        let mut env =
-            RecordedEnv::of(Box::new(GymEnv::new("CartPole-v1", Box::new(transport), 2).expect("an environment")));
-        env.env.reset(4, &ResetOptions::default()).expect("a reset");
+        let transport = WorkerTransport::new(&id("CartPole-v1"), config.clone()).expect("starting the worker");
+        let id = transport.process_id().expect("the worker has a process id");
+        let mut env = RecordedEnv::of(Box::new(
+            GymEnv::new("CartPole-v1", Box::new(transport), 2).expect("creating the environment"),
+        ));
+        env.env.reset(4, &ResetOptions::default()).expect("resetting the environment");
         let mut outputs = vec![];
         for t in 0..6 {
             if kill == Some(t) {
                 kill_process(id);
             }
-            env.env.step(Action::Discrete(&[i64::from(t % 2)])).expect("a step");
+            env.env.step(Action::Discrete(&[i64::from(t % 2)])).expect("stepping the environment");
             outputs.push(env.all_outputs());
         }
         outputs
@@ -47,10 +48,11 @@ fn dispatched_calls_are_repeated_in_a_new_worker() {
     let Some(config) = config() else { return };
     let options = ResetOptions::default();
     let run = |kill: Option<(&str, bool)>| {
-        let transport = WorkerTransport::new(&id("CartPole-v1"), config.clone()).expect("a worker");
-        let id = transport.process_id().expect("a process");
-        let mut env =
-            RecordedEnv::of(Box::new(GymEnv::new("CartPole-v1", Box::new(transport), 2).expect("an environment")));
+        let transport = WorkerTransport::new(&id("CartPole-v1"), config.clone()).expect("starting the worker");
+        let id = transport.process_id().expect("the worker has a process id");
+        let mut env = RecordedEnv::of(Box::new(
+            GymEnv::new("CartPole-v1", Box::new(transport), 2).expect("creating the environment"),
+        ));
         let dispatch = |env: &mut RecordedEnv, call: &str, next: PendingCall<'_>| {
             if kill == Some((call, false)) {
                 kill_process(id);
@@ -61,11 +63,11 @@ fn dispatched_calls_are_repeated_in_a_new_worker() {
             }
         };
         dispatch(&mut env, "reset", PendingCall::Reset(4, &options));
-        env.env.reset(4, &options).expect("a reset");
+        env.env.reset(4, &options).expect("resetting the environment");
         let mut outputs = env.all_outputs();
         for call in ["first", "second"] {
             dispatch(&mut env, call, PendingCall::Step(Action::Discrete(&[1])));
-            env.env.step(Action::Discrete(&[1])).expect("a step");
+            env.env.step(Action::Discrete(&[1])).expect("stepping the environment");
             outputs.extend(env.all_outputs());
         }
         outputs
@@ -85,41 +87,41 @@ pub fn kill_process(id: u32) {
 fn repeated_worker_deaths_are_an_error_with_the_last_output() {
     let Some(config) = config() else { return };
     let mut env = make(&format!("{ROOM},die_at=2"), &config);
-    env.reset(0, &ResetOptions::default()).expect("a reset");
-    env.step(PUSH).expect("a step");
+    env.reset(0, &ResetOptions::default()).expect("resetting the environment");
+    env.step(PUSH).expect("stepping the environment");
     let error = env.step(PUSH).expect_err("the worker dies").to_string();
     for words in [ROOM, "3 workers", "signal: 9", "about to die"] {
         assert!(error.contains(words), "{words}: {error}");
     }
-    assert!(env.step(PUSH).expect_err("no episode").to_string().contains("reset it first"));
-    env.reset(0, &ResetOptions::default()).expect("a reset after an error");
-    env.step(PUSH).expect("a step after an error");
+    assert!(env.step(PUSH).expect_err("stepping without an episode").to_string().contains("reset it first"));
+    env.reset(0, &ResetOptions::default()).expect("resetting the environment after an error");
+    env.step(PUSH).expect("stepping the environment after an error");
 }
 
 #[test]
 fn an_exception_is_reported_without_a_retry() {
     let Some(config) = config() else { return };
     let mut env = make(&format!("{ROOM},raise_at=2"), &config);
-    env.reset(0, &ResetOptions::default()).expect("a reset");
-    env.step(PUSH).expect("a step");
-    let error = env.step(PUSH).expect_err("an exception").to_string();
+    env.reset(0, &ResetOptions::default()).expect("resetting the environment");
+    env.step(PUSH).expect("stepping the environment");
+    let error = env.step(PUSH).expect_err("a step that raises an exception").to_string();
     for words in [ROOM, "its step raised", "raise ValueError('the room is on fire')", "environments.py"] {
         assert!(error.contains(words), "{words}: {error}");
     }
-    env.reset(0, &ResetOptions::default()).expect("a reset after an error");
-    env.step(PUSH).expect("a step after an error");
+    env.reset(0, &ResetOptions::default()).expect("resetting the environment after an error");
+    env.step(PUSH).expect("stepping the environment after an error");
 }
 
 #[test]
-fn a_hanging_environment_is_stopped() {
+fn environment_that_exceeds_the_call_timeout_is_an_error() {
     let Some(config) = config() else { return };
     let config = GymConfig { call_timeout: Duration::from_millis(1500), restarts: 1, ..config };
     let mut env = make(&format!("{ROOM},hang_at=2"), &config);
-    env.reset(0, &ResetOptions::default()).expect("a reset");
-    env.step(PUSH).expect("a step");
-    let error = env.step(PUSH).expect_err("a timeout").to_string();
+    env.reset(0, &ResetOptions::default()).expect("resetting the environment");
+    env.step(PUSH).expect("stepping the environment");
+    let error = env.step(PUSH).expect_err("a step that exceeds the timeout").to_string();
     for words in ["2 workers", "did not answer within 1.5s", "about to hang"] {
         assert!(error.contains(words), "{words}: {error}");
     }
-    env.reset(0, &ResetOptions::default()).expect("a reset after an error");
+    env.reset(0, &ResetOptions::default()).expect("resetting the environment after an error");
 }

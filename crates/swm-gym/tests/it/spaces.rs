@@ -18,7 +18,7 @@ fn actions_of_every_space_reach_the_environment() {
     for (kind, space, action) in cases {
         let mut env = RecordedEnv::of(make(&format!("tests.it.environments:Choices-v0,kind={kind}"), &config));
         assert_eq!(env.env.spec().action_space, space, "{kind}");
-        env.env.reset(0, &ResetOptions::default()).expect("a reset");
+        env.env.reset(0, &ResetOptions::default()).expect("resetting the environment");
         env.env.step(Action::Discrete(action)).unwrap_or_else(|error| panic!("{kind}: {error}"));
         let observed = env.column("observation");
         let expected: Vec<f64> = action.iter().map(|&choice| choice as f64).collect();
@@ -28,13 +28,15 @@ fn actions_of_every_space_reach_the_environment() {
     let mut env = RecordedEnv::of(make("tests.it.environments:Choices-v0,kind=dict", &config));
     let (low, high) = (vec![-1.0, -1.0, 0.0], vec![1.0; 3]);
     assert_eq!(env.env.spec().action_space, Space::Box { shape: vec![3], dtype: DType::Float32, low, high });
-    env.env.reset(0, &ResetOptions::default()).expect("a reset");
-    env.env.step(Action::Continuous(&[0.5, -0.25, 3.0])).expect("a step");
+    env.env.reset(0, &ResetOptions::default()).expect("resetting the environment");
+    env.env.step(Action::Continuous(&[0.5, -0.25, 3.0])).expect("stepping the environment");
     assert_eq!(env.column("observation")[..3], [0.5, -0.25, 3.0]);
-    let error =
-        swm_gym::make(&id("tests.it.environments:Choices-v0,kind=mixed"), config.clone()).err().expect("an error");
+    let error = swm_gym::make(&id("tests.it.environments:Choices-v0,kind=mixed"), config.clone())
+        .err()
+        .expect("the call must fail");
     assert!(error.to_string().contains("wrap the environment"), "{error}");
     let rgb = &mut [0; 3];
-    let error = env.env.render(swm_core::FrameMut::new(1, 1, rgb)).expect_err("no rendering").to_string();
+    let error =
+        env.env.render(swm_core::FrameMut::new(1, 1, rgb)).expect_err("an environment without rendering").to_string();
     assert!(error.contains("render"), "{error}");
 }

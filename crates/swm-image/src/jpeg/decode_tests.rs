@@ -12,14 +12,16 @@ type PillowImage = (String, Vec<u8>, [usize; 2], Vec<u8>);
 /// Returns the images that Pillow wrote, and the pixels that Pillow decodes from them (`tests/interop/jpeg_export.py`).
 fn pillow_images() -> Vec<PillowImage> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop/jpeg");
-    let mut paths: Vec<_> =
-        std::fs::read_dir(folder).expect("a folder of images").map(|e| e.expect("a folder entry").path()).collect();
+    let mut paths: Vec<_> = std::fs::read_dir(folder)
+        .expect("listing the folder of images")
+        .map(|e| e.expect("reading the folder entry").path())
+        .collect();
     paths.retain(|path| path.extension().is_some_and(|extension| extension == "jpg"));
     paths.sort();
     let read = |path: &Path| {
-        let decoded = crate::read_png(&path.with_extension("png")).expect("an image");
+        let decoded = crate::read_png(&path.with_extension("png")).expect("reading the PNG file");
         let name = path.file_stem().expect("a name").to_string_lossy().into_owned();
-        (name, std::fs::read(path).expect("an image"), [decoded.height, decoded.width], decoded.rgb)
+        (name, std::fs::read(path).expect("reading the image file"), [decoded.height, decoded.width], decoded.rgb)
     };
     paths.iter().map(|path| read(path)).collect()
 }
@@ -49,7 +51,7 @@ fn decodes_bit_for_bit_as_pillow() {
             assert!(out == expected, "{name} without AVX2");
         }
         // The general decoder also reads the kinds that the fast decoder does not support, and rounds differently.
-        crate::decode(&bytes, height, width, &mut out).expect("an image");
+        crate::decode(&bytes, height, width, &mut out).expect("decoding the image");
         let off: u32 = out.iter().zip(&expected).map(|(a, b)| u32::from(a.abs_diff(*b))).sum();
         assert!(f64::from(off) / (expected.len() as f64) < 3.0, "{name}: {off}");
         assert!(!decode(&bytes, width, height, &mut out), "{name} has another size");

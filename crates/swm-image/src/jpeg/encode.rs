@@ -301,7 +301,7 @@ mod tests {
         assert_eq!(bytes[0], 7, "the encoder appends to the vector");
         let options = DecoderOptions::default().jpeg_set_out_colorspace(ColorSpace::RGB).set_strict_mode(true);
         let mut decoder = zune_jpeg::JpegDecoder::new_with_options(ZCursor::new(&bytes[1..]), options);
-        let pixels = decoder.decode().expect("a JPEG image");
+        let pixels = decoder.decode().expect("decoding the JPEG image");
         let info = decoder.info().expect("a header");
         assert_eq!((info.height, info.width), (height, width));
         pixels
@@ -342,7 +342,7 @@ mod tests {
     }
 
     #[test]
-    fn largest_coefficients_have_codes() {
+    fn noise_with_the_largest_coefficients_is_encoded() {
         // Black and white noise with the finest steps has the largest coefficients and most bytes 0xff.
         let noise = image(64, 48, |y, x| [if (x * 7919 + y * 104_729 + x * y * 31) % 5 < 2 { 255 } else { 0 }; 3]);
         assert!(psnr(&decoded(&noise, 64, 48, 100), &noise) > 40.0);

@@ -187,7 +187,7 @@ mod tests {
     use super::{avx2, portable};
 
     #[test]
-    fn intrinsics_and_portable_code_agree() {
+    fn avx2_and_portable_inverse_dct_agree() {
         if swm_simd::cpu_level() < swm_simd::CpuLevel::Avx2 {
             return;
         }

@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn results_equal_pillow() {
+    fn bilinear_and_nearest_resizing_match_pillow() {
         // Image.fromarray(image).resize(size, Image.BILINEAR), then Image.NEAREST.
         for (width, height, expected) in BILINEAR {
             let found = red(*width, *height, PillowFilter::Triangle);

@@ -67,7 +67,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn results_are_close_to_pillow() {
+    fn triangle_resizing_is_close_to_pillow() {
         // The expected values are the results of Image.fromarray(image).resize(size, Image.BILINEAR) for an image of
         // 6 x 6 pixels with the red channel (x * 37 + y * y * 11) % 256.
         let old: Vec<u8> = (0..36).flat_map(|i| [((i % 6 * 37 + (i / 6) * (i / 6) * 11) % 256) as u8, 0, 0]).collect();

@@ -80,7 +80,7 @@ mod tests {
     }
 
     #[test]
-    fn expectile_weights_positive_residuals_by_tau() {
+    fn expectile_loss_weights_positive_residuals_by_tau() {
         // Residuals 1 and -3: the loss is (0.9 * 1 + 0.1 * 9) / 2.
         let loss: f32 = expectile(tensor(&[0.0, 0.0]), tensor(&[1.0, -3.0]), 0.9).into_scalar();
         assert!((loss - 0.9).abs() < 1e-6, "{loss}");

@@ -132,15 +132,17 @@ mod tests {
     use swm_core::Key;
 
     #[test]
-    fn vit_encoder_matches_module_on_any_number_of_threads() {
+    fn cpu_vit_encoder_matches_the_module_for_one_and_three_threads() {
         let sizes = VitConfig { patch: 2, dim: 24, depth: 2, heads: 3, mlp: 40 };
         // The 50 tokens need two blocks of the kernel. The image has more patches than there are learnt positions, so
         // the positions are resampled.
         let (patches, elements) = (49, 12);
         let vit = sizes.init(&Init::new(Key::new(1), &Device::flex()), 12);
-        let encoder = vit_encoder(&vit, patches).expect("a transformer with layers");
+        let encoder = vit_encoder(&vit, patches).expect("creating the CPU encoder");
         let image: Vec<f32> = (0..patches * elements).map(|i| (i * 37 % 101) as f32 / 50.0 - 1.0).collect();
-        let on = |threads: usize| swm_core::pool::threads(threads).expect("threads").install(|| encoder.encode(&image));
+        let on = |threads: usize| {
+            swm_core::pool::threads(threads).expect("creating the thread pool").install(|| encoder.encode(&image))
+        };
         let class = on(1);
         assert_eq!(class, on(3));
         let input = Tensor::from_data(TensorData::new(image.clone(), [1, patches, elements]), &Device::flex());

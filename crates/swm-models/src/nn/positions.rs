@@ -79,7 +79,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn constants_and_linear_ramps_are_preserved() {
+    fn position_resampling_preserves_constants_and_linear_ramps() {
         for resampling in [Resampling::Bicubic, Resampling::Antialiased] {
             for (from, to) in [(8, 5), (5, 8), (37, 16)] {
                 let weights = matrix(from, to, resampling);

@@ -288,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn unsuitable_image_sizes_are_refused() {
+    fn image_sides_that_are_no_multiple_of_16_are_refused() {
         let init = Init::new(Key::new(0), &Device::flex());
         let error = Decoder::new(&init, 3, 65, &ReconstructionConfig::default())
             .expect_err("a side of 65 pixels is accepted")

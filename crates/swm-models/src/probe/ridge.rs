@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn linear_map_is_recovered() {
+    fn ridge_regression_recovers_a_linear_map() {
         let (rows, features) = (200, 7);
         let x = noise(rows * features, "x");
         let truth = noise(2 * features, "w");

@@ -131,8 +131,8 @@ mod tests {
 
     #[test]
     fn events_round_trip_with_valid_checksums() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let mut log = Log::new(folder.path(), false).expect("a log");
+        let folder = tempfile::tempdir().expect("creating a temporary folder");
+        let mut log = Log::new(folder.path(), false).expect("creating the log");
         log.write(7, &[("loss", 0.5), ("lr", 1e-3)]).expect("writing scalars");
         let line = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("reading train.jsonl");
         assert_eq!(line, "{\"loss\":0.5,\"lr\":0.001,\"step\":7}\n");
@@ -144,7 +144,7 @@ mod tests {
             let length = u64::from_le_bytes(unread[..8].try_into().expect("8 bytes")) as usize;
             assert_eq!(word(8), masked_crc(&unread[..8]));
             assert_eq!(word(12 + length), masked_crc(&unread[12..12 + length]));
-            found.push(Event::decode(&unread[12..12 + length]).expect("an event"));
+            found.push(Event::decode(&unread[12..12 + length]).expect("decoding the event"));
             unread = &unread[16 + length..];
         }
         assert_eq!(found[0].file_version.as_deref(), Some("brain.Event:2"));

@@ -79,12 +79,13 @@ mod tests {
     #[test]
     fn keys_keep_the_order_of_the_file() {
         let text = r#"{"z": {"second": 1, "first": [{"x": 2}], "null": null}, "a": "text"}"#;
-        let keys: Keys = serde_json::from_str(text).expect("JSON");
+        let keys: Keys = serde_json::from_str(text).expect("parsing the JSON");
         let names = |keys: &Keys| keys.0.iter().map(|(name, _)| name.clone()).collect::<Vec<_>>();
         assert_eq!(names(&keys), ["z", "a"]);
         assert_eq!(names(keys.at("z").expect("the key z")), ["second", "first", "null"]);
         assert!(keys.at("z.third").is_none());
-        let written = serde_json::to_string(&InOrder(vec![("b".to_owned(), 1), ("a".to_owned(), 2)])).expect("JSON");
+        let written = serde_json::to_string(&InOrder(vec![("b".to_owned(), 1), ("a".to_owned(), 2)]))
+            .expect("serialising to JSON");
         assert_eq!(written, r#"{"b":1,"a":2}"#);
     }
 }

@@ -87,7 +87,7 @@ mod tests {
     }
 
     #[test]
-    fn names_round_trip() {
+    fn weight_names_round_trip_between_transformers_versions() {
         let families = [
             (
                 ["e.encoder.layer.0.attention.attention.query.bias", "e.encoder.layer.0.attention.output.dense.bias"],

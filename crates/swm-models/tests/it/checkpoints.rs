@@ -7,56 +7,56 @@ use swm_models::lewm::Lewm;
 use swm_models::{Checkpoint, TrainOptions};
 
 fn edit(path: &Path, change: impl FnOnce(&mut serde_json::Value)) {
-    let mut value = serde_json::from_slice(&std::fs::read(path).expect("a readable file")).expect("JSON");
+    let mut value = serde_json::from_slice(&std::fs::read(path).expect("reading the file")).expect("parsing the JSON");
     change(&mut value);
-    std::fs::write(path, value.to_string()).expect("a written file");
+    std::fs::write(path, value.to_string()).expect("writing the file");
 }
 
 #[test]
 fn damaged_checkpoints_are_refused() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let trained = folder.path().join("run");
     let load = |path: &Path| Checkpoint::<Lewm>::load(path, &Device::flex());
-    let message = |path: &Path| load(path).expect_err("an error").to_string();
+    let message = |path: &Path| load(path).expect_err("loading must fail").to_string();
     assert!(message(&trained).contains("no checkpoint"));
 
-    run(&config(&["schedule.steps=1"]), &trained, &TrainOptions::default(), 0).expect("a trained model");
-    let checkpoint = load(&trained).expect("an undamaged checkpoint");
+    run(&config(&["schedule.steps=1"]), &trained, &TrainOptions::default(), 0).expect("training the model");
+    let checkpoint = load(&trained).expect("loading the undamaged checkpoint");
     assert_eq!(checkpoint.dataset_info.env.as_deref(), Some("test/Dots-v0"));
     assert_eq!(checkpoint.hash().len(), 64);
 
     let inner = trained.join("checkpoint");
     let weights = inner.join("weights.safetensors");
-    let valid_weights = std::fs::read(&weights).expect("a readable file");
-    std::fs::write(&weights, &valid_weights[..valid_weights.len() / 2]).expect("a written file");
+    let valid_weights = std::fs::read(&weights).expect("reading the file");
+    std::fs::write(&weights, &valid_weights[..valid_weights.len() / 2]).expect("writing the file");
     assert!(message(&trained).contains("is damaged"), "{}", message(&trained));
     let mut flipped = valid_weights.clone();
     *flipped.last_mut().expect("bytes") ^= 1;
-    std::fs::write(&weights, flipped).expect("a written file");
+    std::fs::write(&weights, flipped).expect("writing the file");
     assert!(message(&trained).contains("the hash differs"), "{}", message(&trained));
-    std::fs::write(&weights, &valid_weights).expect("a written file");
+    std::fs::write(&weights, &valid_weights).expect("writing the file");
 
     let config_file = inner.join("config.json");
-    let original = std::fs::read(&config_file).expect("a readable file");
+    let original = std::fs::read(&config_file).expect("reading the file");
     edit(&config_file, |file| file["config"]["model"]["latent"] = 8.into());
     assert!(message(&trained).contains("but config.json requires"), "{}", message(&trained));
-    std::fs::write(&config_file, &original).expect("a written file");
+    std::fs::write(&config_file, &original).expect("writing the file");
     edit(&config_file, |file| file["config"]["model"]["predictor"]["depth"] = 1.into());
     assert!(message(&trained).contains("is not a weight of config.json"), "{}", message(&trained));
-    std::fs::write(&config_file, &original).expect("a written file");
+    std::fs::write(&config_file, &original).expect("writing the file");
     edit(&config_file, |file| file["family"] = "pldm".into());
     assert!(message(&trained).contains("family 'pldm'"), "{}", message(&trained));
-    std::fs::write(&config_file, &original).expect("a written file");
+    std::fs::write(&config_file, &original).expect("writing the file");
 
     // If a process is killed between the two renames of a save, the folder `checkpoint.old` remains.
-    std::fs::rename(&inner, trained.join("checkpoint.old")).expect("a renamed folder");
-    load(&trained).expect("the old checkpoint");
+    std::fs::rename(&inner, trained.join("checkpoint.old")).expect("renaming the folder");
+    load(&trained).expect("loading the old checkpoint");
 }
 
 #[test]
 fn resuming_with_another_configuration_is_refused() {
-    let folder = tempfile::tempdir().expect("a folder");
-    run(&config(&["schedule.steps=1"]), folder.path(), &TrainOptions::default(), 0).expect("a trained model");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    run(&config(&["schedule.steps=1"]), folder.path(), &TrainOptions::default(), 0).expect("training the model");
     let resume = TrainOptions { resume: true, ..TrainOptions::default() };
     let error = run(&config(&["schedule.steps=1", "optim.lr=2e-3"]), folder.path(), &resume, 0);
     let message = error.expect_err("another configuration").to_string();

@@ -9,12 +9,12 @@ type Config = TrainConfig<Lewm>;
 fn presets_round_trip_and_settings_override_presets() {
     for preset in Lewm::PRESETS {
         let config = Config::load(preset.id, &[]).expect(preset.id);
-        let text = config.to_toml().expect("TOML");
+        let text = config.to_toml().expect("serialising to TOML");
         let again = toml::from_str::<Config>(&text).expect("parsing the written configuration");
-        assert_eq!(again.to_toml().expect("TOML"), text);
+        assert_eq!(again.to_toml().expect("serialising to TOML"), text);
     }
     let settings = ["optim.lr=3e-4".to_owned(), "model.latent=16".to_owned(), "optim.betas=[0.9, 0.99]".to_owned()];
-    let config = Config::load("tiny", &settings).expect("a configuration");
+    let config = Config::load("tiny", &settings).expect("loading the configuration");
     assert_eq!((config.optim.lr, config.model.latent, config.optim.betas[1]), (3e-4, 16, 0.99));
 }
 

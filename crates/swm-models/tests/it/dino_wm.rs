@@ -52,19 +52,19 @@ fn run(config: &TrainConfig<DinoWm>, out: &Path, threads: usize) -> Result<Train
 
 fn dataset_info(config: &TrainConfig<DinoWm>) -> DatasetInfo {
     let columns: Vec<String> = config.model.columns.iter().map(|column| column.name.clone()).collect();
-    DatasetInfo::from_reader(&Dots::new(2, 0), &columns, false).expect("dataset statistics")
+    DatasetInfo::from_reader(&Dots::new(2, 0), &columns, false).expect("computing the dataset statistics")
 }
 
 #[test]
 fn results_do_not_depend_on_threads_and_the_encoder_is_frozen() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let config = config(&[POSITIONS, "model.decoder=16"]).expect("a configuration");
-    let one = run(&config, &folder.path().join("1"), 1).expect("a trained model");
-    let two = run(&config, &folder.path().join("2"), 2).expect("a trained model");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let config = config(&[POSITIONS, "model.decoder=16"]).expect("loading the configuration");
+    let one = run(&config, &folder.path().join("1"), 1).expect("training the model");
+    let two = run(&config, &folder.path().join("2"), 2).expect("training the model");
     assert_eq!(one.weights, two.weights);
-    let loaded = Checkpoint::<DinoWm>::load(&folder.path().join("1"), &Device::flex()).expect("a checkpoint");
+    let loaded = Checkpoint::<DinoWm>::load(&folder.path().join("1"), &Device::flex()).expect("loading the checkpoint");
     let init = Init::new(Key::new(config.seed).with("init"), &Device::flex());
-    let fresh = DinoWm::new(&config, &loaded.dataset_info, &init).expect("a model");
+    let fresh = DinoWm::new(&config, &loaded.dataset_info, &init).expect("creating the model");
     let (before, after) = (parameters::values(&fresh), parameters::values(&loaded.model));
     for (name, value) in &before {
         assert_eq!(name.starts_with("backbone."), after[name] == *value, "{name}");
@@ -73,7 +73,7 @@ fn results_do_not_depend_on_threads_and_the_encoder_is_frozen() {
 
 #[test]
 fn training_reduces_every_loss() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let overrides = [
         POSITIONS,
         "model.decoder=16",
@@ -82,10 +82,11 @@ fn training_reduces_every_loss() {
         "model.predictor.dropout=0",
         "optim.lr=3e-3",
     ];
-    run(&config(&overrides).expect("a configuration"), folder.path(), 2).expect("a trained model");
+    run(&config(&overrides).expect("loading the configuration"), folder.path(), 2).expect("training the model");
     let lines = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("reading train.jsonl");
     let value = |line: Option<&str>, name: &str| {
-        let line: serde_json::Value = serde_json::from_str(line.expect("a line")).expect("JSON");
+        let line: serde_json::Value =
+            serde_json::from_str(line.expect("the log has a line")).expect("parsing the JSON");
         line[name].as_f64().unwrap_or_else(|| panic!("{name} in {line}"))
     };
     for name in ["loss", "prediction", "pixels", "reconstruction"] {
@@ -96,13 +97,13 @@ fn training_reduces_every_loss() {
 
 #[test]
 fn invalid_settings_and_data_are_refused() {
-    let message = |overrides: &[&str]| config(overrides).expect_err("an error").to_string();
+    let message = |overrides: &[&str]| config(overrides).expect_err("the call must fail").to_string();
     assert!(message(&["model.columns=[]"]).contains("name = \"action\""));
     assert!(message(&[IMAGES, "model.encoder.vit.patch=7"]).contains("model.encoder"));
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let trained = |overrides: &[&str]| {
-        let config = config(overrides).expect("a configuration");
-        run(&config, &folder.path().join("none"), 1).expect_err("an error").to_string()
+        let config = config(overrides).expect("loading the configuration");
+        run(&config, &folder.path().join("none"), 1).expect_err("training must fail").to_string()
     };
     let missing = "model.columns=[{ name = \"velocity\", dim = 3 }, { name = \"action\", dim = 5 }]";
     assert!(trained(&[missing]).contains("velocity"), "{}", trained(&[missing]));
@@ -112,9 +113,10 @@ fn invalid_settings_and_data_are_refused() {
 }
 
 fn checkpoint(overrides: &[&str]) -> Checkpoint<DinoWm> {
-    let config = config(overrides).expect("a configuration");
+    let config = config(overrides).expect("loading the configuration");
     let dataset_info = dataset_info(&config);
-    let model = DinoWm::new(&config, &dataset_info, &Init::new(Key::new(3), &Device::flex())).expect("a model");
+    let model =
+        DinoWm::new(&config, &dataset_info, &Init::new(Key::new(3), &Device::flex())).expect("creating the model");
     Checkpoint { model, config, dataset_info, manifest: Manifest::new("train", 0, serde_json::Value::Null) }
 }
 
@@ -126,7 +128,7 @@ fn infos(extra_columns: &[&str]) -> Batch {
         "history.pixels" => ColumnSpec::new(*name, DType::U8, [1, SIDE, SIDE, 3]),
         position => ColumnSpec::new(position, DType::Float32, [2]),
     }));
-    let mut infos = Batch::zeros(&Schema::new(columns).expect("columns"), ENVS);
+    let mut infos = Batch::zeros(&Schema::new(columns).expect("creating the schema"), ENVS);
     for env in 0..ENVS {
         let mut row = infos.row_mut(env);
         draw([3.0 + env as f32, 5.0], row.at::<u8>(0));
@@ -157,13 +159,13 @@ fn costs(overrides: &[&str], infos: &Batch, envs: &[usize], threads: usize) -> (
     let mut model = DinoWmCost::new(&checkpoint(overrides));
     let (mut plain, mut costs) = (vec![f32::NAN; envs.len() * SAMPLES], vec![f32::NAN; envs.len() * SAMPLES]);
     let mut slopes = vec![f32::NAN; actions.len()];
-    swm_core::pool::threads(threads).expect("threads").install(|| {
-        model.observe(infos, envs).expect("observed environments");
+    swm_core::pool::threads(threads).expect("creating the thread pool").install(|| {
+        model.observe(infos, envs).expect("observing the environments");
         let candidates =
             Candidates { actions: &actions, envs: envs.len(), samples: SAMPLES, horizon: HORIZON, dim: DIM };
-        model.cost(candidates, &mut plain).expect("costs");
+        model.cost(candidates, &mut plain).expect("computing the costs");
         let differentiable = model.differentiable().expect("a differentiable cost");
-        differentiable.cost_and_gradient(candidates, &mut costs, &mut slopes).expect("gradients");
+        differentiable.cost_and_gradient(candidates, &mut costs, &mut slopes).expect("computing the gradients");
     });
     for (cost, plain) in costs.iter().zip(&plain) {
         assert!((cost - plain).abs() < 1e-4 * plain.abs(), "{cost}, not {plain}");
@@ -195,14 +197,14 @@ fn gradients_match_finite_differences() {
     let (infos, all) = (infos(&["position", "goal_position"]), candidates());
     let width = HORIZON * DIM;
     let mut model = DinoWmCost::new(&checkpoint(&[POSITIONS]));
-    model.observe(&infos, &[1]).expect("observed environments");
+    model.observe(&infos, &[1]).expect("observing the environments");
     let slopes = costs(&[POSITIONS], &infos, &[1], 1).1;
     let mut cost_at = |i: usize, by: f32| {
         let mut actions = all[SAMPLES * width..][..width].to_vec();
         actions[i] += by;
         let mut cost = [0.0];
         let one = Candidates { actions: &actions, envs: 1, samples: 1, horizon: HORIZON, dim: DIM };
-        model.cost(one, &mut cost).expect("a cost");
+        model.cost(one, &mut cost).expect("computing the cost");
         cost[0]
     };
     let largest = slopes[..width].iter().fold(0.0f32, |most, slope| slope.abs().max(most));

@@ -21,7 +21,7 @@ impl Dots {
             ColumnSpec::new("action", DType::Float32, [2]),
             ColumnSpec::new("position", DType::Float32, [2]),
         ])
-        .expect("three columns");
+        .expect("creating the schema");
         let mut rows = Batch::zeros(&schema, episodes * LENGTH);
         for episode in 0..episodes {
             let mut rng = Key::new(seed).at(episode as u64).rng();

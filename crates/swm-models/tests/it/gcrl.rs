@@ -29,7 +29,7 @@ const SMALL: &[&str] = &[
 
 fn config<M: GoalConditioned<Config = GcrlConfig>>(overrides: &[&str]) -> TrainConfig<M> {
     let overrides: Vec<String> = SMALL.iter().chain(overrides).map(|&setting| setting.to_owned()).collect();
-    TrainConfig::load("tiny", &overrides).expect("a configuration")
+    TrainConfig::load("tiny", &overrides).expect("loading the configuration")
 }
 
 fn run<M: Trainable>(config: &TrainConfig<M>, out: &Path, options: &TrainOptions) -> Result<TrainSummary> {
@@ -37,8 +37,8 @@ fn run<M: Trainable>(config: &TrainConfig<M>, out: &Path, options: &TrainOptions
 }
 
 fn trained<M: Trainable>(config: &TrainConfig<M>, out: &Path) -> Checkpoint<M> {
-    run(config, out, &TrainOptions::default()).expect("a trained model");
-    Checkpoint::load(out, &Device::flex()).expect("a checkpoint")
+    run(config, out, &TrainOptions::default()).expect("training the model");
+    Checkpoint::load(out, &Device::flex()).expect("loading the checkpoint")
 }
 
 /// The specification of an environment with a dot; the tests do not step the environment.
@@ -61,7 +61,7 @@ fn box_actions() -> Space {
 /// Infos with one row per entry of `positions`: the positions of the dot in the observation and in the goal image.
 fn infos(positions: &[([f32; 2], [f32; 2])]) -> Batch {
     let schema = Schema::new([ColumnSpec::image("pixels", SIDE, SIDE), ColumnSpec::image("goal", SIDE, SIDE)]);
-    let mut infos = Batch::zeros(&schema.expect("columns"), positions.len());
+    let mut infos = Batch::zeros(&schema.expect("creating the schema"), positions.len());
     for (env, &(at, goal)) in positions.iter().enumerate() {
         let mut row = infos.row_mut(env);
         draw(at, row.at::<u8>(0));
@@ -71,11 +71,11 @@ fn infos(positions: &[([f32; 2], [f32; 2])]) -> Batch {
 }
 
 fn actions(envs: usize) -> Batch {
-    Batch::zeros(&Schema::new([ColumnSpec::new("action", DType::Float32, [2])]).expect("a column"), envs)
+    Batch::zeros(&Schema::new([ColumnSpec::new("action", DType::Float32, [2])]).expect("creating the schema"), envs)
 }
 
 #[test]
-fn presets_load() {
+fn presets_have_the_steps_and_frozen_encoder_of_their_family() {
     fn check<M: GoalConditioned<Config = GcrlConfig>>() {
         for preset in M::PRESETS {
             let config = TrainConfig::<M>::load(preset.id, &[]).expect(preset.id);
@@ -92,12 +92,12 @@ fn presets_load() {
 #[test]
 fn results_do_not_depend_on_threads() {
     fn check<M: GoalConditioned<Config = GcrlConfig>>(overrides: &[&str]) {
-        let folder = tempfile::tempdir().expect("a folder");
+        let folder = tempfile::tempdir().expect("creating a temporary folder");
         let config = config::<M>(overrides);
         let weights = [("one", 1), ("three", 3)].map(|(name, threads)| {
             let out = folder.path().join(name);
-            run(&config, &out, &TrainOptions { threads, ..TrainOptions::default() }).expect("a trained model");
-            std::fs::read(out.join("checkpoint/weights.safetensors")).expect("weights")
+            run(&config, &out, &TrainOptions { threads, ..TrainOptions::default() }).expect("training the model");
+            std::fs::read(out.join("checkpoint/weights.safetensors")).expect("reading the weights")
         });
         assert_eq!(weights[0], weights[1], "{}", M::FAMILY);
     }
@@ -109,14 +109,16 @@ fn results_do_not_depend_on_threads() {
 fn first_and_last(run: &Path, name: &str) -> (f64, f64) {
     let lines = std::fs::read_to_string(run.join("train.jsonl")).expect("reading train.jsonl");
     let value = |line: &str| {
-        serde_json::from_str::<serde_json::Value>(line).expect("JSON")[name].as_f64().expect("a value in the log")
+        serde_json::from_str::<serde_json::Value>(line).expect("parsing the JSON")[name]
+            .as_f64()
+            .expect("a value in the log")
     };
-    (value(lines.lines().next().expect("a line")), value(lines.lines().last().expect("a line")))
+    (value(lines.lines().next().expect("the log has a line")), value(lines.lines().last().expect("the log has a line")))
 }
 
 #[test]
 fn behaviour_cloning_reduces_the_loss() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let overrides = ["schedule.steps=240", "log_every=40", "model.history=2", "data.num_steps=2"];
     trained(&config::<Gcbc>(&overrides), folder.path());
     let (first, last) = first_and_last(folder.path(), "loss");
@@ -126,7 +128,7 @@ fn behaviour_cloning_reduces_the_loss() {
 #[test]
 fn training_lowers_the_mean_value() {
     fn check<M: GoalConditioned<Config = GcrlConfig>>() {
-        let folder = tempfile::tempdir().expect("a folder");
+        let folder = tempfile::tempdir().expect("creating a temporary folder");
         let overrides = ["schedule.steps=240", "log_every=20", "loss.target=0.9"];
         trained(&config::<M>(&overrides), folder.path());
         let (first, last) = first_and_last(folder.path(), "value");
@@ -139,11 +141,11 @@ fn training_lowers_the_mean_value() {
 
 #[test]
 fn target_networks_lag_and_frozen_encoders_do_not_change() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let config = config::<Gcivl>(&["loss.target=0.5"]);
     let dataset_info = DatasetInfo { action: ActionScale::identity(2), columns: Default::default(), env: None };
     let init = Init::new(Key::new(config.seed).with("init"), &Device::flex());
-    let first = Gcivl::new(&config, &dataset_info, &init).expect("a model");
+    let first = Gcivl::new(&config, &dataset_info, &init).expect("creating the model");
     let last = trained(&config, folder.path()).model;
     let (first, last) = (parameters::values(&first), parameters::values(&last));
     let name = "out_proj.weight";
@@ -172,10 +174,10 @@ fn target_networks_lag_and_frozen_encoders_do_not_change() {
 
 #[test]
 fn policy_acts_in_chunks_within_bounds_independent_of_other_environments() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let checkpoint = trained(&config::<Gcbc>(&["model.history=2", "data.num_steps=2"]), folder.path());
     let policy = |slots: usize| -> FeedForwardPolicy<Actor> {
-        Gcbc::actor(&checkpoint).policy(&spec(box_actions()), slots).expect("a policy")
+        Gcbc::actor(&checkpoint).policy(&spec(box_actions()), slots).expect("creating the policy")
     };
     let scene = ([4.0, 5.0], [11.0, 9.0]);
     // One policy acts for this environment only. The other policy also acts for an environment that begins later.
@@ -186,10 +188,10 @@ fn policy_acts_in_chunks_within_bounds_independent_of_other_environments() {
     let mut taken: Vec<Vec<f32>> = vec![];
     for step in 0..5 {
         let (mut one, mut two) = (actions(1), actions(2));
-        alone.act(&infos(&[observed(step)]), &[true], &mut one).expect("an action");
+        alone.act(&infos(&[observed(step)]), &[true], &mut one).expect("choosing an action");
         together
             .act(&infos(&[([9.0, 9.0], [2.0, 2.0]), observed(step)]), &[step > 1, true], &mut two)
-            .expect("an action");
+            .expect("choosing an action");
         let action = one.row(0).at::<f32>(0).to_vec();
         assert_eq!(action, two.row(1).at::<f32>(0));
         assert!(action.iter().all(|v| (-1.0..=1.0).contains(v)), "{action:?}");
@@ -202,10 +204,10 @@ fn policy_acts_in_chunks_within_bounds_independent_of_other_environments() {
 
 #[test]
 fn invalid_settings_data_and_environments_are_refused() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let message = |overrides: &[&str]| {
         let overrides: Vec<String> = SMALL.iter().chain(overrides).map(|&setting| setting.to_owned()).collect();
-        TrainConfig::<Gcivl>::load("tiny", &overrides).expect_err("an error").to_string()
+        TrainConfig::<Gcivl>::load("tiny", &overrides).expect_err("loading must fail").to_string()
     };
     assert!(message(&["data.num_steps=1"]).contains("model.history"), "{}", message(&["data.num_steps=1"]));
     assert!(message(&["model.head.depth=2"]).contains("attends to the goal"));
@@ -216,16 +218,19 @@ fn invalid_settings_data_and_environments_are_refused() {
     // The images of the dataset have another size than the images of the model.
     let mut large = config::<Gcbc>(&[]);
     large.model.image = 32;
-    let error = run(&large, &folder.path().join("large"), &TrainOptions::default()).expect_err("an error").to_string();
+    let error = run(&large, &folder.path().join("large"), &TrainOptions::default())
+        .expect_err("training must fail")
+        .to_string();
     assert!(error.contains("[16, 16, 3]") && error.contains("model.image"), "{error}");
 
     let checkpoint = trained(&config::<Gcbc>(&[]), &folder.path().join("run"));
     let discrete = Gcbc::actor(&checkpoint).policy(&spec(Space::Discrete { n: 3, start: 0 }), 1);
-    let error = discrete.err().expect("an error for discrete actions").to_string();
+    let error = discrete.err().expect("a space of discrete actions must be an error").to_string();
     assert!(error.contains("2 means"), "{error}");
-    let mut policy = Gcbc::actor(&checkpoint).policy(&spec(box_actions()), 1).expect("a policy");
+    let mut policy = Gcbc::actor(&checkpoint).policy(&spec(box_actions()), 1).expect("creating the policy");
     policy.begin(0, Key::new(0));
-    let without_goal = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", SIDE, SIDE)]).expect("a column"), 1);
+    let without_goal =
+        Batch::zeros(&Schema::new([ColumnSpec::image("pixels", SIDE, SIDE)]).expect("creating the schema"), 1);
     let error = policy.act(&without_goal, &[true], &mut actions(1)).expect_err("infos without a goal").to_string();
     assert!(error.contains("'goal'"), "{error}");
     // The checkpoint belongs to another family.
@@ -264,7 +269,7 @@ fn probes_read_the_position_and_reconstruct_the_image() {
     let data = Dots::new(40, 1);
     let mut settings = StateConfig::new(vec!["position".to_owned()]);
     settings.fit.steps = 300;
-    let report = probe::read_state(&Profiles, &data, &settings).expect("a report");
+    let report = probe::read_state(&Profiles, &data, &settings).expect("fitting the probe");
     assert_eq!((report.latent, report.linear.len(), report.network.len()), (2 * SIDE, 2, 2));
     for score in report.linear.iter().chain(&report.network) {
         let r2 = score.r2.expect("a score of a moving dot");
@@ -272,25 +277,25 @@ fn probes_read_the_position_and_reconstruct_the_image() {
         assert!((r2 - (1.0 - (score.rmse / score.spread).powi(2))).abs() < 1e-9);
     }
     assert_eq!(
-        probe::read_state(&Profiles, &data, &settings).expect("a report"),
+        probe::read_state(&Profiles, &data, &settings).expect("fitting the probe"),
         report,
         "a second fit gives another report"
     );
     // Images do not determine the actions. The probe skips the last row of an episode, which has no action.
     let actions = StateConfig { columns: vec!["action".to_owned()], ..settings };
-    let report = probe::read_state(&Profiles, &data, &actions).expect("a report");
+    let report = probe::read_state(&Profiles, &data, &actions).expect("fitting the probe");
     assert!(report.linear.iter().all(|score| score.r2.expect("a score of actions that differ") < 0.1), "{report:?}");
 
     let mut settings = ReconstructionConfig { channels: vec![16, 8], shown: 6, ..ReconstructionConfig::default() };
     (settings.fit.steps, settings.fit.lr) = (1000, 5e-3);
-    let (report, sheet) = probe::reconstruct_images(&Profiles, &data, &settings).expect("a fit");
+    let (report, sheet) = probe::reconstruct_images(&Profiles, &data, &settings).expect("fitting the decoder");
     assert!(report.explained > 0.2 && report.rmse < report.rmse_of_mean, "{report:?}");
     let cell = SIDE * 8 + 2;
     assert_eq!((sheet.width, sheet.height), (6 * cell + 2, 2 * cell + 2));
 
     let error = |columns: &[&str]| {
         let columns = columns.iter().map(|&name| name.to_owned()).collect();
-        probe::read_state(&Profiles, &data, &StateConfig::new(columns)).expect_err("an error").to_string()
+        probe::read_state(&Profiles, &data, &StateConfig::new(columns)).expect_err("the call must fail").to_string()
     };
     assert!(error(&["positoin"]).contains("did you mean position"), "{}", error(&["positoin"]));
     assert!(error(&["pixels"]).contains("holds images"));

@@ -227,7 +227,8 @@ fn copied(family: &str) -> (tempfile::TempDir, PathBuf) {
 
 #[test]
 fn hostile_reference_configs_are_refused() {
-    let imports: [(&str, fn(&Path) -> swm_core::Result<()>); 3] = [
+    type Import = fn(&Path) -> swm_core::Result<()>;
+    let imports: [(&str, Import); 3] = [
         ("lewm", |path| lewm::import::import(path, dataset_info()).map(drop)),
         ("pldm", |path| pldm::import::import(path, dataset_info()).map(drop)),
         ("prejepa", |path| {

@@ -11,14 +11,14 @@ const FILE: &[u8] = b"the content of a weights file";
 /// Serves [`FILE`] as `model.safetensors` of the repository `owner/name`. Returns the address of the server and the
 /// counter of its requests.
 fn serve() -> (String, Arc<AtomicUsize>) {
-    let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
-    let address = format!("http://{}", listener.local_addr().expect("an address"));
+    let listener = TcpListener::bind("127.0.0.1:0").expect("binding a port");
+    let address = format!("http://{}", listener.local_addr().expect("reading the local address"));
     let requests = Arc::new(AtomicUsize::new(0));
     let count = Arc::clone(&requests);
     std::thread::spawn(move || {
         for stream in listener.incoming() {
-            let mut stream = stream.expect("a connection");
-            let mut lines = BufReader::new(stream.try_clone().expect("a socket")).lines();
+            let mut stream = stream.expect("accepting a connection");
+            let mut lines = BufReader::new(stream.try_clone().expect("cloning the socket")).lines();
             let mut next = || lines.next().and_then(Result::ok).unwrap_or_default();
             let request = next();
             while !next().is_empty() {}
@@ -49,7 +49,7 @@ fn serve() -> (String, Arc<AtomicUsize>) {
 
 #[test]
 fn files_are_downloaded_once() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let (address, requests) = serve();
     let hub = Hub::at(&address, folder.path());
     let path = hub.fetch("owner/name", "model.safetensors").expect("downloading the served file");
@@ -57,14 +57,14 @@ fn files_are_downloaded_once() {
     assert!(path.ends_with("models--owner--name/snapshots/main/model.safetensors"), "{}", path.display());
     let before = requests.load(Ordering::Relaxed);
     assert_eq!(hub.fetch("owner/name", "model.safetensors").expect("finding the cached file"), path);
-    assert_eq!(requests.load(Ordering::Relaxed), before, "no further request");
+    assert_eq!(requests.load(Ordering::Relaxed), before, "a cached file needs no further request");
     let missing = hub.fetch("owner/name", "other.safetensors").expect_err("a missing file").to_string();
     assert!(missing.contains("no such object"), "{missing}");
 }
 
 #[test]
 fn unreachable_hub_error_names_the_fix() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     // The top-level domain `invalid` is reserved and never resolves.
     let hub = Hub::at("http://hub.invalid", folder.path());
     let message = hub.fetch("owner/name", "model.safetensors").expect_err("an unreachable hub").to_string();

@@ -43,7 +43,7 @@ fn config<M: Trainable>(settings: &[&str]) -> TrainConfig<M> {
     ];
     let settings: Vec<String> =
         family.iter().chain(&small).chain(settings).map(|&setting| setting.to_owned()).collect();
-    TrainConfig::load("tiny", &settings).expect("a configuration")
+    TrainConfig::load("tiny", &settings).expect("loading the configuration")
 }
 
 /// Makes pools of the environment `id`, whose episodes are truncated after `steps` steps.
@@ -62,7 +62,9 @@ fn run<M: Agent>(config: &TrainConfig<M>, out: &Path, options: &TrainOptions, st
 /// Reads the files of a run that its configuration determines.
 fn files(run: &Path) -> Vec<Vec<u8>> {
     let of = |folder: &str, name: &str| std::fs::read(run.join(folder).join(name)).expect(name);
-    let data_folders = std::fs::read_dir(run).expect("a folder").map(|entry| entry.expect("an entry").file_name());
+    let data_folders = std::fs::read_dir(run)
+        .expect("listing a folder")
+        .map(|entry| entry.expect("reading the folder entry").file_name());
     let data_folders: Vec<String> = data_folders
         .map(|name| name.to_string_lossy().into_owned())
         .filter(|name| name.starts_with("played-"))
@@ -79,7 +81,7 @@ fn files(run: &Path) -> Vec<Vec<u8>> {
 fn lines(run: &Path) -> Vec<serde_json::Value> {
     let lines = std::fs::read_to_string(run.join("train.jsonl")).expect("reading train.jsonl");
     let fixed = |line: &str| {
-        let mut line: serde_json::Value = serde_json::from_str(line).expect("JSON");
+        let mut line: serde_json::Value = serde_json::from_str(line).expect("parsing the JSON");
         for name in ["clips_per_second", "playing", "seconds"] {
             line.as_object_mut().expect("an object").remove(name);
         }
@@ -89,12 +91,12 @@ fn lines(run: &Path) -> Vec<serde_json::Value> {
 }
 
 fn check_threads<M: Agent>() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let config = config::<M>(&[]);
     let out = |name: &str| folder.path().join(name);
     for (name, threads) in [("one", 1), ("three", 3)] {
         let options = TrainOptions { threads, ..TrainOptions::default() };
-        let summary = run(&config, &out(name), &options, 0).expect("a trained model");
+        let summary = run(&config, &out(name), &options, 0).expect("training the model");
         assert_eq!((summary.steps, summary.interrupted), (24, false));
         // The warm-up makes 60 environment steps; each of the 12 later rounds makes one step of 3 environments.
         assert_eq!(summary.env_steps, 60 + 12 * 3);
@@ -103,7 +105,7 @@ fn check_threads<M: Agent>() {
     assert_eq!(files(&out("one")), files(&out("three")));
     assert_eq!(lines(&out("one")), lines(&out("three")));
     let other = self::config::<M>(&["seed=1"]);
-    run(&other, &out("other"), &TrainOptions::default(), 0).expect("a trained model");
+    run(&other, &out("other"), &TrainOptions::default(), 0).expect("training the model");
     assert_ne!(files(&out("other"))[1], files(&out("one"))[1]);
 }
 
@@ -114,18 +116,18 @@ fn online_results_do_not_depend_on_threads() {
 }
 
 #[test]
-fn resumed_online_run_gives_the_same_bytes() {
-    let folder = tempfile::tempdir().expect("a folder");
+fn resumed_online_run_gives_the_files_of_an_uninterrupted_run() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let (complete, resumed) = (folder.path().join("complete"), folder.path().join("resumed"));
     let config = config::<Sac>(&[]);
     let options = TrainOptions::default();
-    run(&config, &complete, &options, 0).expect("a trained model");
-    let first = run(&config, &resumed, &options, 10).expect("a trained model");
+    run(&config, &complete, &options, 0).expect("training the model");
+    let first = run(&config, &resumed, &options, 10).expect("training the model");
     assert_eq!((first.steps, first.interrupted), (10, true));
     let refused = run(&config, &resumed, &options, 0).expect_err("the folder holds a run").to_string();
     assert!(refused.contains("resume"), "{refused}");
     let resume = TrainOptions { resume: true, ..options };
-    let second = run(&config, &resumed, &resume, 0).expect("a trained model");
+    let second = run(&config, &resumed, &resume, 0).expect("training the model");
     assert_eq!((second.steps, second.interrupted), (24, false));
     assert_eq!(files(&complete), files(&resumed));
     let other = run(&self::config::<Sac>(&["optim.lr=1e-4"]), &resumed, &resume, 0)
@@ -136,11 +138,11 @@ fn resumed_online_run_gives_the_same_bytes() {
 
 #[test]
 fn invalid_settings_and_data_are_refused() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let refused = |config: &TrainConfig<Sac>, id: &'static str| {
         let out = folder.path().join("refused");
         let error = train_online(config, &pools(id, None), &out, &TrainOptions::default(), &mut Control::new());
-        error.expect_err("an error").to_string()
+        error.expect_err("the call must fail").to_string()
     };
     let discrete = refused(&config(&[]), "swm/CartPoleControl-v1");
     assert!(discrete.contains("continuous actions"), "{discrete}");
@@ -151,8 +153,9 @@ fn invalid_settings_and_data_are_refused() {
     let missing = refused(&offline, PENDULUM);
     assert!(missing.contains("online") && missing.contains("--data"), "{missing}");
 
-    let message =
-        |setting: &str| TrainConfig::<Tdmpc2>::load("tiny", &[setting.to_owned()]).expect_err("an error").to_string();
+    let message = |setting: &str| {
+        TrainConfig::<Tdmpc2>::load("tiny", &[setting.to_owned()]).expect_err("loading must fail").to_string()
+    };
     assert!(message("model.simplex=7").contains("multiple"), "{}", message("model.simplex=7"));
     assert!(message("data.frameskip=5").contains("rewards"), "{}", message("data.frameskip=5"));
     assert!(message("loss.discount=1.5").contains("loss.discount"));

@@ -39,7 +39,7 @@ fn infos(history: bool) -> Batch {
         columns.push(ColumnSpec::new("history.action", DType::Float32, [1, DIM]));
         columns.push(ColumnSpec::new("history.pixels", DType::U8, [1, SIDE, SIDE, 3]));
     }
-    let mut infos = Batch::zeros(&Schema::new(columns).expect("columns"), ENVS);
+    let mut infos = Batch::zeros(&Schema::new(columns).expect("creating the schema"), ENVS);
     for env in 0..ENVS {
         let mut row = infos.row_mut(env);
         draw([3.0 + env as f32, 5.0], row.at::<u8>(0));
@@ -65,11 +65,11 @@ fn costs(infos: &Batch, envs: &[usize], threads: usize) -> Vec<f32> {
     let actions: Vec<f32> = envs.iter().flat_map(|&env| all[env * per_env..][..per_env].to_vec()).collect();
     let mut cost = LewmCost::new(&checkpoint());
     let mut costs = vec![f32::NAN; envs.len() * SAMPLES];
-    swm_core::pool::threads(threads).expect("threads").install(|| {
-        cost.observe(infos, envs).expect("observed environments");
+    swm_core::pool::threads(threads).expect("creating the thread pool").install(|| {
+        cost.observe(infos, envs).expect("observing the environments");
         let candidates =
             Candidates { actions: &actions, envs: envs.len(), samples: SAMPLES, horizon: HORIZON, dim: DIM };
-        cost.cost(candidates, &mut costs).expect("costs");
+        cost.cost(candidates, &mut costs).expect("computing the costs");
     });
     costs
 }
@@ -99,16 +99,16 @@ fn history_changes_the_cost() {
 #[test]
 fn invalid_candidates_and_observations_are_refused() {
     let mut cost = LewmCost::new(&checkpoint());
-    cost.observe(&infos(false), &[0]).expect("observed environments");
+    cost.observe(&infos(false), &[0]).expect("observing the environments");
     let actions = vec![0.0; 6];
     let wrong = Candidates { actions: &actions, envs: 1, samples: 1, horizon: 2, dim: 3 };
     let message = cost.cost(wrong, &mut [0.0]).expect_err("actions of dimension 3").to_string();
     assert!(message.contains("4 action elements a model step"), "{message}");
-    let schema = Schema::new([ColumnSpec::image("pixels", SIDE, SIDE)]).expect("a column");
+    let schema = Schema::new([ColumnSpec::image("pixels", SIDE, SIDE)]).expect("creating the schema");
     let message = cost.observe(&Batch::zeros(&schema, 1), &[0]).expect_err("infos without a goal").to_string();
     assert!(message.contains("'goal'"), "{message}");
     let large = Schema::new([ColumnSpec::image("pixels", 2 * SIDE, 2 * SIDE), ColumnSpec::image("goal", SIDE, SIDE)])
-        .expect("columns");
+        .expect("creating the schema");
     let message = cost.observe(&Batch::zeros(&large, 1), &[0]).expect_err("images of 32 pixels").to_string();
     assert!(message.contains("[16, 16, 3]"), "{message}");
 }
@@ -116,7 +116,7 @@ fn invalid_candidates_and_observations_are_refused() {
 /// Returns a cost that has observed environments 0 and 1 with their histories.
 fn observed() -> LewmCost {
     let mut cost = LewmCost::new(&checkpoint());
-    cost.observe(&infos(true), &[0, 1]).expect("observed environments");
+    cost.observe(&infos(true), &[0, 1]).expect("observing the environments");
     cost
 }
 
@@ -130,9 +130,9 @@ fn gradients_match_finite_differences() {
     let mut model = observed();
     let (mut costs, mut slopes) = (vec![0.0; 2 * samples], vec![0.0; actions.len()]);
     let differentiable = model.differentiable().expect("a LeWM has a gradient");
-    differentiable.cost_and_gradient(candidates_of(actions), &mut costs, &mut slopes).expect("gradients");
+    differentiable.cost_and_gradient(candidates_of(actions), &mut costs, &mut slopes).expect("computing the gradients");
     let mut plain = vec![0.0; 2 * samples];
-    model.cost(candidates_of(actions), &mut plain).expect("costs");
+    model.cost(candidates_of(actions), &mut plain).expect("computing the costs");
     for (cost, plain) in costs.iter().zip(&plain) {
         assert!((cost - plain).abs() < 1e-4 * plain.abs(), "{cost}, not {plain}");
     }
@@ -140,7 +140,7 @@ fn gradients_match_finite_differences() {
     let mut moved = |i: usize, by: f32| {
         let mut actions = actions.to_vec();
         actions[i] += by;
-        model.cost(candidates_of(&actions), &mut plain).expect("costs");
+        model.cost(candidates_of(&actions), &mut plain).expect("computing the costs");
         f64::from(plain[i / width])
     };
     let largest = slopes.iter().fold(0.0, |most, slope| slope.abs().max(most));
@@ -161,11 +161,11 @@ fn gradients_do_not_depend_on_other_environments_or_threads() {
             envs.iter().flat_map(|&env| all[env * samples * width..][..samples * width].to_vec()).collect();
         let mut model = LewmCost::new(&checkpoint());
         let (mut costs, mut slopes) = (vec![0.0; envs.len() * samples], vec![0.0; actions.len()]);
-        swm_core::pool::threads(threads).expect("threads").install(|| {
-            model.observe(&infos(true), envs).expect("observed environments");
+        swm_core::pool::threads(threads).expect("creating the thread pool").install(|| {
+            model.observe(&infos(true), envs).expect("observing the environments");
             let candidates = Candidates { actions: &actions, envs: envs.len(), samples, horizon: HORIZON, dim: DIM };
             let model = model.differentiable().expect("a LeWM has a gradient");
-            model.cost_and_gradient(candidates, &mut costs, &mut slopes).expect("gradients");
+            model.cost_and_gradient(candidates, &mut costs, &mut slopes).expect("computing the gradients");
         });
         slopes
     };
@@ -180,17 +180,19 @@ fn vector_jacobian_products_match_finite_differences() {
     let latent = model.latent().expect("a LeWM has latents");
     let width = latent.latent_dim();
     let (mut start, mut goal) = (vec![0.0; 2 * width], vec![0.0; 2 * width]);
-    latent.encode(&mut start, &mut goal).expect("latents");
+    latent.encode(&mut start, &mut goal).expect("encoding the latents");
     assert_ne!(start, goal);
     let actions = candidates()[..2 * DIM].to_vec();
     let mut next = vec![0.0; 2 * width];
-    latent.predict(&start, &actions, &mut next).expect("a step");
+    latent.predict(&start, &actions, &mut next).expect("predicting the next latent");
     // The vector-Jacobian products with the vector `pull` are the gradients of the scalar `next · pull`.
     let pull: Vec<f32> = (0..2 * width).map(|i| ((i * 29 % 17) as f32 - 8.0) / 8.0).collect();
     let (mut by_latent, mut by_action) = (vec![0.0; 2 * width], vec![0.0; 2 * DIM]);
-    latent.predict_vjp(&start, &actions, &pull, &mut by_latent, &mut by_action).expect("vector-Jacobian products");
+    latent
+        .predict_vjp(&start, &actions, &pull, &mut by_latent, &mut by_action)
+        .expect("computing the vector-Jacobian products");
     let mut value = |start: &[f32], actions: &[f32]| {
-        latent.predict(start, actions, &mut next).expect("a step");
+        latent.predict(start, actions, &mut next).expect("predicting the next latent");
         next.iter().zip(&pull).map(|(a, b)| f64::from(a * b)).sum::<f64>()
     };
     let step = 2e-2f32;

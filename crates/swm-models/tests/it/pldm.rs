@@ -39,26 +39,28 @@ fn config(overrides: &[&str]) -> Result<TrainConfig<Pldm>> {
 
 fn run(config: &TrainConfig<Pldm>, out: &Path, threads: usize) -> TrainSummary {
     let options = TrainOptions { threads, ..TrainOptions::default() };
-    train(config, Arc::new(Dots::new(6, 0)), out, &options, &mut Control::new()).expect("a trained model")
+    train(config, Arc::new(Dots::new(6, 0)), out, &options, &mut Control::new()).expect("training the model")
 }
 
 #[test]
 fn results_do_not_depend_on_threads() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let config = config(&[]).expect("a configuration");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let config = config(&[]).expect("loading the configuration");
     let (one, two) = (run(&config, &folder.path().join("1"), 1), run(&config, &folder.path().join("2"), 2));
     assert_eq!(one.weights, two.weights);
-    let loaded = Checkpoint::<Pldm>::load(&folder.path().join("1"), &Device::flex()).expect("a checkpoint");
+    let loaded = Checkpoint::<Pldm>::load(&folder.path().join("1"), &Device::flex()).expect("loading the checkpoint");
     assert_eq!((loaded.hash(), loaded.config.loss.idm_hidden), (one.weights.as_str(), 16));
 }
 
 #[test]
-fn every_term_is_logged_and_the_loss_decreases() {
-    let folder = tempfile::tempdir().expect("a folder");
+fn every_loss_term_is_logged_and_the_loss_decreases() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let overrides = ["schedule.steps=300", "log_every=20", "model.predictor.dropout=0", "optim.lr=3e-3", "loss.idm=10"];
-    run(&config(&overrides).expect("a configuration"), folder.path(), 2);
+    run(&config(&overrides).expect("loading the configuration"), folder.path(), 2);
     let lines = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("reading train.jsonl");
-    let line = |line: Option<&str>| serde_json::from_str::<serde_json::Value>(line.expect("a line")).expect("JSON");
+    let line = |line: Option<&str>| {
+        serde_json::from_str::<serde_json::Value>(line.expect("the log has a line")).expect("parsing the JSON")
+    };
     let (first, last) = (line(lines.lines().next()), line(lines.lines().last()));
     let value =
         |line: &serde_json::Value, name: &str| line[name].as_f64().unwrap_or_else(|| panic!("{name} in {line}"));
@@ -80,8 +82,8 @@ fn invalid_settings_are_refused() {
     assert!(short.contains("loss.temp_straight") && short.contains("data.num_steps of at least 3"), "{short}");
     assert!(message(&["data.num_steps=2"]).contains("model.predictor.history"));
     assert!(message(&["loss.stdd=1"]).contains("did you mean loss.std"));
-    let folder = tempfile::tempdir().expect("a folder");
-    let large = config(&["model.image=32"]).expect("a configuration");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let large = config(&["model.image=32"]).expect("loading the configuration");
     let reader = Arc::new(Dots::new(2, 0));
     let trained = train(&large, reader, folder.path(), &TrainOptions::default(), &mut Control::new());
     let message = trained.expect_err("images of 16 pixels").to_string();

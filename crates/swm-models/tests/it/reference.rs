@@ -42,26 +42,27 @@ fn check_world_model(golden: &Golden, model: &Lewm) {
 }
 
 #[test]
-fn lewm_checkpoints_load() {
-    let checkpoint = lewm::import::import(&folder("lewm"), dataset_info(2)).expect("a checkpoint");
+fn lewm_checkpoint_of_the_reference_gives_its_outputs() {
+    let checkpoint = lewm::import::import(&folder("lewm"), dataset_info(2)).expect("importing the checkpoint");
     assert_eq!((checkpoint.config.data.frameskip, checkpoint.config.model.image), (2, 8));
     check_world_model(&recorded("lewm"), &checkpoint.model);
 }
 
 #[test]
-fn pldm_checkpoints_load() {
+fn pldm_checkpoint_of_the_reference_gives_its_outputs() {
     // `import` accepts the path of the weights file as well as the folder.
-    let checkpoint = pldm::import::import(&folder("pldm").join("weights.pt"), dataset_info(4)).expect("a checkpoint");
+    let checkpoint =
+        pldm::import::import(&folder("pldm").join("weights.pt"), dataset_info(4)).expect("importing the checkpoint");
     assert_eq!((checkpoint.config.data.frameskip, checkpoint.config.model.predictor.history), (1, 3));
     check_world_model(&recorded("pldm"), &checkpoint.model.model);
 }
 
 fn dino_wm_checkpoint() -> swm_models::Checkpoint<DinoWm> {
-    dino_wm::import::import(&folder("prejepa"), dataset_info(2)).expect("a checkpoint")
+    dino_wm::import::import(&folder("prejepa"), dataset_info(2)).expect("importing the checkpoint")
 }
 
 #[test]
-fn dino_wm_checkpoints_load() {
+fn dino_wm_checkpoint_of_the_reference_gives_its_outputs() {
     let (golden, checkpoint) = (recorded("prejepa"), dino_wm_checkpoint());
     let names: Vec<&str> = checkpoint.config.model.columns.iter().map(|column| column.name.as_str()).collect();
     assert_eq!((names, checkpoint.config.data.frameskip), (vec!["proprio", "action"], 2));
@@ -75,20 +76,20 @@ fn dino_wm_checkpoints_load() {
 }
 
 #[test]
-fn exported_checkpoints_load_again() {
-    let out = tempfile::tempdir().expect("a folder");
+fn exported_checkpoints_round_trip() {
+    let out = tempfile::tempdir().expect("creating a temporary folder");
     for naming in [Naming::Published, Naming::Transformers5] {
         let exported_folder = out.path().join(format!("lewm-{naming:?}"));
-        let lewm = lewm::import::import(&folder("lewm"), dataset_info(2)).expect("a checkpoint");
-        lewm::import::export(&lewm, &exported_folder, naming).expect("an exported checkpoint");
-        let again = lewm::import::import(&exported_folder, dataset_info(2)).expect("a checkpoint");
+        let lewm = lewm::import::import(&folder("lewm"), dataset_info(2)).expect("importing the checkpoint");
+        lewm::import::export(&lewm, &exported_folder, naming).expect("exporting the checkpoint");
+        let again = lewm::import::import(&exported_folder, dataset_info(2)).expect("importing the checkpoint");
         assert_eq!(again.config.model, lewm.config.model);
         assert_eq!(parameters::values(&again.model), parameters::values(&lewm.model));
 
         let exported_folder = out.path().join(format!("pldm-{naming:?}"));
-        let pldm = pldm::import::import(&folder("pldm"), dataset_info(2)).expect("a checkpoint");
-        pldm::import::export(&pldm, &exported_folder, naming).expect("an exported checkpoint");
-        let again = pldm::import::import(&exported_folder, dataset_info(2)).expect("a checkpoint");
+        let pldm = pldm::import::import(&folder("pldm"), dataset_info(2)).expect("importing the checkpoint");
+        pldm::import::export(&pldm, &exported_folder, naming).expect("exporting the checkpoint");
+        let again = pldm::import::import(&exported_folder, dataset_info(2)).expect("importing the checkpoint");
         assert_eq!(parameters::values(&again.model), parameters::values(&pldm.model));
     }
     // Weights with published names are exported unchanged, except for counters.
@@ -126,11 +127,11 @@ fn unsuitable_checkpoints_are_refused() {
     let missing = message(lewm::import::import(Path::new("nowhere"), dataset_info(2)));
     assert!(missing.contains("nowhere"), "{missing}");
     // The config.json has fewer layers than the weights.
-    let out = tempfile::tempdir().expect("a folder");
-    let text = std::fs::read_to_string(folder("lewm").join("config.json")).expect("a configuration file");
+    let out = tempfile::tempdir().expect("creating a temporary folder");
+    let text = std::fs::read_to_string(folder("lewm").join("config.json")).expect("reading the configuration file");
     std::fs::write(out.path().join("config.json"), text.replace("\"depth\": 2", "\"depth\": 1"))
-        .expect("a written file");
-    std::fs::copy(folder("lewm").join("weights.pt"), out.path().join("weights.pt")).expect("a copied file");
+        .expect("writing the file");
+    std::fs::copy(folder("lewm").join("weights.pt"), out.path().join("weights.pt")).expect("copying the file");
     let mismatch = message(lewm::import::import(out.path(), dataset_info(2)));
     assert!(mismatch.contains("layers.1") && mismatch.contains("config.json"), "{mismatch}");
 }
@@ -141,7 +142,7 @@ fn unsuitable_checkpoints_are_refused() {
 #[ignore = "needs SWM_TORCH_PYTHON"]
 fn exported_checkpoints_load_in_the_reference() {
     let python = std::env::var_os("SWM_TORCH_PYTHON").expect("SWM_TORCH_PYTHON names an interpreter");
-    let out = tempfile::tempdir().expect("a folder");
+    let out = tempfile::tempdir().expect("creating a temporary folder");
     let load = |family: &str| {
         let golden = folder("..");
         let status = std::process::Command::new(&python)
@@ -149,12 +150,12 @@ fn exported_checkpoints_load_in_the_reference() {
             .arg(out.path().join(family))
             .arg(golden.join(format!("reference-{family}.safetensors")))
             .status();
-        assert!(status.expect("a finished process").success(), "{family}");
+        assert!(status.expect("running Python").success(), "{family}");
     };
-    let lewm = lewm::import::import(&folder("lewm"), dataset_info(2)).expect("a checkpoint");
-    lewm::import::export(&lewm, &out.path().join("lewm"), Naming::Transformers5).expect("an exported checkpoint");
+    let lewm = lewm::import::import(&folder("lewm"), dataset_info(2)).expect("importing the checkpoint");
+    lewm::import::export(&lewm, &out.path().join("lewm"), Naming::Transformers5).expect("exporting the checkpoint");
     load("lewm");
-    let pldm = pldm::import::import(&folder("pldm"), dataset_info(2)).expect("a checkpoint");
-    pldm::import::export(&pldm, &out.path().join("pldm"), Naming::Transformers5).expect("an exported checkpoint");
+    let pldm = pldm::import::import(&folder("pldm"), dataset_info(2)).expect("importing the checkpoint");
+    pldm::import::export(&pldm, &out.path().join("pldm"), Naming::Transformers5).expect("exporting the checkpoint");
     load("pldm");
 }

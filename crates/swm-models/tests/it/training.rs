@@ -33,7 +33,7 @@ pub fn config(overrides: &[&str]) -> TrainConfig<Lewm> {
         "log_every=5",
     ];
     let overrides: Vec<String> = small.iter().chain(overrides).map(|&setting| setting.to_owned()).collect();
-    TrainConfig::load("tiny", &overrides).expect("a configuration")
+    TrainConfig::load("tiny", &overrides).expect("loading the configuration")
 }
 
 /// A control that interrupts the run after the step `stop_at`.
@@ -57,70 +57,75 @@ fn files(run: &Path) -> Vec<Vec<u8>> {
 }
 
 #[test]
-fn resumed_run_gives_the_same_bytes() {
-    let folder = tempfile::tempdir().expect("a folder");
+fn resumed_run_gives_the_files_of_an_uninterrupted_run() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let (complete, resumed) = (folder.path().join("complete"), folder.path().join("resumed"));
     // 6 episodes of 17 clips give 6 batches of 16 clips. The first epoch therefore ends after step 6, which the resumed
     // run makes.
     let config = config(&[]);
     let options = TrainOptions::default();
-    let summary = run(&config, &complete, &options, 0).expect("a trained model");
+    let summary = run(&config, &complete, &options, 0).expect("training the model");
     assert!((summary.steps, summary.interrupted) == (10, false));
-    let first = run(&config, &resumed, &options, 5).expect("a trained model");
+    let first = run(&config, &resumed, &options, 5).expect("training the model");
     assert!((first.steps, first.interrupted) == (5, true));
     let refused = run(&config, &resumed, &options, 0).expect_err("the folder holds a run").to_string();
     assert!(refused.contains("resume"), "{refused}");
     let resume = TrainOptions { resume: true, ..options };
-    let second = run(&config, &resumed, &resume, 0).expect("a trained model");
+    let second = run(&config, &resumed, &resume, 0).expect("training the model");
     assert_eq!((second.steps, &second.weights), (10, &summary.weights));
     assert_eq!(files(&complete), files(&resumed));
     let lines = std::fs::read_to_string(resumed.join("train.jsonl")).expect("reading train.jsonl");
     let steps: Vec<u64> = lines
         .lines()
-        .map(|line| serde_json::from_str::<serde_json::Value>(line).expect("JSON")["step"].as_u64().expect("a step"))
+        .map(|line| {
+            serde_json::from_str::<serde_json::Value>(line).expect("parsing the JSON")["step"]
+                .as_u64()
+                .expect("the step is an integer")
+        })
         .collect();
     assert_eq!(steps, [5, 10]);
 }
 
 #[test]
 fn second_training_into_a_folder_is_refused() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let out = folder.path().join("run");
-    let first = Lock::folder(&out).expect("a run of another process");
-    let error = run(&config(&[]), &out, &TrainOptions::default(), 0).expect_err("a second run");
+    let first = Lock::folder(&out).expect("locking the folder for another process");
+    let error = run(&config(&[]), &out, &TrainOptions::default(), 0).expect_err("training into a locked folder");
     assert!(error.is_usage() && error.to_string().contains(&out.display().to_string()), "{error}");
-    assert_eq!(out.read_dir().expect("the folder").count(), 0, "the second run writes nothing");
+    assert_eq!(out.read_dir().expect("listing the folder").count(), 0, "the second run writes nothing");
     drop(first);
-    assert!(run(&config(&[]), &out, &TrainOptions::default(), 1).expect("a run").interrupted);
+    assert!(run(&config(&[]), &out, &TrainOptions::default(), 1).expect("training the model").interrupted);
 }
 
 #[test]
 fn results_do_not_depend_on_threads() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let config = config(&[]);
     let mut all = vec![];
     for (name, threads, loader_threads) in [("one", 1, 0), ("two", 2, 1), ("three", 3, 2)] {
         let options = TrainOptions { threads, loader_threads, ..TrainOptions::default() };
-        run(&config, &folder.path().join(name), &options, 0).expect("a trained model");
+        run(&config, &folder.path().join(name), &options, 0).expect("training the model");
         all.push(files(&folder.path().join(name)));
     }
     assert_eq!(all[0], all[1]);
     assert_eq!(all[0], all[2]);
     let other = self::config(&["seed=1"]);
-    run(&other, &folder.path().join("other"), &TrainOptions::default(), 0).expect("a trained model");
+    run(&other, &folder.path().join("other"), &TrainOptions::default(), 0).expect("training the model");
     assert_ne!(files(&folder.path().join("other"))[1], all[0][1]);
 }
 
 #[test]
 fn training_reduces_the_loss() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let overrides = ["schedule.steps=300", "log_every=20", "model.predictor.dropout=0", "optim.lr=3e-3"];
-    run(&config(&overrides), folder.path(), &TrainOptions::default(), 0).expect("a trained model");
+    run(&config(&overrides), folder.path(), &TrainOptions::default(), 0).expect("training the model");
     let lines = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("reading train.jsonl");
     let value = |line: &str, name: &str| {
-        serde_json::from_str::<serde_json::Value>(line).expect("JSON")[name].as_f64().expect(name)
+        serde_json::from_str::<serde_json::Value>(line).expect("parsing the JSON")[name].as_f64().expect(name)
     };
-    let (first, last) = (lines.lines().next().expect("a line"), lines.lines().last().expect("a line"));
+    let (first, last) =
+        (lines.lines().next().expect("the log has a line"), lines.lines().last().expect("the log has a line"));
     assert!(value(last, "loss") < 0.5 * value(first, "loss"), "{first}\n{last}");
     // Collapsed latents are predicted perfectly, but their SIGReg loss is about a tenth of the batch size.
     assert!(value(last, "sigreg") < 2.0, "{last}");
@@ -128,7 +133,7 @@ fn training_reduces_the_loss() {
 
 #[test]
 fn non_finite_loss_stops_the_run() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let error = run(&config(&["optim.lr=1e30", "optim.clip=1e30"]), folder.path(), &TrainOptions::default(), 0);
     let message = error.expect_err("a loss that is not finite").to_string();
     assert!(message.contains("not finite") && message.contains("optim.lr"), "{message}");

@@ -86,7 +86,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn tolerances_equal_those_of_the_suite() {
+    fn tolerances_equal_those_of_dm_control() {
         let bell = Tolerance::at_least(1.2).gaussian(0.6);
         assert_eq!([bell.of(1.2), bell.of(9.0)], [1.0, 1.0]);
         assert!((bell.of(0.6) - 0.1).abs() < 1e-15 && (bell.of(0.9) - 0.1f64.powf(0.25)).abs() < 1e-15);
@@ -97,7 +97,11 @@ mod tests {
         let parabola = Tolerance::within(0.0, 0.0).quadratic(1.0);
         assert_eq!([0.0, 0.5, -0.5, 1.0, -2.0].map(|x| parabola.of(x)), [1.0, 0.75, 0.75, 0.0, 0.0]);
         let step = Tolerance::at_least(0.0).linear(0.0, 0.0);
-        assert_eq!([-1e-9, 0.0, 1.0].map(|x| step.of(x)), [0.0, 1.0, 1.0], "without a margin, 0 outside");
+        assert_eq!(
+            [-1e-9, 0.0, 1.0].map(|x| step.of(x)),
+            [0.0, 1.0, 1.0],
+            "without a margin, values outside the bounds are 0"
+        );
         assert_eq!(mean(parabola, &[0.0, 0.5, 1.0, 1.0]), 0.4375);
     }
 }

@@ -175,7 +175,7 @@ mod tests {
         let variation = if all { vary } else { VariationRequest::default() };
         let options = ResetOptions { variation, ..ResetOptions::default() };
         let mut env = entry.env().expect("creating the environment");
-        let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("creating a schema"), 1);
+        let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("creating the schema"), 1);
         let mut count = 0;
         for seed in 0..seeds {
             let mut expert = (entry.experts[0].make)();

@@ -10,7 +10,7 @@ use swm_mujoco::render::{self, Choice};
 static ALLOCATOR: Counting = Counting;
 
 #[test]
-fn counter_counts_allocations() {
+fn counting_allocator_is_active() {
     allocation::counting_allocator_is_active();
 }
 

@@ -180,7 +180,7 @@ fn start(env: &dyn Env, family: &Family, golden: &mut Golden) -> Vec<f64> {
 
 /// The present value of a column.
 fn column(env: &dyn Env, name: &str) -> Vec<f64> {
-    let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("creating a schema"), 1);
+    let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("creating the schema"), 1);
     env.observe(&mut row.row_mut(0));
     row.row(0).to_f64(name).expect("reading a column")
 }
@@ -238,7 +238,7 @@ struct Comparison<'a> {
 
 impl<'a> Comparison<'a> {
     fn new(family: &'a Family, env: Box<dyn Env>, file: &Path) -> Self {
-        let row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("creating a schema"), 1);
+        let row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("creating the schema"), 1);
         let name = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         Self { family, name, env, row, golden: Golden::open(file), differences: BTreeMap::new() }
     }

@@ -56,10 +56,10 @@ fn solve(mut a: Vec<Vec<f64>>, mut b: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
 #[test]
 #[ignore = "renders 300 frames with OpenGL"]
 #[allow(clippy::print_stderr, clippy::too_many_lines, reason = "one experiment with a table for `--no-capture`")]
-fn read_out_error_is_equal_for_frames_of_both_renderers() {
+fn pose_read_out_error_is_similar_for_frames_of_both_renderers() {
     let mut env = ENVS.get(ID).and_then(|entry| entry.env()).expect("creating the environment");
     let (mut poses, mut frames) = (vec![], [vec![], vec![]]);
-    let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("creating a schema"), 1);
+    let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("creating the schema"), 1);
     for episode in 0..EPISODES {
         env.reset(episode, &ResetOptions::default()).expect("resetting the environment");
         let mut rng = Key::new(episode).rng();

@@ -122,7 +122,7 @@ fn both_renderers_agree_on_geoms_and_distances() {
         env.reset(1, &ResetOptions::default()).expect("resetting the environment");
         let mut view_of = |choice, modality| {
             let view = CameraView { camera: None, modality };
-            let mut row = Batch::zeros(&Schema::new([view.column(SIDE, SIDE)]).expect("creating a schema"), 1);
+            let mut row = Batch::zeros(&Schema::new([view.column(SIDE, SIDE)]).expect("creating the schema"), 1);
             render::with(choice, || env.render_view(&view, SIDE, SIDE, row.row_mut(0).bytes(0)))
                 .unwrap_or_else(|error| panic!("{}: {error}", entry.id));
             row.row(0).to_f64(&view.to_string()).expect("reading the column")

@@ -76,7 +76,7 @@ pub fn starts(entry: &EnvEntry, protocol: Protocol, n: usize) -> Result<Vec<Star
 
 /// The rows of one episode of the first expert.
 fn demonstrate(entry: &EnvEntry, seed: u64) -> Result<Batch> {
-    let mut env = entry.env().expect("a valid environment");
+    let mut env = entry.env().expect("creating the environment");
     let mut expert = (entry.experts[0].make)();
     env.reset(seed, &ResetOptions::default())?;
     expert.begin(Key::new(seed).with("expert"));
@@ -105,7 +105,7 @@ pub fn play(entry: &EnvEntry, starts: &[Start], planner: &Planner, budget: usize
     let begun = Instant::now();
     let (mut solved_at_start, mut played, mut successes, mut latencies) = (0, 0, vec![], vec![]);
     for starts in starts.chunks(SLOTS) {
-        let envs = starts.iter().map(|_| entry.env().expect("a valid environment")).collect();
+        let envs = starts.iter().map(|_| entry.env().expect("creating the environment")).collect();
         let mut pool = EnvPool::new(envs, None, Some(budget), threads(0)?)?;
         let slots: Vec<usize> = (0..starts.len()).collect();
         pool.restart(&slots, |slot, env| {

@@ -60,7 +60,7 @@ mod tests {
     }
 
     #[test]
-    fn power_falls_with_frequency() {
+    fn noise_power_falls_with_frequency_by_the_exponent() {
         // The spectrum over many candidates follows f^-β, and the variance of every value is 1.
         let (horizon, dim, n) = (8, 2, 40_000);
         let colour = ColouredNoise::new(2.0, horizon);

@@ -129,7 +129,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn smallest_breaks_ties_by_index() {
+    fn smallest_costs_are_selected_with_ties_broken_by_index() {
         let mut order = vec![];
         assert_eq!(smallest(&[2.0, 1.0, 1.0, 0.5, 1.0], 3, &mut order), [3, 1, 2]);
         assert_eq!(smallest(&[0.0, -0.0, 0.0], 2, &mut order), [0, 1]);

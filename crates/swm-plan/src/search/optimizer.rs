@@ -170,11 +170,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn errors_name_the_setting() {
+    fn optimizer_errors_name_the_invalid_setting() {
         let read = |json: &str| serde_json::from_str::<Optimizer>(json);
-        let adam = read(r#"{"kind": "adam", "step": 0.2}"#).expect("a valid optimizer");
+        let adam = read(r#"{"kind": "adam", "step": 0.2}"#).expect("parsing the optimizer");
         assert_eq!(adam, Optimizer::Adam(Adam { step: 0.2, ..Adam::default() }));
-        assert_eq!(read(r#"{"kind": "rmsprop"}"#).expect("a valid optimizer"), Optimizer::RmsProp(RmsProp::default()));
+        assert_eq!(
+            read(r#"{"kind": "rmsprop"}"#).expect("parsing the optimizer"),
+            Optimizer::RmsProp(RmsProp::default())
+        );
         let unknown = read(r#"{"kind": "adam", "momentum": 0.9}"#).expect_err("Adam has no momentum").to_string();
         assert!(unknown.contains("momentum"), "{unknown}");
         let message = |optimizer: Optimizer| optimizer.check("gd").expect_err("invalid settings").to_string();
@@ -185,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn clip_norm_scales_each_row() {
+    fn clip_norm_scales_rows_above_the_limit() {
         let mut gradient = [3.0, 4.0, 0.3, 0.4];
         clip_norm(&mut gradient, 2, 1.0);
         assert_eq!(gradient, [0.6, 0.8, 0.3, 0.4]);

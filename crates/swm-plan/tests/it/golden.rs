@@ -29,8 +29,8 @@ const ENV: usize = 4;
 fn short_search(row: &SolverEntry) -> Golden {
     let toys = PREFERRED.iter().flat_map(|name| TOYS.iter().filter(move |toy| toy.name == *name));
     let toy = toys.into_iter().find(|toy| solves(row, toy)).expect("a toy for this solver");
-    let settings = serde_json::from_str(trial(row.id).short).expect("valid settings");
-    let mut solver = (row.make)(&settings).expect("valid settings");
+    let settings = serde_json::from_str(trial(row.id).short).expect("parsing the settings");
+    let mut solver = (row.make)(&settings).expect("creating the solver");
     let plan = solve(&mut *solver, &mut Model::new(toy, &[ENV]), toy, &[ENV]).expect("the solver returns a plan");
     let Plan { actions, trace, .. } = plan;
     let round =
@@ -49,11 +49,11 @@ fn iterations_equal_golden_plans() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/plans.json");
     let ours: BTreeMap<&str, Golden> = SOLVERS.rows.iter().map(|row| (row.id, short_search(row))).collect();
     if std::env::var_os("BLESS").is_some() {
-        std::fs::write(&path, serde_json::to_string_pretty(&ours).expect("valid JSON") + "\n")
+        std::fs::write(&path, serde_json::to_string_pretty(&ours).expect("serialising to JSON") + "\n")
             .expect("the file is written");
     }
-    let text = std::fs::read_to_string(&path).expect("golden plans");
-    let published: BTreeMap<String, Golden> = serde_json::from_str(&text).expect("golden plans");
+    let text = std::fs::read_to_string(&path).expect("reading the golden plans");
+    let published: BTreeMap<String, Golden> = serde_json::from_str(&text).expect("parsing the golden plans");
     assert!(ours.keys().eq(published.keys()), "BLESS=1 adds a new solver");
     for (ours, (solver, published)) in ours.values().zip(&published) {
         assert_eq!(ours.toy, published.toy, "{solver}");

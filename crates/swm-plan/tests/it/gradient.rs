@@ -50,7 +50,7 @@ fn golden() -> Golden {
 
 #[track_caller]
 fn assert_near(given: &[f32], expected: &[f32], tolerance: f32) {
-    assert_eq!(given.len(), expected.len(), "length");
+    assert_eq!(given.len(), expected.len(), "the numbers of values differ");
     let near = given.iter().zip(expected).all(|(a, b)| (a - b).abs() <= tolerance);
     assert!(near, "{given:?}\n{expected:?}");
 }
@@ -234,10 +234,11 @@ const NOISY: &[(&str, &str, &str)] = &[
 fn noisy_plans_do_not_depend_on_batches_or_threads() {
     for &(solver, name, settings) in NOISY {
         let toy = toy(name);
-        let settings = serde_json::from_str(settings).expect("valid settings");
-        let mut solver = (SOLVERS.get(solver).expect("a registered solver").make)(&settings).expect("valid settings");
+        let settings = serde_json::from_str(settings).expect("parsing the settings");
+        let mut solver =
+            (SOLVERS.get(solver).expect("a registered solver").make)(&settings).expect("creating the solver");
         let mut run = |threads: usize, size: usize| -> Vec<u32> {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a thread pool");
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("creating the thread pool");
             let all: Vec<usize> = (0..50).collect();
             let mut plan = |envs: &[usize]| {
                 let plan = pool.install(|| crate::toys::solve(&mut *solver, &mut Model::new(toy, envs), toy, envs));
@@ -264,13 +265,14 @@ fn noisy_plans_do_not_depend_on_batches_or_threads() {
 }
 
 #[test]
-fn noisy_searches_are_pinned() {
+fn noisy_searches_have_the_pinned_costs() {
     // Published results depend on these values: changing them is a breaking change. The values are rounded, because
     // `exp` and `ln` may differ in the last bit between platforms.
     for (&(solver, name, settings), expected) in NOISY.iter().zip(PINNED) {
         let toy = toy(name);
-        let settings = serde_json::from_str(settings).expect("valid settings");
-        let mut solver = (SOLVERS.get(solver).expect("a registered solver").make)(&settings).expect("valid settings");
+        let settings = serde_json::from_str(settings).expect("parsing the settings");
+        let mut solver =
+            (SOLVERS.get(solver).expect("a registered solver").make)(&settings).expect("creating the solver");
         let plan =
             crate::toys::solve(&mut *solver, &mut Model::new(toy, &[0]), toy, &[0]).expect("the solver returns a plan");
         let rounded: Vec<f32> = plan.trace[0].mean.iter().map(|cost| (cost * 1e3).round() / 1e3).collect();
@@ -292,7 +294,8 @@ fn errors_locate_gradients_that_are_not_finite() {
         // Value 3 of candidate 1 of environment 1, of two environments with two candidates each.
         let mut bowl = Bowl { wrong: Some((3 * 6 + 3, wrong)), ..BOWL };
         let mut gd = GradientDescent { samples: 2, ..GradientDescent::default() };
-        let message = solve(&mut gd, &mut bowl, &[Key::new(0), Key::new(1)]).expect_err("invalid input").to_string();
+        let message =
+            solve(&mut gd, &mut bowl, &[Key::new(0), Key::new(1)]).expect_err("the input is invalid").to_string();
         let location = format!("{wrong} at step 1 for candidate 1 of planned environment 1 in iteration 0");
         assert!(message.contains(&location), "{message}");
     }
@@ -316,7 +319,7 @@ fn deadline_ends_the_search() {
         let problem =
             |deadline| PlanProblem { horizon: toy.horizon, space: toy.space, keys: &keys, init: None, deadline };
         let mut solver =
-            (SOLVERS.get(id).expect("a registered solver").make)(&serde_json::json!({})).expect("a solver");
+            (SOLVERS.get(id).expect("a registered solver").make)(&serde_json::json!({})).expect("creating the solver");
         let stopped =
             solver.solve(&mut Model::new(toy, &[0]), problem(Some(Instant::now()))).expect("the solver returns a plan");
         let complete = solver.solve(&mut Model::new(toy, &[0]), problem(None)).expect("the solver returns a plan");
@@ -335,7 +338,7 @@ fn deadline_ends_the_search() {
 #[test]
 fn errors_name_invalid_settings() {
     let message =
-        |gd: GradientDescent| solve(&mut gd.clone(), &mut { BOWL }, &[]).expect_err("invalid input").to_string();
+        |gd: GradientDescent| solve(&mut gd.clone(), &mut { BOWL }, &[]).expect_err("the input is invalid").to_string();
     let default = GradientDescent::default;
     assert!(message(GradientDescent { samples: 0, ..default() }).contains("gd samples: 0; choose at least 1"));
     assert!(message(GradientDescent { iterations: 0, ..default() }).contains("gd iterations"));
@@ -349,7 +352,7 @@ fn errors_name_invalid_settings() {
             Ok(solver) => solver,
             Err(error) => return error.to_string(),
         };
-        solve(&mut *solver, &mut { BOWL }, &[]).expect_err("invalid input").to_string()
+        solve(&mut *solver, &mut { BOWL }, &[]).expect_err("the input is invalid").to_string()
     };
     let table = [
         ("pgd", r#"{"step": 0}"#, "pgd optimizer, step: 0"),
@@ -368,7 +371,7 @@ fn errors_name_invalid_settings() {
         ("grasp", r#"{"state_optimizer": {"kind": "sgd", "momentum": 2}}"#, "grasp optimizer, momentum: 2"),
     ];
     for (id, settings, expected) in table {
-        let message = message(id, serde_json::from_str(settings).expect("valid settings"));
+        let message = message(id, serde_json::from_str(settings).expect("parsing the settings"));
         assert!(message.contains(expected), "{message}");
     }
 }

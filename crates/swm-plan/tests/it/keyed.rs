@@ -16,8 +16,8 @@ fn bits(plan: &Plan, envs: usize) -> Vec<Vec<u32>> {
 }
 
 fn plan(row: &SolverEntry, toy: &'static Toy, envs: &[usize]) -> Vec<Vec<u32>> {
-    let settings = serde_json::from_str(trial(row.id).short).expect("valid settings");
-    let mut solver = (row.make)(&settings).expect("valid settings");
+    let settings = serde_json::from_str(trial(row.id).short).expect("parsing the settings");
+    let mut solver = (row.make)(&settings).expect("creating the solver");
     bits(&solve(&mut *solver, &mut Model::new(toy, envs), toy, envs).expect("the solver returns a plan"), envs.len())
 }
 
@@ -31,7 +31,7 @@ fn plans_do_not_depend_on_batches_or_threads() {
     let envs: Vec<usize> = (0..50).collect();
     for row in SOLVERS.rows {
         let run = |threads, size| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a thread pool");
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("creating the thread pool");
             pool.install(|| envs.chunks(size).flat_map(|envs| plan(row, toy_for(row), envs)).collect::<Vec<_>>())
         };
         let alone = run(1, 1);

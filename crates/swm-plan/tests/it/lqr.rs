@@ -99,7 +99,7 @@ fn product(a: Matrix, b: Matrix) -> Matrix {
 }
 
 #[test]
-fn gradient_vanishes_at_the_closed_form() {
+fn lqr_gradient_vanishes_at_the_closed_form_optimum() {
     for env in 0..3 {
         let lqr = Lqr::new(env);
         let slopes = lqr.gradient(&lqr.optimum());

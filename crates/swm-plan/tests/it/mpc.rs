@@ -90,9 +90,10 @@ impl Fixture {
         let (observed, past) = (Arc::clone(&cost.observed), Arc::clone(&cost.past));
         let scale = ActionScale { mean: vec![1.0], std: vec![2.0] };
         let solver = Box::new(RecordingSolver { calls: Arc::clone(&calls) });
-        let policy = MpcPolicy::new(solver, Box::new(cost), config, scale, &spec(high), slots).expect("a valid policy");
-        let infos = Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("a valid schema");
-        let actions = Schema::new([spec(high).action_column()]).expect("a valid schema");
+        let policy =
+            MpcPolicy::new(solver, Box::new(cost), config, scale, &spec(high), slots).expect("creating the policy");
+        let infos = Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("creating the schema");
+        let actions = Schema::new([spec(high).action_column()]).expect("creating the schema");
         Self {
             policy,
             calls,
@@ -105,7 +106,7 @@ impl Fixture {
 
     fn act(&mut self, active: &[bool]) -> Vec<f32> {
         self.policy.act(&self.infos, active, &mut self.actions).expect("the policy acts");
-        self.actions.get::<f32>("action").expect("the column of actions").to_vec()
+        self.actions.get::<f32>("action").expect("reading the column of actions").to_vec()
     }
 
     fn observed(&self) -> Vec<Vec<usize>> {
@@ -172,7 +173,7 @@ fn history_contains_past_frames_and_actions() {
     let mut fixture = Fixture::new(config, 1e6, 2);
     fixture.policy.begin(1, Key::new(0));
     for step in 0..7u8 {
-        fixture.infos.get_mut::<u8>("pixels").expect("the column of frames").fill(10 + step);
+        fixture.infos.get_mut::<u8>("pixels").expect("accessing the column of frames").fill(10 + step);
         fixture.act(&[false, true]);
     }
     let past = fixture.past.lock().expect("no thread has panicked");
@@ -193,7 +194,7 @@ fn errors_name_invalid_settings() {
     let make = |config: MpcConfig, scale: ActionScale, spec: &EnvSpec| {
         let solver = Box::new(RecordingSolver { calls: Arc::default() });
         let made = MpcPolicy::new(solver, Box::new(RecordingModel::default()), config, scale, spec, 1);
-        made.err().expect("invalid input").to_string()
+        made.err().expect("the input is invalid").to_string()
     };
     let scale = ActionScale::identity(1);
     let far = MpcConfig { receding_horizon: 6, ..MpcConfig::default() };
@@ -236,9 +237,9 @@ fn integers_are_planned_as_one_hot_vectors() {
     let (model, scale) = (RecordingModel::default(), ActionScale::unscaled(&spec));
     let (past, solver) = (Arc::clone(&model.past), Options(vec![2, 0, 1, 1, 0, 0, 0, 0]));
     let mut policy =
-        MpcPolicy::new(Box::new(solver), Box::new(model), config, scale, &spec, 1).expect("a valid policy");
-    let infos = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("a valid schema"), 1);
-    let mut actions = Batch::zeros(&Schema::new([spec.action_column()]).expect("a valid schema"), 1);
+        MpcPolicy::new(Box::new(solver), Box::new(model), config, scale, &spec, 1).expect("creating the policy");
+    let infos = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("creating the schema"), 1);
+    let mut actions = Batch::zeros(&Schema::new([spec.action_column()]).expect("creating the schema"), 1);
     for expected in [[2, 5], [1, 6], [2, 5]] {
         policy.act(&infos, &[true], &mut actions).expect("the policy acts");
         assert_eq!(actions.get::<i64>("action").expect("the column holds integers"), expected);
@@ -248,8 +249,8 @@ fn integers_are_planned_as_one_hot_vectors() {
 
     // An action column of another type is an error.
     let mut floats =
-        Batch::zeros(&Schema::new([ColumnSpec::new("action", DType::Float32, [2])]).expect("a valid schema"), 1);
-    let error = policy.act(&infos, &[true], &mut floats).expect_err("float actions");
+        Batch::zeros(&Schema::new([ColumnSpec::new("action", DType::Float32, [2])]).expect("creating the schema"), 1);
+    let error = policy.act(&infos, &[true], &mut floats).expect_err("an action column of floats");
     assert!(error.to_string().contains("Int64"), "{error}");
 }
 
@@ -270,9 +271,9 @@ fn latency_budget_sets_the_deadline() {
         let (solver, model) = (DeadlineSolver(Arc::clone(&deadline)), RecordingModel::default());
         let config = MpcConfig { latency_budget, ..MpcConfig::default() };
         let policy = MpcPolicy::new(Box::new(solver), Box::new(model), config, ActionScale::identity(1), &spec(1.0), 1);
-        let infos = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("a valid schema"), 1);
-        let mut actions = Batch::zeros(&Schema::new([spec(1.0).action_column()]).expect("a valid schema"), 1);
-        policy.expect("a valid policy").act(&infos, &[true], &mut actions).expect("the policy acts");
+        let infos = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("creating the schema"), 1);
+        let mut actions = Batch::zeros(&Schema::new([spec(1.0).action_column()]).expect("creating the schema"), 1);
+        policy.expect("creating the policy").act(&infos, &[true], &mut actions).expect("the policy acts");
         *deadline.lock().expect("no thread has panicked")
     };
     let (before, budget) = (Instant::now(), Duration::from_secs(5));
@@ -301,7 +302,7 @@ fn trace_log_records_plans() {
     assert_eq!(recorded[1..], [(first, 0, 1, 2, 200.0, two.clone()), (second, 1, 0, 2, 200.0, two)]);
     assert!(plans.iter().all(|plan| plan.seconds >= plan.model_seconds && plan.model_seconds >= 0.0));
     assert!(log.take().is_empty(), "each plan is returned once");
-    let json = serde_json::to_value(&plans[0]).expect("valid JSON");
+    let json = serde_json::to_value(&plans[0]).expect("serialising to JSON");
     assert_eq!((&json["episode"], &json["best"]), (&first.into(), &serde_json::json!([100.0])));
 }
 
@@ -332,9 +333,13 @@ fn errors_name_the_source_of_invalid_plans() {
     let message = |solver: Box<dyn Solver>| {
         let scale = ActionScale::identity(1);
         let policy = MpcPolicy::new(solver, Box::new(Panicking), MpcConfig::default(), scale, &spec(1.0), 1);
-        let infos = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("a valid schema"), 1);
-        let mut actions = Batch::zeros(&Schema::new([spec(1.0).action_column()]).expect("a valid schema"), 1);
-        policy.expect("a valid policy").act(&infos, &[true], &mut actions).expect_err("invalid input").to_string()
+        let infos = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("creating the schema"), 1);
+        let mut actions = Batch::zeros(&Schema::new([spec(1.0).action_column()]).expect("creating the schema"), 1);
+        policy
+            .expect("creating the policy")
+            .act(&infos, &[true], &mut actions)
+            .expect_err("the input is invalid")
+            .to_string()
     };
     let wrong = |plan| message(Box::new(Wrong(plan)));
     assert!(wrong(|_, len| Plan { actions: vec![0.0; len - 1], ..Plan::default() }).contains("24 values"));

@@ -122,7 +122,7 @@ impl LatentDynamics for System {
 /// Calls `observe` with the indices of environments and a batch without columns.
 fn observe(model: &mut dyn CostModel, envs: &[usize]) {
     model
-        .observe(&Batch::zeros(&Schema::new([]).expect("an empty schema is valid"), 0), envs)
+        .observe(&Batch::zeros(&Schema::new([]).expect("creating the schema"), 0), envs)
         .expect("the model reads no columns");
 }
 
@@ -193,7 +193,8 @@ fn total(values: &[f32]) -> f64 {
 
 #[test]
 fn gradients_through_time_equal_finite_differences() {
-    let mut model = ObjectiveCost::new(Box::new(nonlinear()), Box::new(all_terms()), limits()).expect("a valid model");
+    let mut model =
+        ObjectiveCost::new(Box::new(nonlinear()), Box::new(all_terms()), limits()).expect("creating the model");
     observe(&mut model, &ENVS);
     let actions = random(ENVS.len() * SAMPLES * HORIZON * 4);
     let (mut costs, mut again) = ([f32::NAN; 6], [f32::NAN; 6]);
@@ -260,7 +261,7 @@ fn terminal_goal_equals_the_cost_of_the_model() {
     observe(&mut model, &ENVS);
     model.cost(candidates(&actions, HORIZON), &mut own).expect("the model computes costs");
     let mut model =
-        ObjectiveCost::new(Box::new(nonlinear()), Box::new(Goal::default()), vec![]).expect("a valid model");
+        ObjectiveCost::new(Box::new(nonlinear()), Box::new(Goal::default()), vec![]).expect("creating the model");
     observe(&mut model, &ENVS);
     model.cost(candidates(&actions, HORIZON), &mut priced).expect("the model computes costs");
     assert_eq!(own, priced);
@@ -279,11 +280,11 @@ fn regularised_model_adds_costs_gradients_and_constraints() {
         "terms": [{"term": "control", "weight": 0.25}, {"term": "change", "weight": 0.5}],
         "constraints": [{"constraint": "action_norm", "limit": 0.5}]
     }"#;
-    let config: ObjectiveConfig = serde_json::from_str(config).expect("a valid objective");
+    let config: ObjectiveConfig = serde_json::from_str(config).expect("parsing the objective");
     let mut own = [0.0; 6];
     Model::new(quadratic, &ENVS).cost(candidates(&actions, 3), &mut own).expect("the model computes costs");
 
-    let mut model = config.apply(Box::new(Model::new(quadratic, &ENVS))).expect("a valid model");
+    let mut model = config.apply(Box::new(Model::new(quadratic, &ENVS))).expect("creating the model");
     let (mut costs, mut gradient) = ([0.0; 6], vec![0.0; actions.len()]);
     model.cost(candidates(&actions, 3), &mut costs).expect("the model computes costs");
     for ((cost, own), a) in costs.iter().zip(own).zip(actions.chunks_exact(6)) {
@@ -308,9 +309,9 @@ fn regularised_model_adds_costs_gradients_and_constraints() {
         values.iter().zip(&weights).map(|(value, weight)| f64::from(value * weight)).sum()
     });
 
-    let mut opaque = config.apply(Box::new(Model::new(quadratic, &ENVS).opaque())).expect("a valid model");
+    let mut opaque = config.apply(Box::new(Model::new(quadratic, &ENVS).opaque())).expect("creating the model");
     assert!(opaque.differentiable().is_none() && opaque.latent().is_none() && opaque.constrained().is_some());
-    let mut with_latents = config.apply(Box::new(Model::new(toy("reach"), &ENVS))).expect("a valid model");
+    let mut with_latents = config.apply(Box::new(Model::new(toy("reach"), &ENVS))).expect("creating the model");
     assert!(with_latents.latent().is_some());
 }
 
@@ -340,7 +341,7 @@ fn plans_satisfy_an_action_norm_constraint() {
     let limit: Vec<Box<dyn Constraint>> = vec![Box::new(ActionNorm { limit: LIMIT, block: 1 })];
     let envs = [0, 1, 2];
     let model = Box::new(Model::new(toy("reach"), &envs));
-    let mut model = Regularised::new(model, Box::new(Vec::<Control>::new()), limit).expect("a valid model");
+    let mut model = Regularised::new(model, Box::new(Vec::<Control>::new()), limit).expect("creating the model");
     let mut solver = AugmentedLagrangian {
         samples: 4,
         outer_iterations: 25,
@@ -375,11 +376,11 @@ fn cart() -> ObjectiveCost {
         terms.push(Box::new(Goal { weight: each, when: When::Running, latents: latents.clone(), ..Goal::default() }));
         terms.push(Box::new(Goal { weight: last - each, latents, ..Goal::default() }));
     }
-    ObjectiveCost::new(Box::new(system), Box::new(terms), vec![]).expect("a valid model")
+    ObjectiveCost::new(Box::new(system), Box::new(terms), vec![]).expect("creating the model")
 }
 
 #[test]
-fn gradient_solvers_find_the_plan_of_the_regulator() {
+fn gradient_solvers_find_the_plan_of_the_linear_quadratic_regulator() {
     let envs = [0, 1, 2];
     let gd = GradientDescent { samples: 4, iterations: 400, ..GradientDescent::default() };
     // The lifted loss of GRASP is not the regulator's cost, so only the synchronisation finds the plan.
@@ -407,11 +408,11 @@ fn unstable(growth: f32) -> ObjectiveCost {
     let mix = vec![vec![growth, 0.2], vec![-0.2, growth]];
     let push = vec![vec![1.0, 0.0], vec![0.0, 1.0]];
     let system = System { mix, push, nonlinear: false, start_and_goal, envs: vec![] };
-    ObjectiveCost::new(Box::new(system), Box::new(Goal::default()), vec![]).expect("a valid model")
+    ObjectiveCost::new(Box::new(system), Box::new(Goal::default()), vec![]).expect("creating the model")
 }
 
 #[test]
-fn one_step_size_of_grasp_works_for_all_horizons() {
+fn grasp_finds_the_optimum_with_one_step_size_for_several_horizons() {
     // The curvature of a rollout's cost grows with the horizon; the curvature of the lifted problem does not. The test
     // uses plain gradient steps, because Adam rescales every value and hides the difference.
     let plain = |step| Optimizer::Sgd(Sgd { step, momentum: 0.0 });
@@ -455,9 +456,9 @@ fn one_step_size_of_grasp_works_for_all_horizons() {
 }
 
 #[test]
-fn errors_name_the_mismatch() {
+fn errors_name_invalid_objectives_and_unsuitable_models() {
     let shape = Shape { horizon: 2, latent: 3, dim: 4 };
-    let message = |objective: &dyn Objective| objective.check(shape).expect_err("invalid input").to_string();
+    let message = |objective: &dyn Objective| objective.check(shape).expect_err("the input is invalid").to_string();
     let goal = Goal::default;
     let past = message(&Goal { latents: vec![Pick::Range([2, 4])], ..goal() });
     assert_eq!(past, "goal term latents = 2..4 is outside its space: expected latent dimensions within 0..3");
@@ -466,7 +467,7 @@ fn errors_name_the_mismatch() {
     assert!(message(&Goal { weight: f32::NAN, ..goal() }).contains("goal term weight: NaN"));
     assert!(message(&Control { weight: -1.0 }).contains("control term weight: -1"));
     assert!(message(&Change { weight: 1.0, block: 3 }).contains("3 actions in a model step of dimension 4"));
-    let message = |constraint: &dyn Constraint| constraint.check(shape).expect_err("invalid input").to_string();
+    let message = |constraint: &dyn Constraint| constraint.check(shape).expect_err("the input is invalid").to_string();
     assert!(message(&ActionNorm { limit: -1.0, block: 1 }).contains("action norm limit: -1"));
     assert!(message(&LatentBox::default()).contains("give a finite lower bound"));
     assert!(message(&LatentBox { low: Some(1.0), high: Some(0.0), ..LatentBox::default() }).contains("Some(1.0)"));
@@ -478,7 +479,7 @@ fn errors_name_the_mismatch() {
     assert!(read(r#"{"terms": [{"term": "joy"}]}"#).expect_err("an unknown term").to_string().contains("joy"));
     let model = |name| Box::new(Model::new(toy(name), &ENVS));
     let reject = |json: &str, name| {
-        read(json).expect("a valid objective").apply(model(name)).err().expect("invalid input").to_string()
+        read(json).expect("parsing the objective").apply(model(name)).err().expect("the input is invalid").to_string()
     };
     let message = reject(r#"{"terms": [{"term": "goal"}]}"#, "quadratic");
     assert!(message.contains("it uses latents, and this model has none"), "{message}");
@@ -487,10 +488,10 @@ fn errors_name_the_mismatch() {
     let message = reject(r#"{"terms": [{"term": "control"}]}"#, "constrained");
     assert!(message.contains("the model has constraints of its own"), "{message}");
     assert!(ObjectiveConfig::default().is_empty());
-    assert!(ObjectiveConfig::default().apply(model("constrained")).is_ok(), "an empty objective");
+    assert!(ObjectiveConfig::default().apply(model("constrained")).is_ok(), "an empty objective fits");
 
-    let mut cost = ObjectiveCost::new(Box::new(nonlinear()), Box::new(goal()), vec![]).expect("a valid model");
+    let mut cost = ObjectiveCost::new(Box::new(nonlinear()), Box::new(goal()), vec![]).expect("creating the model");
     let actions = random(ENVS.len() * SAMPLES * HORIZON * 4);
-    let message = cost.cost(candidates(&actions, HORIZON), &mut [0.0; 6]).expect_err("nothing observed").to_string();
+    let message = cost.cost(candidates(&actions, HORIZON), &mut [0.0; 6]).expect_err("nothing is observed").to_string();
     assert!(message.contains("got 2, expected 0, the number of observed environments"), "{message}");
 }

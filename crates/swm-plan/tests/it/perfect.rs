@@ -11,13 +11,13 @@ use rows::Task;
 use serde_json::Value;
 
 fn run(task: &Task, solver: &'static str, n: usize) -> Outcome {
-    let starts = starts(task.entry, task.protocol, n).expect("valid starts");
-    let planner = rows::planner(task, solver, &Value::Null).expect("valid settings");
+    let starts = starts(task.entry, task.protocol, n).expect("creating the starts");
+    let planner = rows::planner(task, solver, &Value::Null).expect("creating the planner");
     play(task.entry, &starts, &planner, task.budget).expect("the planner plays the starts")
 }
 
 #[test]
-fn solves_two_room() {
+fn planning_with_true_dynamics_solves_two_room() {
     for solver in rows::SOLVERS {
         let found = run(&rows::TASKS[0], solver, 40);
         assert!(found.success.rate >= 0.95, "{solver}: {:?}", found.success);
@@ -25,7 +25,7 @@ fn solves_two_room() {
 }
 
 #[test]
-fn solves_push_t_from_demonstrations() {
+fn planning_with_true_dynamics_solves_push_t_from_demonstrations() {
     // CEM is not tested here, because it takes five times as long.
     for solver in ["icem", "mppi"] {
         let found = run(&rows::TASKS[1], solver, 5);

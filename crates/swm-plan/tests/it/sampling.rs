@@ -12,7 +12,7 @@ fn sampling_solvers() -> impl Iterator<Item = (&'static SolverEntry, &'static To
 }
 
 fn make(id: &str, settings: &Value) -> Box<dyn Solver> {
-    (SOLVERS.get(id).expect("a registered solver").make)(settings).expect("valid settings")
+    (SOLVERS.get(id).expect("a registered solver").make)(settings).expect("creating the solver")
 }
 
 fn plan(id: &str, toy: &'static Toy, init: Option<&[f32]>, deadline: Option<Instant>) -> Plan {
@@ -46,7 +46,7 @@ fn deadline_ends_the_search() {
 }
 
 #[test]
-fn traces_are_consistent() {
+fn trace_best_cost_is_at_most_the_mean_cost_and_spread_shrinks() {
     for (row, toy) in sampling_solvers() {
         let trace = &plan(row.id, toy, None, None).trace[0];
         let n = trace.best.len();
@@ -88,7 +88,8 @@ fn candidates_stay_within_bounds() {
 #[test]
 fn no_environments_give_no_plans() {
     for (row, toy) in sampling_solvers() {
-        let plan = solve(&mut *make(row.id, &json!({})), &mut Model::new(toy, &[]), toy, &[]).expect("an empty plan");
+        let plan = solve(&mut *make(row.id, &json!({})), &mut Model::new(toy, &[]), toy, &[])
+            .expect("planning for no environments");
         assert!(plan.actions.is_empty() && plan.costs.is_empty() && plan.trace.is_empty());
     }
 }
@@ -121,7 +122,7 @@ fn errors_name_invalid_settings() {
         assert!(error.is_usage() && error.to_string().contains(expected), "{error}");
     }
     for (row, _) in sampling_solvers() {
-        let error = (row.make)(&json!({"sampels": 3})).err().expect("a typo").to_string();
+        let error = (row.make)(&json!({"sampels": 3})).err().expect("an unknown setting must be an error").to_string();
         assert!(error.contains("sampels"), "{error}");
     }
 }
@@ -132,7 +133,10 @@ fn errors_name_invalid_problems() {
     let message = |id: &str, horizon, space, init: Option<&[f32]>| {
         let keys = [Key::new(0), Key::new(1)];
         let problem = PlanProblem { horizon, space, keys: &keys, init, deadline: None };
-        make(id, &json!({})).solve(&mut Model::new(quadratic, &[0, 1]), problem).expect_err("invalid input").to_string()
+        make(id, &json!({}))
+            .solve(&mut Model::new(quadratic, &[0, 1]), problem)
+            .expect_err("the input is invalid")
+            .to_string()
     };
     let space = quadratic.space;
     assert!(message("cem", 0, space, None).contains("planning horizon: 0 model steps"));

@@ -10,10 +10,11 @@ const HORIZON: usize = 3;
 const BLOCK: usize = 2;
 
 fn pool(entry: &EnvEntry, envs: usize) -> EnvPool {
-    let envs = (0..envs).map(|_| entry.env().expect("a valid environment")).collect();
-    let mut pool = EnvPool::new(envs, None, None, threads(1).expect("a thread")).expect("a pool");
+    let envs = (0..envs).map(|_| entry.env().expect("creating the environment")).collect();
+    let mut pool = EnvPool::new(envs, None, None, threads(1).expect("creating the thread pool"))
+        .expect("creating the environment pool");
     let resets = (0..pool.len()).map(|slot| Reset { slot, seed: slot as u64, options: ResetOptions::default() });
-    pool.reset(&resets.collect::<Vec<_>>()).expect("the reset succeeds");
+    pool.reset(&resets.collect::<Vec<_>>()).expect("resetting the environment");
     pool
 }
 
@@ -28,9 +29,9 @@ fn simulator(entry: &EnvEntry, pool: &EnvPool, slots: &[usize], score: Score) ->
         BLOCK,
         score,
     )
-    .expect("a simulator");
-    slots.iter().for_each(|&slot| simulator.observe_env(slot, pool.env(slot)).expect("an environment of this kind"));
-    simulator.observe(pool.infos(), slots).expect("observed environments");
+    .expect("creating the simulator");
+    slots.iter().for_each(|&slot| simulator.observe_env(slot, pool.env(slot)).expect("observing the environment"));
+    simulator.observe(pool.infos(), slots).expect("observing the environments");
     simulator
 }
 
@@ -56,13 +57,13 @@ fn costs_equal_distances_in_the_environment() {
         for score in [Score::Terminal, Score::Running] {
             let costs = costs(&mut simulator(entry, &pool, &[1], score), &actions, 1, samples);
             for (candidate, cost) in actions.chunks_exact(HORIZON * BLOCK * 2).zip(costs) {
-                let mut environment = entry.env().expect("a valid environment");
-                environment.restore(&pool.env(1).snapshot()).expect("the environment restores the snapshot");
+                let mut environment = entry.env().expect("creating the environment");
+                environment.restore(&pool.env(1).snapshot()).expect("restoring the snapshot");
                 let distances: Vec<f64> = candidate
                     .chunks_exact(2)
                     .map(|action| {
                         let action = [action[0].clamp(-1.0, 1.0), action[1].clamp(-1.0, 1.0)];
-                        environment.step(Action::Continuous(&action)).expect("the environment steps");
+                        environment.step(Action::Continuous(&action)).expect("stepping the environment");
                         environment.goal_distance()
                     })
                     .collect();
@@ -77,7 +78,7 @@ fn costs_equal_distances_in_the_environment() {
 }
 
 #[test]
-fn reaching_the_goal_early_is_cheapest() {
+fn reach_score_counts_remaining_steps_or_the_final_distance() {
     let entry = &two_room::ENTRY;
     let mut pool = pool(entry, 1);
     // The goal is within 16 pixels after 3 steps of 5 pixels to the right.
@@ -89,7 +90,7 @@ fn reaching_the_goal_early_is_cheapest() {
         };
         env.reset(0, &options)
     })
-    .expect("the reset succeeds");
+    .expect("resetting the environment");
     let walk = |steps: usize| (0..6).flat_map(move |t| [if t < steps { 1.0 } else { 0.0 }, 0.0]);
     let actions: Vec<f32> = walk(3).chain(walk(2)).chain(walk(6)).collect();
     let costs = costs(&mut simulator(entry, &pool, &[0], Score::Reach), &actions, 1, 3);
@@ -116,7 +117,8 @@ fn costs_do_not_depend_on_other_environments_or_threads() {
         let own = samples * HORIZON * BLOCK * width;
         let all = actions(&mut Key::new(2).rng(), envs * own);
         let run = |threads: usize, slots: &[usize]| {
-            let workers = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a thread pool");
+            let workers =
+                rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("creating the thread pool");
             let actions: Vec<f32> = slots.iter().flat_map(|&slot| &all[slot * own..][..own]).copied().collect();
             let mut simulator = simulator(entry, &pool, slots, Score::Terminal);
             let costs = workers.install(|| costs(&mut simulator, &actions, slots.len(), samples));
@@ -144,7 +146,10 @@ fn rejects_environments_of_another_kind_and_wrong_shapes() {
     let mut simulator = simulator(&two_room::ENTRY, &two_room_pool, &[0], Score::Terminal);
     let message = simulator.observe_env(0, push_t_pool.env(0)).expect_err("another environment").to_string();
     assert!(message.contains(push_t::ENTRY.id) && message.contains(two_room::ENTRY.id), "{message}");
-    let again = simulator.observe(two_room_pool.infos(), &[0]).expect_err("passed once, observed twice").to_string();
+    let again = simulator
+        .observe(two_room_pool.infos(), &[0])
+        .expect_err("observing twice after passing the environment once")
+        .to_string();
     assert!(again.contains("was not passed to the policy"), "{again}");
     let wide = Candidates { actions: &[0.0; 6], envs: 1, samples: 1, horizon: 1, dim: 6 };
     assert!(simulator.cost(wide, &mut [0.0]).expect_err("too many action values").to_string().contains("6 values"));

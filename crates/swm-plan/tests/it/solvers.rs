@@ -151,7 +151,7 @@ pub fn solves(row: &SolverEntry, toy: &Toy) -> bool {
 fn solvers_find_the_optima_of_toys() {
     for row in SOLVERS.rows {
         let trial = trial(row.id);
-        let settings = serde_json::from_str(trial.settings).expect("valid settings");
+        let settings = serde_json::from_str(trial.settings).expect("parsing the settings");
         for toy in TOYS {
             // A sampling solver receives constraints as a penalty.
             let penalised = toy.constrained && fits(row, toy) && row.needs.is_empty();
@@ -161,7 +161,7 @@ fn solvers_find_the_optima_of_toys() {
             assert_eq!(near.is_some(), tried, "the trial of {} on {}", row.id, toy.name);
             let Some(&(_, excess, distance)) = near else { continue };
 
-            let mut solver = (row.make)(&settings).expect("valid settings");
+            let mut solver = (row.make)(&settings).expect("creating the solver");
             let mut model = Model::new(toy, &ENVS);
             let plan = if penalised {
                 let mut model = Penalised::new(Box::new(model), PENALTY).expect("the toy has constraints");
@@ -192,9 +192,9 @@ fn solvers_find_the_optima_of_toys() {
 }
 
 #[test]
-fn pairing_names_the_solvers_that_fit() {
+fn pairing_errors_name_the_solvers_that_fit() {
     let message = |row: &SolverEntry, toy: &Toy, model: &mut Model| {
-        let mut solver = (row.make)(&serde_json::json!({})).expect("a solver");
+        let mut solver = (row.make)(&serde_json::json!({})).expect("creating the solver");
         let rejected = solve(&mut *solver, model, toy, &ENVS).expect_err(row.id).to_string();
         let message = pairing(row.id, model, ActionKind::of_plan(toy.space)).expect_err(row.id).to_string();
         let obstacle = |message: &str| message.split("; ").next().map(str::to_owned);
@@ -223,7 +223,7 @@ fn pairing_names_the_solvers_that_fit() {
 }
 
 #[test]
-fn skipped_trials_exist_and_have_reasons() {
+fn trials_and_skipped_trials_name_existing_solvers_and_toys() {
     for &(solver, name, why) in SKIPPED {
         assert!(SOLVERS.get(solver).is_ok() && TOYS.iter().any(|toy| toy.name == name) && why.len() > 10, "{solver}");
     }
@@ -238,7 +238,7 @@ fn errors_name_costs_that_are_missing_or_not_finite() {
     for row in SOLVERS.rows {
         let toy = TOYS.iter().find(|toy| solves(row, toy)).expect("a toy for this solver");
         let message = |cost| {
-            let mut solver = (row.make)(&serde_json::json!({})).expect("a solver");
+            let mut solver = (row.make)(&serde_json::json!({})).expect("creating the solver");
             let model = Model::new(toy, &ENVS).with_wrong_cost(1, 0, cost);
             solve(&mut *solver, &mut { model }, toy, &ENVS).expect_err(row.id).to_string()
         };

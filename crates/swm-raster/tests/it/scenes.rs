@@ -141,8 +141,8 @@ pub fn assets() -> Assets {
     let solid = Mesh::new([[a, b, d], [a, d, c], [a, c, b], [b, c, d]]);
     let broken = Mesh::new([[a, a, a], [a, b, corner([f32::NAN, 0.0, 0.0])], [a, b, corner([1e30; 3])]]);
     let bytes: Vec<u8> = (0..72u8).map(|i| i.wrapping_mul(89)).collect();
-    let flat = Texture::flat(3, 2, 3, &bytes[..18]).expect("a texture");
-    let cube = Texture::cube(2, 3, &bytes).expect("a texture");
+    let flat = Texture::flat(3, 2, 3, &bytes[..18]).expect("creating the texture");
+    let cube = Texture::cube(2, 3, &bytes).expect("creating the texture");
     Assets {
         textures: vec![Arc::new(flat), Arc::new(cube), Arc::new(Texture::white())],
         meshes: vec![Arc::new(solid), Arc::new(broken), Arc::new(Mesh::new([]))],

@@ -17,52 +17,54 @@ fn page_with_videos(folder: &Path, videos: &[&str]) -> String {
 
 #[test]
 fn videos_outside_the_folder_are_not_embedded() {
-    let root = tempfile::tempdir().expect("a temporary folder");
+    let root = tempfile::tempdir().expect("creating a temporary folder");
     let folder = root.path().join("results");
-    fs::create_dir_all(folder.join("videos")).expect("a folder");
+    fs::create_dir_all(folder.join("videos")).expect("creating a folder");
     let secret = root.path().join("secret.mp4");
-    fs::write(&secret, "a secret").expect("a file");
-    std::os::unix::fs::symlink(&secret, folder.join("videos/link.mp4")).expect("a link");
-    std::os::unix::fs::symlink(root.path(), folder.join("up")).expect("a link");
-    fs::write(folder.join("inside.mp4"), "inside").expect("a file");
+    fs::write(&secret, "a secret").expect("writing the file");
+    std::os::unix::fs::symlink(&secret, folder.join("videos/link.mp4")).expect("making a link");
+    std::os::unix::fs::symlink(root.path(), folder.join("up")).expect("making a link");
+    fs::write(folder.join("inside.mp4"), "inside").expect("writing the file");
     let absolute = secret.to_str().expect("a path");
     let page = page_with_videos(
         &folder,
         &["../secret.mp4", absolute, "videos/link.mp4", "up/secret.mp4", "videos/../inside.mp4"],
     );
     assert_eq!(page.matches("is outside the folder of its results file").count(), 4);
-    assert_eq!(page.matches("data:video/").count(), 1, "the video inside is embedded");
+    assert_eq!(page.matches("data:video/").count(), 1, "the video inside the folder is embedded");
 }
 
 #[test]
 fn pipes_and_folders_are_not_read_as_videos() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let pipe = folder.path().join("pipe.mp4");
-    let made = std::process::Command::new("mkfifo").arg(&pipe).status().expect("mkfifo");
+    let made = std::process::Command::new("mkfifo").arg(&pipe).status().expect("running mkfifo");
     assert!(made.success());
-    fs::create_dir(folder.path().join("folder.mp4")).expect("a folder");
+    fs::create_dir(folder.path().join("folder.mp4")).expect("creating a folder");
     let page = page_with_videos(folder.path(), &["pipe.mp4", "folder.mp4"]);
     assert_eq!(page.matches("is not a regular file").count(), 2);
-    assert!(read_results(&pipe).expect_err("a pipe").to_string().contains("not a regular file"));
-    assert!(read_metrics(&pipe).expect_err("a pipe").to_string().contains("not a regular file"));
+    assert!(read_results(&pipe).expect_err("reading a pipe").to_string().contains("not a regular file"));
+    assert!(read_metrics(&pipe).expect_err("reading a pipe").to_string().contains("not a regular file"));
 }
 
 #[test]
-fn a_video_is_embedded_once_and_all_videos_have_a_budget() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    fs::write(folder.path().join("one.mp4"), "one video").expect("a file");
+fn each_video_is_embedded_once_within_a_total_budget() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    fs::write(folder.path().join("one.mp4"), "one video").expect("writing the file");
     let again = page_with_videos(folder.path(), &["one.mp4"; 60]);
     assert_eq!(again.matches("data:video/").count(), 1);
     assert_eq!(again.matches("The same file as <a href=\"#video-1\">video 1</a>").count(), 59);
 
     let names: Vec<String> = (0..8).map(|i| format!("large-{i}.mp4")).collect();
     for name in &names {
-        fs::File::create(folder.path().join(name)).and_then(|file| file.set_len(8 << 20)).expect("a sparse file");
+        fs::File::create(folder.path().join(name))
+            .and_then(|file| file.set_len(8 << 20))
+            .expect("creating a sparse file");
     }
     let mut large = results();
     large.runs[2].videos = names;
-    let path = write_report(&[(folder.path().join("results.json"), large)], folder.path()).expect("the report");
-    let page = fs::read_to_string(path).expect("the page");
+    let path = write_report(&[(folder.path().join("results.json"), large)], folder.path()).expect("writing the report");
+    let page = fs::read_to_string(path).expect("reading the page");
     assert_eq!(page.matches("data:video/").count(), 6);
     assert!(page.contains("2 more videos are left out, because a page holds at most 200 videos and 48.0 MiB"));
 
@@ -72,15 +74,16 @@ fn a_video_is_embedded_once_and_all_videos_have_a_budget() {
 }
 
 #[test]
-fn many_policies_give_a_small_page() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn many_policies_give_a_bounded_page_and_too_many_runs_are_refused() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let mut many = results();
     many.runs = vec![run("in distribution", "random", 40, 2, None)];
     many.runs.extend((0..1500).map(|i| run("in distribution", &format!("policy-{i}"), 40, i % 40, None)));
     many.comparisons = Comparison::all(&many.runs, many.counting);
     assert_eq!(many.comparisons.len(), 1500 + 1499);
-    let path = write_report(&[(PathBuf::from("results.json"), many.clone())], folder.path()).expect("the report");
-    let page = fs::read_to_string(path).expect("the page");
+    let path =
+        write_report(&[(PathBuf::from("results.json"), many.clone())], folder.path()).expect("writing the report");
+    let page = fs::read_to_string(path).expect("reading the page");
     assert!(page.len() < 32 << 20, "{} bytes", page.len());
     assert!(
         page.contains(&format!("With more than {MAX_ALL_PAIRS} runs")) && page.contains("The chart is cut off here")
@@ -93,11 +96,11 @@ fn many_policies_give_a_small_page() {
 
 /// Reads results after a change of their JSON document; returns the error.
 fn refused(change: impl Fn(&mut Value)) -> String {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let mut results = results();
     let trajectory = |success| Trajectory { start: [0, 0], success: Some(success), errors: vec![0.5, 1.0] };
     results.runs[2].prediction = Some(Prediction::new(5, 1.0, vec![trajectory(true), trajectory(false)]));
-    let mut value = serde_json::to_value(results).expect("valid JSON");
+    let mut value = serde_json::to_value(results).expect("serialising to JSON");
     change(&mut value);
     let path = folder.path().join("results.json");
     fs::write(&path, value.to_string()).expect("the file is written");
@@ -128,7 +131,7 @@ fn statistics_that_contradict_the_episodes_are_refused() {
     ];
     for (pointer, value, part) in changes {
         let error = refused(|v| {
-            let strict = v["runs"][2].as_object_mut().expect("a run");
+            let strict = v["runs"][2].as_object_mut().expect("the run is a JSON object");
             strict.insert("strict".to_owned(), Value::Null);
             *v.pointer_mut(pointer).expect(pointer) = value.clone();
         });
@@ -139,7 +142,7 @@ fn statistics_that_contradict_the_episodes_are_refused() {
 }
 
 #[test]
-fn absurd_values_never_panic() {
+fn extreme_values_are_accepted_and_values_outside_the_layout_are_refused() {
     for (pointer, value) in [
         (
             "/runs/2/timing",
@@ -159,7 +162,7 @@ fn absurd_values_never_panic() {
         ("/manifest/seed", json!(u64::MAX)),
     ] {
         let found = refused(|v| {
-            let run = v["runs"][2].as_object_mut().expect("a run");
+            let run = v["runs"][2].as_object_mut().expect("the run is a JSON object");
             run.entry("searches").or_insert(Value::Null);
             *v.pointer_mut(pointer).expect(pointer) = value.clone();
         });
@@ -180,7 +183,7 @@ fn absurd_values_never_panic() {
 
 #[test]
 fn hostile_training_logs_are_refused_or_bounded() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let log = folder.path().join("train.jsonl");
     let error = |text: &str| {
         fs::write(&log, text).expect("the log is written");
@@ -191,13 +194,13 @@ fn hostile_training_logs_are_refused_or_bounded() {
     assert!(error(&format!("{{{}}}\n", names.join(","))).contains("another metric after 1000"));
     assert!(error(&format!("{{\"{}\": 1}}\n", "x".repeat(300))).contains("a name of more than 200 bytes"));
     assert!(error(&format!("{}1{}\n", "{\"a\":".repeat(200), "}".repeat(200))).contains("line 1 is not"));
-    fs::File::create(&log).and_then(|file| file.set_len(10 << 30)).expect("a sparse file of 10 GiB");
+    fs::File::create(&log).and_then(|file| file.set_len(10 << 30)).expect("creating a sparse file of 10 GiB");
     assert!(read_metrics(&log).expect_err("a large log").to_string().contains("is larger than 256.0 MiB"));
 
     let hostile =
         "{\"<script>alert(1)</script>\": 1e308, \"step\": 1}\n{\"<script>alert(1)</script>\": -1e308, \"step\": 2}\n";
     fs::write(&log, format!("{hostile}{{\"step\": null, \"tiny\": 5e-324}}\n{{\"step\": 4, \"other\": []}}\n"))
-        .expect("a log");
+        .expect("writing the log");
     let options = ReportOptions { metrics: Some(log), ..ReportOptions::default() };
     let results: [(PathBuf, Results); 1] = [(PathBuf::from("results.json"), results())];
     let path = write_report_with(&results, &options, folder.path()).expect("the report is written");

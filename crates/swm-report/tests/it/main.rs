@@ -122,7 +122,7 @@ fn well_formed(page: &str) {
 
 #[test]
 fn page_contains_the_results() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let results = [(PathBuf::from("runs/demo/results.json"), results())];
     let page = page(&results, folder.path());
     // 37 of 40: Wilson 80.1 to 97.4 % (z = 1.96); 2 of 40: 1.4 to 16.5 %; 3 of 39: 2.7 to 20.3 %.
@@ -153,7 +153,7 @@ fn page_contains_the_results() {
 
 #[test]
 fn policies_are_compared_on_the_same_starts() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let page = page(&[(PathBuf::from("runs/all/results.json"), results_with_all_parts())], folder.path());
     // 37 of 40 against 2 of 40, none solved by the floor alone: p = 2 × 0.5^35. 25 of 40 against 37 of 40: 25 both, 12
     // only one policy, 0 only the other.
@@ -182,7 +182,7 @@ fn policies_are_compared_on_the_same_starts() {
 
 #[test]
 fn compat_counting_is_described_with_the_strict_rate() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let mut results = results();
     results.counting = Counting::Compat { envs: 8 };
     results.runs.truncate(3);
@@ -193,8 +193,8 @@ fn compat_counting_is_described_with_the_strict_rate() {
     results.runs[2].strict = Some(Counting::default().rate(&results.runs[2].episodes));
     results.comparisons = Comparison::all(&results.runs, results.counting);
     let file = folder.path().join("results.json");
-    std::fs::write(&file, serde_json::to_string(&results).expect("valid JSON")).expect("the file is written");
-    let results = read_results(&file).expect("consistent results");
+    std::fs::write(&file, serde_json::to_string(&results).expect("serialising to JSON")).expect("the file is written");
+    let results = read_results(&file).expect("reading the results");
     let page = page(&[(file, results)], &folder.path().join("report"));
     for words in [
         "every episode counts, solved at the start or not (1 were)",
@@ -208,8 +208,8 @@ fn compat_counting_is_described_with_the_strict_rate() {
 }
 
 #[test]
-fn equal_results_give_equal_bytes() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn equal_results_give_equal_pages() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let results = [(PathBuf::from("a/results.json"), results())];
     let pages = ["x", "y"].map(|name| page(&results, &folder.path().join(name)));
     assert!(pages[0] == pages[1]);
@@ -217,7 +217,7 @@ fn equal_results_give_equal_bytes() {
 
 #[test]
 fn external_text_is_escaped() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let mut results = results();
     let markup = "<img src=x onerror=\"alert('1')\">&";
     (results.env, results.protocol) = (markup.to_owned(), markup.to_owned());
@@ -237,7 +237,7 @@ fn external_text_is_escaped() {
 
 #[test]
 fn empty_results_are_described() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let mut empty = results();
     empty.runs.clear();
     let mut unsolved = results();
@@ -255,7 +255,7 @@ fn empty_results_are_described() {
 
 #[test]
 fn files_of_one_environment_share_a_section() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let files = ["a.json", "b.json"].map(|name| (PathBuf::from(name), results()));
     let page = page(&files, folder.path());
     assert_eq!(page.matches("<h2>Success</h2>").count(), 1);
@@ -274,7 +274,7 @@ fn files_of_one_environment_share_a_section() {
 
 #[test]
 fn environments_and_countings_have_separate_sections() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let (first, other) = (results(), Results { env: "swm/PushT-v1".to_owned(), ..results() });
     let compat = Results { counting: Counting::Compat { envs: 8 }, ..results() };
     let files = [first, other, compat].map(|results| (PathBuf::from("results.json"), results));
@@ -287,7 +287,7 @@ fn environments_and_countings_have_separate_sections() {
 
 #[test]
 fn videos_are_embedded_or_listed_with_a_reason() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     std::fs::create_dir_all(folder.path().join("videos")).expect("the folder is created");
     std::fs::write(folder.path().join("videos/lewm-2.mp4"), b"not really a video").expect("the file is written");
     let large = std::fs::File::create(folder.path().join("videos/lewm-39.mp4")).expect("the file is written");
@@ -306,7 +306,7 @@ fn videos_are_embedded_or_listed_with_a_reason() {
 
 #[test]
 fn training_metrics_become_charts() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let log = folder.path().join("train.jsonl");
     let lines: String = (0..900)
         .map(|i| {
@@ -336,12 +336,12 @@ fn training_metrics_become_charts() {
 }
 
 #[test]
-fn results_are_read_and_errors_name_the_problem() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
+fn valid_results_are_read_and_invalid_files_are_refused() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("results.json");
-    let good = serde_json::to_value(results()).expect("valid JSON");
+    let good = serde_json::to_value(results()).expect("serialising to JSON");
     std::fs::write(&path, good.to_string()).expect("the file is written");
-    assert_eq!(read_results(&path).expect("valid results"), results());
+    assert_eq!(read_results(&path).expect("reading the results"), results());
 
     let wrong = |change: &dyn Fn(&mut serde_json::Value)| {
         let mut value = good.clone();
@@ -367,7 +367,7 @@ fn results_are_read_and_errors_name_the_problem() {
     let fields = older.as_object_mut().expect("a JSON object");
     fields.remove("counting").and(fields.remove("comparisons")).expect("the results have both fields");
     std::fs::write(&path, older.to_string()).expect("the file is written");
-    let older = read_results(&path).expect("valid results");
+    let older = read_results(&path).expect("reading the results");
     assert_eq!((older.counting, older.runs, older.comparisons), (Counting::default(), results().runs, vec![]));
 
     std::fs::write(&path, "{\"manifest\": ").expect("the file is written");

@@ -113,16 +113,19 @@ mod tests {
             variation: Some(vec!["agent".to_owned()]),
             pin: vec!["background.color=1, 2,3".to_owned()],
         };
-        let request = args.request().expect("a valid request");
+        let request = args.request().expect("parsing the request");
         assert_eq!(request.variation_values["background.color"], [1.0, 2.0, 3.0]);
         assert_eq!(args.describe(), "agent sampled, background.color=1, 2,3");
         let none = VariationArgs { variation: Some(vec!["none".to_owned()]), pin: vec![] };
-        assert_eq!(none.request().expect("a valid request").variation, Some(vec![]));
+        assert_eq!(none.request().expect("parsing the request").variation, Some(vec![]));
         let twice = ["agent.x=1", "agent.y=1", "agent.x=2"].map(str::to_owned).to_vec();
-        let twice = VariationArgs { variation: None, pin: twice }.request().expect_err("a factor twice").to_string();
+        let twice = VariationArgs { variation: None, pin: twice }
+            .request()
+            .expect_err("a factor that is given twice")
+            .to_string();
         assert!(twice.contains("--pin agent.x: is given twice: 'agent.x=1' and 'agent.x=2'"), "{twice}");
         let wrong = VariationArgs { variation: None, pin: vec!["background.color".to_owned()] };
-        assert!(wrong.request().expect_err("no value").to_string().contains("background.color=200"));
+        assert!(wrong.request().expect_err("a pin without a value").to_string().contains("background.color=200"));
         assert_eq!(image_size("64x96"), Ok((64, 96)));
         assert!(image_size("3").is_err());
     }

@@ -270,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn examples_parse() {
+    fn example_of_every_command_parses() {
         fn parse(command: &Command) {
             let example = command.get_after_help().expect("an example").to_string();
             let words = example.trim_start_matches("Example: ").split(' ');

@@ -127,7 +127,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn training_message_shows_the_model_first() {
+    fn training_message_shows_the_losses_before_the_speed() {
         let metrics =
             [("loss", 0.5), ("validation_loss", 0.25), ("lr", 1e-3), ("clips_per_second", 12.0), ("data_wait", 0.5)];
         let progress = Progress { stage: "train", done: 1, total: 2, unit: "steps", metrics: &metrics };
@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn only_evaluations_have_a_success_rate() {
+    fn success_rate_requires_counts_of_successes_and_episodes() {
         assert_eq!(success_rate(&[("loss", 0.5)]), None);
         assert!(success_rate(&[("successes", 1.0), ("episodes", 2.0)]).is_some_and(|rate| rate.starts_with("50 %")));
     }

@@ -104,11 +104,11 @@ mod tests {
 
     #[test]
     fn parses_solvers_with_settings() {
-        let (entry, settings) = parse("cem,samples=64,sigma=0.5").expect("a valid solver");
+        let (entry, settings) = parse("cem,samples=64,sigma=0.5").expect("parsing the solver");
         assert_eq!(entry.id, "cem");
         assert_eq!((&settings["samples"], &settings["sigma"]), (&json!(64), &json!(0.5)));
-        assert_eq!(settings["iterations"], json!(30), "the default");
-        let (_, settings) = parse("gd,optimizer.step=0.5").expect("a valid solver");
+        assert_eq!(settings["iterations"], json!(30), "unset settings have their defaults");
+        let (_, settings) = parse("gd,optimizer.step=0.5").expect("parsing the solver");
         assert_eq!((&settings["optimizer"]["step"], &settings["optimizer"]["kind"]), (&json!(0.5), &json!("adam")));
         for (text, message) in [
             ("cme", "did you mean cem"),

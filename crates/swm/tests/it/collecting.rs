@@ -18,7 +18,7 @@ fn content(swm: &Swm, name: &str) -> (String, usize) {
 }
 
 #[test]
-fn dataset_does_not_depend_on_threads_or_environments() {
+fn dataset_does_not_depend_on_thread_and_environment_counts() {
     let swm = Swm::new();
     let hashes = [("1", "1"), ("2", "3"), ("2", "8")].map(|(threads, envs)| {
         let more = ["--episodes", "9", "--overwrite", "--threads", threads, "--envs", envs];
@@ -42,7 +42,7 @@ fn killed_collection_keeps_committed_episodes_and_resumes() {
         std::thread::sleep(Duration::from_millis(50));
         let output = swm.run(&["inspect", "rooms", "--json"]);
         if output.status.success() {
-            let found: serde_json::Value = serde_json::from_slice(&output.stdout).expect("valid JSON");
+            let found: serde_json::Value = serde_json::from_slice(&output.stdout).expect("parsing the JSON");
             if found["episodes"].as_u64() > Some(0) {
                 break found["episodes"].as_u64();
             }
@@ -108,7 +108,12 @@ fn truncated_dataset_is_an_error() {
     let swm = Swm::new();
     swm.json(&with(ROOMS, &["--episodes", "3"]));
     let data = swm.path("datasets/rooms.lance/data");
-    let file = std::fs::read_dir(data).expect("data files").flatten().next().expect("the folder has a file").path();
+    let file = std::fs::read_dir(data)
+        .expect("listing the data files")
+        .flatten()
+        .next()
+        .expect("the folder has a file")
+        .path();
     let bytes = std::fs::read(&file).expect("the file is readable");
     std::fs::write(&file, &bytes[..bytes.len() / 2]).expect("the file is writable");
     swm.fails(&["inspect", "rooms"], 1, &["rooms.lance"]);
@@ -141,12 +146,13 @@ fn shards_of_two_renderers_require_mix_renderers() {
     }
     let logs = swm.path("datasets/swings.lance/_shards");
     let second = std::fs::read_dir(logs)
-        .expect("the folder of shards")
-        .map(|entry| entry.expect("a shard").path())
+        .expect("listing the folder of shards")
+        .map(|entry| entry.expect("reading the entry of a shard").path())
         .max()
         .expect("two shards");
     let log = second.join("begun.json");
-    let changed = std::fs::read_to_string(&log).expect("a log").replace(r#""renderer":"cpu"#, r#""renderer":"egl"#);
+    let changed =
+        std::fs::read_to_string(&log).expect("reading the log").replace(r#""renderer":"cpu"#, r#""renderer":"egl"#);
     std::fs::write(&log, changed).expect("the file is writable");
     swm.fails(&["datasets", "commit", "swings"], 2, &["egl", "--mix-renderers"]);
     assert_eq!(swm.json(&["datasets", "commit", "swings", "--mix-renderers"])["added"], 2);

@@ -82,7 +82,7 @@ fn doctor_finds_truncated_files() {
 }
 
 fn largest(folder: &Path) -> std::path::PathBuf {
-    let entries = std::fs::read_dir(folder).expect("a readable folder").flatten();
+    let entries = std::fs::read_dir(folder).expect("listing the folder").flatten();
     entries
         .map(|entry| entry.path())
         .max_by_key(|path| path.metadata().map_or(0, |m| m.len()))

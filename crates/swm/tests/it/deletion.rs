@@ -10,12 +10,12 @@ const DEMO: &[&str] =
 
 /// Writes a file of the user, and its folders.
 fn user_file(path: &Path) {
-    fs::create_dir_all(path.parent().expect("a folder")).expect("creating folders");
+    fs::create_dir_all(path.parent().expect("the path has a parent folder")).expect("creating folders");
     fs::write(path, "thesis").expect("writing a file");
 }
 
 fn assert_untouched(path: &Path) {
-    assert_eq!(fs::read_to_string(path).expect("the user's file"), "thesis", "{}", path.display());
+    assert_eq!(fs::read_to_string(path).expect("reading the user's file"), "thesis", "{}", path.display());
 }
 
 #[test]

@@ -83,7 +83,7 @@ fn environment_with_state_setters_starts_from_a_dataset() {
         return;
     }
     let swm = Swm::new();
-    std::fs::write(swm.path("trains.py"), TRAIN).expect("a module");
+    std::fs::write(swm.path("trains.py"), TRAIN).expect("writing the module");
     let train = "trains:Train-v0";
     swm.json(&["collect", train, "-o", "trains", "--policy", "random", "--episodes", "3", "--no-pixels"]);
     let eval = ["eval", "random", "--env", train, "--dataset", "trains", "--goal-offset", "4", "--episodes", "6"];

@@ -40,7 +40,7 @@ fn same(found: &Value, expected: &Value) -> bool {
 }
 
 #[test]
-fn listings_print_tables() {
+fn listing_commands_print_the_registered_names() {
     let swm = Swm::new();
     for (args, names) in [
         (&["envs"][..], &["swm/PushT-v1", "swm/TwoRoom-v1"][..]),

@@ -22,7 +22,7 @@ pub(crate) struct Swm {
 
 impl Swm {
     pub fn new() -> Self {
-        Self { home: tempfile::tempdir().expect("a temporary folder") }
+        Self { home: tempfile::tempdir().expect("creating a temporary folder") }
     }
 
     pub fn home(&self) -> &Path {

@@ -20,14 +20,14 @@ fn demo(swm: &Swm, more: &[&str]) -> (Value, Value) {
 }
 
 #[test]
-fn demo_does_not_depend_on_threads_and_environments() {
+fn demo_does_not_depend_on_thread_and_environment_counts() {
     let swm = Swm::new();
     let first = demo(&swm, &["--threads", "1", "--envs", "1"]);
-    let page = std::fs::read_to_string(swm.path("demo/index.html")).expect("the report");
+    let page = std::fs::read_to_string(swm.path("demo/index.html")).expect("reading the report");
     assert!(page.contains("Two rooms") && page.contains("data:video/mp4"));
     let second = demo(&swm, &["--threads", "2", "--envs", "5"]);
-    assert_eq!(first.0, second.0, "datasets");
-    assert_eq!(first.1, second.1, "results");
+    assert_eq!(first.0, second.0, "the datasets differ");
+    assert_eq!(first.1, second.1, "the results differ");
     let other = demo(&swm, &["--seed", "1"]);
     assert_ne!(first.0, other.0, "the seed changes the data");
 }
@@ -56,7 +56,8 @@ fn trains_evaluates_and_reports() {
     assert_eq!(dataset["protocol"], "dataset");
     assert_eq!(dataset["runs"][1]["condition"], "agent.color=0,0,255");
     let report = swm.json(&["report", "episodic", "dataset", "-o", "report"]);
-    let page = std::fs::read_to_string(swm.path(report["report"].as_str().expect("a path"))).expect("the report");
+    let page =
+        std::fs::read_to_string(swm.path(report["report"].as_str().expect("a path"))).expect("reading the report");
     assert!(page.contains("agent.color=0,0,255") && page.contains("data:video/mp4"));
 
     swm.fails(&["eval", "small", "--env", "swm/PushT-v1"], 2, &["trained on swm/TwoRoom-v1"]);
@@ -78,7 +79,7 @@ fn trains_evaluates_and_reports() {
 fn find(folder: &std::path::Path, name: &str) -> std::path::PathBuf {
     let mut folders = vec![folder.to_owned()];
     while let Some(folder) = folders.pop() {
-        for entry in std::fs::read_dir(&folder).expect("a readable folder").flatten() {
+        for entry in std::fs::read_dir(&folder).expect("listing the folder").flatten() {
             let path = entry.path();
             if path.is_dir() && !path.is_symlink() {
                 folders.push(path);
@@ -120,8 +121,8 @@ fn compares_policies_from_the_same_starts_and_reproduces_results() {
         "planning with the true dynamics beats the floor"
     );
     let traces: Value =
-        serde_json::from_slice(&std::fs::read(swm.path("found/traces.json")).expect("the file of traces"))
-            .expect("valid JSON");
+        serde_json::from_slice(&std::fs::read(swm.path("found/traces.json")).expect("reading the file of traces"))
+            .expect("parsing the JSON");
     assert!(traces[0]["policy"] == "small" && traces[0]["best"].as_array().map(Vec::len) == Some(2), "{}", traces[0]);
 
     // These solvers require gradients, latents, terms or constraints of the checkpoint.
@@ -149,7 +150,7 @@ fn compares_policies_from_the_same_starts_and_reproduces_results() {
 }
 
 #[test]
-fn checks_protocols_splits_and_settings() {
+fn eval_records_protocol_split_and_hold_and_rejects_unknown_settings() {
     let swm = Swm::new();
     swm.json(&["collect", "swm/TwoRoom-v1", "-o", "rooms", "--no-pixels", "--episodes", "40", "--max-steps", "40"]);
     let expert = ["eval", "expert", "--env", "swm/TwoRoom-v1", "--episodes", "6", "-o", "found"];

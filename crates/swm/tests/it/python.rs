@@ -35,7 +35,7 @@ fn python_lance_opens_a_collected_dataset() {
         .output()
         .expect("Python starts");
     assert!(output.status.success(), "{}", text(&output.stderr));
-    let found: serde_json::Value = serde_json::from_slice(&output.stdout).expect("valid JSON");
+    let found: serde_json::Value = serde_json::from_slice(&output.stdout).expect("parsing the JSON");
     assert_eq!(found["rows"], ours["steps"]);
     assert_eq!(found["episodes"], 3);
     // An episode has no action after its last observation.

@@ -207,8 +207,8 @@ mod tests {
     use swm_core::Key;
 
     #[test]
-    fn reads_ranges_within_the_capacity() {
-        let runtime = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
+    fn block_cache_reads_byte_ranges_within_its_capacity() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().expect("creating the runtime");
         runtime.block_on(async {
             let store = InMemory::new();
             let contents: Vec<Vec<u8>> = [1000, 37, 256].map(|n| (0..n).map(|i| (i * i / 3) as u8).collect()).into();

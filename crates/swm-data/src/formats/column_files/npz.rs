@@ -245,38 +245,42 @@ mod tests {
     use super::*;
 
     #[test]
-    fn arrays_and_members_round_trip() {
-        let folder = tempfile::tempdir().expect("a folder");
+    fn npz_arrays_and_members_round_trip() {
+        let folder = tempfile::tempdir().expect("creating a temporary folder");
         let path = folder.path().join("a.npz");
         let mut writer = NpzWriter::create(&path).expect("creating the archive");
         writer.array(DType::Int32, 3, &[2], &[&[1; 8], &[2; 16]]).expect("writing to the archive");
         writer.member("note", b"hello").expect("writing to the archive");
         writer.finish().expect("completing the archive");
         let mut npz = Npz::open(&path).expect("opening the archive");
-        let (header, bytes) = npz.array().expect("an array");
+        let (header, bytes) = npz.array().expect("reading the array");
         assert_eq!((header.rows(), header.spec("a")), (3, Some(ColumnSpec::new("a", DType::Int32, [2]))));
         assert_eq!(header.stored, Some(StoredScalar::of(DType::Int32)));
         assert_eq!((&bytes[..8], &bytes[8..]), (&[1; 8][..], &[2; 16][..]));
-        assert_eq!(npz.header().expect("a header"), header);
-        assert_eq!(npz.member("note").expect("a member"), b"hello");
+        assert_eq!(npz.header().expect("reading the header"), header);
+        assert_eq!(npz.member("note").expect("reading the member"), b"hello");
         assert!(npz.has("note") && !npz.has("other") && npz.member("other").is_err());
     }
 
     #[test]
-    fn parses_headers_of_text_scalars_and_invalid_arrays() {
+    fn array_headers_are_parsed_or_rejected() {
         let array = |text: &str| {
             let mut bytes = b"\x93NUMPY\x02\x00".to_vec();
             bytes.extend((text.len() as u32).to_le_bytes());
             bytes.extend(text.as_bytes());
             parse(&bytes).map(|(header, _)| header)
         };
-        let text = array("{'descr': '<U5', 'fortran_order': False, 'shape': (4,), }").expect("an array of text");
+        let text = array("{'descr': '<U5', 'fortran_order': False, 'shape': (4,), }")
+            .expect("parsing the header of a text array");
         assert_eq!((text.stored, text.rows()), (None, 4));
-        let scalar = array("{'descr': '>f8', 'fortran_order': False, 'shape': (), }").expect("an array");
+        let scalar = array("{'descr': '>f8', 'fortran_order': False, 'shape': (), }").expect("reading the array");
         assert_eq!((scalar.stored.expect("a numeric type").big_endian, scalar.rows()), (true, 1));
-        let fortran = array("{'descr': '<f8', 'fortran_order': True, 'shape': (2, 3), }").expect_err("Fortran order");
+        let fortran =
+            array("{'descr': '<f8', 'fortran_order': True, 'shape': (2, 3), }").expect_err("an array in Fortran order");
         assert!(fortran.contains("ascontiguousarray"), "{fortran}");
         assert!(array("{'descr': '<f8', 'fortran_order': False, 'shape': (-2, 3), }").is_err());
-        assert!(parse(b"PK\x03\x04 is something else").expect_err("not an array").contains("not a NumPy array"));
+        assert!(
+            parse(b"PK\x03\x04 is something else").expect_err("bytes that are no array").contains("not a NumPy array")
+        );
     }
 }

@@ -351,7 +351,9 @@ mod tests {
     #[test]
     fn rejects_invalid_column_names() {
         for name in ["ep_len", "a/b", "."] {
-            let error = Layout::new(&[ColumnSpec::new(name, DType::U8, [])]).err().expect("an invalid name");
+            let error = Layout::new(&[ColumnSpec::new(name, DType::U8, [])])
+                .err()
+                .expect("an invalid column name must be an error");
             assert!(error.to_string().contains(name), "{error}");
         }
     }

@@ -269,12 +269,20 @@ mod tests {
     fn rejects_columns_with_the_same_stored_name() {
         let schema = |names: &[&str]| {
             let specs: Vec<ColumnSpec> = names.iter().map(|n| ColumnSpec::new(*n, DType::Float32, [])).collect();
-            columns_to_write(&Schema::new(specs).expect("schema"))
+            columns_to_write(&Schema::new(specs).expect("creating the schema"))
         };
-        let names: Vec<String> =
-            schema(&["a.b", "step_idx", "c"]).expect("columns").into_iter().map(|c| c.name).collect();
+        let names: Vec<String> = schema(&["a.b", "step_idx", "c"])
+            .expect("creating the columns to write")
+            .into_iter()
+            .map(|c| c.name)
+            .collect();
         assert_eq!(names, ["a_b", "c"]);
-        assert!(schema(&["a.b", "a_b"]).expect_err("equal names").to_string().contains("'a.b' and 'a_b'"));
-        assert!(schema(&["step_idx"]).expect_err("no columns").to_string().contains("no columns"));
+        assert!(
+            schema(&["a.b", "a_b"])
+                .expect_err("columns with equal stored names")
+                .to_string()
+                .contains("'a.b' and 'a_b'")
+        );
+        assert!(schema(&["step_idx"]).expect_err("a schema without columns").to_string().contains("no columns"));
     }
 }

@@ -466,7 +466,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn system_errors_keep_their_error_code() {
+    fn lance_errors_keep_the_system_error_code() {
         let full = lance_core::Error::io("failed to persist: No space left on device (os error 28)".to_owned());
         let error = lance_error(Path::new("x.lance"), "writing", &full);
         assert!(matches!(&error, Error::Io { source, .. } if source.kind() == ErrorKind::StorageFull));
@@ -474,12 +474,12 @@ mod tests {
     }
 
     #[test]
-    fn checksum_detects_flipped_bits() {
+    fn manifest_checksum_detects_flipped_bits() {
         let plain = [&b"transaction"[..], &7_u32.to_le_bytes(), b"message", &11_u64.to_le_bytes(), b"\0\0\x02\0LANC"];
         let plain = plain.concat();
         assert!(verify_checksum(&plain).is_ok(), "a manifest of another writer has no checksum");
         let intact = with_checksum(&plain).expect("adding a checksum");
-        assert_eq!(&intact[message_start(&intact).expect("a message")..][4..11], b"message");
+        assert_eq!(&intact[message_start(&intact).expect("finding the message")..][4..11], b"message");
         assert!(verify_checksum(&intact).is_ok());
         for at in (0..intact.len()).filter(|at| !(11..19).contains(at)) {
             let mut damaged = intact.clone();

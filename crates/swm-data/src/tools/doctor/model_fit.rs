@@ -65,7 +65,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lists_unmet_requirements() {
+    fn model_fit_lists_the_requirements_that_a_dataset_does_not_meet() {
         let world_model = DatasetRequirements {
             model: "world model",
             observations: RequiredObservations::Images,
@@ -82,7 +82,7 @@ mod tests {
         let action = |dtype| ColumnSpec::new(ACTION, dtype, [2]);
         let reward = ColumnSpec::new(REWARD, DType::Float32, []);
         let missing = |columns: &[ColumnSpec], lengths: &[usize]| -> Vec<usize> {
-            let schema = Schema::new(columns.to_vec()).expect("a valid schema");
+            let schema = Schema::new(columns.to_vec()).expect("creating the schema");
             [world_model, from_rewards]
                 .iter()
                 .map(|required| ModelFit::new(required, &schema, lengths).missing.len())
@@ -94,7 +94,7 @@ mod tests {
         let states = [ColumnSpec::new(STATE, DType::Float64, [4]), action(DType::Float32), reward.clone()];
         assert_eq!(missing(&states, &[30]), [1, 0]);
         assert_eq!(missing(&[pixels, action(DType::Int64), reward], &[30]), [1, 1]);
-        let schema = Schema::new(states.to_vec()).expect("a valid schema");
+        let schema = Schema::new(states.to_vec()).expect("creating the schema");
         assert_eq!(ModelFit::new(&world_model, &schema, &[30]).missing, ["there are no images ('pixels')"]);
     }
 }

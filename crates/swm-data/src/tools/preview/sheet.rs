@@ -60,15 +60,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn frames_are_laid_out_in_reading_order() {
+    fn contact_sheet_places_frames_in_reading_order() {
         let frames: Vec<Vec<u8>> = (1..=3).map(|v| vec![v; 2 * 3]).collect();
-        let sheet = contact_sheet(2, 1, &frames, 2, 3).expect("a contact sheet");
+        let sheet = contact_sheet(2, 1, &frames, 2, 3).expect("creating the contact sheet");
         assert_eq!((sheet.width, sheet.height), (GAP + 2 * (6 + GAP), GAP + 2 * (3 + GAP)));
         let at = |x: usize, y: usize| sheet.rgb[(y * sheet.width + x) * 3];
         assert_eq!([at(0, 0), at(2, 2), at(7, 4), at(8, 4), at(10, 2)], [BACKGROUND, 1, 1, BACKGROUND, 2]);
         assert_eq!([at(2, 5), at(2, 7), at(10, 7)], [BACKGROUND, 3, BACKGROUND]);
         // Fewer frames than columns leave no empty cells.
-        assert_eq!(contact_sheet(2, 1, &frames[..1], 8, 1).expect("a contact sheet").width, 2 + 2 * GAP);
+        assert_eq!(contact_sheet(2, 1, &frames[..1], 8, 1).expect("creating the contact sheet").width, 2 + 2 * GAP);
         let wrong = contact_sheet(2, 2, &frames, 2, 1).expect_err("frames of another size").to_string();
         assert!(wrong.contains("frame 0") && wrong.contains("12"), "{wrong}");
         assert!(contact_sheet::<Vec<u8>>(2, 2, &[], 2, 1).is_err());

@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn writes_all_frames_reproducibly() {
+    fn videos_have_all_frames_and_are_reproducible() {
         let folder = tempfile::tempdir().expect("folder");
         let [a, b] = ["a.mp4", "b: 2.mp4"].map(|name| folder.path().join(name));
         let twice = |width, height| {

@@ -14,8 +14,8 @@ mod tests {
 
     #[test]
     fn expert_lifts_the_end_above_the_line() {
-        assert_eq!(tally(&ENTRY, false, false).successes, 200, "line reached");
-        assert_eq!(tally(&ENTRY, true, false).successes, 199, "line reached, all factors varied");
-        assert!(tally(&ENTRY, false, true).successes >= 160, "sampled goals reached");
+        assert_eq!(tally(&ENTRY, false, false).successes, 200, "the expert reaches the line");
+        assert_eq!(tally(&ENTRY, true, false).successes, 199, "the expert reaches the line, all factors varied");
+        assert!(tally(&ENTRY, false, true).successes >= 160, "the expert reaches sampled goals");
     }
 }

@@ -238,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn shapes_cover_the_pixels_of_gfxdraw() {
+    fn discs_and_polygons_equal_those_of_pygame_gfxdraw() {
         // pygame 2.6.1: gfxdraw.aacircle and filled_circle at (6, 6), radius 4.
         let disc = rows(|surface| surface.disc(Point::new(6, 6), 4, Color::new([0; 3])), 2..7, 1..7);
         let expected = [

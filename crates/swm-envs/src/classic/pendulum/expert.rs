@@ -31,8 +31,8 @@ mod tests {
 
     #[test]
     fn expert_swings_the_rod_up_and_holds_it() {
-        assert_eq!(tally(&ENTRY, false, false).successes, 200, "upright");
-        assert_eq!(tally(&ENTRY, true, false).successes, 169, "upright, all factors varied");
-        assert!(tally(&ENTRY, false, true).successes >= 180, "sampled goals reached");
+        assert_eq!(tally(&ENTRY, false, false).successes, 200, "the rod is upright");
+        assert_eq!(tally(&ENTRY, true, false).successes, 169, "the rod is upright, all factors varied");
+        assert!(tally(&ENTRY, false, true).successes >= 180, "the expert reaches sampled goals");
     }
 }

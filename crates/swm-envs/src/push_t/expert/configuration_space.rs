@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn agent_touches_the_block_at_the_edge_of_the_difference() {
+    fn clearance_is_the_distance_to_the_minkowski_difference() {
         // The agent extends 10 pixels to the left and up, 20 to the right and down.
         let space =
             ConfigurationSpace::new(&[rect(-10.0, -10.0, 20.0, 20.0).to_vec()], &[rect(200.0, 200.0, 300.0, 250.0)]);

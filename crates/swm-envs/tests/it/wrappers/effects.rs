@@ -40,7 +40,7 @@ fn bounds(rgb: &[u8], width: usize) -> Option<[usize; 4]> {
 }
 
 #[test]
-fn background_replaces_the_key_colours_and_follows_the_steps() {
+fn chroma_key_replaces_key_colours_by_the_background_frame_of_the_step() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let levels = [250, 10, 130, 70];
     for (i, level) in levels.into_iter().enumerate() {
@@ -185,7 +185,7 @@ fn rectangles_have_the_requested_size_and_uniform_positions() {
 }
 
 #[test]
-fn moving_patches_move_straight_and_stay_inside() {
+fn moving_patches_keep_their_size_and_move_at_most_their_speed() {
     let mut wrapper = make("moving-patch,size=0.2,color=7,speed=3");
     for seed in 0..20 {
         wrapper.reset(Key::new(seed));

@@ -116,7 +116,7 @@ fn restored_snapshot_continues_bit_for_bit() {
 }
 
 #[test]
-fn everything_but_the_frames_is_unchanged() {
+fn wrappers_change_only_frames() {
     for entry in ENVS.rows {
         let stack = Stack::parse(&["noise", "occlusion"]).expect("parsing the wrappers");
         let (mut env, mut bare) = (
@@ -124,7 +124,7 @@ fn everything_but_the_frames_is_unchanged() {
             entry.env().expect("creating the environment"),
         );
         assert_eq!(env.spec().id, bare.spec().id);
-        let schema = Schema::new(bare.spec().columns.clone()).expect("building the schema");
+        let schema = Schema::new(bare.spec().columns.clone()).expect("creating the schema");
         let [mut wrapped_row, mut bare_row] = [Batch::zeros(&schema, 1), Batch::zeros(&schema, 1)];
         env.reset(4, &ResetOptions::default()).expect("resetting the environment");
         bare.reset(4, &ResetOptions::default()).expect("resetting the environment");
@@ -155,7 +155,7 @@ fn everything_but_the_frames_is_unchanged() {
 }
 
 #[test]
-fn wrapped_goal_has_the_appearance_of_the_episode() {
+fn wrapped_goal_frame_has_the_values_sampled_for_the_episode() {
     let mut env = wrapped(&["color-jitter,hue=0.5", "noise"], GoalFrame::Wrapped);
     let mut clean = wrapped(&["color-jitter,hue=0.5"], GoalFrame::Wrapped);
     let at_goal =
@@ -171,16 +171,16 @@ fn wrapped_goal_has_the_appearance_of_the_episode() {
 }
 
 #[test]
-fn dataset_row_starts_an_episode_of_the_last_seed() {
+fn restored_dataset_row_starts_at_step_0_with_the_seed_of_the_last_reset() {
     let texts = ["noise", "occlusion,num_patches=3"];
     let (mut env, mut other) = (wrapped(&texts, GoalFrame::Clean), wrapped(&texts, GoalFrame::Clean));
     env.reset(6, &fixed_factors()).expect("resetting the environment");
     other.reset(6, &fixed_factors()).expect("resetting the environment");
     let at_start = frame(&mut *env);
     (0..3).for_each(|_| step(&mut *env));
-    let schema = Schema::new([ColumnSpec::new("state", DType::Float64, [2])]).expect("building the schema");
+    let schema = Schema::new([ColumnSpec::new("state", DType::Float64, [2])]).expect("creating the schema");
     let mut row = Batch::zeros(&schema, 1);
-    row.get_mut("state").expect("the `state` column").copy_from_slice(&[60.0, 112.0]);
+    row.get_mut("state").expect("accessing the column `state`").copy_from_slice(&[60.0, 112.0]);
     for env in [&mut env, &mut other] {
         env.restore_from(row.row(0), row.row(0)).expect("restoring from the row");
         assert_eq!(frame(&mut **env), at_start, "steps are counted from the row");
@@ -218,14 +218,14 @@ fn frames_do_not_depend_on_threads_or_other_environments() {
             .map(|_| stack.wrap(two_room::ENTRY.env().expect("creating the environment"), GoalFrame::Wrapped))
             .collect();
         let image = Some((SIZE[1], SIZE[0]));
-        let mut pool = EnvPool::new(envs, image, None, threads(workers).expect("creating the threads"))
-            .expect("creating the pool");
+        let mut pool = EnvPool::new(envs, image, None, threads(workers).expect("creating the thread pool"))
+            .expect("creating the environment pool");
         let resets: Vec<Reset> =
             seeds.iter().enumerate().map(|(slot, &seed)| Reset { slot, seed, options: fixed_factors() }).collect();
         pool.reset(&resets).expect("resetting the environment");
         let mut actions =
-            Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("building the schema"), seeds.len());
-        actions.get_mut::<f32>("action").expect("the action column").fill(0.3);
+            Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("creating the schema"), seeds.len());
+        actions.get_mut::<f32>("action").expect("accessing the column `action`").fill(0.3);
         let mut frames = vec![vec![]; seeds.len()];
         for _ in 0..5 {
             for (slot, frames) in frames.iter_mut().enumerate() {

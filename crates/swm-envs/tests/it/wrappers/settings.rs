@@ -5,7 +5,7 @@ use serde_json::{Value, json};
 use swm_envs::wrappers::{WRAPPERS, parse};
 
 #[test]
-fn every_row_and_parameter_is_tested_and_documented() {
+fn every_wrapper_and_parameter_is_tested_and_documented() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let variants = variants(folder.path());
     let docs = include_str!("../../../../../docs/wrappers.md");

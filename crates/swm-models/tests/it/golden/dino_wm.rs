@@ -14,7 +14,7 @@ fn without_masks(weights: Named<HostTensor>) -> Named<HostTensor> {
 }
 
 #[test]
-fn golden_predictor() {
+fn predictor_equals_the_reference() {
     for file in files("dino-wm-predictor") {
         println!("{}", file.display());
         let golden = Golden::read(&file);
@@ -91,7 +91,7 @@ impl Golden {
 }
 
 #[test]
-fn golden_model() {
+fn embeddings_losses_gradients_and_rollouts_equal_the_reference() {
     for file in files("dino-wm-model") {
         println!("{}", file.display());
         let golden = Golden::read(&file);

@@ -116,7 +116,7 @@ impl Golden {
 }
 
 #[test]
-fn golden_gcrl_heads() {
+fn heads_and_expectile_losses_equal_the_reference() {
     for file in files("gcrl") {
         println!("{}", file.display());
         let golden = Golden::read(&file);
@@ -144,7 +144,7 @@ fn golden_gcrl_heads() {
 }
 
 #[test]
-fn golden_gcbc() {
+fn gcbc_losses_equal_the_reference() {
     for file in files("gcbc") {
         println!("{}", file.display());
         let golden = Golden::read(&file);
@@ -155,7 +155,7 @@ fn golden_gcbc() {
 }
 
 #[test]
-fn golden_gcivl() {
+fn gcivl_losses_equal_the_reference() {
     for file in files("gcivl") {
         println!("{}", file.display());
         let golden = Golden::read(&file);
@@ -167,7 +167,7 @@ fn golden_gcivl() {
 }
 
 #[test]
-fn golden_gciql() {
+fn gciql_losses_equal_the_reference() {
     for file in files("gciql") {
         println!("{}", file.display());
         let golden = Golden::read(&file);
@@ -179,7 +179,7 @@ fn golden_gciql() {
 }
 
 #[test]
-fn golden_gcrl_checkpoints_round_trip() {
+fn gcivl_checkpoint_of_the_reference_round_trips() {
     let golden_folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/golden");
     let dataset_info = DatasetInfo { action: ActionScale::identity(2), columns: Default::default(), env: None };
     let checkpoint = import::import::<Gcivl>(&golden_folder.join("reference/gcivl"), dataset_info.clone())
@@ -192,7 +192,7 @@ fn golden_gcrl_checkpoints_round_trip() {
     assert_eq!(actual, golden.group("w."));
 
     // Exported weights have the names and shapes of the reference's class, without the target networks.
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     import::export(&checkpoint, folder.path(), Naming::Published).expect("exporting a checkpoint");
     let written = weights::read(&folder.path().join("weights.pt")).expect("reading the exported weights");
     let expected =

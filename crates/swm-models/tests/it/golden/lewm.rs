@@ -50,7 +50,7 @@ impl Golden {
 }
 
 #[test]
-fn golden_evaluation() {
+fn latents_predictions_rollouts_and_costs_equal_the_reference() {
     for file in files("lewm") {
         println!("{}", file.display());
         let golden = Golden::read(&file);
@@ -60,7 +60,7 @@ fn golden_evaluation() {
         let latents = model.encode(golden.patches("i.pixels")).reshape([clips, steps, dim]);
         check(&golden, "o.eval.emb", &values(latents.clone()));
         // The CPU encoder encodes one image at a time.
-        let fast = HostEncoder::new(&model, &golden.config()).expect("a transformer");
+        let fast = HostEncoder::new(&model, &golden.config()).expect("creating the CPU encoder");
         let images = golden.patches("i.pixels");
         let size = images.dims()[1] * images.dims()[2];
         let fast: Vec<f32> = values(images).chunks(size).flat_map(|patches| fast.encode(patches)).collect();
@@ -117,7 +117,7 @@ fn golden_evaluation() {
 }
 
 #[test]
-fn golden_training() {
+fn training_losses_and_gradients_equal_the_reference() {
     for file in files("lewm") {
         println!("{}", file.display());
         let golden = Golden::read(&file);

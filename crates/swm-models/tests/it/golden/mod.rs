@@ -30,9 +30,9 @@ pub struct Golden {
 impl Golden {
     pub fn read(path: &std::path::Path) -> Self {
         let bytes = std::fs::read(path).expect("reading a golden file");
-        let (_, metadata) = SafeTensors::read_metadata(&bytes).expect("a safetensors file");
+        let (_, metadata) = SafeTensors::read_metadata(&bytes).expect("parsing the safetensors file");
         let config = &metadata.metadata().as_ref().expect("the metadata of a golden file")["config"];
-        let tensors = SafeTensors::deserialize(&bytes).expect("a safetensors file");
+        let tensors = SafeTensors::deserialize(&bytes).expect("parsing the safetensors file");
         let tensors = tensors
             .iter()
             .filter(|(_, view)| view.dtype() == safetensors::Dtype::F32)
@@ -83,7 +83,11 @@ impl Golden {
         println!("worst gradient: {:.1e} ({})", worst.0, worst.1);
         assert!(worst.0 < TOLERANCE, "gradient of {} differs by {:.1e}", worst.1, worst.0);
         let names = |all: Vec<&String>| all.into_iter().cloned().collect::<Vec<_>>();
-        assert_eq!(names(actual.keys().collect()), names(expected.keys().collect()), "parameters with gradients");
+        assert_eq!(
+            names(actual.keys().collect()),
+            names(expected.keys().collect()),
+            "names of the parameters with gradients"
+        );
     }
 
     /// Normalised images of the configured size as patches.
@@ -136,7 +140,7 @@ fn files(model: &str) -> Vec<PathBuf> {
         .iter()
         .filter_map(|folder| std::fs::read_dir(folder).ok())
         .flatten()
-        .map(|entry| entry.expect("a folder entry").path())
+        .map(|entry| entry.expect("reading the folder entry").path())
         .filter(|path| {
             let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
             name.starts_with(&format!("{model}-")) && name.ends_with(".safetensors")

@@ -11,7 +11,7 @@ use swm_models::pldm::step::step;
 use swm_models::pldm::{Pldm, PldmLoss, Terms};
 
 #[test]
-fn golden_loss_terms() {
+fn loss_terms_equal_the_reference() {
     for file in files("pldm-losses") {
         println!("{}", file.display());
         let golden = Golden::read(&file);
@@ -80,7 +80,7 @@ impl Golden {
 }
 
 #[test]
-fn golden_evaluation() {
+fn latents_predictions_rollouts_and_costs_equal_the_reference() {
     for file in files("pldm-model") {
         println!("{}", file.display());
         let golden = Golden::read(&file);
@@ -114,7 +114,7 @@ fn golden_evaluation() {
 }
 
 #[test]
-fn golden_training() {
+fn training_losses_and_gradients_equal_the_reference() {
     for file in files("pldm-model") {
         println!("{}", file.display());
         let golden = Golden::read(&file);

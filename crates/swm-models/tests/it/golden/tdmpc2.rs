@@ -15,7 +15,7 @@ impl Golden {
     }
 
     fn tdmpc2(&self) -> (Tdmpc2, Published) {
-        let published = Published::read(&self.text).expect("a configuration");
+        let published = Published::read(&self.text).expect("reading the published configuration");
         (published.with(&self.group("w."), &Device::flex()).expect("published weights"), published)
     }
 }
@@ -25,7 +25,7 @@ fn forward_files() -> impl Iterator<Item = Golden> {
 }
 
 #[test]
-fn golden_tdmpc2_forward() {
+fn network_outputs_and_costs_equal_the_reference() {
     for golden in forward_files() {
         let (model, published) = golden.tdmpc2();
         let config = published.model();
@@ -68,18 +68,18 @@ fn golden_tdmpc2_forward() {
 }
 
 #[test]
-fn golden_tdmpc2_checkpoints_round_trip() {
-    let folder = tempfile::tempdir().expect("a folder");
+fn exported_checkpoints_round_trip() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     for golden in forward_files() {
         let (model, published) = golden.tdmpc2();
-        let mut config = TrainConfig::<Tdmpc2>::load("paper", &[]).expect("a configuration");
+        let mut config = TrainConfig::<Tdmpc2>::load("paper", &[]).expect("loading the configuration");
         (config.model, config.loss) = (published.model(), published.loss());
         let action = ActionScale::identity(model.action_dim());
         let dataset_info = DatasetInfo { action, columns: Named::new(), env: None };
         let manifest = swm_core::Manifest::new("test", 0, serde_json::Value::Null);
         let checkpoint = Checkpoint { model, config, dataset_info: dataset_info.clone(), manifest };
-        export(&checkpoint, folder.path()).expect("an exported checkpoint");
-        let again = import(folder.path(), dataset_info).expect("a checkpoint");
+        export(&checkpoint, folder.path()).expect("exporting the checkpoint");
+        let again = import(folder.path(), dataset_info).expect("importing the checkpoint");
         assert_eq!(parameters::values(&again.model), parameters::values(&checkpoint.model));
         assert_eq!((&again.config.model, &again.config.loss), (&checkpoint.config.model, &checkpoint.config.loss));
         let other = DatasetInfo { action: ActionScale::identity(1), columns: Named::new(), env: None };
@@ -90,7 +90,7 @@ fn golden_tdmpc2_checkpoints_round_trip() {
 }
 
 #[test]
-fn golden_tdmpc2_training() {
+fn training_losses_and_gradients_equal_the_reference() {
     let mut checked_files = 0;
     for file in files("tdmpc2") {
         let golden = Golden::read(&file);

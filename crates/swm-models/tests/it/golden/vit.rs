@@ -24,7 +24,7 @@ fn compare<M: Module>(golden: &Golden, module: M, tokens: impl Fn(&M, Tensor<3>)
 }
 
 #[test]
-fn golden_vit() {
+fn vit_tokens_equal_the_reference() {
     for file in files("vit") {
         println!("{}", file.display());
         let golden = Golden::read(&file);
@@ -42,7 +42,7 @@ fn golden_vit() {
 }
 
 #[test]
-fn golden_dinov2() {
+fn dinov2_tokens_equal_the_reference() {
     for file in files("dinov2") {
         println!("{}", file.display());
         let golden = Golden::read(&file);

@@ -20,7 +20,7 @@ fn weight_files_of_all_formats_have_equal_content() {
 
 #[test]
 fn state_dicts_round_trip() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("weights.pt");
     let tensor = |shape: &[usize], first: f32| HostTensor {
         shape: shape.to_vec(),
@@ -40,8 +40,8 @@ fn state_dicts_round_trip() {
 }
 
 #[test]
-fn invalid_files_are_refused() {
-    let folder = tempfile::tempdir().expect("a folder");
+fn invalid_weight_files_are_refused() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let message = |name: &str, bytes: &[u8]| {
         let path = folder.path().join(name);
         std::fs::write(&path, bytes).expect("writing a file");

@@ -162,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn solve_reaches_target() {
+    fn inverse_kinematics_reaches_the_target() {
         use std::f64::consts::FRAC_PI_2 as RIGHT;
         let (arm, home) = (arm(), [-RIGHT, -RIGHT, RIGHT, -RIGHT, -RIGHT, 0.0]);
         let (start, _) = arm.forward(&home);

@@ -239,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn cells_and_points_correspond() {
+    fn points_map_to_the_cell_that_contains_them() {
         let map = &MAPS[0];
         for cell in map.cells() {
             let [x, y] = center(cell);

@@ -37,8 +37,12 @@ impl Model {
 
     /// The candidates, each with the landscape of its environment.
     fn each<'a>(&'a self, candidates: Candidates<'a>) -> impl Iterator<Item = (&'a dyn Landscape, Vec<f64>)> {
-        assert_eq!(candidates.envs, self.landscapes.len(), "environments");
-        assert_eq!((candidates.horizon, candidates.dim), (self.toy.horizon, self.toy.space.dim()), "shape");
+        assert_eq!(candidates.envs, self.landscapes.len(), "the numbers of environments differ");
+        assert_eq!(
+            (candidates.horizon, candidates.dim),
+            (self.toy.horizon, self.toy.space.dim()),
+            "the shapes of candidates differ"
+        );
         let plans = candidates.actions.chunks_exact(candidates.horizon * candidates.dim);
         plans.enumerate().map(move |(i, plan)| (self.landscape(i / candidates.samples), wide(plan)))
     }
@@ -59,7 +63,7 @@ impl CostModel for Model {
     }
 
     fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
-        assert_eq!(costs.len(), candidates.envs * candidates.samples, "costs");
+        assert_eq!(costs.len(), candidates.envs * candidates.samples, "the numbers of costs differ");
         for (i, (landscape, plan)) in self.each(candidates).enumerate() {
             let wrong = self.wrong.filter(|&(env, sample, _)| i == env * candidates.samples + sample);
             match wrong {

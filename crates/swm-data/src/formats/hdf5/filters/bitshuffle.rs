@@ -97,7 +97,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn undo_restores_the_order_of_bits() {
+    fn undo_reverses_the_bit_shuffle() {
         for size in [1, 2, 4, 8] {
             let bytes: Vec<u8> = (0..size * 24).map(|i| (i * 37 + 11) as u8).collect();
             let mut bits = vec![0_u8; bytes.len()];

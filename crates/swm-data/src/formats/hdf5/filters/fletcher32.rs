@@ -67,7 +67,7 @@ mod tests {
     }
 
     #[test]
-    fn checksum_matches_the_definition() {
+    fn checksum_equals_the_word_by_word_sum_and_detects_flipped_bits() {
         for length in [0, 1, 2, 3, 511, 512, 513, 719, 720, 721, 5000, 150_528] {
             let bytes: Vec<u8> = (0..length).map(|i| (i * i / 7 + i) as u8).collect();
             assert_eq!(sum(&bytes), word_by_word(&bytes), "{length}");

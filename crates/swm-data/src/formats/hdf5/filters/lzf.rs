@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn does_not_encode_short_input_and_rejects_damage() {
+    fn short_input_is_not_encoded_and_damaged_chunks_are_rejected() {
         let mut encoder = Encoder::default();
         let mut out = vec![];
         assert!(!encoder.encode(&[1, 2, 3, 4], &mut out) && out.is_empty());

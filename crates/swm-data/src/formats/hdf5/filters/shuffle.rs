@@ -37,7 +37,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn undo_restores_the_order_of_bytes() {
+    fn undo_reverses_the_byte_shuffle() {
         for size in [1, 2, 3, 4, 8, 12] {
             let bytes: Vec<u8> = (0..100).collect();
             let count = bytes.len() / size;

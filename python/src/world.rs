@@ -302,7 +302,8 @@ impl World {
             manifest.config["wrappers"] = settings.wrappers;
             let schema = world.collect_schema(config.goal)?;
             let create = |location: &Location, mode, manifest| {
-                let options = WriteOptions { mode, codec, manifest: Some(manifest), ..WriteOptions::default() };
+                let manifest = Some(manifest);
+                let options = WriteOptions { mode, codec, manifest, exclusive: true, ..WriteOptions::default() };
                 match &format {
                     Some(format) => swm::data::FORMATS.get(format)?.create(location, &schema, options),
                     None => swm::data::create(location.clone(), &schema, options),

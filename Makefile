@@ -18,7 +18,7 @@ SWM := $(CARGO_TARGET_DIR)/release/swm
 SUDO := $(shell [ "$$(id -u)" = 0 ] || command -v sudo)
 CARGO := cargo
 
-.PHONY: help demo test test-python check build tests wheel wheel-portable gpu assets setup setup-python reference bench clean
+.PHONY: help demo test test-python check build tests wheel wheel-portable gpu assets setup setup-python reference bench deny nightly clean
 
 help:
 	@echo 'make demo       collect, train, plan, evaluate and report on a laptop CPU'
@@ -28,6 +28,8 @@ help:
 	@echo 'make wheel-portable   the same with the FFmpeg it uses inside, for other machines: $(WHEELS)/portable'
 	@echo 'make gpu        the same with models on a GPU through Vulkan: $(CARGO_TARGET_DIR)-gpu/release/swm'
 	@echo 'make assets     MuJoCo, its models and meshes, into $(SWM_ASSETS)'
+	@echo 'make nightly    what takes longer: fuzzers, sanitizer, models of threads, long tests; one part: PART=fuzz'
+	@echo 'make deny       licences and sources of the dependencies'
 	@echo 'make bench      our benchmarks, against the reference where `make reference` installed it'
 
 demo: build
@@ -119,6 +121,19 @@ $(VENV)/ready: | setup
 reference: setup
 	python3 -m venv $(CACHE)/reference
 	$(CACHE)/reference/bin/python -m pip install --quiet stable-worldmodel opencv-python-headless imageio matplotlib pygame pymunk shapely
+
+# Tools of cargo that only `deny` and `nightly` need.
+export PATH := $(CACHE)/tools/bin:$(PATH)
+
+# Licences, banned libraries and sources of all dependencies (deny.toml).
+deny: setup
+	@$(CARGO) deny --version >/dev/null 2>&1 || $(CARGO) install --locked --root $(CACHE)/tools cargo-deny
+	$(CARGO) deny check licenses bans sources
+
+# At most two hours after `tests` compiled everything. Parts that passed on the same commit are skipped; the page
+# docs/nightly.md has a row for each.
+nightly: tests setup-python
+	SWM_CACHE=$(CACHE) SWM_LANCE_PYTHON=$(VENV)/bin/python $(CARGO) xtask nightly $(PART)
 
 clean:
 	rm -rf $(CACHE)

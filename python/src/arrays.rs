@@ -39,8 +39,9 @@ pub fn copy_rows<'py>(py: Python<'py>, batch: &Batch, column: usize, rows: &[usi
 pub fn array<'py>(py: Python<'py>, dtype: DType, shape: &[usize], bytes: &[u8]) -> PyResult<Bound<'py, PyAny>> {
     fn make<'py, T: Element + Copy>(py: Python<'py>, shape: &[usize], bytes: &[u8]) -> PyResult<Bound<'py, PyAny>> {
         let array = PyArrayDyn::<T>::zeros(py, IxDyn(shape), false);
-        // SAFETY: the new array is contiguous and has no other reference. It has the size of `bytes` (asserted), and
-        // `bytes` holds valid values of `T`: batches store booleans as 0 and 1.
+        // SAFETY: the new array is contiguous and has no other reference. It has the size of `bytes` (asserted). Bytes are
+        // copied as bytes: no Rust code reads the array's booleans, whose bytes a file may have set to other values than 0
+        // and 1.
         #[allow(unsafe_code, reason = "numpy arrays share memory with the engine")]
         unsafe {
             assert_eq!(array.len() * size_of::<T>(), bytes.len(), "the bytes must fill the shape");
@@ -70,7 +71,8 @@ pub unsafe fn view<'py>(
         shape: &[usize],
         owner: &Bound<'py, PyAny>,
     ) -> PyResult<Bound<'py, PyAny>> {
-        // SAFETY: columns are aligned to 64 bytes and hold values of this type; the caller guarantees their lifetime.
+        // SAFETY: columns are aligned to 64 bytes and have the size of the shape; the caller guarantees their lifetime. The
+        // view only describes a numpy array: no Rust code reads its elements.
         let view = unsafe { ArrayView::from_shape_ptr(IxDyn(shape), bytes.as_ptr().cast::<T>()) };
         // SAFETY: `owner` keeps the memory alive, as the caller guarantees.
         Ok(unsafe { PyArrayDyn::borrow_from_array(&view, owner.clone()) }.into_any())

@@ -52,7 +52,8 @@ fn columns(py: Python<'_>, batch: BatchMemory) -> PyResult<Bound<'_, PyDict>> {
     let shared = Bound::new(py, SharedBatch(batch))?;
     let dict = PyDict::new(py);
     for (i, column) in shared.get().schema().columns().iter().enumerate() {
-        // SAFETY: a `SharedBatch` is immutable, and every array keeps it alive.
+        // SAFETY: a `SharedBatch` never moves or resizes its buffers, and every array keeps it alive. Python may write to
+        // the arrays; the engine does not access the batch after this function.
         #[allow(unsafe_code, reason = "numpy arrays share memory with the engine")]
         dict.set_item(&column.name, unsafe { arrays::view(shared.get(), i, false, shared.as_any()) }?)?;
     }

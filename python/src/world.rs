@@ -131,7 +131,8 @@ impl World {
         let world = slf.get().lock()?;
         let batch = world.pool().infos();
         for (i, column) in batch.schema().columns().iter().enumerate() {
-            // SAFETY: the pool never resizes its infos, and lives as long as this object, which the array keeps alive.
+            // SAFETY: the pool never resizes its infos, and lives as long as this object, which the array keeps alive. Only
+            // steps and resets write; a thread of Python that reads an array meanwhile may find values of both states.
             #[allow(unsafe_code, reason = "numpy arrays share memory with the engine")]
             infos.set_item(&column.name, unsafe { arrays::view(batch, i, true, slf.as_any()) }?)?;
         }
@@ -143,6 +144,7 @@ impl World {
         let mut world = slf.get().lock()?;
         let batch = world.actions_mut();
         // SAFETY: the world never resizes its actions, and lives as long as this object, which the array keeps alive.
+        // Python writes the array, and the engine reads it during a step; its elements are plain numbers.
         #[allow(unsafe_code, reason = "numpy arrays share memory with the engine")]
         unsafe {
             arrays::view(batch, 0, false, slf.as_any())
@@ -300,7 +302,8 @@ impl World {
             manifest.config["wrappers"] = settings.wrappers;
             let schema = world.collect_schema(config.goal)?;
             let create = |location: &Location, mode, manifest| {
-                let options = WriteOptions { mode, codec, manifest: Some(manifest), ..WriteOptions::default() };
+                let manifest = Some(manifest);
+                let options = WriteOptions { mode, codec, manifest, exclusive: true, ..WriteOptions::default() };
                 match &format {
                     Some(format) => swm::data::FORMATS.get(format)?.create(location, &schema, options),
                     None => swm::data::create(location.clone(), &schema, options),

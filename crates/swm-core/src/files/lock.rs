@@ -19,6 +19,9 @@ impl Lock {
     /// # Errors
     /// When another writer holds the lock, or the folder cannot be created or opened.
     pub fn folder(path: &Path) -> Result<Self> {
+        if path.exists() && !path.is_dir() {
+            return Err(Error::corrupt(path, "is not a folder", "choose another path"));
+        }
         Self::acquire(path, || {
             std::fs::create_dir_all(path)?;
             File::open(path)

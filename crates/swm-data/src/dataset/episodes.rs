@@ -58,6 +58,15 @@ impl EpisodeRows {
         self.total = self.total.saturating_add(length as u64);
     }
 
+    /// Removes the episodes after the first `episodes`, which must be contiguous.
+    pub fn truncate(&mut self, episodes: usize) {
+        if let Some(&end) = self.first_rows.get(episodes) {
+            self.total = end;
+        }
+        self.episodes.truncate(episodes);
+        self.first_rows.truncate(episodes);
+    }
+
     /// The episodes, in stored order.
     pub fn episodes(&self) -> &[Episode] {
         &self.episodes

@@ -2,7 +2,7 @@
 
 use super::reader::Constants;
 use std::time::Duration;
-use swm_core::{Batch, Manifest, Result};
+use swm_core::{Batch, Error, Manifest, Result};
 use swm_image::ImageCodec;
 
 /// The treatment of an existing dataset at the location to write.
@@ -46,6 +46,28 @@ pub struct WriteOptions {
     pub manifest: Option<Manifest>,
     /// Limits at which finished episodes are committed.
     pub commit: CommitPolicy,
+    /// Whether this must be the only writer. An exclusive writer fails when another writer adds to the dataset at the
+    /// same time, instead of adding its episodes after those of the other. Collections are exclusive, because two that
+    /// continue the same dataset would store the same episodes twice. Formats other than Lance have one writer anyway.
+    pub exclusive: bool,
+}
+
+/// Whether an error means that the disk, a quota or the largest possible file is full.
+pub(crate) fn is_full(error: &Error) -> bool {
+    use std::io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
+    let full = |kind| matches!(kind, StorageFull | QuotaExceeded | FileTooLarge);
+    matches!(error, Error::Io { source, .. } if full(source.kind()))
+}
+
+/// Adds the number of episodes that are stored to an error of writing.
+pub(crate) fn with_stored(error: Error, episodes: usize) -> Error {
+    match error {
+        Error::Io { path, action, source } => {
+            let stored = if episodes == 1 { "1 episode is".to_owned() } else { format!("{episodes} episodes are") };
+            Error::Io { path, action: format!("{action} ({stored} stored)"), source }
+        }
+        other => other,
+    }
 }
 
 /// Stores complete episodes. Committed episodes survive a killed process. Dropping a writer commits the remaining

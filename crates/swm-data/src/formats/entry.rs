@@ -1,8 +1,9 @@
 //! [`FormatEntry`]: the registry row of a dataset format.
 
 use crate::dataset::{Location, Reader, WriteOptions, Writer};
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use swm_core::{Error, Named, Result, Schema};
+use swm_core::{Error, Named, Result, Schema, files};
 
 /// A dataset format: its id, its suffixes, and the functions that detect, open and create its datasets.
 pub struct FormatEntry {
@@ -12,6 +13,8 @@ pub struct FormatEntry {
     pub summary: &'static str,
     /// File name suffixes of the format's datasets. New datasets get the first suffix.
     pub suffixes: &'static [&'static str],
+    /// The files of a dataset, as patterns of [`swm_core::files::delete`]; empty if a dataset is one file.
+    pub files: &'static [&'static str],
     /// The Cargo feature of `swm-data` that this format requires, if any.
     pub feature: Option<&'static str>,
     /// Returns whether an existing dataset, or a dataset to create, at this location has this format.
@@ -61,6 +64,17 @@ impl FormatEntry {
     /// writing fails, or this build lacks the format's feature.
     pub fn create(&self, location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
         (self.backend()?.create)(location, schema, options)
+    }
+
+    /// Deletes the files of a dataset on this machine, and no other file. Returns the remaining entries of its folder.
+    ///
+    /// # Errors
+    /// If a file cannot be deleted.
+    pub fn remove(&self, path: &Path) -> Result<Vec<PathBuf>> {
+        match self.files {
+            [] => files::delete_file(path).map(|()| vec![]),
+            patterns => files::delete(path, patterns),
+        }
     }
 
     fn backend(&self) -> Result<Backend> {

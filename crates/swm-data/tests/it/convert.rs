@@ -259,3 +259,21 @@ fn conversion_preserves_doubles_or_reports_the_rounding_error() {
     let state = &report.columns[0];
     assert!(state.exact || (state.max_error > 0.0 && state.max_error < 1e-7), "{state:?}");
 }
+
+#[test]
+fn failed_conversion_leaves_no_empty_dataset() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let source = folder.path().join("source.h5");
+    let schema = Schema::new([ColumnSpec::new("id", DType::Int64, [])]).expect("a schema");
+    let mut episode = Batch::zeros(&schema, 2);
+    episode.row_mut(1).set(0, &[(1_i64 << 24) + 1]);
+    let mut writer = create(&source, &schema, WriteOptions::default()).expect("creating");
+    writer.write_episode(&episode).expect("writing");
+    writer.finish().expect("finishing");
+    let reader = open(&source).expect("opening");
+    let target = Location::from(folder.path().join("target.lance"));
+    let error =
+        convert(&reader, &target, &ConvertOptions::default(), &mut Control::new()).expect_err("a large integer");
+    assert!(error.to_string().contains("another format"), "{error}");
+    assert_eq!(folder.path().read_dir().expect("listing").count(), 1, "only the source remains");
+}

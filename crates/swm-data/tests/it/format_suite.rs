@@ -17,7 +17,8 @@ const GROUP: usize = 2;
 
 pub fn writer(location: impl Into<Location>, mode: WriteMode) -> Result<Box<dyn Writer>> {
     let commit = CommitPolicy { episodes: GROUP, ..CommitPolicy::default() };
-    create(location, &schema(), WriteOptions { mode, codec: ImageCodec::Png, manifest: Some(manifest(3)), commit })
+    let options = WriteOptions { mode, codec: ImageCodec::Png, manifest: Some(manifest(3)), commit, exclusive: false };
+    create(location, &schema(), options)
 }
 
 /// The constants of episode `e`: a scene that every third episode shares, and a unique note.

@@ -9,6 +9,7 @@ mod damage;
 mod doctor;
 mod folder;
 mod format_suite;
+mod full_disk;
 mod fuzz;
 mod goals;
 #[cfg(feature = "hdf5")]
@@ -25,7 +26,9 @@ mod loader;
 mod objects;
 mod preview;
 mod reference;
+mod replacing;
 mod replay;
 mod sample;
+mod second_writer;
 mod video;
 mod views;

@@ -210,7 +210,8 @@ impl Collection<'_> {
     }
 
     fn writer(&self, schema: &Schema, mode: WriteMode, manifest: Manifest) -> Result<Box<dyn Writer>> {
-        let options = WriteOptions { mode, codec: self.codec, manifest: Some(manifest), ..WriteOptions::default() };
+        let (codec, manifest) = (self.codec, Some(manifest));
+        let options = WriteOptions { mode, codec, manifest, exclusive: true, ..WriteOptions::default() };
         match (self.shard, self.format) {
             (Some(shard), _) => create_shard(self.location, schema, options, shard),
             (None, Some(format)) => FORMATS.get(format)?.create(self.location, schema, options),

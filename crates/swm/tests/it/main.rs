@@ -6,6 +6,7 @@ mod data;
 mod deletion;
 mod finite;
 mod gym;
+mod kills;
 mod listing;
 mod output;
 mod pipeline;

@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
-use swm_core::{ColumnSpec, Error, Result};
+use swm_core::{ColumnSpec, Error, Result, files};
 
 /// The tag that starts every record. The lengths of the record's head and body, and their BLAKE3 hash, follow.
 const MAGIC: &[u8; 8] = b"swm-ep-1";
@@ -29,23 +29,25 @@ pub(super) fn path(folder: &Path) -> PathBuf {
     folder.join(format!("{LENGTHS}.journal"))
 }
 
-/// Appends the record of an episode to `out`.
-pub(super) fn record(episode: usize, pending: &PendingEpisode, out: &mut Vec<u8>) -> Result<()> {
+/// The record of an episode.
+///
+/// # Errors
+/// If its head cannot be serialised as JSON.
+pub(super) fn record(episode: usize, pending: &PendingEpisode) -> Result<Vec<u8>> {
     let constants = pending.constants.iter().map(|(name, bytes)| (name.clone(), bytes.len())).collect();
     let head = serde_json::to_vec(&Head { episode, rows: pending.rows, constants })
         .map_err(|e| Error::external("describing an episode", e))?;
-    let start = out.len();
-    out.extend([0; LEAD]);
+    let mut out = vec![0; LEAD];
     out.extend(&head);
     pending.columns.iter().chain(pending.constants.values()).for_each(|bytes| out.extend(bytes));
-    let body = out.len() - start - LEAD - head.len();
-    let hash = blake3::hash(&out[start + LEAD..]);
-    let lead = &mut out[start..start + LEAD];
+    let body = out.len() - LEAD - head.len();
+    let hash = blake3::hash(&out[LEAD..]);
+    let lead = &mut out[..LEAD];
     lead[..8].copy_from_slice(MAGIC);
     lead[8..16].copy_from_slice(&(head.len() as u64).to_le_bytes());
     lead[16..24].copy_from_slice(&(body as u64).to_le_bytes());
     lead[24..].copy_from_slice(hash.as_bytes());
-    Ok(())
+    Ok(out)
 }
 
 /// Parses the episodes of a journal, from episode index `from` on. An incomplete record at the end was never committed
@@ -124,14 +126,15 @@ impl Journal {
     ///
     /// # Errors
     /// If writing fails.
-    pub fn append(&mut self, records: &[u8]) -> Result<()> {
-        let written = self.file.write_all(records).and_then(|()| self.file.sync_data());
+    pub fn append(&mut self, records: &[Vec<u8>]) -> Result<()> {
+        let written = records.iter().try_for_each(|record| self.file.write_all(record));
+        let written = written.and_then(|()| self.file.sync_data());
         if let Err(error) = written {
             // A partial record would make all later records unreadable.
             self.truncate(self.length)?;
             return Err(Error::io(&self.path, "writing the journal", error));
         }
-        self.length += records.len() as u64;
+        self.length += records.iter().map(Vec::len).sum::<usize>() as u64;
         Ok(())
     }
 
@@ -157,6 +160,6 @@ impl Journal {
     /// # Errors
     /// If deleting fails.
     pub fn remove(self) -> Result<()> {
-        std::fs::remove_file(&self.path).map_err(|e| Error::io(&self.path, "removing the journal", e))
+        files::delete_file(&self.path)
     }
 }

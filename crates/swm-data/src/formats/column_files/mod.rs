@@ -41,6 +41,18 @@ const OFFSETS: &str = "ep_offset";
 /// The member of `ep_len.npz` that holds [`Metadata`].
 const METADATA: &str = "stable_worldmodel.json";
 
+/// The files of a dataset, of the formats `folder` and `video`.
+pub(crate) const FILES: &[&str] = &[
+    "*.npz",
+    "ep_len.journal",
+    "ep_len.tmp",
+    "*/ep_*.jpeg",
+    "*/ep_*.jpg",
+    "*/ep_*.png",
+    "*/ep_*.mp4",
+    "*/ep_*.mp4.tmp",
+];
+
 /// Metadata of the dataset, stored in `ep_len.npz`.
 #[derive(Default, Serialize, Deserialize)]
 struct Metadata {

@@ -3,20 +3,24 @@
 use super::journal::{self, Journal};
 use super::npz::NpzWriter;
 use super::{
-    ColumnFiles, LENGTHS, METADATA, Metadata, OFFSETS, PendingEpisode, check_name, column_path, constant_member, exists,
+    ColumnFiles, FILES, LENGTHS, METADATA, Metadata, OFFSETS, PendingEpisode, check_name, column_path, constant_member,
+    exists,
 };
 use crate::dataset::episodes::{self, EpisodeRows};
-use crate::dataset::{CommitPolicy, Constants, StepRange, WriteMode, WriteOptions};
+use crate::dataset::{CommitPolicy, Constants, StepRange, WriteMode, WriteOptions, is_full, with_stored};
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
-use swm_core::files::Lock;
+use swm_core::files::{self, Lock};
 use swm_core::{Batch, ColumnSpec, DType, Error, Result, Schema};
 
 /// Bounds, in bytes, of the journal size at which the journal is merged: half the size of the column files, clamped to
 /// these bounds. The upper bound also limits the memory of a writer.
 const MERGE_BYTES: std::ops::RangeInclusive<usize> = 16 << 20..=256 << 20;
+
+/// Deletes the images of all episodes from `from` on, in the folder of an image column.
+pub(crate) type DiscardImages = fn(folder: &Path, from: usize) -> Result<()>;
 
 /// Commits the numeric columns of episodes. Formats write an episode's images first, then call
 /// [`ColumnFilesWriter::write`].
@@ -32,10 +36,11 @@ pub(crate) struct ColumnFilesWriter {
     last_commit: Instant,
     /// The rows of all episodes, including uncommitted episodes.
     rows: EpisodeRows,
+    discard: DiscardImages,
     /// Records of uncommitted episodes.
-    group: Vec<u8>,
-    /// Number of uncommitted episodes.
-    in_group: usize,
+    group: Vec<Vec<u8>>,
+    /// Number of committed episodes.
+    committed: usize,
     /// Number of rows in the column files.
     rows_in_files: usize,
     /// Size of the rows in the column files, in bytes.
@@ -58,7 +63,13 @@ impl ColumnFilesWriter {
     /// # Errors
     /// If the dataset exists and `options.mode` forbids it, its columns differ, another process writes to it, or
     /// writing fails.
-    pub fn create(folder: &Path, schema: &Schema, options: &WriteOptions, known: Option<&Schema>) -> Result<Self> {
+    pub fn create(
+        folder: &Path,
+        schema: &Schema,
+        options: &WriteOptions,
+        known: Option<&Schema>,
+        discard: DiscardImages,
+    ) -> Result<Self> {
         for column in schema.columns() {
             check_name(&column.name)?;
             let problem = match &*column.name {
@@ -80,7 +91,7 @@ impl ColumnFilesWriter {
                     let fix = "choose another path, append to it, or overwrite it";
                     return Err(Error::config("dataset", problem, fix));
                 }
-                WriteMode::Overwrite => remove_dataset(folder)?,
+                WriteMode::Overwrite => remove_dataset(folder, FILES)?,
                 WriteMode::Append => {}
             }
         }
@@ -97,8 +108,9 @@ impl ColumnFilesWriter {
             policy: options.commit,
             last_commit: Instant::now(),
             rows: EpisodeRows::default(),
+            discard,
             group: vec![],
-            in_group: 0,
+            committed: 0,
             rows_in_files: 0,
             bytes_in_files: 0,
             new_constants: vec![],
@@ -111,6 +123,12 @@ impl ColumnFilesWriter {
         }
         writer.merge_journal()?;
         writer.journal = Some(Journal::create(folder)?);
+        writer.committed = writer.episodes();
+        for column in schema.columns().iter().filter(|column| column.is_image()) {
+            let folder = folder.join(&column.name);
+            std::fs::create_dir_all(&folder).map_err(|e| Error::io(&folder, "creating the folder", e))?;
+        }
+        writer.discard_images(writer.committed)?;
         Ok(writer)
     }
 
@@ -191,12 +209,11 @@ impl ColumnFilesWriter {
                 pending.columns.push(episode.bytes(episode.schema().index(&column.name)?).to_vec());
             }
         }
-        journal::record(position, &pending, &mut self.group)?;
-        self.in_group += 1;
+        self.group.push(journal::record(position, &pending)?);
         self.unmerged.iter_mut().zip(&pending.columns).for_each(|(unmerged_rows, bytes)| unmerged_rows.extend(bytes));
         self.add_constants(constants);
-        let due = self.in_group >= self.policy.episodes
-            || self.group.len() >= self.policy.bytes
+        let due = self.group.len() >= self.policy.episodes
+            || self.group.iter().map(Vec::len).sum::<usize>() >= self.policy.bytes
             || self.last_commit.elapsed() >= self.policy.interval;
         if due { self.commit() } else { Ok(()) }
     }
@@ -217,13 +234,9 @@ impl ColumnFilesWriter {
     /// Commits the uncommitted episodes.
     fn commit(&mut self) -> Result<()> {
         self.last_commit = Instant::now();
-        let Some(journal) = self.journal.as_mut() else { return Ok(()) };
         // Remains `true` if one of the operations below fails.
         self.failed = true;
-        if self.in_group > 0 {
-            journal.append(&self.group)?;
-            (self.in_group, self.group) = (0, vec![]);
-        }
+        self.append_group()?;
         let unmerged_bytes: usize = self.unmerged.iter().chain(&self.new_constants).map(Vec::len).sum();
         if unmerged_bytes >= (self.bytes_in_files / 2).clamp(*MERGE_BYTES.start(), *MERGE_BYTES.end()) {
             self.merge_journal()?;
@@ -235,8 +248,59 @@ impl ColumnFilesWriter {
         Ok(())
     }
 
+    /// Appends the uncommitted episodes to the journal. If the disk is full, deletes the last ones until the others fit.
+    ///
+    /// # Errors
+    /// If an episode was not stored.
+    fn append_group(&mut self) -> Result<()> {
+        let Some(journal) = self.journal.as_mut() else { return Ok(()) };
+        let mut failure = None;
+        while !self.group.is_empty() {
+            match journal.append(&self.group) {
+                Ok(()) => {
+                    self.committed += self.group.len();
+                    self.group.clear();
+                }
+                Err(error) => {
+                    // Also frees the space of their images.
+                    let keep = if is_full(&error) { self.group.len() * 7 / 8 } else { 0 };
+                    failure.get_or_insert(error);
+                    self.group.truncate(keep);
+                    Self::discard_images_of(&self.folder, &self.schema, self.discard, self.committed + keep)?;
+                }
+            }
+        }
+        failure.map_or(Ok(()), |error| Err(with_stored(error, self.committed)))
+    }
+
+    /// Commits the finished episodes after the images of the next one could not be written, and deletes those images.
+    /// Returns the error to report.
+    pub fn fail(&mut self, error: Error) -> Error {
+        self.failed = true;
+        let discarded = self.discard_images(self.episodes());
+        let appended = self.append_group();
+        if let Err(other) = discarded.and(appended) {
+            tracing::debug!("after {error}: {other}");
+        }
+        with_stored(error, self.committed)
+    }
+
+    /// Deletes the images of all episodes from `from` on.
+    fn discard_images(&self, from: usize) -> Result<()> {
+        Self::discard_images_of(&self.folder, &self.schema, self.discard, from)
+    }
+
+    fn discard_images_of(folder: &Path, schema: &Schema, discard: DiscardImages, from: usize) -> Result<()> {
+        let mut images = schema.columns().iter().filter(|column| column.is_image());
+        images.try_for_each(|column| discard(&folder.join(&column.name), from))
+    }
+
     /// Merges the journal into new column files. Each file is replaced atomically, the lengths last.
     fn merge_journal(&mut self) -> Result<()> {
+        self.try_merge_journal().map_err(|error| with_stored(error, self.committed))
+    }
+
+    fn try_merge_journal(&mut self) -> Result<()> {
         let old = exists(&self.folder).then(|| ColumnFiles::open(&self.folder)).transpose()?;
         let old_constants = old.as_ref().map_or_else(|| Ok(vec![]), ColumnFiles::stored_constants)?;
         let rows = usize::try_from(self.rows.total()).map_err(|e| Error::external("writing columns", e))?;
@@ -275,11 +339,17 @@ impl ColumnFilesWriter {
     fn replace_column(&self, name: &str, fill: impl FnOnce(&mut NpzWriter) -> Result<()>) -> Result<()> {
         // The reference ignores names that start with `ep_len`.
         let temporary = self.folder.join(format!("{LENGTHS}.tmp"));
-        let mut npz = NpzWriter::create(&temporary)?;
-        fill(&mut npz)?;
-        npz.finish()?;
         let path = column_path(&self.folder, name);
-        std::fs::rename(&temporary, &path).map_err(|e| Error::io(&path, "replacing a column file", e))
+        let replaced = NpzWriter::create(&temporary).and_then(|mut npz| {
+            fill(&mut npz)?;
+            npz.finish()?;
+            std::fs::rename(&temporary, &path).map_err(|e| Error::io(&path, "replacing a column file", e))
+        });
+        if replaced.is_err() {
+            // A failure only wastes space; the next file has the same temporary name.
+            let _ = files::delete_file(&temporary);
+        }
+        replaced
     }
 
     /// Commits all episodes and completes the column files.
@@ -313,14 +383,19 @@ impl Drop for ColumnFilesWriter {
     }
 }
 
-/// Removes a dataset. Renames the folder first, so that no partly removed dataset exists under the original name.
-pub(crate) fn remove_dataset(folder: &Path) -> Result<()> {
+/// Deletes the files of a dataset, named by `patterns` (see [`files::delete`]). Renames the folder first, so that no
+/// partly deleted dataset exists under the original name. Other files return to the folder.
+pub(crate) fn remove_dataset(folder: &Path, patterns: &[&str]) -> Result<()> {
     let _lock = Lock::folder(folder)?;
     let mut aside = folder.as_os_str().to_owned();
     aside.push(format!(".replaced-{}", uuid::Uuid::new_v4().simple()));
+    let aside = PathBuf::from(aside);
     std::fs::rename(folder, &aside).map_err(|e| Error::io(folder, "replacing the dataset", e))?;
-    if let Err(error) = std::fs::remove_dir_all(&aside) {
-        tracing::warn!(folder = %Path::new(&aside).display(), "a replaced dataset could not be removed: {error}");
+    let remaining = files::delete(&aside, patterns)?;
+    for path in &remaining {
+        let target = folder.join(path.file_name().unwrap_or_default());
+        let moved = std::fs::create_dir_all(folder).and_then(|()| std::fs::rename(path, &target));
+        moved.map_err(|e| Error::io(&target, "returning a file that is not part of the dataset", e))?;
     }
-    Ok(())
+    if remaining.is_empty() { Ok(()) } else { files::remove_empty_folder(&aside) }
 }

@@ -18,7 +18,7 @@ mod reader;
 mod writer;
 
 use crate::dataset::Location;
-use crate::formats::column_files::{contains_videos, exists};
+use crate::formats::column_files::{FILES, contains_videos, exists};
 use crate::formats::entry::{Backend, FormatEntry};
 use std::path::{Path, PathBuf};
 
@@ -27,6 +27,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
     id: "folder",
     summary: "folder NAME.folder of numpy's npz files and one image per step; the reference opens it",
     suffixes: &["folder"],
+    files: FILES,
     feature: None,
     detect,
     backend: Some(Backend { open: reader::open, create: writer::create }),

@@ -8,7 +8,7 @@ use crate::dataset::{Constants, Reader as _, WriteMode, WriteOptions, Writer};
 use crate::formats::column_files::{ColumnFilesWriter, exists};
 use rayon::prelude::*;
 use std::path::Path;
-use swm_core::{Batch, Error, Result, Schema};
+use swm_core::{Batch, Error, Result, Schema, files};
 use swm_image::ImageCodec;
 
 /// Creates, continues or replaces a dataset of the format `folder`.
@@ -20,21 +20,18 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
     } else {
         None
     };
-    let columns = ColumnFilesWriter::create(folder, schema, &options, known.as_ref())?;
-    for column in schema.columns().iter().filter(|column| column.is_image()) {
-        prepare(&folder.join(&column.name), columns.episodes())?;
-    }
+    let columns = ColumnFilesWriter::create(folder, schema, &options, known.as_ref(), discard)?;
     Ok(Box::new(FolderWriter { columns, schema: schema.clone(), codec: options.codec }))
 }
 
-/// Creates the folder of an image column and removes images of uncommitted episodes.
-fn prepare(folder: &Path, episodes: usize) -> Result<()> {
-    let io = |e| Error::io(folder, "preparing the folder", e);
-    std::fs::create_dir_all(folder).map_err(io)?;
+/// Deletes the images of all episodes from `from` on, in the folder of an image column.
+fn discard(folder: &Path, from: usize) -> Result<()> {
+    let io = |e| Error::io(folder, "deleting images of uncommitted episodes", e);
     for entry in std::fs::read_dir(folder).map_err(io)? {
         let entry = entry.map_err(io)?;
-        if entry.file_name().to_str().and_then(episode_of).is_some_and(|episode| episode >= episodes) {
-            std::fs::remove_file(entry.path()).map_err(io)?;
+        let is_image = entry.file_type().map_err(io)?.is_file();
+        if is_image && entry.file_name().to_str().and_then(episode_of).is_some_and(|episode| episode >= from) {
+            files::delete_file(&entry.path())?;
         }
     }
     Ok(())
@@ -50,7 +47,8 @@ impl Writer for FolderWriter {
     fn write_episode_with(&mut self, episode: &Batch, constants: &Constants) -> Result<()> {
         episodes::check_episode(episode, &self.schema)?;
         let episode_index = self.columns.episodes();
-        for (index, column) in self.schema.columns().iter().enumerate().filter(|(_, column)| column.is_image()) {
+        let mut images = self.schema.columns().iter().enumerate().filter(|(_, column)| column.is_image());
+        let written = images.try_for_each(|(index, column)| {
             let (height, width) = (column.shape[0], column.shape[1]);
             let frames = episode.bytes(index).par_chunks_exact(column.row_bytes());
             frames.enumerate().with_max_len(1).try_for_each_init(Vec::new, |bytes, (step, frame)| {
@@ -58,8 +56,9 @@ impl Writer for FolderWriter {
                 self.codec.encode(frame, height, width, bytes)?;
                 let path = image_path(self.columns.folder(), &column.name, episode_index, step, SUFFIXES[0]);
                 std::fs::write(&path, &*bytes).map_err(|e| Error::io(path, "writing an image", e))
-            })?;
-        }
+            })
+        });
+        written.map_err(|error| self.columns.fail(error))?;
         self.columns.write(episode, constants)
     }
 

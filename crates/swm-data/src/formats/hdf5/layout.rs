@@ -22,6 +22,8 @@ use swm_core::{ColumnSpec, DType, Error, Result};
 pub(super) const UNDEFINED: u64 = u64::MAX;
 /// The signature of HDF5 files.
 pub(super) const SIGNATURE: [u8; 8] = *b"\x89HDF\r\n\x1a\n";
+/// The bytes after the signature: versions, then the sizes of addresses and of lengths.
+pub(super) const VERSIONS: [u8; 8] = [0, 0, 0, 0, 0, 8, 8, 0];
 /// Offset of the end-of-file address in the superblock.
 pub(super) const END_AT: u64 = 40;
 /// Offset of the address of the root's B-tree in the superblock.
@@ -243,8 +245,7 @@ pub(super) fn record(source: &Source) -> Result<Option<Table>, String> {
 
 fn superblock(leaf_k: u16, end: u64, tree: u64, heap: u64) -> Vec<u8> {
     let mut out = SIGNATURE.to_vec();
-    // Versions, then the sizes of addresses and of lengths: 8 bytes.
-    out.extend([0, 0, 0, 0, 0, 8, 8, 0]);
+    out.extend(VERSIONS);
     out.extend(leaf_k.to_le_bytes());
     out.extend(GROUP_K.to_le_bytes());
     out.extend(0_u32.to_le_bytes());

@@ -56,6 +56,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
     id: "hdf5",
     summary: "one file NAME.h5 or NAME.hdf5; opens in h5py and in the reference",
     suffixes: &["h5", "hdf5"],
+    files: &[],
     feature: Some("hdf5"),
     detect,
     backend: BACKEND,

@@ -21,6 +21,7 @@ thread_local! {
 }
 
 /// Allocates space at the end of the file.
+#[derive(Clone)]
 pub(super) struct Space {
     /// Offset of the end of the file, in bytes.
     pub end: u64,
@@ -53,6 +54,18 @@ impl Space {
 /// Appends the rows of a dataset.
 pub(super) struct TableWriter {
     pub table: Table,
+    /// The stored rows, without the buffers that are used while rows are appended.
+    pub state: TableState,
+    /// Encoded chunks of an episode.
+    encoded: Vec<Vec<u8>>,
+    /// Bytes of the current write; the buffer is reused.
+    writing: Vec<u8>,
+}
+
+/// The rows of a dataset and where the file holds them. Restoring an earlier state removes later rows, as long as no
+/// commit wrote them.
+#[derive(Clone)]
+pub(super) struct TableState {
     rows: u64,
     tree: Tree,
     /// Rows of the incomplete chunk.
@@ -63,26 +76,13 @@ pub(super) struct TableWriter {
     free: Vec<u64>,
     /// Addresses that may be overwritten after the next commit.
     free_after_commit: Vec<u64>,
-    /// Encoded chunks of an episode.
-    encoded: Vec<Vec<u8>>,
-    /// Bytes of the current write; the buffer is reused.
-    writing: Vec<u8>,
 }
 
 impl TableWriter {
     pub fn new(table: Table) -> Self {
         let tree = Tree::new(&table);
-        Self {
-            table,
-            rows: 0,
-            tree,
-            open: vec![],
-            stored: 0,
-            free: vec![],
-            free_after_commit: vec![],
-            encoded: vec![],
-            writing: vec![],
-        }
+        let state = TableState { rows: 0, tree, open: vec![], stored: 0, free: vec![], free_after_commit: vec![] };
+        Self { table, state, encoded: vec![], writing: vec![] }
     }
 
     /// Continues a dataset after its first `rows` rows.
@@ -91,32 +91,33 @@ impl TableWriter {
     /// If the dataset is damaged.
     pub fn load(table: Table, source: &Source, rows: u64) -> Result<Self, String> {
         let tree = Tree::load(&table, source, rows)?;
-        let mut writer = Self { rows, tree, ..Self::new(table) };
-        if let Some(last) = writer.tree.last()
+        let mut writer = Self::new(table);
+        (writer.state.rows, writer.state.tree) = (rows, tree);
+        if let Some(last) = writer.state.tree.last()
             && last.row + writer.table.chunk_rows as u64 > rows
         {
-            writer.open = read_chunk(&writer.table, source, &last)?;
-            writer.open.truncate((rows - last.row) as usize * writer.table.spec.row_bytes());
-            writer.stored = writer.open.len();
+            writer.state.open = read_chunk(&writer.table, source, &last)?;
+            writer.state.open.truncate((rows - last.row) as usize * writer.table.spec.row_bytes());
+            writer.state.stored = writer.state.open.len();
         }
         Ok(writer)
     }
 
     /// Appends rows. Complete chunks are written immediately.
     pub fn append(&mut self, file: &File, space: &mut Space, rows: &[u8]) -> io::Result<()> {
-        self.rows += (rows.len() / self.table.spec.row_bytes()) as u64;
+        self.state.rows += (rows.len() / self.table.spec.row_bytes()) as u64;
         if self.table.compressed {
             return self.append_compressed(file, space, rows);
         }
         let mut rest = rows;
         while !rest.is_empty() {
-            let (now, later) = rest.split_at(rest.len().min(self.table.chunk_bytes() - self.open.len()));
-            self.open.extend(now);
+            let (now, later) = rest.split_at(rest.len().min(self.table.chunk_bytes() - self.state.open.len()));
+            self.state.open.extend(now);
             rest = later;
-            if self.open.len() == self.table.chunk_bytes() {
+            if self.state.open.len() == self.table.chunk_bytes() {
                 self.store_open(file, space)?;
-                self.open.clear();
-                self.stored = 0;
+                self.state.open.clear();
+                self.state.stored = 0;
             }
         }
         Ok(())
@@ -147,11 +148,11 @@ impl TableWriter {
         self.writing.clear();
         self.encoded[..count].iter().for_each(|chunk| self.writing.extend(chunk));
         file.write_all_at(&self.writing, address)?;
-        let first = self.rows - count as u64;
+        let first = self.state.rows - count as u64;
         for ((chunk, smaller), row) in self.encoded.iter().zip(smaller).zip(first..) {
             let filter_mask = if smaller { 0 } else { NOT_COMPRESSED };
             let entry = Entry { size: chunk.len() as u32, filter_mask, row, address };
-            self.tree.push(entry, &mut |size| space.take_node(size));
+            self.state.tree.push(entry, &mut |size| space.take_node(size));
             address += chunk.len() as u64;
         }
         Ok(())
@@ -160,40 +161,40 @@ impl TableWriter {
     /// Writes the incomplete chunk to a free address or to the end of the file.
     fn store_open(&mut self, file: &File, space: &mut Space) -> io::Result<()> {
         let size = stored_chunk_bytes(&self.table);
-        let address = self.free.pop().unwrap_or_else(|| space.take(size));
+        let address = self.state.free.pop().unwrap_or_else(|| space.take(size));
         self.writing.clear();
-        self.writing.extend(&self.open);
+        self.writing.extend(&self.state.open);
         self.writing.resize(self.table.chunk_bytes(), 0);
         self.writing.extend(fletcher32::sum(&self.writing).to_le_bytes());
         file.write_all_at(&self.writing, address)?;
-        if self.stored > 0 {
-            self.free_after_commit.extend(self.tree.move_last(address));
+        if self.state.stored > 0 {
+            self.state.free_after_commit.extend(self.state.tree.move_last(address));
         } else {
-            let row = self.tree.last().map_or(0, |last| last.row + self.table.chunk_rows as u64);
+            let row = self.state.tree.last().map_or(0, |last| last.row + self.table.chunk_rows as u64);
             let entry = Entry { size: size as u32, filter_mask: 0, row, address };
-            self.tree.push(entry, &mut |size| space.take_node(size));
+            self.state.tree.push(entry, &mut |size| space.take_node(size));
         }
-        self.stored = self.open.len();
+        self.state.stored = self.state.open.len();
         Ok(())
     }
 
     /// Writes the incomplete chunk and the new nodes of the B-tree, which the file does not refer to yet.
     pub fn write_new(&mut self, file: &File, space: &mut Space) -> io::Result<()> {
-        if self.open.len() > self.stored {
+        if self.state.open.len() > self.state.stored {
             self.store_open(file, space)?;
         }
-        self.tree.write_new(file)
+        self.state.tree.write_new(file)
     }
 
     /// Updates the B-tree in the file.
     pub fn write_changes(&mut self, file: &File) -> io::Result<()> {
-        self.tree.write_changes(file)
+        self.state.tree.write_changes(file)
     }
 
     /// Updates the number of rows in the file.
     pub fn write_rows(&mut self, file: &File) -> io::Result<()> {
-        file.write_all_at(&self.rows.to_le_bytes(), self.table.rows_at)?;
-        self.free.append(&mut self.free_after_commit);
+        file.write_all_at(&self.state.rows.to_le_bytes(), self.table.rows_at)?;
+        self.state.free.append(&mut self.state.free_after_commit);
         Ok(())
     }
 }

@@ -27,6 +27,7 @@ pub(super) struct Entry {
 }
 
 /// A node on the right edge, or a node that was completed since the last commit.
+#[derive(Clone)]
 struct Node {
     address: u64,
     /// 0 for a leaf.
@@ -45,6 +46,7 @@ struct Node {
 }
 
 /// The B-tree of a dataset's chunks.
+#[derive(Clone)]
 pub(super) struct Tree {
     /// See [`Table::sides`].
     sides: usize,

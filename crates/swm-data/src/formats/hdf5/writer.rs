@@ -1,20 +1,19 @@
 //! Writes episodes: rows are appended to the file immediately and become visible when they are committed.
 
-use super::layout::{END_AT, Layout, SIGNATURE};
+use super::layout::{END_AT, Layout, SIGNATURE, VERSIONS};
 use super::reader::Hdf5Reader;
 use super::record::RecordWriter;
 use super::source::Source;
-use super::table::{Space, TableWriter};
+use super::table::{Space, TableState, TableWriter};
 use crate::dataset::Location;
 use crate::dataset::episodes::{self, EpisodeRows};
-use crate::dataset::{CommitPolicy, Constants, Reader as _, StepRange, WriteMode, WriteOptions, Writer};
-use std::fs::File;
+use crate::dataset::{CommitPolicy, Constants, Reader as _, StepRange, WriteMode, WriteOptions, Writer, with_stored};
 use std::io;
 use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
-use swm_core::files::Lock;
+use swm_core::files::{self, Lock};
 use swm_core::{Batch, Error, Manifest, Result, Schema};
 
 /// Creates, continues or replaces a file.
@@ -29,24 +28,22 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
     }
     let manifest = options.manifest.as_ref();
     let mut writer = match (options.mode, is_complete_file(path)?) {
-        (_, false) => Hdf5Writer::begin(path, Lock::file(path)?, schema, manifest)?,
+        (_, false) => create_file(path, schema, manifest)?,
         (WriteMode::Create, true) => {
             let problem = format!("{} exists already", path.display());
             let fix = "choose another path, append to it, or overwrite it";
             return Err(Error::config("dataset", problem, fix));
         }
         (WriteMode::Overwrite, true) => {
-            let _old = Lock::file(path)?;
+            let old = Lock::file(path)?;
+            check_is_dataset(&old, path)?;
             let temporary = temporary_path(path);
-            let writer = Hdf5Writer::begin(&temporary, Lock::file(&temporary)?, schema, manifest)?;
+            let writer = create_file(&temporary, schema, manifest)?;
             replace_file(writer, &temporary, path)?
         }
         (WriteMode::Append, true) => {
             let old = Lock::file(path)?;
-            let reader = Hdf5Reader::of(Source::of(
-                old.try_clone().map_err(|e| Error::io(path, "opening the file again", e))?,
-                path,
-            )?)?;
+            let reader = reader(&old, path)?;
             episodes::check_appendable(&location, schema, reader.schema())?;
             let mut writer = match Hdf5Writer::resume(path, &reader, old)? {
                 Ok(writer) => writer,
@@ -67,18 +64,45 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
     Ok(Box::new(writer))
 }
 
-/// Whether a complete HDF5 file exists at `path`.
+/// Whether a file exists at `path`, other than an empty file or one whose creation was killed.
 fn is_complete_file(path: &Path) -> Result<bool> {
-    let mut start = [0; SIGNATURE.len()];
-    match File::open(path) {
+    // The signature is written last when a file is created.
+    let killed = [[0; SIGNATURE.len()], VERSIONS].concat();
+    let mut start = [0; 2 * SIGNATURE.len()];
+    match files::open(path) {
         Ok(file) => {
             let size = file.read_at(&mut start, 0).map_err(|e| Error::io(path, "reading the file", e))?;
-            // The signature is written last when a file is created.
-            Ok(start[..size] != [0; SIGNATURE.len()][..size])
+            Ok(start[..size] != killed[..size])
         }
-        Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(false),
-        Err(e) => Err(Error::io(path, "opening the file", e)),
+        Err(Error::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => Ok(false),
+        Err(error) => Err(error),
     }
+}
+
+/// Creates a file without episodes. Leaves no file if that fails.
+fn create_file(path: &Path, schema: &Schema, manifest: Option<&Manifest>) -> Result<Hdf5Writer> {
+    let file = Lock::file(path)?;
+    // Another process may have created the file before it was locked.
+    if is_complete_file(path)? {
+        return Err(Error::config("dataset", format!("{} exists already", path.display()), "choose another path"));
+    }
+    Hdf5Writer::begin(path, file, schema, manifest).inspect_err(|_| {
+        // Returns the error of the file, even if it cannot be removed.
+        let _ = files::delete_file(path);
+    })
+}
+
+/// Reads a locked file.
+fn reader(file: &Lock, path: &Path) -> Result<Hdf5Reader> {
+    Hdf5Reader::of(Source::of(file.try_clone().map_err(|e| Error::io(path, "opening it", e))?, path)?)
+}
+
+/// Checks that a file may be replaced by a dataset.
+fn check_is_dataset(file: &Lock, path: &Path) -> Result<()> {
+    reader(file, path).map(drop).map_err(|error| {
+        let problem = format!("it is not a dataset that can be replaced: {error}");
+        Error::config(path.display().to_string(), problem, "choose another path, or remove the file")
+    })
 }
 
 /// A temporary path in the folder of `path`.
@@ -103,7 +127,7 @@ fn copy_to_this_layout(path: &Path, reader: &Hdf5Reader) -> Result<Hdf5Writer> {
     let schema = Schema::new(reader.stored())?;
     let temporary = temporary_path(path);
     let copy = || {
-        let mut writer = Hdf5Writer::begin(&temporary, Lock::file(&temporary)?, &schema, reader.manifest().as_ref())?;
+        let mut writer = create_file(&temporary, &schema, reader.manifest().as_ref())?;
         let names: Vec<&str> = schema.columns().iter().map(|column| &*column.name).collect();
         for (position, episode) in reader.episodes().iter().enumerate() {
             let batch = reader.read(&names, &[StepRange::new(position, 0, episode.length)])?;
@@ -114,8 +138,16 @@ fn copy_to_this_layout(path: &Path, reader: &Hdf5Reader) -> Result<Hdf5Writer> {
     };
     copy().inspect_err(|_| {
         // Returns the error of the copy, even if the temporary file cannot be removed.
-        let _ = std::fs::remove_file(&temporary);
+        let _ = files::delete_file(&temporary);
     })
+}
+
+/// The state of a writer before an episode was added.
+struct Snapshot {
+    space: Space,
+    tables: Vec<TableState>,
+    episodes: usize,
+    in_group: usize,
 }
 
 struct Hdf5Writer {
@@ -130,8 +162,13 @@ struct Hdf5Writer {
     last_commit: Instant,
     /// End of the file at the last commit.
     committed_end: u64,
-    /// Number of episodes since the last commit.
+    /// Number of committed episodes, and of episodes since the last commit.
+    committed: usize,
     in_group: usize,
+    /// States after 1, 2, 4, … episodes since the last commit.
+    earlier: Vec<Snapshot>,
+    /// Whether a commit changes the committed part of the file at present.
+    changing: bool,
     /// Whether episodes were added since the record was last closed.
     unclosed: bool,
     rows: EpisodeRows,
@@ -198,7 +235,7 @@ impl Hdf5Writer {
         }
         let record = RecordWriter::resume(reader.record());
         let mut writer = Self::of(path, file, Space::new(source.size()), tables, schema);
-        (writer.rows, writer.record) = (rows, record);
+        (writer.committed, writer.rows, writer.record) = (rows.episodes().len(), rows, record);
         Ok(Ok(writer))
     }
 
@@ -212,7 +249,10 @@ impl Hdf5Writer {
             schema: schema.clone(),
             policy: CommitPolicy::default(),
             last_commit: Instant::now(),
+            committed: 0,
             in_group: 0,
+            earlier: vec![],
+            changing: false,
             unclosed: false,
             rows: EpisodeRows::default(),
             record: RecordWriter::default(),
@@ -269,15 +309,18 @@ impl Hdf5Writer {
         self.try_commit().map_err(|e| Error::io(&self.path, "committing episodes", e))?;
         self.failed = false;
         (self.in_group, self.committed_end, self.last_commit) = (0, self.space.end, Instant::now());
+        self.committed = self.rows.episodes().len();
+        self.earlier.clear();
         Ok(())
     }
 
     fn try_commit(&mut self) -> io::Result<()> {
-        let Self { file, space, tables, .. } = self;
+        let Self { file, space, tables, changing, .. } = self;
         for table in &mut *tables {
             table.write_new(file, space)?;
         }
         file.set_len(space.end)?;
+        *changing = true;
         file.write_all_at(&space.end.to_le_bytes(), END_AT)?;
         file.sync_data()?;
         for table in &mut *tables {
@@ -288,7 +331,9 @@ impl Hdf5Writer {
         for at in (COLUMNS..tables.len()).chain([RECORD, OFFSETS, LENGTHS]) {
             tables[at].write_rows(file)?;
         }
-        file.sync_data()
+        file.sync_data()?;
+        *changing = false;
+        Ok(())
     }
 
     /// Commits the remaining episodes and marks the file as complete.
@@ -303,6 +348,36 @@ impl Hdf5Writer {
         Ok(())
     }
 
+    fn snapshot(&self) -> Snapshot {
+        Snapshot {
+            space: self.space.clone(),
+            tables: self.tables.iter().map(|table| table.state.clone()).collect(),
+            episodes: self.episodes(),
+            in_group: self.in_group,
+        }
+    }
+
+    /// Removes the episode that could not be stored, and commits the finished episodes before it, or fewer if the disk
+    /// has no room for the commit. Returns the error to report.
+    fn fail(&mut self, before: Snapshot, error: Error) -> Error {
+        let mut next = Some(before);
+        while let Some(state) = next.filter(|_| !self.changing) {
+            self.space = state.space;
+            self.tables.iter_mut().zip(state.tables).for_each(|(table, state)| table.state = state);
+            self.rows.truncate(state.episodes);
+            self.in_group = state.in_group;
+            next = self.earlier.pop();
+            // Frees the space of the removed episodes, which the commit may need.
+            let shortened = self.file.set_len(self.space.end).map_err(|e| Error::io(&self.path, "shortening it", e));
+            match shortened.and_then(|()| self.close()) {
+                Ok(()) => break,
+                Err(other) => tracing::debug!("after {error}: {other}"),
+            }
+        }
+        self.failed = true;
+        with_stored(error, self.committed)
+    }
+
     fn earlier_failure() -> Error {
         Error::external("writing an episode", "an earlier write failed; later episodes are not stored")
     }
@@ -314,11 +389,20 @@ impl Writer for Hdf5Writer {
         if self.failed {
             return Err(Self::earlier_failure());
         }
-        self.append(episode, constants)?;
+        let before = self.snapshot();
+        if let Err(error) = self.append(episode, constants) {
+            return Err(self.fail(before, error));
+        }
         let due = self.in_group >= self.policy.episodes
             || self.space.end - self.committed_end >= self.policy.bytes as u64
             || self.last_commit.elapsed() >= self.policy.interval;
-        if due { self.commit() } else { Ok(()) }
+        if due {
+            return self.commit().map_err(|error| self.fail(before, error));
+        }
+        if before.in_group.is_power_of_two() {
+            self.earlier.push(before);
+        }
+        Ok(())
     }
 
     fn episodes(&self) -> usize {

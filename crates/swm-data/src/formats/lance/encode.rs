@@ -111,8 +111,10 @@ fn encode_values(episode: &Batch, index: usize, precision: Precision) -> Result<
         return Err(Error::OutOfSpace {
             what: format!("a value of column '{}'", spec.name),
             given: value.to_string(),
-            expected: "integers within ±2^24, because the table stores float32; store larger values in two columns"
-                .to_owned(),
+            expected:
+                "integers within ±2^24, because the table stores float32; use another format, such as .h5, or split \
+                       larger values into two columns"
+                    .to_owned(),
         });
     }
     let n = spec.len() as i32;

@@ -14,6 +14,7 @@
 mod convert;
 mod encode;
 mod image_locations;
+mod manifest_file;
 mod reader;
 mod record;
 mod salvage;
@@ -33,7 +34,12 @@ pub const ENTRY: FormatEntry = FormatEntry {
     id: "lance",
     summary: "Lance table, one folder NAME.lance; opens in Python's lance and lancedb",
     suffixes: &["lance"],
+    files: FILES,
     feature: None,
     detect: store::detect,
     backend: Some(Backend { open: reader::open, create: writer::create }),
 };
+
+/// The files of a table.
+const FILES: &[&str] =
+    &["_versions/*.manifest", "_versions/*.json", "_transactions/*.txn", "_shards/*/*.json", "data/*.lance"];

@@ -16,6 +16,7 @@ use crate::dataset::{Location, Reader as _};
 use crate::dataset::{WriteMode, WriteOptions, Writer};
 use lance_table::format::Fragment;
 use lance_table::transaction::Operation;
+use object_store::path::Path as StorePath;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -86,8 +87,9 @@ pub fn create_shard(
     }
     let store = Store::new(location)?;
     store.check_writable()?;
-    let version = store.latest()?;
     let mut columns = schema::columns_to_write(schema)?;
+    let lock = store.lock(&shard.folder())?;
+    let version = store.latest()?;
     let fresh = new_table_schema(&columns, schema, &options)?;
     if let Some(old) = &version {
         let known = LanceReader::of(store.clone(), Arc::clone(&old.manifest))?;
@@ -113,7 +115,7 @@ pub fn create_shard(
     }
     let mut log = ShardLog { table: Table::new(store, version, fresh), folder: shard.folder(), groups };
     log.write_entry("begun.json", &begun)?;
-    PreparedWriter { sink: Sink::Shard(log), columns, episodes }.start(schema, &options)
+    PreparedWriter { sink: Sink::Shard(log), columns, episodes }.start(schema, &options, lock)
 }
 
 /// The log of the shard that this process writes.
@@ -129,7 +131,13 @@ impl ShardLog {
     pub fn append(&mut self, episodes: &[EncodedEpisode]) -> Result<()> {
         let fragment = self.table.write_episodes(episodes, None)?;
         let rows = episodes.iter().map(|episode| episode.rows as u64).collect();
-        self.write_entry(&format!("{:08}.json", self.groups), &Group { fragment, rows })?;
+        let path = self.path(&format!("{:08}.json", self.groups));
+        let group = Group { fragment, rows };
+        if !self.table.store.write_new(&path, schema::json(&group)?.into())? {
+            self.table.discard(&group.fragment);
+            let problem = format!("another process writes {} of {}", self.folder, self.table.store.label.display());
+            return Err(Error::config("shard", problem, "wait until that process has ended, then continue (--resume)"));
+        }
         self.groups += 1;
         Ok(())
     }
@@ -140,8 +148,11 @@ impl ShardLog {
     }
 
     fn write_entry(&mut self, name: &str, value: &impl Serialize) -> Result<()> {
-        let path = self.table.store.path(&format!("{}/{name}", self.folder));
-        self.table.store.write(&path, schema::json(value)?.into())
+        self.table.store.write(&self.path(name), schema::json(value)?.into())
+    }
+
+    fn path(&self, name: &str) -> StorePath {
+        self.table.store.path(&format!("{}/{name}", self.folder))
     }
 }
 
@@ -253,7 +264,7 @@ impl ShardLogFiles {
     }
 }
 
-fn parse<T: DeserializeOwned>(store: &Store, path: &object_store::path::Path) -> Result<T> {
+fn parse<T: DeserializeOwned>(store: &Store, path: &StorePath) -> Result<T> {
     serde_json::from_slice(&store.read(path)?).map_err(|e| damaged(&store.label, format!("{path} is unreadable: {e}")))
 }
 

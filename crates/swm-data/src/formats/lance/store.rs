@@ -1,11 +1,10 @@
 //! Storage of a Lance table: its location, its newest version, and commits of new versions.
 
-use super::ENTRY;
+use super::{ENTRY, manifest_file};
 use crate::dataset::{Location, objects};
 use arrow_schema::Schema as ArrowSchema;
 use bytes::Bytes;
 use futures::TryStreamExt as _;
-use futures::future::BoxFuture;
 use lance_core::cache::LanceCache;
 use lance_encoding::decoder::DecoderPlugins;
 use lance_file::reader::{FileReader, FileReaderOptions};
@@ -14,18 +13,18 @@ use lance_io::scheduler::{ScanScheduler, SchedulerConfig};
 use lance_table::feature_flags::{ensure_can_read_manifest, ensure_can_write_manifest};
 use lance_table::format::{DataFile, Fragment, IndexMetadata, Manifest, ManifestBuildConfig};
 use lance_table::io::commit::{
-    CommitError, CommitHandler as _, ConditionalPutCommitHandler, ManifestLocation, ManifestNamingScheme,
-    write_manifest_file_to_path,
+    CommitHandler as _, ConditionalPutCommitHandler, ManifestLocation, ManifestNamingScheme, write_version_hint,
 };
 use lance_table::io::manifest::{read_manifest, read_manifest_indexes};
 use lance_table::transaction::{Operation, Transaction, validate_operation};
 use object_store::path::Path as StorePath;
-use object_store::{ObjectMeta, ObjectStoreExt as _};
+use object_store::{ObjectMeta, ObjectStoreExt as _, PutMode, PutOptions};
 use std::ffi::OsString;
 use std::future::Future;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use swm_core::files::Lock;
 use swm_core::{Error, Result};
 use url::Url;
 
@@ -153,6 +152,17 @@ impl Store {
         Ok(Self { label: location.label(), remote: true, lists, base, objects: Arc::new(objects) })
     }
 
+    /// Locks a subfolder of a local table against other exclusive writers; `None` for an object store.
+    ///
+    /// # Errors
+    /// If another process holds the lock.
+    pub fn lock(&self, subfolder: &str) -> Result<Option<Lock>> {
+        if self.remote {
+            return Ok(None);
+        }
+        Lock::folder(&self.label.join(subfolder)).map(Some)
+    }
+
     /// Checks that the location can be written.
     ///
     /// # Errors
@@ -177,13 +187,16 @@ impl Store {
         block_on(&self.label, "reading the newest version", async move {
             let location = store.latest_location().await?;
             let bytes = store.objects.inner.get(&location.path).await?.bytes().await?;
-            verify_checksum(&bytes)?;
+            manifest_file::verify_checksum(&bytes)?;
             // Lance parses the verified bytes, not the object, which may have changed.
             let memory = ObjectStore::memory();
             memory.put(&location.path, &bytes).await?;
             let manifest = read_manifest(&memory, &location.path, Some(bytes.len() as u64)).await?;
             if manifest.version != location.version {
-                return Err(corrupt(format!("version {} is stored as version {}", manifest.version, location.version)));
+                return Err(manifest_file::corrupt(format!(
+                    "version {} is stored as version {}",
+                    manifest.version, location.version
+                )));
             }
             ensure_can_read_manifest(&manifest)?;
             let indices = read_manifest_indexes(&memory, &location, &manifest).await?;
@@ -241,7 +254,7 @@ impl Store {
             let manifest = current.as_ref().map(|version| &*version.manifest);
             if let Some(manifest) = manifest {
                 ensure_can_write_manifest(manifest)?;
-                if store.latest_location().await?.version != manifest.version {
+                if !store.is_latest(manifest.version).await? {
                     return Ok(None);
                 }
             }
@@ -254,27 +267,18 @@ impl Store {
             let indices = current.as_ref().map(|version| version.indices.clone()).unwrap_or_default();
             // The manifest contains the transaction, so no separate transaction file is needed.
             let (mut next, indices) = transaction.build_manifest(manifest, indices, "", &config)?;
-            let result = ConditionalPutCommitHandler
-                .commit(
-                    &mut next,
-                    (!indices.is_empty()).then(|| indices.clone()),
-                    &store.base,
-                    &store.objects,
-                    write_with_checksum,
-                    ManifestNamingScheme::V2,
-                    Some((&transaction).try_into()?),
-                )
-                .await;
-            let location = match result {
-                Ok(location) => location,
-                Err(CommitError::CommitConflict) => return Ok(None),
-                Err(CommitError::OtherError(error)) => return Err(error),
-            };
-            if !store.contains(next.version, &appended).await? {
-                store.objects.delete(&location.path).await?;
+            let path = ManifestNamingScheme::V2.manifest_path(&store.base, next.version);
+            let stored_indices = (!indices.is_empty()).then(|| indices.clone());
+            let bytes = manifest_file::encode(&mut next, stored_indices, &path, (&transaction).try_into()?).await?;
+            if !store.put_new(&path, bytes.into()).await? {
                 return Ok(None);
             }
-            Ok(Some((Version { manifest: Arc::new(next), indices }, location.path)))
+            write_version_hint(&store.objects, &store.base, next.version).await;
+            if !store.contains(next.version, &appended).await? {
+                store.objects.delete(&path).await?;
+                return Ok(None);
+            }
+            Ok(Some((Version { manifest: Arc::new(next), indices }, path)))
         })
     }
 
@@ -283,11 +287,39 @@ impl Store {
         ConditionalPutCommitHandler.resolve_latest_location(&self.base, &self.objects).await
     }
 
+    /// Whether a version of this process is the newest one. A list of an object store may be older than the version.
+    async fn is_latest(&self, version: u64) -> lance_core::Result<bool> {
+        let newest = self.latest_location().await?.version;
+        if newest >= version || !self.remote {
+            return Ok(newest == version);
+        }
+        self.objects.exists(&ManifestNamingScheme::V2.manifest_path(&self.base, version)).await
+    }
+
+    /// Writes an object unless one of that name exists, and returns whether the object has this content. If the answer
+    /// to a request is lost, its repetition finds the object that the request wrote.
+    async fn put_new(&self, path: &StorePath, content: Bytes) -> lance_core::Result<bool> {
+        let options = PutOptions { mode: PutMode::Create, ..PutOptions::default() };
+        let Err(error) = self.objects.inner.put_opts(path, content.clone().into(), options).await else {
+            return Ok(true);
+        };
+        let stored = match self.objects.inner.get(path).await {
+            Ok(stored) => stored.bytes().await.ok(),
+            Err(_) => None,
+        };
+        match (stored, error) {
+            (Some(stored), _) if stored == content => Ok(true),
+            (_, object_store::Error::AlreadyExists { .. } | object_store::Error::Precondition { .. }) => Ok(false),
+            (_, error) => Err(error.into()),
+        }
+    }
+
     /// Whether the newest version contains the appended fragments. Because old versions are deleted, a late commit may
     /// reuse the number of a version that other writers already replaced.
     async fn contains(&self, version: u64, appended: &[Fragment]) -> lance_core::Result<bool> {
         let newest = self.latest_location().await?;
-        if newest.version == version || appended.is_empty() {
+        // A list that is older than this commit shows an older version.
+        if newest.version <= version || appended.is_empty() {
             return Ok(true);
         }
         let manifest = read_manifest(&self.objects, &newest.path, newest.size).await?;
@@ -353,6 +385,15 @@ impl Store {
         })
     }
 
+    /// Writes a whole file that must not exist yet, and returns whether this process wrote it.
+    ///
+    /// # Errors
+    /// If writing fails.
+    pub fn write_new(&self, path: &StorePath, content: Bytes) -> Result<bool> {
+        let (store, path) = (self.clone(), path.clone());
+        block_on(&self.label, "writing a file", async move { store.put_new(&path, content).await })
+    }
+
     /// Removes a file that is no longer used. A failure only wastes space, so it is logged and ignored.
     pub fn remove(&self, path: &StorePath) {
         let (objects, removed_path) = (Arc::clone(&self.objects), path.clone());
@@ -383,66 +424,6 @@ const REQUESTS: usize = 64;
 /// Number of retries of a failed download.
 const RETRIES: usize = 3;
 
-/// Start of the checksum in a manifest's file; a BLAKE3 hash of all other bytes of the file follows. The checksum is
-/// stored before Lance's protobuf message, whose offset is in the file's footer, so other readers skip the checksum.
-const CHECKSUM_TAG: &[u8; 8] = b"swmSEAL1";
-/// Size of the checksum in bytes: the tag and the hash.
-const CHECKSUM_LEN: usize = CHECKSUM_TAG.len() + 32;
-/// Size of the footer in bytes: offset of the message, format versions, and magic number.
-const FOOTER: usize = 16;
-
-/// Writes a manifest as Lance does, with a checksum.
-fn write_with_checksum<'a>(
-    objects: &'a ObjectStore,
-    manifest: &'a mut Manifest,
-    indices: Option<Vec<IndexMetadata>>,
-    path: &'a StorePath,
-    transaction: Option<lance_table::format::Transaction>,
-) -> BoxFuture<'a, lance_core::Result<lance_io::object_writer::WriteResult>> {
-    Box::pin(async move {
-        let memory = ObjectStore::memory();
-        write_manifest_file_to_path(&memory, manifest, indices, path, transaction).await?;
-        let plain = memory.read_one_all(path).await?;
-        objects.put(path, &with_checksum(&plain)?).await
-    })
-}
-
-/// Offset of the message in a manifest's file.
-fn message_start(file: &[u8]) -> lance_core::Result<usize> {
-    let start = file.len().checked_sub(FOOTER).and_then(|at| file[at..].first_chunk());
-    let start = start.and_then(|&bytes| usize::try_from(u64::from_le_bytes(bytes)).ok());
-    start.filter(|&start| start <= file.len() - FOOTER).ok_or_else(|| corrupt("a manifest is truncated".to_owned()))
-}
-
-/// Adds a checksum before the message of a manifest's file.
-fn with_checksum(plain: &[u8]) -> lance_core::Result<Vec<u8>> {
-    let start = message_start(plain)?;
-    let (before, message) = plain.split_at(start);
-    let mut after = message.to_vec();
-    let footer = after.len() - FOOTER;
-    after[footer..footer + 8].copy_from_slice(&((start + CHECKSUM_LEN) as u64).to_le_bytes());
-    let hash = blake3::Hasher::new().update(before).update(&after).finalize();
-    Ok([before, CHECKSUM_TAG, hash.as_bytes(), &after].concat())
-}
-
-/// Verifies the checksum of a manifest's file, if there is one. Manifests of other writers have no checksum.
-fn verify_checksum(file: &[u8]) -> lance_core::Result<()> {
-    let start = message_start(file)?;
-    let Some(checksum) = start.checked_sub(CHECKSUM_LEN).filter(|&checksum| file[checksum..].starts_with(CHECKSUM_TAG))
-    else {
-        return Ok(());
-    };
-    let hash = blake3::Hasher::new().update(&file[..checksum]).update(&file[start..]).finalize();
-    if file[checksum + CHECKSUM_TAG.len()..start] == *hash.as_bytes() {
-        return Ok(());
-    }
-    Err(corrupt("the newest manifest does not match its hash".to_owned()))
-}
-
-fn corrupt(problem: String) -> lance_core::Error {
-    lance_core::Error::internal(problem)
-}
-
 /// The name of a data file: the hash of its content, so that damage can be detected before decoding.
 pub fn name_of_hash(hash: blake3::Hash) -> String {
     format!("{}.lance", hash.to_hex())
@@ -470,22 +451,6 @@ mod tests {
         let full = lance_core::Error::io("failed to persist: No space left on device (os error 28)".to_owned());
         let error = lance_error(Path::new("x.lance"), "writing", &full);
         assert!(matches!(&error, Error::Io { source, .. } if source.kind() == ErrorKind::StorageFull));
-        assert!(error.to_string().contains("committed episodes are kept"));
-    }
-
-    #[test]
-    fn manifest_checksum_detects_flipped_bits() {
-        let plain = [&b"transaction"[..], &7_u32.to_le_bytes(), b"message", &11_u64.to_le_bytes(), b"\0\0\x02\0LANC"];
-        let plain = plain.concat();
-        assert!(verify_checksum(&plain).is_ok(), "a manifest of another writer has no checksum");
-        let intact = with_checksum(&plain).expect("adding a checksum");
-        assert_eq!(&intact[message_start(&intact).expect("finding the message")..][4..11], b"message");
-        assert!(verify_checksum(&intact).is_ok());
-        for at in (0..intact.len()).filter(|at| !(11..19).contains(at)) {
-            let mut damaged = intact.clone();
-            damaged[at] ^= 4;
-            let in_message_offset = at >= intact.len() - FOOTER && at < intact.len() - 8;
-            assert!(verify_checksum(&damaged).is_err() || in_message_offset, "byte {at}");
-        }
+        assert!(error.to_string().contains("free some space"));
     }
 }

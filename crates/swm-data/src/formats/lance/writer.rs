@@ -5,7 +5,8 @@
 //! a killed process loses only uncommitted episodes.
 //!
 //! Several writers may append concurrently. If another writer commits first, this writer renumbers its episodes after
-//! the new ones and retries.
+//! the new ones and retries. An exclusive writer fails instead: on this machine it locks the folder, in an object store
+//! it notices another writer at its next commit.
 
 use super::encode::EncodedEpisode;
 use super::reader::LanceReader;
@@ -13,7 +14,7 @@ use super::schema::{self, Kind, StoredColumn};
 use super::shard::ShardLog;
 use super::store::{Store, Version};
 use super::table::{MAX_ATTEMPTS, Table};
-use crate::dataset::{CommitPolicy, Constants, WriteMode, WriteOptions, Writer};
+use crate::dataset::{CommitPolicy, Constants, WriteMode, WriteOptions, Writer, is_full, with_stored};
 use crate::dataset::{Location, episodes};
 use arrow_schema::Schema as ArrowSchema;
 use lance_core::datatypes::Schema as LanceSchema;
@@ -25,6 +26,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Instant;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
+use swm_core::files::Lock;
 use swm_core::{Batch, ColumnSpec, Error, Result, Schema};
 use swm_image::ImageCodec;
 
@@ -37,11 +39,13 @@ pub fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Re
     options.codec.check()?;
     let store = Store::new(location)?;
     store.check_writable()?;
+    schema::columns_to_write(schema)?;
+    let lock = if options.exclusive { store.lock("")? } else { None };
     for _ in 0..MAX_ATTEMPTS {
         // If another process creates, continues or replaces the table in between, the next attempt starts from the new
         // state.
         if let Some(prepared) = prepare(&store, schema, &options)? {
-            return prepared.start(schema, &options);
+            return prepared.start(schema, &options, lock);
         }
     }
     Err(too_many_conflicts(&store.label))
@@ -69,6 +73,8 @@ pub enum Sink {
         table: Table,
         /// `episode_idx` of the next episode.
         next: i64,
+        /// See [`WriteOptions::exclusive`].
+        exclusive: bool,
     },
     /// Each commit becomes an entry in the log of a shard.
     Shard(ShardLog),
@@ -117,20 +123,30 @@ fn prepare(store: &Store, schema: &Schema, options: &WriteOptions) -> Result<Opt
             }
         }
     };
-    Ok(committed.then_some(PreparedWriter { sink: Sink::Table { table, next }, columns, episodes }))
+    Ok(committed.then_some(PreparedWriter {
+        sink: Sink::Table { table, next, exclusive: options.exclusive },
+        columns,
+        episodes,
+    }))
 }
 
 impl PreparedWriter {
     /// Starts the committing thread.
-    pub fn start(self, schema: &Schema, options: &WriteOptions) -> Result<Box<dyn Writer>> {
+    pub fn start(self, schema: &Schema, options: &WriteOptions, lock: Option<Lock>) -> Result<Box<dyn Writer>> {
         let folder = match &self.sink {
             Sink::Table { table, .. } => table.store.label.clone(),
             Sink::Shard(log) => log.table.store.label.clone(),
         };
         let shared = Arc::<Shared>::default();
         let (sender, receiver) = sync_channel(MAX_QUEUED);
-        let committer =
-            Committer { sink: self.sink, policy: options.commit, group: vec![], bytes: 0, shared: Arc::clone(&shared) };
+        let committer = Committer {
+            sink: self.sink,
+            policy: options.commit,
+            group: vec![],
+            bytes: 0,
+            stored: self.episodes,
+            shared: Arc::clone(&shared),
+        };
         let thread = std::thread::Builder::new()
             .name("swm-commit".to_owned())
             .spawn(move || committer.run(&receiver))
@@ -145,6 +161,7 @@ impl PreparedWriter {
             thread: Some(thread),
             shared,
             reported: false,
+            _lock: lock,
         }))
     }
 }
@@ -232,6 +249,7 @@ struct LanceWriter {
     shared: Arc<Shared>,
     /// Whether the caller received the failure.
     reported: bool,
+    _lock: Option<Lock>,
 }
 
 impl Writer for LanceWriter {
@@ -294,13 +312,15 @@ struct Committer {
     policy: CommitPolicy,
     group: Vec<EncodedEpisode>,
     bytes: usize,
+    /// Number of stored episodes.
+    stored: usize,
     shared: Arc<Shared>,
 }
 
 impl Committer {
     fn run(mut self, episodes: &Receiver<EncodedEpisode>) {
         if let Err(error) = self.receive(episodes) {
-            *self.shared.failure() = Some(error);
+            *self.shared.failure() = Some(with_stored(error, self.stored));
         }
     }
 
@@ -347,7 +367,7 @@ impl Committer {
             return Ok(());
         }
         let committed = match &mut self.sink {
-            Sink::Table { table, next } => append(table, next, episodes),
+            Sink::Table { table, next, exclusive } => append(table, next, *exclusive, episodes),
             Sink::Shard(log) => log.append(episodes),
         };
         match committed {
@@ -356,13 +376,16 @@ impl Committer {
                 self.commit_episodes(first)?;
                 self.commit_episodes(second)
             }
-            committed => committed,
+            committed => {
+                self.stored += if committed.is_ok() { episodes.len() } else { 0 };
+                committed
+            }
         }
     }
 }
 
 /// Commits episodes as one version, numbered after all existing episodes.
-fn append(table: &mut Table, next: &mut i64, episodes: &[EncodedEpisode]) -> Result<()> {
+fn append(table: &mut Table, next: &mut i64, exclusive: bool, episodes: &[EncodedEpisode]) -> Result<()> {
     for _ in 0..MAX_ATTEMPTS {
         let fragment = table.write_episodes(episodes, Some(*next))?;
         match table.commit(Operation::Append { fragments: vec![fragment.clone()] }) {
@@ -372,6 +395,11 @@ fn append(table: &mut Table, next: &mut i64, episodes: &[EncodedEpisode]) -> Res
             }
             Ok(false) => {
                 table.discard(&fragment);
+                if exclusive {
+                    let problem = "another process writes to it, and added or replaced episodes";
+                    let fix = "wait until that process has ended, then continue (--resume)";
+                    return Err(Error::config(table.store.label.display().to_string(), problem, fix));
+                }
                 *next = table.refresh()?;
             }
             Err(error) => {
@@ -384,10 +412,4 @@ fn append(table: &mut Table, next: &mut i64, episodes: &[EncodedEpisode]) -> Res
         }
     }
     Err(too_many_conflicts(&table.store.label))
-}
-
-/// Whether an error means that the disk is full.
-fn is_full(error: &Error) -> bool {
-    use std::io::ErrorKind::{QuotaExceeded, StorageFull};
-    matches!(error, Error::Io { source, .. } if matches!(source.kind(), StorageFull | QuotaExceeded))
 }

@@ -23,6 +23,13 @@ pub const ENTRY: FormatEntry = FormatEntry {
     id: "lance-video",
     summary: "folder NAME.lance-video of a Lance table with one MP4 per episode",
     suffixes: &["lance-video"],
+    files: &[
+        "steps.lance/_versions/*.manifest",
+        "steps.lance/_versions/*.json",
+        "steps.lance/_transactions/*.txn",
+        "steps.lance/_shards/*/*.json",
+        "steps.lance/data/*.lance",
+    ],
     feature: Some("ffmpeg"),
     detect,
     backend: BACKEND,

@@ -7,10 +7,10 @@ use super::info::{DATA_PATH, EPISODES_PATH, Info, VIDEO_PATH, WriterMetadata, da
 use super::reader::{LerobotReader, StoredConstant};
 use super::stats::{self, Stats};
 use super::table::{self, write_atomically};
-use super::{CONSTANTS, NO_TASK, TASK, values};
+use super::{CONSTANTS, FILES, NO_TASK, TASK, values};
 use crate::dataset::Location;
 use crate::dataset::episodes;
-use crate::dataset::{Constants, Reader as _, WriteMode, WriteOptions, Writer};
+use crate::dataset::{Constants, Reader as _, WriteMode, WriteOptions, Writer, with_stored};
 use crate::formats::column_files::remove_dataset;
 use arrow_array::builder::{ListBuilder, StringBuilder};
 use arrow_array::{ArrayRef, Float64Array, Int64Array, RecordBatch, StringArray};
@@ -22,7 +22,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 use swm_core::columns::ACTION;
-use swm_core::files::Lock;
+use swm_core::files::{self, Lock};
 use swm_core::{Batch, ColumnSpec, DType, Error, Result, Schema};
 use swm_video::{Encoder, Encoding};
 
@@ -83,7 +83,9 @@ impl LerobotWriter {
             return Err(Error::config("dataset", problem, fix));
         }
         if exists && options.mode == WriteMode::Overwrite {
-            remove_dataset(root)?;
+            // Refuses another program's folder that happens to have such a file.
+            Info::read(root)?;
+            remove_dataset(root, FILES)?;
         }
         let lock = Lock::folder(root)?;
         let mut writer = Self {
@@ -159,7 +161,7 @@ impl LerobotWriter {
                     chunk.zip(index_of(&path, "file-")).map(|(chunk, file)| chunk * self.info.chunks_size + file);
                 let temporary = path.extension().is_some_and(|suffix| suffix == "tmp");
                 if temporary || file.is_some_and(|file| file >= self.file) {
-                    std::fs::remove_file(&path).map_err(io)?;
+                    files::delete_file(&path)?;
                 }
             }
         }
@@ -220,7 +222,19 @@ impl LerobotWriter {
         Ok(())
     }
 
+    /// Commits the finished episodes, all or none.
     fn commit(&mut self) -> Result<()> {
+        let stored = self.info.total_episodes;
+        self.try_commit().map_err(|error| {
+            // Frees the space of files that no episode refers to.
+            if let Err(other) = self.remove_uncommitted() {
+                tracing::debug!("after {error}: {other}");
+            }
+            with_stored(error, stored)
+        })
+    }
+
+    fn try_commit(&mut self) -> Result<()> {
         self.last_commit = Instant::now();
         if self.group.episodes.is_empty() {
             return Ok(());

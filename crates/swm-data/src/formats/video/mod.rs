@@ -25,7 +25,7 @@ mod reader;
 mod writer;
 
 use crate::dataset::Location;
-use crate::formats::column_files::{contains_videos, exists};
+use crate::formats::column_files::{FILES, contains_videos, exists};
 use crate::formats::entry::{Backend, FormatEntry};
 #[cfg(feature = "ffmpeg")]
 use std::path::{Path, PathBuf};
@@ -35,6 +35,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
     id: "video",
     summary: "folder NAME.video of numpy's npz files and one MP4 per episode; the reference opens it",
     suffixes: &["video"],
+    files: FILES,
     feature: Some("ffmpeg"),
     detect,
     backend: BACKEND,

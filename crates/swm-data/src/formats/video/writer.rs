@@ -8,7 +8,7 @@ use crate::dataset::{Constants, Reader as _, WriteMode, WriteOptions, Writer};
 use crate::formats::column_files::{ColumnFilesWriter, exists};
 use rayon::prelude::*;
 use std::path::Path;
-use swm_core::{Batch, Error, Result, Schema};
+use swm_core::{Batch, Error, Result, Schema, files};
 use swm_video::{Encoding, encode};
 
 /// Frame rate of written videos, in frames per second: the reference's default.
@@ -23,26 +23,27 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
     } else {
         None
     };
-    let columns = ColumnFilesWriter::create(folder, schema, &options, known.as_ref())?;
-    for column in schema.columns().iter().filter(|column| column.is_image()) {
-        prepare(&folder.join(&column.name), columns.episodes())?;
-    }
+    let columns = ColumnFilesWriter::create(folder, schema, &options, known.as_ref(), discard)?;
     Ok(Box::new(VideoWriter { columns, schema: schema.clone(), encoding: Encoding::training(options.codec) }))
 }
 
-/// Creates the folder of an image column and removes videos of uncommitted episodes.
-fn prepare(folder: &Path, episodes: usize) -> Result<()> {
-    let io = |e| Error::io(folder, "preparing the folder", e);
-    std::fs::create_dir_all(folder).map_err(io)?;
+/// Deletes the videos of all episodes from `from` on, in the folder of an image column.
+fn discard(folder: &Path, from: usize) -> Result<()> {
+    let io = |e| Error::io(folder, "deleting videos of uncommitted episodes", e);
     for entry in std::fs::read_dir(folder).map_err(io)? {
         let entry = entry.map_err(io)?;
-        let name = entry.file_name().to_string_lossy().into_owned();
-        let episode = name.strip_prefix("ep_").and_then(|name| name.strip_suffix(".mp4")?.parse::<usize>().ok());
-        if name.ends_with(TEMPORARY_SUFFIX) || episode.is_some_and(|episode| episode >= episodes) {
-            std::fs::remove_file(entry.path()).map_err(io)?;
+        let is_video = entry.file_type().map_err(io)?.is_file();
+        if is_video && entry.file_name().to_str().and_then(episode_of).is_some_and(|episode| episode >= from) {
+            files::delete_file(&entry.path())?;
         }
     }
     Ok(())
+}
+
+/// The episode in the name of a video or of an incomplete video.
+fn episode_of(name: &str) -> Option<usize> {
+    let name = name.strip_suffix(TEMPORARY_SUFFIX).or_else(|| name.strip_suffix(".mp4"))?;
+    name.strip_prefix("ep_")?.parse().ok()
 }
 
 /// Suffix of incomplete videos.
@@ -59,7 +60,7 @@ impl Writer for VideoWriter {
         episodes::check_episode(episode, &self.schema)?;
         let (folder, position) = (self.columns.folder(), self.columns.episodes());
         let images = self.schema.columns().par_iter().enumerate().filter(|(_, column)| column.is_image());
-        images.try_for_each(|(index, column)| {
+        let written = images.try_for_each(|(index, column)| {
             let frames = episode.bytes(index).chunks_exact(column.row_bytes());
             let bytes = encode(column.shape[1], column.shape[0], FPS, self.encoding, frames)?;
             let path = video_path(folder, &column.name, position);
@@ -67,7 +68,8 @@ impl Writer for VideoWriter {
             let io = |e| Error::io(&path, "writing a video", e);
             std::fs::write(&temporary, bytes).map_err(io)?;
             std::fs::rename(&temporary, &path).map_err(io)
-        })?;
+        });
+        written.map_err(|error| self.columns.fail(error))?;
         self.columns.write(episode, constants)
     }
 

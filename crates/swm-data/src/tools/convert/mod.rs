@@ -9,7 +9,7 @@ pub use comparison::ColumnComparison;
 
 use crate::dataset::episodes::describe_columns;
 use crate::dataset::{CommitPolicy, Constants, Location, Reader, StepRange, WriteMode, WriteOptions};
-use crate::formats::{FORMATS, FormatEntry, create, open};
+use crate::formats::{FORMATS, FormatEntry, create, detect, open};
 use comparison::{data_columns, dataset_hash, episode_hash};
 use serde::Serialize;
 use std::ops::Range;
@@ -18,7 +18,7 @@ use std::sync::mpsc::{Receiver, SyncSender, channel, sync_channel};
 use std::thread::scope;
 use swm_core::columns::ACTION;
 use swm_core::run::{Control, Event, Progress, Stage};
-use swm_core::{Batch, DType, Error, Result, Schema};
+use swm_core::{Batch, DType, Error, Result, Schema, files};
 use swm_image::ImageCodec;
 
 /// The unit of progress.
@@ -114,6 +114,7 @@ pub fn convert(
     options: &ConvertOptions,
     control: &mut Control<'_>,
 ) -> Result<Converted> {
+    let is_new = target.path().is_some_and(|path| !path.exists());
     let source = Source::new(&**reader);
     let format = options.format.as_deref().map(|id| FORMATS.get(id)).transpose()?;
     let all = reader.episodes().len();
@@ -158,9 +159,15 @@ pub fn convert(
             ConvertMode::Create => WriteMode::Create,
             ConvertMode::Overwrite => WriteMode::Overwrite,
         };
-        let write = WriteOptions { mode, codec: options.codec, manifest: reader.manifest(), commit: options.commit };
+        let exclusive = options.mode != ConvertMode::Append;
+        let write =
+            WriteOptions { mode, codec: options.codec, manifest: reader.manifest(), commit: options.commit, exclusive };
         let hashed = options.verify.then_some(&mut hashes[..]);
-        source.copy(target, format, write, first..all, hashed, &mut report, control)?;
+        let copied = source.copy(target, format, write, first..all, hashed, &mut report, control);
+        if is_new && copied.is_err() {
+            remove_if_empty(target, format);
+        }
+        copied?;
     }
     report.episodes = base + all;
     if options.verify {
@@ -194,6 +201,21 @@ fn open_existing(target: &Location, format: Option<&FormatEntry>) -> Result<Opti
 
 fn reopen(target: &Location, format: Option<&FormatEntry>) -> Result<Arc<dyn Reader>> {
     format.map_or_else(|| open(target), |format| format.open(target))
+}
+
+/// Deletes a dataset on this machine without episodes, which a failed conversion leaves.
+fn remove_if_empty(target: &Location, format: Option<&FormatEntry>) {
+    let Some((path, format)) = target.path().zip(format.or_else(|| detect(target))) else { return };
+    if !format.open(target).is_ok_and(|written| written.episodes().is_empty()) {
+        return;
+    }
+    let removed = format.remove(path).and_then(|remaining| {
+        remaining.iter().filter(|path| path.is_dir()).try_for_each(|path| files::remove_empty_folder(path))?;
+        if path.exists() { files::remove_empty_folder(path) } else { Ok(()) }
+    });
+    if let Err(error) = removed {
+        tracing::warn!("an empty dataset could not be deleted: {error}");
+    }
 }
 
 /// The error for a target whose content is not the beginning of the source.

@@ -1,6 +1,5 @@
 //! Videos for viewing: H.264 in MP4, which browsers play.
 
-use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use swm_core::{Error, Result};
 
@@ -104,21 +103,7 @@ impl VideoFile {
             return Err(Error::config(what, "there is no frame to write", "record at least one step"));
         }
         let bytes = self.inner.finish()?;
-        let Some(name) = self.path.file_name() else {
-            let problem = format!("'{}' names no file", self.path.display());
-            return Err(Error::config("video path", problem, "end it in .mp4"));
-        };
-        // With the process id in the name, processes that write the same video use different temporary files.
-        let mut hidden = OsString::from(".");
-        hidden.push(name);
-        hidden.push(format!(".{}.partial", std::process::id()));
-        let temporary = self.path.with_file_name(hidden);
-        let written = std::fs::write(&temporary, bytes).and_then(|()| std::fs::rename(&temporary, &self.path));
-        written.map_err(|source| {
-            // Removing fails if the file was never created.
-            let _ = std::fs::remove_file(&temporary);
-            Error::io(&self.path, "writing the video", source)
-        })
+        swm_core::files::write(&self.path, &bytes)
     }
 }
 
@@ -168,6 +153,7 @@ mod encoder {
 #[cfg(all(test, feature = "ffmpeg"))]
 mod tests {
     use super::*;
+    use std::ffi::OsString;
     use swm_video::{DecoderPool, FrameRequest, Source, Video};
 
     fn frames(width: usize, height: usize, n: usize) -> Vec<Vec<u8>> {

@@ -1,0 +1,56 @@
+//! Two writers of one dataset: exclusive writers refuse each other, so that two continued collections cannot store the
+//! same episodes twice.
+
+use crate::sample::{check, episode, options, schema, write};
+use swm_data::lance::{Shard, create_shard};
+use swm_data::{CommitPolicy, Location, WriteMode, WriteOptions, create, open};
+
+fn exclusive(mode: WriteMode) -> WriteOptions {
+    let commit = CommitPolicy { episodes: 1, ..CommitPolicy::default() };
+    WriteOptions { exclusive: true, commit, ..options(mode) }
+}
+
+#[test]
+fn second_collection_into_a_dataset_is_refused() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    for format in ["lance", "lance-video", "folder", "video", "h5", "lerobot"] {
+        let path = folder.path().join(format!("data.{format}"));
+        write(&path, WriteMode::Create, 1, 0..2);
+        let mut first = create(&path, &schema(), exclusive(WriteMode::Append)).expect("continuing");
+        for mode in [WriteMode::Append, WriteMode::Overwrite] {
+            let error = create(&path, &schema(), exclusive(mode)).err().expect("a second writer");
+            assert!(error.is_usage() && error.to_string().contains("another process writes"), "{format}: {error}");
+        }
+        first.write_episode(&episode(2)).expect("writing");
+        first.finish().expect("finishing");
+        let reader = open(&path).expect("opening");
+        assert_eq!(reader.episodes().len(), 3, "{format}");
+        check(&*reader, 0);
+    }
+}
+
+#[test]
+fn exclusive_writer_fails_when_another_writer_commits() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let path = folder.path().join("data.lance");
+    write(&path, WriteMode::Create, 1, 0..2);
+    let mut writer = create(&path, &schema(), exclusive(WriteMode::Append)).expect("continuing");
+    // As in an object store, the other writer takes no lock.
+    write(&path, WriteMode::Append, 1, 2..3);
+    let failed = writer.write_episode(&episode(2)).and_then(|()| writer.finish()).expect_err("another writer");
+    assert!(failed.to_string().contains("another process writes to it"), "{failed}");
+    let reader = open(&path).expect("opening");
+    assert_eq!(reader.episodes().len(), 3);
+    check(&*reader, 0);
+}
+
+#[test]
+fn second_writer_of_a_shard_is_refused() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let location = Location::from(folder.path().join("data.lance"));
+    let shard = |index| create_shard(&location, &schema(), exclusive(WriteMode::Append), Shard { index, count: 2 });
+    let _first = shard(0).expect("creating");
+    let error = shard(0).err().expect("a second writer").to_string();
+    assert!(error.contains("another process writes"), "{error}");
+    shard(1).expect("another shard");
+}

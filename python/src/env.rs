@@ -9,7 +9,9 @@ use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 use std::sync::{Mutex, MutexGuard, PoisonError};
-use swm::core::{Action, Batch, CameraView, DType, Env, Error, FrameMut, Key, Origin, Schema, Snapshot, thread_budget};
+use swm::core::{
+    Action, Batch, CameraView, DType, Env, Error, FrameMut, Key, Origin, Schema, Snapshot, limits, thread_budget,
+};
 
 /// A single native environment.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
@@ -96,6 +98,7 @@ impl NativeEnv {
     fn render<'py>(&self, py: Python<'py>, height: usize, width: usize, goal: bool) -> PyResult<Bound<'py, PyAny>> {
         let mut state = self.lock();
         let state = &mut *state;
+        limits::IMAGE_SIDE.check(height.max(width)).map_err(to_py_err)?;
         let mut rgb = vec![0; height * width * 3];
         let frame = FrameMut::new(width, height, &mut rgb);
         let draw = || if goal { state.env.render_goal(frame) } else { state.env.render(frame) };
@@ -112,6 +115,7 @@ impl NativeEnv {
         width: usize,
     ) -> PyResult<Bound<'py, PyAny>> {
         let view = CameraView::parse(view).map_err(to_py_err)?;
+        limits::IMAGE_SIDE.check(height.max(width)).map_err(to_py_err)?;
         let column = view.column(height, width);
         let mut bytes = vec![0; column.row_bytes()];
         let mut state = self.lock();

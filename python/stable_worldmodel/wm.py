@@ -37,9 +37,7 @@ class Model:
         trust: Whether the checkpoint may choose an environment that imports a Python module, which `get_action` makes.
     """
 
-    def __init__(
-        self, name: str, device: str = "cpu", objective: dict[str, Any] | None = None, *, trust: bool = False
-    ) -> None:
+    def __init__(self, name: str, device: str = "cpu", objective: dict[str, Any] | None = None, *, trust: bool = False) -> None:
         self._engine_model = _engine.Model(str(name), device, json.dumps(objective), bool(trust))
         #: The checkpoint info: `family`, `env`, `image`, `action_block`, `history`, `config`, `weights`, `action_mean` and
         #: `action_std`.

@@ -159,6 +159,13 @@ impl Error {
         Self::UnknownName { kind, given: given.to_owned(), nearest: nearest(given, known), hint: hint.into() }
     }
 
+    /// An [`Error::External`] for a panic, as `catch_unwind` and a joined thread return it. `context` says what panicked.
+    pub fn panicked(context: &str, panic: &(dyn std::any::Any + Send)) -> Self {
+        let text = panic.downcast_ref::<&str>().copied();
+        let text = text.or_else(|| panic.downcast_ref::<String>().map(String::as_str));
+        Self::external(context, text.unwrap_or("the panic has no message"))
+    }
+
     /// Whether user input caused the error, which is exit code 2 of the command line.
     pub fn is_usage(&self) -> bool {
         matches!(self, Self::UnknownName { .. } | Self::OutOfSpace { .. } | Self::Config { .. })

@@ -14,7 +14,8 @@
 //! 6. [`run`]: progress and interruption of long commands. [`registry`], [`manifest`], [`results`], [`error`]: names,
 //!    provenance, evaluation results and errors. [`files`]: reading, replacing and deleting files. [`home`]: the home
 //!    folder. [`text`]: text from files, made safe to print. [`origin`]: names that only the user may choose.
-//!    [`finite`]: counts of NaN and infinite values.
+//!    [`finite`]: counts of NaN and infinite values. [`limits`]: the largest counts that
+//!    commands accept.
 
 pub mod batch;
 pub mod camera_view;
@@ -28,6 +29,7 @@ pub mod files;
 pub mod finite;
 pub mod home;
 pub mod key;
+pub mod limits;
 pub mod manifest;
 pub mod origin;
 mod parallelism;

@@ -24,18 +24,10 @@ impl Limit {
     /// # Errors
     /// When it is too large.
     pub fn check(self, given: usize) -> Result<()> {
-        self.check_as(self.what, given)
-    }
-
-    /// Checks a count that has a name of its own.
-    ///
-    /// # Errors
-    /// When it is too large.
-    pub fn check_as(self, what: &str, given: usize) -> Result<()> {
         if given <= self.max {
             return Ok(());
         }
-        Err(Error::config(what, format!("{given} is too large"), format!("choose at most {}", self.max)))
+        Err(Error::config(self.what, format!("{given} is too large"), format!("choose at most {}", self.max)))
     }
 }
 
@@ -55,9 +47,13 @@ pub const EVALUATED_EPISODES: Limit = Limit::new("number of evaluated episodes",
 pub const STEPS: Limit = Limit::new("number of steps", 1_000_000_000);
 /// Shards of a dataset.
 pub const SHARDS: Limit = Limit::new("number of shards", 1_000_000);
-/// A count of a solver or of model-predictive control: samples, iterations, steps of the horizon.
-pub const SEARCH: Limit = Limit::new("setting of the search", 1_000_000);
-/// Bytes of the observations and frames of all environments, and of the candidate plans of a search.
+/// Model steps of a plan, of its history, and of prediction errors.
+pub const MODEL_STEPS: Limit = Limit::new("number of model steps", 10_000);
+/// Candidates of a solver.
+pub const SAMPLES: Limit = Limit::new("number of samples", 1_000_000);
+/// Values of all candidates of one iteration of a solver: 4 GiB.
+pub const CANDIDATE_VALUES: Limit = Limit::new("values of all candidates", 1 << 30);
+/// Bytes of the observations and frames of all environments.
 pub const BATCH_BYTES: Limit = Limit::new("bytes of a batch", 16 << 30);
 
 #[cfg(test)]

@@ -9,7 +9,7 @@ use crate::batch::{Batch, ColumnSpec, DType, RowMut, Schema};
 use crate::columns::{self, ColumnIndices};
 use crate::parallelism::Parallelism;
 use crate::thread_budget;
-use crate::{Action, CameraView, Env, EnvSpec, Error, FrameMut, PendingCall, ResetOptions, Result};
+use crate::{Action, CameraView, Env, EnvSpec, Error, FrameMut, PendingCall, ResetOptions, Result, limits};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -101,6 +101,7 @@ struct Slot {
 /// # Errors
 /// When the operating system cannot start the threads.
 pub fn threads(n: usize) -> Result<Arc<rayon::ThreadPool>> {
+    limits::THREADS.check(n)?;
     let pool = rayon::ThreadPoolBuilder::new().num_threads(n).thread_name(|i| format!("swm-{i}")).build();
     pool.map(Arc::new).map_err(|error| Error::external("starting worker threads", error))
 }
@@ -138,7 +139,12 @@ impl EnvPool {
             return Err(Error::config("number of environments", "0", "choose at least 1"));
         };
         let spec = first.spec();
+        limits::ENVS.check(envs.len())?;
+        let (height, width) = image.unwrap_or_default();
+        limits::IMAGE_SIDE.check(height.max(width))?;
         let (schema, columns) = PoolColumns::add(spec.columns.clone(), image, views)?;
+        let row_bytes = schema.columns().iter().map(ColumnSpec::row_bytes);
+        limits::BATCH_BYTES.check(row_bytes.fold(0, usize::saturating_add).saturating_mul(envs.len()))?;
         let max_episode_steps = max_episode_steps.unwrap_or(spec.max_episode_steps);
         Ok(Self {
             infos: Batch::zeros(&schema, envs.len()),

@@ -33,7 +33,7 @@ use swm_core::finite::not_finite;
 use swm_core::pool::Reset;
 use swm_core::run::{Control, Progress};
 use swm_core::{
-    Batch, ColumnSpec, DType, EnvPool, EnvSpec, Error, Key, Manifest, Policy, Result, Schema, VariationRequest,
+    Batch, ColumnSpec, DType, EnvPool, EnvSpec, Error, Key, Manifest, Policy, Result, Schema, VariationRequest, limits,
 };
 use swm_data::{Constants, Writer};
 
@@ -113,6 +113,7 @@ impl World {
         control: &mut Control<'_>,
     ) -> Result<Collected> {
         let layout = Layout::of(self.pool().infos().schema(), self.spec(), config.goal)?;
+        limits::EPISODES.check(config.episodes)?;
         let first = writer.episodes();
         let threads = self.pool().threads().clone();
         let mut check = FiniteCheck::new(&layout, config);
@@ -389,7 +390,7 @@ impl Collection<'_> {
         }
         match writing.join() {
             Ok(outcome) => outcome?,
-            Err(panic) => std::panic::resume_unwind(panic),
+            Err(panic) => return Err(Error::panicked("the thread that stores episodes panicked", &*panic)),
         }
         Ok(Collected { episodes: self.stored, added: self.stored - self.first, steps: self.steps })
     }

@@ -6,7 +6,7 @@
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use swm_core::results::Counting;
-use swm_core::{Error, Manifest, Result, VariationRequest};
+use swm_core::{Error, Manifest, Result, VariationRequest, limits};
 use swm_data::{Part, Split};
 
 /// An evaluation: policies, environment, starts, and counting.
@@ -48,7 +48,7 @@ pub struct EvalRequest {
 }
 
 /// The longest side of a frame, in pixels.
-pub const MAX_SIDE: usize = 4096;
+pub const MAX_SIDE: usize = limits::IMAGE_SIDE.max;
 
 /// A solver or a wrapper, with settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -194,6 +194,12 @@ impl EvalRequest {
     /// When there is no condition, two policies or conditions share a name, frames are larger than [`MAX_SIDE`], or
     /// prediction errors are requested without a dataset.
     pub fn check(&self) -> Result<()> {
+        limits::EVALUATED_EPISODES.check(self.episodes)?;
+        limits::STEPS.check(self.budget.unwrap_or_default())?;
+        limits::MODEL_STEPS.check(self.prediction.unwrap_or_default())?;
+        if let StartsRequest::Dataset { goal_offset, .. } = self.starts {
+            limits::STEPS.check(goal_offset)?;
+        }
         if self.conditions.is_empty() {
             return Err(Error::config("conditions of an evaluation", "the list is empty", "name at least one"));
         }

@@ -9,7 +9,7 @@ use swm_core::columns::{flat, flat_factor};
 use swm_core::pool::Reset;
 use swm_core::{
     Batch, Callable, ColumnSpec, DatasetStart, Env, EnvPool, Error, Key, ResetOptions, Result, Schema,
-    VariationRequest, dataset_start,
+    VariationRequest, dataset_start, limits,
 };
 use swm_data::{Reader, StepRange};
 
@@ -78,6 +78,7 @@ impl Starts {
         calls: &[Callable],
     ) -> Result<Self> {
         check_count(picks.len())?;
+        limits::STEPS.check(goal_offset)?;
         let columns = unshifted(dataset_start::required_columns(env, reader.schema(), calls)?, env, &variation)?;
         let mut ranges = Vec::with_capacity(2 * picks.len());
         for &[episode, step] in &picks {
@@ -231,6 +232,7 @@ fn no_episode(reader: &dyn Reader, episode: usize) -> Error {
 }
 
 fn check_count(n: usize) -> Result<()> {
+    limits::EVALUATED_EPISODES.check(n)?;
     if n > 0 {
         return Ok(());
     }

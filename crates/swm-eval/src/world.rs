@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use swm_core::pool::{Reset, threads};
 use swm_core::run::Control;
 use swm_core::{
-    Batch, CameraView, Env, EnvChoice, EnvPool, EnvSpec, Error, Key, Policy, Result, Schema, VariationRequest,
+    Batch, CameraView, Env, EnvChoice, EnvPool, EnvSpec, Error, Key, Policy, Result, Schema, VariationRequest, limits,
 };
 
 /// The size of a world and the frames it renders.
@@ -66,6 +66,11 @@ impl World {
                 "choose at least one pixel in each dimension, or no frames",
             ));
         }
+        limits::ENVS.check(config.envs)?;
+        limits::THREADS.check(config.threads)?;
+        let (height, width) = config.image.unwrap_or_default();
+        limits::IMAGE_SIDE.check(height.max(width))?;
+        limits::STEPS.check(config.max_episode_steps.unwrap_or_default())?;
         if config.max_episode_steps == Some(0) {
             return Err(Error::config("steps of an episode", "0", "choose at least 1"));
         }

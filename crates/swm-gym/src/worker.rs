@@ -16,10 +16,11 @@ use std::os::unix::net::UnixStream;
 use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Child, ChildStderr, Command, Stdio};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
-use swm_core::Error;
+use swm_core::{Error, limits};
 
 /// The number of last lines of a worker's standard error in error messages.
 const LINES: usize = 20;
@@ -47,6 +48,32 @@ struct Process {
     /// Whether the answer to a sent request is not read yet. Meanwhile only the worker accesses the memory.
     pending: bool,
     tail: Tail,
+    _counted: Counted,
+}
+
+/// The number of running worker processes.
+static RUNNING: AtomicUsize = AtomicUsize::new(0);
+
+/// One of the running worker processes.
+struct Counted;
+
+impl Counted {
+    /// Counts a process.
+    ///
+    /// # Errors
+    /// When there are [`limits::WORKERS`] already.
+    fn new() -> swm_core::Result<Self> {
+        let running = RUNNING.fetch_add(1, Ordering::Relaxed);
+        let counted = Self;
+        limits::WORKERS.check(running + 1)?;
+        Ok(counted)
+    }
+}
+
+impl Drop for Counted {
+    fn drop(&mut self) {
+        RUNNING.fetch_sub(1, Ordering::Relaxed);
+    }
 }
 
 impl WorkerTransport {
@@ -201,6 +228,7 @@ impl Transport for WorkerTransport {
 
 impl Process {
     fn start(id: &str, python: &Python) -> swm_core::Result<Self> {
+        let counted = Counted::new()?;
         let shared = if Path::new("/dev/shm").is_dir() { "/dev/shm".into() } else { std::env::temp_dir() };
         let file = tempfile::tempfile_in(&shared).map_err(|error| Error::io(&shared, "making shared memory", error))?;
         let io = |error| Error::external("starting a worker", error);
@@ -236,7 +264,7 @@ impl Process {
             Error::config("Python", format!("{python} cannot be started: {error}"), python.fix("gymnasium"))
         })?;
         let tail = Tail::of(child.stderr.take(), id);
-        Ok(Self { child, socket, file, memory: None, pending: false, tail })
+        Ok(Self { child, socket, file, memory: None, pending: false, tail, _counted: counted })
     }
 
     fn send(&mut self, op: u8, payload: &[u8]) -> std::io::Result<()> {

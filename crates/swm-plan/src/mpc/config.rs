@@ -3,7 +3,7 @@
 use crate::search::Settings;
 use serde::{Deserialize, Serialize};
 use std::time::{Duration, Instant};
-use swm_core::{Error, Result};
+use swm_core::{Error, Result, limits};
 
 /// The planning horizon and the number of steps to execute before replanning.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -35,7 +35,7 @@ impl Default for MpcConfig {
 }
 
 /// The largest number of steps of a setting. Plans of more steps would not fit into memory.
-const MAX_STEPS: usize = 10_000;
+const MAX_STEPS: usize = limits::MODEL_STEPS.max;
 
 impl MpcConfig {
     /// Checks the settings.

@@ -3,7 +3,6 @@
 //! The wrapper measures the time spent in the model, so that the planner's own time is known, and turns a panic of the
 //! model into an error.
 
-use std::any::Any;
 use std::cell::RefCell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::Instant;
@@ -22,12 +21,7 @@ pub(crate) struct GuardedModel<'m> {
 pub(crate) fn catch_panic<T>(who: &str, doing: &str, work: impl FnOnce() -> Result<T>) -> Result<T> {
     // A panic may leave values inconsistent, but the error ends the run, so these values are not used again.
     catch_unwind(AssertUnwindSafe(work))
-        .unwrap_or_else(|panic| Err(Error::external(format!("{who} panicked while {doing}"), message(&*panic))))
-}
-
-fn message(panic: &(dyn Any + Send)) -> &str {
-    let text = panic.downcast_ref::<&str>().copied();
-    text.or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("the panic has no message")
+        .unwrap_or_else(|panic| Err(Error::panicked(&format!("{who} panicked while {doing}"), &*panic)))
 }
 
 fn not_offered(what: &str) -> Error {

@@ -6,7 +6,7 @@ use super::problem::evaluate;
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 use rayon::prelude::*;
-use swm_core::{Candidates, CostModel, Error, Key, Plan, PlanProblem, PlanTrace, Result};
+use swm_core::{Candidates, CostModel, Error, Key, Plan, PlanProblem, PlanTrace, Result, limits};
 
 /// Candidate action sequences of several environments, and their costs.
 pub struct Population {
@@ -21,8 +21,8 @@ pub struct Population {
     dim: usize,
 }
 
-/// The largest number of values of all candidates of one iteration: 4 GiB.
-pub const MAX_VALUES: usize = 1 << 30;
+/// The largest number of values of all candidates of one iteration.
+pub const MAX_VALUES: usize = limits::CANDIDATE_VALUES.max;
 
 impl Population {
     /// Creates a population of zeros with `samples` candidates for each environment. Draws are keyed by `solver`, so

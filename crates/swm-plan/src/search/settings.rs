@@ -1,9 +1,9 @@
 //! [`Settings`]: the checks of configuration values that solvers, objectives and the MPC policy share.
 
-use swm_core::{Error, Result};
+use swm_core::{Error, Result, limits};
 
 /// The largest number of candidates of a solver.
-const MAX_SAMPLES: usize = 1_000_000;
+const MAX_SAMPLES: usize = limits::SAMPLES.max;
 
 /// Checks the settings of one owner (a solver, a term, the policy). Error messages begin with the owner's name.
 #[derive(Clone, Copy)]

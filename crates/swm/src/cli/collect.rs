@@ -8,7 +8,7 @@ use crate::{collect_target, home};
 use clap::Args;
 use serde_json::json;
 use std::time::Instant;
-use swm_core::{CameraView, EnvChoice, Manifest, Origin, Result, Schema};
+use swm_core::{CameraView, EnvChoice, Manifest, Origin, Result, Schema, limits};
 use swm_data::lance::{Shard, create_shard};
 use swm_data::{FORMATS, ImageCodec, Location, WriteMode, WriteOptions, Writer};
 use swm_eval::{CollectConfig, Collected, World, WorldConfig};
@@ -158,6 +158,8 @@ pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
 /// Collects, and shows progress.
 pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> {
     let Collection { env, location, config, .. } = collection;
+    limits::EPISODES.check(config.episodes)?;
+    limits::SHARDS.check(collection.shard.map_or(0, |shard| shard.count))?;
     let (stack, goal) = collection.wrappers.stack()?;
     let mut world = World::of(|| Ok(stack.wrap(env.env()?, goal)), collection.world.clone())?;
     let (mut policy, weights) = policy_by_name(&env.entry, collection.policy, &world)?;

@@ -95,7 +95,7 @@ impl VariationArgs {
 /// # Errors
 /// When the text is malformed or a side is not within 4 to 4096.
 pub fn image_size(given: &str) -> std::result::Result<(usize, usize), String> {
-    let parse = |s: &str| s.trim().parse::<usize>().ok().filter(|n| (4..=4096).contains(n));
+    let parse = |s: &str| s.trim().parse::<usize>().ok().filter(|n| (4..=swm_core::limits::IMAGE_SIDE.max).contains(n));
     let size = match given.split_once('x') {
         Some((height, width)) => parse(height).zip(parse(width)),
         None => parse(given).map(|n| (n, n)),

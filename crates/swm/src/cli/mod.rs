@@ -29,9 +29,12 @@ mod wrappers;
 
 use clap::{Parser, Subcommand};
 use output::{emit, emit_json, eprint, table};
+use std::backtrace::{Backtrace, BacktraceStatus};
 use std::ffi::OsString;
+use std::panic::{AssertUnwindSafe, PanicHookInfo, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use swm_core::limits;
 
 /// Collect data from environments, train world models, plan, evaluate, report
 #[derive(Parser)]
@@ -180,7 +183,10 @@ impl Cli {
             )
             .without_time()
             .try_init();
-        match self.dispatch() {
+        std::panic::set_hook(Box::new(print_panic));
+        // A panic of the main thread, or of a thread that it joins, ends the run as an error does.
+        let outcome = catch_unwind(AssertUnwindSafe(|| self.dispatch()));
+        match outcome.unwrap_or_else(|panic| Err(swm_core::Error::panicked("the command panicked", &*panic).into())) {
             Ok(()) => 0,
             Err(error) => {
                 // An error of this engine is one complete line; other errors are printed with their causes.
@@ -197,6 +203,7 @@ impl Cli {
 
     fn dispatch(self) -> anyhow::Result<()> {
         let json = self.json;
+        limits::THREADS.check(self.threads)?;
         swm_mujoco::render::choose(self.renderer);
         match self.command {
             Command::Envs(args) => envs::envs(&args, json),
@@ -239,6 +246,18 @@ impl Context {
         })
         .ok();
         Self { json, threads, interrupt }
+    }
+}
+
+/// Prints a panic as one line, and its backtrace only if `RUST_BACKTRACE` asks for one. It holds no lock while it
+/// captures the backtrace, and the program ends if there is no memory for it.
+fn print_panic(panic: &PanicHookInfo<'_>) {
+    let (thread, message) = (std::thread::current(), panic.payload_as_str().unwrap_or("no message"));
+    let place = panic.location().map_or(String::new(), |location| format!(" ({location})"));
+    eprint(&format!("internal error in the thread '{}': {message}{place}\n", thread.name().unwrap_or("?")));
+    let backtrace = Backtrace::capture();
+    if backtrace.status() == BacktraceStatus::Captured {
+        eprint(&format!("{backtrace}\n"));
     }
 }
 

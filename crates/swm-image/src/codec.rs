@@ -39,7 +39,7 @@ impl ImageCodec {
     /// Encodes one RGB image, `[height, width, 3]`, and appends it to `out`. Equal images give equal bytes.
     ///
     /// # Errors
-    /// When a side is 0 or above 65535, or `rgb` has another length.
+    /// When a side is 0 or above 65535, there are more than [`MAX_PIXELS`], or `rgb` has another length.
     pub fn encode(self, rgb: &[u8], height: usize, width: usize, out: &mut Vec<u8>) -> Result<()> {
         let (Ok(h), Ok(w)) = (u16::try_from(height), u16::try_from(width)) else {
             return Err(Error::mismatch(
@@ -48,6 +48,7 @@ impl ImageCodec {
                 "sides below 65536",
             ));
         };
+        check_pixels(height, width)?;
         if rgb.len() != height * width * 3 || rgb.is_empty() {
             return Err(Error::mismatch(
                 "encoding an image",
@@ -101,16 +102,38 @@ impl FileFormat {
     }
 }
 
+/// The pixel budget: the most pixels of an image in a file, whatever its format. Headers can state any size.
+pub const MAX_PIXELS: usize = 1 << 26;
+
+/// Checks a size from a header against [`MAX_PIXELS`].
+pub(crate) fn check_pixels(height: usize, width: usize) -> Result<()> {
+    match height.checked_mul(width) {
+        Some(pixels) if pixels <= MAX_PIXELS => Ok(()),
+        _ => Err(Error::mismatch(
+            "reading the header of an image",
+            format!("{height} x {width} pixels"),
+            format!("at most {MAX_PIXELS} pixels"),
+        )),
+    }
+}
+
 /// Returns the height and width of an encoded image, from its header.
 ///
 /// # Errors
-/// When the bytes are neither JPEG, PNG nor QOI, or the header is damaged.
+/// When the bytes are neither JPEG, PNG nor QOI, the header is damaged, or it states more than [`MAX_PIXELS`].
 pub fn image_size(bytes: &[u8]) -> Result<(usize, usize)> {
-    match FileFormat::of(bytes)? {
-        FileFormat::Jpeg => Ok(jpeg::Decoder::new(bytes)?.size()),
-        FileFormat::Png => Ok(png_file::Decoder::new(bytes)?.size()),
-        FileFormat::Qoi => qoi::size(bytes),
-    }
+    let (height, width) = match FileFormat::of(bytes)? {
+        FileFormat::Jpeg => jpeg::Decoder::new(bytes)?.size(),
+        FileFormat::Png => png_file::Decoder::new(bytes)?.size(),
+        FileFormat::Qoi => qoi::size(bytes)?,
+    };
+    check_pixels(height, width)?;
+    Ok((height, width))
+}
+
+/// Returns whether bytes begin as a JPEG, PNG or QOI file does.
+pub fn is_image(bytes: &[u8]) -> bool {
+    FileFormat::of(bytes).is_ok()
 }
 
 /// Decodes an image into `out`, `[height, width, 3]` RGB bytes.
@@ -118,6 +141,7 @@ pub fn image_size(bytes: &[u8]) -> Result<(usize, usize)> {
 /// # Errors
 /// When the bytes are neither JPEG, PNG nor QOI, are damaged, or hold an image of another size.
 pub fn decode(bytes: &[u8], height: usize, width: usize, out: &mut [u8]) -> Result<()> {
+    check_pixels(height, width)?;
     let length = out.len();
     let check = |given: (usize, usize)| {
         if given == (height, width) && length == height * width * 3 {
@@ -189,6 +213,31 @@ mod tests {
             let (rgb, decoded) = round_trip(ImageCodec::Jpeg { quality: 95 }, height, width);
             let error: f64 = rgb.iter().zip(&decoded).map(|(&a, &b)| f64::from(a.abs_diff(b))).sum();
             assert!(error / rgb.len() as f64 <= 6.0, "{height} x {width}: {}", error / rgb.len() as f64);
+        }
+    }
+
+    #[test]
+    fn headers_with_absurd_sizes_are_errors() {
+        let mut png = vec![];
+        png_file::encode(&test_image(4, 4), 4, 4, &mut png).expect("an encoded image");
+        let crc = |bytes: &[u8]| {
+            let step = |crc: u32, byte: &u8| {
+                (0..8).fold(crc ^ u32::from(*byte), |crc, _| crc >> 1 ^ if crc & 1 == 1 { 0xedb8_8320 } else { 0 })
+            };
+            !bytes.iter().fold(!0, step)
+        };
+        for side in [65535_u32, u32::MAX / 2, u32::MAX] {
+            png[16..20].copy_from_slice(&side.to_be_bytes());
+            png[20..24].copy_from_slice(&side.to_be_bytes());
+            let sum = crc(&png[12..29]);
+            png[29..33].copy_from_slice(&sum.to_be_bytes());
+            let qoi =
+                [b"qoif".as_slice(), &side.to_be_bytes(), &side.to_be_bytes(), &[3, 0], &[0xc0, 0, 0, 0]].concat();
+            for bytes in [&png, &qoi] {
+                assert!(image_size(bytes).is_err() && is_image(bytes), "{side}");
+                assert!(decode(bytes, side as usize, side as usize, &mut [0; 48]).is_err(), "{side}");
+                assert!(decode(bytes, 4, 4, &mut [0; 48]).is_err(), "{side}");
+            }
         }
     }
 

@@ -14,6 +14,6 @@ mod qoi;
 pub mod resize;
 mod rgb_image;
 
-pub use codec::{ImageCodec, decode, image_size};
+pub use codec::{ImageCodec, MAX_PIXELS, decode, image_size, is_image};
 pub use png_file::{read_png, write_png};
 pub use rgb_image::RgbImage;

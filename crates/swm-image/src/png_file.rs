@@ -1,14 +1,12 @@
 //! PNG: encoding and decoding of stored frames in memory, and reading and writing of image files.
 
 use crate::RgbImage;
+use crate::codec::check_pixels;
 use png::{Compression, EncodingError, Filter, Transformations};
 use std::fs::File;
 use std::io::{BufReader, BufWriter, Cursor};
 use std::path::Path;
-use swm_core::{Error, Result};
-
-/// The maximum size of the pixels of a PNG file in memory, in bytes.
-const MAX_BYTES: usize = 1 << 30;
+use swm_core::{Error, Result, files};
 
 /// Appends an RGB image, `[height, width, 3]`, as a PNG file tuned for fast decoding.
 ///
@@ -76,16 +74,16 @@ fn rgb_of(pixel: &[u8]) -> [u8; 3] {
 /// Reads a PNG file of any kind: grey is repeated in all three channels, 16 bits become 8, opacity is dropped.
 ///
 /// # Errors
-/// When the file cannot be opened, is damaged, or takes more than 1 GiB in memory.
+/// When the file cannot be opened, is damaged, or has more than [`crate::MAX_PIXELS`].
 pub fn read_png(path: &Path) -> Result<RgbImage> {
     let damaged = |problem: String| Error::corrupt(path, problem, "give a readable PNG file");
-    let file = File::open(path).map_err(|source| Error::io(path, "opening an image", source))?;
+    let file = files::open(path)?;
     let mut decoder = png::Decoder::new(BufReader::new(file));
     decoder.set_transformations(Transformations::EXPAND | Transformations::STRIP_16);
     let mut reader = decoder.read_info().map_err(|error| damaged(error.to_string()))?;
     let (width, height) = (reader.info().width as usize, reader.info().height as usize);
-    let bytes = reader.output_buffer_size().filter(|&bytes| bytes <= MAX_BYTES);
-    let bytes = bytes.ok_or_else(|| damaged(format!("its pixels take more than {} MiB in memory", MAX_BYTES >> 20)))?;
+    check_pixels(height, width).map_err(|error| damaged(error.to_string()))?;
+    let bytes = reader.output_buffer_size().ok_or_else(|| damaged("its pixels do not fit into memory".to_owned()))?;
     let mut raw = vec![0; bytes];
     reader.next_frame(&mut raw).map_err(|error| damaged(error.to_string()))?;
     let channels = reader.output_color_type().0.samples();

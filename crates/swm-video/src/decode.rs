@@ -12,7 +12,7 @@ use std::fs::File;
 use std::io::{Read as _, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
-use swm_core::{Error, Result};
+use swm_core::{Error, Result, files};
 
 /// The maximum number of idle decoders in the pool. Each holds the memory of a few decoded frames.
 const IDLE_DECODERS: usize = 32;
@@ -42,7 +42,7 @@ impl Source {
         Ok(match self {
             Self::File(path) => {
                 let io = |e| Error::io(path, "opening a video", e);
-                let file = File::open(path).map_err(io)?;
+                let file = files::open(path)?;
                 let length = file.metadata().map_err(io)?.len();
                 (Open::File(file), length)
             }

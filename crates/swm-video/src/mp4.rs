@@ -353,6 +353,9 @@ fn description(stsd: &[u8]) -> Result<(Codec, Arc<[u8]>, usize, usize)> {
     if width == 0 || height == 0 {
         return Err("has frames without a size".to_owned());
     }
+    if width * height > swm_image::MAX_PIXELS {
+        return Err(format!("has frames of {width} x {height} pixels, more than {}", swm_image::MAX_PIXELS));
+    }
     Ok((codec, extradata.into(), width, height))
 }
 

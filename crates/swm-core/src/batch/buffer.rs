@@ -28,6 +28,12 @@ impl Buffer {
         self.len = len;
     }
 
+    /// Allocates memory for `len` bytes; returns whether there is enough.
+    pub fn reserve(&mut self, len: usize) -> bool {
+        let missing = len.div_ceil(64).saturating_sub(self.lines.len());
+        self.lines.try_reserve_exact(missing).is_ok()
+    }
+
     /// The bytes.
     pub fn bytes(&self) -> &[u8] {
         &bytemuck::cast_slice(&self.lines)[..self.len]

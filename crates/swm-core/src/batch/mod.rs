@@ -41,6 +41,35 @@ impl Batch {
         batch
     }
 
+    /// A batch of `rows` rows, all zero, where a file determines the number or the size of the rows.
+    ///
+    /// # Errors
+    /// When the rows do not fit into memory.
+    pub fn try_zeros(schema: &Schema, rows: usize) -> Result<Self> {
+        let mut batch = Self::zeros(schema, 0);
+        batch.try_resize(rows)?;
+        Ok(batch)
+    }
+
+    /// Changes the number of rows as [`Batch::resize`] does, where a file determines the number or the size of the rows.
+    ///
+    /// # Errors
+    /// When the rows do not fit into memory.
+    pub fn try_resize(&mut self, rows: usize) -> Result<()> {
+        for (buffer, column) in self.data.iter_mut().zip(self.schema.columns()) {
+            let reserved = rows.checked_mul(column.row_bytes()).is_some_and(|bytes| buffer.reserve(bytes));
+            if !reserved {
+                return Err(Error::mismatch(
+                    format!("reading column '{}'", column.name),
+                    format!("{rows} rows of {} bytes, more than the free memory", column.row_bytes()),
+                    "fewer rows at once; `swm doctor` checks the dataset",
+                ));
+            }
+        }
+        self.resize(rows);
+        Ok(())
+    }
+
     /// The columns.
     pub fn schema(&self) -> &Schema {
         &self.schema

@@ -68,6 +68,9 @@ element! {
     f64 => DType::Float64,
 }
 
+/// The limit of a row of one column, in bytes. Shapes come from files, too, so no size computation may overflow.
+const LARGEST_ROW: usize = 1 << 36;
+
 /// One column: its name, element type, and the shape of one row (empty for a scalar).
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ColumnSpec {
@@ -105,6 +108,12 @@ impl ColumnSpec {
         self.len() * self.dtype.size()
     }
 
+    /// The number of bytes of one row, or `None` above [`LARGEST_ROW`].
+    fn checked_row_bytes(&self) -> Option<usize> {
+        let bytes = self.shape.iter().try_fold(self.dtype.size(), |bytes, &side| bytes.checked_mul(side))?;
+        (bytes <= LARGEST_ROW).then_some(bytes)
+    }
+
     /// Whether rows are RGB images.
     pub fn is_image(&self) -> bool {
         self.dtype == DType::U8 && matches!(self.shape[..], [_, _, 3])
@@ -134,10 +143,17 @@ impl Schema {
     /// A schema of these columns.
     ///
     /// # Errors
-    /// When two columns have the same name.
+    /// When two columns have the same name, or a row of a column has more than 64 GiB.
     pub fn new(columns: impl Into<Vec<ColumnSpec>>) -> Result<Self> {
         let columns = columns.into();
         for (i, column) in columns.iter().enumerate() {
+            if column.checked_row_bytes().is_none() {
+                return Err(Error::config(
+                    format!("column '{}'", column.name),
+                    format!("its rows have the shape {:?}, which is too large", column.shape),
+                    "check the file that it comes from",
+                ));
+            }
             if columns[..i].iter().any(|other| other.name == column.name) {
                 return Err(Error::config(
                     "schema",

@@ -71,7 +71,8 @@ pub trait Reader: Send + Sync {
     /// As [`Reader::read_column`].
     fn read(&self, columns: &[&str], ranges: &[StepRange]) -> Result<Batch> {
         let specs: Result<Vec<ColumnSpec>> = columns.iter().map(|name| self.schema().column(name).cloned()).collect();
-        let mut batch = Batch::zeros(&Schema::new(specs?)?, ranges.iter().map(|range| range.length).sum());
+        let rows = ranges.iter().fold(0_usize, |rows, range| rows.saturating_add(range.length));
+        let mut batch = Batch::try_zeros(&Schema::new(specs?)?, rows)?;
         for (i, name) in columns.iter().enumerate() {
             self.read_column(name, ranges, batch.bytes_mut(i))?;
         }

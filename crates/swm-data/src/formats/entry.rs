@@ -54,7 +54,9 @@ impl FormatEntry {
     /// # Errors
     /// If there is no such dataset, it is damaged, or this build lacks the format's feature.
     pub fn open(&self, location: &Location) -> Result<Arc<dyn Reader>> {
-        (self.backend()?.open)(location)
+        let reader = (self.backend()?.open)(location)?;
+        check_sizes(&*reader, location)?;
+        Ok(reader)
     }
 
     /// Creates, continues or replaces a dataset whose episodes have the columns of `schema`.
@@ -83,5 +85,29 @@ impl FormatEntry {
             let problem = format!("this build lacks the feature {feature}");
             Error::config(format!("format {}", self.id), problem, format!("build it with `--features {feature}`"))
         })
+    }
+}
+
+/// The most bytes of a row of a stored column: an image of the largest size.
+const MAX_ROW_BYTES: usize = 3 * swm_image::MAX_PIXELS;
+/// The most rows of a dataset.
+const MAX_ROWS: usize = 1 << 40;
+
+/// Checks the sizes that a dataset states, before anything allocates memory for its rows.
+///
+/// # Errors
+/// When a row of a column has more than [`MAX_ROW_BYTES`], or the episodes have more than [`MAX_ROWS`].
+fn check_sizes(reader: &dyn Reader, location: &Location) -> Result<()> {
+    let damaged = |problem: String| {
+        Error::corrupt(location.label(), problem, "restore the dataset from a copy, or rebuild it with smaller rows")
+    };
+    if let Some(column) = reader.schema().columns().iter().find(|column| column.row_bytes() > MAX_ROW_BYTES) {
+        let shape = &column.shape;
+        return Err(damaged(format!("a row of column '{}' has the shape {shape:?}, which is too large", column.name)));
+    }
+    let rows = reader.episodes().iter().try_fold(0_usize, |rows, episode| rows.checked_add(episode.length));
+    match rows {
+        Some(rows) if rows <= MAX_ROWS => Ok(()),
+        _ => Err(damaged("its episodes have more than 2^40 rows".to_owned())),
     }
 }

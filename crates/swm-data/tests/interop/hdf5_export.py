@@ -60,6 +60,14 @@ def filters():
             file.create_dataset(f"numbers {name}", data=values(), chunks=(rows, 5), **options)
             file.create_dataset(f"pictures {name}", data=images(), chunks=(4, 6, 8, 3), **options)
 
+    with begin("hdf5-snappy.h5", libver=("v110", "v110")) as file:
+        for shuffle in (0, 1, 2):
+            options = hdf5plugin.Blosc(cname="snappy", clevel=5, shuffle=shuffle)
+            file.create_dataset(f"numbers {shuffle}", data=values(), chunks=(rows, 5), **options)
+            file.create_dataset(f"pictures {shuffle}", data=images(), chunks=(4, 6, 8, 3), **options)
+    with begin("hdf5-blosc2.h5", libver=("v110", "v110")) as file:
+        file.create_dataset("numbers", data=values(), chunks=(rows, 5), **hdf5plugin.Blosc2())
+
 
 def layouts():
     with begin("hdf5-layouts.h5", libver=("v110", "v110")) as file:

@@ -198,6 +198,21 @@ fn decodes_every_filter_of_h5py_and_hdf5plugin() {
 }
 
 #[test]
+fn decodes_snappy_in_blosc() {
+    let reader = open(interop("hdf5-snappy.h5")).expect("opening the dataset");
+    for shuffle in 0..3 {
+        has_values(&*reader, &format!("numbers {shuffle}"));
+        has_images(&*reader, &format!("pictures {shuffle}"));
+    }
+}
+
+#[test]
+fn unsupported_filters_are_named() {
+    let error = open(interop("hdf5-blosc2.h5")).err().expect("an error").to_string();
+    assert!(error.contains("32026 (Blosc2)") && error.contains("h5repack -f GZIP=4"), "{error}");
+}
+
+#[test]
 fn reads_every_hdf5_layout_and_element_type() {
     let reader = open(interop("hdf5-layouts.h5")).expect("opening the dataset");
     for name in ["contiguous", "one chunk", "fixed", "growing", "growing blocks"] {

@@ -16,6 +16,7 @@ mod goals;
 mod hdf5;
 #[cfg(all(feature = "hdf5", feature = "s3", feature = "http"))]
 mod hdf5_objects;
+mod hostile;
 mod interruption;
 mod kill;
 mod lance;

@@ -7,7 +7,7 @@ use crate::formats::stored_scalar::{Class, StoredScalar};
 use std::fs::File;
 use std::io::{BufReader, BufWriter, Read as _, Write};
 use std::path::{Path, PathBuf};
-use swm_core::{ColumnSpec, DType, Error, Result};
+use swm_core::{ColumnSpec, DType, Error, Result, files};
 use zip::write::SimpleFileOptions;
 use zip::{ZipArchive, ZipWriter};
 
@@ -17,6 +17,10 @@ const ARRAY: &str = "arr_0.npy";
 const MAGIC: &[u8] = b"\x93NUMPY";
 /// Maximum compression ratio of deflate. An archive that declares a higher ratio is damaged.
 const MAX_COMPRESSION: u64 = 1032;
+/// The compression ratio up to which a member of any size is read.
+const USUAL_COMPRESSION: u64 = 128;
+/// The size in bytes up to which a member of any ratio is read, such as a column of zeros.
+const ALWAYS_READ: u64 = 1 << 30;
 
 /// The header of a `.npy` array.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -25,6 +29,8 @@ pub(crate) struct Header {
     pub stored: Option<StoredScalar>,
     /// Shape of the array; the first axis counts rows.
     pub shape: Vec<usize>,
+    /// Whether the first axis changes fastest in the file (Fortran order), as NumPy stores a transposed array.
+    pub column_major: bool,
 }
 
 impl Header {
@@ -52,7 +58,7 @@ impl Npz {
     /// # Errors
     /// If the file does not exist or is damaged.
     pub fn open(path: &Path) -> Result<Self> {
-        let file = File::open(path).map_err(|e| Error::io(path, "opening a column file", e))?;
+        let file = files::open(path)?;
         let archive = ZipArchive::new(BufReader::new(file)).map_err(|e| damaged(path, e))?;
         Ok(Self { path: path.to_owned(), archive })
     }
@@ -74,12 +80,29 @@ impl Npz {
     pub fn member(&mut self, member: &str) -> Result<Vec<u8>> {
         let path = self.path.clone();
         let mut file = self.archive.by_name(member).map_err(|e| damaged(&path, format!("{member}: {e}")))?;
-        if file.size() / MAX_COMPRESSION > file.compressed_size() {
-            return Err(damaged(&path, format!("{member} cannot be {} bytes long", file.size())));
+        let (size, compressed) = (file.size(), file.compressed_size());
+        if size / MAX_COMPRESSION > compressed || size > ALWAYS_READ.saturating_add(USUAL_COMPRESSION * compressed) {
+            return Err(damaged(
+                &path,
+                format!("{member} takes {compressed} bytes, and would be {size} bytes in memory"),
+            ));
         }
         let mut bytes = vec![];
-        file.read_to_end(&mut bytes).map_err(|e| damaged(&path, format!("{member}: {e}")))?;
+        let fits = usize::try_from(size).is_ok_and(|size| bytes.try_reserve_exact(size).is_ok());
+        if !fits {
+            return Err(damaged(&path, format!("{member} has {size} bytes, more than the free memory")));
+        }
+        // The archive's checksum is compared at the end of the member, so the byte after the last one is read as well.
+        file.by_ref().take(size + 1).read_to_end(&mut bytes).map_err(|e| damaged(&path, format!("{member}: {e}")))?;
+        if bytes.len() as u64 != size {
+            return Err(damaged(&path, format!("{member} is not {size} bytes long")));
+        }
         Ok(bytes)
+    }
+
+    /// Returns the size of a member as the archive states it, in bytes.
+    fn size(&mut self, member: &str) -> Option<u64> {
+        Some(self.archive.by_name(member).ok()?.size())
     }
 
     /// Reads the header of the array.
@@ -87,11 +110,16 @@ impl Npz {
     /// # Errors
     /// If there is no array, or the array is damaged.
     pub fn header(&mut self) -> Result<Header> {
+        Ok(self.parsed()?.0)
+    }
+
+    /// Reads the header of the array, and the offset of the elements.
+    fn parsed(&mut self) -> Result<(Header, usize)> {
         let path = self.path.clone();
         let file = self.archive.by_name(ARRAY).map_err(|e| damaged(&path, format!("{ARRAY}: {e}")))?;
         let mut start = vec![];
         file.take(1 << 16).read_to_end(&mut start).map_err(|e| damaged(&path, format!("{ARRAY}: {e}")))?;
-        Ok(parse(&start).map_err(|problem| damaged(&path, problem))?.0)
+        parse(&start).map_err(|problem| damaged(&path, problem))
     }
 
     /// Reads the header of the array, and the elements, converted to the type [`StoredScalar::dtype`].
@@ -99,16 +127,20 @@ impl Npz {
     /// # Errors
     /// If there is no array, its elements are not numeric, or the array is damaged.
     pub fn array(&mut self) -> Result<(Header, Vec<u8>)> {
-        let mut bytes = self.member(ARRAY)?;
-        let (header, start) = parse(&bytes).map_err(|problem| damaged(&self.path, problem))?;
+        let (header, mut start) = self.parsed()?;
         let Some((stored, dtype)) = header.stored.and_then(|stored| Some((stored, stored.dtype()?))) else {
             return Err(damaged(&self.path, "its elements are not numeric"));
         };
+        let stated = self.size(ARRAY).unwrap_or(0).saturating_sub(start as u64);
         let count = header.shape.iter().try_fold(1_usize, |n, &side| n.checked_mul(side));
-        let Some(count) = count.filter(|n| n.checked_mul(stored.size) == Some(bytes.len() - start)) else {
-            let problem = format!("{} bytes do not fit an array of shape {:?}", bytes.len() - start, header.shape);
-            return Err(damaged(&self.path, problem));
+        let Some(count) = count.filter(|n| n.checked_mul(stored.size).map(|bytes| bytes as u64) == Some(stated)) else {
+            return Err(damaged(&self.path, format!("{stated} bytes do not fit an array of shape {:?}", header.shape)));
         };
+        let mut bytes = self.member(ARRAY)?;
+        if header.column_major {
+            bytes = row_major(&bytes[start..], &header.shape, stored.size);
+            start = 0;
+        }
         if stored.is_plain() {
             bytes.drain(..start);
             return Ok((header, bytes));
@@ -138,15 +170,42 @@ fn parse(bytes: &[u8]) -> Result<(Header, usize), String> {
         Some(rest.trim_start())
     };
     let invalid = || format!("the array's header is invalid: {}", text.trim_end());
-    if !field("fortran_order").ok_or_else(invalid)?.starts_with("False") {
-        return Err("the array is in Fortran order; save numpy.ascontiguousarray of it".to_owned());
-    }
+    let column_major = match field("fortran_order").ok_or_else(invalid)? {
+        order if order.starts_with("False") => false,
+        order if order.starts_with("True") => true,
+        _ => return Err(invalid()),
+    };
     let shape = field("shape").and_then(|rest| rest.strip_prefix('(')?.split_once(')')).ok_or_else(invalid)?.0;
     let shape: Result<Vec<usize>, _> =
         shape.split(',').map(str::trim).filter(|side| !side.is_empty()).map(str::parse).collect();
     // A structured type is a list; any other type is a quoted string.
     let descr = field("descr").and_then(|rest| rest.strip_prefix('\'')?.split_once('\'')).map(|(descr, _)| descr);
-    Ok((Header { stored: descr.and_then(scalar_type), shape: shape.map_err(|_| invalid())? }, end))
+    Ok((Header { stored: descr.and_then(scalar_type), shape: shape.map_err(|_| invalid())?, column_major }, end))
+}
+
+/// Returns the elements of an array in row-major order, given those in column-major order.
+///
+/// # Shapes
+/// `bytes` are the elements of `size` bytes of an array of shape `shape`.
+fn row_major(bytes: &[u8], shape: &[usize], size: usize) -> Vec<u8> {
+    let mut out = Vec::with_capacity(bytes.len());
+    // The number of elements between two neighbours along each axis.
+    let strides: Vec<usize> = (0..shape.len()).map(|axis| shape[..axis].iter().product()).collect();
+    let mut index = vec![0; shape.len()];
+    let mut from = 0;
+    while out.len() < bytes.len() {
+        out.extend_from_slice(&bytes[from * size..(from + 1) * size]);
+        for axis in (0..shape.len()).rev() {
+            index[axis] += 1;
+            from += strides[axis];
+            if index[axis] < shape[axis] {
+                break;
+            }
+            from -= strides[axis] * shape[axis];
+            index[axis] = 0;
+        }
+    }
+    out
 }
 
 /// Parses a numeric NumPy type, such as `<f4`.
@@ -262,6 +321,53 @@ mod tests {
         assert!(npz.has("note") && !npz.has("other") && npz.member("other").is_err());
     }
 
+    /// Writes an archive of one deflated array with the given header and elements.
+    fn deflated(path: &Path, header: &str, elements: &mut dyn std::io::Read) {
+        let mut zip = ZipWriter::new(File::create(path).expect("a file"));
+        let options =
+            SimpleFileOptions::default().compression_method(zip::CompressionMethod::Deflated).large_file(true);
+        zip.start_file(ARRAY, options).expect("a member");
+        let start = [b"\x93NUMPY\x01\x00", &(header.len() as u16).to_le_bytes()[..], header.as_bytes()].concat();
+        zip.write_all(&start).expect("a header");
+        std::io::copy(elements, &mut zip).expect("elements");
+        zip.finish().expect("an archive");
+    }
+
+    #[test]
+    fn arrays_of_zeros_are_read_up_to_a_limit() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("a.npz");
+        let header = |rows: u64| format!("{{'descr': '|u1', 'fortran_order': False, 'shape': ({rows},), }}");
+        deflated(&path, &header(1 << 40), &mut std::io::repeat(0).take(1 << 20));
+        let error = Npz::open(&path).and_then(|mut npz| npz.array()).expect_err("a shape without elements").to_string();
+        assert!(error.contains("do not fit an array"), "{error}");
+        deflated(&path, &header(1 << 20), &mut std::io::repeat(0).take(1 << 20));
+        assert_eq!(Npz::open(&path).and_then(|mut npz| npz.array()).expect("zeros").1.len(), 1 << 20);
+        // A member of 3 GiB of zeros would take long to write, so its stated sizes are replaced in both headers.
+        let mut bytes = std::fs::read(&path).expect("an archive");
+        let (large, small) = ((3_u64 << 30) + 60, (1_u64 << 20) + header(1 << 20).len() as u64 + 10);
+        let at: Vec<usize> =
+            bytes.windows(8).enumerate().filter(|(_, w)| *w == small.to_le_bytes()).map(|(i, _)| i).collect();
+        for at in at {
+            bytes[at..at + 8].copy_from_slice(&large.to_le_bytes());
+        }
+        std::fs::write(&path, bytes).expect("an archive");
+        assert!(Npz::open(&path).and_then(|mut npz| npz.array()).is_err());
+    }
+
+    #[test]
+    fn column_major_arrays_are_transposed() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("a.npz");
+        // numpy.asfortranarray(numpy.arange(24).reshape(2, 3, 4)), whose first axis changes fastest in the file.
+        let value = |i: usize, j: usize, k: usize| (12 * i + 4 * j + k) as u16;
+        let stored: Vec<u8> = (0..24).flat_map(|n| value(n % 2, n / 2 % 3, n / 6).to_le_bytes()).collect();
+        deflated(&path, "{'descr': '<u2', 'fortran_order': True, 'shape': (2, 3, 4), }", &mut &stored[..]);
+        let (header, bytes) = Npz::open(&path).and_then(|mut npz| npz.array()).expect("an array");
+        let values: Vec<i32> = bytes.as_chunks().0.iter().map(|&b| i32::from_ne_bytes(b)).collect();
+        assert_eq!((header.rows(), values), (2, (0..24).collect()));
+    }
+
     #[test]
     fn array_headers_are_parsed_or_rejected() {
         let array = |text: &str| {
@@ -275,9 +381,9 @@ mod tests {
         assert_eq!((text.stored, text.rows()), (None, 4));
         let scalar = array("{'descr': '>f8', 'fortran_order': False, 'shape': (), }").expect("reading the array");
         assert_eq!((scalar.stored.expect("a numeric type").big_endian, scalar.rows()), (true, 1));
-        let fortran =
-            array("{'descr': '<f8', 'fortran_order': True, 'shape': (2, 3), }").expect_err("an array in Fortran order");
-        assert!(fortran.contains("ascontiguousarray"), "{fortran}");
+        let fortran = array("{'descr': '<f8', 'fortran_order': True, 'shape': (2, 3), }").expect("an array");
+        assert!(fortran.column_major && !text.column_major);
+        assert!(array("{'descr': '<f8', 'fortran_order': 2, 'shape': (2, 3), }").is_err());
         assert!(array("{'descr': '<f8', 'fortran_order': False, 'shape': (-2, 3), }").is_err());
         assert!(
             parse(b"PK\x03\x04 is something else").expect_err("bytes that are no array").contains("not a NumPy array")

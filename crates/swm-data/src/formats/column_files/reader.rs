@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
-use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema};
+use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema, files};
 
 /// The numeric columns of a folder, and the rows of its episodes. A column is read at its first access and then
 /// cached in memory.
@@ -39,10 +39,9 @@ impl ColumnFiles {
     pub fn open(folder: &Path) -> Result<Self> {
         // Reads the journal before the lengths, so that episodes merged between the two reads are skipped.
         let journal_path = journal::path(folder);
-        let journal = match std::fs::read(&journal_path) {
-            Ok(bytes) => bytes,
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => vec![],
-            Err(e) => return Err(Error::io(&journal_path, "reading the journal", e)),
+        let journal = match files::read(&journal_path, u64::MAX) {
+            Err(Error::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => vec![],
+            read => read?,
         };
         let lengths_path = column_path(folder, LENGTHS);
         let mut lengths_file = Npz::open(&lengths_path)?;
@@ -310,8 +309,16 @@ fn column_file_names(folder: &Path) -> Result<Vec<String>> {
     Ok(names)
 }
 
+/// The most episodes of a dataset.
+const MAX_EPISODES: usize = 1 << 24;
+
 /// Reads the integers in the one-dimensional array of an archive.
 fn integers(npz: &mut Npz, path: &Path) -> Result<Vec<i64>> {
+    let rows = npz.header()?.rows();
+    if rows > MAX_EPISODES {
+        let problem = format!("it has {rows} episodes, more than {MAX_EPISODES}");
+        return Err(Error::corrupt(path, problem, "rebuild the dataset"));
+    }
     let (header, bytes) = npz.array()?;
     match header.spec("").filter(|_| header.shape.len() == 1).map(|spec| spec.dtype) {
         Some(DType::Int32) => Ok(bytes.as_chunks().0.iter().map(|&b| i64::from(i32::from_ne_bytes(b))).collect()),

@@ -8,7 +8,7 @@ use crate::formats::column_files::{ColumnFiles, exists};
 use rayon::prelude::*;
 use std::path::Path;
 use std::sync::Arc;
-use swm_core::{ColumnSpec, Error, Manifest, Result, Schema};
+use swm_core::{ColumnSpec, Error, Manifest, Result, Schema, files};
 
 /// Maximum compression ratio of an image file (deflate's limit). A file with a higher ratio is damaged.
 const MAX_COMPRESSION: usize = 1032;
@@ -129,14 +129,16 @@ fn infer_image_columns(files: &ColumnFiles) -> Result<Vec<ColumnSpec>> {
     Ok(columns)
 }
 
+/// The limit of the size of an image file: the pixels of the largest image, with opacity.
+const MAX_FILE_BYTES: u64 = 8 * swm_image::MAX_PIXELS as u64;
+
 /// Reads the image file of a step, with any suffix of [`SUFFIXES`].
 fn read_image(folder: &Path, column: &str, episode: usize, step: usize) -> Result<Vec<u8>> {
     for suffix in SUFFIXES {
         let path = image_path(folder, column, episode, step, suffix);
-        match std::fs::read(&path) {
-            Ok(bytes) => return Ok(bytes),
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => {}
-            Err(e) => return Err(Error::io(path, "reading an image", e)),
+        match files::read(&path, MAX_FILE_BYTES) {
+            Err(Error::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => {}
+            read => return read,
         }
     }
     let path = image_path(folder, column, episode, step, SUFFIXES[0]);

@@ -18,6 +18,9 @@ use swm_core::ColumnSpec;
 /// Maximum size of a chunk in bytes. Only damaged files declare larger chunks.
 const MAX_CHUNK_BYTES: u64 = 128 << 20;
 
+/// Maximum size of rows in the header of a dataset, in bytes: that of a header message, and of booleans as integers.
+const MAX_COMPACT_BYTES: u64 = 8 << 16;
+
 /// Maximum number of bytes that one read of contiguous rows covers.
 const RUN_BYTES: u64 = 1 << 20;
 
@@ -98,7 +101,12 @@ impl Column {
                 }
                 Storage::Contiguous(address)
             }
-            Layout::Compact { .. } => Storage::Compact,
+            Layout::Compact { .. } => {
+                if row_bytes.and_then(|bytes| bytes.checked_mul(rows)).is_none_or(|bytes| bytes > MAX_COMPACT_BYTES) {
+                    return Err(format!("{rows} rows do not fit the header of a dataset"));
+                }
+                Storage::Compact
+            }
             Layout::Chunked { chunk_shape, .. } => {
                 let filters = catch_panic("reading its filters", || Ok::<_, String>(dataset.filter_pipeline()))?;
                 let pipeline = Pipeline::new(&filters, stored.size)?;
@@ -160,7 +168,11 @@ impl Column {
     /// If the rows are damaged.
     pub fn read_all(&self, source: &Source) -> Result<Vec<u8>, String> {
         let size = self.spec.row_bytes();
-        let mut all = vec![0; self.rows as usize * size];
+        let length = usize::try_from(self.rows).ok().and_then(|rows| rows.checked_mul(size));
+        let length = length.ok_or_else(|| format!("{} rows do not fit into memory", self.rows))?;
+        let mut all = vec![];
+        all.try_reserve_exact(length).map_err(|_| format!("its {length} bytes do not fit into memory"))?;
+        all.resize(length, 0);
         let mut slots: Vec<RowSlot<'_>> =
             all.chunks_exact_mut(size).enumerate().map(|(row, slot)| ((0, row), slot)).collect();
         self.read(source, &mut slots, |(_, row)| row as u64)?;

@@ -179,7 +179,7 @@ impl Reader for Hdf5Reader {
         let mut steps = Batch::zeros(&Schema::new([column.spec.clone()])?, 0);
         let row_of = |(episode, step): (usize, usize)| self.rows.first_rows()[episode] + step as u64;
         for (position, episode) in self.episodes().iter().enumerate() {
-            steps.resize(episode.length);
+            steps.try_resize(episode.length)?;
             let range = [StepRange::new(position, 0, episode.length)];
             let mut slots = self.rows.row_slots(&column.spec, &range, steps.bytes_mut(0))?;
             column.read(&self.source, &mut slots, row_of).map_err(|problem| self.fail(STEP_IDX, &problem))?;

@@ -9,7 +9,7 @@ use std::ops::Range;
 use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
-use swm_core::{Error, Result};
+use swm_core::{Error, Result, files};
 
 /// Block size for reading the structure of a remote file, in bytes.
 const BLOCK: u64 = 256 << 10;
@@ -43,15 +43,11 @@ impl Source {
             let file = ObjectFile::open(location)?;
             return Ok(Self(Arc::new(Kind::Remote { file, label: location.label(), blocks: Mutex::default() })));
         };
-        let file = File::open(path).map_err(|e| match e.kind() {
-            std::io::ErrorKind::NotFound => Error::corrupt(
-                path,
-                "there is no such dataset",
-                "check the path; `swm datasets` lists the stored datasets",
-            ),
-            _ => Error::io(path, "opening the file", e),
-        })?;
-        Self::of(file, path)
+        if !path.exists() {
+            let fix = "check the path; `swm datasets` lists the stored datasets";
+            return Err(Error::corrupt(path, "there is no such dataset", fix));
+        }
+        Self::of(files::open(path)?, path)
     }
 
     /// Wraps an open local file, with the present size of the file.

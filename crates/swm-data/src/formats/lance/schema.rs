@@ -214,7 +214,11 @@ pub fn columns_to_read(
                 None => {
                     let Some(bytes) = first_image(name)? else { continue };
                     // Binary columns of third-party tables may hold other data than images.
-                    let Ok((height, width)) = swm_image::image_size(&bytes) else { continue };
+                    if !swm_image::is_image(&bytes) {
+                        continue;
+                    }
+                    let (height, width) = swm_image::image_size(&bytes)
+                        .map_err(|problem| super::store::damaged(folder, format!("column '{name}': {problem}")))?;
                     (ColumnSpec::image(name, height, width), Kind::Image)
                 }
             },

@@ -1,13 +1,13 @@
 //! The list of episodes in `meta/`: the files, length, tasks and constants of each episode.
 
-use super::info::{Info, damaged};
+use super::info::{Info, MAX_TEXT_BYTES, damaged};
 use super::{CONSTANTS, table};
 use arrow_array::Array as _;
 use arrow_array::cast::AsArray as _;
 use arrow_array::types::Float64Type;
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
-use swm_core::{Error, Result};
+use swm_core::{Result, files};
 
 /// The files, length, tasks and constants of an episode.
 pub(super) struct EpisodeFiles {
@@ -42,10 +42,11 @@ fn episode_files_v2(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
         length: usize,
     }
     let path = root.join("meta").join("episodes.jsonl");
-    let text = std::fs::read_to_string(&path).map_err(|e| match e.kind() {
-        std::io::ErrorKind::NotFound => damaged(root, "meta/episodes.jsonl is missing".to_owned()),
-        _ => Error::io(&path, "reading the list of episodes", e),
-    })?;
+    if !path.exists() {
+        return Err(damaged(root, "meta/episodes.jsonl is missing".to_owned()));
+    }
+    let text = String::from_utf8(files::read(&path, MAX_TEXT_BYTES)?)
+        .map_err(|e| damaged(&path, format!("it is no UTF-8 text: {e}")))?;
     let mut files_of_episodes = vec![];
     for line in text.lines().filter(|line| !line.trim().is_empty()) {
         let line: Line =

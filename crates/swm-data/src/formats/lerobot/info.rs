@@ -7,7 +7,7 @@ use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use swm_core::columns::{PIXELS, PROPRIO, STATE};
-use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema};
+use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema, files};
 
 /// The LeRobot version of written datasets.
 pub const VERSION: &str = "v3.0";
@@ -18,6 +18,9 @@ pub const DATA_PATH: &str = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.
 pub const VIDEO_PATH: &str = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4";
 /// Path template of the list of episodes in version 3.0.
 pub const EPISODES_PATH: &str = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet";
+
+/// The limit of the size of a text file in `meta/`, in bytes.
+pub const MAX_TEXT_BYTES: u64 = 1 << 30;
 
 /// The content of `meta/info.json`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -138,13 +141,11 @@ impl Info {
     /// If the file is missing or damaged, or the version is not supported.
     pub fn read(root: &Path) -> Result<Self> {
         let path = root.join("meta").join("info.json");
-        let bytes = std::fs::read(&path).map_err(|e| match e.kind() {
-            std::io::ErrorKind::NotFound => {
-                let problem = if root.exists() { "it holds no meta/info.json" } else { "there is no such dataset" };
-                Error::corrupt(root, problem, "check the path; `swm datasets` lists the stored datasets")
-            }
-            _ => Error::io(&path, "reading the description of the dataset", e),
-        })?;
+        if !path.exists() {
+            let problem = if root.exists() { "it holds no meta/info.json" } else { "there is no such dataset" };
+            return Err(Error::corrupt(root, problem, "check the path; `swm datasets` lists the stored datasets"));
+        }
+        let bytes = files::read(&path, MAX_TEXT_BYTES)?;
         let info: Self = serde_json::from_slice(&bytes).map_err(|e| damaged(&path, format!("is unreadable: {e}")))?;
         if !info.is_v3() && info.codebase_version != "v2.1" && info.codebase_version != "v2.0" {
             let problem = format!("LeRobot's version {} is not supported", info.codebase_version);

@@ -322,7 +322,8 @@ impl Reader for LerobotReader {
             Ok(ColumnSpec::new(*name, known.dtype, known.shape.clone()))
         };
         let specs: Result<Vec<ColumnSpec>> = columns.iter().map(spec).collect();
-        let mut batch = Batch::zeros(&Schema::new(specs?)?, ranges.iter().map(|range| range.length).sum());
+        let rows = ranges.iter().fold(0_usize, |rows, range| rows.saturating_add(range.length));
+        let mut batch = Batch::try_zeros(&Schema::new(specs?)?, rows)?;
         for (i, name) in columns.iter().enumerate() {
             self.read_column(name, ranges, batch.bytes_mut(i))?;
         }

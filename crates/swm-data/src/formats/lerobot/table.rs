@@ -9,12 +9,14 @@ use parquet::arrow::{ArrowWriter, ProjectionMask};
 use parquet::basic::Compression;
 use parquet::file::metadata::KeyValue;
 use parquet::file::properties::WriterProperties;
-use std::fs::File;
 use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::sync::Arc;
-use swm_core::{Error, Result};
+use swm_core::{Error, Result, files};
+
+/// The most rows per byte of a file. A file of equal values, which are stored as runs, has a few thousand.
+const MAX_ROWS_PER_BYTE: u64 = 1 << 14;
 
 /// Rows per decoded batch.
 const ROWS: usize = 4096;
@@ -24,16 +26,20 @@ const ROWS: usize = 4096;
 /// # Errors
 /// If the file cannot be read or is damaged, including when the Parquet library panics.
 pub fn read(path: &Path, columns: &[&str], rows: Option<Vec<Range<usize>>>) -> Result<Vec<RecordBatch>> {
-    let file = File::open(path).map_err(|e| match e.kind() {
-        std::io::ErrorKind::NotFound => damaged(path, "the file is missing".to_owned()),
-        _ => Error::io(path, "opening a table", e),
-    })?;
+    if !path.exists() {
+        return Err(damaged(path, "the file is missing".to_owned()));
+    }
+    let file = files::open(path)?;
+    let length = file.metadata().map_err(|e| Error::io(path, "opening a table", e))?.len();
     let failed = |e: &dyn std::fmt::Display| damaged(path, format!("the table is damaged: {e}"));
     let work = || -> Result<Vec<RecordBatch>> {
         // Ignores the Arrow schema that other programs embed, because it is redundant and could be damaged.
         let options = ArrowReaderOptions::new().with_skip_arrow_metadata(true);
         let builder = ParquetRecordBatchReaderBuilder::try_new_with_options(file, options).map_err(|e| failed(&e))?;
         let total = usize::try_from(builder.metadata().file_metadata().num_rows()).map_err(|e| failed(&e))?;
+        if total as u64 > MAX_ROWS_PER_BYTE.saturating_mul(length) {
+            return Err(failed(&format!("{total} rows do not fit {length} bytes")));
+        }
         let fields = builder.parquet_schema().root_schema().get_fields();
         let column_indices: Vec<usize> =
             columns.iter().filter_map(|name| fields.iter().position(|field| field.name() == *name)).collect();

@@ -399,7 +399,7 @@ fn check_psnr(columns: &[ColumnComparison], options: &ConvertOptions) -> Result<
 
 /// Reads all columns of an episode except index columns.
 fn read(reader: &dyn Reader, schema: &Schema, episode: usize, length: usize, rows: &mut Batch) -> Result<()> {
-    rows.resize(length);
+    rows.try_resize(length)?;
     let range = [StepRange::new(episode, 0, length)];
     for (i, column) in data_columns(schema) {
         reader.read_column(&column.name, &range, rows.bytes_mut(i))?;

@@ -62,9 +62,10 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
             match flags >> 5 {
                 0 => blosclz(bytes, stream)?,
                 1 => lz4_block(bytes, stream)?,
+                2 => snappy(bytes, stream)?,
                 3 => inflate(bytes, stream)?,
                 4 => zstd_frame(bytes, stream)?,
-                codec => return Err(format!("Blosc: codec {codec} (Snappy is 2) is not supported")),
+                codec => return Err(format!("Blosc: there is no codec {codec}")),
             }
         }
         if flags & flag::BITSHUFFLE != 0 {
@@ -79,6 +80,12 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
         }
     }
     Ok(())
+}
+
+/// Decodes a raw Snappy block, which must be exactly as long as `out`.
+fn snappy(from: &[u8], out: &mut [u8]) -> Result<(), String> {
+    let decoded = snap::raw::Decoder::new().decompress(from, out).map_err(|error| format!("Snappy: {error}"))?;
+    if decoded == out.len() { Ok(()) } else { Err(format!("Snappy: {decoded} bytes instead of {}", out.len())) }
 }
 
 /// Decodes BloscLZ, a descendant of FastLZ. It differs from LZF in two ways: a length may have any number of bytes, and

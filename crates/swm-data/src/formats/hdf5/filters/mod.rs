@@ -1,7 +1,7 @@
 //! Decoders for HDF5 filters.
 //!
 //! This module supports the filters of the HDF5 library (deflate, shuffle, Fletcher's checksum), h5py's LZF, and LZ4,
-//! Zstandard, bitshuffle and Blosc (with all codecs except Snappy) of the package hdf5plugin.
+//! Zstandard, bitshuffle and Blosc (with all codecs) of the package hdf5plugin. Other filters are errors that name them.
 
 mod bitshuffle;
 mod blosc;
@@ -22,6 +22,19 @@ pub(super) mod id {
     pub const BITSHUFFLE: u16 = 32_008;
     pub const ZSTD: u16 = 32_015;
 }
+
+/// Names of registered filters that this module does not decode.
+const UNSUPPORTED: &[(u16, &str)] = &[
+    (4, "SZIP"),
+    (5, "N-bit"),
+    (6, "scale-offset"),
+    (307, "BZIP2"),
+    (32_003, "Snappy"),
+    (32_013, "ZFP"),
+    (32_017, "SZ"),
+    (32_024, "SZ3"),
+    (32_026, "Blosc2"),
+];
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Filter {
@@ -65,10 +78,12 @@ impl Pipeline {
                 id::BLOSC => Filter::Blosc,
                 id::BITSHUFFLE => Filter::Bitshuffle { size: element(2), codec: bitshuffle::Codec::new(value(4))? },
                 unknown => {
-                    let name = filter.name.as_deref().map(str::trim).filter(|name| !name.is_empty());
+                    let stored = filter.name.as_deref().map(str::trim).filter(|name| !name.is_empty());
+                    let known = UNSUPPORTED.iter().find(|(id, _)| *id == unknown).map(|(_, name)| *name);
                     return Err(format!(
-                        "its chunks use the unsupported filter {unknown} ({})",
-                        name.unwrap_or("no name")
+                        "its chunks use the unsupported filter {unknown} ({}); `h5repack -f GZIP=4 IN OUT` writes a copy \
+                         without it",
+                        known.or(stored).unwrap_or("no name")
                     ));
                 }
             })

@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::Path;
 use std::sync::Arc;
-use swm_core::{Error, Result};
+use swm_core::{Error, Result, files};
 
 /// Maximum number of data files in an object store that are opened concurrently.
 const OPENED_TOGETHER: usize = 16;
@@ -102,6 +102,12 @@ impl LanceReader {
     pub(super) fn file(&self, file: &DataFile) -> Result<Arc<FileReader>> {
         if let Some(reader) = lock(&self.files).get(&file.path) {
             return Ok(reader);
+        }
+        if !self.store.remote {
+            let local = self.store.local(&self.store.data_path(&file.path));
+            if local.exists() {
+                files::open(&local)?;
+            }
         }
         let (store, data_file) = (self.store.clone(), file.clone());
         let path = self.folder().join("data").join(&file.path);

@@ -1,0 +1,138 @@
+//! Datasets that a stranger made: headers with absurd sizes, and files that are no regular files. Opening and reading
+//! gives an error; a panic, an abort or a hang fails the test.
+
+use crate::fuzz;
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+use swm_data::{WriteMode, open};
+
+fn interop(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop").join(name)
+}
+
+/// A copy of a dataset of `tests/interop` in a new folder.
+fn copied(name: &str) -> (tempfile::TempDir, PathBuf) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join(name);
+    fuzz::copy_all(&interop(name), &path);
+    (folder, path)
+}
+
+fn error(path: &Path) -> String {
+    fuzz::read_everything(path).expect_err("an error").to_string()
+}
+
+/// The header of a PNG file of `side` x `side` pixels.
+fn png(side: u32) -> Vec<u8> {
+    let body = [b"IHDR".as_slice(), &side.to_be_bytes(), &side.to_be_bytes(), &[8, 2, 0, 0, 0]].concat();
+    let step = |crc: u32, byte: &u8| {
+        (0..8).fold(crc ^ u32::from(*byte), |crc, _| crc >> 1 ^ if crc & 1 == 1 { 0xedb8_8320 } else { 0 })
+    };
+    let crc = !body.iter().fold(!0, step);
+    [b"\x89PNG\r\n\x1a\n\0\0\0\r".as_slice(), &body, &crc.to_be_bytes(), b"\0\0\0\0IDAT"].concat()
+}
+
+#[test]
+fn foreign_images_of_absurd_sizes_are_refused() {
+    let qoi = |side: u32| [b"qoif".as_slice(), &side.to_be_bytes(), &side.to_be_bytes(), &[3, 0]].concat();
+    for header in [png(65535), png(1 << 30), qoi(65535), qoi(u32::MAX)] {
+        let (_folder, path) = copied("reference.lance");
+        let mut changed = 0;
+        for file in fuzz::files(&path).iter().filter(|file| file.extension().is_some_and(|end| end == "lance")) {
+            let mut bytes = std::fs::read(file).expect("a data file");
+            let starts: Vec<usize> = (0..bytes.len().saturating_sub(header.len()))
+                .filter(|&at| bytes[at..].starts_with(&[0xff, 0xd8, 0xff]) || bytes[at..].starts_with(b"\x89PNG"))
+                .collect();
+            for at in starts {
+                bytes[at..at + header.len()].copy_from_slice(&header);
+                changed += 1;
+            }
+            std::fs::write(file, bytes).expect("a data file");
+        }
+        assert!(changed > 0, "the dataset has images");
+        let error = error(&path);
+        // The PNG library has a limit of its own.
+        assert!(["at most 67108864 pixels", "limits are exceeded"].iter().any(|text| error.contains(text)), "{error}");
+    }
+}
+
+#[test]
+fn hostile_descriptions_of_lerobot_datasets_are_refused() {
+    let (_folder, path) = copied("lerobot-v21");
+    let file = path.join("meta/info.json");
+    let original: Value = serde_json::from_slice(&std::fs::read(&file).expect("a file")).expect("JSON");
+    // Parsed objects are sorted by key, and the order of features is that of the columns.
+    std::fs::write(&file, original.to_string()).expect("a written file");
+    let expected = fuzz::read_everything(&path).expect("the original");
+    let features = original["features"].as_object().expect("features");
+    let shapes = features.keys().map(|name| format!("/features/{name}/shape"));
+    let counts = ["total_episodes", "total_frames", "chunks_size", "fps"].map(|name| format!("/{name}"));
+    for pointer in shapes.chain(counts) {
+        let is_shape = pointer.ends_with("shape");
+        let sizes = [json!(-1), json!(0), json!(1_u64 << 31), json!(1_u64 << 60), json!(u64::MAX), json!(1e308)];
+        for size in sizes {
+            let mut changed = original.clone();
+            let new = if is_shape { json!([size, size, 3]) } else { size };
+            *changed.pointer_mut(&pointer).expect("the value") = new.clone();
+            std::fs::write(&file, changed.to_string()).expect("a written file");
+            // Columns without elements are skipped, so a shape of 0 can be valid, as a frame rate can be.
+            match fuzz::read_everything(&path) {
+                Ok(hash) => assert!(new == json!([0, 0, 3]) || hash == expected, "{pointer} = {new}"),
+                Err(error) => assert!(!error.to_string().is_empty()),
+            }
+        }
+    }
+}
+
+#[test]
+fn lengths_of_lerobot_episodes_do_not_allocate_memory() {
+    let (_folder, path) = copied("lerobot-v21");
+    let (list, info) = (path.join("meta/episodes.jsonl"), path.join("meta/info.json"));
+    let text = std::fs::read_to_string(&list).expect("the list of episodes");
+    let total: Value = serde_json::from_slice(&std::fs::read(&info).expect("a file")).expect("JSON");
+    for length in [1_u64 << 31, 1 << 39, 1 << 60] {
+        let lines: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).expect("JSON")).collect();
+        let mut lines = lines;
+        let (mut rows, first) = (0, lines[0]["length"].as_u64().expect("a length"));
+        lines[0]["length"] = json!(length);
+        rows += total["total_frames"].as_u64().expect("a count") - first + length;
+        let lines: Vec<String> = lines.iter().map(Value::to_string).collect();
+        std::fs::write(&list, lines.join("\n")).expect("a written file");
+        let mut changed = total.clone();
+        changed["total_frames"] = json!(rows);
+        std::fs::write(&info, changed.to_string()).expect("a written file");
+        assert!(!error(&path).is_empty());
+    }
+}
+
+#[test]
+fn pipes_are_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let pipe = |path: &Path| {
+        if path.exists() {
+            std::fs::remove_file(path).expect("a removed file");
+        }
+        assert!(std::process::Command::new("mkfifo").arg(path).status().expect("mkfifo").success());
+    };
+    let refused = |path: &Path| {
+        let error = error(path);
+        // A pipe in the place of the file that identifies a format is no dataset of the format.
+        assert!(["not a regular file", "known format"].iter().any(|text| error.contains(text)), "{error}");
+    };
+    pipe(&folder.path().join("d.h5"));
+    refused(&folder.path().join("d.h5"));
+    for (name, suffix) in [("folder-reference", "ep_len.npz"), ("lerobot-v21", "parquet"), ("reference.lance", "lance")]
+    {
+        let (_folder, path) = copied(name);
+        let files = fuzz::files(&path);
+        let file = files.iter().find(|file| file.to_string_lossy().ends_with(suffix)).expect("a file");
+        pipe(file);
+        refused(&path);
+    }
+    let path = folder.path().join("e.folder");
+    crate::format_suite::write(&path, WriteMode::Create, 0..2);
+    assert!(open(&path).is_ok());
+    let image = fuzz::files(&path).into_iter().find(|file| file.extension().is_some_and(|end| end != "npz"));
+    pipe(&image.expect("an image"));
+    refused(&path);
+}

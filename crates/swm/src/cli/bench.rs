@@ -1,5 +1,6 @@
 //! `swm bench`: measures speed, compared with the reference implementation where it is installed.
 
+use super::config::{count, seconds};
 use super::{Context, emit, emit_json, eprint, table};
 use crate::ENVS;
 use crate::subject::LewmSubject;
@@ -8,6 +9,7 @@ use swm_bench::{
     BenchConfig, DataBenchConfig, Drawing, ModelBenchConfig, ModelBenchReport, PlanBenchConfig, RenderBenchConfig,
     Work, bench_data, bench_envs, bench_model, bench_plan, bench_render,
 };
+use swm_core::limits::{ENVS as PARALLEL, IMAGE_SIDE};
 use swm_core::{EnvChoice, Origin};
 use swm_data::Location;
 use swm_models::device;
@@ -51,13 +53,13 @@ struct RenderArgs {
     /// Ids of environments (default: all 3-D environments)
     envs: Vec<String>,
     /// Frame sizes, in pixels
-    #[arg(long, value_delimiter = ',', default_value = "64,224")]
+    #[arg(long, value_delimiter = ',', default_value = "64,224", value_parser = count::<1, { IMAGE_SIDE.max }>)]
     sizes: Vec<usize>,
     /// Measurements per renderer
-    #[arg(long, default_value_t = 5)]
+    #[arg(long, default_value_t = 5, value_parser = count::<1, 1000>)]
     turns: usize,
     /// Seconds per measurement
-    #[arg(long, default_value_t = 0.5)]
+    #[arg(long, default_value_t = 0.5, value_parser = seconds)]
     seconds: f64,
 }
 
@@ -99,22 +101,22 @@ struct DataArgs {
     #[arg(long, value_delimiter = ',')]
     formats: Vec<String>,
     /// Episodes per dataset
-    #[arg(long, default_value_t = 40)]
+    #[arg(long, default_value_t = 40, value_parser = count::<0, 1_000_000>)]
     episodes: usize,
     /// Steps per episode
-    #[arg(long, default_value_t = 100)]
+    #[arg(long, default_value_t = 100, value_parser = count::<1, 1_000_000>)]
     steps: usize,
     /// Frame size, in pixels
-    #[arg(long, default_value_t = 224)]
+    #[arg(long, default_value_t = 224, value_parser = count::<1, { IMAGE_SIDE.max }>)]
     size: usize,
     /// Pairs of measurements: this engine and the reference implementation
-    #[arg(long, default_value_t = 5)]
+    #[arg(long, default_value_t = 5, value_parser = count::<0, 1000>)]
     pairs: usize,
     /// Seconds per measurement
-    #[arg(long, default_value_t = 2.0)]
+    #[arg(long, default_value_t = 2.0, value_parser = seconds)]
     seconds: f64,
     /// Epochs over which memory use is measured
-    #[arg(long, default_value_t = 10)]
+    #[arg(long, default_value_t = 10, value_parser = count::<0, 1_000_000>)]
     epochs: usize,
     /// Also load from a folder of an object store, such as s3://bucket/bench
     ///
@@ -154,16 +156,16 @@ fn data(args: &DataArgs, context: &Context) -> anyhow::Result<()> {
 #[derive(Args)]
 struct PlanArgs {
     /// Environments per planning call
-    #[arg(long, value_delimiter = ',', default_value = "1,16")]
+    #[arg(long, value_delimiter = ',', default_value = "1,16", value_parser = count::<1, { PARALLEL.max }>)]
     envs: Vec<usize>,
     /// Pairs of measurements: this engine and the reference implementation
-    #[arg(long, default_value_t = 5)]
+    #[arg(long, default_value_t = 5, value_parser = count::<0, 1000>)]
     pairs: usize,
     /// Seconds per measurement with a model that takes no time
-    #[arg(long, default_value_t = 1.0)]
+    #[arg(long, default_value_t = 1.0, value_parser = seconds)]
     seconds: f64,
     /// Iterations per plan with a LeWM; 0 skips the LeWM
-    #[arg(long, default_value_t = 30)]
+    #[arg(long, default_value_t = 30, value_parser = count::<0, 1_000_000>)]
     iterations: usize,
     /// Device of the LeWM: cpu, vulkan[:I], cuda[:I] or auto
     #[arg(long, default_value = "cpu")]
@@ -197,10 +199,10 @@ fn plan(args: &PlanArgs, context: &Context) -> anyhow::Result<()> {
 #[derive(Args)]
 struct TrainArgs {
     /// Clips per batch
-    #[arg(long, default_value_t = 8)]
+    #[arg(long, default_value_t = 8, value_parser = count::<1, 4096>)]
     clips: usize,
     /// Pairs of measurements: this engine and the reference implementation
-    #[arg(long, default_value_t = 5)]
+    #[arg(long, default_value_t = 5, value_parser = count::<0, 1000>)]
     pairs: usize,
     /// Device: cpu, vulkan[:I], cuda[:I] or auto
     #[arg(long, default_value = "cpu")]
@@ -243,25 +245,25 @@ struct EnvsArgs {
     /// Ids of environments (default: all)
     envs: Vec<String>,
     /// Environments stepped at the same time
-    #[arg(long, default_value_t = 8)]
+    #[arg(long, default_value_t = 8, value_parser = count::<1, { PARALLEL.max }>)]
     num_envs: usize,
     /// Frame sizes, in pixels
-    #[arg(long, value_delimiter = ',', default_value = "224,64")]
+    #[arg(long, value_delimiter = ',', default_value = "224,64", value_parser = count::<1, { IMAGE_SIDE.max }>)]
     sizes: Vec<usize>,
     /// Skip stepping without rendering
     #[arg(long, alias = "pictures-only")]
     frames_only: bool,
     /// Pairs of measurements: this engine and the reference implementation
-    #[arg(long, default_value_t = 5)]
+    #[arg(long, default_value_t = 5, value_parser = count::<0, 1000>)]
     pairs: usize,
     /// Seconds per measurement
-    #[arg(long, default_value_t = 1.0)]
+    #[arg(long, default_value_t = 1.0, value_parser = seconds)]
     seconds: f64,
     /// Episodes that the reference collects per measurement; 0 skips collecting
-    #[arg(long, default_value_t = 8)]
+    #[arg(long, default_value_t = 8, value_parser = count::<0, 1_000_000>)]
     episodes: usize,
     /// Steps per collected episode; resets weigh more in shorter episodes
-    #[arg(long, default_value_t = 50)]
+    #[arg(long, default_value_t = 50, value_parser = count::<1, 1_000_000>)]
     episode_steps: usize,
 }
 

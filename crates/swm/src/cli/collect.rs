@@ -172,7 +172,8 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
     let writer = collection.writer(&world.collect_schema(config.goal)?, collection.mode, manifest.clone())?;
     // A shard has consecutive episodes, so that the committed dataset has all episodes in order.
     let episodes = collection.shard.map_or(0..config.episodes, |Shard { index, count }| {
-        config.episodes * index / count..config.episodes * (index + 1) / count
+        let share = |index: usize| (config.episodes as u128 * index as u128 / count as u128) as usize;
+        share(index)..share(index + 1)
     });
     let config = &CollectConfig { episodes: episodes.len(), first: episodes.start, ..config.clone() };
     let start = Instant::now();

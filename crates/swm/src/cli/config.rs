@@ -90,6 +90,24 @@ impl VariationArgs {
     }
 }
 
+/// Parses a count from `LOW` to `HIGH`. An absurd count would otherwise take all memory before any check.
+///
+/// # Errors
+/// When it is not such a count.
+pub fn count<const LOW: usize, const HIGH: usize>(given: &str) -> std::result::Result<usize, String> {
+    let count = given.parse::<usize>().ok().filter(|count| (LOW..=HIGH).contains(count));
+    count.ok_or_else(|| format!("'{given}' is not a whole number from {LOW} to {HIGH}"))
+}
+
+/// Parses the seconds of a measurement, at most an hour.
+///
+/// # Errors
+/// When they are not a positive number of at most 3600.
+pub fn seconds(given: &str) -> std::result::Result<f64, String> {
+    let seconds = given.parse::<f64>().ok().filter(|seconds| *seconds > 0.0 && *seconds <= 3600.0);
+    seconds.ok_or_else(|| format!("'{given}' is not a number of seconds above 0 and at most 3600"))
+}
+
 /// Parses a frame size in pixels: `64` or `HEIGHTxWIDTH`.
 ///
 /// # Errors
@@ -128,5 +146,8 @@ mod tests {
         assert!(wrong.request().expect_err("a pin without a value").to_string().contains("background.color=200"));
         assert_eq!(image_size("64x96"), Ok((64, 96)));
         assert!(image_size("3").is_err());
+        assert_eq!((count::<1, 9>("9"), seconds("0.5")), (Ok(9), Ok(0.5)));
+        assert!(["0", "10", "-1", "nan", "", "1e3"].into_iter().all(|given| count::<1, 9>(given).is_err()));
+        assert!(["0", "-1", "nan", "inf", "3601"].into_iter().all(|given| seconds(given).is_err()));
     }
 }

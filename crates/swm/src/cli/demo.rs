@@ -1,6 +1,7 @@
 //! `swm demo`: collects, trains, plans, evaluates and reports within minutes on a laptop CPU.
 
 use super::collect::{self, Collection};
+use super::config::count;
 use super::output_folder;
 use super::results_tables::summary;
 use super::wrappers::WrapperArgs;
@@ -12,6 +13,7 @@ use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 use swm_core::files::{self, Lock};
+use swm_core::limits::EVALUATED_EPISODES;
 use swm_core::results::Counting;
 use swm_core::{Error, Origin, Result, VariationRequest};
 use swm_data::{ImageCodec, Location, WriteMode};
@@ -35,10 +37,10 @@ pub struct DemoArgs {
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Episodes to collect
-    #[arg(long, default_value_t = 300)]
+    #[arg(long, default_value_t = 300, value_parser = count::<1, { EVALUATED_EPISODES.max }>)]
     episodes: usize,
     /// Episodes to evaluate per policy and condition
-    #[arg(long, default_value_t = 100)]
+    #[arg(long, default_value_t = 100, value_parser = count::<1, { EVALUATED_EPISODES.max }>)]
     eval_episodes: usize,
     /// Parallel environments of the evaluation; results do not depend on their number
     #[arg(long, default_value_t = 50)]
@@ -186,7 +188,7 @@ fn request(args: &DemoArgs, model: &Path, side: usize, resolver: &HomeResolver) 
         policies: vec![PolicyRequest { name: "lewm".to_owned(), kind }],
         starts: StartsRequest::Episodic,
         episodes: args.eval_episodes,
-        seed: args.seed + 1,
+        seed: args.seed.wrapping_add(1),
         budget: Some(TIME_LIMIT),
         counting: Counting::default(),
         conditions: vec![

@@ -1,6 +1,6 @@
 //! `swm eval`: evaluates policies and the random-policy floor from the same starts.
 
-use super::config::{VariationArgs, image_size};
+use super::config::{VariationArgs, count, image_size};
 use super::eval_policy::NamedPolicy;
 use super::output_folder;
 use super::planner::PlannerArgs;
@@ -12,6 +12,7 @@ use crate::resolver::HomeResolver;
 use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
+use swm_core::limits::EVALUATED_EPISODES;
 use swm_core::results::Counting;
 use swm_core::{Error, Origin, Result, Results, files};
 use swm_data::{Part, Split};
@@ -48,7 +49,7 @@ pub struct EvalArgs {
     #[arg(long, default_value_t = 0, requires = "split")]
     split_seed: u64,
     /// Number of episodes
-    #[arg(long, default_value_t = 50)]
+    #[arg(long, default_value_t = 50, value_parser = count::<1, { EVALUATED_EPISODES.max }>)]
     episodes: usize,
     /// Seed of starts, goals, factors and plans
     #[arg(long, default_value_t = 0)]

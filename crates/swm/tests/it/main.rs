@@ -6,6 +6,7 @@ mod data;
 mod deletion;
 mod finite;
 mod gym;
+mod hostile;
 mod kills;
 mod limits;
 mod listing;

@@ -1,0 +1,70 @@
+//! A table of hostile arguments: each command refuses them with a message, without a panic, an abort or a hang.
+
+use crate::{Swm, text};
+use std::ffi::OsStr;
+use std::fs;
+use std::os::unix::ffi::OsStrExt as _;
+use std::process::Stdio;
+
+/// Commands that read one name or path.
+const COMMANDS: &[&[&str]] =
+    &[&["inspect"], &["report"], &["reproduce"], &["fovs"], &["checkpoints", "show"], &["datasets", "commit"]];
+
+#[test]
+fn hostile_names_are_refused() {
+    let swm = Swm::new();
+    fs::create_dir(swm.path("folder")).expect("a folder");
+    for name in ["empty.json", "empty.h5", "empty.parquet"] {
+        fs::write(swm.path(name), "").expect("a file");
+    }
+    std::os::unix::fs::symlink("loop", swm.path("loop")).expect("a link");
+    let long = "x".repeat(10_000);
+    let names: [&[u8]; 12] = [
+        b"",
+        b"-",
+        b"/",
+        b"folder",
+        b"empty.json",
+        b"empty.h5",
+        b"empty.parquet",
+        b"loop",
+        b"/dev/zero",
+        b"a\nb",
+        b"\xff\xfe",
+        long.as_bytes(),
+    ];
+    for command in COMMANDS {
+        for name in names {
+            let output = swm.command(command).arg(OsStr::from_bytes(name)).stdin(Stdio::null()).output().expect("swm");
+            let (code, error) = (output.status.code(), text(&output.stderr));
+            assert!(matches!(code, Some(1 | 2)), "{command:?} {name:?}: {code:?} {error}");
+            assert!(error.starts_with("error: ") && !error.contains("panicked"), "{command:?} {name:?}: {error}");
+        }
+    }
+}
+
+#[test]
+fn hostile_numbers_are_refused() {
+    let swm = Swm::new();
+    let room = ["--env", "swm/TwoRoom-v1"];
+    let commands: [(&[&str], &[&str]); 4] = [
+        (&["eval", "expert"], &["--episodes", "--image", "--budget", "--hold"]),
+        (&["bench", "plan"], &["--envs", "--pairs", "--seconds", "--iterations"]),
+        (&["bench", "render"], &["--sizes", "--turns", "--seconds"]),
+        (&["demo"], &["--episodes", "--eval-episodes", "--seed"]),
+    ];
+    for (command, options) in commands {
+        let more: &[&str] = if command[0] == "eval" { &room } else { &[] };
+        for option in options {
+            for value in ["-1", "nan", "1e400", "99999999999999999999999", ""] {
+                let given = format!("{option}={value}");
+                swm.fails(&[command, more, &[given.as_str()]].concat(), 2, &["error: "]);
+            }
+        }
+    }
+    for absurd in ["--episodes=1152921504606846976", "--image=1152921504606846976"] {
+        swm.fails(&[&["eval", "expert"], &room[..], &[absurd]].concat(), 2, &["error: "]);
+    }
+    swm.fails(&["bench", "train", "--clips=1152921504606846976"], 2, &["from 1 to 4096"]);
+    swm.fails(&["bench", "plan", "--envs=1152921504606846976"], 2, &["from 1 to 16384"]);
+}

@@ -88,8 +88,11 @@ impl LerobotReader {
                 let path = &episode.videos[feature].0;
                 let size = videos.frame_size(path, || Ok(Source::File(path.clone())))?;
                 if [size.0, size.1] != column.spec.shape[..2] {
-                    let problem =
-                        format!("camera '{}' has frames of {size:?} instead of {:?}", column.native, column.spec.shape);
+                    let problem = format!(
+                        "camera '{}' has frames of {size:?} instead of {:?}",
+                        column.native,
+                        &column.spec.shape[..2]
+                    );
                     return Err(damaged(root, problem));
                 }
             }
@@ -132,7 +135,9 @@ impl LerobotReader {
         let repeats = self.info.stable_worldmodel.as_ref().is_some_and(|recorded| recorded.last_action_repeats);
         if repeats && column.spec.name == ACTION {
             let size = column.spec.row_bytes();
-            for (&first, episode) in self.rows.first_rows().iter().zip(self.rows.episodes()) {
+            let episodes = self.rows.first_rows().iter().zip(self.rows.episodes());
+            // LeRobot has no missing values, so the writer repeats the last action of an episode.
+            for (&first, episode) in episodes.filter(|(_, episode)| episode.length > 0) {
                 // The offset fits in `usize`, because all rows are in memory.
                 let last = (first as usize + episode.length) * size;
                 set_missing(column.spec.dtype, &mut data[last - size..last]);

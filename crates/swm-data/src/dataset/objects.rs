@@ -6,19 +6,21 @@
 //! store has its own Cargo feature.
 
 mod blocks;
+#[cfg(feature = "tls")]
+mod patience;
 
 pub(crate) use blocks::{BlockCache, ObjectRanges};
 
 use crate::dataset::location::Location;
 use futures::FutureExt as _;
 use object_store::path::Path as StorePath;
-use object_store::{ObjectStore, ObjectStoreExt as _, RetryConfig};
+use object_store::{ObjectStore, ObjectStoreExt as _};
+use std::collections::BTreeMap;
 use std::future::Future;
 use std::ops::Range;
 use std::panic::AssertUnwindSafe;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError, mpsc};
-use std::time::Duration;
 use swm_core::{Error, Result};
 use tokio::runtime::Runtime;
 use url::Url;
@@ -32,15 +34,6 @@ const GAP: u64 = 128 << 10;
 
 /// Maximum number of concurrent requests per read.
 const REQUESTS: usize = 32;
-
-/// Retries of failed requests to a store, for about six seconds in total.
-#[cfg_attr(
-    not(any(feature = "s3", feature = "gs", feature = "az", feature = "http")),
-    allow(unused, reason = "local files need no retries")
-)]
-fn retry_config() -> RetryConfig {
-    RetryConfig { max_retries: 6, retry_timeout: Duration::from_secs(60), ..RetryConfig::default() }
-}
 
 /// The runtime for asynchronous code: two threads, started at first use and never stopped. A forked process (Python
 /// forks) does not inherit threads, so it starts a new runtime.
@@ -96,6 +89,15 @@ pub fn store(location: &Location) -> Result<(Arc<dyn ObjectStore>, StorePath)> {
     }
 }
 
+/// Stores that the program provides, by name.
+static PROVIDED: Mutex<BTreeMap<String, Arc<dyn ObjectStore>>> = Mutex::new(BTreeMap::new());
+
+/// Provides a store of the program's own: locations `store://NAME/path` are read from it and written to it. The scheme
+/// is available to programs only, see [`Location::Uri`]; the command line does not know it.
+pub fn provide(name: &str, store: Arc<dyn ObjectStore>) {
+    PROVIDED.lock().unwrap_or_else(PoisonError::into_inner).insert(name.to_owned(), store);
+}
+
 #[cfg_attr(
     not(any(feature = "s3", feature = "gs", feature = "az", feature = "http")),
     allow(unused, reason = "without these features every URI is an error")
@@ -108,28 +110,46 @@ fn remote(url: &Url) -> Result<Arc<dyn ObjectStore>> {
     #[cfg(feature = "tls")]
     provide_tls();
     match url.scheme() {
+        "store" => {
+            let provided = PROVIDED.lock().unwrap_or_else(PoisonError::into_inner);
+            let found = provided.get(url.host_str().unwrap_or_default()).cloned();
+            found.ok_or_else(|| Error::config("dataset", format!("{url}: no such store is provided"), "provide it"))
+        }
         #[cfg(feature = "s3")]
         "s3" => {
-            // AWS_ENDPOINT_URL may name a server without TLS.
-            let builder = object_store::aws::AmazonS3Builder::from_env().with_url(url.as_str()).with_allow_http(true);
-            Ok(Arc::new(builder.with_retry(retry_config()).build().map_err(invalid)?))
+            use object_store::aws::{AmazonS3Builder, AmazonS3ConfigKey};
+            let mut builder = AmazonS3Builder::from_env().with_url(url.as_str());
+            for (key, value) in patience::client_settings() {
+                builder = builder.with_config(AmazonS3ConfigKey::Client(key), value);
+            }
+            Ok(patient(url, builder.with_retry(patience::retry_config()).build().map_err(invalid)?))
         }
         #[cfg(feature = "gs")]
         "gs" => {
-            let builder = object_store::gcp::GoogleCloudStorageBuilder::from_env().with_url(url.as_str());
-            Ok(Arc::new(builder.with_retry(retry_config()).build().map_err(invalid)?))
+            use object_store::gcp::{GoogleCloudStorageBuilder, GoogleConfigKey};
+            let mut builder = GoogleCloudStorageBuilder::from_env().with_url(url.as_str());
+            for (key, value) in patience::client_settings() {
+                builder = builder.with_config(GoogleConfigKey::Client(key), value);
+            }
+            Ok(patient(url, builder.with_retry(patience::retry_config()).build().map_err(invalid)?))
         }
         #[cfg(feature = "az")]
         "az" => {
-            let builder = object_store::azure::MicrosoftAzureBuilder::from_env().with_url(url.as_str());
-            Ok(Arc::new(builder.with_allow_http(true).with_retry(retry_config()).build().map_err(invalid)?))
+            use object_store::azure::{AzureConfigKey, MicrosoftAzureBuilder};
+            let mut builder = MicrosoftAzureBuilder::from_env().with_url(url.as_str());
+            for (key, value) in patience::client_settings() {
+                builder = builder.with_config(AzureConfigKey::Client(key), value);
+            }
+            Ok(patient(url, builder.with_retry(patience::retry_config()).build().map_err(invalid)?))
         }
         #[cfg(feature = "http")]
         "http" | "https" => {
-            let options = object_store::ClientOptions::new().with_allow_http(true);
+            let options = patience::client_settings()
+                .into_iter()
+                .fold(object_store::ClientOptions::new(), |options, (key, value)| options.with_config(key, value));
             let server = &url[..url::Position::BeforePath];
             let builder = object_store::http::HttpBuilder::new().with_url(server).with_client_options(options);
-            Ok(Arc::new(builder.with_retry(retry_config()).build().map_err(invalid)?))
+            Ok(patient(url, builder.with_retry(patience::retry_config()).build().map_err(invalid)?))
         }
         scheme => {
             let feature = if scheme == "https" { "http" } else { scheme };
@@ -138,6 +158,12 @@ fn remote(url: &Url) -> Result<Arc<dyn ObjectStore>> {
             Err(Error::config("dataset", problem, fix))
         }
     }
+}
+
+/// A remote store that reports when its server does not answer.
+#[cfg(feature = "tls")]
+fn patient<T: ObjectStore>(url: &Url, inner: T) -> Arc<dyn ObjectStore> {
+    Arc::new(patience::Patience { inner: Arc::new(inner), name: url[..url::Position::BeforePath].to_owned() })
 }
 
 /// Installs ring as the cryptography provider of the process, unless a provider is installed already.

@@ -7,6 +7,8 @@ mod cache;
 mod convert;
 mod damage;
 mod doctor;
+#[cfg(feature = "s3")]
+mod faults;
 mod folder;
 mod format_suite;
 mod full_disk;

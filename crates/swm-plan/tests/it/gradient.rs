@@ -340,7 +340,7 @@ fn errors_name_invalid_settings() {
     let message =
         |gd: GradientDescent| solve(&mut gd.clone(), &mut { BOWL }, &[]).expect_err("the input is invalid").to_string();
     let default = GradientDescent::default;
-    assert!(message(GradientDescent { samples: 0, ..default() }).contains("gd samples: 0; choose at least 1"));
+    assert!(message(GradientDescent { samples: 0, ..default() }).contains("gd samples: 0; choose 1 to"));
     assert!(message(GradientDescent { iterations: 0, ..default() }).contains("gd iterations"));
     assert!(message(GradientDescent { sigma: f32::NAN, ..default() }).contains("gd sigma: NaN"));
     assert!(message(GradientDescent { action_noise: -1.0, ..default() }).contains("gd action_noise: -1"));

@@ -470,7 +470,10 @@ fn errors_name_invalid_objectives_and_unsuitable_models() {
     let message = |constraint: &dyn Constraint| constraint.check(shape).expect_err("the input is invalid").to_string();
     assert!(message(&ActionNorm { limit: -1.0, block: 1 }).contains("action norm limit: -1"));
     assert!(message(&LatentBox::default()).contains("give a finite lower bound"));
-    assert!(message(&LatentBox { low: Some(1.0), high: Some(0.0), ..LatentBox::default() }).contains("Some(1.0)"));
+    assert!(
+        message(&LatentBox { low: Some(1.0), high: Some(0.0), ..LatentBox::default() })
+            .contains("lower bound 1, upper bound 0")
+    );
     let error = Goal::default().check(Shape { latent: 0, ..shape }).expect_err("a model without latents").to_string();
     assert!(error.contains("this model has none"), "{error}");
 

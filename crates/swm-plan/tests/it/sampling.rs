@@ -118,7 +118,10 @@ fn errors_name_invalid_settings() {
     ];
     for (id, settings, expected) in wrong {
         let toy = sampling_solvers().find(|(row, _)| row.id == id).expect("a sampling solver").1;
-        let error = solve(&mut *make(id, &settings), &mut Model::new(toy, &[0]), toy, &[0]).expect_err(expected);
+        let error = match (SOLVERS.get(id).expect("a registered solver").make)(&settings) {
+            Err(error) => error,
+            Ok(mut solver) => solve(&mut *solver, &mut Model::new(toy, &[0]), toy, &[0]).expect_err(expected),
+        };
         assert!(error.is_usage() && error.to_string().contains(expected), "{error}");
     }
     for (row, _) in sampling_solvers() {

@@ -194,9 +194,9 @@ fn verify(given: &[String], as_json: bool) -> anyhow::Result<()> {
         }
     }
     if damaged > 0 {
-        anyhow::bail!(Error::config(
-            "checkpoints",
-            format!("{damaged} of {} cannot be used", found.len()),
+        anyhow::bail!(Error::corrupt(
+            home::checkpoints()?,
+            format!("{damaged} of {} checkpoints have faults", found.len()),
             "train them again, or `swm checkpoints remove` them"
         ));
     }

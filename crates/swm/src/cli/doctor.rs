@@ -26,6 +26,11 @@ pub struct DoctorArgs {
 /// Examines a dataset, and repairs it on request. Fails when there are problems that are not repaired.
 pub fn doctor(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
     let name = &args.dataset;
+    let target =
+        args.repair.as_deref().map(|target| home::target(target, args.target.format.as_deref())).transpose()?;
+    if let (Some(target), Ok(source)) = (&target, home::find_dataset(name)) {
+        home::check_distinct(&source, target)?;
+    }
     let (reader, lost) = match home::find_dataset(name).and_then(|location| open_damaged(&location)) {
         Ok(opened) => opened,
         Err(error) if error.is_usage() => return Err(error.into()),
@@ -44,13 +49,12 @@ pub fn doctor(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
     if !context.json {
         emit(&report(&diagnosis));
     }
-    if let Some(target) = &args.repair {
-        let target = home::target(target, args.target.format.as_deref())?;
+    if let Some(target) = &target {
         let start = Instant::now();
         let options = args.target.options(ConvertMode::Resume);
-        let converted = repair(&reader, &diagnosis, &target, &options, &mut control(context))?;
+        let converted = repair(&reader, &diagnosis, target, &options, &mut control(context))?;
         if !context.json {
-            emit(&convert::describe(&converted, &target, start.elapsed().as_secs_f64()));
+            emit(&convert::describe(&converted, target, start.elapsed().as_secs_f64()));
         }
         repaired = Some(converted);
     }

@@ -37,13 +37,14 @@ pub fn report(args: &ReportArgs, as_json: bool) -> anyhow::Result<()> {
             swm_report::read_results(&file).map(|results| (file, results))
         })
         .collect();
+    let read = read?;
     let options = ReportOptions {
         title: args.title.clone(),
         metrics: args.training.as_deref().map(home::find_checkpoint).transpose()?.as_deref().map(log_of),
         command: None,
     };
     let _lock = output_folder::claim(&args.output, &["index.html"])?;
-    let page = swm_report::write_report_with(&read?, &options, &args.output)?;
+    let page = swm_report::write_report_with(&read, &options, &args.output)?;
     if as_json {
         return emit_json(&json!({"report": page}));
     }

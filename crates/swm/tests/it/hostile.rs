@@ -44,6 +44,21 @@ fn hostile_names_are_refused() {
 }
 
 #[test]
+fn datasets_are_not_written_over_themselves() {
+    let swm = Swm::new();
+    let collect =
+        ["collect", "swm/TwoRoom-v1", "--no-pixels", "--episodes", "2", "--max-steps", "4", "-o", "rooms.lance"];
+    swm.json(&collect);
+    std::os::unix::fs::symlink("rooms.lance", swm.path("other.lance")).expect("a link");
+    for target in ["rooms.lance", "./rooms.lance", "other.lance"] {
+        let message = ["is the dataset that is read"];
+        swm.fails(&["convert", "rooms.lance", target, "--mode", "overwrite"], 2, &message);
+        swm.fails(&["doctor", "rooms.lance", "--repair", target], 2, &message);
+    }
+    assert_eq!(swm.json(&["inspect", "rooms.lance"])["episodes"], 2);
+}
+
+#[test]
 fn hostile_numbers_are_refused() {
     let swm = Swm::new();
     let room = ["--env", "swm/TwoRoom-v1"];

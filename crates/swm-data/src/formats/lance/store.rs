@@ -303,9 +303,11 @@ impl Store {
         let Err(error) = self.objects.inner.put_opts(path, content.clone().into(), options).await else {
             return Ok(true);
         };
+        // If the object cannot be read, it may be this one: the caller must not delete what it refers to.
         let stored = match self.objects.inner.get(path).await {
-            Ok(stored) => stored.bytes().await.ok(),
-            Err(_) => None,
+            Ok(stored) => Some(stored.bytes().await?),
+            Err(object_store::Error::NotFound { .. }) => None,
+            Err(unreadable) => return Err(unreadable.into()),
         };
         match (stored, error) {
             (Some(stored), _) if stored == content => Ok(true),

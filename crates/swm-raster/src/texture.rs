@@ -41,13 +41,13 @@ pub(crate) struct TextureLookup<'a> {
 /// Mask of every other byte of a word: two channels that are multiplied by up to 256 at once.
 const TWO: u32 = 0x00ff_00ff;
 
-/// Returns the mean of words, channel by channel, with weights that sum to 256.
+/// Returns the mean of words, channel by channel, with weights that sum to 256 modulo 2³².
 #[inline(always)]
 fn weighted<const N: usize>(words: [u32; N], weights: [u32; N]) -> u32 {
-    let (mut even, mut odd) = (0x0080_0080, 0x0080_0080);
+    let (mut even, mut odd) = (0x0080_0080_u32, 0x0080_0080_u32);
     for (word, weight) in words.into_iter().zip(weights) {
-        even += (word & TWO) * weight;
-        odd += (word >> 8 & TWO) * weight;
+        even = even.wrapping_add((word & TWO).wrapping_mul(weight));
+        odd = odd.wrapping_add((word >> 8 & TWO).wrapping_mul(weight));
     }
     (even >> 8 & TWO) | (odd & !TWO)
 }
@@ -354,11 +354,11 @@ vectorize! {
         let (right, below) = (&right[..n], &below[..n]);
         for i in 0..n {
             let both = right[i] * below[i];
-            // The weights are rounded such that they sum to 256.
+            // The weights sum to 256. Rounding can make the sum of three weights 257; the first weight is then -1.
             let q = (256 * right[i] - both + 128) >> 8;
             let r = (256 * below[i] - both + 128) >> 8;
             let s = (both + 128) >> 8;
-            words[i] = weighted([a[i], b[i], c[i], d[i]], [256 - q - r - s, q, r, s]);
+            words[i] = weighted([a[i], b[i], c[i], d[i]], [256_u32.wrapping_sub(q + r + s), q, r, s]);
         }
     }
 

@@ -5,7 +5,7 @@ use std::fs;
 use std::path::Path;
 
 /// A demo of a few seconds in the folder `demo`.
-const DEMO: &[&str] =
+pub(crate) const DEMO: &[&str] =
     &["demo", "-o", "demo", "--episodes", "2", "--eval-episodes", "2", "schedule.steps=2", "schedule.warmup=1"];
 
 /// Writes a file of the user, and its folders.

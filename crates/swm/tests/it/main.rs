@@ -5,6 +5,7 @@ mod collecting;
 mod data;
 mod deletion;
 mod finite;
+mod foreign;
 mod gym;
 mod hostile;
 mod kills;

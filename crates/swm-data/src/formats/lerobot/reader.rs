@@ -87,12 +87,9 @@ impl LerobotReader {
             {
                 let path = &episode.videos[feature].0;
                 let size = videos.frame_size(path, || Ok(Source::File(path.clone())))?;
-                if [size.0, size.1] != column.spec.shape[..2] {
-                    let problem = format!(
-                        "camera '{}' has frames of {size:?} instead of {:?}",
-                        column.native,
-                        &column.spec.shape[..2]
-                    );
+                let declared = &column.spec.shape[..2];
+                if [size.0, size.1] != *declared {
+                    let problem = format!("camera '{}' has frames of {size:?}, not {declared:?}", column.native);
                     return Err(damaged(root, problem));
                 }
             }

@@ -310,7 +310,8 @@ fn repair_writes_the_intact_episodes() {
     let unrepairable: Arc<dyn Reader> = Arc::new(Broken::new(2, |_, rows| rows.resize(0)));
     let diagnosis = diagnose(&*unrepairable);
     let refused = repair(&unrepairable, &diagnosis, &to, &ConvertOptions::default(), &mut Control::new());
-    assert!(refused.expect_err("repairing without an intact episode").to_string().contains("none of its 2 episodes"));
+    let refused = refused.expect_err("repairing without an intact episode").to_string();
+    assert!(refused.contains("none of the dataset's 2 episodes is intact"), "{refused}");
     let mut control = Control::new().with_interrupt(Arc::new(AtomicBool::new(true)));
     let stopped = examine(&*repaired, &MODELS, &mut control);
     assert!(matches!(stopped, Err(Error::Interrupted)));

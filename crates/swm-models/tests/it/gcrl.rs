@@ -28,7 +28,7 @@ const SMALL: &[&str] = &[
 ];
 
 fn config<M: GoalConditioned<Config = GcrlConfig>>(overrides: &[&str]) -> TrainConfig<M> {
-    let overrides: Vec<String> = SMALL.iter().chain(overrides).map(|&setting| setting.to_owned()).collect();
+    let overrides = crate::overridden(SMALL, overrides);
     TrainConfig::load("tiny", &overrides).expect("loading the configuration")
 }
 
@@ -206,7 +206,7 @@ fn policy_acts_in_chunks_within_bounds_independent_of_other_environments() {
 fn invalid_settings_data_and_environments_are_refused() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let message = |overrides: &[&str]| {
-        let overrides: Vec<String> = SMALL.iter().chain(overrides).map(|&setting| setting.to_owned()).collect();
+        let overrides = crate::overridden(SMALL, overrides);
         TrainConfig::<Gcivl>::load("tiny", &overrides).expect_err("loading must fail").to_string()
     };
     assert!(message(&["data.num_steps=1"]).contains("model.history"), "{}", message(&["data.num_steps=1"]));

@@ -15,3 +15,10 @@ mod planning;
 mod pldm;
 mod reference;
 mod training;
+
+/// Returns the default settings whose keys no override has, then the overrides.
+pub(crate) fn overridden(defaults: &[&str], overrides: &[&str]) -> Vec<String> {
+    let key = |setting: &str| setting.split('=').next().map(str::to_owned);
+    let kept = defaults.iter().filter(|setting| overrides.iter().all(|given| key(given) != key(setting)));
+    kept.chain(overrides).map(|&setting| setting.to_owned()).collect()
+}

@@ -33,7 +33,7 @@ fn config(overrides: &[&str]) -> Result<TrainConfig<Pldm>> {
         "schedule.warmup=2",
         "log_every=5",
     ];
-    let overrides: Vec<String> = small.iter().chain(overrides).map(|&setting| setting.to_owned()).collect();
+    let overrides = crate::overridden(&small, overrides);
     TrainConfig::load("tiny", &overrides)
 }
 

@@ -32,7 +32,7 @@ pub fn config(overrides: &[&str]) -> TrainConfig<Lewm> {
         "schedule.warmup=2",
         "log_every=5",
     ];
-    let overrides: Vec<String> = small.iter().chain(overrides).map(|&setting| setting.to_owned()).collect();
+    let overrides = crate::overridden(&small, overrides);
     TrainConfig::load("tiny", &overrides).expect("loading the configuration")
 }
 

@@ -354,7 +354,7 @@ fn valid_results_are_read_and_invalid_files_are_refused() {
     let lacking = wrong(&|v| v["runs"][0].as_object_mut().map(|run| run.remove("success")).map_or((), drop));
     assert!(lacking.contains("a layout that this version does not read") && lacking.contains("success"), "{lacking}");
     let inconsistent = wrong(&|v| v["runs"][0]["success"]["successes"] = 39.into());
-    assert!(inconsistent.contains("states 39 successes in 40, its episodes have 2 in 40"), "{inconsistent}");
+    assert!(inconsistent.contains("states 39 successes in 40, but its episodes have 2 in 40"), "{inconsistent}");
     let inconsistent = wrong(&|v| v["comparisons"][1]["only_a"] = 36.into());
     assert!(
         inconsistent.contains("the comparison of lewm-tiny and random does not match the episodes"),

@@ -16,7 +16,6 @@ fn absurd_counts_are_refused_before_work_starts() {
         (&ROOMS[..4], "--episodes", huge, "number of episodes"),
         (ROOMS, "--max-steps", huge, "number of steps"),
         (ROOMS, "--shard", "0/1000000000000000", "number of shards"),
-        (EVAL, "--episodes", huge, "number of evaluated episodes"),
         (EVAL, "--budget", huge, "number of steps"),
         (EVAL, "--threads", huge, "number of threads"),
     ] {
@@ -24,6 +23,7 @@ fn absurd_counts_are_refused_before_work_starts() {
     }
     swm.fails(&[&ROOMS[..6], &["--image", "100000"]].concat(), 2, &["100000", "4096"]);
     swm.fails(&[&ROOMS[..6], &["--image", "4096", "--envs", "10000"]].concat(), 2, &["bytes of a batch"]);
+    swm.fails(&[EVAL, &["--episodes", huge]].concat(), 2, &[huge, "from 1 to 1000000"]);
     assert!(!swm.path("datasets/rooms.lance").exists());
 }
 

@@ -46,7 +46,7 @@ fn invalid_settings_are_errors_that_name_the_setting() {
         words.iter().for_each(|word| assert!(message.contains(word), "{text}: {message}"));
     };
     error_contains("nose", &["wrapper", "'nose'", "noise", "swm wrappers"]);
-    error_contains("noise,sdt=8", &["'sdt'", "std", "takes kind, std, amount"]);
+    error_contains("noise,sdt=8", &["'sdt'", "std", "are kind, std, amount"]);
     error_contains("chroma-key,color=1/2/3", &["'color'", "key_color"]);
     error_contains("grayscale,keep=1", &["'keep'", "has no parameters"]);
     error_contains("noise,8", &["'8'", "NAME=VALUE"]);

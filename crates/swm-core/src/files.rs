@@ -53,7 +53,8 @@ pub fn read(path: &Path, limit: u64) -> Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Replaces a file by `bytes`: writes a temporary file in the same folder and renames it.
+/// Replaces a file by `bytes`: writes a temporary file in the same folder and renames it. A symbolic link is replaced
+/// itself; the file that it points to stays as it is.
 ///
 /// # Errors
 /// When writing fails; the old file is unchanged and the temporary file is removed.
@@ -63,13 +64,27 @@ pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
         .file_name()
         .ok_or_else(|| Error::config(path.display().to_string(), "has no file name", "give the path of a file"))?;
     let temporary = path.with_file_name(format!(".{}.{}.tmp", name.to_string_lossy(), std::process::id()));
-    let written = File::create(&temporary)
+    delete_file(&temporary)?;
+    // `create_new` does not follow a link that somebody made meanwhile.
+    let written = File::create_new(&temporary)
         .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_data()))
         .and_then(|()| std::fs::rename(&temporary, path));
     if written.is_err() {
         let _ = unlink(&temporary);
     }
     written.map_err(io)
+}
+
+/// Opens a file for writing, or creates it; `append` keeps the contents.
+///
+/// # Errors
+/// When `path` is a symbolic link, a folder or a device, or cannot be opened.
+pub fn open_to_write(path: &Path, append: bool) -> Result<File> {
+    if std::fs::symlink_metadata(path).is_ok_and(|found| !found.is_file()) {
+        return Err(Error::corrupt(path, "is not a regular file", "move it away, or choose another folder"));
+    }
+    let file = File::options().create(true).append(append).write(true).truncate(!append).open(path);
+    file.map_err(|error| Error::io(path, "opening the file to write", error))
 }
 
 /// Deletes the files of the program in `folder`. `patterns` are relative paths such as `checkpoint/config.json` or

@@ -3,7 +3,6 @@
 use crate::RgbImage;
 use crate::codec::check_pixels;
 use png::{Compression, EncodingError, Filter, Transformations};
-use std::fs::File;
 use std::io::{BufReader, BufWriter, Cursor};
 use std::path::Path;
 use swm_core::{Error, Result, files};
@@ -110,7 +109,7 @@ pub fn write_png(path: &Path, width: usize, height: usize, rgb: &[u8]) -> Result
         })
     };
     let (wide, high) = (side(width)?, side(height)?);
-    let file = File::create(path).map_err(|source| Error::io(path, "creating an image", source))?;
+    let file = files::open_to_write(path, false)?;
     let mut encoder = png::Encoder::new(BufWriter::new(file), wide, high);
     encoder.set_color(png::ColorType::Rgb);
     encoder.set_depth(png::BitDepth::Eight);
@@ -137,6 +136,6 @@ mod tests {
         assert!(write_png(&path, 4, 4, &rgb).is_err());
         let missing =
             write_png(&folder.path().join("missing/a.png"), 5, 4, &rgb).expect_err("a missing folder").to_string();
-        assert!(missing.contains("creating an image"), "{missing}");
+        assert!(missing.contains("opening the file to write"), "{missing}");
     }
 }

@@ -230,10 +230,7 @@ pub(crate) fn write(
     let new = run.join(format!("{FOLDER}.new"));
     files::delete(&new, CHECKPOINT_FILES)?;
     std::fs::create_dir_all(&new).map_err(|error| Error::io(&new, "creating a checkpoint", error))?;
-    let write_file = |name: &str, bytes: &[u8]| {
-        let path = new.join(name);
-        std::fs::write(&path, bytes).map_err(|error| Error::io(&path, "writing a checkpoint", error))
-    };
+    let write_file = |name: &str, bytes: &[u8]| files::write(&new.join(name), bytes);
     write_file(CONFIG, text(config)?.as_bytes())?;
     let weights = pack(weights)?;
     let hash = manifest::hash(&weights);

@@ -77,6 +77,7 @@ pub fn store(location: &Location) -> Result<(Arc<dyn ObjectStore>, StorePath)> {
     match location {
         Location::Path(path) => {
             let path = std::path::absolute(path).map_err(|e| Error::io(path, "finding the file", e))?;
+            let path = without_parent_components(&path);
             let object_path = StorePath::from_absolute_path(&path)
                 .map_err(|e| Error::config("dataset path", e.to_string(), "use another path"))?;
             Ok((Arc::new(object_store::local::LocalFileSystem::new()), object_path))
@@ -87,6 +88,20 @@ pub fn store(location: &Location) -> Result<(Arc<dyn ObjectStore>, StorePath)> {
             Ok((remote(url)?, object_path))
         }
     }
+}
+
+/// Returns an absolute path without `..`, which object stores do not accept. Links are followed before each `..`.
+fn without_parent_components(path: &Path) -> PathBuf {
+    let mut plain = PathBuf::new();
+    for component in path.components() {
+        if component == std::path::Component::ParentDir {
+            plain = plain.canonicalize().unwrap_or(plain);
+            plain.pop();
+        } else {
+            plain.push(component);
+        }
+    }
+    plain
 }
 
 /// Stores that the program provides, by name.

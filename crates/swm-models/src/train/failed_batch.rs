@@ -2,7 +2,7 @@
 
 use safetensors::tensor::{Dtype, TensorView};
 use std::path::{Path, PathBuf};
-use swm_core::{Batch, DType, Error, Result};
+use swm_core::{Batch, DType, Error, Result, files};
 
 /// Saves `batch` in `folder` and returns the error that `what` is not finite. The error contains the `values` of the
 /// step and the path of the batch.
@@ -37,7 +37,7 @@ fn save(folder: &Path, batch: &Batch) -> Result<PathBuf> {
         .collect();
     let path = folder.join("failed-batch.safetensors");
     let bytes = safetensors::serialize(views?, None).map_err(failed)?;
-    std::fs::write(&path, bytes).map_err(|error| Error::io(&path, "saving a batch", error))?;
+    files::write(&path, &bytes)?;
     Ok(path)
 }
 

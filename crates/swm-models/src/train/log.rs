@@ -1,11 +1,11 @@
 //! The log of a training run: JSON lines (`train.jsonl`) and a TensorBoard event file.
 
 use prost::Message;
-use std::fs::{File, OpenOptions};
+use std::fs::File;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
-use swm_core::{Error, Result};
+use swm_core::{Error, Result, files};
 
 /// Named values of one step.
 pub type Scalars<'a> = &'a [(&'a str, f64)];
@@ -23,8 +23,7 @@ struct Writer {
 
 impl Writer {
     fn open(path: PathBuf, append: bool) -> Result<Self> {
-        let file = OpenOptions::new().create(true).append(append).write(true).truncate(!append).open(&path);
-        let file = file.map_err(|error| Error::io(&path, "opening a log", error))?;
+        let file = files::open_to_write(&path, append)?;
         Ok(Self { path, file })
     }
 

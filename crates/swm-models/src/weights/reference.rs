@@ -187,5 +187,5 @@ pub(crate) fn write(folder: &Path, config: &impl Serialize, weights: &Named<Host
     torch::write(&folder.join("weights.pt"), weights)?;
     let path = folder.join(CONFIG);
     let text = serde_json::to_string_pretty(config).map_err(|error| Error::external("writing JSON", error))?;
-    std::fs::write(&path, text).map_err(|error| Error::io(&path, "writing a checkpoint", error))
+    files::write(&path, text.as_bytes())
 }

@@ -4,7 +4,7 @@
 use crate::nn::parameters::{HostTensor, Named};
 use std::io::{Seek, Write};
 use std::path::Path;
-use swm_core::{Error, Result};
+use swm_core::{Error, Result, files};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
@@ -18,7 +18,7 @@ pub const BATCHES_TRACKED: &str = "num_batches_tracked";
 /// When writing fails.
 pub fn write(path: &Path, tensors: &Named<HostTensor>) -> Result<()> {
     let failed = |error: std::io::Error| Error::io(path, "writing weights", error);
-    let file = std::fs::File::create(path).map_err(failed)?;
+    let file = files::open_to_write(path, false)?;
     let mut file = std::io::BufWriter::new(file);
     archive(&mut file, tensors).map_err(|error| failed(error.into()))?;
     file.flush().map_err(failed)

@@ -1,7 +1,7 @@
 //! The output folder of a command.
 
 use std::path::Path;
-use swm_core::files::Lock;
+use swm_core::files::{self, Lock};
 use swm_core::{Error, Result};
 
 /// Creates the folder that a command writes these files to, and keeps other writers away until the lock is dropped. A
@@ -9,13 +9,17 @@ use swm_core::{Error, Result};
 ///
 /// # Errors
 /// When the folder cannot be created or written to, another process writes to it, or one of the files is a folder.
-pub fn claim(folder: &Path, files: &[&str]) -> Result<Lock> {
+pub fn claim(folder: &Path, names: &[&str]) -> Result<Lock> {
     if folder.exists() && !folder.is_dir() {
         return Err(Error::config(folder.display().to_string(), "is not a folder", "give a folder with --output"));
     }
     let lock = Lock::folder(folder)?;
     check_writable(folder)?;
-    match files.iter().map(|name| folder.join(name)).find(|path| path.is_dir()) {
+    if let Some(path) = names.iter().map(|name| folder.join(name)).find(|path| path.exists() && !is_own(path)) {
+        let fix = "move it away, or give another folder with --output";
+        return Err(Error::config(path.display().to_string(), "exists and was not written by this program", fix));
+    }
+    match names.iter().map(|name| folder.join(name)).find(|path| path.is_dir()) {
         None => Ok(lock),
         Some(path) => {
             let fix = "remove it, or give another folder with --output";
@@ -23,6 +27,26 @@ pub fn claim(folder: &Path, files: &[&str]) -> Result<Lock> {
         }
     }
 }
+
+/// Returns whether an existing output file was written by this program: a page names it, results have a manifest, and
+/// traces lie beside results. A folder is reported by the caller.
+fn is_own(path: &Path) -> bool {
+    let contains = |path: &Path, mark: &str| {
+        let bytes = files::read(path, MAX_OUTPUT_BYTES).unwrap_or_default();
+        bytes.windows(mark.len()).any(|part| part == mark.as_bytes())
+    };
+    let results = path.with_file_name("results.json");
+    match path.file_name().and_then(|name| name.to_str()) {
+        _ if path.is_dir() => true,
+        Some("index.html") => contains(path, PAGE_MARK),
+        _ => contains(&results, "\"swm_version\""),
+    }
+}
+
+/// The heading of every page of this program.
+const PAGE_MARK: &str = "<p class=\"eyebrow\">stable-worldmodel</p>";
+/// The largest existing output file that is recognised as the program's own.
+const MAX_OUTPUT_BYTES: u64 = 1 << 30;
 
 /// Checks, before the work, that a command can write its one output file.
 ///

@@ -58,6 +58,53 @@ fn checkpoint_removal_keeps_files_of_the_user() {
 }
 
 #[test]
+fn training_does_not_write_through_links() {
+    let swm = Swm::new();
+    swm.json(DEMO);
+    let (thesis, run) = (swm.path("thesis.txt"), swm.path("linked"));
+    user_file(&thesis);
+    fs::create_dir_all(run.join("checkpoint.new")).expect("creating folders");
+    for name in ["checkpoint.new/config.json", "checkpoint.new/weights.safetensors"] {
+        std::os::unix::fs::symlink(&thesis, run.join(name)).expect("making a link");
+    }
+    let train = |out: &'static str| {
+        ["train", "lewm", "--data", "demo/rooms.lance", "-o", out, "schedule.steps=2", "schedule.warmup=1"]
+    };
+    swm.json(&train("./linked"));
+    assert_untouched(&thesis);
+    fs::create_dir_all(swm.path("logged")).expect("creating a folder");
+    std::os::unix::fs::symlink(&thesis, swm.path("logged/train.jsonl")).expect("making a link");
+    swm.fails(&train("./logged"), 1, &["train.jsonl", "not a regular file"]);
+    assert_untouched(&thesis);
+}
+
+#[test]
+fn outputs_do_not_replace_files_of_the_user() {
+    let swm = Swm::new();
+    let files = ["site/index.html", "site/results.json"].map(|name| swm.path(name));
+    files.iter().for_each(|path| user_file(path));
+    let eval = |out| ["eval", "random", "--env", "swm/TwoRoom-v1", "--episodes", "2", "--budget", "5", "-o", out];
+    swm.fails(&eval("site"), 2, &["results.json", "not written by this program"]);
+    swm.json(&eval("results"));
+    swm.fails(&["report", "results", "-o", "site"], 2, &["index.html", "not written by this program"]);
+    files.iter().for_each(|path| assert_untouched(path));
+    // The program replaces its own files.
+    swm.json(&eval("results"));
+    swm.json(&["report", "results", "-o", "page"]);
+    swm.json(&["report", "results", "-o", "page"]);
+}
+
+#[test]
+fn dataset_paths_may_contain_parent_folders() {
+    let swm = Swm::new();
+    fs::create_dir_all(swm.path("a/b")).expect("creating folders");
+    let collect = ["collect", "swm/TwoRoom-v1", "-o", "a/b/../rooms.lance", "--episodes", "1", "--max-steps", "3"];
+    swm.json(&collect);
+    assert!(swm.path("a/rooms.lance").is_dir());
+    assert_eq!(swm.json(&["inspect", "a/b/../rooms.lance"])["episodes"], 1);
+}
+
+#[test]
 fn empty_names_are_refused() {
     let swm = Swm::new();
     let file = swm.path("checkpoints/thesis.txt");

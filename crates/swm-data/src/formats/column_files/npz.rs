@@ -235,7 +235,7 @@ impl NpzWriter {
     /// # Errors
     /// If writing fails.
     pub fn create(path: &Path) -> Result<Self> {
-        let file = File::create(path).map_err(|e| Error::io(path, "creating a column file", e))?;
+        let file = files::open_to_write(path, false)?;
         Ok(Self { path: path.to_owned(), zip: ZipWriter::new(BufWriter::with_capacity(1 << 20, file)) })
     }
 

@@ -386,6 +386,9 @@ impl Drop for ColumnFilesWriter {
 /// Deletes the files of a dataset, named by `patterns` (see [`files::delete`]). Renames the folder first, so that no
 /// partly deleted dataset exists under the original name. Other files return to the folder.
 pub(crate) fn remove_dataset(folder: &Path, patterns: &[&str]) -> Result<()> {
+    if folder.is_symlink() {
+        return Err(Error::config(folder.display().to_string(), "is a symbolic link", "give the folder it points to"));
+    }
     let _lock = Lock::folder(folder)?;
     let mut aside = folder.as_os_str().to_owned();
     aside.push(format!(".replaced-{}", uuid::Uuid::new_v4().simple()));

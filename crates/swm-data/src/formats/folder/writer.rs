@@ -7,6 +7,7 @@ use crate::dataset::episodes;
 use crate::dataset::{Constants, Reader as _, WriteMode, WriteOptions, Writer};
 use crate::formats::column_files::{ColumnFilesWriter, exists};
 use rayon::prelude::*;
+use std::io::Write as _;
 use std::path::Path;
 use swm_core::{Batch, Error, Result, Schema, files};
 use swm_image::ImageCodec;
@@ -55,7 +56,8 @@ impl Writer for FolderWriter {
                 bytes.clear();
                 self.codec.encode(frame, height, width, bytes)?;
                 let path = image_path(self.columns.folder(), &column.name, episode_index, step, SUFFIXES[0]);
-                std::fs::write(&path, &*bytes).map_err(|e| Error::io(path, "writing an image", e))
+                let mut file = files::open_to_write(&path, false)?;
+                file.write_all(bytes).map_err(|e| Error::io(path, "writing an image", e))
             })
         });
         written.map_err(|error| self.columns.fail(error))?;

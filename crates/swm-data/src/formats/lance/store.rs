@@ -93,7 +93,8 @@ fn tables_in(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
 
 /// The location of the table: `location` itself, or the only table in that folder.
 fn table(location: &Location) -> Result<Location> {
-    let Some(path) = location.path().filter(|_| !location.has_suffix("lance")) else { return Ok(location.clone()) };
+    let is_folder = |path: &&Path| !location.has_suffix("lance") && path.is_dir();
+    let Some(path) = location.path().filter(is_folder) else { return Ok(location.clone()) };
     let tables = tables_in(path).map_err(|e| Error::io(path, "listing the folder", e))?;
     match &tables[..] {
         [table] => Ok(Location::from(table)),

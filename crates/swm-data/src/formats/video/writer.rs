@@ -7,6 +7,7 @@ use crate::dataset::episodes;
 use crate::dataset::{Constants, Reader as _, WriteMode, WriteOptions, Writer};
 use crate::formats::column_files::{ColumnFilesWriter, exists};
 use rayon::prelude::*;
+use std::io::Write as _;
 use std::path::Path;
 use swm_core::{Batch, Error, Result, Schema, files};
 use swm_video::{Encoding, encode};
@@ -66,7 +67,7 @@ impl Writer for VideoWriter {
             let path = video_path(folder, &column.name, position);
             let temporary = path.with_extension(&TEMPORARY_SUFFIX[1..]);
             let io = |e| Error::io(&path, "writing a video", e);
-            std::fs::write(&temporary, bytes).map_err(io)?;
+            files::open_to_write(&temporary, false)?.write_all(&bytes).map_err(io)?;
             std::fs::rename(&temporary, &path).map_err(io)
         });
         written.map_err(|error| self.columns.fail(error))?;

@@ -194,7 +194,7 @@ class ReplayBuffer(Dataset):
     def _load_slice(self, ep_idx: int, start: int, end: int) -> dict[str, Any]:
         if not 0 <= ep_idx < self.num_episodes or not 0 <= start <= end <= self.lengths[ep_idx]:
             raise IndexError(
-                f"rows {start} .. {end} of episode {ep_idx} are outside the replay buffer, which has {self.num_episodes} episodes"
+                f"rows {start} .. {end} of episode {ep_idx} are outside the replay buffer of {self.num_episodes} episodes"
             )
         episodes, starts, lengths = (np.asarray([value]) for value in (ep_idx, start, end - start))
         sample: dict[str, Any] = self._read(episodes, starts, lengths, self.frameskip)

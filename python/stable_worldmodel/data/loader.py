@@ -224,7 +224,9 @@ class Loader:
         changed = {name: (state[name], own[name]) for name in ("seed", "batch_size", "clips") if state[name] != own[name]}
         if changed:
             changes = ", ".join(f"{name} was {was} and is {now}" for name, (was, now) in changed.items())
-            raise ValueError(f"the state belongs to a loader with other settings ({changes}); create the loader with the saved settings")
+            raise ValueError(
+                f"the state belongs to a loader with other settings ({changes}); create it with the saved settings"
+            )
         self._next = self._at = (int(state["epoch"]), int(state["batch"]))
 
     def __iter__(self) -> Iterator[dict[str, Any]]:

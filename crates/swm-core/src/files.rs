@@ -65,7 +65,7 @@ pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
         .ok_or_else(|| Error::config(path.display().to_string(), "has no file name", "give the path of a file"))?;
     let temporary = path.with_file_name(format!(".{}.{}.tmp", name.to_string_lossy(), std::process::id()));
     delete_file(&temporary)?;
-    // `create_new` does not follow a link that somebody made meanwhile.
+    // `create_new` does not follow a link that another process made meanwhile.
     let written = File::create_new(&temporary)
         .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_data()))
         .and_then(|()| std::fs::rename(&temporary, path));

@@ -1,8 +1,19 @@
 //! Single rows of a batch: [`RowRef`] reads a row, [`RowMut`] writes a row. Several threads write disjoint rows at
 //! once.
 
-use super::{Batch, DType, Element, Schema};
+use super::{Batch, ColumnSpec, DType, Element, Schema};
 use crate::Result;
+
+/// Panics if a column holds another type than `T`.
+fn assert_type<T: Element>(column: &ColumnSpec) {
+    assert!(
+        T::is(column.dtype),
+        "column '{}' holds {}, which was read as {}",
+        column.name,
+        column.dtype.name(),
+        std::any::type_name::<T>()
+    );
+}
 
 /// One row of a [`Batch`].
 #[derive(Clone, Copy)]
@@ -23,13 +34,7 @@ impl<'a> RowRef<'a> {
     /// When the column holds another type: indices come from a schema, so another type is a bug of the caller.
     pub fn at<T: Element>(self, index: usize) -> &'a [T] {
         let column = &self.schema().columns()[index];
-        assert!(
-            T::is(column.dtype),
-            "column '{}' holds {}, which was read as {}",
-            column.name,
-            column.dtype.name(),
-            std::any::type_name::<T>()
-        );
+        assert_type::<T>(column);
         let n = column.row_bytes();
         bytemuck::cast_slice(&self.batch.bytes(index)[self.row * n..(self.row + 1) * n])
     }
@@ -77,7 +82,7 @@ pub(super) use shared::{ColumnStart, RowsMut};
 /// Disjoint rows of one batch, written by several threads at once.
 #[allow(unsafe_code, reason = "threads write disjoint rows of one buffer, which safe slices cannot express by column")]
 mod shared {
-    use super::{Element, Schema};
+    use super::{Element, Schema, assert_type};
 
     /// The address of a column's first byte.
     #[derive(Clone, Copy)]
@@ -132,13 +137,7 @@ mod shared {
         /// When the column holds another type: indices come from a schema, so another type is a bug of the caller.
         pub fn at<T: Element>(&mut self, index: usize) -> &mut [T] {
             let column = &self.schema.columns()[index];
-            assert!(
-                T::is(column.dtype),
-                "column '{}' holds {}, which was read as {}",
-                column.name,
-                column.dtype.name(),
-                std::any::type_name::<T>()
-            );
+            assert_type::<T>(column);
             bytemuck::cast_slice_mut(self.bytes(index))
         }
 

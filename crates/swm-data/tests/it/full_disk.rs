@@ -59,21 +59,32 @@ fn largest_file_keeps_what_fits() {
     }
 }
 
+/// A small file system in memory, until it is dropped.
+pub(crate) struct SmallDisk<'a>(&'a Path);
+
+impl<'a> SmallDisk<'a> {
+    /// Mounts a file system of this size over a folder; `None` without the right to mount.
+    pub fn mount(folder: &'a Path, size: &str) -> Option<Self> {
+        let options = format!("size={size}");
+        let mount = Command::new("mount").args(["-t", "tmpfs", "-o", &options, "tmpfs"]).arg(folder).output();
+        if !mount.is_ok_and(|output| output.status.success()) {
+            println!("SKIPPED: mounting a small file system needs more rights than this test has");
+            return None;
+        }
+        Some(Self(folder))
+    }
+}
+
+impl Drop for SmallDisk<'_> {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").arg("-l").arg(self.0).status();
+    }
+}
+
 #[test]
 fn full_disk_keeps_what_fits() {
     let folder = tempfile::tempdir().expect("creating a folder");
-    let mount = Command::new("mount").args(["-t", "tmpfs", "-o", "size=4m", "tmpfs"]).arg(folder.path()).output();
-    if !mount.is_ok_and(|output| output.status.success()) {
-        println!("SKIPPED: mounting a small file system needs more rights than this test has");
-        return;
-    }
-    struct Mounted<'a>(&'a Path);
-    impl Drop for Mounted<'_> {
-        fn drop(&mut self) {
-            let _ = Command::new("umount").arg("-l").arg(self.0).status();
-        }
-    }
-    let mounted = Mounted(folder.path());
+    let Some(mounted) = SmallDisk::mount(folder.path(), "4m") else { return };
     // The first commit of HDF5 allocates a chunk for every column.
     let formats =
         [("folder", 96, 200), ("video", 64, 200), ("h5", 2048, 2_000), ("lance", 96, 100), ("lerobot", 64, 200)];

@@ -1,5 +1,6 @@
 //! Writers that are killed or run out of disk space keep committed episodes and leave no partial episodes.
 
+use crate::full_disk::SmallDisk;
 use crate::sample::{check, episode, options, schema, write};
 use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
@@ -109,17 +110,6 @@ fn file_size_limit_keeps_committed_episodes() {
 #[test]
 fn full_disk_keeps_committed_episodes() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
-    let mount = Command::new("mount").args(["-t", "tmpfs", "-o", "size=1m", "tmpfs"]).arg(folder.path()).output();
-    if !mount.is_ok_and(|output| output.status.success()) {
-        println!("SKIPPED: mounting a small file system needs more rights than this test has");
-        return;
-    }
-    struct Mounted<'a>(&'a Path);
-    impl Drop for Mounted<'_> {
-        fn drop(&mut self) {
-            let _ = Command::new("umount").arg("-l").arg(self.0).status();
-        }
-    }
-    let _mounted = Mounted(folder.path());
+    let Some(_mounted) = SmallDisk::mount(folder.path(), "1m") else { return };
     write_until_failure(&folder.path().join("d.lance"), "", "No space left on device");
 }

@@ -1,23 +1,26 @@
-//! CPU kernels for planning and for training vision transformers, on plain row-major `f32` slices.
+//! CPU kernels for planning and for training image encoders, on plain row-major `f32` slices.
 //!
 //! A tensor library allocates and reads memory once per operation. Here weights are laid out once ([`Panels`]), scratch
 //! memory is reused ([`ScratchPool`]), and every row is computed independently, so no byte of a result depends on the
 //! number of threads or on the other rows. The crate depends neither on tensors nor on model families: `swm-models`
-//! converts its layers to [`Affine`], [`Norm`], [`Panels`] and [`VitParameters`].
+//! converts its layers to [`Affine`], [`Norm`], [`Panels`], [`VitParameters`] and [`ConvParameters`].
 
 #![allow(clippy::needless_range_loop, reason = "indexed loops over constant lane counts are vectorised")]
 
 mod affine;
 mod attention;
+mod conv;
 pub mod functions;
 mod norm;
 mod panels;
+mod product;
 mod scratch;
 mod vit;
 mod vit_gradient;
 
 pub use affine::Affine;
 pub use attention::causal_attention;
+pub use conv::{ChannelStatistics, ConvEncoder, ConvGradient, ConvParameters, ConvSizes, ConvStage};
 pub use norm::{Modulation, Norm, add_gated};
 pub use panels::Panels;
 pub use scratch::{ScratchPool, grown};

@@ -5,34 +5,31 @@
 //! other rows.
 
 use crate::Affine;
-use swm_simd::{CpuLevel, Kernel, Level, dispatch};
+use crate::product::{Columns, Rows, Segment, Starts, multiply};
 
 /// The number of elements of a SIMD vector.
 pub(crate) const LANES: usize = 16;
 /// The number of columns of a panel.
-const WIDTH: usize = 2 * LANES;
-
-/// The number of SIMD vectors of the largest tile.
-const TILE: usize = 24;
+pub(crate) const WIDTH: usize = 2 * LANES;
 
 /// A SIMD vector, whose elements are computed at once.
 #[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
-struct Lanes([f32; LANES]);
+pub(crate) struct Lanes(pub [f32; LANES]);
 
 /// The elements of a panel in one row of the matrix.
-type Pair = [Lanes; WIDTH / LANES];
+pub(crate) type Pair = [Lanes; WIDTH / LANES];
 const ZERO: Pair = [Lanes([0.0; LANES]); WIDTH / LANES];
 
 /// A matrix `[inputs, outputs]` and a bias, cut into panels.
 #[derive(Clone, Debug)]
 pub struct Panels {
-    inputs: usize,
-    outputs: usize,
+    pub(crate) inputs: usize,
+    pub(crate) outputs: usize,
     /// The elements of each panel, row by row; columns beyond the matrix are 0.
-    elements: Vec<Pair>,
+    pub(crate) elements: Vec<Pair>,
     /// The bias of the columns of each panel.
-    bias: Vec<Pair>,
+    pub(crate) bias: Vec<Pair>,
 }
 
 impl Panels {
@@ -53,10 +50,15 @@ impl Panels {
     /// Returns the matrix with a bias, `[outputs]`.
     #[must_use]
     pub fn with_bias(mut self, bias: &[f32]) -> Self {
+        self.set_bias(bias);
+        self
+    }
+
+    /// Replaces the first elements of the bias, at most `[outputs]`.
+    pub(crate) fn set_bias(&mut self, bias: &[f32]) {
         for (column, value) in bias.iter().enumerate() {
             self.bias[column / WIDTH][column % WIDTH / LANES].0[column % LANES] = *value;
         }
-        self
     }
 
     /// Replaces the matrix by a matrix with as many outputs and with elements `at(input, output)`, in the same memory.
@@ -80,17 +82,28 @@ impl Panels {
     /// # Shapes
     /// `rows` is `[inputs, outputs]` with the given stride.
     pub fn fill_rows(&mut self, inputs: usize, (rows, stride): (&[f32], usize)) {
+        self.fill_from(inputs, (rows, stride));
+    }
+
+    /// Replaces the matrix by the rows of an array that start at the given indices.
+    pub(crate) fn fill_starts(&mut self, rows: &[f32], starts: &[usize]) {
+        self.fill_from(starts.len(), (rows, starts));
+    }
+
+    fn fill_from(&mut self, inputs: usize, (rows, starts): (&[f32], impl Starts)) {
         self.inputs = inputs;
-        self.elements.clear();
         self.elements.resize(self.bias.len() * inputs, ZERO);
         for (index, panel) in self.elements.chunks_exact_mut(inputs.max(1)).enumerate() {
             let first = index * WIDTH;
             let width = WIDTH.min(self.outputs - first);
             for (input, pair) in panel.iter_mut().enumerate() {
-                let row = &rows[input * stride + first..][..width];
-                for (lanes, row) in pair.iter_mut().zip(row.chunks(LANES)) {
+                let row = &rows[starts.of(input) + first..][..width];
+                let (filled, rest) = pair.split_at_mut(width.div_ceil(LANES));
+                for (lanes, row) in filled.iter_mut().zip(row.chunks(LANES)) {
                     lanes.0[..row.len()].copy_from_slice(row);
+                    lanes.0[row.len()..].fill(0.0);
                 }
+                rest.fill(ZERO[0]);
             }
         }
     }
@@ -119,8 +132,8 @@ impl Panels {
     /// # Shapes
     /// `x` is `[rows, inputs]`, `y` is `[rows, outputs]`.
     pub fn apply_strided(&self, rows: usize, x: (&[f32], usize), y: (&mut [f32], usize)) {
-        let mut tile = [Lanes([0.0; LANES]); TILE];
-        dispatch(Product::<false> { rows, x, y, weights: self, tile: &mut tile });
+        let whole = [Segment { offset: 0, length: self.inputs }];
+        multiply(rows, Rows { values: x.0, starts: x.1, segments: &whole }, self, y);
     }
 
     /// Computes `y += xᵀ W + b`, the product in the gradient of weights. Each array is a slice and the distance from
@@ -129,103 +142,7 @@ impl Panels {
     /// # Shapes
     /// `x` is `[inputs, rows]`, `y` is `[rows, outputs]`.
     pub fn add_transposed(&self, rows: usize, x: (&[f32], usize), y: (&mut [f32], usize)) {
-        let mut tile = [Lanes([0.0; LANES]); TILE];
-        dispatch(Product::<true> { rows, x, y, weights: self, tile: &mut tile });
-    }
-}
-
-/// A product to compute; with `TRANSPOSED`, `x` is transposed and the product is added to `y`.
-struct Product<'a, const TRANSPOSED: bool> {
-    rows: usize,
-    x: (&'a [f32], usize),
-    y: (&'a mut [f32], usize),
-    weights: &'a Panels,
-    /// Memory to which a finished tile is copied: an array that is indexed at run time does not stay in registers.
-    tile: &'a mut [Lanes; TILE],
-}
-
-impl<const TRANSPOSED: bool> Kernel for Product<'_, TRANSPOSED> {
-    type Output = ();
-
-    #[inline(always)]
-    fn run<L: Level>(mut self) {
-        let (rows, inputs) = (self.rows, self.weights.inputs);
-        for (index, bias) in self.weights.bias.iter().enumerate() {
-            let panel =
-                Panel { first: index * WIDTH, elements: &self.weights.elements[index * inputs..][..inputs], bias };
-            // The first tiles have as many rows as the registers hold, and smaller tiles compute the remaining rows.
-            let mut row = 0;
-            if L::CPU == CpuLevel::Avx512 {
-                while rows - row >= 12 {
-                    self.tile::<L, 12, 2>(row, panel);
-                    row += 12;
-                }
-                while rows - row >= 4 {
-                    self.tile::<L, 4, 2>(row, panel);
-                    row += 4;
-                }
-            } else {
-                while rows - row >= 6 {
-                    self.tile::<L, 6, 1>(row, panel);
-                    row += 6;
-                }
-            }
-            while row < rows {
-                self.tile::<L, 1, 2>(row, panel);
-                row += 1;
-            }
-        }
-    }
-}
-
-/// One panel of a matrix.
-#[derive(Clone, Copy)]
-struct Panel<'a> {
-    /// The index of the first column.
-    first: usize,
-    elements: &'a [Pair],
-    bias: &'a Pair,
-}
-
-impl<const TRANSPOSED: bool> Product<'_, TRANSPOSED> {
-    /// Computes `R` rows of a panel, `W` vectors at a time.
-    #[inline(always)]
-    fn tile<L: Level, const R: usize, const W: usize>(&mut self, row: usize, panel: Panel<'_>) {
-        let ((x, x_stride), k) = (self.x, panel.elements.len());
-        let by_row: [&[f32]; R] =
-            std::array::from_fn(|r| if TRANSPOSED { &[][..] } else { &x[(row + r) * x_stride..][..k] });
-        for half in (0..WIDTH / LANES).step_by(W) {
-            let first = panel.first + half * LANES;
-            if first >= self.weights.outputs {
-                break;
-            }
-            let mut sums: [[Lanes; W]; R] = [std::array::from_fn(|w| panel.bias[half + w]); R];
-            for p in 0..k {
-                let weights: [Lanes; W] = std::array::from_fn(|w| panel.elements[p][half + w]);
-                let column = if TRANSPOSED { &x[p * x_stride + row..][..R] } else { &[] };
-                for r in 0..R {
-                    let x = if TRANSPOSED { column[r] } else { by_row[r][p] };
-                    for w in 0..W {
-                        for lane in 0..LANES {
-                            sums[r][w].0[lane] = L::fma(x, weights[w].0[lane], sums[r][w].0[lane]);
-                        }
-                    }
-                }
-            }
-            let Some(stored) = self.tile.as_chunks_mut::<W>().0.first_chunk_mut::<R>() else { return };
-            *stored = sums;
-            let width = (self.weights.outputs - first).min(W * LANES);
-            for (r, sums) in stored.iter().enumerate() {
-                let to = &mut self.y.0[(row + r) * self.y.1 + first..][..width];
-                for (to, sums) in to.chunks_mut(LANES).zip(sums) {
-                    if TRANSPOSED {
-                        to.iter_mut().zip(&sums.0).for_each(|(to, sum)| *to += sum);
-                    } else {
-                        to.copy_from_slice(&sums.0[..to.len()]);
-                    }
-                }
-            }
-        }
+        multiply(rows, Columns { values: x.0, starts: x.1 }, self, y);
     }
 }
 

@@ -1,6 +1,6 @@
 //! Kernels: computations that are compiled for every level and dispatched at run time.
 
-use crate::{CpuLevel, F32x8, Portable};
+use crate::{CpuLevel, F32x8, F32x16, Portable, Portable16};
 
 /// The instruction set that a kernel is compiled for.
 ///
@@ -13,9 +13,14 @@ pub trait Level: sealed::Sealed {
     const FUSED: bool;
     /// The implementation of the operations on eight floats.
     type F32x8: F32x8;
+    /// The implementation of the operations on sixteen floats.
+    type F32x16: F32x16;
 
     /// Returns the operations on eight floats.
     fn f32x8() -> Self::F32x8;
+
+    /// Returns the operations on sixteen floats.
+    fn f32x16() -> Self::F32x16;
 
     /// Returns `a * b + c`, rounded once where [`Level::FUSED`] and twice elsewhere.
     #[inline(always)]
@@ -48,10 +53,16 @@ impl Level for Baseline {
     const CPU: CpuLevel = CpuLevel::Baseline;
     const FUSED: bool = cfg!(target_arch = "aarch64");
     type F32x8 = Portable;
+    type F32x16 = Portable16;
 
     #[inline(always)]
     fn f32x8() -> Portable {
         Portable
+    }
+
+    #[inline(always)]
+    fn f32x16() -> Portable16 {
+        Portable16
     }
 }
 
@@ -85,6 +96,7 @@ mod x86 {
     use super::{Kernel, Level, sealed::Sealed};
     use crate::CpuLevel;
     use crate::f32x8::Avx2Lanes;
+    use crate::f32x16::{Avx2Pair, Avx512Lanes};
 
     struct Avx2;
 
@@ -94,6 +106,7 @@ mod x86 {
         const CPU: CpuLevel = CpuLevel::Avx2;
         const FUSED: bool = true;
         type F32x8 = Avx2Lanes;
+        type F32x16 = Avx2Pair;
 
         #[inline(always)]
         fn f32x8() -> Avx2Lanes {
@@ -101,6 +114,16 @@ mod x86 {
             #[allow(unsafe_code, reason = "the level shows that the CPU supports AVX2")]
             unsafe {
                 Avx2Lanes::new()
+            }
+        }
+
+        #[inline(always)]
+        fn f32x16() -> Avx2Pair {
+            // SAFETY: only `run_avx2` names this level, and `dispatch_avx2` calls it only where the CPU supports AVX2 and
+            // FMA.
+            #[allow(unsafe_code, reason = "the level shows that the CPU supports AVX2 and FMA")]
+            unsafe {
+                Avx2Pair::new()
             }
         }
     }
@@ -113,6 +136,7 @@ mod x86 {
         const CPU: CpuLevel = CpuLevel::Avx512;
         const FUSED: bool = true;
         type F32x8 = Avx2Lanes;
+        type F32x16 = Avx512Lanes;
 
         #[inline(always)]
         fn f32x8() -> Avx2Lanes {
@@ -121,6 +145,15 @@ mod x86 {
             #[allow(unsafe_code, reason = "the level shows that the CPU supports AVX2")]
             unsafe {
                 Avx2Lanes::new()
+            }
+        }
+
+        #[inline(always)]
+        fn f32x16() -> Avx512Lanes {
+            // SAFETY: only `run_avx512` names this level, and `dispatch` calls it only where the CPU supports AVX-512.
+            #[allow(unsafe_code, reason = "the level shows that the CPU supports AVX-512")]
+            unsafe {
+                Avx512Lanes::new()
             }
         }
     }
@@ -156,5 +189,38 @@ mod tests {
         let values = [1.0, 2.5, 4.0];
         assert_eq!(dispatch(Sum(&values)), (7.5, crate::cpu_level()));
         assert_eq!(dispatch_avx2(Sum(&values)), (7.5, crate::cpu_level().min(CpuLevel::Avx2)));
+    }
+
+    struct Operations;
+
+    impl Kernel for Operations {
+        type Output = Vec<[f32; 16]>;
+
+        #[inline(always)]
+        fn run<L: Level>(self) -> Vec<[f32; 16]> {
+            let simd = L::f32x16();
+            let a = simd.load(&std::array::from_fn(|i| i as f32 - 7.0));
+            let (b, c) = (simd.load(&std::array::from_fn(|i| 3.0 * i as f32 - 20.0)), simd.splat(0.5));
+            let results =
+                [simd.add(a, b), simd.sub(a, b), simd.fma(a, b, c), simd.max(a, b), simd.where_positive(a, b)];
+            let mut stored = [[0.0; 16]; 5];
+            results.into_iter().zip(&mut stored).for_each(|(result, to)| simd.store(result, to));
+            stored.to_vec()
+        }
+    }
+
+    #[test]
+    fn sixteen_floats_have_the_same_values_at_every_level() {
+        let lanes = |value: fn(f32, f32) -> f32| std::array::from_fn(|i| value(i as f32 - 7.0, 3.0 * i as f32 - 20.0));
+        let expected = [
+            lanes(|a, b| a + b),
+            lanes(|a, b| a - b),
+            lanes(|a, b| a * b + 0.5),
+            lanes(f32::max),
+            lanes(|a, b| if a > 0.0 { b } else { 0.0 }),
+        ];
+        assert_eq!(dispatch(Operations), expected);
+        assert_eq!(dispatch_avx2(Operations), expected);
+        assert_eq!(Operations.run::<Baseline>(), expected);
     }
 }

@@ -1,0 +1,232 @@
+//! The products of [`Panels`]: tiles of the result, some rows of a panel, stay in registers while terms are added.
+//!
+//! Rows may lie anywhere in an array, and a row may be a concatenation of segments, so that convolutions read their
+//! patches without copying them.
+
+use crate::panels::{LANES, Pair, Panels, WIDTH};
+use swm_simd::{CpuLevel, F32x16, Kernel, Level, dispatch};
+
+/// A vector of the level `L`.
+type Vector<L> = <<L as Level>::F32x16 as F32x16>::Vector;
+
+/// The indices in an array at which rows start.
+pub(crate) trait Starts: Copy {
+    /// Returns the index of the first element of a row.
+    fn of(self, row: usize) -> usize;
+}
+
+/// Rows at a constant distance, given in elements.
+impl Starts for usize {
+    #[inline(always)]
+    fn of(self, row: usize) -> usize {
+        row * self
+    }
+}
+
+/// Rows at listed indices.
+impl Starts for &[usize] {
+    #[inline(always)]
+    fn of(self, row: usize) -> usize {
+        self[row]
+    }
+}
+
+/// A part of a row whose elements are contiguous.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Segment {
+    /// The distance of the first element from the start of the row, in elements.
+    pub offset: usize,
+    /// The number of elements.
+    pub length: usize,
+}
+
+/// The left operand of a product.
+pub(crate) trait Operand: Copy {
+    /// Whether the operand is transposed and the product is added to the previous result.
+    const ADDS: bool;
+
+    /// Adds the terms of rows `row .. row + R` and of `W` vectors of a panel to `sums`.
+    fn accumulate<L: Level, const R: usize, const W: usize>(
+        self,
+        row: usize,
+        panel: &[Pair],
+        first: usize,
+        sums: &mut [[Vector<L>; W]; R],
+    );
+}
+
+/// The matrix `[rows, inputs]` whose rows are concatenations of segments.
+#[derive(Clone, Copy)]
+pub(crate) struct Rows<'a, S> {
+    pub values: &'a [f32],
+    pub starts: S,
+    pub segments: &'a [Segment],
+}
+
+/// The transpose of the matrix `[inputs, rows]`.
+#[derive(Clone, Copy)]
+pub(crate) struct Columns<'a, S> {
+    pub values: &'a [f32],
+    pub starts: S,
+}
+
+/// Adds `x * weights` to a row of a tile.
+#[inline(always)]
+fn add_term<L: Level, const W: usize>(sums: &mut [Vector<L>; W], x: f32, weights: &[Vector<L>; W]) {
+    let simd = L::f32x16();
+    let x = simd.splat(x);
+    for w in 0..W {
+        sums[w] = simd.fma(x, weights[w], sums[w]);
+    }
+}
+
+/// Loads `W` vectors of a row of a panel.
+#[inline(always)]
+fn load<L: Level, const W: usize>(pair: &Pair, first: usize) -> [Vector<L>; W] {
+    std::array::from_fn(|w| L::f32x16().load(&pair[first + w].0))
+}
+
+impl<S: Starts> Operand for Rows<'_, S> {
+    const ADDS: bool = false;
+
+    #[inline(always)]
+    fn accumulate<L: Level, const R: usize, const W: usize>(
+        self,
+        row: usize,
+        panel: &[Pair],
+        first: usize,
+        sums: &mut [[Vector<L>; W]; R],
+    ) {
+        let starts: [usize; R] = std::array::from_fn(|r| self.starts.of(row + r));
+        let mut later = panel;
+        for segment in self.segments {
+            let (now, rest) = later.split_at(segment.length);
+            later = rest;
+            let rows: [&[f32]; R] =
+                std::array::from_fn(|r| &self.values[starts[r] + segment.offset..][..segment.length]);
+            for (p, pair) in now.iter().enumerate() {
+                let weights = load::<L, W>(pair, first);
+                for r in 0..R {
+                    add_term::<L, W>(&mut sums[r], rows[r][p], &weights);
+                }
+            }
+        }
+    }
+}
+
+impl<S: Starts> Operand for Columns<'_, S> {
+    const ADDS: bool = true;
+
+    #[inline(always)]
+    fn accumulate<L: Level, const R: usize, const W: usize>(
+        self,
+        row: usize,
+        panel: &[Pair],
+        first: usize,
+        sums: &mut [[Vector<L>; W]; R],
+    ) {
+        for (p, pair) in panel.iter().enumerate() {
+            let weights = load::<L, W>(pair, first);
+            let column = &self.values[self.starts.of(p) + row..][..R];
+            for r in 0..R {
+                add_term::<L, W>(&mut sums[r], column[r], &weights);
+            }
+        }
+    }
+}
+
+/// Computes the product of `rows` rows of `x` with a matrix. `y` is the array of the result and the starts of its rows.
+pub(crate) fn multiply<X: Operand, S: Starts>(rows: usize, x: X, weights: &Panels, y: (&mut [f32], S)) {
+    dispatch(Product { rows, x, weights, y });
+}
+
+struct Product<'a, X, S> {
+    rows: usize,
+    x: X,
+    weights: &'a Panels,
+    y: (&'a mut [f32], S),
+}
+
+/// One panel of a matrix.
+#[derive(Clone, Copy)]
+struct Panel<'a> {
+    /// The index of the first column.
+    first: usize,
+    elements: &'a [Pair],
+    bias: &'a Pair,
+}
+
+impl<X: Operand, S: Starts> Kernel for Product<'_, X, S> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<L: Level>(mut self) {
+        let (rows, inputs) = (self.rows, self.weights.inputs);
+        for (index, bias) in self.weights.bias.iter().enumerate() {
+            let panel =
+                Panel { first: index * WIDTH, elements: &self.weights.elements[index * inputs..][..inputs], bias };
+            // The first tiles have as many rows as the registers hold, and smaller tiles compute the remaining rows.
+            let mut row = 0;
+            if L::CPU == CpuLevel::Avx512 {
+                while rows - row >= 12 {
+                    self.tile::<L, 12, 2>(row, panel);
+                    row += 12;
+                }
+                if rows - row >= 8 {
+                    self.tile::<L, 8, 2>(row, panel);
+                    row += 8;
+                }
+                if rows - row >= 4 {
+                    self.tile::<L, 4, 2>(row, panel);
+                    row += 4;
+                }
+            } else {
+                while rows - row >= 6 {
+                    self.tile::<L, 6, 1>(row, panel);
+                    row += 6;
+                }
+            }
+            while row < rows {
+                self.tile::<L, 1, 2>(row, panel);
+                row += 1;
+            }
+        }
+    }
+}
+
+impl<X: Operand, S: Starts> Product<'_, X, S> {
+    /// Computes `R` rows of a panel, `W` vectors at a time.
+    #[inline(always)]
+    fn tile<L: Level, const R: usize, const W: usize>(&mut self, row: usize, panel: Panel<'_>) {
+        for half in (0..WIDTH / LANES).step_by(W) {
+            let first = panel.first + half * LANES;
+            if first >= self.weights.outputs {
+                break;
+            }
+            let mut sums = [load::<L, W>(panel.bias, half); R];
+            self.x.accumulate::<L, R, W>(row, panel.elements, half, &mut sums);
+            let width = (self.weights.outputs - first).min(W * LANES);
+            for r in 0..R {
+                let to = &mut self.y.0[self.y.1.of(row + r) + first..][..width];
+                if let Some(to) = to.as_chunks_mut::<LANES>().0.first_chunk_mut::<W>() {
+                    store::<L, W, X>(&sums[r], to);
+                } else {
+                    let mut whole = [[0.0; LANES]; W];
+                    whole.as_flattened_mut()[..width].copy_from_slice(to);
+                    store::<L, W, X>(&sums[r], &mut whole);
+                    to.copy_from_slice(&whole.as_flattened()[..width]);
+                }
+            }
+        }
+    }
+}
+
+/// Stores a row of a tile.
+#[inline(always)]
+fn store<L: Level, const W: usize, X: Operand>(sums: &[Vector<L>; W], to: &mut [[f32; LANES]; W]) {
+    let simd = L::f32x16();
+    for w in 0..W {
+        let sum = if X::ADDS { simd.add(simd.load(&to[w]), sums[w]) } else { sums[w] };
+        simd.store(sum, &mut to[w]);
+    }
+}

@@ -21,7 +21,7 @@ const EXPERTS: &[ExpertEntry] = &[
     ExpertEntry {
         id: "expert",
         summary: "pushes planned with the environment's own physics",
-        make: || Box::new(OnGrid(expert::Pusher::new(rounded))),
+        make: || Box::new(OnGrid(expert::Pusher::new(rounded, expert::Pace::FULL))),
     },
     ExpertEntry {
         id: "weak",

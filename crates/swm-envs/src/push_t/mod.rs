@@ -35,7 +35,12 @@ const EXPERTS: &[ExpertEntry] = &[
     ExpertEntry {
         id: "expert",
         summary: "pushes planned with the environment's own physics",
-        make: || Box::new(expert::Pusher::new(|action| action)),
+        make: || Box::new(expert::Pusher::new(|action| action, expert::Pace::FULL)),
+    },
+    ExpertEntry {
+        id: "paper-speed",
+        summary: "the pushes of `expert`, at the speed of the published demonstrations",
+        make: || Box::new(expert::Pusher::new(|action| action, expert::Pace::PAPER)),
     },
     ExpertEntry {
         id: "weak",

@@ -5,4 +5,5 @@ mod conformance;
 mod golden_classic;
 mod golden_point_agents;
 mod golden_push_t;
+mod push_t_experts;
 mod wrappers;

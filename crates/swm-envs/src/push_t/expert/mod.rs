@@ -2,10 +2,12 @@
 //! the block.
 
 mod configuration_space;
+mod pace;
 mod paths;
 mod push_model;
 mod pusher;
 mod weak;
 
+pub use pace::Pace;
 pub use pusher::Pusher;
 pub use weak::WeakExpert;

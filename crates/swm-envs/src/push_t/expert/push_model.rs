@@ -1,6 +1,7 @@
 //! [`PushModel`]: a copy of the simulation in which the expert tries pushes.
 
 use super::configuration_space::ConfigurationSpace;
+use super::pace::Pace;
 use super::paths::ShortestPaths;
 use crate::push_t::ACTION_SCALE;
 use crate::push_t::physics::{AGENT, BLOCK, Pose, Simulation, Vec2};
@@ -18,10 +19,11 @@ const CIRCLE_CORNERS: usize = 16;
 /// Cost of one radian of rotation, in units of the block's radius of gyration. A push at this radius rotates the
 /// block by one radian per two radii of distance.
 const ROTATION_WEIGHT: f64 = 1.6;
-/// Steps added to the cost of every push, so that few long pushes are preferred to many short ones.
+/// Time added to the cost of every push, in steps at full speed, so that few long pushes are preferred to many short
+/// ones.
 const PUSH_OVERHEAD: f64 = 30.0;
-/// The number of steps for which a push is continued after the step with the best rate.
-const PATIENCE: usize = 3;
+/// The time for which a push is continued after the step with the best rate, in steps at full speed.
+const PATIENCE: f64 = 3.0;
 
 /// The part of the observation that the expert reads.
 pub struct Observation {
@@ -45,9 +47,9 @@ pub struct Push {
     pub steps: usize,
     /// The error after the push, in pixels (see [`PushModel::error`]).
     pub error: f64,
-    /// Steps of the path and the push.
+    /// Duration of the path and the push, in steps at full speed.
     pub time: f64,
-    /// Reduction of the error per step, in pixels.
+    /// Reduction of the error per step at full speed, in pixels.
     pub rate: f64,
 }
 
@@ -57,7 +59,7 @@ pub struct Candidates<'a> {
     pub spacing: f64,
     /// Angles between the push and the direction into the block, in radians.
     pub angles: &'a [f64],
-    /// Lengths of the action, as shares of the largest action.
+    /// Lengths of the action, as shares of the largest action of the pace.
     pub strengths: &'a [f64],
 }
 
@@ -77,13 +79,15 @@ pub struct PushModel {
     drift: f64,
     /// Cost of one radian of rotation, in pixels.
     rotation_cost: f64,
-    /// The maximal number of steps of a push.
-    pub max_steps: usize,
+    /// The maximal duration of a push, in steps at full speed.
+    max_time: f64,
+    /// The pace of the agent.
+    pub pace: Pace,
 }
 
 impl PushModel {
     /// Makes a model for these shapes.
-    pub fn new(shapes: [f64; 4], round_action: fn([f64; 2]) -> [f64; 2]) -> Self {
+    pub fn new(shapes: [f64; 4], round_action: fn([f64; 2]) -> [f64; 2], pace: Pace) -> Self {
         let body_shapes = [0, 2].map(|i| BodyShape::new(shapes[i] as i64, shapes[i + 1]));
         let bodies = [body_shapes[AGENT].body(), body_shapes[BLOCK].body()];
         let gyration = bodies[BLOCK].inverse_inertia.sqrt().recip();
@@ -91,10 +95,10 @@ impl PushModel {
         // A round agent is a critically damped spring of 10 / s for 0.1 s: it covers 1 - 2 / e of the distance, and
         // moves velocity / 10 e farther. Other agents lose their velocity in every physics step: each step covers a
         // hundredth of the remaining distance.
-        let (covered, drift, max_steps) = if body_shapes[AGENT].is_circle() {
-            (1.0 - 2.0 * e, 0.1 * e, 6)
+        let (covered, drift, max_time) = if body_shapes[AGENT].is_circle() {
+            (1.0 - 2.0 * e, 0.1 * e, 6.0)
         } else {
-            (1.0 - 0.99f64.powi(10), 0.0, 24)
+            (1.0 - 0.99f64.powi(10), 0.0, 24.0)
         };
         let initial = assemble(&body_shapes, bodies);
         Self {
@@ -106,16 +110,17 @@ impl PushModel {
             speed: covered * f64::from(ACTION_SCALE),
             drift,
             rotation_cost: ROTATION_WEIGHT * gyration,
-            max_steps,
+            max_time,
+            pace,
         }
     }
 
-    /// Returns the action that moves the agent to a position in one step, or as near as the largest action allows.
-    pub fn approach(&self, now: &Observation, to: Vec2) -> [f64; 2] {
+    /// Returns the action that moves the agent to a position, or towards it as far as the pace allows. `last` is the
+    /// preceding action.
+    pub fn approach(&self, now: &Observation, to: Vec2, last: [f64; 2]) -> [f64; 2] {
         let drift = Vec2::new(now.state[5], now.state[6]) * self.drift;
-        let wanted = (to - now.agent() - drift) * (1.0 / self.speed);
-        let strength = wanted.x.abs().max(wanted.y.abs()).max(1.0);
-        [wanted.x / strength, wanted.y / strength]
+        let wanted = (to - now.agent() - drift) * (self.pace.approach / self.speed);
+        self.pace.limited([wanted.x, wanted.y], last)
     }
 
     /// Returns the distance of the block from its goal: of its origin in pixels, and of its angle in radians.
@@ -190,15 +195,16 @@ impl PushModel {
         for _ in 0..if starts.is_empty() { 0 } else { samples } {
             let (from, inward) = starts[rng.random_range(0..starts.len())];
             let action = self.action(inward, rng.random_range(-0.8..0.8), 1.0);
-            let steps = rng.random_range(2..=self.max_steps);
+            let steps = rng.random_range(2..=self.pace.steps(self.max_time));
             self.set_start(now, from);
-            (0..steps).for_each(|_| self.advance(action));
+            let mut last = [0.0; 2];
+            (0..steps).for_each(|_| last = self.advance(action, last));
             let after =
                 Observation { state: state_of(&self.simulation), agent_angle: self.simulation.bodies[AGENT].angle };
             let (Some((length, node)), Some(next)) = (paths.to(from), self.best_push(&after, goal, candidates)) else {
                 continue;
             };
-            let time = length / self.speed + steps as f64 + next.time;
+            let time = length / self.speed + steps as f64 * self.pace.largest + next.time;
             let rate = (before - next.error) / (time + PUSH_OVERHEAD);
             if best.as_ref().is_none_or(|best| rate > best.rate) {
                 let waypoints = paths.waypoints(from, node);
@@ -212,7 +218,7 @@ impl PushModel {
     fn action(&self, inward: Vec2, angle: f64, strength: f64) -> [f64; 2] {
         let (sin, cos) = angle.sin_cos();
         let direction = inward * cos + inward.perp() * sin;
-        let scale = strength / direction.x.abs().max(direction.y.abs());
+        let scale = strength * self.pace.largest / direction.x.abs().max(direction.y.abs());
         (self.round_action)([direction.x * scale, direction.y * scale])
     }
 
@@ -227,12 +233,15 @@ impl PushModel {
         set_state(&mut self.simulation, &start);
     }
 
-    fn advance(&mut self, action: [f64; 2]) {
+    /// Runs one step of a push, and returns the action that the pace allows after the action `last`.
+    fn advance(&mut self, action: [f64; 2], last: [f64; 2]) -> [f64; 2] {
+        let action = self.pace.limited(action, last);
         advance(&mut self.simulation, action.map(|v| v as f32));
+        action
     }
 
     /// Tries a push from a position, and returns it with the best number of steps. `before` is the present error,
-    /// `path` the number of steps to the position.
+    /// `path` the time to the position, in steps at full speed.
     fn attempt(
         &mut self,
         now: &Observation,
@@ -244,14 +253,15 @@ impl PushModel {
     ) -> Push {
         self.set_start(now, from);
         let mut best = Push { waypoints: vec![], action, steps: 1, error: before, time: path, rate: f64::NEG_INFINITY };
-        for steps in 1..=self.max_steps {
-            self.advance(action);
+        let (patience, mut last) = (self.pace.steps(PATIENCE), [0.0; 2]);
+        for steps in 1..=self.pace.steps(self.max_time) {
+            last = self.advance(action, last);
             let error = self.error(&state_of(&self.simulation), goal);
-            let time = path + steps as f64;
+            let time = path + steps as f64 * self.pace.largest;
             let rate = (before - error) / (time + PUSH_OVERHEAD);
             if rate > best.rate {
                 best = Push { steps, error, time, rate, ..best };
-            } else if steps > best.steps + PATIENCE {
+            } else if steps > best.steps + patience {
                 break;
             }
         }

@@ -5,6 +5,7 @@
 //! error fastest. If no push reduces the error enough, the expert searches for a push after which a good push is
 //! possible. When the block is at its goal, the agent walks to its own goal.
 
+use super::pace::Pace;
 use super::paths::ShortestPaths;
 use super::push_model::{Candidates, Observation, Push, PushModel};
 use crate::push_t::TABLE;
@@ -22,8 +23,8 @@ const COARSE: Candidates<'_> = Candidates { spacing: 40.0, angles: &[0.0], stren
 const DETOURS: usize = 40;
 /// The least reduction of the error that a push must achieve, in pixels.
 const MIN_PROGRESS: f64 = 0.5;
-/// The least rate that a push must achieve: the reduction of the error (pixels) divided by the number of steps, including
-/// the overhead of a push ([`super::push_model`]).
+/// The least rate that a push must achieve: the reduction of the error (pixels) divided by the number of steps at full
+/// speed, including the overhead of a push ([`super::push_model`]).
 const MIN_RATE: f64 = 0.1;
 /// The distance of the block from its goal (pixels, radians) below which the block is not pushed any more.
 const IN_PLACE: (f64, f64) = (12.0, 0.28);
@@ -31,16 +32,19 @@ const IN_PLACE: (f64, f64) = (12.0, 0.28);
 const PASSED: f64 = 5.0;
 /// A push starts within this distance of its starting point, in pixels.
 const ARRIVED: f64 = 2.0;
-/// A plan that has not ended after this many steps is abandoned.
-const PATIENCE: usize = 60;
+/// A plan that has not ended after this time is abandoned, in steps at full speed.
+const PATIENCE: f64 = 60.0;
 
 /// The expert that plans pushes.
 pub struct Pusher {
     /// Rounds an action to an action of the action space.
     round_action: fn([f64; 2]) -> [f64; 2],
+    pace: Pace,
     rng: Rng,
     model: Option<PushModel>,
     plan: Plan,
+    /// The preceding action of the episode.
+    last: [f64; 2],
 }
 
 /// A path and the push at its end.
@@ -58,14 +62,14 @@ struct Plan {
 
 impl From<Push> for Plan {
     fn from(push: Push) -> Self {
-        Self { waypoints: push.waypoints, push: push.action, steps: push.steps, patience: PATIENCE }
+        Self { waypoints: push.waypoints, push: push.action, steps: push.steps, patience: 0 }
     }
 }
 
 impl Plan {
     /// Makes a plan of a path without a push.
     fn walk(waypoints: Vec<Vec2>) -> Self {
-        Self { waypoints, patience: PATIENCE, ..Self::default() }
+        Self { waypoints, ..Self::default() }
     }
 
     /// Drops the waypoints that the agent has reached.
@@ -85,9 +89,9 @@ impl Plan {
 }
 
 impl Pusher {
-    /// Makes an expert for an environment that rounds actions by `round_action`.
-    pub fn new(round_action: fn([f64; 2]) -> [f64; 2]) -> Self {
-        Self { round_action, rng: Key::new(0).rng(), model: None, plan: Plan::default() }
+    /// Makes an expert of this pace for an environment that rounds actions by `round_action`.
+    pub fn new(round_action: fn([f64; 2]) -> [f64; 2], pace: Pace) -> Self {
+        Self { round_action, pace, rng: Key::new(0).rng(), model: None, plan: Plan::default(), last: [0.0; 2] }
     }
 }
 
@@ -95,6 +99,7 @@ impl Expert for Pusher {
     fn begin(&mut self, key: Key) {
         self.rng = key.rng();
         self.plan = Plan::default();
+        self.last = [0.0; 2];
     }
 
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
@@ -103,21 +108,24 @@ impl Expert for Pusher {
         let shapes: [f64; 4] = row.get::<f64>("shapes")?.try_into().unwrap_or_default();
         let now = Observation { state, agent_angle: row.get::<f64>("agent_pose")?[2] };
         let known = self.model.take().filter(|model| model.shapes == shapes);
-        let model = self.model.insert(known.unwrap_or_else(|| PushModel::new(shapes, self.round_action)));
+        let model = self.model.insert(known.unwrap_or_else(|| PushModel::new(shapes, self.round_action, self.pace)));
         self.plan.drop_reached(now.agent());
         if self.plan.is_over() {
-            self.plan = next_plan(model, &now, &goal, &mut self.rng);
+            model.pace = self.pace.drawn(&mut self.rng);
+            let patience = model.pace.steps(PATIENCE);
+            self.plan = Plan { patience, ..next_plan(model, &now, &goal, &mut self.rng) };
             self.plan.drop_reached(now.agent());
         }
         self.plan.patience = self.plan.patience.saturating_sub(1);
         let planned = match self.plan.waypoints.last() {
-            Some(&next) => model.approach(&now, next),
+            Some(&next) => model.approach(&now, next, self.last),
             None if self.plan.steps > 0 => {
                 self.plan.steps -= 1;
-                self.plan.push
+                model.pace.limited(self.plan.push, self.last)
             }
             None => [0.0; 2],
         };
+        self.last = planned;
         action.copy_from_slice(&planned);
         Ok(())
     }

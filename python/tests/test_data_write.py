@@ -217,6 +217,8 @@ def test_conversion_between_native_formats_keeps_the_content(tmp_path):
         data.convert(tmp_path / "a.lance", tmp_path / "e.lance", progress=False)
     data.convert(tmp_path / "a.lance", tmp_path / "e.lance", mode="append", progress=False)
     assert data.load_dataset(tmp_path / "e.lance").num_episodes == 5
+    with pytest.raises(ValueError, match="is the dataset that is read"):
+        data.convert(tmp_path / "a.lance", tmp_path / "a.lance", mode="overwrite", progress=False)
     with pytest.raises(TypeError, match="takes no colour"):
         data.convert(tmp_path / "a.lance", tmp_path / "f.lance", colour="red", progress=False)
 

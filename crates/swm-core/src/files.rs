@@ -3,7 +3,9 @@
 //!
 //! - [`open`] and [`read`] accept regular files only. A pipe or a device could block forever or never end.
 //! - [`write`] replaces a file whole: readers and killed processes see the old content or the new.
-//! - [`delete`] removes the regular files of a folder whose names are the program's own, and nothing else.
+//! - [`check_free`] and [`check_own`] refuse to replace a file that the program did not write.
+//! - [`delete_named`] removes regular files of a folder by their exact names, [`delete`] by the patterns of names that only
+//!   the program gives, and nothing else.
 //! - [`Lock`] keeps a second writer away from a file or folder.
 
 mod lock;
@@ -11,9 +13,10 @@ mod lock;
 pub use lock::Lock;
 
 use crate::{Error, Result};
-use std::fs::File;
-use std::io::{Read as _, Write as _};
-use std::path::{Path, PathBuf};
+use std::collections::BTreeSet;
+use std::fs::{File, FileType};
+use std::io::{ErrorKind, Read as _, Write as _};
+use std::path::{Component, Path, PathBuf};
 
 /// Opens a regular file for reading.
 ///
@@ -80,11 +83,108 @@ pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
 /// # Errors
 /// When `path` is a symbolic link, a folder or a device, or cannot be opened.
 pub fn open_to_write(path: &Path, append: bool) -> Result<File> {
-    if std::fs::symlink_metadata(path).is_ok_and(|found| !found.is_file()) {
+    if kind(path)?.is_some_and(|found| !found.is_file()) {
         return Err(Error::corrupt(path, "is not a regular file", "move it away, or choose another folder"));
     }
     let file = File::options().create(true).append(append).write(true).truncate(!append).open(path);
     file.map_err(|error| Error::io(path, "opening the file to write", error))
+}
+
+/// Checks that nothing exists at the path of a new file.
+///
+/// # Errors
+/// When something exists there, even a symbolic link to nothing.
+pub fn check_free(path: &Path) -> Result<()> {
+    if kind(path)?.is_none() {
+        return Ok(());
+    }
+    let fix = "move it away, or choose another path";
+    Err(Error::config(path.display().to_string(), "exists already, and is not replaced", fix))
+}
+
+/// Checks that an output file may be written: nothing exists at its path, or a file for which `is_own` holds.
+///
+/// # Errors
+/// When a file exists that the program did not write, or a folder, a link or a device.
+pub fn check_own(path: &Path, is_own: impl FnOnce(&Path) -> bool) -> Result<()> {
+    let problem = match kind(path)? {
+        None => return Ok(()),
+        Some(found) if found.is_dir() => "is a folder; a file is written there",
+        Some(found) if found.is_file() && is_own(path) => return Ok(()),
+        Some(_) => "exists and was not written by this program",
+    };
+    Err(Error::config(path.display().to_string(), problem, "move it away, or choose another path"))
+}
+
+/// Checks that a path does not end in a symbolic link. Folders before its last name may be links.
+///
+/// # Errors
+/// When the path ends in a link.
+pub fn check_no_link(path: &Path) -> Result<()> {
+    if kind(path)?.is_some_and(|found| found.is_symlink()) {
+        let fix = "give the path that it points to, or remove the link";
+        return Err(Error::config(path.display().to_string(), "is a symbolic link", fix));
+    }
+    Ok(())
+}
+
+/// Returns the type of what a path names, without following a link at its end; `None` if nothing exists.
+fn kind(path: &Path) -> Result<Option<FileType>> {
+    // Without the slash at the end of a path, which would follow a link.
+    let path: PathBuf = path.components().collect();
+    match std::fs::symlink_metadata(&path) {
+        Ok(found) => Ok(Some(found.file_type())),
+        Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => Ok(None),
+        Err(error) => Err(Error::io(path, "examining the path", error)),
+    }
+}
+
+/// Deletes regular files of `folder`, given by their relative paths, in this order. Files that do not exist are skipped.
+/// Then removes the folders below `folder` that this emptied.
+///
+/// # Errors
+/// When one of the paths leads out of the folder or through a symbolic link, or names something other than a regular file:
+/// then nothing is deleted. Also when a file cannot be deleted.
+pub fn delete_named(folder: &Path, names: &[PathBuf]) -> Result<()> {
+    let (mut folders, mut found) = (BTreeSet::new(), vec![]);
+    check_folder(folder)?;
+    for name in names {
+        let inside = name.components().all(|part| matches!(part, Component::Normal(_)));
+        if !inside {
+            let problem = format!("the file name '{}' leads outside of the folder", name.display());
+            return Err(Error::corrupt(folder, problem, "delete the files by hand"));
+        }
+        let parents: Vec<&Path> = name.ancestors().skip(1).filter(|parent| !parent.as_os_str().is_empty()).collect();
+        // The outermost folder first: a link among the folders would lead the next ones elsewhere.
+        let mut missing = false;
+        for parent in parents.iter().rev().filter(|parent| !folders.contains(**parent)) {
+            missing |= check_folder(&folder.join(parent))?;
+        }
+        let path = folder.join(name);
+        match kind(&path)? {
+            _ if missing => {}
+            None => {}
+            Some(kind) if kind.is_file() => {
+                found.push(path);
+                folders.extend(parents.iter().map(|parent| parent.to_path_buf()));
+            }
+            Some(_) => return Err(Error::corrupt(path, "is not a regular file", "remove it by hand")),
+        }
+    }
+    for path in found {
+        unlink(&path).map_err(|error| Error::io(&path, "deleting the file", error))?;
+    }
+    // A folder follows its parent in a sorted set.
+    folders.iter().rev().try_for_each(|name| remove_empty_folder(&folder.join(name)))
+}
+
+/// Checks that a path is a folder, or that nothing exists there. Returns whether nothing exists.
+fn check_folder(path: &Path) -> Result<bool> {
+    match kind(path)? {
+        None => Ok(true),
+        Some(found) if found.is_dir() => Ok(false),
+        Some(_) => Err(Error::corrupt(path, "is a file or a symbolic link", "give the folder itself")),
+    }
 }
 
 /// Deletes the files of the program in `folder`. `patterns` are relative paths such as `checkpoint/config.json` or
@@ -95,15 +195,12 @@ pub fn open_to_write(path: &Path, append: bool) -> Result<File> {
 /// # Errors
 /// When `folder` is a symbolic link or not a folder, or a file cannot be removed. A missing folder is not an error.
 pub fn delete(folder: &Path, patterns: &[&str]) -> Result<Vec<PathBuf>> {
-    match std::fs::symlink_metadata(folder) {
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(vec![]),
-        Err(error) => return Err(Error::io(folder, "deleting files", error)),
-        Ok(found) if !found.is_dir() => {
-            return Err(Error::corrupt(folder, "is a file or a symbolic link", "give the folder itself"));
-        }
-        Ok(_) => {}
-    }
-    delete_in(folder, patterns).map(|(_, remaining)| remaining)
+    // A folder cannot be removed by a path that ends in `.` or `..`.
+    let folder = match folder.file_name() {
+        Some(_) => folder.components().collect(),
+        None => folder.canonicalize().map_err(|error| Error::io(folder, "deleting files", error))?,
+    };
+    if check_folder(&folder)? { Ok(vec![]) } else { delete_in(&folder, patterns).map(|(_, remaining)| remaining) }
 }
 
 /// As [`delete`], for an existing folder; also returns whether a file was deleted.
@@ -151,22 +248,25 @@ fn after_name<'a>(pattern: &'a str, name: &str) -> Option<&'a str> {
 /// # Errors
 /// When `path` is a folder, a symbolic link or a device, or the file cannot be removed.
 pub fn delete_file(path: &Path) -> Result<()> {
-    let io = |error| Error::io(path, "deleting the file", error);
-    match std::fs::symlink_metadata(path) {
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(()),
-        Err(error) => Err(io(error)),
-        Ok(found) if !found.is_file() => Err(Error::corrupt(path, "is not a regular file", "remove it by hand")),
-        Ok(_) => unlink(path).map_err(io),
+    match kind(path)? {
+        None => Ok(()),
+        Some(found) if found.is_file() => unlink(path).map_err(|error| Error::io(path, "deleting the file", error)),
+        Some(_) => Err(Error::corrupt(path, "is not a regular file", "remove it by hand")),
     }
 }
 
-/// Removes a folder if it is empty.
+/// Removes a folder if it exists and is empty. A symbolic link is no folder.
 ///
 /// # Errors
-/// When the folder cannot be removed for another reason than its contents.
+/// When an empty folder cannot be removed.
 pub fn remove_empty_folder(folder: &Path) -> Result<()> {
     match std::fs::remove_dir(folder) {
-        Err(error) if error.kind() != std::io::ErrorKind::DirectoryNotEmpty => {
+        Err(error)
+            if !matches!(
+                error.kind(),
+                ErrorKind::DirectoryNotEmpty | ErrorKind::NotFound | ErrorKind::NotADirectory
+            ) =>
+        {
             Err(Error::io(folder, "removing an empty folder", error))
         }
         _ => Ok(()),

@@ -15,7 +15,9 @@ pub use dataset::{
     Split, StepRange, WriteMode, WriteOptions, Writer, column_quantiles, column_stats, goals, objects, views,
 };
 pub use formats::{FORMATS, FormatEntry, create, lance, open};
-pub use swm_image::{self as image, ImageCodec, RgbImage, write_png};
+pub use swm_image::{self as image, ImageCodec, RgbImage, check_png, write_png};
 pub use tools::convert::{self, ConvertMode, ConvertOptions, Converted, checksum, convert};
 pub use tools::doctor;
-pub use tools::preview::{self, PreviewOptions, contact_sheet, integer_scale, preview, write_mp4, write_mp4_scaled};
+pub use tools::preview::{
+    self, PreviewOptions, check_mp4, contact_sheet, integer_scale, preview, write_mp4, write_mp4_scaled,
+};

@@ -18,6 +18,13 @@ pub struct Videos {
     pub fps: u32,
 }
 
+impl Videos {
+    /// The path of a video below `root`.
+    fn name(&self, index: usize) -> String {
+        format!("{}-{index}.mp4", self.prefix)
+    }
+}
+
 /// The side length that small frames are enlarged to, in pixels.
 const MIN_SIDE: usize = 256;
 
@@ -36,7 +43,7 @@ impl VideoRecording {
     /// Prepares the recording of up to `videos.count` of the `episodes`.
     ///
     /// # Errors
-    /// When the pool renders no frames.
+    /// When the pool renders no frames, or a file of a video exists and was not written by this program.
     pub fn new(videos: &Videos, pool: &EnvPool, episodes: usize) -> Result<Self> {
         let Some(size) = pool.image() else {
             return Err(Error::config(
@@ -45,12 +52,13 @@ impl VideoRecording {
                 "give the world a frame size, or request no videos",
             ));
         };
-        let schema = pool.infos().schema();
+        let (schema, count) = (pool.infos().schema(), videos.count.min(episodes));
+        (0..count).try_for_each(|i| swm_data::check_mp4(&videos.root.join(videos.name(i))))?;
         Ok(Self {
             videos: videos.clone(),
             size,
             columns: [schema.index(PIXELS)?, schema.index(GOAL)?],
-            frames: vec![vec![]; videos.count.min(episodes)],
+            frames: vec![vec![]; count],
         })
     }
 
@@ -73,7 +81,7 @@ impl VideoRecording {
         let mut written = vec![];
         for (i, &episode) in counted.iter().enumerate() {
             let Some(frames) = self.frames.get(episode) else { continue };
-            let name = format!("{}-{i}.mp4", self.videos.prefix);
+            let name = self.videos.name(i);
             let path = self.videos.root.join(&name);
             let folder = path.parent().unwrap_or(Path::new("."));
             let made = std::fs::create_dir_all(folder)

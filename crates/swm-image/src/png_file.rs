@@ -3,7 +3,7 @@
 use crate::RgbImage;
 use crate::codec::check_pixels;
 use png::{Compression, EncodingError, Filter, Transformations};
-use std::io::{BufReader, BufWriter, Cursor};
+use std::io::{BufReader, BufWriter, Cursor, Read as _};
 use std::path::Path;
 use swm_core::{Error, Result, files};
 
@@ -19,6 +19,7 @@ pub fn encode(rgb: &[u8], height: u16, width: u16, out: &mut Vec<u8>) -> Result<
     // are the fastest to decode.
     encoder.set_compression(Compression::Fast);
     encoder.set_filter(Filter::Up);
+    encoder.add_text_chunk(SOFTWARE[0].to_owned(), SOFTWARE[1].to_owned()).map_err(failed)?;
     let mut writer = encoder.write_header().map_err(failed)?;
     writer.write_image_data(rgb).map_err(failed)
 }
@@ -90,10 +91,27 @@ pub fn read_png(path: &Path) -> Result<RgbImage> {
     Ok(RgbImage { width, height, rgb })
 }
 
-/// Writes an RGB image, `[height, width, 3]` bytes, as a PNG file.
+/// The text chunk of PNG files that this program writes: keyword and value.
+const SOFTWARE: [&str; 2] = ["Software", "stable-worldmodel"];
+
+/// Checks that a PNG file may be written: nothing exists at its path, or an image that [`write_png`] wrote.
 ///
 /// # Errors
-/// When `rgb` has another length, a side is 0, or the file cannot be written.
+/// When another file exists there.
+pub fn check_png(path: &Path) -> Result<()> {
+    files::check_own(path, |path| {
+        // Text chunks precede the pixels.
+        let mut start = vec![];
+        let read = files::open(path).is_ok_and(|file| file.take(1 << 10).read_to_end(&mut start).is_ok());
+        let chunk = format!("tEXt{}\0{}", SOFTWARE[0], SOFTWARE[1]);
+        read && start.windows(chunk.len()).any(|part| part == chunk.as_bytes())
+    })
+}
+
+/// Writes an RGB image, `[height, width, 3]` bytes, as a PNG file. An image of this program is replaced.
+///
+/// # Errors
+/// When `rgb` has another length, a side is 0, [`check_png`] fails, or the file cannot be written.
 pub fn write_png(path: &Path, width: usize, height: usize, rgb: &[u8]) -> Result<()> {
     if width == 0 || height == 0 || rgb.len() != width * height * 3 {
         return Err(Error::mismatch(
@@ -109,6 +127,7 @@ pub fn write_png(path: &Path, width: usize, height: usize, rgb: &[u8]) -> Result
         })
     };
     let (wide, high) = (side(width)?, side(height)?);
+    check_png(path)?;
     let file = files::open_to_write(path, false)?;
     let mut encoder = png::Encoder::new(BufWriter::new(file), wide, high);
     encoder.set_color(png::ColorType::Rgb);
@@ -117,6 +136,7 @@ pub fn write_png(path: &Path, width: usize, height: usize, rgb: &[u8]) -> Result
         EncodingError::IoError(source) => Error::io(path, "writing an image", source),
         other => Error::external(format!("encoding {}", path.display()), other),
     };
+    encoder.add_text_chunk(SOFTWARE[0].to_owned(), SOFTWARE[1].to_owned()).map_err(failed)?;
     let mut writer = encoder.write_header().map_err(failed)?;
     writer.write_image_data(rgb).map_err(failed)?;
     writer.finish().map_err(failed)

@@ -72,7 +72,7 @@ impl Open<'_> {
 #[derive(Debug)]
 pub struct Video {
     source: Source,
-    index: Index,
+    pub(crate) index: Index,
 }
 
 impl Video {

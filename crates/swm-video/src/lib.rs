@@ -18,6 +18,13 @@ pub use cache::VideoCache;
 pub use decode::{DecoderPool, FrameRequest, Source, Video};
 pub use encode::{Encoder, Encoding, Quality, encode};
 
+use std::path::Path;
+
+/// Returns whether this program wrote a video file: whether it has checksums of its frames.
+pub fn is_own(path: &Path) -> bool {
+    Video::open(Source::File(path.to_owned())).is_ok_and(|video| video.index.sums.is_some())
+}
+
 /// Initialises FFmpeg's libraries once. FFmpeg logs nothing to standard error, because failures become errors.
 fn prepare() {
     static ONCE: std::sync::Once = std::sync::Once::new();

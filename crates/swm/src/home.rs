@@ -137,22 +137,6 @@ fn unknown(kind: &'static str, given: &str, path: &Path, folder: Result<PathBuf>
     Error::unknown(kind, given, names.iter().map(String::as_str), hint)
 }
 
-/// Checks that a dataset is not written over the dataset that it is read from.
-///
-/// # Errors
-/// When both locations are the same dataset.
-pub fn check_distinct(source: &Location, target: &Location) -> Result<()> {
-    let canonical = |location: &Location| location.path().and_then(|path| path.canonicalize().ok());
-    let same = match (canonical(source), canonical(target)) {
-        (Some(source), Some(target)) => source == target,
-        _ => source.to_string() == target.to_string(),
-    };
-    if !same {
-        return Ok(());
-    }
-    Err(Error::config(format!("target {target}"), "is the dataset that is read", "give another target"))
-}
-
 /// Returns the sorted names of the entries of a folder without dataset suffixes; hidden entries are left out.
 pub fn names_in(folder: &Path) -> Vec<String> {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();

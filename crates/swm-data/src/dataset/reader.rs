@@ -5,6 +5,7 @@
 //! (float) or -1 (integer).
 
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 use swm_core::{Batch, ColumnSpec, Manifest, Result, Schema};
 
 /// Named bytes that are constant over an episode, such as the XML of its scene. Text is UTF-8.
@@ -95,6 +96,12 @@ pub trait Reader: Send + Sync {
     /// If the stored data is damaged.
     fn irregularities(&self) -> Result<Vec<Irregularity>> {
         Ok(vec![])
+    }
+
+    /// The paths and URIs of the datasets that this reader reads, none of which may be replaced meanwhile. Empty if it reads
+    /// memory.
+    fn sources(&self) -> Vec<PathBuf> {
+        vec![]
     }
 
     /// The manifest, which records the provenance of the data, if the dataset stores one.

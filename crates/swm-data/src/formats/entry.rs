@@ -1,7 +1,7 @@
 //! [`FormatEntry`]: the registry row of a dataset format.
 
-use crate::dataset::{Location, Reader, WriteOptions, Writer};
-use std::path::{Path, PathBuf};
+use crate::dataset::{Location, Reader, WriteMode, WriteOptions, Writer};
+use std::path::Path;
 use std::sync::Arc;
 use swm_core::{Error, Named, Result, Schema, files};
 
@@ -13,8 +13,6 @@ pub struct FormatEntry {
     pub summary: &'static str,
     /// File name suffixes of the format's datasets. New datasets get the first suffix.
     pub suffixes: &'static [&'static str],
-    /// The files of a dataset, as patterns of [`swm_core::files::delete`]; empty if a dataset is one file.
-    pub files: &'static [&'static str],
     /// The Cargo feature of `swm-data` that this format requires, if any.
     pub feature: Option<&'static str>,
     /// Returns whether an existing dataset, or a dataset to create, at this location has this format.
@@ -23,13 +21,15 @@ pub struct FormatEntry {
     pub backend: Option<Backend>,
 }
 
-/// The functions that open and create datasets of a format.
+/// The functions that open, create and delete datasets of a format.
 #[derive(Clone, Copy)]
 pub struct Backend {
     /// Opens a dataset.
     pub open: fn(&Location) -> Result<Arc<dyn Reader>>,
     /// Creates, continues or replaces a dataset.
     pub create: fn(&Location, &Schema, WriteOptions) -> Result<Box<dyn Writer>>,
+    /// Deletes a dataset on this machine: the files that its own metadata names, and no other file.
+    pub remove: fn(&Path) -> Result<()>,
 }
 
 impl Named for FormatEntry {
@@ -62,21 +62,25 @@ impl FormatEntry {
     /// Creates, continues or replaces a dataset whose episodes have the columns of `schema`.
     ///
     /// # Errors
-    /// If the dataset exists and `options.mode` forbids it, the schema differs from that of the dataset to continue,
-    /// writing fails, or this build lacks the format's feature.
+    /// If the dataset exists and `options.mode` forbids it, the dataset to replace is a symbolic link, the schema differs
+    /// from that of the dataset to continue, writing fails, or this build lacks the format's feature.
     pub fn create(&self, location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
+        if options.mode == WriteMode::Overwrite
+            && let Some(path) = location.path()
+        {
+            files::check_no_link(path)?;
+        }
         (self.backend()?.create)(location, schema, options)
     }
 
-    /// Deletes the files of a dataset on this machine, and no other file. Returns the remaining entries of its folder.
+    /// Deletes a dataset on this machine, and its folder if that is empty then.
     ///
     /// # Errors
-    /// If a file cannot be deleted.
-    pub fn remove(&self, path: &Path) -> Result<Vec<PathBuf>> {
-        match self.files {
-            [] => files::delete_file(path).map(|()| vec![]),
-            patterns => files::delete(path, patterns),
-        }
+    /// If the metadata of the dataset does not name its files, or a file cannot be deleted.
+    pub fn remove(&self, path: &Path) -> Result<()> {
+        files::check_no_link(path)?;
+        (self.backend()?.remove)(path)?;
+        files::remove_empty_folder(path)
     }
 
     fn backend(&self) -> Result<Backend> {

@@ -6,7 +6,7 @@ use crate::dataset::{Location, Reader, WriteOptions, Writer};
 use std::sync::Arc;
 use swm_core::{Error, Named, Registry, Result, Schema};
 
-/// All dataset formats. The first format that detects a location is used.
+/// All dataset formats. The suffix of a location determines its format; without a suffix, the first format that detects it.
 pub static FORMATS: Registry<FormatEntry> = Registry {
     kind: "dataset format",
     hint: "`swm formats` lists them",
@@ -23,7 +23,8 @@ pub static FORMATS: Registry<FormatEntry> = Registry {
 
 /// The format of an existing dataset, or of a dataset to create, at this location.
 pub fn detect(location: &Location) -> Option<&'static FormatEntry> {
-    FORMATS.rows.iter().find(|format| (format.detect)(location))
+    let by_suffix = FORMATS.rows.iter().find(|format| format.has_suffix(location));
+    by_suffix.or_else(|| FORMATS.rows.iter().find(|format| (format.detect)(location)))
 }
 
 /// Opens a dataset of any format.

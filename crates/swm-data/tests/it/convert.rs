@@ -277,3 +277,29 @@ fn failed_conversion_leaves_no_empty_dataset() {
     assert!(error.to_string().contains("another format"), "{error}");
     assert_eq!(folder.path().read_dir().expect("listing").count(), 1, "only the source remains");
 }
+
+#[test]
+fn dataset_is_not_written_over_itself() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    for format in ["lance", "lance-video", "folder", "video", "lerobot", "h5"] {
+        let path = folder.path().join(format!("{format}/data.{format}"));
+        std::fs::create_dir_all(path.parent().expect("a folder")).expect("creating a folder");
+        write(&path, WriteMode::Create, 1, 0..2);
+        let link = folder.path().join(format!("link.{format}"));
+        std::os::unix::fs::symlink(&path, &link).expect("making a link");
+        let reader = open(&path).expect("opening");
+        let views = [
+            swm_data::views::subset(Arc::clone(&reader), vec![1]).expect("a view"),
+            swm_data::views::concat(vec![Arc::clone(&reader)]).expect("a view"),
+        ];
+        for reader in views.iter().chain([&reader]) {
+            // The folder that holds a single table or file is a name of this dataset.
+            for target in [&*path, &link, path.parent().expect("a folder")] {
+                let options = ConvertOptions { mode: ConvertMode::Overwrite, ..ConvertOptions::default() };
+                let error = convert(reader, &target.into(), &options, &mut Control::new()).expect_err("the source");
+                assert!(error.is_usage() && error.to_string().contains("is the dataset that is read"), "{error}");
+            }
+        }
+        assert_eq!(open(&path).expect("opening").episodes().len(), 2);
+    }
+}

@@ -137,13 +137,18 @@ fn killed_appends(kills: u64) {
 fn killed_replacements(kills: u64) {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
+    replacements(&path, kills, |path| assert!(check_all(path, true) <= 10));
+}
+
+/// Kills processes that replace a dataset, and calls `check` after each kill.
+pub fn replacements(path: &Path, kills: u64, check: impl Fn(&Path)) {
     for index in 0..kills {
-        let child = start("child_that_replaces", &path);
+        let child = start("child_that_replaces", path);
         assert!(
             kill(child, Key::new(0).with("replace").at(index), Duration::from_millis(120)),
             "the child ended before it was killed"
         );
-        assert!(check_all(&path, true) <= 10);
+        check(path);
     }
 }
 

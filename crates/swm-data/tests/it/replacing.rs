@@ -1,8 +1,73 @@
-//! Replacing a dataset deletes the dataset's own files only.
+//! Replacing a dataset deletes the dataset's own files only, and no writer writes through symbolic links.
 
-use crate::sample::{check, options, schema, write};
-use std::path::Path;
-use swm_data::{WriteMode, WriteOptions, create, open};
+use crate::fuzz::{copy_all, files};
+use crate::kill;
+use crate::sample::{check, episode, options, schema, write};
+use crate::video::interop;
+use std::collections::BTreeMap;
+use std::os::unix::fs::symlink;
+use std::path::{Path, PathBuf};
+use swm_core::{ColumnSpec, DType, Schema};
+use swm_data::{FORMATS, Location, PreviewOptions, WriteMode, WriteOptions, create, open, preview};
+
+/// The formats whose datasets are folders.
+const FOLDER_FORMATS: [&str; 5] = ["lance", "lance-video", "folder", "video", "lerobot"];
+
+/// Names of files of a user that resemble those of a dataset of some format.
+const USER_FILES: [&str; 19] = [
+    "thesis.txt",
+    "thesis.npz",
+    "notes/deep/a.txt",
+    "holiday/ep_1.mp4",
+    "holiday/ep_0_step_0.jpeg",
+    "pixels/ep_notes.txt",
+    "pixels/ep_x_step_y.png",
+    "pixels/ep_0_step_y.jpeg",
+    "pixels/ep_00.mp4",
+    "pixels/ep_99.mp4",
+    "pixels/ep_99_step_0.jpeg",
+    "data/thesis.lance",
+    "data/chunk-000/thesis.parquet",
+    "data/chunk-000/file-099.parquet",
+    "meta/notes.json.tmp",
+    "meta/episodes/chunk-000/thesis.parquet",
+    "videos/holiday/chunk-000/file-000.mp4",
+    "videos/chunk-000/holiday/episode_0.mp4",
+    "_versions/notes.manifest",
+];
+
+/// Writes the files of the user into a folder.
+pub fn add_user_files(folder: &Path) {
+    for file in USER_FILES.map(|name| folder.join(name)) {
+        std::fs::create_dir_all(file.parent().expect("a folder")).expect("creating a folder");
+        std::fs::write(file, "thesis").expect("writing a file");
+    }
+}
+
+/// Checks that the files of the user are unchanged.
+pub fn check_user_files(folder: &Path) {
+    for file in USER_FILES.map(|name| folder.join(name)) {
+        assert_eq!(std::fs::read_to_string(&file).unwrap_or_default(), "thesis", "{}", file.display());
+    }
+}
+
+/// The content of every file in a folder.
+fn contents(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    files(folder).into_iter().map(|file| (file.clone(), std::fs::read(file).expect("reading a file"))).collect()
+}
+
+/// The relative paths of all files in a folder.
+fn names(folder: &Path) -> Vec<PathBuf> {
+    files(folder).iter().map(|file| file.strip_prefix(folder).expect("a file of the folder").to_owned()).collect()
+}
+
+/// Expects that replacing a dataset fails with this message and changes no file.
+fn refused(path: &Path, message: &str) {
+    let before = contents(path);
+    let error = overwrite(path).expect("a refusal").to_string();
+    assert!(error.contains(message), "{error}");
+    assert_eq!(contents(path), before, "{}", path.display());
+}
 
 fn overwrite(path: &Path) -> Option<swm_core::Error> {
     create(path, &schema(), WriteOptions { exclusive: true, ..options(WriteMode::Overwrite) }).err()
@@ -35,22 +100,251 @@ fn files_of_another_kind_are_not_replaced() {
 #[test]
 fn other_files_in_the_folder_of_a_dataset_stay() {
     let folder = tempfile::tempdir().expect("creating a folder");
-    for format in ["lance", "lance-video", "folder", "video", "lerobot"] {
+    for format in FOLDER_FORMATS {
+        let path = folder.path().join(format!("data.{format}"));
+        write(&path, WriteMode::Create, 1, 0..3);
+        add_user_files(&path);
+        let read = |episodes| {
+            check_user_files(&path);
+            let reader = open(&path).expect("opening");
+            assert_eq!(reader.episodes().len(), episodes, "{format}");
+            check(&*reader, 0);
+        };
+        read(3);
+        write(&path, WriteMode::Overwrite, 1, 0..1);
+        read(1);
+        write(&path, WriteMode::Append, 1, 1..2);
+        read(2);
+    }
+    assert_eq!(folder.path().read_dir().expect("listing").count(), 5, "nothing is beside the datasets");
+}
+
+#[test]
+fn replacement_leaves_no_file_of_the_old_dataset() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    for format in ["folder", "video", "lerobot"] {
+        let [path, new] = ["old", "new"].map(|name| folder.path().join(format!("{name}.{format}")));
+        write(&path, WriteMode::Create, 1, 0..4);
+        write(&path, WriteMode::Overwrite, 1, 0..1);
+        write(&new, WriteMode::Create, 1, 0..1);
+        assert_eq!(names(&path), names(&new));
+    }
+}
+
+#[test]
+fn replacement_completes_one_that_was_killed() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    for (format, last) in [("folder", "ep_len.npz"), ("video", "ep_len.npz"), ("lerobot", "meta/info.json")] {
+        let path = folder.path().join(format!("data.{format}"));
+        write(&path, WriteMode::Create, 1, 0..3);
+        let expected = names(&path);
+        let own = files(&path);
+        // The metadata is deleted last.
+        for file in own.iter().filter(|file| **file != path.join(last)) {
+            std::fs::remove_file(file).expect("removing a file");
+        }
+        add_user_files(&path);
+        assert!(open(&path).is_err(), "{format}: missing files are reported");
+        write(&path, WriteMode::Overwrite, 1, 0..3);
+        check(&*open(&path).expect("opening"), 0);
+        check_user_files(&path);
+        assert!(expected.iter().all(|name| path.join(name).is_file()), "{format}");
+    }
+}
+
+#[test]
+fn killed_replacements_keep_files_of_the_user() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    for format in ["folder", "video", "lerobot", "lance"] {
         let path = folder.path().join(format!("data.{format}"));
         write(&path, WriteMode::Create, 1, 0..2);
-        let notes: Vec<_> =
-            ["thesis.txt", "notes/deep/a.txt", "pixels/ep_notes.txt"].map(|name| path.join(name)).into();
-        for file in &notes {
-            std::fs::create_dir_all(file.parent().expect("a folder")).expect("creating a folder");
-            std::fs::write(file, "notes").expect("writing a file");
-        }
-        write(&path, WriteMode::Overwrite, 1, 0..1);
-        for file in &notes {
-            assert_eq!(std::fs::read_to_string(file).expect("the file"), "notes", "{format}");
-        }
-        let reader = open(&path).expect("opening");
-        assert_eq!(reader.episodes().len(), 1);
-        check(&*reader, 0);
+        let own = names(&path);
+        add_user_files(&path);
+        kill::replacements(&path, 4, check_user_files);
+        write(&path, WriteMode::Overwrite, 1, 0..2);
+        check(&*open(&path).expect("opening"), 0);
+        check_user_files(&path);
+        let left: Vec<PathBuf> = names(&path);
+        let left =
+            left.iter().filter(|name| !own.contains(name) && !USER_FILES.iter().any(|user| Path::new(user) == **name));
+        assert!(format == "lance" || left.clone().count() == 0, "{format}: {:?}", left.collect::<Vec<_>>());
     }
-    assert_eq!(folder.path().read_dir().expect("listing").count(), 5, "no folder of a replaced dataset remains");
+    assert_eq!(folder.path().read_dir().expect("listing").count(), 4, "nothing is beside the datasets");
+}
+
+#[test]
+fn datasets_whose_files_are_unknown_are_not_replaced() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let third_party = [
+        ("folder-reference", "folder"),
+        ("reference-video", "video"),
+        ("lerobot-v21", "lerobot"),
+        ("lerobot-v30-h264", "lerobot"),
+    ];
+    for (name, format) in third_party {
+        let path = folder.path().join(format!("{name}.{format}"));
+        copy_all(&interop().join(name), &path);
+        refused(&path, "another program wrote it");
+    }
+    for (format, metadata) in [("folder", "ep_len.npz"), ("video", "ep_len.npz"), ("lerobot", "meta/info.json")] {
+        let path = folder.path().join(format!("damaged.{format}"));
+        write(&path, WriteMode::Create, 1, 0..2);
+        std::fs::write(path.join(metadata), "thesis").expect("writing a file");
+        refused(&path, "the names of its files are unknown");
+    }
+}
+
+#[test]
+fn dataset_of_another_format_is_not_replaced() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    for (old, new) in [("video", "folder"), ("folder", "video")] {
+        let path = folder.path().join(format!("a-{old}"));
+        let create = |format, mode| {
+            let format = FORMATS.get(format).expect("a format");
+            format.create(&Location::from(&path), &schema(), options(mode))
+        };
+        let mut writer = create(old, WriteMode::Create).expect("creating");
+        writer.write_episode(&episode(0)).expect("writing");
+        writer.finish().expect("finishing");
+        let before = contents(&path);
+        let error = create(new, WriteMode::Overwrite).err().expect("another format").to_string();
+        assert!(error.contains(&format!("is a dataset of the format {old}")), "{error}");
+        assert_eq!(contents(&path), before);
+    }
+}
+
+#[test]
+fn new_columns_do_not_replace_files_of_the_user() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let path = folder.path().join("data.folder");
+    write(&path, WriteMode::Create, 1, 0..2);
+    add_user_files(&path);
+    let schema = Schema::new([ColumnSpec::new("thesis", DType::Float32, [])]).expect("a schema");
+    let before = contents(&path);
+    let error = create(&path, &schema, options(WriteMode::Overwrite)).err().expect("an existing file").to_string();
+    assert!(error.contains("thesis.npz") && error.contains("is not replaced"), "{error}");
+    assert_eq!(contents(&path), before);
+}
+
+#[test]
+fn new_episodes_do_not_replace_files_of_the_user() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let cases = [
+        ("folder", "pixels/ep_1_step_0.jpeg"),
+        ("video", "pixels/ep_1.mp4"),
+        ("lerobot", "data/chunk-000/file-001.parquet"),
+        ("lerobot", "videos/observation.images.pixels/chunk-000/file-001.mp4"),
+    ];
+    for (i, (format, name)) in cases.into_iter().enumerate() {
+        let path = folder.path().join(format!("{i}.{format}"));
+        write(&path, WriteMode::Create, 1, 0..1);
+        std::fs::write(path.join(name), "thesis").expect("writing a file");
+        let mut writer = create(&path, &schema(), options(WriteMode::Append)).expect("continuing");
+        let error = writer.write_episode(&episode(1)).and_then(|()| writer.finish()).expect_err("an existing file");
+        assert!(error.to_string().contains("is not replaced"), "{format}: {error}");
+        assert_eq!(std::fs::read_to_string(path.join(name)).expect("the file"), "thesis", "{name}");
+        assert_eq!(open(&path).expect("opening").episodes().len(), 1);
+    }
+}
+
+#[test]
+fn linked_datasets_are_not_replaced() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    for format in ["lance", "lance-video", "folder", "video", "lerobot", "h5"] {
+        let path = folder.path().join(format!("data.{format}"));
+        write(&path, WriteMode::Create, 1, 0..2);
+        let before = contents(&path);
+        let link = folder.path().join(format!("link.{format}"));
+        symlink(&path, &link).expect("making a link");
+        let with_slash = PathBuf::from(format!("{}/", link.display()));
+        for link in [&link, &with_slash] {
+            let error = overwrite(link).expect("a refusal").to_string();
+            assert!(error.contains("is a symbolic link"), "{format}: {error}");
+        }
+        assert_eq!(contents(&path), before, "{format}");
+        check(&*open(&link).expect("a link is read"), 0);
+    }
+}
+
+#[test]
+fn linked_parts_of_a_dataset_are_not_replaced() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let cases = [
+        ("folder", "pixels"),
+        ("folder", "action.npz"),
+        ("video", "pixels"),
+        ("video", "ep_len.journal"),
+        ("lerobot", "videos"),
+        ("lerobot", "data/chunk-000"),
+        ("lance", "data"),
+        ("lance", "_versions"),
+    ];
+    for (i, (format, name)) in cases.into_iter().enumerate() {
+        let (path, outside) = (folder.path().join(format!("{i}.{format}")), folder.path().join(format!("{i}-outside")));
+        write(&path, WriteMode::Create, 1, 0..2);
+        match path.join(name).exists() {
+            true => std::fs::rename(path.join(name), &outside).expect("moving"),
+            false => std::fs::write(&outside, "").expect("writing a file"),
+        }
+        symlink(&outside, path.join(name)).expect("making a link");
+        let before = [contents(&path), contents(&outside)];
+        let error = overwrite(&path).expect("a refusal").to_string();
+        assert!(error.contains(name), "{format} {name}: {error}");
+        assert_eq!([contents(&path), contents(&outside)], before, "{format} {name}");
+    }
+}
+
+#[test]
+fn temporary_files_are_not_written_through_links() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let cases = [
+        ("folder", "ep_len.tmp"),
+        ("folder", "ep_len.journal"),
+        ("folder", "pixels/ep_1_step_0.jpeg"),
+        ("video", "pixels/ep_1.mp4.tmp"),
+        ("video", "pixels/ep_1.mp4"),
+        ("lerobot", "data/chunk-000/file-001.parquet.tmp"),
+        ("lerobot", "videos/observation.images.pixels/chunk-000/file-001.mp4.tmp"),
+        ("lerobot", "meta/info.json.tmp"),
+    ];
+    for (i, (format, name)) in cases.into_iter().enumerate() {
+        let (path, thesis) = (folder.path().join(format!("{i}.{format}")), folder.path().join(format!("{i}-thesis")));
+        write(&path, WriteMode::Create, 1, 0..1);
+        std::fs::write(&thesis, "thesis").expect("writing a file");
+        symlink(&thesis, path.join(name)).expect("making a link");
+        let written = create(&path, &schema(), options(WriteMode::Append)).and_then(|mut writer| {
+            writer.write_episode(&episode(1))?;
+            writer.finish()
+        });
+        assert!(written.is_err(), "{format} {name}");
+        assert_eq!(std::fs::read_to_string(&thesis).expect("the file"), "thesis", "{format} {name}");
+    }
+}
+
+#[test]
+fn preview_replaces_only_its_own_files() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let path = folder.path().join("data.lance");
+    write(&path, WriteMode::Create, 1, 0..2);
+    let reader = open(&path).expect("opening");
+    let thesis = folder.path().join("thesis");
+    std::fs::write(&thesis, "thesis").expect("writing a file");
+    for name in ["contact_sheet.png", "episode_1.mp4"] {
+        for linked in [false, true] {
+            let out = tempfile::tempdir().expect("creating a folder");
+            match linked {
+                true => symlink(&thesis, out.path().join(name)).expect("making a link"),
+                false => drop(std::fs::copy(&thesis, out.path().join(name)).expect("copying a file")),
+            }
+            let error =
+                preview(&*reader, out.path(), &PreviewOptions::default(), |_| ()).expect_err("a file of the user");
+            assert!(error.to_string().contains("was not written by this program"), "{name}: {error}");
+            assert_eq!(names(out.path()), [Path::new(name)]);
+            assert_eq!(std::fs::read_to_string(out.path().join(name)).expect("the file"), "thesis");
+        }
+    }
+    let out = folder.path().join("preview");
+    for _ in 0..2 {
+        preview(&*reader, &out, &PreviewOptions::default(), |_| ()).expect("a preview replaces its own files");
+    }
 }

@@ -12,10 +12,9 @@ pub const ENTRY: FormatEntry = FormatEntry {
     id: "json",
     summary: "one JSON file",
     suffixes: &["extjson"],
-    files: &[],
     feature: None,
     detect: |location| location.has_suffix("extjson"),
-    backend: Some(Backend { open, create }),
+    backend: Some(Backend { open, create, remove: swm::core::files::delete_file }),
 };
 
 #[derive(Serialize, Deserialize)]

@@ -181,11 +181,13 @@ fn only_weights(folder: &Path) -> Result<PathBuf> {
     }
 }
 
-/// Writes a checkpoint that the reference's `load_pretrained` reads: `weights.pt` and `config.json`.
+/// Writes a checkpoint that the reference's `load_pretrained` reads: `weights.pt` and `config.json`. Existing files are not
+/// replaced, because nothing in them shows which program wrote them.
 pub(crate) fn write(folder: &Path, config: &impl Serialize, weights: &Named<HostTensor>) -> Result<()> {
     std::fs::create_dir_all(folder).map_err(|error| Error::io(folder, "creating a folder", error))?;
-    torch::write(&folder.join("weights.pt"), weights)?;
-    let path = folder.join(CONFIG);
+    let (path, weights_path) = (folder.join(CONFIG), folder.join("weights.pt"));
+    [&path, &weights_path].into_iter().try_for_each(|path| files::check_free(path))?;
+    torch::write(&weights_path, weights)?;
     let text = serde_json::to_string_pretty(config).map_err(|error| Error::external("writing JSON", error))?;
     files::write(&path, text.as_bytes())
 }

@@ -122,7 +122,8 @@ fn claim(folder: &Path) -> Result<Lock> {
     let lock = output_folder::claim(folder, &["index.html"])?;
     let mark = folder.join(MARK);
     let io = |error| Error::io(folder, "listing the folder", error);
-    if !mark.is_file() && std::fs::read_dir(folder).map_err(io)?.next().is_some() {
+    let is_marked = files::read(&mark, MARK_TEXT.len() as u64).is_ok_and(|text| text == MARK_TEXT.as_bytes());
+    if !is_marked && std::fs::read_dir(folder).map_err(io)?.next().is_some() {
         let fix = "give an empty folder with --output, or move its contents away";
         return Err(Error::config(folder.display().to_string(), "has files that `swm demo` did not write", fix));
     }

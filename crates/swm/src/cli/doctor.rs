@@ -28,9 +28,6 @@ pub fn doctor(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
     let name = &args.dataset;
     let target =
         args.repair.as_deref().map(|target| home::target(target, args.target.format.as_deref())).transpose()?;
-    if let (Some(target), Ok(source)) = (&target, home::find_dataset(name)) {
-        home::check_distinct(&source, target)?;
-    }
     let (reader, lost) = match home::find_dataset(name).and_then(|location| open_damaged(&location)) {
         Ok(opened) => opened,
         Err(error) if error.is_usage() => return Err(error.into()),

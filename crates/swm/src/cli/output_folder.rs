@@ -8,28 +8,20 @@ use swm_core::{Error, Result};
 /// command calls this before its work, so that hours of it are not lost because its results cannot be written.
 ///
 /// # Errors
-/// When the folder cannot be created or written to, another process writes to it, or one of the files is a folder.
+/// When the folder cannot be created or written to, another process writes to it, or one of the files exists and was not
+/// written by this program.
 pub fn claim(folder: &Path, names: &[&str]) -> Result<Lock> {
     if folder.exists() && !folder.is_dir() {
         return Err(Error::config(folder.display().to_string(), "is not a folder", "give a folder with --output"));
     }
     let lock = Lock::folder(folder)?;
     check_writable(folder)?;
-    if let Some(path) = names.iter().map(|name| folder.join(name)).find(|path| path.exists() && !is_own(path)) {
-        let fix = "move it away, or give another folder with --output";
-        return Err(Error::config(path.display().to_string(), "exists and was not written by this program", fix));
-    }
-    match names.iter().map(|name| folder.join(name)).find(|path| path.is_dir()) {
-        None => Ok(lock),
-        Some(path) => {
-            let fix = "remove it, or give another folder with --output";
-            Err(Error::config(path.display().to_string(), "is a folder; a file is written there", fix))
-        }
-    }
+    names.iter().try_for_each(|name| files::check_own(&folder.join(name), is_own))?;
+    Ok(lock)
 }
 
 /// Returns whether an existing output file was written by this program: a page names it, results have a manifest, and
-/// traces lie beside results. A folder is reported by the caller.
+/// traces lie beside results.
 fn is_own(path: &Path) -> bool {
     let contains = |path: &Path, mark: &str| {
         let bytes = files::read(path, MAX_OUTPUT_BYTES).unwrap_or_default();
@@ -37,7 +29,6 @@ fn is_own(path: &Path) -> bool {
     };
     let results = path.with_file_name("results.json");
     match path.file_name().and_then(|name| name.to_str()) {
-        _ if path.is_dir() => true,
         Some("index.html") => contains(path, PAGE_MARK),
         _ => contains(&results, "\"swm_version\""),
     }

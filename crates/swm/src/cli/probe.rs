@@ -6,7 +6,7 @@ use clap::Args;
 use serde_json::json;
 use std::path::PathBuf;
 use swm_core::Error;
-use swm_data::write_png;
+use swm_data::{check_png, write_png};
 use swm_models::Device;
 use swm_models::probe::{self, ReconstructionConfig, Score, StateConfig, StateReport};
 
@@ -50,6 +50,7 @@ pub fn probe(args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
     }
     if let Some(file) = &args.images {
         output_folder::check_file(file)?;
+        check_png(file)?;
     }
     let reader = home::open_dataset(&args.data)?;
     let threads = swm_core::pool::threads(context.threads)?;

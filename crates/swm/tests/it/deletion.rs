@@ -95,6 +95,51 @@ fn outputs_do_not_replace_files_of_the_user() {
 }
 
 #[test]
+fn previews_videos_images_and_exports_do_not_replace_files_of_the_user() {
+    let swm = Swm::new();
+    swm.json(DEMO);
+    let names = ["shown/episode_0.mp4", "site/videos/random-in-distribution-0.mp4", "thesis.png", "out/config.json"];
+    let files = names.map(|name| swm.path(name));
+    files.iter().for_each(|path| user_file(path));
+    let eval = ["eval", "random", "--env", "swm/TwoRoom-v1", "--episodes", "2", "--budget", "5", "--videos", "1", "-o"];
+    let probe = ["probe", "demo/lewm-rooms", "--data", "demo/rooms.lance", "--steps", "1", "--frames", "8", "--images"];
+    let preview = ["preview", "demo/rooms.lance", "-o"];
+    let refused = "was not written by this program";
+    let with = |args: &[&'static str], last: &'static str| [args, &[last]].concat();
+    swm.fails(&with(&preview, "shown"), 2, &["episode_0.mp4", refused]);
+    swm.fails(&with(&eval, "site"), 2, &[".mp4", refused]);
+    swm.fails(&with(&probe, "thesis.png"), 2, &["thesis.png", refused]);
+    swm.fails(&["checkpoints", "export", "demo/lewm-rooms", "out"], 2, &["config.json", "is not replaced"]);
+    files.iter().for_each(|path| assert_untouched(path));
+    assert!(!swm.path("out/weights.pt").exists() && !swm.path("shown/contact_sheet.png").exists());
+    // The program replaces its own files.
+    for _ in 0..2 {
+        swm.json(&with(&preview, "preview"));
+        swm.json(&with(&eval, "results"));
+    }
+}
+
+#[test]
+fn demo_does_not_take_a_file_of_the_user_for_its_mark() {
+    let swm = Swm::new();
+    let files = ["demo/.swm-demo", "demo/results/thesis.txt"].map(|name| swm.path(name));
+    files.iter().for_each(|path| user_file(path));
+    swm.fails(DEMO, 2, &["demo", "did not write", "--output"]);
+    files.iter().for_each(|path| assert_untouched(path));
+}
+
+#[test]
+fn checkpoints_are_removed_by_paths_that_end_in_dots() {
+    for end in [".", "checkpoint/.."] {
+        let swm = Swm::new();
+        swm.json(DEMO);
+        let run = swm.path("demo/lewm-rooms");
+        swm.json(&["checkpoints", "remove", &format!("demo/lewm-rooms/{end}"), "--yes"]);
+        assert!(!run.exists(), "{end}");
+    }
+}
+
+#[test]
 fn dataset_paths_may_contain_parent_folders() {
     let swm = Swm::new();
     fs::create_dir_all(swm.path("a/b")).expect("creating folders");

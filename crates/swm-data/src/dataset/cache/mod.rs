@@ -223,6 +223,10 @@ impl Reader for CachedReader {
         self.inner.irregularities()
     }
 
+    fn sources(&self) -> Vec<PathBuf> {
+        self.inner.sources()
+    }
+
     fn manifest(&self) -> Option<Manifest> {
         self.inner.manifest()
     }

@@ -5,6 +5,7 @@ use crate::dataset::episodes::{EpisodeRows, describe_columns, index_columns};
 use crate::dataset::reader::{Constants, Episode, Irregularity, Reader, StepRange};
 use crate::dataset::sync::lock;
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{ColumnSpec, Error, Manifest, Result, Schema};
@@ -137,6 +138,10 @@ impl Reader for Concat {
             }));
         }
         Ok(found)
+    }
+
+    fn sources(&self) -> Vec<PathBuf> {
+        self.parts.iter().flat_map(|part| part.sources()).collect()
     }
 
     /// Returns the manifest of the first part if all parts have the same manifest. Otherwise, returns a new manifest

@@ -2,6 +2,7 @@
 
 use super::view_hash;
 use crate::dataset::reader::{Constants, Episode, Irregularity, Reader, StepRange};
+use std::path::PathBuf;
 use std::sync::Arc;
 use swm_core::{Error, Manifest, Result, Schema};
 
@@ -73,6 +74,10 @@ impl Reader for Merge {
 
     fn irregularities(&self) -> Result<Vec<Irregularity>> {
         self.base.irregularities()
+    }
+
+    fn sources(&self) -> Vec<PathBuf> {
+        [self.base.sources(), self.other.sources()].concat()
     }
 
     fn manifest(&self) -> Option<Manifest> {

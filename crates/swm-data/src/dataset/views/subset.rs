@@ -2,6 +2,7 @@
 
 use super::view_hash;
 use crate::dataset::reader::{Constants, Episode, Irregularity, Reader, StepRange};
+use std::path::PathBuf;
 use std::sync::Arc;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{ColumnSpec, Error, Manifest, Result, Schema};
@@ -104,6 +105,10 @@ impl Reader for Subset {
             None => Some(found),
         });
         Ok(found.collect())
+    }
+
+    fn sources(&self) -> Vec<PathBuf> {
+        self.reader.sources()
     }
 
     fn manifest(&self) -> Option<Manifest> {

@@ -1,10 +1,9 @@
 //! The journal: episodes that are committed but not yet in the column files.
 
-use super::{LENGTHS, PendingEpisode};
 use crate::dataset::Constants;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-use std::fs::{File, OpenOptions};
+use std::fs::File;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use swm_core::{ColumnSpec, Error, Result, files};
@@ -13,6 +12,14 @@ use swm_core::{ColumnSpec, Error, Result, files};
 const MAGIC: &[u8; 8] = b"swm-ep-1";
 /// Size in bytes of the tag, the lengths and the hash, which precede the head of a record.
 const LEAD: usize = 8 + 8 + 8 + 32;
+
+/// An episode in the journal that is not yet in the column files.
+pub(super) struct PendingEpisode {
+    pub rows: usize,
+    /// The bytes of each numeric column.
+    pub columns: Vec<Vec<u8>>,
+    pub constants: Constants,
+}
 
 /// The head of a record. The body holds the numeric columns, one after another, then the constants in order of their
 /// names.
@@ -24,9 +31,12 @@ struct Head {
     constants: BTreeMap<String, usize>,
 }
 
+/// Name of the journal.
+pub(super) const NAME: &str = "ep_len.journal";
+
 /// The path of a folder's journal.
 pub(super) fn path(folder: &Path) -> PathBuf {
-    folder.join(format!("{LENGTHS}.journal"))
+    folder.join(NAME)
 }
 
 /// The record of an episode.
@@ -116,9 +126,7 @@ impl Journal {
     /// If writing fails.
     pub fn create(folder: &Path) -> Result<Self> {
         let path = path(folder);
-        let mut options = OpenOptions::new();
-        let file = options.write(true).create(true).truncate(true).open(&path);
-        let file = file.map_err(|e| Error::io(&path, "creating the journal", e))?;
+        let file = files::open_to_write(&path, false)?;
         Ok(Self { path, file, length: 0 })
     }
 

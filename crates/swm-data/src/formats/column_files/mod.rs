@@ -19,16 +19,22 @@
 //! temporary file and renamed, `ep_len.npz` last. Readers use only as many rows of a column file as `ep_len.npz`
 //! declares. The journal is merged when it is half as large as the column files, and when the writer finishes, so the
 //! total amount written is a small multiple of the data.
+//!
+//! **Replacing** ([`remove`]) deletes the old dataset's own files in place, its metadata last, before the new dataset is
+//! created. Other files in the folder are neither deleted nor moved nor overwritten.
 
+mod images;
 mod journal;
 mod npz;
 mod reader;
+mod removal;
 mod writer;
 
-pub(crate) use reader::ColumnFiles;
-pub(crate) use writer::{ColumnFilesWriter, remove_dataset};
+pub(crate) use images::{ImageFiles, SUFFIXES, image_path, video_path};
+pub(crate) use reader::{ColumnFiles, contains_videos};
+pub(crate) use removal::remove;
+pub(crate) use writer::ColumnFilesWriter;
 
-use crate::dataset::Constants;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -41,17 +47,8 @@ const OFFSETS: &str = "ep_offset";
 /// The member of `ep_len.npz` that holds [`Metadata`].
 const METADATA: &str = "stable_worldmodel.json";
 
-/// The files of a dataset, of the formats `folder` and `video`.
-pub(crate) const FILES: &[&str] = &[
-    "*.npz",
-    "ep_len.journal",
-    "ep_len.tmp",
-    "*/ep_*.jpeg",
-    "*/ep_*.jpg",
-    "*/ep_*.png",
-    "*/ep_*.mp4",
-    "*/ep_*.mp4.tmp",
-];
+/// Name of the temporary file that replaces a column file. The reference ignores names that start with `ep_len`.
+const TEMPORARY: &str = "ep_len.tmp";
 
 /// Metadata of the dataset, stored in `ep_len.npz`.
 #[derive(Default, Serialize, Deserialize)]
@@ -69,24 +66,9 @@ fn constant_member(index: usize) -> String {
     format!("constants/{index}")
 }
 
-/// An episode in the journal that is not yet in the column files.
-struct PendingEpisode {
-    rows: usize,
-    /// The bytes of each numeric column.
-    columns: Vec<Vec<u8>>,
-    constants: Constants,
-}
-
 /// Returns whether a folder contains `ep_len.npz`.
 pub(crate) fn exists(folder: &Path) -> bool {
     column_path(folder, LENGTHS).is_file()
-}
-
-/// Returns whether the first file of a subfolder of `folder` is a video.
-pub(crate) fn contains_videos(folder: &Path) -> bool {
-    let entries = |folder: &Path| folder.read_dir().into_iter().flatten().flatten();
-    let is_video = |path: &Path| path.extension().is_some_and(|suffix| suffix.eq_ignore_ascii_case("mp4"));
-    entries(folder).any(|entry| entries(&entry.path()).next().is_some_and(|first| is_video(&first.path())))
 }
 
 /// Path of the file of a column.

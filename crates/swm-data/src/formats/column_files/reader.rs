@@ -1,7 +1,9 @@
 //! Reads numeric columns from column files.
 
+use super::images::{SUFFIXES, image_path, video_path};
+use super::journal::PendingEpisode;
 use super::npz::Npz;
-use super::{LENGTHS, METADATA, Metadata, OFFSETS, PendingEpisode, column_path, constant_member, journal};
+use super::{LENGTHS, METADATA, Metadata, OFFSETS, column_path, constant_member, journal};
 use crate::dataset::episodes::{EpisodeRows, index_columns};
 use crate::dataset::{Constants, StepRange};
 use std::collections::BTreeMap;
@@ -43,22 +45,12 @@ impl ColumnFiles {
             Err(Error::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => vec![],
             read => read?,
         };
-        let lengths_path = column_path(folder, LENGTHS);
-        let mut lengths_file = Npz::open(&lengths_path)?;
-        let lengths = integers(&mut lengths_file, &lengths_path)?;
+        let (lengths, recorded) = stored_metadata(folder)?;
         let offsets_path = column_path(folder, OFFSETS);
         let offsets = integers(&mut Npz::open(&offsets_path)?, &offsets_path)?;
         let damaged =
             |problem: String| Error::corrupt(folder, problem, "restore it from a copy, or rebuild the dataset");
         let mut rows = EpisodeRows::from_lengths(&lengths, &offsets).map_err(damaged)?;
-        let recorded: Metadata = if lengths_file.has(METADATA) {
-            serde_json::from_slice(&lengths_file.member(METADATA)?)
-                .map_err(|e| damaged(format!("the metadata in {LENGTHS}.npz is unreadable: {e}")))?
-        } else if lengths_file.is_plain() {
-            Metadata::default()
-        } else {
-            return Err(damaged(format!("{LENGTHS}.npz has members that this version does not know")));
-        };
         let in_files = usize::try_from(rows.total()).map_err(|e| damaged(e.to_string()))?;
         let (mut columns, skipped) = columns(folder, &recorded, in_files)?;
         let specs: Vec<&ColumnSpec> = columns.iter().map(|column| &column.spec).collect();
@@ -243,6 +235,42 @@ impl ColumnFiles {
         parts.sort_by(|a, b| b.1.cmp(&a.1).then_with(|| a.0.cmp(&b.0)));
         Ok(parts)
     }
+}
+
+/// The content of `ep_len.npz`: the lengths of the episodes, and the metadata, which is empty if another program wrote it.
+///
+/// # Errors
+/// If the file is missing or damaged.
+pub(super) fn stored_metadata(folder: &Path) -> Result<(Vec<i64>, Metadata)> {
+    let path = column_path(folder, LENGTHS);
+    let mut file = Npz::open(&path)?;
+    let lengths = integers(&mut file, &path)?;
+    let damaged = |problem: String| Error::corrupt(folder, problem, "restore it from a copy, or rebuild the dataset");
+    let recorded = if file.has(METADATA) {
+        serde_json::from_slice(&file.member(METADATA)?)
+            .map_err(|e| damaged(format!("the metadata in {LENGTHS}.npz is unreadable: {e}")))?
+    } else if file.is_plain() {
+        Metadata::default()
+    } else {
+        return Err(damaged(format!("{LENGTHS}.npz has members that this version does not know")));
+    };
+    Ok((lengths, recorded))
+}
+
+/// Returns whether the images of a dataset are videos: whether a column has a video and no image of the first episode.
+pub(crate) fn contains_videos(folder: &Path) -> bool {
+    let Ok((lengths, recorded)) = stored_metadata(folder) else { return false };
+    // All episodes may be in the journal; writers store no episode without rows.
+    let first = lengths.iter().position(|&length| length > 0).unwrap_or(0);
+    let columns: Vec<String> = match recorded.schema {
+        Some(schema) => schema.columns().iter().filter(|c| c.is_image()).map(|c| c.name.clone()).collect(),
+        None => {
+            let entries = folder.read_dir().into_iter().flatten().flatten();
+            entries.filter_map(|entry| entry.file_name().into_string().ok()).collect()
+        }
+    };
+    let has_image = |column: &str| SUFFIXES.iter().any(|end| image_path(folder, column, first, 0, end).is_file());
+    columns.iter().any(|column| video_path(folder, column, first).is_file() && !has_image(column))
 }
 
 /// Size of all files in a folder of images, in bytes.

@@ -1,10 +1,10 @@
 //! Writes numeric columns: to the journal at every commit, to column files when the journal is merged.
 
-use super::journal::{self, Journal};
+use super::journal::{self, Journal, PendingEpisode};
 use super::npz::NpzWriter;
 use super::{
-    ColumnFiles, FILES, LENGTHS, METADATA, Metadata, OFFSETS, PendingEpisode, check_name, column_path, constant_member,
-    exists,
+    ColumnFiles, ImageFiles, LENGTHS, METADATA, Metadata, OFFSETS, TEMPORARY, check_name, column_path, constant_member,
+    exists, images, removal,
 };
 use crate::dataset::episodes::{self, EpisodeRows};
 use crate::dataset::{CommitPolicy, Constants, StepRange, WriteMode, WriteOptions, is_full, with_stored};
@@ -18,9 +18,6 @@ use swm_core::{Batch, ColumnSpec, DType, Error, Result, Schema};
 /// Bounds, in bytes, of the journal size at which the journal is merged: half the size of the column files, clamped to
 /// these bounds. The upper bound also limits the memory of a writer.
 const MERGE_BYTES: std::ops::RangeInclusive<usize> = 16 << 20..=256 << 20;
-
-/// Deletes the images of all episodes from `from` on, in the folder of an image column.
-pub(crate) type DiscardImages = fn(folder: &Path, from: usize) -> Result<()>;
 
 /// Commits the numeric columns of episodes. Formats write an episode's images first, then call
 /// [`ColumnFilesWriter::write`].
@@ -36,11 +33,13 @@ pub(crate) struct ColumnFilesWriter {
     last_commit: Instant,
     /// The rows of all episodes, including uncommitted episodes.
     rows: EpisodeRows,
-    discard: DiscardImages,
+    images: ImageFiles,
     /// Records of uncommitted episodes.
     group: Vec<Vec<u8>>,
     /// Number of committed episodes.
     committed: usize,
+    /// Whether the `ep_len.npz` in the folder is that of this dataset, not of the replaced one.
+    merged: bool,
     /// Number of rows in the column files.
     rows_in_files: usize,
     /// Size of the rows in the column files, in bytes.
@@ -68,34 +67,26 @@ impl ColumnFilesWriter {
         schema: &Schema,
         options: &WriteOptions,
         known: Option<&Schema>,
-        discard: DiscardImages,
+        images: ImageFiles,
     ) -> Result<Self> {
-        for column in schema.columns() {
-            check_name(&column.name)?;
-            let problem = match &*column.name {
-                _ if column.is_empty() => "has no elements",
-                EPISODE_IDX | STEP_IDX if column.len() != 1 => "must be a scalar",
-                _ => continue,
-            };
-            return Err(Error::config("schema", format!("column '{}' {problem}", column.name), "leave it out"));
-        }
+        check_columns(schema)?;
         let exists = exists(folder);
         if !exists && folder.read_dir().is_ok_and(|mut entries| entries.next().is_some()) {
             let problem = format!("{} holds other files", folder.display());
             return Err(Error::config("dataset", problem, "choose another path"));
         }
-        if exists {
-            match options.mode {
-                WriteMode::Create => {
-                    let problem = format!("{} exists already", folder.display());
-                    let fix = "choose another path, append to it, or overwrite it";
-                    return Err(Error::config("dataset", problem, fix));
-                }
-                WriteMode::Overwrite => remove_dataset(folder, FILES)?,
-                WriteMode::Append => {}
-            }
+        if exists && options.mode == WriteMode::Create {
+            let problem = format!("{} exists already", folder.display());
+            let fix = "choose another path, append to it, or overwrite it";
+            return Err(Error::config("dataset", problem, fix));
         }
         let lock = Lock::folder(folder)?;
+        let image_columns = || schema.columns().iter().filter(|column| column.is_image());
+        image_columns().try_for_each(|column| files::check_no_link(&folder.join(&column.name)))?;
+        if exists && options.mode == WriteMode::Overwrite {
+            removal::check_new_files(folder, schema)?;
+            removal::clear(folder, images)?;
+        }
         let columns = schema.columns().iter().filter(|c| !c.is_image()).cloned().collect::<Vec<_>>();
         let mut writer = Self {
             folder: folder.to_owned(),
@@ -108,9 +99,10 @@ impl ColumnFilesWriter {
             policy: options.commit,
             last_commit: Instant::now(),
             rows: EpisodeRows::default(),
-            discard,
+            images,
             group: vec![],
             committed: 0,
+            merged: exists && options.mode == WriteMode::Append,
             rows_in_files: 0,
             bytes_in_files: 0,
             new_constants: vec![],
@@ -118,17 +110,21 @@ impl ColumnFilesWriter {
             known_constants: HashMap::new(),
             failed: false,
         };
-        if exists && options.mode == WriteMode::Append {
+        if writer.merged {
             writer.continue_from(known)?;
         }
+        // A journal shows that the last writer was killed or failed, and may have left images.
+        let killed = journal::path(folder).exists();
         writer.merge_journal()?;
+        if killed {
+            writer.discard_images(writer.episodes())?;
+        }
         writer.journal = Some(Journal::create(folder)?);
         writer.committed = writer.episodes();
-        for column in schema.columns().iter().filter(|column| column.is_image()) {
+        for column in image_columns() {
             let folder = folder.join(&column.name);
             std::fs::create_dir_all(&folder).map_err(|e| Error::io(&folder, "creating the folder", e))?;
         }
-        writer.discard_images(writer.committed)?;
         Ok(writer)
     }
 
@@ -266,7 +262,7 @@ impl ColumnFilesWriter {
                     let keep = if is_full(&error) { self.group.len() * 7 / 8 } else { 0 };
                     failure.get_or_insert(error);
                     self.group.truncate(keep);
-                    Self::discard_images_of(&self.folder, &self.schema, self.discard, self.committed + keep)?;
+                    discard_images(&self.folder, &self.schema, self.images, self.committed + keep)?;
                 }
             }
         }
@@ -285,14 +281,8 @@ impl ColumnFilesWriter {
         with_stored(error, self.committed)
     }
 
-    /// Deletes the images of all episodes from `from` on.
     fn discard_images(&self, from: usize) -> Result<()> {
-        Self::discard_images_of(&self.folder, &self.schema, self.discard, from)
-    }
-
-    fn discard_images_of(folder: &Path, schema: &Schema, discard: DiscardImages, from: usize) -> Result<()> {
-        let mut images = schema.columns().iter().filter(|column| column.is_image());
-        images.try_for_each(|column| discard(&folder.join(&column.name), from))
+        discard_images(&self.folder, &self.schema, self.images, from)
     }
 
     /// Merges the journal into new column files. Each file is replaced atomically, the lengths last.
@@ -301,7 +291,7 @@ impl ColumnFilesWriter {
     }
 
     fn try_merge_journal(&mut self) -> Result<()> {
-        let old = exists(&self.folder).then(|| ColumnFiles::open(&self.folder)).transpose()?;
+        let old = self.merged.then(|| ColumnFiles::open(&self.folder)).transpose()?;
         let old_constants = old.as_ref().map_or_else(|| Ok(vec![]), ColumnFiles::stored_constants)?;
         let rows = usize::try_from(self.rows.total()).map_err(|e| Error::external("writing columns", e))?;
         for (column, unmerged_rows) in self.columns.iter().zip(&self.unmerged) {
@@ -328,6 +318,7 @@ impl ColumnFilesWriter {
             }
             Ok(())
         })?;
+        self.merged = true;
         self.bytes_in_files += self.unmerged.iter().map(Vec::len).sum::<usize>();
         self.rows_in_files = rows;
         self.unmerged.iter_mut().for_each(Vec::clear);
@@ -337,8 +328,7 @@ impl ColumnFilesWriter {
 
     /// Replaces a column file atomically.
     fn replace_column(&self, name: &str, fill: impl FnOnce(&mut NpzWriter) -> Result<()>) -> Result<()> {
-        // The reference ignores names that start with `ep_len`.
-        let temporary = self.folder.join(format!("{LENGTHS}.tmp"));
+        let temporary = self.folder.join(TEMPORARY);
         let path = column_path(&self.folder, name);
         let replaced = NpzWriter::create(&temporary).and_then(|mut npz| {
             fill(&mut npz)?;
@@ -383,22 +373,26 @@ impl Drop for ColumnFilesWriter {
     }
 }
 
-/// Deletes the files of a dataset, named by `patterns` (see [`files::delete`]). Renames the folder first, so that no
-/// partly deleted dataset exists under the original name. Other files return to the folder.
-pub(crate) fn remove_dataset(folder: &Path, patterns: &[&str]) -> Result<()> {
-    if folder.is_symlink() {
-        return Err(Error::config(folder.display().to_string(), "is a symbolic link", "give the folder it points to"));
+/// Checks that the columns of a new dataset can be stored.
+fn check_columns(schema: &Schema) -> Result<()> {
+    for column in schema.columns() {
+        check_name(&column.name)?;
+        let problem = match &*column.name {
+            _ if column.is_empty() => "has no elements",
+            EPISODE_IDX | STEP_IDX if column.len() != 1 => "must be a scalar",
+            _ => continue,
+        };
+        return Err(Error::config("schema", format!("column '{}' {problem}", column.name), "leave it out"));
     }
-    let _lock = Lock::folder(folder)?;
-    let mut aside = folder.as_os_str().to_owned();
-    aside.push(format!(".replaced-{}", uuid::Uuid::new_v4().simple()));
-    let aside = PathBuf::from(aside);
-    std::fs::rename(folder, &aside).map_err(|e| Error::io(folder, "replacing the dataset", e))?;
-    let remaining = files::delete(&aside, patterns)?;
-    for path in &remaining {
-        let target = folder.join(path.file_name().unwrap_or_default());
-        let moved = std::fs::create_dir_all(folder).and_then(|()| std::fs::rename(path, &target));
-        moved.map_err(|e| Error::io(&target, "returning a file that is not part of the dataset", e))?;
+    Ok(())
+}
+
+/// Deletes the images of the uncommitted episodes, which begin at episode `from`.
+fn discard_images(folder: &Path, schema: &Schema, images: ImageFiles, from: usize) -> Result<()> {
+    for column in schema.columns().iter().filter(|column| column.is_image()) {
+        let files = images.list(folder, &column.name)?;
+        let names: Vec<PathBuf> = images::uncommitted(&files, from).map(|file| file.name.clone()).collect();
+        files::delete_named(folder, &names)?;
     }
-    if remaining.is_empty() { Ok(()) } else { files::remove_empty_folder(&aside) }
+    Ok(())
 }

@@ -18,23 +18,22 @@ mod reader;
 mod writer;
 
 use crate::dataset::Location;
-use crate::formats::column_files::{FILES, contains_videos, exists};
+use crate::formats::column_files::{self, ImageFiles, contains_videos, exists};
 use crate::formats::entry::{Backend, FormatEntry};
-use std::path::{Path, PathBuf};
 
 /// The registry row of this format.
 pub const ENTRY: FormatEntry = FormatEntry {
     id: "folder",
     summary: "folder NAME.folder of numpy's npz files and one image per step; the reference opens it",
     suffixes: &["folder"],
-    files: FILES,
     feature: None,
     detect,
-    backend: Some(Backend { open: reader::open, create: writer::create }),
+    backend: Some(Backend {
+        open: reader::open,
+        create: writer::create,
+        remove: |path| column_files::remove(path, ImageFiles::Images),
+    }),
 };
-
-/// File name suffixes of images. The first is used for writing.
-const SUFFIXES: [&str; 3] = ["jpeg", "jpg", "png"];
 
 fn detect(location: &Location) -> bool {
     let Some(path) = location.path() else { return false };
@@ -42,15 +41,4 @@ fn detect(location: &Location) -> bool {
         return exists(path) && !contains_videos(path) || ENTRY.has_suffix(location) && path.is_dir();
     }
     ENTRY.has_suffix(location)
-}
-
-/// Path of the image file of a step.
-fn image_path(folder: &Path, column: &str, episode: usize, step: usize, suffix: &str) -> PathBuf {
-    folder.join(column).join(format!("ep_{episode}_step_{step}.{suffix}"))
-}
-
-/// The episode index in the name of an image file.
-fn episode_of(name: &str) -> Option<usize> {
-    let (episode, _) = name.strip_prefix("ep_")?.split_once("_step_")?;
-    episode.parse().ok()
 }

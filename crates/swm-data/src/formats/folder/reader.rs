@@ -1,12 +1,11 @@
 //! Reads a folder: numeric columns from column files, images from image files.
 
-use super::{SUFFIXES, image_path};
 use crate::dataset::Location;
 use crate::dataset::episodes::{EpisodeRows, content_hash};
 use crate::dataset::{Constants, Episode, Reader, StepRange};
-use crate::formats::column_files::{ColumnFiles, exists};
+use crate::formats::column_files::{ColumnFiles, SUFFIXES, exists, image_path};
 use rayon::prelude::*;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use swm_core::{ColumnSpec, Error, Manifest, Result, Schema, files};
 
@@ -71,6 +70,10 @@ impl Reader for FolderReader {
 
     fn constants(&self, episode: usize) -> Result<Constants> {
         self.files.constants(episode)
+    }
+
+    fn sources(&self) -> Vec<PathBuf> {
+        vec![self.files.folder().to_owned()]
     }
 
     fn manifest(&self) -> Option<Manifest> {

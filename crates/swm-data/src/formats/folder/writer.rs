@@ -1,14 +1,12 @@
 //! Writes the images of an episode, then its numeric columns. Committing the numeric columns commits the episode.
 
 use super::reader::FolderReader;
-use super::{SUFFIXES, episode_of, image_path};
 use crate::dataset::Location;
 use crate::dataset::episodes;
 use crate::dataset::{Constants, Reader as _, WriteMode, WriteOptions, Writer};
-use crate::formats::column_files::{ColumnFilesWriter, exists};
+use crate::formats::column_files::{ColumnFilesWriter, ImageFiles, SUFFIXES, exists, image_path};
 use rayon::prelude::*;
 use std::io::Write as _;
-use std::path::Path;
 use swm_core::{Batch, Error, Result, Schema, files};
 use swm_image::ImageCodec;
 
@@ -21,21 +19,8 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
     } else {
         None
     };
-    let columns = ColumnFilesWriter::create(folder, schema, &options, known.as_ref(), discard)?;
+    let columns = ColumnFilesWriter::create(folder, schema, &options, known.as_ref(), ImageFiles::Images)?;
     Ok(Box::new(FolderWriter { columns, schema: schema.clone(), codec: options.codec }))
-}
-
-/// Deletes the images of all episodes from `from` on, in the folder of an image column.
-fn discard(folder: &Path, from: usize) -> Result<()> {
-    let io = |e| Error::io(folder, "deleting images of uncommitted episodes", e);
-    for entry in std::fs::read_dir(folder).map_err(io)? {
-        let entry = entry.map_err(io)?;
-        let is_image = entry.file_type().map_err(io)?.is_file();
-        if is_image && entry.file_name().to_str().and_then(episode_of).is_some_and(|episode| episode >= from) {
-            files::delete_file(&entry.path())?;
-        }
-    }
-    Ok(())
 }
 
 struct FolderWriter {
@@ -49,6 +34,11 @@ impl Writer for FolderWriter {
         episodes::check_episode(episode, &self.schema)?;
         let episode_index = self.columns.episodes();
         let mut images = self.schema.columns().iter().enumerate().filter(|(_, column)| column.is_image());
+        // A failed write deletes the images of its episode, so they must be the writer's own.
+        images.clone().try_for_each(|(_, column)| {
+            let path = |step| image_path(self.columns.folder(), &column.name, episode_index, step, SUFFIXES[0]);
+            (0..episode.rows()).try_for_each(|step| files::check_free(&path(step)))
+        })?;
         let written = images.try_for_each(|(index, column)| {
             let (height, width) = (column.shape[0], column.shape[1]);
             let frames = episode.bytes(index).par_chunks_exact(column.row_bytes());

@@ -19,6 +19,9 @@
 //! `ep_len` last. The file is valid at any time; uncommitted data of a killed writer lies beyond these lengths, and the
 //! next writer overwrites it.
 //!
+//! To replace a dataset, the writer creates an empty one in a temporary file beside it, and renames that: at any time the
+//! old or the new dataset exists.
+//!
 //! A writer locks the file. h5py locks the file even for reading, unless `HDF5_USE_FILE_LOCKING=FALSE`. To append to
 //! a file with another layout, the writer first replaces the file with a copy in this layout.
 
@@ -49,31 +52,31 @@ use crate::dataset::Location;
 use crate::formats::entry::{Backend, FormatEntry};
 use std::path::{Path, PathBuf};
 #[cfg(feature = "hdf5")]
-use swm_core::{Error, Result};
+use swm_core::{Error, Result, files};
 
 /// The registry row of this format.
 pub const ENTRY: FormatEntry = FormatEntry {
     id: "hdf5",
     summary: "one file NAME.h5 or NAME.hdf5; opens in h5py and in the reference",
     suffixes: &["h5", "hdf5"],
-    files: &[],
     feature: Some("hdf5"),
     detect,
     backend: BACKEND,
 };
 
 #[cfg(feature = "hdf5")]
-const BACKEND: Option<Backend> = Some(Backend { open: reader::open, create: writer::create });
+const BACKEND: Option<Backend> =
+    Some(Backend { open: reader::open, create: writer::create, remove: files::delete_file });
 #[cfg(not(feature = "hdf5"))]
 const BACKEND: Option<Backend> = None;
 
 fn detect(location: &Location) -> bool {
     let folder = location.path().filter(|path| path.is_dir());
-    ENTRY.has_suffix(location) || folder.is_some_and(|path| !files(path).is_empty())
+    ENTRY.has_suffix(location) || folder.is_some_and(|path| !files_in(path).is_empty())
 }
 
 /// The files in a folder with a suffix of this format, sorted by name.
-fn files(folder: &Path) -> Vec<PathBuf> {
+fn files_in(folder: &Path) -> Vec<PathBuf> {
     let entries = folder.read_dir().into_iter().flatten().flatten().map(|entry| entry.path());
     let mut files: Vec<PathBuf> = entries.filter(|path| ENTRY.has_suffix(&path.into())).collect();
     files.sort();
@@ -84,7 +87,7 @@ fn files(folder: &Path) -> Vec<PathBuf> {
 #[cfg(feature = "hdf5")]
 fn file(location: &Location) -> Result<Location> {
     let Some(folder) = location.path().filter(|path| path.is_dir()) else { return Ok(location.clone()) };
-    match &files(folder)[..] {
+    match &files_in(folder)[..] {
         [file] => Ok(Location::from(file)),
         [] => Err(Error::corrupt(folder, "it is a folder without .h5 files", "give the path of an .h5 file")),
         many => {

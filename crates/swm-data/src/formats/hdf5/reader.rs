@@ -9,6 +9,7 @@ use super::table;
 use crate::dataset::Location;
 use crate::dataset::episodes::{EpisodeRows, content_hash, index_columns};
 use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
+use std::path::PathBuf;
 use std::sync::Arc;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{Batch, ColumnSpec, DType, Error, Manifest, Result, Schema};
@@ -191,6 +192,10 @@ impl Reader for Hdf5Reader {
             }
         }
         Ok(found)
+    }
+
+    fn sources(&self) -> Vec<PathBuf> {
+        vec![self.source.label().to_owned()]
     }
 
     fn manifest(&self) -> Option<Manifest> {

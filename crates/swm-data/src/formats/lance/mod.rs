@@ -17,6 +17,7 @@ mod image_locations;
 mod manifest_file;
 mod reader;
 mod record;
+mod removal;
 mod salvage;
 mod schema;
 mod shard;
@@ -34,12 +35,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
     id: "lance",
     summary: "Lance table, one folder NAME.lance; opens in Python's lance and lancedb",
     suffixes: &["lance"],
-    files: FILES,
     feature: None,
     detect: store::detect,
-    backend: Some(Backend { open: reader::open, create: writer::create }),
+    backend: Some(Backend { open: reader::open, create: writer::create, remove: removal::remove }),
 };
-
-/// The files of a table.
-const FILES: &[&str] =
-    &["_versions/*.manifest", "_versions/*.json", "_transactions/*.txn", "_shards/*/*.json", "data/*.lance"];

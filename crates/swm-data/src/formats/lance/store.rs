@@ -24,7 +24,7 @@ use std::future::Future;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use swm_core::files::Lock;
+use swm_core::files::{self, Lock};
 use swm_core::{Error, Result};
 use url::Url;
 
@@ -71,7 +71,7 @@ fn lance_error(label: &Path, action: &str, error: &lance_core::Error) -> Error {
 }
 
 /// Folders that may exist if a writer was killed before the first commit of a table.
-const FOLDERS: [&str; 4] = ["_versions", "_transactions", "_shards", "data"];
+pub const FOLDERS: [&str; 4] = ["_versions", "_transactions", "_shards", "data"];
 
 /// Whether a location is a Lance table: its name ends in `.lance`, or it is a folder that contains such a table.
 pub fn detect(location: &Location) -> bool {
@@ -162,6 +162,17 @@ impl Store {
             return Ok(None);
         }
         Lock::folder(&self.label.join(subfolder)).map(Some)
+    }
+
+    /// Checks that no folder of a local table is a symbolic link, because replacing the table would delete files elsewhere.
+    ///
+    /// # Errors
+    /// If a folder is a link.
+    pub fn check_no_links(&self) -> Result<()> {
+        if self.remote {
+            return Ok(());
+        }
+        FOLDERS.iter().try_for_each(|name| files::check_no_link(&self.label.join(name)))
     }
 
     /// Checks that the location can be written.
@@ -426,6 +437,11 @@ const BLOCK: usize = 64 << 10;
 const REQUESTS: usize = 64;
 /// Number of retries of a failed download.
 const RETRIES: usize = 3;
+
+/// Whether a file in `_versions` has a name that Lance gives to a version: digits.
+pub fn is_version(name: &str) -> bool {
+    name.strip_suffix(".manifest").is_some_and(|number| number.bytes().all(|b| b.is_ascii_digit()))
+}
 
 /// The name of a data file: the hash of its content, so that damage can be detected before decoding.
 pub fn name_of_hash(hash: blake3::Hash) -> String {

@@ -220,11 +220,13 @@ impl Table {
         }
     }
 
-    /// Removes data files and manifests of replaced versions.
+    /// Removes data files and manifests of replaced versions, after the new version is committed. After a kill in between,
+    /// the remaining files only waste space.
     pub fn remove_replaced(&self, old: &Version) {
         old.manifest.fragments.iter().for_each(|fragment| self.discard(fragment));
         for version in self.store.list("_versions").unwrap_or_default() {
-            let old = version.location.extension() == Some("manifest") && !self.manifests.contains(&version.location);
+            let is_version = version.location.filename().is_some_and(store::is_version);
+            let old = is_version && !self.manifests.contains(&version.location);
             if old {
                 self.store.remove(&version.location);
             }

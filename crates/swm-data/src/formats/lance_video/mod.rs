@@ -23,20 +23,17 @@ pub const ENTRY: FormatEntry = FormatEntry {
     id: "lance-video",
     summary: "folder NAME.lance-video of a Lance table with one MP4 per episode",
     suffixes: &["lance-video"],
-    files: &[
-        "steps.lance/_versions/*.manifest",
-        "steps.lance/_versions/*.json",
-        "steps.lance/_transactions/*.txn",
-        "steps.lance/_shards/*/*.json",
-        "steps.lance/data/*.lance",
-    ],
     feature: Some("ffmpeg"),
     detect,
     backend: BACKEND,
 };
 
 #[cfg(feature = "ffmpeg")]
-const BACKEND: Option<Backend> = Some(Backend { open: reader::open, create: writer::create });
+const BACKEND: Option<Backend> = Some(Backend {
+    open: reader::open,
+    create: writer::create,
+    remove: |path| crate::formats::lance::ENTRY.remove(&path.join(TABLE)),
+});
 #[cfg(not(feature = "ffmpeg"))]
 const BACKEND: Option<Backend> = None;
 
@@ -51,11 +48,15 @@ const VIDEO: &str = "lance-video/video/";
 #[cfg(feature = "ffmpeg")]
 const SCHEMA: &str = "lance-video/schema.json";
 
+/// Name of the Lance table within the dataset's folder.
+#[cfg(feature = "ffmpeg")]
+const TABLE: &str = "steps.lance";
+
 /// The location of the Lance table within the dataset's folder.
 #[cfg(feature = "ffmpeg")]
 fn table(location: &Location) -> swm_core::Result<Location> {
     Ok(match location {
-        Location::Path(path) => Location::Path(path.join("steps.lance")),
-        Location::Uri(uri) => Location::parse(&format!("{}/steps.lance", uri.as_str().trim_end_matches('/')))?,
+        Location::Path(path) => Location::Path(path.join(TABLE)),
+        Location::Uri(uri) => Location::parse(&format!("{}/{TABLE}", uri.as_str().trim_end_matches('/')))?,
     })
 }

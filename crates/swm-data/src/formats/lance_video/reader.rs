@@ -106,6 +106,10 @@ impl Reader for LanceVideoReader {
         Ok(all)
     }
 
+    fn sources(&self) -> Vec<PathBuf> {
+        vec![self.label.clone()]
+    }
+
     fn manifest(&self) -> Option<Manifest> {
         self.steps.manifest()
     }

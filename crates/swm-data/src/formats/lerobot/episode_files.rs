@@ -100,6 +100,10 @@ fn episode_files_v3(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
     let columns: Vec<&str> = columns.iter().map(String::as_str).collect();
     let mut files_of_episodes = vec![];
     for path in &files {
+        // Ignores files that are not part of the dataset.
+        if files_of_episodes.len() == info.total_episodes {
+            break;
+        }
         let batches = table::read(path, &columns, None)?;
         let column_values = |column: &str| -> Result<Vec<usize>> {
             let valid = |value: i64| usize::try_from(value).ok().filter(|&n| n < 1 << 40);

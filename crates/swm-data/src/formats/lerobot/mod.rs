@@ -35,6 +35,8 @@ mod info;
 #[cfg(feature = "lerobot")]
 mod reader;
 #[cfg(feature = "lerobot")]
+mod removal;
+#[cfg(feature = "lerobot")]
 mod stats;
 #[cfg(feature = "lerobot")]
 mod table;
@@ -51,35 +53,15 @@ pub const ENTRY: FormatEntry = FormatEntry {
     id: "lerobot",
     summary: "LeRobot dataset, versions 2.1 (read) and 3.0; a folder with meta/info.json, new ones NAME.lerobot",
     suffixes: &["lerobot"],
-    files: FILES,
     feature: Some("lerobot"),
     detect,
     backend: BACKEND,
 };
 
 #[cfg(feature = "lerobot")]
-const BACKEND: Option<Backend> = Some(Backend { open: reader::open, create: writer::create });
+const BACKEND: Option<Backend> = Some(Backend { open: reader::open, create: writer::create, remove: removal::remove });
 #[cfg(not(feature = "lerobot"))]
 const BACKEND: Option<Backend> = None;
-
-/// The files of a dataset, of all versions of the format.
-const FILES: &[&str] = &[
-    "meta/info.json",
-    "meta/*.json.tmp",
-    "meta/stats.json",
-    "meta/tasks.parquet",
-    "meta/tasks.parquet.tmp",
-    "meta/tasks.jsonl",
-    "meta/episodes.jsonl",
-    "meta/episodes_stats.jsonl",
-    "meta/episodes/chunk-*/file-*.parquet",
-    "meta/episodes/chunk-*/file-*.parquet.tmp",
-    "data/chunk-*/*.parquet",
-    "data/chunk-*/*.parquet.tmp",
-    "videos/*/chunk-*/file-*.mp4",
-    "videos/*/chunk-*/file-*.mp4.tmp",
-    "videos/chunk-*/*/episode_*.mp4",
-];
 
 fn detect(location: &Location) -> bool {
     let Some(path) = location.path() else { return false };

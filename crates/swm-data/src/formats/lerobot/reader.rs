@@ -352,6 +352,10 @@ impl Reader for LerobotReader {
         Ok(constants)
     }
 
+    fn sources(&self) -> Vec<PathBuf> {
+        vec![self.root.clone()]
+    }
+
     fn manifest(&self) -> Option<Manifest> {
         self.info.stable_worldmodel.as_ref()?.manifest.clone()
     }

@@ -5,13 +5,13 @@
 use super::features::{FRAMES_PER_SECOND, new_info, stored_columns};
 use super::info::{DATA_PATH, EPISODES_PATH, Info, VIDEO_PATH, WriterMetadata, damaged, fill};
 use super::reader::{LerobotReader, StoredConstant};
+use super::removal::{self, INFO, STATS, TASKS, WRITING};
 use super::stats::{self, Stats};
 use super::table::{self, write_atomically};
-use super::{CONSTANTS, FILES, NO_TASK, TASK, values};
+use super::{CONSTANTS, NO_TASK, TASK, values};
 use crate::dataset::Location;
 use crate::dataset::episodes;
 use crate::dataset::{Constants, Reader as _, WriteMode, WriteOptions, Writer, with_stored};
-use crate::formats::column_files::remove_dataset;
 use arrow_array::builder::{ListBuilder, StringBuilder};
 use arrow_array::{ArrayRef, Float64Array, Int64Array, RecordBatch, StringArray};
 use arrow_schema::{DataType, Field, Schema as ArrowSchema};
@@ -72,7 +72,7 @@ impl LerobotWriter {
     fn create(root: &Path, schema: &Schema, options: WriteOptions) -> Result<Self> {
         options.codec.check()?;
         let columns = stored_columns(schema)?;
-        let exists = root.join("meta").join("info.json").is_file();
+        let exists = root.join(INFO).is_file();
         if !exists && root.read_dir().is_ok_and(|mut entries| entries.next().is_some()) {
             let problem = format!("{} holds other files", root.display());
             return Err(Error::config("dataset", problem, "choose another path"));
@@ -82,12 +82,11 @@ impl LerobotWriter {
             let fix = "choose another path, append to it, or overwrite it";
             return Err(Error::config("dataset", problem, fix));
         }
-        if exists && options.mode == WriteMode::Overwrite {
-            // Refuses another program's folder that happens to have such a file.
-            Info::read(root)?;
-            remove_dataset(root, FILES)?;
-        }
         let lock = Lock::folder(root)?;
+        check_folders(root, &columns, schema)?;
+        if exists && options.mode == WriteMode::Overwrite {
+            removal::clear(root)?;
+        }
         let mut writer = Self {
             root: root.to_owned(),
             _lock: lock,
@@ -108,6 +107,7 @@ impl LerobotWriter {
         }
         writer.clear_group();
         writer.describe()?;
+        files::write(&root.join(WRITING), &[])?;
         Ok(writer)
     }
 
@@ -122,7 +122,7 @@ impl LerobotWriter {
         self.file = old.files_of_episodes.last().map_or(0, |files| files.file + 1);
         let manifest = self.options.manifest.clone().or(recorded.manifest);
         self.info = Info { stable_worldmodel: Some(WriterMetadata { manifest, ..recorded }), ..old.info };
-        let path = self.root.join("meta").join("stats.json");
+        let path = self.root.join(STATS);
         let read = |path: &Path| std::fs::read(path).map_err(|e| Error::io(path, "reading the statistics", e));
         if self.info.total_episodes > 0 {
             let stored: Value =
@@ -131,7 +131,7 @@ impl LerobotWriter {
                 let known = stats.continue_from(&stored[native.as_str()]);
                 known.ok_or_else(|| damaged(&path, format!("it has no statistics of '{native}'")))?;
             }
-            let path = self.root.join("meta").join("tasks.parquet");
+            let path = self.root.join(TASKS);
             for batch in table::read(&path, &[INDEX], None)? {
                 use arrow_array::cast::AsArray as _;
                 let texts = batch.column_by_name(INDEX).and_then(|array| array.as_string_opt::<i32>());
@@ -139,33 +139,12 @@ impl LerobotWriter {
                 self.tasks.extend(texts.iter().flatten().map(str::to_owned));
             }
         }
-        self.remove_uncommitted()
+        if self.root.join(WRITING).exists() { self.remove_uncommitted() } else { Ok(()) }
     }
 
-    /// Removes temporary files, and files with higher indices than the committed files.
+    /// Deletes the files of the next commit, which a killed or failed commit left.
     fn remove_uncommitted(&self) -> Result<()> {
-        let mut folders = vec![self.root.clone()];
-        while let Some(folder) = folders.pop() {
-            let io = |e| Error::io(&folder, "preparing the folder", e);
-            for entry in std::fs::read_dir(&folder).map_err(io)? {
-                let path = entry.map_err(io)?.path();
-                if path.is_dir() {
-                    folders.push(path);
-                    continue;
-                }
-                let index_of = |path: &Path, prefix: &str| -> Option<usize> {
-                    path.file_stem()?.to_str()?.strip_prefix(prefix)?.parse().ok()
-                };
-                let chunk = path.parent().and_then(|chunk| index_of(chunk, "chunk-"));
-                let file =
-                    chunk.zip(index_of(&path, "file-")).map(|(chunk, file)| chunk * self.info.chunks_size + file);
-                let temporary = path.extension().is_some_and(|suffix| suffix == "tmp");
-                if temporary || file.is_some_and(|file| file >= self.file) {
-                    files::delete_file(&path)?;
-                }
-            }
-        }
-        Ok(())
+        files::delete_named(&self.root, &removal::files_of_index(&self.info, self.file))
     }
 
     fn clear_group(&mut self) {
@@ -225,6 +204,11 @@ impl LerobotWriter {
     /// Commits the finished episodes, all or none.
     fn commit(&mut self) -> Result<()> {
         let stored = self.info.total_episodes;
+        if !self.group.episodes.is_empty() {
+            let names = removal::files_of_index(&self.info, self.file);
+            let free = names.iter().try_for_each(|name| files::check_free(&self.root.join(name)));
+            free.map_err(|error| with_stored(error, stored))?;
+        }
         self.try_commit().map_err(|error| {
             // Frees the space of files that no episode refers to.
             if let Err(other) = self.remove_uncommitted() {
@@ -240,8 +224,7 @@ impl LerobotWriter {
             return Ok(());
         }
         let group = std::mem::take(&mut self.group);
-        let indices =
-            [("chunk_index", self.file / self.info.chunks_size), ("file_index", self.file % self.info.chunks_size)];
+        let indices = removal::indices(&self.info, self.file);
         for ((_, native), encoder) in self.columns.iter().zip(group.encoders) {
             if let Some(encoder) = encoder {
                 write_atomically(&self.root.join(fill(VIDEO_PATH, native, &indices)), &encoder.finish()?)?;
@@ -339,7 +322,6 @@ impl LerobotWriter {
 
     /// Writes the files that describe the dataset. Writing the last file, `meta/info.json`, commits the episodes.
     fn describe(&mut self) -> Result<()> {
-        let meta = self.root.join("meta");
         if self.info.total_episodes > 0 {
             let fields =
                 vec![Field::new("task_index", DataType::Int64, false), Field::new(INDEX, DataType::Utf8, false)];
@@ -349,14 +331,14 @@ impl LerobotWriter {
             let pandas = HashMap::from([("pandas".to_owned(), pandas())]);
             let schema = Arc::new(ArrowSchema::clone(&schema).with_metadata(pandas));
             let batch = batch.with_schema(Arc::clone(&schema)).map_err(|e| Error::external("writing a table", e))?;
-            table::write(&meta.join("tasks.parquet"), &schema, &batch)?;
+            table::write(&self.root.join(TASKS), &schema, &batch)?;
             let names = self.columns.iter().map(|(_, native)| native.as_str());
-            write_atomically(&meta.join("stats.json"), &stats::file(names.zip(&self.stats))?)?;
+            write_atomically(&self.root.join(STATS), &stats::file(names.zip(&self.stats))?)?;
         }
         self.info.total_tasks = self.tasks.len();
         self.info.splits = BTreeMap::from([("train".to_owned(), format!("0:{}", self.info.total_episodes))]);
         let info = serde_json::to_vec_pretty(&self.info).map_err(|e| Error::external("describing the dataset", e))?;
-        write_atomically(&meta.join("info.json"), &info)
+        write_atomically(&self.root.join(INFO), &info)
     }
 
     fn complete(&mut self) -> Result<()> {
@@ -367,6 +349,7 @@ impl LerobotWriter {
             ));
         }
         self.commit()?;
+        files::delete_file(&self.root.join(WRITING))?;
         self.failed = false;
         Ok(())
     }
@@ -410,6 +393,13 @@ impl Drop for LerobotWriter {
             tracing::error!(dataset = %self.root.display(), "the last episodes could not be stored: {error}");
         }
     }
+}
+
+/// Checks that no folder of the dataset's files is a symbolic link, because the files would be written elsewhere.
+fn check_folders(root: &Path, columns: &[(usize, String)], schema: &Schema) -> Result<()> {
+    ["meta", "meta/episodes", "data", "videos"].iter().try_for_each(|name| files::check_no_link(&root.join(name)))?;
+    let mut cameras = columns.iter().filter(|(index, _)| schema.columns()[*index].is_image());
+    cameras.try_for_each(|(_, native)| files::check_no_link(&root.join("videos").join(native)))
 }
 
 /// The column of `meta/tasks.parquet` that pandas uses as the index.

@@ -25,24 +25,27 @@ mod reader;
 mod writer;
 
 use crate::dataset::Location;
-use crate::formats::column_files::{FILES, contains_videos, exists};
-use crate::formats::entry::{Backend, FormatEntry};
 #[cfg(feature = "ffmpeg")]
-use std::path::{Path, PathBuf};
+use crate::formats::column_files::{self, ImageFiles};
+use crate::formats::column_files::{contains_videos, exists};
+use crate::formats::entry::{Backend, FormatEntry};
 
 /// The registry row of this format.
 pub const ENTRY: FormatEntry = FormatEntry {
     id: "video",
     summary: "folder NAME.video of numpy's npz files and one MP4 per episode; the reference opens it",
     suffixes: &["video"],
-    files: FILES,
     feature: Some("ffmpeg"),
     detect,
     backend: BACKEND,
 };
 
 #[cfg(feature = "ffmpeg")]
-const BACKEND: Option<Backend> = Some(Backend { open: reader::open, create: writer::create });
+const BACKEND: Option<Backend> = Some(Backend {
+    open: reader::open,
+    create: writer::create,
+    remove: |path| column_files::remove(path, ImageFiles::Videos),
+});
 #[cfg(not(feature = "ffmpeg"))]
 const BACKEND: Option<Backend> = None;
 
@@ -52,10 +55,4 @@ fn detect(location: &Location) -> bool {
         return exists(path) && contains_videos(path) || ENTRY.has_suffix(location) && path.is_dir();
     }
     ENTRY.has_suffix(location)
-}
-
-/// Path of the video of an episode.
-#[cfg(feature = "ffmpeg")]
-fn video_path(folder: &Path, column: &str, episode: usize) -> PathBuf {
-    folder.join(column).join(format!("ep_{episode}.mp4"))
 }

@@ -1,11 +1,10 @@
 //! Reads numeric columns from column files, and frames from videos.
 
-use super::video_path;
 use crate::dataset::Location;
 use crate::dataset::episodes::content_hash;
 use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
-use crate::formats::column_files::{ColumnFiles, exists};
-use std::path::Path;
+use crate::formats::column_files::{ColumnFiles, exists, video_path};
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use swm_core::{ColumnSpec, Error, Manifest, Result, Schema};
 use swm_video::{Source, VideoCache};
@@ -76,6 +75,10 @@ impl Reader for VideoReader {
             })
         });
         Ok(found.collect())
+    }
+
+    fn sources(&self) -> Vec<PathBuf> {
+        vec![self.files.folder().to_owned()]
     }
 
     fn manifest(&self) -> Option<Manifest> {

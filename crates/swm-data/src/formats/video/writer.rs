@@ -1,14 +1,12 @@
 //! Writes the videos of an episode, then its numeric columns. Committing the numeric columns commits the episode.
 
 use super::reader::VideoReader;
-use super::video_path;
 use crate::dataset::Location;
 use crate::dataset::episodes;
 use crate::dataset::{Constants, Reader as _, WriteMode, WriteOptions, Writer};
-use crate::formats::column_files::{ColumnFilesWriter, exists};
+use crate::formats::column_files::{ColumnFilesWriter, ImageFiles, exists, video_path};
 use rayon::prelude::*;
 use std::io::Write as _;
-use std::path::Path;
 use swm_core::{Batch, Error, Result, Schema, files};
 use swm_video::{Encoding, encode};
 
@@ -24,27 +22,8 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
     } else {
         None
     };
-    let columns = ColumnFilesWriter::create(folder, schema, &options, known.as_ref(), discard)?;
+    let columns = ColumnFilesWriter::create(folder, schema, &options, known.as_ref(), ImageFiles::Videos)?;
     Ok(Box::new(VideoWriter { columns, schema: schema.clone(), encoding: Encoding::training(options.codec) }))
-}
-
-/// Deletes the videos of all episodes from `from` on, in the folder of an image column.
-fn discard(folder: &Path, from: usize) -> Result<()> {
-    let io = |e| Error::io(folder, "deleting videos of uncommitted episodes", e);
-    for entry in std::fs::read_dir(folder).map_err(io)? {
-        let entry = entry.map_err(io)?;
-        let is_video = entry.file_type().map_err(io)?.is_file();
-        if is_video && entry.file_name().to_str().and_then(episode_of).is_some_and(|episode| episode >= from) {
-            files::delete_file(&entry.path())?;
-        }
-    }
-    Ok(())
-}
-
-/// The episode in the name of a video or of an incomplete video.
-fn episode_of(name: &str) -> Option<usize> {
-    let name = name.strip_suffix(TEMPORARY_SUFFIX).or_else(|| name.strip_suffix(".mp4"))?;
-    name.strip_prefix("ep_")?.parse().ok()
 }
 
 /// Suffix of incomplete videos.
@@ -60,6 +39,9 @@ impl Writer for VideoWriter {
     fn write_episode_with(&mut self, episode: &Batch, constants: &Constants) -> Result<()> {
         episodes::check_episode(episode, &self.schema)?;
         let (folder, position) = (self.columns.folder(), self.columns.episodes());
+        // A failed write deletes the videos of its episode, so they must be the writer's own.
+        let mut cameras = self.schema.columns().iter().filter(|column| column.is_image());
+        cameras.try_for_each(|column| files::check_free(&video_path(folder, &column.name, position)))?;
         let images = self.schema.columns().par_iter().enumerate().filter(|(_, column)| column.is_image());
         let written = images.try_for_each(|(index, column)| {
             let frames = episode.bytes(index).chunks_exact(column.row_bytes());

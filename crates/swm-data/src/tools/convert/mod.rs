@@ -13,12 +13,13 @@ use crate::formats::{FORMATS, FormatEntry, create, detect, open};
 use comparison::{data_columns, dataset_hash, episode_hash};
 use serde::Serialize;
 use std::ops::Range;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, channel, sync_channel};
 use std::thread::scope;
 use swm_core::columns::ACTION;
 use swm_core::run::{Control, Event, Progress, Stage};
-use swm_core::{Batch, DType, Error, Result, Schema, files};
+use swm_core::{Batch, DType, Error, Result, Schema};
 use swm_image::ImageCodec;
 
 /// The unit of progress.
@@ -105,8 +106,8 @@ pub fn checksum(reader: &dyn Reader) -> Result<String> {
 /// Writes a dataset to another location. If the run is stopped, another call continues the conversion.
 ///
 /// # Errors
-/// If the source is damaged, the target cannot be written or differs from the source, or the run is stopped
-/// ([`Error::Interrupted`]).
+/// If the target is the source, the source is damaged, the target cannot be written or differs from the source, or the run
+/// is stopped ([`Error::Interrupted`]).
 #[allow(clippy::too_many_lines, reason = "compare, copy and verify share the report")]
 pub fn convert(
     reader: &Arc<dyn Reader>,
@@ -114,6 +115,7 @@ pub fn convert(
     options: &ConvertOptions,
     control: &mut Control<'_>,
 ) -> Result<Converted> {
+    check_distinct(&**reader, target)?;
     let is_new = target.path().is_some_and(|path| !path.exists());
     let source = Source::new(&**reader);
     let format = options.format.as_deref().map(|id| FORMATS.get(id)).transpose()?;
@@ -189,6 +191,16 @@ pub fn convert(
     Ok(report)
 }
 
+/// Checks that a dataset is not written over a dataset that it is read from, nor into a folder that holds it.
+fn check_distinct(reader: &dyn Reader, target: &Location) -> Result<()> {
+    let canonical = |path: PathBuf| path.canonicalize().unwrap_or(path);
+    let written = canonical(target.label());
+    if reader.sources().into_iter().any(|source| canonical(source).starts_with(&written)) {
+        return Err(Error::config(format!("target {target}"), "is the dataset that is read", "give another target"));
+    }
+    Ok(())
+}
+
 /// Opens the target if it exists.
 fn open_existing(target: &Location, format: Option<&FormatEntry>) -> Result<Option<Arc<dyn Reader>>> {
     let Some(path) = target.path() else { return Ok(reopen(target, format).ok()) };
@@ -209,11 +221,7 @@ fn remove_if_empty(target: &Location, format: Option<&FormatEntry>) {
     if !format.open(target).is_ok_and(|written| written.episodes().is_empty()) {
         return;
     }
-    let removed = format.remove(path).and_then(|remaining| {
-        remaining.iter().filter(|path| path.is_dir()).try_for_each(|path| files::remove_empty_folder(path))?;
-        if path.exists() { files::remove_empty_folder(path) } else { Ok(()) }
-    });
-    if let Err(error) = removed {
+    if let Err(error) = format.remove(path) {
         tracing::warn!("an empty dataset could not be deleted: {error}");
     }
 }

@@ -7,12 +7,12 @@ mod video;
 
 pub use sheet::contact_sheet;
 pub(crate) use video::VideoFile;
-pub use video::{integer_scale, write_mp4, write_mp4_scaled};
+pub use video::{check_mp4, integer_scale, write_mp4, write_mp4_scaled};
 
 use crate::dataset::{Reader, StepRange};
 use std::path::{Path, PathBuf};
 use swm_core::{Batch, ColumnSpec, Error, Result};
-use swm_image::write_png;
+use swm_image::{check_png, write_png};
 
 /// Settings of a preview.
 #[derive(Clone, Debug)]
@@ -44,7 +44,8 @@ const ROWS: usize = 32;
 /// `progress` with the number of finished episodes.
 ///
 /// # Errors
-/// If the dataset has no images, lacks one of the columns or is damaged, or the folder cannot be written.
+/// If the dataset has no images, lacks one of the columns or is damaged, one of the files exists and was not written by this
+/// program, or the folder cannot be written.
 pub fn preview(
     reader: &dyn Reader,
     folder: &Path,
@@ -54,11 +55,16 @@ pub fn preview(
     let layout = FrameLayout::new(reader, &options.columns)?;
     std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, "creating the folder", e))?;
     let chosen = chosen(reader, options.episodes)?;
+    let video_of = |episode: usize| folder.join(format!("episode_{}.mp4", reader.episodes()[episode].index));
+    let contact_sheet_path = folder.join("contact_sheet.png");
+    // Before any work, so that a refusal leaves no part of a preview.
+    chosen.iter().try_for_each(|&episode| check_mp4(&video_of(episode)))?;
+    check_png(&contact_sheet_path)?;
     let (mut written, mut sheet) = (vec![], vec![]);
     let scale = integer_scale(layout.width, layout.height, ENLARGED_SIDE);
     for (done, &episode) in chosen.iter().enumerate() {
         let index = reader.episodes()[episode].index;
-        let path = folder.join(format!("episode_{index}.mp4"));
+        let path = video_of(episode);
         let length = reader.episodes()[episode].length;
         let last = length - 1;
         let mut video = VideoFile::begin(&path, layout.width, layout.height, options.fps, scale)?;
@@ -79,9 +85,8 @@ pub fn preview(
         progress(done + 1);
     }
     let image = contact_sheet(layout.width, layout.height, &sheet, SHEET_COLUMNS, 1)?;
-    let path = folder.join("contact_sheet.png");
-    write_png(&path, image.width, image.height, &image.rgb)?;
-    written.push(path);
+    write_png(&contact_sheet_path, image.width, image.height, &image.rgb)?;
+    written.push(contact_sheet_path);
     Ok(written)
 }
 

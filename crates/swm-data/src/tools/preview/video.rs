@@ -1,15 +1,15 @@
 //! Videos for viewing: H.264 in MP4, which browsers play.
 
 use std::path::{Path, PathBuf};
-use swm_core::{Error, Result};
+use swm_core::{Error, Result, files};
 
 /// Writes `frames` (each `[height, width, 3]` RGB bytes) as an MP4 that browsers play. Odd sizes get an additional
 /// black row or column, because H.264 halves the chroma planes. The file is written atomically. Equal frames give equal
 /// bytes with the same FFmpeg version.
 ///
 /// # Errors
-/// If this build lacks the feature `ffmpeg`, FFmpeg has no H.264 encoder, a frame does not have the given size, there
-/// is no frame, or writing fails.
+/// If [`check_mp4`] fails, this build lacks the feature `ffmpeg`, FFmpeg has no H.264 encoder, a frame does not have the
+/// given size, there is no frame, or writing fails.
 pub fn write_mp4<I>(path: &Path, width: usize, height: usize, fps: u32, frames: I) -> Result<()>
 where
     I: IntoIterator,
@@ -33,6 +33,22 @@ where
         video.add(frame.as_ref())?;
     }
     video.finish()
+}
+
+/// Checks that a video may be written: nothing exists at its path, or a video that this program wrote.
+///
+/// # Errors
+/// If another file exists there.
+pub fn check_mp4(path: &Path) -> Result<()> {
+    files::check_own(path, is_own)
+}
+
+#[cfg(feature = "ffmpeg")]
+use swm_video::is_own;
+
+#[cfg(not(feature = "ffmpeg"))]
+fn is_own(_: &Path) -> bool {
+    false
 }
 
 /// The integer factor that enlarges an image's longer side to at most `target` pixels; at least 1.
@@ -62,6 +78,7 @@ impl VideoFile {
                 "make each value at least 1",
             ));
         }
+        check_mp4(path)?;
         let (wide, high) = even(width, height, scale);
         Ok(Self {
             path: path.to_owned(),
@@ -103,7 +120,7 @@ impl VideoFile {
             return Err(Error::config(what, "there is no frame to write", "record at least one step"));
         }
         let bytes = self.inner.finish()?;
-        swm_core::files::write(&self.path, &bytes)
+        files::write(&self.path, &bytes)
     }
 }
 

@@ -24,6 +24,7 @@ use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
 use lance_table::format::Manifest as Table;
 use std::collections::BTreeMap;
 use std::ops::Range;
+use std::path::PathBuf;
 use std::slice;
 use std::sync::{Arc, Mutex};
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
@@ -242,6 +243,10 @@ impl Reader for LanceReader {
             }
         }
         Ok(found)
+    }
+
+    fn sources(&self) -> Vec<PathBuf> {
+        vec![self.store.label.clone()]
     }
 
     fn manifest(&self) -> Option<Manifest> {

@@ -1,0 +1,101 @@
+//! Deletes a dataset of column files, and nothing else in its folder.
+
+use super::images::uncommitted;
+use super::reader::stored_metadata;
+use super::{ImageFiles, LENGTHS, OFFSETS, TEMPORARY, check_name, journal};
+use std::path::{Path, PathBuf};
+use swm_core::files::{self, Lock};
+use swm_core::{ColumnSpec, Error, Result, Schema};
+
+/// Deletes the dataset in a folder.
+///
+/// # Errors
+/// As [`clear`], and if another process writes to the dataset.
+pub(crate) fn remove(folder: &Path, images: ImageFiles) -> Result<()> {
+    let _lock = Lock::folder(folder)?;
+    clear(folder, images)?;
+    files::delete_named(folder, &[format!("{LENGTHS}.npz").into()])
+}
+
+/// Deletes the dataset in a folder that the caller has locked, except `ep_len.npz`: the files of its own columns and
+/// episodes, as `ep_len.npz` and the journal name them.
+///
+/// Images are deleted first, then column files, then the journal; nothing is moved. The `ep_len.npz` of the next dataset
+/// replaces the old one. So after a kill at any time the remaining files still have the metadata that names them: readers
+/// report the missing files, and the next replacement deletes the rest.
+///
+/// # Errors
+/// If the metadata cannot be read or records no columns, the dataset has the other format, or a file is a symbolic link;
+/// then nothing is deleted. Also if a file cannot be deleted.
+pub(super) fn clear(folder: &Path, images: ImageFiles) -> Result<()> {
+    let (schema, rows, killed) = stored_episodes(folder)?;
+    let mut names = vec![];
+    for column in schema.columns().iter().filter(|column| column.is_image()) {
+        let files = images.list(folder, &column.name)?;
+        check_format(folder, &column.name, images, files.is_empty())?;
+        let stored = files.iter().filter(|file| rows.get(file.episode).is_some_and(|&rows| file.step < rows));
+        // The journal shows that the writer was killed.
+        let left = uncommitted(&files, rows.len()).filter(|_| killed);
+        names.extend(stored.chain(left).map(|file| file.name.clone()));
+    }
+    names.extend(own_files(&schema));
+    files::delete_named(folder, &names)?;
+    // The folders of a dataset without episodes.
+    let mut columns = schema.columns().iter().filter(|column| column.is_image());
+    columns.try_for_each(|column| files::remove_empty_folder(&folder.join(&column.name)))
+}
+
+/// Checks that the files of a new dataset, which replaces the one in `folder`, replace no file that is not part of it.
+///
+/// # Errors
+/// If a file has the name of a new column file or of the folder of an image column.
+pub(super) fn check_new_files(folder: &Path, new: &Schema) -> Result<()> {
+    let (old, ..) = stored_episodes(folder)?;
+    let old: Vec<PathBuf> = own_files(&old).collect();
+    own_files(new).filter(|name| !old.contains(name)).try_for_each(|name| files::check_free(&folder.join(name)))?;
+    let folders = new.columns().iter().filter(|column| column.is_image()).map(|column| folder.join(&column.name));
+    folders.filter(|path| !path.is_dir()).try_for_each(|path| files::check_free(&path))
+}
+
+/// The columns, the number of rows of each episode, and whether a writer was killed.
+fn stored_episodes(folder: &Path) -> Result<(Schema, Vec<usize>, bool)> {
+    let refused = |problem: String| {
+        let problem = format!("the names of its files are unknown: {problem}");
+        Error::corrupt(folder, problem, "delete the dataset by hand, or choose another path")
+    };
+    let (lengths, recorded) = stored_metadata(folder).map_err(|error| refused(error.to_string()))?;
+    let schema = recorded.schema.ok_or_else(|| refused("another program wrote it".to_owned()))?;
+    schema.columns().iter().try_for_each(|column| check_name(&column.name)).map_err(|e| refused(e.to_string()))?;
+    let mut rows: Vec<usize> = lengths.iter().map(|&length| usize::try_from(length).unwrap_or(0)).collect();
+    let path = journal::path(folder);
+    let killed = path.exists();
+    if killed {
+        let columns: Vec<&ColumnSpec> = schema.columns().iter().filter(|column| !column.is_image()).collect();
+        let pending = files::read(&path, u64::MAX)
+            .and_then(|bytes| journal::replay(&path, &bytes, &columns, rows.len()))
+            .map_err(|error| refused(error.to_string()))?;
+        rows.extend(pending.iter().map(|episode| episode.rows));
+    }
+    Ok((schema, rows, killed))
+}
+
+/// The files of a dataset apart from images and `ep_len.npz`, in the order of deletion.
+fn own_files(schema: &Schema) -> impl Iterator<Item = PathBuf> {
+    let columns =
+        schema.columns().iter().filter(|column| !column.is_image()).map(|column| format!("{}.npz", column.name));
+    let others = [format!("{OFFSETS}.npz"), TEMPORARY.to_owned(), journal::NAME.to_owned()];
+    columns.chain(others).map(PathBuf::from)
+}
+
+/// Checks that a column has the image files of this format. A column without files may be left by a kill.
+fn check_format(folder: &Path, column: &str, images: ImageFiles, is_empty: bool) -> Result<()> {
+    let (other, name) = match images {
+        ImageFiles::Images => (ImageFiles::Videos, "video"),
+        ImageFiles::Videos => (ImageFiles::Images, "folder"),
+    };
+    if is_empty && !other.list(folder, column)?.is_empty() {
+        let problem = format!("{} is a dataset of the format {name}", folder.display());
+        return Err(Error::config("dataset", problem, format!("give --format {name}, or choose another path")));
+    }
+    Ok(())
+}

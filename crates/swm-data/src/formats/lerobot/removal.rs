@@ -1,0 +1,77 @@
+//! Deletes a dataset that this project wrote, and nothing else in its folder; and the names of its files.
+
+use super::info::{DATA_PATH, EPISODES_PATH, Info, VIDEO_PATH, fill};
+use std::path::{Path, PathBuf};
+use swm_core::files::{self, Lock};
+use swm_core::{Error, Result};
+
+/// The file that declares the features and the number of episodes.
+pub(super) const INFO: &str = "meta/info.json";
+/// The table of tasks.
+pub(super) const TASKS: &str = "meta/tasks.parquet";
+/// The statistics of the features.
+pub(super) const STATS: &str = "meta/stats.json";
+
+/// An empty file that exists while a writer is active, or after a writer was killed or failed.
+pub(super) const WRITING: &str = "meta/writing.tmp";
+
+/// Deletes the dataset in a folder.
+///
+/// # Errors
+/// As [`clear`], and if another process writes to the dataset.
+pub(super) fn remove(root: &Path) -> Result<()> {
+    let _lock = Lock::folder(root)?;
+    clear(root)?;
+    files::delete_named(root, &[INFO.into()])
+}
+
+/// Deletes the dataset in a folder that the caller has locked, except `meta/info.json`.
+///
+/// The names are those of the features in `meta/info.json` and of the files that `meta/episodes` has, whose indices count
+/// up from 0. The last index is deleted first, and of an index the list of episodes last; nothing is moved. The
+/// `meta/info.json` of the next dataset replaces the old one. So after a kill at any time the remaining files still have
+/// the metadata that names them, and the next replacement deletes the rest.
+///
+/// # Errors
+/// If the metadata cannot be read, another program wrote the dataset, or a file is a symbolic link; then nothing is
+/// deleted. Also if a file cannot be deleted.
+pub(super) fn clear(root: &Path) -> Result<()> {
+    let refused = |problem: String| {
+        let problem = format!("the names of its files are unknown: {problem}");
+        Error::corrupt(root, problem, "delete the dataset by hand, or choose another path")
+    };
+    let info = Info::read(root).map_err(|error| refused(error.to_string()))?;
+    if info.stable_worldmodel.is_none() || !info.is_v3() {
+        return Err(refused("another program wrote it".to_owned()));
+    }
+    let has_episodes = |index: &usize| root.join(fill(EPISODES_PATH, "", &indices(&info, *index))).is_file();
+    // Every file has at least one episode. A killed commit may have left the files of one more index.
+    let killed = root.join(WRITING).exists();
+    let files = (0..=info.total_episodes).take_while(has_episodes).count() + usize::from(killed);
+    let mut names: Vec<PathBuf> = (0..files).rev().flat_map(|index| files_of_index(&info, index)).collect();
+    names.extend([TASKS, STATS].into_iter().flat_map(with_temporary));
+    names.extend([temporary(INFO), WRITING.into()]);
+    files::delete_named(root, &names)
+}
+
+/// The files of one commit, and their temporary files: videos, rows, and the list of episodes.
+pub(super) fn files_of_index(info: &Info, index: usize) -> Vec<PathBuf> {
+    let indices = indices(info, index);
+    let videos = info.video_keys().into_iter().map(|key| fill(VIDEO_PATH, key, &indices));
+    let tables = [DATA_PATH, EPISODES_PATH].map(|template| fill(template, "", &indices));
+    videos.chain(tables).flat_map(|name| with_temporary(&name)).collect()
+}
+
+/// Index of the chunk, and index of the file in it.
+pub(super) fn indices(info: &Info, index: usize) -> [(&'static str, usize); 2] {
+    [("chunk_index", index / info.chunks_size), ("file_index", index % info.chunks_size)]
+}
+
+fn with_temporary(name: &str) -> [PathBuf; 2] {
+    [name.into(), temporary(name)]
+}
+
+/// The temporary file that replaces a file.
+fn temporary(name: &str) -> PathBuf {
+    format!("{name}.tmp").into()
+}

@@ -132,6 +132,7 @@ pub fn catch_library_panics() {
 }
 
 /// Calls `read` and aborts if a panic escapes from it.
+#[allow(clippy::print_stderr, reason = "the log of the fuzzer")]
 pub fn contained(read: impl FnOnce()) {
     if catch_unwind(AssertUnwindSafe(read)).is_err() {
         eprintln!("{}", LAST.lock().unwrap_or_else(PoisonError::into_inner));
@@ -145,12 +146,10 @@ pub fn json(value: &impl serde::Serialize) -> Vec<u8> {
 }
 
 /// Opens a dataset and reads everything in it.
-#[cfg(feature = "data")]
 pub fn read_dataset(path: &Path) {
     let _ = try_read(path);
 }
 
-#[cfg(feature = "data")]
 fn try_read(path: &Path) -> swm_core::Result<()> {
     use swm_data::StepRange;
     /// Rows of a dataset that the fuzzers read.

@@ -16,12 +16,13 @@ const BUILDS: &[(&str, &[&str], bool)] = &[
     ("the Python extension", &["-p", "swm-python"], false),
     ("the tests of swm-data", &["-p", "swm-data"], true),
     ("the tests of swm-models", &["-p", "swm-models"], true),
+    ("the fuzzers", &["-p", "swm-fuzz", "--features", "libfuzzer"], false),
 ];
 
 /// Libraries with their features, by name and version.
 type Features = BTreeMap<String, BTreeSet<String>>;
 
-/// Returns a sentence for each library that two builds compile with different features.
+/// Returns a sentence for each library that the tests and another build compile with different features.
 pub fn violations(root: &Path) -> Result<Vec<String>> {
     let resolved: Vec<(&str, Features)> = BUILDS
         .iter()
@@ -32,7 +33,7 @@ pub fn violations(root: &Path) -> Result<Vec<String>> {
     for (name, features) in &resolved[1..] {
         for (library, sets) in features {
             let missing: Vec<&String> =
-                sets.iter().filter(|set| all.get(library).is_none_or(|sets| !sets.contains(*set))).collect();
+                sets.iter().filter(|set| all.get(library).is_some_and(|sets| !sets.contains(*set))).collect();
             if let [set, ..] = missing[..] {
                 let sets: Vec<&str> = all.get(library).into_iter().flatten().map(String::as_str).collect();
                 found.push(format!(

@@ -65,14 +65,19 @@ pub const RULES: &[Rule] = &[
     },
     Rule::Only {
         users: &["swm"],
-        crates: &["swm-envs", "swm-mujoco", "swm-models"],
-        words: "only the facade depends on concrete families",
+        crates: &["swm-envs", "swm-mujoco"],
+        words: "only the facade depends on concrete environments",
+    },
+    Rule::Only {
+        users: &["swm", "swm-fuzz"],
+        crates: &["swm-models"],
+        words: "only the facade and the fuzzers depend on model families",
     },
     Rule::Only { users: &["swm-data"], crates: &["swm-video"], words: "only the dataset crate depends on FFmpeg" },
     Rule::Only {
-        users: &["swm", "swm-python"],
+        users: &["swm", "swm-python", "swm-fuzz"],
         crates: &["swm-gym"],
-        words: "only the facade and the Python extension depend on the Gymnasium bridge",
+        words: "only the facade, the Python extension and the fuzzers depend on the Gymnasium bridge",
     },
 ];
 
@@ -173,7 +178,7 @@ mod tests {
             ("swm-report", "swm-models", "swm-report → swm-models (only the facade"),
             ("swm-image", "ffmpeg-next", "swm-image → ffmpeg-next ("),
             ("swm-eval", "swm-video", "swm-eval → swm-video (only the dataset crate"),
-            ("swm-data", "swm-gym", "swm-data → swm-gym (only the facade and"),
+            ("swm-data", "swm-gym", "swm-data → swm-gym (only the facade, the"),
             (
                 "lance-file",
                 "datafusion-physical-plan",

@@ -92,7 +92,17 @@ fn fmt() -> Result<()> {
 
 fn clippy() -> Result<()> {
     cargo(
-        &["clippy", "--release", "--workspace", "--all-targets", "--", "-D", "warnings"],
+        &[
+            "clippy",
+            "--release",
+            "--workspace",
+            "--all-targets",
+            "--features",
+            "swm-fuzz/libfuzzer",
+            "--",
+            "-D",
+            "warnings",
+        ],
         "fix what clippy names above",
     )?;
     verdict("clippy", &[])

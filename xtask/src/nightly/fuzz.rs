@@ -1,4 +1,4 @@
-//! The fuzzers of `fuzz/`: builds them, runs two at a time, and adds their times to the page.
+//! The fuzzers of `fuzz/`: builds them, runs those that ran least, and adds their times to the page.
 
 use super::page::{Page, Totals};
 use super::{Run, root};
@@ -8,53 +8,69 @@ use std::process::{Command, Stdio};
 use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
-/// Fuzzers that run at the same time.
-const AT_ONCE: u64 = 2;
+/// Seconds that a fuzzer runs. Every run starts with the inputs that the runs before found.
+const SECONDS: u64 = 600;
 
-/// Seconds that a fuzzer runs at most.
-const LONGEST: u64 = 300;
+/// Seconds of the part's time limit that remain after the last fuzzer.
+const MARGIN: u64 = 30;
 
-/// Builds the fuzzers and runs each for an equal part of the time that is left.
-pub fn run(run: &Run, page: &mut Page) -> Result<String> {
-    run.tool("cargo-fuzz")?;
-    let target = run.target("fuzz");
-    run.cargo_nightly(&["fuzz", "build", "--codegen-units", "16"], &[("CARGO_TARGET_DIR", &target)])?;
-    let programs = Path::new(&target).join("x86_64-unknown-linux-gnu/release");
-    let names = names()?;
-    let left = run.end.saturating_duration_since(Instant::now()).as_secs();
-    let rounds = (names.len() as u64).div_ceil(AT_ONCE);
-    let seconds = (left / rounds.max(1)).saturating_sub(10).min(LONGEST);
-    if seconds == 0 {
-        bail!("building the fuzzers took all the time; run this part again");
-    }
-    let (queue, found) = (Mutex::new(names.iter()), Mutex::new(vec![]));
+/// The shortest run that is worth its start, in seconds.
+const SHORTEST: u64 = 60;
+
+/// Builds the fuzzers and runs them, those with the shortest time on the page first, one per processor, until the time of the
+/// part has passed.
+pub fn run(run: &Run) -> Result<String> {
+    run.cargo(&["build", "--release", "-p", "swm-fuzz", "--features", "libfuzzer"], &[run.instrumented()])?;
+    let programs = Path::new(&run.target_folder()).join("release");
+    let totals = Page::read(&run.page)?;
+    let mut names = names()?;
+    names.sort_by(|a, b| totals.minutes(a).total_cmp(&totals.minutes(b)));
+    let (queue, ended) = (Mutex::new(names.iter()), Mutex::new(vec![]));
+    let at_once = std::thread::available_parallelism().map_or(1, usize::from);
     std::thread::scope(|scope| {
-        for _ in 0..AT_ONCE {
+        for _ in 0..at_once {
             scope.spawn(|| {
-                loop {
+                while let Some(seconds) = seconds_left(run) {
                     let next = queue.lock().unwrap_or_else(PoisonError::into_inner).next();
                     let Some(name) = next else { return };
                     let outcome = fuzz(&programs.join(name), name, &run.cache.join("fuzz"), seconds);
-                    found.lock().unwrap_or_else(PoisonError::into_inner).push((name, outcome));
+                    let mut ended = ended.lock().unwrap_or_else(PoisonError::into_inner);
+                    // The page is written under the lock.
+                    ended.push((name.as_str(), outcome.and_then(|totals| record(run, name, totals))));
                 }
             });
         }
     });
-    let mut failures = vec![];
-    for (name, outcome) in found.into_inner().unwrap_or_else(PoisonError::into_inner) {
-        match outcome {
-            Ok(totals) => {
-                page.add(name, totals);
-                if totals.findings > 0 {
-                    failures.push(format!("{name} (see {})", run.cache.join("fuzz/findings").join(name).display()));
-                }
-            }
-            Err(error) => failures.push(format!("{name}: {error:#}")),
-        }
+    verdict(ended.into_inner().unwrap_or_else(PoisonError::into_inner))
+}
+
+/// The seconds that the next fuzzer may run; `None` if the part has no time for it.
+fn seconds_left(run: &Run) -> Option<u64> {
+    let left = run.end.saturating_duration_since(Instant::now()).as_secs().saturating_sub(MARGIN);
+    Some(left.min(SECONDS)).filter(|&seconds| seconds >= SHORTEST)
+}
+
+/// Adds the totals of a run to the page. A finding is an error.
+fn record(run: &Run, name: &str, totals: Totals) -> Result<()> {
+    Page::update(&run.page, |page| page.add(name, totals))?;
+    if totals.findings > 0 {
+        bail!("a finding, in {}", run.cache.join("fuzz/findings").join(name).display());
     }
-    match failures.is_empty() {
-        true => Ok(format!("{} fuzzers, {seconds} seconds each", names.len())),
-        false => bail!("{}", failures.join("; ")),
+    Ok(())
+}
+
+/// The result of the part: the fuzzers that ran, or those that failed.
+fn verdict(mut ended: Vec<(&str, Result<()>)>) -> Result<String> {
+    if ended.is_empty() {
+        bail!("building the fuzzers took all the time; run this part again");
+    }
+    ended.sort_by_key(|(name, _)| *name);
+    let ran: Vec<&str> = ended.iter().map(|(name, _)| *name).collect();
+    let ran = format!("{} ran at most {} minutes each", ran.join(", "), SECONDS / 60);
+    let failed = ended.iter().filter_map(|(name, outcome)| Some(format!("{name}: {:#}", outcome.as_ref().err()?)));
+    match failed.collect::<Vec<_>>()[..] {
+        [] => Ok(ran),
+        ref failed => bail!("{}; {ran}", failed.join("; ")),
     }
 }
 
@@ -77,7 +93,7 @@ fn fuzz(program: &Path, name: &str, folder: &Path, seconds: u64) -> Result<Total
     let child = Command::new(program)
         .arg(&corpus)
         .args([format!("-max_total_time={seconds}"), format!("-artifact_prefix={}/", findings.display())])
-        .args(["-malloc_limit_mb=256", "-rss_limit_mb=4096", "-timeout=30", "-print_final_stats=1"])
+        .args(["-malloc_limit_mb=256", "-rss_limit_mb=4096", "-timeout=30", "-print_final_stats=1", "-print_funcs=0"])
         .stdout(Stdio::null())
         .stderr(Stdio::piped())
         .spawn()
@@ -93,4 +109,19 @@ fn fuzz(program: &Path, name: &str, folder: &Path, seconds: u64) -> Result<Total
     let inputs = inputs.and_then(|text| text.trim().parse().ok()).unwrap_or(0);
     let minutes = start.elapsed().as_secs_f64() / 60.0;
     Ok(Totals { minutes, inputs, findings: u64::from(!output.status.success()) })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use anyhow::anyhow;
+
+    #[test]
+    fn result_names_the_fuzzers_that_ran_and_those_that_failed() {
+        let passed = verdict(vec![("npz", Ok(())), ("hdf5", Ok(()))]).expect("no failure");
+        assert_eq!(passed, "hdf5, npz ran at most 10 minutes each");
+        let failed = verdict(vec![("npz", Ok(())), ("hdf5", Err(anyhow!("a finding")))]).expect_err("a failure");
+        assert_eq!(failed.to_string(), "hdf5: a finding; hdf5, npz ran at most 10 minutes each");
+        assert!(verdict(vec![]).is_err());
+    }
 }

@@ -21,10 +21,8 @@ struct Part {
     what: &'static str,
     /// Time limit of the part. All limits together are two hours.
     minutes: u64,
-    /// Whether the part requires a nightly toolchain.
-    nightly: bool,
     /// Runs the part and returns what it found.
-    run: fn(&Run, &mut Page) -> Result<String>,
+    run: fn(&Run) -> Result<String>,
 }
 
 /// The parts, shortest first.
@@ -33,8 +31,7 @@ const PARTS: &[Part] = &[
         name: "deny",
         what: "licences, banned libraries and sources of the dependencies (`deny.toml`)",
         minutes: 2,
-        nightly: false,
-        run: |run, _| {
+        run: |run| {
             run.tool("cargo-deny")?;
             run.cargo(&["deny", "check", "licenses", "bans", "sources"], &[])?;
             Ok("no dependency refused".to_owned())
@@ -44,10 +41,9 @@ const PARTS: &[Part] = &[
         name: "loom",
         what: "the loader's queue under all interleavings of its threads (`loom/`)",
         minutes: 6,
-        nightly: false,
-        run: |run, _| {
+        run: |run| {
             let target = run.target("loom");
-            run.cargo(&["test", "--release", "--manifest-path", "loom/Cargo.toml"], &[("CARGO_TARGET_DIR", &target)])?;
+            run.cargo(&["test", "--release", "--manifest-path", "loom/Cargo.toml"], &[("CARGO_TARGET_DIR", target)])?;
             run.tests()
         },
     },
@@ -55,7 +51,6 @@ const PARTS: &[Part] = &[
         name: "soak",
         what: "1,000,000 steps collected by one process, and the doctor's verdict",
         minutes: 10,
-        nightly: false,
         run: soak,
     },
     Part {
@@ -63,15 +58,13 @@ const PARTS: &[Part] = &[
         what: "tests of the crates with `unsafe` code and no C library (core, simd, kernels, image, raster, gym) under \
                AddressSanitizer",
         minutes: 20,
-        nightly: true,
         run: asan,
     },
     Part {
         name: "kills",
         what: "50 kills of every command and of every writer that keeps what it stored",
         minutes: 15,
-        nightly: false,
-        run: |run, _| {
+        run: |run| {
             run.cargo(
                 &["test", "--release", "-p", "swm-data", "-p", "swm", "--test", "it", "kill", "--", "--ignored"],
                 &[],
@@ -83,8 +76,7 @@ const PARTS: &[Part] = &[
         name: "long",
         what: "the tests that `make test` leaves out (`#[ignore]`)",
         minutes: 25,
-        nightly: false,
-        run: |run, _| {
+        run: |run| {
             let mut arguments = vec!["test", "--release", "--workspace", "--", "--ignored", "--skip", "kill"];
             if std::env::var_os("SWM_TORCH_PYTHON").is_none() {
                 arguments.extend(["--skip", "exported_checkpoints_load_in_the_reference"]);
@@ -93,13 +85,20 @@ const PARTS: &[Part] = &[
             run.tests()
         },
     },
-    Part { name: "fuzz", what: "every fuzzer of `fuzz/`, two at a time", minutes: 42, nightly: true, run: fuzz::run },
+    Part {
+        name: "fuzz",
+        what: "the fuzzers of `fuzz/` that ran least so far, under AddressSanitizer",
+        minutes: 42,
+        run: fuzz::run,
+    },
 ];
 
 /// Where a part runs and logs.
 struct Run {
     /// The folder of downloads and caches.
     cache: PathBuf,
+    /// The page of the results.
+    page: PathBuf,
     /// The output of the part.
     log: PathBuf,
     end: Instant,
@@ -120,24 +119,20 @@ pub fn nightly(only: Option<&str>) -> Result<()> {
     let cache = cache.or_else(home).context("no home folder: name a folder in SWM_CACHE")?;
     let logs = cache.join("nightly");
     std::fs::create_dir_all(&logs).with_context(|| format!("creating {}", logs.display()))?;
-    let path = root().join("docs/nightly.md");
-    let mut page = Page::read(&path)?;
+    let page = root().join("docs/nightly.md");
     let mut failed = vec![];
     for part in PARTS.iter().filter(|part| only.is_none_or(|name| name == part.name)) {
-        if only.is_none() && page.passed(part.name, &commit) {
+        if only.is_none() && Page::read(&page)?.passed(part.name, &commit) {
             println!("{}: passed on {commit} before", part.name);
             continue;
         }
         println!("{}: {} (at most {} minutes)", part.name, part.what, part.minutes);
         let start = Instant::now();
         let end = start + Duration::from_secs(60 * part.minutes);
-        let run = Run { cache: cache.clone(), log: logs.join(format!("{}.log", part.name)), end };
+        let log = logs.join(format!("{}.log", part.name));
+        let run = Run { cache: cache.clone(), page: page.clone(), log, end };
         File::create(&run.log).with_context(|| format!("creating {}", run.log.display()))?;
-        let outcome = match part.nightly {
-            true => toolchain().and_then(|()| (part.run)(&run, &mut page)),
-            false => (part.run)(&run, &mut page),
-        };
-        let (passed, result) = match outcome {
+        let (passed, result) = match (part.run)(&run) {
             Ok(found) => (true, found),
             Err(error) => (false, format!("{error:#}").replace(['\n', '|'], " ")),
         };
@@ -147,24 +142,13 @@ pub fn nightly(only: Option<&str>) -> Result<()> {
             failed.push(part.name);
         }
         let minutes = start.elapsed().as_secs_f64() / 60.0;
-        page.set(Row { part: part.name, what: part.what, passed, result, minutes, commit: &commit, date: date() });
-        page.write(&path)?;
+        let row = Row { part: part.name, what: part.what, passed, result, minutes, commit: &commit, date: date() };
+        Page::update(&page, |page| page.set(row))?;
     }
     match failed.is_empty() {
         true => Ok(()),
         false => bail!("failed: {}", failed.join(", ")),
     }
-}
-
-/// Checks that there is a nightly toolchain.
-fn toolchain() -> Result<()> {
-    let found = Command::new("rustup").args(["run", "nightly", "rustc", "--version"]).output();
-    if found.is_ok_and(|output| output.status.success()) {
-        return Ok(());
-    }
-    bail!(
-        "there is no nightly toolchain, which sanitizers require: `rustup toolchain install nightly --profile minimal`"
-    )
 }
 
 /// The commit that is checked out, with a `+` if files other than the page differ from it.
@@ -216,19 +200,17 @@ impl Run {
         }
     }
 
-    /// Runs cargo of the stable toolchain.
-    fn cargo(&self, arguments: &[&str], variables: &[(&str, &str)]) -> Result<()> {
+    /// Runs cargo.
+    fn cargo(&self, arguments: &[&str], variables: &[(&str, String)]) -> Result<()> {
         let mut command = self.command("cargo", arguments)?;
-        command.envs(variables.iter().copied());
+        command.envs(variables.iter().map(|(name, value)| (name, value)));
         self.check(command, &format!("cargo {}", arguments.join(" ")))
     }
 
-    /// Runs cargo of the nightly toolchain.
-    fn cargo_nightly(&self, arguments: &[&str], variables: &[(&str, &str)]) -> Result<()> {
-        let all: Vec<&str> = ["run", "nightly", "cargo"].iter().chain(arguments).copied().collect();
-        let mut command = self.command("rustup", &all)?;
-        command.envs(variables.iter().copied());
-        self.check(command, &format!("cargo +nightly {}", arguments.join(" ")))
+    /// The variable with which cargo instruments the crates of the workspace. Libraries of ordinary builds are used as they
+    /// are, in the same target folder.
+    fn instrumented(&self) -> (&'static str, String) {
+        ("RUSTC_WORKSPACE_WRAPPER", root().join("xtask/instrument.sh").display().to_string())
     }
 
     /// Installs a tool of cargo where it is missing.
@@ -251,27 +233,17 @@ impl Run {
 }
 
 /// Runs the tests of crates with `unsafe` code under AddressSanitizer.
-fn asan(run: &Run, _: &mut Page) -> Result<String> {
-    let target = run.target("asan");
-    let flags = [
-        ("CARGO_TARGET_DIR", target.as_str()),
-        ("RUSTFLAGS", "-Zsanitizer=address -Cdebug-assertions"),
-        // Threads of the program that still run at its end keep their memory.
-        ("ASAN_OPTIONS", "detect_leaks=0"),
-    ];
+fn asan(run: &Run) -> Result<String> {
     let crates = ["swm-core", "swm-simd", "swm-kernels", "swm-image", "swm-raster", "swm-gym"];
     let packages = crates.iter().flat_map(|name| ["-p", name]);
-    // With `--target`, the flags do not reach build scripts.
-    let all: Vec<&str> = ["test", "--release", "--target", "x86_64-unknown-linux-gnu", "--lib", "--tests"]
-        .into_iter()
-        .chain(packages)
-        .collect();
-    run.cargo_nightly(&all, &flags)?;
+    let all: Vec<&str> = ["test", "--release", "--lib", "--tests"].into_iter().chain(packages).collect();
+    // Threads of the program that still run at its end keep their memory.
+    run.cargo(&all, &[run.instrumented(), ("ASAN_OPTIONS", "detect_leaks=0".to_owned())])?;
     run.tests()
 }
 
 /// Collects a million steps in one process and watches its memory.
-fn soak(run: &Run, _: &mut Page) -> Result<String> {
+fn soak(run: &Run) -> Result<String> {
     /// The most memory that the process may use, in MiB; a leak of a kilobyte a step would be a gibibyte.
     const LIMIT: u64 = 1024;
     run.cargo(&["build", "--release", "-p", "swm", "--bins"], &[])?;

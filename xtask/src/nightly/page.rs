@@ -10,20 +10,20 @@ use std::path::Path;
 const HEAD: &str = "# Nightly checks
 
 `make nightly` runs what takes too long for `make test`, in parts of two hours together, and writes this page. A run that was
-stopped continues with the first part that has not passed on the same commit; `make nightly PART=fuzz` runs one part. The
-fuzzers and AddressSanitizer require a nightly toolchain; the other parts do not.
+stopped continues with the first part that has not passed on the same commit; `make nightly PART=fuzz` runs one part. No
+nightly toolchain is required.
 
-AddressSanitizer does not run over `swm-video`, `swm-mujoco` and the Python extension, whose `unsafe` code is calls of C
-libraries (FFmpeg, MuJoCo, EGL, Python) that are not compiled with it. `swm-data` is covered by the fuzzers, which run
-under AddressSanitizer.
+The fuzzers and the part `asan` compile the crates of the workspace with AddressSanitizer, checks of overflow and coverage counters
+(`xtask/instrument.sh`), and use the libraries of ordinary builds, which are not instrumented. AddressSanitizer does not run over
+`swm-video`, `swm-mujoco` and the Python extension, whose `unsafe` code is calls of C libraries (FFmpeg, MuJoCo, EGL, Python).
 ";
 
 /// The text before the table of the fuzzers.
 const FUZZERS: &str = "
 ## Fuzzers
 
-The time of all runs on the machine that writes this page. The goal is an hour each; a finding becomes a test of the crate
-that owns the parser.
+The time of all runs on the machine that writes this page. A night runs those with the shortest time for ten minutes each; the goal
+is an hour each. A finding becomes a test of the crate that owns the parser.
 
 | fuzzer | minutes | inputs | findings |
 | --- | --- | --- | --- |
@@ -91,6 +91,11 @@ impl Page {
         self.parts.iter().any(|cells| cells[0] == part && cells[2].starts_with("passed") && cells[4] == commit)
     }
 
+    /// The time that a fuzzer ran in all.
+    pub fn minutes(&self, fuzzer: &str) -> f64 {
+        self.fuzzers.get(fuzzer).map_or(0.0, |totals| totals.minutes)
+    }
+
     /// Replaces the row of a part.
     pub fn set(&mut self, row: Row<'_>) {
         let verdict = if row.passed { "passed" } else { "**failed**" };
@@ -116,9 +121,11 @@ impl Page {
         totals.findings += run.findings;
     }
 
-    /// Writes the page.
-    pub fn write(&self, path: &Path) -> Result<()> {
-        std::fs::write(path, self.text()).with_context(|| format!("writing {}", path.display()))
+    /// Reads the page, changes it and writes it back.
+    pub fn update(path: &Path, change: impl FnOnce(&mut Self)) -> Result<()> {
+        let mut page = Self::read(path)?;
+        change(&mut page);
+        std::fs::write(path, page.text()).with_context(|| format!("writing {}", path.display()))
     }
 
     fn text(&self) -> String {
@@ -160,6 +167,7 @@ mod tests {
         let read = Page::parse(&page.text());
         assert_eq!(read, page);
         assert!(read.passed("loom", "bbbb") && !read.passed("loom", "aaaa") && !read.passed("fuzz", "bbbb"));
+        assert!(read.minutes("jpeg") == 3.0 && read.minutes("png") == 0.0);
         assert_eq!(read.fuzzers["jpeg"], Totals { minutes: 3.0, inputs: 1010, findings: 1 });
     }
 }

@@ -21,7 +21,8 @@ pub(crate) struct EqualityRow {
 /// Replaces the contacts and the reference accelerations of equality constraints in every time step. Supports only
 /// models with Euler integration and without activations, flexes and tendons.
 pub(crate) trait StepHooks: Send + Sync {
-    /// Appends the contacts to simulate to `contacts`. `found` are MuJoCo's contacts, grouped by pair of geoms.
+    /// Appends the contacts to simulate to `contacts`, all between geoms of `model`: MuJoCo does not check their indices.
+    /// `found` are MuJoCo's contacts, grouped by pair of geoms.
     fn replace_contacts(
         &self,
         model: &MjModel,

@@ -84,7 +84,7 @@ impl Physics {
     /// and addresses or replace the model.
     pub(crate) fn model_mut(&mut self) -> &mut MjModel {
         self.edited = true;
-        // SAFETY: this crate edits values in the model's arrays and never replaces the model.
+        // SAFETY: callers of this crate edit values, keep counts and addresses, and never replace the model.
         unsafe { self.data.model_mut() }
     }
 
@@ -148,7 +148,12 @@ impl Physics {
     }
 
     /// Linear (m/s) and angular (rad/s) velocity of a site: its Jacobian at the derived poses times the present `qvel`.
+    ///
+    /// # Panics
+    /// When the model has no site with this index.
     pub fn site_velocity(&self, site: usize) -> ([f64; 3], [f64; 3]) {
+        let sites = self.data.site_xpos().len();
+        assert!(site < sites, "site {site} of {sites}: take the index from `index_of` on the same model");
         let velocities = self.data.qvel();
         // Models of up to 32 degrees of freedom need no allocation.
         let mut on_stack = [0.0; 6 * 32];
@@ -161,8 +166,8 @@ impl Physics {
             }
         };
         let (linear, angular) = jacobian.split_at_mut(3 * velocities.len());
-        let site = i32::try_from(site).unwrap_or(0);
-        // SAFETY: both matrices have three rows of `nv` values, and the index is that of a site of this model.
+        let site = site as i32;
+        // SAFETY: both matrices have three rows of `nv` values, and the index was compared with the number of sites.
         unsafe { mj_jacSite(self.model().ffi(), self.data.ffi(), linear.as_mut_ptr(), angular.as_mut_ptr(), site) };
         let times_qvel = |matrix: &[f64]| {
             std::array::from_fn(|i| {
@@ -187,9 +192,9 @@ impl Physics {
         }
     }
 
-    /// The pointers that MuJoCo's functions take.
+    /// The pointers that MuJoCo's functions take. Later borrows of the model or the data end their validity for writing.
     pub(crate) fn pointers(&mut self) -> (*mut mjModel, *mut mjData) {
-        // SAFETY: the pointers are passed to MuJoCo's functions only, one call at a time, while `self` is borrowed.
+        // SAFETY: MuJoCo's functions, and the code of this crate that writes through the pointers, keep sizes and addresses.
         unsafe { (std::ptr::from_mut(self.data.model_mut().ffi_mut()), std::ptr::from_mut(self.data.ffi_mut())) }
     }
 

@@ -87,13 +87,15 @@ impl Physics {
                 // SAFETY: model and data are valid and belong together.
                 self.guarded("computing derived quantities", || unsafe { ffi::mj_forward(model, data) })
             }
-            // SAFETY: model and data are valid and belong together; the flags are restored.
-            Derivation::ForwardPassive => self.guarded("computing derived quantities", || unsafe {
-                let flags = (*model).opt.disableflags;
-                (*model).opt.disableflags |= mjtDisableBit::mjDSBL_ACTUATION as i32;
-                ffi::mj_forward(model, data);
-                (*model).opt.disableflags = flags;
-            }),
+            Derivation::ForwardPassive => {
+                let flags = self.data.model_opt().disableflags;
+                self.data.model_opt_mut().disableflags = flags | mjtDisableBit::mjDSBL_ACTUATION as i32;
+                let (model, data) = self.pointers();
+                // SAFETY: model and data are valid and belong together.
+                let done = self.guarded("computing derived quantities", || unsafe { ffi::mj_forward(model, data) });
+                self.data.model_opt_mut().disableflags = flags;
+                done
+            }
             Derivation::Step => self.step_once(),
             // SAFETY: model and data are valid and belong together.
             Derivation::ControlStep => self.guarded("stepping", || unsafe {
@@ -143,7 +145,9 @@ impl Physics {
         let found = unsafe { array((*data).contact, (*data).ncon) };
         hooks.replace_contacts(self.data.model(), poses, found, &mut self.contacts);
         let contacts = std::mem::take(&mut self.contacts);
-        // SAFETY: model and data are valid and belong together, which the two helpers also require.
+        let (model, data) = self.pointers();
+        // SAFETY: model and data are valid and belong together, the hooks return contacts between geoms of this model, and
+        // the reference accelerations are replaced when constraints and velocities are computed.
         let done = self.guarded("computing constraints", || unsafe {
             write_contacts(model, data, &contacts);
             ffi::mj_makeConstraint(model, data);
@@ -178,9 +182,10 @@ unsafe fn array<'a, T>(first: *const T, count: i32) -> &'a [T] {
 /// MuJoCo allocates memory.
 ///
 /// # Safety
-/// Model and data must be valid and belong together.
+/// Model and data must be valid and belong together, and the contacts must be between geoms of the model.
 unsafe fn write_contacts(model: *const mjModel, data: *mut mjData, contacts: &[mjContact]) {
-    // SAFETY: guaranteed by the caller; `contact` has room for the `ncon` contacts that were found.
+    // SAFETY: guaranteed by the caller; `contact` has room for the `ncon` contacts that were found, and `mj_addContact`
+    // allocates behind the first `ncon`.
     unsafe {
         let found = usize::try_from((*data).ncon).unwrap_or(0);
         let (overwriting, further) = contacts.split_at(contacts.len().min(found));
@@ -213,5 +218,24 @@ unsafe fn replace_reference_accelerations(data: *mut mjData, hooks: &dyn StepHoo
                 *(*data).efc_aref.add(row) = hooks.reference_acceleration(&equality);
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::compile_xml;
+    use super::*;
+
+    #[test]
+    fn actuators_stay_enabled_after_an_error_in_forward_passive() {
+        let xml = r#"<mujoco><worldbody><body><joint name="hinge"/><geom size="0.1" pos="1 0 0"/></body></worldbody>
+            <equality><joint joint1="hinge"/></equality></mujoco>"#;
+        let model = compile_xml("a test's model", xml, &[]).expect("compiling the model");
+        let mut physics = Physics::new(Arc::new(model)).expect("allocating the state");
+        let flags = physics.model().opt().disableflags;
+        physics.model_mut().opt_mut().solver = 99;
+        physics.forward_passive();
+        assert!(physics.is_unstable(), "MuJoCo knows no solver 99");
+        assert_eq!(physics.model().opt().disableflags, flags);
     }
 }

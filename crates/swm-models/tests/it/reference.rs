@@ -82,6 +82,8 @@ fn exported_checkpoints_round_trip() {
         let exported_folder = out.path().join(format!("lewm-{naming:?}"));
         let lewm = lewm::import::import(&folder("lewm"), dataset_info(2)).expect("importing the checkpoint");
         lewm::import::export(&lewm, &exported_folder, naming).expect("exporting the checkpoint");
+        let second = lewm::import::export(&lewm, &exported_folder, naming).expect_err("existing files").to_string();
+        assert!(second.contains("config.json") && second.contains("is not replaced"), "{second}");
         let again = lewm::import::import(&exported_folder, dataset_info(2)).expect("importing the checkpoint");
         assert_eq!(again.config.model, lewm.config.model);
         assert_eq!(parameters::values(&again.model), parameters::values(&lewm.model));

@@ -7,8 +7,10 @@ use crate::{arrays, solver};
 use numpy::PyArray1;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use std::collections::BTreeMap;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use swm::core::{Batch, EnvPool, Key, Named as _, Policy, RandomPolicy, Result};
+use swm::eval::PolicyChoice;
 use swm::plan::{ActionScale, MpcConfig, MpcPolicy, TraceLog};
 
 /// A policy for the environments of one world.
@@ -16,8 +18,8 @@ use swm::plan::{ActionScale, MpcConfig, MpcPolicy, TraceLog};
 pub struct Actor {
     policy: Mutex<Box<dyn Policy>>,
     log: Option<TraceLog>,
-    /// The hash of the policy's weights; `None` unless the policy or its model is a checkpoint.
-    pub weights: Option<String>,
+    /// The hashes of the weights of checkpoints, as a manifest stores them.
+    pub hashes: BTreeMap<String, String>,
 }
 
 impl Actor {
@@ -31,7 +33,7 @@ impl Actor {
             Some(seed) => Box::new(Seeded { policy, seed }),
             None => policy,
         };
-        Self { policy: Mutex::new(policy), log: None, weights: None }
+        Self { policy: Mutex::new(policy), log: None, hashes: BTreeMap::new() }
     }
 }
 
@@ -58,7 +60,21 @@ impl Actor {
         let world = world.lock()?;
         let (spec, slots) = (world.spec().clone(), world.pool().len());
         let (policy, info) = py.detach(|| swm::resolver::checkpoint_policy(name, &spec, slots)).map_err(to_py_err)?;
-        Ok(Self { weights: Some(info.weights), ..Self::new(policy, None) })
+        Ok(Self { hashes: hash_of(Some(info.weights)), ..Self::new(policy, None) })
+    }
+
+    /// Creates the mixture of policies that a [`PolicyChoice`] describes in JSON.
+    #[staticmethod]
+    fn mixture(py: Python<'_>, world: &World, choice: &str) -> PyResult<Self> {
+        let choice: PolicyChoice = json("policy", choice)?;
+        let mut world = world.lock()?;
+        let world = &mut *world;
+        let made = py.detach(move || {
+            let entry = swm::env(&world.spec().id, &swm::core::Origin::User)?.entry;
+            swm::resolver::policy_of_choice(&entry, &choice, world)
+        });
+        let (policy, hashes) = made.map_err(to_py_err)?;
+        Ok(Self { hashes, ..Self::new(policy, None) })
     }
 
     /// Creates a policy implemented in Python: `call(infos, active, fresh)` returns an array of actions. `infos` is a
@@ -98,7 +114,7 @@ impl Actor {
         let policy = py.detach(|| MpcPolicy::new(search, cost, mpc, scale, &spec, slots)).map_err(to_py_err)?;
         let policy = policy.traced(log.clone());
         let policy: Box<dyn Policy> = if model.python { Box::new(OnThisThread(policy)) } else { Box::new(policy) };
-        Ok(Self { log: Some(log), weights: model.weights, ..Self::new(policy, seed) })
+        Ok(Self { log: Some(log), hashes: hash_of(model.weights), ..Self::new(policy, seed) })
     }
 
     /// Returns and clears the records of the plans since the last call, as JSON.
@@ -118,6 +134,11 @@ impl Actor {
             .map(|expert| expert.id())
             .collect())
     }
+}
+
+/// Returns the hashes of a policy with these weights.
+fn hash_of(weights: Option<String>) -> BTreeMap<String, String> {
+    weights.map(|weights| ("policy".to_owned(), weights)).into_iter().collect()
 }
 
 /// A policy whose random stream depends on a seed in addition to the episode's key.

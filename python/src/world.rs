@@ -17,10 +17,10 @@ use swm::core::columns::{TERMINATED, TRUNCATED};
 use swm::core::pool::Reset;
 use swm::core::results::Counting;
 use swm::core::run::{Control, Event};
-use swm::core::{Callable, CameraView, Env, Error, Key, Origin, ResetOptions, Snapshot, VariationRequest};
+use swm::core::{Callable, CameraView, Env, Error, Key, Manifest, Origin, ResetOptions, Snapshot, VariationRequest};
 use swm::data::{ImageCodec, Location, WriteMode, WriteOptions};
 use swm::envs::wrappers::{GoalFrame, Stack, WRAPPERS};
-use swm::eval::{CollectConfig, EvalConfig, Starts, Videos, WorldConfig, episode_key, reset_seed};
+use swm::eval::{CollectConfig, EvalConfig, PolicyChoice, Starts, Videos, WorldConfig, episode_key, reset_seed};
 use swm::gym::GymEnv;
 
 /// A batch of environments of one kind.
@@ -290,17 +290,15 @@ impl World {
                 seed: settings.seed,
                 variation: settings.variation,
                 policy: settings.policy,
+                action_noise: settings.action_noise,
                 goal: settings.goal,
                 first: settings.first,
                 strict_finite: settings.strict_finite,
             };
-            let mut manifest = world.collect_manifest(&config);
-            if let Some(weights) = &actor.weights {
-                manifest.hashes.insert("policy".to_owned(), weights.clone());
-            }
+            let mut manifest = Manifest { hashes: actor.hashes.clone(), ..world.collect_manifest(&config) };
             manifest.config["codec"] = serde_json::json!(codec);
             manifest.config["wrappers"] = settings.wrappers;
-            let schema = world.collect_schema(config.goal)?;
+            let schema = world.collect_schema(&config)?;
             let create = |location: &Location, mode, manifest| {
                 let manifest = Some(manifest);
                 let options = WriteOptions { mode, codec, manifest, exclusive: true, ..WriteOptions::default() };
@@ -407,7 +405,8 @@ struct Collection {
     episodes: usize,
     seed: u64,
     variation: VariationRequest,
-    policy: String,
+    policy: PolicyChoice,
+    action_noise: f64,
     goal: bool,
     first: usize,
     strict_finite: bool,

@@ -28,6 +28,7 @@ __all__ = [
     "ExpertPolicy",
     "FeedForwardPolicy",
     "MPCPolicy",
+    "MixturePolicy",
     "PlanConfig",
     "Policy",
     "RandomPolicy",
@@ -144,6 +145,31 @@ class ExpertPolicy(_EnginePolicy):
 
     def _actor(self, world: World) -> Any:
         return _engine.Actor.expert(world._world, self.name, self.seed)
+
+
+class MixturePolicy(_EnginePolicy):
+    """Plays every episode with one of several policies; the episode's seed and index decide which.
+
+    Args:
+        weights: The weight of each policy by name: `"random"`, `"expert"`, another expert, or a checkpoint that acts without
+            a solver. A policy plays a share of the episodes that is its weight divided by the sum of all weights.
+
+    The column `policy_index` of a collected dataset holds the index of the episode's policy in `weights`.
+    """
+
+    type = "mixture"
+
+    def __init__(self, weights: Mapping[str, float], **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.weights = {str(name): float(weight) for name, weight in weights.items()}
+
+    @property
+    def _choice(self) -> list[dict[str, Any]]:
+        """The policies and weights, as a manifest stores them."""
+        return [{"name": name, "weight": weight} for name, weight in self.weights.items()]
+
+    def _actor(self, world: World) -> Any:
+        return _engine.Actor.mixture(world._world, json.dumps(self._choice))
 
 
 class FeedForwardPolicy(BasePolicy):

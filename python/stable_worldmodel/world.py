@@ -365,6 +365,7 @@ class World:
         codec: str | None = None,
         goal: bool = False,
         strict_finite: bool = False,
+        action_noise: float = 0.0,
     ) -> dict[str, int]:
         """Collects episodes with the policy into a dataset.
 
@@ -377,13 +378,16 @@ class World:
             writer: Instead of a path: an object with `write_episode(dict of arrays)`, such as `swm.data.ReplayBuffer`.
             progress: Whether to show progress.
             dataset_path: Another name for `path`.
-            policy: The policy to set first; `None` keeps the policy of `set_policy`.
+            policy: The policy to set first; `None` keeps the policy of `set_policy`. A dict of weights by policy name, such as
+                `{"expert": 0.7, "random": 0.3}`, stands for `swm.policy.MixturePolicy`.
             mode: The treatment of an existing dataset: `"error"` raises, `"overwrite"` replaces it, `"append"` adds `episodes`
                 more, `"resume"` continues until the dataset has `episodes`.
             codec: The codec of frames: `"qoi"` (lossless), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
             goal: Whether to store the frame of the goal in every row.
             strict_finite: Whether NaN and infinite values raise an error. Otherwise they are stored and counted in the
                 manifest, and a warning lists the columns.
+            action_noise: The standard deviation of Gaussian noise, in the units of the action space, that is added to every
+                action. Actions are clipped to the space and stored as executed.
 
         Returns:
             A dict with the counts `episodes` (in the dataset), `added` (episodes) and `steps`. After an interrupt or an error
@@ -396,6 +400,10 @@ class World:
             raise ValueError(f"mode: {mode!r}; expected 'error', 'overwrite', 'append' or 'resume'")
         if int(episodes) < 1:
             raise ValueError(f"episodes: {episodes}; expected at least 1")
+        if isinstance(policy, Mapping):
+            from .policy import MixturePolicy
+
+            policy = MixturePolicy(policy)
         policy = self._chosen(policy)
         if writer is None and format is None:
             format = _FORMAT_OF_SUFFIX.get(Path(str(path)).suffix)
@@ -407,7 +415,8 @@ class World:
             "episodes": int(episodes),
             "seed": _seed(seed),
             "variation": _options.variation(_without_states(options), self.spec["variation"]),
-            "policy": _name(policy),
+            "policy": getattr(policy, "_choice", None) or _name(policy),
+            "action_noise": float(action_noise),
             "goal": bool(goal),
             "first": 0,
             "strict_finite": bool(strict_finite),

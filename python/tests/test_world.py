@@ -90,6 +90,25 @@ def test_factors_are_sampled_and_pinned():
         world.reset(options={"variations": ["all"]})
 
 
+def test_mixtures_with_noise_equal_for_any_number_of_environments(tmp_path):
+    for num_envs in (1, 4):
+        world = rooms(num_envs=num_envs, max_episode_steps=6)
+        path = tmp_path / f"{num_envs}.lance"
+        mixture = {"expert": 0.5, "random": 0.5}
+        world.collect(path, episodes=12, seed=1, policy=mixture, action_noise=0.1, progress=False)
+    one, other = (swm.data.load_dataset(str(tmp_path / name), backend="numpy") for name in ("1.lance", "4.lance"))
+    assert set(one.get_col_data("policy_index").ravel()) == {0, 1}
+    for column in ("policy_index", "action", "state"):
+        assert np.array_equal(one.get_col_data(column), other.get_col_data(column), equal_nan=True)
+    assert isinstance(world.policy, swm.policy.MixturePolicy)
+    with pytest.raises(ValueError, match="give a positive weight"):
+        world.collect(tmp_path / "c.lance", episodes=1, policy={"expert": 1, "random": 0}, progress=False)
+    with pytest.raises(ValueError, match="unknown policy 'exprt'"):
+        world.collect(tmp_path / "c.lance", episodes=1, policy={"exprt": 1}, progress=False)
+    with pytest.raises(ValueError, match="at least 0"):
+        world.collect(tmp_path / "c.lance", episodes=1, policy=mixture, action_noise=-1, progress=False)
+
+
 def test_python_policy_collects_new_and_appended_episodes(tmp_path):
     world = rooms(max_episode_steps=6)
     policy = Zero(0.5)

@@ -245,14 +245,13 @@ fn collect(env: &EnvChoice, config: &DataBenchConfig, path: &Path) -> Result<usi
     let image = Some((config.size, config.size));
     let world = WorldConfig { image, max_episode_steps: Some(config.steps), ..WorldConfig::default() };
     let mut world = World::new(env.clone(), world)?;
-    let collected =
-        CollectConfig { episodes: config.episodes, policy: "random".to_owned(), ..CollectConfig::default() };
+    let collected = CollectConfig { episodes: config.episodes, policy: "random".into(), ..CollectConfig::default() };
     let options = WriteOptions {
         codec: ImageCodec::Png,
         manifest: Some(world.collect_manifest(&collected)),
         ..WriteOptions::default()
     };
-    let writer = create(path, &world.collect_schema(false)?, options)?;
+    let writer = create(path, &world.collect_schema(&collected)?, options)?;
     let mut policy = RandomPolicy::new(world.spec(), WorldConfig::default().envs);
     world.collect(&mut policy, writer, &collected, &mut Control::default())?;
     Ok(open(path)?.episodes().iter().map(|episode| episode.length).sum())

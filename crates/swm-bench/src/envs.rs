@@ -154,7 +154,7 @@ pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchRe
             let path = |side: &str, pair: usize| folder.path().join(format!("{side}-{pair}.lance"));
             let collect = CollectConfig {
                 episodes: config.episodes * EPISODE_FACTOR,
-                policy: "random".to_owned(),
+                policy: "random".into(),
                 ..CollectConfig::default()
             };
             // The reference stores JPEG of quality 95; the default codec of this implementation is lossless.
@@ -244,7 +244,7 @@ impl Ours {
         let begun = Instant::now();
         let manifest = Some(self.world.collect_manifest(&config));
         let options = WriteOptions { manifest, codec, ..Default::default() };
-        let writer = create(path, &self.world.collect_schema(false)?, options)?;
+        let writer = create(path, &self.world.collect_schema(&config)?, options)?;
         let collected = self.world.collect(&mut self.policy, writer, &config, &mut Control::default())?;
         let rate = collected.steps as f64 / begun.elapsed().as_secs_f64();
         // The next measurement of stepping requires that every slot has a running episode.

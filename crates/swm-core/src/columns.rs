@@ -37,6 +37,8 @@ pub const STEP_IDX: &str = "step_idx";
 pub const EPISODE_IDX: &str = "episode_idx";
 /// The reset seed of the episode, as [`split_seed`] stores it.
 pub const EPISODE_SEED: &str = "episode_seed";
+/// The index of the episode's policy in the mixture that the manifest lists.
+pub const POLICY_INDEX: &str = "policy_index";
 /// The reset seed of the episode as one integer, the form in which other programs store it.
 pub const SEED: &str = "seed";
 

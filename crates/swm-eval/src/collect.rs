@@ -17,10 +17,13 @@
 //! | `action`, `reward`, `terminated`, `truncated`, `success` | the step |
 //! | `variation.<key>` | every factor of variation, constant over the episode |
 //! | `episode_seed` | the reset seed, constant over the episode: three `int32` of 21 bits each, the lowest first |
+//! | `policy_index` | of mixtures: the index of the episode's policy in the manifest's list, constant over the episode |
 //!
 //! The seed is split because datasets store values as `float32`, which represents integers up to 2^24. The column is
 //! not called `seed`, because the reference implementation resets environments with a column of that name.
 
+use crate::action_noise::{self, NoisyPolicy};
+use crate::policy_mixture::PolicyChoice;
 use crate::seeding::{episode_key, reset, reset_seed};
 use crate::world::{Play, World};
 use serde::Serialize;
@@ -46,8 +49,11 @@ pub struct CollectConfig {
     pub seed: u64,
     /// The factors that are sampled and pinned.
     pub variation: VariationRequest,
-    /// The name of the policy, for the manifest.
-    pub policy: String,
+    /// The names of the policies, for the manifest, and their weights, which determine the policy of every episode.
+    pub policy: PolicyChoice,
+    /// The standard deviation of the noise added to actions, in the units of the action space; 0 for none. The stored
+    /// actions contain the noise.
+    pub action_noise: f64,
     /// Whether to store the frame of the goal in every row.
     pub goal: bool,
     /// The number of the first episode; above 0 if several machines collect one part each.
@@ -77,15 +83,16 @@ impl World {
     /// The columns of a dataset collected in this world.
     ///
     /// # Errors
-    /// When a column of the environment has the name of a collected column.
-    pub fn collect_schema(&self, goal: bool) -> Result<Schema> {
-        Layout::of(&self.pool().infos().schema().clone(), self.spec(), goal).map(|layout| layout.schema)
+    /// When a column of the environment has the name of a collected column, or its actions cannot have the noise.
+    pub fn collect_schema(&self, config: &CollectConfig) -> Result<Schema> {
+        action_noise::check(config.action_noise, self.spec())?;
+        Layout::of(self.pool().infos().schema(), self.spec(), config).map(|layout| layout.schema)
     }
 
     /// The manifest of a dataset collected in this world.
     pub fn collect_manifest(&self, config: &CollectConfig) -> Manifest {
         let image = self.pool().image().map(|(height, width)| [height, width]);
-        let settings = json!({
+        let mut settings = json!({
             "env": self.spec().id,
             "policy": config.policy,
             "episodes": config.episodes,
@@ -95,6 +102,9 @@ impl World {
             "views": self.pool().views().iter().map(ToString::to_string).collect::<Vec<_>>(),
             "goal": config.goal,
         });
+        if config.action_noise != 0.0 {
+            settings["action_noise"] = json!(config.action_noise);
+        }
         Manifest { libraries: self.libraries(), ..Manifest::new("collect", config.seed, settings) }
     }
 
@@ -112,7 +122,14 @@ impl World {
         config: &CollectConfig,
         control: &mut Control<'_>,
     ) -> Result<Collected> {
-        let layout = Layout::of(self.pool().infos().schema(), self.spec(), config.goal)?;
+        let layout = Layout::of(self.pool().infos().schema(), self.spec(), config)?;
+        let mut noisy;
+        let policy: &mut dyn Policy = if config.action_noise == 0.0 {
+            policy
+        } else {
+            noisy = NoisyPolicy::new(policy, config.action_noise, self.spec(), self.pool().len())?;
+            &mut noisy
+        };
         limits::EPISODES.check(config.episodes)?;
         let first = writer.episodes();
         let threads = self.pool().threads().clone();
@@ -160,7 +177,7 @@ pub fn check_continues(stored: &Manifest, wanted: &Manifest) -> Result<()> {
     if stored.seed != wanted.seed {
         return differs("seed", stored.seed.to_string(), wanted.seed.to_string());
     }
-    for what in ["env", "policy", "max_episode_steps", "variation", "image", "views", "goal"] {
+    for what in ["env", "policy", "action_noise", "max_episode_steps", "variation", "image", "views", "goal"] {
         let (stored, wanted) = (&stored.config[what], &wanted.config[what]);
         if stored != wanted && !(what == "views" && stored.is_null()) {
             return differs(what, stored.to_string(), wanted.to_string());
@@ -236,17 +253,19 @@ struct Layout {
     /// The index of the first factor column; the columns of all other factors follow.
     factors: usize,
     episode_seed: usize,
+    /// The index of the column of the policy; `None` for one policy.
+    policy_index: Option<usize>,
     /// The indices of the standard columns in the infos.
     infos: ColumnIndices,
 }
 
 impl Layout {
-    fn of(infos: &Schema, spec: &EnvSpec, goal: bool) -> Result<Self> {
+    fn of(infos: &Schema, spec: &EnvSpec, config: &CollectConfig) -> Result<Self> {
         let mut columns: Vec<ColumnSpec> = vec![];
         let mut observed = vec![];
         let copied = |name: &str| match name {
             columns::REWARD | columns::TERMINATED | columns::TRUNCATED | columns::STEP_IDX => false,
-            columns::GOAL => goal,
+            columns::GOAL => config.goal,
             _ => true,
         };
         for (from, column) in infos.columns().iter().enumerate().filter(|(_, column)| copied(&column.name)) {
@@ -264,9 +283,11 @@ impl Layout {
         }
         let episode_seed = columns.len();
         columns.push(ColumnSpec::new(columns::EPISODE_SEED, DType::Int32, [3]));
+        let policy_index = config.policy.is_mixture().then_some(columns.len());
+        columns.extend(policy_index.map(|_| ColumnSpec::new(columns::POLICY_INDEX, DType::Int32, [])));
         let schema = Schema::new(columns)?;
         let (columns, infos) = (ColumnIndices::of(&schema)?, ColumnIndices::of(infos)?);
-        Ok(Self { schema, observed, columns, action, factors, episode_seed, infos })
+        Ok(Self { schema, observed, columns, action, factors, episode_seed, policy_index, infos })
     }
 
     /// Copies the observation of a slot to a row, which may be one past the last.
@@ -281,12 +302,15 @@ impl Layout {
     }
 
     /// Writes the columns that are constant over an episode to all its rows.
-    fn fill_constants(&self, episode: &mut Batch, pool: &EnvPool, slot: usize, seed: u64) {
+    fn fill_constants(&self, episode: &mut Batch, pool: &EnvPool, slot: usize, key: Key, policy: &PolicyChoice) {
+        if let Some(column) = self.policy_index {
+            fill(episode, column, &[policy.draw(key) as f64]);
+        }
         let factors = pool.env(slot).factors();
         for (i, (_, value)) in factors.iter().enumerate() {
             fill(episode, self.factors + i, value);
         }
-        let elements = columns::split_seed(seed);
+        let elements = columns::split_seed(reset_seed(key));
         for row in 0..episode.rows() {
             episode.row_mut(row).set(self.episode_seed, &elements);
         }
@@ -464,9 +488,9 @@ impl Play for Collection<'_> {
         row.set(layout.columns.reward, &[0.0f32]);
         row.set(layout.columns.terminated, &[0u8]);
         row.set(layout.columns.truncated, &[0u8]);
-        let seed = reset_seed(self.key(recording.number));
+        let key = self.key(recording.number);
         recording.rows.resize(recording.length);
-        layout.fill_constants(&mut recording.rows, pool, slot, seed);
+        layout.fill_constants(&mut recording.rows, pool, slot, key, &self.config.policy);
         self.finish(recording, pool.env(slot).constants())?;
         Ok(false)
     }

@@ -1,7 +1,7 @@
 //! Collection of episodes with policies, and evaluation of policies.
 //!
 //! - [`world`]: [`World`], many environments of one kind and the loop that plays a policy in them.
-//! - [`collect`]: writes every episode to a dataset.
+//! - [`collect`]: writes every episode to a dataset. [`policy_mixture`]: policies that share the episodes.
 //! - [`starts`] and [`evaluate`]: initial states and goals, and the success rate of a policy from them.
 //! - [`request`]: all settings of an evaluation as one value. [`runner`] evaluates the policies of a request on the
 //!   same starts, and [`reproduce`] repeats an evaluation from its results.
@@ -10,8 +10,10 @@
 //! An episode depends only on its key: neither on the number of environments or threads, nor on earlier episodes in the
 //! same slot.
 
+mod action_noise;
 pub mod collect;
 pub mod evaluate;
+pub mod policy_mixture;
 pub mod prediction;
 pub mod reproduce;
 pub mod request;
@@ -25,6 +27,7 @@ pub mod world;
 
 pub use collect::{CollectConfig, Collected};
 pub use evaluate::EvalConfig;
+pub use policy_mixture::{MixturePolicy, PolicyChoice, WeightedPolicy};
 pub use prediction::Predictor;
 pub use reproduce::{Difference, Reproduction, reproduce};
 pub use request::{Choice, Condition, EvalRequest, HeldOut, Model, PolicyKind, PolicyRequest, StartsRequest};

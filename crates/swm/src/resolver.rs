@@ -15,7 +15,10 @@ use swm_core::{
 };
 use swm_data::Reader;
 use swm_envs::wrappers::{GoalFrame, Stack, WRAPPERS};
-use swm_eval::{Choice, EvalRequest, Model, PolicyKind, PolicyRequest, Predictor, ResolvedPolicy, Resolver, World};
+use swm_eval::{
+    Choice, EvalRequest, MixturePolicy, Model, PolicyChoice, PolicyKind, PolicyRequest, Predictor, ResolvedPolicy,
+    Resolver, World,
+};
 use swm_models::{CheckpointInfo, Device, LoadedModel, load};
 use swm_plan::objective::ObjectiveConfig;
 use swm_plan::{
@@ -235,13 +238,30 @@ fn with_provenance(policy: ResolvedPolicy, info: CheckpointInfo) -> ResolvedPoli
     }
 }
 
-/// Returns the policy with a name for a world: a [`scripted`] policy, or a checkpoint that acts without a solver. For a
-/// checkpoint, also returns the hash of the weights.
+/// Returns the policy of a choice for a world, and the hashes of the checkpoints' weights as a manifest stores them:
+/// under `policy`, in a mixture under `policy.INDEX`.
 ///
 /// # Errors
-/// When neither an expert nor a checkpoint has the name, or the checkpoint was trained on another environment or
-/// requires a solver.
-pub fn policy_by_name(entry: &EnvEntry, name: &str, world: &World) -> Result<(Box<dyn Policy>, Option<String>)> {
+/// When neither an expert nor a checkpoint has a name, or a checkpoint was trained on another environment or requires a
+/// solver.
+pub fn policy_of_choice(
+    entry: &EnvEntry,
+    choice: &PolicyChoice,
+    world: &World,
+) -> Result<(Box<dyn Policy>, BTreeMap<String, String>)> {
+    let (mut policies, mut hashes) = (vec![], BTreeMap::new());
+    for (index, name) in choice.names().into_iter().enumerate() {
+        let (policy, weights) = policy_by_name(entry, name, world)?;
+        let part = if choice.is_mixture() { format!("policy.{index}") } else { "policy".to_owned() };
+        hashes.extend(weights.map(|weights| (part, weights)));
+        policies.push(policy);
+    }
+    Ok((Box::new(MixturePolicy::new(choice.clone(), policies, world.pool().len())), hashes))
+}
+
+/// Returns the policy with a name for a world: a [`scripted`] policy, or a checkpoint that acts without a solver. For a
+/// checkpoint, also returns the hash of the weights.
+fn policy_by_name(entry: &EnvEntry, name: &str, world: &World) -> Result<(Box<dyn Policy>, Option<String>)> {
     let is_scripted = ["random", "expert"].contains(&name) || entry.experts.iter().any(|expert| expert.id == name);
     if is_scripted || !home::checkpoint(name)?.exists() {
         return Ok((scripted(entry, name, world)?, None));

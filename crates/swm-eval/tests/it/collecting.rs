@@ -5,9 +5,9 @@ use crate::memory::Memory;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use swm_core::run::{Control, Event};
-use swm_core::{Batch, DType, Error, Key, Policy, RandomPolicy, Result, VariationRequest};
+use swm_core::{Batch, DType, EnvEntry, Error, Key, Policy, RandomPolicy, Result, VariationRequest};
 use swm_eval::collect::check_continues;
-use swm_eval::{CollectConfig, Collected, World, WorldConfig};
+use swm_eval::{CollectConfig, Collected, MixturePolicy, PolicyChoice, World, WorldConfig};
 
 fn world(envs: usize, threads: usize) -> World {
     let config = WorldConfig { envs, image: Some((2, 3)), views: vec![], max_episode_steps: None, threads };
@@ -19,7 +19,7 @@ fn config(episodes: usize) -> CollectConfig {
         episodes,
         seed: 11,
         variation: VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() },
-        policy: "random".to_owned(),
+        policy: "random".into(),
         ..CollectConfig::default()
     }
 }
@@ -50,9 +50,13 @@ fn datasets_do_not_depend_on_environment_and_thread_counts() {
 fn row_holds_an_observation_and_the_transition_after_it() {
     let memory = Memory::default();
     let mut world = world(3, 1);
-    let schema = world.collect_schema(false).expect("creating the schema of collected episodes");
+    let schema = world.collect_schema(&config(6)).expect("creating the schema of collected episodes");
     assert_eq!(
-        world.collect_schema(true).expect("creating the schema of collected episodes").columns().len(),
+        world
+            .collect_schema(&CollectConfig { goal: true, ..config(6) })
+            .expect("creating the schema of collected episodes")
+            .columns()
+            .len(),
         schema.columns().len() + 1
     );
     world.collect(&mut Walker, memory.writer(), &config(6), &mut Control::default()).expect("the collection succeeds");
@@ -130,6 +134,107 @@ fn interruption_keeps_finished_episodes() {
     assert!(interrupted.bytes() == complete.bytes());
 }
 
+/// Collects with three quarters of the episodes played by the walker, the others by the random policy.
+fn collect_mixture(envs: usize, threads: usize, config: &CollectConfig, memory: &Memory) -> Result<Collected> {
+    let mut world = world(envs, threads);
+    let policies: Vec<Box<dyn Policy>> = vec![Box::new(Walker), Box::new(RandomPolicy::new(world.spec(), envs))];
+    let mut policy = MixturePolicy::new(config.policy.clone(), policies, envs);
+    world.collect(&mut policy, memory.writer(), config, &mut Control::default())
+}
+
+fn mixture(episodes: usize, action_noise: f64) -> CollectConfig {
+    let policy = PolicyChoice::parse(&["walker:3".to_owned(), "random".to_owned()]).expect("the weights are positive");
+    CollectConfig { policy, action_noise, ..config(episodes) }
+}
+
+#[test]
+fn mixtures_with_noise_do_not_depend_on_environments_threads_and_interruptions() {
+    let config = mixture(23, 0.3);
+    let single = Memory::default();
+    collect_mixture(1, 1, &config, &single).expect("the collection succeeds");
+    for (envs, threads) in [(1, 2), (5, 1), (5, 2), (40, 3)] {
+        let memory = Memory::default();
+        collect_mixture(envs, threads, &config, &memory).expect("the collection succeeds");
+        assert!(memory.bytes() == single.bytes(), "{envs} environments on {threads} threads");
+    }
+    let resumed = Memory::default();
+    collect_mixture(4, 2, &mixture(9, 0.3), &resumed).expect("the first collection succeeds");
+    collect_mixture(3, 1, &config, &resumed).expect("the second collection succeeds");
+    assert!(resumed.bytes() == single.bytes());
+    // A shard has the episodes from `first` on.
+    let shard = Memory::default();
+    collect_mixture(2, 1, &CollectConfig { first: 9, ..mixture(14, 0.3) }, &shard).expect("the shard is collected");
+    assert!(single.bytes().ends_with(&shard.bytes()));
+}
+
+#[test]
+fn episodes_of_a_mixture_store_the_index_of_their_policy() {
+    let memory = Memory::default();
+    let many = mixture(40, 0.0);
+    collect_mixture(5, 2, &many, &memory).expect("the collection succeeds");
+    let mut counts = [0; 2];
+    for episode in memory.episodes.lock().expect("no thread has panicked").iter() {
+        let index = episode.get::<i32>("policy_index").expect("reading the policies");
+        assert!(index.iter().all(|&i| i == index[0]), "constant over the episode");
+        counts[index[0] as usize] += 1;
+        let state = episode.get::<f64>("state").expect("reading the states");
+        let goal = episode.get::<f64>("goal_state").expect("reading the goals")[0];
+        let action = episode.get::<f32>("action").expect("reading the actions");
+        let walks = |(&x, &a): (&f64, &f32)| f64::from(a) == f64::from((goal - x).clamp(-1.0, 1.0) as f32);
+        let walked = state.iter().zip(&action[..episode.rows() - 1]).all(walks);
+        assert_eq!(walked, index[0] == 0, "only the walker moves straight to the goal");
+    }
+    assert!((24..=36).contains(&counts[0]), "{counts:?}");
+    let one = world(1, 1).collect_schema(&config(1)).expect("creating the schema");
+    assert!(one.find("policy_index").is_none(), "one policy has no index");
+    let list = &world(1, 1).collect_manifest(&many).config["policy"];
+    assert_eq!(list[1], serde_json::json!({"name": "random", "weight": 1.0}));
+}
+
+#[test]
+fn noisy_actions_are_clipped_and_stored_as_executed() {
+    let actions = |action_noise: f64| {
+        let memory = Memory::default();
+        let config = CollectConfig { policy: "walker".into(), action_noise, ..config(60) };
+        world(4, 2)
+            .collect(&mut Walker, memory.writer(), &config, &mut Control::default())
+            .expect("the collection succeeds");
+        let mut actions = vec![];
+        for episode in memory.episodes.lock().expect("no thread has panicked").iter() {
+            let state = episode.get::<f64>("state").expect("reading the states");
+            let action = episode.get::<f32>("action").expect("reading the actions");
+            for t in 0..episode.rows() - 1 {
+                let reached = (state[t] + f64::from(action[t])).clamp(-5.0, 5.0);
+                assert!((reached - state[t + 1]).abs() < 1e-6, "the stored action leads to the next row");
+                assert!(action[t].abs() <= 1.0);
+                actions.push(action[t]);
+            }
+        }
+        actions
+    };
+    let (quiet, noisy) = (actions(0.0), actions(0.2));
+    assert!(quiet.iter().filter(|v| v.abs() < 1.0).count() < noisy.iter().filter(|v| v.abs() < 1.0).count());
+    assert!(noisy.iter().any(|v| v.abs() == 1.0), "some actions are clipped");
+}
+
+#[test]
+fn invalid_noise_is_refused_before_a_dataset_is_written() {
+    let schema = |entry: &EnvEntry, action_noise: f64| {
+        let world =
+            World::new(entry, WorldConfig { image: None, ..WorldConfig::default() }).expect("creating the world");
+        world.collect_schema(&CollectConfig { action_noise, ..config(1) }).expect_err("invalid noise").to_string()
+    };
+    for std in [-0.1, f64::NAN, f64::INFINITY] {
+        assert!(schema(&ENTRY, std).contains("at least 0"));
+    }
+    let discrete = swm_envs::ENVS.get("swm/PushT-Discrete-v1").expect("finding the environment");
+    assert!(schema(discrete, 0.1).contains("the actions of swm/PushT-Discrete-v1 are discrete"));
+    let manifest = world(1, 1).collect_manifest(&mixture(2, 0.1));
+    let stored = world(1, 1).collect_manifest(&mixture(2, 0.2));
+    let error = check_continues(&stored, &manifest).expect_err("continuing with other noise").to_string();
+    assert!(error.contains("action_noise 0.1") && error.contains("0.2"), "{error}");
+}
+
 /// A policy that fails after `remaining` steps.
 struct Failing {
     walker: Walker,
@@ -184,6 +289,6 @@ fn manifest_contains_settings_but_no_run_options() {
     let seed = other(CollectConfig { seed: 12, ..config(9) }).expect_err("resuming with another seed").to_string();
     assert!(seed.contains("seed 12") && seed.contains("11"), "{seed}");
     let policy =
-        other(CollectConfig { policy: "expert".to_owned(), ..config(9) }).expect_err("resuming with another policy");
+        other(CollectConfig { policy: "expert".into(), ..config(9) }).expect_err("resuming with another policy");
     assert!(policy.to_string().contains("\"expert\""), "{policy}");
 }

@@ -21,11 +21,10 @@ fn expert(world: &World) -> ExpertPolicy {
 fn collect(path: &Path, mode: WriteMode, envs: usize, episodes: usize) -> Collected {
     let mut world = world(envs, 2);
     let variation = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
-    let config =
-        CollectConfig { episodes, seed: 4, variation, policy: "expert".to_owned(), ..CollectConfig::default() };
+    let config = CollectConfig { episodes, seed: 4, variation, policy: "expert".into(), ..CollectConfig::default() };
     let manifest = Some(world.collect_manifest(&config));
     let options = WriteOptions { mode, manifest, ..WriteOptions::default() };
-    let schema = world.collect_schema(config.goal).expect("creating the schema of collected episodes");
+    let schema = world.collect_schema(&config).expect("creating the schema of collected episodes");
     let writer = swm_data::create(path, &schema, options).expect("creating the dataset");
     let mut policy = expert(&world);
     world.collect(&mut policy, writer, &config, &mut Control::default()).expect("the collection succeeds")
@@ -89,7 +88,7 @@ fn dataset_of_another_environment_is_an_error() {
     let config = CollectConfig { episodes: 1, ..CollectConfig::default() };
     let writer = swm_data::create(
         &path,
-        &line.collect_schema(false).expect("creating the schema of collected episodes"),
+        &line.collect_schema(&config).expect("creating the schema of collected episodes"),
         WriteOptions::default(),
     );
     let writer = writer.expect("creating the dataset");

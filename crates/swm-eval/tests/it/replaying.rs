@@ -15,7 +15,7 @@ fn world() -> World {
 
 fn config(episodes: usize) -> CollectConfig {
     let variation = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
-    CollectConfig { episodes, seed: 11, variation, policy: "random".to_owned(), ..CollectConfig::default() }
+    CollectConfig { episodes, seed: 11, variation, policy: "random".into(), ..CollectConfig::default() }
 }
 
 #[test]
@@ -23,7 +23,7 @@ fn replay_buffer_is_read_while_episodes_are_collected() {
     let mut world = world();
     let mut policy = RandomPolicy::new(world.spec(), 3);
     let buffer =
-        ReplayBuffer::new(&world.collect_schema(false).expect("creating the schema of collected episodes"), 120)
+        ReplayBuffer::new(&world.collect_schema(&config(1)).expect("creating the schema of collected episodes"), 120)
             .expect("creating the replay buffer");
     let collect_into_buffer = |world: &mut World, policy: &mut RandomPolicy, episodes| {
         world

@@ -32,8 +32,8 @@ fn registered_extensions_collect_train_plan_and_evaluate() {
 
     let format = FORMATS.get("json").unwrap();
     let dataset = folder.path().join("line.extjson").into();
-    let collecting = CollectConfig { episodes: 20, seed: 1, policy: "random".to_owned(), ..CollectConfig::default() };
-    let writer = format.create(&dataset, &world.collect_schema(false).unwrap(), WriteOptions::default()).unwrap();
+    let collecting = CollectConfig { episodes: 20, seed: 1, policy: "random".into(), ..CollectConfig::default() };
+    let writer = format.create(&dataset, &world.collect_schema(&collecting).unwrap(), WriteOptions::default()).unwrap();
     let mut random = RandomPolicy::new(world.spec(), world.pool().len());
     world.collect(&mut random, writer, &collecting, &mut Control::new()).unwrap();
     let reader = format.open(&dataset).unwrap();
@@ -56,7 +56,7 @@ fn registered_extensions_collect_train_plan_and_evaluate() {
     let slots = world.pool().len();
     let mut policy = MpcPolicy::new(solver, model.cost().unwrap(), planning, scale, world.spec(), slots).unwrap();
     let starts = Starts::episodic(10, 7, VariationRequest::default()).unwrap();
-    let evaluation = EvalConfig { policy: "line".to_owned(), ..EvalConfig::default() };
+    let evaluation = EvalConfig { policy: "line".into(), ..EvalConfig::default() };
     let result = world.evaluate(&mut policy, &starts, &evaluation, &mut Control::new()).unwrap();
     assert_eq!(result.episodes.len(), 10);
     assert!(result.success.rate > 0.9, "{:?}", result.success);

@@ -3,15 +3,16 @@
 use super::config::{CodecArgs, VariationArgs, image_size};
 use super::wrappers::WrapperArgs;
 use super::{Context, emit, emit_json, eprint, progress};
-use crate::resolver::policy_by_name;
+use crate::resolver::policy_of_choice;
 use crate::{collect_target, home};
 use clap::Args;
 use serde_json::json;
+use std::collections::BTreeMap;
 use std::time::Instant;
 use swm_core::{CameraView, EnvChoice, Manifest, Origin, Result, Schema, limits};
 use swm_data::lance::{Shard, create_shard};
 use swm_data::{FORMATS, ImageCodec, Location, WriteMode, WriteOptions, Writer};
-use swm_eval::{CollectConfig, Collected, World, WorldConfig};
+use swm_eval::{CollectConfig, Collected, PolicyChoice, World, WorldConfig};
 
 /// Arguments of `swm collect`.
 #[derive(Args)]
@@ -23,9 +24,15 @@ pub struct CollectArgs {
     output: String,
     /// The policy: random, expert, an expert's id, or a checkpoint
     ///
-    /// The checkpoint must act without a solver. `swm envs ENV` lists the experts.
-    #[arg(long, default_value = "expert")]
-    policy: String,
+    /// The checkpoint must act without a solver. `swm envs ENV` lists the experts. Repeat the option with weights for a
+    /// mixture (--policy expert:0.7 --policy random:0.3): every episode draws its policy.
+    #[arg(long = "policy", value_name = "NAME[:WEIGHT]", default_value = "expert")]
+    policies: Vec<String>,
+    /// Add Gaussian noise of this standard deviation to every action
+    ///
+    /// The unit is that of the action space. Actions are clipped to the space, and stored as executed.
+    #[arg(long, value_name = "STD", default_value_t = 0.0)]
+    action_noise: f64,
     /// Number of episodes of the complete dataset
     #[arg(long, default_value_t = 100)]
     episodes: usize,
@@ -98,11 +105,9 @@ pub struct Collection<'a> {
     pub format: Option<&'a str>,
     /// The shard to collect; `None` for the whole dataset.
     pub shard: Option<Shard>,
-    /// The name of the policy.
-    pub policy: &'a str,
     /// The number of environments, the frames, and the number of threads.
     pub world: WorldConfig,
-    /// The episodes, the seed, and the factors of variation.
+    /// The policies, the episodes, the seed, and the factors of variation.
     pub config: CollectConfig,
     /// Whether to create, continue or replace the dataset.
     pub mode: WriteMode,
@@ -122,7 +127,6 @@ pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
         location: &location,
         format: args.format.as_deref(),
         shard: args.shard,
-        policy: &args.policy,
         world: WorldConfig {
             envs: args.envs,
             image: (!args.no_pixels).then_some(args.image),
@@ -134,7 +138,8 @@ pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
             episodes: args.episodes,
             seed: args.seed,
             variation: args.variation.request()?,
-            policy: args.policy.clone(),
+            policy: PolicyChoice::parse(&args.policies)?,
+            action_noise: args.action_noise,
             strict_finite: args.strict_finite,
             ..CollectConfig::default()
         },
@@ -162,14 +167,14 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
     limits::SHARDS.check(collection.shard.map_or(0, |shard| shard.count))?;
     let (stack, goal) = collection.wrappers.stack()?;
     let mut world = World::of(|| Ok(stack.wrap(env.env()?, goal)), collection.world.clone())?;
-    let (mut policy, weights) = policy_by_name(&env.entry, collection.policy, &world)?;
+    let (mut policy, weights) = policy_of_choice(&env.entry, &config.policy, &world)?;
     // An invalid factor fails before an older dataset is replaced.
     world.spec().variation_space.resolve(&config.variation, swm_core::Key::new(config.seed))?;
     let mut manifest = collection.manifest(&world, weights)?;
     if collection.shard.is_none() {
         manifest.not_finite = collect_target::check(location, collection.mode, &manifest, collection.mix_renderers)?;
     }
-    let writer = collection.writer(&world.collect_schema(config.goal)?, collection.mode, manifest.clone())?;
+    let writer = collection.writer(&world.collect_schema(config)?, collection.mode, manifest.clone())?;
     // A shard has consecutive episodes, so that the committed dataset has all episodes in order.
     let episodes = collection.shard.map_or(0..config.episodes, |Shard { index, count }| {
         let share = |index: usize| (config.episodes as u128 * index as u128 / count as u128) as usize;
@@ -182,7 +187,7 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
         eprint(&format!("warning: {warning}\n"));
         if collection.shard.is_none() {
             collect_target::add_not_finite(&mut manifest, world.not_finite());
-            collection.writer(&world.collect_schema(config.goal)?, WriteMode::Append, manifest)?.finish()?;
+            collection.writer(&world.collect_schema(config)?, WriteMode::Append, manifest)?.finish()?;
         }
     }
     let collected = collected?;
@@ -198,12 +203,9 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
 }
 
 impl Collection<'_> {
-    /// Returns the manifest of the dataset; `weights` is the hash of the policy's weights.
-    fn manifest(&self, world: &World, weights: Option<String>) -> Result<Manifest> {
-        let mut manifest = world.collect_manifest(&self.config);
-        if let Some(weights) = weights {
-            manifest.hashes.insert("policy".to_owned(), weights);
-        }
+    /// Returns the manifest of the dataset; `hashes` are those of the policies' weights.
+    fn manifest(&self, world: &World, hashes: BTreeMap<String, String>) -> Result<Manifest> {
+        let mut manifest = Manifest { hashes, ..world.collect_manifest(&self.config) };
         manifest.config["codec"] = json!(self.codec);
         if !self.wrappers.wrappers.is_empty() {
             manifest.config["wrappers"] = json!(self.wrappers.choices()?);

@@ -138,7 +138,6 @@ fn collect_rooms(args: &DemoArgs, data: &Path, side: usize, context: &Context) -
         location: &Location::from(data),
         format: None,
         shard: None,
-        policy: "explore",
         world: WorldConfig {
             envs: 16,
             image: Some((side, side)),
@@ -149,7 +148,7 @@ fn collect_rooms(args: &DemoArgs, data: &Path, side: usize, context: &Context) -
         config: CollectConfig {
             episodes: args.episodes,
             seed: args.seed,
-            policy: "explore".to_owned(),
+            policy: "explore".into(),
             ..CollectConfig::default()
         },
         mode: WriteMode::Overwrite,

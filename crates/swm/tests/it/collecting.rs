@@ -104,6 +104,34 @@ fn invalid_requests_fail_without_replacing_the_dataset() {
 }
 
 #[test]
+fn mixtures_of_policies_and_shards_have_the_same_content() {
+    let swm = Swm::new();
+    let mixture =
+        with(ROOMS, &["--policy", "expert:2", "--policy", "random", "--action-noise", "0.1", "--episodes", "8"]);
+    swm.json(&with(&mixture, &["--envs", "3"]));
+    let whole = content(&swm, "rooms");
+    let found = swm.json(&["inspect", "rooms"]);
+    let config = &found["manifest"]["config"];
+    assert_eq!(config["policy"][0], serde_json::json!({"name": "expert", "weight": 2.0}));
+    assert_eq!(config["action_noise"], 0.1);
+    assert!(found["columns"].to_string().contains("policy_index"));
+    let sharded = Swm::new();
+    sharded.json(&with(&mixture, &["--shard", "1/2"]));
+    sharded.json(&with(&mixture, &["--shard", "0/2", "--envs", "1"]));
+    sharded.json(&["datasets", "commit", "rooms"]);
+    assert_eq!(content(&sharded, "rooms"), whole);
+    let fails = |more: &[&str], parts: &[&str]| swm.fails(&with(ROOMS, more), 2, parts);
+    fails(&["--resume", "--policy", "expert:2", "--policy", "random"], &["action_noise", "0.1"]);
+    fails(&["--overwrite", "--policy", "expert:0", "--policy", "random"], &["the policy 'expert'", "positive"]);
+    fails(&["--overwrite", "--policy", "expert:2", "--policy", "randon"], &["unknown policy 'randon'"]);
+    fails(&["--overwrite", "--action-noise=-1"], &["action noise", "at least 0"]);
+    let discrete =
+        ["collect", "swm/PushT-Discrete-v1", "-o", "rooms", "--overwrite", "--no-pixels", "--action-noise", "0.1"];
+    swm.fails(&discrete, 2, &["swm/PushT-Discrete-v1 are discrete"]);
+    assert_eq!(content(&swm, "rooms"), whole);
+}
+
+#[test]
 fn truncated_dataset_is_an_error() {
     let swm = Swm::new();
     swm.json(&with(ROOMS, &["--episodes", "3"]));

@@ -19,6 +19,8 @@ pub const STATE: &str = "state";
 pub const GOAL_STATE: &str = "goal_state";
 /// The proprioceptive observation: the state of the agent's own body.
 pub const PROPRIO: &str = "proprio";
+/// The position of the agent, in environments that have other objects.
+pub const POS_AGENT: &str = "pos_agent";
 /// The goal in the layout of [`PROPRIO`].
 pub const GOAL_PROPRIO: &str = "goal_proprio";
 /// The action taken from the observation of the same row.

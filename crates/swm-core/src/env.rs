@@ -32,6 +32,9 @@ pub struct EnvSpec {
     pub max_episode_steps: usize,
     /// The names of the cameras, the default camera first; empty for an environment with a single unnamed view.
     pub cameras: Vec<String>,
+    /// The elements of columns that are angles of full turns, in radians: the column and the index of the element. Equal
+    /// angles may differ by full turns, so regressions predict their sine and cosine.
+    pub angles: Vec<(&'static str, usize)>,
 }
 
 impl EnvSpec {

@@ -241,6 +241,7 @@ impl EnvLayout {
             variation_space: VariationSpace::new(factors, &[]),
             max_episode_steps: description.max_episode_steps,
             cameras: vec![],
+            angles: vec![],
         };
         let column = spec.action_column();
         let action = description.action_offset..description.action_offset.saturating_add(column.row_bytes());

@@ -15,6 +15,10 @@ pub fn entries_are_complete_and_have_unique_ids(suite: &Suite) {
         assert!(spec.max_episode_steps > 0, "{id} must have a time limit of at least 1 step");
         let schema = Schema::new(spec.columns.clone()).unwrap_or_else(|error| panic!("{id}: {error}"));
         assert!(schema.find(STATE).is_some(), "{id} must observe its state");
+        for &(name, element) in &spec.angles {
+            let column = schema.column(name).unwrap_or_else(|error| panic!("{id}, angles: {error}"));
+            assert!(element < column.len(), "{id}: the angle {name}[{element}] is not in the column");
+        }
         let supported = match spec.action_space {
             Space::Box { dtype, .. } => dtype == DType::Float32,
             Space::Discrete { .. } | Space::MultiDiscrete { .. } => true,

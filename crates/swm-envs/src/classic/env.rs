@@ -67,6 +67,7 @@ impl<T: ControlTask> ClassicEnv<T> {
             variation_space: variation_space::<T>(),
             max_episode_steps: T::MAX_EPISODE_STEPS,
             cameras: vec![],
+            angles: vec![],
         };
         let defaults = VariationRequest { variation: Some(vec![]), ..VariationRequest::default() };
         let factors = spec.variation_space.resolve(&defaults, Key::new(0)).expect("defaults are in their spaces");

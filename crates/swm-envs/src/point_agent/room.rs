@@ -48,6 +48,7 @@ pub fn spec(id: &str, observation_len: usize, privileged: (&str, usize), variati
         variation_space,
         max_episode_steps: 100,
         cameras: vec![],
+        angles: vec![],
     }
 }
 

@@ -84,6 +84,7 @@ impl PointTask for PointMaze {
             variation_space: variation_space(),
             max_episode_steps: 100,
             cameras: vec![],
+            angles: vec![],
         }
     }
 

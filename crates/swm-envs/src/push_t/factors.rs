@@ -3,7 +3,7 @@
 use super::TABLE;
 use super::shapes::BodyShape;
 use std::f64::consts::{PI, TAU};
-use swm_core::columns::{GOAL_PROPRIO, GOAL_STATE, PROPRIO, STATE};
+use swm_core::columns::{GOAL_PROPRIO, GOAL_STATE, POS_AGENT, PROPRIO, STATE};
 use swm_core::{ColumnSpec, DType, Factor, FactorValues, Space, VariationSpace};
 
 /// Every factor, in the reference's sampling order.
@@ -56,7 +56,7 @@ pub fn columns() -> Vec<ColumnSpec> {
     vec![
         column(STATE, 7),
         column(PROPRIO, 4),
-        column("pos_agent", 2),
+        column(POS_AGENT, 2),
         column("vel_agent", 2),
         column("block_pose", 3),
         column("goal_pose", 3),
@@ -67,6 +67,10 @@ pub fn columns() -> Vec<ColumnSpec> {
         column("agent_pose", 3),
     ]
 }
+
+/// The elements of [`columns`] that are angles.
+pub const ANGLES: [(&str, usize); 5] =
+    [(STATE, 4), ("block_pose", 2), ("goal_pose", 2), (GOAL_STATE, 4), ("agent_pose", 2)];
 
 /// The observation columns with the reference's bounds. As in the reference, agents may leave the bounds.
 pub fn observation_space() -> Vec<(&'static str, Space)> {

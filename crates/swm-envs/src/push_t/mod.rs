@@ -9,7 +9,7 @@ mod shapes;
 mod state;
 mod table;
 
-use factors::{columns, index, observation_space, shapes_row, variation_space};
+use factors::{ANGLES, columns, index, observation_space, shapes_row, variation_space};
 use physics::{AGENT, BLOCK, Simulation, append_items, take_array};
 use render::{DrawnState, TableRenderer};
 use state::{State, checked, goal_distance, is_reached, set_state, settled, start_state, state_distance, state_of};
@@ -89,6 +89,7 @@ impl PushT {
             variation_space,
             max_episode_steps: 200,
             cameras: vec![],
+            angles: ANGLES.to_vec(),
         };
         let (renderer, shapes) = (TableRenderer::new(&factors), shapes_row(&factors));
         Self { spec, factors, simulation, goal, goal_drawn, contacts: 0, shapes, renderer }

@@ -51,6 +51,7 @@ impl Line {
             variation_space,
             max_episode_steps: 12,
             cameras: vec![],
+            angles: vec![],
         };
         Self { spec, factors, x: 0.0, goal: 0.0, noise: 0.0, rng: Key::new(0).rng() }
     }

@@ -39,6 +39,7 @@ impl Line {
             variation_space,
             max_episode_steps: 50,
             cameras: vec![],
+            angles: vec![],
         };
         let factors = spec.variation_space.resolve(&Default::default(), Key::new(0))?;
         Ok(Self { spec, factors, position: 0.0, goal: 0.0 })

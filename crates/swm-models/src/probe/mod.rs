@@ -1,7 +1,7 @@
 //! Probes, which measure the information about an environment's state in the latents of a frozen encoder.
 //!
 //! - [`state`]: regression of the columns of a dataset on latents, [linear](ridge) and with a small network, scored on
-//!   held-out episodes.
+//!   held-out episodes, and compared with a regression on a baseline such as the position of the agent.
 //! - [`reconstruction`]: reconstruction of images from latents.
 //!
 //! If the linear map predicts a state, the latents represent the state linearly; if only the network predicts the
@@ -13,9 +13,12 @@ pub mod ridge;
 mod samples;
 mod scale;
 pub mod state;
+mod targets;
 
 pub use reconstruction::{ReconstructionConfig, ReconstructionReport, reconstruct_images};
-pub use state::{Score, StateConfig, StateReport, read_state};
+pub use state::{Baseline, Score, StateConfig, StateReport, read_state};
+
+pub use targets::AnglePart;
 
 use swm_core::Result;
 

@@ -47,7 +47,13 @@ pub(super) fn sample(
         .flat_map(|episode| (0..reader.episodes()[episode].length).map(move |row| StepRange::new(episode, row, 1)))
         .collect();
     let rows = choose(rows, count.min(MAX_ELEMENTS / encoder.latent_dim()), key.with(&part.to_string()));
-    let names: Vec<&str> = std::iter::once(PIXELS).chain(columns.iter().map(String::as_str)).collect();
+    let mut names = vec![PIXELS];
+    for name in columns {
+        // A column may be predicted and in the baseline.
+        if !names.contains(&name.as_str()) {
+            names.push(name);
+        }
+    }
     let mut samples = Samples { count: 0, latents: vec![], images: vec![], targets: vec![] };
     // Several blocks are read and encoded in parallel.
     for blocks in rows.chunks(BLOCK_FRAMES * 16) {

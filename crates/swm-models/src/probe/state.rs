@@ -1,8 +1,9 @@
-//! Regression of numeric columns on latents.
+//! Regression of numeric columns on latents, and on a baseline such as the position of the agent.
 
 use super::fit::{FitConfig, fit, rows};
 use super::ridge::{Ridge, mean_and_std};
 use super::scale::Scale;
+use super::targets::{AnglePart, Target, Targets};
 use super::{ImageEncoder, samples};
 use crate::nn::parameters::{self, IntoF32};
 use crate::nn::{Init, Mlp};
@@ -11,7 +12,7 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use swm_core::{Error, Key, Result};
+use swm_core::{Key, Result};
 use swm_data::{Part, Reader};
 
 /// The settings of a state probe: the columns to predict and the settings of both regressions.
@@ -22,6 +23,11 @@ pub struct StateConfig {
     pub seed: u64,
     /// The columns to predict.
     pub columns: Vec<String>,
+    /// The elements of columns that are angles in radians: the column and the index of the element. The sine and the
+    /// cosine of an angle are predicted instead of the angle.
+    pub angles: Vec<(String, usize)>,
+    /// The columns of the baseline, such as the position of the agent; without columns there is no baseline.
+    pub baseline: Vec<String>,
     /// The largest number of frames to fit on, from the training episodes.
     pub frames: usize,
     /// The largest number of frames to score on, from the validation episodes.
@@ -35,20 +41,33 @@ pub struct StateConfig {
 }
 
 impl StateConfig {
-    /// Returns the default settings for `columns`.
+    /// Returns the default settings for `columns`, without angles and without a baseline.
     pub fn new(columns: Vec<String>) -> Self {
         let fit = FitConfig { steps: 1500, batch_size: 128, lr: 2e-3 };
-        Self { seed: 0, columns, frames: 6000, held_out: 2000, ridge: 1e-4, hidden: 128, fit }
+        Self {
+            seed: 0,
+            columns,
+            angles: vec![],
+            baseline: vec![],
+            frames: 6000,
+            held_out: 2000,
+            ridge: 1e-4,
+            hidden: 128,
+            fit,
+        }
     }
 }
 
-/// The prediction errors of one element of a column on held-out episodes.
+/// The prediction errors of one element of a column, or of the sine or cosine of an angle, on held-out episodes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Score {
     /// The column.
     pub column: String,
     /// The index of the element in a row of the column.
     pub index: usize,
+    /// The function of an angle that was predicted; `None` for the element itself.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub part: Option<AnglePart>,
     /// The standard deviation of the element, in the units of the column.
     pub spread: f64,
     /// The coefficient of determination: 1 for perfect predictions, 0 for predictions of the mean. `None` for a
@@ -73,6 +92,21 @@ pub struct StateReport {
     pub linear: Vec<Score>,
     /// The scores of the network with two hidden layers, element by element.
     pub network: Vec<Score>,
+    /// What the columns of the baseline predict without an image.
+    pub baseline: Option<Baseline>,
+}
+
+/// What the columns of the baseline predict. A latent that contains only the baseline predicts the columns as well as the
+/// baseline does.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Baseline {
+    /// The columns of the baseline.
+    pub columns: Vec<String>,
+    /// The scores of a network from the baseline to the columns, element by element.
+    pub network: Vec<Score>,
+    /// The share of the variance of the latents that a network from the baseline to the latents explains on held-out
+    /// episodes. `None` for constant latents.
+    pub latent_variance: Option<f64>,
 }
 
 /// Fits a linear and a nonlinear regression of columns on an encoder's latents, and scores both on held-out episodes.
@@ -89,45 +123,80 @@ pub fn read_state(encoder: &dyn ImageEncoder, reader: &dyn Reader, config: &Stat
         ("fit.steps", config.fit.steps, 1, limits::STEPS),
         ("fit.batch_size", config.fit.batch_size, 1, limits::BATCH),
     ])?;
-    let mut names = vec![];
-    for name in &config.columns {
-        let column = reader.schema().column(name)?;
-        if column.is_image() {
-            let fix = "name numeric columns; the image probe reconstructs images";
-            return Err(Error::config(name, "holds images", fix));
-        }
-        names.extend((0..column.len()).map(|index| (name.clone(), index)));
-    }
+    let targets = Targets::new(reader, &config.columns, &config.angles)?;
+    let baseline = Targets::new(reader, &config.baseline, &config.angles)?;
+    let columns = [&config.columns[..], &config.baseline].concat();
     let key = Key::new(config.seed).with("probe");
-    let sample =
-        |part, count| samples::sample(encoder, reader, part, &config.columns, false, (count, key.with("frames")));
-    let train = sample(Part::Train, config.frames)?;
-    let held_out = sample(Part::Validation, config.held_out)?;
+    let tables = |part, count| -> Result<Tables> {
+        let samples = samples::sample(encoder, reader, part, &columns, false, (count, key.with("frames")))?;
+        Ok(Tables::new(samples, &targets, &baseline))
+    };
+    let train = tables(Part::Train, config.frames)?;
+    let held_out = tables(Part::Validation, config.held_out)?;
 
+    let score = |predictions: &[f32]| scores(&targets.list, predictions, &held_out.targets);
+    let network = |x: &[f32], y: &[f32], key| Network::fit((x, y, train.count), config, key);
+    let baseline = if config.baseline.is_empty() {
+        None
+    } else {
+        let to_targets = network(&train.baseline, &train.targets, key.with("baseline"))?;
+        let to_latents = network(&train.baseline, &train.latents, key.with("latents of the baseline"))?;
+        let predicted = to_latents.predict(&held_out.baseline);
+        Some(Baseline {
+            columns: config.baseline.clone(),
+            network: score(&to_targets.predict(&held_out.baseline)),
+            latent_variance: explained_variance(&predicted, &held_out.latents, held_out.count),
+        })
+    };
     let ridge = Ridge::fit(&train.latents, &train.targets, train.count, config.ridge)?;
-    let network = Network::fit(&train, config, key)?;
-    let score = |predictions: &[f32]| scores(&names, predictions, &held_out.targets);
     Ok(StateReport {
         latent: encoder.latent_dim(),
         frames: train.count,
         held_out: held_out.count,
         linear: score(&ridge.predict(&held_out.latents)),
-        network: score(&network.predict(&held_out.latents)),
+        network: score(&network(&train.latents, &train.targets, key)?.predict(&held_out.latents)),
+        baseline,
     })
+}
+
+/// The values of one split of a dataset, a row for each frame.
+struct Tables {
+    count: usize,
+    latents: Vec<f32>,
+    targets: Vec<f32>,
+    baseline: Vec<f32>,
+}
+
+impl Tables {
+    /// Splits samples of the columns of the targets and the baseline.
+    fn new(samples: samples::Samples, targets: &Targets, baseline: &Targets) -> Self {
+        let width = targets.width + baseline.width;
+        let columns = &samples.targets;
+        Self {
+            count: samples.count,
+            targets: targets.of(columns, width, 0),
+            baseline: baseline.of(columns, width, targets.width),
+            latents: samples.latents,
+        }
+    }
 }
 
 /// The nonlinear regression.
 struct Network {
     model: Mlp,
-    latents: Scale,
-    targets: Scale,
+    from: Scale,
+    to: Scale,
 }
 
 impl Network {
-    fn fit(train: &samples::Samples, config: &StateConfig, key: Key) -> Result<Self> {
-        let (latents, targets) = (Scale::of(&train.latents, train.count), Scale::of(&train.targets, train.count));
-        let (x, y) = (latents.apply(&train.latents), targets.apply(&train.targets));
-        let (inputs, outputs) = (latents.width(), targets.width());
+    /// Fits the regression of `y` on `x`.
+    ///
+    /// # Shapes
+    /// `x` is `[count, inputs]`, `y` is `[count, outputs]`.
+    fn fit((x, y, count): (&[f32], &[f32], usize), config: &StateConfig, key: Key) -> Result<Self> {
+        let (from, to) = (Scale::of(x, count), Scale::of(y, count));
+        let (x, y) = (from.apply(x), to.apply(y));
+        let (inputs, outputs) = (from.width(), to.width());
         let model = Mlp::new(&Init::new(key.with("init"), &Device::flex()), inputs, config.hidden, outputs);
         let step = |model: &Mlp, indices: &[usize]| {
             let trained = model.clone().train();
@@ -137,13 +206,13 @@ impl Network {
             let gradients = parameters::gradients(&trained, &loss.backward());
             Ok(StepOutput { metrics, gradients, ..StepOutput::default() })
         };
-        let (model, _) = fit(model, config.fit, train.count, key.with("batches"), step)?;
-        Ok(Self { model, latents, targets })
+        let (model, _) = fit(model, config.fit, count, key.with("batches"), step)?;
+        Ok(Self { model, from, to })
     }
 
-    fn predict(&self, latents: &[f32]) -> Vec<f32> {
-        let width = self.latents.width();
-        let x = self.latents.apply(latents);
+    fn predict(&self, x: &[f32]) -> Vec<f32> {
+        let width = self.from.width();
+        let x = self.from.apply(x);
         let chunks: Vec<Vec<f32>> = x
             .par_chunks(256 * width)
             .map(|x| {
@@ -152,26 +221,39 @@ impl Network {
             })
             .collect();
         let mut predictions = chunks.concat();
-        self.targets.undo(&mut predictions);
+        self.to.undo(&mut predictions);
         predictions
     }
 }
 
-/// Scores predictions of the elements `names`, given as column and index.
+/// Scores predictions of targets.
 ///
 /// # Shapes
-/// `predictions` and `targets` are `[rows, names.len()]`.
-fn scores(names: &[(String, usize)], predictions: &[f32], targets: &[f32]) -> Vec<Score> {
-    let (width, count) = (names.len(), (targets.len() / names.len()) as f64);
-    let (_, spread) = mean_and_std(targets, targets.len() / width);
-    let score = |(i, (column, index)): (usize, &(String, usize))| {
-        let errors = || predictions.iter().zip(targets).skip(i).step_by(width).map(|(a, b)| f64::from(a - b));
+/// `predictions` and `values` are `[rows, targets.len()]`.
+fn scores(targets: &[Target], predictions: &[f32], values: &[f32]) -> Vec<Score> {
+    let (width, count) = (targets.len(), (values.len() / targets.len()) as f64);
+    let (_, spread) = mean_and_std(values, values.len() / width);
+    let score = |(i, Target { column, index, part }): (usize, &Target)| {
+        let errors = || predictions.iter().zip(values).skip(i).step_by(width).map(|(a, b)| f64::from(a - b));
         let square = errors().map(|e| e * e).sum::<f64>() / count;
-        let (column, index, spread) = (column.clone(), *index, spread[i]);
+        let (column, index, part, spread) = (column.clone(), *index, *part, spread[i]);
         let r2 = (spread > 1e-9).then(|| 1.0 - square / spread.powi(2));
-        Score { column, index, spread, r2, rmse: square.sqrt(), mae: errors().map(f64::abs).sum::<f64>() / count }
+        let (rmse, mae) = (square.sqrt(), errors().map(f64::abs).sum::<f64>() / count);
+        Score { column, index, part, spread, r2, rmse, mae }
     };
-    names.iter().enumerate().map(score).collect()
+    targets.iter().enumerate().map(score).collect()
+}
+
+/// Returns the share of the variance of `rows` values, summed over their dimensions, that predictions explain; `None` for
+/// constant values.
+///
+/// # Shapes
+/// `predictions` and `values` are `[rows, dim]`.
+fn explained_variance(predictions: &[f32], values: &[f32], rows: usize) -> Option<f64> {
+    let (_, std) = mean_and_std(values, rows);
+    let variance = std.iter().map(|std| std * std).sum::<f64>() * rows as f64;
+    let error: f64 = predictions.iter().zip(values).map(|(a, b)| f64::from(a - b).powi(2)).sum();
+    (variance > 1e-12).then(|| 1.0 - error / variance)
 }
 
 #[cfg(test)]
@@ -180,12 +262,21 @@ mod tests {
 
     #[test]
     fn scores_are_in_column_units_and_constants_have_no_r2() {
-        let names = vec![("x".to_owned(), 0), ("x".to_owned(), 1)];
+        let names = [0, 1].map(|index| Target { column: "x".to_owned(), index, part: None });
         let (predictions, targets) = ([1.0, 5.0, 2.0, 5.0, 6.0, 5.0], [0.0, 5.0, 3.0, 5.0, 6.0, 5.0]);
         let scores = scores(&names, &predictions, &targets);
         assert!((scores[0].mae - 2.0 / 3.0).abs() < 1e-9 && (scores[0].rmse - (2.0f64 / 3.0).sqrt()).abs() < 1e-9);
         // The variance of 0, 3, 6 is 6.
         assert!((scores[0].r2.expect("a coefficient of determination") - (1.0 - 2.0 / 3.0 / 6.0)).abs() < 1e-9);
         assert!(scores[1].r2.is_none() && scores[1].mae == 0.0);
+    }
+
+    #[test]
+    fn explained_variance_is_summed_over_dimensions() {
+        // Variances of 1 and 4; the predictions are exact for the first dimension and the mean for the second.
+        let values = [0.0, 0.0, 2.0, 4.0];
+        let explained = explained_variance(&[0.0, 2.0, 2.0, 2.0], &values, 2).expect("the values vary");
+        assert!((explained - 0.2).abs() < 1e-9, "{explained}");
+        assert!(explained_variance(&[1.0; 4], &[1.0; 4], 2).is_none());
     }
 }

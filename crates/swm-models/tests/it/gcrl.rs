@@ -8,7 +8,7 @@ use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Key, Policy as _, Result, Sche
 use swm_models::feed_forward::FeedForwardPolicy;
 use swm_models::gcrl::{Actor, Gcbc, Gciql, Gcivl, GcrlConfig, GoalConditioned};
 use swm_models::nn::{Init, parameters};
-use swm_models::probe::{self, ImageEncoder, ReconstructionConfig, StateConfig};
+use swm_models::probe::{self, AnglePart, ImageEncoder, ReconstructionConfig, StateConfig};
 use swm_models::train::DatasetInfo;
 use swm_models::{Checkpoint, Device, TrainConfig, TrainOptions, TrainSummary, Trainable, train};
 use swm_plan::ActionScale;
@@ -51,6 +51,7 @@ fn spec(action_space: Space) -> EnvSpec {
         variation_space: VariationSpace::new(vec![], &[]),
         max_episode_steps: 10,
         cameras: vec![],
+        angles: vec![],
     }
 }
 
@@ -281,6 +282,25 @@ fn probes_read_the_position_and_reconstruct_the_image() {
         report,
         "a second fit gives another report"
     );
+    // Here the baseline is what the latents contain. The angle is the sine and the cosine of the first coordinate.
+    let with_baseline = StateConfig {
+        angles: vec![("position".to_owned(), 0)],
+        baseline: vec!["position".to_owned()],
+        ..settings.clone()
+    };
+    let report = probe::read_state(&Profiles, &data, &with_baseline).expect("fitting the probe");
+    let parts: Vec<_> = report.linear.iter().map(|score| (score.index, score.part)).collect();
+    assert_eq!(parts, [(0, Some(AnglePart::Sin)), (0, Some(AnglePart::Cos)), (1, None)]);
+    assert!(report.linear.iter().all(|score| score.r2.expect("a score of a moving dot") > 0.8), "{report:?}");
+    let baseline = report.baseline.expect("a baseline was requested");
+    assert!(baseline.network[2].r2.expect("a score of a moving dot") > 0.95, "{baseline:?}");
+    assert!(baseline.latent_variance.expect("the latents vary") > 0.3, "{baseline:?}");
+    // Actions determine neither the position nor the latents.
+    let of_actions = StateConfig { baseline: vec!["action".to_owned()], ..settings.clone() };
+    let report = probe::read_state(&Profiles, &data, &of_actions).expect("fitting the probe");
+    let baseline = report.baseline.expect("a baseline was requested");
+    assert!(baseline.network[1].r2.expect("a score of a moving dot") < 0.2, "{baseline:?}");
+    assert!(baseline.latent_variance.expect("the latents vary") < 0.2, "{baseline:?}");
     // Images do not determine the actions. The probe skips the last row of an episode, which has no action.
     let actions = StateConfig { columns: vec!["action".to_owned()], ..settings };
     let report = probe::read_state(&Profiles, &data, &actions).expect("fitting the probe");

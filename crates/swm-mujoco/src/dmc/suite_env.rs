@@ -119,6 +119,7 @@ pub(super) fn env_arguments<D: Domain>(choice: &EnvChoice) -> Result<(EnvSpec, A
         variation_space,
         max_episode_steps: D::MAX_STEPS,
         cameras: vec![],
+        angles: vec![],
     };
     let coordinates = GoalCoordinates::new(&model, D::IGNORED_JOINTS);
     let goal = vec![0.0; nq + nv];

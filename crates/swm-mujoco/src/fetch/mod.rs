@@ -79,6 +79,7 @@ fn make(
         variation_space: factors::variation_space(config.has_object()),
         max_episode_steps: 50,
         cameras: vec![],
+        angles: vec![],
     };
     Ok(Box::new(MujocoEnv::new(spec, model, Fetch::new(config, setup, reward, observation)?)?))
 }

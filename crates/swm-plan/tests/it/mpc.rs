@@ -70,6 +70,7 @@ fn spec(high: f64) -> EnvSpec {
         variation_space: VariationSpace::new(vec![], &[]),
         max_episode_steps: 100,
         cameras: vec![],
+        angles: vec![],
     }
 }
 

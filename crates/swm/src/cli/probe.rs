@@ -6,9 +6,10 @@ use clap::Args;
 use serde_json::json;
 use std::path::PathBuf;
 use swm_core::Error;
-use swm_data::{check_png, write_png};
+use swm_core::columns::POS_AGENT;
+use swm_data::{Reader, check_png, write_png};
 use swm_models::Device;
-use swm_models::probe::{self, ReconstructionConfig, Score, StateConfig, StateReport};
+use swm_models::probe::{self, AnglePart, ReconstructionConfig, Score, StateConfig, StateReport};
 
 /// Arguments of `swm probe`. Probes are fitted on the training episodes of the dataset, and evaluated on its validation
 /// episodes.
@@ -22,6 +23,9 @@ pub struct ProbeArgs {
     /// Columns to predict from latents, such as state,goal_state
     #[arg(long, value_name = "COLUMN,…", value_delimiter = ',')]
     columns: Vec<String>,
+    /// Columns that predict without an image, for comparison (default: pos_agent, if the dataset has it)
+    #[arg(long, value_name = "COLUMN,…", value_delimiter = ',', requires = "columns")]
+    baseline: Vec<String>,
     /// Reconstruct images from latents; write samples to this PNG file
     #[arg(long, alias = "pictures", value_name = "FILE")]
     images: Option<PathBuf>,
@@ -58,6 +62,11 @@ pub fn probe(args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
         None
     } else {
         let mut config = StateConfig { seed: args.seed, ..StateConfig::new(args.columns.clone()) };
+        config.angles = angles(&*reader);
+        config.baseline = args.baseline.clone();
+        if config.baseline.is_empty() && reader.schema().find(POS_AGENT).is_some() {
+            config.baseline.push(POS_AGENT.to_owned());
+        }
         config.frames = args.frames.unwrap_or(config.frames);
         config.fit.steps = args.steps.unwrap_or(config.fit.steps);
         Some(threads.install(|| probe::read_state(&*encoder, &*reader, &config))?)
@@ -92,24 +101,49 @@ pub fn probe(args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Returns the elements of a dataset's columns that are angles, as its environment declares them; none for an environment
+/// that is not built in or not available.
+fn angles(reader: &dyn Reader) -> Vec<(String, usize)> {
+    let manifest = reader.manifest();
+    let id = manifest.as_ref().and_then(|manifest| manifest.config["env"].as_str());
+    let env = id.and_then(|id| crate::ENVS.choose(id).and_then(|choice| choice.env()).ok());
+    let angles = env.map(|env| env.spec().angles.clone()).unwrap_or_default();
+    angles.into_iter().map(|(column, index)| (column.to_owned(), index)).collect()
+}
+
 /// Returns a table of the predicted columns, element by element.
 fn state_table(report: &StateReport) -> String {
     let r2 = |r2: Option<f64>| r2.map_or("–".to_owned(), |r2| format!("{r2:.3}"));
-    let row = |(linear, network): (&Score, &Score)| {
-        vec![
-            format!("{}[{}]", linear.column, linear.index),
+    let baseline = report.baseline.as_ref();
+    let row = |(i, (linear, network)): (usize, (&Score, &Score))| {
+        let element = format!("{}[{}]", linear.column, linear.index);
+        let mut row = vec![
+            match linear.part {
+                None => element,
+                Some(AnglePart::Sin) => format!("sin {element}"),
+                Some(AnglePart::Cos) => format!("cos {element}"),
+            },
             format!("{:.3}", linear.spread),
             r2(linear.r2),
             format!("{:.3}", linear.rmse),
             r2(network.r2),
             format!("{:.3}", network.rmse),
-        ]
+        ];
+        row.extend(baseline.map(|baseline| r2(baseline.network[i].r2)));
+        row
     };
-    let header = ["element", "spread", "linear R²", "linear RMSE", "network R²", "network RMSE"];
-    let rows = report.linear.iter().zip(&report.network).map(row);
+    let mut header = vec!["element", "spread", "linear R²", "linear RMSE", "network R²", "network RMSE"];
+    let from = baseline.map(|baseline| baseline.columns.join(","));
+    let from_baseline = from.as_ref().map(|from| format!("R² from {from}"));
+    header.extend(from_baseline.as_deref());
+    let rows = report.linear.iter().zip(&report.network).enumerate().map(row);
+    let latents = baseline.zip(from).map_or(String::new(), |(baseline, from)| {
+        let share = baseline.latent_variance.map_or("–".to_owned(), |share| format!("{:.1} %", 100.0 * share));
+        format!("a network from {from} explains {share} of the variance of the latents\n")
+    });
     format!(
-        "{}latent dimension {}; fitted on {} frames, evaluated on {} frames of other episodes; errors are in the column's \
-         units\n",
+        "{}{latents}latent dimension {}; fitted on {} frames, evaluated on {} frames of other episodes; errors are in the \
+         column's units\n",
         table(&header, rows),
         report.latent,
         report.frames,

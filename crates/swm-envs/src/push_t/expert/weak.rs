@@ -2,6 +2,7 @@
 
 use crate::push_t::ACTION_SCALE;
 use rand::Rng as _;
+use swm_core::columns::POS_AGENT;
 use swm_core::policy::Expert;
 use swm_core::{Key, Result, Rng, RowRef};
 
@@ -26,7 +27,7 @@ impl Expert for WeakExpert {
     }
 
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
-        let (agent, block) = (row.get::<f64>("pos_agent")?, row.get::<f64>("block_pose")?);
+        let (agent, block) = (row.get::<f64>(POS_AGENT)?, row.get::<f64>("block_pose")?);
         let scale = f64::from(ACTION_SCALE);
         for i in 0..2 {
             let target = agent[i] + scale * self.rng.random_range(-1.0..=1.0);

@@ -100,6 +100,7 @@ fn spec(choice: &EnvChoice, agent: Agent, pixels: bool, model: &MjModel) -> EnvS
         variation_space: variation_space(pixels),
         max_episode_steps: MAX_STEPS,
         cameras: vec![],
+        angles: vec![],
     }
 }
 

@@ -125,6 +125,7 @@ fn make(config: &'static TableConfig, choice: &EnvChoice) -> Result<Box<dyn Env>
         variation_space: factors::space(config, if chosen("multiview") == "true" { 2 } else { 1 }),
         max_episode_steps: config.max_steps,
         cameras: vec![],
+        angles: vec![],
     };
     Ok(Box::new(MujocoEnv::new(spec, model, table)?))
 }

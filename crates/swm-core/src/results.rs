@@ -9,12 +9,14 @@ mod paired;
 mod prediction;
 mod searches;
 mod statistics;
+mod study;
 
 pub use counting::Counting;
 pub use paired::{Comparison, MAX_ALL_PAIRS, Paired, pairs};
 pub use prediction::{Group, Prediction, Trajectory};
 pub use searches::{Band, Searches};
 pub use statistics::{Proportion, Summary};
+pub use study::{StudyResults, StudyRow};
 
 use crate::Manifest;
 use serde::{Deserialize, Serialize};

@@ -5,6 +5,7 @@
 //! - [`starts`] and [`evaluate`]: initial states and goals, and the success rate of a policy from them.
 //! - [`request`]: all settings of an evaluation as one value. [`runner`] evaluates the policies of a request on the
 //!   same starts, and [`reproduce`] repeats an evaluation from its results.
+//! - [`study`]: many evaluations with one table.
 //! - [`prediction`]: the prediction errors of a model on recorded trajectories.
 //!
 //! An episode depends only on its key: neither on the number of environments or threads, nor on earlier episodes in the
@@ -21,6 +22,7 @@ pub mod runner;
 mod seeding;
 pub mod starts;
 mod starts_hash;
+pub mod study;
 mod success_criterion;
 mod video_recording;
 pub mod world;
@@ -34,5 +36,6 @@ pub use request::{Choice, Condition, EvalRequest, HeldOut, Model, PolicyKind, Po
 pub use runner::{ResolvedPolicy, Resolver, RunOptions};
 pub use seeding::{episode_key, reset_seed};
 pub use starts::Starts;
+pub use study::{Cell, Study, StudyFolder};
 pub use video_recording::Videos;
 pub use world::{World, WorldConfig};

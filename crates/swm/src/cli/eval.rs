@@ -133,7 +133,10 @@ pub fn eval(args: &EvalArgs, context: &Context) -> anyhow::Result<()> {
 
 impl EvalArgs {
     /// Returns the settings that determine the results.
-    fn request(&self, resolver: &HomeResolver) -> Result<EvalRequest> {
+    ///
+    /// # Errors
+    /// When a policy, an environment or a setting does not exist.
+    pub fn request(&self, resolver: &HomeResolver) -> Result<EvalRequest> {
         let find = |given: &String| NamedPolicy::find(given, self.env.as_deref(), resolver);
         let named: Vec<NamedPolicy> = self.policies.iter().map(find).collect::<Result<_>>()?;
         let trained_on = named.iter().find_map(|policy| policy.env.clone());

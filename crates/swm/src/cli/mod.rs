@@ -24,6 +24,7 @@ mod report;
 mod reproduce;
 mod results_tables;
 mod solvers;
+mod study;
 mod train;
 mod wrappers;
 
@@ -118,6 +119,9 @@ enum Command {
     /// Repeat an evaluation from its results and list the differences
     #[command(after_help = "Example: swm reproduce results")]
     Reproduce(reproduce::ReproduceArgs),
+    /// Run many evaluations with one table: a study, such as an experiment of the paper
+    #[command(after_help = "Example: swm study list")]
+    Study(study::StudyArgs),
     /// Write one self-contained HTML page of results
     #[command(after_help = "Example: swm report results --output report --training lewm-rooms")]
     Report(report::ReportArgs),
@@ -225,6 +229,7 @@ impl Cli {
             Command::Pull(args) => pull::pull(&args, json),
             Command::Probe(args) => probe::probe(&args, &Context::new(json, self.threads)),
             Command::Eval(args) => eval::eval(&args, &Context::new(json, self.threads)),
+            Command::Study(args) => study::study(&args, json, || Context::new(json, self.threads)),
             Command::Reproduce(args) => reproduce::reproduce(&args, &Context::new(json, self.threads)),
             Command::Bench(args) => bench::bench(&args, &Context::new(json, self.threads)),
             Command::Demo(args) => demo::demo(&args, &Context::new(json, self.threads)),

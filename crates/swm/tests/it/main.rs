@@ -14,6 +14,7 @@ mod listing;
 mod output;
 mod pipeline;
 mod python;
+mod study;
 mod trust;
 
 use std::path::{Path, PathBuf};

@@ -1,0 +1,91 @@
+//! [`StudyResults`]: the success rates of all cells of a study, as read by tables and reports.
+
+use super::{Counting, Paired, Proportion, Run};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// The outcomes of a study: one row for each policy in each cell that is done.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct StudyResults {
+    /// The title of the study.
+    pub title: String,
+    /// The question that the study asks.
+    pub question: String,
+    /// The BLAKE3 hash of the study: of all its requests and their inputs.
+    pub hash: String,
+    /// The number of cells.
+    pub cells: usize,
+    /// The number of cells with results.
+    pub done: usize,
+    /// The rows, in the order of the cells.
+    pub rows: Vec<StudyRow>,
+}
+
+/// The outcome of one policy under one condition.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct StudyRow {
+    /// The id of the cell.
+    pub cell: String,
+    /// The name of the source of starts.
+    pub starts: String,
+    /// The name of the condition.
+    pub condition: String,
+    /// The values of the variables in the condition and in the policy, such as `count` of `{count} occluders`.
+    pub variables: BTreeMap<String, String>,
+    /// The policy.
+    pub policy: String,
+    /// The rule for counting episodes.
+    pub counting: Counting,
+    /// The seed.
+    pub seed: u64,
+    /// The success rate.
+    pub success: Proportion,
+    /// The number of episodes that were solved at start.
+    pub solved_at_start: usize,
+    /// The success rate of the random-policy floor on the same starts.
+    pub floor: Proportion,
+    /// The shifted minus the unshifted success rate of this policy on the same starts: the first condition of the study
+    /// is unshifted. `None` for that condition, and where the starts differ.
+    pub gap: Option<Paired>,
+}
+
+impl Paired {
+    /// Compares the outcomes of two runs on the same starts, whose conditions or policies differ. A start counts if it
+    /// counts in both runs. `None` if the runs did not play the same starts, or no start counts.
+    pub fn of_runs(a: &Run, b: &Run, counting: Counting) -> Option<Self> {
+        let pairs = || a.episodes.iter().zip(&b.episodes);
+        let same = a.episodes.len() == b.episodes.len() && pairs().all(|(a, b)| (a.seed, a.start) == (b.seed, b.start));
+        let mut counts = [0; 4];
+        for (a, b) in pairs().filter(|(a, b)| counting.counts(a) && counting.counts(b)) {
+            counts[2 * usize::from(!a.success) + usize::from(!b.success)] += 1;
+        }
+        let [both, only_a, only_b, neither] = counts;
+        (same && counts != [0; 4]).then(|| Self::of(both, only_a, only_b, neither))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::results::{EpisodeResult, Timing};
+
+    #[test]
+    fn starts_count_that_count_under_both_conditions() {
+        let run = |condition: &str, outcomes: [(bool, bool); 4]| {
+            let episodes = outcomes.iter().zip(0..).map(|(&(success, solved_at_start), seed)| EpisodeResult {
+                success,
+                solved_at_start,
+                ..EpisodeResult::new(seed)
+            });
+            Run::new(condition, "model", Counting::default(), episodes.collect(), Timing::default())
+        };
+        let plain = run("in distribution", [(true, false), (true, false), (true, true), (false, false)]);
+        let shifted = run("red", [(true, false), (false, false), (false, false), (false, true)]);
+        let gap = Paired::of_runs(&shifted, &plain, Counting::default()).expect("two starts count");
+        assert_eq!([gap.both, gap.only_a, gap.only_b, gap.neither], [1, 0, 1, 0]);
+        assert!((gap.difference + 0.5).abs() < 1e-12);
+        let mut other = shifted.clone();
+        other.episodes[0].seed = 9;
+        assert!(Paired::of_runs(&other, &plain, Counting::default()).is_none(), "other starts");
+    }
+}

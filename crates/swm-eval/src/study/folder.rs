@@ -1,0 +1,90 @@
+//! [`StudyFolder`]: the files of a study.
+
+use super::cell::{Cell, Study};
+use std::path::{Path, PathBuf};
+use swm_core::files::{self, Lock};
+use swm_core::{Error, Result, Results};
+
+/// The folder of a study: `study.json`, and the results of each cell in `cells/ID.json`.
+pub struct StudyFolder {
+    root: PathBuf,
+}
+
+/// The name of the file with all cells.
+const STUDY: &str = "study.json";
+/// The largest file of a study, in bytes.
+const MAX_BYTES: u64 = 256 << 20;
+
+impl StudyFolder {
+    /// The folder at a path.
+    pub fn new(root: &Path) -> Self {
+        Self { root: root.to_owned() }
+    }
+
+    /// Creates the folder and writes the study. Results of cells that the study no longer has stay in the folder, and are
+    /// used again when it has them again. Keeps other writers away until the lock is dropped.
+    ///
+    /// # Errors
+    /// When another process writes to the folder, it holds other files and no study, or writing fails.
+    pub fn create(&self, study: &Study) -> Result<Lock> {
+        let is_empty = || std::fs::read_dir(&self.root).map_or(true, |mut entries| entries.next().is_none());
+        if !self.root.join(STUDY).exists() && !is_empty() {
+            let problem = "has files and no study.json";
+            return Err(Error::config(self.root.display().to_string(), problem, "give an empty folder with --output"));
+        }
+        let lock = Lock::folder(&self.root)?;
+        let cells = self.root.join("cells");
+        std::fs::create_dir_all(&cells).map_err(|error| Error::io(&cells, "creating the folder", error))?;
+        files::write(&self.root.join(STUDY), &json(study)?)?;
+        Ok(lock)
+    }
+
+    /// Reads the study.
+    ///
+    /// # Errors
+    /// When the folder has no study, or it is damaged.
+    pub fn study(&self) -> Result<Study> {
+        let path = self.root.join(STUDY);
+        let bytes = files::read(&path, MAX_BYTES)?;
+        serde_json::from_slice(&bytes)
+            .map_err(|error| Error::corrupt(path, format!("is not a study ({error})"), "run the study again"))
+    }
+
+    /// Returns the results of a cell, or `None` if it is not done.
+    ///
+    /// # Errors
+    /// When the results are damaged, or are those of another request.
+    pub fn results(&self, cell: &Cell) -> Result<Option<Results>> {
+        let path = self.path(cell)?;
+        if !path.exists() {
+            return Ok(None);
+        }
+        let damaged = |problem: String| Error::corrupt(&path, problem, "remove the file and run the study again");
+        let results: Results = serde_json::from_slice(&files::read(&path, MAX_BYTES)?)
+            .map_err(|error| damaged(format!("is not a results file ({error})")))?;
+        results.check().map_err(|problem| damaged(format!("is inconsistent: {problem}")))?;
+        Ok(Some(results))
+    }
+
+    /// Stores the results of a cell, without times.
+    ///
+    /// # Errors
+    /// When writing fails.
+    pub fn store(&self, cell: &Cell, mut results: Results) -> Result<()> {
+        for run in &mut results.runs {
+            run.timing = Default::default();
+        }
+        files::write(&self.path(cell)?, &json(&results)?)
+    }
+
+    fn path(&self, cell: &Cell) -> Result<PathBuf> {
+        Ok(self.root.join("cells").join(format!("{}.json", cell.id()?)))
+    }
+}
+
+fn json(value: &impl serde::Serialize) -> Result<Vec<u8>> {
+    let mut bytes =
+        serde_json::to_vec_pretty(value).map_err(|error| Error::external("writing the files of a study", error))?;
+    bytes.push(b'\n');
+    Ok(bytes)
+}

@@ -1,0 +1,16 @@
+//! Studies: many evaluations of one question, with one result.
+//!
+//! A [`Study`] is a list of [`Cell`]s, each an [`EvalRequest`] with the hashes of its inputs. [`Study::run`] evaluates the
+//! cells whose results are not in the [`StudyFolder`] yet. All cells with one source of starts and one seed play the same
+//! starts, so that policies and conditions are compared in pairs.
+//!
+//! The files of a study hold no times, so a study that was interrupted and continued writes the same bytes as one that was
+//! not.
+
+mod cell;
+mod folder;
+mod rows;
+mod run;
+
+pub use cell::{Cell, Study};
+pub use folder::StudyFolder;

@@ -1,0 +1,150 @@
+//! Expands the tables of a study's file to cells.
+
+use super::file::{StudyFile, Variant};
+use crate::cli::eval::EvalArgs;
+use crate::resolver::HomeResolver;
+use clap::{Args as _, Command, FromArgMatches as _};
+use std::collections::BTreeMap;
+use swm_core::{Error, Origin, Result};
+use swm_eval::{Cell, EvalRequest, Model, PolicyKind, Resolver as _, StartsRequest, Study};
+
+/// A cell before its names are resolved.
+struct Combination {
+    starts: Variant,
+    condition: Variant,
+    policy: Variant,
+    /// The options of all tables.
+    all: Variant,
+}
+
+/// Returns the arguments of `swm eval` for every cell.
+///
+/// # Errors
+/// When a table is invalid.
+pub fn commands(file: &StudyFile, settings: &[String]) -> Result<Vec<Vec<String>>> {
+    Ok(combinations(file, settings)?.iter().map(|combination| combination.all.arguments()).collect())
+}
+
+/// Joins arguments for a shell.
+pub fn shell(arguments: &[String]) -> String {
+    let plain = |argument: &String| {
+        let safe = |c: char| c.is_ascii_alphanumeric() || "-_=.,/:@%+".contains(c);
+        if argument.chars().all(safe) { argument.clone() } else { format!("'{}'", argument.replace('\'', "'\\''")) }
+    };
+    arguments.iter().map(plain).collect::<Vec<_>>().join(" ")
+}
+
+/// Returns the study with all names resolved.
+///
+/// # Errors
+/// When a table is invalid, an environment, dataset, checkpoint or setting does not exist, or two cells are equal.
+pub fn study(file: &StudyFile, settings: &[String], resolver: &HomeResolver) -> Result<Study> {
+    let (mut cells, mut inputs) = (vec![], Inputs { resolver, known: BTreeMap::new() });
+    for combination in combinations(file, settings)? {
+        let Combination { starts, condition, policy, all } = combination;
+        let within = |error: Error| {
+            let places: Vec<&str> = [&condition, &policy].iter().map(|variant| variant.at.as_str()).collect();
+            match error {
+                Error::Interrupted => error,
+                error => Error::config(
+                    format!("'{}' of '{}' ({})", condition.name, policy.name, places.join(", ")),
+                    error.to_string(),
+                    "correct the file of the study",
+                ),
+            }
+        };
+        let request = request(&all, &condition.name, &policy.name, resolver).map_err(within)?;
+        let inputs = inputs.of(&request).map_err(within)?;
+        cells.push(Cell { starts: starts.name, variables: all.variables, request, inputs });
+    }
+    let study = Study { title: file.title.clone(), question: file.question.clone(), cells };
+    study.check()?;
+    Ok(study)
+}
+
+/// Every combination of defaults, starts, conditions and policies, in this order.
+fn combinations(file: &StudyFile, settings: &[String]) -> Result<Vec<Combination>> {
+    let defaults = file.defaults.with(settings)?;
+    let env = defaults.option("env").map(|env| crate::env(env, &Origin::User)?.env()).transpose()?;
+    let space = env.as_ref().map(|env| &env.spec().variation_space);
+    let expand = |tables: &[super::file::Table]| -> Result<Vec<Variant>> {
+        Ok(tables.iter().map(|table| table.variants(space)).collect::<Result<Vec<_>>>()?.concat())
+    };
+    let (starts, conditions, policies) = (expand(&file.starts)?, expand(&file.conditions)?, expand(&file.policies)?);
+    let mut combinations = vec![];
+    for defaults in defaults.variants(space)? {
+        for starts in &starts {
+            for condition in &conditions {
+                for policy in &policies {
+                    combinations.push(Combination {
+                        all: Variant::combine(&[&defaults, starts, condition, policy]),
+                        starts: starts.clone(),
+                        condition: condition.clone(),
+                        policy: policy.clone(),
+                    });
+                }
+            }
+        }
+    }
+    Ok(combinations)
+}
+
+/// The request of a cell, with the names of the study.
+fn request(all: &Variant, condition: &str, policy: &str, resolver: &HomeResolver) -> Result<EvalRequest> {
+    let matches = EvalArgs::augment_args(Command::new("swm eval")).try_get_matches_from(all.arguments());
+    let parsed = matches.and_then(|matches| EvalArgs::from_arg_matches(&matches));
+    let args = parsed.map_err(|error| {
+        let text = error.render().to_string();
+        let line = text.lines().next().unwrap_or_default().trim_start_matches("error: ").to_owned();
+        Error::config("options", line, "the options are those of `swm eval`")
+    })?;
+    let mut request = args.request(resolver)?;
+    let [only] = &mut request.policies[..] else {
+        let problem = format!("its options make {} policies", request.policies.len());
+        return Err(Error::config("the policy", problem, "give one policy and one solver; `each` makes several"));
+    };
+    if only.kind != PolicyKind::Random {
+        policy.clone_into(&mut only.name);
+    }
+    request.conditions.iter_mut().for_each(|only| condition.clone_into(&mut only.name));
+    Ok(request)
+}
+
+/// Hashes of datasets and weights, each computed once.
+struct Inputs<'a> {
+    resolver: &'a HomeResolver,
+    known: BTreeMap<(&'static str, String), String>,
+}
+
+impl Inputs<'_> {
+    fn of(&mut self, request: &EvalRequest) -> Result<BTreeMap<String, String>> {
+        let mut inputs = BTreeMap::new();
+        if let StartsRequest::Dataset { dataset, .. } = &request.starts {
+            let hash = self.hash("dataset", dataset, |resolver| resolver.dataset(dataset)?.content_hash())?;
+            inputs.insert("dataset".to_owned(), hash);
+        }
+        for policy in &request.policies {
+            if let PolicyKind::Plan { model: Model::Checkpoint(given), .. }
+            | PolicyKind::Direct { checkpoint: given, .. } = &policy.kind
+            {
+                let hash = self.hash("weights", given, |resolver| Ok(resolver.checkpoint(given)?.info()?.weights))?;
+                inputs.insert("weights".to_owned(), hash);
+            }
+        }
+        Ok(inputs)
+    }
+
+    fn hash(
+        &mut self,
+        kind: &'static str,
+        name: &str,
+        compute: impl FnOnce(&HomeResolver) -> Result<String>,
+    ) -> Result<String> {
+        if let Some(hash) = self.known.get(&(kind, name.to_owned())) {
+            return Ok(hash.clone());
+        }
+        let hash = compute(self.resolver)?;
+        self.known.insert((kind, name.to_owned()), hash.clone());
+        Ok(hash)
+    }
+}

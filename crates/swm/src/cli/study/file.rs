@@ -1,0 +1,353 @@
+//! The file of a study: tables of options of `swm eval`, each of which may stand for several variants.
+
+use super::colour;
+use crate::cli::eval::EvalArgs;
+use clap::{ArgAction, Args as _, Command};
+use std::collections::BTreeMap;
+use std::path::Path;
+use swm_core::{Error, Result, VariationSpace};
+use toml::Spanned;
+use toml::de::{DeTable, DeValue};
+
+/// A study as its file describes it.
+#[derive(Debug)]
+pub struct StudyFile {
+    /// The title.
+    pub title: String,
+    /// The question that the study asks.
+    pub question: String,
+    /// The options of all evaluations.
+    pub defaults: Table,
+    /// The sources of starts; one without options if the file names none.
+    pub starts: Vec<Table>,
+    /// The conditions, the unshifted one first.
+    pub conditions: Vec<Table>,
+    /// The policies.
+    pub policies: Vec<Table>,
+}
+
+/// A table of options.
+#[derive(Debug, Default)]
+pub struct Table {
+    /// The file and the line, for errors.
+    pub at: String,
+    /// The name; may contain variables.
+    pub name: String,
+    /// The values of every option, by the name of the option without its dashes.
+    options: BTreeMap<String, Vec<String>>,
+    /// The variables and their values, in alphabetical order.
+    each: Vec<(String, Values)>,
+}
+
+/// The values of a variable.
+#[derive(Clone, Debug)]
+enum Values {
+    /// These values.
+    List(Vec<String>),
+    /// The factors of variation of the environment.
+    Factors,
+}
+
+/// A table with one value for each variable.
+#[derive(Clone, Debug, Default)]
+pub struct Variant {
+    /// The file and the line, for errors.
+    pub at: String,
+    /// The name.
+    pub name: String,
+    /// The values of every option.
+    pub options: BTreeMap<String, Vec<String>>,
+    /// The values of the variables.
+    pub variables: BTreeMap<String, String>,
+}
+
+/// The option of a policy's table that names the policy.
+pub const POLICY: &str = "policy";
+
+/// Options that belong to a run and not to an evaluation.
+const RUN_OPTIONS: &[&str] = &["output", "videos", "trace", "trust", "envs", "help"];
+
+/// The tables of a file.
+const TABLES: &[&str] = &["title", "question", "defaults", "starts", "condition", "policy"];
+
+impl StudyFile {
+    /// Parses a file; `path` is named in errors.
+    ///
+    /// # Errors
+    /// When the text is not TOML, has an unknown table or option, or lacks a title, a policy or a condition. The error
+    /// names the line, and the nearest name.
+    pub fn parse(text: &str, path: &Path) -> Result<Self> {
+        let source = Source::new(text, Some(path));
+        let table = DeTable::parse(text).map_err(|error| {
+            let at = error.span().map_or(0, |span| span.start);
+            Error::config(source.at(at), error.message(), "correct the file")
+        })?;
+        let (mut file, mut title) = (
+            Self {
+                title: String::new(),
+                question: String::new(),
+                defaults: Table::default(),
+                starts: vec![],
+                conditions: vec![],
+                policies: vec![],
+            },
+            None,
+        );
+        for (key, value) in table.get_ref() {
+            match key.get_ref().as_ref() {
+                "title" => title = Some(source.text_of(value)?),
+                "question" => file.question = source.text_of(value)?,
+                "defaults" => file.defaults = source.table(value, false)?,
+                "starts" => file.starts = source.tables(value)?,
+                "condition" => file.conditions = source.tables(value)?,
+                "policy" => file.policies = source.tables(value)?,
+                other => {
+                    let what = Error::unknown("table", other, TABLES.iter().copied(), "docs/studies.md lists them");
+                    return Err(Error::config(source.at(key.span().start), what.to_string(), "correct the file"));
+                }
+            }
+        }
+        let missing = |what: &str, fix: &str| Error::config(path.display().to_string(), format!("has no {what}"), fix);
+        file.title = title.ok_or_else(|| missing("title", "begin the file with title = \"…\""))?;
+        if file.starts.is_empty() {
+            file.starts.push(Table::default());
+        }
+        if file.conditions.is_empty() {
+            return Err(missing("condition", "add [[condition]] with a name; the first one is not shifted"));
+        }
+        if file.policies.is_empty() {
+            return Err(missing("policy", "add [[policy]] with a name and policy = \"…\""));
+        }
+        Ok(file)
+    }
+}
+
+/// The text of a file, for positions in errors, and the options of `swm eval`.
+struct Source<'a> {
+    text: &'a str,
+    /// The path; `None` for a setting of the command line.
+    path: Option<&'a Path>,
+    command: Command,
+}
+
+impl Source<'_> {
+    fn new<'a>(text: &'a str, path: Option<&'a Path>) -> Source<'a> {
+        Source { text, path, command: EvalArgs::augment_args(Command::new("eval")) }
+    }
+
+    /// The file and line of a byte, or the setting.
+    fn at(&self, byte: usize) -> String {
+        let Some(path) = self.path else { return self.text.to_owned() };
+        let line = 1 + self.text.as_bytes().iter().take(byte).filter(|byte| **byte == b'\n').count();
+        format!("{}:{line}", path.display())
+    }
+
+    fn invalid(&self, value: &Spanned<DeValue<'_>>, problem: &str, fix: &str) -> Error {
+        Error::config(self.at(value.span().start), problem, fix)
+    }
+
+    fn text_of(&self, value: &Spanned<DeValue<'_>>) -> Result<String> {
+        match value.get_ref() {
+            DeValue::String(text) => Ok(text.to_string()),
+            DeValue::Integer(number) => Ok(number.to_string()),
+            DeValue::Float(number) => Ok(number.to_string()),
+            _ => Err(self.invalid(value, "is not a text or a number", "give a text or a number")),
+        }
+    }
+
+    /// A list of texts; one text is a list of one.
+    fn list(&self, value: &Spanned<DeValue<'_>>) -> Result<Vec<String>> {
+        match value.get_ref() {
+            DeValue::Array(values) => values.iter().map(|value| self.text_of(value)).collect(),
+            _ => Ok(vec![self.text_of(value)?]),
+        }
+    }
+
+    fn tables(&self, value: &Spanned<DeValue<'_>>) -> Result<Vec<Table>> {
+        match value.get_ref() {
+            DeValue::Array(values) => values.iter().map(|value| self.table(value, true)).collect(),
+            _ => Err(self.invalid(value, "is not a list of tables", "write the name in double brackets")),
+        }
+    }
+
+    fn table(&self, value: &Spanned<DeValue<'_>>, named: bool) -> Result<Table> {
+        let DeValue::Table(entries) = value.get_ref() else {
+            return Err(self.invalid(
+                value,
+                "is not a table",
+                "write options as KEY = VALUE below the name in brackets",
+            ));
+        };
+        let mut table = Table { at: self.at(value.span().start), ..Table::default() };
+        for (key, value) in entries {
+            match key.get_ref().as_ref() {
+                "name" if named => table.name = self.text_of(value)?,
+                "each" => self.each(value, &mut table)?,
+                option => self.option(option, key.span().start, value, &mut table)?,
+            }
+        }
+        if named && table.name.is_empty() {
+            return Err(Error::config(table.at, "the table has no name", "add name = \"…\""));
+        }
+        Ok(table)
+    }
+
+    fn each(&self, value: &Spanned<DeValue<'_>>, table: &mut Table) -> Result<()> {
+        let DeValue::Table(variables) = value.get_ref() else {
+            return Err(self.invalid(value, "is not a table", "write each = { NAME = [VALUE, VALUE] }"));
+        };
+        for (name, values) in variables {
+            let list = match values.get_ref() {
+                DeValue::String(text) if text == "factors" => Values::Factors,
+                DeValue::Array(_) => Values::List(self.list(values)?),
+                _ => {
+                    let fix = "give a list, or \"factors\" for all factors of the environment";
+                    return Err(self.invalid(values, "is not a list of values", fix));
+                }
+            };
+            table.each.push((name.get_ref().to_string(), list));
+        }
+        Ok(())
+    }
+
+    /// Adds an option of `swm eval`. A list of an option that can be given once makes a variant of each value.
+    fn option(&self, key: &str, at: usize, value: &Spanned<DeValue<'_>>, table: &mut Table) -> Result<()> {
+        if key == POLICY {
+            table.options.insert(key.to_owned(), vec![self.text_of(value)?]);
+            return Ok(());
+        }
+        let known = || self.command.get_arguments().filter_map(|argument| argument.get_long());
+        let known = || known().filter(|long| !RUN_OPTIONS.contains(long));
+        let argument = self.command.get_arguments().find(|argument| argument.get_long() == Some(key));
+        let Some(argument) = argument.filter(|_| !RUN_OPTIONS.contains(&key)) else {
+            let names = known().chain([POLICY, "name", "each"]);
+            let problem = Error::unknown("option", key, names, "the options are those of `swm eval`").to_string();
+            return Err(Error::config(self.at(at), problem, "correct the file"));
+        };
+        let many = matches!(argument.get_action(), ArgAction::Append)
+            || argument.get_num_args().is_some_and(|range| range.max_values() > 1);
+        let flag = !argument.get_action().takes_values();
+        let values = match value.get_ref() {
+            DeValue::Boolean(true) if flag => vec![],
+            DeValue::Boolean(false) if flag => return Ok(()),
+            DeValue::Table(pins) if many => pins
+                .iter()
+                .map(|(key, value)| Ok(format!("{}={}", key.get_ref(), self.list(value)?.join(","))))
+                .collect::<Result<_>>()?,
+            DeValue::Array(_) if !many => {
+                let values = self.list(value)?;
+                table.each.push((key.to_owned(), Values::List(values)));
+                vec![format!("{{{key}}}")]
+            }
+            _ if flag => return Err(self.invalid(value, "the option takes no value", "give true or false")),
+            _ => self.list(value)?,
+        };
+        table.options.insert(key.to_owned(), values);
+        Ok(())
+    }
+}
+
+impl Table {
+    /// Returns the table with settings `KEY=VALUE`, which replace options of the same name.
+    ///
+    /// # Errors
+    /// When a setting is malformed, is given twice, or is no option of `swm eval`.
+    pub fn with(&self, settings: &[String]) -> Result<Self> {
+        let mut table =
+            Self { at: self.at.clone(), name: String::new(), options: self.options.clone(), each: self.each.clone() };
+        let mut given: BTreeMap<&str, &str> = BTreeMap::new();
+        for setting in settings {
+            let Some((key, value)) = setting.split_once('=') else {
+                return Err(Error::config(setting, "is not a setting", "write KEY=VALUE, such as episodes=20"));
+            };
+            if let Some(first) = given.insert(key, setting) {
+                return Err(Error::twice(format!("setting {key}"), first, setting));
+            }
+            table.each.retain(|(name, _)| name != key);
+            // A value that is not valid TOML is a string.
+            let toml = [format!("value = {value}"), format!("value = {}", toml::Value::from(value))];
+            let parsed = toml.iter().find_map(|text| DeTable::parse(text).ok());
+            let Some(value) = parsed.as_ref().and_then(|parsed| parsed.get_ref().get("value")) else { continue };
+            Source::new(setting, None).option(key, 0, value, &mut table)?;
+        }
+        Ok(table)
+    }
+
+    /// The value of an option that has one value without variables.
+    pub fn option(&self, key: &str) -> Option<&str> {
+        self.options.get(key).and_then(|values| values.first()).map(String::as_str)
+    }
+
+    /// Returns the table with every combination of the values of its variables; the last variable changes fastest.
+    ///
+    /// # Errors
+    /// When a variable has no values, or a colour is malformed.
+    pub fn variants(&self, factors: Option<&VariationSpace>) -> Result<Vec<Variant>> {
+        let mut combinations: Vec<BTreeMap<String, String>> = vec![BTreeMap::new()];
+        for (name, values) in &self.each {
+            let values: Vec<String> = match values {
+                Values::List(values) => values.clone(),
+                Values::Factors => {
+                    let space = factors.ok_or_else(|| {
+                        Error::config(self.at.clone(), "no environment has these factors", "name one: env = \"…\"")
+                    })?;
+                    space.factors().iter().map(|factor| factor.key.clone()).collect()
+                }
+            };
+            if values.is_empty() {
+                return Err(Error::config(format!("{}: {name}", self.at), "has no values", "give at least one"));
+            }
+            let extended = |known: &BTreeMap<String, String>| {
+                let known = known.clone();
+                let with = |value: &String| {
+                    let mut all = known.clone();
+                    all.insert(name.clone(), value.clone());
+                    all
+                };
+                values.iter().map(with).collect::<Vec<_>>()
+            };
+            combinations = combinations.iter().flat_map(extended).collect();
+        }
+        combinations.into_iter().map(|variables| self.variant(variables)).collect()
+    }
+
+    fn variant(&self, variables: BTreeMap<String, String>) -> Result<Variant> {
+        let fill = |text: &String| {
+            variables.iter().fold(text.clone(), |text, (name, value)| text.replace(&format!("{{{name}}}"), value))
+        };
+        let mut options = BTreeMap::new();
+        for (key, values) in &self.options {
+            let filled = values.iter().map(|value| {
+                let value = fill(value);
+                if key == "pin" { colour::resolve(&value, &self.at) } else { Ok(value) }
+            });
+            options.insert(key.clone(), filled.collect::<Result<Vec<String>>>()?);
+        }
+        Ok(Variant { at: self.at.clone(), name: fill(&self.name), options, variables })
+    }
+}
+
+impl Variant {
+    /// Combines tables; the options of a later table replace those of an earlier one.
+    pub fn combine(variants: &[&Self]) -> Self {
+        let mut all = Self::default();
+        for variant in variants {
+            all.options.extend(variant.options.clone());
+            all.variables.extend(variant.variables.clone());
+        }
+        all
+    }
+
+    /// The arguments of `swm eval`, the program's name first.
+    pub fn arguments(&self) -> Vec<String> {
+        let mut arguments = vec!["eval".to_owned()];
+        arguments.extend(self.options.get(POLICY).into_iter().flatten().cloned());
+        for (key, values) in self.options.iter().filter(|(key, _)| *key != POLICY) {
+            if values.is_empty() {
+                arguments.push(format!("--{key}"));
+            }
+            arguments.extend(values.iter().map(|value| format!("--{key}={value}")));
+        }
+        arguments
+    }
+}

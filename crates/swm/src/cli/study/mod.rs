@@ -1,0 +1,162 @@
+//! `swm study`: many evaluations with one table.
+
+mod colour;
+mod expand;
+mod export;
+mod file;
+mod shipped;
+
+use super::config::count;
+use super::eval::run_options;
+use super::progress::control;
+use super::results_tables::percent;
+use super::{Context, emit, emit_json, table};
+use crate::resolver::HomeResolver;
+use clap::{Args, Subcommand};
+use export::Format;
+use serde_json::json;
+use std::path::PathBuf;
+use swm_core::results::StudyResults;
+use swm_core::{Origin, limits};
+use swm_eval::{Study, StudyFolder};
+
+/// Arguments of `swm study`.
+#[derive(Args)]
+pub struct StudyArgs {
+    #[command(subcommand)]
+    command: StudyCommand,
+}
+
+#[derive(Subcommand)]
+enum StudyCommand {
+    /// List the studies of this program
+    #[command(after_help = "Example: swm study list")]
+    List,
+    /// Evaluate the cells of a study that have no results
+    ///
+    /// A study is a file of tables with the options of `swm eval` (docs/studies.md), or the name of a study of this
+    /// program. An interrupted study continues.
+    #[command(after_help = "Example: swm study run paper/factors --output factors episodes=20")]
+    Run(RunArgs),
+    /// Show how many cells are done, and their results
+    #[command(after_help = "Example: swm study status factors")]
+    Status {
+        /// The folder of the study
+        folder: PathBuf,
+    },
+    /// Print the results as CSV, LaTeX or Markdown
+    #[command(after_help = "Example: swm study export factors --format latex")]
+    Export {
+        /// The folder of the study
+        folder: PathBuf,
+        /// The format
+        #[arg(long, value_enum, default_value_t = Format::Csv)]
+        format: Format,
+    },
+}
+
+/// Arguments of `swm study run`.
+#[derive(Args)]
+struct RunArgs {
+    /// The path of a file, or the name of a study of this program
+    study: String,
+    /// Options of all evaluations, which replace the defaults of the study
+    #[arg(value_name = "KEY=VALUE")]
+    settings: Vec<String>,
+    /// Folder of the study
+    #[arg(short, long, value_name = "DIR", required_unless_present = "commands")]
+    output: Option<PathBuf>,
+    /// Parallel environments; results do not depend on their number
+    #[arg(long, default_value_t = 16, value_parser = count::<1, { limits::ENVS.max }>)]
+    envs: usize,
+    /// Print a `swm eval` command for each cell, and evaluate nothing
+    #[arg(long, conflicts_with = "output")]
+    commands: bool,
+}
+
+/// Runs `swm study`.
+pub fn study(args: &StudyArgs, json: bool, context: impl FnOnce() -> Context) -> anyhow::Result<()> {
+    match &args.command {
+        StudyCommand::List => list(json),
+        StudyCommand::Run(args) => run(args, &context()),
+        StudyCommand::Status { folder } => {
+            let folder = StudyFolder::new(folder);
+            show(&folder.study()?.results(&folder)?, json)
+        }
+        StudyCommand::Export { folder, format } => {
+            let folder = StudyFolder::new(folder);
+            emit(&format.write(&folder.study()?.results(&folder)?));
+            Ok(())
+        }
+    }
+}
+
+fn list(json: bool) -> anyhow::Result<()> {
+    let studies = shipped::all()?;
+    if json {
+        let studies =
+            studies.iter().map(|(name, file)| json!({"name": name, "title": file.title, "question": file.question}));
+        return emit_json(&studies.collect::<Vec<_>>());
+    }
+    emit(&table(
+        &["study", "question"],
+        studies.iter().map(|(name, file)| vec![(*name).to_owned(), file.question.clone()]),
+    ));
+    Ok(())
+}
+
+fn run(args: &RunArgs, context: &Context) -> anyhow::Result<()> {
+    let file = shipped::find(&args.study)?;
+    let resolver = HomeResolver::new(Origin::User);
+    if args.commands {
+        for arguments in expand::commands(&file, &args.settings)? {
+            emit(&format!("swm {}\n", expand::shell(&arguments)));
+        }
+        return Ok(());
+    }
+    let Some(output) = &args.output else { return Ok(()) };
+    let study: Study = expand::study(&file, &args.settings, &resolver)?;
+    let folder = StudyFolder::new(output);
+    let _lock = folder.create(&study)?;
+    study.run(&folder, &resolver, &run_options(args.envs, None, context), &mut control(context))?;
+    show(&study.results(&folder)?, context.json)
+}
+
+/// Prints the results.
+fn show(results: &StudyResults, json: bool) -> anyhow::Result<()> {
+    if json {
+        return emit_json(results);
+    }
+    emit(&format!("{}: {} of {} cells\n", results.title, results.done, results.cells));
+    let several = |of: fn(&swm_core::results::StudyRow) -> String| {
+        results.rows.first().is_some_and(|first| results.rows.iter().any(|row| of(row) != of(first)))
+    };
+    let optional: [(&str, fn(&swm_core::results::StudyRow) -> String); 3] = [
+        ("starts", |row| row.starts.clone()),
+        ("counting", |row| row.counting.name().to_owned()),
+        ("seed", |row| row.seed.to_string()),
+    ];
+    let shown: Vec<_> = optional.into_iter().filter(|(_, of)| several(*of)).collect();
+    let mut header: Vec<&str> = shown.iter().map(|(name, _)| *name).collect();
+    header.extend(["condition", "policy", "success [95 %]", "n", "floor", "gap [95 %]", "p"]);
+    let rows = results.rows.iter().map(|row| {
+        let mut cells: Vec<String> = shown.iter().map(|(_, of)| of(row)).collect();
+        let (gap, p) = row.gap.as_ref().map_or(("–".to_owned(), "–".to_owned()), |gap| {
+            let [difference, low, high] = [gap.difference, gap.low, gap.high].map(|share| 100.0 * share);
+            (format!("{difference:+.0} % [{low:+.0}, {high:+.0}]"), format!("{:.4}", gap.p))
+        });
+        let floor = format!("{:.0} %", 100.0 * row.floor.rate);
+        cells.extend([
+            row.condition.clone(),
+            row.policy.clone(),
+            percent(&row.success),
+            row.success.n.to_string(),
+            floor,
+            gap,
+            p,
+        ]);
+        cells
+    });
+    emit(&table(&header, rows));
+    Ok(())
+}

@@ -7,6 +7,7 @@
 
 #![allow(clippy::needless_range_loop, reason = "indexed loops over constant lane counts are vectorised")]
 
+mod adamw;
 mod affine;
 mod attention;
 mod conv;
@@ -18,6 +19,7 @@ mod scratch;
 mod vit;
 mod vit_gradient;
 
+pub use adamw::{AdamWStep, sum_of_squares};
 pub use affine::Affine;
 pub use attention::causal_attention;
 pub use conv::{ChannelStatistics, ConvEncoder, ConvGradient, ConvParameters, ConvSizes, ConvStage};

@@ -72,6 +72,12 @@ pub fn patches(images: &ImageNormalization, patch: usize, rgb: &[u8], device: &D
     let table = images.table();
     let mut values = vec![0.0f32; frames * bytes];
     values.par_chunks_mut(bytes).zip(rgb.par_chunks(bytes)).for_each(|(to, from)| {
+        if patch == 1 {
+            for (to, pixel) in to.as_chunks_mut::<3>().0.iter_mut().zip(from.as_chunks::<3>().0) {
+                *to = std::array::from_fn(|c| table[c][usize::from(pixel[c])]);
+            }
+            return;
+        }
         for (index, to) in to.chunks_mut(width).enumerate() {
             let (top, left) = (index / grid * patch, index % grid * patch);
             for y in 0..patch {

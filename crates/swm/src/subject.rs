@@ -1,12 +1,12 @@
-//! [`LewmSubject`]: the LeWM that `swm bench plan` and `swm bench train` measure. The model has the published size. Its
-//! weights are random, because the speed of planning and training does not depend on the weights.
+//! [`LewmSubject`]: the LeWM that `swm bench plan` and `swm bench train` measure. Its weights are random, because the speed of planning and training does not depend on the weights.
 
 use rand::Rng as _;
 use std::path::Path;
 use swm_bench::{Subject, Work};
 use swm_core::columns::{ACTION, GOAL, PIXELS};
 use swm_core::{
-    Batch, Candidates, ColumnSpec, CostModel as _, DType, Key, PlanProblem, PlanSpace, Result, Schema, Solver as _,
+    Batch, Candidates, ColumnSpec, CostModel as _, DType, Error, Key, PlanProblem, PlanSpace, Result, Schema,
+    Solver as _,
 };
 use swm_models::lewm::{EncoderConfig, Lewm, LewmCost, pixels};
 use swm_models::nn::parameters::{self, HostTensor};
@@ -44,13 +44,13 @@ struct TrainingRun {
 }
 
 impl LewmSubject {
-    /// The published model with a CEM of `iterations` iterations and training batches of `clips` clips.
+    /// The model of a preset with a CEM of `iterations` iterations and training batches of `clips` clips.
     ///
     /// # Errors
-    /// When the preset does not load.
-    pub fn new(iterations: usize, clips: usize, device: &Device) -> Result<Self> {
+    /// When there is no such preset.
+    pub fn new(preset: &str, iterations: usize, clips: usize, device: &Device) -> Result<Self> {
         let settings = [format!("data.batch_size={clips}"), format!("shards={}", rayon::current_num_threads())];
-        let config = TrainConfig::<Lewm>::load("paper", &settings)?;
+        let config = TrainConfig::<Lewm>::load(preset, &settings)?;
         let action_dim = config.data.frameskip * ACTION_DIM;
         let model = with_modulations(Lewm::init(&config.model, action_dim, &Init::new(Key::new(0), device)));
         let mut cost = LewmCost::of(&model, &config.model, action_dim);
@@ -69,18 +69,36 @@ impl LewmSubject {
 
     /// Returns the sizes of the model and of the benchmark as JSON, for the process that runs the reference
     /// implementation.
-    pub fn sizes(&self) -> serde_json::Value {
+    ///
+    /// # Errors
+    /// When that process cannot run the encoder.
+    pub fn sizes(&self) -> Result<serde_json::Value> {
         let (model, predictor) = (&self.config.model, &self.config.model.predictor);
-        let EncoderConfig::Vit(vit) = &model.encoder else { return serde_json::Value::Null };
-        serde_json::json!({
+        let mut sizes = match &model.encoder {
+            EncoderConfig::Vit(vit) => serde_json::json!({
+                "patch": vit.patch, "vit_layers": vit.depth, "vit_heads": vit.heads, "vit_mlp": vit.mlp,
+            }),
+            EncoderConfig::Conv(conv) => serde_json::json!({ "channels": conv.channels, "hidden": conv.hidden }),
+            EncoderConfig::Dinov2(_) | EncoderConfig::PatchCnn(_) => {
+                return Err(Error::config(
+                    "preset",
+                    "the reference implementation has no such encoder",
+                    "choose a preset with `vit` or `conv`: paper or small",
+                ));
+            }
+        };
+        let all = serde_json::json!({
             "device": if self.device == Device::flex() { "cpu" } else { "cuda" },
-            "image": model.image, "patch": vit.patch, "dim": vit.dim, "vit_layers": vit.depth, "vit_heads": vit.heads,
-            "vit_mlp": vit.mlp, "latent": model.latent, "proj_hidden": model.projector, "actions": self.action_dim(),
+            "image": model.image, "dim": model.encoder.dim(), "latent": model.latent, "proj_hidden": model.projector, "actions": self.action_dim(),
             "history": predictor.history, "depth": predictor.depth, "heads": predictor.heads, "mlp": predictor.mlp,
             "predictor_dim": predictor.dim, "dim_head": predictor.dim_head, "dropout": predictor.dropout,
             "iterations": self.cem.iterations, "elites": self.cem.elites, "batch": self.config.data.batch_size,
             "knots": self.config.loss.knots, "directions": self.config.loss.directions,
-        })
+        });
+        if let (Some(sizes), serde_json::Value::Object(all)) = (sizes.as_object_mut(), all) {
+            sizes.extend(all);
+        }
+        Ok(sizes)
     }
 
     /// Writes weights (`w.NAME`) and inputs (`i.NAME`, with normalised images) for the process that runs the reference

@@ -5,12 +5,14 @@ Arguments: the sizes as JSON, and a file of weights and inputs. Requests, one pe
 `encode` (one frame) or `train` (one step, including the optimizer). Answers are lines that start with `SWM `; other
 output of the reference is ignored.
 
-The encoder of the reference is from another package, so this file contains a vision transformer with fused attention.
+The encoder of the reference is from another package, so this file contains a vision transformer with fused attention, and
+the convolutional encoder of the preset `small`.
 """
 
 import json
 import sys
 import time
+from collections import OrderedDict
 from importlib.metadata import version
 
 import gymnasium as gym
@@ -76,10 +78,32 @@ class Vit(nn.Module):
         return tree(last_hidden_state=self.layernorm(x))
 
 
+class Conv(nn.Module):
+    def __init__(self):
+        super().__init__()
+        stage = lambda i, o: nn.Sequential(
+            OrderedDict(conv=nn.Conv2d(i, o, 3, 2, 1, bias=False), norm=nn.BatchNorm2d(o), relu=nn.ReLU())
+        )
+        channels, side = c["channels"], c["image"]
+        self.stages = nn.Sequential(*map(stage, [3, *channels], channels))
+        for _ in channels:
+            side = (side + 1) // 2
+        if c["hidden"]:
+            self.hidden = nn.Linear(side * side * channels[-1], c["hidden"])
+        self.out = nn.Linear(c["hidden"] or side * side * channels[-1], c["dim"])
+        # The layout in which PyTorch trains convolutions fastest on a CPU.
+        self.to(memory_format=torch.channels_last)
+
+    def forward(self, pixels, **_):
+        x = self.stages(pixels.contiguous(memory_format=torch.channels_last)).flatten(1)
+        x = self.out(self.hidden(x).relu() if c["hidden"] else x)
+        return tree(last_hidden_state=x[:, None])
+
+
 def lewm():
     latent, norm = c["latent"], nn.BatchNorm1d
     model = LeWM(
-        encoder=Vit(),
+        encoder=Conv() if "channels" in c else Vit(),
         predictor=Predictor(
             num_frames=c["history"], depth=c["depth"], heads=c["heads"], mlp_dim=c["mlp"], input_dim=latent,
             hidden_dim=c["predictor_dim"], output_dim=latent, dim_head=c["dim_head"], dropout=c["dropout"],

@@ -109,6 +109,16 @@ impl ConvGradient {
         }
     }
 
+    /// The sizes of the encoder.
+    pub fn sizes(&self) -> &ConvSizes {
+        &self.sizes
+    }
+
+    /// The number of features of an image.
+    pub fn dim(&self) -> usize {
+        self.sizes.dim
+    }
+
     /// Lays out the parameters for the passes over a batch.
     pub fn load(&mut self, parameters: &ConvParameters) {
         let stages = parameters.stages.iter().map(|stage| (&stage.weight, &[][..], Some(&stage.norm)));

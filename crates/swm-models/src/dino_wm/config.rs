@@ -48,7 +48,7 @@ pub struct ColumnConfig {
 impl DinoWmConfig {
     /// Returns the number of features of a patch: the features of the encoder, then the features of the columns.
     pub fn dim(&self) -> usize {
-        self.encoder.dim() + self.columns.iter().map(|column| column.dim).sum::<usize>()
+        self.encoder.patch_dim() + self.columns.iter().map(|column| column.dim).sum::<usize>()
     }
 
     /// Returns the number of patches of a frame.
@@ -83,6 +83,13 @@ impl DinoWmConfig {
             ("model.predictor.dim_head", predictor.dim_head, 1, limits::FEATURES),
             ("model.predictor.mlp", predictor.mlp, 1, limits::FEATURES),
         ])?;
+        if self.decoder > 0 && self.patches() * self.encoder.patch().pow(2) != self.image.pow(2) {
+            return Err(Error::config(
+                "model.decoder",
+                "the patches of this encoder do not cover the image".to_owned(),
+                "set model.decoder=0, or choose a `vit` or `dinov2` encoder",
+            ));
+        }
         checks::dropout_rates(&[
             ("model.predictor.dropout", predictor.dropout),
             ("model.predictor.emb_dropout", predictor.emb_dropout),

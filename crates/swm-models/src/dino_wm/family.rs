@@ -52,7 +52,7 @@ impl ImageEncoder for Checkpoint<DinoWm> {
     }
 
     fn latent_dim(&self) -> usize {
-        self.config.model.patches() * self.config.model.encoder.dim()
+        self.config.model.patches() * self.config.model.encoder.patch_dim()
     }
 
     fn encode(&self, rgb: &[u8]) -> Result<Vec<f32>> {

@@ -86,7 +86,7 @@ impl DinoWm {
             predictor: config.predictor.init(&init.of("predictor"), config.patches(), config.dim()),
             extra_encoders: ModuleDict(columns.collect()),
             decoder: (config.decoder > 0).then(|| PatchDecoder {
-                hidden: Linear::new(&decoder.of("hidden"), config.encoder.dim(), config.decoder),
+                hidden: Linear::new(&decoder.of("hidden"), config.encoder.patch_dim(), config.decoder),
                 pixels: Linear::new(&decoder.of(PIXELS), config.decoder, pixels),
             }),
         }

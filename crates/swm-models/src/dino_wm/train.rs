@@ -4,7 +4,7 @@ use super::config::{ACTION, DinoWmConfig};
 use super::model::DinoWm;
 use super::step::{DinoWmStep, TrainBatch, step};
 use crate::checks;
-use crate::nn::{Backbone, Init, Named};
+use crate::nn::{Init, Named};
 use crate::pixels;
 use crate::train::{DatasetInfo, Preset, StepContext, StepOutput, TrainConfig, Trainable, shards};
 use crate::weights;
@@ -85,12 +85,7 @@ impl Trainable for DinoWm {
         }
         let path = weights::locate(from, cache)?;
         let found = weights::names::to_published(weights::read(&path)?, "");
-        let what = "model.encoder";
-        self.backbone = match self.backbone {
-            Backbone::Vit(vit) => Backbone::Vit(weights::fill(vit, &found, &path, what)?),
-            Backbone::Dinov2(dino) => Backbone::Dinov2(weights::fill(dino, &found, &path, what)?),
-            Backbone::PatchCnn(cnn) => Backbone::PatchCnn(weights::fill(cnn, &found, &path, what)?),
-        };
+        self.backbone = weights::fill(self.backbone, &found, &path, "model.encoder")?;
         Ok(self)
     }
 

@@ -47,7 +47,7 @@ impl GcrlConfig {
     /// Returns the sizes of the heads' input. An encoder without patches gives one patch per image.
     pub(super) fn patch_grid(&self) -> PatchGrid {
         let patches = self.encoder.patches(self.image);
-        PatchGrid { frames: self.history, patches, dim: self.encoder.dim() }
+        PatchGrid { frames: self.history, patches, dim: self.encoder.patch_dim() }
     }
 
     /// Checks the configuration.

@@ -6,10 +6,11 @@
 use super::heads::{Critic, Head};
 use super::loss::{self, ValueLoss};
 use super::model::{Gcbc, Gciql, Gcivl};
-use crate::nn::{Backbone, DropoutRng, parameters};
+use crate::nn::{Backbone, BatchStatistics, DropoutRng, Named, conv, parameters};
 use crate::train::StepOutput;
 use burn::module::Module;
 use burn::tensor::Tensor;
+use std::ops::Range;
 
 /// Normalised clips; the tensors are outside the autodiff graph.
 #[derive(Clone, Debug)]
@@ -48,17 +49,11 @@ impl Gcbc {
     /// Computes the mean squared error of actions and, in training, the gradients of the error.
     pub fn losses(&self, clips: &Clips, rng: &mut DropoutRng<'_>, training: bool) -> StepOutput {
         let model = self.clone().train();
-        let [count, _, _] = clips.actions.dims();
-        let encode = |images: &Tensor<3>| {
-            if self.config.frozen {
-                embed(&self.encoder, images.clone(), count).autodiff()
-            } else {
-                embed(&model.encoder, images.clone().autodiff(), count)
-            }
-        };
-        let means = model.action_predictor.forward(&encode(&clips.frames), &encode(&clips.goal), rng);
+        let encoders = Encoders::new(&self.encoder, &model.encoder, self.config.frozen, training, clips);
+        let ([frames, goal], statistics) = encoders.with_gradient(clips.frames.clone(), clips.goal.clone());
+        let means = model.action_predictor.forward(&frames, &goal, rng);
         let loss = (means - clips.actions.clone().autodiff()).square().mean();
-        finish(&model, &loss, vec![("loss", scalar(&loss))], training)
+        finish(&model, &loss, vec![("loss", scalar(&loss))], training, statistics)
     }
 }
 
@@ -74,7 +69,8 @@ impl Gcivl {
         training: bool,
     ) -> StepOutput {
         let model = self.clone().train();
-        let inputs = head_inputs(&self.encoder, &model.encoder, self.config.frozen, clips, relabelled);
+        let encoders = Encoders::new(&self.encoder, &model.encoder, self.config.frozen, training, clips);
+        let (inputs, statistics) = head_inputs(&encoders, clips, relabelled);
         let HeadInputs { now, goal, next, policy_goal } = &inputs;
         let target = bootstrap(&self.value_predictor.teacher, &inputs, relabelled, settings);
         let value = model.value_predictor.student.forward(now, goal, rng);
@@ -94,7 +90,7 @@ impl Gcivl {
             ("weight", scalar(&weights.mean())),
             ("reached", scalar(&relabelled.reached.clone().mean())),
         ];
-        finish(&model, &total, metrics, training)
+        finish(&model, &total, metrics, training, statistics)
     }
 }
 
@@ -110,7 +106,8 @@ impl Gciql {
         training: bool,
     ) -> StepOutput {
         let model = self.clone().train();
-        let inputs = head_inputs(&self.encoder, &model.encoder, self.config.frozen, clips, relabelled);
+        let encoders = Encoders::new(&self.encoder, &model.encoder, self.config.frozen, training, clips);
+        let (inputs, statistics) = head_inputs(&encoders, clips, relabelled);
         let HeadInputs { now, goal, policy_goal, .. } = &inputs;
         let (actions, frames) = (clips.actions.clone(), now.clone().inner());
         let evaluate = |critic: &Critic, goal: &Tensor<3>| {
@@ -139,50 +136,85 @@ impl Gciql {
             ("weight", scalar(&weights.mean())),
             ("reached", scalar(&relabelled.reached.clone().mean())),
         ];
-        finish(&model, &total, metrics, training)
+        finish(&model, &total, metrics, training, statistics)
     }
 }
 
-/// Encodes images, with the patches of a clip in one row.
-///
-/// # Shapes
-/// `images` is `[clips * frames, patches, 3 * patch * patch]`; returns `[clips, frames * patches, dim]`.
-fn embed(encoder: &Backbone, images: Tensor<3>, clips: usize) -> Tensor<3> {
-    let patches = encoder.patches(images);
-    let [frames, count, dim] = patches.dims();
-    patches.reshape([clips, frames / clips * count, dim])
+/// The name of the encoder in a model.
+pub(super) const ENCODER: &str = "encoder";
+
+/// The encoder of a model, in and outside the autodiff graph. In training, an encoder that is not frozen normalises with
+/// the statistics of the batch.
+struct Encoders<'a> {
+    plain: &'a Backbone,
+    trained: &'a Backbone,
+    frozen: bool,
+    training: bool,
+    clips: usize,
 }
 
-/// Encodes the inputs of the heads; only the history and the goal of the values are encoded in the autodiff graph.
-/// `plain` is the encoder outside the graph, `trained` is the encoder in the graph.
-fn head_inputs(
-    plain: &Backbone,
-    trained: &Backbone,
-    frozen: bool,
-    clips: &Clips,
-    relabelled: &Relabelled,
-) -> HeadInputs {
+impl<'a> Encoders<'a> {
+    fn new(plain: &'a Backbone, trained: &'a Backbone, frozen: bool, training: bool, clips: &Clips) -> Self {
+        let [count, _, _] = clips.actions.dims();
+        Self { plain, trained, frozen, training, clips: count }
+    }
+
+    /// Encodes frames and goals as one batch in the autodiff graph, with the patches of a clip in one row. Also returns
+    /// the statistics of the batch.
+    ///
+    /// # Shapes
+    /// `frames` is `[clips * frames, patches, 3 * patch * patch]`, `goals` has one image per clip; returns
+    /// `[clips, frames * patches, dim]` and `[clips, patches, dim]`.
+    fn with_gradient(&self, frames: Tensor<3>, goals: Tensor<3>) -> ([Tensor<3>; 2], Vec<BatchStatistics>) {
+        let images = Tensor::cat(vec![frames, goals], 0);
+        let (patches, statistics) = match self.frozen {
+            true => (self.plain.patches(images).autodiff(), vec![]),
+            false => self.encode(self.trained, images.autodiff()),
+        };
+        let [all, count, dim] = patches.dims();
+        let frames = all - self.clips;
+        let part = |range: Range<usize>| {
+            let per_clip = range.len() / self.clips;
+            patches.clone().slice([range, 0..count, 0..dim]).reshape([self.clips, per_clip * count, dim])
+        };
+        ([part(0..frames), part(frames..all)], statistics)
+    }
+
+    /// Encodes images outside the autodiff graph.
+    ///
+    /// # Shapes
+    /// `images` is `[clips, patches, 3 * patch * patch]`; returns `[clips, patches, dim]`.
+    fn without_gradient(&self, images: Tensor<3>) -> Tensor<3> {
+        self.encode(self.plain, images).0
+    }
+
+    fn encode(&self, encoder: &Backbone, images: Tensor<3>) -> (Tensor<3>, Vec<BatchStatistics>) {
+        if self.training && !self.frozen { encoder.patches_train(images) } else { (encoder.patches(images), vec![]) }
+    }
+}
+
+/// Encodes the inputs of the heads; only the history and the goal of the values are encoded in the autodiff graph. Also
+/// returns the statistics of their batch.
+fn head_inputs(encoders: &Encoders<'_>, clips: &Clips, relabelled: &Relabelled) -> (HeadInputs, Vec<BatchStatistics>) {
     let [count, history, _] = clips.actions.dims();
     let [frames, patches, elements] = clips.frames.dims();
     let steps = frames / count;
-    let images = |range: std::ops::Range<usize>| {
+    let images = |range: Range<usize>| {
         let length = range.len();
         let frames = clips.frames.clone().reshape([count, steps, patches * elements]);
         frames.slice([0..count, range, 0..patches * elements]).reshape([count * length, patches, elements])
     };
-    let encode = |images: Tensor<3>| {
-        if frozen { embed(plain, images, count).autodiff() } else { embed(trained, images.autodiff(), count) }
-    };
-    let now = encode(images(0..history));
-    let last = embed(plain, images(history..steps), count);
+    let ([now, goal], statistics) = encoders.with_gradient(images(0..history), clips.goal.clone());
+    let last = encoders.without_gradient(images(history..steps));
     let [_, tokens, dim] = now.dims();
     let later = now.clone().inner().slice([0..count, tokens / history..tokens, 0..dim]);
-    HeadInputs {
+    let inputs = HeadInputs {
         now,
-        goal: encode(clips.goal.clone()),
+        goal,
         next: if history > 1 { Tensor::cat(vec![later, last], 1) } else { last },
-        policy_goal: embed(plain, relabelled.policy_goal.clone(), count),
-    }
+        policy_goal: encoders.without_gradient(relabelled.policy_goal.clone()),
+    };
+    (inputs, statistics)
 }
 
 /// Returns the bootstrapped targets `r + γ m V(s', g)`: the reward `r` is -1 and the mask `m` is 1 until the goal is
@@ -222,9 +254,19 @@ fn scalar(value: &Tensor<1>) -> f64 {
     f64::from(value.clone().inner().into_scalar::<f32>())
 }
 
-/// Returns the output of a training step; the gradients are empty unless `training`.
-fn finish<M: Module>(model: &M, loss: &Tensor<1>, metrics: Vec<(&'static str, f64)>, training: bool) -> StepOutput {
-    let gradients =
-        if training { parameters::gradients(model, &loss.clone().backward()) } else { parameters::Named::new() };
-    StepOutput { metrics, gradients, ..StepOutput::default() }
+/// Returns the output of a training step; the gradients are empty unless `training`. The buffers are the batch statistics
+/// of the encoder.
+fn finish<M: Module>(
+    model: &M,
+    loss: &Tensor<1>,
+    metrics: Vec<(&'static str, f64)>,
+    training: bool,
+    statistics: Vec<BatchStatistics>,
+) -> StepOutput {
+    let (mut gradients, mut buffers) = (Named::new(), Named::new());
+    if training {
+        gradients = parameters::gradients(model, &loss.clone().backward());
+        conv::store(statistics, ENCODER, &mut buffers);
+    }
+    StepOutput { metrics, gradients, buffers }
 }

@@ -4,7 +4,7 @@ use super::config::GcrlConfig;
 use super::loss::{CloningLoss, ValueLoss};
 use super::model::{Gcbc, Gciql, Gcivl};
 use super::policy::Actor;
-use super::step::{Clips, Relabelled};
+use super::step::{Clips, ENCODER, Relabelled};
 use crate::checkpoint::Checkpoint;
 use crate::nn::{Backbone, DropoutRng, Init, Named, parameters};
 use crate::train::{DatasetInfo, ParameterGroup, Preset, StepContext, StepOutput, TrainConfig, Trainable, shards};
@@ -21,12 +21,18 @@ const GOAL: &str = "goal";
 const POLICY_GOAL: &str = "policy_goal";
 
 const TINY: &str = "64 px, a small trained convolutional encoder: minutes on two CPU cores";
+const SMALL: &str = "64 px, overlapping convolutions, for small and rotated objects: for two CPU cores";
 const PAPER: &str = "224 px, frozen DINOv2-small, heads of 6 layers, history 3: the published size, for a GPU";
 
 macro_rules! presets {
     ($family:literal) => {
         &[
             Preset { id: "tiny", summary: TINY, toml: include_str!(concat!("../../presets/", $family, "/tiny.toml")) },
+            Preset {
+                id: "small",
+                summary: SMALL,
+                toml: include_str!(concat!("../../presets/", $family, "/small.toml")),
+            },
             Preset {
                 id: "paper",
                 summary: PAPER,
@@ -110,6 +116,11 @@ impl Trainable for Gcbc {
             Ok(self.losses(&reader.clips(range)?, &mut noise, *training))
         })
     }
+
+    fn after_step(mut self, _: &StepContext<'_, Self>, mut buffers: Named<Tensor<1>>) -> Self {
+        self.encoder.track(ENCODER, &mut buffers);
+        self
+    }
 }
 
 macro_rules! value_learner {
@@ -167,7 +178,8 @@ macro_rules! value_learner {
                 })
             }
 
-            fn after_step(mut self, context: &StepContext<'_, Self>, _: Named<Tensor<1>>) -> Self {
+            fn after_step(mut self, context: &StepContext<'_, Self>, mut buffers: Named<Tensor<1>>) -> Self {
+                self.encoder.track(ENCODER, &mut buffers);
                 let keep = f64::from(context.config.loss.target);
                 $(self.$target = self.$target.update_target(keep);)*
                 self

@@ -198,8 +198,14 @@ mod tests {
 
     #[test]
     fn host_and_device_rollouts_give_equal_costs() {
-        let config =
-            TrainConfig::<Lewm>::load("tiny", &["model.predictor.history=3".to_owned()]).expect("loading the preset");
+        check_costs("tiny", &["model.predictor.history=3"]);
+        let small = ["model.image=12", "model.encoder.conv.channels=[6, 9]", "model.latent=5", "model.predictor.dim=8"];
+        check_costs("small", &small);
+    }
+
+    fn check_costs(preset: &str, settings: &[&str]) {
+        let settings: Vec<String> = settings.iter().map(|setting| (*setting).to_owned()).collect();
+        let config = TrainConfig::<Lewm>::load(preset, &settings).expect("loading the preset");
         let (samples, horizon, dim) = (5, 5, 4);
         let model = Lewm::init(&config.model, dim, &Init::new(Key::new(0), &Device::flex()));
         // Modulations are zero-initialised, and actions have no effect through zero modulations.

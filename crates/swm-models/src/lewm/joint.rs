@@ -1,14 +1,15 @@
 //! The training step of joint-embedding models (LeWM, PLDM), with the regulariser as a parameter.
 //!
-//! The encoder processes a fixed number of shards of the batch in parallel; the other modules process the whole batch.
-//! The configuration sets the number of shards, and gradients are summed in the order of the shards, so the result does
+//! The encoder and the predictor process a fixed number of shards of the batch in parallel; the projectors process the
+//! whole batch. The configuration sets the number of shards, and gradients are summed in the order of the shards, so the result does
 //! not depend on the number of threads.
 
 use super::model::Lewm;
+use super::prediction::{self, Windows};
 use super::shard::{Differentiation, Shard};
 use super::step::TrainBatch;
 use crate::nn::parameters::{self, Named};
-use crate::nn::{BatchStatistics, DropoutRng};
+use crate::nn::{BatchStatistics, conv};
 use burn::module::Module;
 use burn::tensor::{Gradients, Tensor};
 use rayon::prelude::*;
@@ -22,8 +23,25 @@ pub(crate) struct JointStep {
     pub gradients: Named<Tensor<1>>,
     /// All gradients, including the gradients of the regulariser's own parameters.
     pub all: Gradients,
-    /// Batch statistics of the projectors after the encoder and after the predictor.
-    pub statistics: [BatchStatistics; 2],
+    /// The batch statistics of the encoder and the projectors, for [`Lewm::track`].
+    pub buffers: Named<Tensor<1>>,
+}
+
+/// The modules with running batch statistics, by their names in a model.
+const ENCODER: &str = "encoder";
+const PROJECTOR: &str = "projector";
+const PRED_PROJ: &str = "pred_proj";
+
+impl Lewm {
+    /// Updates the running statistics with the batch statistics of a step.
+    pub(crate) fn track(&mut self, mut buffers: Named<Tensor<1>>) {
+        self.encoder.track(ENCODER, &mut buffers);
+        for (name, projector) in [(PROJECTOR, &mut self.projector), (PRED_PROJ, &mut self.pred_proj)] {
+            if let Some(statistics) = BatchStatistics::take(name, &mut buffers) {
+                projector.track(statistics);
+            }
+        }
+    }
 }
 
 /// Returns every window of `history` steps that another step follows, shifted by `offset` steps: one window per clip
@@ -49,11 +67,11 @@ pub(crate) fn step(
     let [clips, steps, _] = batch.actions.dims();
     let frames = clips * steps;
 
-    let size = frames.div_ceil(shards.max(1));
-    let ranges: Vec<_> = (0..frames).step_by(size).map(|start| start..(start + size).min(frames)).collect();
     let [_, count, elements] = batch.patches.dims();
     let differentiation = Differentiation::of(&model.encoder, count, &model.device());
-    let encoded: Vec<Shard> = ranges
+    let size = if differentiation.needs_whole_batch() { frames } else { frames.div_ceil(shards.max(1)) };
+    let ranges: Vec<_> = (0..frames).step_by(size).map(|start| start..(start + size).min(frames)).collect();
+    let mut encoded: Vec<Shard> = ranges
         .par_iter()
         .map(|range| {
             let patches = batch.patches.clone().slice([range.clone(), 0..count, 0..elements]);
@@ -61,7 +79,9 @@ pub(crate) fn step(
         })
         .collect();
 
-    // The modules after the encoder process the whole batch.
+    let mut buffers = Named::new();
+    conv::store(encoded.iter_mut().flat_map(|shard| shard.statistics.drain(..)).collect(), ENCODER, &mut buffers);
+    // The projector processes the whole batch.
     let head = model.clone().train();
     let features = Tensor::cat(encoded.iter().map(|shard| shard.features.clone()).collect(), 0);
     let features = features.autodiff().require_grad();
@@ -69,16 +89,24 @@ pub(crate) fn step(
     let [_, latent] = latents.dims();
     let latents = latents.reshape([clips, steps, latent]);
     let regulariser = regularise(&latents);
-    let history = head.predictor.config().history.min(steps - 1);
-    let conditions = head.embed_actions(windows(&batch.actions, history, 0).autodiff());
-    let (predicted, pred_proj_statistics) =
-        head.predict_train(windows(&latents, history, 0), conditions, &mut DropoutRng(noise));
-    let prediction = (predicted - windows(&latents, history, 1)).square().mean();
-    let prediction_value: f32 = prediction.clone().inner().into_scalar();
+    let (history, values) = (head.predictor.config().history.min(steps - 1), latents.clone().inner());
+    let inputs = Windows {
+        latents: windows(&values, history, 0),
+        actions: windows(&batch.actions, history, 0),
+        targets: windows(&values, history, 1),
+    };
+    let prediction = prediction::predict(model, &inputs, shards, noise);
+    projector_statistics.store(PROJECTOR, &mut buffers);
+    prediction.statistics.store(PRED_PROJ, &mut buffers);
 
-    let mut all = (prediction + regulariser).backward();
+    // Autodiff receives linear functions of the latents whose gradients equal those of the prediction error.
+    let linear = |x: Tensor<3>, gradient: Tensor<3>| (x * gradient.autodiff()).sum();
+    let error = linear(windows(&latents, history, 0), prediction.latents)
+        + linear(windows(&latents, history, 1), prediction.targets);
+    let mut all = (error + regulariser).backward();
     let features_gradient = features.grad_remove(&mut all);
-    let mut gradients = parameters::gradients(&head, &all);
+    let mut gradients = prediction.gradients;
+    parameters::add(&mut gradients, parameters::gradients(&head, &all));
 
     if let Some(features_gradient) = features_gradient {
         let [_, width] = features_gradient.dims();
@@ -90,24 +118,8 @@ pub(crate) fn step(
                 shard.backward(&differentiation, gradient)
             })
             .collect();
-        shards.into_iter().for_each(|shard| add_encoder_gradients(&mut gradients, shard));
+        let shards = shards.into_iter().map(|shard| parameters::prefixed(ENCODER, shard));
+        shards.for_each(|shard| parameters::add(&mut gradients, shard));
     }
-    JointStep {
-        prediction: f64::from(prediction_value),
-        gradients,
-        all,
-        statistics: [projector_statistics, pred_proj_statistics],
-    }
-}
-
-/// Adds the gradients of the encoder on one shard to the sums over the earlier shards.
-fn add_encoder_gradients(sums: &mut Named<Tensor<1>>, shard: Named<Tensor<1>>) {
-    for (name, gradient) in shard {
-        let name = format!("encoder.{name}");
-        let sum = match sums.remove(&name) {
-            Some(sum) => sum + gradient,
-            None => gradient,
-        };
-        sums.insert(name, sum);
-    }
+    JointStep { prediction: prediction.error, gradients, all, buffers }
 }

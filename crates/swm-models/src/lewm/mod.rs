@@ -11,6 +11,7 @@ pub(crate) mod joint;
 pub mod loss;
 pub mod model;
 pub mod pixels;
+mod prediction;
 mod predictor;
 pub mod rollout;
 mod shard;

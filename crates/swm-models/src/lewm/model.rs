@@ -2,7 +2,7 @@
 
 use super::config::LewmConfig;
 pub use crate::nn::Backbone as Encoder;
-use crate::nn::{BatchStatistics, DropoutRng, Embedder, Init, Predictor, Projector};
+use crate::nn::{DropoutRng, Embedder, Init, Predictor, Projector};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 
@@ -74,22 +74,6 @@ impl Lewm {
         let features = self.predictor.forward(latents, conditions, &mut DropoutRng::disabled());
         let [windows, steps, latent] = features.dims();
         self.pred_proj.forward(features.reshape([windows * steps, latent])).reshape([windows, steps, latent])
-    }
-
-    /// Predicts the latent after each latent of a window, in training: with batch statistics and dropout.
-    ///
-    /// # Shapes
-    /// `latents` and `conditions` are `[windows, steps, latent]`; returns latents of the same shape.
-    pub fn predict_train(
-        &self,
-        latents: Tensor<3>,
-        conditions: Tensor<3>,
-        noise: &mut DropoutRng<'_>,
-    ) -> (Tensor<3>, BatchStatistics) {
-        let features = self.predictor.forward(latents, conditions, noise);
-        let [windows, steps, latent] = features.dims();
-        let (latents, statistics) = self.pred_proj.forward_train(features.reshape([windows * steps, latent]));
-        (latents.reshape([windows, steps, latent]), statistics)
     }
 
     /// Rolls the model out: returns the given latents, then one predicted latent after each further action.

@@ -4,7 +4,6 @@
 use super::joint::{self, JointStep};
 use super::loss;
 use super::model::Lewm;
-use crate::nn::BatchStatistics;
 use crate::nn::parameters::{IntoF32, Named};
 use burn::tensor::{Tensor, TensorData};
 use serde::{Deserialize, Serialize};
@@ -47,8 +46,8 @@ pub struct LewmStep {
     pub losses: Losses,
     /// The flattened gradient of each parameter, by parameter name.
     pub gradients: Named<Tensor<1>>,
-    /// Batch statistics of the projectors after the encoder and after the predictor.
-    pub statistics: [BatchStatistics; 2],
+    /// The batch statistics, which update the model's running statistics.
+    pub buffers: Named<Tensor<1>>,
     /// The latents, `[clips, steps, latent]`.
     pub latents: Vec<f32>,
 }
@@ -75,11 +74,11 @@ pub fn step(
         // Autodiff receives a linear function of the latents whose gradient equals the gradient of the statistic.
         (latents.clone() * gradient).sum() * config.weight
     });
-    let JointStep { prediction, gradients, statistics, .. } = step;
+    let JointStep { prediction, gradients, buffers, .. } = step;
     LewmStep {
         losses: Losses { total: prediction + f64::from(config.weight) * sigreg, prediction, sigreg },
         gradients,
-        statistics,
+        buffers,
         latents: host,
     }
 }

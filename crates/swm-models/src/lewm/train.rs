@@ -3,7 +3,7 @@
 use super::step::{self, LewmStep, SigregConfig, TrainBatch};
 use super::{Lewm, LewmConfig, loss, pixels};
 use crate::checks;
-use crate::nn::{BatchStatistics, Init, Named};
+use crate::nn::{Init, Named};
 use crate::train::{
     DataConfig, DatasetInfo, Preset, StepContext, StepOutput, TrainConfig, Trainable, check_sizes, limits,
 };
@@ -20,6 +20,11 @@ impl Trainable for Lewm {
             id: "tiny",
             summary: "64 px, a small convolutional encoder: trains in half a minute on two CPU cores",
             toml: include_str!("../../presets/lewm/tiny.toml"),
+        },
+        Preset {
+            id: "small",
+            summary: "64 px, overlapping convolutions, for small and rotated objects: trains in about an hour on two CPU cores",
+            toml: include_str!("../../presets/lewm/small.toml"),
         },
         Preset {
             id: "paper",
@@ -56,9 +61,8 @@ impl Trainable for Lewm {
         let batch = prepare(&config.model, &config.data, dataset_info, batch, device)?;
         let mut noise = key.with("dropout").rng();
         let noise = training.then_some(&mut noise);
-        let LewmStep { losses, gradients, statistics, .. } =
+        let LewmStep { losses, gradients, buffers, .. } =
             step::step(self, &batch, &config.loss, &directions, config.shards, noise);
-        let buffers = stored(statistics);
         let metrics = vec![("loss", losses.total), ("prediction", losses.prediction), ("sigreg", losses.sigreg)];
         Ok(StepOutput { metrics, gradients, buffers })
     }
@@ -95,27 +99,4 @@ pub(crate) fn prepare(
         patches: pixels::patches(model, batch.get::<u8>(PIXELS)?, device)?,
         actions: dataset_info.actions(batch, data.num_steps, data.frameskip, device)?,
     })
-}
-
-/// The modules with running batch statistics.
-const TRACKED: [&str; 2] = ["projector", "pred_proj"];
-
-/// Returns batch statistics under the names of the modules in [`TRACKED`], for [`Trainable::after_step`].
-pub(crate) fn stored(statistics: [BatchStatistics; 2]) -> Named<Tensor<1>> {
-    let mut buffers = Named::new();
-    for (name, statistics) in TRACKED.into_iter().zip(statistics) {
-        statistics.store(name, &mut buffers);
-    }
-    buffers
-}
-
-impl Lewm {
-    /// Updates the running statistics with batch statistics from [`stored`].
-    pub(crate) fn track(&mut self, mut buffers: Named<Tensor<1>>) {
-        for (name, projector) in TRACKED.into_iter().zip([&mut self.projector, &mut self.pred_proj]) {
-            if let Some(statistics) = BatchStatistics::take(name, &mut buffers) {
-                projector.track(statistics);
-            }
-        }
-    }
 }

@@ -1,6 +1,8 @@
-//! [`Backbone`]: an image encoder of one of three kinds.
+//! [`Backbone`]: an image encoder of one of four kinds.
 
-use super::{Dino, DinoConfig, Init, PatchCnn, PatchCnnConfig, Vit, VitConfig};
+use super::{
+    BatchStatistics, Conv, ConvConfig, Dino, DinoConfig, Init, Named, PatchCnn, PatchCnnConfig, Vit, VitConfig,
+};
 use crate::train::{check_sizes, limits};
 use burn::module::Module;
 use burn::tensor::Tensor;
@@ -18,6 +20,8 @@ pub enum BackboneConfig {
     /// Convolutions over disjoint patches: small and fast.
     #[serde(rename = "pyramid")]
     PatchCnn(PatchCnnConfig),
+    /// Overlapping convolutions with batch normalisation.
+    Conv(ConvConfig),
 }
 
 /// An image encoder.
@@ -33,6 +37,8 @@ pub enum Backbone {
     Dinov2(Dino),
     /// Convolutions over disjoint patches.
     PatchCnn(PatchCnn),
+    /// Overlapping convolutions with batch normalisation.
+    Conv(Conv),
 }
 
 impl BackboneConfig {
@@ -42,15 +48,25 @@ impl BackboneConfig {
             Self::Vit(vit) => vit.patch,
             Self::Dinov2(dino) => dino.patch,
             Self::PatchCnn(cnn) => cnn.stages.first().map_or(0, |stage| stage.patch),
+            Self::Conv(_) => 1,
         }
     }
 
-    /// The number of features of an image, or of a patch.
+    /// The number of features of an image.
     pub fn dim(&self) -> usize {
         match self {
             Self::Vit(vit) => vit.dim,
             Self::Dinov2(dino) => dino.dim,
             Self::PatchCnn(cnn) => cnn.dim,
+            Self::Conv(conv) => conv.dim,
+        }
+    }
+
+    /// The number of features of each of the [`Backbone::patches`].
+    pub fn patch_dim(&self) -> usize {
+        match self {
+            Self::Conv(conv) => conv.last(),
+            _ => self.dim(),
         }
     }
 
@@ -59,6 +75,7 @@ impl BackboneConfig {
         match self {
             Self::Vit(_) | Self::Dinov2(_) => (image / self.patch().max(1)).pow(2),
             Self::PatchCnn(_) => 1,
+            Self::Conv(conv) => conv.map(image).pow(2),
         }
     }
 
@@ -105,6 +122,23 @@ impl BackboneConfig {
                 }
                 cnn.stages.iter().map(|stage| stage.patch).collect()
             }
+            Self::Conv(conv) => {
+                if conv.channels.is_empty() {
+                    return invalid("conv.channels", "the list is empty".to_owned(), "give at least one number");
+                }
+                let channels = conv.channels.iter().map(|&channels| ("channels", channels, 1));
+                for (what, size, least) in
+                    [("hidden", conv.hidden, 0), ("dim", conv.dim, 1)].into_iter().chain(channels)
+                {
+                    check_sizes(&[(&format!("{at}.conv.{what}"), size, least, limits::FEATURES)])?;
+                }
+                let most = image.max(1).ilog2() as usize;
+                if conv.channels.len() > most {
+                    let problem = format!("{} convolutions halve a side of {image} pixels", conv.channels.len());
+                    return invalid("conv.channels", problem, &format!("give at most {most}, or larger images"));
+                }
+                vec![]
+            }
         };
         check_sizes(&[("model.image", image, 1, limits::SIDE)])?;
         let mut side = image;
@@ -124,6 +158,7 @@ impl BackboneConfig {
             Self::Vit(vit) => Backbone::Vit(vit.init(init, image)),
             Self::Dinov2(dino) => Backbone::Dinov2(dino.init(init)),
             Self::PatchCnn(cnn) => Backbone::PatchCnn(cnn.init(init, image)),
+            Self::Conv(conv) => Backbone::Conv(conv.init(init, image)),
         }
     }
 }
@@ -138,13 +173,27 @@ impl Backbone {
             Self::Vit(vit) => vit.forward(patches),
             Self::Dinov2(dino) => dino.forward(patches),
             Self::PatchCnn(cnn) => cnn.forward(patches),
+            Self::Conv(conv) => conv.forward(patches),
         }
     }
 
-    /// Computes the features of every patch; a [`PatchCnn`] returns the features of the image as one patch.
+    /// Computes the features of images in training. Also returns the statistics of the batch for
+    /// [`Backbone::track`], one for each batch normalisation.
     ///
     /// # Shapes
-    /// Maps `[frames, patches, 3 * patch * patch]` to `[frames, patches, dim]`.
+    /// As [`Backbone::forward`].
+    pub fn forward_train(&self, patches: Tensor<3>) -> (Tensor<2>, Vec<BatchStatistics>) {
+        match self {
+            Self::Conv(conv) => conv.forward_train(patches),
+            _ => (self.forward(patches), vec![]),
+        }
+    }
+
+    /// Computes the features of every patch; a [`PatchCnn`] returns the features of the image as one patch, and a
+    /// [`Conv`] returns the cells of its last feature map.
+    ///
+    /// # Shapes
+    /// Maps `[frames, patches, 3 * patch * patch]` to `[frames, patches, patch_dim]`.
     pub fn patches(&self, patches: Tensor<3>) -> Tensor<3> {
         match self {
             Self::Vit(vit) => {
@@ -155,6 +204,25 @@ impl Backbone {
             }
             Self::Dinov2(dino) => dino.patches(patches),
             Self::PatchCnn(cnn) => cnn.forward(patches).unsqueeze_dim(1),
+            Self::Conv(conv) => conv.cells(patches),
+        }
+    }
+
+    /// Computes the features of every patch in training, and the statistics of the batch for [`Backbone::track`].
+    ///
+    /// # Shapes
+    /// As [`Backbone::patches`].
+    pub fn patches_train(&self, patches: Tensor<3>) -> (Tensor<3>, Vec<BatchStatistics>) {
+        match self {
+            Self::Conv(conv) => conv.cells_train(patches),
+            _ => (self.patches(patches), vec![]),
+        }
+    }
+
+    /// Updates the running statistics with batch statistics that [`store`](super::conv::store) inserted under `name`.
+    pub fn track(&mut self, name: &str, buffers: &mut Named<Tensor<1>>) {
+        if let Self::Conv(conv) = self {
+            conv.track(name, buffers);
         }
     }
 }

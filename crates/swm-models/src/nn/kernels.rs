@@ -4,8 +4,12 @@ use super::norm::BatchNorm;
 use super::parameters::{Named, host};
 use super::positions::{Resampling, positions};
 use super::vit::{Layer, Projection};
-use super::{LayerNorm, Linear, Projector, Vit};
-use swm_kernels::{Affine, Norm, Panels, VitEncoder, VitGradient, VitLayerParameters, VitParameters};
+use super::{BatchStatistics, Conv, LayerNorm, Linear, Projector, Vit};
+use burn::tensor::{Device, Tensor, TensorData};
+use swm_kernels::{
+    Affine, ChannelStatistics, ConvEncoder, ConvParameters, ConvSizes, ConvStage, Norm, Panels, VitEncoder,
+    VitGradient, VitLayerParameters, VitParameters,
+};
 
 /// Converts a linear layer to [`Panels`].
 pub(crate) fn panels(layer: &Linear) -> Panels {
@@ -114,6 +118,59 @@ fn layer_parameters(layer: &Layer) -> VitLayerParameters {
     }
 }
 
+/// Converts a convolutional encoder for images with a side of `side` pixels.
+pub(crate) fn conv_encoder(conv: &Conv, side: usize) -> ConvEncoder {
+    let running = conv.stages.iter().map(|stage| ChannelStatistics {
+        mean: host(stage.norm.running_mean.val()),
+        variance: host(stage.norm.running_var.val()),
+    });
+    ConvEncoder::new(&conv_sizes(conv, side), &conv_parameters(conv), &running.collect::<Vec<_>>())
+}
+
+/// Returns the sizes of a convolutional encoder for images with a side of `side` pixels.
+pub(crate) fn conv_sizes(conv: &Conv, side: usize) -> ConvSizes {
+    ConvSizes {
+        side,
+        channels: conv.stages.iter().map(|stage| stage.conv.weight.dims()[0]).collect(),
+        hidden: conv.hidden.as_ref().map_or(0, |hidden| hidden.weight.dims()[0]),
+        dim: conv.out.weight.dims()[0],
+    }
+}
+
+/// Copies the parameters of a convolutional encoder.
+pub(crate) fn conv_parameters(conv: &Conv) -> ConvParameters {
+    let stages = conv.stages.iter().map(|stage| ConvStage {
+        weight: host(stage.conv.weight.val()),
+        norm: Affine { weight: host(stage.norm.weight.val()), bias: host(stage.norm.bias.val()) },
+    });
+    let linear = conv.hidden.iter().chain([&conv.out]).map(linear_parameters);
+    ConvParameters { stages: stages.collect(), linear: linear.collect() }
+}
+
+/// Returns the gradients of a convolutional encoder under the parameter names of [`Conv`].
+pub(crate) fn named_conv_gradients(gradients: ConvParameters) -> Named<Vec<f32>> {
+    let mut named = Named::new();
+    for (index, stage) in gradients.stages.into_iter().enumerate() {
+        named.insert(format!("stages.{index}.conv.weight"), stage.weight);
+        named.insert(format!("stages.{index}.norm.weight"), stage.norm.weight);
+        named.insert(format!("stages.{index}.norm.bias"), stage.norm.bias);
+    }
+    for (name, layer) in ["out", "hidden"].into_iter().zip(gradients.linear.into_iter().rev()) {
+        named.insert(format!("{name}.weight"), layer.weight);
+        named.insert(format!("{name}.bias"), layer.bias);
+    }
+    named
+}
+
+/// Converts batch statistics to tensors.
+pub(crate) fn batch_statistics(all: Vec<ChannelStatistics>, device: &Device) -> Vec<BatchStatistics> {
+    let tensor = |values: Vec<f32>| {
+        let shape = [values.len()];
+        Tensor::from_data(TensorData::new(values, shape), device)
+    };
+    all.into_iter().map(|batch| BatchStatistics::new(tensor(batch.mean), tensor(batch.variance))).collect()
+}
+
 fn norm_parameters(layer: &LayerNorm) -> Affine {
     Affine { weight: host(layer.weight.val()), bias: host(layer.bias.val()) }
 }
@@ -127,8 +184,8 @@ fn linear_parameters(layer: &Linear) -> Affine {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::nn::{Init, VitConfig};
-    use burn::tensor::{Device, Tensor, TensorData};
+    use crate::nn::{ConvConfig, Init, VitConfig, conv::store, parameters};
+    use burn::module::Module;
     use swm_core::Key;
 
     #[test]
@@ -148,6 +205,49 @@ mod tests {
         let input = Tensor::from_data(TensorData::new(image.clone(), [1, patches, elements]), &Device::flex());
         for (actual, expected) in class.iter().zip(host(vit.forward(input))) {
             assert!((actual - expected).abs() < 1e-4, "{actual}, expected {expected}");
+        }
+    }
+
+    #[test]
+    fn cpu_kernels_of_a_convolutional_encoder_match_the_module() {
+        let (side, images) = (10, 5);
+        for hidden in [0, 7] {
+            let sizes = ConvConfig { channels: vec![5, 18], hidden, dim: 6 };
+            let mut conv = sizes.init(&Init::new(Key::new(1), &Device::flex()), side);
+            let pixels: Vec<f32> = (0..images * side * side * 3).map(|i| (i * 37 % 101) as f32 / 50.0 - 1.0).collect();
+            let input =
+                Tensor::<3>::from_data(TensorData::new(pixels.clone(), [images, side * side, 3]), &Device::flex());
+            let close = |name: &str, actual: &[f32], expected: Vec<f32>| {
+                let largest = expected.iter().fold(1e-6f32, |largest, value| largest.max(value.abs()));
+                assert_eq!(actual.len(), expected.len(), "{name}");
+                for (actual, expected) in actual.iter().zip(expected) {
+                    assert!((actual - expected).abs() < 1e-4 * largest, "{name}: {actual}, expected {expected}");
+                }
+            };
+            // The features and the gradients of a training batch.
+            let mut kernels = conv.kernels(side);
+            kernels.load(&conv_parameters(&conv));
+            let trained = conv.clone().train();
+            let (features, statistics) = trained.forward_train(input.clone().autodiff());
+            close("features", &kernels.forward(&pixels), host(features.clone().inner()));
+            let gradients = parameters::gradients(&trained, &features.clone().square().sum().backward());
+            let d: Vec<f32> = host(features.inner()).iter().map(|feature| 2.0 * feature).collect();
+            let actual = named_conv_gradients(kernels.backward(&pixels, &d));
+            assert_eq!(actual.keys().collect::<Vec<_>>(), gradients.keys().collect::<Vec<_>>());
+            for (name, gradient) in gradients {
+                close(&name, &actual[&name], host(gradient));
+            }
+            let (mut actual, mut expected) = (Named::new(), Named::new());
+            store(batch_statistics(kernels.statistics(), &Device::flex()), "", &mut actual);
+            store(statistics, "", &mut expected);
+            for (name, expected) in &expected {
+                close(name, &host(actual[name].clone()), host(expected.clone()));
+            }
+            // The features of single images with the running statistics.
+            conv.track("", &mut actual);
+            let encoder = conv_encoder(&conv, side);
+            let features: Vec<f32> = pixels.chunks(side * side * 3).flat_map(|image| encoder.encode(image)).collect();
+            close("features with running statistics", &features, host(conv.forward(input)));
         }
     }
 }

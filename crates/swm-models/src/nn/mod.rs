@@ -4,6 +4,7 @@
 pub mod activation;
 pub mod attention;
 pub mod backbone;
+pub mod conv;
 mod custom_derivative;
 pub mod dino;
 pub(crate) mod kernels;
@@ -22,6 +23,7 @@ pub mod vit;
 pub use activation::{Activation, DropoutRng};
 pub use attention::{FeedForward, SelfAttention};
 pub use backbone::{Backbone, BackboneConfig};
+pub use conv::{Conv, ConvConfig};
 pub use custom_derivative::with_derivative;
 pub use dino::{Dino, DinoConfig};
 pub use linear::Linear;

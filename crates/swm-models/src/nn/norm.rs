@@ -66,6 +66,11 @@ pub struct BatchStatistics {
 }
 
 impl BatchStatistics {
+    /// Creates statistics from mean and unbiased variance, `[features]` each.
+    pub fn new(mean: Tensor<1>, variance: Tensor<1>) -> Self {
+        Self { mean, variance }
+    }
+
     /// Inserts the statistics into `tensors` under `name`.
     pub fn store(self, name: &str, tensors: &mut Named<Tensor<1>>) {
         tensors.insert(format!("{name}.mean"), self.mean);

@@ -148,6 +148,22 @@ pub fn blend<M: Module>(average: M, module: &M, keep: f64) -> M {
     })
 }
 
+/// Adds tensors to sums, by name.
+pub(crate) fn add(sums: &mut Named<Tensor<1>>, terms: Named<Tensor<1>>) {
+    for (name, term) in terms {
+        let sum = match sums.remove(&name) {
+            Some(sum) => sum + term,
+            None => term,
+        };
+        sums.insert(name, sum);
+    }
+}
+
+/// Returns values under the names of a module's submodule `prefix`.
+pub(crate) fn prefixed<T>(prefix: &str, named: Named<T>) -> Named<T> {
+    named.into_iter().map(|(name, value)| (format!("{prefix}.{name}"), value)).collect()
+}
+
 /// Counts the trained scalars of a module: the elements of parameters that need a gradient.
 pub fn trained_count<M: Module>(module: &M) -> usize {
     struct Visitor(usize);
@@ -178,6 +194,6 @@ pub(crate) trait IntoF32 {
 
 impl IntoF32 for TensorData {
     fn into_f32_vec(self) -> Vec<f32> {
-        self.iter::<f32>().collect()
+        self.try_into_vec_as().expect("the values of a tensor convert to single precision")
     }
 }

@@ -4,7 +4,6 @@ use super::loss::{PldmLoss, Terms};
 use super::model::Pldm;
 use crate::lewm::joint::{self, JointStep};
 use crate::lewm::step::TrainBatch;
-use crate::nn::BatchStatistics;
 use crate::nn::parameters::{self, IntoF32, Named};
 use burn::module::Module;
 use burn::tensor::Tensor;
@@ -16,8 +15,8 @@ pub struct PldmStep {
     pub losses: Vec<(&'static str, f64)>,
     /// The flattened gradient of each parameter, by parameter name.
     pub gradients: Named<Tensor<1>>,
-    /// Batch statistics of the projectors after the encoder and after the predictor.
-    pub statistics: [BatchStatistics; 2],
+    /// The batch statistics, which update the model's running statistics.
+    pub buffers: Named<Tensor<1>>,
     /// The latents, `[clips, steps, latent]`.
     pub latents: Vec<f32>,
 }
@@ -46,14 +45,10 @@ pub fn step(model: &Pldm, batch: &TrainBatch, weights: &PldmLoss, shards: usize,
         terms.extend(latent_terms.temp_straight.as_ref().map(|straight| ("temp_straight", value(straight))));
         sum
     });
-    let JointStep { prediction, gradients, all, statistics } = step;
+    let JointStep { prediction, gradients, all, buffers } = step;
     let mut losses = vec![("loss", prediction + regulariser), ("prediction", prediction)];
     losses.extend(terms);
-    let mut named = prefixed("model", gradients);
-    named.extend(prefixed("idm", parameters::gradients(&idm, &all)));
-    PldmStep { losses, gradients: named, statistics, latents: host }
-}
-
-fn prefixed<T>(prefix: &str, named: Named<T>) -> Named<T> {
-    named.into_iter().map(|(name, value)| (format!("{prefix}.{name}"), value)).collect()
+    let mut named = parameters::prefixed("model", gradients);
+    named.extend(parameters::prefixed("idm", parameters::gradients(&idm, &all)));
+    PldmStep { losses, gradients: named, buffers, latents: host }
 }

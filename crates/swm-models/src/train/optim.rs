@@ -3,11 +3,12 @@
 //! Burn's optimizer clips every tensor separately and keys its state by ids that change from run to run. This optimizer
 //! clips the whole gradient and keys its state by parameter name, so that the state can be stored with the weights.
 
-use crate::nn::parameters::{self, HostTensor, IntoF32, Named};
+use crate::nn::parameters::{self, HostTensor, IntoF32, Named, host};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use swm_kernels::{AdamWStep, sum_of_squares};
 
 /// The settings of [`AdamW`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -124,20 +125,48 @@ impl AdamW {
             let lr = config.lr * lr_factor * group.lr;
             // PyTorch adds 1e-6 to the norm, so that the divisor of a zero gradient is not 0.
             let scale = config.clip / (squared_norms[&group.clip].sqrt() + 1e-6);
-            let gradient = if scale < 1.0 { gradient * scale } else { gradient };
-            let (first, second) = match moments.remove(name) {
-                Some(Moments { first, second }) => (
-                    first * beta1 + gradient.clone() * (1.0 - beta1),
-                    second * beta2 + gradient.square() * (1.0 - beta2),
-                ),
-                None => (gradient.clone() * (1.0 - beta1), gradient.square() * (1.0 - beta2)),
+            let step = AdamWStep {
+                gradient: scale.min(1.0) as f32,
+                betas: [beta1 as f32, beta2 as f32],
+                weights: [(1.0 - beta1) as f32, (1.0 - beta2) as f32],
+                root_bias: root_bias2 as f32,
+                epsilon: config.epsilon as f32,
+                keep: (1.0 - lr * config.weight_decay) as f32,
+                rate: (lr / bias1) as f32,
             };
-            let update = first.clone() / (second.clone().sqrt() / root_bias2 + config.epsilon);
-            moments.insert(name.to_owned(), Moments { first, second });
-            value * (1.0 - lr * config.weight_decay) - update * (lr / bias1)
+            let zeros = || Tensor::zeros_like(&gradient);
+            let old = moments.remove(name).unwrap_or_else(|| Moments { first: zeros(), second: zeros() });
+            let (value, new) = if value.device() == Device::flex() {
+                host_step(&step, value, gradient, old)
+            } else {
+                device_step(&step, value, gradient, old)
+            };
+            moments.insert(name.to_owned(), new);
+            value
         });
         (module, norm)
     }
+}
+
+/// Makes the step of one parameter with the CPU kernel, in one pass.
+fn host_step(step: &AdamWStep, value: Tensor<1>, gradient: Tensor<1>, old: Moments) -> (Tensor<1>, Moments) {
+    let device = value.device();
+    let (mut value, mut first, mut second) = (host(value), host(old.first), host(old.second));
+    step.apply(&mut value, &host(gradient), &mut first, &mut second);
+    let tensor = |values: Vec<f32>| {
+        let shape = [values.len()];
+        Tensor::from_data(TensorData::new(values, shape), &device)
+    };
+    (tensor(value), Moments { first: tensor(first), second: tensor(second) })
+}
+
+/// Makes the step of one parameter with tensors, on any device.
+fn device_step(step: &AdamWStep, value: Tensor<1>, gradient: Tensor<1>, old: Moments) -> (Tensor<1>, Moments) {
+    let gradient = gradient * step.gradient;
+    let first = old.first * step.betas[0] + gradient.clone() * step.weights[0];
+    let second = old.second * step.betas[1] + gradient.square() * step.weights[1];
+    let update = first.clone() / (second.clone().sqrt() / step.root_bias + step.epsilon);
+    (value * step.keep - update * step.rate, Moments { first, second })
 }
 
 /// The squared gradient norm of every clipping group, and the norm of the whole gradient. Sums run in the order of
@@ -145,7 +174,11 @@ impl AdamW {
 fn squared_norms(gradients: &Named<Tensor<1>>, group: fn(&str) -> ParameterGroup) -> (BTreeMap<usize, f64>, f64) {
     let mut squares: BTreeMap<usize, f64> = BTreeMap::new();
     for (name, gradient) in gradients {
-        let square = f64::from(gradient.clone().square().sum().into_scalar::<f32>());
+        let square = if gradient.device() == Device::flex() {
+            sum_of_squares(&host(gradient.clone()))
+        } else {
+            f64::from(gradient.clone().square().sum().into_scalar::<f32>())
+        };
         *squares.entry(group(name).clip).or_default() += square;
     }
     let norm = squares.values().sum::<f64>().sqrt();

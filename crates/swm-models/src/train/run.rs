@@ -195,7 +195,7 @@ impl<'a> Run<'a> {
         let output = self.learner.loss_and_gradients(batch, key, true)?;
         let not_finite = if !output.loss().is_finite() {
             "the loss"
-        } else if output.gradients.values().any(|g| !g.clone().abs().sum().into_scalar::<f32>().is_finite()) {
+        } else if output.gradients.values().any(|g| !g.clone().sum().into_scalar::<f32>().is_finite()) {
             "the gradient of the loss"
         } else {
             return Ok(output);

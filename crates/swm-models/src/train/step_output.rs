@@ -1,6 +1,6 @@
 //! [`StepOutput`]: the loss, the gradients and the buffers of a batch, and their weighted sums over several batches.
 
-use crate::nn::parameters::Named;
+use crate::nn::parameters::{self, Named};
 use burn::tensor::Tensor;
 
 /// The result of a training step on one batch.
@@ -39,17 +39,7 @@ impl StepOutput {
                 sum.1 += value;
             }
         }
-        add_by_name(&mut self.gradients, other.gradients);
-        add_by_name(&mut self.buffers, other.buffers);
-    }
-}
-
-fn add_by_name(sums: &mut Named<Tensor<1>>, terms: Named<Tensor<1>>) {
-    for (name, tensor) in terms {
-        let tensor = match sums.remove(&name) {
-            Some(sum) => sum + tensor,
-            None => tensor,
-        };
-        sums.insert(name, tensor);
+        parameters::add(&mut self.gradients, other.gradients);
+        parameters::add(&mut self.buffers, other.buffers);
     }
 }

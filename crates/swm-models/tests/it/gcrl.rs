@@ -7,7 +7,7 @@ use swm_core::run::Control;
 use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Key, Policy as _, Result, Schema, Space, VariationSpace};
 use swm_models::feed_forward::FeedForwardPolicy;
 use swm_models::gcrl::{Actor, Gcbc, Gciql, Gcivl, GcrlConfig, GoalConditioned};
-use swm_models::nn::{Init, parameters};
+use swm_models::nn::{BackboneConfig, ConvConfig, Init, parameters};
 use swm_models::probe::{self, AnglePart, ImageEncoder, ReconstructionConfig, StateConfig};
 use swm_models::train::DatasetInfo;
 use swm_models::{Checkpoint, Device, TrainConfig, TrainOptions, TrainSummary, Trainable, train};
@@ -104,6 +104,23 @@ fn results_do_not_depend_on_threads() {
     }
     check::<Gcbc>(&["model.history=2", "data.num_steps=2", "model.head.dropout=0.1"]);
     check::<Gciql>(&["model.history=2", "data.num_steps=3", "model.head.dropout=0.1"]);
+}
+
+#[test]
+fn cells_of_a_feature_map_are_the_patches_of_a_convolutional_encoder() {
+    fn check_conv<M: GoalConditioned<Config = GcrlConfig>>() {
+        let folder = tempfile::tempdir().expect("creating a temporary folder");
+        let mut config = config::<M>(&["schedule.steps=3"]);
+        config.model.encoder = BackboneConfig::Conv(ConvConfig { channels: vec![4, 6, 8], hidden: 0, dim: 5 });
+        let checkpoint = trained(&config, folder.path());
+        let weights = parameters::values(&checkpoint.model);
+        let running = &weights["encoder.stages.2.norm.running_mean"].values;
+        assert!(running.len() == 8 && running.iter().all(|mean| *mean > 0.0 || *mean < 0.0), "{running:?}");
+        // An image of 16 pixels gives a map of 2 x 2 cells.
+        assert_eq!(M::actor(&checkpoint).latent_dim(), 4 * 8);
+    }
+    check_conv::<Gcbc>();
+    check_conv::<Gciql>();
 }
 
 /// Returns a value in the first and the last line of a run's log.

@@ -147,6 +147,19 @@ fn hostile_config_lewm() {
 }
 
 #[test]
+fn hostile_config_conv() {
+    let sizes = ["model.encoder.conv.channels=[2,3]", "model.encoder.conv.hidden=3", "model.encoder.conv.dim=4"];
+    check("lewm", |folder| {
+        let settings: Vec<String> = [&sizes, SMALL_PREDICTOR].concat().into_iter().map(str::to_owned).collect();
+        let config = TrainConfig::<Lewm>::load("small", &settings).expect("a configuration");
+        let dataset_info = dataset_info();
+        let model = Lewm::new(&config, &dataset_info, &Init::new(Key::new(0), &Device::flex())).expect("a model");
+        let manifest = Manifest::new("train", 0, Value::Null);
+        Checkpoint { model, config, dataset_info, manifest }.save_to(folder).expect("a checkpoint");
+    });
+}
+
+#[test]
 fn hostile_config_pldm() {
     check("pldm", saved::<Pldm>(&[SMALL, SMALL_PREDICTOR, &["loss.idm_hidden=4", "model.latent=3"]]));
 }

@@ -7,8 +7,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use swm_core::Result;
 use swm_core::files::Lock;
 use swm_core::run::{Control, Event};
-use swm_models::lewm::Lewm;
-use swm_models::{TrainConfig, TrainOptions, TrainSummary, train};
+use swm_models::lewm::{EncoderConfig, Lewm};
+use swm_models::nn::{ConvConfig, parameters};
+use swm_models::{Checkpoint, Device, TrainConfig, TrainOptions, TrainSummary, train};
 
 /// A model of a few thousand parameters.
 pub fn config(overrides: &[&str]) -> TrainConfig<Lewm> {
@@ -87,6 +88,24 @@ fn resumed_run_gives_the_files_of_an_uninterrupted_run() {
 }
 
 #[test]
+fn running_statistics_of_the_encoder_are_stored_and_resumed() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let (complete, resumed) = (folder.path().join("complete"), folder.path().join("resumed"));
+    let (config, options) = (conv_config(), TrainOptions::default());
+    run(&config, &complete, &options, 0).expect("training the model");
+    run(&config, &resumed, &options, 5).expect("training the model");
+    run(&config, &resumed, &TrainOptions { resume: true, ..options }, 0).expect("training the model");
+    assert_eq!(files(&complete), files(&resumed));
+    let checkpoint = Checkpoint::<Lewm>::load(&complete, &Device::flex()).expect("loading the checkpoint");
+    let weights = parameters::values(&checkpoint.model);
+    for stage in 0..2 {
+        let running = |name: &str| &weights[&format!("encoder.stages.{stage}.norm.{name}")].values;
+        assert!(running("running_mean").iter().all(|mean| *mean != 0.0));
+        assert!(running("running_var").iter().all(|variance| *variance != 1.0));
+    }
+}
+
+#[test]
 fn second_training_into_a_folder_is_refused() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let out = folder.path().join("run");
@@ -98,28 +117,45 @@ fn second_training_into_a_folder_is_refused() {
     assert!(run(&config(&[]), &out, &TrainOptions::default(), 1).expect("training the model").interrupted);
 }
 
+/// A model with an encoder of overlapping convolutions.
+fn conv_config() -> TrainConfig<Lewm> {
+    let mut config = config(&["model.predictor.dropout=0"]);
+    config.model.encoder = EncoderConfig::Conv(ConvConfig { channels: vec![6, 9], hidden: 0, dim: 10 });
+    config
+}
+
 #[test]
 fn results_do_not_depend_on_threads() {
+    threads_give_equal_files(&config(&[]));
+    threads_give_equal_files(&conv_config());
+}
+
+fn threads_give_equal_files(config: &TrainConfig<Lewm>) {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
-    let config = config(&[]);
     let mut all = vec![];
     for (name, threads, loader_threads) in [("one", 1, 0), ("two", 2, 1), ("three", 3, 2)] {
         let options = TrainOptions { threads, loader_threads, ..TrainOptions::default() };
-        run(&config, &folder.path().join(name), &options, 0).expect("training the model");
+        run(config, &folder.path().join(name), &options, 0).expect("training the model");
         all.push(files(&folder.path().join(name)));
     }
     assert_eq!(all[0], all[1]);
     assert_eq!(all[0], all[2]);
-    let other = self::config(&["seed=1"]);
+    let mut other = config.clone();
+    other.seed = 1;
     run(&other, &folder.path().join("other"), &TrainOptions::default(), 0).expect("training the model");
     assert_ne!(files(&folder.path().join("other"))[1], all[0][1]);
 }
 
 #[test]
 fn training_reduces_the_loss() {
-    let folder = tempfile::tempdir().expect("creating a temporary folder");
     let overrides = ["schedule.steps=300", "log_every=20", "model.predictor.dropout=0", "optim.lr=3e-3"];
-    run(&config(&overrides), folder.path(), &TrainOptions::default(), 0).expect("training the model");
+    loss_is_reduced(&config(&overrides));
+    loss_is_reduced(&TrainConfig { model: conv_config().model, ..config(&overrides) });
+}
+
+fn loss_is_reduced(config: &TrainConfig<Lewm>) {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    run(config, folder.path(), &TrainOptions::default(), 0).expect("training the model");
     let lines = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("reading train.jsonl");
     let value = |line: &str, name: &str| {
         serde_json::from_str::<serde_json::Value>(line).expect("parsing the JSON")[name].as_f64().expect(name)

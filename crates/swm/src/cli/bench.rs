@@ -183,7 +183,7 @@ fn plan(args: &PlanArgs, context: &Context) -> anyhow::Result<()> {
     })?;
     if args.iterations > 0 {
         let works = vec![(Work::Plan, 1), (Work::Cost, 2), (Work::Encode, 10)];
-        let model = lewm(works, args.iterations, 2, args.pairs, &args.device, context)?;
+        let model = lewm("paper", works, args.iterations, 2, args.pairs, &args.device, context)?;
         if context.json {
             return emit_json(&serde_json::json!({ "planner": planner, "model": model }));
         }
@@ -198,6 +198,9 @@ fn plan(args: &PlanArgs, context: &Context) -> anyhow::Result<()> {
 
 #[derive(Args)]
 struct TrainArgs {
+    /// Preset of LeWM: paper or small
+    #[arg(long, default_value = "paper")]
+    preset: String,
     /// Clips per batch
     #[arg(long, default_value_t = 8, value_parser = count::<1, 4096>)]
     clips: usize,
@@ -211,7 +214,7 @@ struct TrainArgs {
 
 /// Measures training.
 fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
-    let report = lewm(vec![(Work::Train, 1)], 1, args.clips, args.pairs, &args.device, context)?;
+    let report = lewm(&args.preset, vec![(Work::Train, 1)], 1, args.clips, args.pairs, &args.device, context)?;
     if context.json {
         return emit_json(&report);
     }
@@ -220,8 +223,9 @@ fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Measures a LeWM of the published size.
+/// Measures a LeWM with the sizes of a preset.
 fn lewm(
+    preset: &str,
     works: Vec<(Work, usize)>,
     iterations: usize,
     clips: usize,
@@ -232,10 +236,10 @@ fn lewm(
     let device = device::parse(name)?;
     let weights = tempfile::NamedTempFile::new()?;
     Ok(swm_core::pool::threads(context.threads)?.install(|| {
-        let mut subject = LewmSubject::new(iterations, clips, &device)?;
+        let mut subject = LewmSubject::new(preset, iterations, clips, &device)?;
         subject.write(weights.path())?;
         let python = PlanBenchConfig::default().python;
-        let config = ModelBenchConfig { works, pairs, sizes: subject.sizes(), python };
+        let config = ModelBenchConfig { works, pairs, sizes: subject.sizes()?, python };
         bench_model(&config, weights.path(), &mut subject)
     })?)
 }

@@ -3,6 +3,7 @@
 //! names. The default folders are `tests/golden`, which also contains the exporters of the files, and
 //! `shared/reference/models` next to the workspace.
 
+mod conv;
 mod dino_wm;
 mod gcrl;
 mod lewm;

@@ -36,10 +36,9 @@ pub struct World {
 /// `ValueError` for an unknown wrapper or setting.
 pub fn stack(wrappers: &str, wrap_goal: bool) -> PyResult<(Arc<Stack>, GoalFrame)> {
     let choices: Vec<(String, Map<String, Value>)> = json("wrappers", wrappers)?;
-    let made: swm::core::Result<_> =
-        choices.into_iter().map(|(id, settings)| WRAPPERS.get(&id)?.make(&settings.into_iter().collect())).collect();
+    let made = choices.into_iter().map(|(id, settings)| WRAPPERS.get(&id)?.make(&settings.into_iter().collect()));
     let goal = if wrap_goal { GoalFrame::Wrapped } else { GoalFrame::Clean };
-    Ok((Arc::new(Stack::new(made.map_err(to_py_err)?)), goal))
+    Ok((Arc::new(Stack::new(made).map_err(to_py_err)?), goal))
 }
 
 impl World {

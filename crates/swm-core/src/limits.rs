@@ -47,14 +47,27 @@ pub const EVALUATED_EPISODES: Limit = Limit::new("number of evaluated episodes",
 pub const STEPS: Limit = Limit::new("number of steps", 1_000_000_000);
 /// Shards of a dataset.
 pub const SHARDS: Limit = Limit::new("number of shards", 1_000_000);
+/// Visual wrappers of an environment.
+pub const WRAPPERS: Limit = Limit::new("number of wrappers", 64);
 /// Model steps of a plan, of its history, and of prediction errors.
 pub const MODEL_STEPS: Limit = Limit::new("number of model steps", 10_000);
 /// Candidates of a solver.
 pub const SAMPLES: Limit = Limit::new("number of samples", 1_000_000);
 /// Values of all candidates of one iteration of a solver: 4 GiB.
 pub const CANDIDATE_VALUES: Limit = Limit::new("values of all candidates", 1 << 30);
-/// Bytes of the observations and frames of all environments.
+/// Bytes of the observations and frames of all environments, and of a batch of clips.
 pub const BATCH_BYTES: Limit = Limit::new("bytes of a batch", 16 << 30);
+/// Bytes of the frames of a dataset that a benchmark collects, which it also holds in memory.
+pub const BENCHMARK_BYTES: Limit = Limit::new("bytes of the frames of a benchmark", 64 << 30);
+/// Bytes of the frames on a contact sheet.
+pub const SHEET_BYTES: Limit = Limit::new("bytes of a contact sheet", 2 << 30);
+/// Bytes of the rows of a replay buffer.
+pub const REPLAY_BYTES: Limit = Limit::new("bytes of a replay buffer", 1 << 40);
+
+/// The product of sizes; the largest value if it is larger.
+pub fn product(sizes: impl IntoIterator<Item = usize>) -> usize {
+    sizes.into_iter().fold(1, usize::saturating_mul)
+}
 
 #[cfg(test)]
 mod tests {
@@ -65,5 +78,6 @@ mod tests {
         assert!(ENVS.check(ENVS.max).is_ok());
         let error = ENVS.check(1_000_000).expect_err("too many").to_string();
         assert_eq!(error, "number of environments: 1000000 is too large; choose at most 16384");
+        assert_eq!((product([2, 3, 4]), product([usize::MAX, 2]), product([usize::MAX, 2, 0])), (24, usize::MAX, 0));
     }
 }

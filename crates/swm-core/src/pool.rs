@@ -143,8 +143,7 @@ impl EnvPool {
         let (height, width) = image.unwrap_or_default();
         limits::IMAGE_SIDE.check(height.max(width))?;
         let (schema, columns) = PoolColumns::add(spec.columns.clone(), image, views)?;
-        let row_bytes = schema.columns().iter().map(ColumnSpec::row_bytes);
-        limits::BATCH_BYTES.check(row_bytes.fold(0, usize::saturating_add).saturating_mul(envs.len()))?;
+        limits::BATCH_BYTES.check(schema.row_bytes().saturating_mul(envs.len()))?;
         let max_episode_steps = max_episode_steps.unwrap_or(spec.max_episode_steps);
         Ok(Self {
             infos: Batch::zeros(&schema, envs.len()),

@@ -19,7 +19,7 @@ pub use statistics::{Proportion, Summary};
 pub use study::{StudyResults, StudyRow};
 
 use crate::Manifest;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 
 /// The content of a `results.json`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -86,7 +86,8 @@ pub struct EpisodeResult {
     /// The first step that satisfied the goal; present only if the goal had to hold for several steps.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reached: Option<usize>,
-    /// The sum of rewards.
+    /// The sum of rewards. JSON has no NaN and no infinite values: they are written as `null`, which is read as NaN.
+    #[serde(deserialize_with = "null_is_nan")]
     pub total_reward: f64,
     /// The dataset row of the initial state, `[episode, step]`, if the episode started from a dataset.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -136,6 +137,10 @@ impl Run {
     }
 }
 
+fn null_is_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    Option::deserialize(deserializer).map(|value| value.unwrap_or(f64::NAN))
+}
+
 impl EpisodeResult {
     /// Creates the result of an episode that has not been stepped yet.
     pub fn new(seed: u64) -> Self {
@@ -145,5 +150,23 @@ impl EpisodeResult {
     /// The time to goal in environment steps, if the episode succeeded.
     pub fn time_to_goal(&self) -> Option<usize> {
         self.success.then(|| self.reached.unwrap_or(self.steps))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rewards_that_are_not_finite_can_be_read_back() {
+        for reward in [f64::NAN, f64::INFINITY, -2.5] {
+            let text = serde_json::to_string(&EpisodeResult { total_reward: reward, ..EpisodeResult::new(1) });
+            let text = text.expect("a document");
+            let read: EpisodeResult = serde_json::from_str(&text).expect("an episode");
+            assert_eq!(read.total_reward.is_finite(), reward.is_finite(), "{text}");
+            assert_eq!(serde_json::to_string(&read).expect("a document"), text);
+        }
+        let missing = serde_json::json!({"seed": 1, "success": true, "solved_at_start": false, "steps": 3});
+        assert!(serde_json::from_value::<EpisodeResult>(missing).is_err());
     }
 }

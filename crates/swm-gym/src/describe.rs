@@ -5,7 +5,9 @@ use crate::finite::FiniteCheck;
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::ops::Range;
-use swm_core::{Action, Callable, ColumnSpec, DType, EnvSpec, Error, Factor, Result, Schema, Space, VariationSpace};
+use swm_core::{
+    Action, Callable, ColumnSpec, DType, EnvSpec, Error, Factor, Result, Schema, Space, VariationSpace, limits,
+};
 
 /// The spaces, columns and factors of an environment, with their offsets in the buffer: `Bridge.describe()`.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
@@ -20,7 +22,8 @@ pub struct Description {
     goal: Option<FrameRegion>,
     no_frame: String,
     pixel_art: bool,
-    max_episode_steps: usize,
+    /// The time limit, which the user or the environment chose and which may be any value.
+    max_episode_steps: serde_json::Value,
     libraries: BTreeMap<String, String>,
     /// The methods that set the state of the environment; empty if it has none.
     #[serde(rename = "calls")]
@@ -42,6 +45,19 @@ impl Description {
         }
         Ok(parsed)
     }
+}
+
+/// Checks a time limit in steps.
+fn time_limit(given: &serde_json::Value) -> Result<usize> {
+    let most = limits::STEPS.max;
+    let limit = given.as_u64().and_then(|steps| usize::try_from(steps).ok()).filter(|steps| (1..=most).contains(steps));
+    limit.ok_or_else(|| {
+        Error::config(
+            "max_episode_steps",
+            format!("{given} is no time limit"),
+            format!("choose from 1 to {most} steps"),
+        )
+    })
 }
 
 /// The maximum size of the buffer of an environment, in bytes: one observation, one frame and one goal frame.
@@ -239,7 +255,7 @@ impl EnvLayout {
             columns,
             observation_space,
             variation_space: VariationSpace::new(factors, &[]),
-            max_episode_steps: description.max_episode_steps,
+            max_episode_steps: time_limit(&description.max_episode_steps)?,
             cameras: vec![],
             angles: vec![],
         };

@@ -14,8 +14,8 @@ pub struct TrustedId {
 
 impl TrustedId {
     /// Parses an id. A file may choose an id that is registered with Gymnasium, with numbers and plain words as
-    /// arguments. Only the user may choose a module (`my_envs:Maze-v0`) and other arguments, which can be the names of
-    /// files, modules and classes.
+    /// arguments. Only the user may choose a module (`my_envs:Maze-v0`), a render mode, which can open a window, and other
+    /// arguments, which can be the names of files, modules and classes.
     ///
     /// # Errors
     /// When the text has another form, or a file chose an id that only the user may choose.
@@ -29,6 +29,9 @@ impl TrustedId {
         }
         if let Some((key, value)) = options.iter().find(|(_, value)| !is_plain(value)) {
             check(&format!("whose argument {key}={value} is neither a number nor a plain word"))?;
+        }
+        if let Some(mode) = options.get("render_mode").filter(|mode| *mode != "rgb_array") {
+            check(&format!("whose argument render_mode={mode} can open a window"))?;
         }
         Ok(Self { text: text.to_owned(), id: id.to_owned(), options })
     }
@@ -114,9 +117,11 @@ mod tests {
     #[test]
     fn files_choose_registered_environments_only() -> Result<()> {
         let file = Origin::file("config.json", false);
-        for text in
-            ["CartPole-v1", "ALE/Pong-v5,frameskip=2,repeat_action_probability=0.25", "A-v0,size=(3, 4),map=4x4"]
-        {
+        for text in [
+            "CartPole-v1,render_mode=rgb_array",
+            "ALE/Pong-v5,repeat_action_probability=0.25",
+            "A-v0,size=(3, 4),map=4x4",
+        ] {
             assert_eq!(TrustedId::new(text, &file)?.text(), text);
         }
         let texts = [
@@ -127,6 +132,7 @@ mod tests {
             "A-v0,policy=evil.mod",
             "A-v0,x='a'",
             "A-v0,x={1: 2}",
+            "CartPole-v1,render_mode=human",
         ];
         for text in texts {
             let error = TrustedId::new(text, &file).expect_err(text).to_string();

@@ -14,7 +14,6 @@ use std::io::{BufRead, BufReader, Read, Write};
 use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixStream;
 use std::os::unix::process::CommandExt;
-use std::path::Path;
 use std::process::{Child, ChildStderr, Command, Stdio};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
@@ -229,8 +228,7 @@ impl Transport for WorkerTransport {
 impl Process {
     fn start(id: &str, python: &Python) -> swm_core::Result<Self> {
         let counted = Counted::new()?;
-        let shared = if Path::new("/dev/shm").is_dir() { "/dev/shm".into() } else { std::env::temp_dir() };
-        let file = tempfile::tempfile_in(&shared).map_err(|error| Error::io(&shared, "making shared memory", error))?;
+        let file = shared_file().map_err(|error| Error::external("making shared memory", error))?;
         let io = |error| Error::external("starting a worker", error);
         let (socket, remote) = UnixStream::pair().map_err(io)?;
         let mut command = Command::new(&python.program);
@@ -298,6 +296,7 @@ impl Process {
     fn open(&mut self, size: usize, answer: Duration) -> std::io::Result<()> {
         self.socket.set_read_timeout(Some(answer))?;
         self.socket.set_write_timeout(Some(answer))?;
+        seal(&self.file)?;
         let allocated = self.file.metadata()?.len();
         if allocated < size as u64 {
             return Err(std::io::Error::other(format!("the shared file has {allocated} bytes of {size}")));
@@ -344,11 +343,36 @@ fn violation(problem: String) -> std::io::Error {
     std::io::Error::new(std::io::ErrorKind::InvalidData, problem)
 }
 
+/// An anonymous file in memory, which a worker sizes.
+#[cfg(target_os = "linux")]
+fn shared_file() -> std::io::Result<File> {
+    use rustix::fs::{MemfdFlags, memfd_create};
+    Ok(File::from(memfd_create("swm-gym", MemfdFlags::CLOEXEC | MemfdFlags::ALLOW_SEALING)?))
+}
+
+/// Fixes the size of the file for all processes, because an access to memory beyond its end is a SIGBUS.
+#[cfg(target_os = "linux")]
+fn seal(file: &File) -> std::io::Result<()> {
+    use rustix::fs::{SealFlags, fcntl_add_seals};
+    Ok(fcntl_add_seals(file, SealFlags::SHRINK | SealFlags::GROW | SealFlags::SEAL)?)
+}
+
+/// An anonymous file, which a worker sizes.
+#[cfg(not(target_os = "linux"))]
+fn shared_file() -> std::io::Result<File> {
+    tempfile::tempfile()
+}
+
+/// Only Linux can fix the size of a file.
+#[cfg(not(target_os = "linux"))]
+fn seal(_: &File) -> std::io::Result<()> {
+    Ok(())
+}
+
 #[allow(unsafe_code, reason = "shared memory is mapped from a file")]
 fn map(file: &File, size: usize) -> std::io::Result<MmapMut> {
-    // SAFETY: the file is anonymous; only this process and its worker hold a descriptor of it. `worker.py` sets its size
-    // before it describes the environment and never changes it, and hides the descriptor from the environment, whose code
-    // the user trusts (docs/security.md). The worker writes to the memory only between a request and its answer, when
+    // SAFETY: the file is anonymous; only this process and its worker hold a descriptor of it, and `seal` has fixed its
+    // size. The worker writes to the memory only between a request and its answer, when
     // this process holds no reference: `Transport::dispatch` and `call` borrow the transport mutably, and between the two
     // calls the transport returns no reference to the memory. A worker that does not answer in time is killed before the
     // memory is accessed again.

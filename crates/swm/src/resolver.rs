@@ -111,7 +111,7 @@ impl HomeResolver {
             }
             entry.make(&settings.into_iter().collect())
         });
-        let stack = Arc::new(Stack::new(wrappers.collect::<Result<_>>()?));
+        let stack = Arc::new(Stack::new(wrappers)?);
         let wrapping = Wrapping { choices: request.wrappers.clone(), stack, goal };
         *self.wrapping.borrow_mut() = Some(wrapping.clone());
         Ok(wrapping)

@@ -170,6 +170,11 @@ impl Schema {
         &self.0
     }
 
+    /// The number of bytes of one row of all columns.
+    pub fn row_bytes(&self) -> usize {
+        self.0.iter().map(ColumnSpec::row_bytes).fold(0, usize::saturating_add)
+    }
+
     /// The index of a column, if the schema has it.
     pub fn find(&self, name: &str) -> Option<usize> {
         self.0.iter().position(|column| column.name == name)

@@ -8,7 +8,9 @@
 use crate::dataset::clips::{ClipSpec, Clips};
 use crate::dataset::episodes::{EpisodeRows, check_episode};
 use crate::dataset::goals::{GoalSpec, Goals};
-use crate::dataset::loader::{BatchFiller, BatchPool, BatchRows, BatchSource, Epoch, LoadedBatch, Workers, window};
+use crate::dataset::loader::{
+    BatchFiller, BatchPool, BatchRows, BatchSource, Epoch, LoadedBatch, Workers, check_batch, window,
+};
 use crate::dataset::reader::{Constants, Episode, Reader, StepRange};
 use crate::dataset::sync::lock;
 use crate::dataset::writer::{WriteOptions, Writer};
@@ -17,7 +19,7 @@ use serde_json::json;
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, OnceLock};
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
-use swm_core::{Batch, ColumnSpec, DType, Error, Key, Manifest, Result, Schema};
+use swm_core::{Batch, ColumnSpec, DType, Error, Key, Manifest, Result, Schema, limits};
 
 /// Number of evicted episodes whose memory is reused.
 const SPARE: usize = 2;
@@ -58,7 +60,7 @@ impl ReplayBuffer {
     /// An episode of `n` steps has `n + 1` rows.
     ///
     /// # Errors
-    /// If the capacity is 0.
+    /// If the capacity is 0, or its rows have more than [`limits::REPLAY_BYTES`].
     pub fn new(schema: &Schema, capacity: usize) -> Result<Self> {
         if capacity == 0 {
             return Err(Error::config(
@@ -67,6 +69,7 @@ impl ReplayBuffer {
                 "use a capacity of at least one episode",
             ));
         }
+        limits::REPLAY_BYTES.check(schema.row_bytes().saturating_mul(capacity))?;
         let dataset_schema = dataset_schema(schema)?;
         Ok(Self(Arc::new(Inner { schema: schema.clone(), dataset_schema, capacity, state: Mutex::default() })))
     }
@@ -190,12 +193,10 @@ impl ReplayBuffer {
     /// Creates a loader. It samples each batch from the buffer's content at the time of loading.
     ///
     /// # Errors
-    /// If a column does not exist, a size in `config` is 0, or a goal's probabilities are invalid.
+    /// If a column does not exist, a size in `config` is 0, a batch is too large, or a goal's probabilities are invalid.
     pub fn loader(&self, config: ReplayConfig) -> Result<ReplayLoader> {
-        if config.batch_size == 0 {
-            return Err(Error::config("batch_size", "0", "choose at least 1"));
-        }
         let filler = BatchFiller::new(&self.0.dataset_schema, config.clip, config.goals)?;
+        check_batch(filler.schema(), config.batch_size)?;
         let prefetch = window(filler.schema(), config.batch_size, config.prefetch, config.prefetch_bytes);
         Ok(ReplayLoader {
             workers: Workers::new(config.threads)?,

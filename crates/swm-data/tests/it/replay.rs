@@ -59,6 +59,15 @@ fn evicts_the_oldest_episodes_and_snapshots_stay_unchanged() {
 }
 
 #[test]
+fn sizes_beyond_any_memory_are_refused() {
+    let error = ReplayBuffer::new(&schema(), usize::MAX).err().expect("a capacity of 2^64 rows").to_string();
+    assert!(error.contains("bytes of a replay buffer"), "{error}");
+    let huge = ReplayConfig { batch_size: 1 << 60, ..config(3) };
+    let error = filled(0..2, 100).loader(huge).err().expect("a batch of 2^60 clips").to_string();
+    assert!(error.contains("bytes of a batch"), "{error}");
+}
+
+#[test]
 fn samples_windows_uniformly_and_reproducibly() {
     let buffer = filled(0..6, 100);
     let loader = buffer.loader(ReplayConfig { batch_size: 9000, ..config(3) }).expect("creating the loader");

@@ -4,7 +4,7 @@ use super::{EpisodeFrame, VisualWrapper, parse};
 use std::collections::BTreeMap;
 use swm_core::{
     Action, Callable, DatasetStart, DatasetStartEnv, DispatchEnv, Env, EnvSpec, Error, FactorValues, FrameMut, Key,
-    ResetOptions, Result, RowMut, RowRef, Schema, Snapshot, Transition, dataset_start,
+    ResetOptions, Result, RowMut, RowRef, Schema, Snapshot, Transition, dataset_start, limits,
 };
 
 /// The treatment of the goal frame by wrappers.
@@ -24,8 +24,12 @@ pub struct Stack(Vec<Box<dyn VisualWrapper>>);
 
 impl Stack {
     /// Makes a stack of wrappers.
-    pub fn new(wrappers: Vec<Box<dyn VisualWrapper>>) -> Self {
-        Self(wrappers)
+    ///
+    /// # Errors
+    /// When there are too many, or the error of a wrapper.
+    pub fn new(wrappers: impl ExactSizeIterator<Item = Result<Box<dyn VisualWrapper>>>) -> Result<Self> {
+        limits::WRAPPERS.check(wrappers.len())?;
+        wrappers.collect::<Result<_>>().map(Self)
     }
 
     /// Reads wrappers in command-line form, such as `noise,std=8`. Files are read once for all environments.
@@ -33,7 +37,7 @@ impl Stack {
     /// # Errors
     /// When a wrapper or a parameter is unknown, a value is not allowed, or a file cannot be read.
     pub fn parse<S: AsRef<str>>(texts: &[S]) -> Result<Self> {
-        texts.iter().map(|text| parse(text.as_ref())).collect::<Result<_>>().map(Self)
+        Self::new(texts.iter().map(|text| parse(text.as_ref())))
     }
 
     /// Returns whether the stack has no wrappers.

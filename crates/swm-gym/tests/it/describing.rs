@@ -63,6 +63,13 @@ fn inconsistent_descriptions_are_errors() {
         (r#""size": [4, 4]"#, r#""size": [0, 4]"#, "at least 1 x 1"),
         (r#""n": 3, "start": 0"#, r#""n": 0, "start": 0"#, "bounds with values"),
         (r#""n": 3, "start": 0"#, r#""n": 3, "start": 9223372036854775807"#, "bounds with values"),
+        (
+            r#"steps": 50"#,
+            r#"steps": 99999999999999999999"#,
+            "max_episode_steps: 1e+20 is no time limit; choose from 1",
+        ),
+        (r#"steps": 50"#, r#"steps": -1"#, "-1 is no time limit"),
+        (r#"steps": 50"#, r#"steps": "long""#, "\"long\" is no time limit"),
         (r#""low": [-1], "high": [1]"#, r#""low": [1], "high": [-1]"#, "bounds with values"),
     ] {
         assert_eq!(DESCRIPTION.matches(from).count(), 1, "{from}");

@@ -60,3 +60,16 @@ fn malformed_answers_are_errors() {
     check("answer", &["4294967295 bytes"]);
     check("answer_unknown", &["an answer of unknown kind 0"]);
 }
+
+/// Before its size was sealed, the memory ended where the engine read the next observation, which is a SIGBUS.
+#[cfg(target_os = "linux")]
+#[test]
+fn environment_cannot_shrink_the_shared_memory() {
+    let Some(config) = config() else { return };
+    let mut env = make("tests.it.environments:Counter-v0,fault=shrink", &config);
+    env.reset(0, &ResetOptions::default()).expect("a reset");
+    for t in 1..4 {
+        env.step(Action::Discrete(&[0])).expect("a step");
+        assert_eq!(observation(&*env), t as f32);
+    }
+}

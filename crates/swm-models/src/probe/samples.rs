@@ -5,7 +5,7 @@ use crate::pixels;
 use rand::Rng as _;
 use rayon::prelude::*;
 use swm_core::columns::PIXELS;
-use swm_core::{Batch, Error, Key, Result};
+use swm_core::{Batch, Error, Key, Result, limits};
 use swm_data::{Part, Reader, Split, StepRange};
 
 /// Frames sampled from a dataset.
@@ -27,7 +27,7 @@ const BLOCK_FRAMES: usize = 64;
 /// The largest number of latent elements held in memory: 1 GB in double precision.
 const MAX_ELEMENTS: usize = 1 << 27;
 
-/// Samples up to `count` frames of the split `part` of a dataset (fewer if latents are very large) without replacement,
+/// Samples up to `count` frames of the split `part` of a dataset (fewer if latents or kept images are very large) without replacement,
 /// in stored order. Frames whose columns are not finite are skipped.
 ///
 /// # Errors
@@ -46,7 +46,12 @@ pub(super) fn sample(
         .into_iter()
         .flat_map(|episode| (0..reader.episodes()[episode].length).map(move |row| StepRange::new(episode, row, 1)))
         .collect();
-    let rows = choose(rows, count.min(MAX_ELEMENTS / encoder.latent_dim()), key.with(&part.to_string()));
+    let mut most = MAX_ELEMENTS / encoder.latent_dim();
+    if keep_images {
+        most =
+            most.min(limits::BATCH_BYTES.max / limits::product([encoder.image_size(), encoder.image_size(), 3]).max(1));
+    }
+    let rows = choose(rows, count.min(most), key.with(&part.to_string()));
     let mut names = vec![PIXELS];
     for name in columns {
         // A column may be predicted and in the baseline.

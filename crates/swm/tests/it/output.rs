@@ -40,6 +40,21 @@ fn lost_output_is_an_error() {
     assert_eq!(run_into(&swm, &["inspect", "nothing"], "/dev/full").status.code(), Some(2));
 }
 
+#[cfg(target_os = "linux")]
+#[test]
+fn closed_output_is_an_error_before_the_work() {
+    let swm = Swm::new();
+    for args in [EVAL, &["formats"], &["--help"]] {
+        let closed = ["-c", "exec \"$0\" \"$@\" >&-", env!("CARGO_BIN_EXE_swm")];
+        let mut command = Command::new("sh");
+        command.args(closed).args(args).env("STABLEWM_HOME", swm.home()).current_dir(swm.home());
+        let output = command.output().expect("sh starts");
+        let error = text(&output.stderr);
+        assert!(output.status.code() == Some(1) && error.contains("standard output is closed"), "{args:?}: {error}");
+    }
+    assert!(!swm.path("found").exists());
+}
+
 #[test]
 fn closed_pipe_ends_quietly() {
     let swm = Swm::new();

@@ -21,7 +21,7 @@ use crate::dataset::reader::Reader;
 use crate::dataset::sync::lock;
 use rand::Rng as _;
 use std::sync::{Arc, Mutex};
-use swm_core::{Error, Key, Result, Schema};
+use swm_core::{Error, Key, Result, Schema, limits};
 
 /// Settings of a [`Loader`].
 #[derive(Clone, Debug)]
@@ -82,18 +82,16 @@ impl Loader {
     /// Creates a loader. Dropping the loader stops its threads.
     ///
     /// # Errors
-    /// If a column or an episode does not exist, no episode is long enough for a clip, a size in `config` is 0, a
-    /// goal's probabilities are invalid, or the cache's folder cannot be used.
+    /// If a column or an episode does not exist, no episode is long enough for a clip, a size in `config` is 0, a batch
+    /// is too large, a goal's probabilities are invalid, or the cache's folder cannot be used.
     pub fn new(reader: Arc<dyn Reader>, config: LoaderConfig) -> Result<Self> {
         let filler = BatchFiller::new(reader.schema(), config.clip, config.goals)?;
-        if config.batch_size == 0 {
-            return Err(Error::config("batch_size", "0", "choose at least 1"));
-        }
         let positions = match config.episodes {
             Some(positions) => positions,
             None => (0..reader.episodes().len()).collect(),
         };
         let clips = Clips::reaching(filler.clip(), filler.reach(), reader.episodes(), &positions)?;
+        check_batch(filler.schema(), config.batch_size.min(clips.len()))?;
         if u32::try_from(clips.len()).is_err() {
             let problem = format!("{} clips are more than a loader can shuffle", clips.len());
             return Err(Error::config("clips", problem, "load fewer episodes at once"));
@@ -159,10 +157,20 @@ impl Loader {
     }
 }
 
+/// Checks the number of clips in a batch.
+///
+/// # Errors
+/// If it is 0, or a batch has more than [`limits::BATCH_BYTES`].
+pub(crate) fn check_batch(schema: &Schema, batch_size: usize) -> Result<()> {
+    if batch_size == 0 {
+        return Err(Error::config("batch_size", "0", "choose at least 1"));
+    }
+    limits::BATCH_BYTES.check(schema.row_bytes().saturating_mul(batch_size))
+}
+
 /// The number of batches that fit into `bytes`; at least 1, at most `batches`.
 pub(crate) fn window(schema: &Schema, batch_size: usize, batches: usize, bytes: usize) -> usize {
-    let batch: usize = schema.columns().iter().map(|column| column.row_bytes() * batch_size).sum();
-    batches.min(bytes / batch.max(1)).max(1)
+    batches.min(bytes / schema.row_bytes().saturating_mul(batch_size).max(1)).max(1)
 }
 
 /// Shuffles items with a keyed generator (Fisher–Yates).

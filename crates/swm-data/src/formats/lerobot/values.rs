@@ -41,14 +41,14 @@ pub fn append(array: &dyn Array, column: &ColumnSpec, out: &mut Vec<u8>) -> Resu
             let values = leaf.as_boolean().values().iter().map(i64::from);
             append_values(values, column.dtype, out, |v| v, |v| v as f64);
         }
-        DataType::Int8 => append_integers::<Int8Type>(&leaf, column, out),
-        DataType::Int16 => append_integers::<Int16Type>(&leaf, column, out),
-        DataType::Int32 => append_integers::<Int32Type>(&leaf, column, out),
-        DataType::Int64 => append_integers::<Int64Type>(&leaf, column, out),
-        DataType::UInt8 => append_integers::<UInt8Type>(&leaf, column, out),
-        DataType::UInt16 => append_integers::<UInt16Type>(&leaf, column, out),
-        DataType::UInt32 => append_integers::<UInt32Type>(&leaf, column, out),
-        DataType::UInt64 => append_integers::<UInt64Type>(&leaf, column, out),
+        DataType::Int8 => append_integers::<Int8Type>(&leaf, column, out)?,
+        DataType::Int16 => append_integers::<Int16Type>(&leaf, column, out)?,
+        DataType::Int32 => append_integers::<Int32Type>(&leaf, column, out)?,
+        DataType::Int64 => append_integers::<Int64Type>(&leaf, column, out)?,
+        DataType::UInt8 => append_integers::<UInt8Type>(&leaf, column, out)?,
+        DataType::UInt16 => append_integers::<UInt16Type>(&leaf, column, out)?,
+        DataType::UInt32 => append_integers::<UInt32Type>(&leaf, column, out)?,
+        DataType::UInt64 => append_integers::<UInt64Type>(&leaf, column, out)?,
         DataType::Float16 => {
             append_floats(leaf.as_primitive::<Float16Type>().values().iter().map(|v| f64::from(*v)), column, out)
         }
@@ -67,13 +67,28 @@ fn check_offsets(offsets: &[i32]) -> Result<(), String> {
     if equal { Ok(()) } else { Err("its rows have different lengths".to_owned()) }
 }
 
-fn append_integers<T: ArrowPrimitiveType>(leaf: &ArrayRef, column: &ColumnSpec, out: &mut Vec<u8>)
+/// Appends integers.
+///
+/// # Errors
+/// If a value does not fit the column's type.
+fn append_integers<T: ArrowPrimitiveType>(leaf: &ArrayRef, column: &ColumnSpec, out: &mut Vec<u8>) -> Result<(), String>
 where
     T::Native: ArrowNativeType + TryInto<i64>,
 {
-    // Unsigned 64-bit values from 2^63 on are clamped.
-    let values = leaf.as_primitive::<T>().values().iter().map(|&v| v.try_into().unwrap_or(i64::MAX));
-    append_values(values, column.dtype, out, |v| v, |v| v as f64);
+    let range = match column.dtype {
+        DType::U8 => 0..=u8::MAX.into(),
+        DType::Int32 => i32::MIN.into()..=i32::MAX.into(),
+        _ => i64::MIN..=i64::MAX,
+    };
+    let fitting = |value: T::Native| value.try_into().ok().filter(|value| range.contains(value));
+    let values: Result<Vec<i64>, String> = leaf
+        .as_primitive::<T>()
+        .values()
+        .iter()
+        .map(|&value| fitting(value).ok_or_else(|| format!("its value {value:?} does not fit {}", column.dtype.name())))
+        .collect();
+    append_values(values?.into_iter(), column.dtype, out, |v| v, |v| v as f64);
+    Ok(())
 }
 
 fn append_floats(values: impl Iterator<Item = f64>, column: &ColumnSpec, out: &mut Vec<u8>) {
@@ -127,4 +142,25 @@ fn primitive<T: ArrowPrimitiveType, const N: usize>(
 ) -> PrimitiveArray<T> {
     let values: Vec<T::Native> = bytes.as_chunks::<N>().0.iter().map(|&chunk| convert(chunk)).collect();
     PrimitiveArray::new(ScalarBuffer::from(values), None)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use arrow_array::UInt64Array;
+
+    #[test]
+    fn integers_that_do_not_fit_the_column_are_errors() {
+        let append = |value: u64, dtype| {
+            let mut out = vec![];
+            append(&UInt64Array::from(vec![1, value]), &ColumnSpec::new("count", dtype, []), &mut out).map(|()| out)
+        };
+        assert_eq!(append(1 << 62, DType::Int64), Ok([1_i64, 1 << 62].map(i64::to_ne_bytes).concat()));
+        for (value, dtype) in
+            [(1 << 63, DType::Int64), (1 << 63, DType::Float64), (1 << 31, DType::Int32), (256, DType::U8)]
+        {
+            let error = append(value, dtype).expect_err("a value that does not fit");
+            assert_eq!(error, format!("its value {value} does not fit {}", dtype.name()));
+        }
+    }
 }

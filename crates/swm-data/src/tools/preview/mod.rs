@@ -11,7 +11,7 @@ pub use video::{check_mp4, integer_scale, write_mp4, write_mp4_scaled};
 
 use crate::dataset::{Reader, StepRange};
 use std::path::{Path, PathBuf};
-use swm_core::{Batch, ColumnSpec, Error, Result};
+use swm_core::{Batch, ColumnSpec, Error, Result, limits};
 use swm_image::{check_png, write_png};
 
 /// Settings of a preview.
@@ -44,8 +44,8 @@ const ROWS: usize = 32;
 /// `progress` with the number of finished episodes.
 ///
 /// # Errors
-/// If the dataset has no images, lacks one of the columns or is damaged, one of the files exists and was not written by this
-/// program, or the folder cannot be written.
+/// If the dataset has no images, lacks one of the columns or is damaged, the contact sheet would be too large, one of the
+/// files exists and was not written by this program, or the folder cannot be written.
 pub fn preview(
     reader: &dyn Reader,
     folder: &Path,
@@ -53,13 +53,14 @@ pub fn preview(
     mut progress: impl FnMut(usize),
 ) -> Result<Vec<PathBuf>> {
     let layout = FrameLayout::new(reader, &options.columns)?;
-    std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, "creating the folder", e))?;
     let chosen = chosen(reader, options.episodes)?;
+    limits::SHEET_BYTES.check(limits::product([chosen.len(), SHEET_COLUMNS, layout.width, layout.height, 3]))?;
     let video_of = |episode: usize| folder.join(format!("episode_{}.mp4", reader.episodes()[episode].index));
     let contact_sheet_path = folder.join("contact_sheet.png");
     // Before any work, so that a refusal leaves no part of a preview.
     chosen.iter().try_for_each(|&episode| check_mp4(&video_of(episode)))?;
     check_png(&contact_sheet_path)?;
+    std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, "creating the folder", e))?;
     let (mut written, mut sheet) = (vec![], vec![]);
     let scale = integer_scale(layout.width, layout.height, ENLARGED_SIDE);
     for (done, &episode) in chosen.iter().enumerate() {

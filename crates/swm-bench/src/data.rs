@@ -13,7 +13,7 @@ use std::time::Instant;
 use swm_core::columns::{ACTION, PIXELS};
 use swm_core::results::Summary;
 use swm_core::run::Control;
-use swm_core::{EnvChoice, Error, Named as _, RandomPolicy, Result};
+use swm_core::{EnvChoice, Error, Named as _, RandomPolicy, Result, limits};
 use swm_data::{
     CacheConfig, ClipSpec, ConvertMode, ConvertOptions, FORMATS, ImageCodec, Loader, LoaderConfig, Location, Reader,
     WriteOptions, convert, create, open,
@@ -160,19 +160,17 @@ const fn layout(
 /// Measures loading from every format, converting, and memory use over several epochs.
 ///
 /// # Errors
-/// When a setting is invalid, an environment or a writer fails, or the reference stops answering. Work that the
-/// reference cannot do is not an error: the row contains the reason.
+/// When a setting is invalid, an environment or a writer fails, `control` stops the run, or the reference stops
+/// answering. Work that the reference cannot do is not an error: the row contains the reason.
 #[allow(clippy::too_many_lines, reason = "the list of all measurements, in order")]
-pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBenchReport> {
-    if config.pairs == 0 || !(config.seconds > 0.0 && config.seconds.is_finite()) {
-        let given = format!("{} pairs of measurements of {} seconds", config.pairs, config.seconds);
-        return Err(Error::config("benchmark", given, "choose at least 1 pair of more than 0 seconds"));
-    }
+pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig, control: &mut Control<'_>) -> Result<DataBenchReport> {
+    crate::check_measurements(config.pairs, config.seconds)?;
+    limits::BENCHMARK_BYTES.check(limits::product([config.episodes, config.steps, config.size, config.size, 3]))?;
     let folder = tempfile::tempdir().map_err(|e| Error::io("a temporary folder", "creating the folder", e))?;
     let at = |name: &str| folder.path().join(name);
     // The source stores PNG, which is lossless and readable for this implementation and for the reference.
     let source = at("source.lance");
-    let rows = collect(env, config, &source)?;
+    let rows = collect(env, config, &source, control)?;
     let mut report = DataBenchReport {
         env: env.id(),
         episodes: config.episodes,
@@ -199,12 +197,12 @@ pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBench
     };
     for layout in LAYOUTS.iter().filter(selected) {
         let path = at(layout.file);
-        write(&source, &path, layout)?;
+        write(&source, &path, layout, control)?;
         let mut reference_side = match &mut reference {
             Some(reference) => ReferenceDataset::new(reference, config, &source, layout, &at(layout.reference_file)),
             None => Err("no reference".to_owned()),
         };
-        report.rates.push(load(layout.name, &path, config, CacheConfig::Off, reference_side.as_mut())?);
+        report.rates.push(load(layout.name, &path, config, CacheConfig::Off, reference_side.as_mut(), control)?);
         if layout.name == "lance, jpeg" {
             let decoded = rows * config.size * config.size * 3;
             // The JSON report contains these labels.
@@ -215,11 +213,11 @@ pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBench
             ];
             for (what, cache) in caches {
                 let what = format!("{}, {what}", layout.name);
-                report.rates.push(load(&what, &path, config, cache, reference_side.as_mut())?);
+                report.rates.push(load(&what, &path, config, cache, reference_side.as_mut(), control)?);
             }
-            report.rates.extend(remote(&path, config)?);
+            report.rates.extend(remote(&path, config, control)?);
             for _ in 0..config.epochs {
-                epoch(&open(&path)?, config, report.resident.len() as u64)?;
+                epoch(&open(&path)?, config, report.resident.len() as u64, control)?;
                 report.resident.extend(resident());
             }
         }
@@ -233,7 +231,8 @@ pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBench
                 let what = format!("lance to {}{what}", layout.name);
                 let source = jpeg.as_deref().unwrap_or(&source);
                 let folder = at("converted");
-                report.rates.push(conversion(&what, verify, source, layout, &folder, config, reference.as_mut())?);
+                let reference = reference.as_mut();
+                report.rates.push(conversion(&what, verify, source, layout, &folder, config, reference, control)?);
             }
         }
     }
@@ -241,7 +240,7 @@ pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBench
 }
 
 /// Collects the content of all datasets; returns the number of rows.
-fn collect(env: &EnvChoice, config: &DataBenchConfig, path: &Path) -> Result<usize> {
+fn collect(env: &EnvChoice, config: &DataBenchConfig, path: &Path, control: &mut Control<'_>) -> Result<usize> {
     let image = Some((config.size, config.size));
     let world = WorldConfig { image, max_episode_steps: Some(config.steps), ..WorldConfig::default() };
     let mut world = World::new(env.clone(), world)?;
@@ -253,12 +252,12 @@ fn collect(env: &EnvChoice, config: &DataBenchConfig, path: &Path) -> Result<usi
     };
     let writer = create(path, &world.collect_schema(&collected)?, options)?;
     let mut policy = RandomPolicy::new(world.spec(), WorldConfig::default().envs);
-    world.collect(&mut policy, writer, &collected, &mut Control::default())?;
+    world.collect(&mut policy, writer, &collected, control)?;
     Ok(open(path)?.episodes().iter().map(|episode| episode.length).sum())
 }
 
 /// Converts the dataset `source` to the format of a layout.
-fn write(source: &Path, path: &Path, layout: &Layout) -> Result<()> {
+fn write(source: &Path, path: &Path, layout: &Layout, control: &mut Control<'_>) -> Result<()> {
     let options = ConvertOptions {
         format: Some(layout.format.to_owned()),
         mode: ConvertMode::Overwrite,
@@ -266,7 +265,7 @@ fn write(source: &Path, path: &Path, layout: &Layout) -> Result<()> {
         verify: false,
         ..ConvertOptions::default()
     };
-    convert(&open(source)?, &Location::from(path), &options, &mut Control::new()).map(|_| ())
+    convert(&open(source)?, &Location::from(path), &options, control).map(|_| ())
 }
 
 /// A dataset that the reference loads.
@@ -330,10 +329,12 @@ fn load(
     config: &DataBenchConfig,
     cache: CacheConfig,
     dataset: std::result::Result<&mut ReferenceDataset<'_>, &mut String>,
+    control: &mut Control<'_>,
 ) -> Result<DataBenchRow> {
     let mut endless = Endless { loader: loader(&open(path)?, config, cache)?, epoch: 0 };
     // The first epoch is a warm-up, which fills caches and buffers.
     for batch in endless.loader.epoch(0, 0) {
+        control.check()?;
         batch?;
     }
     let reference_setup = match &dataset {
@@ -343,7 +344,7 @@ fn load(
     let mut dataset = dataset.ok();
     let (mut ours, mut reference) = (vec![], vec![]);
     for _ in 0..config.pairs {
-        ours.push(endless.measure(config)?);
+        ours.push(endless.measure(config, control)?);
         if let Some(dataset) = &mut dataset {
             reference.push(dataset.measure(config)?);
         }
@@ -352,18 +353,18 @@ fn load(
 }
 
 /// Measures loading, alternately from the object store and from the local disk.
-fn remote(local: &Path, config: &DataBenchConfig) -> Result<Option<DataBenchRow>> {
+fn remote(local: &Path, config: &DataBenchConfig, control: &mut Control<'_>) -> Result<Option<DataBenchRow>> {
     let Some(folder) = &config.remote else { return Ok(None) };
     let target = Location::parse(&format!("{}/bench.lance", folder.to_string().trim_end_matches('/')))?;
     let options = ConvertOptions { mode: ConvertMode::Overwrite, codec: JPEG, verify: false, ..Default::default() };
-    convert(&open(local)?, &target, &options, &mut Control::new())?;
+    convert(&open(local)?, &target, &options, control)?;
     let mut loaders =
         [loader(&open(&target)?, config, CacheConfig::Off)?, loader(&open(local)?, config, CacheConfig::Off)?]
             .map(|loader| Endless { loader, epoch: 0 });
     let (mut remote, mut local) = (vec![], vec![]);
     for _ in 0..=config.pairs {
-        remote.push(loaders[0].measure(config)?);
-        local.push(loaders[1].measure(config)?);
+        remote.push(loaders[0].measure(config, control)?);
+        local.push(loaders[1].measure(config, control)?);
     }
     // The first measurement of each loader is a warm-up.
     let reference_setup = "the local disk".to_owned();
@@ -385,7 +386,7 @@ struct Endless {
 
 impl Endless {
     /// Loads for about `config.seconds`, after one batch that is not counted; returns clips per second.
-    fn measure(&mut self, config: &DataBenchConfig) -> Result<f64> {
+    fn measure(&mut self, config: &DataBenchConfig, control: &mut Control<'_>) -> Result<f64> {
         self.epoch += 1;
         let mut batches = (self.epoch..).flat_map(|epoch| self.loader.epoch(epoch, 0));
         let mut next =
@@ -393,6 +394,7 @@ impl Endless {
         next()?;
         let (begun, mut clips) = (Instant::now(), 0);
         while begun.elapsed().as_secs_f64() < config.seconds {
+            control.check()?;
             clips += next()?.rows();
         }
         Ok(clips as f64 / begun.elapsed().as_secs_f64())
@@ -400,8 +402,9 @@ impl Endless {
 }
 
 /// Loads one epoch.
-fn epoch(reader: &Arc<dyn Reader>, config: &DataBenchConfig, epoch: u64) -> Result<()> {
+fn epoch(reader: &Arc<dyn Reader>, config: &DataBenchConfig, epoch: u64, control: &mut Control<'_>) -> Result<()> {
     for batch in loader(reader, config, CacheConfig::Off)?.epoch(epoch, 0) {
+        control.check()?;
         batch?;
     }
     Ok(())
@@ -415,6 +418,7 @@ fn resident() -> Option<u64> {
 }
 
 /// Measures conversions, alternately by this implementation and by the reference.
+#[allow(clippy::too_many_arguments, reason = "a part of `bench_data` that uses its state")]
 fn conversion(
     what: &str,
     verify: bool,
@@ -423,6 +427,7 @@ fn conversion(
     folder: &Path,
     config: &DataBenchConfig,
     mut reference: Option<&mut Reference>,
+    control: &mut Control<'_>,
 ) -> Result<DataBenchRow> {
     let (mut ours, mut theirs) = (vec![], vec![]);
     let mut reference_setup =
@@ -438,7 +443,7 @@ fn conversion(
             ..ConvertOptions::default()
         };
         let begun = Instant::now();
-        convert(&open(source)?, &Location::from(&our_path), &options, &mut Control::new())?;
+        convert(&open(source)?, &Location::from(&our_path), &options, control)?;
         ours.push(1.0 / begun.elapsed().as_secs_f64());
         if let Some(process) = &mut reference {
             match process.convert(source, layout.reference_format, &reference_path) {

@@ -9,7 +9,7 @@ use swm_core::pool::Reset;
 use swm_core::results::Summary;
 use swm_core::run::Control;
 use swm_core::{
-    Action, ColumnIndices, EnvChoice, Error, Key, RandomPolicy, ResetOptions, Result, Space, VariationRequest,
+    Action, ColumnIndices, EnvChoice, Error, Key, RandomPolicy, ResetOptions, Result, Space, VariationRequest, limits,
 };
 use swm_data::{ImageCodec, WriteOptions, create};
 use swm_eval::{CollectConfig, World, WorldConfig, episode_key, reset_seed};
@@ -97,13 +97,14 @@ pub struct BenchRow {
 /// for every environment.
 ///
 /// # Errors
-/// When a setting is invalid, an environment fails, or the reference fails after its start. A reference that does not
-/// start is not an error: [`BenchReport::reference`] contains the reason.
+/// When a setting is invalid, an environment fails, `control` stops the run, or the reference fails after its start. A
+/// reference that does not start is not an error: [`BenchReport::reference`] contains the reason.
 #[allow(clippy::too_many_lines, reason = "the list of all measurements, in order")]
-pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchReport> {
-    if config.pairs == 0 || !(config.seconds > 0.0 && config.seconds.is_finite()) {
-        let given = format!("{} pairs of measurements of {} seconds", config.pairs, config.seconds);
-        return Err(Error::config("benchmark", given, "choose at least 1 pair of more than 0 seconds"));
+pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig, control: &mut Control<'_>) -> Result<BenchReport> {
+    crate::check_measurements(config.pairs, config.seconds)?;
+    for &size in &config.sizes {
+        let sizes = [config.episodes, EPISODE_FACTOR, config.episode_steps, size, size, 3];
+        limits::BENCHMARK_BYTES.check(limits::product(sizes))?;
     }
     let mut report = BenchReport {
         envs: config.envs,
@@ -115,37 +116,40 @@ pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchRe
         if config.bare {
             let mut reference = report.start_reference(env, 64, config);
             let mut ours = Ours::new(env, None, config)?;
-            ours.step(config.seconds / 4.0)?;
+            ours.step(config.seconds / 4.0, control)?;
             report.rows.push(BenchRow::measure(
                 env,
                 None,
                 "step",
                 config.pairs,
-                |_| ours.step(config.seconds),
+                |_, control| ours.step(config.seconds, control),
                 reference.as_mut().map(|reference| |_| reference.bare(config.seconds)),
+                control,
             )?);
             report.rows.push(BenchRow::measure(
                 env,
                 None,
                 "step, one thread",
                 config.pairs,
-                |pair| single(env, pair as u64, config),
+                |pair, control| single(env, pair as u64, config, control),
                 reference.as_mut().map(|reference| |_| reference.bare(config.seconds)),
+                control,
             )?);
         }
         for &size in &config.sizes {
             let mut reference = report.start_reference(env, size, config);
             let mut ours = Ours::new(env, Some(size), config)?;
             // The first measurements of this implementation and of the reference are warm-ups and are not counted.
-            ours.step(config.seconds / 4.0)?;
+            ours.step(config.seconds / 4.0, control)?;
             reference.as_mut().map(|reference| reference.step(config.seconds / 4.0)).transpose()?;
             report.rows.push(BenchRow::measure(
                 env,
                 Some(size),
                 "step + render",
                 config.pairs,
-                |_| ours.step(config.seconds),
+                |_, control| ours.step(config.seconds, control),
                 reference.as_mut().map(|reference| |_| reference.step(config.seconds)),
+                control,
             )?);
             if config.episodes == 0 {
                 continue;
@@ -166,9 +170,9 @@ pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchRe
                     Some(size),
                     what,
                     config.pairs,
-                    |pair| {
+                    |pair, control| {
                         let config = CollectConfig { seed: pair as u64, ..collect.clone() };
-                        ours.collect(&path(&format!("ours-{name}"), pair), codec, config)
+                        ours.collect(&path(&format!("ours-{name}"), pair), codec, config, control)
                     },
                     reference.as_mut().map(|reference| {
                         |pair| {
@@ -176,6 +180,7 @@ pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchRe
                             reference.collect(&path, config.episodes, pair as u64)
                         }
                     }),
+                    control,
                 )?);
             }
         }
@@ -211,12 +216,13 @@ impl Ours {
     }
 
     /// Steps with random actions for about `seconds`; returns environment steps per second.
-    fn step(&mut self, seconds: f64) -> Result<f64> {
+    fn step(&mut self, seconds: f64, control: &mut Control<'_>) -> Result<f64> {
         let columns = ColumnIndices::of(self.world.pool().infos().schema())?;
         let ended = [columns.terminated, columns.truncated];
         let begun = Instant::now();
         let mut steps = 0;
         let elapsed = loop {
+            control.check()?;
             self.world.step(&mut self.policy, &self.active)?;
             steps += self.active.len();
             self.done.clear();
@@ -240,12 +246,18 @@ impl Ours {
     }
 
     /// Collects a Lance dataset, including the commit; returns environment steps per second.
-    fn collect(&mut self, path: &Path, codec: ImageCodec, config: CollectConfig) -> Result<f64> {
+    fn collect(
+        &mut self,
+        path: &Path,
+        codec: ImageCodec,
+        config: CollectConfig,
+        control: &mut Control<'_>,
+    ) -> Result<f64> {
         let begun = Instant::now();
         let manifest = Some(self.world.collect_manifest(&config));
         let options = WriteOptions { manifest, codec, ..Default::default() };
         let writer = create(path, &self.world.collect_schema(&config)?, options)?;
-        let collected = self.world.collect(&mut self.policy, writer, &config, &mut Control::default())?;
+        let collected = self.world.collect(&mut self.policy, writer, &config, control)?;
         let rate = collected.steps as f64 / begun.elapsed().as_secs_f64();
         // The next measurement of stepping requires that every slot has a running episode.
         self.world.reset(0, &VariationRequest::default())?;
@@ -274,7 +286,7 @@ impl BenchReport {
 
 /// Environment steps per second of a single environment on this thread, without observations, with precomputed random
 /// actions.
-fn single(env: &EnvChoice, seed: u64, config: &BenchConfig) -> Result<f64> {
+fn single(env: &EnvChoice, seed: u64, config: &BenchConfig, control: &mut Control<'_>) -> Result<f64> {
     const ACTIONS: usize = 4096;
     /// Steps between two readings of the clock.
     const ROUND: usize = 1000;
@@ -289,6 +301,7 @@ fn single(env: &EnvChoice, seed: u64, config: &BenchConfig) -> Result<f64> {
     env.reset(seed, &ResetOptions::default())?;
     let begun = Instant::now();
     loop {
+        control.check()?;
         for i in 0..ROUND {
             let i = (steps + i) % ACTIONS;
             let action = if continuous { Action::Continuous(&values[i]) } else { Action::Discrete(&choices[i]) };
@@ -315,12 +328,14 @@ impl BenchRow {
         size: Option<usize>,
         what: &'static str,
         pairs: usize,
-        mut ours: impl FnMut(usize) -> Result<f64>,
+        mut ours: impl FnMut(usize, &mut Control<'_>) -> Result<f64>,
         mut reference: Option<impl FnMut(usize) -> Result<f64>>,
+        control: &mut Control<'_>,
     ) -> Result<Self> {
         let (mut our_rates, mut their_rates) = (vec![], vec![]);
         for pair in 0..pairs {
-            our_rates.push(ours(pair)?);
+            control.check()?;
+            our_rates.push(ours(pair, control)?);
             if let Some(reference) = &mut reference {
                 their_rates.push(reference(pair)?);
             }

@@ -21,3 +21,14 @@ pub use model::{ModelBenchConfig, ModelBenchReport, ModelBenchRow, Subject, Work
 pub use plan::{PlanBenchConfig, PlanBenchReport, PlanBenchRow, bench_plan};
 pub use reference::REFERENCE_PYTHON;
 pub use render::{Drawing, RenderBenchConfig, RenderRow, bench_render};
+
+use swm_core::{Error, Result};
+
+/// Checks the number and the duration of measurements.
+fn check_measurements(pairs: usize, seconds: f64) -> Result<()> {
+    if pairs > 0 && seconds > 0.0 && seconds.is_finite() {
+        return Ok(());
+    }
+    let given = format!("{pairs} pairs of measurements of {seconds} seconds");
+    Err(Error::config("benchmark", given, "choose at least 1 pair of more than 0 seconds"))
+}

@@ -10,6 +10,7 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 use swm_core::results::Summary;
+use swm_core::run::Control;
 use swm_core::{Error, Result};
 
 /// A workload of a model.
@@ -95,9 +96,14 @@ pub struct ModelBenchRow {
 /// Measures a model; `weights` is the file from which the reference reads the weights and the inputs of the model.
 ///
 /// # Errors
-/// When there are no measurements, a workload fails, or the reference fails after its start. A reference that does not
+/// When there are no measurements, a workload fails, `control` stops the run, or the reference fails after its start. A reference that does not
 /// start is not an error: [`ModelBenchReport::reference`] contains the reason.
-pub fn bench_model(config: &ModelBenchConfig, weights: &Path, subject: &mut dyn Subject) -> Result<ModelBenchReport> {
+pub fn bench_model(
+    config: &ModelBenchConfig,
+    weights: &Path,
+    subject: &mut dyn Subject,
+    control: &mut Control<'_>,
+) -> Result<ModelBenchReport> {
     if config.pairs == 0 || config.works.iter().any(|(_, count)| *count == 0) {
         return Err(Error::config("measurements of a benchmark", "0", "choose at least 1"));
     }
@@ -113,6 +119,7 @@ pub fn bench_model(config: &ModelBenchConfig, weights: &Path, subject: &mut dyn 
         }
     }
     for &(work, count) in &config.works {
+        control.check()?;
         // The first repetition is a warm-up and is not counted.
         let outputs = subject.run(work)?;
         let difference = match &mut reference {
@@ -127,6 +134,7 @@ pub fn bench_model(config: &ModelBenchConfig, weights: &Path, subject: &mut dyn 
         for _ in 0..config.pairs {
             let begun = Instant::now();
             for _ in 0..count {
+                control.check()?;
                 subject.run(work)?;
             }
             ours.push(begun.elapsed().as_secs_f64() / count as f64);
@@ -203,12 +211,13 @@ mod tests {
 
     #[test]
     fn report_states_that_the_reference_is_missing() {
-        let report = bench_model(&config(None), Path::new("none"), &mut Constant).expect("the benchmark succeeds");
+        let report = bench_model(&config(None), Path::new("none"), &mut Constant, &mut Control::new())
+            .expect("the benchmark succeeds");
         assert!(report.to_string().contains(REFERENCE_PYTHON));
         assert_eq!(report.rows.len(), 2);
         assert!(report.rows.iter().all(|row| row.ours.len() == 3 && row.share.is_none() && row.difference.is_none()));
         let no_pairs = ModelBenchConfig { pairs: 0, ..config(None) };
-        assert!(bench_model(&no_pairs, Path::new("none"), &mut Constant).is_err());
+        assert!(bench_model(&no_pairs, Path::new("none"), &mut Constant, &mut Control::new()).is_err());
     }
 
     #[cfg(unix)]
@@ -222,8 +231,8 @@ mod tests {
             if [ $what = run ]; then echo SWM 2 1.0; else echo SWM 1.0 2.5; fi; done\n";
         std::fs::write(&python, script).expect("the file is written");
         std::fs::set_permissions(&python, std::fs::Permissions::from_mode(0o755)).expect("the file is made executable");
-        let report =
-            bench_model(&config(Some(python)), Path::new("none"), &mut Constant).expect("the benchmark succeeds");
+        let report = bench_model(&config(Some(python)), Path::new("none"), &mut Constant, &mut Control::new())
+            .expect("the benchmark succeeds");
         assert_eq!(report.reference, "1.2.3");
         assert_eq!((report.rows[0].difference, report.rows[1].difference), (Some(0.2), None));
         for row in &report.rows {

@@ -11,6 +11,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 use swm_core::pool::threads;
 use swm_core::results::Summary;
+use swm_core::run::Control;
 use swm_core::{Batch, Candidates, CostModel, Error, Key, PlanProblem, PlanSpace, Result, Solver};
 use swm_plan::Cem;
 
@@ -95,9 +96,9 @@ pub struct PlanBenchRow {
 /// Measures CEM with a model that takes no time.
 ///
 /// # Errors
-/// When a setting is invalid, or the reference fails after its start. A reference that does not start is not an error:
+/// When a setting is invalid, `control` stops the run, or the reference fails after its start. A reference that does not start is not an error:
 /// [`PlanBenchReport::reference`] contains the reason.
-pub fn bench_plan(config: &PlanBenchConfig) -> Result<PlanBenchReport> {
+pub fn bench_plan(config: &PlanBenchConfig, control: &mut Control<'_>) -> Result<PlanBenchReport> {
     let positive = |seconds: f64| seconds > 0.0 && seconds.is_finite();
     if config.pairs == 0 || !positive(config.seconds) || !positive(config.model_seconds) {
         let given = format!(
@@ -134,11 +135,11 @@ pub fn bench_plan(config: &PlanBenchConfig) -> Result<PlanBenchReport> {
         }
         let mut planning = Planning::new(config, envs);
         // The first measurements of this implementation and of the reference are warm-ups and are not counted.
-        workers.install(|| planning.solve(config.seconds / 4.0))?;
+        workers.install(|| planning.solve(config.seconds / 4.0, control))?;
         reference.as_mut().map(|reference| reference.solve(config.seconds / 4.0)).transpose()?;
         let (mut ours, mut theirs) = (vec![], vec![]);
         for _ in 0..config.pairs {
-            ours.push(workers.install(|| planning.solve(config.seconds))?);
+            ours.push(workers.install(|| planning.solve(config.seconds, control))?);
             if let Some(reference) = &mut reference {
                 theirs.push(reference.solve(config.seconds)?);
             }
@@ -182,10 +183,11 @@ impl<'a> Planning<'a> {
     }
 
     /// Plans for about `seconds`; returns iterations per second.
-    fn solve(&mut self, seconds: f64) -> Result<f64> {
+    fn solve(&mut self, seconds: f64, control: &mut Control<'_>) -> Result<f64> {
         self.model.calls = 0;
         let begun = Instant::now();
         let elapsed = loop {
+            control.check()?;
             let keys: Vec<Key> = self.keys.iter().map(|key| key.at(self.plans)).collect();
             self.plans += 1;
             let space = PlanSpace::Continuous { low: &self.low, high: &self.high };
@@ -258,7 +260,7 @@ mod tests {
 
     #[test]
     fn report_states_that_the_reference_is_missing() {
-        let report = bench_plan(&config()).expect("the benchmark succeeds");
+        let report = bench_plan(&config(), &mut Control::new()).expect("the benchmark succeeds");
         assert!(report.reference.contains(REFERENCE_PYTHON));
         assert_eq!(report.rows.iter().map(|row| row.envs).collect::<Vec<_>>(), [1, 3]);
         for row in &report.rows {
@@ -266,7 +268,7 @@ mod tests {
             assert!(row.iterations_per_second > 0.0 && row.overhead > 0.0);
         }
         let missing = PlanBenchConfig { python: Some("/no/such/python".into()), ..config() };
-        let report = bench_plan(&missing).expect("the benchmark succeeds");
+        let report = bench_plan(&missing, &mut Control::new()).expect("the benchmark succeeds");
         assert!(report.reference.contains("/no/such/python"), "{}", report.reference);
     }
 
@@ -280,7 +282,8 @@ mod tests {
         let script = "#!/bin/sh\necho hello\necho SWM ready 1.2.3\nwhile read line; do echo SWM 10 2.0; done\n";
         std::fs::write(&python, script).expect("the file is written");
         std::fs::set_permissions(&python, std::fs::Permissions::from_mode(0o755)).expect("the file is made executable");
-        let report = bench_plan(&PlanBenchConfig { python: Some(python), ..config() }).expect("the benchmark succeeds");
+        let config = PlanBenchConfig { python: Some(python), ..config() };
+        let report = bench_plan(&config, &mut Control::new()).expect("the benchmark succeeds");
         assert_eq!(report.reference, "1.2.3");
         for row in &report.rows {
             assert_eq!(row.reference, [5.0; 3]);
@@ -291,9 +294,13 @@ mod tests {
 
     #[test]
     fn invalid_settings_are_errors() {
-        assert!(bench_plan(&PlanBenchConfig { pairs: 0, ..config() }).is_err());
-        assert!(bench_plan(&PlanBenchConfig { seconds: f64::NAN, ..config() }).is_err());
-        assert!(bench_plan(&PlanBenchConfig { model_seconds: 0.0, ..config() }).is_err());
-        assert!(bench_plan(&PlanBenchConfig { envs: vec![0], ..config() }).is_err());
+        for config in [
+            PlanBenchConfig { pairs: 0, ..config() },
+            PlanBenchConfig { seconds: f64::NAN, ..config() },
+            PlanBenchConfig { model_seconds: 0.0, ..config() },
+            PlanBenchConfig { envs: vec![0], ..config() },
+        ] {
+            assert!(bench_plan(&config, &mut Control::new()).is_err());
+        }
     }
 }

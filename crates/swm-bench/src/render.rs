@@ -6,6 +6,7 @@
 use serde::Serialize;
 use std::time::{Duration, Instant};
 use swm_core::results::Summary;
+use swm_core::run::Control;
 use swm_core::{Action, Env, EnvChoice, FrameMut, Key, ResetOptions, Result, Space, thread_budget};
 use swm_eval::episode_key;
 
@@ -50,11 +51,12 @@ pub struct RenderRow {
 /// Measures environments with every renderer.
 ///
 /// # Errors
-/// When an environment cannot be created, fails, or does not render.
+/// When an environment cannot be created, fails, or does not render, or `control` stops the run.
 pub fn bench_render(
     envs: &[EnvChoice],
     renderers: &[(String, &Drawing<'_>)],
     config: &RenderBenchConfig,
+    control: &mut Control<'_>,
 ) -> Result<Vec<RenderRow>> {
     let mut rows = vec![];
     for choice in envs {
@@ -76,6 +78,7 @@ pub fn bench_render(
                     render(&mut *env)?;
                     let begun = Instant::now();
                     while begun.elapsed().as_secs_f64() < config.seconds {
+                        control.check()?;
                         act(&mut *env, &space, step)?;
                         step += 1;
                         let before = Instant::now();

@@ -3,6 +3,7 @@
 use std::io::Write as _;
 use swm_bench::{BenchConfig, bench_envs};
 use swm_core::EnvChoice;
+use swm_core::run::Control;
 
 /// A native environment whose steps take little time.
 fn env() -> EnvChoice {
@@ -26,7 +27,7 @@ fn config() -> BenchConfig {
 
 #[test]
 fn report_states_that_the_reference_is_missing() {
-    let report = bench_envs(&[env()], &config()).expect("the benchmark succeeds");
+    let report = bench_envs(&[env()], &config(), &mut Control::new()).expect("the benchmark succeeds");
     assert!(report.reference.contains("SWM_REFERENCE_PYTHON"));
     let works: Vec<_> = report.rows.iter().map(|row| (row.what, row.size)).collect();
     assert_eq!(works, [("step", None), ("step, one thread", None), ("step + render", Some(8))]);
@@ -35,7 +36,7 @@ fn report_states_that_the_reference_is_missing() {
         assert!(row.steps_per_second > 0.0);
     }
     let missing = BenchConfig { python: Some("/no/such/python".into()), ..config() };
-    let report = bench_envs(&[env()], &missing).expect("the benchmark succeeds");
+    let report = bench_envs(&[env()], &missing, &mut Control::new()).expect("the benchmark succeeds");
     assert!(report.reference.contains("/no/such/python"), "{}", report.reference);
 }
 
@@ -51,8 +52,8 @@ fn ratio_is_the_median_over_measurement_pairs() {
     file.write_all(script.as_bytes()).expect("the file is written");
     file.set_permissions(std::fs::Permissions::from_mode(0o755)).expect("making the file executable");
     drop(file);
-    let report =
-        bench_envs(&[env()], &BenchConfig { python: Some(python), ..config() }).expect("the benchmark succeeds");
+    let report = bench_envs(&[env()], &BenchConfig { python: Some(python), ..config() }, &mut Control::new())
+        .expect("the benchmark succeeds");
     assert_eq!(report.reference, "1.2.3");
     for row in &report.rows {
         assert_eq!(row.reference, [5.0; 3]);
@@ -63,6 +64,6 @@ fn ratio_is_the_median_over_measurement_pairs() {
 
 #[test]
 fn invalid_settings_are_errors() {
-    assert!(bench_envs(&[env()], &BenchConfig { pairs: 0, ..config() }).is_err());
-    assert!(bench_envs(&[env()], &BenchConfig { seconds: f64::NAN, ..config() }).is_err());
+    assert!(bench_envs(&[env()], &BenchConfig { pairs: 0, ..config() }, &mut Control::new()).is_err());
+    assert!(bench_envs(&[env()], &BenchConfig { seconds: f64::NAN, ..config() }, &mut Control::new()).is_err());
 }

@@ -8,21 +8,19 @@
 mod blocks;
 #[cfg(feature = "tls")]
 mod patience;
+mod threads;
 
 pub(crate) use blocks::{BlockCache, ObjectRanges};
+pub(crate) use threads::{block_on, start_lance};
 
 use crate::dataset::location::Location;
-use futures::FutureExt as _;
 use object_store::path::Path as StorePath;
 use object_store::{ObjectStore, ObjectStoreExt as _};
 use std::collections::BTreeMap;
-use std::future::Future;
 use std::ops::Range;
-use std::panic::AssertUnwindSafe;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError, mpsc};
+use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::{Error, Result};
-use tokio::runtime::Runtime;
 use url::Url;
 
 /// Bytes of an object.
@@ -34,39 +32,6 @@ const GAP: u64 = 128 << 10;
 
 /// Maximum number of concurrent requests per read.
 const REQUESTS: usize = 32;
-
-/// The runtime for asynchronous code: two threads, started at first use and never stopped. A forked process (Python
-/// forks) does not inherit threads, so it starts a new runtime.
-fn runtime() -> Result<&'static Runtime> {
-    static RUNTIME: Mutex<Option<(u32, &'static Runtime)>> = Mutex::new(None);
-    let mut started = RUNTIME.lock().unwrap_or_else(PoisonError::into_inner);
-    let process = std::process::id();
-    if let Some((owner, runtime)) = *started
-        && owner == process
-    {
-        return Ok(runtime);
-    }
-    let runtime =
-        tokio::runtime::Builder::new_multi_thread().worker_threads(2).thread_name("swm-io").enable_all().build();
-    let runtime = runtime.map_err(|e| Error::external("starting the threads that read datasets", e))?;
-    let runtime = &*Box::leak(Box::new(runtime));
-    *started = Some((process, runtime));
-    Ok(runtime)
-}
-
-/// Runs a future to completion; may be called from any thread, including threads of another runtime. Returns `None` if
-/// the future panics, which damaged files can cause in the libraries that read them.
-///
-/// # Errors
-/// If the runtime's threads cannot be started.
-pub(crate) fn block_on<T: Send + 'static>(future: impl Future<Output = T> + Send + 'static) -> Result<Option<T>> {
-    let (sender, receiver) = mpsc::sync_channel(1);
-    runtime()?.spawn(async move {
-        // The receiver below outlives the future, so sending cannot fail.
-        let _ = sender.send(AssertUnwindSafe(future).catch_unwind().await);
-    });
-    Ok(receiver.recv().ok().and_then(std::result::Result::ok))
-}
 
 /// The object store of a location, and the path within that store.
 ///
@@ -326,15 +291,6 @@ mod tests {
             assert_eq!(bytes, content[range.start as usize..range.end as usize]);
         }
         assert!(file.read(std::slice::from_ref(&(0..3_000_001))).is_err());
-        Ok(())
-    }
-
-    #[test]
-    fn block_on_runs_inside_another_runtime_and_returns_none_after_a_panic() -> Result<()> {
-        let outer = tokio::runtime::Builder::new_current_thread().build().expect("creating the runtime");
-        assert_eq!(outer.block_on(async { block_on(async { 7 }) })?, Some(7));
-        let panics = block_on::<()>(async { std::panic::resume_unwind(Box::new("damaged")) })?;
-        assert_eq!(panics, None);
         Ok(())
     }
 }

@@ -5,11 +5,13 @@ use super::{Context, emit, emit_json, eprint, table};
 use crate::ENVS;
 use crate::subject::LewmSubject;
 use clap::{Args, Subcommand};
+use std::sync::Arc;
 use swm_bench::{
     BenchConfig, DataBenchConfig, Drawing, ModelBenchConfig, ModelBenchReport, PlanBenchConfig, RenderBenchConfig,
     Work, bench_data, bench_envs, bench_model, bench_plan, bench_render,
 };
 use swm_core::limits::{ENVS as PARALLEL, IMAGE_SIDE};
+use swm_core::run::Control;
 use swm_core::{EnvChoice, Origin};
 use swm_data::Location;
 use swm_models::device;
@@ -78,7 +80,7 @@ fn render(args: &RenderArgs, context: &Context) -> anyhow::Result<()> {
     }
     let threads = context.threads.max(1);
     let config = RenderBenchConfig { sizes: args.sizes.clone(), turns: args.turns, seconds: args.seconds, threads };
-    let rows = bench_render(&envs, &renderers, &config)?;
+    let rows = bench_render(&envs, &renderers, &config, &mut control(context))?;
     if context.json {
         return emit_json(&rows);
     }
@@ -145,6 +147,7 @@ fn data(args: &DataArgs, context: &Context) -> anyhow::Result<()> {
             threads: if context.threads > 0 { context.threads } else { DataBenchConfig::default().threads },
             ..DataBenchConfig::default()
         },
+        &mut control(context),
     )?;
     if context.json {
         return emit_json(&report);
@@ -174,13 +177,14 @@ struct PlanArgs {
 
 /// Measures the solver alone, then planning with a LeWM.
 fn plan(args: &PlanArgs, context: &Context) -> anyhow::Result<()> {
-    let planner = bench_plan(&PlanBenchConfig {
+    let config = PlanBenchConfig {
         envs: args.envs.clone(),
         pairs: args.pairs,
         seconds: args.seconds,
         threads: context.threads,
         ..PlanBenchConfig::default()
-    })?;
+    };
+    let planner = bench_plan(&config, &mut control(context))?;
     if args.iterations > 0 {
         let works = vec![(Work::Plan, 1), (Work::Cost, 2), (Work::Encode, 10)];
         let model = lewm("paper", works, args.iterations, 2, args.pairs, &args.device, context)?;
@@ -240,7 +244,7 @@ fn lewm(
         subject.write(weights.path())?;
         let python = PlanBenchConfig::default().python;
         let config = ModelBenchConfig { works, pairs, sizes: subject.sizes()?, python };
-        bench_model(&config, weights.path(), &mut subject)
+        bench_model(&config, weights.path(), &mut subject, &mut control(context))
     })?)
 }
 
@@ -269,6 +273,11 @@ struct EnvsArgs {
     /// Steps per collected episode; resets weigh more in shorter episodes
     #[arg(long, default_value_t = 50, value_parser = count::<1, 1_000_000>)]
     episode_steps: usize,
+}
+
+/// A control that stops a benchmark at Ctrl-C and shows no progress, which would take time from the measurements.
+fn control(context: &Context) -> Control<'static> {
+    Control::new().with_interrupt(Arc::clone(&context.interrupt))
 }
 
 /// Runs a benchmark and prints its report.
@@ -301,6 +310,7 @@ fn envs(args: &EnvsArgs, context: &Context) -> anyhow::Result<()> {
             episodes: args.episodes,
             ..BenchConfig::default()
         },
+        &mut control(context),
     )?;
     if context.json {
         return emit_json(&report);

@@ -23,6 +23,7 @@ mod pull;
 mod report;
 mod reproduce;
 mod results_tables;
+mod signals;
 mod solvers;
 mod study;
 mod train;
@@ -31,11 +32,12 @@ mod wrappers;
 use clap::{Parser, Subcommand};
 use output::{emit, emit_json, eprint, table};
 use std::backtrace::{Backtrace, BacktraceStatus};
+use std::error::Error as _;
 use std::ffi::OsString;
 use std::panic::{AssertUnwindSafe, PanicHookInfo, catch_unwind};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use swm_core::limits;
+use std::sync::atomic::AtomicBool;
+use swm_core::{Error, Result, limits};
 
 /// Collect data from environments, train world models, plan, evaluate, report
 #[derive(Parser)]
@@ -190,14 +192,14 @@ impl Cli {
         std::panic::set_hook(Box::new(print_panic));
         // A panic of the main thread, or of a thread that it joins, ends the run as an error does.
         let outcome = catch_unwind(AssertUnwindSafe(|| self.dispatch()));
-        match outcome.unwrap_or_else(|panic| Err(swm_core::Error::panicked("the command panicked", &*panic).into())) {
+        match outcome.unwrap_or_else(|panic| Err(Error::panicked("the command panicked", &*panic).into())) {
             Ok(()) => 0,
             Err(error) => {
                 // An error of this engine is one complete line; other errors are printed with their causes.
-                let own = error.downcast_ref::<swm_core::Error>();
+                let own = error.downcast_ref::<Error>();
                 eprint(&own.map_or_else(|| format!("error: {error:#}\n"), |own| format!("error: {own}\n")));
                 match own {
-                    Some(swm_core::Error::Interrupted) => 130,
+                    Some(Error::Interrupted) => 130,
                     Some(error) if error.is_usage() => 2,
                     _ => 1,
                 }
@@ -222,35 +224,34 @@ impl Cli {
             Command::Models => models::models(json),
             Command::Checkpoints(args) => checkpoints::checkpoints(&args, json),
             Command::Report(args) => report::report(&args, json),
-            Command::Convert(args) => convert::convert(&args, &Context::new(json, self.threads)),
-            Command::Doctor(args) => doctor::doctor(&args, &Context::new(json, self.threads)),
-            Command::Collect(args) => collect::collect(&args, &Context::new(json, self.threads)),
-            Command::Train(args) => train::train(&args, &Context::new(json, self.threads)),
+            Command::Convert(args) => convert::convert(&args, &Context::new(json, self.threads)?),
+            Command::Doctor(args) => doctor::doctor(&args, &Context::new(json, self.threads)?),
+            Command::Collect(args) => collect::collect(&args, &Context::new(json, self.threads)?),
+            Command::Train(args) => train::train(&args, &Context::new(json, self.threads)?),
             Command::Pull(args) => pull::pull(&args, json),
-            Command::Probe(args) => probe::probe(&args, &Context::new(json, self.threads)),
-            Command::Eval(args) => eval::eval(&args, &Context::new(json, self.threads)),
+            Command::Probe(args) => probe::probe(&args, &Context::new(json, self.threads)?),
+            Command::Eval(args) => eval::eval(&args, &Context::new(json, self.threads)?),
             Command::Study(args) => study::study(&args, json, || Context::new(json, self.threads)),
-            Command::Reproduce(args) => reproduce::reproduce(&args, &Context::new(json, self.threads)),
-            Command::Bench(args) => bench::bench(&args, &Context::new(json, self.threads)),
-            Command::Demo(args) => demo::demo(&args, &Context::new(json, self.threads)),
+            Command::Reproduce(args) => reproduce::reproduce(&args, &Context::new(json, self.threads)?),
+            Command::Bench(args) => bench::bench(&args, &Context::new(json, self.threads)?),
+            Command::Demo(args) => demo::demo(&args, &Context::new(json, self.threads)?),
         }
     }
 }
 
 impl Context {
-    fn new(json: bool, threads: usize) -> Self {
-        // Burn's matrix products run in rayon's global pool, so the pool gets the same number of threads.
-        rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().ok();
-        let interrupt = Arc::new(AtomicBool::new(false));
-        let flag = Arc::clone(&interrupt);
-        ctrlc::set_handler(move || {
-            if flag.swap(true, Ordering::SeqCst) {
-                std::process::exit(130);
-            }
-            eprint("\nstopping at the next safe point; press Ctrl-C again to stop at once\n");
-        })
-        .ok();
-        Self { json, threads, interrupt }
+    /// Starts the threads of matrix products, and handles signals.
+    fn new(json: bool, threads: usize) -> Result<Self> {
+        // Burn's matrix products run in rayon's global pool, so the pool gets the same number of threads. An embedding
+        // program may have started the pool already, which is not an error.
+        let started = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global();
+        if let Err(error) = started
+            && error.source().is_some()
+        {
+            return Err(Error::external("starting worker threads", error));
+        }
+        let interrupt = signals::interrupt_flag().map_err(|error| Error::external("handling Ctrl-C", error))?;
+        Ok(Self { json, threads, interrupt })
     }
 }
 

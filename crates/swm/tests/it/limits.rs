@@ -1,7 +1,9 @@
 //! Tests of absurd counts and of runs with little memory (docs/security.md).
 
 use crate::{Swm, text};
-use std::process::Command;
+use std::process::{Command, Output};
+#[cfg(target_os = "linux")]
+use std::sync::mpsc::RecvTimeoutError;
 
 const ROOMS: &[&str] = &["collect", "swm/TwoRoom-v1", "-o", "rooms", "--episodes", "1", "--image", "32"];
 const EVAL: &[&str] = &["eval", "random", "--env", "swm/TwoRoom-v1", "--image", "32"];
@@ -24,29 +26,148 @@ fn absurd_counts_are_refused_before_work_starts() {
     swm.fails(&[&ROOMS[..6], &["--image", "100000"]].concat(), 2, &["100000", "4096"]);
     swm.fails(&[&ROOMS[..6], &["--image", "4096", "--envs", "10000"]].concat(), 2, &["bytes of a batch"]);
     swm.fails(&[EVAL, &["--episodes", huge]].concat(), 2, &[huge, "from 1 to 1000000"]);
+    let wrappers = ["--wrapper", "noise"].repeat(20_000);
+    swm.fails(&[&ROOMS[..6], &wrappers].concat(), 2, &["number of wrappers", "20000 is too large"]);
+    swm.fails(&[EVAL, &wrappers].concat(), 2, &["number of wrappers", "20000 is too large"]);
+    swm.fails(&["bench", "data", "--episodes", "1000000", "--steps", "1000000"], 2, &["bytes of the frames"]);
+    swm.fails(&["bench", "envs", "swm/TwoRoom-v1", "--episodes", "1000000"], 2, &["bytes of the frames"]);
     assert!(!swm.path("datasets/rooms.lance").exists());
+}
+
+/// Runs the command with a limit of its virtual memory, and ends it after a minute.
+#[cfg(target_os = "linux")]
+fn run_with_memory(swm: &Swm, args: &[&str], kilobytes: usize, stack: &str) -> Output {
+    let program = env!("CARGO_BIN_EXE_swm");
+    Command::new("sh")
+        .args(["-c", &format!("ulimit -v {kilobytes}; exec timeout -s KILL 60 '{program}' \"$@\""), "sh"])
+        .args(args)
+        .envs([("STABLEWM_HOME", swm.home().as_os_str()), ("RUST_BACKTRACE", "1".as_ref())])
+        .env("RUST_MIN_STACK", stack)
+        .current_dir(swm.home())
+        .output()
+        .expect("sh starts")
+}
+
+/// Every thread reserves a stack of 1 GiB, so the limit is the number of threads that the program can start, while
+/// small allocations succeed. A thread after the first of a runtime that could not be started made the run wait for ever.
+#[cfg(target_os = "linux")]
+#[test]
+fn run_without_threads_ends_with_an_error() {
+    const STACK: usize = 1 << 30;
+    let swm = Swm::new();
+    let two = |args: &[&'static str]| [args, &["--threads", "2"]].concat();
+    let collect = |name| two(&["collect", "swm/TwoRoom-v1", "-o", name, "--image", "32", "--episodes", "2"]);
+    swm.json(&collect("rooms"));
+    for args in [collect("more"), two(&["convert", "rooms", "rooms.h5"]), two(&["doctor", "rooms"])] {
+        let mut outcomes = vec![];
+        for threads in 0..16 {
+            let _absent = std::fs::remove_dir_all(swm.path("datasets/more.lance"));
+            let _absent = std::fs::remove_file(swm.path("rooms.h5"));
+            let output = run_with_memory(&swm, &args, (threads * STACK + (STACK >> 1)) >> 10, &STACK.to_string());
+            let (code, error) = (output.status.code(), text(&output.stderr));
+            assert!(matches!(code, Some(0 | 1)), "{args:?} with {threads} threads: {:?}: {error}", output.status);
+            assert!(code == Some(0) || error.contains("error: "), "{args:?} with {threads} threads: {error}");
+            outcomes.push(code);
+        }
+        assert_eq!((outcomes[0], outcomes[15]), (Some(1), Some(0)), "{args:?}: {outcomes:?}");
+    }
 }
 
 /// With little memory, threads cannot be started and allocations fail anywhere. With backtraces on, the program waited
 /// forever for the lock of the backtrace of another panic.
 #[cfg(target_os = "linux")]
 #[test]
-#[ignore = "a thread that cannot be started still makes a run wait for ever, once in some tens of runs"]
 fn run_without_memory_ends_with_an_error() {
     let swm = Swm::new();
-    for (i, kilobytes) in (300..=700).step_by(40).enumerate() {
+    for (i, kilobytes) in (300_000..=700_000).step_by(40_000).enumerate() {
         let name = format!("rooms-{i}");
         let collect = ["collect", "swm/TwoRoom-v1", "-o", &name, "--image", "96", "--episodes", "12", "--threads", "2"];
-        let program = env!("CARGO_BIN_EXE_swm");
-        let limited = format!("ulimit -v {}; exec timeout -k 5 20 '{program}' \"$@\"", kilobytes * 1000);
-        let output = Command::new("sh")
-            .args(["-c", &limited, "sh"])
-            .args(collect)
-            .env("STABLEWM_HOME", swm.home())
-            .env("RUST_BACKTRACE", "1")
-            .output()
-            .expect("sh starts");
+        let output = run_with_memory(&swm, &collect, kilobytes, "");
         let code = output.status.code();
-        assert!(matches!(code, Some(0 | 1)), "{kilobytes} MB: {code:?}: {}", text(&output.stderr));
+        assert!(matches!(code, Some(0 | 1)), "{kilobytes} kB: {:?}: {}", output.status, text(&output.stderr));
+    }
+}
+
+/// A running command that gets signals. It is killed after a minute, so that a test ends.
+#[cfg(target_os = "linux")]
+struct Running {
+    child: std::process::Child,
+    lines: std::io::Lines<std::io::BufReader<std::process::ChildStderr>>,
+    /// Dropped at the end, so that the program is not killed.
+    _ended: std::sync::mpsc::Sender<()>,
+}
+
+#[cfg(target_os = "linux")]
+impl Running {
+    fn start(swm: &Swm, args: &[&str]) -> Self {
+        use std::io::BufRead as _;
+        let mut child = swm.command(args).stderr(std::process::Stdio::piped()).spawn().expect("swm starts");
+        let lines = std::io::BufReader::new(child.stderr.take().expect("standard error")).lines();
+        let (_ended, timeout) = std::sync::mpsc::channel::<()>();
+        let id = child.id().to_string();
+        std::thread::spawn(move || {
+            if timeout.recv_timeout(std::time::Duration::from_secs(60)) == Err(RecvTimeoutError::Timeout) {
+                let _sent = Command::new("kill").args(["-KILL", &id]).status();
+            }
+        });
+        Self { child, lines, _ended }
+    }
+
+    /// Waits until the program handles interrupts, bit 1 of the mask of handled signals.
+    fn wait_for_handler(&self) {
+        let handles_interrupts = || {
+            let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).expect("a process");
+            let mask = status.lines().find_map(|line| line.strip_prefix("SigCgt:")).expect("a mask of signals");
+            u64::from_str_radix(mask.trim(), 16).expect("a number") & 2 > 0
+        };
+        while !handles_interrupts() {
+            std::thread::yield_now();
+        }
+    }
+
+    /// Waits for a line of standard error.
+    fn wait_for(&mut self, text: &str) {
+        let line = self.lines.find(|line| line.as_ref().is_ok_and(|line| line.contains(text)));
+        assert!(line.is_some(), "the program ended without '{text}'");
+    }
+
+    fn signal(&self, name: &str) {
+        let sent = Command::new("kill").args([&format!("-{name}"), &self.child.id().to_string()]).status();
+        assert!(sent.expect("kill starts").success());
+    }
+
+    /// Waits for the end; returns the exit code.
+    fn end(mut self) -> Option<i32> {
+        self.child.wait().expect("the program ends").code()
+    }
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn first_signal_stops_a_benchmark() {
+    let swm = Swm::new();
+    let long = ["--pairs", "1", "--seconds", "3600"];
+    for bench in [&["envs", "swm/TwoRoom-v1", "--sizes", "32"][..], &["plan", "--envs", "1", "--iterations", "0"]] {
+        let running = Running::start(&swm, &[&["bench"], bench, &long].concat());
+        running.wait_for_handler();
+        running.signal("INT");
+        assert_eq!(running.end(), Some(130), "{bench:?}");
+    }
+}
+
+/// The unit of work is one plan of many iterations, during which nothing looks at the first signal.
+#[cfg(target_os = "linux")]
+#[test]
+fn second_signal_ends_the_program() {
+    let swm = Swm::new();
+    let solver = ["--solver", "cem,samples=100000,iterations=1000000", "--budget", "3"];
+    for (signal, code) in [("INT", 130), ("TERM", 143), ("HUP", 129)] {
+        let args = ["eval", "simulator", "--env", "swm/TwoRoom-v1", "--image", "32", "--episodes", "1"];
+        let mut running = Running::start(&swm, &[&args[..], &solver].concat());
+        running.wait_for("evaluate: random");
+        running.signal(signal);
+        running.wait_for("stopping at the next safe point");
+        running.signal(signal);
+        assert_eq!(running.end(), Some(code), "{signal}");
     }
 }

@@ -147,15 +147,14 @@ impl Shared {
 
 impl Workers {
     pub fn new(threads: usize) -> Result<Arc<Self>> {
-        let shared = Arc::<Shared>::default();
-        let threads: std::io::Result<Vec<thread::JoinHandle<()>>> = (0..threads)
-            .map(|_| {
-                let shared = Arc::clone(&shared);
-                thread::Builder::new().name("swm-load".to_owned()).spawn(move || shared.work())
-            })
-            .collect();
-        let threads = threads.map_err(|error| Error::external("starting the loader's threads", error))?;
-        Ok(Arc::new(Self { shared, threads }))
+        let mut workers = Self { shared: Arc::default(), threads: vec![] };
+        for _ in 0..threads {
+            let shared = Arc::clone(&workers.shared);
+            // If a thread cannot be started, dropping `workers` stops the others.
+            let thread = thread::Builder::new().name("swm-load".to_owned()).spawn(move || shared.work());
+            workers.threads.push(thread.map_err(|error| Error::external("starting the loader's threads", error))?);
+        }
+        Ok(Arc::new(workers))
     }
 
     /// Starts loading batches, at most `window` batches ahead of the consumer.

@@ -29,11 +29,15 @@ use swm_core::{Error, Result};
 use url::Url;
 
 /// Runs a future to completion. A panic in Lance, which damaged files can cause, becomes an error.
+///
+/// # Errors
+/// The errors of the future, or threads that cannot be started.
 pub fn block_on<T, F>(label: &Path, action: &str, future: F) -> Result<T>
 where
     T: Send + 'static,
     F: Future<Output = lance_core::Result<T>> + Send + 'static,
 {
+    objects::start_lance()?;
     match objects::block_on(future)? {
         Some(result) => result.map_err(|e| lance_error(label, action, &e)),
         None => Err(damaged(label, format!("{action}: the content is invalid"))),
@@ -219,6 +223,11 @@ impl Store {
     }
 
     fn has_versions(&self) -> Result<bool> {
+        if !self.remote {
+            // A list of the store has no pipes, but Lance lists local versions itself.
+            let entries = std::fs::read_dir(self.label.join("_versions")).into_iter().flatten().flatten();
+            entries.into_iter().try_for_each(|entry| check_regular(&entry.path()))?;
+        }
         Ok(self.list("_versions")?.iter().any(|meta| meta.location.extension() == Some("manifest")))
     }
 
@@ -377,6 +386,9 @@ impl Store {
     /// # Errors
     /// If the file does not exist or reading fails.
     pub fn read(&self, path: &StorePath) -> Result<Bytes> {
+        if !self.remote {
+            check_regular(&self.local(path))?;
+        }
         let (objects, path) = (Arc::clone(&self.objects), path.clone());
         block_on(&self.label, "reading a file", async move { Ok(objects.inner.get(&path).await?.bytes().await?) })
     }
@@ -428,6 +440,15 @@ impl Store {
         let scheduler = scheduler.open_file(&self.data_path(&file.path), &file.file_size_bytes).await?;
         let plugins = Arc::<DecoderPlugins>::default();
         FileReader::try_open(scheduler, None, plugins, &LanceCache::no_cache(), FileReaderOptions::default()).await
+    }
+}
+
+/// Checks that a file is a regular file, if it exists: Lance would wait for ever for the content of a pipe. Other writers
+/// may delete files of old versions at any time.
+fn check_regular(path: &Path) -> Result<()> {
+    match files::open(path) {
+        Err(error @ Error::Corrupt { .. }) => Err(error),
+        _ => Ok(()),
     }
 }
 

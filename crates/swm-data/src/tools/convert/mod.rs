@@ -16,7 +16,7 @@ use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, channel, sync_channel};
-use std::thread::scope;
+use std::thread::{Builder, scope};
 use swm_core::columns::ACTION;
 use swm_core::run::{Control, Event, Progress, Stage};
 use swm_core::{Batch, DType, Error, Result, Schema};
@@ -281,7 +281,10 @@ impl<'a> Source<'a> {
         let outcome = scope(|scope| {
             let (to_writer, from_reader) = sync_channel(1);
             let (back, empty) = channel();
-            scope.spawn(move || self.send(episodes, &to_writer, &empty, hashed));
+            Builder::new()
+                .name("swm-read".to_owned())
+                .spawn_scoped(scope, move || self.send(episodes, &to_writer, &empty, hashed))
+                .map_err(|error| Error::external("starting the thread that reads episodes", error))?;
             for (done, episode) in from_reader.into_iter().enumerate() {
                 let SourceEpisode { rows, constants, hash, cut } = episode?;
                 writer.write_episode_with(&rows, &constants)?;

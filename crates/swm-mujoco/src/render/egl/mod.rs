@@ -86,16 +86,16 @@ impl EglRenderer {
         let (sender, started) = mpsc::channel();
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let threads = cores.min(if display.hardware { MAX_HARDWARE_THREADS } else { MAX_THREADS });
+        let mut failure = None;
         for i in 0..threads {
             let (library, queue, sender) = (Arc::clone(&library), Arc::clone(&queue), sender.clone());
-            std::thread::Builder::new()
-                .name(format!("render-{i}"))
-                .spawn(move || run_render_thread(library, display, &queue, &sender))
-                .map_err(|error| Error::external("starting a render thread", error))?;
+            let run = move || run_render_thread(library, display, &queue, &sender);
+            if let Err(error) = std::thread::Builder::new().name(format!("render-{i}")).spawn(run) {
+                failure = Some(Error::external("starting a render thread", error));
+            }
         }
         drop(sender);
         // One working thread is enough; a thread that cannot create a context ends.
-        let mut failure = None;
         for result in started {
             match result {
                 Ok(device) => return Ok(Self { name: format!("egl ({device})"), queue }),

@@ -30,7 +30,7 @@ use serde::Serialize;
 use serde_json::json;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
-use std::thread::{ScopedJoinHandle, scope};
+use std::thread::{Builder, ScopedJoinHandle, scope};
 use swm_core::columns::{self, ColumnIndices};
 use swm_core::finite::not_finite;
 use swm_core::pool::Reset;
@@ -138,7 +138,9 @@ impl World {
             let (to_writer, from_world) = sync_channel::<Finished>(QUEUE);
             let (back, written) = channel();
             let check = &mut check;
-            let writing = scope.spawn(move || write_all(writer, check, &from_world, &back, &threads));
+            let write = move || write_all(writer, check, config.episodes, &from_world, &back, &threads);
+            let writing = Builder::new().name("swm-write".to_owned()).spawn_scoped(scope, write);
+            let writing = writing.map_err(|e| Error::external("starting the thread that stores episodes", e))?;
             let mut collection = Collection {
                 layout,
                 config,
@@ -186,11 +188,12 @@ pub fn check_continues(stored: &Manifest, wanted: &Manifest) -> Result<()> {
     Ok(())
 }
 
-/// Writes the received episodes and sends their batches back for reuse. Encoding runs on the world's threads, so that
-/// one setting limits all threads.
+/// Writes the received episodes, up to `total`, and sends their batches back for reuse. Encoding runs on the world's
+/// threads, so that one setting limits all threads.
 fn write_all(
     mut writer: Box<dyn Writer>,
     check: &mut FiniteCheck,
+    total: usize,
     episodes: &Receiver<Finished>,
     back: &Sender<Batch>,
     threads: &rayon::ThreadPool,
@@ -201,7 +204,7 @@ fn write_all(
         // The receiver is dropped if the world fails. The episodes that are already finished are stored nevertheless.
         let _ = back.send(episode);
     }
-    writer.finish()
+    if writer.episodes() < total { writer.pause() } else { writer.finish() }
 }
 
 /// Counts the NaN and infinite values of the stored episodes.

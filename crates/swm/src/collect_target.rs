@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use swm_core::{Error, Manifest, Result};
-use swm_data::lance::shard_manifests;
+use swm_data::lance::{Shard, shard_manifests};
 use swm_data::{Location, WriteMode};
 use swm_eval::collect::check_continues;
 
@@ -52,6 +52,15 @@ pub fn check(
     }
 }
 
+/// Returns the numbers of NaN and infinite values of the stored episodes of a shard, by column.
+///
+/// # Errors
+/// When the log of a shard is damaged.
+pub fn not_finite_of_shard(location: &Location, shard: Shard) -> Result<BTreeMap<String, u64>> {
+    let stored = shard_manifests(location)?.into_iter().find(|(stored, _)| *stored == shard);
+    Ok(stored.map(|(_, manifest)| manifest.not_finite).unwrap_or_default())
+}
+
 /// Adds the NaN and infinite values of a collection to those in its manifest.
 pub fn add_not_finite(manifest: &mut Manifest, counts: &BTreeMap<String, u64>) {
     for (column, count) in counts {
@@ -73,7 +82,7 @@ pub fn describe_not_finite(counts: &BTreeMap<String, u64>) -> Option<String> {
 pub fn check_shards(location: &Location) -> Result<()> {
     let stored = swm_data::open(location.clone()).ok().and_then(|reader| reader.manifest());
     let shards = shard_manifests(location)?;
-    let mut manifests = stored.iter().chain(&shards);
+    let mut manifests = stored.iter().chain(shards.iter().map(|(_, manifest)| manifest));
     let Some(first) = manifests.next() else { return Ok(()) };
     manifests.try_for_each(|other| check_renderer("committing a shard", first, other))
 }

@@ -92,9 +92,17 @@ pub trait Writer: Send {
     /// Number of episodes in the dataset, including those that are not committed yet.
     fn episodes(&self) -> usize;
 
-    /// Commits the remaining episodes.
+    /// Commits the remaining episodes; the dataset, or the shard, is complete.
     ///
     /// # Errors
     /// If writing fails, or another process changed the dataset in the meantime.
     fn finish(self: Box<Self>) -> Result<()>;
+
+    /// As [`Writer::finish`], if more episodes are to follow after an interruption or an error: a shard stays unfinished.
+    ///
+    /// # Errors
+    /// As [`Writer::finish`].
+    fn pause(self: Box<Self>) -> Result<()> {
+        self.finish()
+    }
 }

@@ -73,6 +73,19 @@ impl FormatEntry {
         (self.backend()?.create)(location, schema, options)
     }
 
+    /// Checks that a new dataset will be recognised at a location: for formats that are recognised by the suffix.
+    ///
+    /// # Errors
+    /// If the location has no suffix of the format.
+    pub(crate) fn check_suffix(&self, location: &Location) -> Result<()> {
+        if (self.detect)(location) {
+            return Ok(());
+        }
+        let suffix = self.suffixes[0];
+        let problem = format!("{location} does not end in .{suffix}, by which the format {} is recognised", self.id);
+        Err(Error::config("dataset path", problem, format!("use {location}.{suffix}")))
+    }
+
     /// Deletes a dataset on this machine, and its folder if that is empty then.
     ///
     /// # Errors

@@ -53,7 +53,8 @@ pub fn open(location: impl Into<Location>) -> Result<Arc<dyn Reader>> {
 /// that of the dataset to continue, or writing fails.
 pub fn create(location: impl Into<Location>, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
     let location = location.into();
-    let Some(format) = detect(&location) else {
+    let named = || FORMATS.rows.iter().find(|format| format.has_suffix(&location));
+    let Some(format) = detect(&location).or_else(named) else {
         let problem = format!("{location} has no suffix of a known format");
         let fix = format!("use a name that ends in .{}", lance::ENTRY.suffixes[0]);
         return Err(Error::config("dataset path", problem, fix));

@@ -105,6 +105,37 @@ fn lengths_of_lerobot_episodes_do_not_allocate_memory() {
     }
 }
 
+/// Writes the footer of a Parquet file again, with this number of rows in the file and in its row groups.
+fn set_parquet_rows(path: &Path, rows: i64) {
+    use parquet::file::metadata::{FileMetaData, ParquetMetaDataBuilder, ParquetMetaDataReader, ParquetMetaDataWriter};
+    let mut bytes = std::fs::read(path).expect("a file");
+    let old = ParquetMetaDataReader::new().parse_and_finish(&bytes::Bytes::from(bytes.clone())).expect("a footer");
+    let file = old.file_metadata();
+    let schema = file.schema_descr_ptr();
+    let file = FileMetaData::new(file.version(), rows, None, None, schema, None);
+    let groups = old
+        .row_groups()
+        .iter()
+        .map(|group| group.clone().into_builder().set_num_rows(rows).build().expect("a row group"));
+    let new = ParquetMetaDataBuilder::new(file).set_row_groups(groups.collect()).build();
+    ParquetMetaDataWriter::new(&mut bytes, &new).finish().expect("a written footer");
+    std::fs::write(path, bytes).expect("a written file");
+}
+
+#[test]
+fn row_counts_of_parquet_files_allocate_no_memory() {
+    for rows in [1 << 31, 1 << 60, i64::MAX, -1] {
+        for part in ["data", "meta/episodes"] {
+            let (_folder, path) = copied("lerobot-v30-h264");
+            let files = fuzz::files(&path);
+            let of_part = |file: &&PathBuf| file.strip_prefix(&path).is_ok_and(|inside| inside.starts_with(part));
+            let file = files.iter().filter(of_part).find(|file| file.extension().is_some_and(|end| end == "parquet"));
+            set_parquet_rows(file.expect("a Parquet file"), rows);
+            assert!(!error(&path).is_empty(), "{part}: {rows} rows");
+        }
+    }
+}
+
 #[test]
 fn pipes_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -121,8 +152,12 @@ fn pipes_are_refused() {
     };
     pipe(&folder.path().join("d.h5"));
     refused(&folder.path().join("d.h5"));
-    for (name, suffix) in [("folder-reference", "ep_len.npz"), ("lerobot-v21", "parquet"), ("reference.lance", "lance")]
-    {
+    for (name, suffix) in [
+        ("folder-reference", "ep_len.npz"),
+        ("lerobot-v21", "parquet"),
+        ("reference.lance", "lance"),
+        ("reference.lance", "manifest"),
+    ] {
         let (_folder, path) = copied(name);
         let files = fuzz::files(&path);
         let file = files.iter().find(|file| file.to_string_lossy().ends_with(suffix)).expect("a file");

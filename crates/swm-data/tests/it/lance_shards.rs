@@ -75,7 +75,9 @@ fn interrupted_shard_is_continued_and_finished_shard_is_overwritten() {
     for e in 0..2 {
         writer.write_episode(&episode(e)).expect("writing an episode");
     }
-    drop(writer);
+    writer.pause().expect("pausing the shard");
+    assert!(failure(&path).contains("shard 0 of 2 is not finished"));
+    drop(shard_writer(&path, WriteMode::Append, 0, 2).expect("continuing the shard"));
     assert!(failure(&path).contains("shard 0 of 2 is not finished"));
     assert!(
         shard_writer(&path, WriteMode::Create, 0, 2)

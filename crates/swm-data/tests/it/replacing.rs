@@ -74,6 +74,25 @@ fn overwrite(path: &Path) -> Option<swm_core::Error> {
 }
 
 #[test]
+fn datasets_that_would_not_be_recognised_are_refused() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    for format in FORMATS.rows {
+        let path = folder.path().join(format!("data-{}", format.id));
+        match format.create(&Location::from(&path), &schema(), options(WriteMode::Create)) {
+            Ok(mut writer) => {
+                writer.write_episode(&episode(0)).expect("writing an episode");
+                writer.finish().expect("finishing the dataset");
+                assert_eq!(open(&path).expect("opening").episodes().len(), 1, "{}", format.id);
+            }
+            Err(error) => {
+                let expected = format!("use {}.{}", path.display(), format.suffixes[0]);
+                assert!(error.to_string().contains(&expected) && !path.exists(), "{error}");
+            }
+        }
+    }
+}
+
+#[test]
 fn files_of_another_kind_are_not_replaced() {
     let folder = tempfile::tempdir().expect("creating a folder");
     let text = b"a thesis, not a dataset";
@@ -87,6 +106,13 @@ fn files_of_another_kind_are_not_replaced() {
             assert!(create(&path, &schema(), options(mode)).is_err(), "{name}");
             assert_eq!(std::fs::read(&path).expect("the file"), content, "{name}");
         }
+    }
+    for format in FOLDER_FORMATS {
+        let path = folder.path().join(format!("a.{format}"));
+        std::fs::write(&path, text).expect("writing a file");
+        let error = overwrite(&path).expect("a refusal").to_string();
+        assert!(error.contains(&format!("{}: is not a folder", path.display())), "{error}");
+        std::fs::remove_file(&path).expect("removing the file");
     }
     for name in ["a.lance", "b.folder", "c.video", "d.lerobot"] {
         let file = folder.path().join(name).join("meta/info.json");

@@ -10,9 +10,15 @@ pub struct Memory {
     /// The number of episodes after which writing fails.
     pub full_at: Option<usize>,
     pub finished: Arc<Mutex<usize>>,
+    pub paused: Arc<Mutex<usize>>,
 }
 
 impl Memory {
+    /// How often a writer was finished, and paused.
+    pub fn ends(&self) -> (usize, usize) {
+        (*self.finished.lock().expect("no thread has panicked"), *self.paused.lock().expect("no thread has panicked"))
+    }
+
     pub fn writer(&self) -> Box<dyn Writer> {
         Box::new(self.clone())
     }
@@ -57,6 +63,11 @@ impl Writer for Memory {
 
     fn finish(self: Box<Self>) -> Result<()> {
         *self.finished.lock().expect("no thread has panicked") += 1;
+        Ok(())
+    }
+
+    fn pause(self: Box<Self>) -> Result<()> {
+        *self.paused.lock().expect("no thread has panicked") += 1;
         Ok(())
     }
 }

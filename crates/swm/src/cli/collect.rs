@@ -171,9 +171,11 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
     // An invalid factor fails before an older dataset is replaced.
     world.spec().variation_space.resolve(&config.variation, swm_core::Key::new(config.seed))?;
     let mut manifest = collection.manifest(&world, weights)?;
-    if collection.shard.is_none() {
-        manifest.not_finite = collect_target::check(location, collection.mode, &manifest, collection.mix_renderers)?;
-    }
+    manifest.not_finite = match (collection.shard, collection.mode) {
+        (None, mode) => collect_target::check(location, mode, &manifest, collection.mix_renderers)?,
+        (Some(shard), WriteMode::Append) => collect_target::not_finite_of_shard(location, shard)?,
+        (Some(_), _) => BTreeMap::new(),
+    };
     let writer = collection.writer(&world.collect_schema(config)?, collection.mode, manifest.clone())?;
     // A shard has consecutive episodes, so that the committed dataset has all episodes in order.
     let episodes = collection.shard.map_or(0..config.episodes, |Shard { index, count }| {
@@ -185,10 +187,9 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
     let collected = world.collect(&mut *policy, writer, config, &mut progress::control(context));
     if let Some(warning) = collect_target::describe_not_finite(world.not_finite()) {
         eprint(&format!("warning: {warning}\n"));
-        if collection.shard.is_none() {
-            collect_target::add_not_finite(&mut manifest, world.not_finite());
-            collection.writer(&world.collect_schema(config)?, WriteMode::Append, manifest)?.finish()?;
-        }
+        collect_target::add_not_finite(&mut manifest, world.not_finite());
+        let writer = collection.writer(&world.collect_schema(config)?, WriteMode::Append, manifest)?;
+        if collected.is_ok() { writer.finish()? } else { writer.pause()? }
     }
     let collected = collected?;
     let message = format!(

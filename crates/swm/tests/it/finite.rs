@@ -52,6 +52,14 @@ fn values_that_are_not_finite_are_counted_or_refused() {
     collect("faulty:Faulty-v0", &["-o", "bad", "--episodes", "3", "--resume"]);
     assert_eq!(counts("bad"), json!({"observation": 3, "reward": 3}), "a resumed collection adds its own");
 
+    for shard in [&["0/2"][..], &["1/2"], &["0/2", "--resume"]] {
+        let args = [&["-o", "sharded", "--episodes", "3", "--shard"], shard].concat();
+        let (code, error) = collect("faulty:Faulty-v0", &args);
+        assert_eq!(code, Some(0), "{error}");
+    }
+    swm.json(&["datasets", "commit", "sharded"]);
+    assert_eq!(counts("sharded"), json!({"observation": 3, "reward": 3}), "the commit adds the counts of the shards");
+
     let (code, error) = collect("faulty:Faulty-v0", &["-o", "strict", "--episodes", "2", "--strict-finite"]);
     assert_eq!(code, Some(1), "{error}");
     assert!(error.contains("column 'observation' of episode 0 is not finite: 1 of 12 values"), "{error}");

@@ -6,6 +6,7 @@
 //! before the log entry that names them, so a killed shard continues after its last group. Episode indices are only
 //! known once all shards are complete; the commit writes them to separate data files.
 
+use super::ENTRY;
 use super::encode::EncodedEpisode;
 use super::reader::LanceReader;
 use super::schema;
@@ -85,6 +86,7 @@ pub fn create_shard(
         let problem = format!("there is no shard {} of {}", shard.index, shard.count);
         return Err(Error::config("shard", problem, "choose an index from 0 up to the number of shards minus 1"));
     }
+    ENTRY.check_suffix(location)?;
     let store = Store::new(location)?;
     store.check_writable()?;
     let mut columns = schema::columns_to_write(schema)?;
@@ -268,13 +270,23 @@ fn parse<T: DeserializeOwned>(store: &Store, path: &StorePath) -> Result<T> {
     serde_json::from_slice(&store.read(path)?).map_err(|e| damaged(&store.label, format!("{path} is unreadable: {e}")))
 }
 
-/// The manifests of the existing shards, in order. Shards without a manifest are skipped.
+/// The existing shards with their manifests, in order. Shards without a manifest are skipped.
 ///
 /// # Errors
 /// If a log is damaged or cannot be read.
-pub fn shard_manifests(location: &Location) -> Result<Vec<Manifest>> {
-    let logs = Logs::read(&Store::new(location)?)?;
-    Ok(logs.shards.into_values().filter_map(|shard_log| shard_log.begun?.manifest).collect())
+pub fn shard_manifests(location: &Location) -> Result<Vec<(Shard, Manifest)>> {
+    let shards = Logs::read(&Store::new(location)?)?.shards.into_iter();
+    let manifests = shards.map(|((count, index), log)| Some((Shard { index, count }, log.begun?.manifest?)));
+    Ok(manifests.flatten().collect())
+}
+
+/// Adds the NaN and infinite values of all shards to those in a manifest.
+fn with_counts(mut manifest: Manifest, shards: &[&ShardLogFiles]) -> Manifest {
+    let manifests = shards.iter().filter_map(|shard| shard.begun.as_ref()?.manifest.as_ref());
+    for (column, count) in manifests.flat_map(|shard| &shard.not_finite) {
+        *manifest.not_finite.entry(column.clone()).or_default() += count;
+    }
+    manifest
 }
 
 /// Commits the episodes of all shards as one version, in the order of the shards, after the existing episodes. Returns
@@ -294,8 +306,11 @@ pub fn commit_shards(location: &Location) -> Result<usize> {
         let Some(begun) = shards.first().and_then(|shard_log| shard_log.begun.as_ref()) else {
             return Err(damaged(&store.label, "a shard has no begun.json"));
         };
-        let options = WriteOptions { codec: begun.codec, manifest: begun.manifest.clone(), ..WriteOptions::default() };
+        let uncounted = begun.manifest.clone().map(|manifest| Manifest { not_finite: BTreeMap::new(), ..manifest });
+        let manifest = uncounted.map(|manifest| with_counts(manifest, &shards));
+        let options = WriteOptions { codec: begun.codec, manifest, ..WriteOptions::default() };
         let fresh = new_table_schema(&schema::columns_to_write(&begun.columns)?, &begun.columns, &options)?;
+        let stored = version.as_ref().and_then(|old| schema::manifest(&old.manifest.schema));
         let mut table = Table::new(store.clone(), version.clone(), fresh);
         let mut next = if version.is_some() { table.refresh()? } else { 0 };
         let first = next;
@@ -311,6 +326,13 @@ pub fn commit_shards(location: &Location) -> Result<usize> {
             None => table.overwrite_operation(fragments.clone()),
         };
         if table.commit(operation)? {
+            let counted = stored.clone().map(|stored| with_counts(stored, &shards));
+            if counted != stored
+                && let Some(operation) = table.manifest_operation(schema::json(&counted)?)
+            {
+                // If this fails, another writer has replaced the manifest.
+                table.commit(operation)?;
+            }
             logs.remove(&store);
             return Ok((next - first) as usize);
         }

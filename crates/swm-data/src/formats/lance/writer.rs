@@ -8,6 +8,7 @@
 //! the new ones and retries. An exclusive writer fails instead: on this machine it locks the folder, in an object store
 //! it notices another writer at its next commit.
 
+use super::ENTRY;
 use super::encode::EncodedEpisode;
 use super::reader::LanceReader;
 use super::schema::{self, Kind, StoredColumn};
@@ -37,6 +38,7 @@ const MAX_QUEUED: usize = 2;
 /// Creates, continues or replaces a table.
 pub fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
     options.codec.check()?;
+    ENTRY.check_suffix(location)?;
     let store = Store::new(location)?;
     store.check_writable()?;
     schema::columns_to_write(schema)?;
@@ -273,6 +275,10 @@ impl Writer for LanceWriter {
 
     fn finish(mut self: Box<Self>) -> Result<()> {
         self.shared.complete.store(true, Ordering::Release);
+        self.close()
+    }
+
+    fn pause(mut self: Box<Self>) -> Result<()> {
         self.close()
     }
 }

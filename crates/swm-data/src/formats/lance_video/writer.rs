@@ -1,6 +1,6 @@
 //! Writes episodes to the table, with the videos as constants of their episode.
 
-use super::{SCHEMA, VIDEO, table};
+use super::{ENTRY, SCHEMA, VIDEO, table};
 use crate::dataset::Location;
 use crate::dataset::episodes;
 use crate::dataset::{Constants, WriteMode, WriteOptions, Writer};
@@ -20,6 +20,7 @@ const MAX_DATA_FILE_BYTES: usize = 4 << 20;
 /// Creates, continues or replaces a dataset.
 pub(super) fn create(location: &Location, schema: &Schema, mut options: WriteOptions) -> Result<Box<dyn Writer>> {
     options.codec.check()?;
+    ENTRY.check_suffix(location)?;
     let table_location = table(location)?;
     let columns: Vec<ColumnSpec> = schema.columns().iter().filter(|column| !column.is_image()).cloned().collect();
     if columns.iter().all(|column| column.name == EPISODE_IDX || column.name == STEP_IDX) {

@@ -75,10 +75,10 @@ struct RunArgs {
 }
 
 /// Runs `swm study`.
-pub fn study(args: &StudyArgs, json: bool, context: impl FnOnce() -> Context) -> anyhow::Result<()> {
+pub fn study(args: &StudyArgs, json: bool, context: impl FnOnce() -> swm_core::Result<Context>) -> anyhow::Result<()> {
     match &args.command {
         StudyCommand::List => list(json),
-        StudyCommand::Run(args) => run(args, &context()),
+        StudyCommand::Run(args) => run(args, &context()?),
         StudyCommand::Status { folder } => {
             let folder = StudyFolder::new(folder);
             show(&folder.study()?.results(&folder)?, json)
@@ -122,6 +122,9 @@ fn run(args: &RunArgs, context: &Context) -> anyhow::Result<()> {
     show(&study.results(&folder)?, context.json)
 }
 
+/// A column of the table that is shown if its cells differ: its title, and its text in a row.
+type OptionalColumn = (&'static str, fn(&swm_core::results::StudyRow) -> String);
+
 /// Prints the results.
 fn show(results: &StudyResults, json: bool) -> anyhow::Result<()> {
     if json {
@@ -131,7 +134,7 @@ fn show(results: &StudyResults, json: bool) -> anyhow::Result<()> {
     let several = |of: fn(&swm_core::results::StudyRow) -> String| {
         results.rows.first().is_some_and(|first| results.rows.iter().any(|row| of(row) != of(first)))
     };
-    let optional: [(&str, fn(&swm_core::results::StudyRow) -> String); 3] = [
+    let optional: [OptionalColumn; 3] = [
         ("starts", |row| row.starts.clone()),
         ("counting", |row| row.counting.name().to_owned()),
         ("seed", |row| row.seed.to_string()),

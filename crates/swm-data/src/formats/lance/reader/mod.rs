@@ -6,6 +6,8 @@
 //! - [`lance_reader`]: the state of an open table.
 
 mod files;
+#[cfg(test)]
+mod hostile;
 mod images;
 mod lance_reader;
 mod stored_rows;
@@ -67,6 +69,13 @@ impl LanceReader {
                     &label,
                     "some rows of the table are marked as deleted",
                     "compact the table first (in Python: lance.dataset(path).optimize.compact_files())",
+                ));
+            }
+            if fragment.files.iter().any(|file| file.base_id.is_some()) {
+                return Err(Error::corrupt(
+                    &label,
+                    "the table is a shallow clone, whose data files are those of another table",
+                    "open the other table, or copy it as a whole",
                 ));
             }
             let rows = fragment.physical_rows.ok_or_else(|| damaged(&label, "a fragment has no row count"))?;

@@ -5,7 +5,7 @@ use std::fs::{File, Metadata, OpenOptions, TryLockError};
 use std::io::{self, ErrorKind};
 use std::ops::Deref;
 use std::os::unix::fs::MetadataExt as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// An exclusive lock of a file or folder, held until it is dropped or the process ends, also by a kill. It is advisory:
 /// it keeps away other writers that take a [`Lock`], on any machine that shares the file system. File systems without
@@ -19,12 +19,15 @@ impl Lock {
     /// # Errors
     /// When another writer holds the lock, or the folder cannot be created or opened.
     pub fn folder(path: &Path) -> Result<Self> {
-        if path.exists() && !path.is_dir() {
-            return Err(Error::corrupt(path, "is not a folder", "choose another path"));
+        // Without the slash at the end of a path, with which a file does not exist.
+        let path: PathBuf = path.components().collect();
+        if let Some(file) = path.ancestors().find(|part| part.exists()).filter(|part| !part.is_dir()) {
+            let below = if file == path { String::new() } else { format!("{} ", file.display()) };
+            return Err(Error::corrupt(&path, format!("{below}is not a folder"), "choose another path"));
         }
-        Self::acquire(path, || {
-            std::fs::create_dir_all(path)?;
-            File::open(path)
+        Self::acquire(&path, || {
+            std::fs::create_dir_all(&path)?;
+            File::open(&path)
         })
     }
 

@@ -111,7 +111,7 @@ fn files_of_another_kind_are_not_replaced() {
         let path = folder.path().join(format!("a.{format}"));
         std::fs::write(&path, text).expect("writing a file");
         let error = overwrite(&path).expect("a refusal").to_string();
-        assert!(error.contains(&format!("{}: is not a folder", path.display())), "{error}");
+        assert!(error.contains(&path.display().to_string()) && error.contains("is not a folder"), "{error}");
         std::fs::remove_file(&path).expect("removing the file");
     }
     for name in ["a.lance", "b.folder", "c.video", "d.lerobot"] {

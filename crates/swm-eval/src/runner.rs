@@ -191,7 +191,7 @@ impl EvalRequest {
     }
 
     /// This request with the random-policy floor first.
-    fn with_floor(&self) -> Result<Self> {
+    pub(crate) fn with_floor(&self) -> Result<Self> {
         let mut request = self.clone();
         match self.policies.iter().position(|policy| policy.kind == PolicyKind::Random) {
             Some(index) => {

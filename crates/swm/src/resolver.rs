@@ -69,8 +69,11 @@ impl HomeResolver {
         Self { env: Some(id.to_owned()), ..self }
     }
 
-    /// Returns the environment that a request names.
-    fn choose_env(&self, id: &str) -> Result<EnvChoice> {
+    /// Returns the environment with an id that a request, or the file that it comes from, names.
+    ///
+    /// # Errors
+    /// As [`crate::env`].
+    pub fn choose_env(&self, id: &str) -> Result<EnvChoice> {
         let origin = if self.env.as_deref() == Some(id) { &Origin::User } else { &self.origin };
         crate::env(id, origin)
     }

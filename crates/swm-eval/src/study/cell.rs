@@ -52,7 +52,7 @@ impl Cell {
 
 impl Study {
     /// The largest number of cells.
-    pub const MAX_CELLS: usize = 100_000;
+    pub const MAX_CELLS: usize = 10_000;
 
     /// The hash of all requests and their inputs.
     ///

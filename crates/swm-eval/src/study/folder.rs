@@ -1,6 +1,7 @@
 //! [`StudyFolder`]: the files of a study.
 
 use super::cell::{Cell, Study};
+use crate::request::EvalRequest;
 use std::path::{Path, PathBuf};
 use swm_core::files::{self, Lock};
 use swm_core::{Error, Result, Results};
@@ -25,17 +26,30 @@ impl StudyFolder {
     /// used again when it has them again. Keeps other writers away until the lock is dropped.
     ///
     /// # Errors
-    /// When another process writes to the folder, it holds other files and no study, or writing fails.
+    /// When another process writes to the folder, it holds other files or another study, or writing fails.
     pub fn create(&self, study: &Study) -> Result<Lock> {
-        let is_empty = || std::fs::read_dir(&self.root).map_or(true, |mut entries| entries.next().is_none());
-        if !self.root.join(STUDY).exists() && !is_empty() {
-            let problem = "has files and no study.json";
-            return Err(Error::config(self.root.display().to_string(), problem, "give an empty folder with --output"));
+        let (lock, path) = (Lock::folder(&self.root)?, self.root.join(STUDY));
+        files::check_own(&path, |_| self.study().is_ok())?;
+        let other = |problem: String| {
+            Error::config(self.root.display().to_string(), problem, "give another folder with --output")
+        };
+        if path.exists() {
+            let found = self.study()?.title;
+            if found != study.title {
+                return Err(other(format!("holds the study '{found}', not '{}'", study.title)));
+            }
+        } else {
+            let io = |error| Error::io(&self.root, "reading the folder", error);
+            let entries = std::fs::read_dir(&self.root).map_err(io)?;
+            let names = entries.map(|entry| Ok(entry.map_err(io)?.file_name())).collect::<Result<Vec<_>>>()?;
+            if !names.is_empty() {
+                return Err(other("has files and no study.json".to_owned()));
+            }
+            files::write(&path, &json(study)?)?;
         }
-        let lock = Lock::folder(&self.root)?;
         let cells = self.root.join("cells");
         std::fs::create_dir_all(&cells).map_err(|error| Error::io(&cells, "creating the folder", error))?;
-        files::write(&self.root.join(STUDY), &json(study)?)?;
+        files::write(&path, &json(study)?)?;
         Ok(lock)
     }
 
@@ -45,9 +59,11 @@ impl StudyFolder {
     /// When the folder has no study, or it is damaged.
     pub fn study(&self) -> Result<Study> {
         let path = self.root.join(STUDY);
-        let bytes = files::read(&path, MAX_BYTES)?;
-        serde_json::from_slice(&bytes)
-            .map_err(|error| Error::corrupt(path, format!("is not a study ({error})"), "run the study again"))
+        let fix = "give the folder of a study";
+        let study: Study = serde_json::from_slice(&files::read(&path, MAX_BYTES)?)
+            .map_err(|error| Error::corrupt(&path, format!("is not a study ({error})"), fix))?;
+        study.check().map_err(|error| Error::corrupt(&path, format!("is not a valid study ({error})"), fix))?;
+        Ok(study)
     }
 
     /// Returns the results of a cell, or `None` if it is not done.
@@ -63,6 +79,9 @@ impl StudyFolder {
         let results: Results = serde_json::from_slice(&files::read(&path, MAX_BYTES)?)
             .map_err(|error| damaged(format!("is not a results file ({error})")))?;
         results.check().map_err(|problem| damaged(format!("is inconsistent: {problem}")))?;
+        if !answers(&results, cell)? {
+            return Err(damaged("has the results of another evaluation".to_owned()));
+        }
         Ok(Some(results))
     }
 
@@ -80,6 +99,15 @@ impl StudyFolder {
     fn path(&self, cell: &Cell) -> Result<PathBuf> {
         Ok(self.root.join("cells").join(format!("{}.json", cell.id()?)))
     }
+}
+
+/// Whether results are those of the cell's request and inputs. The runner writes the time limit that it used.
+fn answers(results: &Results, cell: &Cell) -> Result<bool> {
+    let (found, requested) = (EvalRequest::of(&results.manifest)?, cell.request.with_floor()?);
+    let budget = requested.budget.or(found.budget);
+    let hashes = &results.manifest.hashes;
+    let same_inputs = cell.inputs.iter().all(|(input, hash)| hashes.get(input) == Some(hash));
+    Ok(found == EvalRequest { budget, ..requested } && same_inputs)
 }
 
 fn json(value: &impl serde::Serialize) -> Result<Vec<u8>> {

@@ -2,6 +2,7 @@
 
 use super::cell::{Cell, Study};
 use super::folder::StudyFolder;
+use std::collections::BTreeMap;
 use swm_core::results::{Paired, Proportion, Run, StudyResults, StudyRow};
 use swm_core::{Result, Results};
 
@@ -18,13 +19,14 @@ impl Study {
             }
         }
         let unshifted = self.cells.first().map_or("", Cell::condition);
+        let of_unshifted = done.iter().filter(|(cell, _)| cell.condition() == unshifted);
+        let unshifted_runs: BTreeMap<String, Option<&Run>> =
+            of_unshifted.map(|(cell, results)| (key(cell), runs(cell, results).map(|(run, _)| run))).collect();
         let mut rows = vec![];
         for (cell, results) in &done {
             let Some((run, floor)) = runs(cell, results) else { continue };
-            let counterpart = done.iter().find(|(other, _)| {
-                other.condition() == unshifted && cell.condition() != unshifted && corresponds(cell, other)
-            });
-            let reference = counterpart.and_then(|(other, results)| runs(other, results));
+            let reference = unshifted_runs.get(&key(cell)).copied().flatten();
+            let reference = reference.filter(|_| cell.condition() != unshifted);
             rows.push(StudyRow {
                 cell: cell.id()?,
                 starts: cell.starts.clone(),
@@ -36,7 +38,7 @@ impl Study {
                 success: run.success,
                 solved_at_start: run.solved_at_start,
                 floor,
-                gap: reference.and_then(|(reference, _)| Paired::of_runs(run, reference, results.counting)),
+                gap: reference.and_then(|reference| Paired::of_runs(run, reference, results.counting)),
             });
         }
         Ok(StudyResults {
@@ -57,8 +59,8 @@ fn runs<'a>(cell: &Cell, results: &'a Results) -> Option<(&'a Run, Proportion)> 
     Some((run(cell.policy())?, floor))
 }
 
-/// Whether two cells differ in the condition only.
-fn corresponds(a: &Cell, b: &Cell) -> bool {
-    let key = |cell: &Cell| (cell.starts.clone(), cell.policy().to_owned(), cell.request.seed, cell.request.episodes);
-    key(a) == key(b) && a.request.counting == b.request.counting && a.request.budget == b.request.budget
+/// What cells that differ in the condition only have in common.
+fn key(cell: &Cell) -> String {
+    let request = &cell.request;
+    format!("{:?}", (&cell.starts, cell.policy(), request.seed, request.episodes, request.budget, request.counting))
 }

@@ -140,12 +140,13 @@ impl EvalArgs {
         let find = |given: &String| NamedPolicy::find(given, self.env.as_deref(), resolver);
         let named: Vec<NamedPolicy> = self.policies.iter().map(find).collect::<Result<_>>()?;
         let trained_on = named.iter().find_map(|policy| policy.env.clone());
-        let given = self.env.clone().map(|env| (env, Origin::User));
-        let from_file = || trained_on.map(|(env, path)| (env, Origin::file(path, self.trust)));
-        let Some((env, origin)) = given.or_else(from_file) else {
-            return Err(Error::config("--env", "no environment is given", "name one (`swm envs` lists them)"));
+        let env = match (&self.env, trained_on) {
+            (Some(env), _) => resolver.choose_env(env)?,
+            (None, Some((env, path))) => crate::env(&env, &Origin::file(path, self.trust))?,
+            (None, None) => {
+                return Err(Error::config("--env", "no environment is given", "name one (`swm envs` lists them)"));
+            }
         };
-        let env = crate::env(&env, &origin)?;
         let image = named.iter().find_map(|policy| policy.image);
         let mut policies = vec![];
         for policy in named {

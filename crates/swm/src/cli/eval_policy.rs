@@ -5,7 +5,7 @@ use crate::home;
 use crate::resolver::{HomeResolver, parse_score};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
-use swm_core::{EnvChoice, Origin, Result};
+use swm_core::{EnvChoice, Result};
 use swm_eval::{Model, PolicyKind, PolicyRequest};
 
 /// A policy that the command line names.
@@ -35,7 +35,7 @@ impl NamedPolicy {
     /// When the environment or the checkpoint does not exist, or the checkpoint is damaged.
     pub fn find(given: &str, env: Option<&str>, resolver: &HomeResolver) -> Result<Self> {
         let without_checkpoint = |kind| Self { name: given.to_owned(), kind, env: None, image: None };
-        let env = env.map(|env| crate::env(env, &Origin::User)).transpose()?;
+        let env = env.map(|env| resolver.choose_env(env)).transpose()?;
         if given == "random" {
             return Ok(without_checkpoint(NamedKind::Direct(PolicyKind::Random)));
         }

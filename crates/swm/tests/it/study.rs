@@ -152,3 +152,75 @@ fn study_leaves_other_files_alone() {
     swm.fails(&["study", "run", "study.toml", "--output", "thesis"], 2, &["thesis", "no study.json"]);
     assert_eq!(contents(&swm.path("thesis")).len(), 1);
 }
+
+#[test]
+fn study_file_chooses_no_modules_files_and_connections() {
+    let swm = Swm::new();
+    let mark = swm.path("imported");
+    std::fs::write(swm.path("evil_mod.py"), format!("open({mark:?}, 'w').close()\n")).expect("writing a module");
+    for (from, to, name) in [
+        ("swm/TwoRoom-v1", "evil_mod:X-v0", "evil_mod"),
+        ("budget = 40", "budget = 40\ndataset = \"s3://bucket/rooms.lance\"", "s3://bucket"),
+        ("budget = 40", "budget = 40\nwrapper = \"chroma-key,key_color=255/255/255,media=/etc/passwd\"", "chroma-key"),
+    ] {
+        std::fs::write(swm.path("study.toml"), STUDY.replace(from, to)).expect("writing the study");
+        swm.fails(&["study", "run", "study.toml", "--output", "out"], 2, &["study.toml", name, "--trust"]);
+        assert!(!mark.exists() && !swm.path("out").exists(), "{name}");
+    }
+    std::fs::write(swm.path("study.toml"), STUDY.replace("swm/TwoRoom-v1", "evil_mod:X-v0"))
+        .expect("writing the study");
+    swm.fails(&["study", "run", "study.toml", "--commands"], 2, &["evil_mod", "--trust"]);
+    assert!(!mark.exists());
+    // The user's own setting replaces the environment of the file.
+    let output = swm.run(&["study", "run", "study.toml", "--commands", "env=swm/TwoRoom-v1"]);
+    assert!(output.status.success(), "{}", text(&output.stderr));
+}
+
+#[test]
+fn study_with_too_many_cells_is_refused_before_they_are_made() {
+    let swm = Swm::new();
+    let values: Vec<String> = (0..1000).map(|value| value.to_string()).collect();
+    let list = format!("[{}]", values.join(","));
+    for (from, to) in [
+        ("what = [\"agent\"], hue = [0, 240]", format!("what = {list}, hue = {list}")),
+        ("seed = [0, 1]", format!("seed = {list}\nhold = {list}")),
+        ("seed = [0, 1]", format!("seed = {list}\nhold = [1, 2, 3, 4]")),
+    ] {
+        std::fs::write(swm.path("study.toml"), STUDY.replace(from, &to)).expect("writing the study");
+        swm.fails(&["study", "run", "study.toml", "--commands"], 2, &["at most 10000"]);
+    }
+}
+
+#[test]
+fn study_replaces_neither_files_of_the_user_nor_another_study() {
+    let swm = with_study();
+    std::fs::create_dir(swm.path("mine")).expect("creating a folder");
+    std::fs::write(swm.path("mine/study.json"), "{\"my\": \"thesis\"}").expect("writing a file");
+    swm.fails(&["study", "run", "study.toml", "--output", "mine"], 2, &["study.json", "not written by this program"]);
+    assert_eq!(std::fs::read(swm.path("mine/study.json")).expect("the file"), b"{\"my\": \"thesis\"}");
+
+    swm.json(&["study", "run", "study.toml", "--output", "first", "seed=0"]);
+    std::fs::write(swm.path("other.toml"), STUDY.replace("Colours in", "Shapes in")).expect("writing another study");
+    swm.fails(&["study", "run", "other.toml", "--output", "first"], 2, &["Colours in Two-Room", "Shapes in Two-Room"]);
+    // A run that ended before it wrote anything leaves an empty folder, in which the study starts.
+    std::fs::create_dir(swm.path("empty")).expect("creating a folder");
+    swm.json(&["study", "run", "study.toml", "--output", "empty", "seed=0"]);
+}
+
+#[test]
+fn results_of_another_evaluation_are_refused() {
+    let swm = with_study();
+    swm.json(&["study", "run", "study.toml", "--output", "out"]);
+    let mut cells: Vec<_> = std::fs::read_dir(swm.path("out/cells")).expect("the cells").flatten().collect();
+    cells.sort_by_key(std::fs::DirEntry::path);
+    std::fs::copy(cells[0].path(), cells[1].path()).expect("copying results over others");
+    for args in [&["study", "status", "out"][..], &["study", "run", "study.toml", "--output", "out"]] {
+        swm.fails(args, 2, &["results of another evaluation"]);
+    }
+    let study = std::fs::read_to_string(swm.path("out/study.json")).expect("the study");
+    let mut twice: serde_json::Value = serde_json::from_str(&study).expect("JSON");
+    let cells = twice["cells"].as_array().expect("cells").repeat(2);
+    twice["cells"] = cells.into();
+    std::fs::write(swm.path("out/study.json"), twice.to_string()).expect("writing the study");
+    swm.fails(&["study", "status", "out"], 2, &["same evaluation"]);
+}

@@ -5,7 +5,8 @@ use crate::cli::eval::EvalArgs;
 use crate::resolver::HomeResolver;
 use clap::{Args as _, Command, FromArgMatches as _};
 use std::collections::BTreeMap;
-use swm_core::{Error, Origin, Result};
+use swm_core::run::Control;
+use swm_core::{Error, Result};
 use swm_eval::{Cell, EvalRequest, Model, PolicyKind, Resolver as _, StartsRequest, Study};
 
 /// A cell before its names are resolved.
@@ -21,8 +22,8 @@ struct Combination {
 ///
 /// # Errors
 /// When a table is invalid.
-pub fn commands(file: &StudyFile, settings: &[String]) -> Result<Vec<Vec<String>>> {
-    Ok(combinations(file, settings)?.iter().map(|combination| combination.all.arguments()).collect())
+pub fn commands(file: &StudyFile, settings: &[String], resolver: &HomeResolver) -> Result<Vec<Vec<String>>> {
+    Ok(combinations(file, settings, resolver)?.iter().map(|combination| combination.all.arguments()).collect())
 }
 
 /// Joins arguments for a shell.
@@ -37,10 +38,17 @@ pub fn shell(arguments: &[String]) -> String {
 /// Returns the study with all names resolved.
 ///
 /// # Errors
-/// When a table is invalid, an environment, dataset, checkpoint or setting does not exist, or two cells are equal.
-pub fn study(file: &StudyFile, settings: &[String], resolver: &HomeResolver) -> Result<Study> {
+/// When a table is invalid, an environment, dataset, checkpoint or setting does not exist, the file names what only the
+/// user may name, two cells are equal, or the user stops the program.
+pub fn study(
+    file: &StudyFile,
+    settings: &[String],
+    resolver: &HomeResolver,
+    control: &mut Control<'_>,
+) -> Result<Study> {
     let (mut cells, mut inputs) = (vec![], Inputs { resolver, known: BTreeMap::new() });
-    for combination in combinations(file, settings)? {
+    for combination in combinations(file, settings, resolver)? {
+        control.check()?;
         let Combination { starts, condition, policy, all } = combination;
         let within = |error: Error| {
             let places: Vec<&str> = [&condition, &policy].iter().map(|variant| variant.at.as_str()).collect();
@@ -63,16 +71,24 @@ pub fn study(file: &StudyFile, settings: &[String], resolver: &HomeResolver) -> 
 }
 
 /// Every combination of defaults, starts, conditions and policies, in this order.
-fn combinations(file: &StudyFile, settings: &[String]) -> Result<Vec<Combination>> {
+fn combinations(file: &StudyFile, settings: &[String], resolver: &HomeResolver) -> Result<Vec<Combination>> {
     let defaults = file.defaults.with(settings)?;
-    let env = defaults.option("env").map(|env| crate::env(env, &Origin::User)?.env()).transpose()?;
+    let env = defaults.option("env").map(|env| resolver.choose_env(env)?.env()).transpose()?;
     let space = env.as_ref().map(|env| &env.spec().variation_space);
     let expand = |tables: &[super::file::Table]| -> Result<Vec<Variant>> {
         Ok(tables.iter().map(|table| table.variants(space)).collect::<Result<Vec<_>>>()?.concat())
     };
     let (starts, conditions, policies) = (expand(&file.starts)?, expand(&file.conditions)?, expand(&file.policies)?);
-    let mut combinations = vec![];
-    for defaults in defaults.variants(space)? {
+    let defaults = defaults.variants(space)?;
+    let sizes = [&defaults, &starts, &conditions, &policies].map(Vec::len);
+    let cells = sizes.into_iter().fold(1, usize::saturating_mul);
+    if cells > Study::MAX_CELLS {
+        let problem =
+            format!("{} defaults x {} starts x {} conditions x {} policies", sizes[0], sizes[1], sizes[2], sizes[3]);
+        return Err(Error::config("the study", problem, format!("give at most {} cells", Study::MAX_CELLS)));
+    }
+    let mut combinations = Vec::with_capacity(cells);
+    for defaults in defaults {
         for starts in &starts {
             for condition in &conditions {
                 for policy in &policies {

@@ -2,6 +2,7 @@
 
 use clap::ValueEnum;
 use swm_core::results::{StudyResults, StudyRow};
+use swm_core::text::printable;
 
 /// The format of a table.
 #[derive(Clone, Copy, ValueEnum)]
@@ -31,6 +32,9 @@ fn csv(results: &StudyResults) -> String {
     variables.sort_unstable();
     variables.dedup();
     let quote = |text: &str| {
+        // A spreadsheet would run a name that begins like a formula.
+        let is_formula = text.starts_with(['=', '+', '-', '@']) && text.parse::<f64>().is_err();
+        let text = &format!("{}{}", if is_formula { "'" } else { "" }, printable(text));
         if text.contains([',', '"', '\n', '\r']) {
             format!("\"{}\"", text.replace('"', "\"\""))
         } else {
@@ -125,7 +129,7 @@ impl<'a> Pivot<'a> {
     }
 
     fn markdown(&self) -> String {
-        let escape = |cell: &str| cell.replace('|', "\\|").replace(['\n', '\r'], " ");
+        let escape = |cell: &str| printable(cell).replace('|', "\\|").replace(['\n', '\r'], " ");
         let line = |cells: &[String]| {
             format!("| {} |\n", cells.iter().map(|cell| escape(cell)).collect::<Vec<_>>().join(" | "))
         };
@@ -137,13 +141,14 @@ impl<'a> Pivot<'a> {
 
     fn latex(&self) -> String {
         let escape = |cell: &str| {
+            let cell = printable(cell);
             let escaped = cell.chars().map(|c| match c {
                 '&' | '%' | '$' | '#' | '_' | '{' | '}' => format!("\\{c}"),
                 '\\' => "\\textbackslash{}".to_owned(),
                 '~' => "\\textasciitilde{}".to_owned(),
                 '^' => "\\textasciicircum{}".to_owned(),
                 '–' => "--".to_owned(),
-                c if c.is_control() => " ".to_owned(),
+                '\n' => " ".to_owned(),
                 c => c.to_string(),
             });
             escaped.collect::<String>()

@@ -6,6 +6,7 @@ use clap::{ArgAction, Args as _, Command};
 use std::collections::BTreeMap;
 use std::path::Path;
 use swm_core::{Error, Result, VariationSpace};
+use swm_eval::Study;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
@@ -281,7 +282,7 @@ impl Table {
     /// Returns the table with every combination of the values of its variables; the last variable changes fastest.
     ///
     /// # Errors
-    /// When a variable has no values, or a colour is malformed.
+    /// When a variable has no values, there are more than [`Study::MAX_CELLS`] combinations, or a colour is malformed.
     pub fn variants(&self, factors: Option<&VariationSpace>) -> Result<Vec<Variant>> {
         let mut combinations: Vec<BTreeMap<String, String>> = vec![BTreeMap::new()];
         for (name, values) in &self.each {
@@ -296,6 +297,10 @@ impl Table {
             };
             if values.is_empty() {
                 return Err(Error::config(format!("{}: {name}", self.at), "has no values", "give at least one"));
+            }
+            if combinations.len().saturating_mul(values.len()) > Study::MAX_CELLS {
+                let (problem, fix) = ("the variables have too many combinations", "give fewer values");
+                return Err(Error::config(self.at.clone(), problem, format!("{fix}: at most {}", Study::MAX_CELLS)));
             }
             let extended = |known: &BTreeMap<String, String>| {
                 let known = known.clone();

@@ -16,8 +16,8 @@ use clap::{Args, Subcommand};
 use export::Format;
 use serde_json::json;
 use std::path::PathBuf;
+use swm_core::limits;
 use swm_core::results::StudyResults;
-use swm_core::{Origin, limits};
 use swm_eval::{Study, StudyFolder};
 
 /// Arguments of `swm study`.
@@ -69,6 +69,11 @@ struct RunArgs {
     /// Parallel environments; results do not depend on their number
     #[arg(long, default_value_t = 16, value_parser = count::<1, { limits::ENVS.max }>)]
     envs: usize,
+    /// Allow the file to name environments, wrappers and datasets that load code or open connections
+    ///
+    /// docs/security.md says what files may do without it.
+    #[arg(long)]
+    trust: bool,
     /// Print a `swm eval` command for each cell, and evaluate nothing
     #[arg(long, conflicts_with = "output")]
     commands: bool,
@@ -106,16 +111,19 @@ fn list(json: bool) -> anyhow::Result<()> {
 }
 
 fn run(args: &RunArgs, context: &Context) -> anyhow::Result<()> {
-    let file = shipped::find(&args.study)?;
-    let resolver = HomeResolver::new(Origin::User);
+    let (file, origin) = shipped::find(&args.study, args.trust)?;
+    let resolver = HomeResolver::new(origin);
+    // Settings on the command line are the user's own.
+    let own_env = args.settings.iter().find_map(|setting| setting.strip_prefix("env="));
+    let resolver = own_env.into_iter().fold(resolver, HomeResolver::with_env);
     if args.commands {
-        for arguments in expand::commands(&file, &args.settings)? {
+        for arguments in expand::commands(&file, &args.settings, &resolver)? {
             emit(&format!("swm {}\n", expand::shell(&arguments)));
         }
         return Ok(());
     }
     let Some(output) = &args.output else { return Ok(()) };
-    let study: Study = expand::study(&file, &args.settings, &resolver)?;
+    let study: Study = expand::study(&file, &args.settings, &resolver, &mut control(context))?;
     let folder = StudyFolder::new(output);
     let _lock = folder.create(&study)?;
     study.run(&folder, &resolver, &run_options(args.envs, None, context), &mut control(context))?;

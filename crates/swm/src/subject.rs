@@ -1,4 +1,5 @@
-//! [`LewmSubject`]: the LeWM that `swm bench plan` and `swm bench train` measure. Its weights are random, because the speed of planning and training does not depend on the weights.
+//! [`LewmSubject`]: the LeWM that `swm bench plan` and `swm bench train` measure. Its weights are random, because the speed
+//! of planning and training does not depend on the weights.
 
 use rand::Rng as _;
 use std::path::Path;
@@ -89,7 +90,8 @@ impl LewmSubject {
         };
         let all = serde_json::json!({
             "device": if self.device == Device::flex() { "cpu" } else { "cuda" },
-            "image": model.image, "dim": model.encoder.dim(), "latent": model.latent, "proj_hidden": model.projector, "actions": self.action_dim(),
+            "image": model.image, "dim": model.encoder.dim(), "latent": model.latent, "proj_hidden": model.projector,
+            "actions": self.action_dim(),
             "history": predictor.history, "depth": predictor.depth, "heads": predictor.heads, "mlp": predictor.mlp,
             "predictor_dim": predictor.dim, "dim_head": predictor.dim_head, "dropout": predictor.dropout,
             "iterations": self.cem.iterations, "elites": self.cem.elites, "batch": self.config.data.batch_size,

@@ -14,7 +14,7 @@ use swm_core::{
     CostModel, Env, EnvChoice, EnvEntry, EnvSpec, Error, Named as _, Origin, Policy, RandomPolicy, Result, Solver,
 };
 use swm_data::Reader;
-use swm_envs::wrappers::{GoalFrame, Stack, WRAPPERS};
+use swm_envs::wrappers::{GoalFrame, Stack, WRAPPERS, WrapperEntry};
 use swm_eval::{
     Choice, EvalRequest, MixturePolicy, Model, PolicyChoice, PolicyKind, PolicyRequest, Predictor, ResolvedPolicy,
     Resolver, World,
@@ -69,6 +69,11 @@ impl HomeResolver {
         Self { env: Some(id.to_owned()), ..self }
     }
 
+    /// Who chose the names in the requests.
+    pub fn origin(&self) -> &Origin {
+        &self.origin
+    }
+
     /// Returns the environment with an id that a request, or the file that it comes from, names.
     ///
     /// # Errors
@@ -109,9 +114,7 @@ impl HomeResolver {
         let wrappers = request.wrappers.iter().map(|choice| {
             let settings = choice.settings.as_object().cloned().unwrap_or_default();
             let entry = WRAPPERS.get(&choice.id)?;
-            if entry.reads_files() {
-                self.origin.check_user(&format!("the wrapper '{}'", choice.id), "which reads files", None)?;
-            }
+            check_wrapper(&self.origin, entry)?;
             entry.make(&settings.into_iter().collect())
         });
         let stack = Arc::new(Stack::new(wrappers)?);
@@ -200,6 +203,17 @@ impl Resolver for HomeResolver {
         let PolicyKind::Plan { model: Model::Checkpoint(given), .. } = &request.kind else { return Ok(None) };
         Ok(self.checkpoint(given)?.predictor())
     }
+}
+
+/// Refuses a wrapper that reads files if a file chose it.
+///
+/// # Errors
+/// As [`Origin::check_user`].
+pub fn check_wrapper(origin: &Origin, entry: &WrapperEntry) -> Result<()> {
+    if entry.reads_files() {
+        origin.check_user(&format!("the wrapper '{}'", entry.id), "which reads files", None)?;
+    }
+    Ok(())
 }
 
 /// A solver with the settings of model-predictive control and the objective.

@@ -209,7 +209,7 @@ impl Collection<'_> {
         let mut manifest = Manifest { hashes, ..world.collect_manifest(&self.config) };
         manifest.config["codec"] = json!(self.codec);
         if !self.wrappers.wrappers.is_empty() {
-            manifest.config["wrappers"] = json!(self.wrappers.choices()?);
+            manifest.config["wrappers"] = json!(self.wrappers.choices(&Origin::User)?);
             manifest.config["wrap_goal"] = json!(self.wrappers.wrap_goal);
         }
         Ok(manifest)

@@ -160,7 +160,7 @@ impl EvalArgs {
         Ok(EvalRequest {
             version: EvalRequest::VERSION,
             env: env.id(),
-            wrappers: self.wrappers.choices()?,
+            wrappers: self.wrappers.choices(resolver.origin())?,
             wrap_goal: self.wrappers.wrap_goal,
             image: (!self.no_pixels).then_some(image),
             policies,

@@ -121,7 +121,7 @@ enum Command {
     /// Repeat an evaluation from its results and list the differences
     #[command(after_help = "Example: swm reproduce results")]
     Reproduce(reproduce::ReproduceArgs),
-    /// Run many evaluations with one table: a study, such as an experiment of the paper
+    /// Run a study: many evaluations with one table
     #[command(after_help = "Example: swm study list")]
     Study(study::StudyArgs),
     /// Write one self-contained HTML page of results

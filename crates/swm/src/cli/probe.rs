@@ -23,7 +23,7 @@ pub struct ProbeArgs {
     /// Columns to predict from latents, such as state,goal_state
     #[arg(long, value_name = "COLUMN,…", value_delimiter = ',')]
     columns: Vec<String>,
-    /// Columns that predict without an image, for comparison (default: pos_agent, if the dataset has it)
+    /// Columns that predict without an image (default: pos_agent, if present)
     #[arg(long, value_name = "COLUMN,…", value_delimiter = ',', requires = "columns")]
     baseline: Vec<String>,
     /// Reconstruct images from latents; write samples to this PNG file

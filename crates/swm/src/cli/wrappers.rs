@@ -1,9 +1,10 @@
 //! `swm wrappers`: lists the visual wrappers; and the arguments of commands that apply wrappers.
 
 use super::{emit, emit_json, table};
+use crate::resolver::check_wrapper;
 use clap::Args;
 use serde_json::{Map, Value};
-use swm_core::Result;
+use swm_core::{Origin, Result};
 use swm_envs::wrappers::{GoalFrame, Stack, WRAPPERS, read};
 use swm_eval::Choice;
 
@@ -21,13 +22,15 @@ pub struct WrapperArgs {
 }
 
 impl WrapperArgs {
-    /// Returns the wrappers with their settings, in order.
+    /// Returns the wrappers with their settings, in order. `origin` is who named them.
     ///
     /// # Errors
-    /// When a wrapper or a setting is unknown or invalid, or a file cannot be read.
-    pub fn choices(&self) -> Result<Vec<Choice>> {
+    /// When a wrapper or a setting is unknown or invalid, a file cannot be read, or a file named a wrapper that reads
+    /// files.
+    pub fn choices(&self, origin: &Origin) -> Result<Vec<Choice>> {
         let choices = self.wrappers.iter().map(|text| {
             let (entry, settings) = read(text)?;
+            check_wrapper(origin, entry)?;
             entry.make(&settings)?;
             Ok(Choice { id: entry.id.to_owned(), settings: settings.into_iter().collect() })
         });

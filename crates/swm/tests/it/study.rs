@@ -215,12 +215,13 @@ fn results_of_another_evaluation_are_refused() {
     cells.sort_by_key(std::fs::DirEntry::path);
     std::fs::copy(cells[0].path(), cells[1].path()).expect("copying results over others");
     for args in [&["study", "status", "out"][..], &["study", "run", "study.toml", "--output", "out"]] {
-        swm.fails(args, 2, &["results of another evaluation"]);
+        swm.fails(args, 1, &["results of another evaluation"]);
     }
     let study = std::fs::read_to_string(swm.path("out/study.json")).expect("the study");
     let mut twice: serde_json::Value = serde_json::from_str(&study).expect("JSON");
-    let cells = twice["cells"].as_array().expect("cells").repeat(2);
+    let cells = twice["cells"].as_array().expect("cells");
+    let cells = [cells.clone(), cells.clone()].concat();
     twice["cells"] = cells.into();
     std::fs::write(swm.path("out/study.json"), twice.to_string()).expect("writing the study");
-    swm.fails(&["study", "status", "out"], 2, &["same evaluation"]);
+    swm.fails(&["study", "status", "out"], 1, &["same evaluation"]);
 }

@@ -123,20 +123,7 @@ impl BackboneConfig {
                 cnn.stages.iter().map(|stage| stage.patch).collect()
             }
             Self::Conv(conv) => {
-                if conv.channels.is_empty() {
-                    return invalid("conv.channels", "the list is empty".to_owned(), "give at least one number");
-                }
-                let channels = conv.channels.iter().map(|&channels| ("channels", channels, 1));
-                for (what, size, least) in
-                    [("hidden", conv.hidden, 0), ("dim", conv.dim, 1)].into_iter().chain(channels)
-                {
-                    check_sizes(&[(&format!("{at}.conv.{what}"), size, least, limits::FEATURES)])?;
-                }
-                let most = image.max(1).ilog2() as usize;
-                if conv.channels.len() > most {
-                    let problem = format!("{} convolutions halve a side of {image} pixels", conv.channels.len());
-                    return invalid("conv.channels", problem, &format!("give at most {most}, or larger images"));
-                }
+                conv.check(&format!("{at}.conv"), image)?;
                 vec![]
             }
         };

@@ -3,11 +3,13 @@
 
 use super::kernels::conv_sizes;
 use super::{Activation, BatchNorm, BatchStatistics, Init, Linear, Named};
+use crate::train::{check_sizes, limits};
 use burn::module::{Module, Param};
 use burn::tensor::{Tensor, module, ops::ConvOptions};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::sync::Arc;
+use swm_core::{Error, Result};
 use swm_kernels::{ConvGradient, ScratchPool};
 
 /// The side of the kernels.
@@ -74,6 +76,27 @@ impl ConvConfig {
     /// The channels of the feature map after the last convolution.
     pub fn last(&self) -> usize {
         self.channels.last().copied().unwrap_or(0)
+    }
+
+    /// Checks the sizes. `at` is the dotted path of the settings, for errors.
+    ///
+    /// # Errors
+    /// When there is no convolution, a size is out of range, or the images are too small for the convolutions.
+    pub fn check(&self, at: &str, image: usize) -> Result<()> {
+        let invalid = |problem: String, fix: &str| Err(Error::config(format!("{at}.channels"), problem, fix));
+        if self.channels.is_empty() {
+            return invalid("the list is empty".to_owned(), "give at least one number");
+        }
+        let channels = self.channels.iter().map(|&channels| ("channels", channels, 1));
+        for (what, size, least) in [("hidden", self.hidden, 0), ("dim", self.dim, 1)].into_iter().chain(channels) {
+            check_sizes(&[(&format!("{at}.{what}"), size, least, limits::FEATURES)])?;
+        }
+        let most = image.max(1).ilog2() as usize;
+        if self.channels.len() > most {
+            let problem = format!("{} convolutions halve a side of {image} pixels", self.channels.len());
+            return invalid(problem, &format!("give at most {most}, or larger images"));
+        }
+        Ok(())
     }
 
     /// Creates an encoder for images with a side of `image` pixels. Kernels have the variance of He et al. 2015.

@@ -69,7 +69,7 @@ struct RunArgs {
     /// Parallel environments; results do not depend on their number
     #[arg(long, default_value_t = 16, value_parser = count::<1, { limits::ENVS.max }>)]
     envs: usize,
-    /// Allow the file to name environments, wrappers and datasets that load code or open connections
+    /// Allow the file to name what loads code or opens connections
     ///
     /// docs/security.md says what files may do without it.
     #[arg(long)]

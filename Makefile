@@ -60,8 +60,7 @@ tests: setup
 	$(CARGO) build --release --workspace --bins --tests
 
 wheel: setup $(PYTHON_VENV)/ready
-	@rm -rf $(WHEELS) python/stable_worldmodel/share
-	@mkdir -p python/stable_worldmodel/share/swm && cp -r zoo python/stable_worldmodel/share/swm/
+	@rm -rf $(WHEELS)
 	$(PYTHON_VENV)/bin/maturin build --release --manifest-path python/Cargo.toml --out $(WHEELS) --compatibility linux \
 	  --auditwheel skip --interpreter $(PYTHON_VENV)/bin/python
 

@@ -1,7 +1,6 @@
 //! Folders of named datasets and checkpoints: `$STABLEWM_HOME` (default `~/.stable_worldmodel`) with `datasets/`,
 //! `checkpoints/` and `weights/`.
 
-use crate::zoo;
 use std::iter::once;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -72,15 +71,12 @@ pub fn location(given: &str) -> Result<Location> {
     if given.contains("://") { Location::parse(given) } else { Ok(dataset(given)?.into()) }
 }
 
-/// Returns the path of a checkpoint given as a path, as a name in [`checkpoints`], or as `zoo:NAME`.
+/// Returns the path of a checkpoint given as a path or as a name in [`checkpoints`].
 ///
 /// # Errors
-/// As [`home`], if it is a name, and when the [zoo](zoo) has no such capsule.
+/// As [`home`], if it is a name.
 pub fn checkpoint(given: &str) -> Result<PathBuf> {
-    match given.strip_prefix(zoo::PREFIX) {
-        Some(name) => zoo::find(name),
-        None => named(given, checkpoints, ""),
-    }
+    named(given, checkpoints, "")
 }
 
 /// Returns the path of a checkpoint to write, given as a path or as a name in [`checkpoints`].
@@ -89,7 +85,7 @@ pub fn checkpoint(given: &str) -> Result<PathBuf> {
 /// When the text is empty.
 pub fn new_checkpoint(given: &str) -> Result<PathBuf> {
     check_name("checkpoint", given)?;
-    named(given, checkpoints, "")
+    checkpoint(given)
 }
 
 /// Opens a dataset given as a path, as a URI, or as a name in [`datasets`].
@@ -112,8 +108,7 @@ pub fn find_dataset(given: &str) -> Result<Location> {
     }
 }
 
-/// Returns the folder or the capsule of an existing checkpoint, given as a path, as a name in [`checkpoints`], or as
-/// `zoo:NAME`.
+/// Returns the folder of an existing checkpoint given as a path or as a name in [`checkpoints`].
 ///
 /// # Errors
 /// When the checkpoint does not exist; the message names the closest name.

@@ -115,17 +115,6 @@ const IN_DISTRIBUTION: &str = "in distribution";
 
 /// Runs `swm eval`.
 pub fn eval(args: &EvalArgs, context: &Context) -> anyhow::Result<()> {
-    let (results, file) = run_args(args, context)?;
-    if context.json {
-        return emit_json(&results);
-    }
-    emit(&summary(&results));
-    emit(&format!("{}\n", file.display()));
-    Ok(())
-}
-
-/// Runs the evaluation of a command line and writes its results.
-pub fn run_args(args: &EvalArgs, context: &Context) -> anyhow::Result<(Results, PathBuf)> {
     // The request checks the one name that a checkpoint chooses: its environment.
     let resolver = HomeResolver::new(Origin::User);
     let resolver = if args.trace { resolver.tracing() } else { resolver };
@@ -134,7 +123,12 @@ pub fn run_args(args: &EvalArgs, context: &Context) -> anyhow::Result<(Results, 
     if args.trace {
         write_json(&args.output.join("traces.json"), &traces(&resolver))?;
     }
-    Ok((results, file))
+    if context.json {
+        return emit_json(&results);
+    }
+    emit(&summary(&results));
+    emit(&format!("{}\n", file.display()));
+    Ok(())
 }
 
 impl EvalArgs {

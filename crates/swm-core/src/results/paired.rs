@@ -46,21 +46,10 @@ pub struct Paired {
 impl Comparison {
     /// Compares two runs of one condition; `None` if they did not play the same starts.
     pub fn of(a: &Run, b: &Run, counting: Counting) -> Option<Self> {
-        let pairs = || a.episodes.iter().zip(&b.episodes);
-        let same = a.condition == b.condition
-            && a.episodes.len() == b.episodes.len()
-            && pairs().all(|(a, b)| (a.seed, a.start, a.solved_at_start) == (b.seed, b.start, b.solved_at_start));
-        let mut counts = [0; 4];
-        for (a, b) in pairs().filter(|(a, _)| counting.counts(a)) {
-            counts[2 * usize::from(!a.success) + usize::from(!b.success)] += 1;
-        }
-        let [both, only_a, only_b, neither] = counts;
-        (same && counts != [0; 4]).then(|| Self {
-            condition: a.condition.clone(),
-            a: a.policy.clone(),
-            b: b.policy.clone(),
-            table: Paired::of(both, only_a, only_b, neither),
-        })
+        let mut pairs = a.episodes.iter().zip(&b.episodes);
+        let same = a.condition == b.condition && pairs.all(|(a, b)| a.solved_at_start == b.solved_at_start);
+        let table = same.then(|| Paired::of_runs(a, b, counting)).flatten()?;
+        Some(Self { condition: a.condition.clone(), a: a.policy.clone(), b: b.policy.clone(), table })
     }
 
     /// Compares every run with each earlier run of the same condition, so that a learned policy is compared with the
@@ -98,6 +87,19 @@ pub fn pairs(runs: &[&Run]) -> impl Iterator<Item = (usize, usize)> {
 }
 
 impl Paired {
+    /// Compares the outcomes of two runs on the same starts, whose conditions or policies differ. A start counts if it
+    /// counts in both runs. `None` if the runs did not play the same starts, or no start counts.
+    pub fn of_runs(a: &Run, b: &Run, counting: Counting) -> Option<Self> {
+        let pairs = || a.episodes.iter().zip(&b.episodes);
+        let same = a.episodes.len() == b.episodes.len() && pairs().all(|(a, b)| (a.seed, a.start) == (b.seed, b.start));
+        let mut counts = [0; 4];
+        for (a, b) in pairs().filter(|(a, b)| counting.counts(a) && counting.counts(b)) {
+            counts[2 * usize::from(!a.success) + usize::from(!b.success)] += 1;
+        }
+        let [both, only_a, only_b, neither] = counts;
+        (same && counts != [0; 4]).then(|| Self::of(both, only_a, only_b, neither))
+    }
+
     /// The statistics of a table of paired outcomes.
     ///
     /// The test is McNemar's exact conditional test (McNemar, "Note on the sampling error of the difference between

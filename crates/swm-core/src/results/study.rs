@@ -1,6 +1,6 @@
 //! [`StudyResults`]: the success rates of all cells of a study, as read by tables and reports.
 
-use super::{Counting, Paired, Proportion, Run};
+use super::{Counting, Paired, Proportion};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -49,25 +49,10 @@ pub struct StudyRow {
     pub gap: Option<Paired>,
 }
 
-impl Paired {
-    /// Compares the outcomes of two runs on the same starts, whose conditions or policies differ. A start counts if it
-    /// counts in both runs. `None` if the runs did not play the same starts, or no start counts.
-    pub fn of_runs(a: &Run, b: &Run, counting: Counting) -> Option<Self> {
-        let pairs = || a.episodes.iter().zip(&b.episodes);
-        let same = a.episodes.len() == b.episodes.len() && pairs().all(|(a, b)| (a.seed, a.start) == (b.seed, b.start));
-        let mut counts = [0; 4];
-        for (a, b) in pairs().filter(|(a, b)| counting.counts(a) && counting.counts(b)) {
-            counts[2 * usize::from(!a.success) + usize::from(!b.success)] += 1;
-        }
-        let [both, only_a, only_b, neither] = counts;
-        (same && counts != [0; 4]).then(|| Self::of(both, only_a, only_b, neither))
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::results::{EpisodeResult, Timing};
+    use crate::results::{EpisodeResult, Run, Timing};
 
     #[test]
     fn starts_count_that_count_under_both_conditions() {

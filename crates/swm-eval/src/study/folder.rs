@@ -45,11 +45,10 @@ impl StudyFolder {
             if !names.is_empty() {
                 return Err(other("has files and no study.json".to_owned()));
             }
-            files::write(&path, &json(study)?)?;
         }
+        files::write(&path, &json(study)?)?;
         let cells = self.root.join("cells");
         std::fs::create_dir_all(&cells).map_err(|error| Error::io(&cells, "creating the folder", error))?;
-        files::write(&path, &json(study)?)?;
         Ok(lock)
     }
 

@@ -60,7 +60,8 @@ tests: setup
 	$(CARGO) build --release --workspace --bins --tests
 
 wheel: setup $(PYTHON_VENV)/ready
-	@rm -rf $(WHEELS)
+	@rm -rf $(WHEELS) python/stable_worldmodel/share
+	@mkdir -p python/stable_worldmodel/share/swm && cp -r zoo python/stable_worldmodel/share/swm/
 	$(PYTHON_VENV)/bin/maturin build --release --manifest-path python/Cargo.toml --out $(WHEELS) --compatibility linux \
 	  --auditwheel skip --interpreter $(PYTHON_VENV)/bin/python
 

@@ -14,7 +14,7 @@ pub fn to_py_err(error: Error) -> PyErr {
             Err(_) => PyRuntimeError::new_err(message),
         },
         Error::Interrupted => PyKeyboardInterrupt::new_err(message),
-        Error::UnknownName { kind: "dataset" | "checkpoint", .. } => PyFileNotFoundError::new_err(message),
+        Error::UnknownName { kind: "dataset" | "checkpoint" | "capsule", .. } => PyFileNotFoundError::new_err(message),
         // Python derives FileNotFoundError, PermissionError, … from the operating system's error number.
         Error::Io { source, path, .. } => match source.raw_os_error() {
             Some(number) => PyOSError::new_err((number, message, path.display().to_string())),

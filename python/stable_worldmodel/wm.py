@@ -1,7 +1,7 @@
 """The engine's models: checkpoints of LeWM, PLDM, DINO-WM, TD-MPC2, GCBC, GCIVL, GCIQL, SAC.
 
     swm.wm.train("lewm", data="rooms", out="lewm-rooms", preset="tiny")
-    model = swm.wm.load("lewm-rooms")  # a name under $STABLEWM_HOME/checkpoints, or a path
+    model = swm.wm.load("lewm-rooms")  # a name under $STABLEWM_HOME/checkpoints, a path, or a name of the zoo
     solver = swm.solver.CEMSolver(model)
 
 Planning with these models runs in the engine, without Python.
@@ -30,7 +30,8 @@ class Model:
     """A checkpoint, for planning (`get_cost`) or for acting (`swm.policy.FeedForwardPolicy`).
 
     Args:
-        name: A name under `$STABLEWM_HOME/checkpoints`, or a path.
+        name: A name under `$STABLEWM_HOME/checkpoints`, the path of a checkpoint or a capsule, or `zoo:` and the name of a
+            capsule (`swm zoo` lists them).
         device: `cpu`, or a GPU if the engine was built with GPU support.
         objective: The planning objective, a dict with `terms` and `constraints`, such as
             `{"terms": [{"term": "control", "weight": 0.01}]}`; `None` for the model's own cost.
@@ -104,7 +105,7 @@ class Model:
 
 
 def load(name: str, device: str = "cpu", **kwargs: Any) -> Model:
-    """Loads a checkpoint by name or path."""
+    """Loads a checkpoint or a capsule by name or path, as `Model`."""
     return Model(name, device, **kwargs)
 
 

@@ -155,6 +155,20 @@ def carts(**more):
     return world
 
 
+def test_environments_of_this_process_run_one_at_a_time(unrendered):
+    def frames():
+        world = carts()
+        frames = []
+        for _ in range(6):
+            world.step()
+            frames.append(np.array(world.infos["pixels"]))
+        return np.stack(frames)
+
+    # pygame draws other pixels if two threads use it at a time.
+    first = frames()
+    assert all(np.array_equal(first, frames()) for _ in range(12))
+
+
 def test_killed_worker_is_replaced_during_an_episode(unrendered):
     before = set(children(os.getpid()))
     local, remote = carts(), carts(workers=True)

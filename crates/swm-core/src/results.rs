@@ -5,16 +5,21 @@
 
 mod consistency;
 mod counting;
+mod family;
 mod paired;
 mod prediction;
+mod score;
 mod searches;
+mod seeds;
 mod statistics;
 mod study;
 
 pub use counting::Counting;
+pub use family::{Family, Verdict};
 pub use paired::{Comparison, MAX_ALL_PAIRS, Paired, pairs};
 pub use prediction::{Group, Prediction, Trajectory};
 pub use searches::{Band, Searches};
+pub use seeds::{Interquartile, OverSeeds, TRAINING_SEED};
 pub use statistics::{Proportion, Summary};
 pub use study::{StudyResults, StudyRow};
 
@@ -35,8 +40,9 @@ pub struct Results {
     pub counting: Counting,
     /// One entry per policy and condition.
     pub runs: Vec<Run>,
-    /// Paired comparisons of policies that played the same starts under the same condition.
-    #[serde(default)]
+    /// Paired comparisons of policies that played the same starts under the same condition. Those of versions with
+    /// another test are left out.
+    #[serde(default, deserialize_with = "of_this_test")]
     pub comparisons: Vec<Comparison>,
 }
 
@@ -141,6 +147,23 @@ fn null_is_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Err
     Option::deserialize(deserializer).map(|value| value.unwrap_or(f64::NAN))
 }
 
+fn of_this_test<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<Comparison>, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(untagged)]
+    enum Stated {
+        Current(Comparison),
+        Older {
+            #[serde(default, rename = "verdict")]
+            _verdict: Option<()>,
+        },
+    }
+    let current = |stated| match stated {
+        Stated::Current(comparison) => Some(comparison),
+        Stated::Older { .. } => None,
+    };
+    Ok(Vec::deserialize(deserializer)?.into_iter().filter_map(current).collect())
+}
+
 impl EpisodeResult {
     /// Creates the result of an episode that has not been stepped yet.
     pub fn new(seed: u64) -> Self {
@@ -156,6 +179,20 @@ impl EpisodeResult {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn comparisons_of_another_test_are_left_out() {
+        let table = Paired::of(1, 2, 3, 4);
+        let comparison = Comparison { condition: "red".to_owned(), a: "x".to_owned(), b: "y".to_owned(), table };
+        let results = Results { comparisons: vec![comparison.clone(), comparison], ..Results::default() };
+        let mut value = serde_json::to_value(&results).expect("a document");
+        assert_eq!(serde_json::from_value::<Results>(value.clone()).expect("results"), results);
+        value["comparisons"][0].as_object_mut().and_then(|stated| stated.remove("verdict")).expect("a verdict");
+        let older: Results = serde_json::from_value(value.clone()).expect("results");
+        assert_eq!(older.comparisons, results.comparisons[1..]);
+        value["comparisons"][1]["verdict"] = "perhaps".into();
+        assert!(serde_json::from_value::<Results>(value).is_err());
+    }
 
     #[test]
     fn rewards_that_are_not_finite_can_be_read_back() {

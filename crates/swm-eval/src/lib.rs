@@ -4,7 +4,7 @@
 //! - [`collect`]: writes every episode to a dataset. [`policy_mixture`]: policies that share the episodes.
 //! - [`starts`] and [`evaluate`]: initial states and goals, and the success rate of a policy from them.
 //! - [`request`]: all settings of an evaluation as one value. [`runner`] evaluates the policies of a request on the
-//!   same starts, and [`reproduce`] repeats an evaluation from its results.
+//!   same starts, [`reproduce`] repeats an evaluation from its results, and [`replay`] some of its episodes.
 //! - [`study`]: many evaluations with one table.
 //! - [`prediction`]: the prediction errors of a model on recorded trajectories.
 //!
@@ -16,6 +16,7 @@ pub mod collect;
 pub mod evaluate;
 pub mod policy_mixture;
 pub mod prediction;
+pub mod replay;
 pub mod reproduce;
 pub mod request;
 pub mod runner;
@@ -31,11 +32,12 @@ pub use collect::{CollectConfig, Collected};
 pub use evaluate::EvalConfig;
 pub use policy_mixture::{MixturePolicy, PolicyChoice, WeightedPolicy};
 pub use prediction::Predictor;
+pub use replay::{Recorded, Replay};
 pub use reproduce::{Difference, Reproduction, reproduce};
 pub use request::{Choice, Condition, EvalRequest, HeldOut, Model, PolicyKind, PolicyRequest, StartsRequest};
 pub use runner::{ResolvedPolicy, Resolver, RunOptions};
 pub use seeding::{episode_key, reset_seed};
 pub use starts::Starts;
-pub use study::{Cell, Study, StudyFolder};
+pub use study::{Cell, Common, Published, Study, StudyFolder};
 pub use video_recording::Videos;
 pub use world::{World, WorldConfig};

@@ -99,16 +99,7 @@ impl EvalRequest {
     pub fn run(&self, resolver: &dyn Resolver, options: &RunOptions, control: &mut Control<'_>) -> Result<Results> {
         self.check()?;
         let request = self.with_floor()?;
-        let mut world = World::of(
-            || resolver.env(&request),
-            WorldConfig {
-                envs: request.parallel_envs(options),
-                image: request.image.map(|[height, width]| (height, width)),
-                views: vec![],
-                max_episode_steps: request.budget,
-                threads: options.threads,
-            },
-        )?;
+        let mut world = request.world(resolver, request.parallel_envs(options), options)?;
         let request = Self { budget: Some(world.pool().max_episode_steps()), ..request };
         let dataset = match &request.starts {
             StartsRequest::Episodic => None,
@@ -174,8 +165,20 @@ impl EvalRequest {
         })
     }
 
+    /// The world of this evaluation, with `envs` environments.
+    pub(crate) fn world(&self, resolver: &dyn Resolver, envs: usize, options: &RunOptions) -> Result<World> {
+        let config = WorldConfig {
+            envs,
+            image: self.image.map(|[height, width]| (height, width)),
+            views: vec![],
+            max_episode_steps: self.budget,
+            threads: options.threads,
+        };
+        World::of(|| resolver.env(self), config)
+    }
+
     /// The settings of one evaluation.
-    fn config(&self, policy: &PolicyRequest, condition: &Condition, options: &RunOptions) -> EvalConfig {
+    pub(crate) fn config(&self, policy: &PolicyRequest, condition: &Condition, options: &RunOptions) -> EvalConfig {
         EvalConfig {
             policy: policy.name.clone(),
             condition: condition.name.clone(),
@@ -219,7 +222,12 @@ impl EvalRequest {
     }
 
     /// The starts under a condition.
-    fn starts(&self, dataset: Option<&dyn Reader>, env: &dyn Env, variation: VariationRequest) -> Result<Starts> {
+    pub(crate) fn starts(
+        &self,
+        dataset: Option<&dyn Reader>,
+        env: &dyn Env,
+        variation: VariationRequest,
+    ) -> Result<Starts> {
         let Some((reader, StartsRequest::Dataset { goal_offset, held_out, .. })) = dataset.zip(Some(&self.starts))
         else {
             return match self.counting {

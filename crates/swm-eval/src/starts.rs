@@ -22,6 +22,8 @@ pub struct Starts {
     sequential: bool,
     variation: VariationRequest,
     dataset: Option<Rows>,
+    /// The numbers of the episodes in the evaluation that the starts are taken from; `None` for all episodes.
+    numbers: Option<Vec<usize>>,
 }
 
 /// Starts and goals from a dataset.
@@ -44,7 +46,7 @@ impl Starts {
     /// When `n` is 0.
     pub fn episodic(n: usize, seed: u64, variation: VariationRequest) -> Result<Self> {
         check_count(n)?;
-        Ok(Self { seed, n, sequential: false, variation, dataset: None })
+        Ok(Self { seed, n, sequential: false, variation, dataset: None, numbers: None })
     }
 
     /// The episodic protocol as the Python package `stable-worldmodel` 0.1.1 seeds it: episode `i` resets with
@@ -95,13 +97,58 @@ impl Starts {
         }
         let names: Vec<&str> = columns.iter().map(String::as_str).collect();
         let rows = renamed(reader.read(&names, &ranges)?)?;
-        Ok(Self {
-            seed,
-            n: picks.len(),
-            sequential: false,
-            variation,
-            dataset: Some(Rows { picks, goal_offset, rows, calls: calls.to_vec() }),
-        })
+        let n = picks.len();
+        let dataset = Some(Rows { picks, goal_offset, rows, calls: calls.to_vec() });
+        Ok(Self { dataset, ..Self::episodic(n, seed, variation)? })
+    }
+
+    /// The dataset protocol without the dataset: `rows` are those of [`Starts::rows`], two for each pick.
+    ///
+    /// # Errors
+    /// When there is no pick, or the number of rows is not twice the number of picks.
+    pub fn from_rows(
+        rows: Batch,
+        picks: Vec<[usize; 2]>,
+        goal_offset: usize,
+        seed: u64,
+        variation: VariationRequest,
+    ) -> Result<Self> {
+        if rows.rows() != 2 * picks.len() {
+            let given = format!("{} rows for {} starts", rows.rows(), picks.len());
+            return Err(Error::mismatch(
+                "starting at recorded rows",
+                given,
+                "a start row and a goal row for each start",
+            ));
+        }
+        let n = picks.len();
+        let dataset = Some(Rows { picks, goal_offset, rows, calls: vec![] });
+        Ok(Self { dataset, ..Self::episodic(n, seed, variation)? })
+    }
+
+    /// The starts with these numbers. They keep the keys and the reset seeds that they have among all starts.
+    ///
+    /// # Errors
+    /// When there is no number, or no start with a number.
+    pub fn only(&self, numbers: &[usize]) -> Result<Self> {
+        check_count(numbers.len())?;
+        if let Some(number) = numbers.iter().find(|&&number| number >= self.n) {
+            return Err(Error::mismatch("choosing starts", format!("number {number}"), format!("one of {}", self.n)));
+        }
+        let dataset = self.dataset.as_ref().map(|dataset| dataset.only(numbers)).transpose()?;
+        Ok(Self { n: numbers.len(), dataset, ..self.clone() }
+            .numbered(numbers.iter().map(|&i| self.number(i)).collect()))
+    }
+
+    /// These starts with the numbers, and therefore the keys and the reset seeds, of other episodes.
+    #[must_use]
+    pub(crate) fn numbered(self, numbers: Vec<usize>) -> Self {
+        Self { numbers: Some(numbers), ..self }
+    }
+
+    /// The number of a start in the evaluation that it is taken from.
+    fn number(&self, start: usize) -> usize {
+        self.numbers.as_ref().map_or(start, |numbers| numbers[start])
     }
 
     /// Chooses `n` different starts of a dataset, uniformly among all starts whose goal lies in the same episode: `[n]`
@@ -194,14 +241,19 @@ impl Starts {
         self.dataset.as_ref().map(|dataset| dataset.picks[episode])
     }
 
+    /// The start row and the goal row of every start, alternating, for starts from a dataset.
+    pub fn rows(&self) -> Option<&Batch> {
+        self.dataset.as_ref().map(|dataset| &dataset.rows)
+    }
+
     pub(crate) fn key(&self, episode: usize) -> Key {
-        episode_key(self.seed, episode)
+        episode_key(self.seed, self.number(episode))
     }
 
     pub(crate) fn reset_seed(&self, episode: usize) -> u64 {
         if self.sequential {
             // At most 63 bits, like all reset seeds.
-            self.seed.wrapping_add(episode as u64) & (u64::MAX >> 1)
+            self.seed.wrapping_add(self.number(episode) as u64) & (u64::MAX >> 1)
         } else {
             reset_seed(self.key(episode))
         }
@@ -223,6 +275,18 @@ impl Starts {
             let from = DatasetStart { start, goal, callables: &dataset.calls };
             dataset_start::reset(env, resets[i].seed, &resets[i].options, from)
         })
+    }
+}
+
+impl Rows {
+    /// The rows of the picks with these indices.
+    fn only(&self, indices: &[usize]) -> Result<Self> {
+        let mut rows = Batch::zeros(self.rows.schema(), 0);
+        for row in indices.iter().flat_map(|index| [2 * index, 2 * index + 1]) {
+            rows.push_row(&self.rows, row)?;
+        }
+        let picks = indices.iter().map(|&index| self.picks[index]).collect();
+        Ok(Self { picks, rows, calls: self.calls.clone(), ..*self })
     }
 }
 

@@ -18,18 +18,22 @@ A name that the engine reserves gets the prefix `obs_` or `info_`; entries that 
 
 import ast
 import difflib
+import functools
 import importlib.metadata
 import inspect
 import json
 import math
 import os
 import struct
+import threading
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 
 ALIGN = 64
+# Environments of one process run one at a time: frames of pygame, for example, differ in some pixels when two threads draw.
+RUNNING = threading.RLock()
 # The header of the buffer: reward, goal distance; terminated, truncated, success.
 HEAD = struct.Struct('<dd???')
 # The index of the flag that a forked process sets, behind the header.
@@ -303,9 +307,21 @@ def numeric(value):
     return None
 
 
+def one_at_a_time(method):
+    """Makes a method wait until no other thread calls an environment."""
+
+    @functools.wraps(method)
+    def waiting(*arguments, **keywords):
+        with RUNNING:
+            return method(*arguments, **keywords)
+
+    return waiting
+
+
 class Bridge:
     """One environment and the buffer it writes into."""
 
+    @one_at_a_time
     def __init__(self, env, max_episode_steps=None):
         """Runs a reset, a step and a render to determine the columns and the frame size."""
         self.env = env
@@ -441,6 +457,7 @@ class Bridge:
                 self.buffer[FORKED_AT] = 1
                 raise Forked(f'process {process} forked process {os.getpid()}, which returned to the caller')
 
+    @one_at_a_time
     def handle(self, op, payload):
         """Handles a request: its kind, and for a reset its arguments as JSON."""
         if op == STEP:

@@ -5,7 +5,8 @@
 //! - [`family`]: [`ModelFamily`], the contract of a model family; [`registry`]: the families of this build.
 //! - [`online`]: training by acting in environments; [`feed_forward`]: policies without planning.
 //! - [`probe`]: regression of the environment state from frozen latents.
-//! - [`checkpoint`]: trained models on disk; [`run_folder`]: the files of a training run.
+//! - [`checkpoint`]: trained models on disk; [`run_folder`]: the files of a training run; [`capsule`]: a trained model in
+//!   one file; [`stored`]: both as the parts of a checkpoint.
 //! - [`weights`]: pretrained weights, and weight files for PyTorch.
 //!
 //! Building blocks: [`nn`], with PyTorch's parameter names; [`pixels`], the normalisation of images; [`device`].
@@ -17,6 +18,7 @@
 //! - [`gcrl`] (GCBC, GCIVL, GCIQL): goal-conditioned policies from offline data.
 //! - [`inverse`]: an inverse-dynamics policy on the encoder of another checkpoint.
 
+pub mod capsule;
 pub mod checkpoint;
 mod checks;
 pub mod device;
@@ -34,12 +36,15 @@ pub mod probe;
 pub mod registry;
 pub mod run_folder;
 pub mod sac;
+pub mod stored;
 pub mod tdmpc2;
+mod tensor_file;
 pub mod train;
 pub mod weights;
 
 pub use burn::tensor::Device;
 pub use checkpoint::Checkpoint;
 pub use family::{CheckpointInfo, FamilyEntry, LoadedModel, ModelFamily, OnlineRun, TrainRun, TrainableConfig};
-pub use registry::{FAMILIES, dataset_requirements, load, load_from};
+pub use registry::{FAMILIES, dataset_requirements, load, load_from, load_stored};
+pub use stored::StoredCheckpoint;
 pub use train::{TrainConfig, TrainOptions, TrainSummary, Trainable, train};

@@ -1,7 +1,8 @@
 //! [`FAMILIES`]: the model families of this build, and [`load`], which loads a checkpoint of any family.
 
 use crate::family::{FamilyEntry, LoadedModel};
-use crate::{checkpoint, dino_wm, gcrl, inverse, lewm, pldm, sac, tdmpc2};
+use crate::stored::StoredCheckpoint;
+use crate::{dino_wm, gcrl, inverse, lewm, pldm, sac, tdmpc2};
 use burn::tensor::Device;
 use std::path::Path;
 use swm_core::requirements::DatasetRequirements;
@@ -32,26 +33,37 @@ pub fn dataset_requirements() -> Result<Vec<DatasetRequirements>> {
     FAMILIES.rows.iter().filter_map(|family| (family.requirements)().transpose()).collect()
 }
 
-/// Loads the checkpoint of a run folder, of any family in [`FAMILIES`].
+/// Loads the checkpoint of a run folder or of a capsule, of any family in [`FAMILIES`].
 ///
 /// # Errors
-/// When the folder holds no checkpoint, or the checkpoint is of an unknown family, is damaged, or has weights that do
+/// When there is no checkpoint at `run`, or the checkpoint is of an unknown family, is damaged, or has weights that do
 /// not fit its configuration.
 pub fn load(run: &Path, device: &Device) -> Result<Box<dyn LoadedModel>> {
     load_from(FAMILIES.rows, run, device)
 }
 
-/// Loads the checkpoint of a run folder, of any of the given families.
+/// Loads the checkpoint of a run folder or of a capsule, of any of the given families.
 ///
 /// # Errors
 /// As [`load`].
 pub fn load_from(families: &[FamilyEntry], run: &Path, device: &Device) -> Result<Box<dyn LoadedModel>> {
-    let Some(family) = checkpoint::family(run) else {
-        return Err(Error::corrupt(run, "there is no checkpoint", "give the folder that `swm train` wrote to"));
-    };
+    load_stored(families, &StoredCheckpoint::read(run)?, device)
+}
+
+/// Loads a stored checkpoint of any of the given families.
+///
+/// # Errors
+/// As [`load`].
+pub fn load_stored(
+    families: &[FamilyEntry],
+    stored: &StoredCheckpoint,
+    device: &Device,
+) -> Result<Box<dyn LoadedModel>> {
+    let family = stored.family();
     let Some(row) = families.iter().find(|row| row.id == family) else {
         let problem = format!("it holds a model of the family '{family}', which this program does not support");
-        return Err(Error::corrupt(run, problem, "give another checkpoint; `swm models` lists the supported families"));
+        let fix = "give another checkpoint; `swm models` lists the supported families";
+        return Err(Error::corrupt(stored.run(), problem, fix));
     };
-    (row.load)(run, device)
+    (row.load)(stored, device)
 }

@@ -3,7 +3,7 @@
 use crate::text::escape;
 use std::path::PathBuf;
 use swm_core::Results;
-use swm_core::results::{Comparison, Counting, Paired, Run, pairs};
+use swm_core::results::{Comparison, Counting, Family, Paired, Run, pairs};
 
 /// The number of different colours of policies.
 const COLOURS: usize = 6;
@@ -113,10 +113,22 @@ impl<'a> Condition<'a> {
     }
 
     /// The compared pairs of runs that played the same starts, the later run first: usually a model, then the
-    /// random-policy floor.
-    pub(crate) fn pairs(&self, counting: Counting) -> Vec<(&Row<'a>, &Row<'a>, Paired)> {
+    /// random-policy floor. They form a family; `None` without pairs.
+    pub(crate) fn pairs(&self, counting: Counting) -> Option<(Family, Vec<Pair<'_, 'a>>)> {
         let runs: Vec<&Run> = self.rows.iter().map(|row| row.run).collect();
         let pairs = pairs(&runs).map(|(later, earlier)| (&self.rows[later], &self.rows[earlier]));
-        pairs.filter_map(|(a, b)| Some((a, b, Comparison::of(a.run, b.run, counting)?.table))).collect()
+        let mut pairs: Vec<Pair<'_, 'a>> = pairs
+            .filter_map(|(a, b)| Some(Pair { a, b, table: Comparison::of(a.run, b.run, counting)?.table }))
+            .collect();
+        let mut tables: Vec<&mut Paired> = pairs.iter_mut().map(|pair| &mut pair.table).collect();
+        let family = Family::correct(self.name, &mut tables, 0)?;
+        Some((family, pairs))
     }
+}
+
+/// Two runs on the same starts.
+pub(crate) struct Pair<'g, 'a> {
+    pub a: &'g Row<'a>,
+    pub b: &'g Row<'a>,
+    pub table: Paired,
 }

@@ -6,6 +6,7 @@
 //!
 //! - `page` writes the page; `sections` has a file for each section; `charts` has a file for each chart, drawn with the SVG
 //!   primitives of `charts/svg.rs`; `style.css` is the style sheet.
+//! - `study` writes the page of a study ([`write_study`]), with figures that `plot` draws with `plotters`, as SVG and PNG.
 //! - `group` groups runs by environment, protocol and counting; `read` and `training_log` read files, within the `limits`;
 //!   `text` formats numbers and escapes text.
 
@@ -13,11 +14,14 @@ mod charts;
 mod group;
 mod limits;
 mod page;
+mod plot;
 mod read;
 mod sections;
+mod study;
 mod text;
 mod training_log;
 
 pub use page::{ReportOptions, render, write_report, write_report_with};
 pub use read::read_results;
+pub use study::{Published, StudyPage, write_study};
 pub use training_log::{Metrics, Series, read_metrics};

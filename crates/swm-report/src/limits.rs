@@ -36,6 +36,27 @@ pub(crate) const CHART_BYTES: usize = 8 << 20;
 /// The size of a page beyond which further charts are left out, in bytes.
 pub(crate) const PAGE_BYTES: usize = 96 << 20;
 
+/// The largest number of figures of a study.
+pub(crate) const FIGURES: usize = 12;
+
+/// The size of the figures of a study in its page, in bytes.
+pub(crate) const STUDY_FIGURES_BYTES: usize = 2_000_000;
+
+/// The size of the table of a study beyond which further rows are left out, in bytes.
+pub(crate) const STUDY_TABLE_BYTES: usize = 2_300_000;
+
+/// The number of published values beside those of a study.
+pub(crate) const PUBLISHED: usize = 200;
+
+/// The number of families, and of rows over training seeds, that the page of a study shows.
+pub(crate) const FAMILIES: usize = 100;
+
+/// The longest name in the page of a study, in characters.
+pub(crate) const STUDY_NAME_CHARS: usize = 120;
+
+/// The longest question or command in the page of a study, in characters.
+pub(crate) const STUDY_TEXT_CHARS: usize = 2000;
+
 /// A size in mebibytes, as a text.
 pub(crate) fn mebibytes(bytes: u64) -> String {
     format!("{:.1} MiB", bytes as f64 / f64::from(1 << 20))

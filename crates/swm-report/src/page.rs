@@ -63,25 +63,43 @@ pub fn render(results: &[(PathBuf, Results)], options: &ReportOptions, metrics: 
         }
     }
     let title = options.title.clone().unwrap_or_else(|| format!("Evaluation in {}", envs.join(", ")));
+    document(&Head { title: &title, lede: &summary(results), style: "" }, |html| {
+        let mut videos = sections::videos::Videos::default();
+        for group in &groups {
+            sections::group::write(html, group, (results, &mut videos), groups.len() > 1);
+        }
+        if let Some(metrics) = metrics {
+            sections::training::write(html, metrics);
+        }
+        sections::provenance::write(html, results, options.command.as_deref());
+    })
+}
+
+/// The head of a page.
+pub(crate) struct Head<'a> {
+    /// The title, not escaped.
+    pub title: &'a str,
+    /// The line below the title, as HTML.
+    pub lede: &'a str,
+    /// What is added to the style sheet.
+    pub style: &'a str,
+}
+
+/// Returns a page whose main part `write` appends.
+pub(crate) fn document(head: &Head<'_>, write: impl FnOnce(&mut String)) -> String {
     let mut html = format!(
         "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\"/>\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n\
          <meta name=\"color-scheme\" content=\"light dark\"/>\n\
          <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; \
-         img-src data:; media-src data:\"/>\n<link rel=\"icon\" href=\"data:,\"/>\n\
-         <title>{title}</title>\n<style>\n{STYLE}</style>\n</head>\n<body>\n<header>\n\
+         img-src data:; media-src data:; font-src data:\"/>\n<link rel=\"icon\" href=\"data:,\"/>\n\
+         <title>{title}</title>\n<style>\n{STYLE}{}</style>\n</head>\n<body>\n<header>\n\
          <p class=\"eyebrow\">stable-worldmodel</p>\n<h1>{title}</h1>\n<p class=\"lede\">{}</p>\n</header>\n<main>\n",
-        summary(results),
-        title = escape(&title),
+        head.style,
+        head.lede,
+        title = escape(head.title),
     );
-    let mut videos = sections::videos::Videos::default();
-    for group in &groups {
-        sections::group::write(&mut html, group, (results, &mut videos), groups.len() > 1);
-    }
-    if let Some(metrics) = metrics {
-        sections::training::write(&mut html, metrics);
-    }
-    sections::provenance::write(&mut html, results, options.command.as_deref());
+    write(&mut html);
     let _ = write!(
         html,
         "</main>\n<footer>Written by stable-worldmodel {}. This page is self-contained: no scripts, no \

@@ -2,20 +2,28 @@
 
 use swm_core::results::EpisodeResult;
 
-/// Escapes a text for HTML and quoted attributes. Control characters, which XML forbids, become spaces, and so do
-/// overrides and isolates of bidirectional text, which would reorder the rest of a line.
+/// Replaces control characters, which XML forbids, by spaces, and so overrides and isolates of bidirectional text, which
+/// would reorder the rest of a line.
+pub(crate) fn plain(words: &str) -> String {
+    let space = |c: char| match c {
+        '\n' | '\t' => c,
+        '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => ' ',
+        c if c.is_control() => ' ',
+        c => c,
+    };
+    words.chars().map(space).collect()
+}
+
+/// Escapes a text for HTML and quoted attributes, and makes it [`plain`].
 pub(crate) fn escape(words: &str) -> String {
     let mut safe = String::with_capacity(words.len());
-    for c in words.chars() {
+    for c in plain(words).chars() {
         match c {
             '&' => safe.push_str("&amp;"),
             '<' => safe.push_str("&lt;"),
             '>' => safe.push_str("&gt;"),
             '"' => safe.push_str("&quot;"),
             '\'' => safe.push_str("&#39;"),
-            '\n' | '\t' => safe.push(c),
-            '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => safe.push(' '),
-            c if c.is_control() => safe.push(' '),
             c => safe.push(c),
         }
     }
@@ -50,6 +58,11 @@ pub(crate) fn percent(rate: f64) -> String {
 /// A difference of fractions in percentage points, with its sign: `+34.0`.
 pub(crate) fn points(difference: f64) -> String {
     format!("{:+.1}", difference * 100.0).replace('-', "\u{2212}")
+}
+
+/// A difference of fractions in whole percentage points, with its sign: `+34`.
+pub(crate) fn whole_points(difference: f64) -> String {
+    format!("{:+.0}", difference * 100.0).replace('-', "\u{2212}")
 }
 
 /// A p-value: `p = 0.032`, `p < 0.001`.
@@ -116,6 +129,7 @@ mod tests {
         assert_eq!(times, ["0.8 ms", "12 ms", "1.00 s", "1.42 s", "1 min 0 s", "3 min 20 s", "2 h 5 min", "–"]);
         assert_eq!(percent(0.925), "92.5\u{a0}%");
         assert_eq!((points(0.34), points(-0.051)), ("+34.0".to_owned(), "\u{2212}5.1".to_owned()));
+        assert_eq!((whole_points(0.347), whole_points(-0.057)), ("+35".to_owned(), "\u{2212}6".to_owned()));
         assert_eq!(
             [0.2, 0.000_99, 1.0].map(p_value).map(|p| p.replace('\u{a0}', " ")),
             ["p = 0.200", "p < 0.001", "p = 1.000"]

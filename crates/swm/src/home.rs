@@ -1,6 +1,7 @@
 //! Folders of named datasets and checkpoints: `$STABLEWM_HOME` (default `~/.stable_worldmodel`) with `datasets/`,
 //! `checkpoints/` and `weights/`.
 
+use crate::zoo;
 use std::iter::once;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -71,12 +72,15 @@ pub fn location(given: &str) -> Result<Location> {
     if given.contains("://") { Location::parse(given) } else { Ok(dataset(given)?.into()) }
 }
 
-/// Returns the path of a checkpoint given as a path or as a name in [`checkpoints`].
+/// Returns the path of a checkpoint given as a path, as a name in [`checkpoints`], or as `zoo:NAME`.
 ///
 /// # Errors
-/// As [`home`], if it is a name.
+/// As [`home`], if it is a name, and when the [zoo](zoo) has no such capsule.
 pub fn checkpoint(given: &str) -> Result<PathBuf> {
-    named(given, checkpoints, "")
+    match given.strip_prefix(zoo::PREFIX) {
+        Some(name) => zoo::find(name),
+        None => named(given, checkpoints, ""),
+    }
 }
 
 /// Returns the path of a checkpoint to write, given as a path or as a name in [`checkpoints`].
@@ -85,7 +89,7 @@ pub fn checkpoint(given: &str) -> Result<PathBuf> {
 /// When the text is empty.
 pub fn new_checkpoint(given: &str) -> Result<PathBuf> {
     check_name("checkpoint", given)?;
-    checkpoint(given)
+    named(given, checkpoints, "")
 }
 
 /// Opens a dataset given as a path, as a URI, or as a name in [`datasets`].
@@ -108,7 +112,8 @@ pub fn find_dataset(given: &str) -> Result<Location> {
     }
 }
 
-/// Returns the folder of an existing checkpoint given as a path or as a name in [`checkpoints`].
+/// Returns the folder or the capsule of an existing checkpoint, given as a path, as a name in [`checkpoints`], or as
+/// `zoo:NAME`.
 ///
 /// # Errors
 /// When the checkpoint does not exist; the message names the closest name.

@@ -14,12 +14,15 @@ pub use swm_mujoco as mujoco;
 pub use swm_plan as plan;
 pub use swm_report as report;
 
+pub mod capsule;
 pub mod cli;
 pub mod collect_target;
 pub mod describe;
 pub mod home;
+mod library;
 pub mod resolver;
 pub mod subject;
+pub mod zoo;
 
 use swm_core::registry::{Registry, concat};
 use swm_core::{EnvChoice, EnvEntry, Origin, Result};

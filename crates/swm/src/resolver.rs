@@ -6,7 +6,7 @@ use crate::home;
 use serde::de::DeserializeOwned;
 use std::cell::RefCell;
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::rc::Rc;
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::policy::ExpertPolicy;
@@ -69,6 +69,12 @@ impl HomeResolver {
         Self { env: Some(id.to_owned()), ..self }
     }
 
+    /// Uses a loaded checkpoint wherever a request names `name`.
+    pub fn with_checkpoint(self, name: &str, loaded: Rc<dyn LoadedModel>) -> Self {
+        self.checkpoints.borrow_mut().insert(PathBuf::from(name), loaded);
+        self
+    }
+
     /// Who chose the names in the requests.
     pub fn origin(&self) -> &Origin {
         &self.origin
@@ -94,6 +100,9 @@ impl HomeResolver {
     /// # Errors
     /// When the checkpoint does not exist or is damaged.
     pub fn checkpoint(&self, given: &str) -> Result<Rc<dyn LoadedModel>> {
+        if let Some(loaded) = self.checkpoints.borrow().get(Path::new(given)) {
+            return Ok(Rc::clone(loaded));
+        }
         let path = home::find_checkpoint(given)?;
         if let Some(loaded) = self.checkpoints.borrow().get(&path) {
             return Ok(Rc::clone(loaded));

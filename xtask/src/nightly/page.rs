@@ -22,7 +22,7 @@ The fuzzers and the part `asan` compile the crates of the workspace with Address
 const FUZZERS: &str = "
 ## Fuzzers
 
-The time of all runs on the machine that writes this page. A night runs those with the shortest time for ten minutes each; the goal
+The time of all runs on the machine that writes this page. A night runs each for ten minutes, the shortest time first; the goal
 is an hour each. A finding becomes a test of the crate that owns the parser.
 
 | fuzzer | minutes | inputs | findings |

@@ -3,8 +3,8 @@
 //! A results file may be edited or damaged. Its rates, intervals and comparisons are therefore never shown as they
 //! stand: they must equal the values that are computed again from the episodes.
 
-use super::{Comparison, Counting, Prediction, Proportion, Results, Run, Summary};
-use std::collections::BTreeMap;
+use super::{Comparison, Counting, Paired, Prediction, Proportion, Results, Run, Summary};
+use std::collections::{BTreeMap, BTreeSet};
 
 impl Results {
     /// Checks that every statistic equals the statistic of the episodes.
@@ -13,30 +13,41 @@ impl Results {
     /// When a value differs; the text names the run, the stated value and the value of its episodes.
     pub fn check(&self) -> Result<(), String> {
         self.runs.iter().try_for_each(|run| check_run(run, self.counting))?;
-        let mut runs: BTreeMap<(&str, &str), &Run> = BTreeMap::new();
-        for run in &self.runs {
-            runs.entry((&run.condition, &run.policy)).or_insert(run);
+        if self.comparisons.is_empty() {
+            return Ok(());
         }
-        let mut seen: BTreeMap<(&str, &str, &str), ()> = BTreeMap::new();
+        // All runs make the family of a comparison, not only those of the stated comparisons.
+        let mut expected: BTreeMap<[&str; 3], &Paired> = BTreeMap::new();
+        let all = Comparison::all(&self.runs, self.counting);
+        for comparison in &all {
+            expected.entry(names(comparison)).or_insert(&comparison.table);
+        }
+        let mut seen = BTreeSet::new();
         for stated in &self.comparisons {
-            let [condition, a, b] = [&stated.condition, &stated.a, &stated.b].map(String::as_str);
+            let [condition, a, b] = names(stated);
             let wrong = |problem: &str| Err(format!("the comparison of {a} and {b} {problem} ({condition})"));
-            // Without this check, one comparison stated a million times would be computed a million times.
-            if seen.insert((condition, a, b), ()).is_some() {
+            if !seen.insert([condition, a, b]) {
                 return wrong("is stated twice");
             }
-            let pair = runs.get(&(condition, a)).zip(runs.get(&(condition, b)));
-            let computed = pair.and_then(|(a, b)| Comparison::of(a, b, self.counting));
-            let Some(computed) = computed else { return wrong("does not match the episodes") };
-            let (stated, computed) = (&stated.table, &computed.table);
-            let counts = |table: &super::Paired| [table.both, table.only_a, table.only_b, table.neither];
-            let values = |table: &super::Paired| [table.p, table.difference, table.low, table.high];
-            if counts(stated) != counts(computed) || !close(&values(stated), &values(computed)) {
+            if !expected.get(&[condition, a, b]).is_some_and(|computed| same_table(&stated.table, computed)) {
                 return wrong("does not match the episodes");
             }
         }
         Ok(())
     }
+}
+
+/// The condition and the policies of a comparison.
+fn names(comparison: &Comparison) -> [&str; 3] {
+    [&comparison.condition, &comparison.a, &comparison.b].map(String::as_str)
+}
+
+fn same_table(stated: &Paired, computed: &Paired) -> bool {
+    let counts = |table: &Paired| [table.both, table.only_a, table.only_b, table.neither, table.comparisons];
+    let values = |table: &Paired| [table.p, table.p_holm, table.design_effect, table.difference, table.low, table.high];
+    counts(stated) == counts(computed)
+        && stated.verdict == computed.verdict
+        && close(&values(stated), &values(computed))
 }
 
 /// Checks the statistics of one run.

@@ -3,7 +3,7 @@
 //! Starts differ in difficulty. A paired test removes this variance: it depends only on the starts that exactly one of
 //! the policies solves.
 
-use super::{Counting, Proportion, Run};
+use super::{Counting, Family, Run, Verdict, score};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -21,7 +21,10 @@ pub struct Comparison {
     pub table: Paired,
 }
 
-/// Counts of paired outcomes, and the test and the interval of the difference in success rate.
+/// Counts of paired outcomes, the test of equal success rates, and the interval of their difference.
+///
+/// The test is the score test, and the interval its inversion (Tango 1998), so that the interval excludes 0 exactly if
+/// the test rejects. Both are corrected for the number of comparisons of the family ([`Family::correct`]).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Paired {
     /// Starts that both policies solved.
@@ -32,19 +35,30 @@ pub struct Paired {
     pub only_b: usize,
     /// Starts that neither policy solved.
     pub neither: usize,
-    /// The two-sided p-value of McNemar's exact test. The null hypothesis is that `only_a` and `only_b` are equally
-    /// likely outcomes of the starts that exactly one policy solved.
+    /// The two-sided p-value of the score test, not corrected. The null hypothesis is that `only_a` and `only_b` are
+    /// equally likely outcomes of the starts that exactly one policy solved.
     pub p: f64,
+    /// Holm's adjusted p-value in the family. It may be below 5 % where `verdict`, which follows the interval, tells
+    /// nothing apart.
+    pub p_holm: f64,
+    /// The number of comparisons of the family.
+    pub comparisons: usize,
+    /// The variance of the difference relative to that of independent starts: starts from one recorded episode form a
+    /// cluster. At least 1, which it is without clusters.
+    pub design_effect: f64,
     /// The success rate of the first policy minus the success rate of the second.
     pub difference: f64,
-    /// The lower end of the 95 % interval of the difference.
+    /// The lower end of the interval of the difference. The intervals of a family hold simultaneously with a probability
+    /// of 95 %.
     pub low: f64,
-    /// The upper end of the 95 % interval of the difference.
+    /// The upper end of the interval of the difference.
     pub high: f64,
+    /// What the interval says about the success rate of the first policy.
+    pub verdict: Verdict,
 }
 
 impl Comparison {
-    /// Compares two runs of one condition; `None` if they did not play the same starts.
+    /// Compares two runs of one condition, as a family of one comparison; `None` if they did not play the same starts.
     pub fn of(a: &Run, b: &Run, counting: Counting) -> Option<Self> {
         let mut pairs = a.episodes.iter().zip(&b.episodes);
         let same = a.condition == b.condition && pairs.all(|(a, b)| a.solved_at_start == b.solved_at_start);
@@ -53,7 +67,8 @@ impl Comparison {
     }
 
     /// Compares every run with each earlier run of the same condition, so that a learned policy is compared with the
-    /// random-policy floor as `learned` minus `random`. A condition with many runs is limited as [`pairs`] says.
+    /// random-policy floor as `learned` minus `random`. A condition with many runs is limited as [`pairs`] says. The
+    /// comparisons of one condition form a family.
     pub fn all(runs: &[Run], counting: Counting) -> Vec<Self> {
         let mut conditions: BTreeMap<&str, Vec<usize>> = BTreeMap::new();
         for (i, run) in runs.iter().enumerate() {
@@ -65,7 +80,20 @@ impl Comparison {
             found.extend(pairs(&members).map(|(later, earlier)| (indices[later], indices[earlier])));
         }
         found.sort_unstable();
-        found.into_iter().filter_map(|(later, earlier)| Self::of(&runs[later], &runs[earlier], counting)).collect()
+        let compared = found.into_iter().filter_map(|(a, b)| Self::of(&runs[a], &runs[b], counting));
+        let mut compared: Vec<Self> = compared.collect();
+        Self::families(&mut compared);
+        compared
+    }
+
+    /// Corrects comparisons for their number: those of one condition form a family. Returns the families by condition.
+    pub fn families(comparisons: &mut [Self]) -> Vec<Family> {
+        let mut conditions: BTreeMap<&str, Vec<&mut Paired>> = BTreeMap::new();
+        for Self { condition, table, .. } in comparisons {
+            conditions.entry(condition).or_default().push(table);
+        }
+        let corrected = |(condition, mut tables): (&str, Vec<&mut Paired>)| Family::correct(condition, &mut tables, 0);
+        conditions.into_iter().filter_map(corrected).collect()
     }
 }
 
@@ -93,106 +121,63 @@ impl Paired {
         let pairs = || a.episodes.iter().zip(&b.episodes);
         let same = a.episodes.len() == b.episodes.len() && pairs().all(|(a, b)| (a.seed, a.start) == (b.seed, b.start));
         let mut counts = [0; 4];
-        for (a, b) in pairs().filter(|(a, b)| counting.counts(a) && counting.counts(b)) {
+        // The excess of the first policy in each recorded episode; a start without one is a cluster of its own.
+        let mut clusters: BTreeMap<(Option<usize>, usize), i64> = BTreeMap::new();
+        for (i, (a, b)) in pairs().enumerate().filter(|(_, (a, b))| counting.counts(a) && counting.counts(b)) {
             counts[2 * usize::from(!a.success) + usize::from(!b.success)] += 1;
+            let cluster = a.start.map_or((None, i), |[episode, _]| (Some(episode), 0));
+            *clusters.entry(cluster).or_default() += i64::from(a.success) - i64::from(b.success);
         }
-        let [both, only_a, only_b, neither] = counts;
-        (same && counts != [0; 4]).then(|| Self::of(both, only_a, only_b, neither))
+        let [_, only_a, only_b, _] = counts;
+        let design_effect = score::design_effect(clusters.into_values(), only_a + only_b);
+        (same && counts != [0; 4]).then(|| Self::with_design_effect(counts, design_effect))
     }
 
-    /// The statistics of a table of paired outcomes.
-    ///
-    /// The test is McNemar's exact conditional test (McNemar, "Note on the sampling error of the difference between
-    /// correlated proportions or percentages", 1947): a two-sided binomial test with p = 1/2. The interval of the
-    /// difference is Newcombe's square-and-add ("Improved confidence intervals for the difference between
-    /// binomial proportions based on paired data", 1998, method 10): Wilson intervals of both rates, combined by
-    /// their correlation.
+    /// The statistics of a table of independent paired outcomes, as a family of one comparison.
     pub fn of(both: usize, only_a: usize, only_b: usize, neither: usize) -> Self {
+        Self::with_design_effect([both, only_a, only_b, neither], 1.0)
+    }
+
+    fn with_design_effect([both, only_a, only_b, neither]: [usize; 4], design_effect: f64) -> Self {
         let n = both + only_a + only_b + neither;
-        let (a, b) = (Proportion::wilson(both + only_a, n), Proportion::wilson(both + only_b, n));
-        let [w, x, y, z] = [both, only_a, only_b, neither].map(|count| count as f64);
-        let margins = (w + x) * (y + z) * (w + y) * (x + z);
-        let excess = w * z - x * y;
-        // Newcombe's continuity correction, which applies to positive correlations only.
-        let corrected = if excess > 0.0 { (excess - n as f64 / 2.0).max(0.0) } else { excess };
-        let phi = if margins > 0.0 { corrected / margins.sqrt() } else { 0.0 };
-        let combined = |a: f64, b: f64| (a * a - 2.0 * phi * a * b + b * b).max(0.0).sqrt();
-        let difference = a.rate - b.rate;
-        Self {
+        let mut table = Self {
             both,
             only_a,
             only_b,
             neither,
-            p: mcnemar(only_a, only_b),
-            difference,
-            low: (difference - combined(a.rate - a.low, b.high - b.rate)).max(-1.0),
-            high: (difference + combined(a.high - a.rate, b.rate - b.low)).min(1.0),
-        }
+            p: score::test(only_a, only_b, design_effect),
+            p_holm: 1.0,
+            comparisons: 1,
+            design_effect,
+            difference: (only_a as f64 - only_b as f64) / n.max(1) as f64,
+            low: -1.0,
+            high: 1.0,
+            verdict: Verdict::TooFew,
+        };
+        Family::correct("", &mut [&mut table], 1);
+        table
     }
 
     /// The number of pairs.
     pub fn n(&self) -> usize {
         self.both + self.only_a + self.only_b + self.neither
     }
-}
 
-/// Returns the two-sided p-value of the exact binomial test of `b` successes in `b + c` trials with p = 1/2.
-fn mcnemar(b: usize, c: usize) -> f64 {
-    let (n, fewer) = (b + c, b.min(c));
-    // Logarithms of the binomial probabilities, which do not underflow for thousands of trials.
-    let mut term = n as f64 * 0.5f64.ln();
-    let mut tail = 0.0;
-    for k in 0..=fewer {
-        tail += term.exp();
-        term += ((n - k) as f64 / (k + 1) as f64).ln();
+    /// The number of starts that exactly one policy solved.
+    pub fn discordant(&self) -> usize {
+        self.only_a + self.only_b
     }
-    (2.0 * tail).min(1.0)
+
+    /// The p-value multiplied by the number of comparisons (Bonferroni): below 5 % exactly if the interval excludes 0.
+    pub fn p_corrected(&self) -> f64 {
+        (self.p * self.comparisons as f64).min(1.0)
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::results::{EpisodeResult, Timing};
-
-    #[test]
-    fn mcnemar_is_the_exact_binomial_test() {
-        // scipy.stats.binomtest(b, b + c, 0.5).pvalue of scipy 1.17.1.
-        let scipy = [
-            (0, 0, 1.0),
-            (1, 0, 1.0),
-            (5, 5, 1.0),
-            (0, 6, 0.03125),
-            (1, 7, 0.0703125),
-            (12, 2, 0.012_939_453_125),
-            (37, 16, 0.005_486_344_876_760_141),
-            (3, 41, 1.618_332_134_967_204_2e-9),
-            (130, 90, 0.008_405_451_752_681_935),
-            (900, 700, 6.319_484_959_450_105e-7),
-        ];
-        for (b, c, p) in scipy {
-            let given = mcnemar(b, c);
-            assert!((given - p).abs() <= 1e-9 * p, "{b} to {c}: {given}, not {p}");
-            assert_eq!(given, mcnemar(c, b));
-        }
-    }
-
-    #[test]
-    fn paired_intervals_match_published_values() {
-        // Newcombe 1998, table of examples: (36, 12, 2, 0) gives 0.0569 to 0.3404. Altman et al., "Statistics with
-        // confidence", table 6.2: (14, 5, 0, 22) gives 0.011 to 0.226. Fagerland, Lydersen and Laake 2014:
-        // (1, 1, 7, 12) gives -0.507 to -0.026, and p = 0.0703.
-        for ([both, only_a, only_b, neither], low, high) in
-            [([36, 12, 2, 0], 0.0569, 0.3404), ([14, 5, 0, 22], 0.0115, 0.2265), ([1, 1, 7, 12], -0.5069, -0.0256)]
-        {
-            let paired = Paired::of(both, only_a, only_b, neither);
-            assert!((paired.low - low).abs() < 6e-5 && (paired.high - high).abs() < 6e-5, "{paired:?}");
-            let swapped = Paired::of(both, only_b, only_a, neither);
-            assert!((swapped.low + paired.high).abs() < 1e-12 && (swapped.high + paired.low).abs() < 1e-12);
-        }
-        assert!((Paired::of(1, 1, 7, 12).p - 0.0703).abs() < 5e-5);
-        let same = Paired::of(30, 0, 0, 0);
-        assert!((same.p, same.difference) == (1.0, 0.0) && same.low < -0.1 && same.high > 0.1, "{same:?}");
-    }
 
     fn run(policy: &str, outcomes: &[(u64, bool, bool)]) -> Run {
         let episodes = outcomes.iter().map(|&(seed, success, solved_at_start)| EpisodeResult {
@@ -227,6 +212,24 @@ mod tests {
     }
 
     #[test]
+    fn starts_from_one_recorded_episode_form_a_cluster() {
+        let outcomes = |solved: fn(u64) -> bool| (0..24).map(|seed| (seed, solved(seed), false)).collect::<Vec<_>>();
+        let mut floor = run("random", &outcomes(|_| false));
+        let mut model = run("model", &outcomes(|seed| seed < 12));
+        let independent = Paired::of_runs(&model, &floor, Counting::default()).expect("24 starts");
+        assert_eq!((independent.design_effect, independent.verdict), (1.0, Verdict::Higher));
+        for run in [&mut floor, &mut model] {
+            for (i, episode) in run.episodes.iter_mut().enumerate() {
+                episode.start = Some([i / 6, i]);
+            }
+        }
+        let clustered = Paired::of_runs(&model, &floor, Counting::default()).expect("24 starts");
+        assert_eq!((clustered.design_effect, clustered.only_a), (6.0, 12));
+        // Two recorded episodes cannot decide.
+        assert!(clustered.verdict == Verdict::TooFew && clustered.low < 0.0 && clustered.high > independent.high);
+    }
+
+    #[test]
     fn many_runs_are_compared_only_with_the_random_floor_and_the_best_run() {
         let outcomes = |solved: u64| (0..8).map(|seed| (seed, seed < solved, false)).collect::<Vec<_>>();
         let mut runs = vec![run("random", &outcomes(1))];
@@ -234,6 +237,7 @@ mod tests {
         let found = Comparison::all(&runs, Counting::default());
         // 30 with the floor, and 29 others with model-7.
         assert_eq!(found.len(), 59);
+        assert!(found.iter().all(|comparison| comparison.table.comparisons == 59));
         assert!(found.iter().all(|c| [c.a.as_str(), c.b.as_str()].iter().any(|p| ["random", "model-7"].contains(p))));
         assert_eq!(
             Comparison::all(&runs[..MAX_ALL_PAIRS], Counting::default()).len(),

@@ -1,6 +1,6 @@
 //! [`StudyResults`]: the success rates of all cells of a study, as read by tables and reports.
 
-use super::{Counting, Paired, Proportion};
+use super::{Counting, Family, OverSeeds, Paired, Proportion};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -19,6 +19,12 @@ pub struct StudyResults {
     pub done: usize,
     /// The rows, in the order of the cells.
     pub rows: Vec<StudyRow>,
+    /// The families of the gaps, by name.
+    #[serde(default)]
+    pub families: Vec<Family>,
+    /// Rows that differ in the training seed only, taken together.
+    #[serde(default)]
+    pub over_seeds: Vec<OverSeeds>,
 }
 
 /// The outcome of one policy under one condition.
@@ -34,6 +40,10 @@ pub struct StudyRow {
     pub variables: BTreeMap<String, String>,
     /// The policy.
     pub policy: String,
+    /// The name of the policy with `*` for its training seed, if it has the variable
+    /// [`TRAINING_SEED`](super::TRAINING_SEED).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub any_seed: Option<String>,
     /// The rule for counting episodes.
     pub counting: Counting,
     /// The seed.
@@ -45,7 +55,7 @@ pub struct StudyRow {
     /// The success rate of the random-policy floor on the same starts.
     pub floor: Proportion,
     /// The shifted minus the unshifted success rate of this policy on the same starts: the first condition of the study
-    /// is unshifted. `None` for that condition, and where the starts differ.
+    /// is unshifted. Corrected for the comparisons of its family. `None` for that condition, and where the starts differ.
     pub gap: Option<Paired>,
 }
 

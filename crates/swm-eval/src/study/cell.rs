@@ -12,8 +12,56 @@ pub struct Study {
     pub title: String,
     /// The question that the study asks.
     pub question: String,
+    /// What the comparisons of a family have in common: their verdicts are corrected for their number.
+    #[serde(default = "Common::by_default")]
+    pub families: Vec<Common>,
     /// The evaluations.
     pub cells: Vec<Cell>,
+    /// Success rates that a publication states for conditions of this study. They are no part of its hash.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub published: Vec<Published>,
+    /// The name of the study and the settings that it was made of, for the command that runs it again. They are no part of
+    /// its hash.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub arguments: Vec<String>,
+}
+
+/// A success rate that a publication states.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Published {
+    /// The condition, as the study names it.
+    pub condition: String,
+    /// The policy, which may be one that the study does not evaluate.
+    pub policy: String,
+    /// The success rate, from 0 to 1.
+    pub rate: f64,
+    /// Where the rate is stated.
+    pub source: String,
+}
+
+/// What the comparisons of a family may have in common.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Common {
+    /// The policy.
+    Policy,
+    /// The source of starts.
+    Starts,
+    /// The rule for counting episodes.
+    Counting,
+    /// The seed.
+    Seed,
+}
+
+impl Common {
+    /// All values, and their names in the file of a study.
+    pub const ALL: [(&str, Self); 4] =
+        [("policy", Self::Policy), ("starts", Self::Starts), ("counting", Self::Counting), ("seed", Self::Seed)];
+
+    /// The families of a study that declares none: one for each policy, rule for counting and seed.
+    pub fn by_default() -> Vec<Self> {
+        vec![Self::Policy, Self::Counting, Self::Seed]
+    }
 }
 
 /// One evaluation of a study: one policy, and the random-policy floor, under one condition.
@@ -23,6 +71,10 @@ pub struct Cell {
     pub starts: String,
     /// The values of the variables in the names of the condition and the policy.
     pub variables: BTreeMap<String, String>,
+    /// The name of the policy with `*` for its training seed, if it has the variable
+    /// [`TRAINING_SEED`](swm_core::results::TRAINING_SEED).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub any_seed: Option<String>,
     /// The evaluation.
     pub request: EvalRequest,
     /// The hashes of the dataset and the weights that the request names. With other data or weights of the same name, it
@@ -42,6 +94,17 @@ impl Cell {
     /// The name of the condition.
     pub fn condition(&self) -> &str {
         self.request.conditions.first().map_or("", |condition| &condition.name)
+    }
+
+    /// The name of the family of the cell's comparison: what it has in common with the others.
+    pub fn family(&self, families: &[Common]) -> String {
+        let part = |common: &Common| match common {
+            Common::Policy => self.policy().to_owned(),
+            Common::Starts => self.starts.clone(),
+            Common::Counting => self.request.counting.to_string(),
+            Common::Seed => format!("seed {}", self.request.seed),
+        };
+        families.iter().map(part).collect::<Vec<_>>().join(" · ")
     }
 
     /// The name of the policy.
@@ -70,6 +133,10 @@ impl Study {
         if !(1..=Self::MAX_CELLS).contains(&self.cells.len()) {
             let problem = format!("it has {} cells", self.cells.len());
             return Err(Error::config("the study", problem, format!("give 1 to {} cells", Self::MAX_CELLS)));
+        }
+        if let Some(value) = self.published.iter().find(|value| !(0.0..=1.0).contains(&value.rate)) {
+            let what = format!("the published rate of '{}' under '{}'", value.policy, value.condition);
+            return Err(Error::config(what, format!("is {}", value.rate), "give a share from 0 to 1"));
         }
         let mut seen = BTreeMap::new();
         for cell in &self.cells {

@@ -30,6 +30,7 @@ impl StudyFolder {
     pub fn create(&self, study: &Study) -> Result<Lock> {
         let (lock, path) = (Lock::folder(&self.root)?, self.root.join(STUDY));
         files::check_own(&path, |_| self.study().is_ok())?;
+        delete_temporary(&self.root, |name| name == STUDY)?;
         let other = |problem: String| {
             Error::config(self.root.display().to_string(), problem, "give another folder with --output")
         };
@@ -49,6 +50,7 @@ impl StudyFolder {
         files::write(&path, &json(study)?)?;
         let cells = self.root.join("cells");
         std::fs::create_dir_all(&cells).map_err(|error| Error::io(&cells, "creating the folder", error))?;
+        delete_temporary(&cells, |name| name.ends_with(".json"))?;
         Ok(lock)
     }
 
@@ -98,6 +100,21 @@ impl StudyFolder {
     fn path(&self, cell: &Cell) -> Result<PathBuf> {
         Ok(self.root.join("cells").join(format!("{}.json", cell.id()?)))
     }
+}
+
+/// Deletes the temporary files that a kill during [`files::write`] leaves of the files with these names.
+fn delete_temporary(folder: &Path, is_written: impl Fn(&str) -> bool) -> Result<()> {
+    let io = |error| Error::io(folder, "reading the folder", error);
+    for entry in std::fs::read_dir(folder).map_err(io)? {
+        let entry = entry.map_err(io)?;
+        let name = entry.file_name();
+        let parts = name.to_str().and_then(|name| name.strip_prefix('.')?.strip_suffix(".tmp")?.rsplit_once('.'));
+        let is_temporary = |(written, process): (&str, &str)| is_written(written) && process.parse::<u32>().is_ok();
+        if parts.is_some_and(is_temporary) {
+            files::delete_file(&entry.path())?;
+        }
+    }
+    Ok(())
 }
 
 /// Whether results are those of the cell's request and inputs. The runner writes the time limit that it used.

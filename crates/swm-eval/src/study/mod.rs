@@ -12,5 +12,5 @@ mod folder;
 mod rows;
 mod run;
 
-pub use cell::{Cell, Study};
+pub use cell::{Cell, Common, Published, Study};
 pub use folder::StudyFolder;

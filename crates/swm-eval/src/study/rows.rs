@@ -2,8 +2,8 @@
 
 use super::cell::{Cell, Study};
 use super::folder::StudyFolder;
-use std::collections::BTreeMap;
-use swm_core::results::{Paired, Proportion, Run, StudyResults, StudyRow};
+use std::collections::{BTreeMap, BTreeSet};
+use swm_core::results::{Family, OverSeeds, Paired, Proportion, Run, StudyResults, StudyRow};
 use swm_core::{Result, Results};
 
 impl Study {
@@ -18,14 +18,15 @@ impl Study {
                 done.push((cell, results));
             }
         }
-        let unshifted = self.cells.first().map_or("", Cell::condition);
+        let (unshifted, variables) = (self.unshifted(), self.common_variables());
         let of_unshifted = done.iter().filter(|(cell, _)| cell.condition() == unshifted);
-        let unshifted_runs: BTreeMap<String, Option<&Run>> =
-            of_unshifted.map(|(cell, results)| (key(cell), runs(cell, results).map(|(run, _)| run))).collect();
+        let unshifted_runs: BTreeMap<String, Option<&Run>> = of_unshifted
+            .map(|(cell, results)| (key(cell, &variables), runs(cell, results).map(|(run, _)| run)))
+            .collect();
         let mut rows = vec![];
         for (cell, results) in &done {
             let Some((run, floor)) = runs(cell, results) else { continue };
-            let reference = unshifted_runs.get(&key(cell)).copied().flatten();
+            let reference = unshifted_runs.get(&key(cell, &variables)).copied().flatten();
             let reference = reference.filter(|_| cell.condition() != unshifted);
             rows.push(StudyRow {
                 cell: cell.id()?,
@@ -33,6 +34,7 @@ impl Study {
                 condition: cell.condition().to_owned(),
                 variables: cell.variables.clone(),
                 policy: cell.policy().to_owned(),
+                any_seed: cell.any_seed.clone(),
                 counting: results.counting,
                 seed: cell.request.seed,
                 success: run.success,
@@ -41,6 +43,8 @@ impl Study {
                 gap: reference.and_then(|reference| Paired::of_runs(run, reference, results.counting)),
             });
         }
+        let families = self.correct(&mut rows)?;
+        let over_seeds = OverSeeds::all(&rows, unshifted);
         Ok(StudyResults {
             title: self.title.clone(),
             question: self.question.clone(),
@@ -48,7 +52,60 @@ impl Study {
             cells: self.cells.len(),
             done: done.len(),
             rows,
+            families,
+            over_seeds,
         })
+    }
+
+    /// Corrects the gaps of the rows for the number of comparisons in their families, with those of cells that are not
+    /// done yet: a verdict does not change while the study goes on.
+    fn correct(&self, rows: &mut [StudyRow]) -> Result<Vec<Family>> {
+        let (unshifted, variables) = (self.unshifted(), self.common_variables());
+        let mut gaps: BTreeMap<String, Option<&mut Paired>> =
+            rows.iter_mut().map(|row| (row.cell.clone(), row.gap.as_mut())).collect();
+        // Whether the unshifted cell of a comparison is done.
+        let mut references: BTreeMap<String, bool> = BTreeMap::new();
+        for cell in self.cells.iter().filter(|cell| cell.condition() == unshifted) {
+            references.insert(key(cell, &variables), gaps.contains_key(&cell.id()?));
+        }
+        let mut families: BTreeMap<String, (usize, Vec<&mut Paired>)> = BTreeMap::new();
+        for cell in self.cells.iter().filter(|cell| cell.condition() != unshifted) {
+            let (Some(reference), gap) = (references.get(&key(cell, &variables)), gaps.remove(&cell.id()?)) else {
+                continue;
+            };
+            if *reference && matches!(gap, Some(None)) {
+                // Both are done and have different starts: there is nothing to compare.
+                continue;
+            }
+            let (comparisons, tables) = families.entry(cell.family(&self.families)).or_default();
+            *comparisons += 1;
+            tables.extend(gap.flatten());
+        }
+        let corrected = |(name, (comparisons, mut tables)): (String, (usize, Vec<&mut Paired>))| {
+            Family::correct(&name, &mut tables, comparisons)
+        };
+        Ok(families.into_iter().filter_map(corrected).collect())
+    }
+
+    /// The name of the first condition, which is not shifted.
+    fn unshifted(&self) -> &str {
+        self.cells.first().map_or("", Cell::condition)
+    }
+
+    /// The variables that do not belong to the conditions: those with the same values in the unshifted cells as in all.
+    fn common_variables(&self) -> BTreeSet<&str> {
+        let values = |only_unshifted: bool| {
+            let mut values: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
+            for cell in self.cells.iter().filter(|cell| !only_unshifted || cell.condition() == self.unshifted()) {
+                for (name, value) in &cell.variables {
+                    values.entry(name).or_default().insert(value);
+                }
+            }
+            values
+        };
+        let (unshifted, mut all) = (values(true), values(false));
+        all.retain(|name, values| unshifted.get(name) == Some(values));
+        all.into_keys().collect()
     }
 }
 
@@ -59,8 +116,10 @@ fn runs<'a>(cell: &Cell, results: &'a Results) -> Option<(&'a Run, Proportion)> 
     Some((run(cell.policy())?, floor))
 }
 
-/// What cells that differ in the condition only have in common.
-fn key(cell: &Cell) -> String {
+/// What cells that differ in the condition only have in common. `variables` are those that no condition has.
+fn key(cell: &Cell, variables: &BTreeSet<&str>) -> String {
     let request = &cell.request;
-    format!("{:?}", (&cell.starts, cell.policy(), request.seed, request.episodes, request.budget, request.counting))
+    let common: Vec<_> = cell.variables.iter().filter(|(name, _)| variables.contains(name.as_str())).collect();
+    let names = (&cell.starts, cell.policy(), common);
+    format!("{:?}", (names, request.seed, request.episodes, request.budget, request.counting))
 }

@@ -12,8 +12,8 @@ use swm_core::{Env, Error, Policy, Result, Results, VariationRequest};
 use swm_data::{Part, Reader, Split};
 use swm_eval::reproduce::{Kind, differences};
 use swm_eval::{
-    Condition, EvalRequest, HeldOut, PolicyKind, PolicyRequest, Predictor, ResolvedPolicy, Resolver, RunOptions,
-    StartsRequest, World, reproduce,
+    Condition, EvalRequest, HeldOut, PolicyKind, PolicyRequest, Predictor, Recorded, ResolvedPolicy, Resolver,
+    RunOptions, StartsRequest, World, reproduce,
 };
 
 /// A resolver of the line environment, one dataset, and a walker with weights.
@@ -299,4 +299,34 @@ fn results_without_a_valid_request_are_not_reproduced() {
     assert!(message.contains("it contains no request"), "{message}");
     let message = rejected(&|old| old.manifest.kind = "train".to_owned());
     assert!(message.contains("'train'"), "{message}");
+}
+
+/// An episode that is played again, alone and without its dataset, has the outcome that it has in the evaluation.
+#[test]
+fn replayed_episodes_have_the_same_outcomes() {
+    let (resolver, options) = (TestResolver::new(), RunOptions { envs: 2, ..RunOptions::default() });
+    let dataset = StartsRequest::Dataset { dataset: "line".to_owned(), goal_offset: 4, held_out: None };
+    for starts in [StartsRequest::Episodic, dataset] {
+        let whole = EvalRequest { starts, prediction: None, counting: Counting::default(), ..request() };
+        let walker = whole.policies.iter().find(|policy| policy.kind != PolicyKind::Random).expect("a policy").clone();
+        let condition = whole.conditions[0].clone();
+        let whole = EvalRequest { policies: vec![walker.clone()], conditions: vec![condition], ..whole };
+        let results = whole.run(&resolver, &options, &mut Control::new()).expect("an evaluation");
+        let run = results.runs.iter().find(|run| run.policy == walker.name).expect("a run");
+        let numbers = [run.episodes.len() - 1, 0, 2];
+        let play = |rows: Option<(&swm_core::Batch, &[[usize; 2]])>| {
+            whole.replay(Recorded { numbers: &numbers, rows }, &resolver, &options, &mut Control::new())
+        };
+        let first = play(None).expect("played episodes");
+        let expected: Vec<_> = numbers.iter().map(|&number| run.episodes[number].clone()).collect();
+        assert_eq!(first.run.episodes, expected);
+        assert_eq!(first.starts.rows(), 3);
+        let picks: Vec<[usize; 2]> = expected.iter().filter_map(|episode| episode.start).collect();
+        assert_eq!(first.rows.is_some(), picks.len() == 3);
+        if let Some(rows) = &first.rows {
+            let again = play(Some((rows, &picks))).expect("played episodes");
+            assert_eq!(again.run.episodes, expected);
+            assert!(play(Some((rows, &picks[1..]))).is_err(), "a start without its rows");
+        }
+    }
 }

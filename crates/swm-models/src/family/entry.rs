@@ -4,6 +4,7 @@ use super::config::TrainableConfig;
 use super::contract::ModelFamily;
 use super::loaded::LoadedModel;
 use crate::checkpoint::Checkpoint;
+use crate::stored::StoredCheckpoint;
 use crate::train::{DatasetInfo, Preset, TrainConfig};
 use burn::tensor::Device;
 use std::path::Path;
@@ -30,8 +31,8 @@ pub struct FamilyEntry {
     /// Returns the dataset requirements of the default preset; `None` for a family that also requires another
     /// checkpoint.
     pub requirements: fn() -> Result<Option<DatasetRequirements>>,
-    /// Loads the checkpoint of a run folder.
-    pub load: fn(&Path, &Device) -> Result<Box<dyn LoadedModel>>,
+    /// Loads a stored checkpoint.
+    pub load: fn(&StoredCheckpoint, &Device) -> Result<Box<dyn LoadedModel>>,
     /// Converts a checkpoint of the reference implementation (`weights.pt` and `config.json` in the first folder),
     /// which was trained on the given dataset, into a checkpoint in the last folder; returns the hash of the weights.
     /// `None` if the reference implementation has no such family.
@@ -48,7 +49,7 @@ impl FamilyEntry {
             borrows_encoder: false,
             config: |preset, settings| Ok(Box::new(TrainConfig::<M>::load(preset, settings)?)),
             requirements: || Ok(Some(M::requirements(&TrainConfig::<M>::load(M::PRESETS[0].id, &[])?))),
-            load: |run, device| Ok(Box::new(Checkpoint::<M>::load(run, device)?)),
+            load: |stored, device| Ok(Box::new(Checkpoint::<M>::of(stored, device)?)),
             import: import::<M>,
         }
     }

@@ -6,7 +6,8 @@ use super::InverseConfig;
 use crate::checkpoint::{self, Checkpoint};
 use crate::lewm::Lewm;
 use crate::nn::{Init, Mlp, parameters};
-use crate::run_folder::{WEIGHTS, WORLD_MODEL};
+use crate::run_folder::WORLD_MODEL;
+use crate::stored::StoredCheckpoint;
 use burn::tensor::Device;
 use std::path::Path;
 use swm_core::{Manifest, Result};
@@ -46,20 +47,18 @@ impl InverseCheckpoint {
         checkpoint::write(run, &description, &mut self.manifest, &parameters::values(&self.model), &[])
     }
 
-    /// Loads the checkpoint of a run folder.
+    /// Loads a stored checkpoint.
     ///
     /// # Errors
-    /// When the folder holds no checkpoint, or the checkpoint is of another family, is damaged, or has weights that
-    /// do not fit its configuration.
-    pub fn load(run: &Path, device: &Device) -> Result<Self> {
-        let stored = checkpoint::StoredCheckpoint::<InverseConfig>::read(run, FAMILY)?;
-        let world_model = Checkpoint::<Lewm>::load(&run.join(WORLD_MODEL), device)?;
-        let config = stored.config;
+    /// When the checkpoint is of another family, is damaged, or has weights that do not fit its configuration, or the
+    /// folder does not hold the world model.
+    pub fn load(stored: &StoredCheckpoint, device: &Device) -> Result<Self> {
+        let config: InverseConfig = stored.config(FAMILY)?;
+        let world_model = Checkpoint::<Lewm>::load(&stored.run().join(WORLD_MODEL), device)?;
         config.check()?;
         let (latent, action_dim) = (world_model.config.model.latent, world_model.action_dim());
-        let path = stored.folder.join(WEIGHTS);
         let create = |init: &Init| Ok(Mlp::new(init, 2 * latent, config.hidden, action_dim));
-        let model = checkpoint::load_weights(create, &path, stored.manifest.hashes.get("weights"), device)?;
-        Ok(Self { world_model, model, config, manifest: stored.manifest })
+        let model = stored.model(create, device)?;
+        Ok(Self { world_model, model, config, manifest: stored.manifest().clone() })
     }
 }

@@ -25,7 +25,7 @@ pub const ENTRY: FamilyEntry = FamilyEntry {
     borrows_encoder: true,
     config: |_, settings| Ok(Box::new(InverseConfig::load(settings)?)),
     requirements: || Ok(None),
-    load: |run, device| Ok(Box::new(InverseCheckpoint::load(run, device)?)),
+    load: |stored, device| Ok(Box::new(InverseCheckpoint::load(stored, device)?)),
     import: |_, _, _| None,
 };
 

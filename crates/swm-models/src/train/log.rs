@@ -37,8 +37,11 @@ impl Log {
     /// file, as TensorBoard expects.
     ///
     /// # Errors
-    /// When the folder cannot be written.
+    /// When the folder cannot be written, or a new run would replace files that no run wrote.
     pub fn new(folder: &Path, resume: bool) -> Result<Self> {
+        if !resume {
+            super::resume::check_new_run(folder)?;
+        }
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let name = format!("events.out.tfevents.{}.{:09}.swm", now.as_secs(), now.subsec_nanos());
         let mut log = Self {

@@ -1,8 +1,15 @@
-//! Checks that a stored run can be continued with a given configuration and dataset.
+//! Checks that a stored run can be continued with a given configuration and dataset, and that a new run
+//! replaces nothing that no run wrote.
 
+use crate::run_folder::{CHECKPOINT_FILES, CONFIG, FOLDER};
+use crate::stored::{is_event_file, locate};
+use serde::Deserialize;
 use serde_json::Value;
 use std::path::Path;
-use swm_core::{Error, Manifest, Result};
+use swm_core::{Error, Manifest, Result, files};
+
+/// The largest log that is recognised as that of an earlier run.
+const MAX_LOG_BYTES: u64 = 1 << 30;
 
 /// Returns the error for a new run whose output folder holds an earlier run.
 pub(crate) fn refuse_existing(out: &Path) -> Error {
@@ -11,6 +18,60 @@ pub(crate) fn refuse_existing(out: &Path) -> Error {
         "holds a training run already",
         "continue the run with `resume`, or choose another folder",
     )
+}
+
+/// Checks that a new run in the folder `out` replaces only what a run left that ended before its first checkpoint: its
+/// log, an unfinished checkpoint, and the best checkpoint. The event file marks the folder of such a run.
+///
+/// # Errors
+/// When the folder has a log or files of a checkpoint that no run wrote, or cannot be listed.
+pub(crate) fn check_new_run(out: &Path) -> Result<()> {
+    let io = |error| Error::io(out, "listing the folder", error);
+    let mut has_events = false;
+    for entry in std::fs::read_dir(out).map_err(io)? {
+        has_events |= is_event_file(&entry.map_err(io)?.file_name().to_string_lossy());
+    }
+    let log = out.join("train.jsonl");
+    // A link or a folder is refused where the log is opened.
+    if std::fs::symlink_metadata(&log).is_ok_and(|found| found.is_file()) {
+        files::check_own(&log, |path| is_log(path, has_events))?;
+    }
+    let current = out.join(FOLDER);
+    let mut foreign = is_occupied(&current) && !current.join(CONFIG).is_file();
+    foreign |= locate(out).is_none() && is_occupied(&out.join("checkpoint.old"));
+    let mut places = vec![out.join("checkpoint.new")];
+    for inner in ["best", "world"] {
+        places.extend(["", ".new", ".old"].map(|end| out.join(inner).join(format!("{FOLDER}{end}"))));
+    }
+    foreign |= !has_events && places.iter().any(|place| is_occupied(place));
+    if foreign {
+        let problem = "has files with the names of a checkpoint, and there is no checkpoint that can be read";
+        return Err(Error::config(out.display().to_string(), problem, "move them away, or choose another folder"));
+    }
+    Ok(())
+}
+
+/// Returns whether a path is a file or a link, or a folder with a file that a checkpoint would replace.
+fn is_occupied(folder: &Path) -> bool {
+    match std::fs::symlink_metadata(folder) {
+        Err(_) => false,
+        Ok(found) if !found.is_dir() => true,
+        Ok(_) => CHECKPOINT_FILES.iter().any(|name| std::fs::symlink_metadata(folder.join(name)).is_ok()),
+    }
+}
+
+/// Returns whether a file is empty, or is the log of a run, whose last line a kill may have cut off.
+fn is_log(path: &Path, has_events: bool) -> bool {
+    #[derive(Deserialize)]
+    struct Line {
+        #[serde(rename = "step")]
+        _step: u64,
+    }
+    let Ok(bytes) = files::read(path, MAX_LOG_BYTES) else { return false };
+    let mut lines: Vec<&[u8]> = bytes.split(|&byte| byte == b'\n').collect();
+    let last = lines.pop().unwrap_or_default();
+    let is_line = |line: &&[u8]| serde_json::from_slice::<Line>(line).is_ok();
+    bytes.is_empty() || (has_events && lines.iter().all(is_line) && (last.is_empty() || last.starts_with(b"{")))
 }
 
 /// Checks that a stored run has the configuration and the data of the requested run.

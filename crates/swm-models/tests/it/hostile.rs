@@ -26,8 +26,8 @@ const UNLIMITED: &[&str] = &["seed", "every", "patience", "warmup", "save_every"
 const COUNTERS: &[&str] = &["steps", "log_every", "batches", "capacity", "part"];
 
 const SMALL_ENCODER: &str = "model.encoder.pyramid.stages=[{patch=32,channels=2},{patch=2,channels=2}]";
-const SMALL: &[&str] = &[SMALL_ENCODER, "model.encoder.pyramid.hidden=3", "model.encoder.pyramid.dim=4"];
-const SMALL_PREDICTOR: &[&str] = &[
+pub(crate) const SMALL: &[&str] = &[SMALL_ENCODER, "model.encoder.pyramid.hidden=3", "model.encoder.pyramid.dim=4"];
+pub(crate) const SMALL_PREDICTOR: &[&str] = &[
     "model.projector=4",
     "model.predictor.dim=4",
     "model.predictor.depth=1",
@@ -46,7 +46,7 @@ fn dataset_info() -> DatasetInfo {
     }
 }
 
-fn model<M: Trainable>(settings: &[&[&str]]) -> Checkpoint<M> {
+pub(crate) fn model<M: Trainable>(settings: &[&[&str]]) -> Checkpoint<M> {
     let settings: Vec<String> = settings.concat().into_iter().map(str::to_owned).collect();
     let config = TrainConfig::<M>::load("tiny", &settings).expect("a configuration");
     let dataset_info = dataset_info();
@@ -55,7 +55,7 @@ fn model<M: Trainable>(settings: &[&[&str]]) -> Checkpoint<M> {
 }
 
 /// Appends the JSON pointers of the numbers and arrays below a value; of an array, only the first element.
-fn pointers(at: &str, value: &Value, out: &mut Vec<String>) {
+pub(crate) fn pointers(at: &str, value: &Value, out: &mut Vec<String>) {
     match value {
         Value::Number(_) => out.push(at.to_owned()),
         Value::Object(map) => map.iter().for_each(|(key, value)| pointers(&format!("{at}/{key}"), value, out)),
@@ -70,7 +70,7 @@ fn pointers(at: &str, value: &Value, out: &mut Vec<String>) {
 }
 
 /// Whether a value cannot be right where `old` was, in a setting with the given key.
-fn must_fail(key: &str, old: &Value, new: &Value) -> bool {
+pub(crate) fn must_fail(key: &str, old: &Value, new: &Value) -> bool {
     let huge = new.as_u64().filter(|value| *value > 1);
     match (old, new) {
         (Value::Array(_), _) => true,
@@ -88,7 +88,23 @@ fn mutate(file: &Path, load: impl Fn() -> Option<String>) {
     assert_eq!(load(), None, "the original loads");
     let mut found = vec![];
     pointers("", &original, &mut found);
-    let hostile = [
+    for pointer in &found {
+        let key = pointer.rsplit('/').find(|part| *part != "0").unwrap_or_default();
+        for new in &hostile_values() {
+            let mut changed = original.clone();
+            let at = changed.pointer_mut(pointer).expect("the value");
+            let old = std::mem::replace(at, new.clone());
+            std::fs::write(file, changed.to_string()).expect("a written file");
+            let Ok(error) = catch_unwind(AssertUnwindSafe(&load)) else { panic!("{pointer} = {new} panics") };
+            assert!(error.is_some() || !must_fail(key, &old, new), "{pointer} = {new} loads");
+        }
+    }
+    std::fs::write(file, original.to_string()).expect("a written file");
+}
+
+/// Values that a stranger puts in the place of numbers and arrays.
+pub(crate) fn hostile_values() -> Vec<Value> {
+    vec![
         json!(0),
         json!(-1),
         json!(1_u64 << 31),
@@ -101,23 +117,11 @@ fn mutate(file: &Path, load: impl Fn() -> Option<String>) {
         json!(""),
         json!([]),
         json!({}),
-    ];
-    for pointer in &found {
-        let key = pointer.rsplit('/').find(|part| *part != "0").unwrap_or_default();
-        for new in &hostile {
-            let mut changed = original.clone();
-            let at = changed.pointer_mut(pointer).expect("the value");
-            let old = std::mem::replace(at, new.clone());
-            std::fs::write(file, changed.to_string()).expect("a written file");
-            let Ok(error) = catch_unwind(AssertUnwindSafe(&load)) else { panic!("{pointer} = {new} panics") };
-            assert!(error.is_some() || !must_fail(key, &old, new), "{pointer} = {new} loads");
-        }
-    }
-    std::fs::write(file, original.to_string()).expect("a written file");
+    ]
 }
 
 /// Loads a checkpoint of any family and makes everything that commands make of one; returns the error.
-fn load(folder: &Path) -> Option<String> {
+pub(crate) fn load(folder: &Path) -> Option<String> {
     let loaded = match swm_models::load(folder, &Device::flex()) {
         Ok(loaded) => loaded,
         Err(error) => return Some(error.to_string()),

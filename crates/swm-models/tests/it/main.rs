@@ -2,6 +2,7 @@
 
 #![allow(clippy::print_stdout, reason = "the measured errors, for `--no-capture`")]
 
+mod capsules;
 mod checkpoints;
 mod config;
 mod dino_wm;

@@ -4,6 +4,8 @@ use swm_core::{Error, Result, limits};
 
 /// The largest number of candidates of a solver.
 const MAX_SAMPLES: usize = limits::SAMPLES.max;
+/// The largest number of iterations of a solver.
+const MAX_ITERATIONS: usize = 100_000;
 
 /// Checks the settings of one owner (a solver, a term, the policy). Error messages begin with the owner's name.
 #[derive(Clone, Copy)]
@@ -24,6 +26,15 @@ impl Settings<'_> {
     /// When it is 0 or above a million.
     pub fn samples(self, samples: usize) -> Result<()> {
         self.check((1..=MAX_SAMPLES).contains(&samples), "samples", samples, &format!("choose 1 to {MAX_SAMPLES}"))
+    }
+
+    /// Checks that a number of iterations is at least 1, and that a plan ends.
+    ///
+    /// # Errors
+    /// When it is 0 or above 100,000.
+    pub fn iterations(self, name: &str, iterations: usize) -> Result<()> {
+        let fix = format!("choose 1 to {MAX_ITERATIONS}");
+        self.check((1..=MAX_ITERATIONS).contains(&iterations), name, iterations, &fix)
     }
 
     /// Checks that the number of elites is at least `least` and at most the number of samples.

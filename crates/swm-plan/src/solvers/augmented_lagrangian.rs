@@ -125,8 +125,8 @@ impl Solver for AugmentedLagrangian {
     fn check(&self) -> Result<()> {
         let settings = Settings(ID);
         settings.samples(self.samples)?;
-        settings.at_least_one("outer_iterations", self.outer_iterations)?;
-        settings.at_least_one("iterations", self.iterations)?;
+        settings.iterations("outer_iterations", self.outer_iterations)?;
+        settings.iterations("iterations", self.iterations)?;
         settings.not_negative("sigma", self.sigma)?;
         settings.not_negative("action_noise", self.action_noise)?;
         settings.not_negative("tolerance", self.tolerance)?;

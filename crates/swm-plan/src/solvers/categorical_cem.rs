@@ -108,7 +108,7 @@ impl Solver for CategoricalCem {
 
     fn check(&self) -> Result<()> {
         let settings = Settings(ID);
-        settings.at_least_one("iterations", self.iterations)?;
+        settings.iterations("iterations", self.iterations)?;
         settings.samples(self.samples)?;
         settings.elites(self.elites, 1, self.samples)?;
         settings.not_negative("smoothing", self.smoothing)?;

@@ -87,7 +87,7 @@ impl Solver for GradientDescent {
     fn check(&self) -> Result<()> {
         let settings = Settings(ID);
         settings.samples(self.samples)?;
-        settings.at_least_one("iterations", self.iterations)?;
+        settings.iterations("iterations", self.iterations)?;
         settings.not_negative("sigma", self.sigma)?;
         settings.not_negative("action_noise", self.action_noise)?;
         self.clip.map_or(Ok(()), |norm| settings.positive("clip", norm))?;

@@ -92,7 +92,7 @@ impl Solver for ICem {
 
     fn check(&self) -> Result<()> {
         let settings = Settings(ID);
-        settings.at_least_one("iterations", self.iterations)?;
+        settings.iterations("iterations", self.iterations)?;
         settings.samples(self.samples)?;
         settings.elites(self.elites, 2, self.samples)?;
         settings.positive("sigma", self.sigma)?;

@@ -358,6 +358,8 @@ fn errors_name_invalid_settings() {
         ("pgd", r#"{"step": 0}"#, "pgd optimizer, step: 0"),
         ("pgd", r#"{"momentum": 0.5}"#, "unknown field `momentum`"),
         ("lagrangian", r#"{"outer_iterations": 0}"#, "lagrangian outer_iterations: 0"),
+        ("lagrangian", r#"{"outer_iterations": 100001}"#, "lagrangian outer_iterations: 100001; choose 1 to 100000"),
+        ("grasp", r#"{"sync_iterations": 100001}"#, "grasp sync_iterations: 100001; choose 1 to 100000"),
         ("lagrangian", r#"{"penalty": -1}"#, "lagrangian penalty: -1"),
         (
             "lagrangian",

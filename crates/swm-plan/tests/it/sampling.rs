@@ -99,7 +99,9 @@ fn errors_name_invalid_settings() {
     let wrong = [
         ("predictive_sampling", json!({"samples": 0}), "predictive_sampling samples: 0"),
         ("predictive_sampling", json!({"sigma": 0}), "predictive_sampling sigma: 0"),
-        ("cem", json!({"iterations": 0}), "cem iterations: 0; choose at least 1"),
+        ("cem", json!({"iterations": 0}), "cem iterations: 0; choose 1 to 100000"),
+        ("cem", json!({"iterations": 1u64 << 60}), "cem iterations: 1152921504606846976; choose 1 to 100000"),
+        ("mppi", json!({"iterations": 100_001}), "mppi iterations: 100001; choose 1 to 100000"),
         ("cem", json!({"samples": 64, "elites": 65}), "cem elites: 65 of 64 samples"),
         ("cem", json!({"elites": 1}), "at least 2 (a standard deviation needs two)"),
         ("cem", json!({"sigma": -1}), "cem sigma: -1; choose a finite number above 0"),

@@ -1,16 +1,17 @@
 //! The cards: the success rate of every learned policy, compared with the random-policy floor.
 
-use crate::group::{Condition, Group, Row};
-use crate::text::{escape, p_value, percent};
+use crate::group::{Condition, Group, Pair, Row};
+use crate::text::{escape, percent};
 use std::fmt::Write as _;
-use swm_core::results::Comparison;
+use swm_core::results::{Proportion, Verdict};
 
 /// Writes the cards of a group.
 pub(super) fn write(html: &mut String, group: &Group<'_>) {
     html.push_str("<div class=\"cards\">\n");
     for condition in &group.conditions {
+        let pairs = condition.pairs(group.counting).map_or(vec![], |(_, pairs)| pairs);
         for row in condition.rows.iter().filter(|row| row.class.starts_with('c')) {
-            card(html, group, condition, row);
+            card(html, condition, &pairs, row);
         }
     }
     html.push_str("</div>\n");
@@ -18,25 +19,19 @@ pub(super) fn write(html: &mut String, group: &Group<'_>) {
 
 /// Writes the card of one policy under one condition: its success rate, compared with the random-policy floor by a
 /// paired test on the same starts, or else by the confidence intervals.
-fn card(html: &mut String, group: &Group<'_>, condition: &Condition<'_>, row: &Row<'_>) {
+fn card(html: &mut String, condition: &Condition<'_>, pairs: &[Pair<'_, '_>], row: &Row<'_>) {
     let p = row.run.success;
-    let floor = condition.floor_of(row);
-    let paired = floor.and_then(|floor| Comparison::of(row.run, floor.run, group.counting)).map(|found| found.table);
-    let verdict = match (floor.map(|floor| floor.run.success), paired) {
-        (None, _) => ("unknown", "the random-policy floor was not measured".to_owned()),
-        (Some(floor), _) if p.n == 0 || floor.n == 0 => ("unknown", "no counted episodes".to_owned()),
-        (Some(floor), paired) => {
-            let (above, below) = match paired {
-                Some(table) => (table.p < 0.05 && table.difference > 0.0, table.p < 0.05 && table.difference < 0.0),
-                None => (p.low > floor.high, p.high < floor.low),
+    let verdict = match floor_and_verdict(condition, pairs, row) {
+        None => ("unknown", "the random-policy floor was not measured".to_owned()),
+        Some((floor, _)) if p.n == 0 || floor.n == 0 => ("unknown", "no counted episodes".to_owned()),
+        Some((floor, verdict)) => {
+            let (class, words) = match verdict {
+                Verdict::Higher => ("above", "above"),
+                Verdict::Lower => ("below", "below"),
+                Verdict::NotToldApart => ("within", "not told apart from"),
+                Verdict::TooFew => ("within", "too few starts differ to tell it from"),
             };
-            let (class, words) = match (above, below) {
-                (true, _) => ("above", "above"),
-                (_, true) => ("below", "below"),
-                _ => ("within", "not significantly different from"),
-            };
-            let test = paired.map_or(String::new(), |table| format!(" ({})", p_value(table.p)));
-            (class, format!("{words} the random-policy floor of {}{}", percent(floor.rate), escape(&test)))
+            (class, format!("{words} the random-policy floor of {}", percent(floor.rate)))
         }
     };
     let _ = write!(
@@ -52,4 +47,32 @@ fn card(html: &mut String, group: &Group<'_>, condition: &Condition<'_>, row: &R
         verdict.0,
         verdict.1
     );
+}
+
+/// The success rate of the floor, and the verdict on a run against it: that of a pair on the same starts, or else of the
+/// intervals of both rates. `None` without a floor.
+fn floor_and_verdict(
+    condition: &Condition<'_>,
+    pairs: &[Pair<'_, '_>],
+    row: &Row<'_>,
+) -> Option<(Proportion, Verdict)> {
+    let nearest = condition.floor_of(row)?;
+    let is = |one: &Row<'_>, other: &Row<'_>| std::ptr::eq(one.run, other.run);
+    for floor in [nearest, condition.floor()?] {
+        for Pair { a, b, table } in pairs {
+            if is(a, row) && is(b, floor) {
+                return Some((floor.run.success, table.verdict));
+            }
+            if is(b, row) && is(a, floor) {
+                return Some((floor.run.success, table.verdict.reversed()));
+            }
+        }
+    }
+    let (own, floor) = (row.run.success, nearest.run.success);
+    let verdict = match (own.low > floor.high, own.high < floor.low) {
+        (true, _) => Verdict::Higher,
+        (_, true) => Verdict::Lower,
+        _ => Verdict::NotToldApart,
+    };
+    Some((floor, verdict))
 }

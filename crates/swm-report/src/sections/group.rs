@@ -50,9 +50,11 @@ fn success(html: &mut String, group: &Group<'_>) {
              highest success rate only."
         );
         let caption = format!(
-            "Points are differences of success rates over starts that both policies played, whiskers their 95 % \
-             confidence intervals (Newcombe’s square-and-add), p-values those of McNemar’s exact test. The p-values are not \
-             corrected for the number of pairs.{}",
+            "Points are differences of success rates over starts that both policies played, whiskers their confidence \
+             intervals (Tango’s, the inversion of the paired score test). The intervals of one condition hold together \
+             with 95 %: intervals and p-values are corrected for the number of pairs (Bonferroni). A policy is higher or \
+             lower where the interval excludes 0. “Too few” means that the starts which exactly one policy solved would \
+             not decide even if the same policy had solved all of them.{}",
             if limited { limit.as_str() } else { "" }
         );
         figure(html, "On the same starts", &caption, &chart);

@@ -118,7 +118,7 @@ fn statistics_that_contradict_the_episodes_are_refused() {
     assert_eq!(refused(|_| {}), "accepted");
     let rate = refused(|v| v["runs"][0]["success"]["rate"] = 0.99.into());
     assert!(rate.contains("states a success rate of 99.0 %") && rate.contains("its episodes have 5.0 %"), "{rate}");
-    let changes: [(&str, Value, &str); 9] = [
+    let changes: [(&str, Value, &str); 11] = [
         ("/runs/0/success/low", 0.9.into(), "success rate"),
         ("/runs/0/success/successes", (1u64 << 60).into(), "states 1152921504606846976 successes"),
         ("/runs/4/solved_at_start", 7.into(), "solved at start"),
@@ -127,6 +127,8 @@ fn statistics_that_contradict_the_episodes_are_refused() {
         ("/runs/2/prediction/groups/0/trajectory/mean", 0.1.into(), "prediction errors"),
         ("/runs/2/prediction/trajectories/1/errors", json!([]), "prediction errors"),
         ("/comparisons/0/p", 0.9.into(), "the comparison of expert and random"),
+        ("/comparisons/0/verdict", "lower".into(), "the comparison of expert and random"),
+        ("/comparisons/0/comparisons", 9.into(), "the comparison of expert and random"),
         ("/comparisons/0/both", (1u64 << 60).into(), "the comparison of expert and random"),
     ];
     for (pointer, value, part) in changes {

@@ -1,6 +1,7 @@
 //! Tests of the whole page, from synthetic results.
 
 mod hostile;
+mod study;
 
 use std::path::{Path, PathBuf};
 use swm_core::results::{Comparison, Counting, EpisodeResult, Prediction, Run, Searches, Summary, Timing, Trajectory};
@@ -133,7 +134,7 @@ fn page_contains_the_results() {
         "2.7 – 20.3 %",
         "92.5 % (37/40)",
         "above the random-policy floor of 5.0 %",
-        "not significantly different from the random-policy floor of 5.0 %",
+        "not told apart from the random-policy floor of 5.0 %",
         "26 (43)",
         "38 ms (58 ms)",
         "1 min 23 s",
@@ -155,17 +156,19 @@ fn page_contains_the_results() {
 fn policies_are_compared_on_the_same_starts() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let page = page(&[(PathBuf::from("runs/all/results.json"), results_with_all_parts())], folder.path());
-    // 37 of 40 against 2 of 40, none solved by the floor alone: p = 2 × 0.5^35. 25 of 40 against 37 of 40: 25 both, 12
-    // only one policy, 0 only the other.
+    // 37 of 40 against 2 of 40, none solved by the floor alone. 25 of 40 against 37 of 40: 25 both, 12 only one policy, 0
+    // only the other: p = 0.000532, one of six comparisons.
     for words in [
         "dataset protocol · counting: strict, held for 5 steps",
         "once the goal was satisfied for 5 steps in a row",
         "One episode was solved at the start; it was not played and does not count",
-        "above the random-policy floor of 5.0 % (p &lt; 0.001)",
+        "above the random-policy floor of 5.0 %<",
         "lewm-tiny \u{2212} random",
         "pldm \u{2212} lewm-tiny",
         "\u{2212}30.0 [\u{2212}",
-        "<td class=\"n\">25</td><td class=\"n\"><b>0</b></td><td class=\"n\"><b>12</b></td><td class=\"n\">3</td>",
+        "<td class=\"n\">25</td><td class=\"n\"><b>0</b></td><td class=\"n\"><b>12</b></td><td class=\"n\">3</td>\
+         <td class=\"n\">0.003</td><td>lower</td>",
+        "in distribution: 6 comparisons of 40 pairs tell a difference of ",
         "swm reproduce all/results.json",
         "lewm-tiny, in distribution: cost",
         "40 plans",
@@ -177,7 +180,7 @@ fn policies_are_compared_on_the_same_starts() {
     }
     assert!(!page.contains("agent.color shifted: cost") && !page.contains("pldm, in distribution: cost"));
     // The shifted run counts one start fewer than its floor, so the report compares their confidence intervals.
-    assert!(page.contains("not significantly different from the random-policy floor of 5.0 %<"));
+    assert!(page.contains("not told apart from the random-policy floor of 5.0 %<"));
 }
 
 #[test]

@@ -1,7 +1,10 @@
-//! `swm checkpoints`: lists, shows, verifies, imports, exports and removes checkpoints.
+//! `swm checkpoints`: lists, shows, verifies, packs, imports, exports and removes checkpoints.
 
-use super::{emit, emit_json, eprint, table};
+use super::capsules::{self, CapsuleInfo, ExportFormat, PackArgs};
+use super::{Context, emit, emit_json, eprint, table};
+use crate::capsule::Verification;
 use crate::home::{self, names_in};
+use crate::zoo;
 use clap::{Args, Subcommand};
 use serde_json::{Value, json};
 use std::io::IsTerminal as _;
@@ -30,12 +33,20 @@ enum CheckpointsCommand {
         /// A path or a name
         checkpoint: String,
     },
-    /// Load checkpoints and compare their hashes
+    /// Load checkpoints and compare their hashes; replay capsules
+    ///
+    /// The model of a capsule computes its reference batch and plays its recorded episodes again.
     #[command(after_help = "Example: swm checkpoints verify lewm-rooms")]
     Verify {
         /// Paths or names (default: all checkpoints in the home folder)
         checkpoints: Vec<String>,
+        /// Allow a capsule to choose any environment
+        #[arg(long)]
+        trust: bool,
     },
+    /// Write a checkpoint as one small file that others can verify
+    #[command(after_help = "Example: swm checkpoints pack lewm-rooms --output lewm.safetensors --eval results")]
+    Pack(PackArgs),
     /// Import a checkpoint of the reference implementation
     #[command(after_help = "Example: swm checkpoints import run --model lewm --data rooms --output lewm-rooms")]
     Import {
@@ -51,13 +62,16 @@ enum CheckpointsCommand {
         #[arg(short, long, value_name = "CHECKPOINT")]
         output: String,
     },
-    /// Write the files that `load_pretrained` of the reference reads
+    /// Write a capsule as a checkpoint folder, or the reference's files
     #[command(after_help = "Example: swm checkpoints export lewm-rooms exported")]
     Export {
         /// A path or a name
         checkpoint: String,
-        /// The folder to write weights.pt and config.json to
+        /// The folder to write to
         folder: PathBuf,
+        /// The format (default: checkpoint for a capsule, else reference)
+        #[arg(long, value_enum)]
+        format: Option<ExportFormat>,
     },
     /// Remove a checkpoint and its logs; other files in its folder stay
     #[command(after_help = "Example: swm checkpoints remove lewm-rooms")]
@@ -71,15 +85,19 @@ enum CheckpointsCommand {
 }
 
 /// Runs `swm checkpoints`.
-pub fn checkpoints(args: &CheckpointsArgs, as_json: bool) -> anyhow::Result<()> {
+pub fn checkpoints(args: &CheckpointsArgs, context: &Context) -> anyhow::Result<()> {
+    let as_json = context.json;
     match (&args.command, &args.checkpoint) {
         (Some(CheckpointsCommand::Show { checkpoint }), _) | (None, Some(checkpoint)) => show(checkpoint, as_json),
         (Some(CheckpointsCommand::List) | None, None | Some(_)) => list(as_json),
-        (Some(CheckpointsCommand::Verify { checkpoints }), _) => verify(checkpoints, as_json),
+        (Some(CheckpointsCommand::Verify { checkpoints, trust }), _) => verify(checkpoints, *trust, context),
+        (Some(CheckpointsCommand::Pack(args)), _) => capsules::pack(args, context),
         (Some(CheckpointsCommand::Import { folder, model, data, output }), _) => {
             import(folder, model, data, output, as_json)
         }
-        (Some(CheckpointsCommand::Export { checkpoint, folder }), _) => export(checkpoint, folder, as_json),
+        (Some(CheckpointsCommand::Export { checkpoint, folder, format }), _) => {
+            export(checkpoint, folder, *format, as_json)
+        }
         (Some(CheckpointsCommand::Remove { checkpoint, yes }), _) => remove(checkpoint, *yes, as_json),
     }
 }
@@ -102,9 +120,13 @@ fn show(given: &str, as_json: bool) -> anyhow::Result<()> {
             "config": info.config,
             "facts": info.dataset_info,
             "manifest": info.manifest,
+            "capsule": path.is_file().then(|| CapsuleInfo::read(&path)).transpose()?,
         }));
     }
     emit(&format!("{}\n{}, weights {}\n", path.display(), info.family, info.weights));
+    if path.is_file() {
+        emit(&CapsuleInfo::read(&path)?.lines());
+    }
     emit(&format!("trained on {}\n", info.dataset_info.env.as_deref().unwrap_or("an unknown environment")));
     emit(&info.toml);
     Ok(())
@@ -152,46 +174,50 @@ struct Findings {
     /// The hash of the weights; empty if the checkpoint cannot be loaded.
     weights: String,
     faults: Vec<String>,
+    /// The behaviour of a capsule.
+    replayed: Option<Verification>,
 }
 
-/// Loads a checkpoint and looks for faults that loading does not find.
-fn examine(given: &str) -> Findings {
-    let loaded = load(given).and_then(|(path, info)| Ok((checkpoint::faults(&path)?, info.weights)));
-    match loaded {
-        Ok((faults, weights)) => Findings { weights, faults },
-        Err(error) => Findings { weights: String::new(), faults: vec![error.to_string()] },
+/// Loads a checkpoint and looks for faults that loading does not find. A capsule is replayed.
+///
+/// # Errors
+/// When the user interrupts.
+fn examine(given: &str, trust: bool, context: &Context) -> Result<Findings> {
+    let examined = home::find_checkpoint(given).and_then(|path| match path.is_file() {
+        true => {
+            let replayed = capsules::verify(&path, trust, context)?;
+            let (weights, faults) = (replayed.weights.clone(), replayed.faults.clone());
+            Ok(Findings { weights, faults, replayed: Some(replayed) })
+        }
+        false => {
+            let (path, info) = load(given)?;
+            Ok(Findings { weights: info.weights, faults: checkpoint::faults(&path)?, replayed: None })
+        }
+    });
+    match examined {
+        Err(Error::Interrupted) => Err(Error::Interrupted),
+        Err(error) => Ok(Findings { weights: String::new(), faults: vec![error.to_string()], replayed: None }),
+        Ok(found) => Ok(found),
     }
 }
 
-fn verify(given: &[String], as_json: bool) -> anyhow::Result<()> {
+fn verify(given: &[String], trust: bool, context: &Context) -> anyhow::Result<()> {
     let all = if given.is_empty() { names_in(&home::checkpoints()?) } else { vec![] };
     let given = if given.is_empty() { &all } else { given };
-    let found: Vec<(&String, Findings)> = given.iter().map(|name| (name, examine(name))).collect();
+    let examined = given.iter().map(|name| Ok((name, examine(name, trust, context)?)));
+    let found: Vec<(&String, Findings)> = examined.collect::<Result<_>>()?;
     let damaged = found.iter().filter(|(_, found)| !found.faults.is_empty()).count();
-    if as_json {
+    if context.json {
         let rows: Vec<Value> = found
             .iter()
-            .map(|(name, Findings { weights, faults })| match faults.is_empty() {
-                true => json!({"name": name, "whole": true, "weights": weights}),
-                false => json!({"name": name, "whole": false, "error": faults.join("; ")}),
+            .map(|(name, Findings { weights, faults, replayed })| match faults.is_empty() {
+                true => json!({"name": name, "whole": true, "weights": weights, "capsule": replayed}),
+                false => json!({"name": name, "whole": false, "error": faults.join("; "), "capsule": replayed}),
             })
             .collect();
         emit_json(&rows)?;
     } else {
-        for (name, Findings { weights, faults }) in &found {
-            if faults.is_empty() {
-                emit(&format!(
-                    "{name}: valid, weights {weights}
-"
-                ));
-            }
-            faults.iter().for_each(|fault| {
-                emit(&format!(
-                    "{name}: {fault}
-"
-                ))
-            });
-        }
+        found.iter().for_each(|(name, found)| emit(&found.lines(name)));
     }
     if damaged > 0 {
         anyhow::bail!(Error::corrupt(
@@ -203,12 +229,27 @@ fn verify(given: &[String], as_json: bool) -> anyhow::Result<()> {
     Ok(())
 }
 
+impl Findings {
+    /// Describes the findings in lines that begin with the name of the checkpoint.
+    fn lines(&self, name: &str) -> String {
+        let mut lines = vec![];
+        if self.faults.is_empty() {
+            lines.push(format!("valid, weights {}", self.weights));
+        }
+        if let Some(Verification { difference, episodes, remarks, .. }) = &self.replayed {
+            let replayed =
+                format!("outputs within {difference:.1e} of the reference, {episodes} episodes played again");
+            lines.push(replayed);
+            lines.extend(remarks.iter().cloned());
+        }
+        lines.extend(self.faults.iter().cloned());
+        lines.iter().map(|line| format!("{name}: {line}\n")).collect()
+    }
+}
+
 fn import(folder: &Path, model: &str, data: &str, output: &str, as_json: bool) -> anyhow::Result<()> {
     let (family, out) = (FAMILIES.get(model)?, home::new_checkpoint(output)?);
-    if checkpoint::family(&out).is_some() {
-        let fix = "choose another --output, or `swm checkpoints remove` it";
-        anyhow::bail!(Error::config(out.display().to_string(), "holds a checkpoint already", fix));
-    }
+    checkpoint::check_unused(&out)?;
     let reader = home::open_dataset(data)?;
     let Some(weights) = (family.import)(folder, &*reader, &out) else {
         let fix = "import lewm, pldm, dino_wm, tdmpc2, gcbc, gcivl or gciql";
@@ -222,13 +263,8 @@ fn import(folder: &Path, model: &str, data: &str, output: &str, as_json: bool) -
     Ok(())
 }
 
-fn export(given: &str, folder: &Path, as_json: bool) -> anyhow::Result<()> {
-    let loaded = swm_models::load(&home::find_checkpoint(given)?, &Device::flex())?;
-    let Some(done) = loaded.export(folder) else {
-        let problem = format!("the reference implementation has no {}", loaded.info()?.family);
-        anyhow::bail!(Error::config(format!("checkpoint {given}"), problem, "its weights are in weights.safetensors"));
-    };
-    done?;
+fn export(given: &str, folder: &Path, format: Option<ExportFormat>, as_json: bool) -> anyhow::Result<()> {
+    capsules::export_as(given, folder, format)?;
     if as_json {
         return emit_json(&json!({"path": folder}));
     }
@@ -238,8 +274,16 @@ fn export(given: &str, folder: &Path, as_json: bool) -> anyhow::Result<()> {
 
 fn remove(given: &str, yes: bool, as_json: bool) -> anyhow::Result<()> {
     let path = home::find_checkpoint(given)?;
+    if given.starts_with(zoo::PREFIX) {
+        let problem = format!("it is the capsule {} of the zoo", path.display());
+        anyhow::bail!(Error::config(given, problem, "delete the file by hand"));
+    }
     if checkpoint::family(&path).is_none() {
         anyhow::bail!(Error::corrupt(&path, "it is not a checkpoint", "give the folder that `swm train` wrote to"));
+    }
+    if path.is_file() {
+        let (problem, fix) = ("it is a capsule, which is a single file", "delete the file yourself");
+        anyhow::bail!(Error::config(path.display().to_string(), problem, fix));
     }
     if !yes && !confirm(&format!("remove the checkpoint and the logs in {}?", path.display()))? {
         anyhow::bail!(Error::config("swm checkpoints remove", "not confirmed", "answer y, or give --yes"));

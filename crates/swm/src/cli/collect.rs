@@ -121,6 +121,16 @@ pub struct Collection<'a> {
 
 /// Runs `swm collect`.
 pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
+    let (location, collected) = run_args(args, context)?;
+    if context.json {
+        return emit_json(&json!({"dataset": location.to_string(), "collected": collected}));
+    }
+    emit(&format!("{location}\n"));
+    Ok(())
+}
+
+/// Collects the dataset of a command line, and shows progress.
+pub fn run_args(args: &CollectArgs, context: &Context) -> anyhow::Result<(Location, Collected)> {
     let location = home::target(&args.output, args.format.as_deref())?;
     let collection = Collection {
         env: crate::env(&args.env, &Origin::User)?,
@@ -153,11 +163,7 @@ pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
         mix_renderers: args.mix_renderers,
     };
     let collected = run(&collection, context)?;
-    if context.json {
-        return emit_json(&json!({"dataset": location.to_string(), "collected": collected}));
-    }
-    emit(&format!("{location}\n"));
-    Ok(())
+    Ok((location, collected))
 }
 
 /// Collects, and shows progress.

@@ -20,7 +20,7 @@ use swm_data::{ImageCodec, Location, WriteMode};
 use swm_eval::{
     Choice, CollectConfig, Condition, EvalRequest, Model, PolicyKind, PolicyRequest, StartsRequest, WorldConfig,
 };
-use swm_models::lewm::Lewm;
+use swm_models::pldm::Pldm;
 use swm_models::{TrainConfig, TrainOptions, run_folder};
 use swm_plan::{Cem, MpcConfig};
 use swm_report::ReportOptions;
@@ -53,13 +53,13 @@ pub struct DemoArgs {
 /// The environment of the demo.
 const ENV: &str = "swm/TwoRoom-v1";
 
-/// The shifted factor: the floor changes from white to pale blue.
-const SHIFT: (&str, [f64; 3]) = ("background.color", [200.0, 220.0, 255.0]);
+/// The shifted factor: the agent is blue instead of red.
+const SHIFT: (&str, [f64; 3]) = ("agent.color", [0.0, 128.0, 255.0]);
 
 /// The solver of the demo: two rooms need a smaller search than the tasks of the paper.
 const SEARCH: Cem = Cem { samples: 128, iterations: 8, elites: 16, sigma: 1.0 };
-const HORIZON: usize = 6;
-const RECEDING_HORIZON: usize = 2;
+const HORIZON: usize = 4;
+const RECEDING_HORIZON: usize = 1;
 
 /// The time limit of an episode, in steps.
 const TIME_LIMIT: usize = 100;
@@ -71,8 +71,8 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
         Some(folder) => folder.clone(),
         None => home::home()?.join("demo"),
     };
-    let (data, model, results) = (output.join("rooms.lance"), output.join("lewm-rooms"), output.join("results"));
-    let mut config = TrainConfig::<Lewm>::load("tiny", &args.settings)?;
+    let (data, model, results) = (output.join("rooms.lance"), output.join("pldm-rooms"), output.join("results"));
+    let mut config = TrainConfig::<Pldm>::load("tiny", &args.settings)?;
     config.seed = args.seed;
     let side = config.model.image;
     let _lock = claim(&output)?;
@@ -81,7 +81,7 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
     eprint("1/4 collect: an exploring policy moves through two rooms\n");
     collect_rooms(args, &data, side, context)?;
 
-    eprint("2/4 train: a small LeWM learns to predict its next observations\n");
+    eprint("2/4 train: a small PLDM learns to predict its next observations\n");
     let options = TrainOptions { threads: context.threads, ..TrainOptions::default() };
     let reader = home::open_dataset(&data.to_string_lossy())?;
     train::run(&config, swm_models::TrainRun { reader, encoder: None, out: &model, options }, context)?;
@@ -112,7 +112,7 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
 /// The file that marks the folder of a demo, and its text.
 const MARK: &str = ".swm-demo";
 const MARK_TEXT: &str =
-    "`swm demo` made this folder, and replaces rooms.lance, lewm-rooms, results and index.html in it.\n";
+    "`swm demo` made this folder, and replaces rooms.lance, pldm-rooms, results and index.html in it.\n";
 
 /// Creates the folder of the demo, keeps other writers away, and marks the folder.
 ///
@@ -185,7 +185,7 @@ fn request(args: &DemoArgs, model: &Path, side: usize, resolver: &HomeResolver) 
         wrappers: vec![],
         wrap_goal: false,
         image: Some([side, side]),
-        policies: vec![PolicyRequest { name: "lewm".to_owned(), kind }],
+        policies: vec![PolicyRequest { name: "pldm".to_owned(), kind }],
         starts: StartsRequest::Episodic,
         episodes: args.eval_episodes,
         seed: args.seed.wrapping_add(1),

@@ -51,10 +51,12 @@ pub struct EvalArgs {
     /// Number of episodes
     #[arg(long, default_value_t = 50, value_parser = count::<1, { EVALUATED_EPISODES.max }>)]
     episodes: usize,
-    /// Seed of starts, goals, factors and plans
-    #[arg(long, default_value_t = 0)]
-    seed: u64,
+    /// Seed of starts, goals, factors and plans (default: 0, or the capsule's)
+    #[arg(long)]
+    seed: Option<u64>,
     /// Time limit, in steps (default: the environment's; 50 with --dataset)
+    ///
+    /// The default of a capsule with an evaluation is the time limit of that evaluation.
     #[arg(long, value_name = "STEPS")]
     budget: Option<usize>,
     /// Rule for counting episodes: strict, or compat with the reference
@@ -107,6 +109,15 @@ enum Protocol {
     Compat,
 }
 
+/// Whether the seed and the time limit, if they are not given, are those of the evaluation in the first capsule.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum CapsuleStarts {
+    /// They are, unless its starts, or those of the command, come from a dataset.
+    Use,
+    /// They are not: all policies of a study have the same starts.
+    Ignore,
+}
+
 /// The time limit of episodes that start from a dataset, in steps, as in the paper's evaluations.
 const DATASET_TIME_LIMIT: usize = 50;
 
@@ -115,14 +126,7 @@ const IN_DISTRIBUTION: &str = "in distribution";
 
 /// Runs `swm eval`.
 pub fn eval(args: &EvalArgs, context: &Context) -> anyhow::Result<()> {
-    // The request checks the one name that a checkpoint chooses: its environment.
-    let resolver = HomeResolver::new(Origin::User);
-    let resolver = if args.trace { resolver.tracing() } else { resolver };
-    let request = args.request(&resolver)?;
-    let (results, file) = run(&request, &resolver, args.envs, (&args.output, args.videos), context)?;
-    if args.trace {
-        write_json(&args.output.join("traces.json"), &traces(&resolver))?;
-    }
+    let (results, file) = run_args(args, context)?;
     if context.json {
         return emit_json(&results);
     }
@@ -131,12 +135,29 @@ pub fn eval(args: &EvalArgs, context: &Context) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Runs the evaluation of a command line and writes its results.
+pub fn run_args(args: &EvalArgs, context: &Context) -> anyhow::Result<(Results, PathBuf)> {
+    // The request checks the one name that a checkpoint chooses: its environment.
+    let resolver = HomeResolver::new(Origin::User);
+    let resolver = if args.trace { resolver.tracing() } else { resolver };
+    let request = args.request(&resolver, CapsuleStarts::Use)?;
+    // Before the work: only a traced evaluation replaces the traces.
+    if args.trace {
+        drop(output_folder::claim(&args.output, &["traces.json"])?);
+    }
+    let (results, file) = run(&request, &resolver, args.envs, (&args.output, args.videos), context)?;
+    if args.trace {
+        write_json(&args.output.join("traces.json"), &traces(&resolver))?;
+    }
+    Ok((results, file))
+}
+
 impl EvalArgs {
     /// Returns the settings that determine the results.
     ///
     /// # Errors
     /// When a policy, an environment or a setting does not exist.
-    pub fn request(&self, resolver: &HomeResolver) -> Result<EvalRequest> {
+    pub fn request(&self, resolver: &HomeResolver, starts: CapsuleStarts) -> Result<EvalRequest> {
         let find = |given: &String| NamedPolicy::find(given, self.env.as_deref(), resolver);
         let named: Vec<NamedPolicy> = self.policies.iter().map(find).collect::<Result<_>>()?;
         let trained_on = named.iter().find_map(|policy| policy.env.clone());
@@ -148,6 +169,11 @@ impl EvalArgs {
             }
         };
         let image = named.iter().find_map(|policy| policy.image);
+        let recorded = named.iter().find_map(|policy| policy.recorded.as_ref()).map(|recorded| &recorded.request);
+        let is_used = starts == CapsuleStarts::Use && self.dataset.is_none();
+        let recorded = recorded.filter(|request| is_used && request.starts == StartsRequest::Episodic);
+        let seed = self.seed.or(recorded.map(|request| request.seed)).unwrap_or_default();
+        let budget = self.budget.or(recorded.and_then(|request| request.budget));
         let mut policies = vec![];
         for policy in named {
             policies.extend(policy.requests(&env, &self.planner)?);
@@ -166,8 +192,8 @@ impl EvalArgs {
             policies,
             starts: self.starts(),
             episodes: self.episodes,
-            seed: self.seed,
-            budget: self.budget.or(self.dataset.as_ref().map(|_| DATASET_TIME_LIMIT)),
+            seed,
+            budget: budget.or(self.dataset.as_ref().map(|_| DATASET_TIME_LIMIT)),
             counting: match self.protocol {
                 Protocol::Strict => Counting::Strict { hold: self.hold },
                 Protocol::Compat => Counting::Compat { envs: self.envs },
@@ -203,7 +229,7 @@ pub fn run(
     (output, videos): (&Path, usize),
     context: &Context,
 ) -> Result<(Results, PathBuf)> {
-    let _lock = output_folder::claim(output, &["results.json", "traces.json"])?;
+    let _lock = output_folder::claim(output, &["results.json"])?;
     let videos = (videos > 0).then(|| (output.to_owned(), videos));
     let results = request.run(resolver, &run_options(envs, videos, context), &mut control(context))?;
     let file = output.join("results.json");

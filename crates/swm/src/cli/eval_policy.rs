@@ -1,12 +1,14 @@
 //! The policies that `swm eval` accepts by name, and their requests for the evaluation.
 
 use super::planner::PlannerArgs;
+use crate::capsule::EvaluationRecord;
 use crate::home;
 use crate::resolver::{HomeResolver, parse_score};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use swm_core::{EnvChoice, Result};
 use swm_eval::{Model, PolicyKind, PolicyRequest};
+use swm_models::capsule::Capsule;
 
 /// A policy that the command line names.
 pub struct NamedPolicy {
@@ -16,6 +18,8 @@ pub struct NamedPolicy {
     pub env: Option<(String, PathBuf)>,
     /// The side of the images that the checkpoint was trained on, in pixels.
     pub image: Option<usize>,
+    /// The evaluation in the capsule, if the policy is one.
+    pub recorded: Option<EvaluationRecord>,
 }
 
 /// The kind of a named policy.
@@ -34,7 +38,7 @@ impl NamedPolicy {
     /// # Errors
     /// When the environment or the checkpoint does not exist, or the checkpoint is damaged.
     pub fn find(given: &str, env: Option<&str>, resolver: &HomeResolver) -> Result<Self> {
-        let without_checkpoint = |kind| Self { name: given.to_owned(), kind, env: None, image: None };
+        let without_checkpoint = |kind| Self { name: given.to_owned(), kind, env: None, image: None, recorded: None };
         let env = env.map(|env| resolver.choose_env(env)).transpose()?;
         if given == "random" {
             return Ok(without_checkpoint(NamedKind::Direct(PolicyKind::Random)));
@@ -59,11 +63,15 @@ impl NamedPolicy {
         };
         let name = Path::new(given).file_name().map_or(given.to_owned(), |name| name.to_string_lossy().into_owned());
         let path = home::checkpoint(given)?;
+        let capsule = path.is_file().then(|| Capsule::read(&path)).transpose()?;
+        let evaluation = capsule.and_then(|capsule| capsule.evaluation);
+        let recorded = evaluation.as_ref().map(EvaluationRecord::read).transpose()?;
         let env = info.dataset_info.env.map(|env| (env, path));
-        Ok(Self { name, kind, env, image: info.image_size })
+        Ok(Self { name, kind, env, image: info.image_size, recorded })
     }
 
-    /// Returns the requests: one policy, or one per solver.
+    /// Returns the requests: one policy, or one per solver. A capsule plans as in its evaluation if no option of planning
+    /// is given.
     ///
     /// # Errors
     /// When a solver, a setting, the objective or the score is unknown.
@@ -78,7 +86,13 @@ impl NamedPolicy {
                 parse_score(&planner.score)?;
                 (Model::Simulator { score: planner.score.clone() }, planner.action_block, 1)
             }
-            NamedKind::Checkpoint { given, block, history, .. } => (Model::Checkpoint(given), block, history),
+            NamedKind::Checkpoint { given, block, history, .. } => {
+                let recorded = self.recorded.filter(|_| !planner.is_given());
+                if let Some(kind) = recorded.and_then(|recorded| recorded.policy(&given)) {
+                    return Ok(vec![PolicyRequest { name, kind }]);
+                }
+                (Model::Checkpoint(given), block, history)
+            }
         };
         // With several solvers, each name contains the solver's text from the command line.
         let given = &planner.solvers;

@@ -2,6 +2,7 @@
 
 mod assets;
 mod bench;
+mod capsules;
 mod checkpoints;
 mod collect;
 mod config;
@@ -20,6 +21,7 @@ mod planner;
 mod probe;
 mod progress;
 mod pull;
+mod recipes;
 mod report;
 mod reproduce;
 mod results_tables;
@@ -28,6 +30,7 @@ mod solvers;
 mod study;
 mod train;
 mod wrappers;
+mod zoo;
 
 use clap::{Parser, Subcommand};
 use output::{emit, emit_json, eprint, table};
@@ -106,10 +109,16 @@ enum Command {
     /// Train a model on a dataset or in an environment
     #[command(after_help = "Example: swm train lewm --data rooms --output lewm-rooms optim.lr=3e-4")]
     Train(train::TrainArgs),
+    /// List the recipes of `swm train --recipe`, or print one
+    #[command(after_help = "Example: swm recipes two-room/pldm")]
+    Recipes(recipes::RecipesArgs),
+    /// List the capsules that `zoo:NAME` finds
+    #[command(after_help = "Example: swm zoo")]
+    Zoo,
     /// Download pretrained weights from the Hugging Face hub
     #[command(after_help = "Example: swm pull facebook/dinov2-small")]
     Pull(pull::PullArgs),
-    /// List the checkpoints; show, verify, import, export or remove one
+    /// List the checkpoints; show, verify, pack, import, export or remove one
     #[command(after_help = "Example: swm checkpoints show lewm-rooms")]
     Checkpoints(checkpoints::CheckpointsArgs),
     /// Predict columns or reconstruct images from a checkpoint's latents
@@ -222,7 +231,9 @@ impl Cli {
             Command::Inspect(args) => inspect::inspect(&args, json),
             Command::Preview(args) => datasets::preview(&args, json),
             Command::Models => models::models(json),
-            Command::Checkpoints(args) => checkpoints::checkpoints(&args, json),
+            Command::Recipes(args) => recipes::recipes(&args, json),
+            Command::Zoo => zoo::zoo(json),
+            Command::Checkpoints(args) => checkpoints::checkpoints(&args, &Context::new(json, self.threads)?),
             Command::Report(args) => report::report(&args, json),
             Command::Convert(args) => convert::convert(&args, &Context::new(json, self.threads)?),
             Command::Doctor(args) => doctor::doctor(&args, &Context::new(json, self.threads)?),

@@ -1,5 +1,7 @@
 //! The output folder of a command.
 
+use serde::Deserialize;
+use serde::de::IgnoredAny;
 use std::path::Path;
 use swm_core::files::{self, Lock};
 use swm_core::{Error, Result};
@@ -20,18 +22,52 @@ pub fn claim(folder: &Path, names: &[&str]) -> Result<Lock> {
     Ok(lock)
 }
 
-/// Returns whether an existing output file was written by this program: a page names it, results have a manifest, and
-/// traces lie beside results.
+/// Returns whether an existing output file was written by this program: a page names it, tables of a study lie beside its
+/// page, results have the manifest of an evaluation, and traces are a list of plans.
 fn is_own(path: &Path) -> bool {
-    let contains = |path: &Path, mark: &str| {
-        let bytes = files::read(path, MAX_OUTPUT_BYTES).unwrap_or_default();
-        bytes.windows(mark.len()).any(|part| part == mark.as_bytes())
-    };
-    let results = path.with_file_name("results.json");
+    let read = |path: &Path| files::read(path, MAX_OUTPUT_BYTES).unwrap_or_default();
+    let is_page = |path: &Path| read(path).windows(PAGE_MARK.len()).any(|part| part == PAGE_MARK.as_bytes());
     match path.file_name().and_then(|name| name.to_str()) {
-        Some("index.html") => contains(path, PAGE_MARK),
-        _ => contains(&results, "\"swm_version\""),
+        Some("index.html") => is_page(path),
+        Some("table.csv" | "table.tex" | "table.md") => is_page(&path.with_file_name("index.html")),
+        Some("traces.json") => serde_json::from_slice::<Vec<StoredPlan>>(&read(path)).is_ok(),
+        _ => serde_json::from_slice::<StoredResults>(&read(path)).is_ok_and(|found| found.manifest.kind == "evaluate"),
     }
+}
+
+/// The fields by which a `results.json` of any version is recognised.
+#[derive(Deserialize)]
+struct StoredResults {
+    manifest: StoredManifest,
+    #[serde(rename = "env")]
+    _env: String,
+    #[serde(rename = "protocol")]
+    _protocol: String,
+    #[serde(rename = "runs")]
+    _runs: Vec<IgnoredAny>,
+}
+
+/// The fields of the manifest by which results are recognised.
+#[derive(Deserialize)]
+struct StoredManifest {
+    kind: String,
+    #[serde(rename = "swm_version")]
+    _swm_version: String,
+}
+
+/// The fields by which a plan in a `traces.json` is recognised.
+#[derive(Deserialize)]
+struct StoredPlan {
+    #[serde(rename = "policy")]
+    _policy: String,
+    #[serde(rename = "episode")]
+    _episode: u64,
+    #[serde(rename = "slot")]
+    _slot: u64,
+    #[serde(rename = "replan")]
+    _replan: u64,
+    #[serde(rename = "together")]
+    _together: u64,
 }
 
 /// The heading of every page of this program.

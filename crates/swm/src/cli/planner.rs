@@ -18,12 +18,12 @@ pub struct PlannerArgs {
     /// `swm solvers` lists them. Default: the first solver for the environment's actions.
     #[arg(long = "solver", value_name = "NAME[,KEY=VALUE…]")]
     pub solvers: Vec<String>,
-    /// Model steps per plan
-    #[arg(long, default_value_t = 5)]
-    pub horizon: usize,
-    /// Model steps to execute before planning again
-    #[arg(long, default_value_t = 5)]
-    pub receding_horizon: usize,
+    /// Model steps per plan (default: 5)
+    #[arg(long, value_name = "STEPS")]
+    pub horizon: Option<usize>,
+    /// Model steps to execute before planning again (default: 5)
+    #[arg(long, value_name = "STEPS")]
+    pub receding_horizon: Option<usize>,
     /// Environment steps per model step of the simulator
     ///
     /// A checkpoint has its own action block.
@@ -49,7 +49,20 @@ pub struct PlannerArgs {
     pub score: String,
 }
 
+/// The default horizon and receding horizon, in model steps.
+const HORIZON: usize = 5;
+
 impl PlannerArgs {
+    /// Returns whether an option of planning in a checkpoint is given.
+    pub fn is_given(&self) -> bool {
+        let lists = [&self.solvers, &self.terms, &self.limits];
+        let horizons = [self.horizon, self.receding_horizon];
+        lists.iter().any(|list| !list.is_empty())
+            || horizons.iter().any(Option::is_some)
+            || self.cold_start
+            || self.latency_budget.is_some()
+    }
+
     /// Returns the solvers with complete settings. Without --solver, this is the first solver for the environment's
     /// actions that requires only a cost.
     ///
@@ -81,9 +94,10 @@ impl PlannerArgs {
     /// # Errors
     /// When a setting of planning or of the objective is invalid.
     pub fn plan(&self, model: Model, solver: Choice, block: usize, history: usize) -> Result<PolicyKind> {
+        let horizon = self.horizon.unwrap_or(HORIZON);
         let mpc = MpcConfig {
-            horizon: self.horizon,
-            receding_horizon: self.receding_horizon.min(self.horizon),
+            horizon,
+            receding_horizon: self.receding_horizon.unwrap_or(HORIZON).min(horizon),
             action_block: block,
             warm_start: !self.cold_start,
             history,

@@ -2,7 +2,7 @@
 
 use super::table;
 use swm_core::Results;
-use swm_core::results::{Proportion, Run};
+use swm_core::results::{Comparison, Paired, Proportion, Run};
 
 /// Returns the tables of some results.
 pub fn summary(results: &Results) -> String {
@@ -62,20 +62,35 @@ fn prediction_errors(results: &Results) -> Option<String> {
     (!rows.is_empty()).then(|| table(&header, rows))
 }
 
+/// The difference with its interval, the corrected p-value, and the verdict of a comparison.
+pub fn compared(paired: &Paired) -> [String; 3] {
+    let [difference, low, high] = [paired.difference, paired.low, paired.high].map(|share| 100.0 * share);
+    let p = paired.p_corrected();
+    [
+        format!("{difference:+.0} % [{low:+.0}, {high:+.0}]"),
+        if p < 1e-4 { "< 0.0001".to_owned() } else { format!("{p:.4}") },
+        paired.verdict.to_string(),
+    ]
+}
+
 /// The paired comparisons of policies; `None` for fewer than two policies.
 fn comparisons(results: &Results) -> Option<String> {
     let rows = results.comparisons.iter().map(|comparison| {
         let paired = &comparison.table;
+        let [difference, p, verdict] = compared(paired);
         vec![
             comparison.condition.clone(),
             format!("{} – {}", comparison.a, comparison.b),
-            format!("{:+.0} % [{:+.0}, {:+.0}]", 100.0 * paired.difference, 100.0 * paired.low, 100.0 * paired.high),
+            difference,
             format!("{} : {}", paired.only_a, paired.only_b),
-            if paired.p < 1e-4 { "< 0.0001".to_owned() } else { format!("{:.4}", paired.p) },
+            p,
+            verdict,
         ]
     });
-    let header = ["condition", "compared", "difference [95 %]", "only one solved", "p (McNemar)"];
-    (!results.comparisons.is_empty()).then(|| table(&header, rows))
+    let header = ["condition", "compared", "difference [95 %]", "only one solved", "p, corrected", "verdict"];
+    let families = Comparison::families(&mut results.comparisons.clone());
+    let notes = families.iter().map(|family| format!("{}: {family}\n", family.name)).collect::<String>();
+    (!results.comparisons.is_empty()).then(|| table(&header, rows) + &notes)
 }
 
 /// Formats a duration in seconds.

@@ -1,20 +1,32 @@
-//! `swm train`: trains a model on a dataset, or online in an environment.
+//! `swm train`: trains a model on a dataset or online in an environment, or runs a recipe.
 
 use super::progress::{control, print_summary};
+use super::recipes::{self, RecipeRun};
 use super::{Context, emit, emit_json};
 use crate::home;
 use clap::Args;
+use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use swm_core::{EnvPool, Error, Origin, Result};
 use swm_data::Reader;
-use swm_models::{FAMILIES, OnlineRun, TrainOptions, TrainRun, TrainSummary, TrainableConfig, device};
+use swm_models::{FAMILIES, FamilyEntry, OnlineRun, TrainOptions, TrainRun, TrainSummary, TrainableConfig, device};
 
 /// Arguments of `swm train`.
 #[derive(Args)]
 pub struct TrainArgs {
     /// The model; `swm models` lists them
-    model: String,
+    #[arg(required_unless_present = "recipe")]
+    model: Option<String>,
+    /// Run a recipe instead: collect, train, evaluate, report
+    ///
+    /// A name that `swm recipes` lists, or a TOML file. Finished steps are not repeated. Settings are STEP.OPTION=VALUE.
+    #[arg(long, value_name = "RECIPE", requires = "output")]
+    #[arg(conflicts_with_all = ["data", "preset", "env", "encoder", "device", "resume", "print_config"])]
+    recipe: Option<String>,
+    /// Allow a recipe from a file to choose any name
+    #[arg(long, requires = "recipe")]
+    trust: bool,
     /// The dataset: a path or a name
     #[arg(long, value_name = "DATASET")]
     data: Option<String>,
@@ -49,16 +61,29 @@ pub struct TrainArgs {
 
 /// Runs `swm train`.
 pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
-    let family = FAMILIES.get(&args.model)?;
-    let preset = args.preset.as_deref().unwrap_or(family.presets[0].id);
-    let config = (family.config)(preset, &args.settings)?;
+    if let (Some(recipe), Some(output)) = (&args.recipe, &args.output) {
+        let settings = args.model.iter().chain(&args.settings).map(String::as_str).collect();
+        return recipes::run(&RecipeRun { recipe, output: Path::new(output), settings, trust: args.trust }, context);
+    }
     if args.print_config {
+        let config = args.config()?;
         if context.json {
             return emit_json(&config.to_json());
         }
         emit(&config.to_toml()?);
         return Ok(());
     }
+    let (checkpoint, summary) = run_args(args, context)?;
+    if context.json {
+        return emit_json(&summary);
+    }
+    emit(&format!("{}\n", checkpoint.display()));
+    Ok(())
+}
+
+/// Trains the model of a command line; returns the checkpoint, and the summary of the run as JSON.
+pub fn run_args(args: &TrainArgs, context: &Context) -> anyhow::Result<(PathBuf, Value)> {
+    let (family, config) = (args.family()?, args.config()?);
     if args.encoder.is_some() && !family.borrows_encoder {
         let problem = format!("{} trains its own encoder", family.id);
         anyhow::bail!(Error::config("--encoder", problem, "remove the flag, or train inverse"));
@@ -77,11 +102,7 @@ pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
     let (reader, out) = args.dataset_and_output()?;
     let setup = TrainRun { reader, encoder: encoder.as_deref(), out: &out, options };
     let summary = run(&*config, setup, context)?;
-    if context.json {
-        return emit_json(&summary);
-    }
-    emit(&format!("{}\n", summary.checkpoint.display()));
-    Ok(())
+    Ok((summary.checkpoint.clone(), json!(summary)))
 }
 
 /// Trains online in an environment.
@@ -91,7 +112,7 @@ fn train_online(
     config: &dyn TrainableConfig,
     options: TrainOptions,
     context: &Context,
-) -> anyhow::Result<()> {
+) -> anyhow::Result<(PathBuf, Value)> {
     let choice = crate::env(env, &Origin::User)?;
     let threads = swm_core::pool::threads(context.threads)?;
     let environments = |count: usize| {
@@ -100,12 +121,12 @@ fn train_online(
     };
     let name = args.output.clone().unwrap_or_else(|| {
         let env = env.rsplit('/').next().unwrap_or(env).split(',').next().unwrap_or(env);
-        format!("{}-{env}", args.model)
+        format!("{}-{env}", args.model())
     });
     let out = home::new_checkpoint(&name)?;
     let setup = OnlineRun { environments: &environments, out: &out, options };
     let Some(summary) = config.train_online(setup, &mut control(context)) else {
-        let problem = format!("{} trains on datasets only", args.model);
+        let problem = format!("{} trains on datasets only", args.model());
         anyhow::bail!(Error::config("--env", problem, "give a dataset with --data, or train tdmpc2 or sac"));
     };
     let summary = summary?;
@@ -122,14 +143,29 @@ fn train_online(
     if summary.interrupted {
         anyhow::bail!(Error::Interrupted);
     }
-    if context.json {
-        return emit_json(&summary);
-    }
-    emit(&format!("{}\n", summary.checkpoint.display()));
-    Ok(())
+    Ok((summary.checkpoint.clone(), json!(summary)))
 }
 
 impl TrainArgs {
+    /// Returns the family of the model.
+    fn family(&self) -> Result<&'static FamilyEntry> {
+        FAMILIES.get(self.model())
+    }
+
+    /// Returns the id of the family as given; the command line requires one without a recipe.
+    fn model(&self) -> &str {
+        self.model.as_deref().unwrap_or_default()
+    }
+
+    /// Returns the configuration: the preset with the settings.
+    ///
+    /// # Errors
+    /// When the family, the preset or a setting is unknown, or a value is invalid.
+    pub fn config(&self) -> Result<Box<dyn TrainableConfig>> {
+        let family = self.family()?;
+        (family.config)(self.preset.as_deref().unwrap_or(family.presets[0].id), &self.settings)
+    }
+
     /// Returns the dataset and the folder of the checkpoint.
     fn dataset_and_output(&self) -> Result<(Arc<dyn Reader>, PathBuf)> {
         let Some(data) = &self.data else {
@@ -139,7 +175,7 @@ impl TrainArgs {
         };
         let name = self.output.clone().unwrap_or_else(|| {
             let stem = Path::new(data).file_stem().unwrap_or_default().to_string_lossy();
-            format!("{}-{stem}", self.model)
+            format!("{}-{stem}", self.model())
         });
         Ok((home::open_dataset(data)?, home::new_checkpoint(&name)?))
     }

@@ -3,6 +3,7 @@
 use crate::Swm;
 use std::fs;
 use std::path::Path;
+use swm::core::files::Lock;
 
 /// A demo of a few seconds in the folder `demo`.
 pub(crate) const DEMO: &[&str] =
@@ -21,7 +22,7 @@ fn assert_untouched(path: &Path) {
 #[test]
 fn demo_refuses_a_folder_that_it_did_not_make() {
     let swm = Swm::new();
-    let files = ["demo/results/thesis.txt", "demo/lewm-rooms/thesis.txt"].map(|name| swm.path(name));
+    let files = ["demo/results/thesis.txt", "demo/pldm-rooms/thesis.txt"].map(|name| swm.path(name));
     files.iter().for_each(|path| user_file(path));
     swm.fails(DEMO, 2, &["demo", "did not write", "--output"]);
     files.iter().for_each(|path| assert_untouched(path));
@@ -31,7 +32,7 @@ fn demo_refuses_a_folder_that_it_did_not_make() {
 fn second_demo_keeps_files_of_the_user() {
     let swm = Swm::new();
     swm.json(DEMO);
-    let files = ["demo/results/thesis.txt", "demo/lewm-rooms/thesis.txt", "demo/lewm-rooms/checkpoint/thesis.txt"]
+    let files = ["demo/results/thesis.txt", "demo/pldm-rooms/thesis.txt", "demo/pldm-rooms/checkpoint/thesis.txt"]
         .map(|name| swm.path(name));
     files.iter().for_each(|path| user_file(path));
     swm.json(DEMO);
@@ -42,16 +43,16 @@ fn second_demo_keeps_files_of_the_user() {
 fn checkpoint_removal_keeps_files_of_the_user() {
     let swm = Swm::new();
     swm.json(DEMO);
-    let run = swm.path("demo/lewm-rooms");
+    let run = swm.path("demo/pldm-rooms");
     let outside = swm.path("outside/config.json");
     let files = [run.join("thesis.txt"), run.join("checkpoint/notes/config.json"), outside.clone()];
     files.iter().for_each(|path| user_file(path));
     std::os::unix::fs::symlink(&outside, run.join("raw.safetensors")).expect("making a link");
     std::os::unix::fs::symlink(swm.path("outside"), run.join("best")).expect("making a link");
 
-    swm.fails(&["checkpoints", "remove", "demo/lewm-rooms"], 2, &["not confirmed", "--yes"]);
+    swm.fails(&["checkpoints", "remove", "demo/pldm-rooms"], 2, &["not confirmed", "--yes"]);
     assert!(run.join("checkpoint/weights.safetensors").exists());
-    let removed = swm.json(&["checkpoints", "remove", "demo/lewm-rooms", "--yes"]);
+    let removed = swm.json(&["checkpoints", "remove", "demo/pldm-rooms", "--yes"]);
     assert_eq!(removed["remaining"].as_array().map(Vec::len), Some(4), "{removed}");
     assert!(!run.join("checkpoint/weights.safetensors").exists() && !run.join("train.jsonl").exists());
     files.iter().for_each(|path| assert_untouched(path));
@@ -67,6 +68,8 @@ fn training_does_not_write_through_links() {
     for name in ["checkpoint.new/config.json", "checkpoint.new/weights.safetensors"] {
         std::os::unix::fs::symlink(&thesis, run.join(name)).expect("making a link");
     }
+    // An event file marks the folder of a run that was killed.
+    fs::write(run.join("events.out.tfevents.1.000000000.swm"), "").expect("writing a file");
     let train = |out: &'static str| {
         ["train", "lewm", "--data", "demo/rooms.lance", "-o", out, "schedule.steps=2", "schedule.warmup=1"]
     };
@@ -92,6 +95,29 @@ fn outputs_do_not_replace_files_of_the_user() {
     swm.json(&eval("results"));
     swm.json(&["report", "results", "-o", "page"]);
     swm.json(&["report", "results", "-o", "page"]);
+    fs::create_dir_all(swm.path("mine")).expect("creating a folder");
+    fs::write(swm.path("mine/results.json"), r#"{"my": "thesis", "swm_version": 1}"#).expect("writing a file");
+    swm.fails(&eval("mine"), 2, &["results.json", "not written by this program"]);
+}
+
+#[test]
+fn traces_do_not_replace_files_of_the_user() {
+    let swm = Swm::new();
+    let eval = ["eval", "simulator", "--env", "swm/TwoRoom-v1", "--episodes", "1", "--budget", "5", "-o", "found"];
+    let eval = [&eval[..], &["--solver", "cem,samples=16,iterations=2,elites=4"]].concat();
+    let traced = [&eval[..], &["--trace"]].concat();
+    swm.json(&eval);
+    let file = swm.path("found/traces.json");
+    user_file(&file);
+    swm.fails(&traced, 2, &["traces.json", "not written by this program"]);
+    swm.json(&eval);
+    assert_untouched(&file);
+    fs::remove_file(&file).expect("removing the user's file");
+    // The program replaces its own traces.
+    for _ in 0..2 {
+        swm.json(&traced);
+        assert!(fs::read_to_string(&file).expect("reading the traces").contains("\"simulator\""));
+    }
 }
 
 #[test]
@@ -102,7 +128,7 @@ fn previews_videos_and_images_do_not_replace_files_of_the_user() {
     let files = names.map(|name| swm.path(name));
     files.iter().for_each(|path| user_file(path));
     let eval = ["eval", "random", "--env", "swm/TwoRoom-v1", "--episodes", "2", "--budget", "5", "--videos", "1", "-o"];
-    let probe = ["probe", "demo/lewm-rooms", "--data", "demo/rooms.lance", "--steps", "1", "--frames", "8", "--images"];
+    let probe = ["probe", "demo/pldm-rooms", "--data", "demo/rooms.lance", "--steps", "1", "--frames", "8", "--images"];
     let preview = ["preview", "demo/rooms.lance", "-o"];
     let refused = "was not written by this program";
     let with = |args: &[&'static str], last: &'static str| [args, &[last]].concat();
@@ -132,8 +158,8 @@ fn checkpoints_are_removed_by_paths_that_end_in_dots() {
     for end in [".", "checkpoint/.."] {
         let swm = Swm::new();
         swm.json(DEMO);
-        let run = swm.path("demo/lewm-rooms");
-        swm.json(&["checkpoints", "remove", &format!("demo/lewm-rooms/{end}"), "--yes"]);
+        let run = swm.path("demo/pldm-rooms");
+        swm.json(&["checkpoints", "remove", &format!("demo/pldm-rooms/{end}"), "--yes"]);
         assert!(!run.exists(), "{end}");
     }
 }
@@ -158,4 +184,78 @@ fn empty_names_are_refused() {
     swm.fails(&["train", "lewm", "--data", "", "-o", "x"], 2, &["name of a dataset", "is empty"]);
     assert_untouched(&file);
     assert!(swm.path("checkpoints/config.json").exists());
+}
+
+#[test]
+fn training_does_not_replace_files_of_the_user() {
+    fn train(out: &str) -> [&str; 8] {
+        ["train", "lewm", "--data", "demo/rooms.lance", "-o", out, "schedule.steps=2", "schedule.warmup=1"]
+    }
+    let swm = Swm::new();
+    swm.json(DEMO);
+    for place in [
+        "a/train.jsonl",
+        "b/checkpoint/weights.safetensors",
+        "c/checkpoint.old/state.json",
+        "d/checkpoint.new/manifest.json",
+        "e/best/checkpoint/weights.safetensors",
+        "f/checkpoint",
+    ] {
+        let file = swm.path(place);
+        user_file(&file);
+        swm.fails(&train(&format!("./{}", &place[..1])), 2, &["choose another"]);
+        assert_untouched(&file);
+    }
+    fs::write(swm.path("a/train.jsonl"), "{\"step\": 1}\n").expect("writing a log of another program");
+    swm.fails(&train("./a"), 2, &["train.jsonl", "not written by this program"]);
+
+    // What a run leaves that was killed while it wrote its first checkpoint is replaced.
+    swm.json(&train("./killed"));
+    let (whole, new) = (swm.path("killed/checkpoint"), swm.path("killed/checkpoint.new"));
+    fs::rename(&whole, &new).expect("renaming the checkpoint");
+    fs::remove_file(new.join("manifest.json")).expect("removing a file of the checkpoint");
+    swm.json(&train("./killed"));
+    assert!(whole.join("manifest.json").is_file() && !new.exists());
+}
+
+#[test]
+fn export_replaces_nothing() {
+    fn export(folder: &str) -> [&str; 4] {
+        ["checkpoints", "export", "zoo:two-room/pldm", folder]
+    }
+    let swm = Swm::new();
+    let refused = "holds a checkpoint already";
+    for place in [
+        "a/checkpoint/weights.safetensors",
+        "b/checkpoint/config.json",
+        "c/checkpoint.old/config.json",
+        "d/checkpoint.new/config.json",
+        "e/checkpoint",
+        "f/train.jsonl",
+    ] {
+        let (file, folder) = (swm.path(place), &place[..1]);
+        user_file(&file);
+        swm.fails(&export(folder), 2, &[refused]);
+        assert_untouched(&file);
+        assert_eq!(fs::read_dir(swm.path(folder)).expect("listing the folder").count(), 1, "{place}");
+    }
+    fs::create_dir_all(swm.path("linked")).expect("creating a folder");
+    std::os::unix::fs::symlink("nowhere", swm.path("linked/checkpoint")).expect("making a link");
+    swm.fails(&export("linked"), 2, &[refused]);
+
+    let held = Lock::folder(&swm.path("held")).expect("locking the folder as training does");
+    swm.fails(&export("held"), 2, &["another process writes to it"]);
+    drop(held);
+    swm.json(&export("held"));
+    assert!(swm.path("held/checkpoint/weights.safetensors").is_file());
+}
+
+#[test]
+fn capsules_of_the_zoo_are_not_removed() {
+    let swm = Swm::new();
+    let file = swm.path("zoo/maze/model.safetensors");
+    user_file(&file);
+    let remove = ["checkpoints", "remove", "zoo:maze/model", "--yes"];
+    swm.fails(&remove, 2, &["zoo/maze/model.safetensors", "delete the file by hand"]);
+    assert_untouched(&file);
 }

@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 use std::fs;
 use std::path::Path;
 
-const RUN: &str = "demo/lewm-rooms";
+const RUN: &str = "demo/pldm-rooms";
 
 fn read(path: &Path) -> Value {
     serde_json::from_slice(&fs::read(path).expect("reading the file")).expect("parsing the JSON")

@@ -160,7 +160,7 @@ fn first_signal_stops_a_benchmark() {
 #[test]
 fn second_signal_ends_the_program() {
     let swm = Swm::new();
-    let solver = ["--solver", "cem,samples=100000,iterations=1000000", "--budget", "3"];
+    let solver = ["--solver", "cem,samples=100000,iterations=100000", "--budget", "3"];
     for (signal, code) in [("INT", 130), ("TERM", 143), ("HUP", 129)] {
         let args = ["eval", "simulator", "--env", "swm/TwoRoom-v1", "--image", "32", "--episodes", "1"];
         let mut running = Running::start(&swm, &[&args[..], &solver].concat());

@@ -1,6 +1,7 @@
 //! Tests of the `swm` command as a process: arguments, output, exit codes and files.
 #![allow(missing_docs, clippy::print_stdout, reason = "a test crate has no public items; skipped tests print why")]
 
+mod capsules;
 mod collecting;
 mod data;
 mod deletion;
@@ -14,8 +15,10 @@ mod listing;
 mod output;
 mod pipeline;
 mod python;
+mod recipes;
 mod study;
 mod trust;
+mod zoo;
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

@@ -33,6 +33,10 @@ policy = "expert"
 [[policy]]
 name = "chance"
 policy = "random"
+
+[[published]]
+source = "a table"
+rates = { "in distribution" = { planner = 0.9 } }
 "#;
 
 /// The files of a folder and their contents.
@@ -67,11 +71,16 @@ fn study_pairs_conditions_and_resumes_to_the_same_bytes() {
         assert_eq!(row["gap"].is_null(), unshifted, "{row}");
         // The agent's colour does not change what the expert does.
         assert!(unshifted || (row["gap"]["only_a"] == 0 && row["gap"]["only_b"] == 0), "{row}");
+        assert!(unshifted || (row["gap"]["comparisons"] == 2 && row["gap"]["verdict"] == "too few"), "{row}");
         assert!(
             unshifted
                 || row["condition"] == format!("agent at hue {}", row["variables"]["hue"].as_str().expect("a hue"))
         );
     }
+    let families = results["families"].as_array().into_iter().flatten();
+    let families: Vec<&str> = families.filter_map(|family| family["name"].as_str()).collect();
+    let of = |policy: &str| [0, 1].map(|seed| format!("{policy} · strict · seed {seed}"));
+    assert_eq!(families, [of("planner"), of("random")].concat());
     let whole = contents(&swm.path("whole"));
 
     // Killed at several moments, with another number of environments and threads, then completed.
@@ -91,8 +100,38 @@ fn study_pairs_conditions_and_resumes_to_the_same_bytes() {
         let (whole, killed) = (swm.run(&args), swm.run(&other));
         assert!(whole.status.success() && whole.stdout == killed.stdout, "{}", text(&killed.stdout));
     }
+    for folder in ["whole", "killed"] {
+        swm.json(&["study", "report", folder]);
+    }
+    let page = contents(&swm.path("whole/report"));
+    assert!(page == contents(&swm.path("killed/report")), "the page of a killed study differs");
+    let names: Vec<&str> = page.keys().map(String::as_str).collect();
+    assert_eq!(names[..3], ["figures/drop-1.png", "figures/drop-1.svg", "figures/drop-2.png"], "{names:?}");
+    assert_eq!(names[4..], ["index.html", "table.csv", "table.md", "table.tex"], "{names:?}");
+    let html = String::from_utf8_lossy(&page["index.html"]);
+    for words in ["12 of 12", "swm study run study.toml --output study", "90.0\u{a0}% [1]", "a table", "seed 1"] {
+        assert!(html.contains(words), "the page lacks: {words}");
+    }
     let latex = swm.run(&["study", "export", "whole", "--format", "latex"]);
     assert!(text(&latex.stdout).contains("\\midrule"));
+}
+
+#[test]
+fn temporary_files_of_a_killed_study_are_deleted() {
+    let swm = with_study();
+    let args = ["study", "run", "study.toml", "--output", "out", "seed=0"];
+    std::fs::create_dir(swm.path("out")).expect("creating a folder");
+    std::fs::write(swm.path("out/.study.json.77.tmp"), "{").expect("writing a file");
+    swm.json(&args);
+    let names = contents(&swm.path("out"));
+    assert_eq!(names.len(), 7, "{:?}", names.keys());
+    for other in ["out/cells/.0123.json.77.tmp", "out/cells/.notes.tmp", "out/.0123.json.77.tmp"] {
+        std::fs::write(swm.path(other), "{").expect("writing a file");
+    }
+    swm.json(&args);
+    let mut remaining = contents(&swm.path("out"));
+    assert!(remaining.remove("cells/.notes.tmp").is_some() && remaining.remove(".0123.json.77.tmp").is_some());
+    assert!(remaining == names, "{:?}", remaining.keys());
 }
 
 #[test]
@@ -105,6 +144,53 @@ fn study_evaluates_only_what_changed() {
     assert_eq!((results["cells"].as_u64(), results["done"].as_u64()), (Some(12), Some(12)));
     let all = contents(&swm.path("out/cells"));
     assert!(all.len() == 12 && first.iter().all(|(name, bytes)| all.get(name) == Some(bytes)));
+}
+
+#[test]
+fn families_count_cells_that_are_not_done_and_follow_the_file() {
+    let swm = with_study();
+    std::fs::write(swm.path("study.toml"), format!("families = [\"seed\"]\n{STUDY}")).expect("writing the study");
+    swm.json(&["study", "run", "study.toml", "--output", "out", "seed=1"]);
+    // The study of both seeds has no cells of seed 0 yet, and lacks one of seed 1.
+    let study = std::fs::read_to_string(swm.path("out/study.json")).expect("the study");
+    assert!(study.contains("\"families\": [\n    \"seed\"\n  ]"), "{study}");
+    let cells = swm.json(&["study", "status", "out"])["rows"].clone();
+    let last = cells.as_array().and_then(|rows| rows.last()).expect("rows");
+    let file = format!("out/cells/{}.json", last["cell"].as_str().expect("an id"));
+    std::fs::remove_file(swm.path(&file)).expect("removing a cell");
+    let results = swm.json(&["study", "status", "out"]);
+    let families = results["families"].as_array().expect("families");
+    assert_eq!(
+        (families.len(), &families[0]["name"], families[0]["comparisons"].as_u64()),
+        (1, &"seed 1".into(), Some(4))
+    );
+    let gaps = results["rows"].as_array().into_iter().flatten().filter(|row| !row["gap"].is_null());
+    assert_eq!(gaps.map(|row| row["gap"]["comparisons"].as_u64()).collect::<Vec<_>>(), [Some(4); 3]);
+}
+
+#[test]
+fn training_seeds_are_taken_together() {
+    let swm = with_study();
+    let policies = r#"
+[[policy]]
+name = "expert {training-seed}"
+policy = "expert"
+each = { training-seed = [0, 1, 2, 3] }
+"#;
+    let (before, _) = STUDY.split_once("[[policy]]").expect("policies");
+    std::fs::write(swm.path("study.toml"), format!("{before}{policies}")).expect("writing the study");
+    let results = swm.json(&["study", "run", "study.toml", "--output", "out", "seed=0"]);
+    let over = results["over_seeds"].as_array().expect("a table over seeds");
+    let conditions: Vec<_> = over.iter().map(|row| row["condition"].as_str()).collect();
+    let [red, blue] = ["agent at hue 0", "agent at hue 240"].map(Some);
+    assert_eq!(conditions, [Some("in distribution"), red, blue, None]);
+    assert!(over.iter().all(|row| row["policy"] == "expert *" && row["scores"].as_array().map(Vec::len) == Some(4)));
+    assert!(over[2]["interquartile"].is_null() && over[3]["interquartile"]["mean"].is_number(), "{over:?}");
+    // Each policy is compared with itself.
+    let rows = results["rows"].as_array().expect("rows");
+    assert!(rows.iter().filter(|row| !row["gap"].is_null()).all(|row| row["gap"]["only_b"] == 0), "{rows:?}");
+    let status = swm.run(&["study", "status", "out"]);
+    assert!(text(&status.stdout).contains("all shifted conditions"), "{}", text(&status.stdout));
 }
 
 #[test]
@@ -135,6 +221,11 @@ fn errors_in_a_study_name_the_line_and_the_nearest_word() {
         ("title = \"Colours in Two-Room\"", "", vec!["has no title"]),
         ("budget = 40", "budget = ", vec!["study.toml:8"]),
         ("hue = [0, 240]", "hue = [0, 0]", vec!["same evaluation"]),
+        ("[defaults]", "families = [\"polisy\"]\n[defaults]", vec!["study.toml:5", "polisy", "policy"]),
+        ("\"random\"", "\"random\"\neach = { training-seed = [1] }", vec!["'chance' does not contain {training-seed}"]),
+        ("planner = 0.9", "planner = 90", vec!["study.toml:30", "not a success rate", "0 to 1"]),
+        ("source = \"a table\"", "sources = \"a table\"", vec!["study.toml:29", "sources", "source"]),
+        ("source = \"a table\"", "", vec!["study.toml:28", "no source"]),
     ] {
         assert!(STUDY.contains(from), "{from}");
         std::fs::write(swm.path("study.toml"), STUDY.replace(from, to)).expect("writing the study");
@@ -142,6 +233,29 @@ fn errors_in_a_study_name_the_line_and_the_nearest_word() {
         assert!(!swm.path("out").exists(), "{to}");
     }
     swm.fails(&["study", "run", "paper/factor", "--output", "out"], 2, &["paper/factors"]);
+}
+
+#[test]
+fn report_of_a_study_replaces_only_its_own_files() {
+    let swm = with_study();
+    swm.json(&["study", "run", "study.toml", "--output", "out", "seed=0"]);
+    for name in ["index.html", "table.csv"] {
+        let folder = swm.path(&format!("mine-{name}"));
+        std::fs::create_dir(&folder).expect("creating a folder");
+        std::fs::write(folder.join(name), "mine").expect("writing a file");
+        let output = format!("mine-{name}");
+        swm.fails(&["study", "report", "out", "--output", &output], 2, &[name, "not written by this program"]);
+        assert_eq!(contents(&folder), BTreeMap::from([(name.to_owned(), b"mine".to_vec())]));
+    }
+    std::fs::create_dir_all(swm.path("paper/figures")).expect("creating a folder");
+    std::fs::write(swm.path("paper/figures/drop-1.svg"), "mine").expect("writing a file");
+    swm.fails(&["study", "report", "out", "--output", "paper"], 2, &["figures", "not written by this program"]);
+    swm.json(&["study", "report", "out", "--output", "page", "--title", "First"]);
+    let first = contents(&swm.path("page"));
+    swm.json(&["study", "report", "out", "--output", "page", "--title", "Second"]);
+    let second = contents(&swm.path("page"));
+    assert!(first["index.html"] != second["index.html"] && first["table.csv"] == second["table.csv"]);
+    swm.fails(&["study", "report", "nowhere"], 1, &["nowhere"]);
 }
 
 #[test]
@@ -224,4 +338,56 @@ fn results_of_another_evaluation_are_refused() {
     twice["cells"] = cells.into();
     std::fs::write(swm.path("out/study.json"), twice.to_string()).expect("writing the study");
     swm.fails(&["study", "status", "out"], 1, &["same evaluation"]);
+}
+
+/// The commands of a study, one to a line.
+fn commands(swm: &Swm, study: &str) -> String {
+    std::fs::write(swm.path("study.toml"), study).expect("writing the study");
+    let output = swm.run(&["study", "run", "study.toml", "--commands"]);
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    text(&output.stdout)
+}
+
+#[test]
+fn small_files_do_not_expand_without_bound() {
+    let swm = Swm::new();
+    // Every value names the next variable 20 times: values are not expanded again.
+    let next = |index: usize| format!("a{index:02} = [\"{}\"]\n", format!("{{a{:02}}}", index + 1).repeat(20));
+    let each: String = (0..12).map(next).collect();
+    let (before, policies) = STUDY.split_once("[[policy]]").expect("policies");
+    let (defaults, _) = before.split_once("[[condition]]").expect("conditions");
+    let nested = format!(
+        "{defaults}[[condition]]\nname = \"{{a00}}\"\nwrapper = \"noise,std={{a12}}\"\n\
+        [condition.each]\n{each}a12 = [1]\n[[policy]]{policies}"
+    );
+    let printed = commands(&swm, &nested);
+    assert!(printed.contains("noise,std=1") && printed.len() < 2000, "{printed}");
+
+    // A long text in many cells.
+    let numbers = (0..5000).map(|number| number.to_string()).collect::<Vec<_>>().join(",");
+    let long = "A".repeat(500_000);
+    for (name, option) in [("c{i}", format!("wrapper = \"{long}\"\n")), ("{i}", format!("each.j = [\"{long}\"]\n"))] {
+        let cloned =
+            format!("{defaults}[[condition]]\nname = \"{name}\"\n{option}each.i = [{numbers}]\n[[policy]]{policies}");
+        std::fs::write(swm.path("study.toml"), cloned).expect("writing the study");
+        swm.fails(&["study", "run", "study.toml", "--commands"], 2, &["64 MiB", "fewer values"]);
+    }
+}
+
+#[test]
+fn names_in_a_study_are_no_options_of_its_commands() {
+    let swm = Swm::new();
+    for policy in ["--trust", "-o"] {
+        let study = STUDY.replace("policy = \"expert\"", &format!("policy = \"{policy}\""));
+        let printed = commands(&swm, &study);
+        let line = printed.lines().next().expect("a command");
+        assert!(line.starts_with("swm eval --") && line.ends_with(&format!(" -- {policy}")), "{line}");
+        // As a command it evaluates a checkpoint of this name, which does not exist.
+        let args: Vec<&str> = line.split(' ').skip(1).collect();
+        swm.fails(&args, 2, &[policy]);
+        swm.fails(&["study", "run", "study.toml", "--output", "out"], 2, &["planner", policy]);
+        assert!(!swm.path("out").exists());
+    }
+    let empty = STUDY.replace("policy = \"expert\"", "policy = \"\"");
+    assert!(commands(&swm, &empty).starts_with("swm eval '' --"));
 }

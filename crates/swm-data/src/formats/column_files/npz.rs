@@ -50,6 +50,8 @@ impl Header {
 pub(crate) struct Npz {
     path: PathBuf,
     archive: ZipArchive<BufReader<File>>,
+    /// The size of the file, in bytes.
+    bytes: u64,
 }
 
 impl Npz {
@@ -59,8 +61,9 @@ impl Npz {
     /// If the file does not exist or is damaged.
     pub fn open(path: &Path) -> Result<Self> {
         let file = files::open(path)?;
+        let bytes = file.metadata().map_err(|error| Error::io(path, "reading the size", error))?.len();
         let archive = ZipArchive::new(BufReader::new(file)).map_err(|e| damaged(path, e))?;
-        Ok(Self { path: path.to_owned(), archive })
+        Ok(Self { path: path.to_owned(), archive, bytes })
     }
 
     /// Returns whether the archive has a member of this name.
@@ -81,6 +84,10 @@ impl Npz {
         let path = self.path.clone();
         let mut file = self.archive.by_name(member).map_err(|e| damaged(&path, format!("{member}: {e}")))?;
         let (size, compressed) = (file.size(), file.compressed_size());
+        if compressed > self.bytes {
+            let problem = format!("{member} takes {compressed} bytes, more than the {} of the file", self.bytes);
+            return Err(damaged(&path, problem));
+        }
         if size / MAX_COMPRESSION > compressed || size > ALWAYS_READ.saturating_add(USUAL_COMPRESSION * compressed) {
             return Err(damaged(
                 &path,
@@ -319,6 +326,24 @@ mod tests {
         assert_eq!(npz.header().expect("reading the header"), header);
         assert_eq!(npz.member("note").expect("reading the member"), b"hello");
         assert!(npz.has("note") && !npz.has("other") && npz.member("other").is_err());
+    }
+
+    #[test]
+    fn members_are_no_larger_than_the_file() {
+        let folder = tempfile::tempdir().expect("creating a temporary folder");
+        let path = folder.path().join("a.npz");
+        let mut writer = NpzWriter::create(&path).expect("creating the archive");
+        writer.member("note", b"hello").expect("writing to the archive");
+        writer.finish().expect("completing the archive");
+        let mut bytes = std::fs::read(&path).expect("reading the archive");
+        let entry = bytes.windows(4).position(|window| window == b"PK\x01\x02").expect("a central directory");
+        // Both sizes of the member, compressed and not.
+        for at in [entry + 20, entry + 24] {
+            bytes[at..at + 4].copy_from_slice(&0x7fff_ffff_u32.to_le_bytes());
+        }
+        std::fs::write(&path, bytes).expect("writing the archive");
+        let error = Npz::open(&path).and_then(|mut npz| npz.member("note")).expect_err("a damaged archive").to_string();
+        assert!(error.contains("takes 2147483647 bytes, more than the"), "{error}");
     }
 
     /// Writes an archive of one deflated array with the given header and elements.

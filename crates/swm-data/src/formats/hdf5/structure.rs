@@ -19,7 +19,7 @@ pub(super) fn catch_panic<T, E: std::fmt::Display>(
 pub(super) fn scalar_type(datatype: &Datatype) -> Option<StoredScalar> {
     let (class, size, order) = match datatype {
         Datatype::FixedPoint { size, byte_order, layout } => {
-            if layout.bit_offset != 0 || u32::from(layout.bit_precision) != size * 8 {
+            if layout.bit_offset != 0 || size.checked_mul(8) != Some(u32::from(layout.bit_precision)) {
                 return None;
             }
             (if layout.signed { Class::Signed } else { Class::Unsigned }, *size, *byte_order)
@@ -55,4 +55,21 @@ pub(super) fn scalar_type(datatype: &Datatype) -> Option<StoredScalar> {
     };
     let stored = StoredScalar { class, size: size as usize, big_endian };
     stored.dtype().map(|_| stored)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use hdf5_pure::FixedPointLayout;
+
+    #[test]
+    fn sizes_of_numbers_in_bits_do_not_overflow() {
+        let number = |size, bits| {
+            let layout = FixedPointLayout { signed: false, bit_offset: 0, bit_precision: bits };
+            scalar_type(&Datatype::FixedPoint { size, byte_order: DatatypeByteOrder::LittleEndian, layout })
+        };
+        assert_eq!(number(4, 32).map(|stored| stored.size), Some(4));
+        // Eight times this size is 8 bits modulo 2^32.
+        assert!(number((1 << 29) + 1, 8).is_none() && number(u32::MAX, 65_528).is_none());
+    }
 }

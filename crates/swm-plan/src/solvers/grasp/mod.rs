@@ -152,7 +152,7 @@ impl Solver for Grasp {
 
     fn check(&self) -> Result<()> {
         let settings = Settings(ID);
-        settings.at_least_one("iterations", self.iterations)?;
+        settings.iterations("iterations", self.iterations)?;
         for (name, schedule) in [("goal_weight", self.goal_weight), ("state_noise", self.state_noise)] {
             settings.not_negative(name, schedule.from)?;
             settings.not_negative(name, schedule.to)?;
@@ -163,6 +163,9 @@ impl Solver for Grasp {
             format!("{} steps every {} iterations", self.sync_iterations, self.sync_every),
             "choose at least 1 step, or no synchronisation with sync_every = 0",
         )?;
+        if self.sync_every > 0 {
+            settings.iterations("sync_iterations", self.sync_iterations)?;
+        }
         [&self.action_optimizer, &self.state_optimizer, &self.sync_optimizer].iter().try_for_each(|it| it.check(ID))
     }
 }

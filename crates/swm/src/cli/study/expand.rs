@@ -1,7 +1,8 @@
 //! Expands the tables of a study's file to cells.
 
-use super::file::{StudyFile, Variant};
-use crate::cli::eval::EvalArgs;
+use super::file::{StudyFile, Table, Variant};
+use super::variants::Budget;
+use crate::cli::eval::{CapsuleStarts, EvalArgs};
 use crate::resolver::HomeResolver;
 use clap::{Args as _, Command, FromArgMatches as _};
 use std::collections::BTreeMap;
@@ -30,7 +31,11 @@ pub fn commands(file: &StudyFile, settings: &[String], resolver: &HomeResolver) 
 pub fn shell(arguments: &[String]) -> String {
     let plain = |argument: &String| {
         let safe = |c: char| c.is_ascii_alphanumeric() || "-_=.,/:@%+".contains(c);
-        if argument.chars().all(safe) { argument.clone() } else { format!("'{}'", argument.replace('\'', "'\\''")) }
+        if !argument.is_empty() && argument.chars().all(safe) {
+            argument.clone()
+        } else {
+            format!("'{}'", argument.replace('\'', "'\\''"))
+        }
     };
     arguments.iter().map(plain).collect::<Vec<_>>().join(" ")
 }
@@ -63,9 +68,17 @@ pub fn study(
         };
         let request = request(&all, &condition.name, &policy.name, resolver).map_err(within)?;
         let inputs = inputs.of(&request).map_err(within)?;
-        cells.push(Cell { starts: starts.name, variables: all.variables, request, inputs });
+        let any_seed = policy.any_seed.clone();
+        cells.push(Cell { starts: starts.name, variables: all.variables, any_seed, request, inputs });
     }
-    let study = Study { title: file.title.clone(), question: file.question.clone(), cells };
+    let study = Study {
+        title: file.title.clone(),
+        question: file.question.clone(),
+        families: file.families.clone(),
+        cells,
+        published: file.published.clone(),
+        arguments: vec![],
+    };
     study.check()?;
     Ok(study)
 }
@@ -75,17 +88,30 @@ fn combinations(file: &StudyFile, settings: &[String], resolver: &HomeResolver) 
     let defaults = file.defaults.with(settings)?;
     let env = defaults.option("env").map(|env| resolver.choose_env(env)?.env()).transpose()?;
     let space = env.as_ref().map(|env| &env.spec().variation_space);
-    let expand = |tables: &[super::file::Table]| -> Result<Vec<Variant>> {
-        Ok(tables.iter().map(|table| table.variants(space)).collect::<Result<Vec<_>>>()?.concat())
+    let mut budget = Budget::default();
+    let mut expand = |tables: &[Table]| -> Result<Vec<Variant>> {
+        let mut variants = vec![];
+        for table in tables {
+            variants.extend(table.variants(space, &mut budget)?);
+            if variants.len() > Study::MAX_CELLS {
+                let fix = format!("give at most {} cells", Study::MAX_CELLS);
+                return Err(Error::config(table.at.clone(), "the tables up to this one make too many cells", fix));
+            }
+        }
+        Ok(variants)
     };
     let (starts, conditions, policies) = (expand(&file.starts)?, expand(&file.conditions)?, expand(&file.policies)?);
-    let defaults = defaults.variants(space)?;
+    let defaults = expand(std::slice::from_ref(&defaults))?;
     let sizes = [&defaults, &starts, &conditions, &policies].map(Vec::len);
     let cells = sizes.into_iter().fold(1, usize::saturating_mul);
     if cells > Study::MAX_CELLS {
         let problem =
             format!("{} defaults x {} starts x {} conditions x {} policies", sizes[0], sizes[1], sizes[2], sizes[3]);
         return Err(Error::config("the study", problem, format!("give at most {} cells", Study::MAX_CELLS)));
+    }
+    for variants in [&defaults, &starts, &conditions, &policies] {
+        let bytes: usize = variants.iter().map(Variant::size).sum();
+        budget.take(bytes.saturating_mul(cells / variants.len().max(1)), "the study")?;
     }
     let mut combinations = Vec::with_capacity(cells);
     for defaults in defaults {
@@ -114,7 +140,7 @@ fn request(all: &Variant, condition: &str, policy: &str, resolver: &HomeResolver
         let line = text.lines().next().unwrap_or_default().trim_start_matches("error: ").to_owned();
         Error::config("options", line, "the options are those of `swm eval`")
     })?;
-    let mut request = args.request(resolver)?;
+    let mut request = args.request(resolver, CapsuleStarts::Ignore)?;
     let [only] = &mut request.policies[..] else {
         let problem = format!("its options make {} policies", request.policies.len());
         return Err(Error::config("the policy", problem, "give one policy and one solver; `each` makes several"));

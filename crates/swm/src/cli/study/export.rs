@@ -1,7 +1,8 @@
 //! Tables of a study as CSV, LaTeX and Markdown.
 
 use clap::ValueEnum;
-use swm_core::results::{StudyResults, StudyRow};
+use std::collections::BTreeMap;
+use swm_core::results::{OverSeeds, StudyResults, StudyRow, Verdict};
 use swm_core::text::printable;
 
 /// The format of a table.
@@ -56,6 +57,10 @@ fn csv(results: &StudyResults) -> String {
         "gap_low",
         "gap_high",
         "p",
+        "p_holm",
+        "design_effect",
+        "comparisons",
+        "verdict",
     ]);
     let mut text = header.iter().map(|name| quote(name)).collect::<Vec<_>>().join(",") + "\n";
     for row in &results.rows {
@@ -66,8 +71,11 @@ fn csv(results: &StudyResults) -> String {
         cells.extend([success.successes.to_string(), success.n.to_string()]);
         cells.extend([success.rate, success.low, success.high].map(|share| share.to_string()));
         cells.extend([row.solved_at_start.to_string(), row.floor.rate.to_string()]);
-        let gap = row.gap.as_ref().map(|gap| [gap.difference, gap.low, gap.high, gap.p].map(|value| value.to_string()));
-        cells.extend(gap.unwrap_or_default());
+        cells.extend(row.gap.as_ref().map_or(Default::default(), |gap| {
+            let numbers = [gap.difference, gap.low, gap.high, gap.p, gap.p_holm, gap.design_effect];
+            let [difference, low, high, p, p_holm, effect] = numbers.map(|value| value.to_string());
+            [difference, low, high, p, p_holm, effect, gap.comparisons.to_string(), gap.verdict.to_string()]
+        }));
         text += &(cells.iter().map(|cell| quote(cell)).collect::<Vec<_>>().join(",") + "\n");
     }
     text
@@ -79,53 +87,100 @@ struct Pivot<'a> {
     /// The names of the rows.
     conditions: Vec<String>,
     policies: Vec<&'a str>,
+    /// The first row of each name and policy, by their positions.
+    cells: BTreeMap<(usize, usize), &'a StudyRow>,
 }
 
-/// The name of a row: the condition, and what else differs between the cells of the study.
-fn name(row: &StudyRow, results: &StudyResults) -> String {
-    let differs = |of: &dyn Fn(&StudyRow) -> String| results.rows.iter().any(|other| of(other) != of(row));
-    let mut name = row.condition.clone();
-    if differs(&|row| row.starts.clone()) {
-        name += &format!(" ({})", row.starts);
-    }
-    if differs(&|row| row.counting.name().to_owned()) {
-        name += &format!(", {}", row.counting.name());
-    }
-    if differs(&|row| row.seed.to_string()) {
-        name += &format!(", seed {}", row.seed);
-    }
-    name
+/// The names of all rows: the condition, and what else differs between the cells of the study.
+fn names(results: &StudyResults) -> Vec<String> {
+    let rows = &results.rows;
+    let differs = |of: fn(&StudyRow) -> String| {
+        let first = rows.first().map(of);
+        rows.iter().any(|row| Some(of(row)) != first)
+    };
+    let by_starts = differs(|row| row.starts.clone());
+    let by_counting = differs(|row| row.counting.name().to_owned());
+    let by_seed = differs(|row| row.seed.to_string());
+    let name = |row: &StudyRow| {
+        let mut name = row.condition.clone();
+        if by_starts {
+            name += &format!(" ({})", row.starts);
+        }
+        if by_counting {
+            name += &format!(", {}", row.counting.name());
+        }
+        if by_seed {
+            name += &format!(", seed {}", row.seed);
+        }
+        name
+    };
+    rows.iter().map(name).collect()
 }
 
 impl<'a> Pivot<'a> {
     fn new(results: &'a StudyResults) -> Self {
-        let (mut conditions, mut policies) = (vec![], vec![]);
-        for row in &results.rows {
-            let name = name(row, results);
-            if !conditions.contains(&name) {
+        let (mut conditions, mut policies, mut cells) = (vec![], vec![], BTreeMap::new());
+        let (mut known_conditions, mut known_policies) = (BTreeMap::new(), BTreeMap::new());
+        for (row, name) in results.rows.iter().zip(names(results)) {
+            let condition = *known_conditions.entry(name.clone()).or_insert_with(|| {
                 conditions.push(name);
-            }
-            if !policies.contains(&row.policy.as_str()) {
+                conditions.len() - 1
+            });
+            let policy = *known_policies.entry(row.policy.as_str()).or_insert_with(|| {
                 policies.push(row.policy.as_str());
-            }
+                policies.len() - 1
+            });
+            cells.entry((condition, policy)).or_insert(row);
         }
-        Self { results, conditions, policies }
+        Self { results, conditions, policies, cells }
     }
 
-    /// The success rate of a cell with its interval, in percent.
-    fn cell(&self, condition: &str, policy: &str) -> String {
-        let row = self.results.rows.iter().find(|row| row.policy == policy && name(row, self.results) == condition);
-        row.map_or("–".to_owned(), |row| {
+    /// The success rate of a cell with its interval, in percent, and the mark of its verdict.
+    fn cell(&self, condition: usize, policy: usize) -> String {
+        self.cells.get(&(condition, policy)).map_or("–".to_owned(), |row| {
             let [rate, low, high] = [row.success.rate, row.success.low, row.success.high].map(|share| 100.0 * share);
-            format!("{rate:.1} [{low:.0}, {high:.0}]")
+            let mark = match row.gap.map(|gap| gap.verdict) {
+                Some(Verdict::Lower) => " ↓",
+                Some(Verdict::Higher) => " ↑",
+                Some(Verdict::TooFew) => " ?",
+                Some(Verdict::NotToldApart) | None => "",
+            };
+            format!("{rate:.1} [{low:.0}, {high:.0}]{mark}")
         })
     }
 
-    fn rows(&self) -> impl Iterator<Item = Vec<String>> + '_ {
-        self.conditions.iter().map(|condition| {
-            let cells = self.policies.iter().map(|policy| self.cell(condition, policy));
-            std::iter::once(condition.clone()).chain(cells).collect()
-        })
+    /// What the marks mean, and what the families of comparisons can show.
+    fn notes(&self) -> Vec<String> {
+        let mut notes = vec![];
+        if !self.results.families.is_empty() {
+            notes.push(
+                "↓ lower, ↑ higher than the first condition on the same starts; unmarked: not told apart; ?: too few \
+                 starts differ to tell any difference. Paired score test, corrected for the comparisons of a family."
+                    .to_owned(),
+            );
+        }
+        notes.extend(self.results.families.iter().map(|family| format!("{}: {family}.", family.name)));
+        notes
+    }
+
+    /// The rows of the table over training seeds, the header first; empty if no policy has several.
+    fn over_seeds(&self) -> Vec<Vec<String>> {
+        let header = ["condition", "policy", "training seeds", "mean success, %", "new seed [95 %]", "IQM [95 %]"];
+        let rows = over_seeds(self.results);
+        if rows.is_empty() {
+            return vec![];
+        }
+        std::iter::once(header.map(str::to_owned).to_vec()).chain(rows).collect()
+    }
+
+    /// The rows of the table, the header first.
+    fn rows(&self) -> Vec<Vec<String>> {
+        let header = std::iter::once("success, % [95 %]").chain(self.policies.iter().copied()).map(str::to_owned);
+        let row = |(condition, name): (usize, &String)| {
+            let cells = (0..self.policies.len()).map(|policy| self.cell(condition, policy));
+            std::iter::once(name.clone()).chain(cells).collect()
+        };
+        std::iter::once(header.collect()).chain(self.conditions.iter().enumerate().map(row)).collect()
     }
 
     fn markdown(&self) -> String {
@@ -133,53 +188,108 @@ impl<'a> Pivot<'a> {
         let line = |cells: &[String]| {
             format!("| {} |\n", cells.iter().map(|cell| escape(cell)).collect::<Vec<_>>().join(" | "))
         };
-        let header: Vec<String> =
-            std::iter::once("success, % [95 %]").chain(self.policies.iter().copied()).map(str::to_owned).collect();
-        let rule: Vec<String> = header.iter().map(|_| "---".to_owned()).collect();
-        line(&header) + &line(&rule) + &self.rows().map(|row| line(&row)).collect::<String>()
+        let table = |rows: &[Vec<String>]| {
+            let [header, rest @ ..] = rows else { return String::new() };
+            let rule = vec!["---".to_owned(); header.len()];
+            line(header) + &line(&rule) + &rest.iter().map(|row| line(row)).collect::<String>()
+        };
+        let mut parts = vec![table(&self.rows())];
+        parts.extend(self.notes().iter().map(|note| format!("{}\n", escape(note))));
+        parts.push(table(&self.over_seeds()));
+        parts.retain(|part| !part.is_empty());
+        parts.join("\n")
     }
 
     fn latex(&self) -> String {
-        let escape = |cell: &str| {
-            let cell = printable(cell);
-            let escaped = cell.chars().map(|c| match c {
-                '&' | '%' | '$' | '#' | '_' | '{' | '}' => format!("\\{c}"),
-                '\\' => "\\textbackslash{}".to_owned(),
-                '~' => "\\textasciitilde{}".to_owned(),
-                '^' => "\\textasciicircum{}".to_owned(),
-                '–' => "--".to_owned(),
-                '\n' => " ".to_owned(),
-                c => c.to_string(),
-            });
-            escaped.collect::<String>()
+        let table = |rows: &[Vec<String>]| {
+            let line = |cells: &Vec<String>| {
+                format!("    {} \\\\\n", cells.iter().map(|cell| latex(cell)).collect::<Vec<_>>().join(" & "))
+            };
+            let [header, rest @ ..] = rows else { return String::new() };
+            format!(
+                "\\begin{{tabular}}{{l{}}}\n    \\toprule\n{}    \\midrule\n{}    \\bottomrule\n\\end{{tabular}}\n",
+                "c".repeat(header.len() - 1),
+                line(header),
+                rest.iter().map(line).collect::<String>(),
+            )
         };
-        let line = |cells: Vec<String>| {
-            format!("    {} \\\\\n", cells.iter().map(|cell| escape(cell)).collect::<Vec<_>>().join(" & "))
-        };
-        let header =
-            std::iter::once("success, % [95 %]").chain(self.policies.iter().copied()).map(str::to_owned).collect();
-        format!(
-            "\\begin{{tabular}}{{l{}}}\n    \\toprule\n{}    \\midrule\n{}    \\bottomrule\n\\end{{tabular}}\n",
-            "c".repeat(self.policies.len()),
-            line(header),
-            self.rows().map(line).collect::<String>(),
-        )
+        let notes = self.notes().iter().map(|note| format!("\n{}\n", latex(note))).collect::<String>();
+        let over_seeds = table(&self.over_seeds());
+        let gap = if over_seeds.is_empty() { "" } else { "\n" };
+        table(&self.rows()) + &notes + gap + &over_seeds
     }
+}
+
+/// Escapes a text for LaTeX.
+fn latex(text: &str) -> String {
+    let escape = |c| match c {
+        '&' | '%' | '$' | '#' | '_' | '{' | '}' => format!("\\{c}"),
+        '\\' => "\\textbackslash{}".to_owned(),
+        '~' => "\\textasciitilde{}".to_owned(),
+        '^' => "\\textasciicircum{}".to_owned(),
+        '–' => "--".to_owned(),
+        '↓' => "$\\downarrow$".to_owned(),
+        '↑' => "$\\uparrow$".to_owned(),
+        '·' => "$\\cdot$".to_owned(),
+        '\n' => " ".to_owned(),
+        c => c.to_string(),
+    };
+    printable(text).chars().map(escape).collect()
+}
+
+/// The rows over training seeds: condition, policy, the rate of each seed, mean, interval of a new seed, interquartile
+/// mean. Rates are in percent.
+pub fn over_seeds(results: &StudyResults) -> Vec<Vec<String>> {
+    let several = |of: &dyn Fn(&OverSeeds) -> String| {
+        results.over_seeds.first().is_some_and(|first| results.over_seeds.iter().any(|row| of(row) != of(first)))
+    };
+    let by_starts = several(&|row| row.starts.clone());
+    let (by_counting, by_seed) = (several(&|row| row.counting.to_string()), several(&|row| row.seed.to_string()));
+    let row = |row: &OverSeeds| {
+        let mut condition = row.condition.clone().unwrap_or_else(|| "all shifted conditions".to_owned());
+        if by_starts {
+            condition += &format!(" ({})", row.starts);
+        }
+        if by_counting {
+            condition += &format!(", {}", row.counting);
+        }
+        if by_seed {
+            condition += &format!(", seed {}", row.seed);
+        }
+        let scores = row.scores.iter().map(|(seed, rate)| format!("{seed}: {:.0}", 100.0 * rate));
+        let [low, high] = row.new_seed.map(|rate| 100.0 * rate);
+        vec![
+            condition,
+            row.policy.clone(),
+            scores.collect::<Vec<_>>().join(", "),
+            format!("{:.1}", 100.0 * row.mean),
+            format!("[{low:.0}, {high:.0}]"),
+            row.interquartile.map_or("–".to_owned(), |iqm| {
+                let [mean, low, high] = [iqm.mean, iqm.low, iqm.high].map(|rate| 100.0 * rate);
+                format!("{mean:.1} [{low:.0}, {high:.0}]")
+            }),
+        ]
+    };
+    results.over_seeds.iter().map(row).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::collections::BTreeMap;
-    use swm_core::results::{Counting, Paired, Proportion};
+    use std::time::{Duration, Instant};
+    use swm_core::results::{Counting, Family, Paired, Proportion, TRAINING_SEED};
 
     fn results() -> StudyResults {
-        let row = |condition: &str, successes: usize, gap: Option<Paired>| StudyRow {
+        let row = |policy: &str, condition: &str, successes: usize, gap: Option<Paired>| StudyRow {
             cell: "00".to_owned(),
             starts: "test".to_owned(),
             condition: condition.to_owned(),
-            variables: BTreeMap::from([("count".to_owned(), "2".to_owned())]),
-            policy: "LeWM_1".to_owned(),
+            variables: BTreeMap::from([
+                ("count".to_owned(), "2".to_owned()),
+                (TRAINING_SEED.to_owned(), policy.trim_start_matches("LeWM_").to_owned()),
+            ]),
+            policy: policy.to_owned(),
+            any_seed: Some("LeWM_*".to_owned()),
             counting: Counting::default(),
             seed: 0,
             success: Proportion::wilson(successes, 10),
@@ -187,25 +297,63 @@ mod tests {
             floor: Proportion::wilson(0, 10),
             gap,
         };
-        let rows = vec![row("plain", 9, None), row("red, 50 %", 4, Some(Paired::of(4, 0, 5, 1)))];
-        StudyResults { title: "t".to_owned(), question: "q?".to_owned(), hash: "h".to_owned(), cells: 2, done: 2, rows }
+        let mut gap = Paired::of(4, 0, 5, 1);
+        let families = Vec::from_iter(Family::correct("LeWM_1 · seed 0", &mut [&mut gap], 1));
+        let rows = vec![
+            row("LeWM_1", "plain", 9, None),
+            row("LeWM_1", "red, 50 %", 4, Some(gap)),
+            row("LeWM_2", "plain", 7, None),
+        ];
+        let over_seeds = OverSeeds::all(&rows, "plain");
+        let [title, question, hash] = ["t", "q?", "h"].map(str::to_owned);
+        StudyResults { title, question, hash, cells: 4, done: 3, rows, families, over_seeds }
+    }
+
+    #[test]
+    fn tables_of_the_largest_study_take_little_time() {
+        let small = results();
+        let rows = (0..10_000_u64).map(|index| StudyRow {
+            condition: format!("condition {}", index / 2),
+            policy: format!("policy {}", index % 2),
+            seed: index % 3,
+            ..small.rows[0].clone()
+        });
+        // The first of two rows of a cell is shown.
+        let second = StudyRow { success: Proportion::wilson(1, 10), ..small.rows[0].clone() };
+        let second = StudyRow { condition: "condition 0".to_owned(), policy: "policy 0".to_owned(), ..second };
+        let results = StudyResults { rows: rows.chain([second]).collect(), ..small };
+        let start = Instant::now();
+        for format in [Format::Csv, Format::Latex, Format::Markdown] {
+            let table = format.write(&results);
+            assert!(table.lines().count() >= 10_000 && table.contains("condition 4999"), "{}", table.len());
+        }
+        let markdown = Format::Markdown.write(&results);
+        assert!(markdown.contains("| condition 0, seed 0 | 90.0 [60, 98] | – |\n"), "a row of the first cells");
+        assert!(start.elapsed() < Duration::from_secs(10), "{:?}", start.elapsed());
     }
 
     #[test]
     fn tables_escape_what_their_formats_reserve() {
         let results = results();
         let csv = Format::Csv.write(&results);
-        assert_eq!(csv.lines().count(), 3);
+        assert_eq!(csv.lines().count(), 4);
+        assert!(csv.lines().nth(2).is_some_and(|line| line.ends_with(",1,lower")), "{csv}");
         assert!(
             csv.lines().nth(2).is_some_and(|line| line.contains("\"red, 50 %\"") && line.contains(",0.4,")),
             "{csv}"
         );
         let latex = Format::Latex.write(&results);
         assert!(
-            latex.contains("LeWM\\_1") && latex.contains("red, 50 \\%") && latex.contains("40.0 [17, 69]"),
+            latex.contains("LeWM\\_1")
+                && latex.contains("red, 50 \\%")
+                && latex.contains("40.0 [17, 69] $\\downarrow$"),
             "{latex}"
         );
         let markdown = Format::Markdown.write(&results);
-        assert_eq!(markdown.lines().nth(2), Some("| plain | 90.0 [60, 98] |"));
+        assert_eq!(markdown.lines().nth(2), Some("| plain | 90.0 [60, 98] | 70.0 [40, 89] |"));
+        assert!(markdown.contains("\n| red, 50 % | 40.0 [17, 69] ↓ | – |\n\n↓ lower, "), "{markdown}");
+        assert!(markdown.contains("LeWM_1 · seed 0: 1 comparison of 10 pairs tells a difference of "), "{markdown}");
+        assert!(markdown.ends_with("| plain | LeWM_* | 1: 90, 2: 70 | 80.0 | [0, 100] | – |\n"), "{markdown}");
+        assert!(latex.contains("LeWM\\_1 $\\cdot$ seed 0") && latex.ends_with("\\end{tabular}\n"), "{latex}");
     }
 }

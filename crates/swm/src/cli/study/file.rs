@@ -1,12 +1,12 @@
 //! The file of a study: tables of options of `swm eval`, each of which may stand for several variants.
 
-use super::colour;
+use super::published;
 use crate::cli::eval::EvalArgs;
 use clap::{ArgAction, Args as _, Command};
 use std::collections::BTreeMap;
 use std::path::Path;
-use swm_core::{Error, Result, VariationSpace};
-use swm_eval::Study;
+use swm_core::{Error, Result};
+use swm_eval::{Common, Published};
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
@@ -17,6 +17,8 @@ pub struct StudyFile {
     pub title: String,
     /// The question that the study asks.
     pub question: String,
+    /// What the comparisons of a family have in common.
+    pub families: Vec<Common>,
     /// The options of all evaluations.
     pub defaults: Table,
     /// The sources of starts; one without options if the file names none.
@@ -25,6 +27,8 @@ pub struct StudyFile {
     pub conditions: Vec<Table>,
     /// The policies.
     pub policies: Vec<Table>,
+    /// Success rates that publications state.
+    pub published: Vec<Published>,
 }
 
 /// A table of options.
@@ -35,14 +39,14 @@ pub struct Table {
     /// The name; may contain variables.
     pub name: String,
     /// The values of every option, by the name of the option without its dashes.
-    options: BTreeMap<String, Vec<String>>,
+    pub(super) options: BTreeMap<String, Vec<String>>,
     /// The variables and their values, in alphabetical order.
-    each: Vec<(String, Values)>,
+    pub(super) each: Vec<(String, Values)>,
 }
 
 /// The values of a variable.
 #[derive(Clone, Debug)]
-enum Values {
+pub(super) enum Values {
     /// These values.
     List(Vec<String>),
     /// The factors of variation of the environment.
@@ -56,6 +60,8 @@ pub struct Variant {
     pub at: String,
     /// The name.
     pub name: String,
+    /// The name with `*` for the training seed, if there is this variable.
+    pub any_seed: Option<String>,
     /// The values of every option.
     pub options: BTreeMap<String, Vec<String>>,
     /// The values of the variables.
@@ -69,7 +75,7 @@ pub const POLICY: &str = "policy";
 const RUN_OPTIONS: &[&str] = &["output", "videos", "trace", "trust", "envs", "help"];
 
 /// The tables of a file.
-const TABLES: &[&str] = &["title", "question", "defaults", "starts", "condition", "policy"];
+const TABLES: &[&str] = &["title", "question", "families", "defaults", "starts", "condition", "policy", "published"];
 
 impl StudyFile {
     /// Parses a file; `path` is named in errors.
@@ -87,10 +93,12 @@ impl StudyFile {
             Self {
                 title: String::new(),
                 question: String::new(),
+                families: Common::by_default(),
                 defaults: Table::default(),
                 starts: vec![],
                 conditions: vec![],
                 policies: vec![],
+                published: vec![],
             },
             None,
         );
@@ -98,10 +106,12 @@ impl StudyFile {
             match key.get_ref().as_ref() {
                 "title" => title = Some(source.text_of(value)?),
                 "question" => file.question = source.text_of(value)?,
+                "families" => file.families = source.families(value)?,
                 "defaults" => file.defaults = source.table(value, false)?,
                 "starts" => file.starts = source.tables(value)?,
                 "condition" => file.conditions = source.tables(value)?,
                 "policy" => file.policies = source.tables(value)?,
+                "published" => file.published = published::read(&source, value)?,
                 other => {
                     let what = Error::unknown("table", other, TABLES.iter().copied(), "docs/studies.md lists them");
                     return Err(Error::config(source.at(key.span().start), what.to_string(), "correct the file"));
@@ -124,7 +134,7 @@ impl StudyFile {
 }
 
 /// The text of a file, for positions in errors, and the options of `swm eval`.
-struct Source<'a> {
+pub(super) struct Source<'a> {
     text: &'a str,
     /// The path; `None` for a setting of the command line.
     path: Option<&'a Path>,
@@ -137,17 +147,17 @@ impl Source<'_> {
     }
 
     /// The file and line of a byte, or the setting.
-    fn at(&self, byte: usize) -> String {
+    pub(super) fn at(&self, byte: usize) -> String {
         let Some(path) = self.path else { return self.text.to_owned() };
         let line = 1 + self.text.as_bytes().iter().take(byte).filter(|byte| **byte == b'\n').count();
         format!("{}:{line}", path.display())
     }
 
-    fn invalid(&self, value: &Spanned<DeValue<'_>>, problem: &str, fix: &str) -> Error {
+    pub(super) fn invalid(&self, value: &Spanned<DeValue<'_>>, problem: &str, fix: &str) -> Error {
         Error::config(self.at(value.span().start), problem, fix)
     }
 
-    fn text_of(&self, value: &Spanned<DeValue<'_>>) -> Result<String> {
+    pub(super) fn text_of(&self, value: &Spanned<DeValue<'_>>) -> Result<String> {
         match value.get_ref() {
             DeValue::String(text) => Ok(text.to_string()),
             DeValue::Integer(number) => Ok(number.to_string()),
@@ -162,6 +172,19 @@ impl Source<'_> {
             DeValue::Array(values) => values.iter().map(|value| self.text_of(value)).collect(),
             _ => Ok(vec![self.text_of(value)?]),
         }
+    }
+
+    /// A list of what the comparisons of a family have in common; an empty list makes one family of all.
+    fn families(&self, value: &Spanned<DeValue<'_>>) -> Result<Vec<Common>> {
+        let common = |name: &String| {
+            let found = Common::ALL.iter().find(|(known, _)| known == name).map(|(_, common)| *common);
+            found.ok_or_else(|| {
+                let names = Common::ALL.iter().map(|(name, _)| *name);
+                let problem = Error::unknown("part of a family", name, names, "docs/studies.md describes them");
+                self.invalid(value, &problem.to_string(), "correct the file")
+            })
+        };
+        self.list(value)?.iter().map(common).collect()
     }
 
     fn tables(&self, value: &Spanned<DeValue<'_>>) -> Result<Vec<Table>> {
@@ -278,58 +301,6 @@ impl Table {
     pub fn option(&self, key: &str) -> Option<&str> {
         self.options.get(key).and_then(|values| values.first()).map(String::as_str)
     }
-
-    /// Returns the table with every combination of the values of its variables; the last variable changes fastest.
-    ///
-    /// # Errors
-    /// When a variable has no values, there are more than [`Study::MAX_CELLS`] combinations, or a colour is malformed.
-    pub fn variants(&self, factors: Option<&VariationSpace>) -> Result<Vec<Variant>> {
-        let mut combinations: Vec<BTreeMap<String, String>> = vec![BTreeMap::new()];
-        for (name, values) in &self.each {
-            let values: Vec<String> = match values {
-                Values::List(values) => values.clone(),
-                Values::Factors => {
-                    let space = factors.ok_or_else(|| {
-                        Error::config(self.at.clone(), "no environment has these factors", "name one: env = \"…\"")
-                    })?;
-                    space.factors().iter().map(|factor| factor.key.clone()).collect()
-                }
-            };
-            if values.is_empty() {
-                return Err(Error::config(format!("{}: {name}", self.at), "has no values", "give at least one"));
-            }
-            if combinations.len().saturating_mul(values.len()) > Study::MAX_CELLS {
-                let (problem, fix) = ("the variables have too many combinations", "give fewer values");
-                return Err(Error::config(self.at.clone(), problem, format!("{fix}: at most {}", Study::MAX_CELLS)));
-            }
-            let extended = |known: &BTreeMap<String, String>| {
-                let known = known.clone();
-                let with = |value: &String| {
-                    let mut all = known.clone();
-                    all.insert(name.clone(), value.clone());
-                    all
-                };
-                values.iter().map(with).collect::<Vec<_>>()
-            };
-            combinations = combinations.iter().flat_map(extended).collect();
-        }
-        combinations.into_iter().map(|variables| self.variant(variables)).collect()
-    }
-
-    fn variant(&self, variables: BTreeMap<String, String>) -> Result<Variant> {
-        let fill = |text: &String| {
-            variables.iter().fold(text.clone(), |text, (name, value)| text.replace(&format!("{{{name}}}"), value))
-        };
-        let mut options = BTreeMap::new();
-        for (key, values) in &self.options {
-            let filled = values.iter().map(|value| {
-                let value = fill(value);
-                if key == "pin" { colour::resolve(&value, &self.at) } else { Ok(value) }
-            });
-            options.insert(key.clone(), filled.collect::<Result<Vec<String>>>()?);
-        }
-        Ok(Variant { at: self.at.clone(), name: fill(&self.name), options, variables })
-    }
 }
 
 impl Variant {
@@ -343,15 +314,21 @@ impl Variant {
         all
     }
 
-    /// The arguments of `swm eval`, the program's name first.
+    /// The arguments of `swm eval`, the program's name first. A policy that looks like an option follows `--`.
     pub fn arguments(&self) -> Vec<String> {
         let mut arguments = vec!["eval".to_owned()];
-        arguments.extend(self.options.get(POLICY).into_iter().flatten().cloned());
+        let policies = || self.options.get(POLICY).into_iter().flatten();
+        let is_option = policies().any(|policy| policy.starts_with('-'));
+        arguments.extend(policies().filter(|_| !is_option).cloned());
         for (key, values) in self.options.iter().filter(|(key, _)| *key != POLICY) {
             if values.is_empty() {
                 arguments.push(format!("--{key}"));
             }
             arguments.extend(values.iter().map(|value| format!("--{key}={value}")));
+        }
+        if is_option {
+            arguments.push("--".to_owned());
+            arguments.extend(policies().cloned());
         }
         arguments
     }

@@ -4,12 +4,15 @@ mod colour;
 mod expand;
 mod export;
 mod file;
+mod published;
+mod report;
 mod shipped;
+mod variants;
 
 use super::config::count;
 use super::eval::run_options;
 use super::progress::control;
-use super::results_tables::percent;
+use super::results_tables::{compared, percent};
 use super::{Context, emit, emit_json, table};
 use crate::resolver::HomeResolver;
 use clap::{Args, Subcommand};
@@ -44,6 +47,12 @@ enum StudyCommand {
         /// The folder of the study
         folder: PathBuf,
     },
+    /// Write one HTML page, with figures and tables beside it
+    ///
+    /// The page shows what is done, so it can be written while the study runs. Figures are SVG and PNG files in the folder
+    /// `figures`; the table is written as CSV, LaTeX and Markdown.
+    #[command(after_help = "Example: swm study report factors --output page")]
+    Report(report::ReportArgs),
     /// Print the results as CSV, LaTeX or Markdown
     #[command(after_help = "Example: swm study export factors --format latex")]
     Export {
@@ -88,6 +97,7 @@ pub fn study(args: &StudyArgs, json: bool, context: impl FnOnce() -> swm_core::R
             let folder = StudyFolder::new(folder);
             show(&folder.study()?.results(&folder)?, json)
         }
+        StudyCommand::Report(args) => report::report(args, json),
         StudyCommand::Export { folder, format } => {
             let folder = StudyFolder::new(folder);
             emit(&format.write(&folder.study()?.results(&folder)?));
@@ -123,7 +133,8 @@ fn run(args: &RunArgs, context: &Context) -> anyhow::Result<()> {
         return Ok(());
     }
     let Some(output) = &args.output else { return Ok(()) };
-    let study: Study = expand::study(&file, &args.settings, &resolver, &mut control(context))?;
+    let mut study: Study = expand::study(&file, &args.settings, &resolver, &mut control(context))?;
+    study.arguments = std::iter::once(shipped::short_name(&args.study)).chain(args.settings.iter().cloned()).collect();
     let folder = StudyFolder::new(output);
     let _lock = folder.create(&study)?;
     study.run(&folder, &resolver, &run_options(args.envs, None, context), &mut control(context))?;
@@ -149,13 +160,10 @@ fn show(results: &StudyResults, json: bool) -> anyhow::Result<()> {
     ];
     let shown: Vec<_> = optional.into_iter().filter(|(_, of)| several(*of)).collect();
     let mut header: Vec<&str> = shown.iter().map(|(name, _)| *name).collect();
-    header.extend(["condition", "policy", "success [95 %]", "n", "floor", "gap [95 %]", "p"]);
+    header.extend(["condition", "policy", "success [95 %]", "n", "floor", "gap [95 %]", "p, corrected", "verdict"]);
     let rows = results.rows.iter().map(|row| {
         let mut cells: Vec<String> = shown.iter().map(|(_, of)| of(row)).collect();
-        let (gap, p) = row.gap.as_ref().map_or(("–".to_owned(), "–".to_owned()), |gap| {
-            let [difference, low, high] = [gap.difference, gap.low, gap.high].map(|share| 100.0 * share);
-            (format!("{difference:+.0} % [{low:+.0}, {high:+.0}]"), format!("{:.4}", gap.p))
-        });
+        let gap = row.gap.as_ref().map_or(["–"; 3].map(str::to_owned), compared);
         let floor = format!("{:.0} %", 100.0 * row.floor.rate);
         cells.extend([
             row.condition.clone(),
@@ -163,11 +171,18 @@ fn show(results: &StudyResults, json: bool) -> anyhow::Result<()> {
             percent(&row.success),
             row.success.n.to_string(),
             floor,
-            gap,
-            p,
         ]);
+        cells.extend(gap);
         cells
     });
     emit(&table(&header, rows));
+    for family in &results.families {
+        emit(&format!("{}: {family}\n", family.name));
+    }
+    let over_seeds = export::over_seeds(results);
+    if !over_seeds.is_empty() {
+        let header = ["condition", "policy", "training seeds, %", "mean", "new seed [95 %]", "IQM [95 %]"];
+        emit(&format!("\n{}", table(&header, over_seeds.into_iter())));
+    }
     Ok(())
 }

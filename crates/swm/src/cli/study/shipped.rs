@@ -9,6 +9,7 @@ const STUDIES: &[(&str, &str)] = &[
     ("paper/factors", include_str!("../../../studies/paper/factors.toml")),
     ("paper/distractors", include_str!("../../../studies/paper/distractors.toml")),
     ("paper/colour-wheel", include_str!("../../../studies/paper/colour-wheel.toml")),
+    ("two-room/colour-wheel", include_str!("../../../studies/two-room/colour-wheel.toml")),
 ];
 
 /// The largest file of a study, in bytes.
@@ -51,6 +52,14 @@ pub fn find(given: &str, trust: bool) -> Result<(StudyFile, Origin)> {
     let text = String::from_utf8(bytes)
         .map_err(|error| Error::corrupt(given, format!("is not UTF-8 ({error})"), "give a TOML file"))?;
     Ok((StudyFile::parse(&text, Path::new(given))?, Origin::file(given, trust)))
+}
+
+/// The name of a study of this program, or the name of a file without its folders, which belong to one computer.
+pub fn short_name(given: &str) -> String {
+    if STUDIES.iter().any(|(name, _)| *name == given) {
+        return given.to_owned();
+    }
+    Path::new(given).file_name().map_or_else(|| given.to_owned(), |name| name.to_string_lossy().into_owned())
 }
 
 #[cfg(test)]

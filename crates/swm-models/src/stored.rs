@@ -1,0 +1,276 @@
+//! [`StoredCheckpoint`]: the parts of a checkpoint of any family, read from the folder of a run or from a capsule.
+
+use crate::capsule::Capsule;
+use crate::nn::Init;
+use crate::nn::parameters::{self, HostTensor, Named};
+use crate::run_folder::{CONFIG, FOLDER, MANIFEST, OPTIMIZER, PLAYED, RAW, WEIGHTS, WORLD_MODEL};
+use crate::train::limits;
+use crate::{tensor_file, weights};
+use burn::module::Module;
+use burn::tensor::Device;
+use serde::de::DeserializeOwned;
+use serde_json::Value;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+use swm_core::{Error, Manifest, Result, files, manifest};
+
+/// The parts of a checkpoint of any family.
+#[derive(Clone, Debug)]
+pub struct StoredCheckpoint {
+    /// The run folder, or the capsule.
+    run: PathBuf,
+    /// The file that holds the configuration: `config.json` of a folder, or the capsule.
+    path: PathBuf,
+    /// Family, configuration and statistics of the dataset: the content of `config.json`.
+    file: Value,
+    manifest: Manifest,
+    weights: Weights,
+}
+
+/// The weights of a stored checkpoint.
+#[derive(Clone, Debug)]
+enum Weights {
+    /// A file in the folder of the checkpoint.
+    File(PathBuf),
+    /// The weights of a capsule.
+    Loaded(Named<HostTensor>),
+}
+
+impl StoredCheckpoint {
+    /// Reads the checkpoint of a run folder (or the checkpoint folder itself), or a capsule. The weights of a folder are
+    /// read when they are needed.
+    ///
+    /// # Errors
+    /// When there is no checkpoint at `run`, or it is damaged.
+    pub fn read(run: &Path) -> Result<Self> {
+        if run.is_file() {
+            return Ok(Self::of(run, &Capsule::read(run)?));
+        }
+        let folder = locate(run).ok_or_else(|| missing(run))?;
+        let path = folder.join(CONFIG);
+        let file = serde_json::from_slice(&read_text(&path)?).map_err(|error| broken(&path, error.to_string()))?;
+        let manifest = read_manifest(&folder)?;
+        let weights = Weights::File(folder.join(WEIGHTS));
+        Ok(Self { run: run.to_owned(), path, file, manifest, weights })
+    }
+
+    /// Returns the checkpoint in a capsule; `path` names the capsule in errors.
+    pub fn of(path: &Path, capsule: &Capsule) -> Self {
+        Self {
+            run: path.to_owned(),
+            path: path.to_owned(),
+            file: capsule.checkpoint.clone(),
+            manifest: capsule.manifest.clone(),
+            weights: Weights::Loaded(capsule.weights.clone()),
+        }
+    }
+
+    /// Returns this checkpoint with another manifest and other weights.
+    pub(crate) fn with(&self, manifest: Manifest, weights: Named<HostTensor>) -> Self {
+        Self { manifest, weights: Weights::Loaded(weights), ..self.clone() }
+    }
+
+    /// Returns the run folder, or the path of the capsule.
+    pub fn run(&self) -> &Path {
+        &self.run
+    }
+
+    /// Returns the id of the model's family, or `unknown`.
+    pub fn family(&self) -> &str {
+        self.file.get("family").and_then(Value::as_str).unwrap_or("unknown")
+    }
+
+    /// Returns the provenance of the checkpoint.
+    pub fn manifest(&self) -> &Manifest {
+        &self.manifest
+    }
+
+    /// Returns the content of `config.json`.
+    pub(crate) fn content(&self) -> &Value {
+        &self.file
+    }
+
+    /// Returns the folder of the checkpoint's files; `None` for a capsule.
+    pub(crate) fn folder(&self) -> Option<&Path> {
+        match &self.weights {
+            Weights::File(path) => path.parent(),
+            Weights::Loaded(_) => None,
+        }
+    }
+
+    /// Returns whether the run folder of the checkpoint holds the checkpoint of a world model, too.
+    pub(crate) fn has_world_model(&self) -> bool {
+        locate(&self.run.join(WORLD_MODEL)).is_some()
+    }
+
+    /// Returns the content of `config.json` as a typed value.
+    ///
+    /// # Errors
+    /// When a field is missing or has another type.
+    pub(crate) fn parsed<T: DeserializeOwned>(&self) -> Result<T> {
+        serde_json::from_value(self.file.clone()).map_err(|error| self.broken(error.to_string()))
+    }
+
+    /// Returns the configuration of a checkpoint of the family `family`.
+    ///
+    /// # Errors
+    /// When the checkpoint is of another family, or the configuration is damaged.
+    pub(crate) fn config<C: DeserializeOwned>(&self, family: &str) -> Result<C> {
+        if self.family() != family {
+            return Err(Error::corrupt(
+                &self.path,
+                format!("it holds a model of the family '{}'", self.family()),
+                format!("give a checkpoint of the family '{family}'"),
+            ));
+        }
+        let config = self.file.get("config").cloned().unwrap_or_default();
+        serde_json::from_value(config).map_err(|error| self.broken(error.to_string()))
+    }
+
+    /// Returns the weights, after checking their hash if the manifest has one.
+    ///
+    /// # Errors
+    /// When the file is damaged, is not the file of the hash, or holds values that are not finite.
+    pub fn weights(&self) -> Result<Named<HostTensor>> {
+        match &self.weights {
+            Weights::File(path) => read_tensors(path, self.manifest.hashes.get("weights")),
+            Weights::Loaded(weights) => Ok(weights.clone()),
+        }
+    }
+
+    /// Creates a model, which may be little larger than the weights, and loads the weights into it.
+    ///
+    /// # Errors
+    /// As [`StoredCheckpoint::weights`], and when the names or shapes of the weights differ from the model's.
+    pub(crate) fn model<M: Module>(&self, create: impl FnOnce(&Init) -> Result<M>, device: &Device) -> Result<M> {
+        let weights = self.weights()?;
+        let path = match &self.weights {
+            Weights::File(path) => path,
+            Weights::Loaded(_) => &self.path,
+        };
+        let init = Init::for_weights(&weights, device);
+        let model = create(&init)?;
+        init.check().map_err(|_| broken(path, format!("{CONFIG} describes a larger model than these weights")))?;
+        with_weights(model, &weights, path)
+    }
+
+    /// Returns the error for damage in the configuration.
+    pub(crate) fn broken(&self, problem: String) -> Error {
+        broken(&self.path, problem)
+    }
+}
+
+/// Returns the family of the model at `run`; `None` if there is no checkpoint.
+pub fn family(run: &Path) -> Option<String> {
+    let file: Value = match run.is_file() {
+        true => StoredCheckpoint::read(run).ok()?.file,
+        false => serde_json::from_slice(&read_text(&locate(run)?.join(CONFIG)).ok()?).ok()?,
+    };
+    Some(file.get("family")?.as_str()?.to_owned())
+}
+
+/// Checks that a folder has no entry with a name of a checkpoint or of a training run, whatever its content, so that a
+/// checkpoint written there replaces nothing.
+///
+/// # Errors
+/// When there is such an entry, or the folder cannot be listed. A missing folder is not an error.
+pub fn check_unused(run: &Path) -> Result<()> {
+    let io = |error| Error::io(run, "listing the folder", error);
+    let entries = match std::fs::read_dir(run) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
+        entries => entries.map_err(io)?,
+    };
+    let mut names = vec![];
+    for entry in entries {
+        names.push(entry.map_err(io)?.file_name().to_string_lossy().into_owned());
+    }
+    names.sort();
+    let is_used = |name: &&String| {
+        let fixed = [CONFIG, FOLDER, "checkpoint.new", "checkpoint.old", "train.jsonl", "best", WORLD_MODEL];
+        fixed.contains(&name.as_str()) || name.starts_with(PLAYED) || is_event_file(name)
+    };
+    let Some(name) = names.iter().find(is_used) else { return Ok(()) };
+    let problem = format!("holds a checkpoint already, or files with such names: '{name}' exists");
+    let fix = "choose another folder, or `swm checkpoints remove` a checkpoint";
+    Err(Error::config(run.display().to_string(), problem, fix))
+}
+
+/// Returns whether a file name is that of a TensorBoard event file of this program.
+pub(crate) fn is_event_file(name: &str) -> bool {
+    name.starts_with("events.out.tfevents.") && name.ends_with(".swm")
+}
+
+/// Returns the faults of a checkpoint that loading does not find: files of tensors without a hash in the manifest, and
+/// a training state whose hash differs. A capsule has none, because loading it checks all hashes.
+///
+/// # Errors
+/// When there is no checkpoint, or a file cannot be read.
+pub fn faults(run: &Path) -> Result<Vec<String>> {
+    if run.is_file() {
+        return Ok(vec![]);
+    }
+    let folder = locate(run).ok_or_else(|| missing(run))?;
+    let manifest = read_manifest(&folder)?;
+    let mut faults = vec![];
+    for (name, file) in [("weights", WEIGHTS), ("optimizer", OPTIMIZER), ("raw", RAW)] {
+        let path = folder.join(file);
+        match manifest.hashes.get(name) {
+            Some(hash) if *hash != manifest::hash(&files::read(&path, u64::MAX)?) => {
+                faults.push(format!("{file} is not the file that {MANIFEST} describes: its hash differs"));
+            }
+            None if path.exists() => faults.push(format!("{MANIFEST} holds no hash of {file}")),
+            _ => {}
+        }
+    }
+    let world_model = run.join(WORLD_MODEL);
+    if locate(&world_model).is_some() {
+        faults.extend(self::faults(&world_model)?.into_iter().map(|fault| format!("{WORLD_MODEL}: {fault}")));
+    }
+    Ok(faults)
+}
+
+/// Replaces the weights of a model by those of the file `path`.
+pub(crate) fn with_weights<M: Module>(model: M, weights: &Named<HostTensor>, path: &Path) -> Result<M> {
+    match weights::mismatch(&parameters::shapes(&model), weights, CONFIG) {
+        Some(problem) => Err(broken(path, problem)),
+        None => Ok(parameters::load(model, weights)),
+    }
+}
+
+/// Returns the folder of a run's checkpoint: `run`, the folder `checkpoint` in `run`, or the old checkpoint, which
+/// remains if a process was killed between the two renamings.
+pub(crate) fn locate(run: &Path) -> Option<PathBuf> {
+    [run.to_owned(), run.join(FOLDER), run.join(format!("{FOLDER}.old"))]
+        .into_iter()
+        .find(|folder| folder.join(CONFIG).is_file())
+}
+
+/// Reads a JSON file of a checkpoint.
+pub(crate) fn read_text(path: &Path) -> Result<Vec<u8>> {
+    files::read(path, limits::JSON_BYTES)
+}
+
+/// Reads the tensors of a file of a checkpoint, after checking the hash of the file if `hash` is given.
+pub(crate) fn read_tensors(path: &Path, hash: Option<&String>) -> Result<Named<HostTensor>> {
+    let bytes = files::read(path, u64::MAX)?;
+    let tensors = tensor_file::decode(&bytes).map_err(|problem| broken(path, problem))?;
+    if hash.is_some_and(|hash| *hash != manifest::hash(&bytes)) {
+        return Err(broken(path, format!("is not the file that {MANIFEST} describes: the hash differs")));
+    }
+    Ok(tensors)
+}
+
+/// Returns the error for a damaged file of a checkpoint.
+pub(crate) fn broken(path: &Path, problem: String) -> Error {
+    Error::corrupt(path, problem, "train again, or copy the checkpoint again from its source")
+}
+
+/// Returns the error for a path without a checkpoint.
+pub(crate) fn missing(run: &Path) -> Error {
+    Error::corrupt(run, "there is no checkpoint", "give the folder that `swm train` wrote to, or a capsule")
+}
+
+fn read_manifest(folder: &Path) -> Result<Manifest> {
+    let path = folder.join(MANIFEST);
+    serde_json::from_slice(&read_text(&path)?).map_err(|error| broken(&path, error.to_string()))
+}

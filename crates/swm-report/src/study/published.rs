@@ -1,0 +1,84 @@
+//! Published values beside ours.
+
+use super::sheet::Sheet;
+use super::{Published, table};
+use crate::limits;
+use crate::text::{escape, percent, points, shorten};
+use std::fmt::Write as _;
+use swm_core::results::Counting;
+
+/// Writes the table of published values; nothing if there are none.
+pub(super) fn write(html: &mut String, sheets: &[Sheet<'_>], published: &[Published]) {
+    if published.is_empty() {
+        return;
+    }
+    // Ours are those of the first sheet: a publication has no other starts or seeds.
+    let sheet = sheets.first();
+    let condition = |value: &Published| sheet?.conditions.iter().position(|name| *name == value.condition);
+    let policy = |value: &Published| sheet?.policies.iter().position(|policy| policy.name == value.policy);
+    let last = |index: Option<usize>| index.unwrap_or(usize::MAX);
+    let mut values: Vec<&Published> = published.iter().take(limits::PUBLISHED).collect();
+    values.sort_by_key(|value| (last(condition(value)), last(policy(value))));
+    let countings = sheet.map_or(&[][..], |sheet| &sheet.countings);
+    head(html, countings);
+    let mut sources: Vec<&str> = vec![];
+    for value in values {
+        let source = sources.iter().position(|source| *source == value.source).unwrap_or_else(|| {
+            sources.push(&value.source);
+            sources.len() - 1
+        });
+        let rate = if (0.0..=1.0).contains(&value.rate) { percent(value.rate) } else { "–".to_owned() };
+        let _ = write!(
+            html,
+            "<tr><th scope=\"row\">{}</th><td>{}</td><td class=\"n\">{rate} [{}]</td>",
+            shown(&value.condition),
+            shown(&value.policy),
+            source + 1
+        );
+        for counting in 0..countings.len() {
+            let row = condition(value).zip(policy(value));
+            let row = row.and_then(|(condition, policy)| sheet?.row(condition, policy, counting));
+            let _ = match row {
+                None => write!(html, "<td class=\"n\"><span class=\"quiet\">not run</span></td><td></td>"),
+                Some(row) => {
+                    let difference = row.success.rate - value.rate;
+                    let difference = if difference.abs() <= 1.0 { points(difference) } else { "–".to_owned() };
+                    write!(html, "<td class=\"n\">{}</td><td class=\"n\">{difference}</td>", table::rate(&row.success))
+                }
+            };
+        }
+        html.push_str("</tr>\n");
+    }
+    html.push_str("</tbody>\n</table>\n</div>\n<ol class=\"sources\">\n");
+    for source in sources {
+        let _ = writeln!(html, "<li>{}</li>", shown(source));
+    }
+    html.push_str("</ol>\n");
+    if published.len() > limits::PUBLISHED {
+        let _ = writeln!(html, "<p class=\"note\">{} more are left out.</p>", published.len() - limits::PUBLISHED);
+    }
+    html.push_str("</section>\n");
+}
+
+/// Writes the start of the section and the head of its table.
+fn head(html: &mut String, countings: &[Counting]) {
+    html.push_str(
+        "<section>\n<h2>Beside published values</h2>\n<p class=\"note\">Published values are those of the named source, \
+         from weights and starts of its own. They have no intervals, so a difference shows how near the values are, and is no \
+         test.</p>\n<div class=\"wide study\" role=\"region\" aria-label=\"Published values\" \
+         tabindex=\"0\">\n<table>\n<thead>\n<tr>\
+         <th scope=\"col\">Condition</th><th scope=\"col\">Policy</th><th scope=\"col\" class=\"n\">Published</th>",
+    );
+    for counting in countings {
+        let name = if countings.len() > 1 { format!(", {}", counting.name()) } else { String::new() };
+        let _ = write!(
+            html,
+            "<th scope=\"col\" class=\"n\">Ours{name}</th><th scope=\"col\" class=\"n\">Difference{name}</th>"
+        );
+    }
+    html.push_str("</tr>\n</thead>\n<tbody>\n");
+}
+
+fn shown(name: &str) -> String {
+    escape(&shorten(name, limits::STUDY_NAME_CHARS))
+}

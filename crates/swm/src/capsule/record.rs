@@ -1,0 +1,263 @@
+//! [`EvaluationRecord`]: an evaluation of the model in a capsule, and the outcomes of some of its episodes.
+
+use super::MODEL;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::Path;
+use swm_core::results::{Counting, EpisodeResult, Proportion, Run};
+use swm_core::{Error, Result, Results, limits};
+use swm_eval::{EvalRequest, Model, PolicyKind, PolicyRequest, Recorded, StartsRequest};
+use swm_models::capsule::Evaluation;
+
+/// The number of recorded episodes that are chosen from the results of an evaluation.
+const EPISODES: usize = 3;
+/// The most recorded episodes of a capsule.
+const MAX_EPISODES: usize = 16;
+/// The largest budget of a recorded episode, in steps.
+const MAX_BUDGET: usize = 10_000;
+/// The most model steps of a plan. The paper's plans have 45,000.
+const MAX_PLAN: usize = 10_000_000;
+
+/// An evaluation of the model in a capsule.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct EvaluationRecord {
+    /// The request, with one policy and one condition. The name of the model is `capsule`.
+    pub request: EvalRequest,
+    /// The hash of the evaluated weights: those of the capsule, or those that were rounded to pack it.
+    pub weights: String,
+    /// The hashes of the starts, the goals and the dataset.
+    pub hashes: BTreeMap<String, String>,
+    /// The successes of the model, and the episodes that count.
+    pub success: [usize; 2],
+    /// The same for the random-policy floor.
+    pub floor: Option<[usize; 2]>,
+    /// The recorded episodes.
+    pub episodes: Vec<RecordedEpisode>,
+}
+
+/// The outcome of an episode.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RecordedEpisode {
+    /// The number of the episode in the evaluation.
+    pub number: usize,
+    /// Whether the episode succeeded.
+    pub success: bool,
+    /// Whether the episode was solved at start.
+    pub solved_at_start: bool,
+    /// The number of steps played.
+    pub steps: usize,
+    /// The dataset's `[episode, step]` of the start, if the starts come from a dataset.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub start: Option<[usize; 2]>,
+}
+
+impl RecordedEpisode {
+    /// Returns the outcome of the episode with this number.
+    pub(super) fn of(number: usize, result: &EpisodeResult) -> Self {
+        let EpisodeResult { success, solved_at_start, steps, start, .. } = *result;
+        Self { number, success, solved_at_start, steps, start }
+    }
+
+    /// Describes the outcome.
+    pub(super) fn outcome(&self) -> String {
+        let outcome = match (self.solved_at_start, self.success) {
+            (true, _) => "solved at start",
+            (_, true) => "solved",
+            _ => "not solved",
+        };
+        format!("{outcome} after {} steps", self.steps)
+    }
+}
+
+impl EvaluationRecord {
+    /// Finds the evaluation of the model with one of these hashes in results. Returns the record, without episodes, and
+    /// the numbers of the episodes to record: two that the model solved and one that it did not, if there are such.
+    ///
+    /// # Errors
+    /// When the results hold no run, or several runs, of the model, or were not counted strictly.
+    pub(super) fn find(file: &Path, results: &Results, hashes: &[&str]) -> Result<(Self, Vec<usize>)> {
+        let wrong = |problem: String| {
+            let fix = "evaluate this checkpoint alone with strict counting (`swm eval`), and give its results.json";
+            Error::config(file.display().to_string(), problem, fix)
+        };
+        let (manifest, request) = (&results.manifest, EvalRequest::of(&results.manifest)?);
+        let Counting::Strict { .. } = request.counting else {
+            return Err(wrong(format!("its counting is {}", request.counting.name())));
+        };
+        let weights = |policy: &PolicyRequest| {
+            let hash =
+                manifest.hashes.get(&format!("weights of {}", policy.name)).or(manifest.hashes.get("weights"))?;
+            (trained(&policy.kind).is_some() && hashes.contains(&hash.as_str())).then(|| hash.clone())
+        };
+        let found: Vec<(&PolicyRequest, String)> =
+            request.policies.iter().filter_map(|policy| Some((policy, weights(policy)?))).collect();
+        let [(policy, weights)] = &found[..] else {
+            return Err(wrong(format!("{} of its policies have the weights of this checkpoint", found.len())));
+        };
+        let (Some(condition), Some(kind)) = (request.conditions.first(), with_model(&policy.kind, MODEL)) else {
+            return Err(wrong("its request has no condition".to_owned()));
+        };
+        let is_run = |run: &&Run, policy: &PolicyRequest| run.policy == policy.name && run.condition == condition.name;
+        let run = results.runs.iter().find(|run| is_run(run, policy));
+        let run = run.ok_or_else(|| wrong(format!("it has no run of '{}'", policy.name)))?;
+        let is_floor = |policy: &&PolicyRequest| policy.kind == PolicyKind::Random;
+        let floor = request.policies.iter().find(is_floor);
+        let floor = floor.and_then(|floor| results.runs.iter().find(|run| is_run(run, floor)));
+        let counts = |run: &Run| [run.success.successes, run.success.n];
+        let kept = ["starts", "goals", "dataset"];
+        let record = Self {
+            weights: weights.clone(),
+            hashes: manifest.hashes.clone().into_iter().filter(|(name, _)| kept.contains(&name.as_str())).collect(),
+            success: counts(run),
+            floor: floor.map(counts),
+            episodes: vec![],
+            request: EvalRequest {
+                policies: vec![PolicyRequest { name: MODEL.to_owned(), kind }],
+                conditions: vec![condition.clone()],
+                prediction: None,
+                ..request.clone()
+            },
+        };
+        Ok((record, choose(run)))
+    }
+
+    /// Reads and checks the record of a capsule.
+    ///
+    /// # Errors
+    /// When the record is damaged, its request names another model, or its episodes do not fit the tensors.
+    pub fn read(evaluation: &Evaluation) -> Result<Self> {
+        let again = "copy the capsule again from its source, or pack it again";
+        let wrong = |problem: String| Error::config("the evaluation in the capsule", problem, again);
+        let record = Self::deserialize(&evaluation.record).map_err(|error| wrong(error.to_string()))?;
+        let Self { request, episodes, .. } = &record;
+        if request.version != EvalRequest::VERSION {
+            return Err(wrong(format!("its request has layout {}", request.version)));
+        }
+        request.check()?;
+        let ([PolicyRequest { kind, .. }], [_]) = (&request.policies[..], &request.conditions[..]) else {
+            let given = format!("{} policies and {} conditions", request.policies.len(), request.conditions.len());
+            return Err(wrong(format!("it has {given} instead of one of each")));
+        };
+        if trained(kind) != Some(MODEL) {
+            return Err(wrong("its policy is not the model of the capsule".to_owned()));
+        }
+        let budget = request.budget.unwrap_or_default();
+        if episodes.len() > MAX_EPISODES || budget > MAX_BUDGET {
+            let given = format!("{} episodes of {budget} steps", episodes.len());
+            return Err(wrong(format!("it has {given}, more than {MAX_EPISODES} of {MAX_BUDGET}")));
+        }
+        if plan(kind) > MAX_PLAN {
+            return Err(wrong(format!("a plan of its policy has {} model steps, more than {MAX_PLAN}", plan(kind))));
+        }
+        let rows = evaluation.rows.as_ref().map_or(0, swm_core::Batch::rows);
+        let expected = if request.starts == StartsRequest::Episodic { 0 } else { 2 * episodes.len() };
+        if evaluation.starts.rows() != episodes.len() || rows != expected {
+            let given = format!("{} starts and {rows} rows", evaluation.starts.rows());
+            return Err(wrong(format!("it has {given} for {} episodes", episodes.len())));
+        }
+        if [Some(record.success), record.floor].into_iter().flatten().any(|[successes, n]| successes > n) {
+            return Err(wrong("it has more successes than episodes".to_owned()));
+        }
+        Ok(record)
+    }
+
+    /// Returns the policy of the evaluation, with the checkpoint `name`.
+    pub fn policy(&self, name: &str) -> Option<PolicyKind> {
+        self.request.policies.first().and_then(|policy| with_model(&policy.kind, name))
+    }
+
+    /// Returns the success rate of the model.
+    pub fn success(&self) -> Proportion {
+        let [successes, n] = self.success;
+        Proportion::wilson(successes, n)
+    }
+
+    /// Returns the success rate of the random-policy floor.
+    pub fn floor(&self) -> Option<Proportion> {
+        self.floor.map(|[successes, n]| Proportion::wilson(successes, n))
+    }
+
+    /// Returns the numbers of the recorded episodes, and the dataset's `[episode, step]` of their starts.
+    pub(super) fn numbers(&self) -> (Vec<usize>, Vec<[usize; 2]>) {
+        let numbers = self.episodes.iter().map(|episode| episode.number).collect();
+        (numbers, self.episodes.iter().filter_map(|episode| episode.start).collect())
+    }
+
+    /// Returns the recorded episodes, to be played again.
+    pub(super) fn recorded<'a>(
+        evaluation: &'a Evaluation,
+        numbers: &'a [usize],
+        starts: &'a [[usize; 2]],
+    ) -> Recorded<'a> {
+        Recorded { numbers, rows: evaluation.rows.as_ref().map(|rows| (rows, starts)) }
+    }
+}
+
+/// Chooses the numbers of the episodes to record.
+fn choose(run: &Run) -> Vec<usize> {
+    let played = |success: bool| {
+        let episodes = run.episodes.iter().enumerate();
+        episodes.filter(move |(_, episode)| !episode.solved_at_start && episode.success == success).map(|(i, _)| i)
+    };
+    let (solved, failed): (Vec<usize>, Vec<usize>) = (played(true).collect(), played(false).collect());
+    let failures = failed.len().min(if solved.len() < EPISODES - 1 { EPISODES - solved.len() } else { 1 });
+    let mut numbers: Vec<usize> = solved.into_iter().take(EPISODES - failures).collect();
+    numbers.extend(failed.into_iter().take(failures));
+    numbers.sort_unstable();
+    numbers
+}
+
+/// Returns the name of the checkpoint that a policy uses.
+fn trained(kind: &PolicyKind) -> Option<&str> {
+    match kind {
+        PolicyKind::Plan { model: Model::Checkpoint(name), .. } | PolicyKind::Direct { checkpoint: name, .. } => {
+            Some(name)
+        }
+        _ => None,
+    }
+}
+
+/// Returns the number of model steps of a plan, as far as the settings state its factors; 1 for other policies.
+fn plan(kind: &PolicyKind) -> usize {
+    let PolicyKind::Plan { solver, mpc, .. } = kind else { return 1 };
+    let count = |settings: &serde_json::Value, name: &str| {
+        settings
+            .get(name)
+            .and_then(serde_json::Value::as_u64)
+            .map_or(1, |count| usize::try_from(count).unwrap_or(usize::MAX))
+    };
+    let of_solver =
+        ["samples", "iterations", "outer_iterations", "sync_iterations"].map(|name| count(&solver.settings, name));
+    limits::product(of_solver.into_iter().chain([count(mpc, "horizon")]))
+}
+
+/// Returns the policy with another checkpoint; `None` if it uses no checkpoint.
+fn with_model(kind: &PolicyKind, name: &str) -> Option<PolicyKind> {
+    match kind.clone() {
+        PolicyKind::Plan { model: Model::Checkpoint(_), solver, mpc, objective } => {
+            Some(PolicyKind::Plan { model: Model::Checkpoint(name.to_owned()), solver, mpc, objective })
+        }
+        PolicyKind::Direct { settings, .. } => Some(PolicyKind::Direct { checkpoint: name.to_owned(), settings }),
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+    use swm_eval::Choice;
+
+    #[test]
+    fn model_steps_of_a_plan_are_counted_without_overflow() {
+        let kind = |settings: serde_json::Value, horizon: u64| PolicyKind::Plan {
+            model: Model::Checkpoint(MODEL.to_owned()),
+            solver: Choice { id: "cem".to_owned(), settings },
+            mpc: json!({"horizon": horizon}),
+            objective: serde_json::Value::Null,
+        };
+        assert_eq!(plan(&kind(json!({"samples": 300, "iterations": 30}), 5)), 45_000);
+        assert_eq!(plan(&kind(json!({"samples": 1000}), 5)), 5000);
+        assert!(plan(&kind(json!({"samples": u64::MAX, "iterations": u64::MAX}), 10_000)) > MAX_PLAN);
+    }
+}

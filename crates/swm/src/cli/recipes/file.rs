@@ -1,0 +1,324 @@
+//! [`Recipe`]: the steps from collecting to evaluating, as a TOML file.
+//!
+//! A step is a table of options of `swm collect`, `swm train` or `swm eval`, without their dashes. `name` names its output;
+//! options of later steps refer to it. `hash` is the expected hash of a dataset or of weights.
+
+use crate::cli::train::TrainArgs;
+use clap::{Args, Parser};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use swm_core::{Error, Origin, Result, manifest};
+use swm_envs::wrappers;
+use toml::{Table, Value};
+
+/// The largest recipe, in bytes.
+pub const MAX_BYTES: u64 = 1 << 20;
+
+/// The largest number of steps of a recipe.
+const MAX_STEPS: usize = 1000;
+
+/// The steps from collecting to evaluating.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+pub struct Recipe {
+    /// What the recipe makes, in a sentence.
+    pub summary: String,
+    /// The processor on which the hashes were recorded: the weights of another one differ in their last bits.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub recorded_on: Option<String>,
+    /// The datasets.
+    #[serde(default)]
+    pub collect: Vec<Step>,
+    /// The checkpoints.
+    #[serde(default)]
+    pub train: Vec<Step>,
+    /// The evaluations.
+    #[serde(default)]
+    pub eval: Vec<Step>,
+}
+
+/// A step of a recipe.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Step {
+    /// The name of the output, in the folder of the run.
+    pub name: String,
+    /// The expected hash of the dataset or the weights.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub hash: Option<String>,
+    /// Settings of the training.
+    #[serde(default, skip_serializing_if = "Table::is_empty")]
+    pub settings: Table,
+    /// Arguments and options of the command.
+    #[serde(flatten)]
+    pub options: BTreeMap<String, Value>,
+}
+
+/// The command of a step.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    Collect,
+    Train,
+    Eval,
+}
+
+/// Options that a recipe may not set: the run sets them, or they are the user's to give.
+const RESERVED: &[&str] =
+    &["output", "resume", "overwrite", "shard", "format", "trust", "recipe", "print-config", "mix-renderers"];
+
+/// Options whose values may be names of earlier steps.
+const REFERENCES: &[&str] = &["data", "dataset", "encoder", "policies", "policy"];
+
+impl Kind {
+    /// The name of the command and of its tables.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Collect => "collect",
+            Self::Train => "train",
+            Self::Eval => "eval",
+        }
+    }
+
+    /// The key of the command's positional argument.
+    fn positional(self) -> &'static str {
+        match self {
+            Self::Collect => "env",
+            Self::Train => "model",
+            Self::Eval => "policies",
+        }
+    }
+
+    /// The path of the output of a step in the folder of the run.
+    pub fn output(self, folder: &Path, name: &str) -> PathBuf {
+        folder.join(if self == Self::Collect { format!("{name}.lance") } else { name.to_owned() })
+    }
+}
+
+impl Step {
+    /// Checks what becomes a positional argument: a second text, or a `=` in a key, would be another setting.
+    fn check_texts(&self, kind: Kind) -> std::result::Result<(), String> {
+        let key = kind.positional();
+        if kind != Kind::Eval && self.options.get(key).is_some_and(|value| !value.is_str()) {
+            return Err(format!("has a '{key}' that is not one text"));
+        }
+        let is_plain =
+            |key: &str| !key.is_empty() && key.chars().all(|c| c.is_ascii_alphanumeric() || "_.".contains(c));
+        match flat(&self.settings).into_iter().find(|(key, _)| !is_plain(key)) {
+            Some((key, _)) => {
+                Err(format!("has the setting '{key}': its name has other characters than letters, digits, _ and ."))
+            }
+            None => Ok(()),
+        }
+    }
+}
+
+impl Recipe {
+    /// Reads a recipe. `what` names it in errors.
+    ///
+    /// # Errors
+    /// When the text is not a recipe, a name is used twice or is not a plain file name, or an option is reserved.
+    pub fn parse(what: &str, text: &str) -> Result<Self> {
+        let invalid =
+            |problem: String| Error::config(format!("recipe {what}"), problem, "docs/zoo.md describes recipes");
+        let recipe: Self = toml::from_str(text).map_err(|error| invalid(error.to_string()))?;
+        let count = recipe.steps().count();
+        if count > MAX_STEPS {
+            return Err(invalid(format!("it has {count} steps, and at most {MAX_STEPS} are allowed")));
+        }
+        let mut names = vec![];
+        for (kind, step) in recipe.steps() {
+            let name = step.name.as_str();
+            let is_plain = name.starts_with(|c: char| c.is_ascii_alphanumeric())
+                && name.chars().all(|c| c.is_ascii_alphanumeric() || "-_".contains(c));
+            if !is_plain || name.len() > 64 {
+                return Err(invalid(format!("the name '{name}' has other characters than letters, digits, - and _")));
+            }
+            if names.contains(&name) {
+                return Err(invalid(format!("two steps have the name '{name}'")));
+            }
+            names.push(name);
+            let is_option = |key: &str| key.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-');
+            if let Some(key) = step.options.keys().find(|key| !is_option(key)) {
+                return Err(invalid(format!("[[{}]] '{name}' has '{key}', which is no option", kind.name())));
+            }
+            if let Some(key) = step.options.keys().find(|key| RESERVED.contains(&key.as_str())) {
+                return Err(invalid(format!("[[{}]] '{name}' sets '{key}', which a recipe may not", kind.name())));
+            }
+            if kind != Kind::Train && !step.settings.is_empty() {
+                return Err(invalid(format!("[[{}]] '{name}' has settings, which only [[train]] has", kind.name())));
+            }
+            step.check_texts(kind).map_err(|problem| invalid(format!("[[{}]] '{name}' {problem}", kind.name())))?;
+        }
+        Ok(recipe)
+    }
+
+    /// Returns the steps in the order in which they run.
+    pub fn steps(&self) -> impl Iterator<Item = (Kind, &Step)> {
+        fn of(kind: Kind, steps: &[Step]) -> impl Iterator<Item = (Kind, &Step)> {
+            steps.iter().map(move |step| (kind, step))
+        }
+        of(Kind::Collect, &self.collect).chain(of(Kind::Train, &self.train)).chain(of(Kind::Eval, &self.eval))
+    }
+
+    /// Changes an option or a setting: `STEP.OPTION=VALUE`, such as `rooms.episodes=20` or `lewm.optim.lr=3e-4`.
+    ///
+    /// # Errors
+    /// When there is no such step, or the text has another form.
+    pub fn set(&mut self, text: &str) -> Result<()> {
+        let wrong = |problem: String| {
+            Error::config(format!("setting {text}"), problem, "write STEP.OPTION=VALUE, such as rooms.episodes=20")
+        };
+        let (name, key, value) = text
+            .split_once('=')
+            .and_then(|(key, value)| key.split_once('.').map(|(name, key)| (name, key, value)))
+            .ok_or_else(|| wrong("it has another form".to_owned()))?;
+        let names: Vec<String> = self.steps().map(|(_, step)| step.name.clone()).collect();
+        let trains = self.train.iter().any(|step| step.name == name);
+        let is_option = |key: &str| {
+            let command = TrainArgs::augment_args(clap::Command::new("train"));
+            key == "model" || command.get_arguments().any(|argument| argument.get_long() == Some(key))
+        };
+        let mut all = self.collect.iter_mut().chain(&mut self.train).chain(&mut self.eval);
+        let Some(step) = all.find(|step| step.name == name) else {
+            let known = names.iter().map(String::as_str);
+            let hint = format!("its steps are {}", names.join(", "));
+            return Err(Error::unknown("step of the recipe", name, known, hint));
+        };
+        if RESERVED.contains(&key) {
+            return Err(wrong(format!("a recipe may not set '{key}'")));
+        }
+        let value = toml::from_str::<Table>(&format!("value = {value}"))
+            .ok()
+            .and_then(|mut table| table.remove("value"))
+            .unwrap_or_else(|| Value::String(value.to_owned()));
+        match trains && !is_option(key) {
+            true => {
+                remove_dotted(&mut step.settings, key);
+                step.settings.insert(key.to_owned(), value);
+            }
+            false => drop(step.options.insert(key.to_owned(), value)),
+        }
+        Ok(())
+    }
+
+    /// Returns the hash that identifies the recipe with its settings; expected hashes do not change it.
+    ///
+    /// # Errors
+    /// Never for a recipe that was parsed.
+    pub fn request_hash(&self) -> Result<String> {
+        let mut request = self.clone();
+        let steps = request.collect.iter_mut().chain(&mut request.train).chain(&mut request.eval);
+        steps.for_each(|step| step.hash = None);
+        let without = Self { recorded_on: None, summary: String::new(), ..request };
+        let text = serde_json::to_string(&without).map_err(|error| Error::external("writing a recipe", error))?;
+        Ok(manifest::hash(text.as_bytes()))
+    }
+
+    /// Checks the names in the recipe that load code, read files or open connections. Pretrained weights are checked in
+    /// the complete configuration of a training, because a preset may name them.
+    ///
+    /// # Errors
+    /// When a file chose such a name.
+    pub fn check_origin(&self, origin: &Origin) -> Result<()> {
+        for (_, step) in self.steps() {
+            for (key, value) in &step.options {
+                for text in texts(value) {
+                    if key == "env" {
+                        crate::env(&text, origin)?;
+                    } else if key == "wrapper" && wrappers::read(&text)?.0.reads_files() {
+                        origin.check_user(&format!("the wrapper '{text}'"), "which reads files", None)?;
+                    } else if key == "preset" && !is_preset_name(&text) {
+                        origin.check_user(&format!("the preset '{text}'"), "which is a file", None)?;
+                    } else if text.contains("://") {
+                        origin.check_user(&format!("'{text}'"), "which opens a network connection", None)?;
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Returns the arguments of a step's command, after the program and the command. Names of steps become paths in
+    /// `folder`.
+    pub fn arguments(&self, kind: Kind, step: &Step, folder: &Path) -> Vec<String> {
+        let resolve = |key: &str, text: String| match self.steps().find(|(_, other)| other.name == text) {
+            Some((kind, other)) if REFERENCES.contains(&key) => kind.output(folder, &other.name).display().to_string(),
+            _ => text,
+        };
+        let values =
+            |key: &str, value: &Value| texts(value).into_iter().map(|text| resolve(key, text)).collect::<Vec<_>>();
+        let mut arguments = vec![format!("--output={}", kind.output(folder, &step.name).display())];
+        for (key, value) in step.options.iter().filter(|(key, _)| *key != kind.positional()) {
+            match value {
+                Value::Boolean(true) => arguments.push(format!("--{key}")),
+                Value::Boolean(false) => {}
+                _ => arguments.extend(values(key, value).into_iter().map(|text| format!("--{key}={text}"))),
+            }
+        }
+        // No text after `--` is an option.
+        arguments.push("--".to_owned());
+        if let Some(value) = step.options.get(kind.positional()) {
+            arguments.extend(values(kind.positional(), value));
+        }
+        arguments.extend(flat(&step.settings).into_iter().map(|(key, value)| format!("{key}={value}")));
+        arguments
+    }
+}
+
+/// Parses the arguments of a step as the command line does.
+///
+/// # Errors
+/// When the command has no such option, or refuses a value.
+pub fn parse<T: Args>(kind: Kind, step: &Step, arguments: &[String]) -> Result<T> {
+    #[derive(Parser)]
+    struct Command<T: Args> {
+        #[command(flatten)]
+        arguments: T,
+    }
+    let words = std::iter::once(kind.name()).chain(arguments.iter().map(String::as_str));
+    Command::<T>::try_parse_from(words).map(|command| command.arguments).map_err(|error| {
+        let text = error.to_string();
+        let lines: Vec<&str> = text.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
+        let problem =
+            lines.iter().take_while(|line| !line.starts_with("Usage")).copied().collect::<Vec<_>>().join("; ");
+        let what = format!("[[{}]] '{}' of the recipe", kind.name(), step.name);
+        Error::config(what, problem, format!("`swm {} --help` lists the options", kind.name()))
+    })
+}
+
+/// Returns the texts of a value: the elements of an array, or one text.
+fn texts(value: &Value) -> Vec<String> {
+    match value {
+        Value::Array(values) => values.iter().flat_map(texts).collect(),
+        Value::String(text) => vec![text.clone()],
+        other => vec![other.to_string()],
+    }
+}
+
+/// Returns whether a text can be the name of a preset, and no path: names have no dots and no slashes.
+fn is_preset_name(text: &str) -> bool {
+    text.chars().all(|c| c.is_ascii_alphanumeric() || "-_".contains(c))
+}
+
+/// Returns the settings of nested tables under dotted keys.
+fn flat(table: &Table) -> Vec<(String, String)> {
+    table
+        .iter()
+        .flat_map(|(key, value)| match value {
+            Value::Table(inner) => {
+                flat(inner).into_iter().map(|(below, text)| (format!("{key}.{below}"), text)).collect()
+            }
+            other => vec![(key.clone(), other.to_string())],
+        })
+        .collect()
+}
+
+/// Removes the setting with a dotted key from nested tables.
+fn remove_dotted(table: &mut Table, key: &str) {
+    table.remove(key);
+    if let Some((first, rest)) = key.split_once('.')
+        && let Some(Value::Table(inner)) = table.get_mut(first)
+    {
+        remove_dotted(inner, rest);
+    }
+}

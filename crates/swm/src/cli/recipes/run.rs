@@ -1,0 +1,290 @@
+//! Running a recipe: every step whose output is missing, then a comparison of the hashes.
+
+use super::file::{Kind, Recipe, Step, parse};
+use super::text;
+use crate::capsule;
+use crate::cli::collect::{self, CollectArgs};
+use crate::cli::eval::{self, EvalArgs};
+use crate::cli::train::{self, TrainArgs, log_of};
+use crate::cli::{Context, emit, emit_json, eprint, output_folder};
+use crate::home;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use swm_core::{Error, Origin, Result, files};
+use swm_models::{StoredCheckpoint, checkpoint};
+use swm_report::ReportOptions;
+
+/// What `swm train --recipe` runs.
+pub struct RecipeRun<'a> {
+    /// The recipe: a name, or the path of a TOML file.
+    pub recipe: &'a str,
+    /// The folder of all outputs.
+    pub output: &'a Path,
+    /// Changes of options and settings.
+    pub settings: Vec<&'a str>,
+    /// Whether a recipe from a file may choose any name.
+    pub trust: bool,
+}
+
+/// The file in the folder of a run that records the finished steps.
+const STATE: &str = "recipe.json";
+
+/// The record of a run.
+#[derive(Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct State {
+    /// The name of the recipe.
+    recipe: String,
+    /// The hash of the recipe with its settings.
+    request: String,
+    /// The changes of options and settings.
+    settings: Vec<String>,
+    /// The processor.
+    processor: String,
+    /// The hash of the output of each finished step; empty for an evaluation.
+    finished: BTreeMap<String, String>,
+}
+
+/// The comparison of a hash with the one in the recipe.
+#[derive(Serialize)]
+struct Compared<'a> {
+    name: &'a str,
+    hash: &'a str,
+    /// The hash in the recipe; `None` if it has none, or if settings were changed.
+    expected: Option<&'a str>,
+}
+
+/// Runs the steps of a recipe whose outputs are missing, and writes a page.
+pub fn run(request: &RecipeRun<'_>, context: &Context) -> anyhow::Result<()> {
+    if request.output.to_string_lossy().contains("://") {
+        let fix = "give a local folder; `swm convert` copies a dataset to a server";
+        anyhow::bail!(Error::config(request.output.display().to_string(), "is the address of a server", fix));
+    }
+    let (text, origin) = text(request.recipe, request.trust)?;
+    let mut recipe = Recipe::parse(request.recipe, &text)?;
+    request.settings.iter().try_for_each(|setting| recipe.set(setting))?;
+    recipe.check_origin(&origin)?;
+    check(&recipe, request.output)?;
+    check_weights(&recipe, request, &origin)?;
+    let _lock = output_folder::claim(request.output, &["index.html"])?;
+    let mut state = State::open(request, &recipe)?;
+    let count = recipe.steps().count() + 1;
+    for (index, (kind, step)) in recipe.steps().enumerate() {
+        let output = kind.output(request.output, &step.name);
+        if let Some(recorded) = state.finished.get(&step.name).filter(|_| output.exists()) {
+            check_output(kind, &output, recorded)?;
+            continue;
+        }
+        eprint(&format!("{}/{count} {}: {}\n", index + 1, kind.name(), step.name));
+        let hash = run_step(&recipe, kind, step, request.output, context)?;
+        state.finished.insert(step.name.clone(), hash);
+        state.write(request.output)?;
+    }
+    let page = report(&recipe, request, context)?;
+    let compared = state.compare(&recipe);
+    let other = recipe.recorded_on.as_deref().filter(|processor| *processor != state.processor);
+    if context.json {
+        return emit_json(&json!({
+            "folder": request.output, "report": page, "hashes": compared, "settings": state.settings,
+            "processor": state.processor, "recorded_on": recipe.recorded_on,
+        }));
+    }
+    for Compared { name, hash, expected } in &compared {
+        let verdict = match (expected, &state.settings[..], other) {
+            (Some(expected), ..) if expected == hash => "equal to the recorded hash".to_owned(),
+            (Some(expected), _, Some(other)) => {
+                format!("recorded as {expected} on {other}, this is {}", state.processor)
+            }
+            (Some(expected), ..) => format!("recorded as {expected}"),
+            (None, [_, ..], _) => "not compared, because settings were changed".to_owned(),
+            (None, ..) => "no hash is recorded".to_owned(),
+        };
+        emit(&format!("{name}: {hash} ({verdict})\n"));
+    }
+    emit(&format!("{}\n", page.unwrap_or_else(|| request.output.to_owned()).display()));
+    Ok(())
+}
+
+/// Checks the options of every step before anything runs.
+///
+/// # Errors
+/// When an option is unknown or invalid.
+pub fn check(recipe: &Recipe, folder: &Path) -> Result<()> {
+    for (kind, step) in recipe.steps() {
+        let arguments = recipe.arguments(kind, step, folder);
+        match kind {
+            Kind::Collect => parse::<CollectArgs>(kind, step, &arguments).map(drop)?,
+            Kind::Train => parse::<TrainArgs>(kind, step, &arguments)?.config().map(drop)?,
+            Kind::Eval => parse::<EvalArgs>(kind, step, &arguments).map(drop)?,
+        }
+    }
+    Ok(())
+}
+
+/// Checks that no training of the recipe begins with weights that would be downloaded. Weights that the user sets are
+/// the user's own.
+///
+/// # Errors
+/// When a file chose such weights, in a setting or by a preset that names them.
+fn check_weights(recipe: &Recipe, request: &RecipeRun<'_>, origin: &Origin) -> Result<()> {
+    for step in &recipe.train {
+        let arguments = recipe.arguments(Kind::Train, step, request.output);
+        let config = parse::<TrainArgs>(Kind::Train, step, &arguments)?.config()?.to_json();
+        let mut found = vec![];
+        weights("", &config, &mut found);
+        for (key, from) in found {
+            let own = format!("{}.{key}=", step.name);
+            // What is no file is looked for on the hub of models.
+            if !Path::new(&from).is_file() && !request.settings.iter().any(|setting| setting.starts_with(&own)) {
+                let name = format!("the pretrained weights '{from}' of [[train]] '{}'", step.name);
+                origin.check_user(&name, "which may be downloaded", Some(format!("{own}FILE").as_str()))?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Appends the dotted keys of all texts named `weights` in a configuration, with their values, to `found`.
+fn weights(prefix: &str, value: &Value, found: &mut Vec<(String, String)>) {
+    let below = |key: &str| if prefix.is_empty() { key.to_owned() } else { format!("{prefix}.{key}") };
+    match value {
+        Value::Object(entries) => {
+            for (key, value) in entries {
+                match value.as_str() {
+                    Some("") => {}
+                    Some(from) if key == "weights" => found.push((below(key), from.to_owned())),
+                    _ => weights(&below(key), value, found),
+                }
+            }
+        }
+        Value::Array(values) => values.iter().for_each(|value| weights(prefix, value, found)),
+        _ => {}
+    }
+}
+
+/// Checks that the output of a finished step is the one that the run recorded: otherwise another one was put in its
+/// place, and the results of later steps are not its own.
+///
+/// # Errors
+/// When its hash differs, or it is damaged.
+fn check_output(kind: Kind, output: &Path, recorded: &str) -> Result<()> {
+    let fix = "remove it and the outputs of the steps that use it, to make them again; or choose another folder";
+    if kind == Kind::Train
+        && let Some(fault) = checkpoint::faults(output)?.into_iter().next()
+    {
+        return Err(Error::corrupt(output, fault, fix));
+    }
+    let found = output_hash(kind, output)?;
+    if found == recorded {
+        return Ok(());
+    }
+    let problem = format!("its hash is {found}, and the run made it with the hash {recorded}");
+    Err(Error::corrupt(output, problem, fix))
+}
+
+/// Returns the hash of a dataset or of weights; an evaluation has none.
+fn output_hash(kind: Kind, output: &Path) -> Result<String> {
+    match kind {
+        Kind::Collect => home::open_dataset(&output.to_string_lossy())?.content_hash(),
+        Kind::Train => {
+            let stored = StoredCheckpoint::read(output)?;
+            Ok(stored.manifest().hashes.get("weights").cloned().unwrap_or_default())
+        }
+        Kind::Eval => Ok(String::new()),
+    }
+}
+
+/// Runs a step and returns the hash of its output.
+fn run_step(recipe: &Recipe, kind: Kind, step: &Step, folder: &Path, context: &Context) -> anyhow::Result<String> {
+    let output = kind.output(folder, &step.name);
+    let mut arguments = recipe.arguments(kind, step, folder);
+    let is_begun = match kind {
+        Kind::Collect => output.exists(),
+        Kind::Train => checkpoint::family(&output).is_some(),
+        Kind::Eval => false,
+    };
+    if is_begun {
+        arguments.insert(0, "--resume".to_owned());
+    }
+    match kind {
+        Kind::Collect => {
+            collect::run_args(&parse(kind, step, &arguments)?, context)?;
+        }
+        Kind::Train => {
+            train::run_args(&parse(kind, step, &arguments)?, context)?;
+        }
+        Kind::Eval => {
+            let (results, _) = eval::run_args(&parse(kind, step, &arguments)?, context)?;
+            if !context.json {
+                emit(&crate::cli::results_tables::summary(&results));
+            }
+        }
+    }
+    Ok(output_hash(kind, &output)?)
+}
+
+/// Writes the page of all evaluations; `None` without evaluations.
+fn report(recipe: &Recipe, request: &RecipeRun<'_>, context: &Context) -> Result<Option<PathBuf>> {
+    let files = recipe.eval.iter().map(|step| request.output.join(&step.name).join("results.json"));
+    let results = files.map(|file| Ok((file.clone(), swm_report::read_results(&file)?))).collect::<Result<Vec<_>>>()?;
+    if results.is_empty() {
+        return Ok(None);
+    }
+    let settings: Vec<String> = request.settings.iter().map(|setting| format!(" {setting}")).collect();
+    let options = ReportOptions {
+        title: Some(recipe.summary.clone()),
+        metrics: recipe.train.first().map(|step| log_of(&request.output.join(&step.name))),
+        command: Some(format!("swm train --recipe {} -o DIR{}", request.recipe, settings.concat())),
+    };
+    if context.interrupt.load(std::sync::atomic::Ordering::SeqCst) {
+        return Err(Error::Interrupted);
+    }
+    swm_report::write_report_with(&results, &options, request.output).map(Some)
+}
+
+impl State {
+    /// Reads the record of the run in the folder, or begins a new one.
+    ///
+    /// # Errors
+    /// When the folder holds a run of another recipe or with other settings.
+    fn open(request: &RecipeRun<'_>, recipe: &Recipe) -> Result<Self> {
+        let path = request.output.join(STATE);
+        let new = Self {
+            recipe: request.recipe.to_owned(),
+            request: recipe.request_hash()?,
+            settings: request.settings.iter().map(ToString::to_string).collect(),
+            processor: capsule::cpu_level(),
+            finished: BTreeMap::new(),
+        };
+        if !path.exists() {
+            new.write(request.output)?;
+            return Ok(new);
+        }
+        let fix = "choose another folder with --output";
+        let bytes = files::read(&path, super::MAX_BYTES)?;
+        let found: Self =
+            serde_json::from_slice(&bytes).map_err(|error| Error::corrupt(&path, error.to_string(), fix))?;
+        if found.request != new.request {
+            let problem = format!("it holds a run of the recipe {} with other settings or steps", found.recipe);
+            return Err(Error::config(request.output.display().to_string(), problem, fix));
+        }
+        Ok(Self { finished: found.finished, ..new })
+    }
+
+    fn write(&self, folder: &Path) -> Result<()> {
+        eval::write_json(&folder.join(STATE), self)
+    }
+
+    /// Returns the hashes of datasets and weights, with the recorded ones.
+    fn compare<'a>(&'a self, recipe: &'a Recipe) -> Vec<Compared<'a>> {
+        let made = recipe.steps().filter(|(kind, _)| *kind != Kind::Eval);
+        let compared = made.filter_map(|(_, step)| {
+            let hash = self.finished.get(&step.name)?;
+            let expected = step.hash.as_deref().filter(|_| self.settings.is_empty());
+            Some(Compared { name: &step.name, hash, expected })
+        });
+        compared.collect()
+    }
+}

@@ -1,0 +1,76 @@
+//! `swm study report`: writes one page of a study, with figures and tables beside it.
+
+use super::expand::shell;
+use super::export::Format;
+use crate::cli::{emit, emit_json, output_folder};
+use clap::Args;
+use serde_json::json;
+use std::path::{Path, PathBuf};
+use swm_core::{Error, files};
+use swm_eval::{Study, StudyFolder};
+use swm_report::{Published, StudyPage};
+
+/// Arguments of `swm study report`.
+#[derive(Args)]
+pub struct ReportArgs {
+    /// The folder of the study
+    folder: PathBuf,
+    /// Folder of the page (default: the folder `report` in that of the study)
+    #[arg(short, long, value_name = "DIR")]
+    output: Option<PathBuf>,
+    /// Title (default: that of the study)
+    #[arg(long)]
+    title: Option<String>,
+}
+
+/// The tables beside the page.
+const TABLES: [(&str, Format); 3] =
+    [("table.csv", Format::Csv), ("table.tex", Format::Latex), ("table.md", Format::Markdown)];
+
+/// Runs `swm study report`.
+pub fn report(args: &ReportArgs, as_json: bool) -> anyhow::Result<()> {
+    let folder = StudyFolder::new(&args.folder);
+    let study = folder.study()?;
+    let results = study.results(&folder)?;
+    let output = args.output.clone().unwrap_or_else(|| args.folder.join("report"));
+    let names: Vec<&str> = std::iter::once("index.html").chain(TABLES.map(|(name, _)| name)).collect();
+    let _lock = output_folder::claim(&output, &names)?;
+    check_figures(&output)?;
+    let tables = TABLES.map(|(name, format)| (name, format.write(&results)));
+    let published = study.published.iter().map(|value| Published {
+        condition: value.condition.clone(),
+        policy: value.policy.clone(),
+        rate: value.rate,
+        source: value.source.clone(),
+    });
+    let page =
+        StudyPage { results, published: published.collect(), title: args.title.clone(), command: command(&study) };
+    let path = swm_report::write_study(&page, &output)?;
+    for (name, text) in tables {
+        files::write(&output.join(name), text.as_bytes())?;
+    }
+    if as_json {
+        return emit_json(&json!({"report": path}));
+    }
+    emit(&format!("{}\n", path.display()));
+    Ok(())
+}
+
+/// The command that runs the study again. It names a folder of its own, so that equal studies have equal pages.
+fn command(study: &Study) -> Option<String> {
+    let name = Path::new(study.arguments.first()?).file_stem()?.to_str()?;
+    let words = ["swm", "study", "run"].into_iter().map(str::to_owned);
+    let output = ["--output".to_owned(), name.to_owned()];
+    Some(shell(&words.chain(study.arguments.iter().cloned()).chain(output).collect::<Vec<_>>()))
+}
+
+/// Checks that the folder of figures does not exist, or lies beside a page of this program.
+fn check_figures(output: &Path) -> swm_core::Result<()> {
+    let figures = output.join("figures");
+    files::check_no_link(&figures)?;
+    if !figures.exists() || output.join("index.html").exists() {
+        return Ok(());
+    }
+    let fix = "give another folder with --output";
+    Err(Error::config(figures.display().to_string(), "exists and was not written by this program", fix))
+}

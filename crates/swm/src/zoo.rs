@@ -1,0 +1,82 @@
+//! The zoo: capsules by name. `zoo:push-t/lewm` is the file `push-t/lewm.safetensors` of the first folder in
+//! [`folders`] that has it.
+
+use crate::{home, library};
+use std::collections::BTreeMap;
+use std::path::{Component, Path, PathBuf};
+use swm_core::{Error, Result};
+
+/// The start of a name in the zoo.
+pub const PREFIX: &str = "zoo:";
+
+/// The suffix of a capsule.
+const SUFFIX: &str = "safetensors";
+
+/// The zoo relative to the folder of an installation.
+const SHARE: &str = "share/swm/zoo";
+
+/// The deepest folder of a zoo that is listed: `ENVIRONMENT/MODEL.safetensors`.
+const DEPTH: usize = 2;
+
+/// Returns the folders that are searched, in order: `$SWM_ZOO`; `zoo/` in the home folder; `share/swm/zoo` in the Python
+/// package, in the folder of the program, and in that folder's parent; `zoo/` of the source tree that the program was
+/// built from. Folders that do not exist are left out.
+pub fn folders() -> Vec<PathBuf> {
+    let library = library::path();
+    let package = library.as_deref().and_then(Path::parent).map(|folder| folder.join(SHARE));
+    let program = std::env::current_exe().ok();
+    let beside =
+        program.iter().flat_map(|program| program.ancestors().skip(1).take(2)).map(|folder| folder.join(SHARE));
+    let given = std::env::var_os("SWM_ZOO").filter(|folder| !folder.is_empty()).map(PathBuf::from);
+    let home = home::home().ok().map(|home| home.join("zoo"));
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../zoo");
+    let all = given.into_iter().chain(home).chain(package).chain(beside).chain([source]);
+    all.filter(|folder| folder.is_dir()).collect()
+}
+
+/// Returns the capsules of all folders by name. A capsule of an earlier folder hides one of the same name in a later
+/// folder.
+pub fn capsules() -> BTreeMap<String, PathBuf> {
+    let mut found = BTreeMap::new();
+    for folder in folders() {
+        add(&folder, "", DEPTH, &mut found);
+    }
+    found
+}
+
+/// Adds the capsules of a folder, whose names begin with `prefix`.
+fn add(folder: &Path, prefix: &str, depth: usize, found: &mut BTreeMap<String, PathBuf>) {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    for path in entries.map(|entry| entry.path()) {
+        let Some(stem) = path.file_stem().and_then(|stem| stem.to_str()) else { continue };
+        if path.is_dir() && depth > 1 {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            add(&path, &format!("{prefix}{name}/"), depth - 1, found);
+        } else if path.is_file() && path.extension().is_some_and(|end| end == SUFFIX) {
+            found.entry(format!("{prefix}{stem}")).or_insert(path);
+        }
+    }
+}
+
+/// Returns the path of the capsule with this name, without the prefix.
+///
+/// # Errors
+/// When no folder of the zoo has it; the message names the closest name.
+pub fn find(name: &str) -> Result<PathBuf> {
+    let is_plain = Path::new(name).components().all(|part| matches!(part, Component::Normal(_)));
+    let mut paths = folders().into_iter().map(|folder| folder.join(format!("{name}.{SUFFIX}")));
+    if is_plain
+        && !name.is_empty()
+        && let Some(path) = paths.find(|path| path.is_file())
+    {
+        return Ok(path);
+    }
+    let known = capsules();
+    let hint = format!("`swm zoo` lists the capsules; it searches {}", listed(&folders()));
+    Err(Error::unknown("capsule", name, known.keys().map(String::as_str), hint))
+}
+
+fn listed(folders: &[PathBuf]) -> String {
+    let folders: Vec<String> = folders.iter().map(|folder| folder.display().to_string()).collect();
+    if folders.is_empty() { "$SWM_ZOO and the home folder's zoo/".to_owned() } else { folders.join(", ") }
+}

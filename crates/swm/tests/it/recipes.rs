@@ -1,0 +1,193 @@
+//! Tests of recipes.
+
+use crate::{Swm, text};
+use serde_json::Value;
+use std::fs;
+
+const RECIPE: &str = r#"
+summary = "A model that is trained for two steps"
+
+[[collect]]
+name = "rooms"
+env = "swm/TwoRoom-v1"
+policy = ["explore:0.7", "random:0.3"]
+episodes = 12
+image = 32
+max-steps = 30
+
+[[train]]
+name = "small"
+model = "lewm"
+data = "rooms"
+settings = { schedule = { steps = 2, warmup = 0 }, data.batch_size = 16, model.image = 32 }
+
+[[eval]]
+name = "found"
+policies = ["small"]
+episodes = 3
+budget = 10
+solver = "cem,samples=8,iterations=1,elites=2"
+"#;
+
+fn write(swm: &Swm, name: &str, text: &str) {
+    fs::write(swm.path(name), text).expect("a recipe");
+}
+
+fn run(swm: &Swm, recipe: &str, out: &str, more: &[&str]) -> Value {
+    swm.json(&[&["train", "--recipe", recipe, "-o", out], more].concat())
+}
+
+#[test]
+fn recipe_runs_what_is_missing_and_compares_hashes() {
+    let swm = Swm::new();
+    write(&swm, "small.toml", RECIPE);
+    let first = run(&swm, "small.toml", "first", &[]);
+    assert!(swm.path("first/index.html").is_file() && swm.path("first/found/results.json").is_file());
+    let hashes: Vec<&str> =
+        first["hashes"].as_array().expect("hashes").iter().filter_map(|row| row["hash"].as_str()).collect();
+    assert_eq!(hashes.len(), 2);
+
+    // Finished steps are not repeated; a missing one is.
+    let changed = |name: &str| fs::metadata(swm.path("first").join(name)).and_then(|file| file.modified()).expect(name);
+    let names = ["small/checkpoint/weights.safetensors", "found/results.json"];
+    let before = names.map(changed);
+    fs::remove_dir_all(swm.path("first/found")).expect("removing the results");
+    assert_eq!(run(&swm, "small.toml", "first", &[])["hashes"], first["hashes"]);
+    assert_eq!(changed(names[0]), before[0]);
+    assert!(changed(names[1]) > before[1]);
+
+    // With the hashes in the recipe, another run says that they are equal.
+    let expected = |hash: &str| {
+        let insert = |text: &str, name: &str, hash: &str| text.replace(name, &format!("{name}\nhash = \"{hash}\""));
+        insert(&insert(RECIPE, "name = \"rooms\"", hashes[0]), "name = \"small\"", hash)
+    };
+    write(&swm, "small.toml", &expected(hashes[1]));
+    let printed = |out: &str, more: &[&str]| {
+        let output = swm.run(&[&["train", "--recipe", "small.toml", "-o", out], more].concat());
+        assert!(output.status.success(), "{}", text(&output.stderr));
+        text(&output.stdout)
+    };
+    assert_eq!(printed("second", &[]).matches("equal to the recorded hash").count(), 2);
+    write(&swm, "small.toml", &expected("0000"));
+    assert!(printed("first", &[]).contains("(recorded as 0000"));
+    let settings = ["rooms.episodes=13", "small.schedule.steps=3"];
+    assert_eq!(printed("third", &settings).matches("settings were changed").count(), 2);
+    assert_eq!(swm.json(&["inspect", "third/rooms.lance"])["episodes"], 13);
+    assert_eq!(swm.json(&["checkpoints", "show", "third/small"])["config"]["schedule"]["steps"], 3);
+    swm.fails(&["train", "--recipe", "small.toml", "-o", "third"], 2, &["other settings or steps", "--output"]);
+}
+
+#[test]
+fn recipes_are_listed_and_checked_before_they_run() {
+    let swm = Swm::new();
+    let listed = swm.json(&["recipes"]);
+    assert!(listed.as_array().is_some_and(|rows| rows.iter().any(|row| row["name"] == "two-room/pldm")), "{listed}");
+    assert_eq!(swm.json(&["recipes", "two-room/pldm"])["train"][0]["model"], "pldm");
+    swm.fails(&["recipes", "two-room/pldn"], 2, &["did you mean two-room/pldm"]);
+    swm.fails(&["train", "--recipe", "two-room/pldm"], 2, &["--output"]);
+    let refused = |from: &str, to: &str, code: i32, parts: &[&str]| {
+        write(&swm, "bad.toml", &RECIPE.replacen(from, to, 1));
+        swm.fails(&["train", "--recipe", "bad.toml", "-o", "bad"], code, parts);
+        assert!(!swm.path("bad").exists(), "{to}");
+    };
+    refused("episodes = 12", "episode = 12", 2, &["[[collect]] 'rooms'", "--episodes"]);
+    refused("budget = 10", "budget = \"ten\"", 2, &["[[eval]] 'found'", "ten"]);
+    refused("steps = 2", "setps = 2", 2, &["did you mean"]);
+    refused("model = \"lewm\"", "model = \"lwem\"", 2, &["did you mean lewm"]);
+    refused("name = \"small\"", "name = \"../small\"", 2, &["'../small'"]);
+    refused("name = \"small\"", "name = \"rooms\"", 2, &["two steps have the name 'rooms'"]);
+    refused("image = 32", "output = \"/tmp/x\"", 2, &["'output', which a recipe may not"]);
+    refused("image = 32", "\"output=/tmp/x\" = 1", 2, &["which is no option"]);
+    refused("policies = [\"small\"]", "policies = [\"--trust\"]\ntrust = true", 2, &["'trust'"]);
+    refused("summary", "sum", 2, &["sum"]);
+    refused(
+        "env = \"swm/TwoRoom-v1\"",
+        "env = \"evil_mod:X-v0\"",
+        2,
+        &["bad.toml", "imports a Python module", "--trust"],
+    );
+    refused("data = \"rooms\"", "data = \"s3://bucket/rooms.lance\"", 2, &["s3://bucket", "network connection"]);
+    refused(
+        "model = \"lewm\"",
+        "model = \"lewm\"\npreset = \"other.toml\"",
+        2,
+        &["the preset 'other.toml'", "--trust"],
+    );
+    refused("image = 32", "wrapper = \"chroma-key,media=/dev/zero\"", 2, &["reads files"]);
+    swm.fails(&["train", "--recipe", "bad.toml", "-o", "bad", "room.episodes=1"], 2, &["did you mean rooms"]);
+    swm.fails(&["train", "--recipe", "/dev/zero", "-o", "bad"], 2, &["ends with .toml"]);
+}
+
+/// A recipe of one collection and one training with `train` in its table.
+fn training(train: &str) -> String {
+    let (collect, _) = RECIPE.split_once("[[train]]").expect("a training");
+    format!("{collect}[[train]]\nname = \"small\"\ndata = \"rooms\"\n{train}\n")
+}
+
+#[test]
+fn recipe_of_a_stranger_chooses_no_weights_of_a_hub() {
+    let swm = Swm::new();
+    let weights = "evil-owner/evil-repo";
+    for (train, parts) in [
+        (format!("model = [\"dino_wm\", \"model.weights={weights}\"]"), vec!["'model' that is not one text"]),
+        (
+            format!("model = \"dino_wm\"\n[train.settings]\n\"model.weights=\\\"{weights}\\\" #\" = 1"),
+            vec!["the setting"],
+        ),
+        ("model = \"dino_wm\"\n[train.settings]\n\"a b\" = 1".to_owned(), vec!["the setting 'a b'"]),
+        ("model = \"dino_wm\"\npreset = \"paper\"".to_owned(), vec!["facebook/dinov2-small", "downloaded", "--trust"]),
+        ("model = \"gcbc\"\npreset = \"paper\"".to_owned(), vec!["facebook/dinov2-small", "downloaded", "--trust"]),
+        (format!("model = \"dino_wm\"\nsettings = {{ model.weights = \"{weights}\" }}"), vec![weights, "downloaded"]),
+        (format!("model = \"dino_wm\"\n[train.settings]\n\"model.weights\" = \"{weights}\""), vec![weights, "--trust"]),
+        ("model = \"lewm\"\npreset = \"other.toml/\"".to_owned(), vec!["the preset 'other.toml/'", "--trust"]),
+        ("model = \"lewm\"\npreset = \"other.toml/.\"".to_owned(), vec!["the preset 'other.toml/.'", "--trust"]),
+        ("model = \"lewm\"\npreset = \"tyni\"".to_owned(), vec!["unknown preset 'tyni'", "tiny"]),
+    ] {
+        write(&swm, "bad.toml", &training(&train));
+        // No server answers at this address; a recipe that is refused asks none.
+        let args = ["train", "--recipe", "bad.toml", "-o", "bad"];
+        let output = swm.command(&args).env("HF_ENDPOINT", "http://127.0.0.1:9").output().expect("swm starts");
+        let error = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{train}: {error}");
+        assert!(parts.iter().all(|part| error.contains(part)), "{train}: {error}");
+        assert!(!swm.path("bad").exists(), "{train}");
+    }
+}
+
+#[test]
+fn recipe_refuses_servers_as_folders_and_countless_steps() {
+    let swm = Swm::new();
+    write(&swm, "small.toml", RECIPE);
+    for folder in ["s3://bucket/x", "http://127.0.0.1:9/x"] {
+        swm.fails(&["train", "--recipe", "small.toml", "-o", folder], 2, &[folder, "address of a server"]);
+    }
+    assert!(!swm.path("s3:").exists() && !swm.path("http:").exists());
+    let step = |index: usize| format!("[[collect]]\nname = \"r{index}\"\nenv = \"swm/TwoRoom-v1\"\n");
+    let steps: String = (0..1001).map(step).collect();
+    write(&swm, "many.toml", &format!("summary = \"x\"\n{steps}"));
+    swm.fails(&["train", "--recipe", "many.toml", "-o", "many"], 2, &["1001 steps", "1000"]);
+}
+
+#[test]
+fn recipe_notices_outputs_that_were_replaced() {
+    let swm = Swm::new();
+    let settings = "{ schedule = { steps = 2, warmup = 0 }, data.batch_size = 16, model.image = 32 }";
+    write(&swm, "small.toml", &training(&format!("model = \"lewm\"\nsettings = {settings}")));
+    let args = ["train", "--recipe", "small.toml", "-o", "run"];
+    let first = swm.json(&args)["hashes"].clone();
+    assert_eq!(swm.json(&args)["hashes"], first);
+    let weights = swm.path("run/small/checkpoint/weights.safetensors");
+    let whole = fs::read(&weights).expect("the weights");
+    let mut other = whole.clone();
+    *other.last_mut().expect("bytes") ^= 1;
+    fs::write(&weights, &other).expect("changing the weights");
+    swm.fails(&args, 1, &["small", "its hash differs", "choose another folder"]);
+    fs::write(&weights, &whole).expect("restoring the weights");
+    assert_eq!(swm.json(&args)["hashes"], first);
+
+    fs::rename(swm.path("run/rooms.lance"), swm.path("mine.lance")).expect("moving the dataset");
+    let other = ["swm/TwoRoom-v1", "-o", "run/rooms.lance", "--episodes", "3", "--image", "32", "--max-steps", "20"];
+    swm.json(&[&["collect"], &other[..]].concat());
+    let recorded = first[0]["hash"].as_str().expect("a hash");
+    swm.fails(&args, 1, &["rooms.lance", recorded, "remove it"]);
+}

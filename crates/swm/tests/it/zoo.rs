@@ -1,0 +1,111 @@
+//! Tests of the zoo: names, folders, and the capsules of the repository.
+
+use crate::{Swm, text};
+use serde_json::json;
+use std::fs;
+use std::path::{Path, PathBuf};
+use swm::capsule::{EvaluationRecord, cpu_level, verify};
+use swm::core::run::Control;
+use swm::eval::{RunOptions, StartsRequest};
+use swm::models::capsule::Capsule;
+use swm_simd::{CpuLevel, limit_cpu_level};
+
+/// The most bytes of all capsules in the repository.
+const MAX_ALL: u64 = 60_000_000;
+
+/// The capsules in `zoo/` of the repository: name and path.
+fn repository() -> Vec<(String, PathBuf)> {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../zoo");
+    let mut found = vec![];
+    for folder in fs::read_dir(&root).expect("the zoo").flatten().filter(|entry| entry.path().is_dir()) {
+        for file in fs::read_dir(folder.path()).expect("a folder of the zoo").flatten() {
+            let name =
+                format!("{}/{}", folder.file_name().display(), file.path().file_stem().expect("a name").display());
+            found.push((name, file.path()));
+        }
+    }
+    found.sort();
+    found
+}
+
+/// Every capsule of the repository behaves as it records, is complete, and is small.
+#[test]
+fn capsules_of_the_repository_are_valid() {
+    let swm = Swm::new();
+    let all = repository();
+    assert!(!all.is_empty());
+    let bytes: u64 = all.iter().map(|(_, path)| fs::metadata(path).expect("a file").len()).sum();
+    assert!(bytes <= MAX_ALL, "the zoo has {bytes} bytes");
+    for (name, path) in &all {
+        assert_eq!(path.extension().and_then(|end| end.to_str()), Some("safetensors"), "{}", path.display());
+        let capsule = Capsule::read(path).unwrap_or_else(|error| panic!("{error}"));
+        let evaluation = capsule.evaluation.as_ref().unwrap_or_else(|| panic!("{name} has no evaluation"));
+        let record = EvaluationRecord::read(evaluation).expect("an evaluation");
+        assert_eq!(record.weights, capsule.weights_hash(), "{name} was evaluated with other weights");
+        assert!(record.floor.is_some() && record.success[1] >= 50, "{name}: {:?}", record.success);
+        let described = &capsule.description;
+        assert!(described.licence.is_some() && described.author.is_some(), "{name} has no licence or no author");
+        let zoo_name = format!("zoo:{name}");
+        let output = swm.run(&["checkpoints", "verify", &zoo_name]);
+        assert!(output.status.success(), "{name}: {}{}", text(&output.stdout), text(&output.stderr));
+
+        // Without options, an evaluation plays the recorded episodes whose starts the environment draws.
+        if record.request.starts != StartsRequest::Episodic {
+            continue;
+        }
+        let episodes = 1 + record.episodes.iter().map(|episode| episode.number).max().expect("an episode");
+        let found = swm.json(&["eval", &zoo_name, "--episodes", &episodes.to_string()]);
+        for episode in record.episodes.iter().filter(|_| described.cpu_level == cpu_level()) {
+            let played = &found["runs"][1]["episodes"][episode.number];
+            assert_eq!(
+                (&played["success"], &played["steps"]),
+                (&json!(episode.success), &json!(episode.steps)),
+                "{name}"
+            );
+        }
+    }
+    // Processors with other vector instructions compute nearly the same outputs.
+    for level in [CpuLevel::Baseline, CpuLevel::Avx2] {
+        limit_cpu_level(level);
+        for (name, path) in &all {
+            let found = verify(path, false, &RunOptions::default(), &mut Control::new()).expect(name);
+            assert!(found.faults.is_empty(), "{name} with {level:?}: {:?}", found.faults);
+        }
+    }
+    limit_cpu_level(CpuLevel::Avx512);
+    let listed = swm.json(&["zoo"]);
+    let names: Vec<&str> = listed.as_array().expect("a list").iter().filter_map(|row| row["name"].as_str()).collect();
+    assert_eq!(names, all.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>());
+}
+
+#[test]
+fn folders_of_the_zoo_are_searched_in_order() {
+    let swm = Swm::new();
+    let (_, path) = repository().swap_remove(0);
+    let own = swm.path("own/maze");
+    for folder in [&own, &swm.path("zoo/maze")] {
+        fs::create_dir_all(folder).expect("a folder");
+        fs::copy(&path, folder.join("model.safetensors")).expect("a copied file");
+    }
+    fs::write(swm.path("zoo/maze/broken.safetensors"), "no capsule").expect("a file");
+    let found = |given: Option<&str>| {
+        let mut command = swm.command(&["zoo", "--json"]);
+        command.env_remove("SWM_ZOO").envs(given.map(|folder| ("SWM_ZOO", folder)));
+        let output = command.output().expect("swm starts");
+        let rows: Vec<serde_json::Value> = serde_json::from_slice(&output.stdout).expect("JSON");
+        let row = |name: &str| rows.iter().find(|row| row["name"] == name).cloned().expect(name);
+        assert!(row("maze/broken")["error"].as_str().is_some_and(|error| error.contains("is no capsule")));
+        row("maze/model")["path"].as_str().expect("a path").to_owned()
+    };
+    assert!(found(None).contains("zoo/maze"));
+    assert!(found(Some("own")).contains("own/maze"));
+    assert!(swm.json(&["checkpoints", "show", "zoo:maze/model"])["capsule"]["hash"].is_string());
+    swm.fails(
+        &["checkpoints", "show", "zoo:maze/modle"],
+        2,
+        &["unknown capsule", "did you mean maze/model", "swm zoo"],
+    );
+    for name in ["zoo:../zoo/maze/model", "zoo:", "zoo:/etc/passwd", "zoo:maze/../maze/model"] {
+        swm.fails(&["checkpoints", "show", name], 2, &["unknown capsule"]);
+    }
+}

@@ -21,7 +21,7 @@ pub use prediction::{Group, Prediction, Trajectory};
 pub use searches::{Band, Searches};
 pub use seeds::{Interquartile, OverSeeds, TRAINING_SEED};
 pub use statistics::{Proportion, Summary};
-pub use study::{StudyResults, StudyRow};
+pub use study::{Published, StudyResults, StudyRow};
 
 use crate::Manifest;
 use serde::{Deserialize, Deserializer, Serialize};

@@ -38,6 +38,6 @@ pub use request::{Choice, Condition, EvalRequest, HeldOut, Model, PolicyKind, Po
 pub use runner::{ResolvedPolicy, Resolver, RunOptions};
 pub use seeding::{episode_key, reset_seed};
 pub use starts::Starts;
-pub use study::{Cell, Common, Published, Study, StudyFolder};
+pub use study::{Cell, Common, Study, StudyFolder};
 pub use video_recording::Videos;
 pub use world::{World, WorldConfig};

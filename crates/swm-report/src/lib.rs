@@ -23,5 +23,5 @@ mod training_log;
 
 pub use page::{ReportOptions, render, write_report, write_report_with};
 pub use read::read_results;
-pub use study::{Published, StudyPage, write_study};
+pub use study::{StudyPage, write_study};
 pub use training_log::{Metrics, Series, read_metrics};

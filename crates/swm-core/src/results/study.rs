@@ -59,6 +59,19 @@ pub struct StudyRow {
     pub gap: Option<Paired>,
 }
 
+/// A success rate that a publication states.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Published {
+    /// The condition, as the study names it.
+    pub condition: String,
+    /// The policy, which may be one that the study does not evaluate.
+    pub policy: String,
+    /// The success rate, from 0 to 1.
+    pub rate: f64,
+    /// Where the rate is stated.
+    pub source: String,
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -3,6 +3,7 @@
 use crate::request::EvalRequest;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use swm_core::results::Published;
 use swm_core::{Error, Result, manifest};
 
 /// A study.
@@ -24,19 +25,6 @@ pub struct Study {
     /// its hash.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub arguments: Vec<String>,
-}
-
-/// A success rate that a publication states.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Published {
-    /// The condition, as the study names it.
-    pub condition: String,
-    /// The policy, which may be one that the study does not evaluate.
-    pub policy: String,
-    /// The success rate, from 0 to 1.
-    pub rate: f64,
-    /// Where the rate is stated.
-    pub source: String,
 }
 
 /// What the comparisons of a family may have in common.

@@ -12,5 +12,5 @@ mod folder;
 mod rows;
 mod run;
 
-pub use cell::{Cell, Common, Published, Study};
+pub use cell::{Cell, Common, Study};
 pub use folder::StudyFolder;

@@ -18,24 +18,11 @@ use crate::text::{escape, shorten};
 use sheet::Sheet;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
-use swm_core::results::{Paired, StudyResults, Verdict};
+use swm_core::results::{Paired, Published, StudyResults, Verdict};
 use swm_core::{Error, Result, files};
 
 /// The style sheet of what only this page has.
 const STYLE: &str = include_str!("style.css");
-
-/// A success rate that a publication states.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Published {
-    /// The condition, as the study names it.
-    pub condition: String,
-    /// The policy, as the study names it; others are shown as well.
-    pub policy: String,
-    /// The success rate, from 0 to 1.
-    pub rate: f64,
-    /// Where the value is stated.
-    pub source: String,
-}
 
 /// What the page of a study shows.
 #[derive(Clone, Debug, Default)]

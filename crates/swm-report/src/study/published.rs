@@ -1,11 +1,11 @@
 //! Published values beside ours.
 
 use super::sheet::Sheet;
-use super::{Published, table};
+use super::table;
 use crate::limits;
 use crate::text::{escape, percent, points, shorten};
 use std::fmt::Write as _;
-use swm_core::results::Counting;
+use swm_core::results::{Counting, Published};
 
 /// Writes the table of published values; nothing if there are none.
 pub(super) fn write(html: &mut String, sheets: &[Sheet<'_>], published: &[Published]) {

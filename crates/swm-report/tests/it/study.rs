@@ -4,8 +4,10 @@ use super::well_formed;
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
-use swm_core::results::{Counting, Family, Interquartile, OverSeeds, Paired, Proportion, StudyResults, StudyRow};
-use swm_report::{Published, StudyPage, write_study};
+use swm_core::results::{
+    Counting, Family, Interquartile, OverSeeds, Paired, Proportion, Published, StudyResults, StudyRow,
+};
+use swm_report::{StudyPage, write_study};
 
 /// A row of a study: `successes` of 50 episodes, of which the first condition solves 40.
 fn row(condition: &str, policy: &str, variables: &[(&str, &str)], successes: usize) -> StudyRow {

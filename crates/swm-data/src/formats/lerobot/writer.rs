@@ -107,7 +107,7 @@ impl LerobotWriter {
         }
         writer.clear_group();
         writer.describe()?;
-        files::write(&root.join(WRITING), &[])?;
+        files::open_to_write(&root.join(WRITING), true)?;
         Ok(writer)
     }
 

@@ -1,6 +1,6 @@
 //! The gap of each condition: a dot with its interval for each policy.
 
-use super::{Drawn, finish, legend};
+use super::{AXIS, Drawn, finish, legend};
 use crate::plot::{Anchor, Canvas, Drawn as Painted, Figure, Ink, Layout, SMALL, Surface, TEXT, stroke, units};
 use crate::study::sheet::{Policy, Sheet};
 use crate::study::told_apart;
@@ -22,8 +22,6 @@ const SPACE: f64 = 9.0;
 const NAMES: f64 = 190.0;
 /// The width of the values beside the dots.
 const VALUES: f64 = 138.0;
-/// The height of ticks and their title.
-const AXIS: f64 = 46.0;
 
 /// The dots of one condition.
 struct Condition<'a> {

@@ -1,6 +1,6 @@
 //! Success against a variable with numbers, with intervals and a fitted decay.
 
-use super::{Drawn, finish, legend};
+use super::{AXIS, Drawn, finish, legend};
 use crate::plot::{Anchor, Canvas, Drawn as Painted, Figure, Ink, Layout, SMALL, Surface, stroke, units};
 use crate::study::decay::{Decay, Point};
 use crate::study::sheet::{Policy, Sheet};
@@ -16,8 +16,6 @@ const POLICIES: usize = 12;
 const VALUES: usize = 200;
 /// The height of the chart.
 const CHART: f64 = 300.0;
-/// The height of ticks and their title.
-const AXIS: f64 = 46.0;
 /// The number of lines that a fitted curve consists of.
 const CURVE: u32 = 100;
 /// The distance between the dots of two policies at one value, in pixels.

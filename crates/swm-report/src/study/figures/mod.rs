@@ -38,6 +38,8 @@ enum Family<'a> {
     Wheel(&'a str, Option<&'a str>, Vec<([f64; 2], usize)>),
 }
 
+/// The height of ticks and their title.
+const AXIS: f64 = 46.0;
 /// The smallest number of values that a line is drawn through.
 const LINE_VALUES: usize = 3;
 

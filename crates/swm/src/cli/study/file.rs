@@ -5,8 +5,9 @@ use crate::cli::eval::EvalArgs;
 use clap::{ArgAction, Args as _, Command};
 use std::collections::BTreeMap;
 use std::path::Path;
+use swm_core::results::Published;
 use swm_core::{Error, Result};
-use swm_eval::{Common, Published};
+use swm_eval::Common;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 

@@ -1,8 +1,8 @@
 //! The tables `[[published]]` of a study's file: success rates that publications state.
 
 use super::file::Source;
+use swm_core::results::Published;
 use swm_core::{Error, Result};
-use swm_eval::Published;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 

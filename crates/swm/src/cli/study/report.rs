@@ -8,7 +8,7 @@ use serde_json::json;
 use std::path::{Path, PathBuf};
 use swm_core::{Error, files};
 use swm_eval::{Study, StudyFolder};
-use swm_report::{Published, StudyPage};
+use swm_report::StudyPage;
 
 /// Arguments of `swm study report`.
 #[derive(Args)]
@@ -37,14 +37,8 @@ pub fn report(args: &ReportArgs, as_json: bool) -> anyhow::Result<()> {
     let _lock = output_folder::claim(&output, &names)?;
     check_figures(&output)?;
     let tables = TABLES.map(|(name, format)| (name, format.write(&results)));
-    let published = study.published.iter().map(|value| Published {
-        condition: value.condition.clone(),
-        policy: value.policy.clone(),
-        rate: value.rate,
-        source: value.source.clone(),
-    });
     let page =
-        StudyPage { results, published: published.collect(), title: args.title.clone(), command: command(&study) };
+        StudyPage { results, published: study.published.clone(), title: args.title.clone(), command: command(&study) };
     let path = swm_report::write_study(&page, &output)?;
     for (name, text) in tables {
         files::write(&output.join(name), text.as_bytes())?;

@@ -3,6 +3,8 @@
 //! The manifest determines everything except [`Run::timing`], so two evaluations with equal manifests write results
 //! that differ in their timing only.
 
+mod betting;
+mod breaking;
 mod consistency;
 mod counting;
 mod family;
@@ -13,7 +15,9 @@ mod searches;
 mod seeds;
 mod statistics;
 mod study;
+mod until;
 
+pub use breaking::{BreakingPoint, Crossing, Evaluated, Level, Ray, Side};
 pub use counting::Counting;
 pub use family::{Family, Verdict};
 pub use paired::{Comparison, MAX_ALL_PAIRS, Paired, pairs};
@@ -22,6 +26,7 @@ pub use searches::{Band, Searches};
 pub use seeds::{Interquartile, OverSeeds, TRAINING_SEED};
 pub use statistics::{Proportion, Summary};
 pub use study::{Published, StudyResults, StudyRow};
+pub use until::Until;
 
 use crate::Manifest;
 use serde::{Deserialize, Deserializer, Serialize};
@@ -44,6 +49,10 @@ pub struct Results {
     /// another test are left out.
     #[serde(default, deserialize_with = "of_this_test")]
     pub comparisons: Vec<Comparison>,
+    /// Whether the results of a study decided the number of episodes: the intervals and comparisons, which are those of a
+    /// fixed number, are not to be shown.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub sequential: bool,
 }
 
 /// The results of one policy under one condition.

@@ -10,7 +10,7 @@ use crate::world::{World, WorldConfig};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
-use swm_core::results::{Comparison, Counting, Run, Searches};
+use swm_core::results::{Comparison, Counting, Proportion, Run, Searches};
 use swm_core::run::{Control, Event, Stage};
 use swm_core::{Env, Error, Manifest, PlanTrace, Policy, RandomPolicy, Result, Results, VariationRequest};
 use swm_data::Reader;
@@ -95,8 +95,20 @@ impl EvalRequest {
     /// # Errors
     /// When the request is invalid or names an unknown environment, dataset, policy or factor, a policy or an
     /// environment fails, or the run is stopped.
-    #[allow(clippy::too_many_lines, reason = "one loop over conditions and policies, which share all state")]
     pub fn run(&self, resolver: &dyn Resolver, options: &RunOptions, control: &mut Control<'_>) -> Result<Results> {
+        self.extend(None, resolver, options, control)
+    }
+
+    /// Evaluates as [`EvalRequest::run`], but plays only the starts that `earlier` lacks: the results of the same request
+    /// with fewer episodes. Everything but times is as if all were played at once.
+    #[allow(clippy::too_many_lines, reason = "one loop over conditions and policies, which share all state")]
+    pub(crate) fn extend(
+        &self,
+        earlier: Option<&Results>,
+        resolver: &dyn Resolver,
+        options: &RunOptions,
+        control: &mut Control<'_>,
+    ) -> Result<Results> {
         self.check()?;
         let request = self.with_floor()?;
         let mut world = request.world(resolver, request.parallel_envs(options), options)?;
@@ -129,6 +141,8 @@ impl EvalRequest {
                 }
             }
             starts_hash.add(&mut world, &starts)?;
+            let played = earlier.and_then(|earlier| earlier.runs.first()).map_or(0, |run| run.episodes.len());
+            let starts = if played > 0 { starts.only(&Vec::from_iter(played..starts.len()))? } else { starts };
             for policy in &request.policies {
                 let mut resolved = match policy.kind {
                     PolicyKind::Random => ResolvedPolicy::from(floor(&world)),
@@ -143,6 +157,9 @@ impl EvalRequest {
                 }));
                 let config = request.config(policy, condition, options);
                 let mut run = world.evaluate(&mut *resolved.policy, &starts, &config, control)?;
+                if let Some(earlier) = earlier.and_then(|earlier| earlier.runs.get(runs.len())) {
+                    run = joined(earlier, run, request.counting);
+                }
                 if let Some((horizon, reader)) = request.prediction.zip(dataset.as_deref())
                     && let Some(mut predictor) = resolver.predictor(policy)?
                 {
@@ -162,6 +179,7 @@ impl EvalRequest {
             counting: request.counting,
             comparisons: Comparison::all(&runs, request.counting),
             runs,
+            sequential: false,
         })
     }
 
@@ -228,21 +246,26 @@ impl EvalRequest {
         env: &dyn Env,
         variation: VariationRequest,
     ) -> Result<Starts> {
-        let Some((reader, StartsRequest::Dataset { goal_offset, held_out, .. })) = dataset.zip(Some(&self.starts))
-        else {
+        let Some((reader, StartsRequest::Dataset { goal_offset, .. })) = dataset.zip(Some(&self.starts)) else {
             return match self.counting {
                 Counting::Strict { .. } => Starts::episodic(self.episodes, self.seed, variation),
                 Counting::Compat { .. } => Starts::sequential(self.episodes, self.seed, variation),
             };
         };
+        Starts::from_dataset(reader, env, self.picks(reader)?, *goal_offset, self.seed, variation, &[])
+    }
+
+    /// The rows of a dataset that are the starts; none if the environment draws them. Those of a request with fewer episodes
+    /// are the first of them.
+    pub(crate) fn picks(&self, reader: &dyn Reader) -> Result<Vec<[usize; 2]>> {
         let (n, seed) = (self.episodes, self.seed);
-        let picks = match held_out {
-            None => Starts::choose(reader, n, *goal_offset, seed)?,
-            Some(HeldOut { part, split }) => {
-                Starts::choose_among(reader, &split.episodes(reader, *part)?, n, *goal_offset, seed)?
+        match &self.starts {
+            StartsRequest::Episodic => Ok(vec![]),
+            StartsRequest::Dataset { goal_offset, held_out: None, .. } => Starts::choose(reader, n, *goal_offset, seed),
+            StartsRequest::Dataset { goal_offset, held_out: Some(HeldOut { part, split }), .. } => {
+                Starts::choose_among(reader, &split.episodes(reader, *part)?, n, *goal_offset, seed)
             }
-        };
-        Starts::from_dataset(reader, env, picks, *goal_offset, seed, variation, &[])
+        }
     }
 
     fn manifest(&self) -> Result<Manifest> {
@@ -263,6 +286,14 @@ impl EvalRequest {
             manifest.device.clone_from(device);
         }
     }
+}
+
+/// The run of the episodes of two runs, one after the other.
+fn joined(earlier: &Run, later: Run, counting: Counting) -> Run {
+    let strict = earlier.strict.zip(later.strict);
+    let strict = strict.map(|(a, b)| Proportion::wilson(a.successes + b.successes, a.n + b.n));
+    let episodes = earlier.episodes.iter().cloned().chain(later.episodes).collect();
+    Run { strict, ..Run::new(&later.condition, &later.policy, counting, episodes, later.timing) }
 }
 
 /// The summary of a run, for [`Event::Finished`].

@@ -4,9 +4,12 @@
 //! with a probability of 95 %: each interval and each test is at the level 5 % / m for m comparisons (Bonferroni). The
 //! verdict of a comparison follows its interval. Holm's adjusted p-values are stated beside: Holm's test rejects whatever
 //! Bonferroni's rejects and sometimes more, but no simultaneous intervals belong to it.
+//!
+//! Comparisons whose outcomes decide how many pairs there are follow the same procedure with confidence sequences and
+//! e-values: a verdict needs an e-value of m / 5 %.
 
 use super::Paired;
-use super::score;
+use super::{betting, score};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
@@ -69,6 +72,9 @@ pub struct Family {
     /// The smallest difference of rates that a comparison tells apart with a probability of 80 %, as [`detectable`]
     /// computes it; `None` if it shows no difference so reliably.
     pub detectable: Option<f64>,
+    /// Whether the outcomes decided how many pairs there are, so that the intervals are confidence sequences.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub sequential: bool,
 }
 
 impl Family {
@@ -80,13 +86,23 @@ impl Family {
         let comparisons = comparisons.max(tables.len());
         let adjusted = holm(&tables.iter().map(|table| table.p).collect::<Vec<_>>(), comparisons);
         let z = score::upper_quantile(LEVEL / (2 * comparisons.max(1)) as f64);
+        let level = LEVEL / comparisons.max(1) as f64;
         for (table, p_holm) in tables.iter_mut().zip(adjusted) {
-            let [low, high] = score::interval(table.only_a, table.only_b, table.n(), table.design_effect, z);
+            let ([low, high], decidable) = match table.e {
+                None => {
+                    let interval = score::interval(table.only_a, table.only_b, table.n(), table.design_effect, z);
+                    (interval, (table.discordant() as f64 / table.design_effect).sqrt() > z)
+                }
+                Some(_) => {
+                    let interval = betting::mean(&table.outcomes(), 0.5, level).map(|mean| 2.0 * mean - 1.0);
+                    (interval, betting::log_capital(&[(1.0, table.discordant())], 0.5) >= -level.ln())
+                }
+            };
             let verdict = match (low > 0.0, high < 0.0) {
                 (true, _) => Verdict::Higher,
                 (_, true) => Verdict::Lower,
-                _ if (table.discordant() as f64 / table.design_effect).sqrt() <= z => Verdict::TooFew,
-                _ => Verdict::NotToldApart,
+                _ if decidable => Verdict::NotToldApart,
+                _ => Verdict::TooFew,
             };
             **table = Paired { low, high, verdict, comparisons, p_holm, ..**table };
         }
@@ -95,8 +111,10 @@ impl Family {
             tables.iter().map(|table| table.n() as f64 / table.design_effect).fold(f64::INFINITY, f64::min);
         let count = |of: fn(&Paired) -> usize| tables.iter().map(|table| of(table) as f64).sum::<f64>();
         let discordant = count(Paired::discordant) / count(Paired::n).max(1.0);
-        let detectable = detectable(independent, discordant, comparisons);
-        Some(Self { name: name.to_owned(), comparisons, pairs, discordant, detectable })
+        let sequential = tables.iter().any(|table| table.e.is_some());
+        // How many pairs there will be is not known, so no difference can be stated.
+        let detectable = if sequential { None } else { detectable(independent, discordant, comparisons) };
+        Some(Self { name: name.to_owned(), comparisons, pairs, discordant, detectable, sequential })
     }
 }
 
@@ -106,7 +124,14 @@ impl fmt::Display for Family {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { comparisons, pairs, .. } = self;
         let one = *comparisons == 1;
-        write!(f, "{comparisons} comparison{} of {pairs} pairs ", if one { "" } else { "s" })?;
+        let s = if one { "" } else { "s" };
+        if self.sequential {
+            return write!(
+                f,
+                "{comparisons} comparison{s} of {pairs} pairs or more, whose verdicts hold at any number"
+            );
+        }
+        write!(f, "{comparisons} comparison{s} of {pairs} pairs ")?;
         match self.detectable.map(|difference| 100.0 * difference) {
             Some(points) => write!(f, "tell{} a difference of {points:.0} points apart", if one { "s" } else { "" })?,
             None => write!(f, "{} too few to tell any difference apart", if one { "is" } else { "are" })?,
@@ -234,6 +259,27 @@ mod tests {
         Family::correct("all", &mut [&mut five], 100);
         assert!(five.verdict == Verdict::TooFew && five.low < 0.0 && five.low < narrow, "{five:?}");
         assert!(Family::correct("none", &mut [], 4).is_none());
+    }
+
+    #[test]
+    fn verdicts_at_any_number_of_pairs_need_an_e_value_for_all_comparisons() {
+        let sequential = |a: usize, b: usize| {
+            let log = betting::log_capital(&[(1.0, a), (0.0, b)], 0.5);
+            Paired { e: Some(log.exp()), p: (-log).exp().min(1.0), ..Paired::of(9, a, b, 11) }
+        };
+        for comparisons in [1, 13] {
+            for (a, b) in (0..30).step_by(3).flat_map(|a| (0..30).step_by(4).map(move |b| (a, b))) {
+                let mut table = sequential(a, b);
+                let family = Family::correct("", &mut [&mut table], comparisons).expect("a family");
+                let told = matches!(table.verdict, Verdict::Lower | Verdict::Higher);
+                assert_eq!(told, table.low > 0.0 || table.high < 0.0, "{table:?}");
+                assert_eq!(told, table.e.is_some_and(|e| e * LEVEL >= comparisons as f64), "{table:?}");
+                assert!(family.sequential && family.detectable.is_none());
+                let mut decisive = sequential(a + b, 0);
+                Family::correct("", &mut [&mut decisive], comparisons);
+                assert_eq!(table.verdict == Verdict::TooFew, decisive.verdict != Verdict::Higher, "{table:?}");
+            }
+        }
     }
 
     #[test]

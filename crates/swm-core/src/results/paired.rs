@@ -3,7 +3,7 @@
 //! Starts differ in difficulty. A paired test removes this variance: it depends only on the starts that exactly one of
 //! the policies solves.
 
-use super::{Counting, Family, Run, Verdict, score};
+use super::{Counting, EpisodeResult, Family, Run, Verdict, betting, score};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -24,7 +24,8 @@ pub struct Comparison {
 /// Counts of paired outcomes, the test of equal success rates, and the interval of their difference.
 ///
 /// The test is the score test, and the interval its inversion (Tango 1998), so that the interval excludes 0 exactly if
-/// the test rejects. Both are corrected for the number of comparisons of the family ([`Family::correct`]).
+/// the test rejects. Both are corrected for the number of comparisons of the family ([`Family::correct`]). Where the outcomes
+/// decide how many pairs there are, the test is an e-process, and the interval its inversion ([`Paired::sequential`]).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Paired {
     /// Starts that both policies solved.
@@ -35,9 +36,12 @@ pub struct Paired {
     pub only_b: usize,
     /// Starts that neither policy solved.
     pub neither: usize,
-    /// The two-sided p-value of the score test, not corrected. The null hypothesis is that `only_a` and `only_b` are
-    /// equally likely outcomes of the starts that exactly one policy solved.
+    /// The two-sided p-value of the score test, or 1 / `e`, not corrected. The null hypothesis is that `only_a` and `only_b`
+    /// are equally likely outcomes of the starts that exactly one policy solved.
     pub p: f64,
+    /// The e-value of the null hypothesis, if the outcomes decided how many pairs there are; `None` for a fixed number.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub e: Option<f64>,
     /// Holm's adjusted p-value in the family. It may be below 5 % where `verdict`, which follows the interval, tells
     /// nothing apart.
     pub p_holm: f64,
@@ -118,8 +122,12 @@ impl Paired {
     /// Compares the outcomes of two runs on the same starts, whose conditions or policies differ. A start counts if it
     /// counts in both runs. `None` if the runs did not play the same starts, or no start counts.
     pub fn of_runs(a: &Run, b: &Run, counting: Counting) -> Option<Self> {
-        let pairs = || a.episodes.iter().zip(&b.episodes);
-        let same = a.episodes.len() == b.episodes.len() && pairs().all(|(a, b)| (a.seed, a.start) == (b.seed, b.start));
+        Self::of_episodes(&a.episodes, &b.episodes, counting)
+    }
+
+    fn of_episodes(a: &[EpisodeResult], b: &[EpisodeResult], counting: Counting) -> Option<Self> {
+        let pairs = || a.iter().zip(b);
+        let same = a.len() == b.len() && pairs().all(|(a, b)| (a.seed, a.start) == (b.seed, b.start));
         let mut counts = [0; 4];
         // The excess of the first policy in each recorded episode; a start without one is a cluster of its own.
         let mut clusters: BTreeMap<(Option<usize>, usize), i64> = BTreeMap::new();
@@ -138,6 +146,28 @@ impl Paired {
         Self::with_design_effect([both, only_a, only_b, neither], 1.0)
     }
 
+    /// Compares two runs whose numbers of episodes the results decided, on the starts that both have: the first ones. As
+    /// [`Paired::of_runs`], but with statistics that hold at every number of pairs: the e-value of a bet on the pairs that
+    /// differ ([`betting`](super::betting)), and the confidence sequence of the difference.
+    ///
+    /// Starts count as independent draws, which those of a dataset are: the statistics say nothing about other recordings.
+    pub fn sequential(a: &Run, b: &Run, counting: Counting) -> Option<Self> {
+        let n = a.episodes.len().min(b.episodes.len());
+        let mut table = Self::of_episodes(&a.episodes[..n], &b.episodes[..n], counting)?;
+        let log = betting::log_capital(&table.outcomes(), 0.5);
+        // JSON has no infinite numbers.
+        table.e = Some(log.exp().min(f64::MAX));
+        table.p = (-log).exp().min(1.0);
+        table.design_effect = 1.0;
+        Family::correct("", &mut [&mut table], 1);
+        Some(table)
+    }
+
+    /// The outcomes of all pairs: 1 where only the first policy succeeded, 0 where only the second did, 1/2 otherwise.
+    pub(super) fn outcomes(&self) -> [(f64, usize); 3] {
+        [(1.0, self.only_a), (0.0, self.only_b), (0.5, self.both + self.neither)]
+    }
+
     fn with_design_effect([both, only_a, only_b, neither]: [usize; 4], design_effect: f64) -> Self {
         let n = both + only_a + only_b + neither;
         let mut table = Self {
@@ -146,6 +176,7 @@ impl Paired {
             only_b,
             neither,
             p: score::test(only_a, only_b, design_effect),
+            e: None,
             p_holm: 1.0,
             comparisons: 1,
             design_effect,
@@ -177,7 +208,7 @@ impl Paired {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::results::{EpisodeResult, Timing};
+    use crate::results::Timing;
 
     fn run(policy: &str, outcomes: &[(u64, bool, bool)]) -> Run {
         let episodes = outcomes.iter().map(|&(seed, success, solved_at_start)| EpisodeResult {
@@ -209,6 +240,27 @@ mod tests {
             Comparison::of(&other, &floor, Counting::default()).is_none(),
             "runs with other conditions are not compared"
         );
+    }
+
+    #[test]
+    fn runs_of_different_lengths_are_compared_on_their_common_starts() {
+        let outcomes = |n: u64, solved: u64| (0..n).map(|seed| (seed, seed < solved, false)).collect::<Vec<_>>();
+        let (model, floor) = (run("model", &outcomes(30, 14)), run("random", &outcomes(20, 2)));
+        let counting = Counting::default();
+        let table = Paired::sequential(&model, &floor, counting).expect("20 common starts");
+        assert_eq!([table.both, table.only_a, table.only_b, table.neither], [2, 12, 0, 6]);
+        let e = table.e.expect("an e-value");
+        assert!((table.p - 1.0 / e).abs() < 1e-12 && table.verdict == Verdict::Higher && table.low > 0.0, "{table:?}");
+        // A fixed number of pairs decides earlier.
+        let fixed = Paired::of(2, 12, 0, 6);
+        assert!(fixed.p < table.p && fixed.low > table.low && fixed.high < table.high && fixed.e.is_none());
+        let five = (run("model", &outcomes(10, 7)), run("random", &outcomes(10, 2)));
+        assert_eq!(Paired::of(2, 5, 0, 3).verdict, Verdict::Higher);
+        let sequential = Paired::sequential(&five.0, &five.1, counting).expect("10 starts");
+        assert_eq!(sequential.verdict, Verdict::TooFew);
+        let mut other = floor;
+        other.episodes[3].seed = 77;
+        assert!(Paired::sequential(&model, &other, counting).is_none(), "other starts");
     }
 
     #[test]

@@ -1,11 +1,12 @@
 //! Statistics of results: proportions with confidence intervals, and summaries of many values.
 
+use super::betting;
 use serde::{Deserialize, Serialize};
 
 /// The 97.5th percentile of the standard normal distribution, for two-sided 95 % intervals.
 const Z: f64 = 1.959_963_984_540_054;
 
-/// A success rate with its 95 % Wilson score interval.
+/// A success rate with its 95 % interval: Wilson's, or a confidence sequence.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Proportion {
     /// The number of successes.
@@ -32,6 +33,13 @@ impl Proportion {
         let centre = (p + Z * Z / (2.0 * count)) / scale;
         let half = Z / scale * (p * (1.0 - p) / count + Z * Z / (4.0 * count * count)).sqrt();
         Self { successes, n, rate: p, low: (centre - half).max(0.0), high: (centre + half).min(1.0) }
+    }
+
+    /// The proportion with the confidence sequence of level 95 %, which holds although the outcomes decide how many trials
+    /// there are ([`betting`](super::betting)).
+    pub fn sequential(successes: usize, n: usize) -> Self {
+        let [low, high] = betting::rate(successes, n, 0.05);
+        Self { low, high, ..Self::wilson(successes, n) }
     }
 }
 
@@ -78,6 +86,16 @@ mod tests {
         for (successes, n, low, high) in [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611)] {
             let p = Proportion::wilson(successes, n);
             assert!((p.low - low).abs() < 5e-5 && (p.high - high).abs() < 5e-5, "{p:?}");
+        }
+    }
+
+    #[test]
+    fn confidence_sequences_hold_the_rate_and_are_wider_than_wilson_intervals() {
+        for (successes, n) in [(0, 0), (0, 7), (7, 7), (3, 7), (450, 1400)] {
+            let (sequential, fixed) = (Proportion::sequential(successes, n), Proportion::wilson(successes, n));
+            assert_eq!((sequential.rate, sequential.n), (fixed.rate, n));
+            assert!(sequential.low <= fixed.rate && fixed.rate <= sequential.high, "{sequential:?}");
+            assert!(sequential.high - sequential.low >= fixed.high - fixed.low, "{sequential:?} {fixed:?}");
         }
     }
 

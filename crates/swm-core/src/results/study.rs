@@ -1,6 +1,6 @@
 //! [`StudyResults`]: the success rates of all cells of a study, as read by tables and reports.
 
-use super::{Counting, Family, OverSeeds, Paired, Proportion};
+use super::{BreakingPoint, Counting, Family, OverSeeds, Paired, Proportion, Until};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -25,6 +25,31 @@ pub struct StudyResults {
     /// Rows that differ in the training seed only, taken together.
     #[serde(default)]
     pub over_seeds: Vec<OverSeeds>,
+    /// The rule that ends the study, if its results decide the numbers of episodes. All intervals are confidence sequences
+    /// then, and verdicts follow e-values; statistics that hold for a fixed number only are left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub until: Option<Until>,
+    /// Where success breaks, for each policy of a study along a ray.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub breaking: Vec<BreakingPoint>,
+}
+
+impl StudyResults {
+    /// What the rule that ends the study means for its statistics, and how many rows of a study that is done did not meet it.
+    /// Nothing without a rule.
+    pub fn notes_on_rule(&self) -> Vec<String> {
+        let Some(until) = self.until else { return vec![] };
+        let mut notes = vec![format!(
+            "The study ran until {until}: intervals are confidence sequences and p-values are 1 / e, so they hold although \
+             the results decided the numbers of episodes."
+        )];
+        let unmet = self.rows.iter().filter(|row| !until.is_met(row)).count();
+        if unmet > 0 && self.done == self.cells {
+            let rows = self.rows.len();
+            notes.push(format!("{unmet} of {rows} rows have the largest number of episodes and do not meet {until}."));
+        }
+        notes
+    }
 }
 
 /// The outcome of one policy under one condition.

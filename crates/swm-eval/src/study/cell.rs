@@ -1,9 +1,9 @@
 //! [`Study`] and [`Cell`]: what a study evaluates.
 
-use crate::request::EvalRequest;
+use crate::request::{EvalRequest, StartsRequest};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-use swm_core::results::Published;
+use swm_core::results::{Counting, Published, Ray, Until};
 use swm_core::{Error, Result, manifest};
 
 /// A study.
@@ -18,6 +18,12 @@ pub struct Study {
     pub families: Vec<Common>,
     /// The evaluations.
     pub cells: Vec<Cell>,
+    /// The rule that ends the study, if its results decide how many of the episodes of each request are played.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub until: Option<Until>,
+    /// The factor that the conditions change along a ray, if they do. It is no part of the hash.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ray: Option<Ray>,
     /// Success rates that a publication states for conditions of this study. They are no part of its hash.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub published: Vec<Published>,
@@ -68,15 +74,20 @@ pub struct Cell {
     /// The hashes of the dataset and the weights that the request names. With other data or weights of the same name, it
     /// is another cell.
     pub inputs: BTreeMap<String, String>,
+    /// Whether the results of the study decide how many episodes are played; those of the request are the most.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub sequential: bool,
 }
 
 impl Cell {
-    /// The id: the first 16 hexadecimal digits of the hash of the request and its inputs.
+    /// The id: the first 16 hexadecimal digits of the hash of the request and its inputs. If the results decide the number
+    /// of episodes, it is no part of the id, so that a cell with more episodes continues one with fewer.
     ///
     /// # Errors
     /// When the request cannot be written as JSON.
     pub fn id(&self) -> Result<String> {
-        Ok(hash(&(&self.request, &self.inputs))?[..16].to_owned())
+        let of = |request: &EvalRequest| -> Result<String> { Ok(hash(&(request, &self.inputs))?[..16].to_owned()) };
+        if self.sequential { of(&EvalRequest { episodes: 0, ..self.request.clone() }) } else { of(&self.request) }
     }
 
     /// The name of the condition.
@@ -105,12 +116,21 @@ impl Study {
     /// The largest number of cells.
     pub const MAX_CELLS: usize = 10_000;
 
-    /// The hash of all requests and their inputs.
+    /// The hash of all requests and their inputs, and of the rule that ends the study, if there is one.
     ///
     /// # Errors
     /// When a request cannot be written as JSON.
     pub fn hash(&self) -> Result<String> {
-        hash(&self.cells.iter().map(|cell| (&cell.request, &cell.inputs)).collect::<Vec<_>>())
+        let cells: Vec<_> = self.cells.iter().map(|cell| (&cell.request, &cell.inputs)).collect();
+        self.until.map_or_else(|| hash(&cells), |until| hash(&(&cells, until)))
+    }
+
+    /// This study with a rule that ends it: its results decide how many of the episodes of each request are played.
+    #[must_use]
+    pub fn until(mut self, until: Until) -> Self {
+        self.until = Some(until);
+        self.cells.iter_mut().for_each(|cell| cell.sequential = true);
+        self
     }
 
     /// Checks every request, and that no two cells are equal.
@@ -126,6 +146,10 @@ impl Study {
             let what = format!("the published rate of '{}' under '{}'", value.policy, value.condition);
             return Err(Error::config(what, format!("is {}", value.rate), "give a share from 0 to 1"));
         }
+        self.check_rule()?;
+        if let Some(ray) = self.ray.as_ref().filter(|ray| !(0.0..=1.0).contains(&ray.below)) {
+            return Err(Error::config("the bound of the ray", format!("is {}", ray.below), "give a share from 0 to 1"));
+        }
         let mut seen = BTreeMap::new();
         for cell in &self.cells {
             cell.request.check()?;
@@ -140,6 +164,27 @@ impl Study {
             }
         }
         Ok(())
+    }
+
+    /// Checks that the cells can be evaluated until the rule is met.
+    fn check_rule(&self) -> Result<()> {
+        let invalid = |problem: &str, fix: &str| Err(Error::config("--until", problem, fix));
+        if self.cells.iter().any(|cell| cell.sequential != self.until.is_some()) {
+            return invalid("some cells have a fixed number of episodes and some do not", "run the study again");
+        }
+        let is_parallel = |cell: &Cell| {
+            matches!(cell.request.counting, Counting::Compat { .. }) && cell.request.starts == StartsRequest::Episodic
+        };
+        match self.until {
+            Some(_) if self.cells.iter().any(is_parallel) => invalid(
+                "compat counting of drawn starts counts the episodes that finish first, so none of them can follow later",
+                "use protocol=strict, or take starts from a dataset",
+            ),
+            Some(Until::Decided(_)) if self.cells.iter().all(|cell| cell.condition() == self.unshifted()) => {
+                invalid("the study has one condition, so no gap to decide", "give --until ci=5, or a second condition")
+            }
+            _ => Ok(()),
+        }
     }
 }
 

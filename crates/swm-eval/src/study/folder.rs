@@ -35,9 +35,15 @@ impl StudyFolder {
             Error::config(self.root.display().to_string(), problem, "give another folder with --output")
         };
         if path.exists() {
-            let found = self.study()?.title;
+            let Study { title: found, until, .. } = self.study()?;
             if found != study.title {
                 return Err(other(format!("holds the study '{found}', not '{}'", study.title)));
+            }
+            if let (Some(until), None) = (until, study.until) {
+                let problem = format!("holds a study that ran with --until {until}");
+                let fix = "intervals for a fixed number of episodes do not hold for it: give --until again, or another folder \
+                           with --output";
+                return Err(Error::config(self.root.display().to_string(), problem, fix));
             }
         } else {
             let io = |error| Error::io(&self.root, "reading the folder", error);
@@ -67,7 +73,7 @@ impl StudyFolder {
         Ok(study)
     }
 
-    /// Returns the results of a cell, or `None` if it is not done.
+    /// Returns the results of a cell, or `None` if it has none. Those of a sequential cell may have any number of episodes.
     ///
     /// # Errors
     /// When the results are damaged, or are those of another request.
@@ -94,6 +100,7 @@ impl StudyFolder {
         for run in &mut results.runs {
             run.timing = Default::default();
         }
+        results.sequential = cell.sequential;
         files::write(&self.path(cell)?, &json(&results)?)
     }
 
@@ -121,9 +128,11 @@ fn delete_temporary(folder: &Path, is_written: impl Fn(&str) -> bool) -> Result<
 fn answers(results: &Results, cell: &Cell) -> Result<bool> {
     let (found, requested) = (EvalRequest::of(&results.manifest)?, cell.request.with_floor()?);
     let budget = requested.budget.or(found.budget);
+    let episodes = if cell.sequential { found.episodes } else { requested.episodes };
     let hashes = &results.manifest.hashes;
     let same_inputs = cell.inputs.iter().all(|(input, hash)| hashes.get(input) == Some(hash));
-    Ok(found == EvalRequest { budget, ..requested } && same_inputs)
+    let has_all = !cell.sequential || results.runs.iter().all(|run| run.episodes.len() == episodes);
+    Ok(found == EvalRequest { budget, episodes, ..requested } && same_inputs && has_all)
 }
 
 fn json(value: &impl serde::Serialize) -> Result<Vec<u8>> {

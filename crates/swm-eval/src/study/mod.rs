@@ -4,6 +4,9 @@
 //! cells whose results are not in the [`StudyFolder`] yet. All cells with one source of starts and one seed play the same
 //! starts, so that policies and conditions are compared in pairs.
 //!
+//! With a rule that ends it ([`Study::until`]), a study plays its starts in stages, and the results of a stage decide which
+//! cells play more.
+//!
 //! The files of a study hold no times, so a study that was interrupted and continued writes the same bytes as one that was
 //! not.
 
@@ -11,6 +14,7 @@ mod cell;
 mod folder;
 mod rows;
 mod run;
+mod stages;
 
 pub use cell::{Cell, Common, Study};
 pub use folder::StudyFolder;

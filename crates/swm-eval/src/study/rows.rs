@@ -3,7 +3,9 @@
 use super::cell::{Cell, Study};
 use super::folder::StudyFolder;
 use std::collections::{BTreeMap, BTreeSet};
-use swm_core::results::{Family, OverSeeds, Paired, Proportion, Run, StudyResults, StudyRow};
+use swm_core::results::{
+    BreakingPoint, Counting, Family, OverSeeds, Paired, Proportion, Ray, Run, StudyResults, StudyRow, Until,
+};
 use swm_core::{Result, Results};
 
 impl Study {
@@ -18,16 +20,25 @@ impl Study {
                 done.push((cell, results));
             }
         }
+        self.tabulate(&done)
+    }
+
+    /// Returns the outcomes of some cells.
+    pub(super) fn tabulate(&self, done: &[(&Cell, Results)]) -> Result<StudyResults> {
         let (unshifted, variables) = (self.unshifted(), self.common_variables());
         let of_unshifted = done.iter().filter(|(cell, _)| cell.condition() == unshifted);
         let unshifted_runs: BTreeMap<String, Option<&Run>> = of_unshifted
             .map(|(cell, results)| (key(cell, &variables), runs(cell, results).map(|(run, _)| run)))
             .collect();
         let mut rows = vec![];
-        for (cell, results) in &done {
+        for (cell, results) in done {
             let Some((run, floor)) = runs(cell, results) else { continue };
             let reference = unshifted_runs.get(&key(cell, &variables)).copied().flatten();
             let reference = reference.filter(|_| cell.condition() != unshifted);
+            let rate = |p: &Proportion| match self.until {
+                None => *p,
+                Some(_) => Proportion::sequential(p.successes, p.n),
+            };
             rows.push(StudyRow {
                 cell: cell.id()?,
                 starts: cell.starts.clone(),
@@ -37,23 +48,27 @@ impl Study {
                 any_seed: cell.any_seed.clone(),
                 counting: results.counting,
                 seed: cell.request.seed,
-                success: run.success,
+                success: rate(&run.success),
                 solved_at_start: run.solved_at_start,
-                floor,
-                gap: reference.and_then(|reference| Paired::of_runs(run, reference, results.counting)),
+                floor: rate(&floor),
+                gap: reference.and_then(|reference| self.comparing()(run, reference, results.counting)),
             });
         }
         let families = self.correct(&mut rows)?;
-        let over_seeds = OverSeeds::all(&rows, unshifted);
+        // The spread over training seeds would be that of a fixed number of episodes.
+        let over_seeds = if self.until.is_some() { vec![] } else { OverSeeds::all(&rows, unshifted) };
+        let open = self.until.map_or(0, |until| self.open(until, &rows, done).len());
         Ok(StudyResults {
             title: self.title.clone(),
             question: self.question.clone(),
             hash: self.hash()?,
             cells: self.cells.len(),
-            done: done.len(),
+            done: done.len() - open,
             rows,
             families,
             over_seeds,
+            until: self.until,
+            breaking: self.breaking(done),
         })
     }
 
@@ -81,14 +96,63 @@ impl Study {
             *comparisons += 1;
             tables.extend(gap.flatten());
         }
+        // Which levels of a ray are evaluated depends on outcomes.
+        let possible = if self.ray.is_some() { Ray::LEVELS } else { 0 };
         let corrected = |(name, (comparisons, mut tables)): (String, (usize, Vec<&mut Paired>))| {
-            Family::correct(&name, &mut tables, comparisons)
+            Family::correct(&name, &mut tables, comparisons.max(possible))
         };
         Ok(families.into_iter().filter_map(corrected).collect())
     }
 
+    /// The comparison of two runs.
+    fn comparing(&self) -> Comparing {
+        if self.until.is_some() { Paired::sequential } else { Paired::of_runs }
+    }
+
+    /// Where success breaks, for each unshifted cell.
+    fn breaking(&self, done: &[(&Cell, Results)]) -> Vec<BreakingPoint> {
+        let (Some(ray), variables) = (&self.ray, self.common_variables()) else { return vec![] };
+        let is_unshifted = |cell: &Cell| cell.condition() == self.unshifted();
+        let point = |(unshifted, results): &(&Cell, Results)| {
+            let same = |cell: &Cell| !is_unshifted(cell) && key(cell, &variables) == key(unshifted, &variables);
+            let levels = done.iter().filter(|(cell, _)| same(cell)).enumerate().filter_map(|(i, (cell, results))| {
+                let change = cell.variables.get(Ray::VARIABLE).and_then(|change| change.parse().ok());
+                Some((change.unwrap_or(i as f64), runs(cell, results)?.0))
+            });
+            let (run, _) = runs(unshifted, results)?;
+            BreakingPoint::of(ray, run, &levels.collect::<Vec<_>>(), results.counting, self.comparing())
+        };
+        done.iter().filter(|(cell, _)| is_unshifted(cell)).filter_map(point).collect()
+    }
+
+    /// The ids of the cells that need more episodes by the rule and have fewer than their requests: those whose rows do not
+    /// meet it, and, for a rule of gaps, the unshifted cells that these are compared with.
+    pub(super) fn open(&self, until: Until, rows: &[StudyRow], done: &[(&Cell, Results)]) -> BTreeSet<String> {
+        let variables = self.common_variables();
+        let unmet: BTreeSet<&str> = rows.iter().filter(|row| !until.is_met(row)).map(|row| row.cell.as_str()).collect();
+        let with_ids = || done.iter().filter_map(|(cell, results)| Some((cell, results, cell.id().ok()?)));
+        let compared: BTreeSet<String> = match until {
+            Until::Width(_) => BTreeSet::new(),
+            Until::Decided(_) => with_ids()
+                .filter(|(_, _, id)| unmet.contains(id.as_str()))
+                .map(|(cell, ..)| key(cell, &variables))
+                .collect(),
+        };
+        let is_reference =
+            |cell: &Cell| cell.condition() == self.unshifted() && compared.contains(&key(cell, &variables));
+        let is_short = |cell: &Cell, results: &Results| {
+            results.runs.first().is_some_and(|run| run.episodes.len() < cell.request.episodes)
+        };
+        with_ids()
+            .filter(|(cell, results, id)| {
+                is_short(cell, results) && (unmet.contains(id.as_str()) || is_reference(cell))
+            })
+            .map(|(.., id)| id)
+            .collect()
+    }
+
     /// The name of the first condition, which is not shifted.
-    fn unshifted(&self) -> &str {
+    pub(super) fn unshifted(&self) -> &str {
         self.cells.first().map_or("", Cell::condition)
     }
 
@@ -108,6 +172,9 @@ impl Study {
         all.into_keys().collect()
     }
 }
+
+/// A paired comparison of two runs.
+type Comparing = fn(&Run, &Run, Counting) -> Option<Paired>;
 
 /// The run of the cell's policy, and the success rate of the random-policy floor.
 fn runs<'a>(cell: &Cell, results: &'a Results) -> Option<(&'a Run, Proportion)> {

@@ -1,18 +1,22 @@
 //! Runs the cells of a study that have no results.
 
-use super::cell::Study;
+use super::cell::{Cell, Study};
 use super::folder::StudyFolder;
+use crate::request::EvalRequest;
 use crate::runner::{Resolver, RunOptions};
 use std::sync::{Mutex, PoisonError};
-use swm_core::Result;
 use swm_core::run::{Control, Event, Progress, Stage};
+use swm_core::{Result, Results};
 
 /// The name of the stage.
 const STAGE: &str = "study";
 
+/// A cell to evaluate, its results so far, and the number of its episodes then.
+pub(super) type Work<'a> = (&'a Cell, Option<Results>, usize);
+
 impl Study {
-    /// Evaluates the cells that have no results in the folder, in order, and stores each when it is done. Returns the
-    /// number of evaluated cells.
+    /// Evaluates the cells that have no results in the folder, in order, and stores each when it is done; in stages, if a rule
+    /// ends the study. Returns the number of evaluated cells.
     ///
     /// The stage is `study`, its unit an episode of the policies; the random-policy floor is not counted.
     ///
@@ -25,16 +29,33 @@ impl Study {
         options: &RunOptions,
         control: &mut Control<'_>,
     ) -> Result<usize> {
-        let mut missing = vec![];
+        if let Some(until) = self.until {
+            return self.run_until(until, folder, resolver, options, control);
+        }
+        let mut missing: Vec<Work<'_>> = vec![];
         for cell in &self.cells {
             if folder.results(cell)?.is_none() {
-                missing.push(cell);
+                missing.push((cell, None, cell.request.episodes));
             }
         }
-        let total = missing.iter().map(|cell| cell.request.episodes).sum();
+        self.evaluate(&missing, folder, resolver, options, control)?;
+        Ok(missing.len())
+    }
+
+    /// Evaluates cells in order, and stores each when it is done.
+    pub(super) fn evaluate(
+        &self,
+        work: &[Work<'_>],
+        folder: &StudyFolder,
+        resolver: &dyn Resolver,
+        options: &RunOptions,
+        control: &mut Control<'_>,
+    ) -> Result<()> {
+        let played = |earlier: &Option<Results>| earlier.as_ref().map_or(0, episodes);
+        let total = work.iter().map(|(_, earlier, episodes)| episodes - played(earlier)).sum();
         control.emit(Event::Started(Stage { name: STAGE, subject: &[&self.title], total, unit: "episodes" }));
         let mut done = 0;
-        for cell in &missing {
+        for (cell, earlier, episodes) in work {
             control.check()?;
             let outer = Mutex::new(&mut *control);
             let lock = || outer.lock().unwrap_or_else(PoisonError::into_inner);
@@ -47,12 +68,18 @@ impl Study {
                 Event::Log(line) => lock().emit(Event::Log(line)),
                 _ => {}
             });
-            let results = cell.request.run(resolver, options, &mut inner)?;
+            let request = EvalRequest { episodes: *episodes, ..cell.request.clone() };
+            let results = request.extend(earlier.as_ref(), resolver, options, &mut inner)?;
             drop(inner);
             folder.store(cell, results)?;
-            done += cell.request.episodes;
+            done += episodes - played(earlier);
         }
-        control.emit(Event::Finished { stage: STAGE, metrics: &[("cells", missing.len() as f64)] });
-        Ok(missing.len())
+        control.emit(Event::Finished { stage: STAGE, metrics: &[("cells", work.len() as f64)] });
+        Ok(())
     }
+}
+
+/// The number of episodes of results.
+pub(super) fn episodes(results: &Results) -> usize {
+    results.runs.first().map_or(0, |run| run.episodes.len())
 }

@@ -9,3 +9,4 @@ mod memory;
 mod predicting;
 mod replaying;
 mod requesting;
+mod stopping;

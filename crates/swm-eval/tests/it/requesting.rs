@@ -17,13 +17,13 @@ use swm_eval::{
 };
 
 /// A resolver of the line environment, one dataset, and a walker with weights.
-struct TestResolver {
+pub struct TestResolver {
     data: Arc<MemoryReader>,
     weights: String,
 }
 
 impl TestResolver {
-    fn new() -> Self {
+    pub fn new() -> Self {
         Self { data: Arc::new(recorded(60)), weights: "w0".to_owned() }
     }
 }
@@ -51,7 +51,7 @@ impl Resolver for TestResolver {
     }
 }
 
-fn request() -> EvalRequest {
+pub fn request() -> EvalRequest {
     EvalRequest {
         version: EvalRequest::VERSION,
         env: "test/Line-v0".to_owned(),

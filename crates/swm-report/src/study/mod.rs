@@ -1,9 +1,10 @@
 //! The page of a study: an answer, figures, a table, and published values beside ours.
 //!
-//! - `sheet` arranges the rows; `answer` says what they show in one sentence; `table`, `over_seeds` and `published` write
-//!   tables; `figures` chooses and draws the figures; `decay` fits a curve; this module writes the files.
+//! - `sheet` arranges the rows; `answer` says what they show in one sentence; `table`, `over_seeds`, `published` and
+//!   `breaking` write tables; `figures` chooses and draws the figures; `decay` fits a curve; this module writes the files.
 
 mod answer;
+mod breaking;
 mod decay;
 mod figures;
 mod over_seeds;
@@ -108,12 +109,16 @@ fn render(page: &StudyPage, sheets: &[Sheet<'_>], figures: &[Placed]) -> String 
             results.cells,
             escape(&shorten(&results.hash, limits::STUDY_NAME_CHARS))
         );
+        for note in results.notes_on_rule() {
+            let _ = writeln!(html, "<p class=\"note\">{}</p>", escape(&note));
+        }
         if let Some(command) = command {
             let command = escape(&shorten(command, limits::STUDY_TEXT_CHARS));
             let _ =
                 write!(html, "<p>The command that runs the study again, or continues it:</p>\n<pre>{command}</pre>\n");
         }
         html.push_str("</section>\n");
+        breaking::write(html, &results.breaking);
         write_figures(html, figures);
         table::write(html, sheets, &results.families);
         over_seeds::write(html, &results.over_seeds);

@@ -15,6 +15,8 @@ pub(super) struct Sheet<'a> {
     rows: BTreeMap<[usize; 3], &'a StudyRow>,
     /// The condition that is not shifted.
     pub unshifted: Option<usize>,
+    /// Whether the results decided the numbers of episodes, so that statistics of a fixed number do not hold.
+    pub sequential: bool,
 }
 
 /// A policy with its colour, which is the same in all sheets.
@@ -44,7 +46,10 @@ impl<'a> Sheet<'a> {
         let inks = inks(results);
         let unshifted = results.rows.first().filter(|row| row.gap.is_none()).map(|row| row.condition.as_str());
         let labels = labels(&groups);
-        let sheets = groups.into_iter().zip(labels).map(|(rows, label)| Self::of(&rows, label, unshifted, &inks));
+        let sheets = groups.into_iter().zip(labels).map(|(rows, label)| Self {
+            sequential: results.until.is_some(),
+            ..Self::of(&rows, label, unshifted, &inks)
+        });
         sheets.collect()
     }
 
@@ -61,7 +66,7 @@ impl<'a> Sheet<'a> {
         }
         let unshifted = conditions.names.iter().position(|name| Some(*name) == unshifted);
         let policies = policies.names.iter().map(|name| Policy { name, ink: inks[name] }).collect();
-        Self { label, countings, conditions: conditions.names, policies, rows: cells, unshifted }
+        Self { label, countings, conditions: conditions.names, policies, rows: cells, unshifted, sequential: false }
     }
 
     /// The row of a condition and a policy, by their indices.

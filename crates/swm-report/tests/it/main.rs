@@ -48,6 +48,7 @@ fn results() -> Results {
         counting: Counting::default(),
         comparisons: Comparison::all(&runs, Counting::default()),
         runs,
+        sequential: false,
     }
 }
 

@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 use swm_core::results::{
-    Counting, Family, Interquartile, OverSeeds, Paired, Proportion, Published, StudyResults, StudyRow,
+    BreakingPoint, Counting, Crossing, Family, Interquartile, Level, OverSeeds, Paired, Proportion, Published, Ray,
+    Side, StudyResults, StudyRow,
 };
 use swm_report::{StudyPage, write_study};
 
@@ -200,8 +201,13 @@ fn curves_wheels_and_maps_follow_from_the_conditions() {
     let successes = [38, 33, 25, 16, 6];
     let mut rows = vec![row("in distribution", "LeWM", &[("count", "0")], 40)];
     rows.extend(values.iter().zip(successes).map(|(x, k)| row(&format!("{x} squares"), "LeWM", &[("count", x)], k)));
-    let line = page(&of(rows), folder.path());
+    let mut study = of(rows);
+    let line = page(&study, folder.path());
     assert!(line.contains("Success against count") && line.contains("LeWM: b = 0.1"), "{line}");
+    // The interval of the decay is that of a fixed number of episodes.
+    study.results.until = Some("ci=5".parse().expect("a rule"));
+    let line = page(&study, folder.path());
+    assert!(line.contains("ran until ci=5") && line.contains("Success against count") && !line.contains("LeWM: b ="));
 
     let mut rows = vec![row("in distribution", "LeWM", &[], 40)];
     for saturation in ["0.5", "1"] {
@@ -241,6 +247,35 @@ fn page_of_ten_thousand_cells_is_small() {
     // Every cell in a sheet of its own: figures and tables are bounded.
     let sheets = page(&cells(10_000, 10_000), folder.path());
     assert!(sheets.contains("more rows are in <code>table.csv</code>"), "{} bytes", sheets.len());
+}
+
+/// A family whose counts are as large as they can be.
+fn family(name: &str, sequential: bool) -> Family {
+    Family {
+        name: name.to_owned(),
+        comparisons: usize::MAX,
+        pairs: usize::MAX,
+        discordant: f64::NAN,
+        detectable: None,
+        sequential,
+    }
+}
+
+/// A breaking point of a policy with many levels and crossings at one value.
+fn breaking(policy: &str, condition: &str, value: f64, ordered: bool) -> BreakingPoint {
+    let name = condition.to_owned();
+    let (half, bound) = (Side::Above, Side::Below);
+    let level = Level { condition: name.clone(), change: value, rate: value, half, bound };
+    let crossing = Crossing { above: Some(name.clone()), below: None, estimates: vec![[value; 2]; 3000] };
+    BreakingPoint {
+        ray: Ray { factor: name.clone(), below: value, ordered },
+        policy: policy.to_owned(),
+        unshifted: value,
+        levels: vec![level; 100],
+        half: crossing.clone(),
+        bound: crossing,
+        rises: vec![[name.clone(), name]; 50],
+    }
 }
 
 #[test]
@@ -284,14 +319,10 @@ fn hostile_names_and_values_are_escaped_and_bounded() {
     };
     study.published = (0..5000).map(of_names).collect();
     study.results.over_seeds = (0..5000).map(|i| over_seeds(names[i % 8], bad[i % bad.len()])).collect();
-    let family = |i: usize| Family {
-        name: names[i % 8].to_owned(),
-        comparisons: usize::MAX,
-        pairs: usize::MAX,
-        discordant: f64::NAN,
-        detectable: None,
-    };
+    let family = |i: usize| family(names[i % 8], i.is_multiple_of(2));
     study.results.families = (0..5000).map(family).collect();
+    let point = |i: usize| breaking(names[i % 8], names[(i + 1) % 8], bad[i % bad.len()], i.is_multiple_of(2));
+    study.results.breaking = (0..100).map(point).collect();
     for (title, text) in [(names[0], long.as_str()), (long.as_str(), names[1]), (names[2], names[3])] {
         study.results.title = title.to_owned();
         study.results.question = text.to_owned();

@@ -7,7 +7,7 @@ use crate::home;
 use clap::Args;
 use serde_json::json;
 use std::path::PathBuf;
-use swm_core::Results;
+use swm_core::{Error, Results};
 use swm_report::ReportOptions;
 
 /// Arguments of `swm report`.
@@ -34,7 +34,13 @@ pub fn report(args: &ReportArgs, as_json: bool) -> anyhow::Result<()> {
         .iter()
         .map(|path| {
             let file = if path.is_dir() { path.join("results.json") } else { path.clone() };
-            swm_report::read_results(&file).map(|results| (file, results))
+            let results = swm_report::read_results(&file)?;
+            if results.sequential {
+                let problem = "its study ran with --until, so the intervals for a fixed number of episodes do not hold";
+                let fix = "show the study: `swm study report`";
+                return Err(Error::config(file.display().to_string(), problem, fix));
+            }
+            Ok((file, results))
         })
         .collect();
     let read = read?;

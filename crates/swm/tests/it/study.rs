@@ -117,6 +117,79 @@ fn study_pairs_conditions_and_resumes_to_the_same_bytes() {
 }
 
 #[test]
+fn study_with_a_rule_shows_confidence_sequences_and_resumes_to_the_same_bytes() {
+    let swm = with_study();
+    let args = |folder: &'static str| ["study", "run", "study.toml", "--output", folder, "--until", "ci=20"];
+    let settings = ["episodes=90", "seed=0"];
+    let results = swm.json(&[&args("whole")[..], &settings].concat());
+    assert_eq!((results["done"].as_u64(), results["until"].as_str()), (Some(6), Some("ci=20")));
+    for row in results["rows"].as_array().expect("rows") {
+        let [low, high] = ["low", "high"].map(|end| row["success"][end].as_f64().expect("an end"));
+        assert!(high - low <= 0.4, "{row}");
+        assert!(row["gap"].is_null() || row["gap"]["e"].is_number(), "{row}");
+    }
+    for moment in 0..3 {
+        let args = [&args("killed")[..], &settings].concat();
+        let mut child = swm.command(&args).stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("swm starts");
+        std::thread::sleep(Duration::from_millis(60 * moment));
+        let _ = child.kill();
+        child.wait().expect("the process ends");
+    }
+    swm.json(&[&args("killed")[..], &settings].concat());
+    assert!(contents(&swm.path("killed")) == contents(&swm.path("whole")), "a study that was killed differs");
+    let csv = swm.run(&["study", "export", "whole"]);
+    assert!(text(&csv.stdout).lines().nth(2).is_some_and(|line| line.ends_with(",ci=20")), "{}", text(&csv.stdout));
+    swm.json(&["study", "report", "whole"]);
+    let status = swm.run(&["study", "status", "whole"]);
+    let [page, table] = ["index.html", "table.tex"].map(|file| contents(&swm.path("whole/report"))[file].clone());
+    for words in [&page, &table, &status.stdout] {
+        assert!(text(words).contains("ran until ci=20: intervals are confidence sequences"), "{}", text(words));
+    }
+    assert!(text(&page).contains("study.toml episodes=90 seed=0 --until ci=20 --output study"));
+    swm.fails(&["study", "run", "study.toml", "--output", "whole"], 2, &["--until ci=20", "--output"]);
+    let cell = format!("whole/cells/{}.json", results["rows"][0]["cell"].as_str().expect("an id"));
+    swm.fails(&["report", &cell], 2, &["--until", "swm study report"]);
+    swm.fails(&["study", "run", "study.toml", "--output", "x", "--until", "narrow"], 2, &["narrow", "ci=5"]);
+}
+
+#[test]
+fn breaking_points_are_found_along_a_ray_and_for_each_value() {
+    let swm = Swm::new();
+    let of = |factor: &'static str| ["study", "break", "expert", "env=swm/TwoRoom-v1", "--factor", factor, "-o"];
+    let settings = ["no-pixels=true", "budget=30", "episodes=80"];
+    // A slow agent does not arrive in time.
+    let args = [&of("agent.speed")[..], &["speed", "--towards", "1.75"], &settings].concat();
+    let results = swm.json(&args);
+    assert_eq!((results["cells"].as_u64(), results["done"].as_u64()), (Some(12), Some(12)), "{results}");
+    let point = &results["breaking"][0];
+    let crossing = &point["half"]["estimates"][0];
+    let [low, high] = [0, 1].map(|end| crossing[end].as_f64().expect("a change"));
+    assert!(high - low < 0.04 && low > 0.1, "{crossing}");
+    for end in ["above", "below"] {
+        assert!(point["half"][end].as_str().is_some_and(|name| name.starts_with("agent.speed=")), "{point}");
+    }
+    assert!(results["families"][0]["comparisons"] == 32 && point["rises"] == serde_json::json!([]), "{results}");
+    let whole = contents(&swm.path("speed"));
+    assert_eq!(swm.json(&args), results);
+    assert!(contents(&swm.path("speed")) == whole, "a study that was done changed");
+    swm.json(&["study", "report", "speed"]);
+    let page = text(&contents(&swm.path("speed/report"))["index.html"]);
+    for words in
+        ["Breaking point</h2>", "falls below half of its unshifted", "swm study break expert env=swm/TwoRoom-v1"]
+    {
+        assert!(page.contains(words), "the page lacks: {words}");
+    }
+    let shapes = swm.json(&[&of("door.number")[..], &["doors"], &settings].concat());
+    assert_eq!((shapes["cells"].as_u64(), &shapes["breaking"][0]["ray"]["ordered"]), (Some(3), &false.into()));
+    let status = swm.run(&["study", "status", "doors"]);
+    assert!(text(&status.stdout).contains("expert, against half of its unshifted"), "{}", text(&status.stdout));
+    let fails = |factor, parts: &[&str]| swm.fails(&[&of(factor)[..], &["x"], &settings].concat(), 2, parts);
+    fails("agent.sped", &["agent.sped", "agent.speed"]);
+    fails("agent.position", &["draws it in every episode"]);
+    assert!(!swm.path("x").exists());
+}
+
+#[test]
 fn temporary_files_of_a_killed_study_are_deleted() {
     let swm = with_study();
     let args = ["study", "run", "study.toml", "--output", "out", "seed=0"];

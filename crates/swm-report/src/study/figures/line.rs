@@ -35,6 +35,8 @@ struct Lines<'a> {
     series: Vec<Series<'a>>,
     /// The rates of the random-policy floor.
     floor: Vec<(f64, f64)>,
+    /// Whether a decay was fitted: its interval is that of a fixed number of episodes.
+    is_fitted: bool,
 }
 
 /// Draws the success rates over a variable; `values` are its values and the conditions.
@@ -47,7 +49,7 @@ pub(super) fn draw(sheet: &Sheet<'_>, counting: usize, variable: &str, values: &
         let rate = |condition: usize| Some(sheet.row(condition, i, counting)?.success).filter(is_drawable);
         let points: Vec<_> = all.iter().filter_map(|(x, condition)| Some((*x, rate(*condition)?))).collect();
         let counts = points.iter().map(|(x, p)| Point { x: *x, successes: p.successes as f64, n: p.n as f64 });
-        let decay = Decay::fit(&counts.collect::<Vec<_>>()).filter(|decay| decay.low > 0.0);
+        let decay = Decay::fit(&counts.collect::<Vec<_>>()).filter(|decay| decay.low > 0.0 && !sheet.sequential);
         let unshifted = if at_unshifted.is_none() { sheet.unshifted.and_then(rate).map(|p| p.rate) } else { None };
         Series { policy: *policy, points, unshifted, decay }
     });
@@ -59,7 +61,7 @@ pub(super) fn draw(sheet: &Sheet<'_>, counting: usize, variable: &str, values: &
     let floor = |condition: usize| (0..sheet.policies.len()).find_map(|policy| sheet.row(condition, policy, counting));
     let floor = all.iter().filter(|_| shows_floor).filter_map(|(x, condition)| Some((*x, floor(*condition)?.floor)));
     let floor = floor.filter(|(_, floor)| is_drawable(floor)).map(|(x, floor)| (x, floor.rate)).collect();
-    let lines = Lines { variable: shorten(variable, 60), series, floor };
+    let lines = Lines { variable: shorten(variable, 60), series, floor, is_fitted: !sheet.sequential };
     let heading = format!("Success against {}", escape(&lines.variable));
     finish("line", heading, lines.caption(), &lines)
 }
@@ -103,6 +105,9 @@ impl Lines<'_> {
         let mut caption = "Success rates with their 95 % intervals.".to_owned();
         if self.series.iter().any(|series| series.unshifted.is_some()) {
             caption += " Dashed lines are the rates of the condition that is not shifted.";
+        }
+        if !self.is_fitted {
+            return caption;
         }
         let fitted: Vec<_> = self.series.iter().filter_map(|series| Some((series, series.decay?))).collect();
         if fitted.is_empty() {

@@ -69,13 +69,22 @@ pub fn study(
         let request = request(&all, &condition.name, &policy.name, resolver).map_err(within)?;
         let inputs = inputs.of(&request).map_err(within)?;
         let any_seed = policy.any_seed.clone();
-        cells.push(Cell { starts: starts.name, variables: all.variables, any_seed, request, inputs });
+        cells.push(Cell {
+            starts: starts.name,
+            variables: all.variables,
+            any_seed,
+            request,
+            inputs,
+            sequential: false,
+        });
     }
     let study = Study {
         title: file.title.clone(),
         question: file.question.clone(),
         families: file.families.clone(),
         cells,
+        until: None,
+        ray: None,
         published: file.published.clone(),
         arguments: vec![],
     };

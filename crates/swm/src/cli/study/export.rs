@@ -2,7 +2,7 @@
 
 use clap::ValueEnum;
 use std::collections::BTreeMap;
-use swm_core::results::{OverSeeds, StudyResults, StudyRow, Verdict};
+use swm_core::results::{BreakingPoint, OverSeeds, StudyResults, StudyRow, Verdict};
 use swm_core::text::printable;
 
 /// The format of a table.
@@ -62,6 +62,9 @@ fn csv(results: &StudyResults) -> String {
         "comparisons",
         "verdict",
     ]);
+    if results.until.is_some() {
+        header.extend(["e", "until"]);
+    }
     let mut text = header.iter().map(|name| quote(name)).collect::<Vec<_>>().join(",") + "\n";
     for row in &results.rows {
         let mut cells = vec![row.cell.clone(), row.starts.clone(), row.condition.clone(), row.policy.clone()];
@@ -76,6 +79,10 @@ fn csv(results: &StudyResults) -> String {
             let [difference, low, high, p, p_holm, effect] = numbers.map(|value| value.to_string());
             [difference, low, high, p, p_holm, effect, gap.comparisons.to_string(), gap.verdict.to_string()]
         }));
+        if let Some(until) = results.until {
+            let e = row.gap.and_then(|gap| gap.e).map(|e| e.to_string());
+            cells.extend([e.unwrap_or_default(), until.to_string()]);
+        }
         text += &(cells.iter().map(|cell| quote(cell)).collect::<Vec<_>>().join(",") + "\n");
     }
     text
@@ -153,12 +160,14 @@ impl<'a> Pivot<'a> {
     fn notes(&self) -> Vec<String> {
         let mut notes = vec![];
         if !self.results.families.is_empty() {
-            notes.push(
+            notes.push(format!(
                 "↓ lower, ↑ higher than the first condition on the same starts; unmarked: not told apart; ?: too few \
-                 starts differ to tell any difference. Paired score test, corrected for the comparisons of a family."
-                    .to_owned(),
-            );
+                     starts differ to tell any difference. {}, corrected for the comparisons of a family.",
+                if self.results.until.is_some() { "E-values of paired starts" } else { "Paired score test" }
+            ));
         }
+        notes.extend(self.results.notes_on_rule());
+        notes.extend(self.results.breaking.iter().flat_map(BreakingPoint::sentences));
         notes.extend(self.results.families.iter().map(|family| format!("{}: {family}.", family.name)));
         notes
     }
@@ -306,7 +315,7 @@ mod tests {
         ];
         let over_seeds = OverSeeds::all(&rows, "plain");
         let [title, question, hash] = ["t", "q?", "h"].map(str::to_owned);
-        StudyResults { title, question, hash, cells: 4, done: 3, rows, families, over_seeds }
+        StudyResults { title, question, hash, cells: 4, done: 3, rows, families, over_seeds, ..StudyResults::default() }
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! `swm study`: many evaluations with one table.
 
+mod breaking;
 mod colour;
 mod expand;
 mod export;
@@ -20,7 +21,7 @@ use export::Format;
 use serde_json::json;
 use std::path::PathBuf;
 use swm_core::limits;
-use swm_core::results::StudyResults;
+use swm_core::results::{BreakingPoint, StudyResults, Until};
 use swm_eval::{Study, StudyFolder};
 
 /// Arguments of `swm study`.
@@ -41,6 +42,12 @@ enum StudyCommand {
     /// program. An interrupted study continues.
     #[command(after_help = "Example: swm study run paper/factors --output factors episodes=20")]
     Run(RunArgs),
+    /// Find the change of a factor at which a policy loses half of its success
+    ///
+    /// Evaluates eight levels from the default of the factor towards another value, then three inside the first interval in
+    /// which success falls below half. The folder is that of a study.
+    #[command(after_help = "Example: swm study break zoo:two-room/pldm --factor agent.color --towards cyan -o cyan")]
+    Break(breaking::BreakArgs),
     /// Show how many cells are done, and their results
     #[command(after_help = "Example: swm study status factors")]
     Status {
@@ -84,8 +91,15 @@ struct RunArgs {
     #[arg(long)]
     trust: bool,
     /// Print a `swm eval` command for each cell, and evaluate nothing
-    #[arg(long, conflicts_with = "output")]
+    #[arg(long, conflicts_with_all = ["output", "until"])]
     commands: bool,
+    /// Play starts until a rule is met: ci=5, decided or decided=10
+    ///
+    /// ci=5 ends a cell when the 95 % interval of its success rate is at most 5 percentage points wide on each side.
+    /// decided=10 ends it when its gap is told apart from zero or shown to be below 10 points. `episodes` is the most. All
+    /// intervals are confidence sequences then.
+    #[arg(long, value_name = "RULE")]
+    until: Option<Until>,
 }
 
 /// Runs `swm study`.
@@ -93,6 +107,7 @@ pub fn study(args: &StudyArgs, json: bool, context: impl FnOnce() -> swm_core::R
     match &args.command {
         StudyCommand::List => list(json),
         StudyCommand::Run(args) => run(args, &context()?),
+        StudyCommand::Break(args) => breaking::run(args, &context()?),
         StudyCommand::Status { folder } => {
             let folder = StudyFolder::new(folder);
             show(&folder.study()?.results(&folder)?, json)
@@ -135,10 +150,20 @@ fn run(args: &RunArgs, context: &Context) -> anyhow::Result<()> {
     let Some(output) = &args.output else { return Ok(()) };
     let mut study: Study = expand::study(&file, &args.settings, &resolver, &mut control(context))?;
     study.arguments = std::iter::once(shipped::short_name(&args.study)).chain(args.settings.iter().cloned()).collect();
+    study = with_rule(study, args.until)?;
     let folder = StudyFolder::new(output);
     let _lock = folder.create(&study)?;
     study.run(&folder, &resolver, &run_options(args.envs, None, context), &mut control(context))?;
     show(&study.results(&folder)?, context.json)
+}
+
+/// The study with the rule that ends it, if there is one.
+fn with_rule(mut study: Study, until: Option<Until>) -> swm_core::Result<Study> {
+    let Some(until) = until else { return Ok(study) };
+    study.arguments.extend(["--until".to_owned(), until.to_string()]);
+    let study = study.until(until);
+    study.check()?;
+    Ok(study)
 }
 
 /// A column of the table that is shown if its cells differ: its title, and its text in a row.
@@ -176,6 +201,12 @@ fn show(results: &StudyResults, json: bool) -> anyhow::Result<()> {
         cells
     });
     emit(&table(&header, rows));
+    for sentence in results.breaking.iter().flat_map(BreakingPoint::sentences) {
+        emit(&format!("{sentence}\n"));
+    }
+    for note in results.notes_on_rule() {
+        emit(&format!("{note}\n"));
+    }
     for family in &results.families {
         emit(&format!("{}: {family}\n", family.name));
     }

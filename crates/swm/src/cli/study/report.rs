@@ -53,7 +53,8 @@ pub fn report(args: &ReportArgs, as_json: bool) -> anyhow::Result<()> {
 /// The command that runs the study again. It names a folder of its own, so that equal studies have equal pages.
 fn command(study: &Study) -> Option<String> {
     let name = Path::new(study.arguments.first()?).file_stem()?.to_str()?;
-    let words = ["swm", "study", "run"].into_iter().map(str::to_owned);
+    let command = if study.ray.is_some() { "break" } else { "run" };
+    let words = ["swm", "study", command].into_iter().map(str::to_owned);
     let output = ["--output".to_owned(), name.to_owned()];
     Some(shell(&words.chain(study.arguments.iter().cloned()).chain(output).collect::<Vec<_>>()))
 }

@@ -1,0 +1,112 @@
+//! Evaluates a study in stages until its rule is met.
+//!
+//! After stage k, every cell that is not met has the first n(k) of its starts: 10, 20, 30, 50, 80, 120 and so on, half as
+//! many again. A start is the same in all stages and its episode depends on nothing else, so the files of a study that was
+//! interrupted are those of one that was not, and a cell that grew is equal to one that was evaluated at once.
+
+use super::cell::{Cell, Study};
+use super::folder::StudyFolder;
+use super::run::{Work, episodes};
+use crate::request::StartsRequest;
+use crate::runner::{Resolver, RunOptions};
+use std::collections::BTreeSet;
+use swm_core::results::{Run, Timing, Until};
+use swm_core::run::Control;
+use swm_core::{Result, Results};
+
+/// The number of starts of the first stage.
+const FIRST: usize = 10;
+
+/// The numbers of starts of the stages: each has half as many again as the one before, rounded up to tens.
+fn stages() -> impl Iterator<Item = usize> {
+    std::iter::successors(Some(FIRST), |n| Some((n + n / 2).next_multiple_of(10)))
+}
+
+impl Study {
+    /// Evaluates the first starts of all cells, then more starts of those that the rule leaves open, up to the episodes of
+    /// their requests. Returns the number of cells that were evaluated further.
+    pub(super) fn run_until(
+        &self,
+        until: Until,
+        folder: &StudyFolder,
+        resolver: &dyn Resolver,
+        options: &RunOptions,
+        control: &mut Control<'_>,
+    ) -> Result<usize> {
+        self.check_starts(resolver)?;
+        let mut evaluated = BTreeSet::new();
+        let mut open: BTreeSet<String> = self.cells.iter().map(Cell::id).collect::<Result<_>>()?;
+        for stage in stages() {
+            let mut work: Vec<Work<'_>> = vec![];
+            for cell in &self.cells {
+                let id = cell.id()?;
+                if !open.contains(&id) {
+                    continue;
+                }
+                let (earlier, wanted) = (folder.results(cell)?, stage.min(cell.request.episodes));
+                if earlier.as_ref().map_or(0, episodes) < wanted {
+                    work.push((cell, earlier, wanted));
+                    evaluated.insert(id);
+                }
+            }
+            if !work.is_empty() {
+                self.evaluate(&work, folder, resolver, options, control)?;
+            }
+            open = self.open_after(until, folder, stage)?;
+            if open.is_empty() {
+                break;
+            }
+        }
+        Ok(evaluated.len())
+    }
+
+    /// The cells that need more starts than those of a stage. What later stages added does not matter, so a study that
+    /// continues decides as it did before.
+    fn open_after(&self, until: Until, folder: &StudyFolder, stage: usize) -> Result<BTreeSet<String>> {
+        let mut done = vec![];
+        for cell in &self.cells {
+            if let Some(results) = folder.results(cell)? {
+                done.push((cell, first(results, stage)));
+            }
+        }
+        let rows = self.tabulate(&done)?.rows;
+        Ok(self.open(until, &rows, &done))
+    }
+
+    /// Checks that datasets have as many starts as the requests have episodes, before the first episode is played.
+    fn check_starts(&self, resolver: &dyn Resolver) -> Result<()> {
+        let mut checked: Vec<(&StartsRequest, u64, usize)> = vec![];
+        for Cell { request, .. } in &self.cells {
+            let starts = (&request.starts, request.seed, request.episodes);
+            if let StartsRequest::Dataset { dataset, .. } = &request.starts
+                && !checked.contains(&starts)
+            {
+                request.picks(&*resolver.dataset(dataset)?)?;
+                checked.push(starts);
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Results of the first `n` episodes.
+fn first(mut results: Results, n: usize) -> Results {
+    for run in &mut results.runs {
+        if run.episodes.len() > n {
+            let episodes = run.episodes[..n].to_vec();
+            *run = Run::new(&run.condition, &run.policy, results.counting, episodes, Timing::default());
+        }
+    }
+    results
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn stages_grow_by_half() {
+        let found: Vec<usize> = stages().take(12).collect();
+        assert_eq!(found, [10, 20, 30, 50, 80, 120, 180, 270, 410, 620, 930, 1400]);
+    }
+}

@@ -135,6 +135,10 @@ impl NativeEnv {
         self.lock().env.goal_distance()
     }
 
+    fn success_distance(&self) -> f64 {
+        self.lock().env.success_distance()
+    }
+
     /// Whether the state satisfies the goal.
     fn is_success(&self) -> bool {
         self.lock().env.is_success()

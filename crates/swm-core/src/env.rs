@@ -264,6 +264,14 @@ pub trait Env: Send {
     /// them. A cost model that simulates the environment uses it as the cost.
     fn goal_distance(&self) -> f64;
 
+    /// The distance to the goal with the weights of the success criterion: below 1 only for states that satisfy the goal.
+    ///
+    /// By default this is [`Env::goal_distance`] in its own unit. An environment overrides it if its goal distance
+    /// weighs parts of the state otherwise than its success criterion does.
+    fn success_distance(&self) -> f64 {
+        self.goal_distance()
+    }
+
     /// Returns the interface for dispatching calls early, if the environment runs in another process.
     fn as_dispatch(&mut self) -> Option<&mut dyn DispatchEnv> {
         None

@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use std::sync::{Mutex, PoisonError};
 use swm_core::{Batch, Candidates, CostModel, Env, Error, Result, Snapshot};
 
-/// The cost of a candidate; distances are [`Env::goal_distance`], in the environment's unit.
+/// The cost of a candidate; distances are [`Env::goal_distance`], in the environment's unit, unless the score says otherwise.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Score {
@@ -26,6 +26,8 @@ pub enum Score {
     /// For a candidate that succeeds, minus the fraction of its steps after the first success (from -1 to 0); for any
     /// other candidate, the distance to the goal at the end.
     Reach,
+    /// As [`Score::Reach`], with [`Env::success_distance`] as the distance.
+    Success,
 }
 
 /// The simulator as a model.
@@ -94,14 +96,18 @@ impl SimulatorCost {
             match self.score {
                 Score::Terminal => {}
                 Score::Running => sum += env.goal_distance(),
-                Score::Reach if env.is_success() => {
+                Score::Reach | Score::Success if env.is_success() => {
                     let steps = actions.len() / width;
                     return Ok((step as f64 + 1.0 - steps as f64) / steps as f64);
                 }
-                Score::Reach => {}
+                Score::Reach | Score::Success => {}
             }
         }
-        Ok(if self.score == Score::Running { sum } else { env.goal_distance() })
+        Ok(match self.score {
+            Score::Terminal | Score::Reach => env.goal_distance(),
+            Score::Running => sum,
+            Score::Success => env.success_distance(),
+        })
     }
 }
 

@@ -348,7 +348,11 @@ pub fn scripted(entry: &EnvEntry, name: &str, world: &World) -> Result<Box<dyn P
 /// When no score has the name.
 pub fn parse_score(name: &str) -> Result<Score> {
     serde_json::from_value(name.into()).map_err(|_| {
-        Error::config("the simulator's score", format!("there is no '{name}'"), "choose terminal, running or reach")
+        Error::config(
+            "the simulator's score",
+            format!("there is no '{name}'"),
+            "choose terminal, running, reach or success",
+        )
     })
 }
 

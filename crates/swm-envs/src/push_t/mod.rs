@@ -12,7 +12,8 @@ mod table;
 use factors::{ANGLES, columns, index, observation_space, shapes_row, variation_space};
 use physics::{AGENT, BLOCK, Simulation, append_items, take_array};
 use render::{DrawnState, TableRenderer};
-use state::{State, checked, goal_distance, is_reached, set_state, settled, start_state, state_distance, state_of};
+use state::{State, checked, goal_distance, is_reached, set_state, settled, start_state};
+use state::{state_distance, state_of, success_distance};
 use std::f64::consts::TAU;
 use swm_core::columns::{GOAL_STATE, STATE};
 use swm_core::factors::{from_row, parse_snapshot, snapshot, wrong_snapshot};
@@ -262,6 +263,10 @@ impl Env for PushT {
 
     fn goal_distance(&self) -> f64 {
         goal_distance(&self.factors, &self.goal, &self.state())
+    }
+
+    fn success_distance(&self) -> f64 {
+        success_distance(&self.factors, &self.goal, &self.state())
     }
 }
 

@@ -70,8 +70,13 @@ pub fn state_distance(a: &State, b: &State) -> f64 {
 /// Returns whether a goal is reached: both positions are near those of the goal, and the angle of the block is near
 /// that of the goal up to the symmetry of the block.
 pub fn is_reached(factors: &FactorValues, goal: &State, state: &State) -> bool {
-    let distance = goal[..4].iter().zip(state).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt();
-    distance < REACH && angle_between(factors.integer("block.shape"), goal[4], state[4]) < REACH_ANGLE
+    position_distance(goal, state) < REACH
+        && angle_between(factors.integer("block.shape"), goal[4], state[4]) < REACH_ANGLE
+}
+
+/// Returns the Euclidean distance of the positions of agent and block together, in pixels.
+fn position_distance(goal: &State, state: &State) -> f64 {
+    goal[..4].iter().zip(state).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt()
 }
 
 /// Returns the smallest rotation between two angles of a block, up to its symmetry, in radians.
@@ -87,6 +92,13 @@ pub fn goal_distance(factors: &FactorValues, goal: &State, state: &State) -> f64
     let distance = |x: usize| (state[x] - goal[x]).hypot(state[x + 1] - goal[x + 1]) / REACH;
     let angle = angle_between(factors.integer("block.shape"), goal[4], state[4]) / REACH_ANGLE;
     (AGENT_WEIGHT * distance(0)).hypot(distance(2)).hypot(angle)
+}
+
+/// Returns the distance to a success in units of the tolerances: the Euclidean norm of the distance of both positions and
+/// of the block's rotation.
+pub fn success_distance(factors: &FactorValues, goal: &State, state: &State) -> f64 {
+    let angle = angle_between(factors.integer("block.shape"), goal[4], state[4]);
+    (position_distance(goal, state) / REACH).hypot(angle / REACH_ANGLE)
 }
 
 #[cfg(test)]
@@ -115,5 +127,29 @@ mod tests {
             let far = [115.0, 100.0, 200.0, 215.0, goal[4], 0.0, 0.0];
             assert!(!is_reached(&factors, &goal, &far), "agent and block are 21 pixels off together");
         }
+    }
+
+    #[test]
+    fn success_distance_counts_the_agent_like_the_block_and_below_1_is_a_success() {
+        let factors =
+            variation_space().resolve(&VariationRequest::default(), Key::new(0)).expect("resolving the factors");
+        let goal = [100.0, 100.0, 200.0, 200.0, 1.0, 0.0, 0.0];
+        let moved = |agent: f64, block: f64, degrees: f64| {
+            [100.0 + agent, 100.0, 200.0, 200.0 + block, 1.0 + degrees.to_radians(), 9.0, 0.0]
+        };
+        for (state, expected) in [
+            (moved(0.0, 0.0, 0.0), 0.0),
+            (moved(40.0, 0.0, 0.0), 2.0),
+            (moved(0.0, 40.0, 0.0), 2.0),
+            (moved(0.0, 0.0, 40.0), 2.0),
+            (moved(12.0, 0.0, 16.0), 1.0),
+        ] {
+            let distance = success_distance(&factors, &goal, &state);
+            assert!((distance - expected).abs() < 1e-9, "{state:?}: {distance}");
+            assert!(distance >= 1.0 - 1e-9 || is_reached(&factors, &goal, &state), "{state:?}");
+        }
+        // Both tolerances count together, so a success may have a distance above 1.
+        let success = moved(19.0, 0.0, 19.0);
+        assert!(is_reached(&factors, &goal, &success) && success_distance(&factors, &goal, &success) > 1.0);
     }
 }

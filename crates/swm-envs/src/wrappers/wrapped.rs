@@ -208,4 +208,8 @@ impl Env for Wrapped {
     fn goal_distance(&self) -> f64 {
         self.env.goal_distance()
     }
+
+    fn success_distance(&self) -> f64 {
+        self.env.success_distance()
+    }
 }

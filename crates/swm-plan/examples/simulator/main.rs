@@ -1,10 +1,11 @@
 //! Success rates of planners with perfect dynamics: an upper bound for every model, and a measure of the search without
 //! model errors.
 //!
-//!     cargo run --release -p swm-plan --example simulator [PART OF AN ENVIRONMENT ID] [SOLVER] [STARTS] [SETTINGS]
+//!     cargo run --release -p swm-plan --example simulator [PART OF A TASK] [SOLVER] [STARTS] [SETTINGS]
 //!
-//! A start that is already solved is counted separately and not played. SETTINGS is JSON that overrides the settings in
-//! `rows.rs`, as in `{"solver": {"samples": 100}, "mpc": {"horizon": 3}}`.
+//! A task is an environment and the origin of its starts, such as `PushT` or `paper-speed`. A start that is already solved is
+//! counted separately and not played. SETTINGS is JSON that overrides the settings in `rows.rs`, as in
+//! `{"solver": {"samples": 100}, "mpc": {"horizon": 3}}`.
 
 mod play;
 mod rows;
@@ -25,18 +26,19 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut out = std::io::stdout();
     writeln!(
         out,
-        "| environment | starts | solver | solved at start | success | 95 % | median steps | median time per plan | total time |"
+        "| environment | starts | solver | solved at start | success | 95 % | median steps | median time per plan | total time | failed by |"
     )?;
-    writeln!(out, "| --- | --- | --- | --- | --- | --- | --- | --- | --- |")?;
-    for task in rows::TASKS.iter().filter(|task| task.entry.id.to_lowercase().contains(&env)) {
+    writeln!(out, "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")?;
+    let name = |task: &rows::Task| format!("{} {:?}", task.entry.id, task.protocol).to_lowercase();
+    for task in rows::TASKS.iter().filter(|task| name(task).contains(&env)) {
         let starts = starts(task.entry, task.protocol, n)?;
         for id in rows::SOLVERS.into_iter().filter(|id| solver.is_empty() || *id == solver) {
             let planner = rows::planner(task, id, &changes)?;
-            let found = play(task.entry, &starts, &planner, task.budget)?;
+            let found = play(task, &starts, &planner)?;
             let success = &found.success;
             writeln!(
                 out,
-                "| `{}` | {:?} | `{id}` | {} | {} of {} | {:.1}–{:.1} % | {:.0} | {:.2} s | {:.0} s |",
+                "| `{}` | {:?} | `{id}` | {} | {} of {} | {:.1}–{:.1} % | {:.0} | {:.2} s | {:.0} s | {} |",
                 task.entry.id,
                 task.protocol,
                 found.solved_at_start,
@@ -47,6 +49,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 found.steps.map_or(f64::NAN, |steps| steps.median),
                 found.plan.map_or(f64::NAN, |plan| plan.median),
                 found.seconds,
+                found.violated.iter().map(|(part, count)| format!("{part} {count}")).collect::<Vec<_>>().join(", "),
             )?;
             out.flush()?;
         }

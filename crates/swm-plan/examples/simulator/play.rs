@@ -1,11 +1,13 @@
 //! Plays episodes with planners that have perfect dynamics. Counting is strict: a start that is already solved is not
 //! played.
 
+use super::rows::Task;
 use rand::seq::index::sample;
+use std::collections::BTreeMap;
 use std::time::Instant;
 use swm_core::pool::threads;
 use swm_core::results::{Proportion, Summary};
-use swm_core::{Action, Batch, EnvEntry, EnvPool, Key, Policy, ResetOptions, Result, Schema, Space};
+use swm_core::{Action, Batch, EnvEntry, EnvPool, Key, Policy, ResetOptions, Result, RowRef, Schema, Space};
 use swm_plan::{ActionScale, MpcConfig, MpcPolicy, SOLVERS, Score, SimulatorCost};
 
 /// The initial state and the goal of an episode.
@@ -20,9 +22,14 @@ pub struct Start {
 pub enum Protocol {
     /// Start and goal from the reset of the environment.
     Episodic,
-    /// Two rows from an episode of the environment's first expert, with this number of steps between them.
-    Demonstrated(usize),
+    /// Two rows from an episode of this expert, with 25 steps between them.
+    Demonstrated(&'static str),
 }
+
+/// The number of steps from the start of a demonstrated episode to its goal.
+const OFFSET: usize = 25;
+/// The time limit of a demonstration.
+const DEMONSTRATION: usize = 300;
 
 /// A solver with its settings.
 #[derive(Clone)]
@@ -49,18 +56,23 @@ pub struct Outcome {
     pub plan: Option<Summary>,
     /// The total time, in seconds.
     pub seconds: f64,
+    /// The number of failed episodes that violated each part of the success criterion when they were nearest to a success.
+    pub violated: BTreeMap<&'static str, usize>,
 }
+
+/// Returns the parts of the success criterion that an observation violates.
+pub type Violated = fn(RowRef<'_>) -> Result<Vec<&'static str>>;
 
 /// The number of environments that are played and planned for at the same time.
 const SLOTS: usize = 25;
 
 /// The first `n` starts of an environment.
 pub fn starts(entry: &EnvEntry, protocol: Protocol, n: usize) -> Result<Vec<Start>> {
-    let Protocol::Demonstrated(offset) = protocol else {
+    let Protocol::Demonstrated(expert) = protocol else {
         return Ok((0..n as u64).map(|seed| Start { seed, rows: None }).collect());
     };
-    let demonstrations = (0..n as u64).map(|seed| demonstrate(entry, seed)).collect::<Result<Vec<Batch>>>()?;
-    let lengths = demonstrations.iter().map(|rows| rows.rows().saturating_sub(offset));
+    let demonstrations = (0..n as u64).map(|seed| demonstrate(entry, expert, seed)).collect::<Result<Vec<Batch>>>()?;
+    let lengths = demonstrations.iter().map(|rows| rows.rows().saturating_sub(OFFSET));
     let all: Vec<(usize, usize)> = lengths.enumerate().flat_map(|(e, len)| (0..len).map(move |t| (e, t))).collect();
     let picks = sample(&mut Key::new(0).with("starts").rng(), all.len(), n);
     let start = |(seed, pick): (usize, usize)| {
@@ -68,19 +80,20 @@ pub fn starts(entry: &EnvEntry, protocol: Protocol, n: usize) -> Result<Vec<Star
         let from = &demonstrations[demonstration];
         let mut rows = Batch::zeros(from.schema(), 2);
         rows.copy_row(0, from, t)?;
-        rows.copy_row(1, from, t + offset)?;
+        rows.copy_row(1, from, t + OFFSET)?;
         Ok(Start { seed: seed as u64, rows: Some(rows) })
     };
     picks.into_iter().enumerate().map(start).collect()
 }
 
-/// The rows of one episode of the first expert.
-fn demonstrate(entry: &EnvEntry, seed: u64) -> Result<Batch> {
+/// The rows of one episode of an expert.
+fn demonstrate(entry: &EnvEntry, expert: &str, seed: u64) -> Result<Batch> {
     let mut env = entry.env().expect("creating the environment");
-    let mut expert = (entry.experts[0].make)();
+    let expert = entry.experts.iter().find(|entry| entry.id == expert).expect("the environment has the expert");
+    let mut expert = (expert.make)();
     env.reset(seed, &ResetOptions::default())?;
     expert.begin(Key::new(seed).with("expert"));
-    let limit = env.spec().max_episode_steps;
+    let limit = DEMONSTRATION;
     let mut rows = Batch::zeros(&Schema::new(env.spec().columns.clone())?, limit + 1);
     let mut action = vec![0.0; env.spec().action_dim()];
     let mut step = 0;
@@ -100,13 +113,14 @@ fn demonstrate(entry: &EnvEntry, seed: u64) -> Result<Batch> {
     Ok(rows)
 }
 
-/// Plays every start once, for at most `budget` steps.
-pub fn play(entry: &EnvEntry, starts: &[Start], planner: &Planner, budget: usize) -> Result<Outcome> {
-    let begun = Instant::now();
+/// Plays every start of a task once.
+pub fn play(task: &Task, starts: &[Start], planner: &Planner) -> Result<Outcome> {
+    let (begun, Task { entry, budget, .. }) = (Instant::now(), task);
     let (mut solved_at_start, mut played, mut successes, mut latencies) = (0, 0, vec![], vec![]);
+    let mut violated = BTreeMap::new();
     for starts in starts.chunks(SLOTS) {
         let envs = starts.iter().map(|_| entry.env().expect("creating the environment")).collect();
-        let mut pool = EnvPool::new(envs, None, Some(budget), threads(0)?)?;
+        let mut pool = EnvPool::new(envs, None, Some(*budget), threads(0)?)?;
         let slots: Vec<usize> = (0..starts.len()).collect();
         pool.restart(&slots, |slot, env| {
             env.reset(starts[slot].seed, &ResetOptions::default())?;
@@ -118,7 +132,8 @@ pub fn play(entry: &EnvEntry, starts: &[Start], planner: &Planner, budget: usize
         played += active.iter().filter(|&&active| active).count();
         slots.iter().for_each(|&slot| policy.begin(slot, Key::new(starts[slot].seed)));
         let mut actions = Batch::zeros(&Schema::new([pool.spec().action_column()])?, pool.len());
-        for step in 1..=budget {
+        let mut nearest = vec![(f64::INFINITY, vec![]); starts.len()];
+        for step in 1..=*budget {
             if !active.contains(&true) {
                 break;
             }
@@ -130,8 +145,14 @@ pub fn play(entry: &EnvEntry, starts: &[Start], planner: &Planner, budget: usize
                 if pool.env(slot).is_success() {
                     successes.push(step as f64);
                     *active = false;
+                    nearest[slot].1.clear();
+                } else if pool.env(slot).success_distance() < nearest[slot].0 {
+                    nearest[slot] = (pool.env(slot).success_distance(), (task.violated)(pool.infos().row(slot))?);
                 }
             }
+        }
+        for part in nearest.into_iter().flat_map(|(_, parts)| parts) {
+            *violated.entry(part).or_insert(0) += 1;
         }
         latencies.extend(policy.take_latencies());
     }
@@ -141,6 +162,7 @@ pub fn play(entry: &EnvEntry, starts: &[Start], planner: &Planner, budget: usize
         steps: Summary::of(&successes),
         plan: Summary::of(&latencies),
         seconds: begun.elapsed().as_secs_f64(),
+        violated,
     })
 }
 

@@ -1,8 +1,9 @@
 //! The tasks of the example and the settings of the planners.
 
-use super::play::{Planner, Protocol};
+use super::play::{Planner, Protocol, Violated};
 use serde_json::{Value, json};
-use swm_core::{EnvEntry, Error, Result};
+use std::f64::consts::TAU;
+use swm_core::{EnvEntry, Error, Result, RowRef};
 use swm_envs::{push_t, two_room};
 use swm_plan::{MpcConfig, Score};
 
@@ -12,12 +13,38 @@ pub struct Task {
     pub protocol: Protocol,
     pub budget: usize,
     pub settings: fn(&str) -> Value,
+    pub violated: Violated,
 }
 
-pub static TASKS: [Task; 2] = [
-    Task { entry: &two_room::ENTRY, protocol: Protocol::Episodic, budget: 100, settings: two_room },
-    Task { entry: &push_t::ENTRY, protocol: Protocol::Demonstrated(25), budget: 50, settings: push_t },
+pub static TASKS: [Task; 3] = [
+    Task {
+        entry: &two_room::ENTRY,
+        protocol: Protocol::Episodic,
+        budget: 100,
+        settings: two_room,
+        violated: |_| Ok(vec!["position"]),
+    },
+    demonstrated("expert"),
+    demonstrated("paper-speed"),
 ];
+
+/// Push-T from states that an expert visits.
+const fn demonstrated(expert: &'static str) -> Task {
+    let protocol = Protocol::Demonstrated(expert);
+    Task { entry: &push_t::ENTRY, protocol, budget: 50, settings: push_t, violated }
+}
+
+/// The parts of Push-T's success criterion: each body within 20 pixels, the block within 20 degrees, and both bodies together
+/// within 20 pixels.
+fn violated(row: RowRef<'_>) -> Result<Vec<&'static str>> {
+    let (state, goal) = (row.to_f64("state")?, row.to_f64("goal_state")?);
+    let distance = |at: usize| (state[at] - goal[at]).hypot(state[at + 1] - goal[at + 1]);
+    let angle = (state[4] - goal[4]).rem_euclid(TAU);
+    let (agent, block, angle) = (distance(0), distance(2), angle.min(TAU - angle).to_degrees());
+    let together = agent.hypot(block) >= 20.0 && agent < 20.0 && block < 20.0;
+    let parts = [("agent", agent >= 20.0), ("block", block >= 20.0), ("angle", angle >= 20.0), ("both", together)];
+    Ok(parts.into_iter().filter(|part| part.1).map(|part| part.0).collect())
+}
 
 pub const SOLVERS: [&str; 3] = ["cem", "icem", "mppi"];
 

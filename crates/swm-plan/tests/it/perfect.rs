@@ -13,7 +13,7 @@ use serde_json::Value;
 fn run(task: &Task, solver: &'static str, n: usize) -> Outcome {
     let starts = starts(task.entry, task.protocol, n).expect("creating the starts");
     let planner = rows::planner(task, solver, &Value::Null).expect("creating the planner");
-    play(task.entry, &starts, &planner, task.budget).expect("the planner plays the starts")
+    play(task, &starts, &planner).expect("the planner plays the starts")
 }
 
 #[test]

@@ -102,6 +102,26 @@ fn reach_score_counts_remaining_steps_or_the_final_distance() {
 }
 
 #[test]
+fn success_score_weighs_the_agent_as_the_success_criterion_does() {
+    let entry = &push_t::ENTRY;
+    let mut pool = pool(entry, 1);
+    pool.restart(&[0], |_, env| {
+        let (state, goal) = ([100.0, 100.0, 300.0, 300.0, 1.0, 0.0, 0.0], [100.0, 140.0, 300.0, 300.0, 1.0, 0.0, 0.0]);
+        let options =
+            ResetOptions { state: Some(state.to_vec()), goal_state: Some(goal.to_vec()), ..ResetOptions::default() };
+        env.reset(0, &options)
+    })
+    .expect("resetting the environment");
+    let wait = [0.0; 2 * HORIZON * BLOCK];
+    let cost = |score| costs(&mut simulator(entry, &pool, &[0], score), &wait, 1, 1)[0];
+    assert!((cost(Score::Reach) - 0.1).abs() < 0.01, "the agent is 40 pixels away and weighs a twentieth");
+    assert!((cost(Score::Success) - 2.0).abs() < 0.01, "the agent is two tolerances away");
+    let walk: Vec<f32> = (0..HORIZON * BLOCK).flat_map(|_| [0.0, 0.5]).collect();
+    let cost = costs(&mut simulator(entry, &pool, &[0], Score::Success), &walk, 1, 1)[0];
+    assert!((-1.0..=0.0).contains(&cost), "{cost}: the agent arrives");
+}
+
+#[test]
 fn costs_do_not_depend_on_other_environments_or_threads() {
     for entry in [&two_room::ENTRY, &push_t::ENTRY, &push_t::discrete::ENTRY] {
         let (envs, samples) = (3, 20);

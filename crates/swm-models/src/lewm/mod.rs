@@ -14,7 +14,7 @@ pub mod pixels;
 mod prediction;
 mod predictor;
 pub mod rollout;
-mod shard;
+pub(crate) mod shard;
 pub mod step;
 pub(crate) mod train;
 

@@ -1,5 +1,6 @@
 //! Training of the small networks of probes: AdamW, warm-up and cosine decay, batches drawn with a key.
 
+use crate::nn::Named;
 use crate::train::{AdamW, OptimConfig, ParameterGroup, ScheduleConfig, StepOutput};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -19,8 +20,8 @@ pub struct FitConfig {
     pub lr: f64,
 }
 
-/// Trains `model`; `step` computes loss and gradients of the samples with the given indices. Returns the model and the
-/// last loss.
+/// Trains `model`; `step` computes loss and gradients of the samples with the given indices, and `track` updates the model
+/// with the buffers of a step, such as running statistics. Returns the model and the last loss.
 ///
 /// # Errors
 /// When a step fails or a loss is not finite.
@@ -30,6 +31,7 @@ pub(super) fn fit<M: Module>(
     samples: usize,
     key: Key,
     step: impl Fn(&M, &[usize]) -> Result<StepOutput>,
+    track: impl Fn(&mut M, Named<Tensor<1>>),
 ) -> Result<(M, f64)> {
     let schedule = ScheduleConfig { steps: config.steps, warmup: config.steps / 20, floor: 0.0 };
     let optim = OptimConfig {
@@ -57,6 +59,7 @@ pub(super) fn fit<M: Module>(
         }
         (model, _) =
             optimizer.step(model, schedule.lr_factor(step_index), output.gradients, |_| ParameterGroup::default());
+        track(&mut model, output.buffers);
     }
     Ok((model, loss))
 }

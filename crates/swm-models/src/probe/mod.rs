@@ -2,6 +2,7 @@
 //!
 //! - [`state`]: regression of the columns of a dataset on latents, [linear](ridge) and with a small network, scored on
 //!   held-out episodes, and compared with a regression on a baseline such as the position of the agent.
+//! - [`supervised`]: regression of the columns on images with an encoder that is trained with them, a ceiling for latents.
 //! - [`reconstruction`]: reconstruction of images from latents.
 //!
 //! If the linear map predicts a state, the latents represent the state linearly; if only the network predicts the
@@ -13,11 +14,13 @@ pub mod ridge;
 mod samples;
 mod scale;
 pub mod state;
+pub mod supervised;
 mod targets;
 
+pub use fit::FitConfig;
 pub use reconstruction::{ReconstructionConfig, ReconstructionReport, reconstruct_images};
 pub use state::{Baseline, Score, StateConfig, StateReport, read_state};
-
+pub use supervised::{SupervisedReport, train_encoder};
 pub use targets::AnglePart;
 
 use swm_core::Result;

@@ -176,7 +176,7 @@ pub fn reconstruct_images(
             Ok(StepOutput { metrics, gradients, ..StepOutput::default() })
         })
     };
-    let (decoder, _) = fit(decoder, config.fit, train.count, key.with("batches"), step)?;
+    let (decoder, _) = fit(decoder, config.fit, train.count, key.with("batches"), step, |_, _| ())?;
 
     let decoded = decode(&decoder, &scale.apply(&held_out.latents), latent, &mean);
     let rmse = root_mean_square(decoded.iter().copied(), &held_out.images);

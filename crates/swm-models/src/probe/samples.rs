@@ -46,7 +46,7 @@ pub(super) fn sample(
         .into_iter()
         .flat_map(|episode| (0..reader.episodes()[episode].length).map(move |row| StepRange::new(episode, row, 1)))
         .collect();
-    let mut most = MAX_ELEMENTS / encoder.latent_dim();
+    let mut most = MAX_ELEMENTS / encoder.latent_dim().max(1);
     if keep_images {
         most =
             most.min(limits::BATCH_BYTES.max / limits::product([encoder.image_size(), encoder.image_size(), 3]).max(1));

@@ -206,7 +206,7 @@ impl Network {
             let gradients = parameters::gradients(&trained, &loss.backward());
             Ok(StepOutput { metrics, gradients, ..StepOutput::default() })
         };
-        let (model, _) = fit(model, config.fit, count, key.with("batches"), step)?;
+        let (model, _) = fit(model, config.fit, count, key.with("batches"), step, |_, _| ())?;
         Ok(Self { model, from, to })
     }
 
@@ -230,7 +230,7 @@ impl Network {
 ///
 /// # Shapes
 /// `predictions` and `values` are `[rows, targets.len()]`.
-fn scores(targets: &[Target], predictions: &[f32], values: &[f32]) -> Vec<Score> {
+pub(super) fn scores(targets: &[Target], predictions: &[f32], values: &[f32]) -> Vec<Score> {
     let (width, count) = (targets.len(), (values.len() / targets.len()) as f64);
     let (_, spread) = mean_and_std(values, values.len() / width);
     let score = |(i, Target { column, index, part }): (usize, &Target)| {

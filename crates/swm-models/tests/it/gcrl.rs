@@ -8,6 +8,7 @@ use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Key, Policy as _, Result, Sche
 use swm_models::feed_forward::FeedForwardPolicy;
 use swm_models::gcrl::{Actor, Gcbc, Gciql, Gcivl, GcrlConfig, GoalConditioned};
 use swm_models::nn::{BackboneConfig, ConvConfig, Init, parameters};
+use swm_models::pixels::ImageNormalization;
 use swm_models::probe::{self, AnglePart, ImageEncoder, ReconstructionConfig, StateConfig};
 use swm_models::train::DatasetInfo;
 use swm_models::{Checkpoint, Device, TrainConfig, TrainOptions, TrainSummary, Trainable, train};
@@ -322,6 +323,14 @@ fn probes_read_the_position_and_reconstruct_the_image() {
     let actions = StateConfig { columns: vec!["action".to_owned()], ..settings };
     let report = probe::read_state(&Profiles, &data, &actions).expect("fitting the probe");
     assert!(report.linear.iter().all(|score| score.r2.expect("a score of actions that differ") < 0.1), "{report:?}");
+
+    // An encoder that is trained with labels reads the position.
+    let mut settings = StateConfig::new(vec!["position".to_owned()]);
+    (settings.fit.steps, settings.fit.batch_size) = (200, 32);
+    let sizes = BackboneConfig::Conv(ConvConfig { channels: vec![8, 16], hidden: 0, dim: 16 });
+    let images = ImageNormalization { side: SIDE, mean: [0.5; 3], std: [0.5; 3] };
+    let report = probe::train_encoder(&sizes, &images, &data, &settings).expect("training the encoder");
+    assert!(report.scores.iter().all(|score| score.r2.expect("a score of a moving dot") > 0.9), "{report:?}");
 
     let mut settings = ReconstructionConfig { channels: vec![16, 8], shown: 6, ..ReconstructionConfig::default() };
     (settings.fit.steps, settings.fit.lr) = (1000, 5e-3);

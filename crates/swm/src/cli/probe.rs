@@ -1,4 +1,5 @@
-//! `swm probe`: predicts columns and reconstructs images from a checkpoint's latents.
+//! `swm probe`: predicts columns and reconstructs images from a checkpoint's latents, or predicts columns from images with an
+//! encoder that is trained with labels.
 
 use super::{Context, emit, emit_json, output_folder, table};
 use crate::home;
@@ -8,15 +9,21 @@ use std::path::PathBuf;
 use swm_core::Error;
 use swm_core::columns::POS_AGENT;
 use swm_data::{Reader, check_png, write_png};
-use swm_models::Device;
-use swm_models::probe::{self, AnglePart, ReconstructionConfig, Score, StateConfig, StateReport};
+use swm_models::lewm::{Lewm, LewmConfig};
+use swm_models::pixels::ImageNormalization;
+use swm_models::probe::{self, AnglePart, FitConfig, ReconstructionConfig, Score, StateConfig, StateReport};
+use swm_models::{Device, TrainConfig};
 
 /// Arguments of `swm probe`. Probes are fitted on the training episodes of the dataset, and evaluated on its validation
 /// episodes.
 #[derive(Args)]
 pub struct ProbeArgs {
     /// The checkpoint: a run folder or a name
-    checkpoint: String,
+    #[arg(required_unless_present = "supervised", conflicts_with = "supervised")]
+    checkpoint: Option<String>,
+    /// Train the encoder of this LeWM preset with the columns as labels: the ceiling of its latents
+    #[arg(long, value_name = "PRESET", requires = "columns", conflicts_with_all = ["baseline", "images"])]
+    supervised: Option<String>,
     /// The dataset: a path, a URI or a name
     #[arg(long, value_name = "DATASET")]
     data: String,
@@ -42,11 +49,15 @@ pub struct ProbeArgs {
 
 /// Runs `swm probe`.
 pub fn probe(args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
-    let run = home::find_checkpoint(&args.checkpoint)?;
+    if let Some(preset) = &args.supervised {
+        return supervised(preset, args, context);
+    }
+    let checkpoint = args.checkpoint.as_deref().unwrap_or_default();
+    let run = home::find_checkpoint(checkpoint)?;
     let loaded = swm_models::load(&run, &Device::flex())?;
     let Some(encoder) = loaded.encoder() else {
         let problem = format!("a {} model has no image encoder", loaded.info()?.family);
-        return Err(Error::config(&args.checkpoint, problem, "probe a model with an image encoder").into());
+        return Err(Error::config(checkpoint, problem, "probe a model with an image encoder").into());
     };
     if args.columns.is_empty() && args.images.is_none() {
         let fix = "name columns with --columns (`swm inspect` lists them), or a file with --images";
@@ -61,14 +72,11 @@ pub fn probe(args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
     let state = if args.columns.is_empty() {
         None
     } else {
-        let mut config = StateConfig { seed: args.seed, ..StateConfig::new(args.columns.clone()) };
-        config.angles = angles(&*reader);
+        let mut config = state_config(args, &*reader, StateConfig::new(args.columns.clone()));
         config.baseline = args.baseline.clone();
         if config.baseline.is_empty() && reader.schema().find(POS_AGENT).is_some() {
             config.baseline.push(POS_AGENT.to_owned());
         }
-        config.frames = args.frames.unwrap_or(config.frames);
-        config.fit.steps = args.steps.unwrap_or(config.fit.steps);
         Some(threads.install(|| probe::read_state(&*encoder, &*reader, &config))?)
     };
     let reconstruction = match &args.images {
@@ -101,6 +109,41 @@ pub fn probe(args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// The frames and the optimizer steps of an encoder that is trained with labels.
+const SUPERVISED: (usize, FitConfig) = (40_000, FitConfig { steps: 4000, batch_size: 128, lr: 1e-3 });
+
+/// Trains the encoder of a LeWM preset with labels and shows the scores.
+fn supervised(preset: &str, args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
+    let LewmConfig { image, pixel_mean, pixel_std, encoder, .. } = TrainConfig::<Lewm>::load(preset, &[])?.model;
+    let images = ImageNormalization { side: image, mean: pixel_mean, std: pixel_std };
+    let reader = home::open_dataset(&args.data)?;
+    let (frames, fit) = SUPERVISED;
+    let defaults = StateConfig { frames, fit, ..StateConfig::new(args.columns.clone()) };
+    let config = state_config(args, &*reader, defaults);
+    let threads = swm_core::pool::threads(context.threads)?;
+    let report = threads.install(|| probe::train_encoder(&encoder, &images, &*reader, &config))?;
+    if context.json {
+        return emit_json(&json!({ "supervised": report }));
+    }
+    let rows = report
+        .scores
+        .iter()
+        .map(|score| vec![element(score), format!("{:.3}", score.spread), r2(score.r2), format!("{:.3}", score.rmse)]);
+    emit(&table(&["element", "spread", "R²", "RMSE"], rows));
+    emit(&format!(
+        "trained with labels on {} frames of {} px, evaluated on {} frames of other episodes; last loss {:.4}\n",
+        report.frames, report.image, report.held_out, report.loss
+    ));
+    Ok(())
+}
+
+/// Returns the settings of a probe of columns: those of the command line, else the defaults.
+fn state_config(args: &ProbeArgs, reader: &dyn Reader, mut defaults: StateConfig) -> StateConfig {
+    defaults.frames = args.frames.unwrap_or(defaults.frames);
+    defaults.fit.steps = args.steps.unwrap_or(defaults.fit.steps);
+    StateConfig { seed: args.seed, angles: angles(reader), ..defaults }
+}
+
 /// Returns the elements of a dataset's columns that are angles, as its environment declares them; none for an environment
 /// that is not built in or not available.
 fn angles(reader: &dyn Reader) -> Vec<(String, usize)> {
@@ -111,18 +154,27 @@ fn angles(reader: &dyn Reader) -> Vec<(String, usize)> {
     angles.into_iter().map(|(column, index)| (column.to_owned(), index)).collect()
 }
 
+/// Returns the name of a predicted element.
+fn element(score: &Score) -> String {
+    let element = format!("{}[{}]", score.column, score.index);
+    match score.part {
+        None => element,
+        Some(AnglePart::Sin) => format!("sin {element}"),
+        Some(AnglePart::Cos) => format!("cos {element}"),
+    }
+}
+
+/// Formats a coefficient of determination.
+fn r2(r2: Option<f64>) -> String {
+    r2.map_or("–".to_owned(), |r2| format!("{r2:.3}"))
+}
+
 /// Returns a table of the predicted columns, element by element.
 fn state_table(report: &StateReport) -> String {
-    let r2 = |r2: Option<f64>| r2.map_or("–".to_owned(), |r2| format!("{r2:.3}"));
     let baseline = report.baseline.as_ref();
     let row = |(i, (linear, network)): (usize, (&Score, &Score))| {
-        let element = format!("{}[{}]", linear.column, linear.index);
         let mut row = vec![
-            match linear.part {
-                None => element,
-                Some(AnglePart::Sin) => format!("sin {element}"),
-                Some(AnglePart::Cos) => format!("cos {element}"),
-            },
+            element(linear),
             format!("{:.3}", linear.spread),
             r2(linear.r2),
             format!("{:.3}", linear.rmse),

@@ -116,7 +116,12 @@ impl ConvGradient {
 
     /// The number of features of an image.
     pub fn dim(&self) -> usize {
-        self.sizes.dim
+        if self.sizes.dim > 0 { self.sizes.dim } else { self.sizes.map().pow(2) * self.sizes.outputs() }
+    }
+
+    /// Whether the encoder has no linear layers, so that the last layer is normalised.
+    fn ends_in_cells(&self) -> bool {
+        self.sizes.dim == 0
     }
 
     /// Lays out the parameters for the passes over a batch.
@@ -134,7 +139,8 @@ impl ConvGradient {
     /// Computes the features of a batch.
     ///
     /// # Shapes
-    /// `images`, normalised, is `[images, side, side, 3]`; returns `[images, dim]`.
+    /// `images`, normalised, is `[images, side, side, 3]`; returns `[images, dim]`, without linear layers
+    /// `[images, map, map, channels]`.
     pub fn forward(&mut self, images: &[f32]) -> Vec<f32> {
         let count = images.len() / self.layers[0].geometry.input();
         for index in 0..self.layers.len() {
@@ -164,9 +170,25 @@ impl ConvGradient {
                 .collect();
             rest[0].finish_forward(moments);
         }
-        let (width, dim) = (self.sizes.dim.next_multiple_of(crate::panels::LANES), self.sizes.dim);
-        let last = &self.states[self.states.len() - 1].y[..count * width];
-        last.chunks_exact(width).flat_map(|features| features[..dim].iter().copied()).collect()
+        self.features(count)
+    }
+
+    /// Returns the features of the `count` images of a forward pass.
+    fn features(&self, count: usize) -> Vec<f32> {
+        let (last, dim) = (self.layers.len() - 1, self.sizes.outputs());
+        let (State { y, activation, .. }, geometry) = (&self.states[last], &self.layers[last].geometry);
+        let mut features = vec![0.0; count * self.dim()];
+        let pixels = features.par_chunks_mut(dim * geometry.pixels()).zip(y.par_chunks(geometry.output()));
+        pixels.for_each(|(to, from)| {
+            for (to, from) in to.chunks_exact_mut(dim).zip(from.chunks_exact(geometry.outputs)) {
+                to.copy_from_slice(&from[..dim]);
+                if self.ends_in_cells() {
+                    let coefficients = activation.scale.iter().zip(&activation.shift);
+                    to.iter_mut().zip(coefficients).for_each(|(y, (scale, shift))| *y = (*y * scale + shift).max(0.0));
+                }
+            }
+        });
+        features
     }
 
     /// Returns mean and unbiased variance of every channel over the last batch, for each convolution.
@@ -187,16 +209,11 @@ impl ConvGradient {
     /// Returns the gradients of the parameters for the batch of the last forward pass.
     ///
     /// # Shapes
-    /// `images` is `[images, side, side, 3]` as in the forward pass; `d`, the gradient of the features, is
-    /// `[images, dim]`.
+    /// `images` is `[images, side, side, 3]` as in the forward pass; `d`, the gradient of the features, has the shape of the
+    /// features.
     pub fn backward(&mut self, images: &[f32], d: &[f32]) -> ConvParameters {
         let count = images.len() / self.layers[0].geometry.input();
-        let width = self.sizes.dim.next_multiple_of(crate::panels::LANES);
-        let output = grown(&mut self.gradients[0], count * width);
-        for (to, from) in output.chunks_exact_mut(width).zip(d.chunks_exact(self.sizes.dim)) {
-            to[..self.sizes.dim].copy_from_slice(from);
-            to[self.sizes.dim..].fill(0.0);
-        }
+        self.load_gradient(count, d);
         let mut gradients = ConvParameters { stages: vec![], linear: vec![] };
         for index in (0..self.layers.len()).rev() {
             let [weight, bias] = self.layer_backward(index, images, count);
@@ -213,6 +230,30 @@ impl ConvGradient {
         gradients
     }
 
+    /// Copies the gradient of the features of `count` images to the gradient of the last layer's output.
+    fn load_gradient(&mut self, count: usize, d: &[f32]) {
+        let (dim, cells, last) = (self.sizes.outputs(), self.ends_in_cells(), self.layers.len() - 1);
+        let (geometry, chunk) = (&self.layers[last].geometry, chunk_size(count));
+        let (width, length) = (geometry.outputs, geometry.output());
+        let output = grown(&mut self.gradients[0], count * length);
+        for (to, from) in output.chunks_exact_mut(width).zip(d.chunks_exact(dim)) {
+            to[..dim].copy_from_slice(from);
+            to[dim..].fill(0.0);
+        }
+        if cells {
+            let State { y, activation, .. } = &self.states[last];
+            let chunks = output.par_chunks(chunk * length).zip(y[..count * length].par_chunks(chunk * length));
+            let sums = |(d, y): (&[f32], &[f32])| {
+                let mut sums = vec![0.0; 2 * width];
+                let images = d.chunks_exact(length).zip(y.chunks_exact(length));
+                images.for_each(|(d, y)| add_norm_gradient(activation, d, y, &mut sums));
+                sums
+            };
+            let sums: Vec<Vec<f64>> = chunks.map(sums).collect();
+            self.states[last].finish_backward(&sums);
+        }
+    }
+
     /// Returns the gradients of the weights and of the bias of a layer, and replaces the gradient of the layer's output by
     /// the gradient of the layer's input.
     fn layer_backward(&mut self, index: usize, images: &[f32], count: usize) -> [Vec<f32>; 2] {
@@ -222,7 +263,7 @@ impl ConvGradient {
         let [d, dx] = &mut self.gradients;
         let backward = Backward {
             layer: &layers[index],
-            state: (index + 1 < layers.len()).then_some(&rest[0]),
+            state: (index + 1 < layers.len() || self.sizes.dim == 0).then_some(&rest[0]),
             source: before.last().map_or(Source::Images(images), Source::Layer),
             d: &d[..count * output],
         };
@@ -258,7 +299,7 @@ impl ConvGradient {
 #[derive(Clone, Copy)]
 struct Backward<'a> {
     layer: &'a Layer,
-    /// The state of the layer; `None` for the last layer, which has no activation.
+    /// The state of the layer; `None` for the last linear layer, which has no activation.
     state: Option<&'a State>,
     source: Source<'a>,
     /// The gradient of the activations of the layer, `[images, pixels, width]`.

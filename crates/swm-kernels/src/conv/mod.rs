@@ -32,7 +32,8 @@ pub struct ConvSizes {
     pub channels: Vec<usize>,
     /// The hidden features after the last convolution; 0 for none.
     pub hidden: usize,
-    /// The output features.
+    /// The output features; 0, together with `hidden`, for an encoder without linear layers, whose features are the cells
+    /// of the feature map.
     pub dim: usize,
 }
 
@@ -40,6 +41,11 @@ impl ConvSizes {
     /// The side of the feature map after the last convolution.
     pub fn map(&self) -> usize {
         self.channels.iter().fold(self.side, |side, _| side.div_ceil(2))
+    }
+
+    /// The channels of a pixel of the last layer: the output features, or the channels of a cell.
+    fn outputs(&self) -> usize {
+        if self.dim > 0 { self.dim } else { self.channels.last().copied().unwrap_or(0) }
     }
 
     /// Returns the layers, first to last, for blocks of at most `images` images.

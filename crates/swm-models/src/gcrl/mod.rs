@@ -1,6 +1,7 @@
 //! Goal-conditioned learning from offline data: behavioural cloning (GCBC) and implicit value and Q-learning (GCIVL,
 //! GCIQL), on the patches of a frozen or trained encoder. The policies act without planning. See `docs/models/gcrl.md`.
 
+mod cells;
 pub mod config;
 mod family;
 pub mod heads;

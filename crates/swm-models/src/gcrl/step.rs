@@ -3,6 +3,7 @@
 //! Values and policy are trained together, as by Kostrikov et al. (2021): the policy's loss has no gradient with
 //! respect to values and encoder, so the gradients are those of the two phases of the published algorithms.
 
+use super::cells::CellPass;
 use super::heads::{Critic, Head};
 use super::loss::{self, ValueLoss};
 use super::model::{Gcbc, Gciql, Gcivl};
@@ -50,10 +51,10 @@ impl Gcbc {
     pub fn losses(&self, clips: &Clips, rng: &mut DropoutRng<'_>, training: bool) -> StepOutput {
         let model = self.clone().train();
         let encoders = Encoders::new(&self.encoder, &model.encoder, self.config.frozen, training, clips);
-        let ([frames, goal], statistics) = encoders.with_gradient(clips.frames.clone(), clips.goal.clone());
+        let ([frames, goal], encoding) = encoders.with_gradient(clips.frames.clone(), clips.goal.clone());
         let means = model.action_predictor.forward(&frames, &goal, rng);
         let loss = (means - clips.actions.clone().autodiff()).square().mean();
-        finish(&model, &loss, vec![("loss", scalar(&loss))], training, statistics)
+        finish(&model, &loss, vec![("loss", scalar(&loss))], training, encoding)
     }
 }
 
@@ -70,7 +71,7 @@ impl Gcivl {
     ) -> StepOutput {
         let model = self.clone().train();
         let encoders = Encoders::new(&self.encoder, &model.encoder, self.config.frozen, training, clips);
-        let (inputs, statistics) = head_inputs(&encoders, clips, relabelled);
+        let (inputs, encoding) = head_inputs(&encoders, clips, relabelled);
         let HeadInputs { now, goal, next, policy_goal } = &inputs;
         let target = bootstrap(&self.value_predictor.teacher, &inputs, relabelled, settings);
         let value = model.value_predictor.student.forward(now, goal, rng);
@@ -90,7 +91,7 @@ impl Gcivl {
             ("weight", scalar(&weights.mean())),
             ("reached", scalar(&relabelled.reached.clone().mean())),
         ];
-        finish(&model, &total, metrics, training, statistics)
+        finish(&model, &total, metrics, training, encoding)
     }
 }
 
@@ -107,7 +108,7 @@ impl Gciql {
     ) -> StepOutput {
         let model = self.clone().train();
         let encoders = Encoders::new(&self.encoder, &model.encoder, self.config.frozen, training, clips);
-        let (inputs, statistics) = head_inputs(&encoders, clips, relabelled);
+        let (inputs, encoding) = head_inputs(&encoders, clips, relabelled);
         let HeadInputs { now, goal, policy_goal, .. } = &inputs;
         let (actions, frames) = (clips.actions.clone(), now.clone().inner());
         let evaluate = |critic: &Critic, goal: &Tensor<3>| {
@@ -136,12 +137,20 @@ impl Gciql {
             ("weight", scalar(&weights.mean())),
             ("reached", scalar(&relabelled.reached.clone().mean())),
         ];
-        finish(&model, &total, metrics, training, statistics)
+        finish(&model, &total, metrics, training, encoding)
     }
 }
 
 /// The name of the encoder in a model.
 pub(super) const ENCODER: &str = "encoder";
+
+/// The state of encoding the images of a batch that the gradients read.
+struct Encoding<'a> {
+    /// The statistics of the batch.
+    statistics: Vec<BatchStatistics>,
+    /// The pass on the CPU kernels; `None` if Burn differentiates the encoder.
+    kernels: Option<CellPass<'a>>,
+}
 
 /// The encoder of a model, in and outside the autodiff graph. In training, an encoder that is not frozen normalises with
 /// the statistics of the batch.
@@ -159,17 +168,23 @@ impl<'a> Encoders<'a> {
         Self { plain, trained, frozen, training, clips: count }
     }
 
-    /// Encodes frames and goals as one batch in the autodiff graph, with the patches of a clip in one row. Also returns
-    /// the statistics of the batch.
+    /// Encodes frames and goals as one batch in the autodiff graph, with the patches of a clip in one row.
     ///
     /// # Shapes
     /// `frames` is `[clips * frames, patches, 3 * patch * patch]`, `goals` has one image per clip; returns
     /// `[clips, frames * patches, dim]` and `[clips, patches, dim]`.
-    fn with_gradient(&self, frames: Tensor<3>, goals: Tensor<3>) -> ([Tensor<3>; 2], Vec<BatchStatistics>) {
+    fn with_gradient(&self, frames: Tensor<3>, goals: Tensor<3>) -> ([Tensor<3>; 2], Encoding<'a>) {
         let images = Tensor::cat(vec![frames, goals], 0);
-        let (patches, statistics) = match self.frozen {
-            true => (self.plain.patches(images).autodiff(), vec![]),
-            false => self.encode(self.trained, images.autodiff()),
+        let trains = self.training && !self.frozen;
+        let (patches, encoding) = match trains.then(|| CellPass::forward(self.plain, &images)).flatten() {
+            Some((pass, statistics)) => (pass.cells.clone(), Encoding { statistics, kernels: Some(pass) }),
+            None if self.frozen => {
+                (self.plain.patches(images).autodiff(), Encoding { statistics: vec![], kernels: None })
+            }
+            None => {
+                let (patches, statistics) = self.encode(self.trained, images.autodiff());
+                (patches, Encoding { statistics, kernels: None })
+            }
         };
         let [all, count, dim] = patches.dims();
         let frames = all - self.clips;
@@ -177,7 +192,7 @@ impl<'a> Encoders<'a> {
             let per_clip = range.len() / self.clips;
             patches.clone().slice([range, 0..count, 0..dim]).reshape([self.clips, per_clip * count, dim])
         };
-        ([part(0..frames), part(frames..all)], statistics)
+        ([part(0..frames), part(frames..all)], encoding)
     }
 
     /// Encodes images outside the autodiff graph.
@@ -193,9 +208,8 @@ impl<'a> Encoders<'a> {
     }
 }
 
-/// Encodes the inputs of the heads; only the history and the goal of the values are encoded in the autodiff graph. Also
-/// returns the statistics of their batch.
-fn head_inputs(encoders: &Encoders<'_>, clips: &Clips, relabelled: &Relabelled) -> (HeadInputs, Vec<BatchStatistics>) {
+/// Encodes the inputs of the heads; only the history and the goal of the values are encoded in the autodiff graph.
+fn head_inputs<'a>(encoders: &Encoders<'a>, clips: &Clips, relabelled: &Relabelled) -> (HeadInputs, Encoding<'a>) {
     let [count, history, _] = clips.actions.dims();
     let [frames, patches, elements] = clips.frames.dims();
     let steps = frames / count;
@@ -204,7 +218,7 @@ fn head_inputs(encoders: &Encoders<'_>, clips: &Clips, relabelled: &Relabelled) 
         let frames = clips.frames.clone().reshape([count, steps, patches * elements]);
         frames.slice([0..count, range, 0..patches * elements]).reshape([count * length, patches, elements])
     };
-    let ([now, goal], statistics) = encoders.with_gradient(images(0..history), clips.goal.clone());
+    let ([now, goal], encoding) = encoders.with_gradient(images(0..history), clips.goal.clone());
     let last = encoders.without_gradient(images(history..steps));
     let [_, tokens, dim] = now.dims();
     let later = now.clone().inner().slice([0..count, tokens / history..tokens, 0..dim]);
@@ -214,7 +228,7 @@ fn head_inputs(encoders: &Encoders<'_>, clips: &Clips, relabelled: &Relabelled) 
         next: if history > 1 { Tensor::cat(vec![later, last], 1) } else { last },
         policy_goal: encoders.without_gradient(relabelled.policy_goal.clone()),
     };
-    (inputs, statistics)
+    (inputs, encoding)
 }
 
 /// Returns the bootstrapped targets `r + γ m V(s', g)`: the reward `r` is -1 and the mask `m` is 1 until the goal is
@@ -261,12 +275,16 @@ fn finish<M: Module>(
     loss: &Tensor<1>,
     metrics: Vec<(&'static str, f64)>,
     training: bool,
-    statistics: Vec<BatchStatistics>,
+    encoding: Encoding<'_>,
 ) -> StepOutput {
     let (mut gradients, mut buffers) = (Named::new(), Named::new());
     if training {
-        gradients = parameters::gradients(model, &loss.clone().backward());
-        conv::store(statistics, ENCODER, &mut buffers);
+        let mut all = loss.clone().backward();
+        gradients = parameters::gradients(model, &all);
+        if let Some(pass) = encoding.kernels {
+            gradients.extend(pass.backward(&mut all));
+        }
+        conv::store(encoding.statistics, ENCODER, &mut buffers);
     }
     StepOutput { metrics, gradients, buffers }
 }

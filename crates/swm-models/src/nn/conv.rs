@@ -1,7 +1,7 @@
 //! [`Conv`]: an image encoder of overlapping convolutions, each followed by batch normalisation and ReLU. In training, the
 //! normalisations use the statistics of the batch.
 
-use super::kernels::conv_sizes;
+use super::kernels::{cell_sizes, conv_sizes};
 use super::{Activation, BatchNorm, BatchStatistics, Init, Linear, Named};
 use crate::train::{check_sizes, limits};
 use burn::module::{Module, Param};
@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::sync::Arc;
 use swm_core::{Error, Result};
-use swm_kernels::{ConvGradient, ScratchPool};
+use swm_kernels::{ConvGradient, ConvSizes, ScratchPool};
 
 /// The side of the kernels.
 const KERNEL: usize = 3;
@@ -187,7 +187,15 @@ impl Conv {
 
     /// Returns CPU kernels for images with a side of `side` pixels: those of the last step, if they were returned.
     pub(crate) fn kernels(&self, side: usize) -> Box<ConvGradient> {
-        let sizes = conv_sizes(self, side);
+        self.kernels_of(conv_sizes(self, side))
+    }
+
+    /// Returns CPU kernels of the convolutions without the linear layers, as [`Conv::kernels`].
+    pub(crate) fn cell_kernels(&self, side: usize) -> Box<ConvGradient> {
+        self.kernels_of(cell_sizes(self, side))
+    }
+
+    fn kernels_of(&self, sizes: ConvSizes) -> Box<ConvGradient> {
         let unused = self.kernels.0.with(Option::take).filter(|kernels| *kernels.sizes() == sizes);
         unused.unwrap_or_else(|| Box::new(ConvGradient::new(&sizes)))
     }

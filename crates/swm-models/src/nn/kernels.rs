@@ -137,6 +137,11 @@ pub(crate) fn conv_sizes(conv: &Conv, side: usize) -> ConvSizes {
     }
 }
 
+/// Returns the sizes of the convolutions of an encoder, without its linear layers.
+pub(crate) fn cell_sizes(conv: &Conv, side: usize) -> ConvSizes {
+    ConvSizes { hidden: 0, dim: 0, ..conv_sizes(conv, side) }
+}
+
 /// Copies the parameters of a convolutional encoder.
 pub(crate) fn conv_parameters(conv: &Conv) -> ConvParameters {
     let stages = conv.stages.iter().map(|stage| ConvStage {
@@ -248,6 +253,34 @@ mod tests {
             let encoder = conv_encoder(&conv, side);
             let features: Vec<f32> = pixels.chunks(side * side * 3).flat_map(|image| encoder.encode(image)).collect();
             close("features with running statistics", &features, host(conv.forward(input)));
+        }
+    }
+
+    #[test]
+    fn cpu_kernels_of_the_cells_of_a_feature_map_match_the_module() {
+        let (side, images) = (10, 40);
+        let conv = ConvConfig { channels: vec![5, 18], hidden: 0, dim: 6 };
+        let conv = conv.init(&Init::new(Key::new(2), &Device::flex()), side).train();
+        let pixels: Vec<f32> = (0..images * side * side * 3).map(|i| (i * 37 % 101) as f32 / 50.0 - 1.0).collect();
+        let input = Tensor::<3>::from_data(TensorData::new(pixels.clone(), [images, side * side, 3]), &Device::flex());
+        let close = |name: &str, actual: &[f32], expected: Vec<f32>| {
+            let largest = expected.iter().fold(1e-6f32, |largest, value| largest.max(value.abs()));
+            assert_eq!(actual.len(), expected.len(), "{name}");
+            for (actual, expected) in actual.iter().zip(expected) {
+                assert!((actual - expected).abs() < 1e-4 * largest, "{name}: {actual}, expected {expected}");
+            }
+        };
+        let (cells, _) = conv.cells_train(input.autodiff());
+        let values = host(cells.clone().inner());
+        let mut kernels = conv.cell_kernels(side);
+        kernels.load(&conv_parameters(&conv));
+        close("cells", &kernels.forward(&pixels), values.clone());
+        let d: Vec<f32> = values.iter().map(|cell| 2.0 * cell + 1.0).collect();
+        let actual = named_conv_gradients(kernels.backward(&pixels, &d));
+        let expected = parameters::gradients(&conv, &(cells.clone().square().sum() + cells.sum()).backward());
+        assert_eq!(actual.keys().collect::<Vec<_>>(), expected.keys().collect::<Vec<_>>());
+        for (name, gradient) in expected {
+            close(&name, &actual[&name], host(gradient));
         }
     }
 }

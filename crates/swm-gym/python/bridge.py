@@ -96,6 +96,20 @@ def column_dtype(dtype):
     raise Unsupported(f'values of type {dtype} cannot be stored in a column')
 
 
+def store(view, value, name):
+    """Writes a value into a column. An integer column must hold the value itself, not a rounded or wrapped one."""
+    value = np.asarray(value)
+    if value.dtype != view.dtype and view.dtype.kind != 'f' and not np.can_cast(value.dtype, view.dtype):
+        with np.errstate(invalid='ignore'):
+            exact = value.dtype.kind in 'biuf' and np.array_equal(value.astype(view.dtype), value)
+        if not exact:
+            raise ValueError(
+                f"'{name}' is {value.tolist()} ({value.dtype}), which a column of {view.dtype} cannot hold:"
+                ' return values of the type that its space declares, below 2^63'
+            )
+    view[...] = value
+
+
 def box(low, high, shape, dtype):
     return {'type': 'Box', 'shape': list(shape), 'dtype': column_dtype(dtype).name, 'low': bounds(low), 'high': bounds(high)}
 
@@ -537,7 +551,7 @@ class Bridge:
             value = observation
             for key in path:
                 value = value[key]
-            view[...] = value
+            store(view, value, '_'.join(map(str, path)) or 'observation')
         for key, view in self.informed_views.items():
             value = info.get(key)
             if value is None:
@@ -548,7 +562,7 @@ class Bridge:
                     f"info['{key}'] was {view.dtype} {list(view.shape)} at the first reset and step, and is"
                     f' {value.dtype} {list(value.shape)} now: keep its type and shape'
                 )
-            view[...] = value
+            store(view, value, f'info.{key}')
         for view, value in self.held:
             view[...] = np.reshape(value, view.shape)
         success = info.get('success', info.get('is_success'))

@@ -19,7 +19,7 @@ pub fn check(
     mix_renderers: bool,
 ) -> Result<BTreeMap<String, u64>> {
     let exists = match location.path() {
-        Some(path) => path.exists(),
+        Some(path) => path.exists() && !swm_data::has_no_dataset(path),
         None => swm_data::open(location.clone()).is_ok(),
     };
     if !exists {

@@ -25,7 +25,8 @@ pub struct CommitPolicy {
     pub episodes: usize,
     /// Maximum number of encoded bytes per commit; this also bounds the writer's memory.
     pub bytes: usize,
-    /// Maximum time between commits. It is checked when an episode arrives.
+    /// Maximum time between commits. It is checked when an episode arrives. LeRobot datasets ignore it, because every
+    /// commit begins new files, and equal collections have equal files.
     pub interval: Duration,
 }
 

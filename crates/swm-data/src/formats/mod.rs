@@ -15,5 +15,6 @@ pub mod registry;
 mod stored_scalar;
 mod video;
 
+pub use column_files::has_no_dataset;
 pub use entry::{Backend, FormatEntry};
 pub use registry::{FORMATS, create, detect, open};

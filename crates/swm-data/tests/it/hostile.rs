@@ -170,4 +170,13 @@ fn pipes_are_refused() {
     let image = fuzz::files(&path).into_iter().find(|file| file.extension().is_some_and(|end| end != "npz"));
     pipe(&image.expect("an image"));
     refused(&path);
+    // Data files that are named by their hash are read to compare it.
+    for name in ["e.lance", "e.lance-video"] {
+        let path = folder.path().join(name);
+        crate::format_suite::write(&path, WriteMode::Create, 0..2);
+        let file =
+            fuzz::files(&path).into_iter().find(|file| file.parent().is_some_and(|parent| parent.ends_with("data")));
+        pipe(&file.expect("a data file"));
+        refused(&path);
+    }
 }

@@ -8,6 +8,7 @@
 use crate::video::{THIRD_PARTY_LENGTHS, check_frames, interop};
 use crate::{format_suite, fuzz, sample};
 use std::process::Command;
+use std::time::Duration;
 use swm_core::{ColumnSpec, DType};
 use swm_data::{CommitPolicy, Constants, ImageCodec, StepRange, WriteMode, WriteOptions, create, open};
 
@@ -112,6 +113,21 @@ fn reads_or_rejects_damaged_datasets() {
 #[ignore = "takes minutes"]
 fn reads_or_rejects_datasets_damaged_in_10000_ways() {
     ["lerobot-v30-h264", "lerobot-v30-av1", "lerobot-v21"].iter().for_each(|name| damaged(name, 4000));
+}
+
+#[test]
+fn files_do_not_depend_on_the_time_of_commits() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let hash = |interval| {
+        let path = folder.path().join(format!("{interval:?}.lerobot"));
+        let commit = CommitPolicy { interval, ..CommitPolicy::default() };
+        let options = WriteOptions { commit, ..WriteOptions::default() };
+        let mut writer = create(&path, &sample::schema(), options).expect("creating the dataset");
+        (0..6).for_each(|e| writer.write_episode(&sample::episode(e)).expect("writing an episode"));
+        writer.finish().expect("finishing the dataset");
+        open(&path).expect("opening the dataset").content_hash().expect("hashing the content")
+    };
+    assert_eq!(hash(Duration::ZERO), hash(Duration::MAX));
 }
 
 #[test]

@@ -179,6 +179,32 @@ fn replacement_completes_one_that_was_killed() {
 }
 
 #[test]
+fn what_a_writer_leaves_before_its_first_commit_is_continued_and_replaced() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    for (format, left) in [("folder", &b"PK\x03\x04"[..]), ("video", b"")] {
+        for mode in [WriteMode::Append, WriteMode::Overwrite] {
+            let path = folder.path().join(format!("{mode:?}.{format}"));
+            std::fs::create_dir(&path).expect("creating a folder");
+            std::fs::write(path.join("ep_len.tmp"), left).expect("writing a file");
+            write(&path, mode, 1, 0..2);
+            check(&*open(&path).expect("opening"), 0);
+            assert!(!path.join("ep_len.tmp").exists(), "{format}");
+        }
+        let path = folder.path().join(format!("thesis.{format}"));
+        std::fs::create_dir(&path).expect("creating a folder");
+        std::fs::write(path.join("ep_len.tmp"), "thesis").expect("writing a file");
+        assert!(overwrite(&path).expect("a refusal").to_string().contains("holds other files"), "{format}");
+        assert_eq!(std::fs::read(path.join("ep_len.tmp")).expect("the file"), b"thesis");
+    }
+    for format in ["folder", "video", "lerobot", "lance", "lance-video"] {
+        let path = folder.path().join(format!("empty.{format}"));
+        std::fs::create_dir(&path).expect("creating a folder");
+        write(&path, WriteMode::Append, 1, 0..2);
+        check(&*open(&path).expect("opening"), 0);
+    }
+}
+
+#[test]
 fn killed_replacements_keep_files_of_the_user() {
     let folder = tempfile::tempdir().expect("creating a folder");
     for format in ["folder", "video", "lerobot", "lance"] {

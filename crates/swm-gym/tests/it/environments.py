@@ -323,6 +323,27 @@ class Counter(gymnasium.Env):
         self.answer(b'\x00\x05\x00\x00\x00abc\xff\xfe')
 
 
+class Wide(gymnasium.Env):
+    """Observes an integer, and from step 2 one of `VALUES`, which its column cannot hold."""
+
+    action_space = spaces.Discrete(2)
+    observation_space = spaces.Box(0, np.iinfo(np.uint64).max, (1,), np.uint64)
+    VALUES = {'large': np.uint64([2**63 + 5]), 'fraction': np.float64([1.5]), 'nan': np.float64([np.nan])}
+
+    def __init__(self, value):
+        self.value, self.t = self.VALUES[value], 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return np.uint64([2**62]), {}
+
+    def step(self, action):
+        self.t += 1
+        return self.value if self.t == 2 else np.float64([self.t]), 0.0, False, False, {}
+
+
+gymnasium.register('Wide-v0', Wide, max_episode_steps=1_000_000)
 gymnasium.register('Counter-v0', Counter, max_episode_steps=1_000_000)
 gymnasium.register('Room-v0', Room, max_episode_steps=30)
 gymnasium.register('Coated-v0', Coated)

@@ -73,3 +73,15 @@ fn environment_cannot_shrink_the_shared_memory() {
         assert_eq!(observation(&*env), t as f32);
     }
 }
+
+#[test]
+fn values_that_a_column_cannot_hold_are_errors() {
+    let Some(config) = config() else { return };
+    for (value, shown) in [("large", "9223372036854775813"), ("fraction", "1.5"), ("nan", "nan")] {
+        let mut env = make(&format!("tests.it.environments:Wide-v0,value={value}"), &config);
+        env.reset(0, &ResetOptions::default()).expect("a reset");
+        env.step(Action::Discrete(&[0])).expect("a whole number");
+        let error = env.step(Action::Discrete(&[0])).expect_err("a value that int64 cannot hold").to_string();
+        assert!(error.contains(shown) && error.contains("int64"), "{error}");
+    }
+}

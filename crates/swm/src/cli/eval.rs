@@ -229,9 +229,14 @@ pub fn run(
     (output, videos): (&Path, usize),
     context: &Context,
 ) -> Result<(Results, PathBuf)> {
+    let is_new = !output.exists();
     let _lock = output_folder::claim(output, &["results.json"])?;
     let videos = (videos > 0).then(|| (output.to_owned(), videos));
-    let results = request.run(resolver, &run_options(envs, videos, context), &mut control(context))?;
+    let results = request.run(resolver, &run_options(envs, videos, context), &mut control(context));
+    if results.is_err() && is_new {
+        files::remove_empty_folder(output)?;
+    }
+    let results = results?;
     let file = output.join("results.json");
     write_json(&file, &results)?;
     Ok((results, file))

@@ -192,6 +192,7 @@ impl Cli {
         // If an embedding program has already set up logging, `try_init` fails and that setup stays in place.
         let _ = tracing_subscriber::fmt()
             .with_writer(std::io::stderr)
+            .with_ansi(std::io::IsTerminal::is_terminal(&std::io::stderr()))
             .with_env_filter(
                 tracing_subscriber::EnvFilter::try_from_env("SWM_LOG")
                     .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn")),

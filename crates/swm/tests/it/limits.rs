@@ -34,6 +34,17 @@ fn absurd_counts_are_refused_before_work_starts() {
     assert!(!swm.path("datasets/rooms.lance").exists());
 }
 
+#[test]
+fn variables_of_lance_are_checked() {
+    let swm = Swm::new();
+    for (name, value) in [("LANCE_IO_THREADS", "abc"), ("LANCE_CPU_THREADS", "0"), ("LANCE_MAX_IOP_SIZE", "0")] {
+        let output = swm.command(ROOMS).env(name, value).output().expect("swm runs");
+        let error = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{name}: {error}");
+        assert!(error.contains(name) && error.contains(value) && !error.contains("internal error"), "{error}");
+    }
+}
+
 /// Runs the command with a limit of its virtual memory, and ends it after a minute.
 #[cfg(target_os = "linux")]
 fn run_with_memory(swm: &Swm, args: &[&str], kilobytes: usize, stack: &str) -> Output {

@@ -36,8 +36,19 @@ pub(crate) fn block_on<T: Send + 'static>(future: impl Future<Output = T> + Send
 /// Starts the threads on which Lance encodes and decodes, which never end.
 ///
 /// # Errors
-/// If they cannot be started, in this call or in an earlier one.
+/// If they cannot be started, in this call or in an earlier one, or a variable in [`COUNTS`] is no count.
 pub(crate) fn start_lance() -> Result<()> {
+    for name in COUNTS {
+        let Some(value) = std::env::var_os(name) else { continue };
+        if value.to_str().and_then(|text| text.parse::<u32>().ok()).is_none_or(|count| count == 0) {
+            let problem = format!("is '{}'", value.display());
+            return Err(Error::config(
+                format!("the environment variable {name}"),
+                problem,
+                "unset it, or give a number from 1",
+            ));
+        }
+    }
     static STARTED: PerProcess<bool> = PerProcess::new();
     let started = STARTED.get(|| {
         // The future only waits for the result; the threads run without it.
@@ -45,6 +56,15 @@ pub(crate) fn start_lance() -> Result<()> {
     })?;
     if started { Ok(()) } else { Err(cannot_start("the system has no memory or no threads for Lance")) }
 }
+
+/// Environment variables of Lance that it uses without a check, and so panics.
+const COUNTS: [&str; 5] = [
+    "LANCE_CPU_THREADS",
+    "LANCE_IO_THREADS",
+    "LANCE_MAX_IOP_SIZE",
+    "LANCE_UPLOAD_CONCURRENCY",
+    "LANCE_INITIAL_UPLOAD_SIZE",
+];
 
 /// The runtimes, each with one thread.
 type Handles = [Handle; 2];

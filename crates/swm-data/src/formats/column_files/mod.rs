@@ -37,8 +37,9 @@ pub(crate) use writer::ColumnFilesWriter;
 
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use std::io::Read as _;
 use std::path::{Path, PathBuf};
-use swm_core::{Error, Manifest, Result, Schema};
+use swm_core::{Error, Manifest, Result, Schema, files};
 
 /// Name of the file with the lengths of the episodes. Replacing this file commits a merge.
 const LENGTHS: &str = "ep_len";
@@ -49,6 +50,8 @@ const METADATA: &str = "stable_worldmodel.json";
 
 /// Name of the temporary file that replaces a column file. The reference ignores names that start with `ep_len`.
 const TEMPORARY: &str = "ep_len.tmp";
+/// The first bytes of a ZIP archive, which an `.npz` is.
+const ZIP: &[u8] = b"PK\x03\x04";
 
 /// Metadata of the dataset, stored in `ep_len.npz`.
 #[derive(Default, Serialize, Deserialize)]
@@ -69,6 +72,19 @@ fn constant_member(index: usize) -> String {
 /// Returns whether a folder contains `ep_len.npz`.
 pub(crate) fn exists(folder: &Path) -> bool {
     column_path(folder, LENGTHS).is_file()
+}
+
+/// Returns whether a folder is empty, or contains only the first file of a writer that was killed before it was complete.
+pub fn has_no_dataset(folder: &Path) -> bool {
+    let Ok(mut entries) = folder.read_dir() else { return false };
+    let is_left = |path: &Path| {
+        path.ends_with(TEMPORARY)
+            && files::open(path).is_ok_and(|file| {
+                let mut start = vec![];
+                file.take(ZIP.len() as u64).read_to_end(&mut start).is_ok() && ZIP.starts_with(&start)
+            })
+    };
+    entries.all(|entry| entry.is_ok_and(|entry| is_left(&entry.path())))
 }
 
 /// Path of the file of a column.

@@ -4,7 +4,7 @@ use super::journal::{self, Journal, PendingEpisode};
 use super::npz::NpzWriter;
 use super::{
     ColumnFiles, ImageFiles, LENGTHS, METADATA, Metadata, OFFSETS, TEMPORARY, check_name, column_path, constant_member,
-    exists, images, removal,
+    exists, has_no_dataset, images, removal,
 };
 use crate::dataset::episodes::{self, EpisodeRows};
 use crate::dataset::{CommitPolicy, Constants, StepRange, WriteMode, WriteOptions, is_full, with_stored};
@@ -71,7 +71,7 @@ impl ColumnFilesWriter {
     ) -> Result<Self> {
         check_columns(schema)?;
         let exists = exists(folder);
-        if !exists && folder.read_dir().is_ok_and(|mut entries| entries.next().is_some()) {
+        if !exists && folder.is_dir() && !has_no_dataset(folder) {
             let problem = format!("{} holds other files", folder.display());
             return Err(Error::config("dataset", problem, "choose another path"));
         }

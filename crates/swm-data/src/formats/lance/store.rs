@@ -57,6 +57,8 @@ pub fn damaged(path: &Path, problem: impl Into<String>) -> Error {
 /// message, and all other errors mean that files are damaged.
 fn lance_error(label: &Path, action: &str, error: &lance_core::Error) -> Error {
     let text = error.to_string();
+    // Lance takes damage for a fault of its own, and asks for a report.
+    let text = text.split_once("/lance/issues. ").map_or(text.as_str(), |(_, found)| found);
     // Lance converts some system errors to text, which still contains their code.
     let code =
         text.split("(os error ").nth(1).and_then(|rest| rest.split(')').next()).and_then(|number| number.parse().ok());

@@ -20,7 +20,6 @@ use serde_json::{Value, json};
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Instant;
 use swm_core::columns::ACTION;
 use swm_core::files::{self, Lock};
 use swm_core::{Batch, ColumnSpec, DType, Error, Result, Schema};
@@ -45,7 +44,6 @@ struct LerobotWriter {
     /// Index of the next files, counted over all chunks.
     file: usize,
     group: Group,
-    last_commit: Instant,
     /// Whether a write failed.
     failed: bool,
 }
@@ -98,7 +96,6 @@ impl LerobotWriter {
             tasks: vec![],
             file: 0,
             group: Group::default(),
-            last_commit: Instant::now(),
             failed: false,
             options,
         };
@@ -219,7 +216,6 @@ impl LerobotWriter {
     }
 
     fn try_commit(&mut self) -> Result<()> {
-        self.last_commit = Instant::now();
         if self.group.episodes.is_empty() {
             return Ok(());
         }
@@ -366,9 +362,8 @@ impl Writer for LerobotWriter {
         }
         self.add(episode, constants)?;
         let (group, policy) = (&self.group, &self.options.commit);
-        let due = group.episodes.len() >= policy.episodes
-            || group.bytes >= policy.bytes
-            || self.last_commit.elapsed() >= policy.interval;
+        let due =
+            group.episodes.len() >= policy.episodes || group.bytes >= policy.bytes || group.rows >= ROWS_PER_COMMIT;
         if due {
             self.commit()?;
         }
@@ -403,6 +398,8 @@ fn check_folders(root: &Path, columns: &[(usize, String)], schema: &Schema) -> R
 }
 
 /// The column of `meta/tasks.parquet` that pandas uses as the index.
+/// Rows after which a commit is due. Unlike a time, it gives equal collections equal files.
+const ROWS_PER_COMMIT: usize = 10_000;
 const INDEX: &str = "__index_level_0__";
 
 /// Metadata that makes pandas use [`INDEX`] as the index.

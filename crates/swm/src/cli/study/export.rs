@@ -193,7 +193,9 @@ impl<'a> Pivot<'a> {
     }
 
     fn markdown(&self) -> String {
-        let escape = |cell: &str| printable(cell).replace('|', "\\|").replace(['\n', '\r'], " ");
+        let escape = |cell: &str| {
+            printable(cell).replace('&', "&amp;").replace('<', "&lt;").replace('|', "\\|").replace(['\n', '\r'], " ")
+        };
         let line = |cells: &[String]| {
             format!("| {} |\n", cells.iter().map(|cell| escape(cell)).collect::<Vec<_>>().join(" | "))
         };

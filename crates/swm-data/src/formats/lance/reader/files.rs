@@ -64,6 +64,7 @@ impl LanceReader {
             return Ok(());
         }
         let path = self.store.local(&self.store.data_path(&file.path));
+        check_regular(&path)?;
         let io = |e: std::io::Error| self.file_error(&path, e);
         if !reads_data && std::fs::metadata(&path).map_err(io)?.len() > SMALL_FILE {
             return Ok(());
@@ -104,10 +105,7 @@ impl LanceReader {
             return Ok(reader);
         }
         if !self.store.remote {
-            let local = self.store.local(&self.store.data_path(&file.path));
-            if local.exists() {
-                files::open(&local)?;
-            }
+            check_regular(&self.store.local(&self.store.data_path(&file.path)))?;
         }
         let (store, data_file) = (self.store.clone(), file.clone());
         let path = self.folder().join("data").join(&file.path);
@@ -123,6 +121,7 @@ impl LanceReader {
             return Ok(file);
         }
         let local = self.store.local(&self.store.data_path(path));
+        check_regular(&local)?;
         let file = Arc::new(File::open(&local).map_err(|e| self.file_error(&local, e))?);
         lock(&self.handles).insert(path, &file);
         Ok(file)
@@ -156,4 +155,9 @@ impl LanceReader {
         let read = async move { reader.read_global_buffer(index).await.map(Some) };
         block_on(self.folder(), "reading the record of a data file", read)
     }
+}
+
+/// Checks that a local data file is a regular file, if it exists: reading a pipe would block, and a device never ends.
+fn check_regular(path: &Path) -> Result<()> {
+    if path.exists() { files::open(path).map(drop) } else { Ok(()) }
 }

@@ -14,15 +14,17 @@ WHEELS := $(CARGO_TARGET_DIR)/wheels
 # Worker processes of Gymnasium environments run in it.
 export SWM_PYTHON ?= $(PYTHON_VENV)/bin/python
 export SWM_TYPOS ?= $(PYTHON_VENV)/bin/typos
+export SWM_CHROMIUM ?= chromium
 SWM := $(CARGO_TARGET_DIR)/release/swm
 SUDO := $(shell [ "$$(id -u)" = 0 ] || command -v sudo)
 CARGO := cargo
 
-.PHONY: help demo test test-python check build tests wheel wheel-portable gpu assets setup setup-python reference bench deny nightly clean
+.PHONY: help demo test test-python test-browser check build tests wheel wheel-portable gpu assets setup setup-python reference bench deny nightly clean
 
 help:
 	@echo 'make demo       collect, train, plan, evaluate and report on a laptop CPU'
 	@echo 'make test       all checks and all tests'
+	@echo 'make test-browser   pages in Chromium: no text is cut off or overlaps another'
 	@echo 'make build      the swm program: $(SWM)'
 	@echo 'make wheel      the Python package: $(WHEELS)'
 	@echo 'make wheel-portable   the same with the FFmpeg it uses inside, for other machines: $(WHEELS)/portable'
@@ -47,6 +49,12 @@ test-python: wheel assets
 	$(CACHE)/venv-bare/bin/python python/tests/bare.py
 	$(PYTHON_VENV)/bin/python -m pip install --quiet --force-reinstall --no-deps $(WHEELS)/*.whl
 	cd python/tests && $(PYTHON_VENV)/bin/python -m pytest -q
+
+# Pages in headless Chromium, at three widths, light and dark.
+test-browser: setup
+	@command -v $(SWM_CHROMIUM) >/dev/null || { $(SUDO) apt-get update -qq && \
+	  DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install -y -qq --no-install-recommends chromium; }
+	$(CARGO) test --release -p swm-report --test it browser -- --ignored
 
 # After `tests`, which compiles xtask with the libraries of everything else.
 check: tests setup-python

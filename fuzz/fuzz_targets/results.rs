@@ -4,7 +4,7 @@
 
 use swm_core::results::{Comparison, Counting, EpisodeResult, Run, Summary, Timing};
 use swm_core::{Manifest, Results};
-use swm_report::{ReportOptions, read_metrics, read_results, render};
+use swm_report::{ReportOptions, Training, read_metrics, read_results, render};
 
 /// Results of two policies, as an evaluation writes them.
 fn results() -> Results {
@@ -32,9 +32,11 @@ libfuzzer_sys::fuzz_target!(
     },
     |bytes: &[u8]| {
         let path = swm_fuzz::file("results.json", bytes);
-        let metrics = read_metrics(&path).ok();
-        if let Ok(results) = read_results(&path) {
-            let _ = render(&[(path, results)], &ReportOptions::default(), metrics.as_ref());
-        }
+        let metrics = read_metrics(&path).map_err(|error| error.to_string());
+        let training = vec![Training { policy: "expert".to_owned(), metrics }];
+        // Some inputs are logs, others are results; the page of each has the other as a seed has it.
+        let results = read_results(&path).unwrap_or_else(|_| results());
+        let page = render(&[(path, results)], &ReportOptions { training, ..ReportOptions::default() });
+        assert!(page.is_ok_and(|page| page.len() < 5_000_000));
     }
 );

@@ -481,7 +481,7 @@ class World:
             episodes: The number of episodes; 50, or the length of `episodes_idx`, for `None`.
             seed: The seed of starts, goals, factors and plans; random for `None`.
             options: Factors to sample (`variation`) and to pin (`variation_values`).
-            video: A folder for videos of the first episodes.
+            video: A folder for videos of the first episodes, with their first frames as PNG files beside them.
             dataset: The dataset of starts and goals: a `swm.data.Dataset`, its path, URI or name.
             episodes_idx, start_steps: The episodes and steps of the dataset to start from; chosen by the seed for `None`.
             goal_offset: The number of steps from a start to its goal; 25 for `None`.

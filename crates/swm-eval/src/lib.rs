@@ -5,6 +5,7 @@
 //! - [`starts`] and [`evaluate`]: initial states and goals, and the success rate of a policy from them.
 //! - [`request`]: all settings of an evaluation as one value. [`runner`] evaluates the policies of a request on the
 //!   same starts, [`reproduce`] repeats an evaluation from its results, and [`replay`] some of its episodes.
+//! - [`baselines`]: policies that need no training and show what a success rate means.
 //! - [`study`]: many evaluations with one table.
 //! - [`prediction`]: the prediction errors of a model on recorded trajectories.
 //!
@@ -12,6 +13,7 @@
 //! same slot.
 
 mod action_noise;
+pub mod baselines;
 pub mod collect;
 pub mod evaluate;
 pub mod policy_mixture;
@@ -28,6 +30,7 @@ mod success_criterion;
 mod video_recording;
 pub mod world;
 
+pub use baselines::{NoOpPolicy, ReplayPolicy};
 pub use collect::{CollectConfig, Collected};
 pub use evaluate::EvalConfig;
 pub use policy_mixture::{MixturePolicy, PolicyChoice, WeightedPolicy};

@@ -105,6 +105,10 @@ pub struct PolicyRequest {
 pub enum PolicyKind {
     /// Uniformly random actions: the floor.
     Random,
+    /// No action: zero, or the bound nearest to zero.
+    NoOp,
+    /// The recorded actions that follow the rows of the starts.
+    Replay,
     /// An expert of the environment.
     Expert {
         /// The id of the expert.

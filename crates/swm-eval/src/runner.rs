@@ -1,5 +1,6 @@
 //! Runs an [`EvalRequest`]: condition by condition, every policy on the same starts, the random-policy floor first.
 
+use crate::baselines::{NoOpPolicy, ReplayPolicy};
 use crate::evaluate::EvalConfig;
 use crate::prediction::{self, Predictor, predict_run};
 use crate::request::{Condition, EvalRequest, HeldOut, PolicyKind, PolicyRequest, StartsRequest};
@@ -35,7 +36,8 @@ pub trait Resolver {
     /// When the dataset does not exist or is damaged.
     fn dataset(&self, name: &str) -> Result<Arc<dyn Reader>>;
 
-    /// Makes a policy for all environments of a world. The runner makes the random-policy floor itself.
+    /// Makes a policy for all environments of a world. The runner makes the random-policy floor and the
+    /// [baselines](crate::baselines) itself.
     ///
     /// # Errors
     /// When a checkpoint, an expert or a solver does not exist or does not fit the world.
@@ -128,7 +130,13 @@ impl EvalRequest {
             world.spec().variation_space.check(&condition.variation)?;
         }
         for policy in request.policies.iter().filter(|policy| policy.kind != PolicyKind::Random) {
-            resolver.policy(policy, &world)?;
+            match policy.kind {
+                PolicyKind::NoOp => drop(NoOpPolicy::new(world.spec())?),
+                PolicyKind::Replay => {
+                    ReplayPolicy::check(dataset.as_deref())?;
+                }
+                _ => drop(resolver.policy(policy, &world)?),
+            }
         }
         let (mut starts_hash, mut runs) = (StartsHash::default(), vec![]);
         for condition in &request.conditions {
@@ -146,6 +154,14 @@ impl EvalRequest {
             for policy in &request.policies {
                 let mut resolved = match policy.kind {
                     PolicyKind::Random => ResolvedPolicy::from(floor(&world)),
+                    PolicyKind::NoOp => {
+                        ResolvedPolicy::from(Box::new(NoOpPolicy::new(world.spec())?) as Box<dyn Policy>)
+                    }
+                    PolicyKind::Replay => {
+                        let (slots, budget) = (world.pool().len(), world.pool().max_episode_steps());
+                        let replay = ReplayPolicy::new(world.spec(), slots, (&starts, dataset.as_deref()), budget)?;
+                        ResolvedPolicy::from(Box::new(replay) as Box<dyn Policy>)
+                    }
                     _ => resolver.policy(policy, &world)?,
                 };
                 request.record_provenance(&mut manifest, policy, &resolved);

@@ -1,11 +1,11 @@
-//! [`VideoRecording`]: videos of the first episodes of an evaluation.
+//! [`VideoRecording`]: videos of the first episodes of an evaluation, and their posters.
 
 use std::path::{Path, PathBuf};
 use swm_core::columns::{GOAL, PIXELS};
 use swm_core::{EnvPool, Error, Result};
 
 /// Options of the videos of the first episodes. A video has the frame of the agent on the left and the frame of the
-/// goal on the right.
+/// goal on the right. Its poster, the first frame as a PNG file, is beside it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Videos {
     /// The folder of the results file; paths in results are relative to it.
@@ -14,7 +14,7 @@ pub struct Videos {
     pub prefix: String,
     /// The number of recorded episodes.
     pub count: usize,
-    /// Frames per second; there is one frame for each step.
+    /// Frames per second. There is one frame for each step; very long episodes have one for every second, fourth, ... step.
     pub fps: u32,
 }
 
@@ -23,10 +23,48 @@ impl Videos {
     fn name(&self, index: usize) -> String {
         format!("{}-{index}.mp4", self.prefix)
     }
+
+    /// The path of the poster of a video.
+    fn poster(&self, index: usize) -> PathBuf {
+        self.root.join(self.name(index)).with_extension("png")
+    }
 }
 
 /// The side length that small frames are enlarged to, in pixels.
 const MIN_SIDE: usize = 256;
+
+/// The largest size of the frames of all recorded episodes in memory, in bytes.
+const FRAMES_BYTES: usize = 256 << 20;
+
+/// The frames of an episode.
+#[derive(Clone, Debug, Default)]
+struct Frames {
+    frames: Vec<Vec<u8>>,
+    /// The number of steps so far, with the reset.
+    steps: usize,
+    /// Every how many steps there is a frame: a power of two; 0 before the first step.
+    every: usize,
+}
+
+impl Frames {
+    /// Appends a frame. Instead of more than `most` frames, every second one is removed, and from then on every second
+    /// step has none.
+    fn push(&mut self, frame: impl FnOnce() -> Vec<u8>, most: usize) {
+        self.every = self.every.max(1);
+        if self.steps.is_multiple_of(self.every) && self.frames.len() >= most.max(2) {
+            let mut kept = false;
+            self.frames.retain(|_| {
+                kept = !kept;
+                kept
+            });
+            self.every *= 2;
+        }
+        if self.steps.is_multiple_of(self.every) {
+            self.frames.push(frame());
+        }
+        self.steps += 1;
+    }
+}
 
 /// Collects the frames of the first episodes and writes them as videos after the evaluation.
 pub(crate) struct VideoRecording {
@@ -36,14 +74,14 @@ pub(crate) struct VideoRecording {
     /// The indices of `pixels` and `goal` among the info columns.
     columns: [usize; 2],
     /// The frames of every recorded episode.
-    frames: Vec<Vec<Vec<u8>>>,
+    frames: Vec<Frames>,
 }
 
 impl VideoRecording {
     /// Prepares the recording of up to `videos.count` of the `episodes`.
     ///
     /// # Errors
-    /// When the pool renders no frames, or a file of a video exists and was not written by this program.
+    /// When the pool renders no frames, or a file of a video or a poster exists and was not written by this program.
     pub fn new(videos: &Videos, pool: &EnvPool, episodes: usize) -> Result<Self> {
         let Some(size) = pool.image() else {
             return Err(Error::config(
@@ -53,26 +91,33 @@ impl VideoRecording {
             ));
         };
         let (schema, count) = (pool.infos().schema(), videos.count.min(episodes));
-        (0..count).try_for_each(|i| swm_data::check_mp4(&videos.root.join(videos.name(i))))?;
+        for i in 0..count {
+            swm_data::check_mp4(&videos.root.join(videos.name(i)))?;
+            swm_data::check_png(&videos.poster(i))?;
+        }
         Ok(Self {
             videos: videos.clone(),
             size,
             columns: [schema.index(PIXELS)?, schema.index(GOAL)?],
-            frames: vec![vec![]; count],
+            frames: vec![Frames::default(); count],
         })
     }
 
     /// Appends the current frame of a slot to its episode.
     pub fn push(&mut self, episode: usize, slot: usize, pool: &EnvPool) {
+        let (count, (height, width)) = (self.frames.len(), self.size);
         let Some(frames) = self.frames.get_mut(episode) else { return };
         let row = pool.infos().row(slot);
         let [agent, goal] = self.columns.map(|column| row.at::<u8>(column));
-        let line = self.size.1 * 3;
-        let pairs = agent.chunks_exact(line).zip(goal.chunks_exact(line));
-        frames.push(pairs.flat_map(|(agent, goal)| agent.iter().chain(goal).copied()).collect());
+        let line = width * 3;
+        let frame = || {
+            let pairs = agent.chunks_exact(line).zip(goal.chunks_exact(line));
+            pairs.flat_map(|(agent, goal)| agent.iter().chain(goal).copied()).collect()
+        };
+        frames.push(frame, FRAMES_BYTES / (2 * line * height * count).max(1));
     }
 
-    /// Writes a video of every episode in `counted` that was recorded. A video's number is the index of its episode in
+    /// Writes a video and a poster of every episode in `counted` that was recorded. A video's number is the index of its episode in
     /// `counted`. Returns the paths relative to the root. A video that cannot be written (no encoder in this build, a
     /// full disk) only causes a warning, because the results do not depend on videos.
     pub fn write(self, counted: &[usize]) -> Vec<String> {
@@ -80,15 +125,18 @@ impl VideoRecording {
         let scale = swm_data::integer_scale(width, height, MIN_SIDE);
         let mut written = vec![];
         for (i, &episode) in counted.iter().enumerate() {
-            let Some(frames) = self.frames.get(episode) else { continue };
+            let Some(Frames { frames, .. }) = self.frames.get(episode) else { continue };
             let name = self.videos.name(i);
             let path = self.videos.root.join(&name);
             let folder = path.parent().unwrap_or(Path::new("."));
             let made = std::fs::create_dir_all(folder)
                 .map_err(|source| Error::io(folder, "creating the folder of videos", source))
                 .and_then(|()| {
-                    let frames = frames.iter().map(Vec::as_slice);
-                    swm_data::write_mp4_scaled(&path, 2 * width, height, self.videos.fps, scale, frames)
+                    let slices = frames.iter().map(Vec::as_slice);
+                    swm_data::write_mp4_scaled(&path, 2 * width, height, self.videos.fps, scale, slices)?;
+                    frames
+                        .first()
+                        .map_or(Ok(()), |first| swm_data::write_png(&self.videos.poster(i), 2 * width, height, first))
                 });
             match made {
                 Ok(()) => written.push(name),
@@ -99,5 +147,21 @@ impl VideoRecording {
             }
         }
         written
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn long_episodes_keep_evenly_spaced_frames() {
+        let mut frames = Frames::default();
+        for step in 0..1000_u16 {
+            frames.push(|| step.to_le_bytes().to_vec(), 8);
+        }
+        let steps: Vec<u16> = frames.frames.iter().map(|frame| u16::from_le_bytes([frame[0], frame[1]])).collect();
+        assert_eq!(steps, [0, 128, 256, 384, 512, 640, 768, 896]);
+        assert_eq!((frames.steps, frames.every), (1000, 128));
     }
 }

@@ -1,12 +1,11 @@
 //! [`Group`]: the runs of one environment, protocol and counting, by condition, from all files.
 
-use crate::text::escape;
+use crate::limits;
+use crate::plot::{Ink, inks};
+use crate::text::{escape, shorten};
 use std::path::PathBuf;
 use swm_core::Results;
-use swm_core::results::{Comparison, Counting, Family, Paired, Run, pairs};
-
-/// The number of different colours of policies.
-const COLOURS: usize = 6;
+use swm_core::results::{Comparison, Counting, Family, Paired, Proportion, Run, Verdict, pairs};
 
 /// All runs in one environment with the same protocol and counting.
 pub(crate) struct Group<'a> {
@@ -29,14 +28,19 @@ pub(crate) struct Row<'a> {
     pub file: usize,
     /// The name of the policy, with the number of the results file if several runs have the same name.
     pub label: String,
-    /// The CSS class of the policy's colour: `floor`, `expert`, or `c0` and so on.
-    pub class: String,
+    /// The colour of the policy.
+    pub ink: Ink,
 }
 
 impl Row<'_> {
     /// Whether this is the random-policy floor.
     pub(crate) fn is_floor(&self) -> bool {
-        self.class == "floor"
+        self.ink == Ink::Floor
+    }
+
+    /// Whether both are the same run.
+    pub(crate) fn is(&self, other: &Row<'_>) -> bool {
+        std::ptr::eq(self.run, other.run)
     }
 }
 
@@ -44,7 +48,7 @@ impl<'a> Group<'a> {
     /// The groups of these results, in the order in which they first appear.
     pub(crate) fn all(results: &'a [(PathBuf, Results)]) -> Vec<Self> {
         let mut groups: Vec<Self> = vec![];
-        let mut learned: Vec<&str> = vec![];
+        let inks = inks(results.iter().flat_map(|(_, result)| &result.runs).map(|run| run.policy.as_str()));
         for (file, (_, result)) in results.iter().enumerate() {
             let counting = result.counting;
             let same = |g: &Self| (g.env, g.protocol, g.counting) == (&*result.env, &*result.protocol, counting);
@@ -59,23 +63,13 @@ impl<'a> Group<'a> {
                     conditions.push(Condition { name: &run.condition, rows: vec![] });
                     conditions.len() - 1
                 });
-                let class = match run.policy.as_str() {
-                    "random" => "floor".to_owned(),
-                    "expert" => "expert".to_owned(),
-                    name => {
-                        let colour = learned.iter().position(|&other| other == name).unwrap_or_else(|| {
-                            learned.push(name);
-                            learned.len() - 1
-                        });
-                        format!("c{}", colour % COLOURS)
-                    }
-                };
+                let ink = inks[run.policy.as_str()];
                 let rows = &mut conditions[at].rows;
                 // Evaluations of several models on the same starts contain the same floor.
-                if class == "floor" && rows.iter().any(|row| row.is_floor() && row.run.episodes == run.episodes) {
+                if ink == Ink::Floor && rows.iter().any(|row| row.is_floor() && row.run.episodes == run.episodes) {
                     continue;
                 }
-                rows.push(Row { run, file, label: run.policy.clone(), class });
+                rows.push(Row { run, file, label: run.policy.clone(), ink });
             }
         }
         for condition in groups.iter_mut().flat_map(|group| &mut group.conditions) {
@@ -96,7 +90,8 @@ impl<'a> Group<'a> {
 
     /// The heading of the group, escaped.
     pub(crate) fn title(&self) -> String {
-        format!("{} · {}, {}", escape(self.env), escape(self.protocol), escape(&self.counting.to_string()))
+        let [env, protocol] = [self.env, self.protocol].map(|words| escape(&shorten(words, limits::TEXT_CHARS)));
+        format!("{env} · {protocol}, {}", escape(&self.counting.to_string()))
     }
 }
 
@@ -112,18 +107,57 @@ impl<'a> Condition<'a> {
         self.rows.iter().find(|row| row.is_floor() && row.file == run.file).or_else(|| self.floor())
     }
 
-    /// The compared pairs of runs that played the same starts, the later run first: usually a model, then the
-    /// random-policy floor. They form a family; `None` without pairs.
-    pub(crate) fn pairs(&self, counting: Counting) -> Option<(Family, Vec<Pair<'_, 'a>>)> {
+    /// The run of the highest success rate, apart from the floor.
+    pub(crate) fn best(&self) -> Option<&Row<'a>> {
+        let rows = self.rows.iter().filter(|row| !row.is_floor() && row.run.success.n > 0);
+        // `max_by` returns the last maximum; the first of equal runs is the best.
+        rows.rev().max_by(|a, b| a.run.success.rate.total_cmp(&b.run.success.rate))
+    }
+
+    /// The success rate of the floor, and the verdict on a run against it: that of a comparison on the same starts, or
+    /// else of the intervals of both rates. `None` without a floor.
+    pub(crate) fn against_floor(
+        &self,
+        compared: Option<&Compared<'_, '_>>,
+        row: &Row<'_>,
+    ) -> Option<(Proportion, Verdict)> {
+        let nearest = self.floor_of(row)?;
+        for floor in [nearest, self.floor()?] {
+            if let Some(verdict) = compared.and_then(|compared| compared.verdict(row, floor)) {
+                return Some((floor.run.success, verdict));
+            }
+        }
+        let (own, floor) = (row.run.success, nearest.run.success);
+        let verdict = match (own.low > floor.high, own.high < floor.low) {
+            (true, _) => Verdict::Higher,
+            (_, true) => Verdict::Lower,
+            _ => Verdict::NotToldApart,
+        };
+        Some((floor, verdict))
+    }
+
+    /// Compares the pairs of runs that played the same starts; `None` without pairs.
+    fn compare(&self, counting: Counting) -> Option<Compared<'_, 'a>> {
         let runs: Vec<&Run> = self.rows.iter().map(|row| row.run).collect();
+        let is_reference = |row: &Row<'_>| row.is_floor() || self.best().is_some_and(|best| best.is(row));
         let pairs = pairs(&runs).map(|(later, earlier)| (&self.rows[later], &self.rows[earlier]));
         let mut pairs: Vec<Pair<'_, 'a>> = pairs
-            .filter_map(|(a, b)| Some(Pair { a, b, table: Comparison::of(a.run, b.run, counting)?.table }))
+            .filter_map(|(a, b)| {
+                let table = Comparison::of(a.run, b.run, counting)?.table;
+                Some(Pair { a, b, table, is_first: is_reference(a) || is_reference(b) })
+            })
             .collect();
         let mut tables: Vec<&mut Paired> = pairs.iter_mut().map(|pair| &mut pair.table).collect();
         let family = Family::correct(self.name, &mut tables, 0)?;
-        Some((family, pairs))
+        Some(Compared { family, pairs })
     }
+}
+
+/// The compared pairs of a condition, which form a family.
+pub(crate) struct Compared<'g, 'a> {
+    pub family: Family,
+    /// The later run first: usually a model, then the random-policy floor.
+    pub pairs: Vec<Pair<'g, 'a>>,
 }
 
 /// Two runs on the same starts.
@@ -131,4 +165,31 @@ pub(crate) struct Pair<'g, 'a> {
     pub a: &'g Row<'a>,
     pub b: &'g Row<'a>,
     pub table: Paired,
+    /// Whether one of the runs is the floor or the best run of the condition: what a reader looks at first.
+    pub is_first: bool,
+}
+
+impl<'g, 'a> Compared<'g, 'a> {
+    /// The comparisons of every condition of a group that has some.
+    pub(crate) fn all(group: &'g Group<'a>) -> Vec<Self> {
+        group.conditions.iter().filter_map(|condition| condition.compare(group.counting)).collect()
+    }
+
+    /// The comparisons of a condition, if it has some.
+    pub(crate) fn of<'c>(all: &'c [Self], condition: &Condition<'_>) -> Option<&'c Self> {
+        all.iter().find(|compared| compared.family.name == condition.name)
+    }
+
+    /// The verdict on a run, compared with another; `None` if they were not compared.
+    pub(crate) fn verdict(&self, run: &Row<'_>, other: &Row<'_>) -> Option<Verdict> {
+        self.pairs.iter().find_map(|Pair { a, b, table, .. }| {
+            if a.is(run) && b.is(other) {
+                Some(table.verdict)
+            } else if a.is(other) && b.is(run) {
+                Some(table.verdict.reversed())
+            } else {
+                None
+            }
+        })
+    }
 }

@@ -4,13 +4,15 @@
 //! page needs no scripts, network access or other files, so it can be mailed, archived and printed. Equal results give
 //! equal bytes.
 //!
-//! - `page` writes the page; `sections` has a file for each section; `charts` has a file for each chart, drawn with the SVG
-//!   primitives of `charts/svg.rs`; `style.css` is the style sheet.
-//! - `study` writes the page of a study ([`write_study`]), with figures that `plot` draws with `plotters`, as SVG and PNG.
-//! - `group` groups runs by environment, protocol and counting; `read` and `training_log` read files, within the `limits`;
-//!   `text` formats numbers and escapes text.
+//! - `page` writes the page; `sections` has a file for each section; `charts` has a file for each chart; `style.css` is the
+//!   style sheet.
+//! - `study` writes the page of a study ([`write_study`]), with figures as SVG and PNG.
+//! - `plot` draws charts and figures with `plotters`, and has the colours of policies.
+//! - `group` groups runs by environment, protocol and counting, and compares them; `gap` compares conditions; `read` and
+//!   `training_log` read files, within the `limits`; `text` formats numbers and escapes text.
 
 mod charts;
+mod gap;
 mod group;
 mod limits;
 mod page;
@@ -24,4 +26,4 @@ mod training_log;
 pub use page::{ReportOptions, render, write_report, write_report_with};
 pub use read::read_results;
 pub use study::{StudyPage, write_study};
-pub use training_log::{Metrics, Series, read_metrics};
+pub use training_log::{Metrics, Series, Training, read_metrics};

@@ -2,9 +2,12 @@
 
 use crate::group::Group;
 use crate::limits;
-use crate::sections;
-use crate::text::escape;
-use crate::training_log::{Metrics, read_metrics};
+use crate::plot;
+use crate::sections::group::Shown;
+use crate::sections::videos::{Poster, Videos};
+use crate::sections::{self, Room};
+use crate::text::{escape, shorten};
+use crate::training_log::Training;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use swm_core::{Error, Result, Results, files};
@@ -17,8 +20,8 @@ const STYLE: &str = include_str!("style.css");
 pub struct ReportOptions {
     /// The title; by default, it contains the environments' ids.
     pub title: Option<String>,
-    /// The training log (`train.jsonl`) whose metrics the page shows.
-    pub metrics: Option<PathBuf>,
+    /// The training logs of the policies.
+    pub training: Vec<Training>,
     /// The command that reproduces the results; by default, the command in the manifest, if there is one.
     pub command: Option<String>,
 }
@@ -32,10 +35,10 @@ pub fn write_report(results: &[(PathBuf, Results)], out_dir: &Path) -> Result<Pa
     write_report_with(results, &ReportOptions::default(), out_dir)
 }
 
-/// Writes a page as [`write_report`] does, with a title, training metrics, or a command.
+/// Writes a page as [`write_report`] does, with a title, training curves, or a command.
 ///
 /// # Errors
-/// As [`write_report`], and when the training log cannot be read.
+/// As [`write_report`].
 pub fn write_report_with(results: &[(PathBuf, Results)], options: &ReportOptions, out_dir: &Path) -> Result<PathBuf> {
     if results.is_empty() {
         return Err(Error::config("report", "there are no results to report", "give at least one results.json"));
@@ -45,16 +48,18 @@ pub fn write_report_with(results: &[(PathBuf, Results)], options: &ReportOptions
         let problem = format!("the files have {runs} runs, more than {}", limits::RUNS);
         return Err(Error::config("report", problem, "give fewer results files"));
     }
-    let metrics = options.metrics.as_deref().map(read_metrics).transpose()?;
-    let page = render(results, options, metrics.as_ref());
+    let page = render(results, options)?;
     std::fs::create_dir_all(out_dir).map_err(|source| Error::io(out_dir, "creating the report's folder", source))?;
     let path = out_dir.join("index.html");
     files::write(&path, page.as_bytes())?;
     Ok(path)
 }
 
-/// Renders the page; `metrics` replaces the training log that `options` names.
-pub fn render(results: &[(PathBuf, Results)], options: &ReportOptions, metrics: Option<&Metrics>) -> String {
+/// Renders the page.
+///
+/// # Errors
+/// When drawing a chart fails, which is a bug.
+pub fn render(results: &[(PathBuf, Results)], options: &ReportOptions) -> Result<String> {
     let groups = Group::all(results);
     let mut envs: Vec<&str> = vec![];
     for group in &groups {
@@ -63,16 +68,46 @@ pub fn render(results: &[(PathBuf, Results)], options: &ReportOptions, metrics: 
         }
     }
     let title = options.title.clone().unwrap_or_else(|| format!("Evaluation in {}", envs.join(", ")));
+    let title = shorten(&title, limits::TEXT_CHARS);
+    let mut videos = Videos::default();
+    let shown: Vec<Shown<'_, '_>> =
+        groups.iter().map(|group| Shown::new(group, results, videos.gallery(group, results))).collect();
+    let inks = plot::inks(results.iter().flat_map(|(_, result)| &result.runs).map(|run| run.policy.as_str()));
     document(&Head { title: &title, lede: &summary(results), style: "" }, |html| {
-        let mut videos = sections::videos::Videos::default();
-        for group in &groups {
-            sections::group::write(html, group, (results, &mut videos), groups.len() > 1);
+        answer(html, &shown, videos.task.as_ref());
+        let mut room = Room::default();
+        for (i, group) in shown.iter().enumerate() {
+            if html.len() > limits::GROUPS_BYTES {
+                let _ =
+                    writeln!(html, "<p class=\"note\">The page has no room for {} more groups.</p>", shown.len() - i);
+                break;
+            }
+            group.write(html, shown.len() > 1, &mut room)?;
         }
-        if let Some(metrics) = metrics {
-            sections::training::write(html, metrics);
-        }
+        sections::training::write(html, &options.training, &inks, &mut room)?;
         sections::provenance::write(html, results, options.command.as_deref());
+        Ok(())
     })
+}
+
+/// Writes a frame of the task, and what every group shows in one sentence.
+fn answer(html: &mut String, shown: &[Shown<'_, '_>], task: Option<&Poster>) {
+    html.push_str("<section class=\"top\">\n");
+    if let Some(Poster { uri, .. }) = task {
+        let _ = write!(
+            html,
+            "<figure class=\"task\">\n<img alt=\"The task: a start and its goal\" src=\"{uri}\"/>\n\
+             <figcaption>A start, and its goal.</figcaption>\n</figure>\n"
+        );
+    }
+    html.push_str("<div>\n");
+    for group in shown.iter().take(limits::SENTENCES) {
+        let title = if shown.len() > 1 { format!("<b>{}</b><br/>", group.title()) } else { String::new() };
+        if let Some(sentence) = group.sentence() {
+            let _ = writeln!(html, "<p class=\"answer\">{title}{}</p>", escape(&sentence));
+        }
+    }
+    html.push_str("</div>\n</section>\n");
 }
 
 /// The head of a page.
@@ -86,27 +121,32 @@ pub(crate) struct Head<'a> {
 }
 
 /// Returns a page whose main part `write` appends.
-pub(crate) fn document(head: &Head<'_>, write: impl FnOnce(&mut String)) -> String {
+///
+/// # Errors
+/// Those of `write`.
+pub(crate) fn document(head: &Head<'_>, write: impl FnOnce(&mut String) -> Result<()>) -> Result<String> {
     let mut html = format!(
         "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\"/>\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n\
          <meta name=\"color-scheme\" content=\"light dark\"/>\n\
          <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; \
          img-src data:; media-src data:; font-src data:\"/>\n<link rel=\"icon\" href=\"data:,\"/>\n\
-         <title>{title}</title>\n<style>\n{STYLE}{}</style>\n</head>\n<body>\n<header>\n\
+         <title>{title}</title>\n<style>\n{}{}{STYLE}{}</style>\n</head>\n<body>\n<header>\n\
          <p class=\"eyebrow\">stable-worldmodel</p>\n<h1>{title}</h1>\n<p class=\"lede\">{}</p>\n</header>\n<main>\n",
+        plot::font_rule(),
+        plot::theme_rules(),
         head.style,
         head.lede,
         title = escape(head.title),
     );
-    write(&mut html);
+    write(&mut html)?;
     let _ = write!(
         html,
         "</main>\n<footer>Written by stable-worldmodel {}. This page is self-contained: no scripts, no \
          network access.</footer>\n</body>\n</html>\n",
         env!("CARGO_PKG_VERSION")
     );
-    html
+    Ok(html)
 }
 
 /// Protocol, counting, number of runs, seed and device of all results, in one line.
@@ -115,7 +155,7 @@ fn summary(results: &[(PathBuf, Results)]) -> String {
         let mut values: Vec<String> = results.iter().map(|(_, r)| of(r)).collect();
         values.sort();
         values.dedup();
-        escape(&values.join(", "))
+        escape(&shorten(&values.join(", "), limits::TEXT_CHARS))
     };
     let runs: usize = results.iter().map(|(_, r)| r.runs.len()).sum();
     let episodes: usize = results.iter().flat_map(|(_, r)| &r.runs).map(|run| run.episodes.len()).sum();

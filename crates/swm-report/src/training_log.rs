@@ -28,6 +28,15 @@ pub struct Series {
     pub points: Vec<(f64, f64)>,
 }
 
+/// The training log of a policy.
+#[derive(Clone, Debug)]
+pub struct Training {
+    /// The name of the policy; empty for one that is not named.
+    pub policy: String,
+    /// The metrics, or why there are none.
+    pub metrics: Result<Metrics, String>,
+}
+
 /// Reads a `train.jsonl`: one JSON object per line, of which every number is a metric. An incomplete last line, left by an
 /// interrupted training, is ignored.
 ///

@@ -16,8 +16,8 @@ use swm_core::{
 use swm_data::Reader;
 use swm_envs::wrappers::{GoalFrame, Stack, WRAPPERS, WrapperEntry};
 use swm_eval::{
-    Choice, EvalRequest, MixturePolicy, Model, PolicyChoice, PolicyKind, PolicyRequest, Predictor, ResolvedPolicy,
-    Resolver, World,
+    Choice, EvalRequest, MixturePolicy, Model, NoOpPolicy, PolicyChoice, PolicyKind, PolicyRequest, Predictor,
+    ResolvedPolicy, Resolver, World,
 };
 use swm_models::{CheckpointInfo, Device, LoadedModel, load};
 use swm_plan::objective::ObjectiveConfig;
@@ -191,6 +191,11 @@ impl Resolver for HomeResolver {
         let (spec, slots) = (world.spec(), world.pool().len());
         match &request.kind {
             PolicyKind::Random => Ok(ResolvedPolicy::from(Box::new(RandomPolicy::new(spec, slots)) as Box<dyn Policy>)),
+            PolicyKind::NoOp => Ok(ResolvedPolicy::from(Box::new(NoOpPolicy::new(spec)?) as Box<dyn Policy>)),
+            PolicyKind::Replay => {
+                let problem = "only an evaluation knows the starts whose actions it repeats";
+                Err(Error::config(format!("policy '{}'", request.name), problem, "use it in `swm eval`"))
+            }
             PolicyKind::Expert { id } => {
                 scripted(&self.choose_env(&spec.id)?.entry, id, world).map(ResolvedPolicy::from)
             }

@@ -83,6 +83,8 @@ const PARTS: &[Part] = &[
             if std::env::var_os("SWM_TORCH_PYTHON").is_none() {
                 arguments.extend(["--skip", "exported_checkpoints_load_in_the_reference"]);
             }
+            // `make test-browser` installs Chromium and runs them.
+            arguments.extend(["--skip", "browser::"]);
             run.cargo(&arguments, &[])?;
             run.tests()
         },

@@ -137,6 +137,27 @@ fn policies_are_compared_with_the_random_floor() {
 }
 
 #[test]
+fn baselines_do_nothing_or_repeat_what_was_recorded() {
+    let kinds = [("no-op", PolicyKind::NoOp), ("replay", PolicyKind::Replay)];
+    let mut request = request();
+    request.conditions.truncate(1);
+    request.policies = kinds.map(|(name, kind)| PolicyRequest { name: name.to_owned(), kind }).to_vec();
+    let resolver = TestResolver::new();
+    let error = request.run(&resolver, &RunOptions::default(), &mut Control::new()).expect_err("episodic starts");
+    assert!(error.is_usage() && error.to_string().contains("take starts from a dataset"), "{error}");
+
+    request.starts = StartsRequest::Dataset { dataset: "line".to_owned(), goal_offset: 4, held_out: None };
+    let found = run(&request, 4, 1);
+    let [_, no_op, replay] = &found.runs[..] else { panic!("{} runs", found.runs.len()) };
+    assert_eq!((no_op.policy.as_str(), replay.policy.as_str()), ("no-op", "replay"));
+    // The goals are four recorded steps away, and the environment repeats them.
+    assert!(no_op.success.successes == 0 && no_op.success.n > 10);
+    assert_eq!(replay.success.successes, replay.success.n);
+    assert!(replay.episodes.iter().all(|episode| episode.steps <= 4));
+    assert_eq!(without_timing(found), without_timing(run(&request, 1, 2)), "slots do not matter");
+}
+
+#[test]
 fn every_policy_and_condition_starts_and_finishes_a_stage() {
     let mut stages = vec![];
     let mut control = Control::new().with_events(|event| match event {

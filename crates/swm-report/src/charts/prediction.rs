@@ -1,88 +1,143 @@
 //! The charts of prediction errors, grouped by success.
 
-use super::svg::{HALF, Scale, Svg};
-use crate::group::{Condition, Row};
-use crate::text::{number, shorten};
-use swm_core::results::{Group, Prediction};
+use super::axis::Axis;
+use super::curves::{Curve, Curves, PANEL, POINTS, Stroke};
+use crate::group::Row;
+use crate::limits;
+use crate::plot::{self, Anchor, Canvas, Drawn as Painted, Figure, HEADING, Ink, Layout, SMALL, Surface, TEXT, stroke};
+use crate::text::number;
+use plotters::style::Color as _;
+use swm_core::Result;
+use swm_core::results::{Group, Prediction, Trajectory};
 
-/// The charts of all runs of a condition with prediction errors.
-pub(crate) fn charts(condition: &Condition<'_>) -> String {
-    let evaluated = condition.rows.iter().filter_map(|row| Some((row, row.run.prediction.as_ref()?)));
-    evaluated
-        .filter(|(_, prediction)| !prediction.groups.is_empty())
-        .map(|(row, prediction)| {
-            let title = format!("{}, {}", row.label, condition.name);
-            steps(row, prediction, &title) + &trajectories(row, prediction, &title)
-        })
-        .collect()
+/// The charts of a run; none without prediction errors.
+///
+/// # Errors
+/// When drawing fails.
+pub(crate) fn charts(row: &Row<'_>, condition: &str) -> Result<Vec<String>> {
+    let Some(prediction) = row.run.prediction.as_ref().filter(|prediction| !prediction.groups.is_empty()) else {
+        return Ok(vec![]);
+    };
+    let title = format!("{}, {condition}", row.label);
+    let charts = [steps(row, prediction, &title)?, trajectories(row, prediction, &title)?];
+    Ok(charts.into_iter().flatten().collect())
 }
 
-/// The label of a group and its CSS class.
-fn label(group: &Group) -> (&'static str, &'static str) {
+/// The name of a group, its colour and how its curve is drawn.
+fn look(group: &Group, row: &Row<'_>) -> (&'static str, Ink, Stroke) {
     match group.success {
-        None => ("all", "dashed"),
-        Some(true) => ("solved", "good"),
-        Some(false) => ("not solved", "bad"),
+        None => ("all", row.ink, Stroke::Dashed),
+        Some(true) => ("solved", Ink::Good, Stroke::Solid),
+        Some(false) => ("not solved", Ink::Bad, Stroke::Solid),
     }
 }
 
-/// The mean error of each model step, one curve for each group.
-fn steps(row: &Row<'_>, prediction: &Prediction, title: &str) -> String {
-    let [left, top, bottom] = [56.0, 46.0, 200.0];
-    let right = HALF - 12.0;
-    let mut svg = Svg::new(HALF, bottom + 42.0);
-    let horizon = prediction.groups[0].steps.len();
-    let highest = prediction.groups.iter().flat_map(|g| &g.steps).map(|step| step.mean).fold(0.0, f64::max);
-    let (y, levels) = Scale::nice(0.0, highest, bottom, top, 4);
-    let x = Scale { low: 0.0, high: horizon as f64, from: left, to: right };
-    let every = horizon.div_ceil(10).max(1);
-    let ticks: Vec<f64> = (0..=horizon).step_by(every).map(|step| step as f64).collect();
-    svg.text("head", [0.0, 16.0], &shorten(&format!("{title}: error by step"), 58));
-    svg.y_axis(y, &levels, [left, right], "");
-    svg.x_axis(x, &ticks, [top, bottom], "");
-    let unit = format!("model steps of {} environment steps", prediction.frameskip);
-    svg.text("tick middle", [(left + right) / 2.0, bottom + 36.0], &unit);
-    for (i, group) in prediction.groups.iter().enumerate() {
-        let (name, class) = label(group);
-        let class = format!("curve {class} {}", row.class);
-        let points = group.steps.iter().enumerate().map(|(i, step)| [x.at((i + 1) as f64), y.at(step.mean)]);
+/// The mean error of each model step, one curve for each group; `None` for values that cannot be drawn.
+fn steps(row: &Row<'_>, prediction: &Prediction, title: &str) -> Result<Option<String>> {
+    let horizon = prediction.groups.iter().map(|group| group.steps.len()).max().unwrap_or(0);
+    let means = prediction.groups.iter().flat_map(|group| &group.steps).map(|step| step.mean);
+    let axes = Axis::of([0.0, horizon as f64].into_iter()).zip(Axis::of(means.chain([0.0])));
+    let Some((x, y)) = axes.filter(|_| horizon > 0) else { return Ok(None) };
+    let curve = |group: &Group| {
+        let (name, ink, stroke) = look(group, row);
+        let every = group.steps.len().div_ceil(POINTS).max(1);
+        let means = group.steps.iter().enumerate().step_by(every).map(|(i, step)| [(i + 1) as f64, step.mean]);
         // The error at step 0, before any prediction, is 0.
-        svg.path(&class, std::iter::once([x.at(0.0), y.at(0.0)]).chain(points));
-        let key = left + 125.0 * i as f64;
-        svg.path(&class, [[key, 32.0], [key + 26.0, 32.0]]);
-        svg.text("tick", [key + 32.0, 36.0], &format!("{name} ({})", group.trajectory.n));
-    }
-    svg.finish(&format!("{title}: mean prediction error by model step"))
+        let points = std::iter::once([0.0, 0.0]).chain(means).collect();
+        Curve { name: format!("{name} ({})", group.trajectory.n), ink, stroke, points, band: vec![] }
+    };
+    let panel = Curves {
+        heading: format!("{title}: error by step"),
+        note: String::new(),
+        x,
+        x_ticks: &|tick| if x.value(*tick).fract() == 0.0 { x.tick(*tick) } else { String::new() },
+        x_title: format!("model steps of {} environment steps", prediction.frameskip),
+        y,
+        y_ticks: &|tick| y.tick(*tick),
+        curves: prediction.groups.iter().map(curve).collect(),
+        description: format!("{title}: mean prediction error by model step"),
+    };
+    plot::inline(&panel).map(Some)
 }
 
-/// The error of every trajectory, one row of strokes for each group.
-fn trajectories(row: &Row<'_>, prediction: &Prediction, title: &str) -> String {
-    const LINE: f64 = 46.0;
-    let [left, top] = [96.0, 30.0];
-    let right = HALF - 16.0;
-    let bottom = top + LINE * prediction.groups.len() as f64;
-    let errors = || prediction.trajectories.iter().map(|trajectory| trajectory.error());
-    let (x, ticks) = Scale::nice(0.0, errors().fold(0.0, f64::max), left, right, 5);
-    let mut svg = Svg::new(HALF, bottom + 42.0);
-    svg.text("head", [0.0, 16.0], &shorten(&format!("{title}: error of each trajectory"), 58));
-    svg.x_axis(x, &ticks, [top, bottom], "");
-    svg.text(
-        "tick middle",
-        [(left + right) / 2.0, bottom + 36.0],
-        "mean over the steps, in units of the latents' variance",
-    );
-    for (i, group) in prediction.groups.iter().enumerate() {
-        let (name, class) = label(group);
-        let y = top + (i as f64 + 0.5) * LINE;
-        svg.text("label end", [left - 12.0, y + 4.5], name);
-        let members = prediction.trajectories.iter().filter(|t| group.success.is_none() || t.success == group.success);
-        for trajectory in members {
-            let at = x.at(trajectory.error());
-            svg.line(&format!("stroke {class} {}", row.class), [at, y - 11.0], [at, y + 11.0]);
+/// The error of every trajectory, one row of strokes for each group; `None` for values that cannot be drawn.
+fn trajectories(row: &Row<'_>, prediction: &Prediction, title: &str) -> Result<Option<String>> {
+    let errors = prediction.trajectories.iter().map(Trajectory::error);
+    let Some(axis) = Axis::of(errors.chain([0.0])) else { return Ok(None) };
+    let strips = prediction.groups.iter().map(|group| {
+        let (name, ink, _) = look(group, row);
+        let is_member = |t: &&Trajectory| group.success.is_none() || t.success == group.success;
+        let members = prediction.trajectories.iter().filter(is_member).take(limits::STROKES);
+        Strip {
+            name,
+            ink,
+            errors: members.map(Trajectory::error).collect(),
+            median: group.trajectory.median,
+            tip: format!("median {} of {} trajectories", number(group.trajectory.median), group.trajectory.n),
         }
-        let at = x.at(group.trajectory.median);
-        let tip = format!("median {} of {} trajectories", number(group.trajectory.median), group.trajectory.n);
-        svg.dot(&format!("point {class} {}", row.class), [at, y], 5.0, &tip);
+    });
+    let heading = format!("{title}: error of each trajectory");
+    let strips = Strips { heading, axis, strips: strips.collect() };
+    plot::inline(&strips).map(Some)
+}
+
+/// The errors of one group.
+struct Strip {
+    name: &'static str,
+    ink: Ink,
+    errors: Vec<f64>,
+    median: f64,
+    tip: String,
+}
+
+/// A row of strokes for each group.
+struct Strips {
+    heading: String,
+    axis: Axis,
+    strips: Vec<Strip>,
+}
+
+/// The height of a row.
+const ROW: f64 = 46.0;
+/// The top of the first row.
+const TOP: f64 = 28.0;
+
+impl Figure for Strips {
+    fn width(&self, layout: Layout) -> f64 {
+        layout.width().min(PANEL)
     }
-    svg.finish(&format!("{title}: prediction error of every trajectory"))
+
+    fn height(&self, _: Layout) -> f64 {
+        TOP + ROW * self.strips.len() as f64 + 48.0
+    }
+
+    fn description(&self) -> String {
+        let medians: Vec<String> = self.strips.iter().map(|strip| format!("{}: {}", strip.name, strip.tip)).collect();
+        format!("{}. {}", self.heading, medians.join("; "))
+    }
+
+    fn draw<B: Surface>(&self, canvas: &Canvas<B>) -> Painted<B> {
+        let width = canvas.width();
+        let heading = canvas.fit(HEADING - 1.0, &self.heading, width - 4.0);
+        canvas.text([0.0, 12.0], Anchor::Start, HEADING - 1.0, Ink::Text, &heading)?;
+        let (left, right, bottom) = (86.0, width - 20.0, TOP + ROW * self.strips.len() as f64);
+        let ticks = |tick: &f64| self.axis.tick(*tick);
+        canvas.chart([left, TOP, right, bottom], (self.axis.range(), &ticks), (bottom..TOP, None))?;
+        let title = "mean over the steps, in variances of the latents";
+        canvas.text([f64::midpoint(left, right), bottom + 36.0], Anchor::Middle, SMALL, Ink::Soft, title)?;
+        for (i, strip) in self.strips.iter().enumerate() {
+            let y = TOP + (i as f64 + 0.5) * ROW;
+            canvas.text([left - 12.0, y], Anchor::End, TEXT, Ink::Text, strip.name)?;
+            let x = |error: f64| left + self.axis.share(error) * (right - left);
+            for error in &strip.errors {
+                let ends = [[x(*error), y - 11.0], [x(*error), y + 11.0]];
+                let mut style = stroke(strip.ink, 1.5);
+                style.color = style.color.mix(0.4);
+                canvas.line(&ends, style)?;
+            }
+            canvas.dot([x(strip.median), y], 5.0, strip.ink, true)?;
+            canvas.tip([left, y - ROW / 2.0], [right - left, ROW], &strip.tip);
+        }
+        Ok(())
+    }
 }

@@ -1,127 +1,122 @@
-//! The section of a group: success rates, comparisons, time to goal, latency, searches, prediction errors and videos.
+//! The section of a group: success rates, videos, comparisons, time to goal, latency, searches and prediction errors.
 
-use super::figure;
-use super::videos::Videos;
-use super::{cards, runs_table};
+use super::Room;
+use super::videos::Gallery;
+use super::{cards, comparisons, runs_table, verdict};
 use crate::charts;
-use crate::group::Group;
-use crate::text::escape;
+use crate::gap::Gaps;
+use crate::group::{Compared, Group};
+use crate::limits;
 use std::fmt::Write as _;
 use std::path::PathBuf;
-use swm_core::Results;
-use swm_core::results::{Counting, MAX_ALL_PAIRS};
+use swm_core::results::Counting;
+use swm_core::{Result, Results};
 
-/// Writes the section; its heading names the group if there are `several`. `videos` are those of the page.
-pub(crate) fn write(
-    html: &mut String,
-    group: &Group<'_>,
-    (results, videos): (&[(PathBuf, Results)], &mut Videos),
-    several: bool,
-) {
-    let _ = write!(html, "<section>\n<h2>{}</h2>\n", if several { group.title() } else { "Success".to_owned() });
-    if group.rows().next().is_none() {
-        html.push_str("<p class=\"note\">These results contain no runs.</p>\n</section>\n");
-        return;
-    }
-    cards::write(html, group);
-    let _ = writeln!(html, "<p class=\"note\">{}</p>", counting_words(group));
-    success(html, group);
-    time_to_goal(html, group);
-    planning(html, group);
-    prediction_errors(html, group);
-    videos.write(html, group, results);
-    html.push_str("</section>\n");
+/// A group with what its section shows.
+pub(crate) struct Shown<'g, 'a> {
+    group: &'g Group<'a>,
+    compared: Vec<Compared<'g, 'a>>,
+    gaps: Vec<Gaps<'g, 'a>>,
+    gallery: Gallery<'a>,
 }
 
-/// Success rates, the table of runs, and paired comparisons.
-fn success(html: &mut String, group: &Group<'_>) {
-    figure(
-        html,
-        "Success rates",
-        "Points are success rates, whiskers their 95 % Wilson confidence intervals. The band is the confidence interval \
-         of the random policy under the same condition, the dashed line its success rate: the random-policy floor.",
-        &charts::success::chart(group),
-    );
-    runs_table::write(html, group);
-    if let Some(chart) = charts::paired::chart(group) {
-        let limited = group.conditions.iter().any(|condition| condition.rows.len() > MAX_ALL_PAIRS);
-        let limit = format!(
-            " With more than {MAX_ALL_PAIRS} runs, each is compared with the random-policy floor and with the run of the \
-             highest success rate only."
-        );
+impl<'g, 'a> Shown<'g, 'a> {
+    /// Compares the runs of a group; `gallery` has its videos.
+    pub(crate) fn new(group: &'g Group<'a>, results: &[(PathBuf, Results)], gallery: Gallery<'a>) -> Self {
+        Self { group, compared: Compared::all(group), gaps: Gaps::all(group, results), gallery }
+    }
+
+    /// What the group shows, in one sentence.
+    pub(crate) fn sentence(&self) -> Option<String> {
+        verdict::sentence(self.group, &self.compared, &self.gaps)
+    }
+
+    /// The heading of the group, escaped.
+    pub(crate) fn title(&self) -> String {
+        self.group.title()
+    }
+
+    /// Writes the section; its heading names the group if there are `several`.
+    ///
+    /// # Errors
+    /// When drawing fails.
+    pub(crate) fn write(&self, html: &mut String, several: bool, room: &mut Room) -> Result<()> {
+        let group = self.group;
+        let _ = write!(html, "<section>\n<h2>{}</h2>\n", if several { group.title() } else { "Success".to_owned() });
+        if group.rows().next().is_none() {
+            html.push_str("<p class=\"note\">These results contain no runs.</p>\n</section>\n");
+            return Ok(());
+        }
+        cards::write(html, group, &self.compared);
+        let _ = writeln!(html, "<p class=\"note\">{}</p>", counting_words(group));
+        success(html, group, room)?;
+        html.push_str(&self.gallery.html);
+        comparisons::gaps(html, &self.gaps, room)?;
+        comparisons::write(html, &self.compared, room)?;
+        self.time_to_goal(html, room)?;
+        planning(html, group, room)?;
+        let each = group.conditions.iter().flat_map(|condition| condition.rows.iter().map(|row| (row, condition.name)));
+        let caption = "Mean squared errors of latents predicted open loop along recorded trajectories, in units of the latents’ \
+                       variance: always predicting the mean has the error 1. Solved and unsolved starts are shown \
+                       separately; dots are medians.";
+        let errors = each.map(|(row, condition)| charts::prediction::charts(row, condition));
+        room.panels(html, ["Prediction errors", caption], errors)?;
+        html.push_str("</section>\n");
+        Ok(())
+    }
+
+    /// The time to goal and the outcome of every episode.
+    fn time_to_goal(&self, html: &mut String, room: &mut Room) -> Result<()> {
+        let group = self.group;
+        let longest = group.rows().flat_map(|row| &row.run.episodes).map(|episode| episode.steps).max().unwrap_or(0);
+        if longest == 0 {
+            return Ok(());
+        }
+        let caption = "The fraction of the counted episodes that had reached the goal after a number of steps.";
+        let chart = |condition| charts::time_to_goal::chart(condition, group.counting, longest);
+        let curves = group.conditions.iter().map(|condition| Ok(chart(condition)?.into_iter().collect()));
+        room.panels(html, ["Time to goal", caption], curves)?;
+        let episodes: usize = group.rows().map(|row| row.run.episodes.len()).sum();
         let caption = format!(
-            "Points are differences of success rates over starts that both policies played, whiskers their confidence \
-             intervals (Tango’s, the inversion of the paired score test). The intervals of one condition hold together \
-             with 95 %: intervals and p-values are corrected for the number of pairs (Bonferroni). A policy is higher or \
-             lower where the interval excludes 0. “Too few” means that the starts which exactly one policy solved would \
-             not decide even if the same policy had solved all of them.{}",
-            if limited { limit.as_str() } else { "" }
+            "One square for each episode, in order: filled if the goal was reached, empty if it was not, faint if the \
+             episode was solved at the start.{}{}",
+            if self.gallery.ids.is_empty() { "" } else { " Squares with a dark outline link to the videos." },
+            if episodes > limits::SQUARES { " Further runs are left out." } else { "" }
         );
-        figure(html, "On the same starts", &caption, &chart);
-        html.push_str(&charts::paired::table(group));
+        room.figure(html, "Every episode", &caption, &charts::episodes::chart(group, &self.gallery.ids)?);
+        Ok(())
     }
 }
 
-/// The time to goal and the outcome of every episode.
-fn time_to_goal(html: &mut String, group: &Group<'_>) {
-    let longest = group.rows().flat_map(|row| &row.run.episodes).map(|episode| episode.steps).max().unwrap_or(0);
-    if longest == 0 {
-        return;
-    }
-    let chart = |condition| charts::time_to_goal::chart(condition, group.counting, longest);
-    let curves: String = group.conditions.iter().map(chart).collect();
-    figure(
-        html,
-        "Time to goal",
-        "The fraction of the counted episodes that had reached the goal after a number of steps.",
-        &format!("<div class=\"pair\">\n{curves}</div>\n{}", legend(group)),
+/// Success rates and the table of runs.
+fn success(html: &mut String, group: &Group<'_>, room: &mut Room) -> Result<()> {
+    let runs = group.rows().count();
+    let caption = format!(
+        "Points are success rates, whiskers their 95 % Wilson confidence intervals. The band is the confidence interval \
+         of the random policy under the same condition, the dashed line its success rate: the random-policy floor.{}",
+        if runs > limits::CHART_ROWS {
+            format!(" The first {} of {runs} runs are drawn.", limits::CHART_ROWS)
+        } else {
+            String::new()
+        }
     );
-    figure(
-        html,
-        "Every episode",
-        "One square for each episode, in order: filled if the goal was reached, empty if it was not, faint if the \
-         episode was solved at the start.",
-        &charts::episodes::chart(group),
-    );
+    room.figure(html, "Success rates", &caption, &charts::success::chart(group)?);
+    runs_table::write(html, group, room);
+    Ok(())
 }
 
 /// Planning latency and the searches of plans.
-fn planning(html: &mut String, group: &Group<'_>) {
-    if let Some(chart) = charts::latency::chart(group) {
-        figure(
-            html,
-            "Planning latency",
-            "The time of one planning call: the bar ends at the median, the whisker at the 95th percentile; the values \
-             are on the right.",
-            &chart,
-        );
+fn planning(html: &mut String, group: &Group<'_>, room: &mut Room) -> Result<()> {
+    if let Some(chart) = charts::latency::chart(group)? {
+        let caption = "The time of one planning call: the bar ends at the median, the whisker at the 95th percentile; the values \
+                       are on the right.";
+        room.figure(html, "Planning latency", caption, &chart);
     }
-    let searches: String = group.conditions.iter().map(charts::searches::charts).collect();
-    if !searches.is_empty() {
-        figure(
-            html,
-            "Searches",
-            "Lines are medians over all plans of a run, bands reach from the 10th to the 90th percentile. If the cost \
-             still falls at the end, more iterations would help; if the spread vanishes long before, fewer \
-             iterations suffice.",
-            &format!("<div class=\"pair\">\n{searches}</div>\n"),
-        );
-    }
-}
-
-/// The prediction errors of models.
-fn prediction_errors(html: &mut String, group: &Group<'_>) {
-    let errors: String = group.conditions.iter().map(charts::prediction::charts).collect();
-    if !errors.is_empty() {
-        figure(
-            html,
-            "Prediction errors",
-            "Mean squared errors of latents predicted open loop along recorded trajectories, in units of the latents’ \
-             variance: always predicting the mean has the error 1. Solved and unsolved starts are shown \
-             separately; dots are medians.",
-            &format!("<div class=\"pair\">\n{errors}</div>\n"),
-        );
-    }
+    let caption = "Lines are medians over all plans of a run, bands reach from the 10th to the 90th percentile. If the cost \
+                   still falls at the end, more iterations would help; if the spread vanishes long before, fewer \
+                   iterations suffice.";
+    let each = group.conditions.iter().flat_map(|condition| condition.rows.iter().map(|row| (row, condition.name)));
+    room.panels(html, ["Searches", caption], each.map(|(row, condition)| charts::searches::charts(row, condition)))
 }
 
 /// The counting of the group in words.
@@ -156,25 +151,4 @@ fn counting_words(group: &Group<'_>) -> String {
             )
         }
     }
-}
-
-/// The legend of policies, shared by all conditions.
-fn legend(group: &Group<'_>) -> String {
-    let mut seen: Vec<(&str, &str)> = vec![];
-    for row in group.rows() {
-        if !seen.contains(&(&row.class, &row.run.policy)) {
-            seen.push((&row.class, &row.run.policy));
-        }
-    }
-    let mut html = "<ul class=\"legend\">\n".to_owned();
-    for (class, policy) in seen {
-        let _ = writeln!(
-            html,
-            "<li><svg viewBox=\"0 0 28 8\" width=\"28\" height=\"8\" aria-hidden=\"true\"><line class=\"curve {class}\" \
-             x1=\"0\" y1=\"4\" x2=\"28\" y2=\"4\"/></svg> {}</li>",
-            escape(policy)
-        );
-    }
-    html.push_str("</ul>\n");
-    html
 }

@@ -31,19 +31,20 @@ pub(super) fn write(html: &mut String, points: &[BreakingPoint]) {
 }
 
 fn levels(html: &mut String, point: &BreakingPoint) {
-    let bound = share(point.ray.below);
+    let below = share(point.ray.below);
     let name = escape(&shorten(&point.policy, limits::STUDY_NAME_CHARS));
     let _ = write!(
         html,
-        "<div class=\"wide study\" role=\"region\" aria-label=\"Levels\" tabindex=\"0\">\n<table>\n<thead>\n<tr>\
+        "<div class=\"wide stack study\">\n<table>\n<thead>\n<tr>\
          <th scope=\"col\">{name}</th><th scope=\"col\" class=\"n\">Success, %</th>\
-         <th scope=\"col\">Half of unshifted</th><th scope=\"col\">{bound} %</th></tr>\n</thead>\n<tbody>\n"
+         <th scope=\"col\">Half of unshifted</th><th scope=\"col\">{below} %</th></tr>\n</thead>\n<tbody>\n"
     );
     for Level { condition, rate, half, bound, .. } in point.levels.iter().take(Ray::LEVELS) {
         let condition = escape(&shorten(condition, limits::STUDY_NAME_CHARS));
         let _ = writeln!(
             html,
-            "<tr><th scope=\"row\">{condition}</th><td class=\"n\"><b>{}</b></td><td>{}</td><td>{}</td></tr>",
+            "<tr><th scope=\"row\">{condition}</th><td class=\"n\" data-label=\"Success, %\"><b>{}</b></td>\
+             <td data-label=\"Half of unshifted\">{}</td><td data-label=\"{below} %\">{}</td></tr>",
             share(*rate),
             word(*half),
             word(*bound)

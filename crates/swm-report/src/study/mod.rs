@@ -14,7 +14,6 @@ mod table;
 
 use crate::limits;
 use crate::page::{Head, document};
-use crate::plot;
 use crate::text::{escape, shorten};
 use sheet::Sheet;
 use std::fmt::Write as _;
@@ -53,7 +52,7 @@ pub fn write_study(page: &StudyPage, out_dir: &Path) -> Result<PathBuf> {
     std::fs::create_dir_all(&folder).map_err(|source| Error::io(&folder, "creating the folder of figures", source))?;
     // The page is written first: it tells that the folder is this program's own.
     let path = out_dir.join("index.html");
-    files::write(&path, render(page, &sheets, &figures).as_bytes())?;
+    files::write(&path, render(page, &sheets, &figures)?.as_bytes())?;
     for figure in &figures {
         files::write(&folder.join(format!("{}.svg", figure.file)), figure.drawn.drawing.svg.as_bytes())?;
         files::write(&folder.join(format!("{}.png", figure.file)), &figure.drawn.drawing.png)?;
@@ -94,12 +93,14 @@ fn draw(sheets: &[Sheet<'_>]) -> Result<Vec<Placed>> {
 }
 
 /// Renders the page.
-fn render(page: &StudyPage, sheets: &[Sheet<'_>], figures: &[Placed]) -> String {
+///
+/// # Errors
+/// Those of [`document`].
+fn render(page: &StudyPage, sheets: &[Sheet<'_>], figures: &[Placed]) -> Result<String> {
     let StudyPage { results, published, title, command } = page;
     let title = shorten(title.as_deref().unwrap_or(&results.title), limits::STUDY_NAME_CHARS);
-    let style = format!("{}{}{STYLE}", plot::font_rule(), plot::theme_rules());
     let question = escape(&shorten(&results.question, limits::STUDY_TEXT_CHARS));
-    document(&Head { title: &title, lede: &question, style: &style }, |html| {
+    document(&Head { title: &title, lede: &question, style: STYLE }, |html| {
         let _ = write!(
             html,
             "<section>\n<p class=\"answer\">{}</p>\n<dl>\n<div><dt>cells done</dt><dd>{} of {}</dd></div>\n\
@@ -123,6 +124,7 @@ fn render(page: &StudyPage, sheets: &[Sheet<'_>], figures: &[Placed]) -> String 
         table::write(html, sheets, &results.families);
         over_seeds::write(html, &results.over_seeds);
         published::write(html, sheets, published);
+        Ok(())
     })
 }
 

@@ -17,8 +17,7 @@ pub(super) fn write(html: &mut String, rows: &[OverSeeds]) {
     html.push_str(
         "<section>\n<h2>Over training seeds</h2>\n<p class=\"note\">The success rate of each training seed, in percent; their \
          mean; the interval that holds the rate of one further seed with 95 %; and the interquartile mean (IQM) of at least \
-         eight rates with its 95 % interval.</p>\n<div class=\"wide study\" role=\"region\" aria-label=\"Over training seeds\" \
-         tabindex=\"0\">\n<table>\n<thead>\n<tr><th scope=\"col\">Condition</th><th scope=\"col\">Policy</th>\
+         eight rates with its 95 % interval.</p>\n<div class=\"wide stack study\">\n<table>\n<thead>\n<tr><th scope=\"col\">Condition</th><th scope=\"col\">Policy</th>\
          <th scope=\"col\">Counting</th><th scope=\"col\">Seeds</th><th scope=\"col\" class=\"n\">Mean</th>\
          <th scope=\"col\" class=\"n\">New seed</th><th scope=\"col\" class=\"n\">IQM</th></tr>\n</thead>\n<tbody>\n",
     );
@@ -33,8 +32,10 @@ pub(super) fn write(html: &mut String, rows: &[OverSeeds]) {
             .map_or("–".to_owned(), |iqm| format!("{} [{}, {}]", share(iqm.mean), share(iqm.low), share(iqm.high)));
         let _ = writeln!(
             html,
-            "<tr><th scope=\"row\">{}</th><td>{}</td><td>{}</td><td class=\"seeds\">{}{more}</td>\
-             <td class=\"n\"><b>{}</b></td><td class=\"n\">[{low}, {high}]</td><td class=\"n\">{iqm}</td></tr>",
+            "<tr><th scope=\"row\">{}</th><td data-label=\"Policy\">{}</td><td data-label=\"Counting\">{}</td>\
+             <td class=\"seeds\" data-label=\"Seeds\">{}{more}</td><td class=\"n\" data-label=\"Mean\"><b>{}</b></td>\
+             <td class=\"n\" data-label=\"New seed\">[{low}, {high}]</td>\
+             <td class=\"n\" data-label=\"IQM\">{iqm}</td></tr>",
             shown(row.condition.as_deref().unwrap_or("all shifted conditions")),
             shown(&row.policy),
             row.counting.name(),

@@ -30,22 +30,27 @@ pub(super) fn write(html: &mut String, sheets: &[Sheet<'_>], published: &[Publis
         let rate = if (0.0..=1.0).contains(&value.rate) { percent(value.rate) } else { "–".to_owned() };
         let _ = write!(
             html,
-            "<tr><th scope=\"row\">{}</th><td>{}</td><td class=\"n\">{rate} [{}]</td>",
+            "<tr><th scope=\"row\">{}</th><td data-label=\"Policy\">{}</td><td class=\"n\" data-label=\"Published\">{rate} \
+             [{}]</td>",
             shown(&value.condition),
             shown(&value.policy),
             source + 1
         );
-        for counting in 0..countings.len() {
+        for (counting, kind) in countings.iter().enumerate() {
+            let name = if countings.len() > 1 { format!(", {}", kind.name()) } else { String::new() };
+            let cell = |label: &str, words: &str| format!("<td class=\"n\" data-label=\"{label}{name}\">{words}</td>");
             let row = condition(value).zip(policy(value));
             let row = row.and_then(|(condition, policy)| sheet?.row(condition, policy, counting));
-            let _ = match row {
-                None => write!(html, "<td class=\"n\"><span class=\"quiet\">not run</span></td><td></td>"),
+            match row {
+                None => {
+                    html.push_str(&(cell("Ours", "<span class=\"quiet\">not run</span>") + &cell("Difference", "–")))
+                }
                 Some(row) => {
                     let difference = row.success.rate - value.rate;
                     let difference = if difference.abs() <= 1.0 { points(difference) } else { "–".to_owned() };
-                    write!(html, "<td class=\"n\">{}</td><td class=\"n\">{difference}</td>", table::rate(&row.success))
+                    html.push_str(&(cell("Ours", &table::rate(&row.success)) + &cell("Difference", &difference)));
                 }
-            };
+            }
         }
         html.push_str("</tr>\n");
     }
@@ -65,8 +70,7 @@ fn head(html: &mut String, countings: &[Counting]) {
     html.push_str(
         "<section>\n<h2>Beside published values</h2>\n<p class=\"note\">Published values are those of the named source, \
          from weights and starts of its own. They have no intervals, so a difference shows how near the values are, and is no \
-         test.</p>\n<div class=\"wide study\" role=\"region\" aria-label=\"Published values\" \
-         tabindex=\"0\">\n<table>\n<thead>\n<tr>\
+         test.</p>\n<div class=\"wide stack study\">\n<table>\n<thead>\n<tr>\
          <th scope=\"col\">Condition</th><th scope=\"col\">Policy</th><th scope=\"col\" class=\"n\">Published</th>",
     );
     for counting in countings {

@@ -1,6 +1,6 @@
 //! [`Sheet`]: the rows of a study from one source of starts with one seed, by condition, policy and counting.
 
-use crate::plot::Ink;
+use crate::plot::{Ink, inks};
 use std::collections::{BTreeMap, BTreeSet};
 use swm_core::results::{Counting, StudyResults, StudyRow};
 
@@ -43,7 +43,7 @@ impl<'a> Sheet<'a> {
             *twice += 1;
             groups[sheet].push(row);
         }
-        let inks = inks(results);
+        let inks = inks(results.rows.iter().map(|row| row.policy.as_str()));
         let unshifted = results.rows.first().filter(|row| row.gap.is_none()).map(|row| row.condition.as_str());
         let labels = labels(&groups);
         let sheets = groups.into_iter().zip(labels).map(|(rows, label)| Self {
@@ -100,22 +100,6 @@ impl<'a> Index<'a> {
             self.names.len() - 1
         })
     }
-}
-
-/// The colour of every policy.
-fn inks(results: &StudyResults) -> BTreeMap<&str, Ink> {
-    let (mut inks, mut learned) = (BTreeMap::new(), 0);
-    for row in &results.rows {
-        inks.entry(row.policy.as_str()).or_insert_with(|| match row.policy.as_str() {
-            "random" => Ink::Floor,
-            "expert" => Ink::Expert,
-            _ => {
-                learned += 1;
-                Ink::Policy(learned - 1)
-            }
-        });
-    }
-    inks
 }
 
 /// What distinguishes the groups of rows: their starts, seeds, and variables with one value in a group.

@@ -57,7 +57,7 @@ fn rows<'s>(sheet: &'s Sheet<'_>) -> impl Iterator<Item = [usize; 2]> + 's {
 /// Writes the table of a sheet until the page has `most` bytes, and returns the number of rows that are left out.
 fn one(html: &mut String, sheet: &Sheet<'_>, most: usize) -> usize {
     html.push_str(
-        "<div class=\"wide study\" role=\"region\" aria-label=\"Results\" tabindex=\"0\">\n<table>\n\
+        "<div class=\"wide stack study numbers\">\n<table>\n\
          <thead>\n<tr><th scope=\"col\">Condition</th><th scope=\"col\">Policy</th>",
     );
     for counting in &sheet.countings {
@@ -104,11 +104,13 @@ fn has_row(sheet: &Sheet<'_>, condition: usize, policy: usize) -> bool {
 fn cells(html: &mut String, sheet: &Sheet<'_>, condition: usize, policy: usize) {
     let rows: Vec<Option<&StudyRow>> =
         (0..sheet.countings.len()).map(|counting| sheet.row(condition, policy, counting)).collect();
-    let cell = |words: &str| format!("<td class=\"n\">{words}</td>");
+    let cell = |label: &str, words: &str| format!("<td data-label=\"{label}\">{words}</td>");
     let none = || NONE.to_owned();
-    for row in &rows {
-        html.push_str(&cell(&row.map_or_else(none, |row| rate(&row.success))));
-        html.push_str(&cell(&row.and_then(|row| row.gap.as_ref()).map_or_else(none, gap)));
+    for (row, counting) in rows.iter().zip(&sheet.countings) {
+        let name = if sheet.countings.len() > 1 { format!(", {}", counting.name()) } else { String::new() };
+        html.push_str(&cell(&format!("Success{name}"), &row.map_or_else(none, |row| rate(&row.success))));
+        let gap = row.and_then(|row| row.gap.as_ref()).map_or_else(none, gap);
+        html.push_str(&cell(&format!("Gap{name}"), &gap));
     }
     let each = |of: &dyn Fn(&StudyRow) -> String| {
         let mut values: Vec<String> = rows.iter().map(|row| row.map_or_else(none, of)).collect();
@@ -116,8 +118,8 @@ fn cells(html: &mut String, sheet: &Sheet<'_>, condition: usize, policy: usize) 
         values.join(" / ")
     };
     let floor = |row: &StudyRow| if is_share(row.floor.rate) { percent(row.floor.rate) } else { none() };
-    html.push_str(&cell(&each(&|row| row.success.n.to_string())));
-    html.push_str(&cell(&each(&floor)));
+    html.push_str(&cell("Episodes", &each(&|row| row.success.n.to_string())));
+    html.push_str(&cell("Floor", &each(&floor)));
 }
 
 /// A success rate with its interval.

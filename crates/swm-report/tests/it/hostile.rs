@@ -5,8 +5,8 @@ use serde_json::{Value, json};
 use std::fs;
 use std::path::{Path, PathBuf};
 use swm_core::Results;
-use swm_core::results::{Comparison, MAX_ALL_PAIRS, Prediction, Trajectory};
-use swm_report::{ReportOptions, read_metrics, read_results, write_report, write_report_with};
+use swm_core::results::{Band, Comparison, Prediction, Searches, Trajectory};
+use swm_report::{ReportOptions, Training, read_metrics, read_results, write_report, write_report_with};
 
 /// Writes a results file whose third run lists these videos, and returns the page of it.
 fn page_with_videos(folder: &Path, videos: &[&str]) -> String {
@@ -58,7 +58,7 @@ fn each_video_is_embedded_once_within_a_total_budget() {
     let names: Vec<String> = (0..8).map(|i| format!("large-{i}.mp4")).collect();
     for name in &names {
         fs::File::create(folder.path().join(name))
-            .and_then(|file| file.set_len(8 << 20))
+            .and_then(|file| file.set_len(300_000))
             .expect("creating a sparse file");
     }
     let mut large = results();
@@ -66,7 +66,7 @@ fn each_video_is_embedded_once_within_a_total_budget() {
     let path = write_report(&[(folder.path().join("results.json"), large)], folder.path()).expect("writing the report");
     let page = fs::read_to_string(path).expect("reading the page");
     assert_eq!(page.matches("data:video/").count(), 6);
-    assert!(page.contains("2 more videos are left out, because a page holds at most 200 videos and 48.0 MiB"));
+    assert!(page.contains("2 more videos are left out, because a page holds at most 200 videos and 1.7 MiB"));
 
     let many: Vec<String> = (0..5000).map(|i| format!("missing-{i}.mp4")).collect();
     let page = page_with_videos(folder.path(), &many.iter().map(String::as_str).collect::<Vec<_>>());
@@ -84,14 +84,48 @@ fn many_policies_give_a_bounded_page_and_too_many_runs_are_refused() {
     let path =
         write_report(&[(PathBuf::from("results.json"), many.clone())], folder.path()).expect("writing the report");
     let page = fs::read_to_string(path).expect("reading the page");
-    assert!(page.len() < 32 << 20, "{} bytes", page.len());
-    assert!(
-        page.contains(&format!("With more than {MAX_ALL_PAIRS} runs")) && page.contains("The chart is cut off here")
-    );
+    assert!(page.len() < 5_000_000, "{} bytes", page.len());
+    for words in [
+        "With more than 20 runs, there are no others",
+        "The first 60 of 1501 runs are drawn",
+        "Further runs are left out",
+        "more comparisons are in the results files",
+    ] {
+        assert!(page.contains(words), "{words}");
+    }
 
     let files = vec![(PathBuf::from("results.json"), many); 4];
     let error = write_report(&files, folder.path()).expect_err("6004 runs").to_string();
     assert!(error.contains("6004 runs, more than 5000"), "{error}");
+}
+
+#[test]
+fn many_conditions_names_and_settings_give_a_bounded_page() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let long = |i: usize| format!("{i} {}", "<&\"'>".repeat(190));
+    let mut many = results();
+    many.manifest.config = json!({"note": "<".repeat(5_000_000)});
+    many.manifest.libraries = (0..1000).map(|i| (long(i), long(i).repeat(50))).collect();
+    many.manifest.hashes = (0..1000).map(|i| (long(i), long(i).repeat(50))).collect();
+    let names: Vec<[String; 2]> = (0..1200).map(|i| [long(i), long(7 * i)]).collect();
+    many.runs = names.iter().map(|[condition, policy]| run(condition, policy, 20, 7, Some(0.1))).collect();
+    let band = Band { low: 0.0, median: 1.0, high: 2.0 };
+    for run in &mut many.runs {
+        run.searches =
+            Some(Searches { plans: 3, best: vec![band; 500], mean: vec![band; 500], spread: vec![band; 500] });
+        run.videos = vec![format!("{}.mp4", run.policy)];
+    }
+    let log = |i: usize| Training { policy: long(i), metrics: Err(long(i)) };
+    let training = (0..1000).map(log).collect();
+    let options = ReportOptions { title: Some(long(1).repeat(100)), command: Some(long(2).repeat(10_000)), training };
+    let files = vec![(PathBuf::from("results.json"), many); 3];
+    let path = write_report_with(&files, &options, folder.path()).expect("writing the report");
+    let page = fs::read_to_string(path).expect("reading the page");
+    well_formed(&page);
+    assert!(page.len() < 5_000_000, "{} bytes", page.len());
+    for words in ["The page has no room for further panels.", "more runs are in the results files"] {
+        assert!(page.contains(words), "{words}");
+    }
 }
 
 /// Reads results after a change of their JSON document; returns the error.
@@ -107,7 +141,7 @@ fn refused(change: impl Fn(&mut Value)) -> String {
     match read_results(&path) {
         Err(error) => error.to_string(),
         Ok(results) => {
-            write_report(&[(path, results)], folder.path()).expect("readable results can be shown");
+            page(&[(path, results)], folder.path());
             "accepted".to_owned()
         }
     }
@@ -203,7 +237,9 @@ fn hostile_training_logs_are_refused_or_bounded() {
         "{\"<script>alert(1)</script>\": 1e308, \"step\": 1}\n{\"<script>alert(1)</script>\": -1e308, \"step\": 2}\n";
     fs::write(&log, format!("{hostile}{{\"step\": null, \"tiny\": 5e-324}}\n{{\"step\": 4, \"other\": []}}\n"))
         .expect("writing the log");
-    let options = ReportOptions { metrics: Some(log), ..ReportOptions::default() };
+    let training =
+        Training { policy: "<b>".to_owned(), metrics: read_metrics(&log).map_err(|error| error.to_string()) };
+    let options = ReportOptions { training: vec![training], ..ReportOptions::default() };
     let results: [(PathBuf, Results); 1] = [(PathBuf::from("results.json"), results())];
     let path = write_report_with(&results, &options, folder.path()).expect("the report is written");
     let page = fs::read_to_string(path).expect("the page is readable");

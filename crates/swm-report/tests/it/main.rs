@@ -1,12 +1,13 @@
 //! Tests of the whole page, from synthetic results.
 
+mod browser;
 mod hostile;
 mod study;
 
 use std::path::{Path, PathBuf};
 use swm_core::results::{Comparison, Counting, EpisodeResult, Prediction, Run, Searches, Summary, Timing, Trajectory};
 use swm_core::{Manifest, PlanTrace, Results};
-use swm_report::{ReportOptions, read_metrics, read_results, write_report, write_report_with};
+use swm_report::{ReportOptions, Training, read_metrics, read_results, write_report, write_report_with};
 
 /// A run of `n` episodes. The first `solved` episodes reach the goal, each one step later than the preceding episode.
 fn run(condition: &str, policy: &str, n: usize, solved: usize, plans: Option<f64>) -> Run {
@@ -92,6 +93,8 @@ fn page(results: &[(PathBuf, Results)], folder: &Path) -> String {
     let path = write_report(results, folder).expect("the report is written");
     let page = std::fs::read_to_string(path).expect("the page is readable");
     well_formed(&page);
+    assert!(page.len() < 5_000_000, "{} bytes", page.len());
+    assert!(!page.contains("NaN") && !page.contains("inf\""));
     page.replace('\u{a0}', " ")
 }
 
@@ -167,12 +170,13 @@ fn policies_are_compared_on_the_same_starts() {
         "lewm-tiny \u{2212} random",
         "pldm \u{2212} lewm-tiny",
         "\u{2212}30.0 [\u{2212}",
-        "<td class=\"n\">25</td><td class=\"n\"><b>0</b></td><td class=\"n\"><b>12</b></td><td class=\"n\">3</td>\
-         <td class=\"n\">0.003</td><td>lower</td>",
+        "data-label=\"Both\">25</td><td class=\"n\" data-label=\"Only A\"><b>0</b></td>\
+         <td class=\"n\" data-label=\"Only B\"><b>12</b></td><td class=\"n\" data-label=\"Neither\">3</td>\
+         <td class=\"n\" data-label=\"p, corrected\">0.003</td><td data-label=\"Verdict on A\">lower</td>",
         "in distribution: 6 comparisons of 40 pairs tell a difference of ",
         "swm reproduce all/results.json",
         "lewm-tiny, in distribution: cost",
-        "40 plans",
+        "40 plans</text>",
         "solved (37)",
         "not solved (3)",
         "model steps of 5 environment steps",
@@ -182,6 +186,48 @@ fn policies_are_compared_on_the_same_starts() {
     assert!(!page.contains("agent.color shifted: cost") && !page.contains("pldm, in distribution: cost"));
     // The shifted run counts one start fewer than its floor, so the report compares their confidence intervals.
     assert!(page.contains("not told apart from the random-policy floor of 5.0 %<"));
+}
+
+#[test]
+fn verdict_and_generalisation_gap_come_from_paired_starts() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let page = page(&[(PathBuf::from("results.json"), results())], folder.path());
+    // Of 39 starts that count in both, 37 are solved in distribution and 3 under the shift.
+    for words in [
+        "<p class=\"answer\">lewm-tiny solves 92.5 % of 40 starts [80, 97], above the random-policy floor of 5.0 %, and \
+         loses 87.2 points [",
+        "] under “agent.color shifted”.</p>",
+        "<h3>Generalisation gap</h3>",
+        "\u{2212}87.2 [",
+        "lewm-tiny: 1 comparison of 39 pairs",
+    ] {
+        assert!(page.contains(words), "the page lacks: {words}");
+    }
+
+    // The runs of a policy may be in two files, if it has the same weights and settings.
+    let part = |shifted: bool, weights: &str| {
+        let mut part = results();
+        part.runs.retain(|run| (run.condition != "in distribution") == shifted);
+        part.manifest.hashes.insert("weights".to_owned(), weights.to_owned());
+        (PathBuf::from("results.json"), part)
+    };
+    let page = self::page(&[part(false, "a"), part(true, "a")], folder.path());
+    assert!(page.contains("<h3>Generalisation gap</h3>"));
+    let page = self::page(&[part(false, "a"), part(true, "b")], folder.path());
+    assert!(
+        !page.contains("<h3>Generalisation gap</h3>") && page.contains("above the random-policy floor of 5.0 %.</p>")
+    );
+}
+
+#[test]
+fn comparisons_with_neither_the_floor_nor_the_best_run_are_folded() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let page = page(&[(PathBuf::from("results.json"), results_with_all_parts())], folder.path());
+    let folded = page.split("<summary>The other comparison</summary>").nth(1).expect("a folded comparison");
+    let (folded, _) = folded.split_once("</details>").expect("the end of the fold");
+    assert!(folded.contains("pldm \u{2212} lewm-tiny") && !folded.contains("pldm \u{2212} expert"));
+    let open = page.split("<summary>").next().expect("the open part");
+    assert!(open.contains("pldm \u{2212} expert") && open.contains("pldm \u{2212} random"));
 }
 
 #[test]
@@ -231,7 +277,7 @@ fn external_text_is_escaped() {
         (run.condition, run.policy) = (markup.to_owned(), markup.to_owned());
         run.videos = vec![markup.to_owned()];
     }
-    let options = ReportOptions { title: Some(markup.to_owned()), command: Some(markup.to_owned()), metrics: None };
+    let options = ReportOptions { title: Some(markup.to_owned()), command: Some(markup.to_owned()), training: vec![] };
     let path =
         write_report_with(&[(PathBuf::from(markup), results)], &options, folder.path()).expect("the report is written");
     let page = std::fs::read_to_string(path).expect("the page is readable");
@@ -301,8 +347,8 @@ fn videos_are_embedded_or_listed_with_a_reason() {
         ["videos/lewm-2.mp4", "videos/lewm-39.mp4", "videos/lost.mp4", "videos/a.avi"].map(str::to_owned).to_vec();
     let page = page(&[(folder.path().join("results.json"), results)], &folder.path().join("report"));
     assert!(page.contains("data:video/mp4;base64,bm90IHJlYWxseSBhIHZpZGVv"));
-    assert!(page.contains("episode 2 <span class=\"mark solved\">solved in 10 steps</span>"));
-    assert!(page.contains("episode 39 <span class=\"mark unsolved\">not solved in 60 steps</span>"));
+    assert!(page.contains("<p>Start 2</p>") && page.contains("<span class=\"mark solved\">solved in 10 steps</span>"));
+    assert!(page.contains("<p class=\"note absent\">lewm-tiny, in distribution, episode 39. Not embedded: <code>"));
     for words in ["has 8.0 MiB", "was not found in the folder of its results file", "is neither MP4 nor WebM"] {
         assert!(page.contains(words), "the page lacks: {words}");
     }
@@ -325,13 +371,17 @@ fn training_metrics_become_charts() {
     assert_eq!(metrics.over, "step");
     assert_eq!(metrics.series.iter().map(|s| s.name.as_str()).collect::<Vec<_>>(), ["loss", "optimizer/lr", "seconds"]);
     assert_eq!(metrics.series[0].points[1], (1.0, 0.5));
-    let options = ReportOptions { metrics: Some(log.clone()), ..ReportOptions::default() };
+    let training = Training { policy: "lewm-tiny".to_owned(), metrics: Ok(metrics) };
+    let damaged = Training { policy: "expert".to_owned(), metrics: Err("line 2 <is> damaged".to_owned()) };
+    let options = ReportOptions { training: vec![training, damaged], ..ReportOptions::default() };
     let results = [(PathBuf::from("results.json"), results())];
     let path = write_report_with(&results, &options, &folder.path().join("report")).expect("the report is written");
     let page = std::fs::read_to_string(path).expect("the page is readable");
     well_formed(&page);
     assert!(page.contains("loss over step, ending at 0.001111") && page.contains("optimizer/lr"));
     assert!(!page.contains("seconds over step"), "metrics of speed are left out");
+    assert!(page.contains("<h3><span class=\"swatch c0\"></span>lewm-tiny</h3>"));
+    assert!(page.contains("No training curves: line 2 &lt;is&gt; damaged."));
 
     std::fs::write(&log, "{\"step\": 1}\nloss = 3\n{\"step\": 2}\n").expect("the log is written");
     assert!(

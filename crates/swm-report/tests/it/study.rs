@@ -67,6 +67,44 @@ fn factors() -> StudyPage {
     StudyPage { published: vec![published("DINO-WM", 0.18), published("PLDM", 0.08)], ..of(rows) }
 }
 
+/// A line of success against a number, with long names.
+fn line() -> StudyPage {
+    let values = ["1", "2", "4", "8", "16"];
+    let long = "checkpoints/a-policy-whose-name-has-no-spaces-and-is-much-longer-than-any-column-of-a-table";
+    let each = |policy: &'static str| {
+        let row = move |(i, x): (usize, &&str)| row(&format!("{x} squares"), policy, &[("count", x)], 38 - 7 * i);
+        let plain = self::row("in distribution", policy, &[("count", "0")], 40);
+        std::iter::once(plain).chain(values.iter().enumerate().map(row)).collect::<Vec<_>>()
+    };
+    of([each("LeWM"), each(long)].concat())
+}
+
+/// A wheel of hues.
+fn wheel() -> StudyPage {
+    let mut rows = vec![row("in distribution", "LeWM", &[], 40)];
+    for saturation in ["0.5", "1"] {
+        for hue in ["0", "60", "120", "180", "240", "300"] {
+            let name = format!("hue {hue}, saturation {saturation}");
+            rows.push(row(&name, "LeWM", &[("hue", hue), ("saturation", saturation)], hue.len() * 10));
+        }
+    }
+    of(rows)
+}
+
+/// A map of many conditions.
+fn heat() -> StudyPage {
+    let mut rows = vec![row("in distribution", "LeWM", &[], 40)];
+    rows.extend((0..130).map(|i| row(&format!("condition {i}"), "LeWM", &[], i % 40)));
+    of(rows)
+}
+
+/// Pages with every kind of figure and table.
+pub(super) fn pages() -> Vec<StudyPage> {
+    let mut study = factors();
+    study.results.over_seeds = vec![over_seeds("LeWM, seed *", 0.5)];
+    vec![study, line(), wheel(), heat()]
+}
+
 /// All files that a page consists of.
 fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
     let mut found = BTreeMap::new();
@@ -119,7 +157,8 @@ fn page_of_a_study_has_its_answer_table_figures_and_published_values() {
         "Gap of each condition · strict counting",
         "<summary>Gap of each condition · compat counting</summary>",
         "<code>figures/drop-2.png</code>",
-        "<td class=\"n\">8.0 % [1]</td><td class=\"n\"><b>24.0 %</b> [14, 37]</td><td class=\"n\">+16.0</td>",
+        "data-label=\"Published\">8.0 % [1]</td><td class=\"n\" data-label=\"Ours, strict\"><b>24.0 %</b> [14, 37]</td>\
+         <td class=\"n\" data-label=\"Difference, strict\">+16.0</td>",
         "not run",
         "<li>table of factors</li>",
     ] {

@@ -5,7 +5,7 @@ use super::config::count;
 use super::output_folder;
 use super::results_tables::summary;
 use super::wrappers::WrapperArgs;
-use super::{Context, emit, emit_json, eprint, eval, train};
+use super::{Context, emit, emit_json, eprint, eval, train, training_curves};
 use crate::resolver::HomeResolver;
 use crate::{ENVS, home};
 use clap::Args;
@@ -53,6 +53,9 @@ pub struct DemoArgs {
 /// The environment of the demo.
 const ENV: &str = "swm/TwoRoom-v1";
 
+/// The name of the model in results.
+const MODEL: &str = "pldm";
+
 /// The shifted factor: the agent is blue instead of red.
 const SHIFT: (&str, [f64; 3]) = ("agent.color", [0.0, 128.0, 255.0]);
 
@@ -89,12 +92,12 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
     eprint("3/4 plan and evaluate: CEM with the model, compared with the random-policy floor\n");
     let resolver = HomeResolver::new(Origin::User).tracing();
     let request = request(args, &model, side, &resolver)?;
-    let (found, file) = eval::run(&request, &resolver, args.envs, (&results, 3), context)?;
+    let (found, file) = eval::run(&request, &resolver, args.envs, (&results, eval::VIDEOS), context)?;
 
     eprint("4/4 report\n");
     let options = ReportOptions {
         title: Some("Two rooms, one small world model".to_owned()),
-        metrics: Some(train::log_of(&model)),
+        training: vec![training_curves::of_checkpoint(MODEL, &model)],
         command: None,
     };
     let page = swm_report::write_report_with(&[(file, found.clone())], &options, &output)?;
@@ -185,7 +188,7 @@ fn request(args: &DemoArgs, model: &Path, side: usize, resolver: &HomeResolver) 
         wrappers: vec![],
         wrap_goal: false,
         image: Some([side, side]),
-        policies: vec![PolicyRequest { name: "pldm".to_owned(), kind }],
+        policies: vec![PolicyRequest { name: MODEL.to_owned(), kind }],
         starts: StartsRequest::Episodic,
         episodes: args.eval_episodes,
         seed: args.seed.wrapping_add(1),

@@ -21,9 +21,10 @@ use swm_eval::{Condition, EvalRequest, HeldOut, RunOptions, StartsRequest};
 /// Arguments of `swm eval`.
 #[derive(Args)]
 pub struct EvalArgs {
-    /// Policies: checkpoints, expert, an expert's id, simulator, random
+    /// Policies: checkpoints, expert, an expert's id, simulator, random, no-op, replay
     ///
-    /// Several policies are compared from the same starts. `simulator` plans by stepping the environment itself.
+    /// Several policies are compared from the same starts. `simulator` plans by stepping the environment itself. `no-op`
+    /// does nothing; `replay` repeats the actions of the dataset that the starts come from.
     #[arg(required = true)]
     policies: Vec<String>,
     /// The environment (default: the training environment of the first checkpoint)
@@ -81,9 +82,9 @@ pub struct EvalArgs {
     /// Folder of results.json and the videos
     #[arg(short, long, default_value = "results", value_name = "DIR")]
     output: PathBuf,
-    /// Number of episodes per policy to record as videos
-    #[arg(long, default_value_t = 0, value_name = "EPISODES")]
-    videos: usize,
+    /// Number of episodes per policy to record as videos (default: 3; 0 without frames)
+    #[arg(long, value_name = "EPISODES")]
+    videos: Option<usize>,
     /// Measure prediction errors over this many model steps, by success
     ///
     /// Predictions are compared with the recorded trajectories of the dataset.
@@ -121,6 +122,9 @@ pub enum CapsuleStarts {
 /// The time limit of episodes that start from a dataset, in steps, as in the paper's evaluations.
 const DATASET_TIME_LIMIT: usize = 50;
 
+/// The number of recorded episodes of each run, unless the command line says otherwise.
+pub const VIDEOS: usize = 3;
+
 /// The name of the condition without any shift.
 const IN_DISTRIBUTION: &str = "in distribution";
 
@@ -145,7 +149,8 @@ pub fn run_args(args: &EvalArgs, context: &Context) -> anyhow::Result<(Results, 
     if args.trace {
         drop(output_folder::claim(&args.output, &["traces.json"])?);
     }
-    let (results, file) = run(&request, &resolver, args.envs, (&args.output, args.videos), context)?;
+    let videos = args.videos.unwrap_or(if args.no_pixels { 0 } else { VIDEOS });
+    let (results, file) = run(&request, &resolver, args.envs, (&args.output, videos), context)?;
     if args.trace {
         write_json(&args.output.join("traces.json"), &traces(&resolver))?;
     }

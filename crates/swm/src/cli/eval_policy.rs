@@ -33,15 +33,22 @@ enum NamedKind {
 }
 
 impl NamedPolicy {
-    /// Returns the policy with a name: `random`, `expert`, an expert's id, `simulator`, or a checkpoint, which is loaded.
+    /// Returns the policy with a name: `random`, `no-op`, `replay`, `expert`, an expert's id, `simulator`, or a checkpoint,
+    /// which is loaded.
     ///
     /// # Errors
     /// When the environment or the checkpoint does not exist, or the checkpoint is damaged.
     pub fn find(given: &str, env: Option<&str>, resolver: &HomeResolver) -> Result<Self> {
         let without_checkpoint = |kind| Self { name: given.to_owned(), kind, env: None, image: None, recorded: None };
         let env = env.map(|env| resolver.choose_env(env)).transpose()?;
-        if given == "random" {
-            return Ok(without_checkpoint(NamedKind::Direct(PolicyKind::Random)));
+        let baseline = match given {
+            "random" => Some(PolicyKind::Random),
+            "no-op" => Some(PolicyKind::NoOp),
+            "replay" => Some(PolicyKind::Replay),
+            _ => None,
+        };
+        if let Some(kind) = baseline {
+            return Ok(without_checkpoint(NamedKind::Direct(kind)));
         }
         if given == "expert" || env.is_some_and(|env| env.entry.experts.iter().any(|expert| expert.id == given)) {
             return Ok(without_checkpoint(NamedKind::Direct(PolicyKind::Expert { id: given.to_owned() })));

@@ -29,6 +29,7 @@ mod signals;
 mod solvers;
 mod study;
 mod train;
+mod training_curves;
 mod wrappers;
 mod zoo;
 

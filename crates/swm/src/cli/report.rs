@@ -1,14 +1,14 @@
 //! `swm report`: writes one self-contained HTML page of results.
 
 use super::output_folder;
-use super::train::log_of;
+use super::training_curves::{log_of, of_results};
 use super::{emit, emit_json};
 use crate::home;
 use clap::Args;
 use serde_json::json;
 use std::path::PathBuf;
 use swm_core::{Error, Results};
-use swm_report::ReportOptions;
+use swm_report::{ReportOptions, Training};
 
 /// Arguments of `swm report`.
 #[derive(Args)]
@@ -22,7 +22,9 @@ pub struct ReportArgs {
     /// Title (default: the environments)
     #[arg(long)]
     title: Option<String>,
-    /// Checkpoint whose training curves are shown: a path or a name
+    /// Checkpoint whose training curves are shown (default: those of the results)
+    ///
+    /// The policies of the results are found by path or name, and by the hash of their weights.
     #[arg(long, value_name = "CHECKPOINT")]
     training: Option<String>,
 }
@@ -44,11 +46,14 @@ pub fn report(args: &ReportArgs, as_json: bool) -> anyhow::Result<()> {
         })
         .collect();
     let read = read?;
-    let options = ReportOptions {
-        title: args.title.clone(),
-        metrics: args.training.as_deref().map(home::find_checkpoint).transpose()?.as_deref().map(log_of),
-        command: None,
+    let training = match &args.training {
+        Some(given) => {
+            let metrics = swm_report::read_metrics(&log_of(&home::find_checkpoint(given)?))?;
+            vec![Training { policy: String::new(), metrics: Ok(metrics) }]
+        }
+        None => of_results(&read),
     };
+    let options = ReportOptions { title: args.title.clone(), training, command: None };
     let _lock = output_folder::claim(&args.output, &["index.html"])?;
     let page = swm_report::write_report_with(&read, &options, &args.output)?;
     if as_json {

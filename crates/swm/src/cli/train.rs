@@ -202,8 +202,3 @@ pub fn run(config: &dyn TrainableConfig, setup: TrainRun<'_>, context: &Context)
     }
     Ok(summary)
 }
-
-/// Returns the path of a checkpoint's training log.
-pub fn log_of(checkpoint: &Path) -> PathBuf {
-    checkpoint.join("train.jsonl")
-}

@@ -59,6 +59,20 @@ fn trains_evaluates_and_reports() {
     let page =
         std::fs::read_to_string(swm.path(report["report"].as_str().expect("a path"))).expect("reading the report");
     assert!(page.contains("agent.color=0,0,255") && page.contains("data:video/mp4"));
+    assert!(
+        page.contains("<p>Start 0</p>")
+            && page.contains("poster=\"data:image/png")
+            && page.contains("alt=\"The goal\"")
+    );
+    // The training curves of `small` are found by its name and the hash of its weights.
+    assert!(page.contains("<h2>Training</h2>") && page.contains("</span>small</h3>"), "no training log");
+    let results = std::fs::read_to_string(swm.path("episodic/results.json")).expect("reading the results");
+    let weights = episodic["manifest"]["hashes"]["weights"].as_str().expect("a hash");
+    std::fs::create_dir(swm.path("other")).expect("creating a folder");
+    std::fs::write(swm.path("other/results.json"), results.replace(weights, &"0".repeat(64))).expect("writing results");
+    let report = swm.json(&["report", "other", "-o", "report"]);
+    let page = std::fs::read_to_string(swm.path(report["report"].as_str().expect("a path"))).expect("reading the page");
+    assert!(!page.contains("<h2>Training</h2>"), "curves of other weights");
 
     swm.fails(&["eval", "small", "--env", "swm/PushT-v1"], 2, &["trained on swm/TwoRoom-v1"]);
     swm.fails(&["report", "nowhere"], 1, &["nowhere"]);

@@ -2,7 +2,7 @@
 
 use super::super::tests::{row, study};
 use super::*;
-use crate::plot::text_boxes;
+use crate::plot::check_texts;
 use swm_core::results::StudyRow;
 
 /// Draws the first sheet of a study, and checks all texts of both layouts.
@@ -13,18 +13,7 @@ fn check(rows: Vec<StudyRow>, kinds: &[&str]) {
     assert_eq!(drawn.iter().map(|figure| figure.name).collect::<Vec<_>>(), kinds);
     for figure in &drawn {
         assert_eq!(figure.drawing.inline.matches("<svg").count(), 2);
-        for svg in figure.drawing.inline.split("<svg").skip(1) {
-            let (size, boxes) = text_boxes(svg);
-            assert!(boxes.len() > 4, "{svg}");
-            for (i, (a, words)) in boxes.iter().enumerate() {
-                let inside = a[0] >= -1.0 && a[1] >= -1.0 && a[2] <= size[0] + 1.0 && a[3] <= size[1] + 1.0;
-                assert!(inside, "{}: “{words}” at {a:?} leaves {size:?}", figure.name);
-                for (b, other) in &boxes[i + 1..] {
-                    let apart = a[2] <= b[0] || b[2] <= a[0] || a[3] <= b[1] || b[3] <= a[1];
-                    assert!(apart, "{}: “{words}” {a:?} overlaps “{other}” {b:?}", figure.name);
-                }
-            }
-        }
+        check_texts(&figure.drawing.inline, 4);
         assert!(figure.drawing.png.starts_with(b"\x89PNG") && figure.drawing.svg.ends_with("</svg>\n"));
     }
 }

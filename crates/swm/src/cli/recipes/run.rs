@@ -5,7 +5,8 @@ use super::text;
 use crate::capsule;
 use crate::cli::collect::{self, CollectArgs};
 use crate::cli::eval::{self, EvalArgs};
-use crate::cli::train::{self, TrainArgs, log_of};
+use crate::cli::train::{self, TrainArgs};
+use crate::cli::training_curves::of_checkpoint;
 use crate::cli::{Context, emit, emit_json, eprint, output_folder};
 use crate::home;
 use serde::{Deserialize, Serialize};
@@ -235,7 +236,7 @@ fn report(recipe: &Recipe, request: &RecipeRun<'_>, context: &Context) -> Result
     let settings: Vec<String> = request.settings.iter().map(|setting| format!(" {setting}")).collect();
     let options = ReportOptions {
         title: Some(recipe.summary.clone()),
-        metrics: recipe.train.first().map(|step| log_of(&request.output.join(&step.name))),
+        training: recipe.train.iter().map(|step| of_checkpoint(&step.name, &request.output.join(&step.name))).collect(),
         command: Some(format!("swm train --recipe {} -o DIR{}", request.recipe, settings.concat())),
     };
     if context.interrupt.load(std::sync::atomic::Ordering::SeqCst) {

@@ -6,6 +6,7 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::Rng as _;
 use serde::{Deserialize, Serialize};
+use swm_core::run::{Control, Progress};
 use swm_core::{Error, Key, Result};
 
 /// The settings of training a network.
@@ -24,7 +25,7 @@ pub struct FitConfig {
 /// with the buffers of a step, such as running statistics. Returns the model and the last loss.
 ///
 /// # Errors
-/// When a step fails or a loss is not finite.
+/// When a step fails, a loss is not finite, or `control` stops the training.
 pub(super) fn fit<M: Module>(
     mut model: M,
     config: FitConfig,
@@ -32,6 +33,7 @@ pub(super) fn fit<M: Module>(
     key: Key,
     step: impl Fn(&M, &[usize]) -> Result<StepOutput>,
     track: impl Fn(&mut M, Named<Tensor<1>>),
+    control: &mut Control<'_>,
 ) -> Result<(M, f64)> {
     let schedule = ScheduleConfig { steps: config.steps, warmup: config.steps / 20, floor: 0.0 };
     let optim = OptimConfig {
@@ -46,6 +48,7 @@ pub(super) fn fit<M: Module>(
     let mut optimizer = AdamW::new(optim);
     let mut loss = f64::NAN;
     for step_index in 0..config.steps {
+        control.check()?;
         let mut rng = key.at(step_index as u64).rng();
         let indices: Vec<usize> = (0..config.batch_size).map(|_| rng.random_range(0..samples)).collect();
         let output = step(&model, &indices)?;
@@ -60,6 +63,8 @@ pub(super) fn fit<M: Module>(
         (model, _) =
             optimizer.step(model, schedule.lr_factor(step_index), output.gradients, |_| ParameterGroup::default());
         track(&mut model, output.buffers);
+        let (stage, total, unit) = ("train", config.steps, "steps");
+        control.progress(Progress { stage, done: step_index + 1, total, unit, metrics: &[("loss", loss)] });
     }
     Ok((model, loss))
 }

@@ -10,6 +10,7 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use swm_core::run::Control;
 use swm_core::{Error, Key, Result};
 use swm_data::{Part, Reader, RgbImage, contact_sheet};
 
@@ -176,7 +177,8 @@ pub fn reconstruct_images(
             Ok(StepOutput { metrics, gradients, ..StepOutput::default() })
         })
     };
-    let (decoder, _) = fit(decoder, config.fit, train.count, key.with("batches"), step, |_, _| ())?;
+    let (decoder, _) =
+        fit(decoder, config.fit, train.count, key.with("batches"), step, |_, _| (), &mut Control::new())?;
 
     let decoded = decode(&decoder, &scale.apply(&held_out.latents), latent, &mean);
     let rmse = root_mean_square(decoded.iter().copied(), &held_out.images);

@@ -12,6 +12,7 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use swm_core::run::Control;
 use swm_core::{Key, Result};
 use swm_data::{Part, Reader};
 
@@ -206,7 +207,7 @@ impl Network {
             let gradients = parameters::gradients(&trained, &loss.backward());
             Ok(StepOutput { metrics, gradients, ..StepOutput::default() })
         };
-        let (model, _) = fit(model, config.fit, count, key.with("batches"), step, |_, _| ())?;
+        let (model, _) = fit(model, config.fit, count, key.with("batches"), step, |_, _| (), &mut Control::new())?;
         Ok(Self { model, from, to })
     }
 

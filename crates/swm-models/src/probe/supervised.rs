@@ -15,6 +15,7 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use swm_core::run::Control;
 use swm_core::{Key, Result};
 use swm_data::{Part, Reader};
 
@@ -46,16 +47,18 @@ const HEAD: &str = "head";
 const BLOCK: usize = 64;
 
 /// Trains an encoder, and the network of a state probe on its features, to predict columns; scores the predictions on
-/// held-out episodes. The baseline and the ridge regression of `config` are not used.
+/// held-out episodes. The baseline and the ridge regression of `config` are not used. `control` receives the progress of the
+/// training.
 ///
 /// # Errors
-/// When a column is missing or holds images, the images have another size, no episode is held out, or a setting is out of
-/// range.
+/// When a column is missing or holds images, the images have another size, no episode is held out, a setting is out of
+/// range, or `control` stops the training.
 pub fn train_encoder(
     encoder: &BackboneConfig,
     images: &ImageNormalization,
     reader: &dyn Reader,
     config: &StateConfig,
+    control: &mut Control<'_>,
 ) -> Result<SupervisedReport> {
     encoder.check("model.encoder", images.side)?;
     check_sizes(&[
@@ -91,7 +94,7 @@ pub fn train_encoder(
         Ok(losses(model, patches, rows(&labels, targets.list.len(), indices)))
     };
     let track = |model: &mut Labelled, mut buffers| model.encoder.track(ENCODER, &mut buffers);
-    let (model, loss) = fit(model, config.fit, train.count, key.with("batches"), step, track)?;
+    let (model, loss) = fit(model, config.fit, train.count, key.with("batches"), step, track, control)?;
 
     let predictions: Result<Vec<Vec<f32>>> = held_out
         .images

@@ -4,7 +4,7 @@ use crate::dots::{Dots, SIDE, draw};
 use std::path::Path;
 use std::sync::Arc;
 use swm_core::run::Control;
-use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Key, Policy as _, Result, Schema, Space, VariationSpace};
+use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Error, Key, Policy as _, Result, Schema, Space, VariationSpace};
 use swm_models::feed_forward::FeedForwardPolicy;
 use swm_models::gcrl::{Actor, Gcbc, Gciql, Gcivl, GcrlConfig, GoalConditioned};
 use swm_models::nn::{BackboneConfig, ConvConfig, Init, parameters};
@@ -284,6 +284,24 @@ impl ImageEncoder for Profiles {
 }
 
 #[test]
+fn an_encoder_that_is_trained_with_labels_reads_the_position() {
+    let data = Dots::new(40, 1);
+    let mut settings = StateConfig::new(vec!["position".to_owned()]);
+    (settings.fit.steps, settings.fit.batch_size) = (200, 32);
+    let sizes = BackboneConfig::Conv(ConvConfig { channels: vec![8, 16], hidden: 0, dim: 16 });
+    let images = ImageNormalization { side: SIDE, mean: [0.5; 3], std: [0.5; 3] };
+    let train = |control: &mut Control| probe::train_encoder(&sizes, &images, &data, &settings, control);
+    let report = train(&mut Control::new()).expect("training the encoder");
+    assert!(report.scores.iter().all(|score| score.r2.expect("a score of a moving dot") > 0.9), "{report:?}");
+    let mut steps = 0;
+    let mut stop = Control::new().with_poll(|| {
+        steps += 1;
+        if steps < 3 { Ok(()) } else { Err(Error::Interrupted) }
+    });
+    assert!(matches!(train(&mut stop), Err(Error::Interrupted)));
+}
+
+#[test]
 fn probes_read_the_position_and_reconstruct_the_image() {
     let data = Dots::new(40, 1);
     let mut settings = StateConfig::new(vec!["position".to_owned()]);
@@ -323,14 +341,6 @@ fn probes_read_the_position_and_reconstruct_the_image() {
     let actions = StateConfig { columns: vec!["action".to_owned()], ..settings };
     let report = probe::read_state(&Profiles, &data, &actions).expect("fitting the probe");
     assert!(report.linear.iter().all(|score| score.r2.expect("a score of actions that differ") < 0.1), "{report:?}");
-
-    // An encoder that is trained with labels reads the position.
-    let mut settings = StateConfig::new(vec!["position".to_owned()]);
-    (settings.fit.steps, settings.fit.batch_size) = (200, 32);
-    let sizes = BackboneConfig::Conv(ConvConfig { channels: vec![8, 16], hidden: 0, dim: 16 });
-    let images = ImageNormalization { side: SIDE, mean: [0.5; 3], std: [0.5; 3] };
-    let report = probe::train_encoder(&sizes, &images, &data, &settings).expect("training the encoder");
-    assert!(report.scores.iter().all(|score| score.r2.expect("a score of a moving dot") > 0.9), "{report:?}");
 
     let mut settings = ReconstructionConfig { channels: vec![16, 8], shown: 6, ..ReconstructionConfig::default() };
     (settings.fit.steps, settings.fit.lr) = (1000, 5e-3);

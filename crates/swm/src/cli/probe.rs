@@ -1,6 +1,7 @@
 //! `swm probe`: predicts columns and reconstructs images from a checkpoint's latents, or predicts columns from images with an
 //! encoder that is trained with labels.
 
+use super::progress::control;
 use super::{Context, emit, emit_json, output_folder, table};
 use crate::home;
 use clap::Args;
@@ -121,7 +122,8 @@ fn supervised(preset: &str, args: &ProbeArgs, context: &Context) -> anyhow::Resu
     let defaults = StateConfig { frames, fit, ..StateConfig::new(args.columns.clone()) };
     let config = state_config(args, &*reader, defaults);
     let threads = swm_core::pool::threads(context.threads)?;
-    let report = threads.install(|| probe::train_encoder(&encoder, &images, &*reader, &config))?;
+    let report =
+        threads.install(|| probe::train_encoder(&encoder, &images, &*reader, &config, &mut control(context)))?;
     if context.json {
         return emit_json(&json!({ "supervised": report }));
     }

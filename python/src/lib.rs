@@ -9,6 +9,7 @@
 //! - [`gym`]: third-party Gymnasium environments in this interpreter.
 //! - [`env`](mod@env), [`frames`]: a single environment, and visual wrappers, for Gymnasium.
 //! - [`listing`]: the engine's registries, and the command line.
+//! - [`study`]: the results of studies.
 
 mod arrays;
 mod cost;
@@ -21,6 +22,7 @@ mod listing;
 mod model;
 mod policy;
 mod solver;
+mod study;
 mod world;
 
 use pyo3::prelude::*;
@@ -52,6 +54,8 @@ mod _engine {
     use super::policy::Actor;
     #[pymodule_export]
     use super::solver::solve;
+    #[pymodule_export]
+    use super::study::{studies, study_export, study_results};
     #[pymodule_export]
     use super::world::World;
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from . import _registration
 
 if TYPE_CHECKING:
-    from . import data, envs, planning, policy, solver, spaces, utils, wm, wrapper
+    from . import data, envs, planning, policy, solver, spaces, studies, utils, wm, wrapper
     from .policy import PlanConfig
     from .world import Metrics, World
 
@@ -32,6 +32,7 @@ __all__ = [
     "policy",
     "solver",
     "spaces",
+    "studies",
     "utils",
     "wm",
     "wrapper",

@@ -4,6 +4,7 @@
 //! the content to files of their own. The reference loads in one process or with worker processes, depending on which
 //! was faster in a first measurement.
 
+use crate::formats::write;
 use crate::reference::{Reference, not_compared, reference_python};
 use serde::Serialize;
 use std::fmt;
@@ -118,12 +119,12 @@ pub struct DataBenchRow {
 }
 
 /// A dataset layout to load, and the reference's format to compare with.
-struct Layout {
-    name: &'static str,
-    format: &'static str,
-    codec: ImageCodec,
+pub(crate) struct Layout {
+    pub name: &'static str,
+    pub format: &'static str,
+    pub codec: ImageCodec,
     /// The name of the dataset's folder or file.
-    file: &'static str,
+    pub file: &'static str,
     /// The format of the reference.
     reference_format: &'static str,
     /// The name of the folder or file of the reference's dataset.
@@ -134,7 +135,7 @@ const JPEG: ImageCodec = ImageCodec::Jpeg { quality: 95 };
 
 /// Every format. Formats that the reference lacks are compared with the reference's Lance format, which always stores
 /// JPEG.
-const LAYOUTS: [Layout; 6] = [
+pub(crate) const LAYOUTS: [Layout; 6] = [
     layout("lance, jpeg", "lance", JPEG, "jpeg.lance", "lance", "theirs.lance"),
     layout("lance, lossless", "lance", LOSSLESS, "lossless.lance", "lance", "theirs.lance"),
     layout("lance-video", "lance-video", LOSSLESS, "ours.lance-video", "lance", "theirs.lance"),
@@ -240,7 +241,12 @@ pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig, control: &mut Contr
 }
 
 /// Collects the content of all datasets; returns the number of rows.
-fn collect(env: &EnvChoice, config: &DataBenchConfig, path: &Path, control: &mut Control<'_>) -> Result<usize> {
+pub(crate) fn collect(
+    env: &EnvChoice,
+    config: &DataBenchConfig,
+    path: &Path,
+    control: &mut Control<'_>,
+) -> Result<usize> {
     let image = Some((config.size, config.size));
     let world = WorldConfig { image, max_episode_steps: Some(config.steps), ..WorldConfig::default() };
     let mut world = World::new(env.clone(), world)?;
@@ -254,18 +260,6 @@ fn collect(env: &EnvChoice, config: &DataBenchConfig, path: &Path, control: &mut
     let mut policy = RandomPolicy::new(world.spec(), WorldConfig::default().envs);
     world.collect(&mut policy, writer, &collected, control)?;
     Ok(open(path)?.episodes().iter().map(|episode| episode.length).sum())
-}
-
-/// Converts the dataset `source` to the format of a layout.
-fn write(source: &Path, path: &Path, layout: &Layout, control: &mut Control<'_>) -> Result<()> {
-    let options = ConvertOptions {
-        format: Some(layout.format.to_owned()),
-        mode: ConvertMode::Overwrite,
-        codec: layout.codec,
-        verify: false,
-        ..ConvertOptions::default()
-    };
-    convert(&open(source)?, &Location::from(path), &options, control).map(|_| ())
 }
 
 /// A dataset that the reference loads.
@@ -316,7 +310,7 @@ impl<'r> ReferenceDataset<'r> {
     }
 }
 
-fn loader(reader: &Arc<dyn Reader>, config: &DataBenchConfig, cache: CacheConfig) -> Result<Loader> {
+pub(crate) fn loader(reader: &Arc<dyn Reader>, config: &DataBenchConfig, cache: CacheConfig) -> Result<Loader> {
     let (clip, batch_size, threads) = (config.clip.clone(), config.batch_size, config.threads);
     let config = LoaderConfig { clip, batch_size, threads, drop_last: true, cache, ..LoaderConfig::default() };
     Loader::new(Arc::clone(reader), config)
@@ -379,14 +373,14 @@ fn remote(local: &Path, config: &DataBenchConfig, control: &mut Control<'_>) -> 
 }
 
 /// A loader that repeats epochs.
-struct Endless {
-    loader: Loader,
-    epoch: u64,
+pub(crate) struct Endless {
+    pub loader: Loader,
+    pub epoch: u64,
 }
 
 impl Endless {
     /// Loads for about `config.seconds`, after one batch that is not counted; returns clips per second.
-    fn measure(&mut self, config: &DataBenchConfig, control: &mut Control<'_>) -> Result<f64> {
+    pub fn measure(&mut self, config: &DataBenchConfig, control: &mut Control<'_>) -> Result<f64> {
         self.epoch += 1;
         let mut batches = (self.epoch..).flat_map(|epoch| self.loader.epoch(epoch, 0));
         let mut next =

@@ -10,6 +10,7 @@
 
 mod data;
 mod envs;
+mod formats;
 mod model;
 mod plan;
 mod reference;
@@ -17,6 +18,7 @@ mod render;
 
 pub use data::{DataBenchConfig, DataBenchReport, DataBenchRow, bench_data};
 pub use envs::{BenchConfig, BenchReport, BenchRow, bench_envs};
+pub use formats::{FormatBench, FormatCost};
 pub use model::{ModelBenchConfig, ModelBenchReport, ModelBenchRow, Subject, Work, bench_model};
 pub use plan::{PlanBenchConfig, PlanBenchReport, PlanBenchRow, bench_plan};
 pub use reference::REFERENCE_PYTHON;

@@ -7,25 +7,31 @@ mod betting;
 mod breaking;
 mod consistency;
 mod counting;
+mod discrimination;
 mod family;
 mod paired;
+mod played;
 mod prediction;
 mod score;
 mod searches;
 mod seeds;
 mod statistics;
 mod study;
+mod table;
 mod until;
 
 pub use breaking::{BreakingPoint, Crossing, Evaluated, Level, Ray, Side};
 pub use counting::Counting;
+pub use discrimination::{Density, Discrimination, ErrorAndSuccess, Predicts};
 pub use family::{Family, Verdict};
 pub use paired::{Comparison, MAX_ALL_PAIRS, Paired, pairs};
+pub use played::{ClusteredMean, Played, PlayedErrors, PlayedTrajectory};
 pub use prediction::{Group, Prediction, Trajectory};
 pub use searches::{Band, Searches};
 pub use seeds::{Interquartile, OverSeeds, TRAINING_SEED};
 pub use statistics::{Proportion, Summary};
-pub use study::{Published, StudyResults, StudyRow};
+pub use study::{Published, Registration, StudyResults, StudyRow};
+pub use table::{StudyTable, TableColumn, TableRow};
 pub use until::Until;
 
 use crate::Manifest;
@@ -80,6 +86,9 @@ pub struct Run {
     /// Prediction errors of the model on the trajectories that the starts come from, if requested.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub prediction: Option<Prediction>,
+    /// Prediction errors of the model on the trajectories that its policy played, if requested.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub played: Option<Played>,
     /// Durations. All other fields are equal for equal manifests.
     pub timing: Timing,
     /// Paths of videos, relative to the results file.
@@ -136,6 +145,7 @@ impl Run {
             strict: None,
             searches: None,
             prediction: None,
+            played: None,
             time_to_goal,
             timing,
             videos: vec![],

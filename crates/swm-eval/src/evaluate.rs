@@ -6,6 +6,7 @@
 //!
 //! An evaluation under a shift is an evaluation whose starts sample or pin factors of variation.
 
+use crate::played::PlayedRecording;
 use crate::starts::Starts;
 use crate::success_criterion::{StepOutcome, SuccessCriterion};
 use crate::video_recording::{VideoRecording, Videos};
@@ -48,6 +49,18 @@ impl World {
         config: &EvalConfig,
         control: &mut Control<'_>,
     ) -> Result<Run> {
+        self.evaluate_recorded(policy, starts, config, None, control)
+    }
+
+    /// As [`World::evaluate`]; also keeps the first steps of every episode, if `played` is given.
+    pub(crate) fn evaluate_recorded(
+        &mut self,
+        policy: &mut dyn Policy,
+        starts: &Starts,
+        config: &EvalConfig,
+        played: Option<&mut PlayedRecording>,
+        control: &mut Control<'_>,
+    ) -> Result<Run> {
         let limit = self.pool().max_episode_steps();
         let budget = config.budget.unwrap_or(limit);
         if budget == 0 || budget > limit {
@@ -71,6 +84,7 @@ impl World {
             satisfied: 0,
             steps: 0,
             videos,
+            played,
         };
         policy.take_latencies();
         let begun = Instant::now();
@@ -123,6 +137,7 @@ struct Evaluation<'a> {
     satisfied: usize,
     steps: usize,
     videos: Option<VideoRecording>,
+    played: Option<&'a mut PlayedRecording>,
 }
 
 impl Evaluation<'_> {
@@ -186,11 +201,17 @@ impl Play for Evaluation<'_> {
         let plays = criterion.plays(solved);
         if !plays {
             self.finish(slot, control);
+        } else if let Some(played) = &mut self.played {
+            played.start(episode, slot, pool);
         }
         Ok(plays)
     }
 
-    fn acted(&mut self, _: usize, _: &EnvPool, _: &Batch) {}
+    fn acted(&mut self, slot: usize, _: &EnvPool, actions: &Batch) {
+        if let Some(played) = &mut self.played {
+            played.act(self.slots[slot].0, slot, actions);
+        }
+    }
 
     fn stepped(&mut self, slot: usize, pool: &EnvPool, control: &mut Control<'_>) -> Result<bool> {
         // Lower slots may have finished the evaluation in this step.
@@ -198,6 +219,9 @@ impl Play for Evaluation<'_> {
             return Ok(false);
         }
         self.record_frame(slot, pool);
+        if let Some(played) = &mut self.played {
+            played.step(self.slots[slot].0, slot, pool);
+        }
         self.steps += 1;
         let row = pool.infos().row(slot);
         let flag = |column| row.at::<u8>(column)[0] != 0;

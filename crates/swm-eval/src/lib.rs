@@ -16,6 +16,7 @@ mod action_noise;
 pub mod baselines;
 pub mod collect;
 pub mod evaluate;
+mod played;
 pub mod policy_mixture;
 pub mod prediction;
 pub mod replay;
@@ -41,6 +42,6 @@ pub use request::{Choice, Condition, EvalRequest, HeldOut, Model, PolicyKind, Po
 pub use runner::{ResolvedPolicy, Resolver, RunOptions};
 pub use seeding::{episode_key, reset_seed};
 pub use starts::Starts;
-pub use study::{Cell, Common, Study, StudyFolder};
+pub use study::{AnyStudy, Cell, Common, Study, StudyFolder, TableCell, TableStudy};
 pub use video_recording::Videos;
 pub use world::{World, WorldConfig};

@@ -179,7 +179,7 @@ fn read(
 }
 
 /// The mean squared error of a predicted latent, both `[latent]`.
-fn squared_error(predicted: &[f32], recorded: &[f32]) -> f64 {
+pub(crate) fn squared_error(predicted: &[f32], recorded: &[f32]) -> f64 {
     let squares = predicted.iter().zip(recorded).map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2));
     squares.sum::<f64>() / recorded.len() as f64
 }

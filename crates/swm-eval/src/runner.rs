@@ -2,6 +2,7 @@
 
 use crate::baselines::{NoOpPolicy, ReplayPolicy};
 use crate::evaluate::EvalConfig;
+use crate::played::PlayedRecording;
 use crate::prediction::{self, Predictor, predict_run};
 use crate::request::{Condition, EvalRequest, HeldOut, PolicyKind, PolicyRequest, StartsRequest};
 use crate::starts::Starts;
@@ -11,7 +12,7 @@ use crate::world::{World, WorldConfig};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
-use swm_core::results::{Comparison, Counting, Proportion, Run, Searches};
+use swm_core::results::{Comparison, Counting, Played, Proportion, Run, Searches};
 use swm_core::run::{Control, Event, Stage};
 use swm_core::{Env, Error, Manifest, PlanTrace, Policy, RandomPolicy, Result, Results, VariationRequest};
 use swm_data::Reader;
@@ -172,15 +173,28 @@ impl EvalRequest {
                     unit: "episodes",
                 }));
                 let config = request.config(policy, condition, options);
-                let mut run = world.evaluate(&mut *resolved.policy, &starts, &config, control)?;
-                if let Some(earlier) = earlier.and_then(|earlier| earlier.runs.get(runs.len())) {
-                    run = joined(earlier, run, request.counting);
+                let predicted = match request.prediction.zip(dataset.as_deref()) {
+                    Some(of) => resolver.predictor(policy)?.map(|predictor| (of, predictor)),
+                    None => None,
+                };
+                let recording = |((horizon, _), predictor): &((usize, _), Box<dyn Predictor>)| {
+                    PlayedRecording::new(&**predictor, *horizon, world.pool().infos().schema())
+                };
+                let mut played = predicted.as_ref().map(recording).transpose()?;
+                let policy = &mut *resolved.policy;
+                let mut run = world.evaluate_recorded(policy, &starts, &config, played.as_mut(), control)?;
+                let before = earlier.and_then(|earlier| earlier.runs.get(runs.len()));
+                let later = run.clone();
+                if let Some(before) = before {
+                    run = joined(before, run, request.counting);
                 }
-                if let Some((horizon, reader)) = request.prediction.zip(dataset.as_deref())
-                    && let Some(mut predictor) = resolver.predictor(policy)?
-                {
+                if let Some((((horizon, reader), mut predictor), played)) = predicted.zip(played) {
                     let threads = world.pool().threads();
                     run.prediction = Some(threads.install(|| predict_run(&mut *predictor, reader, &run, horizon))?);
+                    let new = threads.install(|| played.predict(&mut *predictor, &later))?;
+                    let old = before.and_then(|before| before.played.clone());
+                    let known = old.into_iter().flat_map(|old| old.trajectories);
+                    run.played = Some(Played { trajectories: known.chain(new.trajectories).collect() });
                 }
                 run.searches = resolved.searches.as_mut().and_then(|take| Searches::of(&take()));
                 control.emit(Event::Finished { stage: STAGE, metrics: &metrics(&run) });

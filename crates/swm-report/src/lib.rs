@@ -25,5 +25,5 @@ mod training_log;
 
 pub use page::{ReportOptions, render, write_report, write_report_with};
 pub use read::read_results;
-pub use study::{StudyPage, write_study};
+pub use study::{StudyPage, TablePage, write_study, write_table};
 pub use training_log::{Metrics, Series, Training, read_metrics};

@@ -238,6 +238,9 @@ mod tests {
             solved_at_start: 0,
             floor: Proportion::wilson(0, 10),
             gap: None,
+            trained_on_starts: None,
+            prediction: None,
+            played: None,
         }
     }
 

@@ -1,8 +1,9 @@
 //! [`StudyResults`]: the success rates of all cells of a study, as read by tables and reports.
 
-use super::{BreakingPoint, Counting, Family, OverSeeds, Paired, Proportion, Until};
+use super::{BreakingPoint, Counting, ErrorAndSuccess, Family, OverSeeds, Paired, PlayedErrors, Proportion, Until};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use std::fmt;
 
 /// The outcomes of a study: one row for each policy in each cell that is done.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -32,6 +33,30 @@ pub struct StudyResults {
     /// Where success breaks, for each policy of a study along a ray.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub breaking: Vec<BreakingPoint>,
+    /// The registration of the study before its results; `None` if it was not registered.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub registration: Option<Registration>,
+}
+
+/// What was registered before the first result.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Registration {
+    /// The BLAKE3 hash of the question, all cells with their inputs, and the families.
+    pub hash: String,
+    /// Whether the study is still the registered one.
+    pub is_same: bool,
+}
+
+impl fmt::Display for Registration {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { hash, is_same } = self;
+        f.write_str(if *is_same {
+            "was registered before its first result as "
+        } else {
+            "differs from its registration "
+        })?;
+        f.write_str(hash)
+    }
 }
 
 impl StudyResults {
@@ -82,11 +107,24 @@ pub struct StudyRow {
     /// The shifted minus the unshifted success rate of this policy on the same starts: the first condition of the study
     /// is unshifted. Corrected for the comparisons of its family. `None` for that condition, and where the starts differ.
     pub gap: Option<Paired>,
+    /// Whether the policy was trained on episodes that the starts come from; `None` where this is not known, or the starts were
+    /// not recorded.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trained_on_starts: Option<bool>,
+    /// The model's prediction errors on the recorded trajectories that the starts come from, by success, if requested.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub prediction: Option<ErrorAndSuccess>,
+    /// The same for the trajectories that the policy played, and the optimism of the model.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub played: Option<PlayedErrors>,
 }
 
 /// A success rate that a publication states.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Published {
+    /// The source of starts, as the study names it; `None` for the first one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub starts: Option<String>,
     /// The condition, as the study names it.
     pub condition: String,
     /// The policy, which may be one that the study does not evaluate.

@@ -69,6 +69,9 @@ pub struct Cell {
     /// [`TRAINING_SEED`](swm_core::results::TRAINING_SEED).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub any_seed: Option<String>,
+    /// Whether the policy was trained on episodes that the starts come from; `None` where this is not known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trained_on_starts: Option<bool>,
     /// The evaluation.
     pub request: EvalRequest,
     /// The hashes of the dataset and the weights that the request names. With other data or weights of the same name, it
@@ -188,7 +191,7 @@ impl Study {
     }
 }
 
-fn hash(value: &impl Serialize) -> Result<String> {
+pub(super) fn hash(value: &impl Serialize) -> Result<String> {
     let bytes = serde_json::to_vec(value).map_err(|error| Error::external("writing a study's requests", error))?;
     Ok(manifest::hash(&bytes))
 }

@@ -1,20 +1,23 @@
 //! [`StudyFolder`]: the files of a study.
 
 use super::cell::{Cell, Study};
+use super::table::{AnyStudy, TableStudy};
 use crate::request::EvalRequest;
+use serde::Deserialize;
 use std::path::{Path, PathBuf};
 use swm_core::files::{self, Lock};
+use swm_core::results::Until;
 use swm_core::{Error, Result, Results};
 
 /// The folder of a study: `study.json`, and the results of each cell in `cells/ID.json`.
 pub struct StudyFolder {
-    root: PathBuf,
+    pub(super) root: PathBuf,
 }
 
 /// The name of the file with all cells.
 const STUDY: &str = "study.json";
 /// The largest file of a study, in bytes.
-const MAX_BYTES: u64 = 256 << 20;
+pub(super) const MAX_BYTES: u64 = 256 << 20;
 
 impl StudyFolder {
     /// The folder at a path.
@@ -28,19 +31,24 @@ impl StudyFolder {
     /// # Errors
     /// When another process writes to the folder, it holds other files or another study, or writing fails.
     pub fn create(&self, study: &Study) -> Result<Lock> {
+        self.create_with(&study.title, study.until, &json(study)?)
+    }
+
+    /// Creates the folder and writes the study with this title, and the rule that ends it.
+    pub(super) fn create_with(&self, title: &str, until: Option<Until>, bytes: &[u8]) -> Result<Lock> {
         let (lock, path) = (Lock::folder(&self.root)?, self.root.join(STUDY));
-        files::check_own(&path, |_| self.study().is_ok())?;
+        files::check_own(&path, |_| self.open().is_ok())?;
         delete_temporary(&self.root, |name| name == STUDY)?;
         let other = |problem: String| {
             Error::config(self.root.display().to_string(), problem, "give another folder with --output")
         };
         if path.exists() {
-            let Study { title: found, until, .. } = self.study()?;
-            if found != study.title {
-                return Err(other(format!("holds the study '{found}', not '{}'", study.title)));
+            let found = self.open()?;
+            if found.title() != title {
+                return Err(other(format!("holds the study '{}', not '{title}'", found.title())));
             }
-            if let (Some(until), None) = (until, study.until) {
-                let problem = format!("holds a study that ran with --until {until}");
+            if let (Some(found), None) = (found.until(), until) {
+                let problem = format!("holds a study that ran with --until {found}");
                 let fix = "intervals for a fixed number of episodes do not hold for it: give --until again, or another folder \
                            with --output";
                 return Err(Error::config(self.root.display().to_string(), problem, fix));
@@ -53,24 +61,53 @@ impl StudyFolder {
                 return Err(other("has files and no study.json".to_owned()));
             }
         }
-        files::write(&path, &json(study)?)?;
+        files::write(&path, bytes)?;
         let cells = self.root.join("cells");
         std::fs::create_dir_all(&cells).map_err(|error| Error::io(&cells, "creating the folder", error))?;
         delete_temporary(&cells, |name| name.ends_with(".json"))?;
         Ok(lock)
     }
 
-    /// Reads the study.
+    /// Reads the study, which may be of any kind.
     ///
     /// # Errors
     /// When the folder has no study, or it is damaged.
-    pub fn study(&self) -> Result<Study> {
+    pub fn open(&self) -> Result<AnyStudy> {
+        #[derive(Deserialize)]
+        struct Head {
+            kind: Option<String>,
+        }
         let path = self.root.join(STUDY);
         let fix = "give the folder of a study";
-        let study: Study = serde_json::from_slice(&files::read(&path, MAX_BYTES)?)
-            .map_err(|error| Error::corrupt(&path, format!("is not a study ({error})"), fix))?;
-        study.check().map_err(|error| Error::corrupt(&path, format!("is not a valid study ({error})"), fix))?;
-        Ok(study)
+        let (bytes, no_study) =
+            (files::read(&path, MAX_BYTES)?, |error| Error::corrupt(&path, format!("is not a study ({error})"), fix));
+        let invalid = |error| Error::corrupt(&path, format!("is not a valid study ({error})"), fix);
+        if serde_json::from_slice::<Head>(&bytes).map_err(no_study)?.kind.is_some() {
+            let study: TableStudy = serde_json::from_slice(&bytes).map_err(no_study)?;
+            study.check().map_err(invalid)?;
+            return Ok(AnyStudy::Table(study));
+        }
+        let study: Study = serde_json::from_slice(&bytes).map_err(no_study)?;
+        study.check().map_err(invalid)?;
+        Ok(AnyStudy::Evaluations(study))
+    }
+
+    /// Reads a study of evaluations.
+    ///
+    /// # Errors
+    /// As [`StudyFolder::open`], and when it is a study of another kind.
+    pub fn study(&self) -> Result<Study> {
+        match self.open()? {
+            AnyStudy::Evaluations(study) => Ok(study),
+            AnyStudy::Table(TableStudy { kind, .. }) => {
+                let problem = format!("has a study of the kind '{kind}', which evaluates nothing");
+                Err(Error::config(
+                    self.root.display().to_string(),
+                    problem,
+                    "give the folder of a study of evaluations",
+                ))
+            }
+        }
     }
 
     /// Returns the results of a cell, or `None` if it has none. Those of a sequential cell may have any number of episodes.
@@ -105,7 +142,12 @@ impl StudyFolder {
     }
 
     fn path(&self, cell: &Cell) -> Result<PathBuf> {
-        Ok(self.root.join("cells").join(format!("{}.json", cell.id()?)))
+        Ok(self.cell_path(&cell.id()?))
+    }
+
+    /// The file of a cell.
+    pub(super) fn cell_path(&self, id: &str) -> PathBuf {
+        self.root.join("cells").join(format!("{id}.json"))
     }
 }
 
@@ -135,7 +177,7 @@ fn answers(results: &Results, cell: &Cell) -> Result<bool> {
     Ok(found == EvalRequest { budget, episodes, ..requested } && same_inputs && has_all)
 }
 
-fn json(value: &impl serde::Serialize) -> Result<Vec<u8>> {
+pub(super) fn json(value: &impl serde::Serialize) -> Result<Vec<u8>> {
     let mut bytes =
         serde_json::to_vec_pretty(value).map_err(|error| Error::external("writing the files of a study", error))?;
     bytes.push(b'\n');

@@ -7,14 +7,19 @@
 //! With a rule that ends it ([`Study::until`]), a study plays its starts in stages, and the results of a stage decide which
 //! cells play more.
 //!
-//! The files of a study hold no times, so a study that was interrupted and continued writes the same bytes as one that was
+//! A [`TableStudy`] has cells that are no evaluations, such as the factors of every environment, in the same folder.
+//!
+//! The files of a study of evaluations hold no times, so a study that was interrupted and continued writes the same bytes as one that was
 //! not.
 
 mod cell;
 mod folder;
+mod registration;
 mod rows;
 mod run;
 mod stages;
+mod table;
 
 pub use cell::{Cell, Common, Study};
 pub use folder::StudyFolder;
+pub use table::{AnyStudy, TableCell, TableStudy};

@@ -4,7 +4,8 @@ use super::cell::{Cell, Study};
 use super::folder::StudyFolder;
 use std::collections::{BTreeMap, BTreeSet};
 use swm_core::results::{
-    BreakingPoint, Counting, Family, OverSeeds, Paired, Proportion, Ray, Run, StudyResults, StudyRow, Until,
+    BreakingPoint, Counting, ErrorAndSuccess, Family, OverSeeds, Paired, PlayedErrors, Proportion, Ray, Run,
+    StudyResults, StudyRow, Until,
 };
 use swm_core::{Result, Results};
 
@@ -20,10 +21,10 @@ impl Study {
                 done.push((cell, results));
             }
         }
-        self.tabulate(&done)
+        Ok(StudyResults { registration: folder.registration(self)?, ..self.tabulate(&done)? })
     }
 
-    /// Returns the outcomes of some cells.
+    /// Returns the outcomes of some cells, without the registration.
     pub(super) fn tabulate(&self, done: &[(&Cell, Results)]) -> Result<StudyResults> {
         let (unshifted, variables) = (self.unshifted(), self.common_variables());
         let of_unshifted = done.iter().filter(|(cell, _)| cell.condition() == unshifted);
@@ -52,6 +53,10 @@ impl Study {
                 solved_at_start: run.solved_at_start,
                 floor: rate(&floor),
                 gap: reference.and_then(|reference| self.comparing()(run, reference, results.counting)),
+                trained_on_starts: cell.trained_on_starts,
+                // Their intervals hold for a number of episodes that is fixed in advance.
+                prediction: run.prediction.as_ref().filter(|_| self.until.is_none()).map(ErrorAndSuccess::of),
+                played: self.until.is_none().then(|| played(run)).flatten(),
             });
         }
         let families = self.correct(&mut rows)?;
@@ -69,6 +74,7 @@ impl Study {
             over_seeds,
             until: self.until,
             breaking: self.breaking(done),
+            registration: None,
         })
     }
 
@@ -189,4 +195,9 @@ fn key(cell: &Cell, variables: &BTreeSet<&str>) -> String {
     let common: Vec<_> = cell.variables.iter().filter(|(name, _)| variables.contains(name.as_str())).collect();
     let names = (&cell.starts, cell.policy(), common);
     format!("{:?}", (names, request.seed, request.episodes, request.budget, request.counting))
+}
+
+/// The errors along the trajectories that the policy played, in the unit of those along the recorded ones.
+fn played(run: &Run) -> Option<PlayedErrors> {
+    Some(PlayedErrors::of(run.played.as_ref()?, run.prediction.as_ref()?.variance))
 }

@@ -238,6 +238,30 @@ fn results_can_be_reproduced() {
     }
 }
 
+/// Checks the played trajectories of a run with the model [`Drifting`]: its error after k model steps is 0.1 k, in one of two
+/// latent dimensions, so its optimism is that of a point that far beyond the one that was reached.
+fn check_played(run: &Run) {
+    let played = run.played.as_ref().expect("played trajectories");
+    let counted: Vec<_> = run.episodes.iter().filter(|episode| episode.steps >= 2).collect();
+    assert!(
+        !counted.is_empty() && played.trajectories.len() == counted.len(),
+        "a trajectory for each episode with a model step"
+    );
+    for (trajectory, episode) in played.trajectories.iter().zip(counted) {
+        assert_eq!((Some(trajectory.start), trajectory.success), (episode.start, episode.success));
+        assert_eq!(trajectory.errors.len(), episode.steps / 2);
+        let off = |k: usize| 0.1 * k as f64;
+        for (k, error) in trajectory.errors.iter().enumerate() {
+            let known = off(k + 1).powi(2) / 2.0;
+            assert!((error - known).abs() < 1e-4 * known, "step {k}: {error}, expected {known}");
+        }
+        // Between the optimism of points on the one and on the other side of the goal, 10 away from it.
+        let (k, optimism) = (trajectory.errors.len(), trajectory.optimism.expect("the line has a goal"));
+        let most = (off(k).powi(2) + 20.0 * off(k)) / 2.0;
+        assert!(optimism != 0.0 && optimism.abs() <= most, "{optimism} of at most {most}");
+    }
+}
+
 #[test]
 fn prediction_errors_are_grouped_by_the_outcome_of_the_episode() {
     let request_with_prediction =
@@ -252,7 +276,16 @@ fn prediction_errors_are_grouped_by_the_outcome_of_the_episode() {
         }
         let grouped: usize = prediction.groups[1..].iter().map(|group| group.trajectory.n).sum();
         assert_eq!((prediction.groups[0].trajectory.n, grouped), (24, run.success.n));
+        check_played(run);
     }
+    let other = run(&request_with_prediction, 3, 2);
+    assert!(
+        found
+            .runs
+            .iter()
+            .zip(&other.runs)
+            .all(|(a, b)| a.played == b.played && (a.policy != "random" || a.played.is_none()))
+    );
     assert_eq!(repeat(&round_trip(&found), &TestResolver::new()).expect("the reproduction succeeds").differences, []);
     let error = EvalRequest { prediction: Some(2), ..request() }.run(
         &TestResolver::new(),

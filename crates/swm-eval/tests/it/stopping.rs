@@ -19,6 +19,7 @@ fn study(episodes: usize, until: Option<Until>) -> Study {
             starts: String::new(),
             variables: BTreeMap::new(),
             any_seed: None,
+            trained_on_starts: None,
             request: EvalRequest { conditions, episodes, budget: Some(3), ..request() },
             inputs: BTreeMap::new(),
             sequential: false,

@@ -125,6 +125,11 @@ impl<B: Surface> Canvas<B> {
         self.area.draw(&Circle::new(at, units(radius - 0.8), inner.rgb().filled()))
     }
 
+    /// Draws a ring around what is drawn already.
+    pub(crate) fn ring(&self, [x, y]: [f64; 2], radius: f64, ink: Ink) -> Drawn<B> {
+        self.area.draw(&Circle::new((units(x), units(y)), units(radius), stroke(ink, 1.6)))
+    }
+
     /// Draws a text whose line is centred at `y`.
     pub(crate) fn text(&self, [x, y]: [f64; 2], anchor: Anchor, size: f64, ink: Ink, words: &str) -> Drawn<B> {
         let h_pos = match anchor {

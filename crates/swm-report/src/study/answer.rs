@@ -3,7 +3,7 @@
 use super::told_apart;
 use crate::limits;
 use crate::text::shorten;
-use swm_core::results::{Counting, Paired, StudyResults, StudyRow};
+use swm_core::results::{Counting, Paired, Predicts, StudyResults, StudyRow};
 
 /// The largest number of policies that the sentence counts gaps for.
 const POLICIES: usize = 4;
@@ -21,6 +21,9 @@ pub(super) fn sentence(results: &StudyResults) -> String {
     let rows = results.rows.iter().filter(|row| row.counting == counting && (only_floor || row.policy != "random"));
     let gaps: Vec<(&StudyRow, &Paired)> =
         rows.filter_map(|row| Some((row, row.gap.as_ref()?))).filter(|(_, gap)| gap.difference.is_finite()).collect();
+    let of_counting = results.rows.iter().filter(|row| row.counting == counting);
+    let predictions: Vec<Predicts> =
+        of_counting.filter_map(|row| Some(row.prediction.as_ref()?.discrimination?.verdict)).collect();
     let mut words = if results.done < results.cells {
         format!("With {} of {} cells done, ", results.done, results.cells)
     } else {
@@ -28,6 +31,16 @@ pub(super) fn sentence(results: &StudyResults) -> String {
     };
     let largest = gaps.iter().min_by(|(_, a), (_, b)| a.difference.total_cmp(&b.difference));
     words += &match largest {
+        None if !predictions.is_empty() => {
+            let count = |of: Predicts| predictions.iter().filter(|verdict| **verdict == of).count();
+            format!(
+                "the prediction error predicts success in {} of {} comparisons, does not predict it in {}, and leaves {} undecided",
+                count(Predicts::Yes),
+                predictions.len(),
+                count(Predicts::No),
+                count(Predicts::Undecided)
+            )
+        }
         None => "no condition is compared with another yet".to_owned(),
         Some((_, gap)) if gap.difference >= 0.0 => "success falls under none of the conditions".to_owned(),
         Some((row, gap)) => {

@@ -1,16 +1,22 @@
 //! The page of a study: an answer, figures, a table, and published values beside ours.
 //!
-//! - `sheet` arranges the rows; `answer` says what they show in one sentence; `table`, `over_seeds`, `published` and
-//!   `breaking` write tables; `figures` chooses and draws the figures; `decay` fits a curve; this module writes the files.
+//! - `table_page` is the page of a study whose cells are no evaluations.
+//! - `sheet` arranges the rows; `answer` says what they show in one sentence; `table`, `over_seeds`, `published`,
+//!   `prediction` and `breaking` write tables; `figures` chooses and draws the figures; `decay` fits a curve; this module
+//!   writes the files.
 
 mod answer;
 mod breaking;
 mod decay;
 mod figures;
 mod over_seeds;
+mod prediction;
 mod published;
 mod sheet;
 mod table;
+mod table_page;
+
+pub use table_page::{TablePage, write_table};
 
 use crate::limits;
 use crate::page::{Head, document};
@@ -46,14 +52,25 @@ pub struct StudyPage {
 /// When a file cannot be written.
 pub fn write_study(page: &StudyPage, out_dir: &Path) -> Result<PathBuf> {
     let sheets = Sheet::all(&page.results);
-    let figures = draw(&sheets)?;
+    let mut figures = draw(&sheets)?;
+    for drawn in figures::density::draw(&page.results)? {
+        let number = 1 + figures.iter().filter(|other| other.drawn.name == drawn.name).count();
+        let file = format!("{}-{number}", drawn.name);
+        figures.push(Placed { drawn, file, label: String::new(), folded: false });
+    }
+    figures.truncate(limits::FIGURES);
+    write_files(out_dir, &render(page, &sheets, &figures)?, &figures)
+}
+
+/// Writes a page and the files of its figures. Returns the path of the page.
+fn write_files(out_dir: &Path, html: &str, figures: &[Placed]) -> Result<PathBuf> {
     let folder = out_dir.join("figures");
     files::check_no_link(&folder)?;
     std::fs::create_dir_all(&folder).map_err(|source| Error::io(&folder, "creating the folder of figures", source))?;
     // The page is written first: it tells that the folder is this program's own.
     let path = out_dir.join("index.html");
-    files::write(&path, render(page, &sheets, &figures)?.as_bytes())?;
-    for figure in &figures {
+    files::write(&path, html.as_bytes())?;
+    for figure in figures {
         files::write(&folder.join(format!("{}.svg", figure.file)), figure.drawn.drawing.svg.as_bytes())?;
         files::write(&folder.join(format!("{}.png", figure.file)), &figure.drawn.drawing.png)?;
     }
@@ -110,6 +127,11 @@ fn render(page: &StudyPage, sheets: &[Sheet<'_>], figures: &[Placed]) -> Result<
             results.cells,
             escape(&shorten(&results.hash, limits::STUDY_NAME_CHARS))
         );
+        if let Some(registration) = &results.registration {
+            let words = escape(&shorten(&registration.to_string(), limits::STUDY_NAME_CHARS));
+            let (open, close) = if registration.is_same { ("", "") } else { ("<b>", "</b>") };
+            let _ = writeln!(html, "<p>{open}This study {words}.{close}</p>");
+        }
         for note in results.notes_on_rule() {
             let _ = writeln!(html, "<p class=\"note\">{}</p>", escape(&note));
         }
@@ -121,7 +143,8 @@ fn render(page: &StudyPage, sheets: &[Sheet<'_>], figures: &[Placed]) -> Result<
         html.push_str("</section>\n");
         breaking::write(html, &results.breaking);
         write_figures(html, figures);
-        table::write(html, sheets, &results.families);
+        table::write(html, sheets, results);
+        prediction::write(html, results);
         over_seeds::write(html, &results.over_seeds);
         published::write(html, sheets, published);
         Ok(())
@@ -187,6 +210,9 @@ mod tests {
             solved_at_start: 0,
             floor: Proportion::wilson(1, 10),
             gap: (condition != "plain").then(|| Paired::of(successes.min(9), 0, 9 - successes.min(9), 1)),
+            trained_on_starts: None,
+            prediction: None,
+            played: None,
         }
     }
 

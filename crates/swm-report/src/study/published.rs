@@ -12,14 +12,17 @@ pub(super) fn write(html: &mut String, sheets: &[Sheet<'_>], published: &[Publis
     if published.is_empty() {
         return;
     }
-    // Ours are those of the first sheet: a publication has no other starts or seeds.
-    let sheet = sheets.first();
-    let condition = |value: &Published| sheet?.conditions.iter().position(|name| *name == value.condition);
-    let policy = |value: &Published| sheet?.policies.iter().position(|policy| policy.name == value.policy);
+    // Ours are those of the first sheet, or of the first one with the stated starts.
+    let sheet = |value: &Published| match &value.starts {
+        None => sheets.first(),
+        Some(starts) => sheets.iter().find(|sheet| sheet.starts() == Some(starts)),
+    };
+    let condition = |value: &Published| sheet(value)?.conditions.iter().position(|name| *name == value.condition);
+    let policy = |value: &Published| sheet(value)?.policies.iter().position(|policy| policy.name == value.policy);
     let last = |index: Option<usize>| index.unwrap_or(usize::MAX);
     let mut values: Vec<&Published> = published.iter().take(limits::PUBLISHED).collect();
-    values.sort_by_key(|value| (last(condition(value)), last(policy(value))));
-    let countings = sheet.map_or(&[][..], |sheet| &sheet.countings);
+    values.sort_by_key(|value| (&value.starts, last(condition(value)), last(policy(value))));
+    let countings = sheets.first().map_or(&[][..], |sheet| &sheet.countings);
     head(html, countings);
     let mut sources: Vec<&str> = vec![];
     for value in values {
@@ -32,7 +35,12 @@ pub(super) fn write(html: &mut String, sheets: &[Sheet<'_>], published: &[Publis
             html,
             "<tr><th scope=\"row\">{}</th><td data-label=\"Policy\">{}</td><td class=\"n\" data-label=\"Published\">{rate} \
              [{}]</td>",
-            shown(&value.condition),
+            shown(
+                &value
+                    .starts
+                    .as_ref()
+                    .map_or(value.condition.clone(), |starts| format!("{starts}: {}", value.condition))
+            ),
             shown(&value.policy),
             source + 1
         );
@@ -40,7 +48,7 @@ pub(super) fn write(html: &mut String, sheets: &[Sheet<'_>], published: &[Publis
             let name = if countings.len() > 1 { format!(", {}", kind.name()) } else { String::new() };
             let cell = |label: &str, words: &str| format!("<td class=\"n\" data-label=\"{label}{name}\">{words}</td>");
             let row = condition(value).zip(policy(value));
-            let row = row.and_then(|(condition, policy)| sheet?.row(condition, policy, counting));
+            let row = row.and_then(|(condition, policy)| sheet(value)?.row(condition, policy, counting));
             match row {
                 None => {
                     html.push_str(&(cell("Ours", "<span class=\"quiet\">not run</span>") + &cell("Difference", "–")))

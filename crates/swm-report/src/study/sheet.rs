@@ -74,6 +74,11 @@ impl<'a> Sheet<'a> {
         self.rows.get(&[condition, policy, counting]).copied()
     }
 
+    /// The name of the source of starts.
+    pub(super) fn starts(&self) -> Option<&'a String> {
+        self.rows.values().next().map(|row| &row.starts)
+    }
+
     /// The values of the variables of a condition.
     pub(super) fn variables(&self, condition: usize) -> Option<&'a BTreeMap<String, String>> {
         let mut rows = self.rows.range([condition, 0, 0]..[condition + 1, 0, 0]);

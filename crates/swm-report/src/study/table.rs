@@ -4,14 +4,14 @@ use super::sheet::Sheet;
 use crate::limits;
 use crate::text::{escape, percent, points, shorten, whole_points};
 use std::fmt::Write as _;
-use swm_core::results::{Family, Paired, Proportion, StudyRow, Verdict};
+use swm_core::results::{Paired, Proportion, StudyResults, StudyRow, Verdict};
 
-const NONE: &str = "<span class=\"quiet\">–</span>";
+pub(super) const NONE: &str = "<span class=\"quiet\">–</span>";
 /// A table of more rows is folded.
 const OPEN_ROWS: usize = 60;
 
 /// Writes the tables of all sheets, up to [`limits::STUDY_TABLE_BYTES`].
-pub(super) fn write(html: &mut String, sheets: &[Sheet<'_>], families: &[Family]) {
+pub(super) fn write(html: &mut String, sheets: &[Sheet<'_>], results: &StudyResults) {
     if sheets.is_empty() {
         return;
     }
@@ -41,11 +41,28 @@ pub(super) fn write(html: &mut String, sheets: &[Sheet<'_>], families: &[Family]
     if left_out > 0 {
         let _ = writeln!(html, "<p class=\"note\">{left_out} more rows are in <code>table.csv</code>.</p>");
     }
-    for family in families.iter().take(limits::FAMILIES) {
+    write_leaks(html, &results.rows);
+    for family in results.families.iter().take(limits::FAMILIES) {
         let name = escape(&shorten(&family.name, limits::STUDY_NAME_CHARS));
         let _ = writeln!(html, "<p class=\"note\">{name}: {}.</p>", escape(&family.to_string()));
     }
     html.push_str("</section>\n");
+}
+
+/// Writes from which starts policies were evaluated that they were trained on, which says nothing about new starts.
+fn write_leaks(html: &mut String, rows: &[StudyRow]) {
+    let mut leaks: Vec<(&str, &str)> = vec![];
+    for row in rows.iter().filter(|row| row.trained_on_starts == Some(true)) {
+        let leak = (row.policy.as_str(), row.starts.as_str());
+        if !leaks.contains(&leak) && leaks.len() < limits::FAMILIES {
+            leaks.push(leak);
+        }
+    }
+    for (policy, starts) in leaks {
+        let [policy, starts] = [policy, starts].map(|name| escape(&shorten(name, limits::STUDY_NAME_CHARS)));
+        let from = if starts.is_empty() { String::new() } else { format!(" from “{starts}”") };
+        let _ = writeln!(html, "<p class=\"note\">{policy} was trained on the episodes of its starts{from}.</p>");
+    }
 }
 
 /// The conditions and policies that have a row.

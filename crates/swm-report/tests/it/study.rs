@@ -26,6 +26,9 @@ fn row(condition: &str, policy: &str, variables: &[(&str, &str)], successes: usi
         solved_at_start: 0,
         floor: Proportion::wilson(2, 50),
         gap: (condition != "in distribution").then(|| Paired::of(both, successes - both, 40 - both, 10)),
+        trained_on_starts: None,
+        prediction: None,
+        played: None,
     }
 }
 
@@ -59,6 +62,7 @@ fn factors() -> StudyPage {
         }
     }
     let published = |policy: &str, rate| Published {
+        starts: None,
         condition: "agent.color".to_owned(),
         policy: policy.to_owned(),
         rate,
@@ -351,6 +355,7 @@ fn hostile_names_and_values_are_escaped_and_bounded() {
     }
     let mut study = of(rows);
     let of_names = |i: usize| Published {
+        starts: None,
         condition: names[i % 8].to_owned(),
         policy: names[(i + 3) % 8].to_owned(),
         rate: bad[i % bad.len()],

@@ -86,6 +86,13 @@ pub struct CollectArgs {
     variation: VariationArgs,
 }
 
+impl CollectArgs {
+    /// The number of episodes of the complete dataset.
+    pub fn episodes(&self) -> usize {
+        self.episodes
+    }
+}
+
 /// Parses `I/N`.
 fn shard(text: &str) -> std::result::Result<Shard, String> {
     let parts = text.split_once('/').and_then(|(index, count)| Some((index.parse().ok()?, count.parse().ok()?)));

@@ -82,6 +82,20 @@ impl VariationArgs {
         Ok(VariationRequest { variation, variation_values })
     }
 
+    /// Returns these factors and one more: `KEY=VALUE` to set it, `KEY` to sample it. `by_default` are the factors that are
+    /// sampled where none are given.
+    pub fn with(&self, shift: &str, by_default: &[String]) -> Self {
+        let mut all = self.clone();
+        if shift.contains('=') {
+            all.pin.push(shift.to_owned());
+        } else {
+            let keys = all.variation.get_or_insert_with(|| by_default.to_vec());
+            keys.retain(|key| key != "none");
+            keys.push(shift.to_owned());
+        }
+        all
+    }
+
     /// Returns a short description of the shift.
     pub fn describe(&self) -> String {
         let varied = self.variation.iter().flatten().map(|key| format!("{key} sampled"));
@@ -144,6 +158,15 @@ mod tests {
         assert!(twice.contains("--pin agent.x: is given twice: 'agent.x=1' and 'agent.x=2'"), "{twice}");
         let wrong = VariationArgs { variation: None, pin: vec!["background.color".to_owned()] };
         assert!(wrong.request().expect_err("a pin without a value").to_string().contains("background.color=200"));
+        let keys = ["agent.position".to_owned()];
+        let all = VariationArgs::default().with("block", &keys).variation;
+        assert_eq!(all, Some(vec!["agent.position".to_owned(), "block".to_owned()]));
+        let none = VariationArgs { variation: Some(vec!["none".to_owned()]), pin: vec![] };
+        assert_eq!(none.with("agent", &keys).variation, Some(vec!["agent".to_owned()]));
+        assert_eq!(
+            args.with("agent.scale=3", &keys).with("block", &keys).describe(),
+            "agent sampled, block sampled, background.color=1, 2,3, agent.scale=3"
+        );
         assert_eq!(image_size("64x96"), Ok((64, 96)));
         assert!(image_size("3").is_err());
         assert_eq!((count::<1, 9>("9"), seconds("0.5")), (Ok(9), Ok(0.5)));

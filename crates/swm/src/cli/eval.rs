@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use swm_core::limits::EVALUATED_EPISODES;
 use swm_core::results::Counting;
-use swm_core::{Error, Origin, Result, Results, files};
+use swm_core::{EnvChoice, Error, Origin, Result, Results, files};
 use swm_data::{Part, Split};
 use swm_eval::{Condition, EvalRequest, HeldOut, RunOptions, StartsRequest};
 
@@ -97,6 +97,16 @@ pub struct EvalArgs {
     wrappers: WrapperArgs,
     #[command(flatten)]
     variation: VariationArgs,
+    /// Also evaluate under a shift, as a condition of its own: KEY=VALUE sets a factor, KEY samples it
+    ///
+    /// Give it repeatedly for several conditions. --pin and --variation change all conditions.
+    #[arg(long, value_name = "KEY[=VALUE]")]
+    shift: Vec<String>,
+    /// Also evaluate with each factor sampled alone, as conditions of their own
+    ///
+    /// Factors that the environment samples anyway are left out.
+    #[arg(long)]
+    each_factor: bool,
     #[command(flatten)]
     planner: PlannerArgs,
 }
@@ -203,7 +213,7 @@ impl EvalArgs {
                 Protocol::Strict => Counting::Strict { hold: self.hold },
                 Protocol::Compat => Counting::Compat { envs: self.envs },
             },
-            conditions: vec![Condition { name: self.condition_name(), variation: self.variation.request()? }],
+            conditions: self.conditions(&env)?,
             prediction: self.predict,
         })
     }
@@ -218,9 +228,32 @@ impl EvalArgs {
         }
     }
 
-    /// Returns the name of the condition: its shifted factors and its wrappers.
-    fn condition_name(&self) -> String {
-        let variation = Some(self.variation.describe()).filter(|shift| shift != IN_DISTRIBUTION);
+    /// Returns the condition of all factors that the arguments set, and then that condition with each shift.
+    fn conditions(&self, env: &EnvChoice) -> Result<Vec<Condition>> {
+        let condition = |named: &VariationArgs, sampled: &VariationArgs| {
+            Ok(Condition { name: self.condition_name(named), variation: sampled.request()? })
+        };
+        let mut conditions = vec![condition(&self.variation, &self.variation)?];
+        if self.shift.is_empty() && !self.each_factor {
+            return Ok(conditions);
+        }
+        let made = env.env()?;
+        let space = &made.spec().variation_space;
+        // What the environment samples anyway stays sampled, so that all conditions have the same starts; recorded starts
+        // have recorded factors.
+        let by_default = if self.dataset.is_none() { space.defaults() } else { &[] };
+        let each = space.factors().iter().map(|factor| &factor.key).filter(|key| !by_default.contains(key));
+        let each: Vec<&String> = if self.each_factor { each.collect() } else { vec![] };
+        for shift in self.shift.iter().chain(each) {
+            let named = self.variation.with(shift, &[]);
+            conditions.push(condition(&named, &self.variation.with(shift, by_default))?);
+        }
+        Ok(conditions)
+    }
+
+    /// Returns the name of a condition: its shifted factors and its wrappers.
+    fn condition_name(&self, variation: &VariationArgs) -> String {
+        let variation = Some(variation.describe()).filter(|shift| shift != IN_DISTRIBUTION);
         let shifts: Vec<String> = variation.into_iter().chain(self.wrappers.wrappers.iter().cloned()).collect();
         if shifts.is_empty() { IN_DISTRIBUTION.to_owned() } else { shifts.join(", ") }
     }

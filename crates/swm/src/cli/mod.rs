@@ -27,7 +27,7 @@ mod reproduce;
 mod results_tables;
 mod signals;
 mod solvers;
-mod study;
+pub mod study;
 mod train;
 mod training_curves;
 mod wrappers;

@@ -17,6 +17,7 @@ mod pipeline;
 mod python;
 mod recipes;
 mod study;
+mod study_shipped;
 mod trust;
 mod zoo;
 

@@ -198,3 +198,31 @@ fn prints_configs_and_rejects_unknown_settings() {
     swm.fails(&["train", "lewm"], 2, &["--data"]);
     swm.fails(&["train", "lewm", "--data", "x", "optim.rl=1"], 2, &["did you mean optim.lr"]);
 }
+
+#[test]
+fn shifts_are_conditions_of_one_evaluation() {
+    let swm = Swm::new();
+    let args = ["eval", "expert", "--env", "swm/TwoRoom-v1", "--episodes", "3", "--budget", "5", "--no-pixels"];
+    let shifts = ["--shift", "agent.color=255,0,0", "--shift", "agent.speed", "--pin", "background.color=9,9,9"];
+    let results = swm.json(&[&args[..], &shifts, &["-o", "out"]].concat());
+    let conditions: Vec<&str> =
+        results["runs"].as_array().into_iter().flatten().filter_map(|run| run["condition"].as_str()).collect();
+    let pinned = "background.color=9,9,9";
+    let of = |shift: &str| if shift.is_empty() { pinned.to_owned() } else { shift.to_owned() };
+    let expected =
+        [of(""), of("background.color=9,9,9, agent.color=255,0,0"), of("agent.speed sampled, background.color=9,9,9")];
+    assert_eq!(conditions, expected.iter().flat_map(|name| [name.as_str(); 2]).collect::<Vec<_>>());
+    let printed = text(&swm.run(&[&args[..], &shifts, &["-o", "out"]].concat()).stdout);
+    assert!(printed.contains("gap to 'background.color=9,9,9'"), "{printed}");
+    let each = swm.json(&[&args[..], &["--each-factor", "-o", "each"]].concat());
+    let factors =
+        swm.json(&["fovs", "swm/TwoRoom-v1"])["variation"].as_object().map(serde_json::Map::len).expect("factors");
+    // Two of them are sampled anyway.
+    assert_eq!(each["runs"].as_array().map(Vec::len), Some(2 * (factors - 1)));
+
+    swm.fails(
+        &[&args[..], &["--shift", "agent.colour=1,2,3", "-o", "none"]].concat(),
+        2,
+        &["agent.colour", "agent.color"],
+    );
+}

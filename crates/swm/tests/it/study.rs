@@ -40,7 +40,7 @@ rates = { "in distribution" = { planner = 0.9 } }
 "#;
 
 /// The files of a folder and their contents.
-fn contents(folder: &Path) -> BTreeMap<String, Vec<u8>> {
+pub(crate) fn contents(folder: &Path) -> BTreeMap<String, Vec<u8>> {
     let mut files = BTreeMap::new();
     for entry in std::fs::read_dir(folder).expect("reading a folder").flatten() {
         let (name, path) = (entry.file_name().to_string_lossy().into_owned(), entry.path());

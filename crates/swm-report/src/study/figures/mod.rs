@@ -1,10 +1,14 @@
 //! The figures of a study, chosen by the variables of its conditions.
 //!
+//! - `density`: prediction errors of solved and of failed trajectories;
+//! - `dots`: the values of a study whose cells are no evaluations;
 //! - `drop`: the gap of each condition, as a dot with its interval;
 //! - `line`: success against a variable with numbers, with a fitted decay;
 //! - `wheel`: success over a hue and another variable;
 //! - `heat`: success of conditions by policies, for more conditions than `drop` shows.
 
+pub(super) mod density;
+pub(super) mod dots;
 mod drop;
 mod heat;
 mod legend;

@@ -1,8 +1,10 @@
 //! `swm recipes`: lists recipes; `swm train --recipe` runs one.
 
+mod datasets;
 mod file;
 mod run;
 
+pub use datasets::Datasets;
 pub use run::{RecipeRun, run};
 
 use super::{emit, emit_json, table};

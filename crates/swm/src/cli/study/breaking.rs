@@ -8,6 +8,7 @@ use crate::cli::Context;
 use crate::cli::config::count;
 use crate::cli::eval::run_options;
 use crate::cli::progress::control;
+use crate::cli::recipes::Datasets;
 use crate::resolver::HomeResolver;
 use clap::Args;
 use std::collections::BTreeMap;
@@ -160,6 +161,7 @@ impl BreakArgs {
                 .map(|change| (Ray::VARIABLE.to_owned(), Values::List(vec![change.to_string()])))
                 .into_iter()
                 .collect(),
+            starts: vec![],
         };
         let ordered = levels.iter().any(|(change, _)| change.is_some());
         let mut conditions = vec![table("in distribution".to_owned(), ordered.then_some(0.0), None)];
@@ -178,6 +180,7 @@ impl BreakArgs {
             conditions,
             policies: vec![table(name, None, Some((POLICY, self.policy.clone())))],
             published: vec![],
+            datasets: Datasets::default(),
         }
     }
 

@@ -5,10 +5,11 @@ use super::variants::Budget;
 use crate::cli::eval::{CapsuleStarts, EvalArgs};
 use crate::resolver::HomeResolver;
 use clap::{Args as _, Command, FromArgMatches as _};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use swm_core::run::Control;
 use swm_core::{Error, Result};
-use swm_eval::{Cell, EvalRequest, Model, PolicyKind, Resolver as _, StartsRequest, Study};
+use swm_data::{Part, Split};
+use swm_eval::{Cell, EvalRequest, HeldOut, Model, PolicyKind, Resolver as _, StartsRequest, Study};
 
 /// A cell before its names are resolved.
 struct Combination {
@@ -55,28 +56,13 @@ pub fn study(
     for combination in combinations(file, settings, resolver)? {
         control.check()?;
         let Combination { starts, condition, policy, all } = combination;
-        let within = |error: Error| {
-            let places: Vec<&str> = [&condition, &policy].iter().map(|variant| variant.at.as_str()).collect();
-            match error {
-                Error::Interrupted => error,
-                error => Error::config(
-                    format!("'{}' of '{}' ({})", condition.name, policy.name, places.join(", ")),
-                    error.to_string(),
-                    "correct the file of the study",
-                ),
-            }
-        };
+        let within = |error| within(&condition, &policy, error);
         let request = request(&all, &condition.name, &policy.name, resolver).map_err(within)?;
         let inputs = inputs.of(&request).map_err(within)?;
         let any_seed = policy.any_seed.clone();
-        cells.push(Cell {
-            starts: starts.name,
-            variables: all.variables,
-            any_seed,
-            request,
-            inputs,
-            sequential: false,
-        });
+        let trained_on_starts = trained_on_starts(&request, &inputs, resolver).map_err(within)?;
+        let (starts, variables) = (starts.name, all.variables);
+        cells.push(Cell { starts, variables, any_seed, trained_on_starts, request, inputs, sequential: false });
     }
     let study = Study {
         title: file.title.clone(),
@@ -90,6 +76,34 @@ pub fn study(
     };
     study.check()?;
     Ok(study)
+}
+
+/// Checks what is known of the cells before their datasets exist: one cell of each policy and source of starts.
+///
+/// # Errors
+/// As [`study`].
+pub fn check(file: &StudyFile, settings: &[String], resolver: &HomeResolver) -> Result<()> {
+    let mut seen = BTreeSet::new();
+    for Combination { starts, condition, policy, all } in combinations(file, settings, resolver)? {
+        if seen.insert([starts.name, policy.name.clone()]) {
+            request(&all, &condition.name, &policy.name, resolver)
+                .map_err(|error| within(&condition, &policy, error))?;
+        }
+    }
+    Ok(())
+}
+
+/// Names the tables of a cell in an error.
+fn within(condition: &Variant, policy: &Variant, error: Error) -> Error {
+    let places: Vec<&str> = [condition, policy].iter().map(|variant| variant.at.as_str()).collect();
+    match error {
+        Error::Interrupted => error,
+        error => Error::config(
+            format!("'{}' of '{}' ({})", condition.name, policy.name, places.join(", ")),
+            error.to_string(),
+            "correct the file of the study",
+        ),
+    }
 }
 
 /// Every combination of defaults, starts, conditions and policies, in this order.
@@ -122,11 +136,19 @@ fn combinations(file: &StudyFile, settings: &[String], resolver: &HomeResolver) 
         let bytes: usize = variants.iter().map(Variant::size).sum();
         budget.take(bytes.saturating_mul(cells / variants.len().max(1)), "the study")?;
     }
+    for policy in &policies {
+        if let Some(name) = policy.starts.iter().find(|name| starts.iter().all(|starts| starts.name != **name)) {
+            let names = starts.iter().map(|starts| starts.name.as_str());
+            let problem = Error::unknown("source of starts", name, names, "name a table [[starts]] of the study");
+            return Err(Error::config(policy.at.clone(), problem.to_string(), "correct the file"));
+        }
+    }
     let mut combinations = Vec::with_capacity(cells);
     for defaults in defaults {
         for starts in &starts {
             for condition in &conditions {
-                for policy in &policies {
+                let evaluated = |policy: &&Variant| policy.starts.is_empty() || policy.starts.contains(&starts.name);
+                for policy in policies.iter().filter(evaluated) {
                     combinations.push(Combination {
                         all: Variant::combine(&[&defaults, starts, condition, policy]),
                         starts: starts.clone(),
@@ -161,6 +183,40 @@ fn request(all: &Variant, condition: &str, policy: &str, resolver: &HomeResolver
     Ok(request)
 }
 
+/// Whether the policy of a request was trained on episodes that the starts come from: the split-leak check. `None` where this
+/// is not known: without recorded starts or a checkpoint, and where the checkpoint was trained on another dataset, of which these
+/// may be a part.
+fn trained_on_starts(
+    request: &EvalRequest,
+    inputs: &BTreeMap<String, String>,
+    resolver: &HomeResolver,
+) -> Result<Option<bool>> {
+    let (Some(given), StartsRequest::Dataset { held_out, .. }) = (checkpoint(request), &request.starts) else {
+        return Ok(None);
+    };
+    let manifest = resolver.checkpoint(given)?.info()?.manifest;
+    let same = manifest.hashes.get("dataset").zip(inputs.get("dataset")).is_some_and(|(a, b)| a == b);
+    let held_out_of_training = [&manifest.config["data"]["hold_out"], &manifest.config["hold_out"]];
+    let Some(holds_out) = held_out_of_training.into_iter().find_map(serde_json::Value::as_bool).filter(|_| same) else {
+        return Ok(None);
+    };
+    // Training leaves out the validation and the test part of the default split.
+    Ok(Some(match held_out {
+        Some(HeldOut { part, split }) => !holds_out || *part == Part::Train || *split != Split::default(),
+        None => true,
+    }))
+}
+
+/// The checkpoint that a request names, if it does.
+fn checkpoint(request: &EvalRequest) -> Option<&String> {
+    request.policies.iter().find_map(|policy| match &policy.kind {
+        PolicyKind::Plan { model: Model::Checkpoint(given), .. } | PolicyKind::Direct { checkpoint: given, .. } => {
+            Some(given)
+        }
+        _ => None,
+    })
+}
+
 /// Hashes of datasets and weights, each computed once.
 struct Inputs<'a> {
     resolver: &'a HomeResolver,
@@ -174,13 +230,9 @@ impl Inputs<'_> {
             let hash = self.hash("dataset", dataset, |resolver| resolver.dataset(dataset)?.content_hash())?;
             inputs.insert("dataset".to_owned(), hash);
         }
-        for policy in &request.policies {
-            if let PolicyKind::Plan { model: Model::Checkpoint(given), .. }
-            | PolicyKind::Direct { checkpoint: given, .. } = &policy.kind
-            {
-                let hash = self.hash("weights", given, |resolver| Ok(resolver.checkpoint(given)?.info()?.weights))?;
-                inputs.insert("weights".to_owned(), hash);
-            }
+        if let Some(given) = checkpoint(request) {
+            let hash = self.hash("weights", given, |resolver| Ok(resolver.checkpoint(given)?.info()?.weights))?;
+            inputs.insert("weights".to_owned(), hash);
         }
         Ok(inputs)
     }

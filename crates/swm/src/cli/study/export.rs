@@ -1,15 +1,20 @@
 //! Tables of a study as CSV, LaTeX and Markdown.
 
+use super::csv;
 use clap::ValueEnum;
 use std::collections::BTreeMap;
 use swm_core::results::{BreakingPoint, OverSeeds, StudyResults, StudyRow, Verdict};
 use swm_core::text::printable;
+use swm_core::{Error, Result};
+use swm_eval::{AnyStudy, StudyFolder};
 
 /// The format of a table.
-#[derive(Clone, Copy, ValueEnum)]
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Format {
     /// Comma-separated values, a row for each cell
     Csv,
+    /// Comma-separated values, a row for each policy over its training seeds
+    CsvSeeds,
     /// A LaTeX table with the booktabs package, conditions by policies
     Latex,
     /// A Markdown table, conditions by policies
@@ -17,75 +22,35 @@ pub enum Format {
 }
 
 impl Format {
+    /// Writes the table of the study in a folder.
+    ///
+    /// # Errors
+    /// When the folder has no study or it is damaged, or it has no training seeds.
+    pub fn of(self, folder: &StudyFolder) -> Result<String> {
+        match folder.open()? {
+            AnyStudy::Evaluations(study) => Ok(self.write(&study.results(folder)?)),
+            AnyStudy::Table(_) if self == Self::CsvSeeds => {
+                let problem = "the cells of this study are no evaluations, so it has no training seeds";
+                Err(Error::config("csv-seeds", problem, "choose csv"))
+            }
+            AnyStudy::Table(study) => Ok(self.write_table(&study.results(folder)?)),
+        }
+    }
+
     /// Writes the results of a study.
     pub fn write(self, results: &StudyResults) -> String {
         match self {
-            Self::Csv => csv(results),
+            Self::Csv => csv::cells(results),
+            Self::CsvSeeds => csv::seeds(results),
             Self::Latex => Pivot::new(results).latex(),
             Self::Markdown => Pivot::new(results).markdown(),
         }
     }
 }
 
-fn csv(results: &StudyResults) -> String {
-    let mut variables: Vec<&str> =
-        results.rows.iter().flat_map(|row| row.variables.keys().map(String::as_str)).collect();
-    variables.sort_unstable();
-    variables.dedup();
-    let quote = |text: &str| {
-        // A spreadsheet would run a name that begins like a formula.
-        let is_formula = text.starts_with(['=', '+', '-', '@']) && text.parse::<f64>().is_err();
-        let text = &format!("{}{}", if is_formula { "'" } else { "" }, printable(text));
-        if text.contains([',', '"', '\n', '\r']) {
-            format!("\"{}\"", text.replace('"', "\"\""))
-        } else {
-            text.to_owned()
-        }
-    };
-    let mut header = vec!["cell", "starts", "condition", "policy", "counting", "seed"];
-    let columns: Vec<String> = variables.iter().map(|name| format!("variable.{name}")).collect();
-    header.extend(columns.iter().map(String::as_str));
-    header.extend([
-        "successes",
-        "n",
-        "rate",
-        "low",
-        "high",
-        "solved_at_start",
-        "floor",
-        "gap",
-        "gap_low",
-        "gap_high",
-        "p",
-        "p_holm",
-        "design_effect",
-        "comparisons",
-        "verdict",
-    ]);
-    if results.until.is_some() {
-        header.extend(["e", "until"]);
-    }
-    let mut text = header.iter().map(|name| quote(name)).collect::<Vec<_>>().join(",") + "\n";
-    for row in &results.rows {
-        let mut cells = vec![row.cell.clone(), row.starts.clone(), row.condition.clone(), row.policy.clone()];
-        cells.extend([row.counting.name().to_owned(), row.seed.to_string()]);
-        cells.extend(variables.iter().map(|name| row.variables.get(*name).cloned().unwrap_or_default()));
-        let success = &row.success;
-        cells.extend([success.successes.to_string(), success.n.to_string()]);
-        cells.extend([success.rate, success.low, success.high].map(|share| share.to_string()));
-        cells.extend([row.solved_at_start.to_string(), row.floor.rate.to_string()]);
-        cells.extend(row.gap.as_ref().map_or(Default::default(), |gap| {
-            let numbers = [gap.difference, gap.low, gap.high, gap.p, gap.p_holm, gap.design_effect];
-            let [difference, low, high, p, p_holm, effect] = numbers.map(|value| value.to_string());
-            [difference, low, high, p, p_holm, effect, gap.comparisons.to_string(), gap.verdict.to_string()]
-        }));
-        if let Some(until) = results.until {
-            let e = row.gap.and_then(|gap| gap.e).map(|e| e.to_string());
-            cells.extend([e.unwrap_or_default(), until.to_string()]);
-        }
-        text += &(cells.iter().map(|cell| quote(cell)).collect::<Vec<_>>().join(",") + "\n");
-    }
-    text
+/// Escapes a cell of a Markdown table.
+pub(super) fn escape_markdown(text: &str) -> String {
+    printable(text).replace('&', "&amp;").replace('<', "&lt;").replace('|', "\\|").replace(['\n', '\r'], " ")
 }
 
 /// Success rates with a row for each condition and a column for each policy.
@@ -193,11 +158,8 @@ impl<'a> Pivot<'a> {
     }
 
     fn markdown(&self) -> String {
-        let escape = |cell: &str| {
-            printable(cell).replace('&', "&amp;").replace('<', "&lt;").replace('|', "\\|").replace(['\n', '\r'], " ")
-        };
         let line = |cells: &[String]| {
-            format!("| {} |\n", cells.iter().map(|cell| escape(cell)).collect::<Vec<_>>().join(" | "))
+            format!("| {} |\n", cells.iter().map(|cell| escape_markdown(cell)).collect::<Vec<_>>().join(" | "))
         };
         let table = |rows: &[Vec<String>]| {
             let [header, rest @ ..] = rows else { return String::new() };
@@ -205,7 +167,7 @@ impl<'a> Pivot<'a> {
             line(header) + &line(&rule) + &rest.iter().map(|row| line(row)).collect::<String>()
         };
         let mut parts = vec![table(&self.rows())];
-        parts.extend(self.notes().iter().map(|note| format!("{}\n", escape(note))));
+        parts.extend(self.notes().iter().map(|note| format!("{}\n", escape_markdown(note))));
         parts.push(table(&self.over_seeds()));
         parts.retain(|part| !part.is_empty());
         parts.join("\n")
@@ -232,7 +194,7 @@ impl<'a> Pivot<'a> {
 }
 
 /// Escapes a text for LaTeX.
-fn latex(text: &str) -> String {
+pub(super) fn latex(text: &str) -> String {
     let escape = |c| match c {
         '&' | '%' | '$' | '#' | '_' | '{' | '}' => format!("\\{c}"),
         '\\' => "\\textbackslash{}".to_owned(),
@@ -307,6 +269,9 @@ mod tests {
             solved_at_start: 0,
             floor: Proportion::wilson(0, 10),
             gap,
+            trained_on_starts: None,
+            prediction: None,
+            played: None,
         };
         let mut gap = Paired::of(4, 0, 5, 1);
         let families = Vec::from_iter(Family::correct("LeWM_1 · seed 0", &mut [&mut gap], 1));
@@ -348,7 +313,7 @@ mod tests {
         let results = results();
         let csv = Format::Csv.write(&results);
         assert_eq!(csv.lines().count(), 4);
-        assert!(csv.lines().nth(2).is_some_and(|line| line.ends_with(",1,lower")), "{csv}");
+        assert!(csv.lines().nth(2).is_some_and(|line| line.ends_with(",1,lower,")), "{csv}");
         assert!(
             csv.lines().nth(2).is_some_and(|line| line.contains("\"red, 50 %\"") && line.contains(",0.4,")),
             "{csv}"
@@ -364,6 +329,8 @@ mod tests {
         assert_eq!(markdown.lines().nth(2), Some("| plain | 90.0 [60, 98] | 70.0 [40, 89] |"));
         assert!(markdown.contains("\n| red, 50 % | 40.0 [17, 69] ↓ | – |\n\n↓ lower, "), "{markdown}");
         assert!(markdown.contains("LeWM_1 · seed 0: 1 comparison of 10 pairs tells a difference of "), "{markdown}");
+        let seeds = Format::CsvSeeds.write(&results);
+        assert!(seeds.ends_with("\ntest,plain,LeWM_*,strict,0,1;2,0.9;0.7,0.8,0,1,,,\n"), "{seeds}");
         assert!(markdown.ends_with("| plain | LeWM_* | 1: 90, 2: 70 | 80.0 | [0, 100] | – |\n"), "{markdown}");
         assert!(latex.contains("LeWM\\_1 $\\cdot$ seed 0") && latex.ends_with("\\end{tabular}\n"), "{latex}");
     }

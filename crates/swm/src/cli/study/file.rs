@@ -1,18 +1,21 @@
 //! The file of a study: tables of options of `swm eval`, each of which may stand for several variants.
 
+use super::any_file::Size;
 use super::published;
 use crate::cli::eval::EvalArgs;
+use crate::cli::recipes::Datasets;
 use clap::{ArgAction, Args as _, Command};
+use serde::Deserialize as _;
 use std::collections::BTreeMap;
 use std::path::Path;
 use swm_core::results::Published;
 use swm_core::{Error, Result};
 use swm_eval::Common;
 use toml::Spanned;
-use toml::de::{DeTable, DeValue};
+use toml::de::{DeString, DeTable, DeValue, ValueDeserializer};
 
 /// A study as its file describes it.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct StudyFile {
     /// The title.
     pub title: String,
@@ -30,10 +33,12 @@ pub struct StudyFile {
     pub policies: Vec<Table>,
     /// Success rates that publications state.
     pub published: Vec<Published>,
+    /// The datasets that the study collects if they do not exist.
+    pub datasets: Datasets,
 }
 
 /// A table of options.
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default)]
 pub struct Table {
     /// The file and the line, for errors.
     pub at: String,
@@ -43,6 +48,8 @@ pub struct Table {
     pub(super) options: BTreeMap<String, Vec<String>>,
     /// The variables and their values, in alphabetical order.
     pub(super) each: Vec<(String, Values)>,
+    /// The names of the sources of starts from which a policy is evaluated; empty for all.
+    pub(super) starts: Vec<String>,
 }
 
 /// The values of a variable.
@@ -67,60 +74,51 @@ pub struct Variant {
     pub options: BTreeMap<String, Vec<String>>,
     /// The values of the variables.
     pub variables: BTreeMap<String, String>,
+    /// The names of the sources of starts from which a policy is evaluated; empty for all.
+    pub starts: Vec<String>,
 }
 
 /// The option of a policy's table that names the policy.
 pub const POLICY: &str = "policy";
 
-/// Options that belong to a run and not to an evaluation.
-const RUN_OPTIONS: &[&str] = &["output", "videos", "trace", "trust", "envs", "help"];
+/// Options that belong to a run and not to an evaluation, or that make several conditions of one.
+const RUN_OPTIONS: &[&str] = &["output", "videos", "trace", "trust", "envs", "help", "shift", "each-factor"];
 
 /// The tables of a file.
-const TABLES: &[&str] = &["title", "question", "families", "defaults", "starts", "condition", "policy", "published"];
+const TABLES: &[&str] =
+    &["title", "question", "families", "collect", "defaults", "starts", "condition", "policy", "published", "small"];
 
 impl StudyFile {
-    /// Parses a file; `path` is named in errors.
+    /// Parses a file at a size; `path` is named in errors.
     ///
     /// # Errors
-    /// When the text is not TOML, has an unknown table or option, or lacks a title, a policy or a condition. The error
-    /// names the line, and the nearest name.
-    pub fn parse(text: &str, path: &Path) -> Result<Self> {
+    /// When the text is not TOML, has an unknown table or option, or lacks a title, a policy, a condition or the size. The
+    /// error names the line, and the nearest name.
+    pub fn parse(text: &str, path: &Path, size: Size) -> Result<Self> {
         let source = Source::new(text, Some(path));
         let table = DeTable::parse(text).map_err(|error| {
             let at = error.span().map_or(0, |span| span.start);
             Error::config(source.at(at), error.message(), "correct the file")
         })?;
-        let (mut file, mut title) = (
-            Self {
-                title: String::new(),
-                question: String::new(),
-                families: Common::by_default(),
-                defaults: Table::default(),
-                starts: vec![],
-                conditions: vec![],
-                policies: vec![],
-                published: vec![],
-            },
-            None,
-        );
+        let (mut file, mut small) = (Self::empty(), None);
         for (key, value) in table.get_ref() {
             match key.get_ref().as_ref() {
-                "title" => title = Some(source.text_of(value)?),
-                "question" => file.question = source.text_of(value)?,
-                "families" => file.families = source.families(value)?,
-                "defaults" => file.defaults = source.table(value, false)?,
-                "starts" => file.starts = source.tables(value)?,
-                "condition" => file.conditions = source.tables(value)?,
-                "policy" => file.policies = source.tables(value)?,
-                "published" => file.published = published::read(&source, value)?,
-                other => {
-                    let what = Error::unknown("table", other, TABLES.iter().copied(), "docs/studies.md lists them");
-                    return Err(Error::config(source.at(key.span().start), what.to_string(), "correct the file"));
-                }
+                "small" => small = Some(value),
+                _ => file.set(&source, key, value)?,
             }
         }
         let missing = |what: &str, fix: &str| Error::config(path.display().to_string(), format!("has no {what}"), fix);
-        file.title = title.ok_or_else(|| missing("title", "begin the file with title = \"…\""))?;
+        match small.map(|small| file.small(&source, small)).transpose()? {
+            Some(small) if size == Size::Small => file = small,
+            None if size == Size::Small => {
+                return Err(missing("small size", "add [small.defaults], or run it as it is"));
+            }
+            _ => {}
+        }
+        if file.title.is_empty() {
+            return Err(missing("title", "begin the file with title = \"…\""));
+        }
+        file.title = size.title(&file.title);
         if file.starts.is_empty() {
             file.starts.push(Table::default());
         }
@@ -129,6 +127,60 @@ impl StudyFile {
         }
         if file.policies.is_empty() {
             return Err(missing("policy", "add [[policy]] with a name and policy = \"…\""));
+        }
+        Ok(file)
+    }
+
+    fn empty() -> Self {
+        Self {
+            title: String::new(),
+            question: String::new(),
+            families: Common::by_default(),
+            defaults: Table::default(),
+            starts: vec![],
+            conditions: vec![],
+            policies: vec![],
+            published: vec![],
+            datasets: Datasets::default(),
+        }
+    }
+
+    /// Reads a table or a text of the file.
+    fn set(&mut self, source: &Source<'_>, key: &Spanned<DeString<'_>>, value: &Spanned<DeValue<'_>>) -> Result<()> {
+        match key.get_ref().as_ref() {
+            "title" => self.title = source.text_of(value)?,
+            "question" => self.question = source.text_of(value)?,
+            "families" => self.families = source.families(value)?,
+            "collect" => self.datasets = source.datasets(value)?,
+            "defaults" => self.defaults = source.table(value, false)?,
+            "starts" => self.starts = source.tables(value)?,
+            "condition" => self.conditions = source.tables(value)?,
+            "policy" => self.policies = source.tables(value)?,
+            "published" => self.published = published::read(source, value)?,
+            other => {
+                let what = Error::unknown("table", other, TABLES.iter().copied(), "docs/studies.md lists them");
+                return Err(Error::config(source.at(key.span().start), what.to_string(), "correct the file"));
+            }
+        }
+        Ok(())
+    }
+
+    /// The study at the small size: options of `small.defaults` replace those of the same name, other tables replace all
+    /// tables of their kind. Published values and datasets of the other size are left out.
+    fn small(&self, source: &Source<'_>, small: &Spanned<DeValue<'_>>) -> Result<Self> {
+        let DeValue::Table(entries) = small.get_ref() else {
+            return Err(source.invalid(small, "is not a table", "write [small.defaults], [[small.condition]], …"));
+        };
+        let mut file = Self { published: vec![], datasets: Datasets::default(), ..self.clone() };
+        for (key, value) in entries {
+            file.set(source, key, value)?;
+        }
+        if entries.contains_key("defaults") {
+            let (mut merged, small) = (self.defaults.clone(), file.defaults);
+            merged.each.retain(|(name, _)| !small.options.contains_key(name));
+            merged.options.extend(small.options);
+            merged.each.extend(small.each);
+            file.defaults = merged;
         }
         Ok(file)
     }
@@ -188,6 +240,13 @@ impl Source<'_> {
         self.list(value)?.iter().map(common).collect()
     }
 
+    /// The tables `[[collect]]`, read from their text.
+    fn datasets(&self, value: &Spanned<DeValue<'_>>) -> Result<Datasets> {
+        let at = self.at(value.span().start);
+        let read = toml::Value::deserialize(ValueDeserializer::from(value.clone()));
+        Datasets::parse(&at, read.map_err(|error| Error::config(&at, error.message(), "correct the file"))?)
+    }
+
     fn tables(&self, value: &Spanned<DeValue<'_>>) -> Result<Vec<Table>> {
         match value.get_ref() {
             DeValue::Array(values) => values.iter().map(|value| self.table(value, true)).collect(),
@@ -207,6 +266,7 @@ impl Source<'_> {
         for (key, value) in entries {
             match key.get_ref().as_ref() {
                 "name" if named => table.name = self.text_of(value)?,
+                "starts" if named => table.starts = self.list(value)?,
                 "each" => self.each(value, &mut table)?,
                 option => self.option(option, key.span().start, value, &mut table)?,
             }
@@ -278,8 +338,7 @@ impl Table {
     /// # Errors
     /// When a setting is malformed, is given twice, or is no option of `swm eval`.
     pub fn with(&self, settings: &[String]) -> Result<Self> {
-        let mut table =
-            Self { at: self.at.clone(), name: String::new(), options: self.options.clone(), each: self.each.clone() };
+        let mut table = Self { name: String::new(), ..self.clone() };
         let mut given: BTreeMap<&str, &str> = BTreeMap::new();
         for setting in settings {
             let Some((key, value)) = setting.split_once('=') else {

@@ -1,13 +1,17 @@
 //! `swm study`: many evaluations with one table.
 
+mod any_file;
 mod breaking;
 mod colour;
+mod csv;
 mod expand;
 mod export;
+mod export_table;
 mod file;
 mod published;
 mod report;
 mod shipped;
+mod tables;
 mod variants;
 
 use super::config::count;
@@ -16,13 +20,14 @@ use super::progress::control;
 use super::results_tables::{compared, percent};
 use super::{Context, emit, emit_json, table};
 use crate::resolver::HomeResolver;
-use clap::{Args, Subcommand};
+use any_file::{AnyFile, Size};
+use clap::{Args, Subcommand, ValueEnum as _};
 use export::Format;
-use serde_json::json;
-use std::path::PathBuf;
-use swm_core::limits;
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
 use swm_core::results::{BreakingPoint, StudyResults, Until};
-use swm_eval::{Study, StudyFolder};
+use swm_core::{Error, Origin, Result, limits};
+use swm_eval::{AnyStudy, Study, StudyFolder};
 
 /// Arguments of `swm study`.
 #[derive(Args)]
@@ -36,12 +41,18 @@ enum StudyCommand {
     /// List the studies of this program
     #[command(after_help = "Example: swm study list")]
     List,
-    /// Evaluate the cells of a study that have no results
+    /// Evaluate or measure the cells of a study that have no results
     ///
     /// A study is a file of tables with the options of `swm eval` (docs/studies.md), or the name of a study of this
     /// program. An interrupted study continues.
     #[command(after_help = "Example: swm study run paper/factors --output factors episodes=20")]
     Run(RunArgs),
+    /// Write the hash of a study before its first result
+    ///
+    /// The hash covers the question, all cells with the hashes of their datasets and weights, and the families. Publish it: the
+    /// page of the study says whether it still is the registered one.
+    #[command(after_help = "Example: swm study register paper/factors --output factors")]
+    Register(RunArgs),
     /// Find the change of a factor at which a policy loses half of its success
     ///
     /// Evaluates eight levels from the default of the factor towards another value, then three inside the first interval in
@@ -79,6 +90,9 @@ struct RunArgs {
     /// Options of all evaluations, which replace the defaults of the study
     #[arg(value_name = "KEY=VALUE")]
     settings: Vec<String>,
+    /// Run the small size of the study: minutes on two cores
+    #[arg(long)]
+    small: bool,
     /// Folder of the study
     #[arg(short, long, value_name = "DIR", required_unless_present = "commands")]
     output: Option<PathBuf>,
@@ -103,67 +117,162 @@ struct RunArgs {
 }
 
 /// Runs `swm study`.
-pub fn study(args: &StudyArgs, json: bool, context: impl FnOnce() -> swm_core::Result<Context>) -> anyhow::Result<()> {
+pub fn study(args: &StudyArgs, json: bool, context: impl FnOnce() -> Result<Context>) -> anyhow::Result<()> {
     match &args.command {
         StudyCommand::List => list(json),
-        StudyCommand::Run(args) => run(args, &context()?),
+        StudyCommand::Run(args) => run(args, false, &context()?),
+        StudyCommand::Register(args) => run(args, true, &context()?),
         StudyCommand::Break(args) => breaking::run(args, &context()?),
         StudyCommand::Status { folder } => {
             let folder = StudyFolder::new(folder);
-            show(&folder.study()?.results(&folder)?, json)
+            match folder.open()? {
+                AnyStudy::Evaluations(study) => show(&study.results(&folder)?, json),
+                AnyStudy::Table(study) => export_table::show(&study.results(&folder)?, json),
+            }
         }
         StudyCommand::Report(args) => report::report(args, json),
         StudyCommand::Export { folder, format } => {
-            let folder = StudyFolder::new(folder);
-            emit(&format.write(&folder.study()?.results(&folder)?));
+            emit(&format.of(&StudyFolder::new(folder))?);
             Ok(())
         }
     }
 }
 
 fn list(json: bool) -> anyhow::Result<()> {
-    let studies = shipped::all()?;
     if json {
-        let studies =
-            studies.iter().map(|(name, file)| json!({"name": name, "title": file.title, "question": file.question}));
-        return emit_json(&studies.collect::<Vec<_>>());
+        return emit_json(&shipped()?);
     }
+    let studies = shipped::all()?;
     emit(&table(
         &["study", "question"],
-        studies.iter().map(|(name, file)| vec![(*name).to_owned(), file.question.clone()]),
+        studies.iter().map(|(name, file)| vec![(*name).to_owned(), file.texts()[1].to_owned()]),
     ));
     Ok(())
 }
 
-fn run(args: &RunArgs, context: &Context) -> anyhow::Result<()> {
-    let (file, origin) = shipped::find(&args.study, args.trust)?;
-    let resolver = HomeResolver::new(origin);
+/// Returns the name, title and question of every study of this program.
+///
+/// # Errors
+/// When a file is invalid, which is a bug.
+pub fn shipped() -> Result<Value> {
+    let studies = shipped::all()?.into_iter().map(|(name, file)| {
+        let [title, question] = file.texts();
+        json!({"name": name, "title": title, "question": question})
+    });
+    Ok(studies.collect())
+}
+
+/// Returns the results of the study in a folder.
+///
+/// # Errors
+/// When the folder has no study, or it is damaged.
+pub fn results(folder: &Path) -> Result<Value> {
+    let folder = StudyFolder::new(folder);
+    let value = match folder.open()? {
+        AnyStudy::Evaluations(study) => serde_json::to_value(study.results(&folder)?),
+        AnyStudy::Table(study) => serde_json::to_value(study.results(&folder)?),
+    };
+    value.map_err(|error| Error::external("writing the results of a study", error))
+}
+
+/// Returns the table of the study in a folder, in a format by its name.
+///
+/// # Errors
+/// When there is no such format, the folder has no study, or it is damaged.
+pub fn export(folder: &Path, format: &str) -> Result<String> {
+    let names =
+        Format::value_variants().iter().filter_map(|format| Some(format.to_possible_value()?.get_name().to_owned()));
+    let names: Vec<String> = names.collect();
+    let names = names.iter().map(String::as_str);
+    let found = Format::from_str(format, false);
+    let found = found
+        .map_err(|_| Error::unknown("format", format, names, "choose one of the formats of `swm study export`"))?;
+    found.of(&StudyFolder::new(folder))
+}
+
+/// Runs or registers a study.
+fn run(args: &RunArgs, only_register: bool, context: &Context) -> anyhow::Result<()> {
+    let size = if args.small { Size::Small } else { Size::Paper };
+    let (file, origin) = shipped::find(&args.study, size, args.trust)?;
+    let file = match file {
+        AnyFile::Evaluations(file) => file,
+        AnyFile::Table(_) if only_register => {
+            let fix = "register a study of evaluations";
+            return Err(Error::config(&args.study, "its cells are no evaluations, and have no families", fix).into());
+        }
+        AnyFile::Table(file) => return run_table(&file, size, &origin, args, context),
+    };
+    let resolver = HomeResolver::new(origin.clone());
     // Settings on the command line are the user's own.
     let own_env = args.settings.iter().find_map(|setting| setting.strip_prefix("env="));
     let resolver = own_env.into_iter().fold(resolver, HomeResolver::with_env);
     if args.commands {
-        for arguments in expand::commands(&file, &args.settings, &resolver)? {
+        let evaluations = expand::commands(&file, &args.settings, &resolver)?;
+        for arguments in file.datasets.commands().into_iter().chain(evaluations) {
             emit(&format!("swm {}\n", expand::shell(&arguments)));
         }
         return Ok(());
     }
     let Some(output) = &args.output else { return Ok(()) };
+    file.datasets.check_origin(&origin)?;
+    // Before datasets are collected, which may take long.
+    expand::check(&file, &args.settings, &resolver)?;
+    file.datasets.make(&origin, context)?;
     let mut study: Study = expand::study(&file, &args.settings, &resolver, &mut control(context))?;
-    study.arguments = std::iter::once(shipped::short_name(&args.study)).chain(args.settings.iter().cloned()).collect();
+    study.arguments = args.arguments();
     study = with_rule(study, args.until)?;
     let folder = StudyFolder::new(output);
+    if only_register {
+        let (_lock, hash) = folder.register(&study)?;
+        if context.json {
+            return emit_json(&json!({"registered": hash, "cells": study.cells.len()}));
+        }
+        emit(&format!("{hash}\n"));
+        return Ok(());
+    }
     let _lock = folder.create(&study)?;
     study.run(&folder, &resolver, &run_options(args.envs, None, context), &mut control(context))?;
     show(&study.results(&folder)?, context.json)
 }
 
 /// The study with the rule that ends it, if there is one.
-fn with_rule(mut study: Study, until: Option<Until>) -> swm_core::Result<Study> {
+fn with_rule(mut study: Study, until: Option<Until>) -> Result<Study> {
     let Some(until) = until else { return Ok(study) };
     study.arguments.extend(["--until".to_owned(), until.to_string()]);
     let study = study.until(until);
     study.check()?;
     Ok(study)
+}
+
+/// Runs a study whose cells are no evaluations.
+fn run_table(
+    file: &tables::TableFile,
+    size: Size,
+    origin: &Origin,
+    args: &RunArgs,
+    context: &Context,
+) -> anyhow::Result<()> {
+    let Some(output) = &args.output else {
+        let fix = "run it with --output DIR";
+        return Err(Error::config("--commands", "no cell of this study is an evaluation", fix).into());
+    };
+    if args.until.is_some() {
+        let fix = "run it without the option";
+        return Err(Error::config("--until", "no cell of this study has episodes", fix).into());
+    }
+    let mut study = file.study(size, &args.settings, origin)?;
+    study.arguments = args.arguments();
+    let folder = StudyFolder::new(output);
+    tables::run(&study, &folder, context)?;
+    export_table::show(&study.results(&folder)?, context.json)
+}
+
+impl RunArgs {
+    /// The name of the study, its size and its settings, for the command that runs it again.
+    fn arguments(&self) -> Vec<String> {
+        let small = self.small.then(|| "--small".to_owned());
+        std::iter::once(shipped::short_name(&self.study)).chain(small).chain(self.settings.iter().cloned()).collect()
+    }
 }
 
 /// A column of the table that is shown if its cells differ: its title, and its text in a row.
@@ -175,6 +284,9 @@ fn show(results: &StudyResults, json: bool) -> anyhow::Result<()> {
         return emit_json(results);
     }
     emit(&format!("{}: {} of {} cells\n", results.title, results.done, results.cells));
+    if let Some(registration) = &results.registration {
+        emit(&format!("{registration}\n"));
+    }
     let several = |of: fn(&swm_core::results::StudyRow) -> String| {
         results.rows.first().is_some_and(|first| results.rows.iter().any(|row| of(row) != of(first)))
     };

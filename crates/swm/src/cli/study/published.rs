@@ -7,12 +7,12 @@ use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
 /// The names in a table.
-const NAMES: &[&str] = &["source", "rates"];
+const NAMES: &[&str] = &["source", "starts", "rates"];
 
 /// Reads the tables.
 ///
 /// # Errors
-/// When a table has another name than `source` and `rates`, lacks one, or a rate is not a share from 0 to 1.
+/// When a table has a name that is not one of [`NAMES`], lacks a source or rates, or a rate is not a share from 0 to 1.
 pub fn read(source: &Source<'_>, value: &Spanned<DeValue<'_>>) -> Result<Vec<Published>> {
     let DeValue::Array(tables) = value.get_ref() else {
         return Err(source.invalid(value, "is not a list of tables", "write [[published]]"));
@@ -21,10 +21,11 @@ pub fn read(source: &Source<'_>, value: &Spanned<DeValue<'_>>) -> Result<Vec<Pub
 }
 
 fn table(source: &Source<'_>, value: &Spanned<DeValue<'_>>) -> Result<Vec<Published>> {
-    let (mut stated, mut rates) = (None, None);
+    let (mut stated, mut starts, mut rates) = (None, None, None);
     for (key, value) in entries(source, value)? {
         match key.get_ref().as_ref() {
             "source" => stated = Some(source.text_of(value)?),
+            "starts" => starts = Some(source.text_of(value)?),
             "rates" => rates = Some(value),
             other => {
                 let what = Error::unknown("name", other, NAMES.iter().copied(), "docs/studies.md explains them");
@@ -44,6 +45,7 @@ fn table(source: &Source<'_>, value: &Spanned<DeValue<'_>>) -> Result<Vec<Publis
                 return Err(source.invalid(value, "is not a success rate", "give a share from 0 to 1"));
             };
             published.push(Published {
+                starts: starts.clone(),
                 condition: condition.get_ref().to_string(),
                 policy: policy.get_ref().to_string(),
                 rate,

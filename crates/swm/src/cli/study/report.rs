@@ -7,8 +7,8 @@ use clap::Args;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use swm_core::{Error, files};
-use swm_eval::{Study, StudyFolder};
-use swm_report::StudyPage;
+use swm_eval::{AnyStudy, StudyFolder};
+use swm_report::{StudyPage, TablePage};
 
 /// Arguments of `swm study report`.
 #[derive(Args)]
@@ -30,16 +30,27 @@ const TABLES: [(&str, Format); 3] =
 /// Runs `swm study report`.
 pub fn report(args: &ReportArgs, as_json: bool) -> anyhow::Result<()> {
     let folder = StudyFolder::new(&args.folder);
-    let study = folder.study()?;
-    let results = study.results(&folder)?;
+    let study = folder.open()?;
     let output = args.output.clone().unwrap_or_else(|| args.folder.join("report"));
     let names: Vec<&str> = std::iter::once("index.html").chain(TABLES.map(|(name, _)| name)).collect();
     let _lock = output_folder::claim(&output, &names)?;
     check_figures(&output)?;
-    let tables = TABLES.map(|(name, format)| (name, format.write(&results)));
-    let page =
-        StudyPage { results, published: study.published.clone(), title: args.title.clone(), command: command(&study) };
-    let path = swm_report::write_study(&page, &output)?;
+    let title = args.title.clone();
+    let (tables, path) = match &study {
+        AnyStudy::Evaluations(study) => {
+            let results = study.results(&folder)?;
+            let tables = TABLES.map(|(name, format)| (name, format.write(&results)));
+            let command = command(if study.ray.is_some() { "break" } else { "run" }, &study.arguments);
+            let page = StudyPage { results, published: study.published.clone(), title, command };
+            (tables, swm_report::write_study(&page, &output)?)
+        }
+        AnyStudy::Table(study) => {
+            let results = study.results(&folder)?;
+            let tables = TABLES.map(|(name, format)| (name, format.write_table(&results)));
+            let page = TablePage { results, title, command: command("run", &study.arguments) };
+            (tables, swm_report::write_table(&page, &output)?)
+        }
+    };
     for (name, text) in tables {
         files::write(&output.join(name), text.as_bytes())?;
     }
@@ -51,12 +62,11 @@ pub fn report(args: &ReportArgs, as_json: bool) -> anyhow::Result<()> {
 }
 
 /// The command that runs the study again. It names a folder of its own, so that equal studies have equal pages.
-fn command(study: &Study) -> Option<String> {
-    let name = Path::new(study.arguments.first()?).file_stem()?.to_str()?;
-    let command = if study.ray.is_some() { "break" } else { "run" };
+fn command(command: &str, arguments: &[String]) -> Option<String> {
+    let name = Path::new(arguments.first()?).file_stem()?.to_str()?;
     let words = ["swm", "study", command].into_iter().map(str::to_owned);
     let output = ["--output".to_owned(), name.to_owned()];
-    Some(shell(&words.chain(study.arguments.iter().cloned()).chain(output).collect::<Vec<_>>()))
+    Some(shell(&words.chain(arguments.iter().cloned()).chain(output).collect::<Vec<_>>()))
 }
 
 /// Checks that the folder of figures does not exist, or lies beside a page of this program.

@@ -107,7 +107,7 @@ impl Table {
             options.insert(key.clone(), filled);
         }
         let name = fill(&self.name, &variables, budget, &self.at)?;
-        Ok(Variant { at: self.at.clone(), name, any_seed, options, variables })
+        Ok(Variant { at: self.at.clone(), name, any_seed, options, variables, starts: self.starts.clone() })
     }
 }
 

@@ -1,0 +1,71 @@
+//! Registering a study before it has results: the hash of all that it decides.
+
+use super::cell::{Study, hash};
+use super::folder::{MAX_BYTES, StudyFolder, json};
+use serde::{Deserialize, Serialize};
+use swm_core::files::{self, Lock};
+use swm_core::results::Registration;
+use swm_core::{Error, Result};
+
+/// The name of the file with the registration.
+const REGISTRATION: &str = "registration.json";
+
+/// The content of the file.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Registered {
+    /// The title of the study, for readers.
+    title: String,
+    /// The number of cells, for readers.
+    cells: usize,
+    /// The hash.
+    registered: String,
+}
+
+impl Study {
+    /// The hash of all that decides the results and what they are taken to say: the question, the cells with their inputs and
+    /// names, and the families. Published values and the command that made the study are left out.
+    ///
+    /// # Errors
+    /// When a request cannot be written as JSON.
+    pub fn registration_hash(&self) -> Result<String> {
+        hash(&Self { published: vec![], arguments: vec![], ..self.clone() })
+    }
+}
+
+impl StudyFolder {
+    /// Registers a study that has no results yet, and returns its hash. Keeps other writers away until the lock is dropped.
+    ///
+    /// # Errors
+    /// When a cell is done, or as [`StudyFolder::create`].
+    pub fn register(&self, study: &Study) -> Result<(Lock, String)> {
+        let lock = self.create(study)?;
+        let cells = self.root.join("cells");
+        let io = |error| Error::io(&cells, "reading the folder", error);
+        if std::fs::read_dir(&cells).map_err(io)?.next().is_some() {
+            let fix = "register a study in an empty folder, before its first run";
+            return Err(Error::config(self.root.display().to_string(), "has results already", fix));
+        }
+        let registered = study.registration_hash()?;
+        let content =
+            Registered { title: study.title.clone(), cells: study.cells.len(), registered: registered.clone() };
+        files::write(&self.root.join(REGISTRATION), &json(&content)?)?;
+        Ok((lock, registered))
+    }
+
+    /// The registration of the study in this folder; `None` if it was not registered.
+    ///
+    /// # Errors
+    /// When the file is damaged.
+    pub(super) fn registration(&self, study: &Study) -> Result<Option<Registration>> {
+        let path = self.root.join(REGISTRATION);
+        if !path.exists() {
+            return Ok(None);
+        }
+        let fix = "restore the file, or remove it: the study then counts as not registered";
+        let found: Registered = serde_json::from_slice(&files::read(&path, MAX_BYTES)?)
+            .map_err(|error| Error::corrupt(&path, format!("is not a registration ({error})"), fix))?;
+        let is_same = found.registered == study.registration_hash()?;
+        Ok(Some(Registration { hash: found.registered, is_same }))
+    }
+}

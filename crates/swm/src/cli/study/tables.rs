@@ -1,0 +1,407 @@
+//! Studies whose cells are no evaluations: files with a `kind`.
+//!
+//! - `factors`: the number of factors of variation of every environment; no environment is stepped.
+//! - `data`: the speed, latency and size of every format of datasets, on the local disk and in an object store.
+
+use super::any_file::Size;
+use crate::cli::Context;
+use crate::cli::progress::control;
+use crate::{ENVS, capsule};
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+use swm_bench::{DataBenchConfig, FormatBench};
+use swm_core::results::TableColumn;
+use swm_core::run::{Control, Event};
+use swm_core::{Error, Origin, Result};
+use swm_data::{ClipSpec, Location};
+use swm_envs::wrappers::WRAPPERS;
+use swm_eval::{StudyFolder, TableCell, TableStudy};
+use toml::Table;
+
+/// The file of such a study.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TableFile {
+    kind: TableKind,
+    /// The title.
+    pub title: String,
+    /// The question that the study asks.
+    pub question: String,
+    /// Where the published values come from.
+    #[serde(default)]
+    source: String,
+    #[serde(default)]
+    defaults: Table,
+    /// What replaces the defaults at the small size.
+    #[serde(default)]
+    small: Table,
+    /// The published values of rows.
+    #[serde(default)]
+    published: BTreeMap<String, Vec<f64>>,
+}
+
+/// What the cells of a study are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum TableKind {
+    Factors,
+    Data,
+}
+
+/// The settings of the kind `data`.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case", default)]
+struct DataSettings {
+    /// The environments whose frames are loaded.
+    envs: Vec<String>,
+    /// Formats with codecs, as `swm bench data` names them.
+    layouts: Vec<String>,
+    /// Layouts that are also loaded from an object store.
+    remote_layouts: Vec<String>,
+    /// A folder of the object store; empty to leave these rows empty.
+    remote: String,
+    episodes: usize,
+    steps: usize,
+    /// The side length of frames, in pixels.
+    size: usize,
+    frames: usize,
+    frameskip: usize,
+    batch: usize,
+    /// The number of measurements, and the seconds of each.
+    repeats: usize,
+    seconds: f64,
+}
+
+impl Default for DataSettings {
+    fn default() -> Self {
+        let config = DataBenchConfig::default();
+        Self {
+            envs: vec![],
+            layouts: FormatBench::layouts().map(str::to_owned).collect(),
+            remote_layouts: vec![],
+            remote: String::new(),
+            episodes: config.episodes,
+            steps: config.steps,
+            size: config.size,
+            frames: config.clip.num_steps,
+            frameskip: config.clip.frameskip,
+            batch: config.batch_size,
+            repeats: config.pairs,
+            seconds: config.seconds,
+        }
+    }
+}
+
+impl TableFile {
+    /// Parses a file; `path` is named in errors.
+    ///
+    /// # Errors
+    /// When the text is not TOML, or has an unknown table, kind or key.
+    pub fn parse(text: &str, path: &Path) -> Result<Self> {
+        toml::from_str(text).map_err(|error| {
+            let at = error.span().map_or(0, |span| span.start);
+            let line = 1 + text.as_bytes().iter().take(at).filter(|byte| **byte == b'\n').count();
+            let what = format!("{}:{line}", path.display());
+            Error::config(what, error.message(), "docs/studies.md describes studies with a kind")
+        })
+    }
+
+    /// Returns the study at a size, with settings `KEY=VALUE`.
+    ///
+    /// # Errors
+    /// When there is no such setting, a value is invalid, or the file names what only the user may name.
+    pub fn study(&self, size: Size, settings: &[String], origin: &Origin) -> Result<TableStudy> {
+        let mut merged = self.defaults.clone();
+        if size == Size::Small {
+            merged.extend(self.small.clone());
+        }
+        let mut own = BTreeSet::new();
+        for setting in settings {
+            let Some((key, value)) = setting.split_once('=') else {
+                return Err(Error::config(setting, "is not a setting", "write KEY=VALUE, such as episodes=20"));
+            };
+            if !own.insert(key) {
+                return Err(Error::config(setting, "is given twice", "give it once"));
+            }
+            let parsed = toml::from_str::<Table>(&format!("value = {value}")).ok();
+            let value = parsed.and_then(|mut table| table.remove("value"));
+            merged.insert(
+                key.to_owned(),
+                value.unwrap_or_else(|| toml::Value::String(setting[key.len() + 1..].to_owned())),
+            );
+        }
+        let (subject, columns, cells) = match self.kind {
+            TableKind::Factors => {
+                known(&merged, &[])?;
+                ("environment", factor_columns(), self.factors()?)
+            }
+            TableKind::Data => {
+                let names = json!(DataSettings::default());
+                let names: Vec<&str> =
+                    names.as_object().into_iter().flat_map(|all| all.keys().map(String::as_str)).collect();
+                known(&merged, &names)?;
+                let invalid =
+                    |error: toml::de::Error| Error::config("settings of the study", error.message(), "correct them");
+                let settings: DataSettings = merged.try_into().map_err(invalid)?;
+                settings.check(origin, &own)?;
+                ("dataset", data_columns(), self.data(&settings, size))
+            }
+        };
+        let study = TableStudy {
+            kind: self.kind.name().to_owned(),
+            title: size.title(&self.title),
+            question: self.question.clone(),
+            subject: subject.to_owned(),
+            columns,
+            source: if size == Size::Small && self.kind == TableKind::Data {
+                String::new()
+            } else {
+                self.source.clone()
+            },
+            cells,
+            arguments: vec![],
+        };
+        study.check()?;
+        Ok(study)
+    }
+
+    /// A row for every environment of the registry, then for third-party environments with published numbers.
+    fn factors(&self) -> Result<Vec<TableCell>> {
+        let version = env!("CARGO_PKG_VERSION");
+        let ids: Vec<&str> = ENVS.rows.iter().map(|row| row.id).collect();
+        if let Some(id) = self.published.keys().find(|id| id.starts_with("swm/") && !ids.contains(&id.as_str())) {
+            return Err(Error::unknown("environment", id, ids, "`swm envs` lists them"));
+        }
+        let third_party = self.published.keys().map(String::as_str).filter(|id| !ids.contains(id)).collect::<Vec<_>>();
+        let cell = |key: &str, id: &str| TableCell {
+            name: id.to_owned(),
+            request: json!({"kind": TableKind::Factors.name(), key: id, "version": version}),
+            published: self.published_of(id, 2),
+        };
+        let native = ids.into_iter().map(|id| cell("env", id));
+        Ok(native.chain(third_party.into_iter().map(|name| cell("third-party", name))).collect())
+    }
+
+    /// A row for each environment, layout and storage.
+    fn data(&self, settings: &DataSettings, size: Size) -> Vec<TableCell> {
+        let mut cells = vec![];
+        for env in &settings.envs {
+            for layout in &settings.layouts {
+                let is_remote = settings.remote_layouts.contains(layout);
+                for (storage, remote) in [("local", None), ("object store", Some(&settings.remote))] {
+                    if remote.is_some() && !is_remote {
+                        continue;
+                    }
+                    let name = format!("{env}, {layout}, {storage}");
+                    let mut request = json!(settings);
+                    for list in ["envs", "layouts", "remote-layouts", "remote"] {
+                        request.as_object_mut().map(|request| request.remove(list));
+                    }
+                    request["kind"] = json!(TableKind::Data.name());
+                    request["env"] = json!(env);
+                    request["layout"] = json!(layout);
+                    request["remote"] = json!(remote);
+                    let published = if size == Size::Small { vec![None; 2] } else { self.published_of(&name, 2) };
+                    cells.push(TableCell { name, request, published });
+                }
+            }
+        }
+        cells
+    }
+
+    fn published_of(&self, name: &str, columns: usize) -> Vec<Option<f64>> {
+        let values = self.published.get(name);
+        (0..columns).map(|i| values.and_then(|values| values.get(i)).copied()).collect()
+    }
+}
+
+impl TableKind {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Factors => "factors",
+            Self::Data => "data",
+        }
+    }
+}
+
+/// Checks the names of settings.
+fn known(settings: &Table, names: &[&str]) -> Result<()> {
+    match settings.keys().find(|key| !names.contains(&key.as_str())) {
+        Some(key) if names.is_empty() => Err(Error::config(key, "this study has no settings", "remove it")),
+        Some(key) => Err(Error::unknown("setting", key, names.iter().copied(), "docs/studies.md lists them")),
+        None => Ok(()),
+    }
+}
+
+fn column(name: &str, unit: &str) -> TableColumn {
+    TableColumn { name: name.to_owned(), unit: unit.to_owned(), published: false }
+}
+
+fn published(name: &str, unit: &str) -> TableColumn {
+    TableColumn { published: true, ..column(&format!("{name}, published"), unit) }
+}
+
+fn factor_columns() -> Vec<TableColumn> {
+    let [native, all] = ["native", "with wrappers"];
+    let of = |make: fn(&str, &str) -> TableColumn| [native, all].map(|name| make(name, "factors"));
+    [of(column), of(published)].concat()
+}
+
+fn data_columns() -> Vec<TableColumn> {
+    let [plain, cached] = ["clips/s", "clips/s, cached"];
+    let of = |make: fn(&str, &str) -> TableColumn| [plain, cached].map(|name| make(name, "clips/s"));
+    [of(column).to_vec(), vec![column("latency", "ms"), column("size", "MB")], of(published).to_vec()].concat()
+}
+
+impl DataSettings {
+    fn check(&self, origin: &Origin, own: &BTreeSet<&str>) -> Result<()> {
+        if !((1..=1000).contains(&self.repeats) && self.seconds > 0.0 && self.seconds <= 3600.0) {
+            let problem = format!("{} measurements of {} seconds", self.repeats, self.seconds);
+            return Err(Error::config("settings of the study", problem, "give 1 to 1000 of at most 3600 seconds"));
+        }
+        let of = |key: &str| if own.contains(key) { &Origin::User } else { origin };
+        for env in &self.envs {
+            crate::env(env, of("envs"))?;
+        }
+        if !self.remote.is_empty() {
+            let name = format!("the object store '{}'", self.remote);
+            of("remote").check_user(&name, "which opens a network connection", Some("remote=URI"))?;
+            Location::parse(&self.remote)?;
+        }
+        for layout in self.layouts.iter().chain(&self.remote_layouts) {
+            if !FormatBench::layouts().any(|known| known == layout) {
+                return Err(Error::unknown("layout", layout, FormatBench::layouts(), "choose one of them"));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Fills the rows of a study that have no values yet.
+///
+/// # Errors
+/// When the folder holds something else, a measurement fails, or the user stops the program.
+pub fn run(study: &TableStudy, folder: &StudyFolder, context: &Context) -> Result<()> {
+    let _lock = folder.create_table(study)?;
+    if study.kind == TableKind::Factors.name() {
+        study.run(folder, "", &mut |cell, control| Ok(count_factors(&cell.request, control)), &mut control(context))?;
+        return Ok(());
+    }
+    let threads = if context.threads > 0 { context.threads } else { DataBenchConfig::default().threads };
+    let machine = format!("{}, {threads} threads", capsule::cpu_level());
+    let mut bench = None;
+    let mut measure =
+        |cell: &TableCell, control: &mut Control<'_>| measure(&cell.request, threads, &mut bench, control);
+    study.run(folder, &machine, &mut measure, &mut control(context))?;
+    Ok(())
+}
+
+/// The numbers of native factors, and of these and all wrappers; `None` for an environment whose libraries are missing.
+fn count_factors(request: &Value, control: &mut Control<'_>) -> Option<Vec<f64>> {
+    let native = match request["env"].as_str().map(|id| (id, ENVS.get(id).and_then(|entry| entry.env()))) {
+        // Third-party environments declare no factors.
+        None => 0,
+        Some((_, Ok(env))) => env.spec().variation_space.factors().len(),
+        Some((id, Err(error))) => {
+            control.emit(Event::Log(&format!("{id} is left out: {error}")));
+            return None;
+        }
+    };
+    Some(vec![native as f64, (native + WRAPPERS.rows.len()) as f64])
+}
+
+/// Measures a row. `bench` holds the dataset of the last environment.
+fn measure(
+    request: &Value,
+    threads: usize,
+    bench: &mut Option<(String, FormatBench)>,
+    control: &mut Control<'_>,
+) -> Result<Option<Vec<f64>>> {
+    let text = |key: &str| request[key].as_str().unwrap_or_default();
+    let remote = request["remote"].as_str();
+    if remote == Some("") {
+        let what = format!("{} in an object store is not measured: name a folder, remote=URI", text("layout"));
+        control.emit(Event::Log(&what));
+        return Ok(None);
+    }
+    let remote = remote.map(Location::parse).transpose()?;
+    let kept = bench.take().filter(|(env, _)| env == text("env"));
+    let (env, made) = match kept {
+        Some(kept) => kept,
+        None => {
+            let number = |key: &str| request[key].as_u64().unwrap_or_default() as usize;
+            let clip = ClipSpec {
+                num_steps: number("frames"),
+                frameskip: number("frameskip"),
+                ..DataBenchConfig::default().clip
+            };
+            let config = DataBenchConfig {
+                episodes: number("episodes"),
+                steps: number("steps"),
+                size: number("size"),
+                clip,
+                batch_size: number("batch"),
+                threads,
+                pairs: number("repeats"),
+                seconds: request["seconds"].as_f64().unwrap_or_default(),
+                ..DataBenchConfig::default()
+            };
+            // The study has checked who chose the id.
+            let env = crate::env(text("env"), &Origin::User)?;
+            (text("env").to_owned(), FormatBench::new(&env, config, control)?)
+        }
+    };
+    let cost = made.measure(text("layout"), remote.as_ref(), control)?;
+    *bench = Some((env, made));
+    Ok(Some(vec![cost.clips_per_second, cost.cached_clips_per_second, cost.latency_ms, cost.megabytes]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn study(text: &str, settings: &[&str], origin: &Origin) -> Result<TableStudy> {
+        let file = TableFile::parse(text, Path::new("study.toml"))?;
+        let settings: Vec<String> = settings.iter().map(ToString::to_string).collect();
+        file.study(Size::Paper, &settings, origin)
+    }
+
+    const DATA: &str = "kind = \"data\"\ntitle = \"T\"\nquestion = \"q?\"\n[defaults]\nenvs = [\"swm/PushT-v1\"]\n\
+                        layouts = [\"hdf5\", \"video\"]\nremote-layouts = [\"hdf5\"]\n[small]\nsize = 32\n\
+                        [published]\n\"swm/PushT-v1, hdf5, local\" = [1416, 1474]\n";
+
+    #[test]
+    fn rows_of_formats_have_settings_and_published_values() {
+        let found = study(DATA, &["size=16"], &Origin::User).expect("a study");
+        let names: Vec<&str> = found.cells.iter().map(|cell| cell.name.as_str()).collect();
+        let of = |end: &str| format!("swm/PushT-v1, {end}");
+        assert_eq!(names, [of("hdf5, local"), of("hdf5, object store"), of("video, local")]);
+        assert_eq!(found.cells[0].published, [Some(1416.0), Some(1474.0)]);
+        assert_eq!((&found.cells[0].request["size"], &found.cells[1].request["remote"]), (&json!(16), &json!("")));
+        assert_eq!(found.columns.len(), 6);
+        let small = TableFile::parse(DATA, Path::new("study.toml")).expect("a file");
+        let small = small.study(Size::Small, &[], &Origin::User).expect("a study");
+        assert_eq!((&small.cells[0].request["size"], &small.cells[0].published[..]), (&json!(32), &[None, None][..]));
+        assert_ne!(small.title, found.title);
+    }
+
+    #[test]
+    fn errors_name_the_line_or_the_nearest_name() {
+        let stranger = Origin::file("study.toml", false);
+        for (text, settings, parts) in [
+            (DATA.replace("layouts = [\"hdf5\"", "layouts = [\"hdf6\""), vec![], ["hdf6", "hdf5"]),
+            (DATA.replace("[small]", "[smaller]"), vec![], ["study.toml:8", "smaller"]),
+            (DATA.replace("\"data\"", "\"date\""), vec![], ["study.toml:1", "date"]),
+            (DATA.to_owned(), vec!["sizes=3"], ["sizes", "did you mean size"]),
+            (DATA.to_owned(), vec!["seconds=0"], ["0 seconds", "3600"]),
+            (DATA.replace("[small]", "remote = \"s3://bucket/a\"\n[small]"), vec![], ["s3://bucket/a", "remote=URI"]),
+            (DATA.replace("swm/PushT-v1", "evil:X-v0"), vec![], ["evil:X-v0", "--trust"]),
+        ] {
+            let error = study(&text, &settings, &stranger).expect_err(parts[0]).to_string();
+            assert!(parts.iter().all(|part| error.contains(part)), "{error}");
+        }
+        assert!(study(DATA, &["remote=s3://bucket/a"], &stranger).is_ok(), "the user's own");
+    }
+}

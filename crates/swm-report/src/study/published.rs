@@ -35,18 +35,14 @@ pub(super) fn write(html: &mut String, sheets: &[Sheet<'_>], published: &[Publis
             html,
             "<tr><th scope=\"row\">{}</th><td data-label=\"Policy\">{}</td><td class=\"n\" data-label=\"Published\">{rate} \
              [{}]</td>",
-            shown(
-                &value
-                    .starts
-                    .as_ref()
-                    .map_or(value.condition.clone(), |starts| format!("{starts}: {}", value.condition))
-            ),
+            name(value),
             shown(&value.policy),
             source + 1
         );
         for (counting, kind) in countings.iter().enumerate() {
-            let name = if countings.len() > 1 { format!(", {}", kind.name()) } else { String::new() };
-            let cell = |label: &str, words: &str| format!("<td class=\"n\" data-label=\"{label}{name}\">{words}</td>");
+            let suffix = if countings.len() > 1 { format!(", {}", kind.name()) } else { String::new() };
+            let cell =
+                |label: &str, words: &str| format!("<td class=\"n\" data-label=\"{label}{suffix}\">{words}</td>");
             let row = condition(value).zip(policy(value));
             let row = row.and_then(|(condition, policy)| sheet(value)?.row(condition, policy, counting));
             match row {
@@ -71,6 +67,12 @@ pub(super) fn write(html: &mut String, sheets: &[Sheet<'_>], published: &[Publis
         let _ = writeln!(html, "<p class=\"note\">{} more are left out.</p>", published.len() - limits::PUBLISHED);
     }
     html.push_str("</section>\n");
+}
+
+/// The condition, with the starts if they are stated.
+fn name(value: &Published) -> String {
+    let starts = value.starts.as_ref().map_or(String::new(), |starts| format!("{starts}: "));
+    shown(&format!("{starts}{}", value.condition))
 }
 
 /// Writes the start of the section and the head of its table.

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use swm_core::Results;
 use swm_core::results::{Comparison, Counting};
-use swm_report::{Metrics, ReportOptions, Series, Training, write_report_with, write_study};
+use swm_report::{Metrics, ReportOptions, Series, Training, write_report_with, write_study, write_table};
 
 /// Measures pages; returns whether all are without faults, and what was printed.
 fn check(pages: &[PathBuf]) -> (bool, String) {
@@ -74,6 +74,7 @@ fn texts_of_pages_are_whole_in_a_browser() {
     for (i, page) in study::pages().iter().enumerate() {
         pages.push(write_study(page, &folder.path().join(format!("study-{i}"))).expect("writing the page"));
     }
+    pages.push(write_table(&study::table(), &folder.path().join("table")).expect("writing the page"));
     let (fine, printed) = check(&pages);
     assert!(fine, "{printed}");
 }

@@ -5,10 +5,11 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 use swm_core::results::{
-    BreakingPoint, Counting, Crossing, Family, Interquartile, Level, OverSeeds, Paired, Proportion, Published, Ray,
-    Side, StudyResults, StudyRow,
+    BreakingPoint, ClusteredMean, Counting, Crossing, ErrorAndSuccess, Family, Interquartile, Level, OverSeeds, Paired,
+    PlayedErrors, Prediction, Proportion, Published, Ray, Side, StudyResults, StudyRow, StudyTable, TableColumn,
+    TableRow, Trajectory,
 };
-use swm_report::{StudyPage, write_study};
+use swm_report::{StudyPage, TablePage, write_study};
 
 /// A row of a study: `successes` of 50 episodes, of which the first condition solves 40.
 fn row(condition: &str, policy: &str, variables: &[(&str, &str)], successes: usize) -> StudyRow {
@@ -102,11 +103,52 @@ fn heat() -> StudyPage {
     of(rows)
 }
 
+/// Prediction errors of solved and of failed trajectories, recorded and played.
+fn predictions() -> StudyPage {
+    let mut study = factors();
+    let trajectory = |i: usize| Trajectory {
+        start: [i, 3],
+        success: Some(!i.is_multiple_of(3)),
+        errors: vec![0.2 + 0.013 * ((i * 37) % 50) as f64; 5],
+    };
+    let errors = ErrorAndSuccess::of(&Prediction::new(5, 1.0, (0..50).map(trajectory).collect()));
+    for row in &mut study.results.rows {
+        row.prediction = Some(errors.clone());
+        let optimism = Some(ClusteredMean { mean: 0.1234, low: -0.5678, high: 0.9012 });
+        row.played = Some(PlayedErrors { errors: errors.clone(), optimism });
+    }
+    study
+}
+
 /// Pages with every kind of figure and table.
 pub(super) fn pages() -> Vec<StudyPage> {
     let mut study = factors();
     study.results.over_seeds = vec![over_seeds("LeWM, seed *", 0.5)];
-    vec![study, line(), wheel(), heat()]
+    vec![study, line(), wheel(), heat(), predictions()]
+}
+
+/// A page of a study whose cells are no evaluations, with many columns.
+pub(super) fn table() -> TablePage {
+    let column = |i: usize| TableColumn {
+        name: format!("{} of clips, cached", ["latency", "throughput", "size"][i % 3]),
+        unit: ["ms", "clips/s", "MB"][i % 3].to_owned(),
+        published: i > 5,
+    };
+    let row = |i: usize| TableRow {
+        cell: String::new(),
+        name: ["lance", "hdf5", "a format with a very long name", "lerobot"][i].to_owned(),
+        values: (0..9).map(|j| (j % 4 != i).then_some(1234.5678 / (i + j + 1) as f64)).collect(),
+        machine: "a processor with two cores".to_owned(),
+    };
+    let results = StudyTable {
+        title: "Formats".to_owned(),
+        columns: (0..9).map(column).collect(),
+        rows: (0..4).map(row).collect(),
+        cells: 4,
+        done: 4,
+        ..StudyTable::default()
+    };
+    TablePage { results, ..TablePage::default() }
 }
 
 /// All files that a page consists of.

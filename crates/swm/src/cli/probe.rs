@@ -22,7 +22,7 @@ pub struct ProbeArgs {
     /// The checkpoint: a run folder or a name
     #[arg(required_unless_present = "supervised", conflicts_with = "supervised")]
     checkpoint: Option<String>,
-    /// Train the encoder of this LeWM preset with the columns as labels: the ceiling of its latents
+    /// Train the encoder of this LeWM preset with labels: what its latents can hold
     #[arg(long, value_name = "PRESET", requires = "columns", conflicts_with_all = ["baseline", "images"])]
     supervised: Option<String>,
     /// The dataset: a path, a URI or a name

@@ -233,8 +233,8 @@ def test_torch_and_burn_costs_are_equal(twins, infos):
 
 
 #: The maximum difference of plans, relative to their largest element; measured differences are a few millionths, and once
-#: 1.2e-4 (GRASP). Searches run few iterations, because they amplify rounding errors: with two samples of nearly equal cost, CEM may choose different
-#: elites, and the first steps of Adam follow the signs of gradients, even of tiny ones.
+#: 1.2e-4 (GRASP). Searches run few iterations, because they amplify rounding errors: with two samples of nearly equal
+#: cost, CEM may choose different elites, and the first steps of Adam follow the signs of gradients, even of tiny ones.
 TOLERANCE = 5e-4
 
 SOLVERS = [

@@ -82,7 +82,7 @@ pub struct EvalArgs {
     /// Folder of results.json and the videos
     #[arg(short, long, default_value = "results", value_name = "DIR")]
     output: PathBuf,
-    /// Number of episodes per policy to record as videos (default: 3; 0 without frames)
+    /// Number of episodes to film per policy (default: 3; 0 without frames)
     #[arg(long, value_name = "EPISODES")]
     videos: Option<usize>,
     /// Measure prediction errors over this many model steps, by success
@@ -97,9 +97,9 @@ pub struct EvalArgs {
     wrappers: WrapperArgs,
     #[command(flatten)]
     variation: VariationArgs,
-    /// Also evaluate under a shift, as a condition of its own: KEY=VALUE sets a factor, KEY samples it
+    /// Also evaluate under a shift, as a condition of its own
     ///
-    /// Give it repeatedly for several conditions. --pin and --variation change all conditions.
+    /// KEY=VALUE sets a factor, KEY samples it. Give it repeatedly for several conditions. --pin and --variation change all conditions.
     #[arg(long, value_name = "KEY[=VALUE]")]
     shift: Vec<String>,
     /// Also evaluate with each factor sampled alone, as conditions of their own

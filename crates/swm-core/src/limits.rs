@@ -37,6 +37,8 @@ pub const ENVS: Limit = Limit::new("number of environments", 16_384);
 pub const WORKERS: Limit = Limit::new("number of worker processes", 1024);
 /// Worker threads.
 pub const THREADS: Limit = Limit::new("number of threads", 1024);
+/// Threads of Rayon.
+pub const RAYON_THREADS: Limit = Limit::new("number of threads in RAYON_NUM_THREADS", 1024);
 /// The height and the width of a frame, in pixels.
 pub const IMAGE_SIDE: Limit = Limit::new("side of a frame in pixels", 4096);
 /// Episodes of a collected dataset.

@@ -221,6 +221,9 @@ impl Cli {
     fn dispatch(self) -> anyhow::Result<()> {
         let json = self.json;
         limits::THREADS.check(self.threads)?;
+        // Rayon starts as many threads as this variable says; hashing files uses them, whatever `--threads` is.
+        let of_rayon = std::env::var("RAYON_NUM_THREADS").ok().and_then(|text| text.parse().ok());
+        limits::RAYON_THREADS.check(of_rayon.unwrap_or(0))?;
         swm_mujoco::render::choose(self.renderer);
         match self.command {
             Command::Envs(args) => envs::envs(&args, json),

@@ -35,9 +35,14 @@ fn absurd_counts_are_refused_before_work_starts() {
 }
 
 #[test]
-fn variables_of_lance_are_checked() {
+fn variables_of_libraries_are_checked() {
     let swm = Swm::new();
-    for (name, value) in [("LANCE_IO_THREADS", "abc"), ("LANCE_CPU_THREADS", "0"), ("LANCE_MAX_IOP_SIZE", "0")] {
+    for (name, value) in [
+        ("LANCE_IO_THREADS", "abc"),
+        ("LANCE_CPU_THREADS", "0"),
+        ("LANCE_MAX_IOP_SIZE", "0"),
+        ("RAYON_NUM_THREADS", "20000"),
+    ] {
         let output = swm.command(ROOMS).env(name, value).output().expect("swm runs");
         let error = text(&output.stderr);
         assert_eq!(output.status.code(), Some(2), "{name}: {error}");

@@ -149,6 +149,22 @@ impl Running {
         assert!(line.is_some(), "the program ended without '{text}'");
     }
 
+    /// The processor time of the program, in ticks of a hundredth of a second.
+    fn ticks(&self) -> u64 {
+        let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.child.id())).expect("a process");
+        // The name of the program, in parentheses, is the second field.
+        let fields = stat.rsplit(") ").next().expect("fields after the name");
+        fields.split(' ').nth(11).and_then(|field| field.parse().ok()).expect("the time in user mode")
+    }
+
+    /// Waits until the program has worked for a second more.
+    fn wait_for_work(&self) {
+        let start = self.ticks();
+        while self.ticks() < start + 100 {
+            std::thread::sleep(std::time::Duration::from_millis(10));
+        }
+    }
+
     fn signal(&self, name: &str) {
         let sent = Command::new("kill").args([&format!("-{name}"), &self.child.id().to_string()]).status();
         assert!(sent.expect("kill starts").success());
@@ -183,6 +199,8 @@ fn second_signal_ends_the_program() {
         let args = ["eval", "simulator", "--env", "swm/TwoRoom-v1", "--image", "32", "--episodes", "1"];
         let mut running = Running::start(&swm, &[&args[..], &solver].concat());
         running.wait_for("evaluate: random");
+        // The plan has begun then, whatever the load of the machine.
+        running.wait_for_work();
         running.signal(signal);
         running.wait_for("stopping at the next safe point");
         running.signal(signal);

@@ -82,7 +82,7 @@ pub struct EvalArgs {
     /// Folder of results.json and the videos
     #[arg(short, long, default_value = "results", value_name = "DIR")]
     output: PathBuf,
-    /// Number of episodes to film per policy (default: 3; 0 without frames)
+    /// Number of videos per policy (default: 3; 0 without frames)
     #[arg(long, value_name = "EPISODES")]
     videos: Option<usize>,
     /// Measure prediction errors over this many model steps, by success

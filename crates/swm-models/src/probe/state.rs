@@ -110,20 +110,27 @@ pub struct Baseline {
     pub latent_variance: Option<f64>,
 }
 
+impl StateConfig {
+    /// Checks that all sizes are in range. A batch has at least `smallest_batch` frames.
+    pub(super) fn check(&self, smallest_batch: usize) -> Result<()> {
+        check_sizes(&[
+            ("columns", self.columns.len(), 1, limits::FEATURES),
+            ("frames", self.frames, 2, limits::BATCH),
+            ("held_out", self.held_out, 2, limits::BATCH),
+            ("hidden", self.hidden, 1, limits::FEATURES),
+            ("fit.steps", self.fit.steps, 1, limits::STEPS),
+            ("fit.batch_size", self.fit.batch_size, smallest_batch, limits::BATCH),
+        ])
+    }
+}
+
 /// Fits a linear and a nonlinear regression of columns on an encoder's latents, and scores both on held-out episodes.
 ///
 /// # Errors
 /// When a column is missing or holds images, the images have another size than the encoder's, no episode is held out,
 /// or a setting is out of range.
 pub fn read_state(encoder: &dyn ImageEncoder, reader: &dyn Reader, config: &StateConfig) -> Result<StateReport> {
-    check_sizes(&[
-        ("columns", config.columns.len(), 1, limits::FEATURES),
-        ("frames", config.frames, 2, limits::BATCH),
-        ("held_out", config.held_out, 2, limits::BATCH),
-        ("hidden", config.hidden, 1, limits::FEATURES),
-        ("fit.steps", config.fit.steps, 1, limits::STEPS),
-        ("fit.batch_size", config.fit.batch_size, 1, limits::BATCH),
-    ])?;
+    config.check(1)?;
     let targets = Targets::new(reader, &config.columns, &config.angles)?;
     let baseline = Targets::new(reader, &config.baseline, &config.angles)?;
     let columns = [&config.columns[..], &config.baseline].concat();

@@ -10,7 +10,7 @@ use crate::lewm::shard::{Differentiation, Shard};
 use crate::nn::parameters::{self, IntoF32};
 use crate::nn::{Backbone, BackboneConfig, Init, Mlp, Named, conv};
 use crate::pixels::{self, ImageNormalization};
-use crate::train::{StepOutput, check_sizes, limits};
+use crate::train::StepOutput;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use rayon::prelude::*;
@@ -61,14 +61,8 @@ pub fn train_encoder(
     control: &mut Control<'_>,
 ) -> Result<SupervisedReport> {
     encoder.check("model.encoder", images.side)?;
-    check_sizes(&[
-        ("columns", config.columns.len(), 1, limits::FEATURES),
-        ("frames", config.frames, 2, limits::BATCH),
-        ("held_out", config.held_out, 2, limits::BATCH),
-        ("hidden", config.hidden, 1, limits::FEATURES),
-        ("fit.steps", config.fit.steps, 1, limits::STEPS),
-        ("fit.batch_size", config.fit.batch_size, 2, limits::BATCH),
-    ])?;
+    // Batch normalisation needs two frames.
+    config.check(2)?;
     let targets = Targets::new(reader, &config.columns, &config.angles)?;
     let key = Key::new(config.seed).with("supervised probe");
     let sample = |part, count| {

@@ -42,7 +42,7 @@ fn a_killed_study_ends_in_the_same_bytes() {
 }
 
 #[test]
-#[ignore = "twenty kills of each study: half an hour"]
+#[ignore = "twenty kills of each study: a minute"]
 fn twenty_kills_of_every_study_end_in_the_same_bytes() {
     for study in [
         "paper/baselines",

@@ -1,12 +1,13 @@
-//! [`VisualWrappers`]: visual wrappers for frames given as numpy arrays.
+//! Frames given as numpy arrays: [`VisualWrappers`] change them, and [`write_video`] stores them.
 
 use crate::arrays;
 use crate::errors::{json, to_py_err};
-use numpy::{PyReadonlyArray3, PyUntypedArrayMethods as _};
+use numpy::{PyReadonlyArray3, PyReadonlyArray4, PyUntypedArrayMethods as _};
 use pyo3::prelude::*;
 use serde_json::{Map, Value};
+use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
-use swm::core::{DType, FrameMut, Key};
+use swm::core::{DType, Error, FrameMut, Key};
 use swm::envs::wrappers::{EpisodeFrame, VisualWrapper, WRAPPERS};
 
 /// A stack of visual wrappers, in the order in which they are applied.
@@ -53,4 +54,21 @@ impl VisualWrappers {
 #[pyfunction]
 pub fn schedule(text: &str, step: u64) -> PyResult<f64> {
     Ok(json::<swm::envs::wrappers::Schedule>("schedule", text)?.at(step))
+}
+
+/// Writes frames as an MP4 video that browsers play. An existing file is replaced only if it is such a video.
+///
+/// # Shapes
+/// `frames`: `[count, height, width, 3]`, `uint8`.
+#[pyfunction]
+pub fn write_video(py: Python<'_>, path: PathBuf, frames: PyReadonlyArray4<'_, u8>, fps: u32) -> PyResult<()> {
+    let shape = frames.shape();
+    let (height, width) = (shape[1], shape[2]);
+    if height * width == 0 || shape[3] != 3 {
+        let problem = format!("they have the shape {shape:?}");
+        return Err(to_py_err(Error::config("frames", problem, "give frames (count, height, width, 3)")));
+    }
+    let rgb = frames.as_slice()?;
+    py.detach(|| swm::data::write_mp4(&path, width, height, fps, rgb.chunks_exact(height * width * 3)))
+        .map_err(to_py_err)
 }

@@ -7,7 +7,7 @@
 //! - [`cost`], [`solver`], [`model`]: models implemented in Python, planning, and the engine's checkpoints.
 //! - [`data`]: datasets, the loader, the replay buffer, conversion.
 //! - [`gym`]: third-party Gymnasium environments in this interpreter.
-//! - [`env`](mod@env), [`frames`]: a single environment, and visual wrappers, for Gymnasium.
+//! - [`env`](mod@env), [`frames`]: a single environment, and visual wrappers, for Gymnasium; videos.
 //! - [`listing`]: the engine's registries, and the command line.
 //! - [`study`]: the results of studies.
 
@@ -43,7 +43,7 @@ mod _engine {
     #[pymodule_export]
     use super::env::NativeEnv;
     #[pymodule_export]
-    use super::frames::{VisualWrappers, schedule};
+    use super::frames::{VisualWrappers, schedule, write_video};
     #[pymodule_export]
     use super::gym::bridge;
     #[pymodule_export]

@@ -365,6 +365,7 @@ impl World {
                 condition: settings.condition,
                 budget: settings.budget,
                 counting: settings.counting,
+                planning_seed: None,
                 videos,
             };
             world.evaluate(policy, &starts, &config, &mut control(progress))

@@ -18,7 +18,23 @@ from typing import TYPE_CHECKING, Any
 from . import _registration
 
 if TYPE_CHECKING:
-    from . import data, envs, planning, policy, solver, spaces, studies, utils, wm, wrapper
+    from . import (
+        buffer,
+        cli,
+        data,
+        envs,
+        planning,
+        plot,
+        policy,
+        protocols,
+        solver,
+        spaces,
+        studies,
+        utils,
+        wm,
+        world,
+        wrapper,
+    )
     from .policy import PlanConfig
     from .world import Metrics, World
 
@@ -26,15 +42,20 @@ __all__ = [
     "Metrics",
     "PlanConfig",
     "World",
+    "buffer",
+    "cli",
     "data",
     "envs",
     "planning",
+    "plot",
     "policy",
+    "protocols",
     "solver",
     "spaces",
     "studies",
     "utils",
     "wm",
+    "world",
     "wrapper",
 ]
 

@@ -3,12 +3,62 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 KNOWN = ("variation", "variation_values", "state", "goal_state")
+
+
+def count(name: str, value: Any, least: int = 1) -> int:
+    """The value as a count of at least `least`.
+
+    Raises:
+        ValueError: When it is no whole number, or is out of range. The engine's counts have 63 bits.
+    """
+    try:
+        whole = not isinstance(value, bool) and int(value) == value and least <= int(value) < 1 << 63
+    except (TypeError, ValueError, OverflowError):
+        whole = False
+    if not whole:
+        raise ValueError(f"{name}: {value!r}; expected a whole number of at least {least}")
+    return int(value)
+
+
+def finite(name: str, value: Any) -> float:
+    """The value as a finite number that is not negative.
+
+    Raises:
+        ValueError: When it is none.
+    """
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not (math.isfinite(number) and number >= 0):
+        raise ValueError(f"{name}: {value!r}; expected a finite number of at least 0")
+    return number
+
+
+def indices(name: str, given: Any, count: int) -> list[int]:
+    """The indices in a sequence of whole numbers, or where a mask of `count` booleans is true.
+
+    Raises:
+        TypeError: When the values are neither.
+        ValueError: When a mask has another length.
+    """
+    array = np.asarray(given)
+    if array.dtype == bool:
+        if array.shape != (count,):
+            raise ValueError(f"{name}: expected a mask of {count} booleans, got the shape {array.shape}")
+        return np.flatnonzero(array).tolist()
+    if array.size == 0:
+        return []
+    if array.ndim != 1 or array.dtype.kind not in "iu":
+        raise TypeError(f"{name}: expected indices or a mask of booleans, got {given!r}")
+    return array.tolist()
 
 
 def variation(options: Mapping[str, Any] | None, spaces: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

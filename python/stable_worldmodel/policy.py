@@ -8,15 +8,16 @@ policies plays depends only on its seed, not on its slot or on other episodes.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from . import _engine
-from .planning import has_torch, prepared
-from .solver import EngineSolver, Solver, single
+from . import _engine, _options
+from .buffer import HistoryBuffer
+from .planning.adapter import has_torch, prepared
+from .planning.solver.engine import EngineSolver, single
 
 if TYPE_CHECKING:
     from .world import World
@@ -143,6 +144,10 @@ class ExpertPolicy(_EnginePolicy):
         self.name, self.seed = name, seed
         self.type = name
 
+    def get_action(self, obs: Any, goal_obs: Any = None, **kwargs: Any) -> np.ndarray:
+        """The actions for the current infos of the world; the arguments are ignored."""
+        return super().get_action(obs)
+
     def _actor(self, world: World) -> Any:
         return _engine.Actor.expert(world._world, self.name, self.seed)
 
@@ -161,7 +166,7 @@ class MixturePolicy(_EnginePolicy):
 
     def __init__(self, weights: Mapping[str, float], **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.weights = {str(name): float(weight) for name, weight in weights.items()}
+        self.weights = {str(name): _options.finite(f"the weight of {name!r}", weight) for name, weight in weights.items()}
 
     @property
     def _choice(self) -> list[dict[str, Any]]:
@@ -199,12 +204,13 @@ class FeedForwardPolicy(BasePolicy):
         name = self.model if isinstance(self.model, str) else getattr(self.model, "_engine_policy", None)
         return None if name is None else _engine.Actor.checkpoint(world._world, name)
 
-    def get_action(self, obs: Any, **kwargs: Any) -> Any:
+    def get_action(self, info_dict: Any, **kwargs: Any) -> Any:  # type: ignore[override]
+        """The actions `(num_envs, ..)` for infos `(num_envs, T, ..)`."""
         if isinstance(self.model, str) or hasattr(self.model, "_engine_policy"):
             if self.env is None:
                 raise RuntimeError("FeedForwardPolicy: it belongs to no world; call world.set_policy(policy) first")
             return self.env._world._engine_actions(self)
-        infos = prepared({key: value for key, value in obs.items() if key[0] != "_"}, self.process, self.transform)
+        infos = prepared({key: value for key, value in info_dict.items() if key[0] != "_"}, self.process, self.transform)
         if "goal" in infos:
             infos["goal_pixels"] = infos["goal"]
         if has_torch():
@@ -233,6 +239,8 @@ class MPCPolicy(BasePolicy):
         process: Scalers by column, applied before the model (`transform`); the scaler of `action` converts planned actions
             back (`inverse_transform`).
         transform: Transforms by frame column (`pixels`, `goal`), called with one frame `(C, H, W)` at a time.
+        history_keys: The columns of which a user-defined solver gets the last `history_len` model steps. The engine's solvers
+            get past `pixels`.
 
     The model gets the infos `(B, T, ..)` of the environments that replan.
     """
@@ -245,10 +253,11 @@ class MPCPolicy(BasePolicy):
         config: PlanConfig | None = None,
         process: Mapping[str, Any] | None = None,
         transform: Mapping[str, Callable[[Any], Any]] | None = None,
+        history_keys: Sequence[str] = ("pixels",),
         **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
-        if not isinstance(solver, Solver):
+        if not all(callable(getattr(solver, name, None)) for name in ("configure", "solve")):
             raise TypeError(f"{type(solver).__name__} is not a solver: expected configure(…) and solve(…)")
         self.solver = solver
         model = getattr(solver, "model", None)
@@ -261,18 +270,35 @@ class MPCPolicy(BasePolicy):
         self.process, self.transform = dict(process or {}), dict(transform or {})
         #: The search traces, one dict for each plan, after `evaluate` and `collect`.
         self.plans: list[dict[str, Any]] = []
+        self.history_keys = tuple(history_keys)
         self._actions: list[list[np.ndarray]] = []
         self._rest: dict[int, Any] = {}
+        #: The past columns and the executed actions, in model units, of every environment.
+        self._seen: list[HistoryBuffer] = []
+        self._done: list[HistoryBuffer] = []
+
+    @property
+    def flatten_receding_horizon(self) -> int:
+        """Environment steps that are executed before planning again."""
+        return self.cfg.receding_horizon * self.cfg.action_block
 
     def set_env(self, env: Any) -> None:
         super().set_env(env)
         self.solver.configure(action_space=env.action_space, n_envs=env.num_envs, config=self.cfg)
         self._actions = [[] for _ in range(env.num_envs)]
         self._rest = {}
+        steps = max(1, (self.cfg.history_len - 1) * self.cfg.action_block)
+        block = self.cfg.action_block
+        self._seen = [HistoryBuffer(1, steps + 1, block) for _ in range(env.num_envs)]
+        self._done = [HistoryBuffer(1, steps, block, ("action",)) for _ in range(env.num_envs)]
 
     def _actor(self, world: World) -> Any:
         scale = _scale(self.process.get("action"))
         if not isinstance(self.solver, EngineSolver) or (scale is None and "action" in self.process):
+            return None
+        in_engine = self.solver.model == "simulator" or hasattr(self.solver.model, "_engine_model")
+        if self.solver.callbacks or (world.transforms and not in_engine):
+            # Callbacks and transforms of frames are functions in Python, so the solver is called from here.
             return None
         model = self.solver.adapter(self.process, self.transform, self.cfg.history_len)
         if isinstance(model, _engine.Model) and (self.process or self.transform):
@@ -285,24 +311,25 @@ class MPCPolicy(BasePolicy):
 
     # Planning in Python, for user-defined solvers.
 
-    def get_action(self, obs: Any, **kwargs: Any) -> np.ndarray:
+    def get_action(self, info_dict: Any, **kwargs: Any) -> np.ndarray:  # type: ignore[override]
         """The actions `(num_envs, ..)` for infos `(num_envs, T, ..)`."""
         if self.env is None:
             raise RuntimeError("MPCPolicy: it belongs to no world; call world.set_policy(policy) first")
-        if self.cfg.history_len > 1:
-            raise ValueError(
-                f"history_len: {self.cfg.history_len}; only the engine's solvers get past frames, and only if actions are "
-                "scaled by a mean and a standard deviation or not at all"
-            )
-        infos = dict(obs)
+        infos = dict(info_dict)
         fresh, active = infos.pop("_needs_flush", None), infos.pop("_active", None)
         envs = self.env.num_envs
         for i in range(envs):
             if fresh is not None and fresh[i]:
                 self._actions[i].clear()
                 self._rest.pop(i, None)
+                self._seen[i].reset()
+                self._done[i].reset()
         over = np.zeros(envs, bool) if active is None else ~np.asarray(active, bool)
         due = [i for i in range(envs) if not self._actions[i] and not over[i]]
+        if self.cfg.history_len > 1:
+            past = {key: np.asarray(infos[key]) for key in self.history_keys if key in infos}
+            for i in np.flatnonzero(~over).tolist():
+                self._seen[i].append({key: value[i : i + 1] for key, value in past.items()})
         if due:
             self._replan({key: np.asarray(value)[due] for key, value in infos.items()}, due)
         space = single(self.env.action_space, self.env.num_envs)
@@ -311,7 +338,35 @@ class MPCPolicy(BasePolicy):
         for i in range(envs):
             if not over[i]:
                 actions[i] = self._actions[i].pop(0).reshape(shape)
+        if self.cfg.history_len > 1:
+            units = actions.reshape(envs, -1)
+            units = np.asarray(self.process["action"].transform(units)) if "action" in self.process else units
+            for i in np.flatnonzero(~over).tolist():
+                self._done[i].append({"action": units[i : i + 1].astype(np.float32)})
         return actions
+
+    def _with_history(self, infos: dict[str, Any], due: list[int]) -> dict[str, Any]:
+        """The infos with the past model steps: columns `(B, history_len, ..)` and `action_history`.
+
+        Before the first step, the history repeats the first observation, and the actions are zero.
+        """
+        length = self.cfg.history_len
+        if length == 1:
+            return infos
+        columns = [self._seen[i].get(length) or {} for i in due]
+        for key in columns[0]:
+            past = [column[key][0] for column in columns]
+            infos[key] = np.stack([np.concatenate([steps[:1]] * (length - len(steps)) + [steps]) for steps in past])
+        space = single(self.env.action_space, self.env.num_envs)
+        size = int(np.prod(space.shape or (1,))) * self.cfg.action_block
+        actions = np.zeros((len(due), length - 1, size), np.float32)
+        for row, i in enumerate(due):
+            done = self._done[i].get(length - 1)
+            if done is not None:
+                blocks = done["action"][0].reshape(-1, size)
+                actions[row, length - 1 - len(blocks) :] = blocks
+        infos["action_history"] = actions
+        return infos
 
     def _replan(self, infos: dict[str, Any], due: list[int]) -> None:
         known = [self._rest.get(i) for i in due]
@@ -323,7 +378,12 @@ class MPCPolicy(BasePolicy):
                 import torch
 
                 init = torch.from_numpy(init)
-        outcome = self.solver.solve(prepared(infos, self.process, self.transform), init_action=init)
+        # The history of actions is in model units already.
+        known_units = {key: value for key, value in self._with_history(infos, due).items() if key != "action_history"}
+        given = prepared(known_units, self.process, self.transform)
+        if "action_history" in infos:
+            given |= prepared({"action_history": infos["action_history"]}, {}, {})
+        outcome = self.solver.solve(given, init_action=init)
         if not isinstance(outcome, Mapping) or "actions" not in outcome:
             raise TypeError(f"{type(self.solver).__name__}.solve: expected a dict with 'actions', got {outcome!r:.200}")
         plan = outcome["actions"]
@@ -376,18 +436,19 @@ def _scale(scaler: Any) -> tuple[list[float], list[float]] | None:
 
 
 def AutoCostModel(run_name: str, cache_dir: Any = None) -> Any:
-    """Loads a checkpoint to plan with, by name or path, as `swm.wm.load`."""
+    """Loads a checkpoint to plan with, by name or path: as `swm.wm.load`, or a torch module that `save_pretrained` saved."""
+    from pathlib import Path
+
     from . import wm
 
-    return wm.load(_named(run_name, cache_dir))
+    name = str(run_name) if cache_dir is None else str(Path(cache_dir) / run_name)
+    home = Path(_engine.home() if cache_dir is None else cache_dir)
+    for folder in (home / "checkpoints" / run_name, Path(name)):
+        if (folder / "config.json").is_file() and any(folder.glob("*.pt")):
+            return wm.utils.load_pretrained(folder.resolve()).eval()
+    return wm.load(name)
 
 
 def AutoActionableModel(run_name: str, cache_dir: Any = None) -> Any:
     """Loads a checkpoint with a policy, by name or path, as `swm.wm.load`."""
     return AutoCostModel(run_name, cache_dir)
-
-
-def _named(name: str, folder: Any) -> str:
-    from pathlib import Path
-
-    return str(name) if folder is None else str(Path(folder) / name)

@@ -6,6 +6,8 @@ must satisfy. A nested `Dict` of factors is a `variation_space`; a factor's key 
 
 from __future__ import annotations
 
+import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -16,6 +18,18 @@ __all__ = ["Box", "Dict", "Discrete", "MultiDiscrete", "RGBBox", "reset_variatio
 
 #: The number of samples after which a condition is considered impossible.
 TRIES = 1000
+
+
+class _Slow:
+    """Warns once if sampling takes longer than some seconds."""
+
+    def __init__(self, space: Any, seconds: float) -> None:
+        self.space, self.until = space, time.monotonic() + seconds
+
+    def check(self) -> None:
+        if time.monotonic() > self.until:
+            self.until = float("inf")
+            warnings.warn(f"sampling {self.space} takes long: few samples satisfy its constrain_fn", stacklevel=4)
 
 
 class _Factor:
@@ -58,11 +72,23 @@ class _Factor:
         """Whether the current value is allowed."""
         return self.contains(self._value)
 
-    def sample(self, mask: Any = None, probability: Any = None, *, max_tries: int = TRIES, set_value: bool = True) -> Any:
-        """Samples until the condition holds, at most `max_tries` times; with `set_value`, the sample becomes the value."""
+    def sample(
+        self, mask: Any = None, max_tries: int = TRIES, warn_after_s: float = 5.0, set_value: bool = True, **kwargs: Any
+    ) -> Any:
+        """Samples until the condition holds.
+
+        Args:
+            mask: As for Gymnasium's space.
+            max_tries: The largest number of tries.
+            warn_after_s: Seconds after which a warning says that the condition is hard to satisfy.
+            set_value: Whether the sample becomes the value.
+            **kwargs: Further arguments of Gymnasium's space: `probability`.
+        """
+        # `probability` is passed only if given, because Gymnasium supports it since 1.1.
+        given = {name: value for name, value in kwargs.items() if value is not None}
+        slow = _Slow(self, warn_after_s)
         for _ in range(max_tries):
-            # `probability` is passed only if given, because Gymnasium supports it since 1.1.
-            given = {} if probability is None else {"probability": probability}
+            slow.check()
             value = super().sample(mask=mask, **given)  # type: ignore[misc]
             if self.contains(value):
                 if set_value:
@@ -87,7 +113,7 @@ class _Factor:
         self._value = self._allowed(value)
 
 
-class Box(_Factor, spaces.Box):
+class Box(_Factor, spaces.Box):  # type: ignore[misc]
     """Values within bounds."""
 
     def __init__(
@@ -113,7 +139,7 @@ class RGBBox(Box):
         super().__init__(low=0, high=255, shape=shape, dtype=np.uint8, init_value=init_value, **kwargs)
 
 
-class Discrete(_Factor, spaces.Discrete):
+class Discrete(_Factor, spaces.Discrete):  # type: ignore[misc]
     """An integer from `start` to `start + n - 1`."""
 
     def __init__(
@@ -130,7 +156,7 @@ class Discrete(_Factor, spaces.Discrete):
         return int(value) if int(value) == value else value
 
 
-class MultiDiscrete(_Factor, spaces.MultiDiscrete):
+class MultiDiscrete(_Factor, spaces.MultiDiscrete):  # type: ignore[misc]
     """Several integers; the `i`-th one has `nvec[i]` possible values."""
 
     def __init__(
@@ -231,20 +257,28 @@ class Dict(spaces.Dict):
         """Whether every current value is in its space and all conditions hold."""
         wrong = [key for key, factor in self.factors() if not factor.check()]
         if debug and wrong:
-            import warnings
-
             names = ", ".join(wrong)
             warnings.warn(f"the values of {names} are outside their spaces or violate a constrain_fn", stacklevel=2)
         return not wrong and (self.constrain_fn is None or bool(self.constrain_fn(self.value)))
 
-    def sample(
-        self, mask: Any = None, probability: Any = None, *, max_tries: int = TRIES, set_value: bool = True
+    def sample(  # type: ignore[override]
+        self, mask: Any = None, max_tries: int = TRIES, warn_after_s: float = 5.0, set_value: bool = True, **kwargs: Any
     ) -> dict[str, Any]:
-        """Samples every factor, in order, until the condition of the `Dict` holds."""
+        """Samples every factor, in order, until the condition of the `Dict` holds.
+
+        Args:
+            mask: The masks of the factors, by key.
+            max_tries: The largest number of tries.
+            warn_after_s: Seconds after which a warning says that the condition is hard to satisfy.
+            set_value: Whether the samples become the values.
+            **kwargs: `probability`: the probabilities of the factors, by key.
+        """
+        masks, chances = mask or {}, kwargs.get("probability") or {}
+        slow = _Slow(self, warn_after_s)
         for _ in range(max_tries):
-            masks, chances = mask or {}, probability or {}
+            slow.check()
             value = {
-                key: self.spaces[key].sample(masks.get(key), chances.get(key), set_value=set_value)
+                key: self.spaces[key].sample(masks.get(key), set_value=set_value, probability=chances.get(key))
                 for key in self._sampling_order
             }
             if self.constrain_fn is None or self.constrain_fn(value):
@@ -268,14 +302,14 @@ class Dict(spaces.Dict):
                 return
         raise RuntimeError(f"the factors' common constrain_fn did not hold in {TRIES} tries; vary fewer of them")
 
-    def set_init_value(self, values: Mapping[str, Any]) -> None:
+    def set_init_value(self, variations_values: Mapping[str, Any]) -> None:
         """Changes defaults, by dot key."""
-        for key, value in self._flat(values):
+        for key, value in self._flat(variations_values):
             self.find(key).set_init_value(value)
 
-    def set_value(self, values: Mapping[str, Any]) -> None:
+    def set_value(self, variations_values: Mapping[str, Any]) -> None:
         """Changes current values, by dot key."""
-        for key, value in self._flat(values):
+        for key, value in self._flat(variations_values):
             self.find(key).set_value(value)
 
     def _flat(self, values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
@@ -301,7 +335,7 @@ def reset_variation_space(
     variation_space: Dict,
     seed: int | None = None,
     options: Mapping[str, Any] | None = None,
-    default_variations: Iterable[str] = (),
+    default_variations: Iterable[str] | None = None,
 ) -> None:
     """Resets the factors of an environment for an episode.
 
@@ -312,7 +346,7 @@ def reset_variation_space(
     variation_space.seed(seed)
     variation_space.reset()
     names = options.get("variation")
-    names = default_variations if names is None else names
+    names = default_variations or () if names is None else names
     variation_space.update([names] if isinstance(names, str) else names)
     variation_space.set_value(options.get("variation_values") or {})
     if not variation_space.check():

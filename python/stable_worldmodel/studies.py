@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from . import _engine
-from .wm import _command
+from .wm.engine import _command
 
 __all__ = ["Study", "available", "read", "run"]
 

@@ -184,3 +184,24 @@ def test_ctrl_c_ends_the_wait_for_a_batch():
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=60)
     assert output.splitlines()[-1] == "interrupted" and process.returncode == 0
+
+
+def test_episodes_are_indices_or_a_mask(tmp_path):
+    path = tmp_path / "a.lance"
+    with data.open_writer(path) as writer:
+        for episode in range(4):
+            writer.write_episode({"action": np.zeros((2, 1), np.float32), "x": np.full((3, 1), episode, np.float32)})
+
+    def seen(episodes):
+        loader = data.Loader(path, 4, columns=["x"], episodes=episodes, backend="numpy", threads=0)
+        return sorted({int(value) for batch in loader for value in np.asarray(batch["x"]).ravel()})
+
+    assert seen([0, 2]) == [0, 2]
+    assert seen([True, False, True, False]) == seen(np.array([1, 0, 1, 0], bool)) == [0, 2]
+    with pytest.raises(ValueError, match="episodes: expected a mask of 4 booleans"):
+        seen([True, False])
+    for wrong in ([0.9, 2.9], ["0"], [[0], [1]]):
+        with pytest.raises(TypeError, match="episodes: expected indices or a mask"):
+            seen(wrong)
+    with pytest.raises(ValueError, match="number of threads"):
+        data.Loader(path, 4, threads=10**6)

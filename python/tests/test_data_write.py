@@ -46,6 +46,37 @@ def test_lists_and_small_types_are_converted(tmp_path):
     assert dataset.get_col_data("step_idx").tolist() == [0, 1, 2, 3], "the writer computes the indices"
 
 
+@pytest.mark.parametrize("name", ["a.h5", "a.lance", "a"])
+def test_values_that_the_stored_type_cannot_hold_are_refused(tmp_path, name):
+    path = tmp_path / name
+    format = None if "." in name else "folder"
+
+    def write(values, **kwargs):
+        with data.open_writer(path, format=format, **kwargs) as writer:
+            writer.write_episode({"action": np.zeros((2, 1), np.float32), "x": np.array(values)[:, None]})
+
+    for value in (2**63, 2**64 - 1):
+        with pytest.raises(ValueError, match=f"column 'x': {value} is stored as int64"):
+            write(np.array([1, value, 2], np.uint64), mode="overwrite")
+    write(np.array([1, 2, 3], np.int32), mode="overwrite")
+    for wrong, kind in ((2**31, np.int64), (-(2**33), np.int64), (2**32 - 1, np.uint32)):
+        with pytest.raises(ValueError, match=f"column 'x': {wrong} is stored as int32"):
+            write(np.array([1, wrong, 3], kind), mode="append")
+    write(np.array([4, 5, 6], np.int64), mode="append")
+    assert data.load_dataset(path, backend="numpy").get_col_data("x").ravel().tolist() == [1, 2, 3, 4, 5, 6]
+    write(np.array([1, 2, 3], np.float32), mode="overwrite")
+    for wrong in (np.array([0, 1e300, 0]), np.array([0, 2**30 + 1, 0])):
+        with pytest.raises(ValueError, match="which cannot hold it"):
+            write(wrong, mode="append")
+    write(np.array([np.nan, np.inf, 0.1]), mode="append")
+
+
+def test_replay_buffers_refuse_integers_that_do_not_fit():
+    buffer = data.ReplayBuffer(max_steps=10)
+    with pytest.raises(ValueError, match=f"column 'x': {2**63} is stored as int64"):
+        buffer.write_episode({"action": np.zeros((1, 1), np.float32), "x": np.array([[1], [2**63]], np.uint64)})
+
+
 def test_missing_discrete_action_is_stored_as_minus_one(tmp_path):
     with data.open_writer(tmp_path / "a.lance") as writer:
         writer.write_episode({"action": np.array([2, 0]), "state": np.zeros((3, 1))})

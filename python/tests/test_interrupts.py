@@ -127,8 +127,11 @@ def test_ctrl_c_stops_an_evaluation(policy):
 def children(pid):
     found = []
     for task in os.listdir(f"/proc/{pid}/task"):
-        with open(f"/proc/{pid}/task/{task}/children") as listed:
-            found += [int(child) for child in listed.read().split()]
+        try:
+            with open(f"/proc/{pid}/task/{task}/children") as listed:
+                found += [int(child) for child in listed.read().split()]
+        except (FileNotFoundError, ProcessLookupError):
+            pass  # the thread ended after it was listed
     return found
 
 

@@ -36,6 +36,39 @@ def test_absurd_counts_are_refused(absurd):
         swm.World("swm/TwoRoom-v1", **{"image_shape": (32, 32), **absurd})
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"num_envs": 1.5},
+        {"num_envs": 0},
+        {"threads": -1},
+        {"image_shape": (-1, 3)},
+        {"max_episode_steps": -1},
+        {"max_episode_steps": 2**70},
+    ],
+)
+def test_numbers_that_are_no_counts_are_named(wrong):
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))}: .*expected a whole number of at least"):
+        swm.World("swm/TwoRoom-v1", **{"image_shape": (32, 32), **wrong})
+
+
+@pytest.mark.parametrize("wrong", [{"image_shape": "32"}, {"views": "pixels"}])
+def test_text_in_place_of_a_list_is_refused(wrong):
+    with pytest.raises(TypeError, match=f"{next(iter(wrong))}: "):
+        swm.World("swm/TwoRoom-v1", **{"image_shape": (32, 32), **wrong})
+
+
+def test_wrong_settings_of_a_collection_do_not_change_the_world(tmp_path):
+    world = swm.World("swm/TwoRoom-v1", add_pixels=False, max_episode_steps=3)
+    world.set_policy(swm.policy.RandomPolicy())
+    settings = {"seed": 0, "progress": False}
+    for wrong in ({"action_noise": np.nan}, {"episodes": 1.5}, {"episodes": 2**70}, {"policy": {"random": np.nan}}):
+        name = "weight of 'random'" if "policy" in wrong else next(iter(wrong))
+        with pytest.raises(ValueError, match=f"{name}: "):
+            world.collect(tmp_path / "a.lance", **{"episodes": 1, **settings, **wrong})
+    assert world.collect(tmp_path / "a.lance", episodes=1, **settings)["added"] == 1
+
+
 def test_values_that_are_not_finite_are_counted_or_refused(tmp_path):
     world = swm.World("Faulty-v0", add_pixels=False)
     world.set_policy(swm.policy.RandomPolicy())

@@ -152,10 +152,10 @@ def test_grasp_reaches_the_goal():
 
 def test_dynamics_are_rolled_out_by_an_evaluator():
     objectives = [swm.planning.GoalDistance(), swm.planning.ActionPenalty(1e-3)]
-    evaluator = swm.planning.ShootingCostEvaluator(Linear(), objectives)
+    evaluator = swm.planning.LatentCost(Linear(), objectives)
     settings = {"num_samples": 200, "n_steps": 15, "topk": 20}
     for model in (evaluator, Linear()):
-        assert isinstance(evaluator, swm.planning.Costable) and isinstance(Linear(), swm.planning.Dynamics)
+        assert isinstance(Linear(), swm.planning.LatentDynamics)
         actions = plan(solvers.CEMSolver(model, **settings))
         assert np.abs(actions.sum(1) - TARGETS).max() < 0.05
     # The gradient passes through the rollout.
@@ -166,7 +166,7 @@ def test_dynamics_are_rolled_out_by_an_evaluator():
     assert running(trajectory, np.array([[1.0]]), None).tolist() == [8.0]
     assert swm.planning.GoalDistance()(trajectory, np.array([[1.0]]), None).tolist() == [4.0]
     with pytest.raises(TypeError, match="encode"):
-        swm.planning.ShootingCostEvaluator(Quadratic())
+        swm.planning.LatentCost(Quadratic())
 
 
 ALL = [
@@ -312,7 +312,8 @@ def test_wrong_model_stops_an_evaluation(defect, error, words):
         (lambda: plan(solvers.CEMSolver()), ValueError, "model"),
         (lambda: plan(solvers.CEMSolver(object())), TypeError, "get_cost"),
         (lambda: solvers.CEMSolver(Quadratic(), samples_n=3), TypeError, "num_samples"),
-        (lambda: solvers.CEMSolver(Quadratic(), callbacks=[print]), TypeError, "trace"),
+        (lambda: solvers.LagrangianSolver(Constrained(), callbacks=[print]), TypeError, "trace"),
+        (lambda: solvers.CEMSolver(Quadratic(), model=Quadratic()), TypeError, "two names"),
         (lambda: solvers.CEMSolver(Quadratic()).solve(infos()), RuntimeError, "configure"),
         (lambda: plan(solvers.CEMSolver(Quadratic(), batch_size=0)), ValueError, "batch_size"),
         (lambda: plan(solvers.CEMSolver(Quadratic(), num_samples=0)), ValueError, "sample"),
@@ -449,10 +450,39 @@ def test_model_gets_scaled_infos():
     assert np.allclose(first["state"][:, 0], (states[0] - [100, 50]) / [10, 20])
 
 
-def test_history_requires_an_engine_solver():
-    policy = swm.policy.MPCPolicy(Wrapped(few(solvers.CEMSolver, ToGoal())), swm.PlanConfig(history_len=2))
-    with pytest.raises(ValueError, match="history_len: 2"):
-        rooms().evaluate(policy=policy, episodes=1, progress=False)
+def test_user_defined_solvers_get_the_history_that_the_engine_gives():
+    config = swm.PlanConfig(2, 1, history_len=3, action_block=2, warm_start=False)
+    scaler = swm.data.ZScoreScaler([0.1, -0.2], [2.0, 0.5])
+    given = []
+    for wrap in (Wrapped, lambda solver: solver):
+
+        class Recorded(ToGoal):
+            def get_cost(self, info_dict, action_candidates):
+                names = ("pixels", "state", "action_history")
+                seen[-1].append({name: info_dict[name][:, 0].numpy().copy() for name in names})
+                return super().get_cost(info_dict, action_candidates)
+
+        given.append(seen := [[]])
+        policy = swm.policy.MPCPolicy(wrap(few(solvers.CEMSolver, Recorded())), config, process={"action": scaler})
+        world = rooms(2, steps=30)
+        world.set_policy(policy)
+        world.reset(seed=3)
+        for _ in range(8):
+            world.step()
+    # A search calls the model three times.
+    ours, engine = given[0][0][::3], given[1][0][::3]
+    assert len(ours) == len(engine) == 4
+    for step, (one, other) in enumerate(zip(ours, engine, strict=True)):
+        # The two paths draw different plans after the first one, so only what precedes it is equal.
+        assert {name: value.shape for name, value in one.items()} == {name: value.shape for name, value in other.items()}
+        if step == 0:
+            assert all(np.array_equal(one[name], other[name]) for name in one)
+            assert (one["action_history"] == 0).all() and (one["pixels"][:, 0] == one["pixels"][:, 2]).all()
+    # A model step later, the newest past frame is the one of the step before.
+    assert np.array_equal(ours[1]["pixels"][:, 1], ours[0]["pixels"][:, 2])
+    assert np.array_equal(ours[3]["pixels"][:, :2], ours[2]["pixels"][:, 1:])
+    assert np.array_equal(ours[3]["action_history"][:, 0], ours[2]["action_history"][:, 1])
+    assert np.abs(ours[1]["action_history"][:, 1]).min() > 0
 
 
 def test_nonlinear_scaler_converts_plans_back():

@@ -208,7 +208,7 @@ def test_restored_snapshot_repeats_the_next_step():
     [
         (lambda: swm.World("swm/PushTT-v1", image_shape=(8, 8)), ValueError, "swm/PushT-v1"),
         (lambda: rooms(num_envs=0), ValueError, "num_envs"),
-        (lambda: rooms(image_shape=(0, 8)), ValueError, "at least one pixel"),
+        (lambda: rooms(image_shape=(0, 8)), ValueError, "image_shape: 0; expected a whole number of at least 1"),
         (lambda: rooms().step(), RuntimeError, "set_policy"),
         (lambda: rooms().reset(seed=-1), ValueError, "from 0"),
         (lambda: rooms().reset(seed=[1, 2]), ValueError, "expected 3 seeds.*got 2"),

@@ -3,6 +3,7 @@
 //! The manifest determines everything except [`Run::timing`], so two evaluations with equal manifests write results
 //! that differ in their timing only.
 
+mod autopsy;
 mod betting;
 mod breaking;
 mod consistency;
@@ -12,14 +13,17 @@ mod family;
 mod paired;
 mod played;
 mod prediction;
+mod ranking;
 mod score;
 mod searches;
 mod seeds;
+mod shapley;
 mod statistics;
 mod study;
 mod table;
 mod until;
 
+pub use autopsy::{Arm, ArmRuns, Autopsy, Contribution, Estimate, Finding, Ingredient, Repair, game, letters, members};
 pub use breaking::{BreakingPoint, Crossing, Evaluated, Level, Ray, Side};
 pub use counting::Counting;
 pub use discrimination::{Density, Discrimination, ErrorAndSuccess, Predicts};
@@ -27,8 +31,10 @@ pub use family::{Family, Verdict};
 pub use paired::{Comparison, MAX_ALL_PAIRS, Paired, pairs};
 pub use played::{ClusteredMean, Played, PlayedErrors, PlayedTrajectory};
 pub use prediction::{Group, Prediction, Trajectory};
+pub use ranking::{Rank, Ranking};
 pub use searches::{Band, Searches};
 pub use seeds::{Interquartile, OverSeeds, TRAINING_SEED};
+pub use shapley::{Coalition, Game};
 pub use statistics::{Proportion, Summary};
 pub use study::{Published, Registration, StudyResults, StudyRow};
 pub use table::{StudyTable, TableColumn, TableRow};

@@ -163,31 +163,6 @@ impl World {
     }
 }
 
-/// Checks that a collection may be continued: environment, policy, seed and settings must be equal; the number of
-/// episodes may differ.
-///
-/// # Errors
-/// When a setting differs; the message names the setting.
-pub fn check_continues(stored: &Manifest, wanted: &Manifest) -> Result<()> {
-    let differs = |what: &str, stored: String, wanted: String| {
-        Err(Error::config(
-            format!("continuing a collection with {what} {wanted}"),
-            format!("its episodes were collected with {what} {stored}"),
-            "use the same settings, or collect into another dataset",
-        ))
-    };
-    if stored.seed != wanted.seed {
-        return differs("seed", stored.seed.to_string(), wanted.seed.to_string());
-    }
-    for what in ["env", "policy", "action_noise", "max_episode_steps", "variation", "image", "views", "goal"] {
-        let (stored, wanted) = (&stored.config[what], &wanted.config[what]);
-        if stored != wanted && !(what == "views" && stored.is_null()) {
-            return differs(what, stored.to_string(), wanted.to_string());
-        }
-    }
-    Ok(())
-}
-
 /// Writes the received episodes, up to `total`, and sends their batches back for reuse. Encoding runs on the world's
 /// threads, so that one setting limits all threads.
 fn write_all(

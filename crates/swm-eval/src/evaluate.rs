@@ -28,6 +28,9 @@ pub struct EvalConfig {
     pub budget: Option<usize>,
     /// The episodes that count, and the success criterion.
     pub counting: Counting,
+    /// Repeats the policy's draws with another stream; `None` for the stream of the starts' seed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub planning_seed: Option<u64>,
     /// Videos of the first episodes, if any.
     #[serde(skip)]
     pub videos: Option<Videos>,
@@ -76,6 +79,7 @@ impl World {
             config.videos.as_ref().map(|videos| VideoRecording::new(videos, self.pool(), starts.len())).transpose()?;
         let mut evaluation = Evaluation {
             starts,
+            planning_seed: config.planning_seed,
             first_to_finish: episodic && matches!(config.counting, Counting::Compat { .. }),
             columns: ColumnIndices::of(self.pool().infos().schema())?,
             slots: vec![(0, SuccessCriterion::new(config.counting, budget)); self.pool().len()],
@@ -124,6 +128,7 @@ fn check_counting(counting: Counting, budget: usize, slots: Option<usize>) -> Re
 /// An evaluation in progress.
 struct Evaluation<'a> {
     starts: &'a Starts,
+    planning_seed: Option<u64>,
     /// Whether episodes start until enough episodes have finished, instead of one episode for each start.
     first_to_finish: bool,
     columns: ColumnIndices,
@@ -182,7 +187,8 @@ impl Play for Evaluation<'_> {
     }
 
     fn key(&self, episode: usize) -> Key {
-        self.starts.key(episode)
+        let key = self.starts.key(episode);
+        self.planning_seed.map_or(key, |seed| key.with("planning seed").at(seed))
     }
 
     fn start(&mut self, pool: &mut EnvPool, starting: &[(usize, usize)]) -> Result<()> {

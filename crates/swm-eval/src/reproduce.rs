@@ -1,15 +1,17 @@
-//! [`reproduce`]: repeats an evaluation from its results and lists all differences.
+//! [`reproduce`]: repeats an evaluation from its results and lists all differences; [`reproduce_episodes`]: repeats some of
+//! its episodes.
 
 use crate::prediction::Predictor;
-use crate::request::{EvalRequest, PolicyRequest};
-use crate::runner::{ResolvedPolicy, Resolver, RunOptions};
+use crate::request::{EvalRequest, PolicyRequest, StartsRequest};
+use crate::runner::{Episodes, ResolvedPolicy, Resolver, RunOptions};
+use crate::seeding::{episode_key, reset_seed};
 use crate::world::World;
 use serde::Serialize;
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::sync::Arc;
-use swm_core::results::Run;
+use swm_core::results::{Counting, Run};
 use swm_core::run::Control;
 use swm_core::{Env, Error, Manifest, Result, Results};
 use swm_data::Reader;
@@ -72,14 +74,74 @@ pub fn reproduce(
     options: &RunOptions,
     control: &mut Control<'_>,
 ) -> Result<Reproduction> {
+    let request = requested(old)?;
+    let results = request.run(&Checked { resolver, manifest: &old.manifest }, options, control)?;
+    Ok(Reproduction { differences: differences(old, &results), results })
+}
+
+/// Repeats the episodes with these numbers of the evaluation that gave `old`, without prediction errors, and lists the
+/// differences between the old and the new results. The reset seeds and the dataset rows of all episodes, and the hashes of
+/// all starts and goals, are compared too, for which nothing is played.
+///
+/// # Errors
+/// As [`reproduce`], and when the counting is not strict or an episode does not exist.
+pub fn reproduce_episodes(
+    old: &Results,
+    numbers: &[usize],
+    resolver: &dyn Resolver,
+    options: &RunOptions,
+    control: &mut Control<'_>,
+) -> Result<Reproduction> {
+    let request = EvalRequest { prediction: None, ..requested(old)? };
+    if !matches!(request.counting, Counting::Strict { .. }) {
+        let problem = format!("counting is {}, for which all episodes are played", request.counting.name());
+        return Err(Error::config("repeating some episodes", problem, "repeat the whole evaluation"));
+    }
+    let checked = Checked { resolver, manifest: &old.manifest };
+    let mut found = differing_starts(old, &request, &checked)?;
+    let results = request.run_episodes(Episodes::Only(numbers), &checked, options, control)?;
+    let mut part = old.clone();
+    if let Some(config) = part.manifest.config.as_object_mut() {
+        config.remove("prediction");
+    }
+    for run in &mut part.runs {
+        let chosen = numbers.iter().map(|&number| run.episodes[number].clone()).collect();
+        *run = Run::new(&run.condition, &run.policy, old.counting, chosen, run.timing.clone());
+    }
+    found.extend(list(&part, &results, &|index| numbers[index]));
+    Ok(Reproduction { differences: found, results })
+}
+
+/// Returns the request of results whose runs have as many episodes as it says.
+fn requested(old: &Results) -> Result<EvalRequest> {
     let request = EvalRequest::of(&old.manifest)?;
     if let Some(run) = old.runs.iter().find(|run| run.episodes.len() != request.episodes) {
         let [found, requested] = [run.episodes.len(), request.episodes];
         let problem = format!("its request has {requested} episodes, its run '{}' has {found}", run.policy);
         return Err(Error::config("the results' manifest", problem, "evaluate again (`swm eval`)"));
     }
-    let results = request.run(&Checked { resolver, manifest: &old.manifest }, options, control)?;
-    Ok(Reproduction { differences: differences(old, &results), results })
+    Ok(request)
+}
+
+/// Lists the episodes whose reset seed or dataset row is not that of the request.
+fn differing_starts(old: &Results, request: &EvalRequest, resolver: &dyn Resolver) -> Result<Vec<Difference>> {
+    request.check()?;
+    let picks = match &request.starts {
+        StartsRequest::Episodic => vec![],
+        StartsRequest::Dataset { dataset, .. } => request.picks(&*resolver.dataset(dataset)?)?,
+    };
+    let mut found = vec![];
+    for run in &old.runs {
+        for (i, episode) in run.episodes.iter().enumerate() {
+            let expected = (reset_seed(episode_key(request.seed, i)), picks.get(i).copied());
+            let given = (episode.seed, episode.start);
+            if given != expected {
+                let what = format!("seed and row of the start of episode {i} of {}", name(run));
+                found.push(Difference { kind: Kind::Input, what, was: json(&given), is: json(&expected) });
+            }
+        }
+    }
+    Ok(found)
 }
 
 /// A resolver that rejects data and weights whose hashes differ from the hashes in the old results.
@@ -128,6 +190,11 @@ impl Resolver for Checked<'_> {
 
 /// Lists the differences between two results, except times and videos.
 pub fn differences(old: &Results, new: &Results) -> Vec<Difference> {
+    list(old, new, &|index| index)
+}
+
+/// Lists the differences; `number` is the number of the episode at an index.
+fn list(old: &Results, new: &Results, number: &dyn Fn(usize) -> usize) -> Vec<Difference> {
     let mut found = vec![];
     let (then, now) = (&old.manifest, &new.manifest);
     let mut compare = |kind, what: &str, was: &str, is: &str| {
@@ -152,7 +219,7 @@ pub fn differences(old: &Results, new: &Results) -> Vec<Difference> {
         compare(Kind::Input, &format!("request, {what}"), was, is);
     }
     for ((run, episode), was, is) in pair_values(&outcomes(old), &outcomes(new)) {
-        compare(Kind::Finding, &format!("episode {episode} of {run}"), was, is);
+        compare(Kind::Finding, &format!("episode {} of {run}", number(*episode)), was, is);
     }
     for (run, was, is) in pair_values(&summaries(old), &summaries(new)) {
         compare(Kind::Finding, run, was, is);

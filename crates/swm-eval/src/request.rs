@@ -45,6 +45,9 @@ pub struct EvalRequest {
     /// `None` to omit prediction errors.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub prediction: Option<usize>,
+    /// Repeats the draws of policies with another stream, from the same starts; `None` for the stream of the seed.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub planning_seed: Option<u64>,
 }
 
 /// The longest side of a frame, in pixels.
@@ -109,6 +112,9 @@ pub enum PolicyKind {
     NoOp,
     /// The recorded actions that follow the rows of the starts.
     Replay,
+    /// The recorded actions that follow the rows nearest to the present and the goal, of other episodes than those of the
+    /// starts.
+    Nearest,
     /// An expert of the environment.
     Expert {
         /// The id of the expert.
@@ -147,6 +153,45 @@ pub enum Model {
         /// The name of the score of a plan, as the simulator model defines it.
         score: String,
     },
+    /// The environment, restored and stepped in place of the dynamics of a trained world model. All else, such as the scale of
+    /// actions, is that of the world model.
+    TrueDynamics {
+        /// The world model: its name or path.
+        checkpoint: String,
+        /// The cost of a plan.
+        cost: EndCost,
+    },
+}
+
+/// The cost of a plan that is simulated in the environment.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum EndCost {
+    /// The squared distance of the world model's latent of the last observation from that of the goal.
+    Latent,
+    /// The environment's distance to the goal by its success criterion.
+    Success,
+}
+
+impl Model {
+    /// The name or path of the trained world model; `None` for the environment alone.
+    pub fn checkpoint(&self) -> Option<&str> {
+        match self {
+            Self::Checkpoint(checkpoint) | Self::TrueDynamics { checkpoint, .. } => Some(checkpoint),
+            Self::Simulator { .. } => None,
+        }
+    }
+}
+
+impl PolicyKind {
+    /// The name or path of the checkpoint that the policy uses, if it uses one.
+    pub fn checkpoint(&self) -> Option<&str> {
+        match self {
+            Self::Plan { model, .. } => model.checkpoint(),
+            Self::Direct { checkpoint, .. } => Some(checkpoint),
+            _ => None,
+        }
+    }
 }
 
 /// A named condition.

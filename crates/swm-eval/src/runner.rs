@@ -1,6 +1,6 @@
 //! Runs an [`EvalRequest`]: condition by condition, every policy on the same starts, the random-policy floor first.
 
-use crate::baselines::{NoOpPolicy, ReplayPolicy};
+use crate::baselines::Baselines;
 use crate::evaluate::EvalConfig;
 use crate::played::PlayedRecording;
 use crate::prediction::{self, Predictor, predict_run};
@@ -14,7 +14,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use swm_core::results::{Comparison, Counting, Played, Proportion, Run, Searches};
 use swm_core::run::{Control, Event, Stage};
-use swm_core::{Env, Error, Manifest, PlanTrace, Policy, RandomPolicy, Result, Results, VariationRequest};
+use swm_core::{Env, Error, Manifest, PlanTrace, Policy, Result, Results, VariationRequest};
 use swm_data::Reader;
 
 /// The name of the random-policy floor in results.
@@ -77,6 +77,31 @@ impl From<Box<dyn Policy>> for ResolvedPolicy {
     }
 }
 
+/// The episodes that a run plays.
+#[derive(Clone, Copy)]
+pub(crate) enum Episodes<'a> {
+    /// All episodes of the request.
+    All,
+    /// Those that these results of the same request with fewer episodes lack.
+    After(&'a Results),
+    /// Those with these numbers.
+    Only(&'a [usize]),
+}
+
+impl Episodes<'_> {
+    /// The numbers among `n` episodes; `None` for all.
+    fn numbers(self, n: usize) -> Option<Vec<usize>> {
+        match self {
+            Self::All => None,
+            Self::Only(numbers) => Some(numbers.to_vec()),
+            Self::After(earlier) => {
+                let played = earlier.runs.first().map_or(0, |run| run.episodes.len());
+                (played > 0).then(|| (played..n).collect())
+            }
+        }
+    }
+}
+
 /// Options of a run that do not change its results.
 #[derive(Clone, Debug, Default)]
 pub struct RunOptions {
@@ -99,15 +124,15 @@ impl EvalRequest {
     /// When the request is invalid or names an unknown environment, dataset, policy or factor, a policy or an
     /// environment fails, or the run is stopped.
     pub fn run(&self, resolver: &dyn Resolver, options: &RunOptions, control: &mut Control<'_>) -> Result<Results> {
-        self.extend(None, resolver, options, control)
+        self.run_episodes(Episodes::All, resolver, options, control)
     }
 
-    /// Evaluates as [`EvalRequest::run`], but plays only the starts that `earlier` lacks: the results of the same request
-    /// with fewer episodes. Everything but times is as if all were played at once.
+    /// Evaluates as [`EvalRequest::run`], but plays only these episodes. Everything but times is as if all were played at
+    /// once.
     #[allow(clippy::too_many_lines, reason = "one loop over conditions and policies, which share all state")]
-    pub(crate) fn extend(
+    pub(crate) fn run_episodes(
         &self,
-        earlier: Option<&Results>,
+        episodes: Episodes<'_>,
         resolver: &dyn Resolver,
         options: &RunOptions,
         control: &mut Control<'_>,
@@ -130,16 +155,14 @@ impl EvalRequest {
         for condition in &request.conditions {
             world.spec().variation_space.check(&condition.variation)?;
         }
-        for policy in request.policies.iter().filter(|policy| policy.kind != PolicyKind::Random) {
-            match policy.kind {
-                PolicyKind::NoOp => drop(NoOpPolicy::new(world.spec())?),
-                PolicyKind::Replay => {
-                    ReplayPolicy::check(dataset.as_deref())?;
-                }
-                _ => drop(resolver.policy(policy, &world)?),
+        let mut baselines = Baselines::new(dataset.as_deref(), request.held_out());
+        for policy in &request.policies {
+            if !baselines.check(&policy.kind, &world)? {
+                drop(resolver.policy(policy, &world)?);
             }
         }
         let (mut starts_hash, mut runs) = (StartsHash::default(), vec![]);
+        let earlier = if let Episodes::After(earlier) = episodes { Some(earlier) } else { None };
         for condition in &request.conditions {
             let starts = request.starts(dataset.as_deref(), world.pool().env(0), condition.variation.clone())?;
             if let Some((horizon, reader)) = request.prediction.zip(dataset.as_deref()) {
@@ -150,20 +173,14 @@ impl EvalRequest {
                 }
             }
             starts_hash.add(&mut world, &starts)?;
-            let played = earlier.and_then(|earlier| earlier.runs.first()).map_or(0, |run| run.episodes.len());
-            let starts = if played > 0 { starts.only(&Vec::from_iter(played..starts.len()))? } else { starts };
+            let starts = match episodes.numbers(starts.len()) {
+                Some(numbers) => starts.only(&numbers)?,
+                None => starts,
+            };
             for policy in &request.policies {
-                let mut resolved = match policy.kind {
-                    PolicyKind::Random => ResolvedPolicy::from(floor(&world)),
-                    PolicyKind::NoOp => {
-                        ResolvedPolicy::from(Box::new(NoOpPolicy::new(world.spec())?) as Box<dyn Policy>)
-                    }
-                    PolicyKind::Replay => {
-                        let (slots, budget) = (world.pool().len(), world.pool().max_episode_steps());
-                        let replay = ReplayPolicy::new(world.spec(), slots, (&starts, dataset.as_deref()), budget)?;
-                        ResolvedPolicy::from(Box::new(replay) as Box<dyn Policy>)
-                    }
-                    _ => resolver.policy(policy, &world)?,
+                let mut resolved = match baselines.policy(&policy.kind, &world, &starts)? {
+                    Some(baseline) => ResolvedPolicy::from(baseline),
+                    None => resolver.policy(policy, &world)?,
                 };
                 request.record_provenance(&mut manifest, policy, &resolved);
                 control.emit(Event::Started(Stage {
@@ -232,6 +249,7 @@ impl EvalRequest {
             condition: condition.name.clone(),
             budget: self.budget,
             counting: self.counting,
+            planning_seed: self.planning_seed,
             videos: options.videos.as_ref().map(|(root, count)| Videos {
                 root: root.clone(),
                 prefix: format!("videos/{}-{}", slug(&policy.name), slug(&condition.name)),
@@ -298,18 +316,30 @@ impl EvalRequest {
         }
     }
 
+    /// The part of a dataset that the starts come from, if there is one.
+    fn held_out(&self) -> Option<HeldOut> {
+        match self.starts {
+            StartsRequest::Dataset { held_out, .. } => held_out,
+            StartsRequest::Episodic => None,
+        }
+    }
+
     fn manifest(&self) -> Result<Manifest> {
         let config = serde_json::to_value(self).map_err(|e| Error::external("writing an evaluation's request", e))?;
         Ok(Manifest::new("evaluate", self.seed, config))
     }
 
+    /// The name under which the manifest of results has the hash of a policy's weights. The request is that of the
+    /// manifest, which lists the random-policy floor.
+    pub fn weights_key(&self, policy: &str) -> String {
+        // The random-policy floor has no weights, so at most one of two policies has weights.
+        if self.policies.len() <= 2 { "weights".to_owned() } else { format!("weights of {policy}") }
+    }
+
     /// Adds the provenance of a policy to the manifest.
     fn record_provenance(&self, manifest: &mut Manifest, policy: &PolicyRequest, resolved: &ResolvedPolicy) {
         if let Some(weights) = &resolved.weights {
-            // The random-policy floor has no weights, so at most one of two policies has weights.
-            let single = self.policies.len() <= 2;
-            let key = if single { "weights".to_owned() } else { format!("weights of {}", policy.name) };
-            manifest.hashes.insert(key, weights.clone());
+            manifest.hashes.insert(self.weights_key(&policy.name), weights.clone());
         }
         manifest.libraries.extend(resolved.libraries.clone());
         if let Some(device) = &resolved.device {
@@ -330,10 +360,6 @@ fn joined(earlier: &Run, later: Run, counting: Counting) -> Run {
 fn metrics(run: &Run) -> [(&'static str, f64); 3] {
     let success = &run.success;
     [("success_rate", success.rate), ("successes", success.successes as f64), ("episodes", success.n as f64)]
-}
-
-fn floor(world: &World) -> Box<dyn Policy> {
-    Box::new(RandomPolicy::new(world.spec(), world.pool().len()))
 }
 
 /// A name in the form of a file name: lower-case words joined by hyphens.

@@ -81,7 +81,8 @@ impl VideoRecording {
     /// Prepares the recording of up to `videos.count` of the `episodes`.
     ///
     /// # Errors
-    /// When the pool renders no frames, or a file of a video or a poster exists and was not written by this program.
+    /// When the pool renders no frames, the folder of the videos is a file or a symbolic link, or a file of a video or a poster
+    /// exists and was not written by this program.
     pub fn new(videos: &Videos, pool: &EnvPool, episodes: usize) -> Result<Self> {
         let Some(size) = pool.image() else {
             return Err(Error::config(
@@ -91,6 +92,15 @@ impl VideoRecording {
             ));
         };
         let (schema, count) = (pool.infos().schema(), videos.count.min(episodes));
+        // All videos are in the folder of the first one.
+        if let Some(folder) =
+            (count > 0).then(|| videos.root.join(videos.name(0)).parent().map(Path::to_owned)).flatten()
+            && folder != videos.root
+            && (folder.is_symlink() || (folder.exists() && !folder.is_dir()))
+        {
+            let problem = "it is a file or a symbolic link, where the folder of the videos should be";
+            return Err(Error::config(folder.display().to_string(), problem, "move it away, or choose another output"));
+        }
         for i in 0..count {
             swm_data::check_mp4(&videos.root.join(videos.name(i)))?;
             swm_data::check_png(&videos.poster(i))?;

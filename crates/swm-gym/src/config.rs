@@ -18,15 +18,17 @@ pub struct GymConfig {
 }
 
 impl Default for GymConfig {
-    /// Half an hour to start (Craftax builds textures and compiles the first time), a minute or `$SWM_GYM_TIMEOUT`
-    /// seconds per call, two restarts.
+    /// Half an hour to start (Craftax builds textures and compiles the first time) or `$SWM_GYM_START_TIMEOUT` seconds, a
+    /// minute or `$SWM_GYM_TIMEOUT` seconds per call, two restarts.
     fn default() -> Self {
-        let seconds = std::env::var("SWM_GYM_TIMEOUT").ok().and_then(|text| text.parse().ok());
-        let seconds = seconds.filter(|seconds: &f64| *seconds > 0.0 && *seconds < 1e9).unwrap_or(60.0);
+        let timeout = |name: &str, default: f64| {
+            let seconds = std::env::var(name).ok().and_then(|text| text.parse().ok());
+            Duration::from_secs_f64(seconds.filter(|given: &f64| *given > 0.0 && *given < 1e9).unwrap_or(default))
+        };
         Self {
             python: Python::find(),
-            start_timeout: Duration::from_secs(1800),
-            call_timeout: Duration::from_secs_f64(seconds),
+            start_timeout: timeout("SWM_GYM_START_TIMEOUT", 1800.0),
+            call_timeout: timeout("SWM_GYM_TIMEOUT", 60.0),
             restarts: 2,
         }
     }

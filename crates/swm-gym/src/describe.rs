@@ -130,7 +130,17 @@ impl SpaceJson {
         };
         match holds_values {
             true => Ok(space),
-            false => Err(Error::mismatch("reading a space", format!("{self:?}"), "bounds with values between them")),
+            false => {
+                let given = match self {
+                    Self::Box { .. } | Self::Rgb => "a Box with a lower bound above its upper bound".to_owned(),
+                    Self::Discrete { n, start } => format!("a Discrete of {n} values from {start}"),
+                    Self::MultiDiscrete { .. } => {
+                        "a MultiDiscrete or a Box of integers with an empty or larger range".to_owned()
+                    }
+                };
+                let expected = "bounds with values between them, and ranges of at most 2^63 - 1 values";
+                Err(Error::mismatch("reading a space", given, expected))
+            }
         }
     }
 

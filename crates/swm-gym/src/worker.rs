@@ -32,6 +32,9 @@ const MAX_LINE: u64 = 4096;
 /// The time that a worker process gets to end by itself.
 const EXIT_TIMEOUT: Duration = Duration::from_millis(500);
 
+/// How long a start may take until a message says what it waits for.
+const SLOW_START: Duration = Duration::from_secs(10);
+
 /// A Python process with one environment.
 pub struct WorkerTransport {
     id: TrustedId,
@@ -46,6 +49,8 @@ struct Process {
     memory: Option<MmapMut>,
     /// Whether the answer to a sent request is not read yet. Meanwhile only the worker accesses the memory.
     pending: bool,
+    /// The first byte of an answer whose rest is not read yet.
+    begun: Option<u8>,
     tail: Tail,
     _counted: Counted,
 }
@@ -176,7 +181,7 @@ impl Transport for WorkerTransport {
     fn describe(&mut self) -> Result<Description, Failure> {
         let limit = self.config.start_timeout;
         let Some(process) = &mut self.process else { return Err(Failure::Lost("its worker process is gone".into())) };
-        let answer = process.socket.set_read_timeout(Some(limit)).and_then(|()| process.receive());
+        let answer = process.wait_to_start(self.id.id(), limit).and_then(|()| process.receive());
         let (kind, text) = answer.map_err(|problem| match self.lose(&problem, limit) {
             // A new worker would exceed the same timeout.
             Failure::Lost(how) if problem.kind() == std::io::ErrorKind::WouldBlock => {
@@ -262,7 +267,7 @@ impl Process {
             Error::config("Python", format!("{python} cannot be started: {error}"), python.fix("gymnasium"))
         })?;
         let tail = Tail::of(child.stderr.take(), id);
-        Ok(Self { child, socket, file, memory: None, pending: false, tail, _counted: counted })
+        Ok(Self { child, socket, file, memory: None, pending: false, begun: None, tail, _counted: counted })
     }
 
     fn send(&mut self, op: u8, payload: &[u8]) -> std::io::Result<()> {
@@ -274,9 +279,34 @@ impl Process {
         if payload.is_empty() { Ok(()) } else { self.socket.write_all(payload) }
     }
 
+    /// Waits until the first answer begins. Says after [`SLOW_START`] what it waits for.
+    fn wait_to_start(&mut self, id: &str, limit: Duration) -> std::io::Result<()> {
+        let mut kind = [0];
+        self.socket.set_read_timeout(Some(SLOW_START.min(limit)))?;
+        let mut answer = self.socket.read_exact(&mut kind);
+        if answer.as_ref().is_err_and(|error| error.kind() == std::io::ErrorKind::WouldBlock) && limit > SLOW_START {
+            tracing::warn!(
+                "{id} is still being made (imports, compilation, a first reset and step); after {} s it is given up \
+                 ($SWM_GYM_START_TIMEOUT changes this)",
+                limit.as_secs()
+            );
+            self.socket.set_read_timeout(Some(limit.saturating_sub(SLOW_START)))?;
+            answer = self.socket.read_exact(&mut kind);
+        }
+        answer?;
+        self.begun = Some(kind[0]);
+        Ok(())
+    }
+
     fn receive(&mut self) -> std::io::Result<(u8, Vec<u8>)> {
         let mut head = [0; 5];
-        self.socket.read_exact(&mut head)?;
+        match self.begun.take() {
+            Some(kind) => {
+                head[0] = kind;
+                self.socket.read_exact(&mut head[1..])?;
+            }
+            None => self.socket.read_exact(&mut head)?,
+        }
         let [kind, n @ ..] = head;
         let n = u32::from_le_bytes(n) as usize;
         if !ANSWERS.contains(&kind) {

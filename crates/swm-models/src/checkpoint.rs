@@ -132,9 +132,11 @@ impl<M: Trainable> Checkpoint<M> {
         config.check().and_then(|()| dataset_info.check()).map_err(invalid)?;
         let expected = (M::image_size(&config.model), config.data.frameskip);
         if (image, action_block) != expected {
-            let given =
-                format!("image and action_block are {:?}, its config gives {expected:?}", (image, action_block));
-            return Err(stored.broken(given));
+            let describe = |(image, block): (Option<usize>, usize)| {
+                format!("image = {}, action_block = {block}", image.map_or("none".to_owned(), |side| side.to_string()))
+            };
+            let (given, expected) = (describe((image, action_block)), describe(expected));
+            return Err(stored.broken(format!("it says {given}, but its config gives {expected}")));
         }
         let create = |init: &Init| M::new(&config, &dataset_info, init).map_err(invalid);
         let model = stored.model(create, device)?;
@@ -179,8 +181,8 @@ impl<M: Trainable> Checkpoint<M> {
     }
 }
 
-/// Writes a checkpoint with additional files to a new folder, which then replaces the old checkpoint. Stores the hash
-/// of the weights in the manifest and returns the hash.
+/// Writes a checkpoint with additional files to a new folder, which then replaces the old checkpoint. Stores the hashes
+/// of configuration and weights in the manifest and returns that of the weights.
 pub(crate) fn write(
     run: &Path,
     config: &impl Serialize,
@@ -192,7 +194,9 @@ pub(crate) fn write(
     files::delete(&new, CHECKPOINT_FILES)?;
     std::fs::create_dir_all(&new).map_err(|error| Error::io(&new, "creating a checkpoint", error))?;
     let write_file = |name: &str, bytes: &[u8]| files::write(&new.join(name), bytes);
-    write_file(CONFIG, text(config)?.as_bytes())?;
+    let config = text(config)?;
+    write_file(CONFIG, config.as_bytes())?;
+    manifest.hashes.insert("config".to_owned(), manifest::hash(config.as_bytes()));
     let weights = tensor_file::encode(weights)?;
     let hash = manifest::hash(&weights);
     write_file(WEIGHTS, &weights)?;

@@ -24,6 +24,8 @@ pub struct StoredCheckpoint {
     /// Family, configuration and statistics of the dataset: the content of `config.json`.
     file: Value,
     manifest: Manifest,
+    /// The hash of `config.json`; `None` for a capsule, which has a hash of its whole content.
+    config_hash: Option<String>,
     weights: Weights,
 }
 
@@ -48,10 +50,11 @@ impl StoredCheckpoint {
         }
         let folder = locate(run).ok_or_else(|| missing(run))?;
         let path = folder.join(CONFIG);
-        let file = serde_json::from_slice(&read_text(&path)?).map_err(|error| broken(&path, error.to_string()))?;
+        let text = read_text(&path)?;
+        let file = serde_json::from_slice(&text).map_err(|error| broken(&path, error.to_string()))?;
         let manifest = read_manifest(&folder)?;
         let weights = Weights::File(folder.join(WEIGHTS));
-        Ok(Self { run: run.to_owned(), path, file, manifest, weights })
+        Ok(Self { run: run.to_owned(), path, file, manifest, config_hash: Some(manifest::hash(&text)), weights })
     }
 
     /// Returns the checkpoint in a capsule; `path` names the capsule in errors.
@@ -61,6 +64,7 @@ impl StoredCheckpoint {
             path: path.to_owned(),
             file: capsule.checkpoint.clone(),
             manifest: capsule.manifest.clone(),
+            config_hash: None,
             weights: Weights::Loaded(capsule.weights.clone()),
         }
     }
@@ -151,7 +155,20 @@ impl StoredCheckpoint {
         let init = Init::for_weights(&weights, device);
         let model = create(&init)?;
         init.check().map_err(|_| broken(path, format!("{CONFIG} describes a larger model than these weights")))?;
-        with_weights(model, &weights, path)
+        let model = with_weights(model, &weights, path)?;
+        self.check_config()?;
+        Ok(model)
+    }
+
+    /// Checks the hash of `config.json` if the manifest has one: statistics of the data and settings of the frames change what
+    /// a model computes without changing its weights.
+    fn check_config(&self) -> Result<()> {
+        match (&self.config_hash, self.manifest.hashes.get("config")) {
+            (Some(found), Some(expected)) if found != expected => {
+                Err(self.broken(format!("is not the file that {MANIFEST} describes: the hash differs")))
+            }
+            _ => Ok(()),
+        }
     }
 
     /// Returns the error for damage in the configuration.
@@ -200,7 +217,7 @@ pub(crate) fn is_event_file(name: &str) -> bool {
     name.starts_with("events.out.tfevents.") && name.ends_with(".swm")
 }
 
-/// Returns the faults of a checkpoint that loading does not find: files of tensors without a hash in the manifest, and
+/// Returns the faults of a checkpoint that loading does not find: files without a hash in the manifest, and
 /// a training state whose hash differs. A capsule has none, because loading it checks all hashes.
 ///
 /// # Errors
@@ -212,7 +229,7 @@ pub fn faults(run: &Path) -> Result<Vec<String>> {
     let folder = locate(run).ok_or_else(|| missing(run))?;
     let manifest = read_manifest(&folder)?;
     let mut faults = vec![];
-    for (name, file) in [("weights", WEIGHTS), ("optimizer", OPTIMIZER), ("raw", RAW)] {
+    for (name, file) in [("config", CONFIG), ("weights", WEIGHTS), ("optimizer", OPTIMIZER), ("raw", RAW)] {
         let path = folder.join(file);
         match manifest.hashes.get(name) {
             Some(hash) if *hash != manifest::hash(&files::read(&path, u64::MAX)?) => {

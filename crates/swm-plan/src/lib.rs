@@ -19,7 +19,7 @@ pub mod solvers;
 pub use entry::{ActionKind, Family, Need, SolverEntry};
 pub use mpc::{ActionScale, MpcConfig, MpcPolicy, PlanRecord, TraceLog};
 pub use objective::Penalised;
-pub use simulator::{Score, SimulatorCost};
+pub use simulator::{Score, SimulatedLatents, SimulatorCost};
 pub use solvers::{
     AugmentedLagrangian, CategoricalCem, Cem, GradientDescent, Grasp, ICem, Mppi, Pgd, PredictiveSampling, SOLVERS,
     pairing,

@@ -7,6 +7,7 @@
 //! - `page` writes the page; `sections` has a file for each section; `charts` has a file for each chart; `style.css` is the
 //!   style sheet.
 //! - `study` writes the page of a study ([`write_study`]), with figures as SVG and PNG.
+//! - `leaderboard` writes the pages of a leaderboard ([`write_leaderboard`]).
 //! - `plot` draws charts and figures with `plotters`, and has the colours of policies.
 //! - `group` groups runs by environment, protocol and counting, and compares them; `gap` compares conditions; `read` and
 //!   `training_log` read files, within the `limits`; `text` formats numbers and escapes text.
@@ -14,6 +15,7 @@
 mod charts;
 mod gap;
 mod group;
+mod leaderboard;
 mod limits;
 mod page;
 mod plot;
@@ -23,7 +25,8 @@ mod study;
 mod text;
 mod training_log;
 
+pub use leaderboard::{BoardEntry, BoardRow, BoardTable, Leaderboard, write_leaderboard};
 pub use page::{ReportOptions, render, write_report, write_report_with};
-pub use read::read_results;
+pub use read::{parse_results, read_results};
 pub use study::{StudyPage, TablePage, write_study, write_table};
 pub use training_log::{Metrics, Series, Training, read_metrics};

@@ -90,6 +90,12 @@ pub(crate) const STUDY_NAME_CHARS: usize = 120;
 /// The longest question or command in the page of a study, in characters.
 pub(crate) const STUDY_TEXT_CHARS: usize = 2000;
 
+/// The size of the tables of a leaderboard beyond which further tables are left out, in bytes.
+pub(crate) const LEADERBOARD_BYTES: usize = 3_600_000;
+
+/// The largest number of entries that one table of a leaderboard compares.
+pub(crate) const LEADERBOARD_ROWS: usize = 200;
+
 /// A size in mebibytes, as a text.
 pub(crate) fn mebibytes(bytes: u64) -> String {
     format!("{:.1} MiB", bytes as f64 / f64::from(1 << 20))

@@ -60,34 +60,40 @@ pub fn write_report_with(results: &[(PathBuf, Results)], options: &ReportOptions
 /// # Errors
 /// When drawing a chart fails, which is a bug.
 pub fn render(results: &[(PathBuf, Results)], options: &ReportOptions) -> Result<String> {
-    let groups = Group::all(results);
     let mut envs: Vec<&str> = vec![];
-    for group in &groups {
-        if !envs.contains(&group.env) {
-            envs.push(group.env);
+    for (_, result) in results {
+        if !envs.contains(&result.env.as_str()) {
+            envs.push(&result.env);
         }
     }
     let title = options.title.clone().unwrap_or_else(|| format!("Evaluation in {}", envs.join(", ")));
     let title = shorten(&title, limits::TEXT_CHARS);
+    let head = Head { title: &title, lede: &summary(results), style: "" };
+    document(&head, |html| write_content(html, results, options))
+}
+
+/// Writes everything that a page of results has below its heading.
+///
+/// # Errors
+/// When drawing a chart fails, which is a bug.
+pub(crate) fn write_content(html: &mut String, results: &[(PathBuf, Results)], options: &ReportOptions) -> Result<()> {
+    let groups = Group::all(results);
     let mut videos = Videos::default();
     let shown: Vec<Shown<'_, '_>> =
         groups.iter().map(|group| Shown::new(group, results, videos.gallery(group, results))).collect();
     let inks = plot::inks(results.iter().flat_map(|(_, result)| &result.runs).map(|run| run.policy.as_str()));
-    document(&Head { title: &title, lede: &summary(results), style: "" }, |html| {
-        answer(html, &shown, videos.task.as_ref());
-        let mut room = Room::default();
-        for (i, group) in shown.iter().enumerate() {
-            if html.len() > limits::GROUPS_BYTES {
-                let _ =
-                    writeln!(html, "<p class=\"note\">The page has no room for {} more groups.</p>", shown.len() - i);
-                break;
-            }
-            group.write(html, shown.len() > 1, &mut room)?;
+    answer(html, &shown, videos.task.as_ref());
+    let mut room = Room::default();
+    for (i, group) in shown.iter().enumerate() {
+        if html.len() > limits::GROUPS_BYTES {
+            let _ = writeln!(html, "<p class=\"note\">The page has no room for {} more groups.</p>", shown.len() - i);
+            break;
         }
-        sections::training::write(html, &options.training, &inks, &mut room)?;
-        sections::provenance::write(html, results, options.command.as_deref());
-        Ok(())
-    })
+        group.write(html, shown.len() > 1, &mut room)?;
+    }
+    sections::training::write(html, &options.training, &inks, &mut room)?;
+    sections::provenance::write(html, results, options.command.as_deref());
+    Ok(())
 }
 
 /// Writes a frame of the task, and what every group shows in one sentence.

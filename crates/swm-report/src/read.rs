@@ -26,8 +26,15 @@ struct HeadManifest {
 /// version with another layout, lacks a field, or states statistics that its episodes do not have. Such a file was edited
 /// or damaged; it is refused instead of shown with other values, because its episodes may be wrong as well.
 pub fn read_results(path: &Path) -> Result<Results> {
-    let bytes = files::read(path, limits::RESULTS_BYTES)?;
-    let theirs = match serde_json::from_slice::<Head>(&bytes) {
+    parse_results(path, &files::read(path, limits::RESULTS_BYTES)?)
+}
+
+/// Reads results from the content of a file, as [`read_results`] does.
+///
+/// # Errors
+/// As [`read_results`].
+pub fn parse_results(path: &Path, bytes: &[u8]) -> Result<Results> {
+    let theirs = match serde_json::from_slice::<Head>(bytes) {
         Ok(head) => head.manifest.swm_version,
         Err(error) if error.is_data() => {
             let problem = "is not a results file: it has no manifest.swm_version";
@@ -40,7 +47,7 @@ pub fn read_results(path: &Path) -> Result<Results> {
         let problem = format!("was written by stable-worldmodel {theirs}; this version is {ours}");
         return Err(Error::corrupt(path, problem, FIX));
     }
-    let results: Results = serde_json::from_slice(&bytes).map_err(|error| {
+    let results: Results = serde_json::from_slice(bytes).map_err(|error| {
         Error::corrupt(path, format!("has a layout that this version does not read ({error})"), FIX)
     })?;
     check_size(path, &results)?;

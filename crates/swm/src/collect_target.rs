@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use swm_core::{Error, Manifest, Result};
 use swm_data::lance::{Shard, shard_manifests};
 use swm_data::{Location, WriteMode};
-use swm_eval::collect::check_continues;
+use swm_eval::continuation::check_continues;
 
 /// Checks, before any episode is played, that a collection with this manifest may be written to a location.
 /// `mix_renderers` permits frames of another renderer than the renderer of the stored frames. Returns the numbers of NaN
@@ -34,15 +34,7 @@ pub fn check(
             if !mix_renderers {
                 check_renderer("continuing a collection", &stored, new)?;
             }
-            let (stored, new) = (&stored.config["codec"], &new.config["codec"]);
-            if stored == new {
-                return Ok(not_finite);
-            }
-            Err(Error::config(
-                "codec (--codec)",
-                format!("the dataset's frames are stored as {stored}, not {new}"),
-                "use the dataset's codec, or collect into another dataset",
-            ))
+            Ok(not_finite)
         }
         WriteMode::Create => Err(Error::config(
             format!("dataset {location}"),
@@ -75,15 +67,19 @@ pub fn describe_not_finite(counts: &BTreeMap<String, u64>) -> Option<String> {
     (!columns.is_empty()).then(|| format!("NaN or infinite values were stored: {}; {hint}", columns.join(", ")))
 }
 
-/// Checks that all uncommitted shards of a dataset, and its committed episodes, have frames of the same renderer.
+/// Checks that all uncommitted shards of a dataset belong to the same collection, and, unless `mix_renderers`, that the
+/// shards and the committed episodes have frames of the same renderer.
 ///
 /// # Errors
-/// When two renderers were used.
-pub fn check_shards(location: &Location) -> Result<()> {
+/// When shards were collected with different settings, or two renderers were used.
+pub fn check_shards(location: &Location, mix_renderers: bool) -> Result<()> {
     let stored = swm_data::open(location.clone()).ok().and_then(|reader| reader.manifest());
     let shards = shard_manifests(location)?;
+    if let Some(((_, first), others)) = shards.split_first() {
+        others.iter().try_for_each(|(_, other)| check_continues(first, other))?;
+    }
     let mut manifests = stored.iter().chain(shards.iter().map(|(_, manifest)| manifest));
-    let Some(first) = manifests.next() else { return Ok(()) };
+    let Some(first) = manifests.next().filter(|_| !mix_renderers) else { return Ok(()) };
     manifests.try_for_each(|other| check_renderer("committing a shard", first, other))
 }
 

@@ -14,11 +14,13 @@ pub use swm_mujoco as mujoco;
 pub use swm_plan as plan;
 pub use swm_report as report;
 
+pub mod autopsy;
 pub mod capsule;
 pub mod cli;
 pub mod collect_target;
 pub mod describe;
 pub mod home;
+pub mod leaderboard;
 mod library;
 pub mod resolver;
 pub mod subject;

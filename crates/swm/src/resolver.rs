@@ -16,13 +16,14 @@ use swm_core::{
 use swm_data::Reader;
 use swm_envs::wrappers::{GoalFrame, Stack, WRAPPERS, WrapperEntry};
 use swm_eval::{
-    Choice, EvalRequest, MixturePolicy, Model, NoOpPolicy, PolicyChoice, PolicyKind, PolicyRequest, Predictor,
+    Choice, EndCost, EvalRequest, MixturePolicy, Model, NoOpPolicy, PolicyChoice, PolicyKind, PolicyRequest, Predictor,
     ResolvedPolicy, Resolver, World,
 };
 use swm_models::{CheckpointInfo, Device, LoadedModel, load};
 use swm_plan::objective::ObjectiveConfig;
 use swm_plan::{
-    ActionKind, ActionScale, MpcConfig, MpcPolicy, PlanRecord, SOLVERS, Score, SimulatorCost, TraceLog, pairing,
+    ActionKind, ActionScale, MpcConfig, MpcPolicy, PlanRecord, SOLVERS, Score, SimulatedLatents, SimulatorCost,
+    TraceLog, pairing,
 };
 
 /// A [`Resolver`] of names in this build and in the home folder. It loads every checkpoint once.
@@ -135,14 +136,49 @@ impl HomeResolver {
     /// Makes a policy that plans by restoring and stepping the environment itself.
     fn simulator_policy(&self, name: &str, score: &str, planner: Planner, world: &World) -> Result<ResolvedPolicy> {
         let (spec, score) = (world.spec(), parse_score(score)?);
+        let scale = ActionScale::unscaled(spec);
+        let cost = SimulatorCost::new(self.maker(spec)?, scale.clone(), planner.mpc.action_block, score)?;
+        Ok(self.traced(name, planner.policy(Box::new(cost), scale, world)?))
+    }
+
+    /// Returns a function that makes environments like those of a world, with the wrappers of the last request.
+    fn maker(&self, spec: &EnvSpec) -> Result<impl Fn() -> Result<Box<dyn Env>> + Send + Sync + use<>> {
         let (env, wrapping) = (self.choose_env(&spec.id)?, self.wrapping.borrow().clone());
-        let make = move || match &wrapping {
+        Ok(move || match &wrapping {
             Some(Wrapping { stack, goal, .. }) => Ok(stack.wrap(env.env()?, *goal)),
             None => env.env(),
+        })
+    }
+
+    /// Makes a policy that plans as with a checkpoint, but steps the environment in place of its dynamics.
+    fn true_dynamics_policy(
+        &self,
+        name: &str,
+        (given, cost): (&str, EndCost),
+        planner: Planner,
+        world: &World,
+    ) -> Result<ResolvedPolicy> {
+        let loaded = self.checkpoint(given)?;
+        let info = loaded.info()?;
+        check_trained_on(&info, given, world.spec())?;
+        let (make, scale) = (self.maker(world.spec())?, info.dataset_info.action.clone());
+        let block = planner.mpc.action_block;
+        let cost: Box<dyn CostModel> = match cost {
+            EndCost::Success => Box::new(SimulatorCost::new(make, scale.clone(), block, Score::Success)?),
+            EndCost::Latent => {
+                let model = loaded.predictor().ok_or_else(|| {
+                    let problem = format!("a {} model offers no latents of observations", info.family);
+                    Error::config(
+                        format!("checkpoint {given}"),
+                        problem,
+                        "plan with its own dynamics (an autopsy: leave out D and E)",
+                    )
+                })?;
+                Box::new(SimulatedLatents::new(make, scale.clone(), block, model)?)
+            }
         };
-        let scale = ActionScale::unscaled(spec);
-        let cost = SimulatorCost::new(make, scale.clone(), planner.mpc.action_block, score)?;
-        Ok(self.traced(name, planner.policy(Box::new(cost), scale, world)?))
+        let policy = planner.policy(cost, scale, world)?;
+        Ok(with_provenance(self.traced(name, policy), info))
     }
 
     /// Makes a policy that plans with a checkpoint.
@@ -192,7 +228,7 @@ impl Resolver for HomeResolver {
         match &request.kind {
             PolicyKind::Random => Ok(ResolvedPolicy::from(Box::new(RandomPolicy::new(spec, slots)) as Box<dyn Policy>)),
             PolicyKind::NoOp => Ok(ResolvedPolicy::from(Box::new(NoOpPolicy::new(spec)?) as Box<dyn Policy>)),
-            PolicyKind::Replay => {
+            PolicyKind::Replay | PolicyKind::Nearest => {
                 let problem = "only an evaluation knows the starts whose actions it repeats";
                 Err(Error::config(format!("policy '{}'", request.name), problem, "use it in `swm eval`"))
             }
@@ -208,6 +244,9 @@ impl Resolver for HomeResolver {
                 match model {
                     Model::Simulator { score } => self.simulator_policy(&request.name, score, planner, world),
                     Model::Checkpoint(given) => self.model_policy(&request.name, given, planner, world),
+                    Model::TrueDynamics { checkpoint, cost } => {
+                        self.true_dynamics_policy(&request.name, (checkpoint, *cost), planner, world)
+                    }
                 }
             }
         }

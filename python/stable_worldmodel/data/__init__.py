@@ -9,6 +9,7 @@
 from .buffer import ReplayBuffer, classic_filter
 from .dataset import ConcatDataset, Dataset, GoalDataset, MergeDataset, StoredDataset
 from .format import (
+    EPISODE_DATA_KEY,
     FORMATS,
     WRITE_MODES,
     Format,
@@ -18,6 +19,7 @@ from .format import (
     list_formats,
     open_writer,
     register_format,
+    split_episode_data,
     validate_write_mode,
 )
 from .formats import (
@@ -28,6 +30,7 @@ from .formats import (
     ImageDataset,
     LanceDataset,
     LanceVideoDataset,
+    LanceVideoWriter,
     LanceWriter,
     LeRobotAdapter,
     VideoDataset,
@@ -42,10 +45,11 @@ from .normalization import (
     column_normalizer,
     get_scaler,
 )
-from .utils import convert, doctor, ensure_dir_exists, get_cache_dir, inspect, load_dataset
+from .utils import convert, doctor, ensure_dir_exists, get_cache_dir, inspect, load_dataset, merge
 from .writer import EpisodeWriter
 
 __all__ = [
+    "EPISODE_DATA_KEY",
     "FORMATS",
     "WRITE_MODES",
     "ColumnTransform",
@@ -63,6 +67,7 @@ __all__ = [
     "ImageDataset",
     "LanceDataset",
     "LanceVideoDataset",
+    "LanceVideoWriter",
     "LanceWriter",
     "LeRobotAdapter",
     "Loader",
@@ -86,7 +91,9 @@ __all__ = [
     "inspect",
     "list_formats",
     "load_dataset",
+    "merge",
     "open_writer",
     "register_format",
+    "split_episode_data",
     "validate_write_mode",
 ]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -15,6 +16,9 @@ Backend = Literal["torch", "numpy"]
 
 #: The columns with the indices of episodes and steps. Readers compute them, writers ignore them.
 NUMBERING = ("episode_idx", "step_idx")
+
+#: The key of an episode's own values, which datasets store as a constant of the episode.
+EPISODE = "episode_data"
 
 #: The type in which values are stored, for each type that datasets do not support.
 _WIDER = {
@@ -85,6 +89,10 @@ def rows(episode: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, str | 
     for name, value in episode.items():
         if name in NUMBERING:
             continue
+        if name == EPISODE:
+            if value:
+                constants[name] = json.dumps({key: _described(key, item) for key, item in dict(value).items()})
+            continue
         text = _text(name, value)
         if text is not None:
             constants[name] = text
@@ -103,9 +111,60 @@ def rows(episode: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, str | 
         channels_lead = array.ndim == 4 and array.shape[1] in (1, 3) and array.shape[-1] not in (1, 3)
         if channels_lead and array.dtype == np.uint8:
             array = np.moveaxis(array, 1, -1)
-        arrays[name] = np.ascontiguousarray(array, dtype=dtype)
+        arrays[name] = exact(f"column {name!r}", array, dtype)
     _equal_lengths(arrays)
     return arrays, constants
+
+
+def exact(what: str, array: Array, dtype: str) -> Array:
+    """The array, contiguous and in another type. Integers keep their values, and finite numbers stay finite.
+
+    Raises:
+        ValueError: When the type cannot hold a value.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        converted = np.ascontiguousarray(array, dtype=dtype)
+    if array.dtype == converted.dtype or array.size == 0:
+        return converted
+    if array.dtype.kind in "iu":
+        with np.errstate(invalid="ignore"):
+            wrong = converted.astype(array.dtype) != array
+        if converted.dtype.kind == "i" and array.dtype.kind == "u":
+            wrong |= converted < 0
+    else:
+        wrong = np.isfinite(array) & ~np.isfinite(converted)
+    if wrong.any():
+        value = array[wrong].ravel()[0]
+        raise ValueError(f"{what}: {value} is stored as {dtype}, which cannot hold it; scale it or leave the column out")
+    return converted
+
+
+def _described(name: str, value: Any) -> Any:
+    """A value of an episode in a form that JSON can hold: text, or an array with its type."""
+    if isinstance(value, str):
+        return value
+    array = to_numpy(value)
+    if array.dtype.kind not in "biuf":
+        raise TypeError(f"{EPISODE}[{name!r}]: {array.dtype} cannot be stored; expected numbers or text")
+    return {"dtype": array.dtype.name, "values": array.tolist()}
+
+
+def episode_values(text: bytes | None) -> dict[str, Any]:
+    """The values of an episode that `rows` stored; empty if it has none."""
+    if text is None:
+        return {}
+    stored = json.loads(text)
+    return {
+        key: item if isinstance(item, str) else np.array(item["values"], dtype=item["dtype"]) for key, item in stored.items()
+    }
+
+
+def episode_table(episodes: Sequence[Mapping[str, Any]]) -> dict[str, Array]:
+    """The values of several episodes, `(episodes, ..)`: those that all of them have."""
+    if not episodes:
+        return {}
+    shared = [name for name in episodes[0] if all(name in episode for episode in episodes)]
+    return {name: np.stack([np.asarray(episode[name]) for episode in episodes]) for name in shared}
 
 
 def _text(name: str, value: Any) -> str | bytes | None:

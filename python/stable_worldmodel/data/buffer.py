@@ -200,6 +200,9 @@ class ReplayBuffer(Dataset):
         sample: dict[str, Any] = self._read(episodes, starts, lengths, self.frameskip)
         return self.transform(sample) if self.transform else sample
 
+    def _episode_values(self, episode: int) -> dict[str, Any]:
+        return _tensors.episode_values(self.engine.constants(episode % self.num_episodes).get(_tensors.EPISODE))
+
     def get_col_data(self, col: str) -> Array:
         if col not in self.column_names:
             raise KeyError(f"there is no column {col!r}; the columns are {', '.join(self.column_names)}")
@@ -213,12 +216,14 @@ class ReplayBuffer(Dataset):
         found = self._read(episodes, rows - self.offsets[episodes], np.ones_like(rows), 1)
         return {name: array[0] for name, array in found.items()} if np.ndim(row_idx) == 0 else found
 
-    def episodes(self) -> Iterator[dict[str, Array]]:
+    def episodes(self) -> Iterator[dict[str, Any]]:
         """Yields the episodes, oldest first, as dicts of arrays `(T, ...)`."""
         snapshot, lengths = self._snapshot, self.lengths
         for episode in range(len(lengths)):
             run = (np.asarray([n], dtype=np.int64) for n in (episode, 0, lengths[episode]))
-            yield dict(snapshot.read(self.column_names, *run, 1))
+            values = _tensors.episode_values(snapshot.constants(episode).get(_tensors.EPISODE))
+            steps: dict[str, Any] = dict(snapshot.read(self.column_names, *run, 1))
+            yield {**steps, _tensors.EPISODE: values} if values else steps
 
     def dump(self, path: str | os.PathLike[str], format: str | None = None, mode: str = "overwrite", **kwargs: Any) -> None:
         """Writes the content to a dataset of any format."""

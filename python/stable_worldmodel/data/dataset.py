@@ -39,6 +39,11 @@ class Dataset:
         transform: A function from the dict of a sample to the sample that the dataset returns.
     """
 
+    #: The number of rows of every episode.
+    lengths: Array
+    #: The index of every episode's first row in the whole dataset.
+    offsets: Array
+
     def __init__(
         self,
         lengths: Sequence[int] | Array,
@@ -125,6 +130,20 @@ class Dataset:
     def get_row_data(self, row_idx: Rows) -> dict[str, Array]:
         """The rows with these indices in the whole dataset: `(...)` for one index, `(rows, ...)` for several."""
         raise NotImplementedError(f"{type(self).__name__}.get_row_data")
+
+    @property
+    def episode_column_names(self) -> list[str]:
+        """The values that every episode has (`EPISODE_DATA_KEY` of a written episode)."""
+        return list(self.get_episode_data([0])) if self.num_episodes else []
+
+    def get_episode_data(self, episodes_idx: Sequence[int] | Array | None = None) -> dict[str, Array]:
+        """The values of episodes, `(episodes, ..)`; of all episodes for `None`."""
+        wanted = range(self.num_episodes) if episodes_idx is None else np.asarray(episodes_idx).reshape(-1).tolist()
+        return _tensors.episode_table([self._episode_values(int(episode)) for episode in wanted])
+
+    def _episode_values(self, episode: int) -> dict[str, Any]:
+        """The values of one episode."""
+        return {}
 
     def get_dim(self, col: str) -> int:
         """The number of elements in a row of a column."""
@@ -238,6 +257,12 @@ class StoredDataset(Dataset):
     def constants(self, episode_idx: int) -> dict[str, bytes]:
         """The non-numeric constants of an episode, such as the XML of its scene."""
         return dict(self.engine.constants(int(episode_idx)))
+
+    def _episode_values(self, episode: int) -> dict[str, Any]:
+        wanted = episode + self.num_episodes if episode < 0 else episode
+        if not 0 <= wanted < self.num_episodes:
+            raise IndexError(f"episode {episode} is outside the dataset, which has {self.num_episodes} episodes")
+        return _tensors.episode_values(self.engine.constants(wanted).get(_tensors.EPISODE))
 
     def _row_shape(self, name: str) -> tuple[int, ...]:
         return self._merged[name].shape[1:] if name in self._merged else self.schema[name][1]
@@ -420,6 +445,18 @@ class MergeDataset:
         """See :meth:`Dataset.load_episode`."""
         return self._picked(dataset.load_episode(episode_idx) for dataset in self.datasets)
 
+    @property
+    def episode_column_names(self) -> list[str]:
+        """See :attr:`Dataset.episode_column_names`."""
+        return list(dict.fromkeys(name for dataset in self.datasets for name in dataset.episode_column_names))
+
+    def get_episode_data(self, episodes_idx: Any = None) -> dict[str, Array]:
+        """See :meth:`Dataset.get_episode_data`. Of equal names, the first dataset's value counts."""
+        found: dict[str, Array] = {}
+        for dataset in self.datasets:
+            found = {**dataset.get_episode_data(episodes_idx), **found}
+        return found
+
     def get_col_data(self, col: str) -> Array:
         """See :meth:`Dataset.get_col_data`."""
         for dataset, keys in zip(self.datasets, self.keys_map, strict=True):
@@ -523,6 +560,19 @@ class ConcatDataset:
         parts, episodes = self._locate(self._episodes_before, [episode_idx], "episodes")
         return dict(self.datasets[int(parts[0])].load_episode(int(episodes[0])))
 
+    @property
+    def episode_column_names(self) -> list[str]:
+        """The values that the episodes of all datasets have."""
+        names = [dataset.episode_column_names for dataset in self.datasets]
+        return [name for name in names[0] if all(name in others for others in names)]
+
+    def get_episode_data(self, episodes_idx: Any = None) -> dict[str, Array]:
+        """See :meth:`Dataset.get_episode_data`."""
+        wanted = np.arange(self.num_episodes) if episodes_idx is None else np.asarray(episodes_idx).reshape(-1)
+        parts, episodes = self._locate(self._episodes_before, wanted, "episodes")
+        found = [self.datasets[part].get_episode_data([episode]) for part, episode in zip(parts, episodes, strict=True)]
+        return _tensors.episode_table([{name: value[0] for name, value in one.items()} for one in found])
+
     def get_col_data(self, col: str) -> Array:
         """See :meth:`Dataset.get_col_data`."""
         having = [dataset for dataset in self.datasets if col in dataset.column_names]
@@ -618,6 +668,15 @@ class GoalDataset:
     def lengths(self) -> Array:
         """The number of rows of every episode."""
         return np.asarray(self.dataset.lengths)
+
+    @property
+    def episode_column_names(self) -> list[str]:
+        """See :attr:`Dataset.episode_column_names`."""
+        return list(self.dataset.episode_column_names)
+
+    def get_episode_data(self, episodes_idx: Any = None) -> dict[str, Array]:
+        """See :meth:`Dataset.get_episode_data`."""
+        return dict(self.dataset.get_episode_data(episodes_idx))
 
     def __len__(self) -> int:
         return len(self._indices)

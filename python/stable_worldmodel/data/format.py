@@ -22,7 +22,10 @@ import os
 from collections.abc import Iterable, Mapping
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
+from ._tensors import EPISODE
+
 __all__ = [
+    "EPISODE_DATA_KEY",
     "FORMATS",
     "WRITE_MODES",
     "Format",
@@ -32,11 +35,25 @@ __all__ = [
     "list_formats",
     "open_writer",
     "register_format",
+    "split_episode_data",
     "validate_write_mode",
 ]
 
 #: The treatment of an existing dataset: append to it (or create one), replace it, or raise an error.
 WRITE_MODES = ("append", "overwrite", "error")
+
+
+#: The key of an episode's own values, which have no step: a dict of numbers, arrays and texts.
+EPISODE_DATA_KEY = EPISODE
+
+
+def split_episode_data(ep_data: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The columns of an episode's steps, and the values under `EPISODE_DATA_KEY`, which belong to the whole episode."""
+    steps = dict(ep_data)
+    episode = steps.pop(EPISODE_DATA_KEY, None) or {}
+    if not isinstance(episode, Mapping):
+        raise TypeError(f"{EPISODE_DATA_KEY!r}: expected a dict of the episode's values, got {type(episode).__name__}")
+    return steps, dict(episode)
 
 
 @runtime_checkable

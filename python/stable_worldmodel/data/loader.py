@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from stable_worldmodel import _engine
+from stable_worldmodel import _engine, _options
 
 from . import _tensors
 from ._tensors import NUMBERING, Array
@@ -96,7 +96,7 @@ class Loader:
         shuffle: Whether clips come in random order, over the whole dataset.
         seed: Determines the order and the goals, together with the epoch.
         drop_last: Whether a last batch with fewer clips is left out.
-        episodes: The indices of the episodes to use; all episodes for `None`.
+        episodes: The indices of the episodes to use, or a mask of one boolean for each episode; all episodes for `None`.
         goals: The goals to sample for every clip: one `Goals`, or several with different names.
         transform: Called with the dict of every batch, in which `action` is `(batch, num_steps * frameskip, action_dim)`, as
             in a dataset's `transform`.
@@ -122,7 +122,7 @@ class Loader:
         shuffle: bool = True,
         seed: int = 0,
         drop_last: bool = False,
-        episodes: Sequence[int] | Array | None = None,
+        episodes: Sequence[int] | Sequence[bool] | Array | None = None,
         goals: Goals | Sequence[Goals] | None = None,
         transform: Transform | None = None,
         device: Any = None,
@@ -172,7 +172,7 @@ class Loader:
             "threads": int(threads),
             "prefetch": int(prefetch),
             "prefetch_bytes": bytes_of(prefetch_bytes),
-            "episodes": None if episodes is None else np.asarray(episodes, dtype=np.int64).tolist(),
+            "episodes": None if episodes is None else _options.indices("episodes", episodes, len(engine.lengths())),
             "cache": bytes_of(cache),
             "cache_dir": None if cache_dir is None else os.fspath(cache_dir),
         }

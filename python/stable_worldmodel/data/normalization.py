@@ -12,7 +12,7 @@ from ._tensors import Array
 
 __all__ = ["ColumnTransform", "IdentityScaler", "PercentileScaler", "ZScoreScaler", "column_normalizer", "get_scaler"]
 
-X = TypeVar("X")
+Values = TypeVar("Values")
 
 
 def _is_tensor(value: Any) -> bool:
@@ -44,24 +44,24 @@ def _finite_rows(values: Any) -> Array:
 class IdentityScaler:
     """A scaler that does not change values."""
 
-    def fit(self, values: Any) -> IdentityScaler:
+    def fit(self, X: Any) -> IdentityScaler:
         """Does nothing."""
         return self
 
-    def transform(self, values: X) -> X:
+    def transform(self, X: Values) -> Values:
         """Returns the values unchanged."""
-        return values
+        return X
 
-    def inverse_transform(self, values: X) -> X:
+    def inverse_transform(self, X: Values) -> Values:
         """Returns the values unchanged."""
-        return values
+        return X
 
-    def fit_transform(self, values: X) -> X:
+    def fit_transform(self, X: Values) -> Values:
         """Returns the values unchanged."""
-        return values
+        return X
 
-    def __call__(self, values: X) -> X:
-        return values
+    def __call__(self, X: Values) -> Values:
+        return X
 
 
 class _Affine:
@@ -71,26 +71,26 @@ class _Affine:
         """The centre and the scale."""
         raise NotImplementedError
 
-    def fit(self, values: Any) -> Any:
+    def fit(self, X: Any) -> Any:
         """Fits the scaler to values `(..., d)`; rows with NaN are ignored."""
         raise NotImplementedError
 
-    def transform(self, values: Any) -> Any:
+    def transform(self, X: Any) -> Any:
         """The scaled values, `(..., d)`."""
-        centre, scale = _like(values, *self._bounds())
-        return (values - centre) / scale
+        centre, scale = _like(X, *self._bounds())
+        return (X - centre) / scale
 
-    def inverse_transform(self, values: Any) -> Any:
+    def inverse_transform(self, X: Any) -> Any:
         """The original values of scaled values, `(..., d)`."""
-        centre, scale = _like(values, *self._bounds())
-        return values * scale + centre
+        centre, scale = _like(X, *self._bounds())
+        return X * scale + centre
 
-    def fit_transform(self, values: Any) -> Any:
+    def fit_transform(self, X: Any) -> Any:
         """Fits the scaler to the values and scales them."""
-        return self.fit(values).transform(values)
+        return self.fit(X).transform(X)
 
-    def __call__(self, values: Any) -> Any:
-        scaled = self.transform(values)
+    def __call__(self, X: Any) -> Any:
+        scaled = self.transform(X)
         return scaled.float() if _is_tensor(scaled) else scaled
 
 
@@ -102,9 +102,9 @@ class ZScoreScaler(_Affine):
         self.std = None if std is None else np.asarray(std)
         self.eps = eps
 
-    def fit(self, values: Any) -> ZScoreScaler:
+    def fit(self, X: Any) -> ZScoreScaler:
         """Fits the scaler to values `(..., d)`; rows with NaN are ignored."""
-        rows = _finite_rows(values)
+        rows = _finite_rows(X)
         self.mean, self.std = rows.mean(axis=0, keepdims=True), rows.std(axis=0, keepdims=True)
         return self
 
@@ -124,9 +124,9 @@ class PercentileScaler(_Affine):
         self.q_high = None if q_high is None else np.asarray(q_high)
         self.eps = eps
 
-    def fit(self, values: Any) -> PercentileScaler:
+    def fit(self, X: Any) -> PercentileScaler:
         """Fits the scaler to values `(..., d)`; rows with NaN are ignored."""
-        self.q_low, self.q_high = np.percentile(_finite_rows(values), [self.low, self.high], axis=0)
+        self.q_low, self.q_high = np.percentile(_finite_rows(X), [self.low, self.high], axis=0)
         return self
 
     def _bounds(self) -> tuple[Array | None, Array | None]:
@@ -134,9 +134,9 @@ class PercentileScaler(_Affine):
             return None, None
         return (self.q_low + self.q_high) / 2, np.maximum(self.q_high - self.q_low, self.eps) / 2
 
-    def transform(self, values: Any) -> Any:
+    def transform(self, X: Any) -> Any:
         """The scaled values, `(..., d)`."""
-        scaled = super().transform(values)
+        scaled = super().transform(X)
         return scaled.clamp(-1, 1) if _is_tensor(scaled) else np.clip(scaled, -1, 1)
 
 

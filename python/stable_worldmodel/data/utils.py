@@ -17,9 +17,10 @@ from . import _tensors
 from .dataset import Transform
 from .foreign import engine_of
 from .format import FORMATS, detect_format, get_format, validate_write_mode
+from .normalization import column_normalizer
 from .writer import codec_json
 
-__all__ = ["convert", "doctor", "ensure_dir_exists", "get_cache_dir", "inspect", "load_dataset"]
+__all__ = ["column_normalizer", "convert", "doctor", "ensure_dir_exists", "get_cache_dir", "inspect", "load_dataset", "merge"]
 
 
 def get_cache_dir(override_root: str | Path | None = None, sub_folder: str | None = None) -> Path:
@@ -191,10 +192,51 @@ def convert(
     report = _progress_callback(progress)
     if not kind.native:
         return write_all(source, kind.open_writer(dest, mode=_plain(mode), **kwargs), report)
+    if kind.name in ("video", "lance-video"):
+        # Frames have no time; videos of datasets have a fixed rate.
+        kwargs.pop("fps", None)
     if kwargs:
         raise TypeError(f"convert: the format {kind.name} takes no {', '.join(kwargs)}")
     options = _options(kind.name, mode, codec, jpeg_quality, verify, least_psnr)
     return dict(json.loads(_engine.convert(engine_of(source), os.fspath(dest), options, report)))
+
+
+def merge(
+    sources: list[Any],
+    dest: str | os.PathLike[str],
+    *,
+    dest_format: str | None = None,
+    source_formats: list[str | None] | str | None = None,
+    mode: str = "error",
+    cache_dir: str | os.PathLike[str] | None = None,
+    progress: bool = True,
+    **dest_kwargs: Any,
+) -> dict[str, Any]:
+    """Writes the episodes of several datasets, one after another, into one dataset.
+
+    Args:
+        sources: Paths, URIs, names, or open datasets.
+        dest: The target. Its name determines the format unless `dest_format` is given; Lance otherwise.
+        dest_format: The format to write.
+        source_formats: The format of all sources, or of each; `None` detects it from the path.
+        mode: The treatment of an existing target; see `convert`.
+        cache_dir: A folder in place of `$STABLEWM_HOME` that contains the sources.
+        progress: Whether to show a progress bar.
+        **dest_kwargs: Further arguments of `convert`, such as `codec`.
+
+    Returns:
+        As `convert`.
+    """
+    from .dataset import ConcatDataset
+
+    if isinstance(sources, (str, os.PathLike)) or not sources:
+        raise ValueError(f"sources: expected a list of datasets, got {sources!r}")
+    given = [source_formats] * len(sources) if source_formats is None or isinstance(source_formats, str) else source_formats
+    opened = [
+        load_dataset(source, cache_dir, format) if isinstance(source, (str, os.PathLike)) else source
+        for source, format in zip(sources, given, strict=True)
+    ]
+    return convert(ConcatDataset(opened), dest, dest_format=dest_format, mode=mode, progress=progress, **dest_kwargs)
 
 
 def _plain(mode: str) -> str:

@@ -136,7 +136,7 @@ class EpisodeWriter:
                 )
             if array.dtype.name != dtype and not np.can_cast(array.dtype, dtype, "same_kind"):
                 raise TypeError(f"{self.path}: column {name!r} is {array.dtype.name}, expected {dtype} as in the dataset")
-            fitted[name] = np.ascontiguousarray(array, dtype=dtype)
+            fitted[name] = _tensors.exact(f"{self.path}: column {name!r}", array, dtype)
         return fitted
 
     def write_episodes(self, episodes: Iterable[Mapping[str, Any]]) -> None:

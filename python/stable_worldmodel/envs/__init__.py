@@ -3,21 +3,18 @@
 `gymnasium.make("swm/PushT-v1")` creates an environment; options of an environment are keyword arguments
 (`gymnasium.make("swm/OGBCube-v0", env_type="double")`). Factors of variation, a start and a goal are options of
 `reset`: `env.reset(seed=0, options={"variation": ["agent.color"], "variation_values": {"block.scale": 40}})`.
+
+The modules of this package have a class for each environment, and its experts as policies:
+
+    from stable_worldmodel.envs.two_room import ExpertPolicy, TwoRoomEnv
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-from functools import cached_property
 from typing import Any
 
-import gymnasium
-import numpy as np
-
-from .. import _engine, _options
-from .. import spaces as swm_spaces
-from .._registration import register
+from .. import _engine, _registration
+from .native import NativeEnv
 
 __all__ = ["NativeEnv", "experts", "ids", "register"]
 
@@ -32,140 +29,18 @@ def experts(env: str) -> list[str]:
     return list(_engine.Actor.experts(env))
 
 
-class NativeEnv(gymnasium.Env):
-    """A native environment.
+def register(id: str | None = None, entry_point: Any = None, discrete: bool = False, **kwargs: Any) -> None:
+    """Registers an environment with Gymnasium; without arguments, the native environments.
 
     Args:
-        name: The id of the environment.
-        render_mode: `"rgb_array"` or `None`.
-        image_shape: `(height, width)` of frames.
-        **options: Options of the environment, such as `env_type="double"`.
-
-    Observations follow `observation_space`. The infos hold all columns of the environment, and `success` (whether the
-    state satisfies the goal) and `goal_distance`.
+        id: The id.
+        entry_point: The class, or `MODULE:NAME`.
+        discrete: Whether its actions are discrete; for the reader.
+        **kwargs: Further arguments of `gymnasium.register`.
     """
+    if id is None:
+        _registration.register()
+        return
+    import gymnasium
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 15}
-
-    def __init__(
-        self, name: str, render_mode: str | None = None, image_shape: tuple[int, int] = (224, 224), **options: Any
-    ) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode: expected 'rgb_array' or None, got {render_mode!r}")
-        #: The id with its options.
-        self.name = ",".join([name, *(f"{key}={value}" for key, value in options.items())])
-        self._env = _engine.NativeEnv(self.name, "[]", False)
-        self._described: dict[str, Any] = json.loads(self._env.spec())
-        self.render_mode = render_mode
-        self.image_shape = (int(image_shape[0]), int(image_shape[1]))
-        self.action_space = swm_spaces.from_description(self._described["action_space"])
-        self.observation_space = swm_spaces.from_description(self._described["observation_space"])
-        columns = self._env.reset(0, _options.reset(None, {}))
-        self._start = columns["state"]
-        if isinstance(self.observation_space, gymnasium.spaces.Dict) and not self.observation_space.spaces:
-            # An environment without an observation space is observed through its state.
-            state = columns["state"]
-            self.observation_space = gymnasium.spaces.Dict(
-                {"state": gymnasium.spaces.Box(-np.inf, np.inf, state.shape, state.dtype)}
-            )
-
-    def __getstate__(self) -> dict[str, Any]:
-        """The attributes, with the native environment as a snapshot."""
-        return {**self.__dict__, "_env": self.snapshot()}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._env = _engine.NativeEnv(self.name, "[]", False)
-        self._env.restore(state["_env"])
-
-    @property
-    def max_episode_steps(self) -> int:
-        """Steps after which `swm.World` truncates an episode. In Gymnasium, `make(…, max_episode_steps=…)` sets one."""
-        return int(self._described["max_episode_steps"])
-
-    @cached_property
-    def _variation_space(self) -> swm_spaces.Dict:
-        return swm_spaces.variation_space(self._described["variation"], self._described["sampling_order"])
-
-    @property
-    def variation_space(self) -> swm_spaces.Dict:
-        """The factors of variation, with the values of the current episode."""
-        space = self._variation_space
-        for key, value in self._env.factors().items():
-            factor = space.find(key)
-            factor._value = np.asarray(value).reshape(factor.shape or ()).astype(factor.dtype)
-            if isinstance(factor, swm_spaces.Discrete):
-                factor._value = int(factor._value)
-        return space
-
-    def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Starts an episode. Factors, start and goal depend only on the seed and the options."""
-        super().reset(seed=seed)
-        if seed is None:
-            seed = int(self.np_random.integers(2**62))
-        columns = self._env.reset(seed, _options.reset(options, self._described["variation"]))
-        self._start = columns["state"]
-        return self._observation(columns), self._info(columns, self._env.is_success())
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Applies an action."""
-        continuous = isinstance(self.action_space, gymnasium.spaces.Box)
-        action = np.ascontiguousarray(action, dtype=np.float32 if continuous else np.int64).reshape(-1)
-        columns, reward, terminated, truncated, success = self._env.step(action)
-        return self._observation(columns), reward, terminated, truncated, self._info(columns, success)
-
-    def render(self) -> np.ndarray | None:
-        """The frame, `(height, width, 3)` of `uint8`; `None` without a render mode."""
-        return self._env.render(*self.image_shape, False) if self.render_mode == "rgb_array" else None
-
-    def render_goal(self) -> np.ndarray:
-        """The frame of the goal, `(height, width, 3)` of `uint8`."""
-        return self._env.render(*self.image_shape, True)
-
-    def render_view(self, view: str) -> np.ndarray:
-        """The frame of a camera view: a camera, `depth`, `segmentation`, or `CAMERA:MODALITY`."""
-        return self._env.render_view(view, *self.image_shape)
-
-    def sample_goal(self, seed: int) -> None:
-        """Samples a new reachable goal and keeps the state."""
-        self._env.sample_goal(seed)
-
-    def goal_distance(self) -> float:
-        """The distance of the state from the goal, in the environment's units."""
-        return self._env.goal_distance()
-
-    def snapshot(self) -> bytes:
-        """The full state, including the random state."""
-        return self._env.snapshot()
-
-    def restore(self, state: bytes) -> tuple[Any, dict[str, Any]]:
-        """Restores a snapshot. Later steps repeat the steps after the snapshot bit for bit."""
-        columns = self._env.restore(state)
-        return self._observation(columns), self._info(columns, self._env.is_success())
-
-    def restore_from(self, start: Mapping[str, Any], goal: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Restores the state of the dataset row `start`, with the state of the row `goal` as the goal."""
-        rows = ({key: np.asarray(value)[None] for key, value in row.items()} for row in (start, goal))
-        columns = self._env.restore_from(*rows)
-        return self._observation(columns), self._info(columns, self._env.is_success())
-
-    # Evaluations from a dataset call these methods if Gymnasium wrappers contain the environment.
-
-    def _set_state(self, state: Any) -> None:
-        self._start = np.asarray(state)
-        self._set_goal_state(state)
-
-    def _set_goal_state(self, goal_state: Any) -> None:
-        self.restore_from({"state": self._start}, {"state": np.asarray(goal_state)})
-
-    def _observation(self, columns: Mapping[str, np.ndarray]) -> Any:
-        space = self.observation_space
-        if isinstance(space, gymnasium.spaces.Dict):
-            return {key: columns[key].astype(inner.dtype, copy=False) for key, inner in space.spaces.items()}
-        name = self._described.get("observation_column", "state")
-        return columns[name].astype(space.dtype, copy=False)
-
-    def _info(self, columns: dict[str, Any], success: bool) -> dict[str, Any]:
-        columns["success"] = success
-        columns["goal_distance"] = self._env.goal_distance()
-        return columns
+    gymnasium.register(id=id, entry_point=entry_point, **kwargs)

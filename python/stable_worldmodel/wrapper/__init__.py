@@ -1,5 +1,15 @@
-"""Wrappers of environments. The wrappers of `visual` change frames."""
+"""Wrappers of environments. The wrappers of `visual` change frames; those of `default` fill and check infos."""
 
+from .default import (
+    AddPixelsWrapper,
+    EnsureGoalInfoWrapper,
+    EnsureImageShape,
+    EnsureInfoKeysWrapper,
+    EverythingToInfoWrapper,
+    MapKeysWrapper,
+    MegaWrapper,
+    ResizeGoalWrapper,
+)
 from .visual import (
     BlurWrapper,
     ChromaKeyWrapper,
@@ -21,16 +31,24 @@ from .visual import (
 )
 
 __all__ = [
+    "AddPixelsWrapper",
     "BlurWrapper",
     "ChromaKeyWrapper",
     "ColorJitterWrapper",
     "CutoutWrapper",
+    "EnsureGoalInfoWrapper",
+    "EnsureImageShape",
+    "EnsureInfoKeysWrapper",
+    "EverythingToInfoWrapper",
     "GrayscaleWrapper",
+    "MapKeysWrapper",
+    "MegaWrapper",
     "MovingPatchWrapper",
     "NoiseWrapper",
     "OcclusionWrapper",
     "RandomConvWrapper",
     "RandomShiftWrapper",
+    "ResizeGoalWrapper",
     "ResolutionWrapper",
     "VisualWrapper",
     "constant",

@@ -67,14 +67,14 @@ def constant(value: float) -> Schedule:
     return Schedule("constant", value)
 
 
-def linear(start: float, end: float, steps: int) -> Schedule:
-    """Linear from `start` to `end` over `steps` steps, then constant."""
-    return Schedule("linear", start, end, steps)
+def linear(start: float, end: float, horizon: int) -> Schedule:
+    """Linear from `start` to `end` over `horizon` steps, then constant."""
+    return Schedule("linear", start, end, horizon)
 
 
-def cosine(start: float, end: float, steps: int) -> Schedule:
-    """Half a cosine from `start` to `end` over `steps` steps, then constant."""
-    return Schedule("cosine", start, end, steps)
+def cosine(start: float, end: float, horizon: int) -> Schedule:
+    """Half a cosine from `start` to `end` over `horizon` steps, then constant."""
+    return Schedule("cosine", start, end, horizon)
 
 
 def exponential(start: float, decay: float, floor: float = 0.0) -> Schedule:
@@ -130,6 +130,11 @@ class VisualWrapper(gymnasium.Wrapper):
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._step += 1
         return observation, reward, terminated, truncated, self._changed(info)
+
+    @property
+    def step_count(self) -> int:
+        """Steps since the reset."""
+        return self._step
 
     def render(self) -> Any:
         """The changed frame."""

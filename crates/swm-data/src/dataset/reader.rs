@@ -104,6 +104,12 @@ pub trait Reader: Send + Sync {
         vec![]
     }
 
+    /// The parts of a third-party dataset that are not read, because they are neither numbers nor images: text, complex
+    /// numbers, groups of HDF5.
+    fn unread(&self) -> Vec<String> {
+        vec![]
+    }
+
     /// The manifest, which records the provenance of the data, if the dataset stores one.
     fn manifest(&self) -> Option<Manifest>;
 

@@ -62,13 +62,14 @@ impl FormatEntry {
     /// Creates, continues or replaces a dataset whose episodes have the columns of `schema`.
     ///
     /// # Errors
-    /// If the dataset exists and `options.mode` forbids it, the dataset to replace is a symbolic link, the schema differs
+    /// If the dataset exists and `options.mode` forbids it, the dataset to replace is a symbolic link or the path a link to nothing, the schema differs
     /// from that of the dataset to continue, writing fails, or this build lacks the format's feature.
     pub fn create(&self, location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
-        if options.mode == WriteMode::Overwrite
-            && let Some(path) = location.path()
-        {
-            files::check_no_link(path)?;
+        if let Some(path) = location.path() {
+            // A link to nothing would place the files where the user may not expect them.
+            if options.mode == WriteMode::Overwrite || !path.exists() {
+                files::check_no_link(path)?;
+            }
         }
         (self.backend()?.create)(location, schema, options)
     }

@@ -279,6 +279,36 @@ fn failed_conversion_leaves_no_empty_dataset() {
 }
 
 #[test]
+fn refused_conversion_does_not_replace_a_dataset() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let source = folder.path().join("source.lance");
+    write(&source, WriteMode::Create, 1, 0..2);
+    let reader = open(&source).expect("opening");
+    for format in ["lance", "lance-video", "folder", "video", "lerobot"] {
+        let path = folder.path().join(format!("old.{format}"));
+        write(&path, WriteMode::Create, 2, 0..3);
+        let content = || checksum(&*open(&path).expect("opening the old dataset")).expect("its hash");
+        let before = content();
+        let quality = ImageCodec::Jpeg { quality: 1 };
+        let options = ConvertOptions {
+            mode: ConvertMode::Overwrite,
+            codec: quality,
+            least_psnr: 90.0,
+            ..ConvertOptions::default()
+        };
+        let error = convert(&reader, &Location::from(&path), &options, &mut Control::new()).expect_err("lossy images");
+        assert!(error.to_string().contains("signal-to-noise"), "{format}: {error}");
+        assert_eq!(content(), before, "{format}");
+        let options = ConvertOptions { least_psnr: 0.0, ..options };
+        convert(&reader, &Location::from(&path), &options, &mut Control::new()).expect(format);
+        assert_eq!(open(&path).expect("opening").episodes().len(), 2, "{format}");
+    }
+    let left: Vec<_> =
+        folder.path().read_dir().expect("listing").map(|entry| entry.expect("an entry").path()).collect();
+    assert_eq!(left.len(), 6, "{left:?}");
+}
+
+#[test]
 fn dataset_is_not_written_over_itself() {
     let folder = tempfile::tempdir().expect("creating a folder");
     for format in ["lance", "lance-video", "folder", "video", "lerobot", "h5"] {

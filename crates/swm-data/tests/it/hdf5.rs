@@ -234,6 +234,7 @@ fn reads_every_hdf5_layout_and_element_type() {
     (0..21)
         .for_each(|t| assert_eq!(read.row(t).get::<u8>("truth").expect("reading the boolean"), [u8::from(t % 3 == 0)]));
     assert!(reader.schema().column("text").is_err(), "text columns are skipped");
+    assert!(reader.unread().contains(&"text".to_owned()), "and named: {:?}", reader.unread());
 
     let reader = open(interop("hdf5-trees.h5")).expect("opening the dataset");
     has_images(&*reader, "growing");

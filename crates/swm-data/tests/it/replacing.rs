@@ -7,8 +7,9 @@ use crate::video::interop;
 use std::collections::BTreeMap;
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
-use swm_core::{ColumnSpec, DType, Schema};
-use swm_data::{FORMATS, Location, PreviewOptions, WriteMode, WriteOptions, create, open, preview};
+use swm_core::columns::{self, ACTION};
+use swm_core::{Batch, ColumnSpec, DType, Schema};
+use swm_data::{FORMATS, Location, PreviewOptions, StepRange, WriteMode, WriteOptions, create, open, preview};
 
 /// The formats whose datasets are folders.
 const FOLDER_FORMATS: [&str; 5] = ["lance", "lance-video", "folder", "video", "lerobot"];
@@ -88,6 +89,50 @@ fn datasets_that_would_not_be_recognised_are_refused() {
                 let expected = format!("use {}.{}", path.display(), format.suffixes[0]);
                 assert!(error.to_string().contains(&expected) && !path.exists(), "{error}");
             }
+        }
+    }
+}
+
+#[test]
+fn links_to_nothing_are_refused() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let target = folder.path().join("target");
+    for format in FORMATS.rows.iter().filter(|format| format.is_available()) {
+        let path = folder.path().join(format!("data.{}", format.suffixes.first().unwrap_or(&"folder")));
+        symlink(&target, &path).expect("creating a link");
+        let error = format.create(&Location::from(&path), &schema(), options(WriteMode::Create)).err();
+        let error = error.expect("a link to nothing").to_string();
+        assert!(error.contains(&path.display().to_string()) && !target.exists(), "{}: {error}", format.id);
+        std::fs::remove_file(&path).expect("removing the link");
+    }
+}
+
+#[test]
+fn names_of_columns_are_refused_or_read_back() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let names = ["", "`", "a`b", ".", "..", "a.b", "a\"b", "a'b", "a b", "a\nb"];
+    for format in FORMATS.rows.iter().filter(|format| format.is_available()) {
+        for (index, name) in names.into_iter().enumerate() {
+            let columns = [ColumnSpec::new(name, DType::Float32, [1]), ColumnSpec::new(ACTION, DType::Float32, [1])];
+            let Ok(schema) = Schema::new(columns) else { continue };
+            let suffix = format.suffixes.first().unwrap_or(&"folder");
+            let location = Location::from(folder.path().join(format!("{}-{index}.{suffix}", format.id)));
+            let Ok(mut writer) = format.create(&location, &schema, options(WriteMode::Create)) else { continue };
+            let mut rows = Batch::zeros(&schema, 2);
+            rows.get_mut::<f32>(name).expect("the column").copy_from_slice(&[1.0, 2.0]);
+            rows.get_mut::<f32>(ACTION).expect("the actions").copy_from_slice(&[0.0, f32::NAN]);
+            writer.write_episode(&rows).and_then(|()| writer.finish()).expect("writing an episode");
+            let range = StepRange { episode: 0, start: 0, length: 2 };
+            let reader = format.open(&location);
+            let stored = reader.and_then(|reader| {
+                // A reader may return the name with `_` for `.`.
+                let same = |stored: &str| stored == name || stored == columns::flat(name);
+                let found = reader.schema().columns().iter().find(|column| same(&column.name));
+                reader.read(&[&found.expect("the column is listed").name], &[range])
+            });
+            let stored = stored.unwrap_or_else(|error| panic!("{}: {name:?}: {error}", format.id));
+            let column = stored.schema().columns()[0].name.clone();
+            assert_eq!(stored.get::<f32>(&column).expect("the column"), [1.0, 2.0], "{}: {name:?}", format.id);
         }
     }
 }

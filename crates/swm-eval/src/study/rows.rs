@@ -194,7 +194,7 @@ fn key(cell: &Cell, variables: &BTreeSet<&str>) -> String {
     let request = &cell.request;
     let common: Vec<_> = cell.variables.iter().filter(|(name, _)| variables.contains(name.as_str())).collect();
     let names = (&cell.starts, cell.policy(), common);
-    format!("{:?}", (names, request.seed, request.episodes, request.budget, request.counting))
+    format!("{:?}", (names, request.seed, request.planning_seed, request.episodes, request.budget, request.counting))
 }
 
 /// The errors along the trajectories that the policy played, in the unit of those along the recorded ones.

@@ -3,7 +3,7 @@
 use super::cell::{Cell, Study};
 use super::folder::StudyFolder;
 use crate::request::EvalRequest;
-use crate::runner::{Resolver, RunOptions};
+use crate::runner::{Episodes, Resolver, RunOptions};
 use std::sync::{Mutex, PoisonError};
 use swm_core::run::{Control, Event, Progress, Stage};
 use swm_core::{Result, Results};
@@ -69,7 +69,8 @@ impl Study {
                 _ => {}
             });
             let request = EvalRequest { episodes: *episodes, ..cell.request.clone() };
-            let results = request.extend(earlier.as_ref(), resolver, options, &mut inner)?;
+            let episodes_to_play = earlier.as_ref().map_or(Episodes::All, Episodes::After);
+            let results = request.run_episodes(episodes_to_play, resolver, options, &mut inner)?;
             drop(inner);
             folder.store(cell, results)?;
             done += episodes - played(earlier);

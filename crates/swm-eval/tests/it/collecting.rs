@@ -5,8 +5,8 @@ use crate::memory::Memory;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use swm_core::run::{Control, Event};
-use swm_core::{Batch, DType, EnvEntry, Error, Key, Policy, RandomPolicy, Result, VariationRequest};
-use swm_eval::collect::check_continues;
+use swm_core::{Batch, DType, EnvEntry, Error, Key, Manifest, Policy, RandomPolicy, Result, VariationRequest};
+use swm_eval::continuation::check_continues;
 use swm_eval::{CollectConfig, Collected, MixturePolicy, PolicyChoice, World, WorldConfig};
 
 fn world(envs: usize, threads: usize) -> World {
@@ -291,4 +291,17 @@ fn manifest_contains_settings_but_no_run_options() {
     let policy =
         other(CollectConfig { policy: "expert".into(), ..config(9) }).expect_err("resuming with another policy");
     assert!(policy.to_string().contains("\"expert\""), "{policy}");
+    // A setting that only one of the collections has, such as wrappers, differs; an empty one does not.
+    let mut changed = manifest.clone();
+    changed.config["wrappers"] = serde_json::json!([]);
+    check_continues(&manifest, &changed).expect("no wrappers in both");
+    changed.config["wrappers"] = serde_json::json!(["noise"]);
+    for (stored, wanted) in [(&manifest, &changed), (&changed, &manifest)] {
+        let error = check_continues(stored, wanted).expect_err("resuming with other wrappers").to_string();
+        assert!(error.contains("wrappers") && error.contains("noise"), "{error}");
+    }
+    let weights = |hash: &str| Manifest { hashes: [("cloned".into(), hash.into())].into(), ..manifest.clone() };
+    check_continues(&weights("a"), &weights("a")).expect("the same weights");
+    let error = check_continues(&weights("a"), &weights("b")).expect_err("the policy was trained again").to_string();
+    assert!(error.contains("weights of cloned"), "{error}");
 }

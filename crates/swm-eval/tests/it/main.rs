@@ -6,6 +6,7 @@ mod evaluating;
 mod lance;
 mod line;
 mod memory;
+mod nearest;
 mod predicting;
 mod replaying;
 mod requesting;

@@ -13,7 +13,7 @@ use swm_data::{Part, Reader, Split};
 use swm_eval::reproduce::{Kind, differences};
 use swm_eval::{
     Condition, EvalRequest, HeldOut, PolicyKind, PolicyRequest, Predictor, Recorded, ResolvedPolicy, Resolver,
-    RunOptions, StartsRequest, World, reproduce,
+    RunOptions, StartsRequest, World, reproduce, reproduce_episodes,
 };
 
 /// A resolver of the line environment, one dataset, and a walker with weights.
@@ -24,7 +24,12 @@ pub struct TestResolver {
 
 impl TestResolver {
     pub fn new() -> Self {
-        Self { data: Arc::new(recorded(60)), weights: "w0".to_owned() }
+        Self::of(recorded(60))
+    }
+
+    /// A resolver with this dataset.
+    pub fn of(data: MemoryReader) -> Self {
+        Self { data: Arc::new(data), weights: "w0".to_owned() }
     }
 }
 
@@ -78,6 +83,7 @@ pub fn request() -> EvalRequest {
             },
         ],
         prediction: None,
+        planning_seed: None,
     }
 }
 
@@ -320,6 +326,49 @@ fn reproduction_lists_differences() {
     let listed = differences(&second.results, &fewer);
     assert_eq!((listed[0].what.as_str(), listed[0].was.as_str(), listed[0].is.as_str()), ("request, seed", "5", "6"));
     assert_eq!(listed.iter().filter(|d| d.is == "nothing").count(), 24 + 1, "24 episodes and the success rate");
+}
+
+#[test]
+fn some_episodes_can_be_reproduced() {
+    let resolver = TestResolver::new();
+    let numbers = [3, 20, 8];
+    let options = RunOptions { envs: 2, threads: 2, ..RunOptions::default() };
+    let again = |old: &Results| reproduce_episodes(old, &numbers, &resolver, &options, &mut Control::new());
+    let of_dataset = EvalRequest { starts: held_out(Part::Test), prediction: Some(2), ..request() };
+    for request in [request(), of_dataset] {
+        let first = round_trip(&run(&request, 4, 1));
+        let second = again(&first).expect("the reproduction succeeds");
+        assert_eq!(second.differences, []);
+        for (old, new) in first.runs.iter().zip(&second.results.runs) {
+            assert_eq!(new.episodes, numbers.map(|number| old.episodes[number].clone()));
+        }
+        let listed = |change: &dyn Fn(&mut Results)| -> Vec<String> {
+            let mut changed = first.clone();
+            change(&mut changed);
+            again(&changed)
+                .expect("the reproduction succeeds")
+                .differences
+                .into_iter()
+                .map(|found| found.what)
+                .collect()
+        };
+        let found = listed(&|results| results.runs[3].episodes[8].success ^= true);
+        assert_eq!(found, ["episode 8 of walker, goal near", "walker, goal near"]);
+        assert_eq!(listed(&|results| results.runs[3].episodes[9].success ^= true), [""; 0], "it is not played");
+        let found = listed(&|results| results.runs[1].episodes[9].seed += 1);
+        assert_eq!(found, ["seed and row of the start of episode 9 of walker, in distribution"]);
+        let found = listed(&|results| results.runs[1].episodes[9].start = Some([0, 0]));
+        assert_eq!(found, ["seed and row of the start of episode 9 of walker, in distribution"]);
+        let found = listed(&|results| drop(results.manifest.hashes.insert("starts".to_owned(), "0".to_owned())));
+        assert_eq!(found, ["hash of starts"]);
+        // Every start has another seed then.
+        let found = listed(&|results| results.manifest.config["seed"] = json!(6));
+        assert!(found.len() > 4 * 24 && found.contains(&"hash of goals".to_owned()), "{found:?}");
+    }
+    let error = reproduce_episodes(&run(&request(), 4, 1), &[24], &resolver, &options, &mut Control::new());
+    assert!(error.expect_err("there are 24 episodes").to_string().contains("number 24"));
+    let compat = run(&EvalRequest { counting: Counting::Compat { envs: 2 }, ..request() }, 2, 1);
+    assert!(again(&compat).expect_err("compat counting").to_string().contains("the whole evaluation"));
 }
 
 #[test]

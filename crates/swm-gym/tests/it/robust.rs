@@ -125,3 +125,14 @@ fn environment_that_exceeds_the_call_timeout_is_an_error() {
     }
     env.reset(0, &ResetOptions::default()).expect("resetting the environment after an error");
 }
+
+#[test]
+fn environment_that_blocks_while_it_is_made_is_given_up() {
+    let Some(config) = config() else { return };
+    let config = GymConfig { start_timeout: Duration::from_millis(2500), ..config };
+    let hanging = swm_gym::make(&id(&format!("{ROOM},hang_at=1")), config).err();
+    let error = hanging.expect("the first step blocks while the environment is made").to_string();
+    for words in ["making the environment", "did not answer within 2.5s"] {
+        assert!(error.contains(words), "{words}: {error}");
+    }
+}

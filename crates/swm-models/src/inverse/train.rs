@@ -65,6 +65,7 @@ impl InverseConfig {
     /// When a setting is out of range; the error names the first such setting.
     pub fn check(&self) -> Result<()> {
         check_finite(self)?;
+        self.optim.check()?;
         let OptimConfig { accumulate, ema, .. } = self.optim;
         if (accumulate, ema) != (1, 0.0) {
             let given = format!("accumulate={accumulate}, ema={ema}");

@@ -1,7 +1,8 @@
 //! [`LewmPredictor`]: predictions of a LeWM for comparison with recorded trajectories.
 
+use super::host_encoder::HostEncoder;
 use super::{Lewm, LewmConfig, Rollout, pixels};
-use crate::nn::parameters::host;
+use crate::nn::parameters::{IntoF32, host};
 use burn::tensor::Device;
 use rayon::prelude::*;
 use swm_core::columns::PIXELS;
@@ -12,6 +13,8 @@ use swm_plan::ActionScale;
 /// own row or trajectory only.
 pub struct LewmPredictor {
     model: Lewm,
+    /// The encoder laid out for the CPU kernels; `None` if there are no kernels for it.
+    encoder: Option<HostEncoder>,
     config: LewmConfig,
     rollout: Rollout,
     scale: ActionScale,
@@ -21,7 +24,8 @@ pub struct LewmPredictor {
 impl LewmPredictor {
     /// Creates the predictor of a trained model whose model step is `frameskip` environment steps.
     pub fn new(model: &Lewm, config: &LewmConfig, scale: ActionScale, frameskip: usize) -> Self {
-        Self { rollout: Rollout::new(model), model: model.clone(), config: config.clone(), scale, frameskip }
+        let encoder = HostEncoder::new(model, config);
+        Self { rollout: Rollout::new(model), model: model.clone(), encoder, config: config.clone(), scale, frameskip }
     }
 }
 
@@ -39,12 +43,16 @@ impl Predictor for LewmPredictor {
     }
 
     fn encode(&mut self, rows: &Batch, latents: &mut [f32]) -> Result<()> {
-        let (config, model) = (&self.config, &self.model);
+        let (config, model, encoder) = (&self.config, &self.model, &self.encoder);
         pixels::check(config, rows.schema(), PIXELS)?;
         let bytes = config.image * config.image * 3;
         let work = latents.par_chunks_exact_mut(config.latent).zip(rows.get::<u8>(PIXELS)?.par_chunks_exact(bytes));
         work.try_for_each(|(latent, rgb)| {
-            latent.copy_from_slice(&host(model.encode(pixels::patches(config, rgb, &Device::flex())?)));
+            let patches = pixels::patches(config, rgb, &Device::flex())?;
+            latent.copy_from_slice(&match encoder {
+                Some(encoder) => encoder.encode(&patches.into_data().into_f32_vec()),
+                None => host(model.encode(patches)),
+            });
             Ok(())
         })
     }

@@ -171,17 +171,7 @@ impl<M: Trainable> TrainConfig<M> {
 impl LoopConfig {
     /// Checks the settings of the optimizer and of the validation.
     fn check(&self) -> Result<()> {
-        let positive =
-            [("optim.lr", self.optim.lr), ("optim.epsilon", self.optim.epsilon), ("optim.clip", self.optim.clip)];
-        for (name, value) in positive {
-            if !(value.is_finite() && value > 0.0) {
-                return Err(Error::config(name, value.to_string(), "give a positive number"));
-            }
-        }
-        if !(0.0..1.0).contains(&self.optim.ema) {
-            let fix = "give a decay of at least 0 (no average) and below 1";
-            return Err(Error::config("optim.ema", self.optim.ema.to_string(), fix));
-        }
+        self.optim.check()?;
         if self.validation.every > 0 && !self.data.hold_out {
             return Err(Error::config(
                 "validation.every",

@@ -8,6 +8,7 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use swm_core::{Error, Result};
 use swm_kernels::{AdamWStep, sum_of_squares};
 
 /// The settings of [`AdamW`].
@@ -36,6 +37,36 @@ pub struct OptimConfig {
 
 fn one() -> usize {
     1
+}
+
+impl OptimConfig {
+    /// Checks the settings.
+    ///
+    /// # Errors
+    /// When one is out of range; the error names the setting.
+    pub(crate) fn check(&self) -> Result<()> {
+        let positive = [("optim.lr", self.lr), ("optim.epsilon", self.epsilon), ("optim.clip", self.clip)];
+        for (name, value) in positive {
+            if !(value.is_finite() && value > 0.0) {
+                return Err(Error::config(name, value.to_string(), "give a positive number"));
+            }
+        }
+        if !(self.weight_decay.is_finite() && self.weight_decay >= 0.0) {
+            return Err(Error::config(
+                "optim.weight_decay",
+                self.weight_decay.to_string(),
+                "give a number of at least 0",
+            ));
+        }
+        if let Some(beta) = self.betas.into_iter().find(|beta| !(0.0..1.0).contains(beta)) {
+            return Err(Error::config("optim.betas", beta.to_string(), "give two decays of at least 0 and below 1"));
+        }
+        if !(0.0..1.0).contains(&self.ema) {
+            let fix = "give a decay of at least 0 (no average) and below 1";
+            return Err(Error::config("optim.ema", self.ema.to_string(), fix));
+        }
+        Ok(())
+    }
 }
 
 /// The clipping group and the learning rate of a parameter.

@@ -7,7 +7,7 @@
 use hf_hub::{Cache, Repo, RepoType};
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
-use swm_core::{Error, Result};
+use swm_core::{Error, Result, files};
 use swm_data::Location;
 use swm_data::objects::ObjectFile;
 
@@ -43,9 +43,13 @@ impl Hub {
     /// not cached.
     ///
     /// # Errors
-    /// When the file is not cached, and the hub does not have it or cannot be reached.
+    /// When a name leads out of the cache; when the file is not cached, and the hub does not have it, answers with something
+    /// else than weights, or cannot be reached.
     pub fn fetch(&self, repo: &str, file: &str) -> Result<PathBuf> {
         let (id, revision) = repo.split_once('@').unwrap_or((repo, "main"));
+        check_inside("repository", id)?;
+        check_inside("revision", revision)?;
+        check_inside("file", file)?;
         let repository = Repo::with_revision(id.to_owned(), RepoType::Model, revision.to_owned());
         let cached = |folder: &PathBuf| Cache::new(folder.clone()).repo(repository.clone()).get(file);
         if let Some(found) = [Some(&self.cache), self.library_cache.as_ref()].into_iter().flatten().find_map(cached) {
@@ -73,19 +77,58 @@ impl Hub {
         std::fs::create_dir_all(folder).map_err(io(folder, "creating a folder"))?;
         // Renaming the complete file allows two processes to download the same file at the same time.
         let part = path.with_extension(format!("part-{}", std::process::id()));
-        let mut out = std::fs::File::create(&part).map_err(io(&part, "saving a download"))?;
-        let mut done = 0;
-        while done < remote.len() {
-            let end = (done + CHUNK).min(remote.len());
-            for bytes in remote.read(std::slice::from_ref(&(done..end))).map_err(unreachable)? {
-                out.write_all(&bytes).map_err(io(&part, "saving a download"))?;
+        let download = || {
+            let mut out = std::fs::File::create(&part).map_err(io(&part, "saving a download"))?;
+            let mut done = 0;
+            while done < remote.len() {
+                let end = (done + CHUNK).min(remote.len());
+                for bytes in remote.read(std::slice::from_ref(&(done..end))).map_err(unreachable)? {
+                    if done == 0 {
+                        check_weights(file, &url, remote.len(), &bytes)?;
+                    }
+                    out.write_all(&bytes).map_err(io(&part, "saving a download"))?;
+                }
+                done = end;
             }
-            done = end;
+            if done == 0 { check_weights(file, &url, 0, &[]) } else { Ok(()) }
+        };
+        if let Err(error) = download() {
+            // The error of the download matters more than that of removing its rest.
+            let _ = files::delete_file(&part);
+            return Err(error);
         }
         std::fs::rename(&part, &path).map_err(io(&path, "saving a download"))?;
         cache.create_ref(revision).map_err(io(&self.cache, "saving a download"))?;
         Ok(path)
     }
+}
+
+/// Checks that a name of a repository, revision or file stays inside the folder of the cache.
+fn check_inside(what: &str, name: &str) -> Result<()> {
+    let inside = name.split('/').all(|part| !matches!(part, "" | "." | ".."));
+    if inside && !name.contains(['\\', '\0', '@', '?', '#']) {
+        return Ok(());
+    }
+    let fix = "name a repository as OWNER/NAME or OWNER/NAME@REVISION, and files as the hub lists them";
+    Err(Error::config(what, format!("'{}' is no such name on the hub", name.escape_debug()), fix))
+}
+
+/// Checks that an answer can be a file of weights: the `length` of a `.safetensors` file holds its header, and a `.bin` or
+/// `.pt` file is a zip archive or a pickle. A page that says something else has neither.
+fn check_weights(file: &str, url: &str, length: u64, start: &[u8]) -> Result<()> {
+    let plausible = match Path::new(file).extension().and_then(|extension| extension.to_str()) {
+        Some("safetensors") => start.first_chunk().is_some_and(|header| {
+            let header = u64::from_le_bytes(*header);
+            header <= length.saturating_sub(8) && start.get(8) == Some(&b'{')
+        }),
+        Some("bin" | "pt" | "pth") => start.starts_with(b"PK") || start.starts_with(&[0x80]),
+        _ => length > 0,
+    };
+    if plausible {
+        return Ok(());
+    }
+    let problem = format!("the server's answer of {length} bytes is not the content of such a file");
+    Err(Error::corrupt(url, problem, "check the server and the name of the file"))
 }
 
 /// Returns the path of a file of a Hugging Face repository, such as `model.safetensors` of `facebook/dinov2-small`;

@@ -48,6 +48,10 @@ fn damaged_checkpoints_are_refused() {
     assert!(message(&trained).contains("family 'pldm'"), "{}", message(&trained));
     std::fs::write(&config_file, &original).expect("writing the file");
 
+    edit(&config_file, |file| file["config"]["model"]["pixel_mean"][0] = 0.75.into());
+    assert!(message(&trained).contains("config.json") && message(&trained).contains("the hash differs"));
+    std::fs::write(&config_file, &original).expect("writing the file");
+
     // If a process is killed between the two renames of a save, the folder `checkpoint.old` remains.
     std::fs::rename(&inner, trained.join("checkpoint.old")).expect("renaming the folder");
     load(&trained).expect("loading the old checkpoint");

@@ -27,6 +27,15 @@ fn errors_name_invalid_settings() {
     assert!(message("optim.lr").contains("key=value"));
     assert!(message("model.image=60").contains("patches"), "{}", message("model.image=60"));
     assert!(message("data.num_steps=1").contains("at least 2"));
+    for setting in
+        ["optim.clip=-1", "optim.clip=0", "optim.weight_decay=-1", "optim.betas=[2, 0.5]", "optim.betas=[0.9, 1]"]
+    {
+        let name = setting.split_once('=').expect("a value").0;
+        assert!(message(setting).contains(name), "{}", message(setting));
+        // Inverse dynamics has a training loop of its own.
+        let inverse = swm_models::inverse::InverseConfig::load(&[setting.to_owned()]);
+        assert!(inverse.expect_err(setting).to_string().contains(name));
+    }
     assert!(Config::load("tniy", &[]).expect_err("no such preset").to_string().contains("did you mean tiny"));
 }
 

@@ -134,6 +134,11 @@ pub(crate) fn load(folder: &Path) -> Option<String> {
 fn check(name: &str, save: impl FnOnce(&Path)) {
     let folder = tempfile::tempdir().expect("a folder");
     save(folder.path());
+    // Without its hash, a changed configuration reaches all checks.
+    let path = folder.path().join("checkpoint/manifest.json");
+    let mut manifest: Value = serde_json::from_slice(&std::fs::read(&path).expect("a manifest")).expect("JSON");
+    manifest["hashes"].as_object_mut().expect("the hashes").remove("config").expect("the hash of the configuration");
+    std::fs::write(&path, manifest.to_string()).expect("writing the manifest");
     mutate(&folder.path().join("checkpoint/config.json"), || load(folder.path()));
     assert!(load(folder.path()).is_none(), "{name}");
 }
@@ -283,7 +288,8 @@ fn weights_without_a_hash_or_with_infinite_values_are_faults() {
     manifest["hashes"] = json!({});
     std::fs::write(&path, manifest.to_string()).expect("a written file");
     assert_eq!(load(run), None, "the weights themselves are valid");
-    assert_eq!(checkpoint::faults(run).expect("a checkpoint"), ["manifest.json holds no hash of weights.safetensors"]);
+    let faults = ["config.json", "weights.safetensors"].map(|file| format!("manifest.json holds no hash of {file}"));
+    assert_eq!(checkpoint::faults(run).expect("a checkpoint"), faults);
     let path = run.join("checkpoint/weights.safetensors");
     let mut bytes = std::fs::read(&path).expect("a file");
     for value in [f32::NAN, f32::INFINITY] {

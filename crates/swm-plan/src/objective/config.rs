@@ -5,6 +5,7 @@ use super::contracts::{Constraint, Objective, Shape, Slope, Trajectory};
 use super::cost::ObjectiveCost;
 use super::regularised::Regularised;
 use super::term::{Change, Control, Goal};
+use crate::search::Settings;
 use serde::{Deserialize, Serialize};
 use swm_core::{CostModel, Result};
 
@@ -95,6 +96,27 @@ impl ObjectiveConfig {
     /// Whether there are no terms and no constraints.
     pub fn is_empty(&self) -> bool {
         self.terms.is_empty() && self.constraints.is_empty()
+    }
+
+    /// Checks the numbers of all terms and constraints, as far as they can be checked without a model.
+    ///
+    /// # Errors
+    /// When a number is invalid; the error names it.
+    pub fn check(&self) -> Result<()> {
+        for term in &self.terms {
+            match term {
+                Term::Goal(goal) => goal.check_numbers()?,
+                Term::Control(Control { weight }) => Settings("control term").not_negative("weight", *weight)?,
+                Term::Change(Change { weight, .. }) => Settings("change term").not_negative("weight", *weight)?,
+            }
+        }
+        for limit in &self.constraints {
+            match limit {
+                Limit::ActionNorm(norm) => Settings("action norm").not_negative("limit", norm.limit)?,
+                Limit::LatentBox(bounds) => bounds.check_bounds()?,
+            }
+        }
+        Ok(())
     }
 
     /// Applies the terms and constraints to a model.

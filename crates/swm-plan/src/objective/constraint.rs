@@ -82,14 +82,12 @@ impl LatentBox {
     }
 }
 
-impl Constraint for LatentBox {
-    fn needs_latents(&self) -> bool {
-        true
-    }
-
-    fn check(&self, shape: Shape) -> Result<()> {
-        check_latents("latent box", shape)?;
-        check_picks("latent box", &self.latents, shape.latent)?;
+impl LatentBox {
+    /// Checks the bounds, without a model.
+    ///
+    /// # Errors
+    /// When there is no bound, a bound is not finite, or the lower bound is above the upper one.
+    pub(super) fn check_bounds(&self) -> Result<()> {
         let (low, high) = (self.low.unwrap_or(f32::NEG_INFINITY), self.high.unwrap_or(f32::INFINITY));
         let bounds = self.low.is_none_or(f32::is_finite) && self.high.is_none_or(f32::is_finite) && low <= high;
         if bounds && (self.low.is_some() || self.high.is_some()) {
@@ -98,6 +96,18 @@ impl Constraint for LatentBox {
         let shown = |bound: Option<f32>| bound.map_or("none".to_owned(), |bound| bound.to_string());
         let given = format!("lower bound {}, upper bound {}", shown(self.low), shown(self.high));
         Err(Error::config("latent box", given, "give a finite lower bound, a finite upper bound not below it, or both"))
+    }
+}
+
+impl Constraint for LatentBox {
+    fn needs_latents(&self) -> bool {
+        true
+    }
+
+    fn check(&self, shape: Shape) -> Result<()> {
+        check_latents("latent box", shape)?;
+        check_picks("latent box", &self.latents, shape.latent)?;
+        self.check_bounds()
     }
 
     fn count(&self, horizon: usize, latent: usize) -> usize {

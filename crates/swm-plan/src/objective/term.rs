@@ -52,14 +52,12 @@ impl Goal {
     }
 }
 
-impl Objective for Goal {
-    fn needs_latents(&self) -> bool {
-        true
-    }
-
-    fn check(&self, shape: Shape) -> Result<()> {
-        check_latents("goal term", shape)?;
-        check_picks("goal term", &self.latents, shape.latent)?;
+impl Goal {
+    /// Checks weight and discount, without a model.
+    ///
+    /// # Errors
+    /// When a number is invalid; the error names it.
+    pub(super) fn check_numbers(&self) -> Result<()> {
         let settings = Settings("goal term");
         settings.not_negative("weight", self.weight)?;
         settings.not_negative("discount", self.discount)?;
@@ -71,6 +69,18 @@ impl Objective for Goal {
             format!("{} of a terminal term", self.discount),
             "make it running, or leave the discount at 1",
         )
+    }
+}
+
+impl Objective for Goal {
+    fn needs_latents(&self) -> bool {
+        true
+    }
+
+    fn check(&self, shape: Shape) -> Result<()> {
+        check_latents("goal term", shape)?;
+        check_picks("goal term", &self.latents, shape.latent)?;
+        self.check_numbers()
     }
 
     fn cost(&self, trajectory: Trajectory<'_>) -> f32 {

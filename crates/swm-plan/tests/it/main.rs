@@ -12,3 +12,4 @@ mod sampling;
 mod simulator;
 mod solvers;
 mod toys;
+mod true_dynamics;

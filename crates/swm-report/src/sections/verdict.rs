@@ -76,7 +76,7 @@ fn shifts(gaps: &Gaps<'_, '_>) -> String {
 }
 
 /// Policies that a trained policy is measured against, beside the floor and the expert.
-const BASELINES: [&str; 3] = ["simulator", "no-op", "replay"];
+const BASELINES: [&str; 4] = ["simulator", "no-op", "replay", "nearest"];
 
 /// Whether a run is of a policy that was trained.
 fn is_learned(row: &Row<'_>) -> bool {

@@ -8,7 +8,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use swm_core::Results;
 use swm_core::results::{Comparison, Counting};
-use swm_report::{Metrics, ReportOptions, Series, Training, write_report_with, write_study, write_table};
+use swm_report::{BoardEntry, BoardRow, BoardTable, Leaderboard, Metrics, ReportOptions, Series, Training};
+use swm_report::{write_leaderboard, write_report_with, write_study, write_table};
 
 /// Measures pages; returns whether all are without faults, and what was printed.
 fn check(pages: &[PathBuf]) -> (bool, String) {
@@ -56,6 +57,40 @@ fn training() -> Training {
     Training { policy: "lewm-tiny".to_owned(), metrics: Ok(metrics) }
 }
 
+/// A leaderboard with long names.
+fn leaderboard() -> Leaderboard {
+    let row = |policy: &str, i: usize, entry| BoardRow {
+        label: policy.to_owned(),
+        entry,
+        run: run("in distribution", policy, 300, 70 * (i + 1), Some(1.25)),
+    };
+    let task = [("dataset (BLAKE3)", "ab".repeat(32)), ("starts", "rows of the test part of a dataset".to_owned())];
+    let table = |condition: &str| BoardTable {
+        env: "swm/TwoRoom-v1".to_owned(),
+        condition: condition.to_owned(),
+        task: task.iter().map(|(name, value)| ((*name).to_owned(), value.clone())).collect(),
+        baselines: ["random", "no-op"].iter().enumerate().map(|(i, name)| row(name, i, None)).collect(),
+        rows: NAMES[1..].iter().enumerate().map(|(i, name)| row(name, i + 1, Some(i))).collect(),
+        ..BoardTable::default()
+    };
+    let entry = |(i, name): (usize, &&str)| BoardEntry {
+        policy: (*name).to_owned(),
+        author: NAMES[i + 1].to_owned(),
+        licence: "MIT OR Apache-2.0".to_owned(),
+        processor: "x86_64 avx512".to_owned(),
+        hash: "cd".repeat(32),
+        weights: "ef".repeat(32),
+        page: format!("entry-{i}"),
+        command: format!("swm leaderboard verify {}.json", NAMES[1]),
+        results: long_names(),
+    };
+    Leaderboard {
+        title: "Leaderboard".to_owned(),
+        tables: vec![table("in distribution"), table(NAMES[1])],
+        entries: NAMES[1..].iter().enumerate().map(entry).collect(),
+    }
+}
+
 #[test]
 #[ignore = "needs Chromium: make test-browser"]
 fn texts_of_pages_are_whole_in_a_browser() {
@@ -75,6 +110,9 @@ fn texts_of_pages_are_whole_in_a_browser() {
         pages.push(write_study(page, &folder.path().join(format!("study-{i}"))).expect("writing the page"));
     }
     pages.push(write_table(&study::table(), &folder.path().join("table")).expect("writing the page"));
+    let (board, site) = (leaderboard(), folder.path().join("site"));
+    write_leaderboard(&board, &site).expect("writing the pages");
+    pages.extend(board.pages().iter().take(2).map(|page| site.join(page)));
     let (fine, printed) = check(&pages);
     assert!(fine, "{printed}");
 }

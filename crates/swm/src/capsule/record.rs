@@ -141,14 +141,10 @@ impl EvaluationRecord {
         if trained(kind) != Some(MODEL) {
             return Err(wrong("its policy is not the model of the capsule".to_owned()));
         }
-        let budget = request.budget.unwrap_or_default();
-        if episodes.len() > MAX_EPISODES || budget > MAX_BUDGET {
-            let given = format!("{} episodes of {budget} steps", episodes.len());
-            return Err(wrong(format!("it has {given}, more than {MAX_EPISODES} of {MAX_BUDGET}")));
+        if episodes.len() > MAX_EPISODES {
+            return Err(wrong(format!("it has {} episodes, more than {MAX_EPISODES}", episodes.len())));
         }
-        if plan(kind) > MAX_PLAN {
-            return Err(wrong(format!("a plan of its policy has {} model steps, more than {MAX_PLAN}", plan(kind))));
-        }
+        check_cost(request).map_err(wrong)?;
         let rows = evaluation.rows.as_ref().map_or(0, swm_core::Batch::rows);
         let expected = if request.starts == StartsRequest::Episodic { 0 } else { 2 * episodes.len() };
         if evaluation.starts.rows() != episodes.len() || rows != expected {
@@ -207,13 +203,26 @@ fn choose(run: &Run) -> Vec<usize> {
     numbers
 }
 
+/// Checks what an episode of a request from a file costs.
+///
+/// # Errors
+/// When its time limit or a plan of a policy is too large; the text says which.
+pub fn check_cost(request: &EvalRequest) -> std::result::Result<(), String> {
+    let budget = request.budget.unwrap_or_default();
+    if budget > MAX_BUDGET {
+        return Err(format!("its episodes have {budget} steps, more than {MAX_BUDGET}"));
+    }
+    match request.policies.iter().map(|policy| plan(&policy.kind)).find(|steps| *steps > MAX_PLAN) {
+        Some(steps) => Err(format!("a plan of its policy has {steps} model steps, more than {MAX_PLAN}")),
+        None => Ok(()),
+    }
+}
+
 /// Returns the name of the checkpoint that a policy uses.
-fn trained(kind: &PolicyKind) -> Option<&str> {
+pub fn trained(kind: &PolicyKind) -> Option<&str> {
     match kind {
-        PolicyKind::Plan { model: Model::Checkpoint(name), .. } | PolicyKind::Direct { checkpoint: name, .. } => {
-            Some(name)
-        }
-        _ => None,
+        PolicyKind::Plan { model: Model::TrueDynamics { .. }, .. } => None,
+        kind => kind.checkpoint(),
     }
 }
 

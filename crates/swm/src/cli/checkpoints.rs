@@ -219,12 +219,10 @@ fn verify(given: &[String], trust: bool, context: &Context) -> anyhow::Result<()
     } else {
         found.iter().for_each(|(name, found)| emit(&found.lines(name)));
     }
-    if damaged > 0 {
-        anyhow::bail!(Error::corrupt(
-            home::checkpoints()?,
-            format!("{damaged} of {} checkpoints have faults", found.len()),
-            "train them again, or `swm checkpoints remove` them"
-        ));
+    if let Some((name, _)) = found.iter().find(|(_, found)| !found.faults.is_empty()) {
+        let problem = format!("{damaged} of {} checkpoints have faults", found.len());
+        let fix = "train them again, or `swm checkpoints remove` them";
+        anyhow::bail!(Error::corrupt(name, problem, fix));
     }
     Ok(())
 }

@@ -35,7 +35,7 @@ pub struct TargetArgs {
     #[command(flatten)]
     codec: CodecArgs,
     /// Minimum peak signal-to-noise ratio of lossy frames, in dB
-    #[arg(long, default_value_t = ConvertOptions::default().least_psnr, value_name = "DB")]
+    #[arg(long, default_value_t = ConvertOptions::default().least_psnr, value_name = "DB", value_parser = decibels)]
     least_psnr: f64,
 }
 
@@ -105,7 +105,14 @@ pub fn describe(report: &Converted, target: &Location, seconds: f64) -> String {
             }
         };
     }
+    if !report.unread.is_empty() {
+        let names = report.unread.join(", ");
+        text += &format!("left out, because they are neither numbers nor images: {names}\n");
+    }
     match &report.checksum {
+        Some(_) if report.columns.iter().all(|column| column.exact) && !report.unread.is_empty() => {
+            text += "verified: the other columns decode to the same bytes\n";
+        }
         Some(_) if report.columns.iter().all(|column| column.exact) => {
             text += "verified: both datasets decode to the same bytes\n";
         }
@@ -116,4 +123,10 @@ pub fn describe(report: &Converted, target: &Location, seconds: f64) -> String {
         text += &format!("checksum of the source: {checksum}\n");
     }
     text
+}
+
+/// Parses a signal-to-noise ratio.
+fn decibels(given: &str) -> Result<f64, String> {
+    let ratio = given.parse::<f64>().ok().filter(|ratio| (0.0..=200.0).contains(ratio));
+    ratio.ok_or_else(|| format!("'{given}' is not a ratio from 0 to 200 dB"))
 }

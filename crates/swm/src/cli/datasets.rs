@@ -61,9 +61,7 @@ pub fn datasets(args: &DatasetsArgs, as_json: bool) -> anyhow::Result<()> {
 /// Commits the shards of a dataset.
 fn commit(dataset: &str, mix_renderers: bool, as_json: bool) -> anyhow::Result<()> {
     let location = home::location(dataset)?;
-    if !mix_renderers {
-        collect_target::check_shards(&location)?;
-    }
+    collect_target::check_shards(&location, mix_renderers)?;
     let added = commit_shards(&location)?;
     if as_json {
         return emit_json(&json!({"dataset": location.to_string(), "added": added}));

@@ -199,5 +199,6 @@ fn request(args: &DemoArgs, model: &Path, side: usize, resolver: &HomeResolver) 
             Condition { name: format!("{factor} shifted"), variation: shift },
         ],
         prediction: None,
+        planning_seed: None,
     })
 }

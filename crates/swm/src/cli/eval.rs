@@ -12,7 +12,7 @@ use crate::resolver::HomeResolver;
 use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
-use swm_core::limits::EVALUATED_EPISODES;
+use swm_core::limits::{ENVS, EVALUATED_EPISODES, STEPS};
 use swm_core::results::Counting;
 use swm_core::{EnvChoice, Error, Origin, Result, Results, files};
 use swm_data::{Part, Split};
@@ -21,10 +21,12 @@ use swm_eval::{Condition, EvalRequest, HeldOut, RunOptions, StartsRequest};
 /// Arguments of `swm eval`.
 #[derive(Args)]
 pub struct EvalArgs {
-    /// Policies: checkpoints, expert, an expert's id, simulator, random, no-op, replay
+    /// Policies: checkpoints, expert, its id, simulator, random, or a baseline
     ///
-    /// Several policies are compared from the same starts. `simulator` plans by stepping the environment itself. `no-op`
-    /// does nothing; `replay` repeats the actions of the dataset that the starts come from.
+    /// Several policies are compared from the same starts. `simulator` plans by stepping the environment itself. The
+    /// baselines are `no-op`, which does nothing, and two that read the dataset that the starts come from: `replay` repeats
+    /// the actions that follow a start, `nearest` those that follow the rows of other episodes nearest to the present and
+    /// the goal.
     #[arg(required = true)]
     policies: Vec<String>,
     /// The environment (default: the training environment of the first checkpoint)
@@ -39,7 +41,7 @@ pub struct EvalArgs {
     #[arg(long, value_name = "DATASET")]
     dataset: Option<String>,
     /// Steps from a start to its goal in the dataset
-    #[arg(long, default_value_t = 25, requires = "dataset")]
+    #[arg(long, default_value_t = 25, requires = "dataset", value_parser = count::<1, { STEPS.max }>)]
     goal_offset: usize,
     /// Part of the dataset to take starts from: train, validation or test
     ///
@@ -55,6 +57,9 @@ pub struct EvalArgs {
     /// Seed of starts, goals, factors and plans (default: 0, or the capsule's)
     #[arg(long)]
     seed: Option<u64>,
+    /// Repeat all draws of policies with another stream, from the same starts
+    #[arg(long, value_name = "SEED")]
+    planning_seed: Option<u64>,
     /// Time limit, in steps (default: the environment's; 50 with --dataset)
     ///
     /// The default of a capsule with an evaluation is the time limit of that evaluation.
@@ -71,7 +76,7 @@ pub struct EvalArgs {
     /// Parallel environments
     ///
     /// Results do not depend on their number, except with the compat protocol.
-    #[arg(long, default_value_t = 16)]
+    #[arg(long, default_value_t = 16, value_parser = count::<1, { ENVS.max }>)]
     envs: usize,
     /// Frame size if no checkpoint determines it: 64 or HEIGHTxWIDTH
     #[arg(long, default_value = "64", value_parser = image_size)]
@@ -215,6 +220,7 @@ impl EvalArgs {
             },
             conditions: self.conditions(&env)?,
             prediction: self.predict,
+            planning_seed: self.planning_seed,
         })
     }
 

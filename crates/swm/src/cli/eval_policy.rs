@@ -33,7 +33,7 @@ enum NamedKind {
 }
 
 impl NamedPolicy {
-    /// Returns the policy with a name: `random`, `no-op`, `replay`, `expert`, an expert's id, `simulator`, or a checkpoint,
+    /// Returns the policy with a name: `random`, `no-op`, `replay`, `nearest`, `expert`, an expert's id, `simulator`, or a checkpoint,
     /// which is loaded.
     ///
     /// # Errors
@@ -45,6 +45,7 @@ impl NamedPolicy {
             "random" => Some(PolicyKind::Random),
             "no-op" => Some(PolicyKind::NoOp),
             "replay" => Some(PolicyKind::Replay),
+            "nearest" => Some(PolicyKind::Nearest),
             _ => None,
         };
         if let Some(kind) = baseline {

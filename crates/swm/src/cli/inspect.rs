@@ -62,6 +62,9 @@ pub fn inspect(args: &InspectArgs, as_json: bool) -> anyhow::Result<()> {
     for (part, size) in others {
         emit(&format!("{part}: {}\n", bytes(*size)));
     }
+    for name in reader.unread() {
+        emit(&format!("not read, because it is neither numbers nor images: {name}\n"));
+    }
     for (name, size) in constants(&*reader)? {
         emit(&format!("constant of every episode: {name}, {} in the first episode\n", bytes(size)));
     }
@@ -80,6 +83,7 @@ fn contents(reader: &dyn Reader, with_checksum: bool) -> Result<Value> {
     contents["lengths"] = json!(Summary::of(&lengths));
     contents["columns"] = json!(reader.schema());
     contents["footprint"] = json!(reader.footprint()?.into_iter().collect::<BTreeMap<_, _>>());
+    contents["unread"] = json!(reader.unread());
     contents["constants"] = json!(constants(reader)?);
     contents["content_hash"] = json!(reader.content_hash()?);
     contents["manifest"] = json!(reader.manifest());

@@ -1,6 +1,7 @@
 //! The command line: one module per command, each a thin layer over the crates.
 
 mod assets;
+mod autopsy;
 mod bench;
 mod capsules;
 mod checkpoints;
@@ -14,6 +15,7 @@ mod envs;
 mod eval;
 mod eval_policy;
 mod inspect;
+mod leaderboard;
 mod models;
 mod output;
 mod output_folder;
@@ -131,9 +133,18 @@ enum Command {
     /// Repeat an evaluation from its results and list the differences
     #[command(after_help = "Example: swm reproduce results")]
     Reproduce(reproduce::ReproduceArgs),
+    /// Submit results to a leaderboard, verify an entry, or build its pages
+    #[command(after_help = "Example: swm leaderboard build leaderboard --output site")]
+    Leaderboard(leaderboard::LeaderboardArgs),
     /// Run a study: many evaluations with one table
     #[command(after_help = "Example: swm study list")]
     Study(study::StudyArgs),
+    /// Find out why a planning world model fails
+    ///
+    /// Plays the same starts with parts of the planning replaced: S ten times as many candidates, R a new plan after every
+    /// model step, D the true dynamics, E the true distance to the goal. docs/autopsy.md explains what the answer means.
+    #[command(after_help = "Example: swm autopsy zoo:two-room/lewm --env swm/TwoRoom-v1 --output autopsy budget=100")]
+    Autopsy(autopsy::AutopsyArgs),
     /// Write one self-contained HTML page of results
     #[command(after_help = "Example: swm report results --output report --training lewm-rooms")]
     Report(report::ReportArgs),
@@ -247,7 +258,9 @@ impl Cli {
             Command::Pull(args) => pull::pull(&args, json),
             Command::Probe(args) => probe::probe(&args, &Context::new(json, self.threads)?),
             Command::Eval(args) => eval::eval(&args, &Context::new(json, self.threads)?),
+            Command::Leaderboard(args) => leaderboard::leaderboard(&args, &Context::new(json, self.threads)?),
             Command::Study(args) => study::study(&args, json, || Context::new(json, self.threads)),
+            Command::Autopsy(args) => autopsy::autopsy(&args, &Context::new(json, self.threads)?),
             Command::Reproduce(args) => reproduce::reproduce(&args, &Context::new(json, self.threads)?),
             Command::Bench(args) => bench::bench(&args, &Context::new(json, self.threads)?),
             Command::Demo(args) => demo::demo(&args, &Context::new(json, self.threads)?),

@@ -28,7 +28,7 @@ fn is_own(path: &Path) -> bool {
     let read = |path: &Path| files::read(path, MAX_OUTPUT_BYTES).unwrap_or_default();
     let is_page = |path: &Path| read(path).windows(PAGE_MARK.len()).any(|part| part == PAGE_MARK.as_bytes());
     match path.file_name().and_then(|name| name.to_str()) {
-        Some("index.html") => is_page(path),
+        Some(name) if name.ends_with(".html") => is_page(path),
         Some("table.csv" | "table.tex" | "table.md") => is_page(&path.with_file_name("index.html")),
         Some("traces.json") => serde_json::from_slice::<Vec<StoredPlan>>(&read(path)).is_ok(),
         _ => serde_json::from_slice::<StoredResults>(&read(path)).is_ok_and(|found| found.manifest.kind == "evaluate"),

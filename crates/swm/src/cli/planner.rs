@@ -124,13 +124,15 @@ impl PlannerArgs {
             "terms": read("--term", "term", &self.terms)?,
             "constraints": read("--limit", "constraint", &self.limits)?,
         });
-        serde_json::from_value(config).map_err(|error| {
+        let objective: ObjectiveConfig = serde_json::from_value(config).map_err(|error| {
             Error::config(
                 "--term or --limit",
                 error.to_string(),
                 "terms are goal, control and change; limits are action_norm and latent_box",
             )
-        })
+        })?;
+        objective.check()?;
+        Ok(objective)
     }
 }
 

@@ -3,7 +3,7 @@
 use crate::home;
 use std::path::{Path, PathBuf};
 use swm_core::Results;
-use swm_eval::{EvalRequest, Model, PolicyKind, PolicyRequest};
+use swm_eval::{EvalRequest, PolicyRequest};
 use swm_models::StoredCheckpoint;
 use swm_report::{Training, read_metrics};
 
@@ -40,12 +40,7 @@ pub fn of_results(results: &[(PathBuf, Results)]) -> Vec<Training> {
 
 /// The checkpoint of a policy, as the request names it.
 fn checkpoint_of(policy: &PolicyRequest) -> Option<&str> {
-    match &policy.kind {
-        PolicyKind::Plan { model: Model::Checkpoint(given), .. } | PolicyKind::Direct { checkpoint: given, .. } => {
-            Some(given)
-        }
-        _ => None,
-    }
+    policy.kind.checkpoint()
 }
 
 /// Whether the checkpoint has the weights that were evaluated: it may have been trained again.

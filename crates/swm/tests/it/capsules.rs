@@ -118,7 +118,7 @@ fn changed_records_of_a_capsule_are_found_and_hostile_ones_refused() {
     };
     refused(&own, "is not the model of the capsule");
     refused(&|capsule| record(capsule)["request"]["budget"] = json!(1_u64 << 40), "number of steps");
-    refused(&|capsule| record(capsule)["request"]["budget"] = json!(1 << 20), "more than 16");
+    refused(&|capsule| record(capsule)["request"]["budget"] = json!(1 << 20), "more than 10000");
     refused(&|capsule| record(capsule)["request"]["version"] = json!(2), "layout 2");
     refused(&|capsule| record(capsule)["request"]["image"] = json!([1_u64 << 40, 64]), "pixels");
     refused(&|capsule| record(capsule)["episodes"] = json!([]), "3 starts");

@@ -63,6 +63,21 @@ fn killed_collection_keeps_committed_episodes_and_resumes() {
     assert_eq!(resumed, content(&swm, "rooms"));
 }
 
+#[test]
+fn other_wrappers_do_not_continue_a_collection() {
+    let swm = Swm::new();
+    let resume = with(ROOMS, &["--episodes", "4", "--resume"]);
+    let noisy = |args: &[&'static str]| with(args, &["--wrapper", "noise,std=30"]);
+    swm.json(&with(ROOMS, &["--episodes", "2"]));
+    let before = content(&swm, "rooms");
+    swm.fails(&noisy(&resume), 2, &["wrappers", "collect into another dataset"]);
+    assert_eq!(content(&swm, "rooms"), before);
+    swm.json(&noisy(&with(ROOMS, &["--episodes", "2", "--overwrite"])));
+    swm.fails(&resume, 2, &["wrappers"]);
+    swm.json(&noisy(&resume));
+    assert_eq!(content(&swm, "rooms").1, 4);
+}
+
 #[cfg(unix)]
 #[test]
 fn interrupted_collection_keeps_finished_episodes() {

@@ -80,6 +80,18 @@ fn hostile_numbers_are_refused() {
     for absurd in ["--episodes=1152921504606846976", "--image=1152921504606846976"] {
         swm.fails(&[&["eval", "expert"], &room[..], &[absurd]].concat(), 2, &["error: "]);
     }
+    swm.fails(&[&["eval", "expert"], &room[..], &["--envs=0"]].concat(), 2, &["from 1 to 16384"]);
+    swm.fails(&[&["eval", "expert"], &room[..], &["--dataset=d", "--goal-offset=0"]].concat(), 2, &["from 1 to"]);
+    for (weight, message) in [("-1", "control term"), ("1e308", "control term")] {
+        let term = format!("--term=control,weight={weight}");
+        swm.fails(&[&["eval", "simulator"], &room[..], &[term.as_str()]].concat(), 2, &[message]);
+    }
+    for ratio in ["nan", "-1", "1e9"] {
+        let given = format!("--least-psnr={ratio}");
+        swm.fails(&["convert", "a.lance", "b.h5", &given], 2, &["from 0 to 200 dB"]);
+    }
+    let ray = ["study", "break", "expert", "env=swm/TwoRoom-v1", "--factor=agent.speed", "--below=101", "-o=o"];
+    swm.fails(&ray, 2, &["1..=100"]);
     swm.fails(&["bench", "train", "--clips=1152921504606846976"], 2, &["from 1 to 4096"]);
     swm.fails(&["bench", "plan", "--envs=1152921504606846976"], 2, &["from 1 to 16384"]);
 }

@@ -1,6 +1,7 @@
 //! Tests of the `swm` command as a process: arguments, output, exit codes and files.
 #![allow(missing_docs, clippy::print_stdout, reason = "a test crate has no public items; skipped tests print why")]
 
+mod autopsy;
 mod capsules;
 mod collecting;
 mod data;
@@ -10,6 +11,7 @@ mod foreign;
 mod gym;
 mod hostile;
 mod kills;
+mod leaderboard;
 mod limits;
 mod listing;
 mod output;

@@ -96,6 +96,24 @@ fn output_folders_are_checked_before_the_work() {
 }
 
 #[test]
+fn videos_are_not_written_through_files_and_links() {
+    let swm = Swm::new();
+    let eval = ["eval", "expert", "--env", "swm/TwoRoom-v1", "--episodes", "1", "--budget", "3", "--image", "32"];
+    fs::create_dir_all(swm.path("mine")).expect("a folder");
+    for (folder, link) in [("a", false), ("b", true)] {
+        fs::create_dir_all(swm.path(folder)).expect("a folder");
+        let videos = swm.path(folder).join("videos");
+        if link {
+            std::os::unix::fs::symlink(swm.path("mine"), &videos).expect("a link");
+        } else {
+            fs::write(&videos, "").expect("a file");
+        }
+        swm.fails(&[&eval[..], &["--videos", "1", "-o", folder]].concat(), 2, &["videos", "a symbolic link"]);
+    }
+    assert_eq!(fs::read_dir(swm.path("mine")).expect("the folder").count(), 0);
+}
+
+#[test]
 fn requests_are_checked_before_the_floor_is_played() {
     let swm = Swm::new();
     let simulator = ["eval", "simulator", "--env", "swm/TwoRoom-v1", "--episodes", "2", "--budget", "3"];

@@ -68,8 +68,11 @@ fn recipe_runs_what_is_missing_and_compares_hashes() {
         text(&output.stdout)
     };
     assert_eq!(printed("second", &[]).matches("equal to the recorded hash").count(), 2);
-    write(&swm, "small.toml", &expected("0000"));
+    write(&swm, "small.toml", &expected(&"0".repeat(64)));
     assert!(printed("first", &[]).contains("(recorded as 0000"));
+    write(&swm, "small.toml", &expected("0000"));
+    swm.fails(&["train", "--recipe", "small.toml", "-o", "other"], 2, &["0000", "64 hexadecimal digits"]);
+    write(&swm, "small.toml", &expected(hashes[1]));
     let settings = ["rooms.episodes=13", "small.schedule.steps=3"];
     assert_eq!(printed("third", &settings).matches("settings were changed").count(), 2);
     assert_eq!(swm.json(&["inspect", "third/rooms.lance"])["episodes"], 13);

@@ -39,6 +39,11 @@ fn checkpoint_does_not_choose_a_module() {
     let stored = fs::read_to_string(&config).expect("the configuration");
     assert!(stored.contains("swm/TwoRoom-v1"), "{stored}");
     fs::write(&config, stored.replace("swm/TwoRoom-v1", "evil_mod:Cart-v0")).expect("writing the configuration");
+    swm.fails(&["eval", "./run", "--episodes", "1"], 1, &["config.json", "the hash differs"]);
+    // A stranger leaves the hash out.
+    edit(&swm.path("run/checkpoint/manifest.json"), |manifest| {
+        manifest["hashes"].as_object_mut().expect("the hashes").remove("config");
+    });
     let parts = ["run", "'evil_mod:Cart-v0'", "imports a Python module", "--env 'evil_mod:Cart-v0'", "--trust"];
     swm.fails(&["eval", "./run", "--episodes", "1"], 2, &parts);
     assert!(!swm.path("imported").exists());

@@ -108,6 +108,7 @@ impl Loader {
         let goals = Goals::new(reader.episodes(), &positions);
         let reader = config.cache.over(reader, &filler.columns())?;
         let prefetch = window(filler.schema(), config.batch_size, config.prefetch, config.prefetch_bytes);
+        limits::THREADS.check(config.threads)?;
         let workers = Workers::new(config.threads)?;
         let source = Source {
             reader,

@@ -30,6 +30,8 @@ pub(super) struct Hdf5Reader {
     record: Record,
     /// Names of datasets that are not numeric.
     non_numeric: Vec<String>,
+    /// Names of groups, whose datasets are not read; none in files of this module.
+    groups: Vec<String>,
 }
 
 impl Hdf5Reader {
@@ -92,13 +94,12 @@ impl Hdf5Reader {
                 return Err(damaged(problem));
             }
         }
-        let known = record.schema.as_ref().map(Schema::columns).unwrap_or_default();
-        let position = |column: &Column| known.iter().position(|k| k.name == column.spec.name).unwrap_or(known.len());
-        columns.sort_by(|a, b| position(a).cmp(&position(b)).then_with(|| a.spec.name.cmp(&b.spec.name)));
-        let specs: Vec<ColumnSpec> = columns.iter().map(|column| column.spec.clone()).collect();
-        let data = specs.iter().filter(|spec| spec.name != EPISODE_IDX && spec.name != STEP_IDX).cloned();
-        let schema = Schema::new(index_columns(&specs).into_iter().chain(data).collect::<Vec<_>>())?;
-        Ok(Self { source, rows, schema, columns, record, non_numeric })
+        let schema = sorted(&mut columns, &record)?;
+        let groups = match record.schema {
+            Some(_) => vec![],
+            None => catch_panic("listing its groups", || file.root().groups()).map_err(damaged)?,
+        };
+        Ok(Self { source, rows, schema, columns, record, non_numeric, groups })
     }
 
     /// First row and length of every episode.
@@ -128,6 +129,16 @@ impl Hdf5Reader {
 
 fn damaged(source: &Source, problem: String) -> Error {
     Error::corrupt(source.label(), problem, "restore it from a copy, or convert the columns that h5py can read")
+}
+
+/// Sorts the columns: those of the record in its order, then the others by name. Returns their schema.
+fn sorted(columns: &mut [Column], record: &Record) -> Result<Schema> {
+    let known = record.schema.as_ref().map(Schema::columns).unwrap_or_default();
+    let position = |column: &Column| known.iter().position(|k| k.name == column.spec.name).unwrap_or(known.len());
+    columns.sort_by(|a, b| position(a).cmp(&position(b)).then_with(|| a.spec.name.cmp(&b.spec.name)));
+    let specs: Vec<ColumnSpec> = columns.iter().map(|column| column.spec.clone()).collect();
+    let data = specs.iter().filter(|spec| spec.name != EPISODE_IDX && spec.name != STEP_IDX).cloned();
+    Schema::new(index_columns(&specs).into_iter().chain(data).collect::<Vec<_>>())
 }
 
 impl Reader for Hdf5Reader {
@@ -196,6 +207,11 @@ impl Reader for Hdf5Reader {
 
     fn sources(&self) -> Vec<PathBuf> {
         vec![self.source.label().to_owned()]
+    }
+
+    fn unread(&self) -> Vec<String> {
+        let groups = self.groups.iter().map(|group| format!("{group}/"));
+        self.non_numeric.iter().cloned().chain(groups).collect()
     }
 
     fn manifest(&self) -> Option<Manifest> {

@@ -67,7 +67,7 @@ impl Precision {
 /// The stored columns of an episode, without the index columns.
 ///
 /// # Errors
-/// If two columns get the same stored name, a column has no elements, or there are no columns.
+/// If two columns get the same stored name, a name is empty or has a '`', a column has no elements, or there are no columns.
 pub fn columns_to_write(schema: &Schema) -> Result<Vec<StoredColumn>> {
     let mut columns: Vec<StoredColumn> = vec![];
     for spec in schema.columns() {
@@ -75,6 +75,11 @@ pub fn columns_to_write(schema: &Schema) -> Result<Vec<StoredColumn>> {
         let name = columns::flat(&spec.name);
         if name == EPISODE_IDX || name == STEP_IDX {
             continue;
+        }
+        if name.is_empty() || name.contains(['`', '\0']) {
+            let problem =
+                format!("the column name '{}' cannot be read back from a Lance table", spec.name.escape_debug());
+            return Err(Error::config("schema", problem, "give the column a name without '`'"));
         }
         if let Some(other) = columns.iter().find(|other| other.name == name) {
             return Err(Error::config(

@@ -19,7 +19,7 @@ use std::sync::mpsc::{Receiver, SyncSender, channel, sync_channel};
 use std::thread::{Builder, scope};
 use swm_core::columns::ACTION;
 use swm_core::run::{Control, Event, Progress, Stage};
-use swm_core::{Batch, DType, Error, Result, Schema};
+use swm_core::{Batch, DType, Error, Result, Schema, files};
 use swm_image::ImageCodec;
 
 /// The unit of progress.
@@ -85,6 +85,8 @@ pub struct Converted {
     pub checksum: Option<String>,
     /// Comparison of each verified column.
     pub columns: Vec<ColumnComparison>,
+    /// The parts of the source that are not read ([`Reader::unread`]), and so are not in the target.
+    pub unread: Vec<String>,
 }
 
 /// The BLAKE3 hash of decoded content: names and types of the columns, and every row. Datasets in any format and codec
@@ -108,14 +110,60 @@ pub fn checksum(reader: &dyn Reader) -> Result<String> {
 /// # Errors
 /// If the target is the source, the source is damaged, the target cannot be written or differs from the source, or the run
 /// is stopped ([`Error::Interrupted`]).
-#[allow(clippy::too_many_lines, reason = "compare, copy and verify share the report")]
 pub fn convert(
     reader: &Arc<dyn Reader>,
     target: &Location,
     options: &ConvertOptions,
     control: &mut Control<'_>,
 ) -> Result<Converted> {
+    if options.least_psnr.is_nan() || options.least_psnr < 0.0 {
+        let (given, fix) = (format!("{} dB", options.least_psnr), "give a number of at least 0");
+        return Err(Error::config("least_psnr", given, fix));
+    }
     check_distinct(&**reader, target)?;
+    if let Some((entry, trial)) = trial(&**reader, target, options)? {
+        let options =
+            ConvertOptions { mode: ConvertMode::Create, format: Some(entry.id.to_owned()), ..options.clone() };
+        let tried = convert_into(reader, &Location::from(&trial), &options, control);
+        let removed = entry.remove(&trial);
+        tried.and(removed)?;
+    }
+    convert_into(reader, target, options, control)
+}
+
+/// Returns the format and a free path beside the target, where a conversion is tried before it replaces a dataset: images may
+/// lose more than the options allow, which is known after all of them are written. `None` if that cannot happen.
+fn trial(
+    reader: &dyn Reader,
+    target: &Location,
+    options: &ConvertOptions,
+) -> Result<Option<(&'static FormatEntry, PathBuf)>> {
+    let Some(path) = target.path().filter(|path| options.mode == ConvertMode::Overwrite && path.exists()) else {
+        return Ok(None);
+    };
+    let entry = match &options.format {
+        Some(id) => Some(FORMATS.get(id)?),
+        None => detect(target),
+    };
+    let has_images = data_columns(reader.schema()).any(|(_, column)| column.is_image());
+    // These formats store images as they are, unless the codec is lossy.
+    let keeps = |entry: &FormatEntry| ["lance", "folder", "hdf5"].contains(&entry.id);
+    let loses = |entry: &&FormatEntry| !keeps(entry) || matches!(options.codec, ImageCodec::Jpeg { .. });
+    let Some(entry) = entry.filter(loses).filter(|_| has_images && options.verify) else { return Ok(None) };
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+    let suffix = path.extension().map(|suffix| format!(".{}", suffix.to_string_lossy())).unwrap_or_default();
+    let trial = path.with_file_name(format!("{stem}.trial-{}{suffix}", std::process::id()));
+    files::check_free(&trial)?;
+    Ok(Some((entry, trial)))
+}
+
+#[allow(clippy::too_many_lines, reason = "compare, copy and verify share the report")]
+fn convert_into(
+    reader: &Arc<dyn Reader>,
+    target: &Location,
+    options: &ConvertOptions,
+    control: &mut Control<'_>,
+) -> Result<Converted> {
     let is_new = target.path().is_some_and(|path| !path.exists());
     let source = Source::new(&**reader);
     let format = options.format.as_deref().map(|id| FORMATS.get(id)).transpose()?;
@@ -127,6 +175,7 @@ pub fn convert(
         last_actions: 0,
         checksum: None,
         columns: data_columns(&source.schema).map(|(_, column)| ColumnComparison::new(column)).collect(),
+        unread: reader.unread(),
     };
     let existing = match options.mode {
         ConvertMode::Resume | ConvertMode::Append => open_existing(target, format)?,

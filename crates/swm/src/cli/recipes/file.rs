@@ -137,6 +137,10 @@ impl Recipe {
                 return Err(invalid(format!("two steps have the name '{name}'")));
             }
             names.push(name);
+            let is_hash = |hash: &String| hash.len() == 64 && hash.bytes().all(|byte| byte.is_ascii_hexdigit());
+            if let Some(hash) = step.hash.as_ref().filter(|hash| !is_hash(hash)) {
+                return Err(invalid(format!("the hash '{hash}' of '{name}' has not 64 hexadecimal digits")));
+            }
             let is_option = |key: &str| key.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-');
             if let Some(key) = step.options.keys().find(|key| !is_option(key)) {
                 return Err(invalid(format!("[[{}]] '{name}' has '{key}', which is no option", kind.name())));

@@ -86,6 +86,11 @@ pub fn run(request: &RecipeRun<'_>, context: &Context) -> anyhow::Result<()> {
     let page = report(&recipe, request, context)?;
     let compared = state.compare(&recipe);
     let other = recipe.recorded_on.as_deref().filter(|processor| *processor != state.processor);
+    let same_processor = recipe.recorded_on.as_ref() == Some(&state.processor);
+    let differs = |compared: &&Compared<'_>| compared.expected.is_some_and(|expected| expected != compared.hash);
+    if let Some(Compared { name, .. }) = compared.iter().find(differs).filter(|_| same_processor) {
+        eprint(&format!("warning: '{name}' differs from what the recipe recorded on such a processor\n"));
+    }
     if context.json {
         return emit_json(&json!({
             "folder": request.output, "report": page, "hashes": compared, "settings": state.settings,

@@ -36,7 +36,7 @@ pub struct BreakArgs {
     #[arg(long, value_name = "VALUE")]
     towards: Option<String>,
     /// The success rate below which success is broken in absolute terms, in percent
-    #[arg(long, value_name = "PERCENT", default_value_t = 50)]
+    #[arg(long, value_name = "PERCENT", default_value_t = 50, value_parser = clap::value_parser!(u8).range(1..=100))]
     below: u8,
     /// Folder of the study
     #[arg(short, long, value_name = "DIR")]

@@ -144,7 +144,23 @@ pub(super) fn line(cells: &[String]) -> String {
 /// Quotes a cell of CSV.
 fn quote(text: &str) -> String {
     // A spreadsheet would run a name that begins like a formula.
-    let is_formula = text.starts_with(['=', '+', '-', '@']) && text.parse::<f64>().is_err();
+    let start = text.trim_start_matches(|c: char| c.is_whitespace() || c.is_control());
+    let is_formula = start.starts_with(['=', '+', '-', '@']) && text.parse::<f64>().is_err();
     let text = format!("{}{}", if is_formula { "'" } else { "" }, printable(text));
     if text.contains([',', '"', '\n', '\r']) { format!("\"{}\"", text.replace('"', "\"\"")) } else { text }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::quote;
+
+    #[test]
+    fn texts_that_a_spreadsheet_would_run_are_quoted() {
+        for text in ["=1+1", "@x", "\t=1+1", "\n-a"] {
+            assert!(quote(text).trim_start_matches('"').starts_with('\''), "{text:?}: {}", quote(text));
+        }
+        for text in ["-1.5", "+2", "a=b", " a"] {
+            assert_eq!(quote(text), text);
+        }
+    }
 }

@@ -9,7 +9,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use swm_core::run::Control;
 use swm_core::{Error, Result};
 use swm_data::{Part, Split};
-use swm_eval::{Cell, EvalRequest, HeldOut, Model, PolicyKind, Resolver as _, StartsRequest, Study};
+use swm_eval::{Cell, EvalRequest, HeldOut, PolicyKind, Resolver as _, StartsRequest, Study};
 
 /// A cell before its names are resolved.
 struct Combination {
@@ -52,7 +52,7 @@ pub fn study(
     resolver: &HomeResolver,
     control: &mut Control<'_>,
 ) -> Result<Study> {
-    let (mut cells, mut inputs) = (vec![], Inputs { resolver, known: BTreeMap::new() });
+    let (mut cells, mut inputs) = (vec![], Inputs::new(resolver));
     for combination in combinations(file, settings, resolver)? {
         control.check()?;
         let Combination { starts, condition, policy, all } = combination;
@@ -208,23 +208,27 @@ fn trained_on_starts(
 }
 
 /// The checkpoint that a request names, if it does.
-fn checkpoint(request: &EvalRequest) -> Option<&String> {
-    request.policies.iter().find_map(|policy| match &policy.kind {
-        PolicyKind::Plan { model: Model::Checkpoint(given), .. } | PolicyKind::Direct { checkpoint: given, .. } => {
-            Some(given)
-        }
-        _ => None,
-    })
+fn checkpoint(request: &EvalRequest) -> Option<&str> {
+    request.policies.iter().find_map(|policy| policy.kind.checkpoint())
 }
 
 /// Hashes of datasets and weights, each computed once.
-struct Inputs<'a> {
+pub struct Inputs<'a> {
     resolver: &'a HomeResolver,
     known: BTreeMap<(&'static str, String), String>,
 }
 
-impl Inputs<'_> {
-    fn of(&mut self, request: &EvalRequest) -> Result<BTreeMap<String, String>> {
+impl<'a> Inputs<'a> {
+    /// Nothing is known yet.
+    pub fn new(resolver: &'a HomeResolver) -> Self {
+        Self { resolver, known: BTreeMap::new() }
+    }
+
+    /// Returns the hashes of the dataset and the weights that a request names.
+    ///
+    /// # Errors
+    /// When one of them does not exist or is damaged.
+    pub fn of(&mut self, request: &EvalRequest) -> Result<BTreeMap<String, String>> {
         let mut inputs = BTreeMap::new();
         if let StartsRequest::Dataset { dataset, .. } = &request.starts {
             let hash = self.hash("dataset", dataset, |resolver| resolver.dataset(dataset)?.content_hash())?;

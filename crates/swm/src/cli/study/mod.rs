@@ -17,6 +17,7 @@ mod variants;
 use super::config::count;
 use super::eval::run_options;
 use super::progress::control;
+use super::recipes::Datasets;
 use super::results_tables::{compared, percent};
 use super::{Context, emit, emit_json, table};
 use crate::resolver::HomeResolver;
@@ -24,10 +25,12 @@ use any_file::{AnyFile, Size};
 use clap::{Args, Subcommand, ValueEnum as _};
 use export::Format;
 use serde_json::{Value, json};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use swm_core::results::{BreakingPoint, StudyResults, Until};
+use swm_core::run::Control;
 use swm_core::{Error, Origin, Result, limits};
-use swm_eval::{AnyStudy, Study, StudyFolder};
+use swm_eval::{AnyStudy, Common, Study, StudyFolder};
 
 /// Arguments of `swm study`.
 #[derive(Args)]
@@ -188,6 +191,37 @@ pub fn export(folder: &Path, format: &str) -> Result<String> {
     let found = found
         .map_err(|_| Error::unknown("format", format, names, "choose one of the formats of `swm study export`"))?;
     found.of(&StudyFolder::new(folder))
+}
+
+/// Returns the study of one policy under one condition. `settings` are options of `swm eval`, each KEY=VALUE.
+///
+/// # Errors
+/// When a name does not exist, a setting is invalid, or the settings make several evaluations.
+pub(super) fn single(
+    [title, question, name, policy]: [&str; 4],
+    settings: &[String],
+    resolver: &HomeResolver,
+    control: &mut Control<'_>,
+) -> Result<Study> {
+    let table = |name: &str, options| file::Table {
+        at: "the command".to_owned(),
+        name: name.to_owned(),
+        options,
+        ..file::Table::default()
+    };
+    let options = BTreeMap::from([(file::POLICY.to_owned(), vec![policy.to_owned()])]);
+    let file = file::StudyFile {
+        title: title.to_owned(),
+        question: question.to_owned(),
+        families: Common::by_default(),
+        defaults: file::Table::default(),
+        starts: vec![file::Table::default()],
+        conditions: vec![table("in distribution", BTreeMap::new())],
+        policies: vec![table(name, options)],
+        published: vec![],
+        datasets: Datasets::default(),
+    };
+    expand::study(&file, settings, resolver, control)
 }
 
 /// Runs or registers a study.

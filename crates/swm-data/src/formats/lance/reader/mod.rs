@@ -258,6 +258,14 @@ impl Reader for LanceReader {
         vec![self.store.label.clone()]
     }
 
+    fn unread(&self) -> Vec<String> {
+        let fields = self.table.schema.fields.iter().map(|field| field.name.clone());
+        let is_read = |name: &String| {
+            [EPISODE_IDX, STEP_IDX].contains(&name.as_str()) || self.columns.iter().any(|column| column.name == *name)
+        };
+        fields.filter(|name| !is_read(name)).collect()
+    }
+
     fn manifest(&self) -> Option<Manifest> {
         schema::manifest(&self.table.schema)
     }

@@ -1,0 +1,317 @@
+//! `swm autopsy`: why a planning world model fails.
+
+use super::config::count;
+use super::eval::{run_options, write_json};
+use super::progress::control;
+use super::results_tables::percent;
+use super::{Context, emit, emit_json, eprint, study, table};
+use crate::autopsy::{Plan, SEARCH, plans};
+use crate::resolver::HomeResolver;
+use clap::Args;
+use serde_json::json;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+use swm_core::results::{Autopsy, Estimate, Ingredient, Repair, letters};
+use swm_core::{Error, Key, Origin, Result, VariationRequest, limits};
+use swm_eval::{EvalRequest, PolicyRequest, Resolver as _, StudyFolder, World, WorldConfig};
+
+/// Arguments of `swm autopsy`.
+#[derive(Args)]
+pub struct AutopsyArgs {
+    /// The world model: a checkpoint that plans
+    model: String,
+    /// Options of `swm eval` for all arms, such as budget=100 or solver=cem,samples=64
+    #[arg(value_name = "KEY=VALUE")]
+    settings: Vec<String>,
+    /// The environment (default: the one that the model was trained on)
+    #[arg(long)]
+    env: Option<String>,
+    /// Number of starts
+    #[arg(long, default_value_t = 30, value_parser = count::<1, { limits::EVALUATED_EPISODES.max }>)]
+    episodes: usize,
+    /// Planning seeds per arm, besides the one that selects the failures
+    #[arg(long, value_name = "COUNT", default_value_t = Autopsy::MIN_SEEDS)]
+    planning_seeds: usize,
+    /// Ingredients: some of the letters S, R, D and E
+    ///
+    /// S: ten times as many candidates. R: a new plan after every model step. D: the true dynamics. E, after D: the true distance
+    /// to the goal. Fewer ingredients cost less time and explain less.
+    #[arg(long, value_name = "LETTERS", default_value = "SRDE")]
+    ingredients: String,
+    /// Folder of the autopsy, which is that of a study
+    #[arg(short, long, default_value = "autopsy", value_name = "DIR")]
+    output: PathBuf,
+    /// Print the estimated time, and run nothing
+    #[arg(long)]
+    estimate: bool,
+    /// Parallel environments; results do not depend on their number
+    #[arg(long, default_value_t = 16, value_parser = count::<1, { limits::ENVS.max }>)]
+    envs: usize,
+}
+
+/// The widest line of the tables.
+const COLUMNS: usize = 80;
+
+/// The environments whose plans are timed.
+const TIMED_ENVS: usize = 2;
+
+/// Runs `swm autopsy`.
+pub fn autopsy(args: &AutopsyArgs, context: &Context) -> anyhow::Result<()> {
+    let ingredients = ingredients(&args.ingredients)?;
+    let own_env = args.env.iter();
+    let resolver = own_env.fold(HomeResolver::new(Origin::User), |resolver, env| resolver.with_env(env));
+    let name =
+        Path::new(&args.model).file_name().map_or(args.model.clone(), |name| name.to_string_lossy().into_owned());
+    let title = format!("Autopsy of {name}");
+    let question = format!("Why does {name} fail?");
+    let env = args.env.iter().map(|env| format!("env={env}"));
+    let settings: Vec<String> =
+        env.chain([format!("episodes={}", args.episodes)]).chain(args.settings.iter().cloned()).collect();
+    let base = study::single([&title, &question, &name, &args.model], &settings, &resolver, &mut control(context))?;
+    let plan = Plan::new(base, &ingredients, args.planning_seeds)?;
+    let folder = StudyFolder::new(&args.output);
+    let seconds = estimate(&plan, &folder, &resolver, context)?;
+    let (arms, starts) = (plan.arms.len(), plan.request()?.episodes);
+    if args.estimate {
+        if context.json {
+            return emit_json(&json!({"arms": arms, "planning_seeds": args.planning_seeds, "seconds": seconds}));
+        }
+        emit(&cost(arms, args.planning_seeds, starts, seconds));
+        return Ok(());
+    }
+    eprint(&cost(arms, args.planning_seeds, starts, seconds));
+    let _lock = folder.create(&plan.study)?;
+    plan.study.run(&folder, &resolver, &run_options(args.envs, None, context), &mut control(context))?;
+    let found = plan.autopsy(&folder)?;
+    let file = args.output.join("autopsy.json");
+    let document = json!({
+        "version": 1,
+        "model": args.model,
+        "env": plan.request()?.env,
+        "study": plan.study.hash()?,
+        "autopsy": found,
+    });
+    write_json(&file, &document)?;
+    if context.json {
+        return emit_json(&document);
+    }
+    emit(&format!("{title} in {}\n", plan.request()?.env));
+    emit(&text(&found));
+    emit(&format!("{}\n", file.display()));
+    Ok(())
+}
+
+/// Parses ingredients by their letters.
+fn ingredients(given: &str) -> Result<Vec<Ingredient>> {
+    let find = |letter: char| {
+        let found = Ingredient::ALL.into_iter().find(|ingredient| ingredient.letter() == letter.to_ascii_uppercase());
+        found.ok_or_else(|| {
+            let problem = format!("there is no ingredient '{letter}'");
+            Error::config("--ingredients", problem, "choose some of S, R, D and E, such as SRD")
+        })
+    };
+    given.chars().filter(|c| *c != ',').map(find).collect()
+}
+
+/// Returns the most seconds that the arms without results take: plans are timed with each model, and a larger search takes
+/// as many times longer. All environments start from the first start.
+fn estimate(plan: &Plan, folder: &StudyFolder, resolver: &HomeResolver, context: &Context) -> Result<f64> {
+    let request = plan.request()?;
+    let config = WorldConfig {
+        envs: TIMED_ENVS.min(request.episodes),
+        image: request.image.map(|[height, width]| (height, width)),
+        views: vec![],
+        max_episode_steps: request.budget,
+        threads: context.threads,
+    };
+    let mut world = World::of(|| resolver.env(request), config)?;
+    let limit = world.pool().max_episode_steps();
+    let variation = request.conditions.first().map_or_else(VariationRequest::default, |c| c.variation.clone());
+    world.reset(request.seed, &variation)?;
+    let mut timed: Vec<(Vec<Ingredient>, f64)> = vec![];
+    let mut total = 0.0;
+    let mut control = control(context);
+    for (set, cells) in &plan.arms {
+        let mut missing = 0;
+        for cell in cells {
+            missing += usize::from(folder.results(cell)?.is_none());
+        }
+        if missing == 0 {
+            continue;
+        }
+        // What a plan costs depends on its model; replanning and the search only multiply it.
+        let model: Vec<Ingredient> =
+            set.iter().copied().filter(|ingredient| *ingredient >= Ingredient::Dynamics).collect();
+        let EvalRequest { policies, .. } = request;
+        let kind =
+            |set: &[Ingredient]| policies.first().map(|policy| crate::autopsy::with(&policy.kind, set)).transpose();
+        let known = timed.iter().find(|(known, _)| *known == model).map(|(_, seconds)| *seconds);
+        let seconds = match (known, kind(&model)?) {
+            (Some(seconds), _) => seconds,
+            (None, Some(kind)) => {
+                control.check()?;
+                let seconds = time(&PolicyRequest { name: "timed".to_owned(), kind }, &mut world, resolver)?;
+                timed.push((model, seconds));
+                seconds
+            }
+            (None, None) => 0.0,
+        };
+        let per_episode = kind(set)?.map_or(0, |kind| plans(&kind, limit));
+        let search = if set.contains(&Ingredient::Search) { SEARCH as f64 } else { 1.0 };
+        total += seconds * search * (per_episode * missing * request.episodes) as f64;
+    }
+    Ok(total)
+}
+
+/// Returns the seconds of one plan.
+fn time(request: &PolicyRequest, world: &mut World, resolver: &HomeResolver) -> Result<f64> {
+    let mut policy = resolver.policy(request, world)?.policy;
+    let slots = world.pool().len();
+    let mut fastest = f64::INFINITY;
+    // The first plan also warms caches up.
+    for repetition in 0..2 {
+        (0..slots).for_each(|slot| policy.begin(slot, Key::new(repetition).at(slot as u64)));
+        world.act(&mut *policy, &vec![true; slots])?;
+        let latencies = policy.take_latencies();
+        fastest = fastest.min(latencies.iter().sum::<f64>() / latencies.len().max(1) as f64);
+    }
+    Ok(fastest)
+}
+
+/// The cost of an autopsy, in words.
+fn cost(arms: usize, seeds: usize, starts: usize, seconds: f64) -> String {
+    let time = Duration::from_secs_f64(seconds.clamp(0.0, 1e12).ceil()).as_secs();
+    let time = match time {
+        0..120 => format!("{time} s"),
+        120..7200 => format!("{} min", time / 60),
+        _ => format!("{:.1} h", time as f64 / 3600.0),
+    };
+    format!("{arms} arms x {seeds} planning seeds x {starts} starts: at most {time}\n")
+}
+
+/// The tables of an autopsy, at most 80 columns wide.
+fn text(found: &Autopsy) -> String {
+    let Autopsy { starts, selection, planning_seeds, contributions, arms, finding, repairs } = found;
+    let failures = repairs.len();
+    let mut text = format!(
+        "{starts} starts, {failures} failures ({} solved), {planning_seeds} planning seeds\n{}",
+        percent(selection),
+        wrapped(&finding.to_string())
+    );
+    let header = ["ingredient", "recovers of failures", "alone", "ranks first"];
+    let rows = contributions.iter().map(|found| {
+        vec![
+            format!("{} {}", found.ingredient.letter(), found.ingredient.summary()),
+            signed(&found.recovered),
+            signed(&found.alone),
+            format!("{:.0} %", 100.0 * found.first),
+        ]
+    });
+    text += &format!("\n{}", table(&header, rows));
+    let rows = arms.iter().map(|arm| {
+        let of_unchanged = |estimate: &Estimate| {
+            if arm.ingredients.is_empty() { "–".to_owned() } else { signed(estimate) }
+        };
+        let Estimate { value, low, high } = arm.success;
+        vec![
+            letters(&arm.ingredients),
+            format!("{:.0} % [{:.0}, {:.0}]", 100.0 * value, 100.0 * low, 100.0 * high),
+            of_unchanged(&arm.recovered),
+            of_unchanged(&arm.harmed),
+        ]
+    });
+    text += &format!("\n{}", table(&["arm", "success", "recovered", "harmed"], rows));
+    let mut counts: Vec<(String, usize)> = vec![];
+    for name in repairs.iter().map(repair) {
+        match counts.iter_mut().find(|(known, _)| *known == name) {
+            Some((_, count)) => *count += 1,
+            None => counts.push((name, 1)),
+        }
+    }
+    counts.sort_by_key(|(_, count)| std::cmp::Reverse(*count));
+    if !counts.is_empty() {
+        let rows = counts.into_iter().map(|(name, count)| vec![name, count.to_string()]);
+        text += &format!("\n{}", table(&["smallest repair", "failures"], rows));
+    }
+    text + "brackets: 95 % bootstrap intervals over starts; recovered: of failures; harmed:\nof solved starts\n"
+}
+
+/// A sentence in lines of at most 80 columns.
+fn wrapped(sentence: &str) -> String {
+    let mut lines = String::new();
+    let mut width = 0;
+    for word in sentence.split(' ') {
+        let length = word.chars().count();
+        if width > 0 && width + 1 + length > COLUMNS {
+            lines.push_str("\n ");
+            width = 1;
+        }
+        if width > 0 {
+            lines.push(' ');
+            width += 1;
+        }
+        lines.push_str(word);
+        width += length;
+    }
+    lines + "\n"
+}
+
+/// A difference of shares, in percent.
+fn signed(Estimate { value, low, high }: &Estimate) -> String {
+    format!("{:+.0} % [{:+.0}, {:+.0}]", 100.0 * value, 100.0 * low, 100.0 * high)
+}
+
+/// The smallest sets of ingredients that solve a failure.
+fn repair(repair: &Repair) -> String {
+    let sets: Vec<String> = repair.sets.iter().map(|set| letters(set)).collect();
+    match &repair.sets[..] {
+        [] => "none".to_owned(),
+        [set] if set.is_empty() => "another planning seed".to_owned(),
+        _ => sets.join(" or "),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use swm_core::results::{Arm, Contribution, Finding, Proportion};
+
+    #[test]
+    fn tables_are_at_most_80_columns_wide() {
+        let most = Estimate { value: -1.0, low: -1.0, high: 1.0 };
+        let contribution = |ingredient| Contribution { ingredient, recovered: most, alone: most, first: 1.0 };
+        let all = Ingredient::ALL.to_vec();
+        let sets = all.iter().map(|ingredient| vec![*ingredient]).collect();
+        for finding in [
+            Finding::Healthy,
+            Finding::TooFew,
+            Finding::Undecided,
+            Finding::Joint(all.clone()),
+            Finding::Culprit(Ingredient::Distance),
+            Finding::Culprit(Ingredient::Replanning),
+        ] {
+            let found = Autopsy {
+                starts: 1_000_000,
+                selection: Proportion::wilson(0, 1_000_000),
+                planning_seeds: 100,
+                contributions: all.iter().map(|ingredient| contribution(*ingredient)).collect(),
+                arms: vec![Arm { ingredients: all.clone(), success: most, recovered: most, harmed: most }],
+                finding,
+                repairs: vec![Repair { start: 0, row: None, sets: Vec::clone(&sets) }],
+            };
+            let text = text(&found);
+            let widest = text.lines().map(|line| line.trim_end().chars().count()).max();
+            assert!(widest.is_some_and(|widest| widest <= COLUMNS), "{widest:?}: {text}");
+        }
+    }
+
+    #[test]
+    fn times_are_rounded_and_letters_checked() {
+        assert_eq!(cost(12, 3, 30, 90.2), "12 arms x 3 planning seeds x 30 starts: at most 91 s\n");
+        assert!(
+            cost(1, 3, 1, 7199.0).ends_with("at most 119 min\n") && cost(1, 3, 1, 1e5).ends_with("at most 27.8 h\n")
+        );
+        assert_eq!(ingredients("s,D").expect("two letters"), [Ingredient::Search, Ingredient::Dynamics]);
+        assert!(ingredients("SX").expect_err("an unknown letter").to_string().contains("'X'"));
+    }
+}

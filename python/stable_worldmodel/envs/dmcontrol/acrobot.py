@@ -1,0 +1,18 @@
+"""`AcrobotDMControlWrapper`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .dmcontrol import DMControlWrapper
+
+__all__ = ["AcrobotDMControlWrapper"]
+
+
+class AcrobotDMControlWrapper(DMControlWrapper):
+    """Acrobot of the DeepMind Control suite: `swm/AcrobotDMControl-v0`."""
+
+    id = "swm/AcrobotDMControl-v0"
+
+    def __init__(self, seed: int | None = None, environment_kwargs: Any = None, render_mode: str | None = None) -> None:
+        super().__init__(None, seed, environment_kwargs, render_mode)

@@ -1,0 +1,18 @@
+"""`CartpoleDMControlWrapper`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .dmcontrol import DMControlWrapper
+
+__all__ = ["CartpoleDMControlWrapper"]
+
+
+class CartpoleDMControlWrapper(DMControlWrapper):
+    """Cartpole of the DeepMind Control suite: `swm/CartpoleDMControl-v0`."""
+
+    id = "swm/CartpoleDMControl-v0"
+
+    def __init__(self, seed: int | None = None, environment_kwargs: Any = None, render_mode: str | None = None) -> None:
+        super().__init__(None, seed, environment_kwargs, render_mode)

@@ -1,0 +1,18 @@
+"""`ManipulatorDMControlWrapper`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .dmcontrol import DMControlWrapper
+
+__all__ = ["ManipulatorDMControlWrapper"]
+
+
+class ManipulatorDMControlWrapper(DMControlWrapper):
+    """Manipulator of the DeepMind Control suite: `swm/ManipulatorDMControl-v0`."""
+
+    id = "swm/ManipulatorDMControl-v0"
+
+    def __init__(self, seed: int | None = None, environment_kwargs: Any = None, render_mode: str | None = None) -> None:
+        super().__init__(None, seed, environment_kwargs, render_mode)

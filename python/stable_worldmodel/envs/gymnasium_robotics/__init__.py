@@ -1,0 +1,5 @@
+"""The Fetch robot."""
+
+from .fetch import FetchWrapper
+
+__all__ = ["FetchWrapper"]

@@ -1,0 +1,41 @@
+"""`PushT`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ..named import NamedEnv
+
+__all__ = ["PushT"]
+
+
+class PushT(NamedEnv):
+    """A disc that pushes a block to a goal: `swm/PushT-v1`.
+
+    Args:
+        block_cog, damping: Must be `None`: the physics are fixed.
+        render_action: Must be false.
+        resolution: Side of the frames in pixels.
+        with_target: Must be true: frames show the goal.
+        render_mode: `"rgb_array"` or `None`.
+        relative: Must be true: actions are relative to the agent.
+        init_value: Values of factors for episodes that do not vary them.
+    """
+
+    id = "swm/PushT-v1"
+
+    def __init__(
+        self,
+        block_cog: Any = None,
+        damping: float | None = None,
+        render_action: bool = False,
+        resolution: int = 224,
+        with_target: bool = True,
+        render_mode: str | None = "rgb_array",
+        relative: bool = True,
+        init_value: Mapping[str, Any] | None = None,
+    ) -> None:
+        self._refuse(block_cog=(block_cog, None), damping=(damping, None), render_action=(render_action, False))
+        self._refuse(with_target=(with_target, True), relative=(relative, True))
+        super().__init__(render_mode, init_value, resolution)

@@ -1,0 +1,270 @@
+"""`EngineSolver`: the base class of the solvers of the engine."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+
+from ... import _engine
+from ..adapter import Adapter, has_torch
+from .callbacks import Callback, StopSearch
+from .hooks import Watched
+
+__all__ = ["EngineSolver", "NotConfigured", "last_step", "single"]
+
+
+class NotConfigured(RuntimeError, AttributeError):
+    """A property of a solver that `configure` sets was read before."""
+
+
+class EngineSolver:
+    """Base class of the engine's solvers. Settings have the names that `swm solvers` lists, or the keys of `_names`."""
+
+    #: The id of the solver in the engine.
+    id: ClassVar[str]
+    #: The engine's names of settings, by their names in the constructor.
+    _names: ClassVar[Mapping[str, str]] = {}
+    #: Whether callbacks can run between the iterations.
+    _has_callbacks: ClassVar[bool] = True
+    #: Whether the solver follows a gradient.
+    _descends: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        cost: Any = None,
+        *,
+        model: Any = None,
+        batch_size: int | None = None,
+        device: Any = "cpu",
+        seed: int = 1234,
+        callbacks: Sequence[Callback] | None = None,
+        **settings: Any,
+    ) -> None:
+        if cost is not None and model is not None:
+            raise TypeError(f"{type(self).__name__}: cost and model are two names of the same argument; give one")
+        if callbacks and not self._has_callbacks:
+            raise TypeError(f"callbacks: {type(self).__name__} calls none; read solve(…)['trace']")
+        model = cost if model is None else model
+        #: The callbacks, which run after every iteration.
+        self.callbacks = list(callbacks or ())
+        self.model, self.batch_size, self.device, self.seed = model, batch_size, device, int(seed)
+        known = json.loads(_engine.solvers())[self.id]
+        self.settings: dict[str, Any] = {}
+        for name, value in settings.items():
+            engine = self._names.get(name, name)
+            if engine not in known:
+                names = sorted({*self._names, *known} - set(self._names.values()))
+                raise TypeError(f"{type(self).__name__} has no setting {name!r}; it has {', '.join(names)}")
+            self.settings[engine] = value
+        self._solved = 0
+        self._action_space: spaces.Space | None = None
+        self._n_envs, self._config = 0, None
+
+    def __repr__(self) -> str:
+        words = [type(self.model).__name__, *(f"{name}={value!r}" for name, value in self.settings.items())]
+        return f"{type(self).__name__}({', '.join(words)})"
+
+    def configure(self, *, action_space: spaces.Space, n_envs: int, config: Any) -> None:
+        """See `Solver.configure`."""
+        self._action_space, self._n_envs, self._config = action_space, int(n_envs), config
+
+    @property
+    def cost(self) -> Any:
+        """The model, as the constructor's argument is named."""
+        return self.model
+
+    @property
+    def dtype(self) -> Any:
+        """The type of the model's parameters; float32 for a model without parameters."""
+        import torch
+
+        parameters = getattr(self.model, "parameters", None)
+        first = next(iter(parameters()), None) if callable(parameters) else None
+        return torch.float32 if first is None else first.dtype
+
+    @property
+    def n_envs(self) -> int:
+        """The number of environments."""
+        return self._n_envs
+
+    @property
+    def horizon(self) -> int:
+        """The number of model steps in a plan."""
+        return self._configured().horizon
+
+    @property
+    def action_dim(self) -> int:
+        """The dimension of one model step."""
+        return _dim(self._space(), self._configured().action_block)
+
+    def adapter(self, process: Any = None, transform: Any = None, history: int = 1) -> Any:
+        """The model for the engine: a checkpoint or an `Adapter`; `None` for the simulator."""
+        if self.model is None:
+            raise ValueError(f"{type(self).__name__} has no model to plan with: pass one, or 'simulator'")
+        if isinstance(self.model, str):
+            if self.model != "simulator":
+                raise ValueError(f"model: {self.model!r}; load a checkpoint with swm.wm.load, or pass 'simulator'")
+            return None
+        engine = getattr(self.model, "_engine_model", None)
+        if engine is not None:
+            return engine
+        return Adapter(self.model, self.device, self.batch_size, process, transform, history, self.action_dim)
+
+    def solve(self, info_dict: dict[str, Any], init_action: Any = None) -> dict[str, Any]:
+        """Plans for every row of `info_dict` `(B, T, ..)`.
+
+        Each call uses new random numbers. The same sequence of calls with the same seed returns the same plans.
+
+        Args:
+            info_dict: Infos `(B, T, ..)`.
+            init_action: The actions at which the search starts, `(B, at most horizon, action_dim)`, padded with zeros.
+
+        Returns:
+            A dict with `actions` `(B, horizon, action_dim)`, `costs` (for each environment, the cost of the cheapest
+            candidate of the last iteration), `trace` (the record of each search) and, with callbacks, `callbacks`: the
+            history of each callback by its `output_key`.
+        """
+        config, space = self._configured(), self._space()
+        block, horizon, dim = config.action_block, config.horizon, self.action_dim
+        model = self.adapter()
+        if model is None:
+            raise ValueError("solve: the simulator needs the environments, and solve gets infos only; use MPCPolicy")
+        infos = {key: value for key, value in info_dict.items() if not isinstance(value, (list, str))}
+        envs = len(next(iter(infos.values())))
+        if isinstance(model, Adapter):
+            model.set_infos(infos)
+            engine_infos: dict[str, Any] = {}
+        else:
+            engine_infos = {key: last_step(value) for key, value in infos.items()}
+        low, high, choices = _bounds(space, block, model)
+        init = None if init_action is None else _padded(init_action, envs, horizon, dim)
+        watched: Any = None
+        if isinstance(model, Adapter):
+            watched = self._watched(model)
+        elif self.callbacks:
+            raise TypeError(f"callbacks: {type(self.model).__name__} is planned with inside of the engine; wrap its get_cost")
+
+        def search(settings: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, str]:
+            given = model if watched is None else watched
+            limits = low, high, choices
+            return _engine.solve(
+                self.id, json.dumps(settings), given, engine_infos, envs, horizon, *limits, init, self.seed, self._solved
+            )
+
+        for callback in self.callbacks:
+            callback.reset()
+            callback.start_batch()
+        try:
+            actions, costs, trace = search(self.settings)
+        except StopSearch:
+            watched.replay()
+            iterates = "iterations" in json.loads(_engine.solvers())[self.id]
+            actions, costs, trace = search({**self.settings, **({"iterations": len(watched.recorded)} if iterates else {})})
+        self._solved += 1
+        found: Any = actions
+        if has_torch():
+            import torch
+
+            found = torch.from_numpy(actions)
+        result = {"actions": found, "costs": costs.tolist(), "trace": json.loads(trace)}
+        if self.callbacks:
+            for callback in self.callbacks:
+                callback.end_solve()
+            result["callbacks"] = {callback.output_key: callback.history for callback in self.callbacks}
+        return result
+
+    def _watched(self, adapter: Adapter) -> Watched:
+        settings = {**json.loads(_engine.solvers())[self.id], **self.settings}
+        # Predictive sampling has no elites; its plan is the cheapest candidate.
+        elites = 0 if self._descends else int(settings.get("elites", 1))
+        sigma, momentum = float(settings.get("sigma", 0.0)), float(settings.get("momentum", 0.0))
+        return Watched(adapter, self.callbacks, elites, sigma, momentum)
+
+    def __getattr__(self, name: str) -> Any:
+        # The settings by their names in the constructor.
+        engine = type(self)._names.get(name, name)
+        settings = self.__dict__.get("settings", {})
+        if engine in settings:
+            return settings[engine]
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    def __call__(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        """The same as `solve`."""
+        return self.solve(*args, **kwargs)
+
+    def _initial(self, n_envs: int, actions: Any) -> Any:
+        """The initial actions `(n_envs, horizon, action_dim)` as a tensor, padded with zeros."""
+        import torch
+
+        if actions is None:
+            return torch.zeros(n_envs, self.horizon, self.action_dim, dtype=self.dtype)
+        return torch.from_numpy(_padded(actions, n_envs, self.horizon, self.action_dim)).to(self.dtype)
+
+    def _configured(self) -> Any:
+        if self._config is None:
+            raise NotConfigured(f"{type(self).__name__}: call configure(action_space=…, n_envs=…, config=…) first")
+        return self._config
+
+    def _space(self) -> spaces.Space:
+        self._configured()
+        return single(self._action_space, self._n_envs)
+
+
+def single(space: Any, envs: int) -> Any:
+    """The action space of one environment, given that space or the batched space of `envs` environments.
+
+    A `MultiDiscrete` of `envs` equal sizes is taken as the batched space of a `Discrete`, as Gymnasium defines it.
+    """
+    if isinstance(space, spaces.Box) and len(space.shape) > 1:
+        return spaces.Box(space.low[0], space.high[0], dtype=space.dtype.type)
+    if isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim > 1:
+        return spaces.MultiDiscrete(space.nvec[0])
+    if isinstance(space, spaces.MultiDiscrete) and len(space.nvec) == envs and (space.nvec == space.nvec[0]).all():
+        return spaces.Discrete(space.nvec[0], start=space.start[0])
+    return space
+
+
+def last_step(value: Any) -> np.ndarray:
+    """The last step `(B, ..)` of an info column `(B, T, ..)`, in a type that the engine supports."""
+    if hasattr(value, "detach"):
+        value = value.detach().cpu().numpy()
+    value = np.asarray(value)
+    value = value[:, -1] if value.ndim > 1 else value
+    kinds = {"float16": np.float32, "int8": np.int32, "int16": np.int32, "uint16": np.int32, "uint32": np.int64}
+    return np.ascontiguousarray(value, dtype=kinds.get(value.dtype.name, value.dtype))
+
+
+def _dim(space: spaces.Space, block: int) -> int:
+    """The dimension of a model step of `block` actions, with one-hot vectors for discrete choices."""
+    if isinstance(space, spaces.Discrete):
+        return int(space.n) * block
+    if isinstance(space, spaces.MultiDiscrete):
+        return int(space.nvec.sum()) * block
+    return int(np.prod(space.shape or ())) * block
+
+
+def _bounds(space: Any, block: int, model: Any) -> tuple[list[float], list[float], list[int] | None]:
+    """The bounds of a model step in the model's units, or the sizes of its discrete choices."""
+    if isinstance(space, spaces.Discrete):
+        return [], [], [int(space.n)] * block
+    if isinstance(space, spaces.MultiDiscrete):
+        return [], [], [int(n) for n in space.nvec.reshape(-1)] * block
+    low, high = (np.asarray(side, dtype=np.float32).reshape(-1) for side in (space.low, space.high))
+    info = getattr(model, "info", None)
+    if info is not None:
+        info = json.loads(info)
+        mean, std = (np.asarray(info[name], dtype=np.float32) for name in ("action_mean", "action_std"))
+        low, high = (low - mean) / std, (high - mean) / std
+    return np.tile(low, block).tolist(), np.tile(high, block).tolist(), None
+
+
+def _padded(init: Any, envs: int, horizon: int, dim: int) -> np.ndarray:
+    """The initial actions, padded with zeros to `(envs, horizon, dim)`."""
+    init = np.asarray(init.detach().cpu() if hasattr(init, "detach") else init, dtype=np.float32)
+    if init.ndim != 3 or init.shape[0] != envs or init.shape[1] > horizon or init.shape[2] != dim:
+        raise ValueError(f"init_action: got shape {init.shape}, expected ({envs}, at most {horizon}, {dim})")
+    return np.concatenate([init, np.zeros((envs, horizon - init.shape[1], dim), np.float32)], 1)

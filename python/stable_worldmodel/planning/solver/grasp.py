@@ -1,0 +1,19 @@
+"""`GRASPSolver`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+from .engine import EngineSolver
+
+__all__ = ["GRASPSolver"]
+
+
+class GRASPSolver(EngineSolver):
+    """GRASP: optimises states and actions of all model steps in parallel; the model is a `planning.LatentDynamics`."""
+
+    id = "grasp"
+    _has_callbacks = False
+    _descends = True
+    _names: ClassVar[Mapping[str, str]] = {"n_steps": "iterations"}

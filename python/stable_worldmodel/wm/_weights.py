@@ -1,0 +1,93 @@
+"""Files of weights: safetensors, and state dicts of torch whose names differ between versions of `transformers`."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+__all__ = ["load_into", "read_safetensors", "read_state_dict"]
+
+_TYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "U8": "u1", "BOOL": "?"}
+#: The largest header of a file, in bytes.
+_MAX_HEADER = 100_000_000
+
+#: Parts of the weight names of a vision transformer: in `transformers` 5, then as published.
+_NEWER = (
+    (".layers.", ".encoder.layer."),
+    (".attention.q_proj.", ".attention.attention.query."),
+    (".attention.k_proj.", ".attention.attention.key."),
+    (".attention.v_proj.", ".attention.attention.value."),
+    (".attention.o_proj.", ".attention.output.dense."),
+    (".mlp.fc1.", ".intermediate.dense."),
+    (".mlp.fc2.", ".output.dense."),
+)
+
+
+def read_safetensors(path: str | os.PathLike[str]) -> dict[str, Tensor]:
+    """The tensors of a safetensors file."""
+    with open(path, "rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        (length,) = struct.unpack("<Q", file.read(8).ljust(8, b"\0"))
+        if not 0 < length <= min(_MAX_HEADER, size - 8):
+            raise RuntimeError(f"{path}: not a safetensors file")
+        header = json.loads(file.read(length))
+        data = file.read()
+    found = {}
+    for name, entry in header.items():
+        if name == "__metadata__":
+            continue
+        begin, end = entry["data_offsets"]
+        if entry["dtype"] not in _TYPES or not 0 <= begin <= end <= len(data):
+            raise RuntimeError(f"{path}: the tensor {name!r} is damaged or of an unknown type")
+        values = np.frombuffer(data[begin:end], np.dtype(_TYPES[entry["dtype"]])).reshape(entry["shape"])
+        found[name] = torch.from_numpy(values.copy())
+    return found
+
+
+def read_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
+    """The tensors of a file that `torch.save` wrote, or of a safetensors file. No code of the file runs."""
+    if Path(path).suffix == ".safetensors":
+        return read_safetensors(path)
+    found: Any = torch.load(path, map_location="cpu", weights_only=True)
+    if isinstance(found, Mapping) and isinstance(found.get("state_dict"), Mapping):
+        found = found["state_dict"]
+    if not isinstance(found, Mapping) or not all(torch.is_tensor(value) for value in found.values()):
+        raise RuntimeError(f"{path}: expected a state dict, a dict of tensors")
+    return dict(found)
+
+
+def load_into(model: nn.Module, weights: Mapping[str, Tensor], source: str) -> None:
+    """Loads weights, renaming those of a vision transformer that `transformers` 5 saved.
+
+    Raises:
+        RuntimeError: If a weight is missing, unexpected, or of another shape.
+    """
+    weights = {published(name): value for name, value in weights.items()}
+    expected = model.state_dict()
+    missing = [name for name in expected if name not in weights and not name.endswith("num_batches_tracked")]
+    unexpected = [name for name in weights if name not in expected]
+    if missing or unexpected:
+        raise RuntimeError(
+            f"{source}: the weights do not fit {type(model).__name__}: missing {missing[:5]}, unexpected {unexpected[:5]}"
+        )
+    try:
+        model.load_state_dict(dict(weights), strict=False)
+    except RuntimeError as error:
+        raise RuntimeError(f"{source}: the weights do not fit {type(model).__name__}: {error}") from error
+
+
+def published(name: str) -> str:
+    """The published name of a weight of an encoder; other names unchanged."""
+    if not name.startswith("encoder.layers."):
+        return name
+    for newer, older in _NEWER:
+        name = name.replace(newer, older, 1)
+    return name

@@ -1,0 +1,167 @@
+"""Image encoders of the engine's checkpoints, as modules with the same weight names.
+
+All map normalised frames `(N, 3, H, W)` to features; `ViT` returns an object with `last_hidden_state`, as the vision
+transformers of `transformers` do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["Convolutions", "Pyramid", "ViT", "encoder_of"]
+
+_ACTIVATIONS = {"relu": nn.functional.relu, "gelu": nn.functional.gelu, "silu": nn.functional.silu}
+
+
+def _tree(**parts: nn.Module) -> nn.Module:
+    """A module with these parts, which give the weights their published names."""
+    module = nn.Module()
+    for name, part in parts.items():
+        setattr(module, name, part)
+    return module
+
+
+class ViT(nn.Module):
+    """A vision transformer (Dosovitskiy et al., 2021) with the weight names of published files.
+
+    Args:
+        image: Side of the images in pixels.
+        patch: Side of the patches.
+        dim: Features of a token.
+        depth: Layers.
+        heads: Attention heads.
+        mlp: Hidden features of a layer.
+        mask_token: Whether there is a token for masked patches, which has no effect here.
+    """
+
+    def __init__(self, image: int, patch: int, dim: int, depth: int, heads: int, mlp: int, mask_token: bool = False) -> None:
+        super().__init__()
+        self.patch, self.heads = patch, heads
+        self.embeddings = _tree(patch_embeddings=_tree(projection=nn.Conv2d(3, dim, patch, patch)))
+        self.embeddings.cls_token = nn.Parameter(0.02 * torch.randn(1, 1, dim))
+        self.embeddings.position_embeddings = nn.Parameter(0.02 * torch.randn(1, (image // patch) ** 2 + 1, dim))
+        if mask_token:
+            self.embeddings.mask_token = nn.Parameter(torch.zeros(1, 1, dim))
+        self.encoder = _tree(layer=nn.ModuleList(self._layer(dim, mlp) for _ in range(depth)))
+        self.layernorm = nn.LayerNorm(dim, eps=1e-12)
+
+    @staticmethod
+    def _layer(dim: int, mlp: int) -> nn.Module:
+        projections = _tree(query=nn.Linear(dim, dim), key=nn.Linear(dim, dim), value=nn.Linear(dim, dim))
+        return _tree(
+            layernorm_before=nn.LayerNorm(dim, eps=1e-12),
+            attention=_tree(attention=projections, output=_tree(dense=nn.Linear(dim, dim))),
+            layernorm_after=nn.LayerNorm(dim, eps=1e-12),
+            intermediate=_tree(dense=nn.Linear(dim, mlp)),
+            output=_tree(dense=nn.Linear(mlp, dim)),
+        )
+
+    def _positions(self, rows: int, columns: int) -> Tensor:
+        """The position embeddings, interpolated to another number of patches."""
+        known: Any = self.embeddings.position_embeddings
+        side = round((known.shape[1] - 1) ** 0.5)
+        if (rows, columns) == (side, side):
+            return known  # type: ignore[no-any-return]
+        grid = known[:, 1:].transpose(1, 2).unflatten(2, (side, side))
+        grid = nn.functional.interpolate(grid, (rows, columns), mode="bicubic", align_corners=False)
+        return torch.cat([known[:, :1], grid.flatten(2).transpose(1, 2)], 1)
+
+    def forward(self, pixels: Tensor, interpolate_pos_encoding: bool = True) -> Any:
+        """Frames `(N, 3, H, W)` to tokens `last_hidden_state` `(N, 1 + patches, dim)`, the class token first."""
+        embeddings: Any = self.embeddings
+        patches = embeddings.patch_embeddings.projection(pixels)
+        tokens = patches.flatten(2).transpose(1, 2)
+        x = torch.cat([embeddings.cls_token.expand(len(tokens), -1, -1), tokens], 1) + self._positions(*patches.shape[2:])
+        layers: Any = self.encoder.layer
+        for layer in layers:
+            normed, part = layer.layernorm_before(x), layer.attention.attention
+            heads = (p(normed).unflatten(-1, (self.heads, -1)).transpose(1, 2) for p in (part.query, part.key, part.value))
+            mixed = nn.functional.scaled_dot_product_attention(*heads)
+            x = x + layer.attention.output.dense(mixed.transpose(1, 2).flatten(2))
+            hidden = nn.functional.gelu(layer.intermediate.dense(layer.layernorm_after(x)))
+            x = x + layer.output.dense(hidden)
+        return SimpleNamespace(last_hidden_state=self.layernorm(x))
+
+
+class Pyramid(nn.Module):
+    """Convolutions of disjoint patches, then two linear layers: small and fast.
+
+    Args:
+        image: Side of the images in pixels.
+        stages: The `patch` and `channels` of each stage.
+        hidden: Features between the linear layers.
+        dim: Features of an image.
+        activation: `relu`, `gelu` or `silu`.
+    """
+
+    takes_frames = True
+
+    def __init__(
+        self, image: int, stages: Sequence[Mapping[str, int]], hidden: int, dim: int, activation: str = "relu"
+    ) -> None:
+        super().__init__()
+        first, *later = stages
+        self.patches = [stage["patch"] for stage in later]
+        self.activation: Any = _ACTIVATIONS[activation]
+        self.stem = nn.Conv2d(3, first["channels"], first["patch"], first["patch"])
+        inputs, side, self.stages = first["channels"], image // first["patch"], nn.ModuleList()
+        for stage in later:
+            self.stages.append(nn.Linear(stage["patch"] ** 2 * inputs, stage["channels"]))
+            inputs, side = stage["channels"], side // stage["patch"]
+        self.hidden, self.out = nn.Linear(side**2 * inputs, hidden), nn.Linear(hidden, dim)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """Frames `(N, 3, H, W)` to features `(N, dim)`."""
+        x = self.activation(self.stem(frames)).movedim(1, -1)
+        for layer, patch in zip(self.stages, self.patches, strict=True):
+            count, side, _, channels = x.shape
+            blocks = x.reshape(count, side // patch, patch, side // patch, patch * channels).transpose(2, 3)
+            x = self.activation(layer(blocks.reshape(count, side // patch, side // patch, -1)))
+        return self.out(self.activation(self.hidden(x.flatten(1))))  # type: ignore[no-any-return]
+
+
+class Convolutions(nn.Module):
+    """Overlapping 3 x 3 convolutions that halve the side, each with batch normalisation, then one or two linear layers.
+
+    Args:
+        image: Side of the images in pixels.
+        channels: Output channels of each convolution.
+        hidden: Features between the linear layers; 0 for one linear layer.
+        dim: Features of an image.
+    """
+
+    takes_frames = True
+
+    def __init__(self, image: int, channels: Sequence[int], dim: int, hidden: int = 0) -> None:
+        super().__init__()
+        inputs, self.stages, side = 3, nn.ModuleList(), image
+        for outputs in channels:
+            convolution = nn.Conv2d(inputs, outputs, 3, stride=2, padding=1, bias=False)
+            self.stages.append(_tree(conv=convolution, norm=nn.BatchNorm2d(outputs)))
+            inputs, side = outputs, -(-side // 2)
+        features = side**2 * inputs
+        self.hidden = nn.Linear(features, hidden) if hidden else None
+        self.out = nn.Linear(hidden or features, dim)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """Frames `(N, 3, H, W)` to features `(N, dim)`."""
+        stages: Any = self.stages
+        for stage in stages:
+            frames = stage.norm(stage.conv(frames)).relu()
+        x = frames.flatten(1)
+        x = x if self.hidden is None else self.hidden(x).relu()
+        return self.out(x)  # type: ignore[no-any-return]
+
+
+def encoder_of(config: Mapping[str, Any], image: int) -> nn.Module:
+    """The encoder of a configuration of the engine: one of `vit`, `pyramid` and `conv` with its settings."""
+    ((kind, settings),) = config.items()
+    kinds: dict[str, Any] = {"vit": ViT, "pyramid": Pyramid, "conv": Convolutions}
+    if kind not in kinds:
+        raise ValueError(f"encoder: {kind!r} has no torch module; expected one of {', '.join(kinds)}")
+    return kinds[kind](image, **settings)  # type: ignore[no-any-return]

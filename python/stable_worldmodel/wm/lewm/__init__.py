@@ -1,0 +1,5 @@
+"""LeWM."""
+
+from .lewm import LeWM
+
+__all__ = ["LeWM"]

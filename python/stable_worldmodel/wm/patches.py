@@ -1,0 +1,76 @@
+"""`PatchEncoder`: the patches of frames and other columns as one embedding, which `PreJEPA` and `GCRL` share.
+
+Shapes: B clips, T frames, P patches of a frame, D features of a patch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from .frames import Frames
+
+__all__ = ["PatchEncoder"]
+
+
+class PatchEncoder(nn.Module):
+    """Base class of models on the patches of an image encoder.
+
+    The embedding of a frame is the features of its patches; the encoded columns of the step are appended to every patch.
+    """
+
+    def __init__(self, extra_encoders: Any, interpolate_pos_encoding: bool) -> None:
+        super().__init__()
+        self.extra_encoders: Any = extra_encoders if extra_encoders is not None else nn.ModuleDict()
+        self.interpolate_pos_encoding = interpolate_pos_encoding
+        #: How frames of `uint8` become inputs of the encoder.
+        self.frames = Frames()
+
+    def _image_encoder(self) -> Any:
+        raise NotImplementedError
+
+    def _embedded(
+        self,
+        info: dict[str, Any],
+        pixels_key: str,
+        emb_keys: Iterable[str] | None,
+        prefix: str | None,
+        target: str,
+        is_video: bool,
+    ) -> dict[str, Any]:
+        """Adds `target` `(B, T, P, D)`, and its parts `pixels_TARGET` `(B, T, P, ..)` and `COLUMN_TARGET` `(B, T, ..)`."""
+        if target in info:
+            raise ValueError(f"encode: the infos have {target!r} already; give another target, or remove it")
+        frames = self.frames(info[pixels_key])
+        patches = self._video_patches(frames) if is_video else self._image_patches(frames)
+        info[f"pixels_{target}"] = patches
+        parts = [patches]
+        for column in self.extra_encoders if emb_keys is None else emb_keys:
+            encoded = self.extra_encoders[column](info[f"{prefix or ''}{column}"].float())
+            info[f"{column}_{target}"] = encoded
+            parts.append(encoded.unsqueeze(2).expand(-1, -1, patches.shape[2], -1))
+        info[target] = torch.cat(parts, -1)
+        return info
+
+    def _encoded(self, images: Tensor) -> Any:
+        interpolation = {"interpolate_pos_encoding": True} if self.interpolate_pos_encoding else {}
+        return self._image_encoder()(images, **interpolation)
+
+    def _image_patches(self, frames: Tensor) -> Tensor:
+        """The patches of each frame on its own, `(B, T, P, ..)`; an encoder without patches gives one."""
+        output = self._encoded(frames.flatten(0, 1))
+        hidden = getattr(output, "last_hidden_state", None)
+        # The first token stands for the whole image.
+        patches = output.logits.unsqueeze(1) if hidden is None else hidden[:, 1:]
+        return patches.unflatten(0, frames.shape[:2])  # type: ignore[no-any-return]
+
+    def _video_patches(self, frames: Tensor) -> Tensor:
+        """The patches of each frame in the video up to it, whose last frame is repeated, `(B, T, P, ..)`."""
+        steps = frames.shape[1]
+        videos = [
+            torch.cat([frames[:, : t + 1], frames[:, t : t + 1].expand(-1, steps - t - 1, -1, -1, -1)], 1) for t in range(steps)
+        ]
+        return torch.stack([self._encoded(video).last_hidden_state for video in videos], 1)

@@ -1,0 +1,5 @@
+"""PLDM."""
+
+from .pldm import PLDM
+
+__all__ = ["PLDM"]

@@ -1,0 +1,5 @@
+"""DINO-WM."""
+
+from .prejepa import PreJEPA
+
+__all__ = ["PreJEPA"]

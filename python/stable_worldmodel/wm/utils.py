@@ -1,0 +1,133 @@
+"""Checkpoints as torch modules.
+
+model = load_pretrained("lewm-rooms")  # a run of `swm train`, or a folder with `weights.pt` and `config.json`
+save_pretrained(model, "mine", config=config)
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from .. import _engine
+from ._build import build
+from ._weights import load_into, read_state_dict
+from .checkpoints import module_of
+
+__all__ = ["load_pretrained", "save_pretrained"]
+
+
+def _folder(cache_dir: str | os.PathLike[str] | None) -> Path:
+    return Path(_engine.home() if cache_dir is None else cache_dir) / "checkpoints"
+
+
+def save_pretrained(
+    model: nn.Module,
+    run_name: str,
+    config: Any = None,
+    config_key: str | None = None,
+    filename: str = "weights.pt",
+    cache_dir: str | os.PathLike[str] | None = None,
+) -> None:
+    """Saves a model's weights and configuration, for `load_pretrained`.
+
+    Args:
+        model: The model.
+        run_name: The name of the folder under `$STABLEWM_HOME/checkpoints`.
+        config: The configuration: a mapping (also of OmegaConf) whose `_target_` names the model's class, with its
+            arguments. Without one, only the weights are saved, and a warning says so.
+        config_key: The key of the model's part of the configuration.
+        filename: The file of the weights.
+        cache_dir: A folder in place of `$STABLEWM_HOME`.
+    """
+    folder = _folder(cache_dir) / run_name
+    folder.mkdir(parents=True, exist_ok=True)
+    torch.save(model.state_dict(), folder / filename)
+    if config is None:
+        warnings.warn(f"{folder}: saved without a config, so load_pretrained cannot build the model", stacklevel=2)
+        return
+    if config_key is not None and config_key in config:
+        config = config[config_key]
+    (folder / "config.json").write_text(json.dumps(_plain(config), indent=2))
+
+
+def _plain(config: Any) -> Any:
+    """The configuration as values of JSON, with the references of OmegaConf replaced by their values."""
+    if type(config).__module__.startswith("omegaconf"):
+        from omegaconf import OmegaConf
+
+        return OmegaConf.to_container(config, resolve=True)
+    if isinstance(config, Mapping):
+        return {str(key): _plain(value) for key, value in config.items()}
+    return [_plain(value) for value in config] if isinstance(config, (list, tuple)) else config
+
+
+def load_pretrained(
+    name: str | os.PathLike[str],
+    cache_dir: str | os.PathLike[str] | None = None,
+    extra_args: Mapping[str, Any] | None = None,
+    *,
+    trust: bool = False,
+) -> Any:
+    """Loads a checkpoint as a torch module, in evaluation mode if the engine trained it.
+
+    Files are read as data: no code of them runs. A `_target_` of a configuration that is neither a model of this package nor
+    a layer of torch is refused.
+
+    Args:
+        name: A path, or a name under `$STABLEWM_HOME/checkpoints`: a run of `swm train`, a folder with one `.pt` file and
+            `config.json`, or the `.pt` file. `OWNER/NAME` also names a folder that the Hugging Face hub's client or
+            `swm pull` stored as `models--OWNER--NAME`.
+        cache_dir: A folder in place of `$STABLEWM_HOME`.
+        extra_args: Values of the configuration to replace, by dot key.
+        trust: Whether a `_target_` may name any function, which is imported and called.
+    """
+    path = _located(str(name), _folder(cache_dir))
+    run = module_of(path)
+    if run is not None:
+        if extra_args:
+            raise ValueError("extra_args: the configuration of a checkpoint of the engine cannot be changed")
+        return run
+    file = path if path.is_file() else _only_weights(path)
+    settings = file.parent / "config.json"
+    if not settings.is_file():
+        raise FileNotFoundError(f"{settings}: there is no such file, which must describe the model")
+    config = json.loads(settings.read_text())
+    for key, value in (extra_args or {}).items():
+        *groups, last = key.split(".")
+        part = config
+        for group in groups:
+            part = part.setdefault(group, {})
+        part[last] = value
+    model = build(config, trust)
+    if not isinstance(model, nn.Module):
+        raise ValueError(f"{settings}: it describes no torch module; expected a _target_ and its arguments")
+    load_into(model, read_state_dict(file), str(file))
+    return model
+
+
+def _located(name: str, folder: Path) -> Path:
+    """The file or folder of a checkpoint."""
+    candidates = [folder / name, Path(name), folder / f"models--{name.replace('/', '--')}"]
+    for candidate in candidates:
+        if candidate.exists():
+            return candidate
+    raise FileNotFoundError(
+        f"there is no checkpoint {name!r}: neither a path nor a name under {folder}; `swm pull` downloads one"
+    )
+
+
+def _only_weights(folder: Path) -> Path:
+    files = sorted(folder.glob("*.pt"))
+    if not files:
+        raise FileNotFoundError(f"{folder}: it has no .pt file")
+    if len(files) > 1:
+        raise ValueError(f"{folder}: it has several .pt files; name one: {', '.join(file.name for file in files)}")
+    return files[0]

@@ -1,0 +1,252 @@
+"""`EnvPool`: Gymnasium environments that are stepped one after another, with their infos as one batch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
+
+from .. import _engine
+from .. import spaces as swm_spaces
+
+if TYPE_CHECKING:
+    from .world import World
+
+__all__ = ["EnvPool", "WorldEnvs"]
+
+
+class EnvPool:
+    """Gymnasium environments that are stepped one after another, in this interpreter, with their infos as one batch.
+
+        pool = EnvPool([lambda: MegaWrapper(gymnasium.make("swm/PushT-v1", render_mode="rgb_array"))] * 2)
+        _, infos = pool.reset(seed=0)
+        _, rewards, terminateds, truncateds, infos = pool.step(pool.action_space.sample())
+
+    `World` steps its environments in parallel; use a pool where your own code steps environments.
+
+    Args:
+        env_fns: Functions without arguments that create the environments.
+
+    Infos are one dict for all environments, which every step overwrites: arrays and tensors `(num_envs, 1, ..)`, and lists
+    `[[value], ..]` of other values. The columns are those of the first reset.
+    """
+
+    def __init__(self, env_fns: Sequence[Callable[[], Any]]) -> None:
+        #: The environments.
+        self.envs: list[Any] = [create() for create in env_fns]
+        if not self.envs:
+            raise ValueError("EnvPool: no environments; expected functions that create them")
+        #: The seeds of the last resets.
+        self.seeds: np.ndarray = np.zeros(len(self.envs), np.int64)
+        self._infos: dict[str, Any] | None = None
+
+    @property
+    def num_envs(self) -> int:
+        """The number of environments."""
+        return len(self.envs)
+
+    @property
+    def single_action_space(self) -> spaces.Space:
+        """The action space of one environment."""
+        return self.envs[0].action_space
+
+    @cached_property
+    def action_space(self) -> spaces.Space:
+        """The action space of all environments together."""
+        return batch_space(self.single_action_space, self.num_envs)
+
+    @property
+    def single_observation_space(self) -> spaces.Space:
+        """The observation space of one environment."""
+        return self.envs[0].observation_space
+
+    @cached_property
+    def observation_space(self) -> spaces.Space:
+        """The observation space of all environments together."""
+        return batch_space(self.single_observation_space, self.num_envs)
+
+    @property
+    def variation_space(self) -> Any:
+        """The factors of variation; `None` if the environments have none."""
+        return getattr(self.envs[0].unwrapped, "variation_space", None)
+
+    @property
+    def single_variation_space(self) -> Any:
+        """The factors of variation, as `variation_space`."""
+        return self.variation_space
+
+    def reset(
+        self,
+        seed: int | Sequence[int | None] | None = None,
+        options: Mapping[str, Any] | Sequence[Mapping[str, Any] | None] | None = None,
+        mask: Sequence[bool] | np.ndarray | None = None,
+    ) -> tuple[None, dict[str, Any]]:
+        """Starts episodes.
+
+        Args:
+            seed: Environment `i` resets with `seed + i`; a list holds one seed for each environment.
+            options: The options of resets; a list holds those of each environment.
+            mask: The environments to reset; the other ones keep their infos.
+
+        Returns:
+            `None` in place of observations, and the infos.
+        """
+        count = self.num_envs
+        if isinstance(seed, (int, np.integer)):
+            seeds: list[Any] = [int(seed) + env for env in range(count)]
+        else:
+            seeds = [None] * count if seed is None else list(seed)
+        given = list(options) if isinstance(options, Sequence) else [options] * count
+        for what, values in (("seed", seeds), ("options", given)):
+            if len(values) != count:
+                raise ValueError(f"{what}: expected {count} values, one for each environment, got {len(values)}")
+        started: dict[int, dict[str, Any]] = {}
+        for env in self._chosen(mask):
+            _, started[env] = self.envs[env].reset(seed=seeds[env], options=given[env])
+            if seeds[env] is not None:
+                self.seeds[env] = seeds[env]
+        if len(started) == count:
+            self._infos = {key: _column([started[env][key] for env in range(count)]) for key in started[0]}
+        elif self._infos is None:
+            raise ValueError("mask: the first reset must be one of all environments")
+        else:
+            for env, info in started.items():
+                self._write(env, info)
+        return None, self._known()
+
+    def step(
+        self, actions: Any, mask: Sequence[bool] | np.ndarray | None = None
+    ) -> tuple[None, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Steps environments.
+
+        Args:
+            actions: One action for each environment.
+            mask: The environments to step. The other ones keep their infos, and have no reward and no end of an episode.
+
+        Returns:
+            `None` in place of observations, the rewards, whether episodes were terminated and truncated, and the infos.
+        """
+        rewards = np.zeros(self.num_envs, np.float32)
+        terminateds, truncateds = np.zeros((2, self.num_envs), bool)
+        self._known()
+        for env in self._chosen(mask):
+            _, rewards[env], terminateds[env], truncateds[env], info = self.envs[env].step(actions[env])
+            self._write(env, info)
+        return None, rewards, terminateds, truncateds, self._known()
+
+    def close(self) -> None:
+        """Closes the environments."""
+        for env in self.envs:
+            env.close()
+
+    def _chosen(self, mask: Any) -> list[int]:
+        return [env for env in range(self.num_envs) if mask is None or mask[env]]
+
+    def _known(self) -> dict[str, Any]:
+        if self._infos is None:
+            raise RuntimeError("EnvPool: call reset before step")
+        return self._infos
+
+    def _write(self, env: int, info: Mapping[str, Any]) -> None:
+        columns = self._known()
+        for key in info.keys() & columns.keys():
+            column, value = columns[key], info[key]
+            if isinstance(column, list):
+                column[env][0] = value
+            elif hasattr(column, "detach") and not hasattr(value, "detach"):
+                import torch
+
+                column[env, 0] = torch.as_tensor(value, dtype=column.dtype, device=column.device)
+            else:
+                column[env, 0] = value
+
+
+def _column(values: list[Any]) -> Any:
+    """The values of the environments as an array or tensor `(num_envs, 1, ..)`, or as a list."""
+    first = values[0]
+    if hasattr(first, "detach"):
+        import torch
+
+        return torch.stack(values).unsqueeze(1)
+    if isinstance(first, (np.ndarray, np.number, np.bool_, bool, int, float)):
+        return np.stack([np.asarray(value) for value in values])[:, None]
+    return [[value] for value in values]
+
+
+class WorldEnvs(EnvPool):
+    """The environments of a `World`, as policies get them: their number, their spaces, and single steps."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+
+    @property
+    def num_envs(self) -> int:
+        """The number of environments."""
+        return self._world.num_envs
+
+    @cached_property
+    def single_action_space(self) -> spaces.Space:
+        """The action space of one environment."""
+        return swm_spaces.from_description(self._world.spec["action_space"])
+
+    @cached_property
+    def action_space(self) -> spaces.Space:
+        """The action space of all environments together."""
+        return batch_space(self.single_action_space, self.num_envs)
+
+    @cached_property
+    def single_observation_space(self) -> spaces.Space:
+        """The observation space of one environment."""
+        return swm_spaces.from_description(self._world.spec["observation_space"])
+
+    @cached_property
+    def observation_space(self) -> spaces.Space:
+        """The observation space of all environments together."""
+        return batch_space(self.single_observation_space, self.num_envs)
+
+    @cached_property
+    def variation_space(self) -> swm_spaces.Dict:
+        """The factors of variation."""
+        return swm_spaces.variation_space(self._world.spec["variation"], self._world.spec["sampling_order"])
+
+    @property
+    def single_variation_space(self) -> swm_spaces.Dict:
+        """The factors of variation, as `variation_space`."""
+        return self.variation_space
+
+    @property
+    def envs(self) -> list[Any]:  # type: ignore[override]
+        """The Gymnasium environments of this interpreter; empty for native environments and worker processes."""
+        return self._world.gym_envs
+
+    def reset(
+        self,
+        seed: int | Sequence[int | None] | None = None,
+        options: Mapping[str, Any] | Sequence[Mapping[str, Any] | None] | None = None,
+        mask: Sequence[bool] | np.ndarray | None = None,
+    ) -> tuple[None, dict[str, Any]]:
+        """As `World.reset`, which starts an episode in every environment."""
+        if mask is not None and not all(mask):
+            raise ValueError("mask: the environments of a World are reset together; World.step resets finished ones")
+        self._world.reset(seed, options)  # type: ignore[arg-type]
+        return None, self._world.infos
+
+    def step(
+        self, actions: Any, mask: Sequence[bool] | np.ndarray | None = None
+    ) -> tuple[None, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Steps environments with these actions; see `EnvPool.step`. Finished episodes are not reset."""
+        return None, *self._world._step_with(actions, mask), self._world.infos
+
+    def close(self) -> None:
+        """Closes the world."""
+        self._world.close()
+
+    @property
+    def seeds(self) -> np.ndarray:  # type: ignore[override]
+        """The seeds of the last resets, `(num_envs,)`."""
+        seed, episodes = self._world.seed or 0, self._world._episodes
+        return np.array([_engine.World.episode_seed(seed, episode) for episode in episodes], dtype=np.int64)

@@ -1,0 +1,668 @@
+"""`World`: a batch of environments that a policy acts in, for interactive loops, collection and evaluation."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import sys
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from .. import _engine, _options, _progress
+from .. import spaces as swm_spaces
+from ..wrapper.visual import engine_wrappers
+from .env_pool import WorldEnvs
+from .metrics import Metrics
+from .transforms import FrameTransforms
+
+__all__ = ["World"]
+
+#: The dataset format of each path suffix.
+_FORMAT_OF_SUFFIX = {".lance": "lance", ".h5": "hdf5", ".hdf5": "hdf5", ".mp4": "video", ".lerobot": "lerobot"}
+
+
+class World:
+    """A batch of environments of one kind, stepped and rendered in parallel.
+
+    Args:
+        env_name: An environment's id, such as `swm/PushT-v1`, with options as `ID,option=value`; or any id that is
+            registered with Gymnasium.
+        num_envs: The number of environments. Episodes do not depend on this number.
+        image_shape: `(height, width)` of frames.
+        max_episode_steps: Steps after which episodes are truncated; the environment's time limit for `None`.
+        goal_conditioned: Whether the infos contain `goal`, the frame of the goal.
+        extra_wrappers: Wrappers of every environment, in order: `functools.partial` of a class of `swm.wrapper.visual`, or
+            any factory of a `gymnasium.Wrapper`.
+        pre_wrappers: Wrappers applied before `extra_wrappers`.
+        image_transform: A function of a frame, a `PIL.Image` if Pillow is installed, else an array `(height, width, 3)`. Its
+            results replace `pixels` in the infos that policies get; datasets and videos have the frames themselves.
+        goal_transform: The same for `goal`.
+        add_pixels: Whether frames are rendered.
+        views: Additional camera views: cameras, `depth`, `segmentation`, or `CAMERA:MODALITY`.
+        wrap_goal: Whether visual wrappers also change the frame of the goal.
+        threads: The number of worker threads, which does not affect results; 0 uses one for each core.
+        workers: Whether each third-party environment runs in a worker process instead of this interpreter. The processes
+            step in parallel and are restarted after a crash. They must be able to import the environment.
+        image_resample: The interpolation that resizes third-party frames: `"bilinear"`, or `"nearest"` for pixel art.
+        **kwargs: Options of the environment.
+
+    Attributes:
+        infos: The info columns by name: arrays `(num_envs, 1, ..)` in the engine's memory, which every reset and step
+            overwrites. `infos[name].copy()` keeps the values of a step.
+    """
+
+    #: The number of environments.
+    num_envs: int
+
+    def __init__(
+        self,
+        env_name: str,
+        num_envs: int = 1,
+        image_shape: tuple[int, int] | None = (224, 224),
+        max_episode_steps: int | None = None,
+        goal_conditioned: bool = True,
+        pre_wrappers: Sequence[Callable[..., Any]] | None = None,
+        extra_wrappers: Sequence[Callable[..., Any]] | None = None,
+        image_transform: Any = None,
+        goal_transform: Any = None,
+        image_resample: Any = None,
+        add_pixels: bool = True,
+        *,
+        views: Sequence[str] = (),
+        wrap_goal: bool = False,
+        threads: int = 0,
+        workers: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        if add_pixels and image_shape is None:
+            raise ValueError("image_shape: None; give (height, width), or add_pixels=False for no frames")
+        if add_pixels and not (
+            isinstance(image_shape, Sequence) and not isinstance(image_shape, str) and len(image_shape) == 2
+        ):
+            raise TypeError(f"image_shape: {image_shape!r}; expected (height, width)")
+        num_envs = _options.count("num_envs", num_envs)
+        if max_episode_steps is not None:
+            max_episode_steps = _options.count("max_episode_steps", max_episode_steps)
+        threads = _options.count("threads", threads, 0)
+        if isinstance(views, str):
+            raise TypeError(f"views: {views!r}; expected a list, such as [{views!r}]")
+        kwargs.pop("render_mode", None)
+        self.env_name = ",".join([env_name, *(f"{key}={value}" for key, value in kwargs.items())])
+        self.num_envs = num_envs
+        image = None
+        if add_pixels and image_shape is not None:
+            image = (_options.count("image_shape", image_shape[0]), _options.count("image_shape", image_shape[1]))
+        wrappers = [*(pre_wrappers or []), *(extra_wrappers or [])]
+        in_engine = engine_wrappers(wrappers)
+        self._native = in_engine is not None and self._is_native(env_name)
+        #: The Gymnasium environments of this world that run in this interpreter.
+        self.gym_envs: list[Any] = []
+        if in_engine is None and workers:
+            raise ValueError("workers: user-defined wrappers cannot run in worker processes; use workers=False")
+        if not (self._native or (in_engine is not None and workers)):
+            from .._gym import open_world
+
+            name, *given = env_name.split(",")
+            settings = {**dict(word.split("=", 1) for word in given), **kwargs}
+            self._world, self.gym_envs, self._wrapping = open_world(
+                name, settings, self.num_envs, wrappers, image, max_episode_steps, image_resample, threads, wrap_goal
+            )
+        else:
+            # Worker processes use this Python interpreter.
+            os.environ.setdefault("SWM_PYTHON", sys.executable)
+            self._wrapping = in_engine or []
+            self._world = _engine.World(
+                self.env_name,
+                self.num_envs,
+                image,
+                list(views),
+                max_episode_steps,
+                threads,
+                json.dumps(in_engine),
+                wrap_goal,
+            )
+        self.infos: dict[str, np.ndarray] = self._world.infos()
+        if not goal_conditioned:
+            self.infos.pop("goal", None)
+        #: The functions that change the frames in infos.
+        self.transforms = FrameTransforms(image_transform, goal_transform)
+        self._frames = {key: self.infos[key] for key in self.transforms.keys(self.infos)}
+        self._actions = self._world.actions()
+        self.infos["action"] = self._actions[:, None]
+        self.envs = WorldEnvs(self)
+        self.policy: Any = None
+        #: The seed of the episodes that `step` plays.
+        self.seed: int | None = None
+        self._actors: dict[int, tuple[Any, Any]] = {}
+        self._episodes = [0] * self.num_envs
+        self._next_episode = 0
+        #: The options of resets, the same for all environments or one for each.
+        self._reset_text: str | list[str] = _options.reset(None, {})
+        self._fresh = np.ones(self.num_envs, bool)
+
+    @staticmethod
+    def _is_native(env_name: str) -> bool:
+        name = env_name.split(",")[0]
+        if name in _engine.envs():
+            return True
+        import gymnasium
+
+        # An unregistered id of the namespace `swm` is a misspelt native id. The engine's error suggests similar ids.
+        return name.startswith("swm/") and not name.startswith("swm/Craftax") and name not in gymnasium.registry
+
+    # Properties.
+
+    @cached_property
+    def spec(self) -> dict[str, Any]:
+        """The specification of the environments: spaces, info columns, factors."""
+        return json.loads(self._world.spec())
+
+    @property
+    def rewards(self) -> np.ndarray:
+        """The rewards of the last step, `(num_envs,)`."""
+        return self.infos["reward"][:, 0]
+
+    @property
+    def terminateds(self) -> np.ndarray:
+        """Whether the last step terminated the episode, `(num_envs,)`."""
+        return self.infos["terminated"][:, 0]
+
+    @property
+    def truncateds(self) -> np.ndarray:
+        """Whether the last step truncated the episode, `(num_envs,)`."""
+        return self.infos["truncated"][:, 0]
+
+    @property
+    def single_action_space(self) -> spaces.Space:
+        """The action space of one environment."""
+        return self.envs.single_action_space
+
+    @property
+    def action_space(self) -> spaces.Space:
+        """The action space of all environments together."""
+        return self.envs.action_space
+
+    @property
+    def variation_space(self) -> swm_spaces.Dict:
+        """The factors of variation."""
+        return self.envs.variation_space
+
+    @property
+    def max_episode_steps(self) -> int:
+        """Steps after which episodes are truncated."""
+        return self._world.max_episode_steps()
+
+    def factors(self, index: int = 0) -> dict[str, list[float]]:
+        """The factors of the current episode of an environment, by key."""
+        return self._world.factors(index)
+
+    def close(self) -> None:
+        """Closes the environments and ends their worker processes. The world cannot be used afterwards."""
+        self._actors.clear()
+        for env in self.gym_envs:
+            env.close()
+        self.gym_envs.clear()
+        # The arrays keep the engine's world alive: release them first.
+        self.infos, self._frames, self._actions = {}, {}, np.empty(0)
+        self.__dict__.pop("_world", None)
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "_world":
+            raise RuntimeError("World: the world is closed; create a new world")
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    def __enter__(self) -> World:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    # Interactive loops.
+
+    def set_policy(self, policy: Any) -> None:
+        """Sets the policy: an object with `get_action(infos)`."""
+        if isinstance(policy, type):
+            raise TypeError(f"{policy.__name__} is a class: pass an instance of it")
+        if not (callable(getattr(policy, "get_action", None)) or callable(getattr(policy, "get_actions", None))):
+            raise TypeError(f"{type(policy).__name__} is not a policy: expected get_action(infos)")
+        if callable(getattr(policy, "set_env", None)):
+            policy.set_env(self.envs)
+        self.policy = policy
+        self._drop_actor(policy)
+
+    def reset(
+        self,
+        seed: int | Sequence[int] | None = None,
+        options: Mapping[str, Any] | Sequence[Mapping[str, Any] | None] | None = None,
+    ) -> None:
+        """Starts an episode in every environment and refreshes `infos`.
+
+        Args:
+            seed: The seed of the episodes: environment `i` plays episode `i` of this seed, as in `collect` and `evaluate`.
+                A list holds one environment seed for each environment. Random for `None`.
+            options: `variation`: factors to sample; `variation_values`: factors to pin; `state`, `goal_state`: start and goal.
+                A list holds the options of each environment.
+        """
+        factors = self.spec["variation"]
+        if isinstance(options, Sequence):
+            if len(options) != self.num_envs:
+                raise ValueError(f"options: expected {self.num_envs} dicts, one for each environment, got {len(options)}")
+            self._reset_text = [_options.reset(given, factors) for given in options]
+        else:
+            self._reset_text = _options.reset(options, factors)
+        single = seed is None or isinstance(seed, (int, np.integer))
+        self.seed = _seed(seed if single else None)  # type: ignore[arg-type]
+        self._episodes = list(range(self.num_envs))
+        self._next_episode = self.num_envs
+        if not single:
+            seeds = [_seed(given) for given in seed]  # type: ignore[union-attr]
+            if len(seeds) != self.num_envs:
+                raise ValueError(f"seed: expected {self.num_envs} seeds, one for each environment, got {len(seeds)}")
+        else:
+            seeds = [_engine.World.episode_seed(self.seed, i) for i in range(self.num_envs)]
+        self._reset_slots(list(enumerate(seeds)))
+        self._begin(range(self.num_envs))
+        self._actions[:] = np.nan if self._actions.dtype.kind == "f" else -1
+        self._transform()
+
+    def _reset_slots(self, starts: list[tuple[int, int]]) -> None:
+        """Resets environments, given as pairs of slot and seed, with the options of the last `reset`."""
+        if isinstance(self._reset_text, str):
+            self._world.reset(starts, self._reset_text)
+            return
+        for slot, seed in starts:
+            self._world.reset([(slot, seed)], self._reset_text[slot])
+
+    def _transform(self) -> None:
+        """Refreshes the transformed frames in `infos`."""
+        for key, frames in self._frames.items():
+            self.infos[key] = self.transforms(key, frames)
+
+    def step(self, steps: int = 1) -> None:
+        """Steps the environments with the policy and refreshes `infos`. Environments whose episode is over are reset.
+
+        Args:
+            steps: The number of steps. With a policy of the engine, all steps run in one call of the engine.
+        """
+        if self.policy is None:
+            raise RuntimeError("World.step: no policy; call set_policy first")
+        if self.seed is None:
+            self.reset()
+        actor = self._actor(self.policy)
+        if actor is not None and isinstance(self._reset_text, str):
+            begun, self._next_episode = self._world.play(actor, int(steps), self.seed, self._next_episode, self._reset_text)
+            for slot, episode in begun:
+                self._episodes[slot] = episode
+            self._fresh[:] = False
+            self._transform()
+            return
+        for _ in range(steps):
+            over = self.terminateds | self.truncateds
+            active = ~over
+            if active.any():
+                infos = {**self.infos, "_needs_flush": self._fresh.copy(), "_active": active}
+                self._actions[:] = self._checked_actions(self.policy, infos, active)
+                self._fresh[:] = False
+                self._world.advance(active.tolist())
+            if over.any():
+                slots = np.flatnonzero(over).tolist()
+                for slot in slots:
+                    self._episodes[slot] = self._next_episode
+                    self._next_episode += 1
+                starts = [(slot, _engine.World.episode_seed(self.seed or 0, self._episodes[slot])) for slot in slots]
+                self._reset_slots(starts)
+                self._begin(slots)
+            self._transform()
+
+    def _step_with(self, actions: Any, mask: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Steps the environments of `mask` whose episode goes on; returns rewards, terminated and truncated."""
+        active = ~(self.terminateds | self.truncateds)
+        active &= True if mask is None else np.asarray(mask, bool)
+        given = np.asarray(actions.detach().cpu() if hasattr(actions, "detach") else actions)
+        if given.size != self._actions.size:
+            raise ValueError(f"actions: got shape {given.shape}, expected {self.envs.action_space.shape}")
+        self._actions[active] = given.reshape(self._actions.shape).astype(self._actions.dtype)[active]
+        self._fresh[active] = False
+        self._world.advance(active.tolist())
+        self._transform()
+        return tuple(
+            np.where(active, value, 0).astype(value.dtype) for value in (self.rewards, self.terminateds, self.truncateds)
+        )  # type: ignore[return-value]
+
+    def snapshot(self, index: int = 0) -> bytes:
+        """The full state of an environment, including its random state."""
+        return self._world.snapshot(index)
+
+    def restore(self, state: bytes, index: int = 0) -> None:
+        """Restores a snapshot. Later steps repeat the steps after the snapshot bit for bit."""
+        self._world.restore(index, state)
+
+    def _begin(self, slots: Sequence[int]) -> None:
+        self._fresh[list(slots)] = True
+        for policy, actor in self._actors.values():
+            if policy is self.policy:
+                for slot in slots:
+                    self._world.begin(actor, slot, self.seed or 0, self._episodes[slot])
+
+    def _engine_actions(self, policy: Any) -> np.ndarray:
+        """The actions `(num_envs, ..)` of a policy of the engine for the current infos."""
+        active = ~(self.terminateds | self.truncateds)
+        self._world.act(self._actor(policy), active.tolist())
+        return self._actions.reshape(self.envs.action_space.shape).copy()
+
+    def _checked_actions(self, policy: Any, infos: dict[str, Any], active: np.ndarray) -> np.ndarray:
+        """The actions of a policy implemented in Python, checked and in the shape and type of the engine."""
+        get_action = getattr(policy, "get_action", None) or policy.get_actions
+        given = get_action(infos)
+        name = type(policy).__name__
+        if given is None:
+            raise TypeError(f"{name}.get_action returned None; expected actions of shape {self.envs.action_space.shape}")
+        given = given.detach().cpu().numpy() if hasattr(given, "detach") else np.asarray(given)
+        want = self._actions
+        if given.size != want.size or given.shape[:1] != want.shape[:1]:
+            expected = self.envs.action_space.shape
+            raise ValueError(f"{name}.get_action: got actions of shape {given.shape}, expected {expected}")
+        given = given.reshape(want.shape)
+        if given.dtype.kind == "f" and not np.isfinite(given[active]).all():
+            raise ValueError(f"{name}.get_action: expected finite actions, got {given[active]}")
+        if want.dtype.kind != "f":
+            given = np.nan_to_num(given, nan=0)
+        return np.ascontiguousarray(given, dtype=want.dtype)
+
+    def _actor(self, policy: Any) -> Any:
+        """The engine's actor of a policy; `None` for a policy implemented in Python."""
+        known = self._actors.get(id(policy))
+        if known is not None and known[0] is policy:
+            return known[1]
+        make = getattr(policy, "_actor", None)
+        actor = make(self) if make is not None else None
+        if actor is not None:
+            self._actors[id(policy)] = (policy, actor)
+            for slot in range(self.num_envs):
+                self._world.begin(actor, slot, self.seed or 0, self._episodes[slot])
+        return actor
+
+    def _drop_actor(self, policy: Any) -> None:
+        self._actors.pop(id(policy), None)
+
+    def _playing(self, policy: Any) -> Any:
+        """The actor of a policy for collection and evaluation. A policy implemented in Python gets an actor that calls it."""
+        actor = self._actor(policy)
+        if actor is not None:
+            return actor
+
+        def call(infos: dict[str, Any], active: np.ndarray, fresh: np.ndarray) -> np.ndarray:
+            infos |= {"_needs_flush": fresh, "_active": active, "action": self.infos["action"]}
+            if "goal" not in self.infos:
+                infos.pop("goal", None)
+            for key in self._frames.keys() & infos.keys():
+                infos[key] = self.transforms(key, infos[key])
+            return self._checked_actions(policy, infos, active)
+
+        return _engine.Actor.python(self._world, call)
+
+    # Collection and evaluation.
+
+    def collect(
+        self,
+        path: str | Path | None = None,
+        episodes: int = 0,
+        seed: int | None = None,
+        options: Mapping[str, Any] | None = None,
+        format: str | None = None,
+        writer: Any = None,
+        progress: bool = True,
+        *,
+        dataset_path: str | Path | None = None,
+        policy: Any = None,
+        mode: str = "error",
+        codec: str | None = None,
+        goal: bool = False,
+        strict_finite: bool = False,
+        action_noise: float = 0.0,
+    ) -> dict[str, int]:
+        """Collects episodes with the policy into a dataset.
+
+        Args:
+            path: The target: a path, a URI of an object store, or a name under `$STABLEWM_HOME/datasets`.
+            episodes: The number of episodes.
+            seed: The seed, which is combined with the index of each episode; random for `None`.
+            options: Factors to sample (`variation`) and to pin (`variation_values`).
+            format: One of `swm.data.list_formats()`. `None` selects the format by the path's suffix, or Lance.
+            writer: Instead of a path: an object with `write_episode(dict of arrays)`, such as `swm.data.ReplayBuffer`.
+            progress: Whether to show progress.
+            dataset_path: Another name for `path`.
+            policy: The policy to set first; `None` keeps the policy of `set_policy`. A dict of weights by policy name, such as
+                `{"expert": 0.7, "random": 0.3}`, stands for `swm.policy.MixturePolicy`.
+            mode: The treatment of an existing dataset: `"error"` raises, `"overwrite"` replaces it, `"append"` adds `episodes`
+                more, `"resume"` continues until the dataset has `episodes`.
+            codec: The codec of frames: `"qoi"` (lossless), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
+            goal: Whether to store the frame of the goal in every row.
+            strict_finite: Whether NaN and infinite values raise an error. Otherwise they are stored and counted in the
+                manifest, and a warning lists the columns.
+            action_noise: The standard deviation of Gaussian noise, in the units of the action space, that is added to every
+                action; that of the policy (`action_noise` of experts in `swm.envs`) for 0. Actions are clipped to the
+                space and stored as executed.
+
+        Returns:
+            A dict with the counts `episodes` (in the dataset), `added` (episodes) and `steps`. After an interrupt or an error
+            the finished episodes remain stored.
+        """
+        path = dataset_path if path is None else path
+        if (path is None) == (writer is None):
+            raise ValueError("World.collect: expected either a path or a writer")
+        if mode not in ("error", "overwrite", "append", "resume"):
+            raise ValueError(f"mode: {mode!r}; expected 'error', 'overwrite', 'append' or 'resume'")
+        episodes = _options.count("episodes", episodes)
+        action_noise = _options.finite("action_noise", action_noise)
+        if isinstance(policy, Mapping):
+            from ..policy import MixturePolicy
+
+            policy = MixturePolicy(policy)
+        policy = self._chosen(policy)
+        if writer is None and format is None:
+            format = _FORMAT_OF_SUFFIX.get(Path(str(path)).suffix)
+        if path is not None and writer is None and format not in _engine.formats():
+            from ..data.format import foreign_writer
+
+            writer = foreign_writer(path, format, "append" if mode == "resume" else mode)
+        config: dict[str, Any] = {
+            "episodes": episodes,
+            "seed": _seed(seed),
+            "variation": _options.variation(_without_states(options), self.spec["variation"]),
+            "policy": getattr(policy, "_choice", None) or _name(policy),
+            "action_noise": action_noise or float(getattr(policy, "action_noise", 0.0)),
+            "goal": bool(goal),
+            "first": 0,
+            "strict_finite": bool(strict_finite),
+            "wrappers": [{"id": id, "settings": settings} for id, settings in self._wrapping],
+        }
+        if writer is not None:
+            with writer as opened:
+                return self._collect(policy, None, opened, None, "create", None, config, progress)
+        if mode == "append":
+            config["episodes"] += _engine.World.stored(str(path), format) or 0
+        engine_mode = {"error": "create", "resume": "append"}.get(mode, mode)
+        return self._collect(policy, str(path), None, format, engine_mode, codec, config, progress)
+
+    def _collect(
+        self,
+        policy: Any,
+        path: str | None,
+        writer: Any,
+        format: str | None,
+        mode: str,
+        codec: str | None,
+        config: dict[str, Any],
+        progress: bool,
+    ) -> dict[str, int]:
+        from ..data.writer import codec_json
+
+        with _progress.bar("collect", config["episodes"], progress) as bar:
+            outcome = self._world.collect(
+                self._playing(policy), path, writer, format, mode, codec_json(codec), json.dumps(config), bar
+            )
+        self._end_interactive_loop()
+        *counts, warning = outcome
+        if warning is not None:
+            warnings.warn(warning, stacklevel=3)
+        return dict(zip(("episodes", "added", "steps"), counts, strict=True))
+
+    def evaluate(
+        self,
+        episodes: int | None = None,
+        seed: int | None = None,
+        options: Mapping[str, Any] | None = None,
+        video: str | Path | None = None,
+        reset_mode: str | None = None,
+        dataset: Any = None,
+        episodes_idx: Sequence[int] | None = None,
+        start_steps: Sequence[int] | None = None,
+        goal_offset: int | None = None,
+        eval_budget: int | None = None,
+        callables: Any = None,
+        *,
+        policy: Any = None,
+        protocol: str = "strict",
+        hold: int = 1,
+        floor: bool = True,
+        videos: int | None = None,
+        condition: str | None = None,
+        progress: bool = True,
+    ) -> Metrics:
+        """Measures the success rate of the policy, and of the random policy on the same starts.
+
+        Args:
+            episodes: The number of episodes; 50, or the length of `episodes_idx`, for `None`.
+            seed: The seed of starts, goals, factors and plans; random for `None`.
+            options: Factors to sample (`variation`) and to pin (`variation_values`).
+            video: A folder for videos of the first episodes, with their first frames as PNG files beside them.
+            dataset: The dataset of starts and goals: a `swm.data.Dataset`, its path, URI or name.
+            episodes_idx, start_steps: The episodes and steps of the dataset to start from; chosen by the seed for `None`.
+            goal_offset: The number of steps from a start to its goal; 25 for `None`.
+            eval_budget: The time limit of an episode in steps. `None` uses the world's time limit, or 50 with a dataset.
+            callables: The methods that set an environment's recorded state, called in this order after its reset:
+                `{"method": NAME, "args": {KEYWORD: {"value": COLUMN}}}`. A column name with the prefix `goal_` reads the
+                row of the goal. `{"value": ANYTHING, "in_dataset": False}` passes the value itself. The default is
+                `set_state(state)` and `set_goal_state(goal_state)`, with or without a leading `_`. Native environments
+                restore recorded states without callables.
+            policy: The policy to set first; `None` keeps the policy of `set_policy`.
+            protocol: `"strict"` leaves out episodes that are solved at start and requires a satisfied goal;
+                `"compat"` counts as the Python package stable-worldmodel 0.1.1 does.
+            hold: Consecutive steps that must satisfy the goal (with `"strict"`).
+            floor: Whether to evaluate the random policy on the same starts.
+            videos: The number of episodes to record with `video`; all for `None`.
+            condition: A description of the distribution shift, for reports.
+            progress: Whether to show progress.
+
+        Returns:
+            The metrics.
+        """
+        if reset_mode not in (None, "auto", "wait"):
+            raise ValueError(f"reset_mode: {reset_mode!r}; expected 'auto' or 'wait', which have the same effect")
+        if protocol not in ("strict", "compat"):
+            raise ValueError(f"protocol: {protocol!r}; expected 'strict' or 'compat'")
+        policy = self._chosen(policy)
+        picks = None
+        if dataset is not None:
+            dataset = str(getattr(dataset, "path", dataset))
+            goal_offset = 25 if goal_offset is None else _options.count("goal_offset", goal_offset)
+            eval_budget = 50 if eval_budget is None else _options.count("eval_budget", eval_budget)
+            if (episodes_idx is None) != (start_steps is None):
+                raise ValueError("episodes_idx, start_steps: give both or neither")
+            if episodes_idx is not None and start_steps is not None:
+                picks = [[int(e), int(s)] for e, s in zip(episodes_idx, start_steps, strict=True)]
+                episodes = len(picks)
+        elif episodes_idx is not None or start_steps is not None or goal_offset is not None:
+            raise ValueError("episodes_idx, start_steps, goal_offset: they select rows of a dataset; pass dataset=…")
+        episodes = 50 if episodes is None else _options.count("episodes", episodes)
+        hold = _options.count("hold", hold)
+        variation = _options.variation(_without_states(options), self.spec["variation"])
+        config = {
+            "episodes": episodes,
+            "seed": _seed(seed),
+            "variation": variation,
+            "condition": condition or _describe(variation),
+            "budget": eval_budget,
+            "counting": {"strict": {"hold": hold}} if protocol == "strict" else {"compat": {"envs": self.num_envs}},
+            "picks": picks,
+            "goal_offset": goal_offset or 0,
+            "callables": self._callables(_options.callables(callables)) if dataset is not None else [],
+        }
+        acting: list[tuple[str, Any]] = [(_name(policy), self._playing(policy))]
+        if floor and acting[0][0] != "random":
+            acting.append(("random", _engine.Actor.random(self._world, None)))
+        runs: list[dict[str, Any]] = []
+        for name, actor in acting:
+            recording = None
+            if video is not None and not runs:
+                folder = Path(video)
+                folder.mkdir(parents=True, exist_ok=True)
+                recording = [str(folder), "episode", episodes if videos is None else int(videos)]
+            given = json.dumps({**config, "policy": name, "videos": recording})
+            with _progress.bar(f"evaluate {name}", episodes, progress) as bar:
+                runs.append(json.loads(self._world.evaluate(actor, given, dataset, bar)))
+        self._end_interactive_loop()
+        if hasattr(policy, "plans"):
+            policy.plans = json.loads(acting[0][1].take_plans())
+        return Metrics._of(self, config, runs, dataset)
+
+    def _callables(self, callables: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        """The callables for the engine; an empty list for native environments, which do not need them."""
+        if not self._native:
+            return callables
+        ignored = sorted({call["method"] for call in callables} - {"_set_state", "_set_goal_state", "set_state"})
+        if ignored:
+            name = self.env_name.partition(",")[0]
+            warnings.warn(f"callables: {name} restores recorded states itself; {ignored} are not called", stacklevel=3)
+        return []
+
+    def _chosen(self, policy: Any) -> Any:
+        if policy is not None and policy is not self.policy:
+            self.set_policy(policy)
+        if self.policy is None:
+            raise RuntimeError("World: no policy; call set_policy, or give policy=…")
+        return self.policy
+
+    def _end_interactive_loop(self) -> None:
+        """Makes the next interactive loop start with a reset, after a collection or an evaluation."""
+        self.seed = None
+        self._actors.clear()
+
+
+def _random_seed() -> int:
+    """A random seed of 32 bits."""
+    return secrets.randbits(32)
+
+
+def _seed(seed: int | None) -> int:
+    """The seed, or a random one for `None`."""
+    if seed is None:
+        return _random_seed()
+    if int(seed) != seed or not 0 <= seed < 2**63:
+        raise ValueError(f"seed: {seed}; expected an integer from 0 to 2^63 - 1")
+    return int(seed)
+
+
+def _name(policy: Any) -> str:
+    return str(getattr(policy, "type", None) or type(policy).__name__)
+
+
+def _without_states(options: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+    """The options of many episodes, checked to contain no fixed state or goal state."""
+    fixed = [name for name in ("state", "goal_state") if (options or {}).get(name) is not None]
+    if fixed:
+        raise ValueError(f"options: {fixed} would apply to every episode; pass them to World.reset")
+    return options
+
+
+def _describe(variation: Mapping[str, Any]) -> str:
+    pinned = [f"{key} = {value}" for key, value in variation["variation_values"].items()]
+    return ", ".join([*(variation["variation"] or []), *pinned]) or "in distribution"

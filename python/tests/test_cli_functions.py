@@ -1,0 +1,50 @@
+"""Tests of the commands as functions."""
+
+import numpy as np
+import pytest
+
+import stable_worldmodel as swm
+from stable_worldmodel import cli
+
+
+def written(path, value):
+    with swm.data.open_writer(path) as writer:
+        pixels = np.full((3, 16, 16, 3), value, np.uint8)
+        writer.write_episode({"pixels": pixels, "x": np.full(3, value, np.float32)})
+    return str(path)
+
+
+def test_listings_print_what_the_command_prints(capfd):
+    cli.envs()
+    assert "swm/TwoRoom-v1" in capfd.readouterr().out
+    cli.fovs("swm/TwoRoom-v1")
+    assert "agent.color" in capfd.readouterr().out
+    cli.main(version=True)
+    assert capfd.readouterr().out.strip() == swm.__version__
+    with pytest.raises(SystemExit):
+        cli.fovs("swm/TwoRooom-v1")
+
+
+def test_checkpoints_are_filtered(home, capfd):
+    for name in ("lewm-rooms", "pldm-rooms", "gcbc"):
+        (home / "checkpoints" / name).mkdir(parents=True)
+    cli.checkpoints("r[o]{2}ms$")
+    assert capfd.readouterr().out.split() == ["lewm-rooms", "pldm-rooms"]
+
+
+def test_datasets_are_converted_merged_and_shown(tmp_path, monkeypatch, capfd):
+    one, other = written(tmp_path / "a.lance", 10), written(tmp_path / "b.h5", 20)
+    cli.convert(one, str(tmp_path / "c.h5"), "hdf5")
+    assert swm.data.load_dataset(tmp_path / "c.h5", backend="numpy").get_col_data("x").ravel().tolist() == [10] * 3
+    cli.convert(one)
+    assert swm.data.load_dataset(tmp_path / "a_video").num_episodes == 1
+    cli.merge([one, other], str(tmp_path / "d.lance"))
+    assert swm.data.load_dataset(tmp_path / "d.lance").num_episodes == 2
+    with pytest.raises(ValueError, match="exists already"):
+        cli.merge([one], str(tmp_path / "d.lance"))
+    cli.merge([one], str(tmp_path / "d.lance"), overwrite=True)
+    assert swm.data.load_dataset(tmp_path / "d.lance").num_episodes == 1
+    monkeypatch.chdir(tmp_path)
+    cli.preview(one, num=1)
+    assert (tmp_path / "a_preview" / "episode_0.mp4").stat().st_size > 500
+    assert "a_preview" in capfd.readouterr().out

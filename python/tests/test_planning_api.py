@@ -1,0 +1,253 @@
+"""Tests of objectives, evaluators and callbacks of solvers."""
+
+import json
+
+import numpy as np
+import pytest
+
+import stable_worldmodel as swm
+
+torch = pytest.importorskip("torch")
+torch.set_num_threads(1)
+
+import gymnasium  # noqa: E402
+
+from stable_worldmodel import _engine, planning  # noqa: E402
+from stable_worldmodel.planning.solver import callbacks as hooks  # noqa: E402
+from stable_worldmodel.planning.solver.utils import prepare_init_action  # noqa: E402
+
+BOX = gymnasium.spaces.Box(-1, 1, (3, 2), np.float32)
+TARGETS = torch.tensor([[0.5, -0.3], [-0.6, 0.2], [0.1, 0.8]])
+
+
+class Sums(torch.nn.Module):
+    """A `Dynamics` whose embedding is the state, to which every action is added."""
+
+    def __init__(self):
+        super().__init__()
+        self.encoded = 0
+
+    def encode(self, info):
+        self.encoded += 1
+        info["emb"] = info["pixels"].float()
+        return info
+
+    def rollout(self, info, action_candidates):
+        start = info["state"][:, :, -1:]
+        info["predicted_emb"] = torch.cat([start, start + action_candidates.cumsum(2)], 2)
+        return info
+
+
+class ToTarget:
+    def get_cost(self, info_dict, action_candidates):
+        return (action_candidates - info_dict["target"][:, :, -1:]).square().sum((2, 3))
+
+
+def infos():
+    return {"goal": TARGETS[:, None], "state": torch.zeros(3, 1, 2), "target": TARGETS[:, None]}
+
+
+def configured(solver, horizon=3, space=BOX):
+    solver.configure(action_space=space, n_envs=3, config=swm.PlanConfig(horizon, horizon))
+    return solver
+
+
+def test_an_evaluator_plans_to_the_goal():
+    model = Sums()
+    cost = planning.ShootingCostEvaluator(model, planning.GoalMSE())
+    solver = configured(planning.CEMSolver(cost=cost, num_samples=200, n_steps=15, topk=20))
+    plan = solver(infos())["actions"]
+    assert (plan.sum(1) - TARGETS).abs().max() < 0.05
+    assert model.encoded == 1, "the goal is encoded once for a search"
+    # The penalty prefers equal small actions: for a distance d, the optimum of (d - 3a)^2 + 3 w a^2 is a = d / (3 + w).
+    weighted = planning.WeightedSum([(1.0, planning.GoalMSE()), (0.5, planning.ControlPenalty())])
+    cost = planning.ShootingCostEvaluator(model, weighted)
+    solver = planning.GradientSolver(cost=cost, n_steps=200, num_samples=2)
+    plan = configured(solver).solve(infos())["actions"]
+    assert (plan - (TARGETS / 3.5)[:, None]).abs().max() < 0.01
+
+
+def test_constraints_make_an_evaluator_constrainable():
+    class Least(torch.nn.Module):
+        """At most 0.2 for the first element of the last action."""
+
+        def forward(self, info_dict):
+            return info_dict["action_candidates"][..., -1, 0] - 0.2
+
+    cost = planning.ShootingCostEvaluator(Sums(), planning.GoalMSE(), constraints=[Least()])
+    assert isinstance(cost, planning.Constrainable) and isinstance(cost, planning.Costable)
+    assert not isinstance(planning.ShootingCostEvaluator(Sums(), planning.GoalMSE()), planning.Constrainable)
+    given = {key: value[:, None].expand(-1, 4, *value.shape[1:]) for key, value in infos().items()}
+    assert cost.get_constraints(given, torch.zeros(3, 4, 3, 2)).tolist() == [[[pytest.approx(-0.2)]] * 4] * 3
+    far = {**infos(), "goal": torch.tensor([[[2.0, 0.0]]] * 3)}
+    plan = configured(planning.LagrangianSolver(cost, num_samples=4, n_outer_steps=8)).solve(far)["actions"]
+    assert plan[:, -1, 0].max() < 0.21 and (plan.sum(1)[:, 0] - 2).abs().max() < 0.05
+
+
+def test_objectives_by_hand():
+    predicted = torch.tensor([[[[9.0, 9.0], [1.0, 2.0]], [[9.0, 9.0], [0.0, 0.0]]]])
+    goals = torch.tensor([[[7.0, 7.0], [1.0, 0.0]]])
+    given = {"predicted_emb": predicted, "goal_emb": goals, "action_candidates": torch.full((1, 2, 3, 2), 2.0)}
+    assert planning.GoalMSE()(given).tolist() == [[4.0, 1.0]]
+    assert planning.GoalMSE(reduction="mean")(given).tolist() == [[2.0, 0.5]]
+    assert planning.GoalMSE()({**given, "goal_emb": goals[:, None].expand(-1, 2, -1, -1)}).tolist() == [[4.0, 1.0]]
+    assert planning.ControlPenalty()(given).tolist() == [[24.0, 24.0]]
+    total = planning.WeightedSum([(2.0, planning.GoalMSE()), (0.5, planning.ControlPenalty())])
+    assert total(given).tolist() == [[20.0, 14.0]]
+    with pytest.raises(KeyError, match="'predicted_emb'"):
+        planning.GoalMSE()({})
+    with pytest.raises(ValueError, match="no terms"):
+        planning.WeightedSum([])
+    with pytest.raises(TypeError, match="encode.*rollout"):
+        planning.ShootingCostEvaluator(ToTarget(), planning.GoalMSE())
+
+
+def test_callbacks_see_every_iteration():
+    states = []
+
+    class Keep(hooks.Callback):
+        name = "kept"
+
+        def compute(self, **state):
+            states.append(state)
+            return state["step"]
+
+    recorders = [hooks.BestCostRecorder("none"), hooks.MeanCostRecorder(), hooks.EliteCostRecorder(), Keep()]
+    recorders += [hooks.VarNormRecorder(), hooks.MeanShiftRecorder(), hooks.EliteSpreadRecorder()]
+    settings = {"num_samples": 50, "n_steps": 4, "topk": 10, "seed": 7}
+    solver = configured(planning.CEMSolver(ToTarget(), callbacks=recorders, **settings))
+    found = solver.solve(infos())
+    # Callbacks change nothing, and agree with the engine's own trace.
+    plain = configured(planning.CEMSolver(ToTarget(), **settings)).solve(infos())
+    assert torch.equal(found["actions"], plain["actions"])
+    history = found["callbacks"]
+    assert history["kept"] == [[0, 1, 2, 3]]
+    best = np.array(history["BestCostRecorder"][0])
+    assert best.shape == (4, 3) and np.allclose(best.T, [trace["best"] for trace in plain["trace"]])
+    assert np.allclose(history["EliteCostRecorder"][0][1]["min"], best[1].mean())
+    last = states[-1]
+    assert last["candidates"].shape == (3, 50, 3, 2) and last["topk_candidates"].shape == (3, 10, 3, 2)
+    assert (last["topk_vals"].diff(dim=1) >= 0).all()
+    assert torch.allclose(last["costs"].gather(1, last["topk_inds"]), last["topk_vals"])
+    # The mean after the last iteration is the plan, and the mean before an iteration is the one after the one before.
+    assert torch.allclose(last["mean"], found["actions"], atol=1e-6)
+    assert torch.allclose(last["prev_mean"], states[-2]["mean"], atol=1e-6)
+    assert torch.allclose(last["var"], last["topk_candidates"].std(1), atol=1e-5)
+    spread = history["VarNormRecorder"][0]
+    assert spread[0] > spread[-1] and np.isclose(history["EliteSpreadRecorder"][0][-1], spread[-1], rtol=1e-5)
+    solver.solve(infos())
+    assert len(recorders[0].history) == 1, "each search begins a new history"
+
+
+@pytest.mark.parametrize(
+    ("solver", "settings", "space"),
+    [
+        (planning.CEMSolver, {"topk": 10, "num_samples": 50}, BOX),
+        (planning.ICEMSolver, {"topk": 10, "num_samples": 50}, BOX),
+        (planning.MPPISolver, {"topk": 10, "num_samples": 50}, BOX),
+        (planning.GradientSolver, {"num_samples": 4}, BOX),
+        (planning.CategoricalCEMSolver, {"topk": 10, "num_samples": 50}, gymnasium.spaces.MultiDiscrete([[2]] * 3)),
+    ],
+    ids=["cem", "icem", "mppi", "gd", "categorical"],
+)
+def test_a_callback_ends_the_search_with_the_plan_so_far(solver, settings, space):
+    calls = []
+
+    class Third(hooks.Callback):
+        def compute(self, **state):
+            calls.append(state["step"])
+            if state["step"] == 2:
+                raise hooks.StopSearch
+            return 1.0
+
+    class Counted(ToTarget):
+        calls = 0
+
+        def get_cost(self, info_dict, action_candidates):
+            Counted.calls += 1
+            return super().get_cost(info_dict, action_candidates)
+
+    stopped = configured(solver(Counted(), n_steps=20, callbacks=[Third()], seed=3, **settings), space=space).solve(infos())
+    evaluated = Counted.calls
+    short = configured(solver(ToTarget(), n_steps=3, seed=3, **settings), space=space).solve(infos())
+    assert torch.equal(stopped["actions"], short["actions"]) and stopped["costs"] == short["costs"]
+    assert calls == [0, 1, 2] and stopped["callbacks"] == {"Third": [[1.0, 1.0]]}
+    # The gradient solvers compare their candidates once more at the end.
+    assert evaluated == (4 if solver is planning.GradientSolver else 3)
+
+
+def test_gradient_recorders():
+    recorders = [hooks.GradNormRecorder("none"), hooks.GradNormRecorder(per_step=True), hooks.ActionNormRecorder("sum")]
+    recorders[1].name = "steps"
+    solver = planning.GradientSolver(ToTarget(), n_steps=1, num_samples=1, callbacks=recorders)
+    history = configured(solver).solve(infos(), init_action=np.zeros((3, 3, 2), np.float32))["callbacks"]
+    # At zero actions, the gradient of |a - t|^2 is -2 t in each of the three steps.
+    lengths = 2 * TARGETS.norm(dim=1)
+    assert np.allclose(history["GradNormRecorder"][0][0], 3**0.5 * lengths)
+    assert np.allclose(history["steps"][0][0], [float(lengths.mean())] * 3)
+    assert history["ActionNormRecorder"] == [[0.0]]
+    params = torch.ones(2, 1, 3, 2, requires_grad=True)
+    assert hooks.GradNormRecorder()(params=params) is None
+    assert hooks.ActionNormRecorder("sum").compute(params=params) == pytest.approx(2 * 6**0.5)
+    with pytest.raises(ValueError, match="reduction"):
+        hooks.Callback("median")
+
+
+def test_callbacks_run_in_a_world():
+    class Distance:
+        def get_cost(self, info_dict, action_candidates):
+            return (action_candidates - 0.5).square().sum((2, 3))
+
+    recorder = hooks.BestCostRecorder()
+    solver = planning.CEMSolver(Distance(), num_samples=20, n_steps=3, topk=5, callbacks=[recorder])
+    world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(16, 16))
+    metrics = world.evaluate(
+        policy=swm.policy.WorldModelPolicy(solver, swm.PlanConfig(2, 2)), episodes=2, seed=0, floor=False, progress=False
+    )
+    assert len(metrics["seeds"]) == 2 and len(recorder.history) == 1 and len(recorder.history[0]) == 3
+
+
+def test_constructors_have_the_defaults_of_the_engine():
+    known = json.loads(_engine.solvers())
+    for solver in (
+        planning.CEMSolver,
+        planning.ICEMSolver,
+        planning.MPPISolver,
+        planning.PredictiveSamplingSolver,
+        planning.CategoricalCEMSolver,
+        planning.GradientSolver,
+        planning.PGDSolver,
+        planning.LagrangianSolver,
+    ):
+        for name, value in solver(ToTarget()).settings.items():
+            assert value == pytest.approx(known[solver.id][name]) if value is not None else known[solver.id][name] is None
+
+
+def test_solvers_have_the_properties_of_the_protocol():
+    solver = planning.CEMSolver(ToTarget(), 2, 64, var_scale=0.5)
+    assert not isinstance(solver, planning.Solver) or solver.n_envs == 0
+    configured(solver)
+    assert isinstance(solver, planning.Solver) and (solver.n_envs, solver.horizon, solver.action_dim) == (3, 3, 2)
+    assert (solver.num_samples, solver.batch_size, solver.var_scale, solver.dtype) == (64, 2, 0.5, torch.float32)
+    mean, spread = solver.init_action_distrib(3, torch.ones(3, 1, 2))
+    assert mean[:, 0].eq(1).all() and mean[:, 1:].eq(0).all() and spread.eq(0.5).all() and spread.shape == (3, 3, 2)
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = solver.nothing
+    discrete = configured(planning.CategoricalCEMSolver(ToTarget()), space=gymnasium.spaces.MultiDiscrete([[2, 4]] * 3))
+    assert discrete.action_simplex_dim == 6 and discrete.init_probs(2)[1, 0].tolist() == [0.5, 0.5, *[0.25] * 4]
+    assert swm.solver.callbacks is hooks and swm.solver.CEMSolver is planning.CEMSolver
+
+
+def test_initial_actions_are_extended_by_zeros_or_by_the_policy_of_the_model():
+    class Acts:
+        def get_action(self, info, horizon=1, prefix_actions=None):
+            count = 0 if prefix_actions is None else prefix_actions.shape[1]
+            return torch.full((2, horizon, 3), float(count))
+
+    given = torch.full((2, 1, 3), 9.0)
+    assert prepare_init_action(None, {}, given, 3, 2, 3)[0, :, 0].tolist() == [9, 0, 0]
+    assert prepare_init_action(Acts(), {}, given, 3, 2, 3)[0, :, 0].tolist() == [9, 1, 1]
+    assert prepare_init_action(Acts(), {}, None, 3, 2, 3)[0, :, 0].tolist() == [0, 0, 0]
+    assert prepare_init_action(None, {}, given, 1, 2, 3) is given
+    with pytest.raises(ValueError, match=r"\(2, 1, 3\)"):
+        prepare_init_action(None, {}, given, 3, 2, 4)

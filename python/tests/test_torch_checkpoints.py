@@ -1,0 +1,165 @@
+"""Tests that checkpoints of the engine and of the published package load as torch modules, as data only."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import stable_worldmodel as swm
+
+torch = pytest.importorskip("torch")
+torch.set_num_threads(1)
+
+from stable_worldmodel.wm import _weights, probes  # noqa: E402
+from stable_worldmodel.wm.utils import load_pretrained, save_pretrained  # noqa: E402
+
+GOLDEN = Path(__file__).parents[2] / "crates/swm-models/tests/golden"
+
+
+@pytest.mark.parametrize("family", ["lewm", "pldm"])
+def test_published_checkpoints_compute_the_recorded_outputs(family):
+    model = load_pretrained(GOLDEN / "reference" / family).eval()
+    recorded = _weights.read_safetensors(GOLDEN / f"reference-{family}.safetensors")
+    assert type(model).__name__ == {"lewm": "LeWM", "pldm": "PLDM"}[family]
+    with torch.no_grad():
+        info = model.encode({"pixels": recorded["i.pixels"], "action": recorded["i.action"]})
+        predicted = model.predict(info["emb"], info["act_emb"])
+    for actual, expected in ((info["emb"], recorded["o.emb"]), (predicted, recorded["o.pred"])):
+        assert (actual - expected).abs().max() < 1e-5 * expected.abs().max()
+
+
+@pytest.mark.parametrize("family", ["lewm", "pldm"])
+def test_engine_checkpoints_equal_their_torch_modules(family, tmp_path):
+    world = swm.World("swm/TwoRoom-v1", num_envs=3, image_shape=(64, 64), max_episode_steps=25)
+    world.collect(tmp_path / "rooms.lance", episodes=8, seed=0, progress=False, policy=swm.policy.RandomPolicy(seed=0))
+    settings = {"preset": "tiny", "data__batch_size": 8, "schedule__steps": 6, "schedule__warmup": 1, "shards": 1}
+    swm.wm.train(family, data=str(tmp_path / "rooms.lance"), out=str(tmp_path / "run"), **settings)
+    engine, module = swm.wm.load(str(tmp_path / "run")), load_pretrained(tmp_path / "run")
+    assert module.action_block == engine.action_block and not module.training
+    world.reset(seed=9)
+    infos = {key: world.infos[key].copy() for key in ("pixels", "goal", "state")}
+    size = len(engine.card["action_mean"]) * engine.action_block
+    candidates = np.random.default_rng(0).normal(size=(3, 6, 4, size)).astype(np.float32)
+    expected = engine.get_cost(infos, candidates)
+    with torch.inference_mode():
+        spread = {key: torch.from_numpy(value)[:, None].expand(-1, 6, *value.shape[1:]) for key, value in infos.items()}
+        found = module.get_cost(spread, torch.from_numpy(candidates)).numpy()
+    assert np.abs(found - expected).max() < 1e-5 * expected.max() and expected.std(1).min() > 1e-4 * expected.mean()
+
+
+def lewm_config():
+    module = "stable_worldmodel.wm.lewm.module"
+    norm = {"_target_": "torch.nn.BatchNorm1d", "_partial_": True}
+    project = {"_target_": f"{module}.MLP", "input_dim": 6, "hidden_dim": 8, "output_dim": 6, "norm_fn": norm}
+    sizes = {"num_frames": 3, "depth": 1, "heads": 2, "mlp_dim": 8, "input_dim": 6, "hidden_dim": 8, "output_dim": 6}
+    return {
+        "_target_": "stable_worldmodel.wm.LeWM",
+        "encoder": {"_target_": "torch.nn.Flatten"},
+        "predictor": {"_target_": f"{module}.Predictor", **sizes},
+        "action_encoder": {"_target_": f"{module}.Embedder", "input_dim": 2, "smoothed_dim": 2, "emb_dim": 6},
+        "projector": project,
+        "pred_proj": project,
+    }
+
+
+def test_models_are_saved_and_loaded(home):
+    from stable_worldmodel.wm._build import build
+
+    model = build(lewm_config())
+    save_pretrained(model, "mine", {"model": lewm_config(), "other": 1}, "model")
+    assert (home / "checkpoints/mine/weights.pt").is_file()
+    again = load_pretrained("mine")
+    assert all(torch.equal(value, again.state_dict()[name]) for name, value in model.state_dict().items())
+    assert load_pretrained("mine/weights.pt").predictor.num_frames == 3
+    found = swm.policy.AutoCostModel("mine")
+    assert isinstance(found, swm.wm.LeWM) and not found.training
+    assert isinstance(swm.policy.AutoCostModel("mine", cache_dir=home), swm.wm.LeWM)
+    with pytest.raises(FileNotFoundError, match="other"):
+        swm.policy.AutoCostModel("other")
+    with pytest.raises(RuntimeError, match="missing|size"):
+        load_pretrained("mine", extra_args={"predictor.depth": 2})
+    with pytest.warns(UserWarning, match="without a config"):
+        save_pretrained(model, "bare")
+    with pytest.raises(FileNotFoundError, match="config.json"):
+        load_pretrained("bare")
+    save_pretrained(model, "mine", lewm_config(), filename="second.pt")
+    with pytest.raises(ValueError, match="second.pt"):
+        load_pretrained("mine")
+    with pytest.raises(FileNotFoundError, match="nothing"):
+        load_pretrained("nothing")
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "os.system",
+        "builtins.eval",
+        "subprocess.run",
+        "torch.load",
+        "torch.nn.functional.relu",
+        "stable_worldmodel.wm.engine.train",
+        "stable_worldmodel.wm.utils.save_pretrained",
+        "stable_worldmodel.wm.engine.os.system",
+        "stable_worldmodel.wm._build.build",
+        "stable_worldmodel.wm.nothing.There",
+    ],
+)
+def test_targets_that_run_code_are_refused(home, target):
+    folder = home / "checkpoints/evil"
+    folder.mkdir(parents=True)
+    torch.save({}, folder / "weights.pt")
+    (folder / "config.json").write_text(json.dumps({**lewm_config(), "encoder": {"_target_": target}}))
+    with pytest.raises(ValueError, match="_target_"):
+        load_pretrained("evil")
+
+
+def test_pickled_code_of_weights_does_not_run(home, tmp_path):
+    class Evil:
+        def __reduce__(self):
+            return (Path.touch, (tmp_path / "ran",))
+
+    folder = home / "checkpoints/evil"
+    folder.mkdir(parents=True)
+    torch.save({"encoder.weight": Evil()}, folder / "weights.pt")
+    (folder / "config.json").write_text(json.dumps(lewm_config()))
+    with pytest.raises(Exception, match="weights_only|Weights only"):
+        load_pretrained("evil")
+    with pytest.raises(Exception, match="weights_only|Weights only"):
+        probes.load_probe(torch.nn.Linear(1, 1), "x", folder / "weights.pt")
+    assert not (tmp_path / "ran").exists()
+
+
+def test_probes_are_kept_with_the_model(tmp_path):
+    model, probe = torch.nn.Linear(2, 2), torch.nn.Linear(2, 1)
+    assert probes.get_probe(model, "angle") is None
+    probes.attach_probe(model, "angle", probe)
+    assert probes.get_probe(model, "angle") is probe and any("angle" in name for name in model.state_dict())
+    torch.save(torch.nn.Linear(2, 1).state_dict(), tmp_path / "probe.pt")
+    before = probe.weight.clone()
+    probes.load_probe(model, "angle", tmp_path / "probe.pt")
+    assert not torch.equal(before, probe.weight)
+    with pytest.raises(ValueError, match="no probe 'speed'"):
+        probes.load_probe(model, "speed", tmp_path / "probe.pt")
+    with pytest.raises(TypeError, match="Module"):
+        probes.attach_probe(model, "angle", lambda x: x)
+
+
+def test_a_subclass_is_planned_with():
+    from stable_worldmodel.wm._build import build
+
+    class NearStart(swm.wm.LeWM):
+        def criterion(self, info_dict, action_candidates=None):
+            return action_candidates.square().sum((2, 3)) if action_candidates is not None else super().criterion(info_dict)
+
+    torch.manual_seed(0)
+    config = lewm_config()
+    parts = {name: build(part) for name, part in config.items() if name != "_target_"}
+    parts["encoder"] = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d((1, 2)), torch.nn.Flatten())
+    parts["encoder"].takes_frames = True
+    solver = swm.planning.CEMSolver(NearStart(**parts).eval(), num_samples=64, n_steps=12, topk=8)
+    world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(16, 16), max_episode_steps=4)
+    world.set_policy(swm.policy.WorldModelPolicy(solver, swm.PlanConfig(3, 1)))
+    world.reset(seed=0)
+    world.step()
+    assert np.abs(world.infos["action"]).max() < 0.1

@@ -10,6 +10,7 @@
 //! - [`env`](mod@env), [`frames`]: a single environment, and visual wrappers, for Gymnasium; videos.
 //! - [`listing`]: the engine's registries, and the command line.
 //! - [`study`]: the results of studies.
+//! - [`training`]: training outside the engine.
 
 mod arrays;
 mod cost;
@@ -23,6 +24,7 @@ mod model;
 mod policy;
 mod solver;
 mod study;
+mod training;
 mod world;
 
 use pyo3::prelude::*;
@@ -56,6 +58,8 @@ mod _engine {
     use super::solver::solve;
     #[pymodule_export]
     use super::study::{studies, study_export, study_results};
+    #[pymodule_export]
+    use super::training::{begin_training, save_checkpoint};
     #[pymodule_export]
     use super::world::World;
 

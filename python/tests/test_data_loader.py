@@ -53,6 +53,55 @@ def test_epoch_has_every_clip_once_in_random_order(stored):
     assert len(list(loader(path, drop_last=True))) == 6
 
 
+@pytest.mark.parametrize("world_size", [1, 2, 3, 4, 9])
+def test_slices_of_all_ranks_are_the_batches(stored, world_size):
+    path, _ = stored
+    goals = data.Goals(columns=["reward"], future=1.0, random=0.0, geometric=0.0, current=0.0)
+    settings = {"seed": 3, "batch_size": 23, "goals": goals}
+    whole = list(loader(path, **settings))
+    ranks = [loader(path, rank=rank, world_size=world_size, **settings) for rank in range(world_size)]
+    assert {len(rank) for rank in ranks} == {len(whole)} and {rank.num_clips for rank in ranks} == {47}
+    for batch, *slices in zip(whole, *ranks, strict=True):
+        for name, column in batch.items():
+            np.testing.assert_array_equal(np.concatenate([part[name] for part in slices]), column, err_msg=name)
+        sizes = [len(part["action"]) for part in slices]
+        assert max(sizes) - min(sizes) <= 1
+    # The last batch has one clip.
+    assert sizes == [1] + [0] * (world_size - 1)
+
+
+def test_an_empty_slice_is_transformed(stored):
+    path, _ = stored
+    seen = []
+
+    def transform(batch):
+        seen.append(batch["action"].shape)
+        return batch
+
+    ranks = loader(path, batch_size=50, rank=1, world_size=2, transform=transform)
+    assert [batch["action"].shape for batch in ranks] == [(25, 3, 4), (0, 3, 4)]
+    assert seen == [(25, 6, 2), (0, 6, 2)]
+    with pytest.raises(ValueError, match="rank 2 of 2"):
+        loader(path, rank=2, world_size=2)
+    with pytest.raises(ValueError, match="negative"):
+        loader(path, rank=-1)
+
+
+def test_tensors_are_on_the_device(stored):
+    torch = pytest.importorskip("torch")
+    path, _ = stored
+    for batch in loader(path, backend="torch", device="cpu", pin_memory=True):
+        assert all(value.device.type == "cpu" and isinstance(value, torch.Tensor) for value in batch.values())
+    if torch.cuda.is_available():
+        assert all(value.is_pinned() for batch in loader(path, backend="torch", pin_memory=True) for value in batch.values())
+        on_gpu = loader(path, backend="torch", device="cuda", pin_memory=True, shuffle=False)
+        for found, expected in zip(on_gpu, loader(path, shuffle=False), strict=True):
+            assert all(value.is_cuda for value in found.values())
+            same({name: value.cpu() for name, value in found.items()}, expected)
+    with pytest.raises(ValueError, match="backend='torch'"):
+        loader(path, device="cpu")
+
+
 def test_saved_position_continues_with_the_same_batches(stored):
     path, _ = stored
     complete = loader(path, seed=5)

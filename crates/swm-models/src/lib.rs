@@ -6,7 +6,7 @@
 //! - [`online`]: training by acting in environments; [`feed_forward`]: policies without planning.
 //! - [`probe`]: regression of the environment state from frozen latents.
 //! - [`checkpoint`]: trained models on disk; [`run_folder`]: the files of a training run; [`capsule`]: a trained model in
-//!   one file; [`stored`]: both as the parts of a checkpoint.
+//!   one file; [`stored`]: both as the parts of a checkpoint; [`store`]: checkpoints that another program trained.
 //! - [`weights`]: pretrained weights, and weight files for PyTorch.
 //!
 //! Building blocks: [`nn`], with PyTorch's parameter names; [`pixels`], the normalisation of images; [`device`].
@@ -36,6 +36,7 @@ pub mod probe;
 pub mod registry;
 pub mod run_folder;
 pub mod sac;
+pub mod store;
 pub mod stored;
 pub mod tdmpc2;
 mod tensor_file;

@@ -69,6 +69,12 @@ impl StoredCheckpoint {
         }
     }
 
+    /// Returns a checkpoint of these parts; `run` names it in errors. `file` is the content of `config.json`.
+    pub(crate) fn of_parts(run: &Path, file: Value, manifest: Manifest, weights: Named<HostTensor>) -> Self {
+        let weights = Weights::Loaded(weights);
+        Self { run: run.to_owned(), path: run.join(CONFIG), file, manifest, config_hash: None, weights }
+    }
+
     /// Returns this checkpoint with another manifest and other weights.
     pub(crate) fn with(&self, manifest: Manifest, weights: Named<HostTensor>) -> Self {
         Self { manifest, weights: Weights::Loaded(weights), ..self.clone() }

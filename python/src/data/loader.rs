@@ -11,7 +11,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::Duration;
 use swm::core::{Error, Result};
-use swm::data::{CacheConfig, ClipSpec, GoalSpec, LoaderConfig};
+use swm::data::{BatchSlice, CacheConfig, ClipSpec, GoalSpec, LoaderConfig};
 
 /// The settings of a loader, from JSON.
 #[derive(Deserialize)]
@@ -24,6 +24,9 @@ struct Options {
     shuffle: bool,
     seed: u64,
     drop_last: bool,
+    /// The rank of this process, and the number of processes.
+    rank: usize,
+    ranks: usize,
     threads: usize,
     prefetch: usize,
     prefetch_bytes: usize,
@@ -53,6 +56,7 @@ impl Options {
             prefetch_bytes: self.prefetch_bytes,
             episodes: self.episodes,
             drop_last: self.drop_last,
+            slice: BatchSlice { rank: self.rank, ranks: self.ranks },
             cache,
         }
     }

@@ -41,6 +41,13 @@ def backend(given: str | None) -> Backend:
     return cast(Backend, given)
 
 
+def has_gpu() -> bool:
+    """Whether torch has a GPU, for page-locked memory."""
+    import torch
+
+    return torch.cuda.is_available()
+
+
 def wrap(array: Array, kind: Backend) -> Any:
     """The array, or a tensor that shares its memory."""
     if kind == "numpy":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -101,6 +102,11 @@ class Loader:
         transform: Called with the dict of every batch, in which `action` is `(batch, num_steps * frameskip, action_dim)`, as
             in a dataset's `transform`.
         device: The device to which tensors are moved; the CPU for `None`.
+        pin_memory: Whether tensors are in page-locked memory, from which a GPU copies without waiting; with `device`, before
+            they are moved. Without a GPU it has no effect.
+        rank, world_size: The index of this process among those of a distributed training. Every process gets a slice of each
+            batch, and all slices together are the batch: `batch_size`, the number of batches and their order do not depend
+            on `world_size`. The sizes of slices differ by at most 1; those of a short last batch may be empty.
         threads: The number of prefetch threads, which decode on the engine's threads; 0 loads batches on demand.
         prefetch: The maximum number of prefetched batches.
         prefetch_bytes: The maximum size of prefetched batches.
@@ -126,6 +132,9 @@ class Loader:
         goals: Goals | Sequence[Goals] | None = None,
         transform: Transform | None = None,
         device: Any = None,
+        pin_memory: bool = False,
+        rank: int = 0,
+        world_size: int = 1,
         threads: int = 2,
         prefetch: int = 4,
         prefetch_bytes: int | str = "512MiB",
@@ -143,6 +152,7 @@ class Loader:
         if device is not None and self.backend == "numpy":
             raise ValueError("device: numpy arrays stay on the CPU; use backend='torch'")
         self.device = device
+        self.pin_memory = bool(pin_memory) and self.backend == "torch" and _tensors.has_gpu()
         self.transform = transform if transform is not None else getattr(dataset, "transform", None)
         self.batch_size = int(batch_size)
         self.seed = int(seed)
@@ -169,6 +179,8 @@ class Loader:
             "shuffle": bool(shuffle),
             "seed": self.seed,
             "drop_last": bool(drop_last),
+            "rank": int(rank),
+            "ranks": int(world_size),
             "threads": int(threads),
             "prefetch": int(prefetch),
             "prefetch_bytes": bytes_of(prefetch_bytes),
@@ -194,12 +206,12 @@ class Loader:
         self._at = (0, 0)
 
     def __len__(self) -> int:
-        """The number of batches in an epoch."""
+        """The number of batches in an epoch, on every rank."""
         return int(self._loader.batches())
 
     @property
     def num_clips(self) -> int:
-        """The number of clips in an epoch."""
+        """The number of clips in an epoch, of all ranks together."""
         return int(self._loader.clips())
 
     @property
@@ -250,6 +262,7 @@ class Loader:
             if shape == (1,) and array.ndim == 2:
                 array = array[..., np.newaxis]
             value = _tensors.wrap(_tensors.channels_first(array, shape), self.backend)
+            value = value.pin_memory() if self.pin_memory else value
             batch[name] = value if self.device is None else value.to(self.device, non_blocking=True)
         if self.transform is None:
             return batch
@@ -258,7 +271,8 @@ class Loader:
             batch["action"] = batch["action"].reshape(size, self.num_steps * self.frameskip, *self._action)
         batch = self.transform(batch)
         if "action" in batch:
-            batch["action"] = batch["action"].reshape(len(batch["action"]), self.num_steps, -1)
+            shape = batch["action"].shape
+            batch["action"] = batch["action"].reshape(shape[0], self.num_steps, math.prod(shape[1:]) // self.num_steps)
         return batch
 
     def __repr__(self) -> str:

@@ -21,7 +21,7 @@ mod writer;
 pub use cache::CacheConfig;
 pub use clips::{ClipSpec, Clips};
 pub use goals::{GoalMixture, GoalSpec};
-pub use loader::{Epoch, LoadedBatch, Loader, LoaderConfig};
+pub use loader::{BatchSlice, Epoch, LoadedBatch, Loader, LoaderConfig};
 pub use location::Location;
 pub use reader::{Constants, Episode, Irregularity, Reader, StepRange};
 pub use replay::{ReplayBuffer, ReplayConfig, ReplayLoader};

@@ -4,7 +4,7 @@ use crate::sample::{rows, write};
 use std::path::PathBuf;
 use std::sync::Arc;
 use swm_core::{Batch, DType};
-use swm_data::{CacheConfig, ClipSpec, LoadedBatch, Loader, LoaderConfig, Reader, WriteMode, open};
+use swm_data::{BatchSlice, CacheConfig, ClipSpec, LoadedBatch, Loader, LoaderConfig, Reader, WriteMode, open};
 
 const EPISODES: usize = 9;
 
@@ -117,6 +117,36 @@ fn batch_order_depends_only_on_seed_and_epoch() {
     assert_ne!(clips(&load(&reader, LoaderConfig { seed: 12, ..config(3, 1) }, 5, 0)), clips(&base));
     let plain = clips(&load(&reader, LoaderConfig { shuffle: false, ..config(3, 1) }, 5, 0));
     assert!(plain.is_sorted());
+}
+
+#[test]
+fn slices_of_all_ranks_are_the_batch() {
+    let (_folder, path) = dataset(2);
+    let reader = open(&path).expect("opening the dataset");
+    let all = Loader::new(Arc::clone(&reader), config(3, 1)).expect("creating the loader").clips();
+    // The last batch has one or two clips, so that some ranks get nothing of it.
+    let batch_size = (all - 1) / 2;
+    let whole = load(&reader, LoaderConfig { batch_size, ..config(3, 1) }, 2, 0);
+    assert!(whole.last().expect("a batch").rows() < 3, "the last batch is full");
+    for ranks in 1..=9 {
+        let slices: Vec<Vec<Batch>> = (0..ranks)
+            .map(|rank| {
+                let slice = BatchSlice { rank, ranks };
+                load(&reader, LoaderConfig { batch_size, slice, ..config(3, 1) }, 2, 0)
+            })
+            .collect();
+        for (index, batch) in whole.iter().enumerate() {
+            for column in 0..batch.schema().columns().len() {
+                let joined: Vec<u8> = slices.iter().flat_map(|slice| slice[index].bytes(column).to_vec()).collect();
+                assert!(joined == batch.bytes(column), "{ranks} ranks, batch {index}, column {column}");
+            }
+            let sizes: Vec<usize> = slices.iter().map(|slice| slice[index].rows()).collect();
+            assert!(sizes.iter().max() <= sizes.iter().min().map(|size| size + 1).as_ref(), "{sizes:?}");
+        }
+    }
+    let outside = LoaderConfig { slice: BatchSlice { rank: 2, ranks: 2 }, ..config(3, 1) };
+    let error = Loader::new(reader, outside).map(|_| ()).expect_err("a rank out of range is accepted").to_string();
+    assert!(error.contains("rank 2 of 2"), "{error}");
 }
 
 #[test]

@@ -2,10 +2,13 @@
 
 use super::contract::{ModelFamily, OnlineRun, TrainRun};
 use crate::online::OnlineSummary;
-use crate::train::{TrainConfig, TrainSummary, train};
+use crate::train::{TrainConfig, TrainOptions, TrainSummary, TrainingPlan, begin, train};
 use serde_json::{Value, json};
+use std::path::Path;
+use std::sync::Arc;
 use swm_core::Result;
 use swm_core::run::Control;
+use swm_data::Reader;
 
 /// A complete training configuration of any family.
 pub trait TrainableConfig {
@@ -35,6 +38,13 @@ pub trait TrainableConfig {
     /// # Errors
     /// As [`crate::train`].
     fn train(&self, run: TrainRun<'_>, control: &mut Control<'_>) -> Result<TrainSummary>;
+
+    /// Writes the checkpoint from which a training loop outside this program begins, or checks the one from which it
+    /// continues; `None` for a family that has no such checkpoint.
+    ///
+    /// # Errors
+    /// As [`crate::train::begin`].
+    fn begin(&self, reader: Arc<dyn Reader>, out: &Path, options: &TrainOptions) -> Option<Result<TrainingPlan>>;
 }
 
 impl<M: ModelFamily> TrainableConfig for TrainConfig<M> {
@@ -60,5 +70,9 @@ impl<M: ModelFamily> TrainableConfig for TrainConfig<M> {
 
     fn train(&self, run: TrainRun<'_>, control: &mut Control<'_>) -> Result<TrainSummary> {
         train(self, run.reader, run.out, &run.options, control)
+    }
+
+    fn begin(&self, reader: Arc<dyn Reader>, out: &Path, options: &TrainOptions) -> Option<Result<TrainingPlan>> {
+        Some(begin(self, reader, out, options))
     }
 }

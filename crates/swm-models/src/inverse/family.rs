@@ -8,10 +8,13 @@ use crate::family::{CheckpointInfo, FamilyEntry, LoadedModel, OnlineRun, TrainRu
 use crate::lewm::Lewm;
 use crate::online::OnlineSummary;
 use crate::probe::ImageEncoder;
-use crate::train::{Preset, TrainSummary, Trainable as _};
+use crate::train::{Preset, TrainOptions, TrainSummary, Trainable as _, TrainingPlan};
 use serde_json::{Value, json};
+use std::path::Path;
+use std::sync::Arc;
 use swm_core::run::Control;
 use swm_core::{EnvSpec, Error, Policy, Result};
+use swm_data::Reader;
 
 /// The registry row of inverse dynamics.
 pub const ENTRY: FamilyEntry = FamilyEntry {
@@ -67,6 +70,10 @@ impl TrainableConfig for InverseConfig {
         }
         let world_model = Checkpoint::<Lewm>::load(encoder, &run.options.device)?;
         train(self, &world_model, run.reader, run.out, run.options.threads, control)
+    }
+
+    fn begin(&self, _: Arc<dyn Reader>, _: &Path, _: &TrainOptions) -> Option<Result<TrainingPlan>> {
+        None
     }
 }
 

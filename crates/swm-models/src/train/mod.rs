@@ -32,7 +32,7 @@ pub use dataset_info::{ColumnInfo, DatasetInfo};
 pub use optim::{AdamW, OptimConfig, ParameterGroup};
 pub use options::{TrainOptions, TrainSummary};
 pub use presets::Preset;
-pub use run::train;
+pub use run::{TrainingPlan, begin, train};
 pub use schedule::ScheduleConfig;
 pub(crate) use split::episodes;
 pub use step_output::StepOutput;

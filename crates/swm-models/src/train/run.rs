@@ -6,17 +6,21 @@ use super::failed_batch;
 use super::learner::{self, DynLearner, Learner, Update};
 use super::log::Log;
 use super::metrics::{MetricWindow, Metrics};
+use super::optim::ParameterGroup;
 use super::options::{TrainOptions, TrainSummary};
+use super::resume;
 use super::run_state::is_due;
 use super::split::episodes;
 use super::step_output::StepOutput;
 use super::trainable::Trainable;
+use crate::checkpoint::Checkpoint;
+use crate::nn::parameters;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 use swm_core::files::Lock;
 use swm_core::run::{Control, Event, Progress, Stage};
-use swm_core::{Batch, Error, Key, Result};
+use swm_core::{Batch, Error, Key, Manifest, Result};
 use swm_data::{Epoch, Loader, LoaderConfig, Part, Reader};
 
 /// The name of the stage in the events of a training run.
@@ -42,20 +46,97 @@ pub fn train<M: Trainable>(
 ) -> Result<TrainSummary> {
     let threads = swm_core::pool::threads(options.threads)?;
     threads.install(|| {
-        config.check()?;
-        let loader_config = M::loader_config(config, reader.schema())?;
-        let goals = loader_config.goals.iter().flat_map(|goal| &goal.columns);
-        let columns: Vec<String> = loader_config.clip.columns.iter().chain(goals).cloned().collect();
-        let dataset_info = DatasetInfo::from_reader(&*reader, &columns, M::BOUNDED_ACTIONS)?;
-        let manifest = learner::manifest(config, reader.content_hash()?, &options.device);
+        let inputs = Inputs::of(config, &*reader, options)?;
         let _lock = Lock::folder(out)?;
-        let mut learner = match Learner::resume(config, &dataset_info, &manifest, out, options)? {
+        let (mut learner, loader) = inputs.learner(config, out, options)?;
+        let run = Run::new(config.loop_config(), loader, &reader, out, options, &mut learner)?;
+        run.run_steps(M::FAMILY, control)
+    })
+}
+
+/// Writes the checkpoint from which a run on a dataset begins, with the initial weights, for a training loop outside this
+/// program; or, to continue a run, checks its checkpoint. Returns what the loop needs besides the checkpoint.
+///
+/// # Errors
+/// As [`train`], before the first step.
+pub fn begin<M: Trainable>(
+    config: &TrainConfig<M>,
+    reader: Arc<dyn Reader>,
+    out: &Path,
+    options: &TrainOptions,
+) -> Result<TrainingPlan> {
+    let inputs = Inputs::of(config, &*reader, options)?;
+    let _lock = Lock::folder(out)?;
+    let (learner, loader) = inputs.learner(config, out, options)?;
+    if !Checkpoint::<M>::exists(out) {
+        resume::check_new_run(out)?;
+        learner.save(out)?;
+    }
+    let settings = config.loop_config();
+    let part = |part| batches(&settings, loader.clone(), part, &*reader);
+    let names = parameters::shapes(learner.model()).into_keys();
+    Ok(TrainingPlan {
+        parameters: names.map(|name| (name.clone(), M::parameter_group(&name))).collect(),
+        training: part(Part::Train)?,
+        validation: if settings.validation.every > 0 { Some(part(Part::Validation)?) } else { None },
+    })
+}
+
+/// What a training loop outside this program needs besides the checkpoint from which a run begins.
+pub struct TrainingPlan {
+    /// The names of all weights, including running statistics, with their groups.
+    pub parameters: Vec<(String, ParameterGroup)>,
+    /// The batches to train on.
+    pub training: LoaderConfig,
+    /// The batches of validation; `None` without validation.
+    pub validation: Option<LoaderConfig>,
+}
+
+/// The inputs of a run, which are checked.
+struct Inputs {
+    loader: LoaderConfig,
+    dataset_info: DatasetInfo,
+    manifest: Manifest,
+}
+
+impl Inputs {
+    fn of<M: Trainable>(config: &TrainConfig<M>, reader: &dyn Reader, options: &TrainOptions) -> Result<Self> {
+        config.check()?;
+        let loader = M::loader_config(config, reader.schema())?;
+        let goals = loader.goals.iter().flat_map(|goal| &goal.columns);
+        let columns: Vec<String> = loader.clip.columns.iter().chain(goals).cloned().collect();
+        let dataset_info = DatasetInfo::from_reader(reader, &columns, M::BOUNDED_ACTIONS)?;
+        let manifest = learner::manifest(config, reader.content_hash()?, &options.device);
+        Ok(Self { loader, dataset_info, manifest })
+    }
+
+    /// Continues the run in `out`, or creates the model of a new run.
+    fn learner<'a, M: Trainable>(
+        self,
+        config: &'a TrainConfig<M>,
+        out: &Path,
+        options: &'a TrainOptions,
+    ) -> Result<(Learner<'a, M>, LoaderConfig)> {
+        let Self { loader, dataset_info, manifest } = self;
+        let learner = match Learner::resume(config, &dataset_info, &manifest, out, options)? {
             Some(learner) => learner,
             None => Learner::start(config, dataset_info, manifest, &options.device)?
                 .with_pretrained_weights(&options.cache)?,
         };
-        let run = Run::new(config.loop_config(), loader_config, &reader, out, options, &mut learner)?;
-        run.run_steps(M::FAMILY, control)
+        Ok((learner, loader))
+    }
+}
+
+/// Returns the batches of a part of the dataset.
+fn batches(config: &LoopConfig, loader: LoaderConfig, part: Part, reader: &dyn Reader) -> Result<LoaderConfig> {
+    Ok(LoaderConfig {
+        batch_size: config.data.batch_size,
+        // Validation clips are shuffled, because the first batches in stored order come from one or two episodes.
+        shuffle: true,
+        seed: config.seed,
+        drop_last: true,
+        episodes: episodes(config.data.hold_out, part, reader)?,
+        ..loader
     })
 }
 
@@ -98,18 +179,8 @@ impl<'a> Run<'a> {
         learner: &'a mut dyn DynLearner,
     ) -> Result<Self> {
         let loader = |part| {
-            let config = LoaderConfig {
-                batch_size: config.data.batch_size,
-                // Validation clips are shuffled, because the first batches in stored order come from one or two
-                // episodes.
-                shuffle: true,
-                seed: config.seed,
-                threads: options.loader_threads,
-                prefetch: options.prefetch,
-                drop_last: true,
-                episodes: episodes(config.data.hold_out, part, &**reader)?,
-                ..loader_config.clone()
-            };
+            let config = batches(&config, loader_config.clone(), part, &**reader)?;
+            let config = LoaderConfig { threads: options.loader_threads, prefetch: options.prefetch, ..config };
             Loader::new(Arc::clone(reader), config)
         };
         let validation = match config.validation.every {

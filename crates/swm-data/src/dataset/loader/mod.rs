@@ -20,6 +20,7 @@ use crate::dataset::goals::{GoalSpec, Goals};
 use crate::dataset::reader::Reader;
 use crate::dataset::sync::lock;
 use rand::Rng as _;
+use std::ops::Range;
 use std::sync::{Arc, Mutex};
 use swm_core::{Error, Key, Result, Schema, limits};
 
@@ -47,6 +48,8 @@ pub struct LoaderConfig {
     pub episodes: Option<Vec<usize>>,
     /// Whether an incomplete last batch is dropped.
     pub drop_last: bool,
+    /// The slice of every batch that is loaded.
+    pub slice: BatchSlice,
     /// Cache of decoded rows, so that later epochs need not decode them again.
     pub cache: CacheConfig,
 }
@@ -64,8 +67,42 @@ impl Default for LoaderConfig {
             prefetch_bytes: 512 << 20,
             episodes: None,
             drop_last: false,
+            slice: BatchSlice::default(),
             cache: CacheConfig::Memory { bytes: 512 << 20 },
         }
+    }
+}
+
+/// The slice of every batch that one process of a distributed training loads. The slices of all ranks, one after another,
+/// are the batch; their sizes differ by at most 1, so the slices of a short batch may be empty.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BatchSlice {
+    /// The index of the process, below `ranks`.
+    pub rank: usize,
+    /// The number of processes.
+    pub ranks: usize,
+}
+
+impl Default for BatchSlice {
+    fn default() -> Self {
+        Self { rank: 0, ranks: 1 }
+    }
+}
+
+impl BatchSlice {
+    /// Returns the positions of the slice in a batch of `clips` clips.
+    fn range(self, clips: usize) -> Range<usize> {
+        let (size, larger) = (clips / self.ranks, clips % self.ranks);
+        let start = self.rank * size + self.rank.min(larger);
+        start..start + size + usize::from(self.rank < larger)
+    }
+
+    fn check(self) -> Result<()> {
+        if self.rank < self.ranks {
+            return Ok(());
+        }
+        let given = format!("rank {} of {} processes", self.rank, self.ranks);
+        Err(Error::config("rank", given, "give a rank from 0 to one less than the number of processes"))
     }
 }
 
@@ -82,9 +119,10 @@ impl Loader {
     /// Creates a loader. Dropping the loader stops its threads.
     ///
     /// # Errors
-    /// If a column or an episode does not exist, no episode is long enough for a clip, a size in `config` is 0, a batch
-    /// is too large, a goal's probabilities are invalid, or the cache's folder cannot be used.
+    /// If a column or an episode does not exist, no episode is long enough for a clip, a size in `config` is 0, the rank is
+    /// out of range, a batch is too large, a goal's probabilities are invalid, or the cache's folder cannot be used.
     pub fn new(reader: Arc<dyn Reader>, config: LoaderConfig) -> Result<Self> {
+        config.slice.check()?;
         let filler = BatchFiller::new(reader.schema(), config.clip, config.goals)?;
         let positions = match config.episodes {
             Some(positions) => positions,
@@ -107,7 +145,8 @@ impl Loader {
         }
         let goals = Goals::new(reader.episodes(), &positions);
         let reader = config.cache.over(reader, &filler.columns())?;
-        let prefetch = window(filler.schema(), config.batch_size, config.prefetch, config.prefetch_bytes);
+        let loaded = config.batch_size.div_ceil(config.slice.ranks);
+        let prefetch = window(filler.schema(), loaded, config.prefetch, config.prefetch_bytes);
         limits::THREADS.check(config.threads)?;
         let workers = Workers::new(config.threads)?;
         let source = Source {
@@ -117,6 +156,7 @@ impl Loader {
             filler,
             key: Key::new(config.seed),
             batch_size: config.batch_size,
+            slice: config.slice,
             scratch: Mutex::default(),
             pool: BatchPool::new(prefetch + 2),
         };
@@ -190,6 +230,7 @@ struct Source {
     filler: BatchFiller,
     key: Key,
     batch_size: usize,
+    slice: BatchSlice,
     /// Reusable lists of rows.
     scratch: Mutex<Vec<BatchRows>>,
     pool: Arc<BatchPool>,
@@ -206,16 +247,27 @@ impl BatchSource for EpochSource {
     fn produce(&self, batch: usize) -> Result<LoadedBatch> {
         let source = &*self.source;
         let first = batch * source.batch_size;
-        let samples = first..(first + source.batch_size).min(source.clips.len());
+        let slice = source.slice.range(source.batch_size.min(source.clips.len() - first));
+        let samples = first + slice.start..first + slice.end;
         let mut rows = lock(&source.scratch).pop().unwrap_or_default();
         rows.clear();
         rows.extend(
             samples.clone().map(|i| source.clips.get(self.order.as_ref().map_or(i, |order| order[i] as usize))),
         );
         let mut out = source.pool.take(source.filler.schema());
+        if samples.is_empty() {
+            out.resize(0);
+            return Ok(out);
+        }
         // The goal of a sample depends on its position in the epoch, not on the batch size.
         let key = source.key.with("goals").at(self.epoch);
-        source.filler.fill(&*source.reader, &mut rows, &source.goals, |i| key.at((first + i) as u64), &mut out)?;
+        source.filler.fill(
+            &*source.reader,
+            &mut rows,
+            &source.goals,
+            |i| key.at((samples.start + i) as u64),
+            &mut out,
+        )?;
         lock(&source.scratch).push(rows);
         Ok(out)
     }

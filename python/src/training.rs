@@ -1,0 +1,99 @@
+//! Training outside the engine: the checkpoint from which a run begins, and the checkpoints that it saves.
+
+use crate::arrays;
+use crate::data::dataset::Dataset;
+use crate::data::process::detached;
+use crate::errors::{json, to_py_err};
+use numpy::{PyUntypedArray, PyUntypedArrayMethods as _};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use serde::Deserialize;
+use serde_json::{Value, json};
+use std::path::PathBuf;
+use swm::core::{Error, Manifest};
+use swm::data::LoaderConfig;
+use swm::models::nn::parameters::{HostTensor, Named};
+use swm::models::store::{Parts, StateParts, store};
+use swm::models::train::TrainingPlan;
+use swm::models::{FAMILIES, TrainOptions};
+
+/// Writes the checkpoint from which a run begins, or with `resume` checks the one from which it continues. Returns the
+/// rest of what the run needs, as JSON: `parameters` (clipping group and factor of the learning rate by name),
+/// and the loaders `training` and `validation`.
+#[pyfunction]
+pub fn begin_training(
+    py: Python<'_>,
+    family: &str,
+    preset: Option<&str>,
+    settings: Vec<String>,
+    dataset: &Dataset,
+    out: PathBuf,
+    resume: bool,
+) -> PyResult<String> {
+    let begun = detached(py, || {
+        let family = FAMILIES.get(family)?;
+        let config = (family.config)(preset.unwrap_or(family.presets[0].id), &settings)?;
+        let options = TrainOptions { resume, cache: swm::home::weights()?, ..TrainOptions::default() };
+        config.begin(dataset.reader()?, &out, &options).unwrap_or_else(|| {
+            let problem = "it is trained by the engine only";
+            Err(Error::config(family.id, problem, "train it with swm.wm.train, or `swm train`"))
+        })
+    });
+    let TrainingPlan { parameters, training, validation } = begun.map_err(to_py_err)?;
+    let groups: Named<[f64; 2]> =
+        parameters.into_iter().map(|(name, group)| (name, [group.clip as f64, group.lr])).collect();
+    let loader = |config: LoaderConfig| {
+        json!({
+            "num_steps": config.clip.num_steps,
+            "frameskip": config.clip.frameskip,
+            "columns": config.clip.columns,
+            "goals": config.goals,
+            "batch_size": config.batch_size,
+            "seed": config.seed,
+            "episodes": config.episodes,
+            "drop_last": config.drop_last,
+        })
+    };
+    let plan = json!({ "parameters": groups, "training": loader(training), "validation": validation.map(loader) });
+    Ok(plan.to_string())
+}
+
+/// The parts of a checkpoint that are no tensors.
+#[derive(Deserialize)]
+struct Texts {
+    /// The content of `config.json`.
+    file: Value,
+    manifest: Manifest,
+    /// The content of `state.json`; `None` for a checkpoint from which no training continues.
+    state: Option<Value>,
+}
+
+/// Writes a checkpoint to a run folder, and returns the hash of its weights. `raw` are the trained weights if `weights` are
+/// their moving average.
+#[pyfunction]
+pub fn save_checkpoint(
+    py: Python<'_>,
+    run: PathBuf,
+    texts: &str,
+    weights: &Bound<'_, PyDict>,
+    moments: &Bound<'_, PyDict>,
+    raw: Option<&Bound<'_, PyDict>>,
+    replace: bool,
+) -> PyResult<String> {
+    let Texts { file, manifest, state } = json("checkpoint", texts)?;
+    let (weights, moments) = (tensors(weights)?, tensors(moments)?);
+    let raw = raw.map(tensors).transpose()?;
+    let state = state.map(|state| StateParts { state, moments, raw });
+    py.detach(|| store(&run, Parts { file, manifest, weights, state }, replace)).map_err(to_py_err)
+}
+
+/// Copies `float32` arrays by name.
+fn tensors(arrays: &Bound<'_, PyDict>) -> PyResult<Named<HostTensor>> {
+    let tensor = |(name, array): (Bound<'_, PyAny>, Bound<'_, PyAny>)| {
+        let name: String = name.extract()?;
+        let shape = array.cast::<PyUntypedArray>()?.shape().to_vec();
+        let values = arrays::f32_values(&name, &array, &shape)?;
+        Ok((name, HostTensor { shape, values }))
+    };
+    arrays.iter().map(tensor).collect()
+}

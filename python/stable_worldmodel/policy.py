@@ -182,7 +182,8 @@ class FeedForwardPolicy(BasePolicy):
 
     Args:
         model: An object with `get_action(info)`, or a checkpoint's name or path.
-        process: Scalers by column; the scaler of `action` converts actions back (`inverse_transform`).
+        process: Scalers by column; the scaler of `action` converts actions back (`inverse_transform`). `None` for those of
+            the model (`model.process`), which torch modules of checkpoints have.
         transform: Transforms of frames by column, called with one frame `(C, H, W)` at a time.
     """
 
@@ -196,7 +197,7 @@ class FeedForwardPolicy(BasePolicy):
         **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
-        self.model, self.process, self.transform = model, dict(process or {}), dict(transform or {})
+        self.model, self.process, self.transform = model, _process(process, model), dict(transform or {})
         if hasattr(model, "eval") and not isinstance(model, str):
             model.eval()
 
@@ -237,7 +238,8 @@ class MPCPolicy(BasePolicy):
         config: The planning config; by default 5 model steps, all of them executed, with the model's `action_block` (1 if the
             model has none).
         process: Scalers by column, applied before the model (`transform`); the scaler of `action` converts planned actions
-            back (`inverse_transform`).
+            back (`inverse_transform`). `None` for those of the model (`model.process`), which torch modules of checkpoints
+            have.
         transform: Transforms by frame column (`pixels`, `goal`), called with one frame `(C, H, W)` at a time.
         history_keys: The columns of which a user-defined solver gets the last `history_len` model steps. The engine's solvers
             get past `pixels`.
@@ -267,7 +269,7 @@ class MPCPolicy(BasePolicy):
         elif hasattr(model, "_engine_model") and config.action_block != block:
             raise ValueError(f"PlanConfig.action_block: {config.action_block}; {model} was trained with {block}")
         self.cfg = self.config = config
-        self.process, self.transform = dict(process or {}), dict(transform or {})
+        self.process, self.transform = _process(process, model), dict(transform or {})
         #: The search traces, one dict for each plan, after `evaluate` and `collect`.
         self.plans: list[dict[str, Any]] = []
         self.history_keys = tuple(history_keys)
@@ -407,6 +409,12 @@ class MPCPolicy(BasePolicy):
 
 
 WorldModelPolicy = MPCPolicy
+
+
+def _process(given: Mapping[str, Any] | None, model: Any) -> dict[str, Any]:
+    """The given scalers, or those of the model."""
+    own = getattr(model, "process", None)
+    return dict(given if given is not None else own if isinstance(own, Mapping) else {})
 
 
 def _executed(step: np.ndarray, space: Any) -> np.ndarray:

@@ -97,6 +97,11 @@ class ShootingCostEvaluator(nn.Module):
         """Environment steps in one step of the model."""
         return int(getattr(self.model, "action_block", 1))
 
+    @property
+    def process(self) -> dict[str, Any]:
+        """The scalers of the model's columns, which policies use by default."""
+        return dict(getattr(self.model, "process", {}))
+
     def get_cost(self, info_dict: dict[str, Any], action_candidates: torch.Tensor) -> torch.Tensor:
         """The costs `(B, S)` of candidates `(B, S, H, A)`, for infos `(B, S, T, ..)`."""
         return self.criterion(self._predicted(info_dict, action_candidates), action_candidates)

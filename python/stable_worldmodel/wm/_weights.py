@@ -13,7 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-__all__ = ["load_into", "read_safetensors", "read_state_dict"]
+from .pretrained import stored_names
+
+__all__ = ["load_into", "read_capsule", "read_safetensors", "read_state_dict"]
 
 _TYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "U8": "u1", "BOOL": "?"}
 #: The largest header of a file, in bytes.
@@ -33,6 +35,23 @@ _NEWER = (
 
 def read_safetensors(path: str | os.PathLike[str]) -> dict[str, Tensor]:
     """The tensors of a safetensors file."""
+    return _read(path)[0]
+
+
+def read_capsule(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The document of a capsule of the engine, and its weights in single precision.
+
+    Raises:
+        RuntimeError: If the file is no capsule.
+    """
+    tensors, metadata = _read(path)
+    if "swm_capsule" not in metadata:
+        raise RuntimeError(f"{path}: it is no capsule; expected a file that `swm checkpoints pack` wrote")
+    return json.loads(metadata["swm_capsule"]), {name: value.float() for name, value in tensors.items() if "/" not in name}
+
+
+def _read(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """The tensors and the metadata of a safetensors file."""
     with open(path, "rb") as file:
         size = os.fstat(file.fileno()).st_size
         (length,) = struct.unpack("<Q", file.read(8).ljust(8, b"\0"))
@@ -49,7 +68,7 @@ def read_safetensors(path: str | os.PathLike[str]) -> dict[str, Tensor]:
             raise RuntimeError(f"{path}: the tensor {name!r} is damaged or of an unknown type")
         values = np.frombuffer(data[begin:end], np.dtype(_TYPES[entry["dtype"]])).reshape(entry["shape"])
         found[name] = torch.from_numpy(values.copy())
-    return found
+    return found, header.get("__metadata__") or {}
 
 
 def read_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
@@ -72,7 +91,7 @@ def load_into(model: nn.Module, weights: Mapping[str, Tensor], source: str) -> N
     """
     weights = {published(name): value for name, value in weights.items()}
     expected = model.state_dict()
-    missing = [name for name in expected if name not in weights and not name.endswith("num_batches_tracked")]
+    missing = [name for name in stored_names(model) if name not in weights]
     unexpected = [name for name in weights if name not in expected]
     if missing or unexpected:
         raise RuntimeError(

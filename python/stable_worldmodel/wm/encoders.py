@@ -1,7 +1,7 @@
 """Image encoders of the engine's checkpoints, as modules with the same weight names.
 
-All map normalised frames `(N, 3, H, W)` to features; `ViT` returns an object with `last_hidden_state`, as the vision
-transformers of `transformers` do.
+All map normalised frames `(N, 3, H, W)` to features; `ViT` and `Dinov2` return an object with `last_hidden_state`, as the
+vision transformers of `transformers` do. `patches` returns the features of each patch.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-__all__ = ["Convolutions", "Pyramid", "ViT", "encoder_of"]
+__all__ = ["Convolutions", "Dinov2", "Pyramid", "ViT", "encoder_of"]
 
 _ACTIVATIONS = {"relu": nn.functional.relu, "gelu": nn.functional.gelu, "silu": nn.functional.silu}
 
@@ -61,31 +61,104 @@ class ViT(nn.Module):
             output=_tree(dense=nn.Linear(mlp, dim)),
         )
 
-    def _positions(self, rows: int, columns: int) -> Tensor:
-        """The position embeddings, interpolated to another number of patches."""
-        known: Any = self.embeddings.position_embeddings
-        side = round((known.shape[1] - 1) ** 0.5)
-        if (rows, columns) == (side, side):
-            return known  # type: ignore[no-any-return]
-        grid = known[:, 1:].transpose(1, 2).unflatten(2, (side, side))
-        grid = nn.functional.interpolate(grid, (rows, columns), mode="bicubic", align_corners=False)
-        return torch.cat([known[:, :1], grid.flatten(2).transpose(1, 2)], 1)
-
     def forward(self, pixels: Tensor, interpolate_pos_encoding: bool = True) -> Any:
         """Frames `(N, 3, H, W)` to tokens `last_hidden_state` `(N, 1 + patches, dim)`, the class token first."""
         embeddings: Any = self.embeddings
         patches = embeddings.patch_embeddings.projection(pixels)
         tokens = patches.flatten(2).transpose(1, 2)
-        x = torch.cat([embeddings.cls_token.expand(len(tokens), -1, -1), tokens], 1) + self._positions(*patches.shape[2:])
+        positions = _positions(embeddings.position_embeddings, patches.shape[2:])
+        x = torch.cat([embeddings.cls_token.expand(len(tokens), -1, -1), tokens], 1) + positions
         layers: Any = self.encoder.layer
         for layer in layers:
-            normed, part = layer.layernorm_before(x), layer.attention.attention
-            heads = (p(normed).unflatten(-1, (self.heads, -1)).transpose(1, 2) for p in (part.query, part.key, part.value))
-            mixed = nn.functional.scaled_dot_product_attention(*heads)
-            x = x + layer.attention.output.dense(mixed.transpose(1, 2).flatten(2))
+            x = x + _attended(layer.attention, layer.layernorm_before(x), self.heads)
             hidden = nn.functional.gelu(layer.intermediate.dense(layer.layernorm_after(x)))
             x = x + layer.output.dense(hidden)
         return SimpleNamespace(last_hidden_state=self.layernorm(x))
+
+    def patches(self, frames: Tensor) -> Tensor:
+        """Frames `(N, 3, H, W)` to the features of their patches `(N, patches, dim)`."""
+        return self(frames).last_hidden_state[:, 1:]  # type: ignore[no-any-return]
+
+
+class Dinov2(nn.Module):
+    """DINOv2 (Oquab et al., 2023), with or without registers, with the weight names of published files.
+
+    Args:
+        image: Side of the images in pixels.
+        patch: Side of the patches.
+        dim: Features of a token.
+        depth: Layers.
+        heads: Attention heads.
+        mlp: Hidden features of a layer.
+        grid: Side of the grid of patches that the position embeddings belong to.
+        registers: Tokens that stand for no patch.
+    """
+
+    def __init__(
+        self, image: int, patch: int, dim: int, depth: int, heads: int, mlp: int, grid: int, registers: int = 0
+    ) -> None:
+        super().__init__()
+        self.heads, self.registers = heads, registers
+        self.embeddings = _tree(patch_embeddings=_tree(projection=nn.Conv2d(3, dim, patch, patch)))
+        self.embeddings.cls_token = nn.Parameter(0.02 * torch.randn(1, 1, dim))
+        self.embeddings.mask_token = nn.Parameter(torch.zeros(1, dim))
+        self.embeddings.position_embeddings = nn.Parameter(0.02 * torch.randn(1, grid**2 + 1, dim))
+        if registers:
+            self.embeddings.register_tokens = nn.Parameter(0.02 * torch.randn(1, registers, dim))
+        self.encoder = _tree(layer=nn.ModuleList(self._layer(dim, mlp) for _ in range(depth)))
+        self.layernorm = nn.LayerNorm(dim, eps=1e-6)
+
+    @staticmethod
+    def _layer(dim: int, mlp: int) -> nn.Module:
+        projections = _tree(query=nn.Linear(dim, dim), key=nn.Linear(dim, dim), value=nn.Linear(dim, dim))
+        layer = _tree(
+            norm1=nn.LayerNorm(dim, eps=1e-6),
+            attention=_tree(attention=projections, output=_tree(dense=nn.Linear(dim, dim))),
+            layer_scale1=nn.Module(),
+            norm2=nn.LayerNorm(dim, eps=1e-6),
+            mlp=_tree(fc1=nn.Linear(dim, mlp), fc2=nn.Linear(mlp, dim)),
+            layer_scale2=nn.Module(),
+        )
+        for scale in (layer.layer_scale1, layer.layer_scale2):
+            scale.lambda1 = nn.Parameter(torch.ones(dim))  # type: ignore[union-attr]
+        return layer
+
+    def forward(self, pixels: Tensor, interpolate_pos_encoding: bool = True) -> Any:
+        """Frames `(N, 3, H, W)` to tokens `last_hidden_state` `(N, 1 + registers + patches, dim)`, the class token first."""
+        embeddings: Any = self.embeddings
+        patches = embeddings.patch_embeddings.projection(pixels)
+        tokens = patches.flatten(2).transpose(1, 2)
+        positions = _positions(embeddings.position_embeddings, patches.shape[2:], antialias=self.registers > 0)
+        x = torch.cat([embeddings.cls_token.expand(len(tokens), -1, -1), tokens], 1) + positions
+        if self.registers:
+            x = torch.cat([x[:, :1], embeddings.register_tokens.expand(len(x), -1, -1), x[:, 1:]], 1)
+        layers: Any = self.encoder.layer
+        for layer in layers:
+            x = x + layer.layer_scale1.lambda1 * _attended(layer.attention, layer.norm1(x), self.heads)
+            x = x + layer.layer_scale2.lambda1 * layer.mlp.fc2(nn.functional.gelu(layer.mlp.fc1(layer.norm2(x))))
+        return SimpleNamespace(last_hidden_state=self.layernorm(x))
+
+    def patches(self, frames: Tensor) -> Tensor:
+        """Frames `(N, 3, H, W)` to the features of their patches `(N, patches, dim)`."""
+        return self(frames).last_hidden_state[:, 1 + self.registers :]  # type: ignore[no-any-return]
+
+
+def _positions(known: Tensor, size: Sequence[int], antialias: bool = False) -> Tensor:
+    """The position embeddings, interpolated to another number of patches."""
+    side = round((known.shape[1] - 1) ** 0.5)
+    if tuple(size) == (side, side):
+        return known
+    grid = known[:, 1:].transpose(1, 2).unflatten(2, (side, side))
+    grid = nn.functional.interpolate(grid, tuple(size), mode="bicubic", align_corners=False, antialias=antialias)
+    return torch.cat([known[:, :1], grid.flatten(2).transpose(1, 2)], 1)
+
+
+def _attended(attention: Any, x: Tensor, heads: int) -> Tensor:
+    """Self-attention of normalised tokens `(N, tokens, dim)`."""
+    part = attention.attention
+    split = (p(x).unflatten(-1, (heads, -1)).transpose(1, 2) for p in (part.query, part.key, part.value))
+    mixed = nn.functional.scaled_dot_product_attention(*split)
+    return attention.output.dense(mixed.transpose(1, 2).flatten(2))  # type: ignore[no-any-return]
 
 
 class Pyramid(nn.Module):
@@ -106,7 +179,7 @@ class Pyramid(nn.Module):
     ) -> None:
         super().__init__()
         first, *later = stages
-        self.patches = [stage["patch"] for stage in later]
+        self.sides = [stage["patch"] for stage in later]
         self.activation: Any = _ACTIVATIONS[activation]
         self.stem = nn.Conv2d(3, first["channels"], first["patch"], first["patch"])
         inputs, side, self.stages = first["channels"], image // first["patch"], nn.ModuleList()
@@ -118,11 +191,15 @@ class Pyramid(nn.Module):
     def forward(self, frames: Tensor) -> Tensor:
         """Frames `(N, 3, H, W)` to features `(N, dim)`."""
         x = self.activation(self.stem(frames)).movedim(1, -1)
-        for layer, patch in zip(self.stages, self.patches, strict=True):
+        for layer, patch in zip(self.stages, self.sides, strict=True):
             count, side, _, channels = x.shape
             blocks = x.reshape(count, side // patch, patch, side // patch, patch * channels).transpose(2, 3)
             x = self.activation(layer(blocks.reshape(count, side // patch, side // patch, -1)))
         return self.out(self.activation(self.hidden(x.flatten(1))))  # type: ignore[no-any-return]
+
+    def patches(self, frames: Tensor) -> Tensor:
+        """Frames `(N, 3, H, W)` to the features of the image as one patch, `(N, 1, dim)`."""
+        return self(frames).unsqueeze(1)  # type: ignore[no-any-return]
 
 
 class Convolutions(nn.Module):
@@ -150,18 +227,25 @@ class Convolutions(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         """Frames `(N, 3, H, W)` to features `(N, dim)`."""
-        stages: Any = self.stages
-        for stage in stages:
-            frames = stage.norm(stage.conv(frames)).relu()
-        x = frames.flatten(1)
+        x = self._map(frames).flatten(1)
         x = x if self.hidden is None else self.hidden(x).relu()
         return self.out(x)  # type: ignore[no-any-return]
 
+    def patches(self, frames: Tensor) -> Tensor:
+        """Frames `(N, 3, H, W)` to the cells of the last feature map, `(N, cells, channels)`."""
+        return self._map(frames).flatten(2).transpose(1, 2)
+
+    def _map(self, frames: Tensor) -> Tensor:
+        stages: Any = self.stages
+        for stage in stages:
+            frames = stage.norm(stage.conv(frames)).relu()
+        return frames
+
 
 def encoder_of(config: Mapping[str, Any], image: int) -> nn.Module:
-    """The encoder of a configuration of the engine: one of `vit`, `pyramid` and `conv` with its settings."""
+    """The encoder of a configuration of the engine: one of `vit`, `dinov2`, `pyramid` and `conv` with its settings."""
     ((kind, settings),) = config.items()
-    kinds: dict[str, Any] = {"vit": ViT, "pyramid": Pyramid, "conv": Convolutions}
+    kinds: dict[str, Any] = {"vit": ViT, "dinov2": Dinov2, "pyramid": Pyramid, "conv": Convolutions}
     if kind not in kinds:
         raise ValueError(f"encoder: {kind!r} has no torch module; expected one of {', '.join(kinds)}")
     return kinds[kind](image, **settings)  # type: ignore[no-any-return]

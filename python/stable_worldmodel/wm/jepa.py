@@ -13,11 +13,12 @@ from torch import Tensor, nn
 from ..planning.evaluator import ShootingCostEvaluator
 from ..planning.objective import GoalMSE
 from .frames import Frames
+from .pretrained import Pretrained
 
 __all__ = ["JEPA"]
 
 
-class JEPA(nn.Module):
+class JEPA(Pretrained):
     """An image encoder and a predictor of the next latent.
 
     A `stable_worldmodel.protocols.Dynamics`, and with `get_cost` a cost of solvers: the squared distance of the last
@@ -46,8 +47,6 @@ class JEPA(nn.Module):
         self.pred_proj = nn.Identity() if pred_proj is None else pred_proj
         #: How frames of `uint8` become inputs of the encoder.
         self.frames = Frames()
-        #: Environment steps in one model step.
-        self.action_block = 1
 
     def encode(self, info: dict[str, Any]) -> dict[str, Any]:
         """Adds `emb` `(B, T, D)`, the latents of `pixels`, and `act_emb` `(B, T, D)` if there is an `action`.

@@ -12,11 +12,12 @@ import torch
 from torch import Tensor, nn
 
 from .frames import Frames
+from .pretrained import Pretrained
 
 __all__ = ["PatchEncoder"]
 
 
-class PatchEncoder(nn.Module):
+class PatchEncoder(Pretrained):
     """Base class of models on the patches of an image encoder.
 
     The embedding of a frame is the features of its patches; the encoded columns of the step are appended to every patch.
@@ -28,6 +29,8 @@ class PatchEncoder(nn.Module):
         self.interpolate_pos_encoding = interpolate_pos_encoding
         #: How frames of `uint8` become inputs of the encoder.
         self.frames = Frames()
+        #: The mean and the standard deviation by which columns are scaled before they are encoded.
+        self.scales: dict[str, tuple[Tensor, Tensor]] = {}
 
     def _image_encoder(self) -> Any:
         raise NotImplementedError
@@ -49,11 +52,18 @@ class PatchEncoder(nn.Module):
         info[f"pixels_{target}"] = patches
         parts = [patches]
         for column in self.extra_encoders if emb_keys is None else emb_keys:
-            encoded = self.extra_encoders[column](info[f"{prefix or ''}{column}"].float())
+            encoded = self.extra_encoders[column](self._scaled(column, info[f"{prefix or ''}{column}"]))
             info[f"{column}_{target}"] = encoded
             parts.append(encoded.unsqueeze(2).expand(-1, -1, patches.shape[2], -1))
         info[target] = torch.cat(parts, -1)
         return info
+
+    def _scaled(self, column: str, values: Tensor) -> Tensor:
+        """The values of a column in the units of its encoder; missing ones (NaN) are the mean."""
+        if column not in self.scales:
+            return values.float()
+        mean, std = (part.to(values.device) for part in self.scales[column])
+        return ((values.double() - mean) / std).nan_to_num().float()
 
     def _encoded(self, images: Tensor) -> Any:
         interpolation = {"interpolate_pos_encoding": True} if self.interpolate_pos_encoding else {}
@@ -61,6 +71,9 @@ class PatchEncoder(nn.Module):
 
     def _image_patches(self, frames: Tensor) -> Tensor:
         """The patches of each frame on its own, `(B, T, P, ..)`; an encoder without patches gives one."""
+        encoder = self._image_encoder()
+        if hasattr(encoder, "patches"):
+            return encoder.patches(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])  # type: ignore[no-any-return]
         output = self._encoded(frames.flatten(0, 1))
         hidden = getattr(output, "last_hidden_state", None)
         # The first token stands for the whole image.

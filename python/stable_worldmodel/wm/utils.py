@@ -82,9 +82,9 @@ def load_pretrained(
     a layer of torch is refused.
 
     Args:
-        name: A path, or a name under `$STABLEWM_HOME/checkpoints`: a run of `swm train`, a folder with one `.pt` file and
-            `config.json`, or the `.pt` file. `OWNER/NAME` also names a folder that the Hugging Face hub's client or
-            `swm pull` stored as `models--OWNER--NAME`.
+        name: A path, or a name under `$STABLEWM_HOME/checkpoints`: a run of `swm train`, a capsule, a folder with one `.pt`
+            file and `config.json`, or the `.pt` file; or `zoo:` and the name of a capsule. `OWNER/NAME` also names a folder
+            that the Hugging Face hub's client or `swm pull` stored as `models--OWNER--NAME`.
         cache_dir: A folder in place of `$STABLEWM_HOME`.
         extra_args: Values of the configuration to replace, by dot key.
         trust: Whether a `_target_` may name any function, which is imported and called.
@@ -115,6 +115,8 @@ def load_pretrained(
 
 def _located(name: str, folder: Path) -> Path:
     """The file or folder of a checkpoint."""
+    if name.startswith("zoo:"):
+        return Path(_engine.Model(name, "cpu", "null", False).path)
     candidates = [folder / name, Path(name), folder / f"models--{name.replace('/', '--')}"]
     for candidate in candidates:
         if candidate.exists():

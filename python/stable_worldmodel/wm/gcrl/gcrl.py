@@ -24,7 +24,7 @@ class GCRL(PatchEncoder):
     Args:
         encoder: An image encoder.
         action_predictor: The policy; see `Predictor`.
-        value_predictor: The value: a `Predictor`, or a `MetricValuePredictor` for HILP.
+        value_predictor: The value: a `Predictor`, or a `MetricValuePredictor` for HILP; in a `WithTarget` for training.
         critic_predictor: The value of actions; see `QPredictor`.
         extra_encoders: Encoders of other columns, by name.
         history_size: Frames that the policy gets.

@@ -5,6 +5,7 @@ Shapes: B clips, T frames, P patches of a frame, D features of a patch.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -25,6 +26,7 @@ __all__ = [
     "QPredictor",
     "SelfAttentionTransformer",
     "Transformer",
+    "WithTarget",
 ]
 
 #: The kinds of attention.
@@ -310,6 +312,30 @@ class DoublePredictorWrapper(nn.Module):
     def forward(self, *args: Any, **kwargs: Any) -> tuple[Any, Any]:
         """The results of both."""
         return self.net1(*args, **kwargs), self.net2(*args, **kwargs)
+
+
+class WithTarget(nn.Module):
+    """A network, `student`, and its target network, `teacher`, which follows it as a moving average.
+
+    Args:
+        network: Creates the network.
+        **kwargs: Its arguments.
+    """
+
+    def __init__(self, network: Callable[..., nn.Module], **kwargs: Any) -> None:
+        super().__init__()
+        self.student = network(**kwargs)
+        self.teacher = copy.deepcopy(self.student).requires_grad_(False)
+
+    def forward(self, *args: Any) -> Any:
+        """The result of the network."""
+        return self.student(*args)
+
+    @torch.no_grad()
+    def update_target(self, keep: float) -> None:
+        """Moves the target network: `keep` is the share of its old weights."""
+        for old, new in zip(self.teacher.parameters(), self.student.parameters(), strict=True):
+            old.lerp_(new, 1 - keep)
 
 
 class ExpectileLoss(nn.Module):

@@ -12,7 +12,16 @@ from torch import Tensor, nn
 
 from ..lewm.module import FeedForward
 
-__all__ = ["BACKBONES", "Attention", "CausalPredictor", "Embedder", "FeedForward", "Transformer", "create_backbone"]
+__all__ = [
+    "BACKBONES",
+    "Attention",
+    "CausalPredictor",
+    "Embedder",
+    "FeedForward",
+    "PatchDecoder",
+    "Transformer",
+    "create_backbone",
+]
 
 #: The names of pretrained encoders on the Hugging Face hub.
 BACKBONES = {
@@ -174,3 +183,19 @@ class CausalPredictor(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Frame by frame `(B, T * P, dim)` to the frames after each of them, `(B, T * P, dim)`."""
         return self.transformer(self.dropout(x + self.pos_embedding[:, : x.shape[1]]))  # type: ignore[no-any-return]
+
+
+class PatchDecoder(nn.Module):
+    """Reconstructs images from the features of their patches: two linear layers for each patch."""
+
+    def __init__(self, features: int, hidden: int, patch: int) -> None:
+        super().__init__()
+        self.patch = patch
+        self.hidden, self.pixels = nn.Linear(features, hidden), nn.Linear(hidden, 3 * patch**2)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Features `(B, T, P, D)` to normalised images `(B * T, 3, H, W)`, and a loss of zero."""
+        patches = self.pixels(nn.functional.gelu(self.hidden(x))).flatten(0, 1)
+        side = round(patches.shape[1] ** 0.5)
+        rows = patches.unflatten(-1, (3, self.patch, self.patch)).unflatten(1, (side, side))
+        return rows.permute(0, 3, 1, 4, 2, 5).flatten(4, 5).flatten(2, 3), x.new_zeros(())

@@ -11,6 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ..frames import Frames
+from ..pretrained import Pretrained
 from .module import (
     NormedLinear,
     RunningScale,
@@ -29,13 +31,14 @@ from .module import (
 __all__ = ["TDMPC2", "tdmpc2_forward"]
 
 
-class TDMPC2(nn.Module):
+class TDMPC2(Pretrained):
     """TD-MPC2 for continuous actions from -1 to 1. Solvers minimise `get_cost`, the negative return.
 
     Args:
         cfg: The configuration: `action_dim`; `extra_dims`, the elements of each column; `image_size` for frames; and `wm`
             with `encoding` (the latent elements of `pixels` and of each column), `enc_dim`, `mlp_dim`, `num_q`, `num_bins`,
-            `vmin`, `vmax`, `tau`, and for training `horizon`, `rho`, `discount` and the weights of the losses.
+            `vmin`, `vmax`, `tau`, and for training `dropout`, `horizon`, `rho`, `discount` and the weights of the losses;
+            `termination` says whether the ends of episodes are predicted.
         extra_encoders: The encoders of the columns, instead of two linear layers for each.
     """
 
@@ -50,6 +53,8 @@ class TDMPC2(nn.Module):
         if not self.latent_dim:
             raise ValueError("TDMPC2: cfg.wm.encoding is empty; name 'pixels' or a column with its latent elements")
         self.use_pixels = "pixels" in self.encoding
+        #: How frames of `uint8` become inputs of the encoder: -0.5 to 0.5, as published.
+        self.frames = Frames((0.5, 0.5, 0.5), (1.0, 1.0, 1.0))
         self.scale = RunningScale(float(setting(wm, "tau", 0.01)))
         if self.use_pixels:
             self.cnn = _convolutions()
@@ -63,7 +68,10 @@ class TDMPC2(nn.Module):
         self.dynamics = mlp(both, width, latent, act=SimNorm(cfg))
         self.reward = mlp(both, width, bins)
         self.pi = mlp(latent, width, 2 * actions)
-        self.qs = nn.ModuleList(mlp(both, width, bins, dropout=0.01) for _ in range(int(setting(wm, "num_q"))))
+        dropout = float(setting(wm, "dropout", 0.01))
+        self.qs = nn.ModuleList(mlp(both, width, bins, dropout=dropout) for _ in range(int(setting(wm, "num_q"))))
+        #: The logit of the end of an episode at a latent; `None` if ends are not predicted.
+        self.termination = mlp(latent, width, 1) if setting(wm, "termination", False) else None
         self.apply(weight_init)
         heads: Any = [self.reward, *self.qs]
         zero_init(head[-1].weight for head in heads)
@@ -85,7 +93,7 @@ class TDMPC2(nn.Module):
         dtype = next(self.parameters()).dtype
         parts = []
         if self.use_pixels:
-            frames = obs_dict["pixels"].to(dtype)
+            frames = self.frames(obs_dict["pixels"], dtype)
             frames = frames.movedim(-1, -3) if frames.shape[-1] == 3 else frames
             features = self.pixel_encoder(self.cnn(frames.flatten(0, -4)))
             parts.append(features.unflatten(0, frames.shape[:-3]))
@@ -133,8 +141,8 @@ class TDMPC2(nn.Module):
     def get_cost(self, info_dict: dict[str, Any], action_candidates: Tensor) -> Tensor:
         """The negative returns `(B, S)` of candidates `(B, S, H, A)`.
 
-        The return adds up the discounted rewards and the value after the last step: the mean of the Q functions, less their
-        disagreement times `uncertainty_penalty`.
+        The return adds up the discounted rewards until the predicted end of the episode, and the value after the last step:
+        the mean of the Q functions, less their disagreement times `uncertainty_penalty`.
 
         Args:
             info_dict: Observations `(B, S, ..)`, or `(B, S, T, ..)`, of which the last step counts; or `(B, ..)`.
@@ -148,16 +156,18 @@ class TDMPC2(nn.Module):
             info_dict["_latent"] = z.unsqueeze(1).expand(-1, samples, -1) if z.ndim == 2 else z
         z = info_dict["_latent"].reshape(envs * samples, -1)
         discount, gamma = 1.0, float(setting(wm, "discount", 0.99))
-        total = z.new_zeros(len(z), 1)
+        total, alive = z.new_zeros(len(z), 1), z.new_ones(len(z), 1)
         for step in range(horizon):
             z, reward = self(z, action_candidates[:, :, step].flatten(0, 1))
-            total = total + discount * two_hot_inv(reward, self.cfg)
+            total = total + alive * discount * two_hot_inv(reward, self.cfg)
+            if self.termination is not None:
+                alive = alive * (self.termination(z) < 0)
             discount *= gamma
         both = torch.cat([z, self.pi(z).chunk(2, -1)[0].tanh()], -1)
         values = torch.stack([two_hot_inv(q(both), self.cfg) for q in self.qs])
         mean = values.mean(0)
         penalty = float(setting(wm, "uncertainty_penalty", 0.5)) * mean.abs() * values.std(0)
-        return -(total + discount * (mean - penalty)).view(envs, samples)
+        return -(total + alive * discount * (mean - penalty)).view(envs, samples)
 
 
 def _convolutions() -> nn.Sequential:

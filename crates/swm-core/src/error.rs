@@ -121,17 +121,18 @@ pub enum Error {
 impl Error {
     /// An [`Error::Config`].
     pub fn config(what: impl Into<String>, problem: impl Into<String>, fix: impl Into<String>) -> Self {
-        Self::Config { what: what.into(), problem: problem.into(), fix: fix.into() }
+        Self::Config { what: shortened(what.into()), problem: shortened(problem.into()), fix: fix.into() }
     }
 
     /// An [`Error::Mismatch`].
     pub fn mismatch(operation: impl Into<String>, given: impl Into<String>, expected: impl Into<String>) -> Self {
-        Self::Mismatch { operation: operation.into(), given: given.into(), expected: expected.into() }
+        let (given, expected) = (shortened(given.into()), shortened(expected.into()));
+        Self::Mismatch { operation: operation.into(), given, expected }
     }
 
     /// An [`Error::Corrupt`].
     pub fn corrupt(path: impl Into<PathBuf>, problem: impl Into<String>, fix: impl Into<String>) -> Self {
-        Self::Corrupt { path: path.into(), problem: problem.into(), fix: fix.into() }
+        Self::Corrupt { path: path.into(), problem: shortened(problem.into()), fix: fix.into() }
     }
 
     /// An [`Error::Io`].
@@ -141,7 +142,7 @@ impl Error {
 
     /// An [`Error::External`].
     pub fn external(context: impl Into<String>, message: impl std::fmt::Display) -> Self {
-        Self::External { context: context.into(), message: message.to_string() }
+        Self::External { context: context.into(), message: shortened(message.to_string()) }
     }
 
     /// An [`Error::Config`] for a setting that is given twice.
@@ -156,7 +157,12 @@ impl Error {
         known: impl IntoIterator<Item = &'a str>,
         hint: impl Into<String>,
     ) -> Self {
-        Self::UnknownName { kind, given: given.to_owned(), nearest: nearest(given, known), hint: hint.into() }
+        Self::UnknownName {
+            kind,
+            given: shortened(given.to_owned()),
+            nearest: nearest(given, known),
+            hint: hint.into(),
+        }
     }
 
     /// An [`Error::External`] for a panic, as `catch_unwind` and a joined thread return it. `context` says what panicked.
@@ -170,6 +176,17 @@ impl Error {
     pub fn is_usage(&self) -> bool {
         matches!(self, Self::UnknownName { .. } | Self::OutOfSpace { .. } | Self::Config { .. })
     }
+}
+
+/// The most bytes of a text in an error. A longer one, such as a value in a damaged file, loses its middle.
+const MAX_TEXT: usize = 2000;
+
+fn shortened(text: String) -> String {
+    if text.len() <= MAX_TEXT {
+        return text;
+    }
+    let (start, end) = (text.floor_char_boundary(MAX_TEXT / 2), text.floor_char_boundary(text.len() - MAX_TEXT / 4));
+    format!("{} [{} bytes left out] {}", &text[..start], end - start, &text[end..])
 }
 
 /// The names most similar to `given`, best first, at most three.
@@ -211,6 +228,18 @@ fn disk_hint(source: &std::io::Error) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn long_values_lose_their_middle() {
+        let message =
+            Error::corrupt("config.json", format!("invalid value \"{}\" of 'a'", "é".repeat(100_000)), "copy it");
+        let message = message.to_string();
+        assert!(message.len() < 2000 && message.ends_with("\" of 'a'; copy it"), "{message}");
+        assert!(
+            message.starts_with("config.json: invalid value") && message.contains(" bytes left out] "),
+            "{message}"
+        );
+    }
 
     #[test]
     fn unknown_names_suggest_similar_names() {

@@ -22,6 +22,11 @@ pub(crate) const WORLD_MODEL: &str = "world";
 /// The files of a checkpoint.
 pub(crate) const CHECKPOINT_FILES: &[&str] = &[CONFIG, MANIFEST, WEIGHTS, RAW, OPTIMIZER, STATE];
 
+/// The file with the weights of the checkpoint in the folder of a run.
+pub fn weights(run: &Path) -> PathBuf {
+    run.join(FOLDER).join(WEIGHTS)
+}
+
 /// The start of the name of a folder with the data of an online run; the gradient step follows.
 pub(crate) const PLAYED: &str = "played-";
 /// The replay buffer in such a folder: a Lance dataset.

@@ -13,6 +13,8 @@ pub struct FormatEntry {
     pub summary: &'static str,
     /// File name suffixes of the format's datasets. New datasets get the first suffix.
     pub suffixes: &'static [&'static str],
+    /// Whether images are stored as they are, unless the user chooses a lossy codec.
+    pub exact_images: bool,
     /// The Cargo feature of `swm-data` that this format requires, if any.
     pub feature: Option<&'static str>,
     /// Returns whether an existing dataset, or a dataset to create, at this location has this format.

@@ -15,6 +15,13 @@ pub mod registry;
 mod stored_scalar;
 mod video;
 
-pub use column_files::has_no_dataset;
 pub use entry::{Backend, FormatEntry};
 pub use registry::{FORMATS, create, detect, open};
+
+use std::path::Path;
+
+/// Returns whether an existing path holds no dataset yet: an empty folder, or what a writer leaves that was killed, or has
+/// not finished, while it created a dataset.
+pub fn has_no_dataset(path: &Path) -> bool {
+    column_files::has_no_dataset(path) || hdf5::is_unfinished(path)
+}

@@ -2,8 +2,9 @@
 //! same episodes twice.
 
 use crate::sample::{check, episode, options, schema, write};
+use swm_core::run::Control;
 use swm_data::lance::{Shard, create_shard};
-use swm_data::{CommitPolicy, Location, WriteMode, WriteOptions, create, open};
+use swm_data::{CommitPolicy, ConvertMode, ConvertOptions, Location, WriteMode, WriteOptions, convert, create, open};
 
 fn exclusive(mode: WriteMode) -> WriteOptions {
     let commit = CommitPolicy { episodes: 1, ..CommitPolicy::default() };
@@ -42,6 +43,33 @@ fn exclusive_writer_fails_when_another_writer_commits() {
     let reader = open(&path).expect("opening");
     assert_eq!(reader.episodes().len(), 3);
     check(&*reader, 0);
+}
+
+#[test]
+fn second_conversion_into_a_dataset_is_refused() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let (path, target) = (folder.path().join("source.lance"), folder.path().join("target.lance"));
+    write(&path, WriteMode::Create, 1, 0..2);
+    write(&target, WriteMode::Create, 1, 0..1);
+    let source = open(&path).expect("opening");
+    let append = ConvertOptions { mode: ConvertMode::Append, ..ConvertOptions::default() };
+    let first = create(&target, &schema(), exclusive(WriteMode::Append)).expect("continuing");
+    let refused =
+        convert(&source, &Location::from(&target), &append, &mut Control::new()).expect_err("a second writer");
+    assert!(refused.to_string().contains("another process writes"), "{refused}");
+    drop(first);
+    // Another program adds an episode after the conversion has counted those of the target.
+    let mut late = true;
+    let mut control = Control::new().with_events(|_| {
+        if std::mem::take(&mut late) {
+            write(&target, WriteMode::Append, 1, 1..2);
+        }
+    });
+    let refused = convert(&source, &Location::from(&target), &append, &mut control).expect_err("a changed target");
+    assert!(refused.to_string().contains("it had 1 episodes, now 2"), "{refused}");
+    assert_eq!(open(&target).expect("opening").episodes().len(), 2);
+    let report = convert(&source, &Location::from(&target), &append, &mut Control::new()).expect("appending");
+    assert_eq!(report.episodes, 4);
 }
 
 #[test]

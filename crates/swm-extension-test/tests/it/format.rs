@@ -12,6 +12,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
     id: "json",
     summary: "one JSON file",
     suffixes: &["extjson"],
+    exact_images: true,
     feature: None,
     detect: |location| location.has_suffix("extjson"),
     backend: Some(Backend { open, create, remove: swm::core::files::delete_file }),

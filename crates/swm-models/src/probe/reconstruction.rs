@@ -133,11 +133,12 @@ impl Decoder {
 ///
 /// # Errors
 /// When the images do not have the encoder's image size, the side is not divisible into the decoder's blocks, no
-/// episode is held out, or a setting is out of range.
+/// episode is held out, a setting is out of range, or the run is stopped ([`Error::Interrupted`](swm_core::Error::Interrupted)).
 pub fn reconstruct_images(
     encoder: &dyn ImageEncoder,
     reader: &dyn Reader,
     config: &ReconstructionConfig,
+    control: &mut Control<'_>,
 ) -> Result<(ReconstructionReport, RgbImage)> {
     check_sizes(&[
         ("frames", config.frames, 2, limits::BATCH),
@@ -177,8 +178,7 @@ pub fn reconstruct_images(
             Ok(StepOutput { metrics, gradients, ..StepOutput::default() })
         })
     };
-    let (decoder, _) =
-        fit(decoder, config.fit, train.count, key.with("batches"), step, |_, _| (), &mut Control::new())?;
+    let (decoder, _) = fit(decoder, config.fit, train.count, key.with("batches"), step, |_, _| (), control)?;
 
     let decoded = decode(&decoder, &scale.apply(&held_out.latents), latent, &mean);
     let rmse = root_mean_square(decoded.iter().copied(), &held_out.images);

@@ -5,7 +5,11 @@
 //! λ has the same meaning for every encoder.
 
 use rayon::prelude::*;
+use swm_core::run::Control;
 use swm_core::{Error, Result};
+
+/// The number of rows of a product after which an interrupt is noticed.
+const ROWS_PER_CHECK: usize = 64;
 
 /// The linear map `y = W x + b`.
 #[derive(Clone, Debug)]
@@ -24,8 +28,8 @@ impl Ridge {
     /// `x` is `[rows, features]`, `y` is `[rows, targets]`.
     ///
     /// # Errors
-    /// When λ is not positive, or a feature or target is not finite.
-    pub fn fit(x: &[f32], y: &[f32], rows: usize, lambda: f64) -> Result<Self> {
+    /// When λ is not positive, a feature or target is not finite, or the run is stopped ([`Error::Interrupted`]).
+    pub fn fit(x: &[f32], y: &[f32], rows: usize, lambda: f64, control: &mut Control<'_>) -> Result<Self> {
         if !(lambda.is_finite() && lambda > 0.0) {
             return Err(Error::config("ridge", lambda.to_string(), "give a positive value"));
         }
@@ -48,13 +52,13 @@ impl Ridge {
         // The solution is `[features, targets]`, for centred and scaled features.
         let solution = if features <= rows {
             let xt = transpose(&x, rows, features);
-            let gram = products(&xt, &xt, rows);
-            let right = products(&xt, &transpose(&y, rows, targets), rows);
-            solve(gram, right, targets, penalty)
+            let gram = products(&xt, &xt, rows, control)?;
+            let right = products(&xt, &transpose(&y, rows, targets), rows, control)?;
+            solve(gram, right, targets, penalty, control)?
         } else {
-            let gram = products(&x, &x, features);
-            let dual = solve(gram, y, targets, penalty);
-            products(&transpose(&x, rows, features), &transpose(&dual, rows, targets), rows)
+            let gram = products(&x, &x, features, control)?;
+            let dual = solve(gram, y, targets, penalty, control)?;
+            products(&transpose(&x, rows, features), &transpose(&dual, rows, targets), rows, control)?
         };
         let mut weights = transpose(&solution, features, targets);
         let mut intercept = mean_y;
@@ -112,23 +116,37 @@ fn transpose(x: &[f64], rows: usize, columns: usize) -> Vec<f64> {
 ///
 /// # Shapes
 /// `a` is `[m, width]`, `b` is `[n, width]`; returns `[m, n]`.
-fn products(a: &[f64], b: &[f64], width: usize) -> Vec<f64> {
-    a.par_chunks_exact(width)
-        .flat_map_iter(|a| b.chunks_exact(width).map(move |b| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>()))
-        .collect()
+fn products(a: &[f64], b: &[f64], width: usize, control: &mut Control<'_>) -> Result<Vec<f64>> {
+    let mut out = Vec::with_capacity(a.len() / width * (b.len() / width));
+    for rows in a.chunks(ROWS_PER_CHECK * width) {
+        control.check()?;
+        out.par_extend(
+            rows.par_chunks_exact(width).flat_map_iter(|a| {
+                b.chunks_exact(width).map(move |b| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>())
+            }),
+        );
+    }
+    Ok(out)
 }
 
 /// Solves `(gram + penalty I) S = right` for a positive semidefinite `gram` and a positive penalty.
 ///
 /// # Shapes
 /// `gram` is `[size, size]`, `right` and the result are `[size, targets]`.
-fn solve(mut gram: Vec<f64>, mut right: Vec<f64>, targets: usize, penalty: f64) -> Vec<f64> {
+fn solve(
+    mut gram: Vec<f64>,
+    mut right: Vec<f64>,
+    targets: usize,
+    penalty: f64,
+    control: &mut Control<'_>,
+) -> Result<Vec<f64>> {
     let size = right.len() / targets;
     // The Cholesky factor overwrites the lower triangle.
     for i in 0..size {
         gram[i * size + i] += penalty;
     }
     for pivot in 0..size {
+        control.check()?;
         let root = gram[pivot * size + pivot].sqrt();
         let (above, below) = gram.split_at_mut((pivot + 1) * size);
         above[pivot * size + pivot] = root;
@@ -159,7 +177,7 @@ fn solve(mut gram: Vec<f64>, mut right: Vec<f64>, targets: usize, penalty: f64) 
         }
         right[i * targets..(i + 1) * targets].iter_mut().for_each(|v| *v /= gram[i * size + i]);
     }
-    right
+    Ok(right)
 }
 
 #[cfg(test)]
@@ -173,6 +191,10 @@ mod tests {
         (0..count).map(|_| rng.random_range(-1.0f32..1.0)).collect()
     }
 
+    fn fit(x: &[f32], y: &[f32], rows: usize, lambda: f64) -> Result<Ridge> {
+        Ridge::fit(x, y, rows, lambda, &mut Control::new())
+    }
+
     #[test]
     fn ridge_regression_recovers_a_linear_map() {
         let (rows, features) = (200, 7);
@@ -182,7 +204,7 @@ mod tests {
             .chunks(features)
             .flat_map(|x| [0, 1].map(|t| 3.0 + x.iter().zip(&truth[t * features..]).map(|(x, w)| x * w).sum::<f32>()))
             .collect();
-        let found = Ridge::fit(&x, &y, rows, 1e-9).expect("fitting the ridge regression").predict(&x);
+        let found = fit(&x, &y, rows, 1e-9).expect("fitting the ridge regression").predict(&x);
         let worst = found.iter().zip(&y).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()));
         assert!(worst < 1e-4, "{worst}");
     }
@@ -193,17 +215,25 @@ mod tests {
         // rows.
         let (rows, features) = (12, 9);
         let (x, y) = (noise(rows * features, "x"), noise(rows * 3, "y"));
-        let primal = Ridge::fit(&x, &y, rows, 0.1).expect("fitting the ridge regression").predict(&x);
+        let primal = fit(&x, &y, rows, 0.1).expect("fitting the ridge regression").predict(&x);
         let twice: Vec<f32> = x.chunks(features).flat_map(|x| [x, x].concat()).collect();
         // Every feature twice with twice the penalty gives the same map, with each weight split in two.
-        let dual = Ridge::fit(&twice, &y, rows, 0.2).expect("fitting the ridge regression").predict(&twice);
+        let dual = fit(&twice, &y, rows, 0.2).expect("fitting the ridge regression").predict(&twice);
         let worst = primal.iter().zip(&dual).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()));
         assert!(worst < 1e-5, "{worst}");
     }
 
     #[test]
     fn zero_penalty_and_non_finite_values_are_refused() {
-        assert!(Ridge::fit(&[1.0, 2.0], &[1.0, 2.0], 2, 0.0).is_err());
-        assert!(Ridge::fit(&[1.0, f32::NAN], &[1.0, 2.0], 2, 0.1).is_err());
+        assert!(fit(&[1.0, 2.0], &[1.0, 2.0], 2, 0.0).is_err());
+        assert!(fit(&[1.0, f32::NAN], &[1.0, 2.0], 2, 0.1).is_err());
+    }
+
+    #[test]
+    fn fit_can_be_interrupted() {
+        let flag = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(true));
+        let mut control = Control::new().with_interrupt(flag);
+        let stopped = Ridge::fit(&[1.0, 2.0], &[1.0, 2.0], 2, 0.1, &mut control);
+        assert!(matches!(stopped, Err(Error::Interrupted)), "{stopped:?}");
     }
 }

@@ -128,8 +128,13 @@ impl StateConfig {
 ///
 /// # Errors
 /// When a column is missing or holds images, the images have another size than the encoder's, no episode is held out,
-/// or a setting is out of range.
-pub fn read_state(encoder: &dyn ImageEncoder, reader: &dyn Reader, config: &StateConfig) -> Result<StateReport> {
+/// a setting is out of range, or the run is stopped ([`Error::Interrupted`](swm_core::Error::Interrupted)).
+pub fn read_state(
+    encoder: &dyn ImageEncoder,
+    reader: &dyn Reader,
+    config: &StateConfig,
+    control: &mut Control<'_>,
+) -> Result<StateReport> {
     config.check(1)?;
     let targets = Targets::new(reader, &config.columns, &config.angles)?;
     let baseline = Targets::new(reader, &config.baseline, &config.angles)?;
@@ -143,12 +148,13 @@ pub fn read_state(encoder: &dyn ImageEncoder, reader: &dyn Reader, config: &Stat
     let held_out = tables(Part::Validation, config.held_out)?;
 
     let score = |predictions: &[f32]| scores(&targets.list, predictions, &held_out.targets);
-    let network = |x: &[f32], y: &[f32], key| Network::fit((x, y, train.count), config, key);
+    let network =
+        |x: &[f32], y: &[f32], key, control: &mut Control<'_>| Network::fit((x, y, train.count), config, key, control);
     let baseline = if config.baseline.is_empty() {
         None
     } else {
-        let to_targets = network(&train.baseline, &train.targets, key.with("baseline"))?;
-        let to_latents = network(&train.baseline, &train.latents, key.with("latents of the baseline"))?;
+        let to_targets = network(&train.baseline, &train.targets, key.with("baseline"), control)?;
+        let to_latents = network(&train.baseline, &train.latents, key.with("latents of the baseline"), control)?;
         let predicted = to_latents.predict(&held_out.baseline);
         Some(Baseline {
             columns: config.baseline.clone(),
@@ -156,13 +162,13 @@ pub fn read_state(encoder: &dyn ImageEncoder, reader: &dyn Reader, config: &Stat
             latent_variance: explained_variance(&predicted, &held_out.latents, held_out.count),
         })
     };
-    let ridge = Ridge::fit(&train.latents, &train.targets, train.count, config.ridge)?;
+    let ridge = Ridge::fit(&train.latents, &train.targets, train.count, config.ridge, control)?;
     Ok(StateReport {
         latent: encoder.latent_dim(),
         frames: train.count,
         held_out: held_out.count,
         linear: score(&ridge.predict(&held_out.latents)),
-        network: score(&network(&train.latents, &train.targets, key)?.predict(&held_out.latents)),
+        network: score(&network(&train.latents, &train.targets, key, control)?.predict(&held_out.latents)),
         baseline,
     })
 }
@@ -201,7 +207,12 @@ impl Network {
     ///
     /// # Shapes
     /// `x` is `[count, inputs]`, `y` is `[count, outputs]`.
-    fn fit((x, y, count): (&[f32], &[f32], usize), config: &StateConfig, key: Key) -> Result<Self> {
+    fn fit(
+        (x, y, count): (&[f32], &[f32], usize),
+        config: &StateConfig,
+        key: Key,
+        control: &mut Control<'_>,
+    ) -> Result<Self> {
         let (from, to) = (Scale::of(x, count), Scale::of(y, count));
         let (x, y) = (from.apply(x), to.apply(y));
         let (inputs, outputs) = (from.width(), to.width());
@@ -214,7 +225,7 @@ impl Network {
             let gradients = parameters::gradients(&trained, &loss.backward());
             Ok(StepOutput { metrics, gradients, ..StepOutput::default() })
         };
-        let (model, _) = fit(model, config.fit, count, key.with("batches"), step, |_, _| (), &mut Control::new())?;
+        let (model, _) = fit(model, config.fit, count, key.with("batches"), step, |_, _| (), control)?;
         Ok(Self { model, from, to })
     }
 

@@ -49,10 +49,21 @@ pub(crate) fn parse<C: DeserializeOwned + Serialize>(text: &str, settings: &[Str
         let key = if error.path.is_empty() { "configuration".to_owned() } else { error.path.join(".") };
         Error::config(
             key,
-            error.kind.to_string(),
+            in_toml_words(&error.kind),
             "give a value of the right type (`--print-config` shows all settings)",
         )
     })
+}
+
+/// Returns what is wrong with a value, without the name of a Rust type.
+fn in_toml_words(kind: &figment::error::Kind) -> String {
+    use figment::error::Kind;
+    match kind {
+        Kind::InvalidType(given, expected) if expected.starts_with("struct ") => {
+            format!("is {given}, and must be a table of settings")
+        }
+        other => other.to_string(),
+    }
 }
 
 /// Merges the TOML and the settings, and checks the keys.

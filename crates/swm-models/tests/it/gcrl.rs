@@ -306,7 +306,7 @@ fn probes_read_the_position_and_reconstruct_the_image() {
     let data = Dots::new(40, 1);
     let mut settings = StateConfig::new(vec!["position".to_owned()]);
     settings.fit.steps = 300;
-    let report = probe::read_state(&Profiles, &data, &settings).expect("fitting the probe");
+    let report = probe::read_state(&Profiles, &data, &settings, &mut Control::new()).expect("fitting the probe");
     assert_eq!((report.latent, report.linear.len(), report.network.len()), (2 * SIDE, 2, 2));
     for score in report.linear.iter().chain(&report.network) {
         let r2 = score.r2.expect("a score of a moving dot");
@@ -314,7 +314,7 @@ fn probes_read_the_position_and_reconstruct_the_image() {
         assert!((r2 - (1.0 - (score.rmse / score.spread).powi(2))).abs() < 1e-9);
     }
     assert_eq!(
-        probe::read_state(&Profiles, &data, &settings).expect("fitting the probe"),
+        probe::read_state(&Profiles, &data, &settings, &mut Control::new()).expect("fitting the probe"),
         report,
         "a second fit gives another report"
     );
@@ -324,7 +324,7 @@ fn probes_read_the_position_and_reconstruct_the_image() {
         baseline: vec!["position".to_owned()],
         ..settings.clone()
     };
-    let report = probe::read_state(&Profiles, &data, &with_baseline).expect("fitting the probe");
+    let report = probe::read_state(&Profiles, &data, &with_baseline, &mut Control::new()).expect("fitting the probe");
     let parts: Vec<_> = report.linear.iter().map(|score| (score.index, score.part)).collect();
     assert_eq!(parts, [(0, Some(AnglePart::Sin)), (0, Some(AnglePart::Cos)), (1, None)]);
     assert!(report.linear.iter().all(|score| score.r2.expect("a score of a moving dot") > 0.8), "{report:?}");
@@ -333,25 +333,28 @@ fn probes_read_the_position_and_reconstruct_the_image() {
     assert!(baseline.latent_variance.expect("the latents vary") > 0.3, "{baseline:?}");
     // Actions determine neither the position nor the latents.
     let of_actions = StateConfig { baseline: vec!["action".to_owned()], ..settings.clone() };
-    let report = probe::read_state(&Profiles, &data, &of_actions).expect("fitting the probe");
+    let report = probe::read_state(&Profiles, &data, &of_actions, &mut Control::new()).expect("fitting the probe");
     let baseline = report.baseline.expect("a baseline was requested");
     assert!(baseline.network[1].r2.expect("a score of a moving dot") < 0.2, "{baseline:?}");
     assert!(baseline.latent_variance.expect("the latents vary") < 0.2, "{baseline:?}");
     // Images do not determine the actions. The probe skips the last row of an episode, which has no action.
     let actions = StateConfig { columns: vec!["action".to_owned()], ..settings };
-    let report = probe::read_state(&Profiles, &data, &actions).expect("fitting the probe");
+    let report = probe::read_state(&Profiles, &data, &actions, &mut Control::new()).expect("fitting the probe");
     assert!(report.linear.iter().all(|score| score.r2.expect("a score of actions that differ") < 0.1), "{report:?}");
 
     let mut settings = ReconstructionConfig { channels: vec![16, 8], shown: 6, ..ReconstructionConfig::default() };
     (settings.fit.steps, settings.fit.lr) = (1000, 5e-3);
-    let (report, sheet) = probe::reconstruct_images(&Profiles, &data, &settings).expect("fitting the decoder");
+    let (report, sheet) =
+        probe::reconstruct_images(&Profiles, &data, &settings, &mut Control::new()).expect("fitting the decoder");
     assert!(report.explained > 0.2 && report.rmse < report.rmse_of_mean, "{report:?}");
     let cell = SIDE * 8 + 2;
     assert_eq!((sheet.width, sheet.height), (6 * cell + 2, 2 * cell + 2));
 
     let error = |columns: &[&str]| {
         let columns = columns.iter().map(|&name| name.to_owned()).collect();
-        probe::read_state(&Profiles, &data, &StateConfig::new(columns)).expect_err("the call must fail").to_string()
+        probe::read_state(&Profiles, &data, &StateConfig::new(columns), &mut Control::new())
+            .expect_err("the call must fail")
+            .to_string()
     };
     assert!(error(&["positoin"]).contains("did you mean position"), "{}", error(&["positoin"]));
     assert!(error(&["pixels"]).contains("holds images"));

@@ -9,7 +9,7 @@ use clap::Args;
 use serde_json::json;
 use std::collections::BTreeMap;
 use std::time::Instant;
-use swm_core::{CameraView, EnvChoice, Manifest, Origin, Result, Schema, limits};
+use swm_core::{CameraView, EnvChoice, Key, Manifest, Origin, Policy, Result, Schema, limits};
 use swm_data::lance::{Shard, create_shard};
 use swm_data::{FORMATS, ImageCodec, Location, WriteMode, WriteOptions, Writer};
 use swm_eval::{CollectConfig, Collected, PolicyChoice, World, WorldConfig};
@@ -139,50 +139,65 @@ pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
 /// Collects the dataset of a command line, and shows progress.
 pub fn run_args(args: &CollectArgs, context: &Context) -> anyhow::Result<(Location, Collected)> {
     let location = home::target(&args.output, args.format.as_deref())?;
-    let collection = Collection {
-        env: crate::env(&args.env, &Origin::User)?,
-        location: &location,
-        format: args.format.as_deref(),
-        shard: args.shard,
-        world: WorldConfig {
-            envs: args.envs,
-            image: (!args.no_pixels).then_some(args.image),
-            views: args.views.iter().map(|view| CameraView::parse(view)).collect::<Result<_>>()?,
-            max_episode_steps: args.max_steps,
-            threads: context.threads,
-        },
-        config: CollectConfig {
-            episodes: args.episodes,
-            seed: args.seed,
-            variation: args.variation.request()?,
-            policy: PolicyChoice::parse(&args.policies)?,
-            action_noise: args.action_noise,
-            strict_finite: args.strict_finite,
-            ..CollectConfig::default()
-        },
-        mode: match (args.resume, args.overwrite) {
-            (true, _) => WriteMode::Append,
-            (_, true) => WriteMode::Overwrite,
-            _ => WriteMode::Create,
-        },
-        codec: args.codec.codec(),
-        wrappers: args.wrappers.clone(),
-        mix_renderers: args.mix_renderers,
-    };
-    let collected = run(&collection, context)?;
+    let collected = run(&Collection::of(args, &location, context.threads)?, context)?;
     Ok((location, collected))
+}
+
+impl<'a> Collection<'a> {
+    /// Returns the collection of a command line.
+    fn of(args: &'a CollectArgs, location: &'a Location, threads: usize) -> Result<Self> {
+        Ok(Self {
+            env: crate::env(&args.env, &Origin::User)?,
+            location,
+            format: args.format.as_deref(),
+            shard: args.shard,
+            world: WorldConfig {
+                envs: args.envs,
+                image: (!args.no_pixels).then_some(args.image),
+                views: args.views.iter().map(|view| CameraView::parse(view)).collect::<Result<_>>()?,
+                max_episode_steps: args.max_steps,
+                threads,
+            },
+            config: CollectConfig {
+                episodes: args.episodes,
+                seed: args.seed,
+                variation: args.variation.request()?,
+                policy: PolicyChoice::parse(&args.policies)?,
+                action_noise: args.action_noise,
+                strict_finite: args.strict_finite,
+                ..CollectConfig::default()
+            },
+            mode: match (args.resume, args.overwrite) {
+                (true, _) => WriteMode::Append,
+                (_, true) => WriteMode::Overwrite,
+                _ => WriteMode::Create,
+            },
+            codec: args.codec.codec(),
+            wrappers: args.wrappers.clone(),
+            mix_renderers: args.mix_renderers,
+        })
+    }
+}
+
+/// Checks the options of a command line against each other, the environment and the policies, and writes nothing.
+///
+/// # Errors
+/// As [`run_args`], before the first episode.
+pub fn check(args: &CollectArgs) -> Result<()> {
+    let location = home::target(&args.output, args.format.as_deref())?;
+    let mut collection = Collection::of(args, &location, 1)?;
+    limits::ENVS.check(args.envs)?;
+    collection.world.envs = 1;
+    let (mut world, ..) = collection.prepare()?;
+    // Environments check camera views when they render.
+    world.reset(args.seed, &collection.config.variation).map(drop)
 }
 
 /// Collects, and shows progress.
 pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> {
-    let Collection { env, location, config, .. } = collection;
-    limits::EPISODES.check(config.episodes)?;
-    limits::SHARDS.check(collection.shard.map_or(0, |shard| shard.count))?;
-    let (stack, goal) = collection.wrappers.stack()?;
-    let mut world = World::of(|| Ok(stack.wrap(env.env()?, goal)), collection.world.clone())?;
-    let (mut policy, weights) = policy_of_choice(&env.entry, &config.policy, &world)?;
-    // An invalid factor fails before an older dataset is replaced.
-    world.spec().variation_space.resolve(&config.variation, swm_core::Key::new(config.seed))?;
+    let Collection { location, config, .. } = collection;
+    // Invalid options fail before an older dataset is replaced.
+    let (mut world, mut policy, weights) = collection.prepare()?;
     let mut manifest = collection.manifest(&world, weights)?;
     manifest.not_finite = match (collection.shard, collection.mode) {
         (None, mode) => collect_target::check(location, mode, &manifest, collection.mix_renderers)?,
@@ -217,6 +232,18 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
 }
 
 impl Collection<'_> {
+    /// Checks the settings, and returns the world, the policy and the hashes of the policies' weights.
+    fn prepare(&self) -> Result<(World, Box<dyn Policy>, BTreeMap<String, String>)> {
+        let Collection { env, config, .. } = self;
+        limits::EPISODES.check(config.episodes)?;
+        limits::SHARDS.check(self.shard.map_or(0, |shard| shard.count))?;
+        let (stack, goal) = self.wrappers.stack()?;
+        let world = World::of(|| Ok(stack.wrap(env.env()?, goal)), self.world.clone())?;
+        let (policy, weights) = policy_of_choice(&env.entry, &config.policy, &world)?;
+        world.spec().variation_space.resolve(&config.variation, Key::new(config.seed))?;
+        Ok((world, policy, weights))
+    }
+
     /// Returns the manifest of the dataset; `hashes` are those of the policies' weights.
     fn manifest(&self, world: &World, hashes: BTreeMap<String, String>) -> Result<Manifest> {
         let mut manifest = Manifest { hashes, ..world.collect_manifest(&self.config) };

@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use swm_core::limits::{ENVS, EVALUATED_EPISODES, STEPS};
 use swm_core::results::Counting;
-use swm_core::{EnvChoice, Error, Origin, Result, Results, files};
+use swm_core::{EnvChoice, Error, Key, Origin, Result, Results, files};
 use swm_data::{Part, Split};
 use swm_eval::{Condition, EvalRequest, HeldOut, RunOptions, StartsRequest};
 
@@ -222,6 +222,25 @@ impl EvalArgs {
             prediction: self.predict,
             planning_seed: self.planning_seed,
         })
+    }
+
+    /// Checks the options before the outputs of earlier steps of a recipe exist; `is_output` is whether a policy is one.
+    ///
+    /// # Errors
+    /// As [`EvalArgs::request`], as far as it is known.
+    pub fn check(&self, resolver: &HomeResolver, is_output: impl Fn(&str) -> bool) -> Result<()> {
+        for policy in self.policies.iter().filter(|policy| !is_output(policy)) {
+            NamedPolicy::find(policy, self.env.as_deref(), resolver)?;
+        }
+        self.wrappers.choices(resolver.origin())?;
+        self.planner.check()?;
+        let Some(env) = &self.env else { return Ok(()) };
+        let env = resolver.choose_env(env)?;
+        let made = env.env()?;
+        for condition in self.conditions(&env)? {
+            made.spec().variation_space.resolve(&condition.variation, Key::new(self.seed.unwrap_or_default()))?;
+        }
+        Ok(())
     }
 
     fn starts(&self) -> StartsRequest {

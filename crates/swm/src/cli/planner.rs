@@ -70,11 +70,7 @@ impl PlannerArgs {
     /// When a solver or a setting is unknown.
     pub fn solvers(&self, env: &EnvChoice) -> Result<Vec<Choice>> {
         if !self.solvers.is_empty() {
-            let choices = self.solvers.iter().map(|text| {
-                let (entry, settings) = solvers::parse(text)?;
-                Ok(Choice { id: entry.id.to_owned(), settings })
-            });
-            return choices.collect();
+            return self.given();
         }
         let actions = ActionKind::of(&env.env()?.spec().action_space);
         let first = match actions {
@@ -86,6 +82,24 @@ impl PlannerArgs {
             }
         };
         Ok(vec![Choice { id: first.id.to_owned(), settings: (first.defaults)() }])
+    }
+
+    /// Returns the solvers that the command names.
+    fn given(&self) -> Result<Vec<Choice>> {
+        let choices = self.solvers.iter().map(|text| {
+            let (entry, settings) = solvers::parse(text)?;
+            Ok(Choice { id: entry.id.to_owned(), settings })
+        });
+        choices.collect()
+    }
+
+    /// Checks the options without a model and an environment.
+    ///
+    /// # Errors
+    /// When a solver or a setting is unknown, or a setting of planning or of the objective is invalid.
+    pub fn check(&self) -> Result<()> {
+        let model = || Model::Simulator { score: self.score.clone() };
+        self.given()?.into_iter().try_for_each(|solver| self.plan(model(), solver, 1, 1).map(drop))
     }
 
     /// Returns the policy that plans in a model with a solver. `block` is the number of environment steps in a

@@ -78,7 +78,7 @@ pub fn probe(args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
         if config.baseline.is_empty() && reader.schema().find(POS_AGENT).is_some() {
             config.baseline.push(POS_AGENT.to_owned());
         }
-        Some(threads.install(|| probe::read_state(&*encoder, &*reader, &config))?)
+        Some(threads.install(|| probe::read_state(&*encoder, &*reader, &config, &mut control(context)))?)
     };
     let reconstruction = match &args.images {
         None => None,
@@ -86,7 +86,8 @@ pub fn probe(args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
             let mut config = ReconstructionConfig { seed: args.seed, ..ReconstructionConfig::default() };
             config.frames = args.frames.unwrap_or(config.frames);
             config.fit.steps = args.steps.unwrap_or(config.fit.steps);
-            let (report, sheet) = threads.install(|| probe::reconstruct_images(&*encoder, &*reader, &config))?;
+            let fitted = || probe::reconstruct_images(&*encoder, &*reader, &config, &mut control(context));
+            let (report, sheet) = threads.install(fitted)?;
             write_png(file, sheet.width, sheet.height, &sheet.rgb)?;
             Some((report, file))
         }

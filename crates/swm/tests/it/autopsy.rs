@@ -72,6 +72,9 @@ fn autopsies_that_explain_nothing_are_refused() {
     let swm = Swm::new();
     let env = ["--env", "swm/TwoRoom-v1"];
     let fails = |args: &[&str], parts: &[&str]| swm.fails(&[&["autopsy"], args, &env[..]].concat(), 2, parts);
+    let unknown = swm.run(&["autopsy", "nowhere"]);
+    let error = text(&unknown.stderr);
+    assert!(!unknown.status.success() && error.contains("nowhere") && !error.contains("file of the study"), "{error}");
     fails(&["expert"], &["does not plan in a trained world model"]);
     fails(&["zoo:two-room/pldm", "--ingredients", "SX"], &["'X'", "S, R, D and E"]);
     fails(&["zoo:two-room/pldm", "--ingredients", "SE"], &["add D"]);

@@ -109,6 +109,22 @@ fn recipes_are_listed_and_checked_before_they_run() {
         2,
         &["bad.toml", "imports a Python module", "--trust"],
     );
+    let contradictions = [
+        ("image = 32", "image = 32\nno-pixels = true", "[[collect]] 'rooms'"),
+        ("explore:0.7", "expolre:0.7", "did you mean"),
+        ("image = 32", "image = 32\nview = [\"nowhere\"]", "[[collect]] 'rooms'"),
+        ("image = 32", "image = 32\npin = [\"agent.colour=1\"]", "did you mean agent.color"),
+        (
+            "budget = 10",
+            "budget = 10\nenv = \"swm/TwoRoom-v1\"\nshift = [\"agent.colour\"]",
+            "did you mean agent.color",
+        ),
+        ("policies = [\"small\"]", "policies = [\"small\", \"samll\"]", "samll"),
+        ("cem,samples=8", "cme,samples=8", "did you mean"),
+    ];
+    for (from, to, part) in contradictions {
+        refused(from, to, 2, &[part]);
+    }
     refused("data = \"rooms\"", "data = \"s3://bucket/rooms.lance\"", 2, &["s3://bucket", "network connection"]);
     refused(
         "model = \"lewm\"",
@@ -125,6 +141,27 @@ fn recipes_are_listed_and_checked_before_they_run() {
 fn training(train: &str) -> String {
     let (collect, _) = RECIPE.split_once("[[train]]").expect("a training");
     format!("{collect}[[train]]\nname = \"small\"\ndata = \"rooms\"\n{train}\n")
+}
+
+#[test]
+fn training_of_a_recipe_begins_with_the_weights_of_an_earlier_one() {
+    let swm = Swm::new();
+    let (collect, _) = RECIPE.split_once("[[train]]").expect("a training");
+    let step = |name: &str, weights: &str| {
+        format!(
+            "[[train]]\nname = \"{name}\"\nmodel = \"gcbc\"\npreset = \"small\"\ndata = \"rooms\"\n[train.settings]\n\
+             model.image = 32\nmodel.weights = \"{weights}\"\nmodel.frozen = {}\nschedule = {{ steps = 1, warmup = 0 }}\n\
+             data.batch_size = 16\n",
+            !weights.is_empty()
+        )
+    };
+    write(&swm, "chain.toml", &format!("{collect}{}{}", step("first", ""), step("second", "first")));
+    run(&swm, "chain.toml", "chain", &[]);
+    let config = fs::read_to_string(swm.path("chain/second/checkpoint/config.json")).expect("a configuration");
+    assert!(config.contains("chain/first/checkpoint/weights.safetensors"), "{config}");
+    // A later training is no source of weights.
+    write(&swm, "late.toml", &format!("{collect}{}{}", step("first", "second"), step("second", "")));
+    swm.fails(&["train", "--recipe", "late.toml", "-o", "late"], 2, &["'second'", "--trust"]);
 }
 
 #[test]

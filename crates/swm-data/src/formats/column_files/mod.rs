@@ -75,7 +75,7 @@ pub(crate) fn exists(folder: &Path) -> bool {
 }
 
 /// Returns whether a folder is empty, or contains only the first file of a writer that was killed before it was complete.
-pub fn has_no_dataset(folder: &Path) -> bool {
+pub(super) fn has_no_dataset(folder: &Path) -> bool {
     let Ok(mut entries) = folder.read_dir() else { return false };
     let is_left = |path: &Path| {
         path.ends_with(TEMPORARY)

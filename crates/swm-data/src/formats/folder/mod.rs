@@ -26,6 +26,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
     id: "folder",
     summary: "folder NAME.folder of numpy's npz files and one image per step; the reference opens it",
     suffixes: &["folder"],
+    exact_images: true,
     feature: None,
     detect,
     backend: Some(Backend {

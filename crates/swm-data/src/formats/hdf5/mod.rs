@@ -59,6 +59,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
     id: "hdf5",
     summary: "one file NAME.h5 or NAME.hdf5; opens in h5py and in the reference",
     suffixes: &["h5", "hdf5"],
+    exact_images: true,
     feature: Some("hdf5"),
     detect,
     backend: BACKEND,
@@ -73,6 +74,17 @@ const BACKEND: Option<Backend> = None;
 fn detect(location: &Location) -> bool {
     let folder = location.path().filter(|path| path.is_dir());
     ENTRY.has_suffix(location) || folder.is_some_and(|path| !files_in(path).is_empty())
+}
+
+/// Returns whether a file is empty, or its creation was killed or has not finished.
+#[cfg(feature = "hdf5")]
+pub(super) fn is_unfinished(path: &Path) -> bool {
+    ENTRY.has_suffix(&path.into()) && path.is_file() && writer::is_complete_file(path).is_ok_and(|complete| !complete)
+}
+
+#[cfg(not(feature = "hdf5"))]
+pub(super) const fn is_unfinished(_: &Path) -> bool {
+    false
 }
 
 /// The files in a folder with a suffix of this format, sorted by name.

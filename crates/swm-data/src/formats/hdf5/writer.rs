@@ -66,7 +66,7 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
 }
 
 /// Whether a file exists at `path`, other than an empty file or one whose creation was killed.
-fn is_complete_file(path: &Path) -> Result<bool> {
+pub(super) fn is_complete_file(path: &Path) -> Result<bool> {
     // The signature is written last when a file is created.
     let killed = [[0; SIGNATURE.len()], VERSIONS].concat();
     let mut start = [0; 2 * SIGNATURE.len()];

@@ -35,6 +35,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
     id: "lance",
     summary: "Lance table, one folder NAME.lance; opens in Python's lance and lancedb",
     suffixes: &["lance"],
+    exact_images: true,
     feature: None,
     detect: store::detect,
     backend: Some(Backend { open: reader::open, create: writer::create, remove: removal::remove }),

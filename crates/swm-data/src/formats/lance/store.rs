@@ -58,7 +58,7 @@ pub fn damaged(path: &Path, problem: impl Into<String>) -> Error {
 fn lance_error(label: &Path, action: &str, error: &lance_core::Error) -> Error {
     let text = error.to_string();
     // Lance takes damage for a fault of its own, and asks for a report.
-    let text = text.split_once("/lance/issues. ").map_or(text.as_str(), |(_, found)| found);
+    let text = without_position(text.split_once("/lance/issues. ").map_or(text.as_str(), |(_, found)| found));
     // Lance converts some system errors to text, which still contains their code.
     let code =
         text.split("(os error ").nth(1).and_then(|rest| rest.split(')').next()).and_then(|number| number.parse().ok());
@@ -74,6 +74,17 @@ fn lance_error(label: &Path, action: &str, error: &lance_core::Error) -> Error {
         (_, lance_core::Error::IO { .. }) if remote => Error::external(format!("{}: {action}", label.display()), text),
         _ => damaged(label, format!("{action}: {text}")),
     }
+}
+
+/// Removes the position in Lance's own source at the end of a message, such as `, rust/lance-io/src/utils.rs:173:28`.
+fn without_position(text: &str) -> &str {
+    let is_position = |end: &str| {
+        let mut parts = end.rsplitn(3, ':');
+        let numbers = [parts.next(), parts.next()];
+        let is_number = |part: &Option<&str>| part.is_some_and(|part| part.parse::<u32>().is_ok());
+        numbers.iter().all(is_number) && parts.next().is_some_and(|file| file.ends_with(".rs"))
+    };
+    text.rsplit_once(", ").filter(|(_, end)| is_position(end)).map_or(text, |(found, _)| found)
 }
 
 /// Folders that may exist if a writer was killed before the first commit of a table.

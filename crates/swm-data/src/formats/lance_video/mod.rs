@@ -23,6 +23,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
     id: "lance-video",
     summary: "folder NAME.lance-video of a Lance table with one MP4 per episode",
     suffixes: &["lance-video"],
+    exact_images: false,
     feature: Some("ffmpeg"),
     detect,
     backend: BACKEND,

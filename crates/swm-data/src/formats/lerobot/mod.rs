@@ -53,6 +53,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
     id: "lerobot",
     summary: "LeRobot dataset, versions 2.1 (read) and 3.0; a folder with meta/info.json, new ones NAME.lerobot",
     suffixes: &["lerobot"],
+    exact_images: false,
     feature: Some("lerobot"),
     detect,
     backend: BACKEND,

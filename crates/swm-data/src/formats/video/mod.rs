@@ -35,6 +35,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
     id: "video",
     summary: "folder NAME.video of numpy's npz files and one MP4 per episode; the reference opens it",
     suffixes: &["video"],
+    exact_images: false,
     feature: Some("ffmpeg"),
     detect,
     backend: BACKEND,

@@ -9,7 +9,7 @@ pub use comparison::ColumnComparison;
 
 use crate::dataset::episodes::describe_columns;
 use crate::dataset::{CommitPolicy, Constants, Location, Reader, StepRange, WriteMode, WriteOptions};
-use crate::formats::{FORMATS, FormatEntry, create, detect, open};
+use crate::formats::{FORMATS, FormatEntry, create, detect, has_no_dataset, open};
 use comparison::{data_columns, dataset_hash, episode_hash};
 use serde::Serialize;
 use std::ops::Range;
@@ -146,9 +146,7 @@ fn trial(
         None => detect(target),
     };
     let has_images = data_columns(reader.schema()).any(|(_, column)| column.is_image());
-    // These formats store images as they are, unless the codec is lossy.
-    let keeps = |entry: &FormatEntry| ["lance", "folder", "hdf5"].contains(&entry.id);
-    let loses = |entry: &&FormatEntry| !keeps(entry) || matches!(options.codec, ImageCodec::Jpeg { .. });
+    let loses = |entry: &&FormatEntry| !entry.exact_images || matches!(options.codec, ImageCodec::Jpeg { .. });
     let Some(entry) = entry.filter(loses).filter(|_| has_images && options.verify) else { return Ok(None) };
     let stem = path.file_stem().unwrap_or_default().to_string_lossy();
     let suffix = path.extension().map(|suffix| format!(".{}", suffix.to_string_lossy())).unwrap_or_default();
@@ -196,6 +194,9 @@ fn convert_into(
         report.existing = first;
         let compared = source.compare("compare", &**existing, 0..first, 0, &mut hashes, &mut report.columns, control);
         compared.map_err(|error| match error {
+            Error::Mismatch { operation, given, expected } if options.mode == ConvertMode::Append => {
+                Error::mismatch(format!("appending to {target}, {operation}"), given, expected)
+            }
             Error::Mismatch { operation, given, expected } => {
                 not_a_prefix(target, format!("{operation}: {given}, expected {expected}"))
             }
@@ -210,11 +211,11 @@ fn convert_into(
             ConvertMode::Create => WriteMode::Create,
             ConvertMode::Overwrite => WriteMode::Overwrite,
         };
-        let exclusive = options.mode != ConvertMode::Append;
-        let write =
-            WriteOptions { mode, codec: options.codec, manifest: reader.manifest(), commit: options.commit, exclusive };
+        let (codec, manifest, commit) = (options.codec, reader.manifest(), options.commit);
+        // The position of the first episode in the target was read before the lock was taken.
+        let write = WriteOptions { mode, codec, manifest, commit, exclusive: true };
         let hashed = options.verify.then_some(&mut hashes[..]);
-        let copied = source.copy(target, format, write, first..all, hashed, &mut report, control);
+        let copied = source.copy(target, format, (write, base + first), first..all, hashed, &mut report, control);
         if is_new && copied.is_err() {
             remove_if_empty(target, format);
         }
@@ -253,8 +254,7 @@ fn check_distinct(reader: &dyn Reader, target: &Location) -> Result<()> {
 /// Opens the target if it exists.
 fn open_existing(target: &Location, format: Option<&FormatEntry>) -> Result<Option<Arc<dyn Reader>>> {
     let Some(path) = target.path() else { return Ok(reopen(target, format).ok()) };
-    let empty = path.is_dir() && path.read_dir().is_ok_and(|mut entries| entries.next().is_none());
-    if empty || !path.exists() {
+    if !path.exists() || has_no_dataset(path) {
         return Ok(None);
     }
     reopen(target, format).map(Some)
@@ -308,13 +308,14 @@ impl<'a> Source<'a> {
         Ok(cut_last_action(rows))
     }
 
-    /// Copies episodes while a thread reads ahead of the writer. Stores the episode hashes in `hashes`, if given.
+    /// Copies episodes while a thread reads ahead of the writer. `existing` is the number of episodes that the target is
+    /// expected to have. Stores the episode hashes in `hashes`, if given.
     #[allow(clippy::too_many_arguments, reason = "a part of `convert` that uses the state of `convert`")]
     fn copy(
         &self,
         target: &Location,
         format: Option<&FormatEntry>,
-        options: WriteOptions,
+        (options, existing): (WriteOptions, usize),
         episodes: Range<usize>,
         mut hashes: Option<&mut [Option<[u8; 32]>]>,
         report: &mut Converted,
@@ -324,6 +325,11 @@ impl<'a> Source<'a> {
             Some(format) => format.create(target, &self.schema, options)?,
             None => create(target, &self.schema, options)?,
         };
+        if writer.episodes() != existing {
+            let problem = format!("another program wrote to it: it had {existing} episodes, now {}", writer.episodes());
+            writer.pause()?;
+            return Err(Error::config(target.to_string(), problem, "run the command again"));
+        }
         let (first, all) = (episodes.start, self.reader.episodes().len());
         start(control, "convert", all);
         let hashed = hashes.is_some();

@@ -10,6 +10,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use swm_core::{Error, Origin, Result, manifest};
 use swm_envs::wrappers;
+use swm_models::run_folder;
 use toml::{Table, Value};
 
 /// The largest recipe, in bytes.
@@ -242,6 +243,20 @@ impl Recipe {
         Ok(())
     }
 
+    /// Returns the settings of a training under dotted keys. The name of an earlier training as `weights` becomes the path of
+    /// its weights.
+    pub fn settings(&self, step: &Step, folder: &Path) -> Vec<(String, String)> {
+        let earlier = || self.train.iter().take_while(|other| other.name != step.name);
+        let resolve = |(key, value): (String, String)| {
+            let is_weights = key.rsplit('.').next() == Some("weights");
+            match earlier().find(|other| is_weights && Value::from(other.name.as_str()).to_string() == value) {
+                Some(other) => (key, Value::from(weights(&other.name, folder).display().to_string()).to_string()),
+                None => (key, value),
+            }
+        };
+        flat(&step.settings).into_iter().map(resolve).collect()
+    }
+
     /// Returns the arguments of a step's command, after the program and the command. Names of steps become paths in
     /// `folder`.
     pub fn arguments(&self, kind: Kind, step: &Step, folder: &Path) -> Vec<String> {
@@ -264,9 +279,14 @@ impl Recipe {
         if let Some(value) = step.options.get(kind.positional()) {
             arguments.extend(values(kind.positional(), value));
         }
-        arguments.extend(flat(&step.settings).into_iter().map(|(key, value)| format!("{key}={value}")));
+        arguments.extend(self.settings(step, folder).into_iter().map(|(key, value)| format!("{key}={value}")));
         arguments
     }
+}
+
+/// The path of the weights of the training with a name.
+pub fn weights(name: &str, folder: &Path) -> PathBuf {
+    run_folder::weights(&Kind::Train.output(folder, name))
 }
 
 /// Parses the arguments of a step as the command line does.

@@ -1,6 +1,6 @@
 //! Running a recipe: every step whose output is missing, then a comparison of the hashes.
 
-use super::file::{Kind, Recipe, Step, parse};
+use super::file::{self, Kind, Recipe, Step, parse};
 use super::text;
 use crate::capsule;
 use crate::cli::collect::{self, CollectArgs};
@@ -9,6 +9,7 @@ use crate::cli::train::{self, TrainArgs};
 use crate::cli::training_curves::of_checkpoint;
 use crate::cli::{Context, emit, emit_json, eprint, output_folder};
 use crate::home;
+use crate::resolver::HomeResolver;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
@@ -113,18 +114,31 @@ pub fn run(request: &RecipeRun<'_>, context: &Context) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Checks the options of every step before anything runs.
+/// Checks the options of every step before anything runs, as far as they do not depend on outputs of earlier steps.
 ///
 /// # Errors
-/// When an option is unknown or invalid.
+/// When an option is unknown or invalid, or contradicts another.
 pub fn check(recipe: &Recipe, folder: &Path) -> Result<()> {
+    let outputs: Vec<PathBuf> = recipe.steps().map(|(kind, step)| kind.output(folder, &step.name)).collect();
+    let resolver = HomeResolver::new(Origin::User);
     for (kind, step) in recipe.steps() {
         let arguments = recipe.arguments(kind, step, folder);
-        match kind {
-            Kind::Collect => parse::<CollectArgs>(kind, step, &arguments).map(drop)?,
-            Kind::Train => parse::<TrainArgs>(kind, step, &arguments)?.config().map(drop)?,
-            Kind::Eval => parse::<EvalArgs>(kind, step, &arguments).map(drop)?,
-        }
+        let checked = match kind {
+            Kind::Collect => collect::check(&parse::<CollectArgs>(kind, step, &arguments)?),
+            Kind::Train => parse::<TrainArgs>(kind, step, &arguments)?.config().map(drop),
+            Kind::Eval => {
+                let is_output = |policy: &str| outputs.iter().any(|output| output == Path::new(policy));
+                parse::<EvalArgs>(kind, step, &arguments)?.check(&resolver, is_output)
+            }
+        };
+        checked.map_err(|error| match error {
+            // Its hint lists names.
+            Error::UnknownName { .. } => error,
+            error => {
+                let what = format!("[[{}]] '{}' of the recipe", kind.name(), step.name);
+                Error::config(what, error.to_string(), "correct its options")
+            }
+        })?;
     }
     Ok(())
 }
@@ -142,8 +156,13 @@ fn check_weights(recipe: &Recipe, request: &RecipeRun<'_>, origin: &Origin) -> R
         weights("", &config, &mut found);
         for (key, from) in found {
             let own = format!("{}.{key}=", step.name);
-            // What is no file is looked for on the hub of models.
-            if !Path::new(&from).is_file() && !request.settings.iter().any(|setting| setting.starts_with(&own)) {
+            // What is no file is looked for on the hub of models, but the weights of an earlier step are made later.
+            let is_made =
+                recipe.train.iter().any(|other| file::weights(&other.name, request.output) == Path::new(&from));
+            if !is_made
+                && !Path::new(&from).is_file()
+                && !request.settings.iter().any(|setting| setting.starts_with(&own))
+            {
                 let name = format!("the pretrained weights '{from}' of [[train]] '{}'", step.name);
                 origin.check_user(&name, "which may be downloaded", Some(format!("{own}FILE").as_str()))?;
             }

@@ -1,6 +1,6 @@
 //! Expands the tables of a study's file to cells.
 
-use super::file::{StudyFile, Table, Variant};
+use super::file::{OF_THE_COMMAND, StudyFile, Table, Variant};
 use super::variants::Budget;
 use crate::cli::eval::{CapsuleStarts, EvalArgs};
 use crate::resolver::HomeResolver;
@@ -98,6 +98,7 @@ fn within(condition: &Variant, policy: &Variant, error: Error) -> Error {
     let places: Vec<&str> = [condition, policy].iter().map(|variant| variant.at.as_str()).collect();
     match error {
         Error::Interrupted => error,
+        error if places.iter().all(|place| *place == OF_THE_COMMAND) => error,
         error => Error::config(
             format!("'{}' of '{}' ({})", condition.name, policy.name, places.join(", ")),
             error.to_string(),

@@ -78,6 +78,9 @@ pub struct Variant {
     pub starts: Vec<String>,
 }
 
+/// The place of a table that the command line makes, instead of a line of a file.
+pub const OF_THE_COMMAND: &str = "the command";
+
 /// The option of a policy's table that names the policy.
 pub const POLICY: &str = "policy";
 

@@ -204,7 +204,7 @@ pub(super) fn single(
     control: &mut Control<'_>,
 ) -> Result<Study> {
     let table = |name: &str, options| file::Table {
-        at: "the command".to_owned(),
+        at: file::OF_THE_COMMAND.to_owned(),
         name: name.to_owned(),
         options,
         ..file::Table::default()

@@ -10,12 +10,23 @@ use pyo3::types::PyDict;
 use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::PathBuf;
-use swm::core::{Error, Manifest};
+use swm::core::{Error, Manifest, Result};
 use swm::data::LoaderConfig;
 use swm::models::nn::parameters::{HostTensor, Named};
 use swm::models::store::{Parts, StateParts, store};
 use swm::models::train::TrainingPlan;
-use swm::models::{FAMILIES, TrainOptions};
+use swm::models::{FAMILIES, TrainOptions, TrainableConfig};
+
+/// The complete configuration of a family, a preset with `key=value` settings, as JSON.
+#[pyfunction]
+pub fn training_config(family: &str, preset: Option<&str>, settings: Vec<String>) -> PyResult<String> {
+    Ok(config(family, preset, &settings).map_err(to_py_err)?.to_json().to_string())
+}
+
+fn config(family: &str, preset: Option<&str>, settings: &[String]) -> Result<Box<dyn TrainableConfig>> {
+    let family = FAMILIES.get(family)?;
+    (family.config)(preset.unwrap_or(family.presets[0].id), settings)
+}
 
 /// Writes the checkpoint from which a run begins, or with `resume` checks the one from which it continues. Returns the
 /// rest of what the run needs, as JSON: `parameters` (clipping group and factor of the learning rate by name),
@@ -31,12 +42,10 @@ pub fn begin_training(
     resume: bool,
 ) -> PyResult<String> {
     let begun = detached(py, || {
-        let family = FAMILIES.get(family)?;
-        let config = (family.config)(preset.unwrap_or(family.presets[0].id), &settings)?;
         let options = TrainOptions { resume, cache: swm::home::weights()?, ..TrainOptions::default() };
-        config.begin(dataset.reader()?, &out, &options).unwrap_or_else(|| {
+        config(family, preset, &settings)?.begin(dataset.reader()?, &out, &options).unwrap_or_else(|| {
             let problem = "it is trained by the engine only";
-            Err(Error::config(family.id, problem, "train it with swm.wm.train, or `swm train`"))
+            Err(Error::config(family, problem, "train it with swm.wm.train, or `swm train`"))
         })
     });
     let TrainingPlan { parameters, training, validation } = begun.map_err(to_py_err)?;

@@ -90,7 +90,11 @@ class Attention(nn.Module):
             answered = self.norm_c(c)
         elif self.att_type == "frame_agg":
             asked = self.frame_tokens[:, : x.shape[1] // self.num_patches].expand(len(x), -1, -1)
-        parts = (self.to_q(asked), *self.to_kv(answered).chunk(2, -1))
+        keys, values = self.to_kv(answered).chunk(2, -1)
+        if keys.shape[1] == 1:
+            # All attention goes to the only token, so queries get no gradient.
+            return self.to_out(values.expand(-1, asked.shape[1], -1))  # type: ignore[no-any-return]
+        parts = (self.to_q(asked), keys, values)
         queries, keys, values = (part.unflatten(-1, (self.heads, -1)).transpose(1, 2) for part in parts)
         mask = self.causal_mask[:, :, : queries.shape[2], : keys.shape[2]] if self.causal else None
         dropout = self.dropout.p if self.training else 0.0

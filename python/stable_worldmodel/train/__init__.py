@@ -1,0 +1,48 @@
+"""Training of the baselines in torch, on any device.
+
+    python -m stable_worldmodel.train lewm data=rooms out=lewm-rooms preset=tiny model.latent=4
+    torchrun --nproc-per-node 2 -m stable_worldmodel.train pldm data=rooms
+
+The settings are those of `swm train`, and so is the checkpoint: `swm eval lewm-rooms` plans with it, and
+`swm train --resume` and this package continue each other's runs.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from .options import Options, parsed, settings_of
+
+if TYPE_CHECKING:
+    from .loop import Trainer
+
+__all__ = ["Options", "Trainer", "parsed", "train"]
+
+
+def train(family: str, data: Any, kind: Any = None, *, settings: Any = (), **options: Any) -> str:
+    """Trains a model, and returns the folder of its checkpoint.
+
+    Args:
+        family: The model: `lewm`, `pldm`, `gcbc`, `gcivl` or `gciql`.
+        data: The dataset: a path or a name.
+        kind: A class derived from that of the family, for models with other methods.
+        settings: Settings of the configuration, such as `["model.latent=4"]`.
+        **options: The other attributes of `Options`; names with `__` are settings, such as `schedule__steps=1000`.
+    """
+    from .loop import Trainer
+
+    more = {key: options.pop(key) for key in list(options) if "__" in key}
+    trainer = Trainer(Options(family, str(data), settings=[*settings, *settings_of(more)], **options), kind)
+    try:
+        trainer.train()
+    finally:
+        trainer.ranks.leave()
+    return str(trainer.run)
+
+
+def __getattr__(name: str) -> Any:
+    if name == "Trainer":
+        from .loop import Trainer
+
+        return Trainer
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,74 @@
+"""The command line of `stable_worldmodel.train`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from .options import Options, parsed
+
+USAGE = """Train a baseline in torch
+
+usage: python -m stable_worldmodel.train FAMILY data=PATH [OPTION=VALUE ...]
+                                         [KEY=VALUE ...]
+
+families: lewm, pldm, gcbc, gcivl, gciql
+
+options:
+  data=DATASET   The dataset: a path or a name
+  out=RUN        The checkpoint to write (default: FAMILY-DATASET)
+  preset=NAME    Size and schedule: a preset or a TOML file
+  device=NAME    cpu, cuda or another device of torch (default: auto)
+  amp=off        Precision of networks: off, bf16 or fp16
+  compile=false  torch.compile: true, or a backend
+  resume=false   Continue an interrupted training
+  threads=2      Threads that load batches
+
+Keys are those of `swm train`, such as optim.lr=3e-4 seed=1. With Hydra
+(pip install hydra-core), its flags work, too: --multirun, --cfg job.
+
+example: python -m stable_worldmodel.train lewm data=rooms preset=tiny
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command and returns its exit code."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if not given or given[0] in ("-h", "--help", "help"):
+        sys.stdout.write(USAGE)
+        return 0 if given else 2
+    family, *rest = given
+    try:
+        if any(argument.startswith("-") for argument in rest):
+            from .sweeps import run
+
+            run(family, rest, train)
+        else:
+            train(parsed(family, rest))
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted; resume=true continues\n")
+        return 130
+    except (ValueError, TypeError, KeyError) as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
+    except (OSError, RuntimeError, FloatingPointError) as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 1
+    return 0
+
+
+def train(options: Options) -> None:
+    """Trains, and prints the folder of the checkpoint."""
+    from .loop import Trainer
+
+    trainer = Trainer(options)
+    try:
+        trainer.train()
+    finally:
+        trainer.ranks.leave()
+    if trainer.ranks.rank == 0:
+        sys.stdout.write(f"{trainer.run}\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,328 @@
+"""`Trainer`: the training loop in torch, whose checkpoints are those of `swm train`."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .. import _engine
+from ..data.foreign import engine_of
+from ..data.loader import Goals, Loader
+from ..data.utils import load_dataset
+from ..wm._weights import read_safetensors
+from ..wm.checkpoints import module_of
+from ..wm.pretrained import Pretrained, stored_names, write
+from .losses import Losses, losses_of
+from .optim import Optimizer, learning_rate
+from .options import Options
+from .ranks import Ranks
+
+__all__ = ["Trainer"]
+
+
+class Trainer:
+    """A training in this process, which may be one of several.
+
+    Args:
+        options: The training.
+        kind: A class derived from that of the family, whose methods replace the family's; the family's class for `None`.
+
+    Raises:
+        FileNotFoundError: If the dataset does not exist.
+        ValueError: If a setting is invalid, or the folder of the checkpoint holds a run that cannot be continued.
+    """
+
+    def __init__(self, options: Options, kind: type[Pretrained] | None = None) -> None:
+        self.options, self.run = options, options.run
+        losses = losses_of(options.family)
+        self.device = _device(options.device)
+        self.ranks = Ranks.join(self.device)
+        if self.device.type == "cuda" and self.device.index is None and self.ranks.size > 1:
+            self.device = torch.device("cuda", self.ranks.rank % torch.cuda.device_count())
+        dataset = load_dataset(options.data)
+        plan = self.ranks.first(lambda: self._begin(dataset))
+        self.model: Any = module_of(self.run, kind)
+        #: The moving average of the weights, by the names of the checkpoint; `None` without one.
+        self.average: dict[str, Tensor] | None = None
+        self.config: dict[str, Any] = self.model.stored.config
+        state = self._restored()
+        self.model.to(self.device)
+        self.losses: Losses = losses(self.model, self.ranks, self._precision, self._compiled)
+        self.optimizer = Optimizer(self.model, plan["parameters"], self.config["optim"])
+        self.optimizer.restore(state["step"], read_safetensors(self.run / "checkpoint/optimizer.safetensors"))
+        self.scaler = torch.amp.GradScaler(self.device.type, enabled=options.amp == "fp16")  # type: ignore[attr-defined]
+        self.step: int = state["step"]
+        self.best: Any = state["best"]
+        self.validations_since_best: int = state["looks"]
+        self.loader = self._loader(dataset, plan["training"])
+        self.validation = None if plan["validation"] is None else self._loader(dataset, plan["validation"])
+        self.waited = 0.0
+
+    def _begin(self, dataset: Any) -> Any:
+        """Writes the first checkpoint of the training, or checks the one that it continues."""
+        options = self.options
+        resume = options.resume and (self.run / "checkpoint").is_dir()
+        settings = list(options.settings)
+        plan = _engine.begin_training(options.family, options.preset, settings, engine_of(dataset), str(self.run), resume)
+        return json.loads(plan)
+
+    def _restored(self) -> Any:
+        """The state of the run; the trained weights, if the checkpoint holds their average, replace the average."""
+        folder = self.run / "checkpoint"
+        if self.config["optim"].get("ema", 0.0) > 0:
+            self.average = {name: value.to(self.device, copy=True) for name, value in self.model.checkpoint_weights().items()}
+            raw = read_safetensors(folder / "raw.safetensors")
+            own = {self.model._checkpoint_name(name): name for name in stored_names(self.model)}
+            self.model.load_state_dict({own[name]: value for name, value in raw.items()}, strict=False)
+        return json.loads((folder / "state.json").read_text())
+
+    def _loader(self, dataset: Any, settings: Mapping[str, Any]) -> Loader:
+        goals = [
+            Goals(columns=goal["columns"], anchor=goal["anchor"], name=goal["name"], **goal["mixture"])
+            for goal in settings["goals"]
+        ]
+        return Loader(
+            dataset,
+            settings["batch_size"],
+            num_steps=settings["num_steps"],
+            frameskip=settings["frameskip"],
+            columns=settings["columns"],
+            seed=settings["seed"],
+            episodes=settings["episodes"],
+            drop_last=settings["drop_last"],
+            goals=goals,
+            backend="torch",
+            device=self.device,
+            pin_memory=self.device.type == "cuda",
+            rank=self.ranks.rank,
+            world_size=self.ranks.size,
+            threads=self.options.threads,
+        )
+
+    def _precision(self) -> Any:
+        if self.options.amp == "off":
+            return contextlib.nullcontext()
+        return torch.autocast(self.device.type, {"bf16": torch.bfloat16, "fp16": torch.float16}[self.options.amp])
+
+    def _compiled(self, network: Any) -> Any:
+        compile = self.options.compile
+        if not compile:
+            return network
+        return torch.compile(network) if compile is True else torch.compile(network, backend=compile)
+
+    def train(self, until: int | None = None) -> str:
+        """Trains until the last step, saves the checkpoint, and returns the hash of its weights.
+
+        Args:
+            until: The step at which to stop, from which `resume` continues; the last step for `None`.
+
+        Raises:
+            KeyboardInterrupt: After Ctrl-C; the checkpoint is saved, and `resume` continues.
+            FloatingPointError: If the loss is not finite; the last checkpoint is kept.
+        """
+        steps, log_every, save_every = self.config["schedule"]["steps"], self.config["log_every"], self.config["save_every"]
+        begin, first, window = time.monotonic(), self.step, []
+        batches = self._batches()
+        stopped_early = False
+        with _interruptions() as interrupted:
+            while self.step < (steps if until is None else min(until, steps)) and not stopped_early:
+                metrics, stop = self._update(batches, interrupted.is_set())
+                window.append(metrics)
+                if self.validation is not None and _due(self.config["validation"]["every"], self.step, steps):
+                    stopped_early = self._validate()
+                if _due(log_every, self.step, steps) or stopped_early or stop:
+                    self._log(window, time.monotonic() - begin, self.step - first)
+                    window = []
+                if save_every and self.step % save_every == 0 and self.step < steps:
+                    self.save()
+                if stop:
+                    self.save()
+                    raise KeyboardInterrupt
+        return self.save()
+
+    def _batches(self) -> Iterator[dict[str, Tensor]]:
+        """The batches from the current step on."""
+        taken = self.step * self.config["optim"].get("accumulate", 1)
+        epoch, batch = divmod(taken, len(self.loader))
+        position = {"epoch": epoch, "batch": batch}
+        self.loader.load_state_dict({**self.loader.state_dict(), **position})
+        while True:
+            yield from self.loader
+
+    def _update(self, batches: Iterator[dict[str, Tensor]], interrupt: bool) -> tuple[dict[str, float], bool]:
+        """A step of the optimizer: its metrics, and whether a rank was interrupted."""
+        model, accumulate = self.model, self.config["optim"].get("accumulate", 1)
+        self._train_mode()
+        self.optimizer.zero_grad()
+        names = self.losses.names
+        total = torch.zeros(len(names) + 1, device=self.device)
+        share = 1.0
+        for index in range(accumulate):
+            begin = time.monotonic()
+            batch = next(batches)
+            self.waited += time.monotonic() - begin
+            sizes = self.ranks.sizes(len(batch["pixels"]), self.device)
+            share = self.losses.share(sizes)
+            self._seed(self.step * accumulate + index)
+            self.losses.accumulate(index, accumulate)
+            found = self.losses(batch, sizes)
+            if found:
+                self.scaler.scale(found["loss"] * (share / accumulate)).backward()
+                total[:-1] += torch.stack([found[name].detach().float() for name in names]) * (share / accumulate)
+        total[-1] = float(interrupt)
+        total = self.ranks.add_up(model, total)
+        *values, stop = total.tolist()
+        metrics = dict(zip(names, values, strict=True))
+        if not all(map(_finite, values)):
+            raise FloatingPointError(
+                f"the loss at training step {self.step + 1} is not finite ({metrics}); lower optim.lr or lengthen "
+                "schedule.warmup; the last checkpoint is kept"
+            )
+        factor = learning_rate(self.config["schedule"], self.step)
+        metrics["lr"] = self.config["optim"]["lr"] * factor
+        metrics["gradient_norm"] = self.optimizer.step(factor, self.scaler)
+        self.ranks.average_buffers(model, share)
+        self.losses.after_step()
+        self._move_average()
+        self.step += 1
+        return metrics, stop > 0
+
+    def _train_mode(self) -> None:
+        self.model.train()
+        if self.config["model"].get("frozen"):
+            self.model.encoder.eval()
+
+    def _seed(self, batch: int) -> None:
+        """Makes random numbers depend on the batch only. Ranks that compute the whole batch draw the same."""
+        own = 0 if self.losses.whole_batch else self.ranks.rank
+        torch.manual_seed((self.config["seed"] * 1_000_003 + batch) * 1_009 + own)
+
+    def _move_average(self) -> None:
+        if self.average is None:
+            return
+        keep = self.config["optim"]["ema"]
+        for name, value in self.model.checkpoint_weights().items():
+            self.average[name].lerp_(value.detach(), 1 - keep)
+
+    def _validate(self) -> bool:
+        """Logs the losses of validation batches, keeps the best weights, and returns whether training is to stop."""
+        assert self.validation is not None
+        settings, rows = self.config["validation"], []
+        with self._averaged(), torch.no_grad(), self.losses.validating():
+            self.validation.set_epoch(0)
+            for index, batch in zip(range(settings["batches"]), self.validation, strict=False):
+                sizes = self.ranks.sizes(len(batch["pixels"]), self.device)
+                self._seed(-1 - index)
+                found = self.losses(batch, sizes)
+                share = self.losses.share(sizes)
+                values = [
+                    found[name].float() * share if found else torch.zeros((), device=self.device) for name in self.losses.names
+                ]
+                rows.append(self.ranks.add_up(torch.nn.Module(), torch.stack(values)).tolist())
+        if not rows:
+            raise ValueError(
+                "validation.every: the validation episodes have fewer clips than a batch of "
+                f"{self.config['data']['batch_size']}; collect more episodes, or lower data.batch_size"
+            )
+        means = [sum(column) / len(rows) for column in zip(*rows, strict=True)]
+        self._write_log({f"validation/{name}": value for name, value in zip(self.losses.names, means, strict=True)})
+        if self.best is None or means[0] < self.best[1]:
+            self.best, self.validations_since_best = (self.step, means[0]), 0
+            self._write(self.run / "best", state=None)
+        else:
+            self.validations_since_best += 1
+        return 0 < settings["patience"] <= self.validations_since_best
+
+    @contextlib.contextmanager
+    def _averaged(self) -> Iterator[None]:
+        """With the average in place of the trained weights, if there is one."""
+        if self.average is None:
+            yield
+            return
+        own = {name: value.clone() for name, value in self.model.checkpoint_weights().items()}
+        try:
+            self._load(self.average)
+            yield
+        finally:
+            self._load(own)
+
+    def _load(self, weights: Mapping[str, Tensor]) -> None:
+        with torch.no_grad():
+            for name, value in self.model.checkpoint_weights().items():
+                value.copy_(weights[name])
+
+    def save(self) -> str:
+        """Writes the checkpoint, from which training can continue, and returns the hash of its weights."""
+        return self._write(self.run, {"step": self.step, "best": self.best, "looks": self.validations_since_best})
+
+    def _write(self, run: Path, state: Mapping[str, Any] | None) -> str:
+        weights = self.model.checkpoint_weights()
+        stored = self.model.stored
+        device = {"device": f"{self.device} (torch)"}
+        stored.manifest.update(device)
+        parts: dict[str, Any] = {}
+        if state is not None:
+            parts = {"state": state, "moments": self.optimizer.moments(), "raw": None if self.average is None else weights}
+        averaged = weights if self.average is None else self.average
+        return self.ranks.first(lambda: write(run, stored, averaged, replace=True, **parts))  # type: ignore[no-any-return]
+
+    def _log(self, window: list[dict[str, float]], elapsed: float, done: int) -> None:
+        """Writes the means of the metrics since the last line."""
+        means = {name: sum(row[name] for row in window) / len(window) for name in window[0]}
+        means["lr"] = window[-1]["lr"]
+        clips = done * self.config["optim"].get("accumulate", 1) * self.config["data"]["batch_size"]
+        rates = {"clips_per_second": clips / elapsed, "data_wait": self.waited / elapsed, "seconds": elapsed}
+        self._write_log({**means, **rates})
+
+    def _write_log(self, values: Mapping[str, float]) -> None:
+        if self.ranks.rank == 0:
+            with open(self.run / "train.jsonl", "a", encoding="utf-8") as file:
+                file.write(json.dumps({"step": self.step, **values}) + "\n")
+
+
+def _device(name: str) -> torch.device:
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise ValueError(f"device: {name!r} is not available ({error}); choose cpu, or another device of torch") from error
+    return device
+
+
+def _due(every: int, done: int, steps: int) -> bool:
+    return every > 0 and (done % every == 0 or done == steps)
+
+
+def _finite(value: float) -> bool:
+    return value - value == 0
+
+
+@contextlib.contextmanager
+def _interruptions() -> Iterator[threading.Event]:
+    """An event that Ctrl-C sets; the second Ctrl-C interrupts at once."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+
+    def handle(number: int, frame: Any) -> None:
+        if event.is_set():
+            raise KeyboardInterrupt
+        event.set()
+
+    before = signal.signal(signal.SIGINT, handle)
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,98 @@
+"""`Optimizer`: AdamW with the engine's parameter groups, whose state a checkpoint holds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["Optimizer", "learning_rate"]
+
+
+class Optimizer:
+    """AdamW, with a clipping group and a factor of the learning rate for each parameter.
+
+    Args:
+        model: The module, of a checkpoint of the engine.
+        groups: The clipping group and the factor of each weight, by the name in the checkpoint.
+        settings: The table `optim` of the configuration.
+    """
+
+    def __init__(self, model: Any, groups: Mapping[str, Sequence[float]], settings: Mapping[str, Any]) -> None:
+        self.settings = settings
+        #: The trained parameters, by the name in the checkpoint.
+        self.parameters: dict[str, nn.Parameter] = {}
+        #: The parameters of each clipping group.
+        self.clipped: dict[float, list[nn.Parameter]] = {}
+        by_rate: dict[float, list[nn.Parameter]] = {}
+        for name, parameter in model.named_parameters():
+            if not parameter.requires_grad:
+                continue
+            name = model._checkpoint_name(name)
+            clip, rate = groups[name]
+            self.parameters[name] = parameter
+            self.clipped.setdefault(clip, []).append(parameter)
+            by_rate.setdefault(rate, []).append(parameter)
+        self.adam = torch.optim.AdamW(
+            [{"params": parameters, "rate": rate} for rate, parameters in by_rate.items()],
+            lr=settings["lr"],
+            betas=tuple(settings["betas"]),
+            eps=settings["epsilon"],
+            weight_decay=settings["weight_decay"],
+        )
+
+    def zero_grad(self) -> None:
+        """Removes gradients."""
+        self.adam.zero_grad(set_to_none=True)
+
+    def step(self, factor: float, scaler: Any) -> float:
+        """Makes a step at `factor` times the peak learning rate, and returns the norm of the gradient before clipping.
+
+        Raises:
+            FloatingPointError: If the gradient is not finite. In half precision, the step is left out instead.
+        """
+        for group in self.adam.param_groups:
+            group["lr"] = self.settings["lr"] * factor * group["rate"]
+        scaler.unscale_(self.adam)
+        norms = [float(nn.utils.clip_grad_norm_(group, self.settings["clip"])) for group in self.clipped.values()]
+        if not scaler.is_enabled() and not all(map(math.isfinite, norms)):
+            raise FloatingPointError(
+                "the gradient of the loss is not finite; lower optim.lr or lengthen schedule.warmup; the last checkpoint "
+                "is kept"
+            )
+        scaler.step(self.adam)
+        scaler.update()
+        return math.sqrt(sum(norm**2 for norm in norms))
+
+    def moments(self) -> dict[str, Tensor]:
+        """The state, as a checkpoint holds it: `first.NAME` and `second.NAME`, flattened."""
+        found = {}
+        for name, parameter in self.parameters.items():
+            state = self.adam.state.get(parameter)
+            if state:
+                found[f"first.{name}"] = state["exp_avg"].flatten()
+                found[f"second.{name}"] = state["exp_avg_sq"].flatten()
+        return found
+
+    def restore(self, steps: int, moments: Mapping[str, Tensor]) -> None:
+        """Restores a state that was taken after `steps` steps."""
+        for name, parameter in self.parameters.items():
+            if f"first.{name}" in moments:
+                first, second = (moments[f"{part}.{name}"].view_as(parameter) for part in ("first", "second"))
+                self.adam.state[parameter] = {
+                    "step": torch.tensor(float(steps)),
+                    "exp_avg": first.to(parameter),
+                    "exp_avg_sq": second.to(parameter),
+                }
+
+
+def learning_rate(schedule: Mapping[str, Any], step: int) -> float:
+    """The factor of the peak learning rate at a step: linear warm-up, then cosine decay to the floor."""
+    warmup, floor = schedule["warmup"], schedule["floor"]
+    if step < warmup:
+        return (step + 1) / warmup  # type: ignore[no-any-return]
+    progress = min((step - warmup) / max(schedule["steps"] - warmup, 1), 1.0)
+    return floor + (1 - floor) * 0.5 * (1 + math.cos(math.pi * progress))  # type: ignore[no-any-return]

@@ -1,0 +1,95 @@
+"""`Options`: what a training needs besides the settings of `swm train`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+__all__ = ["Options", "parsed"]
+
+#: The values that switch something on or off.
+_FLAGS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
+
+
+@dataclass
+class Options:
+    """A training.
+
+    Attributes:
+        family: The model: `lewm`, `pldm`, `gcbc`, `gcivl` or `gciql`.
+        data: The dataset: a path or a name.
+        out: The checkpoint to write: a path or a name; `FAMILY-DATASET` for `None`.
+        preset: The name of a configuration, or a TOML file; the first one of the family for `None`.
+        device: `cpu`, `cuda`, or another device of torch; `auto` is `cuda` if there is a GPU.
+        amp: The precision of networks: `off` (single), `bf16` or `fp16`.
+        compile: Whether `torch.compile` compiles the networks; or the name of its backend.
+        resume: Whether an interrupted training is continued.
+        threads: Threads that prefetch batches.
+        settings: `key=value` settings of the configuration, as for `swm train`.
+    """
+
+    family: str
+    data: str
+    out: str | None = None
+    preset: str | None = None
+    device: str = "auto"
+    amp: str = "off"
+    compile: bool | str = False
+    resume: bool = False
+    threads: int = 2
+    settings: Sequence[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if self.amp not in ("off", "bf16", "fp16"):
+            raise ValueError(f"amp: {self.amp!r}; expected off, bf16 or fp16")
+
+    @property
+    def run(self) -> Path:
+        """The folder of the checkpoint."""
+        from ..wm.pretrained import run_path
+
+        return run_path(self.out or f"{self.family}-{Path(self.data).stem}")
+
+
+def parsed(family: str, arguments: Sequence[str]) -> Options:
+    """The options of a command line: `data=PATH`, other options, and settings of the configuration.
+
+    Raises:
+        ValueError: If an argument is no `key=value`, or the dataset is missing.
+    """
+    own = {item.name: item.default for item in fields(Options) if item.name not in ("family", "settings")}
+    given: dict[str, Any] = {}
+    settings = []
+    for argument in arguments:
+        key, equals, value = argument.partition("=")
+        if not equals:
+            raise ValueError(f"{argument!r}: expected KEY=VALUE, such as data=rooms or model.latent=64")
+        if key in own:
+            given[key] = _value(key, value, own[key])
+        else:
+            settings.append(argument)
+    if "data" not in given:
+        raise ValueError("data: no dataset is given; name one with data=PATH")
+    return Options(family, settings=settings, **given)
+
+
+def _value(key: str, value: str, default: Any) -> Any:
+    """The value of an option, of the type of its default."""
+    if isinstance(default, bool):
+        if value.lower() in _FLAGS:
+            return _FLAGS[value.lower()]
+        if key == "compile":
+            return value
+        raise ValueError(f"{key}: {value!r}; expected true or false")
+    if isinstance(default, int):
+        if not value.isdecimal():
+            raise ValueError(f"{key}: {value!r}; expected a whole number")
+        return int(value)
+    return value
+
+
+def settings_of(overrides: Mapping[str, Any]) -> list[str]:
+    """Settings given as keyword arguments, with `__` for dots, as `key=value`."""
+    return [f"{key.replace('__', '.')}={value}" for key, value in overrides.items()]

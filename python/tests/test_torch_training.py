@@ -1,0 +1,342 @@
+"""Tests of training in torch: it computes what the engine's training computes, on any number of processes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import stable_worldmodel as swm
+
+torch = pytest.importorskip("torch")
+torch.set_num_threads(1)
+
+from stable_worldmodel.train import Options, Trainer, parsed, train  # noqa: E402
+from stable_worldmodel.wm._weights import read_safetensors  # noqa: E402
+from stable_worldmodel.wm.utils import load_pretrained  # noqa: E402
+
+#: A training of seconds. A large epsilon, because AdamW turns rounding errors of tiny gradients into steps.
+SHORT = [
+    "data.batch_size=10",
+    "schedule.steps=6",
+    "schedule.warmup=2",
+    "optim.epsilon=1e-2",
+    "log_every=2",
+    "shards=1",
+]
+CONV = "model.encoder={conv={channels=[6,8],hidden=12,dim=10}}"
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "rooms.lance"
+    world = swm.World("swm/TwoRoom-v1", num_envs=3, image_shape=(64, 64), max_episode_steps=25)
+    world.collect(path, episodes=12, seed=0, progress=False, policy=swm.policy.RandomPolicy(seed=0))
+    return str(path)
+
+
+def engine_train(family, rooms, out, settings, *flags):
+    arguments = ["swm", "train", family, "--data", rooms, "--output", str(out), "--preset", "tiny", *flags, *settings]
+    swm.wm.engine._command(arguments)
+
+
+def torch_train(family, rooms, out, settings, **options):
+    return train(family, rooms, settings=[*settings], out=str(out), preset="tiny", device="cpu", **options)
+
+
+def weights(run, name="weights"):
+    return read_safetensors(Path(run) / f"checkpoint/{name}.safetensors")
+
+
+def distance(found, expected):
+    return sum((found[name] - value).square().sum().item() for name, value in expected.items()) ** 0.5
+
+
+def log_of(run):
+    return [json.loads(line) for line in (Path(run) / "train.jsonl").read_text().splitlines()]
+
+
+RUNS = [
+    # The random directions of SIGReg are drawn differently.
+    ("lewm", ["loss.weight=0.0"]),
+    ("pldm", [CONV, "model.predictor.history=2", "optim.ema=0.5"]),
+    ("pldm", ["loss.std_t=1.0", "loss.cov_t=1.0", "loss.temp_straight=0.5"]),
+    ("gcbc", ["validation.every=3", "validation.batches=2"]),
+    ("gcbc", [CONV, "optim.accumulate=2"]),
+    ("gcivl", []),
+    ("gcivl", [CONV, "model.history=2", "data.num_steps=3"]),
+    ("gciql", []),
+]
+
+
+def assert_close(found, expected, tolerance, scale=None):
+    """Asserts that tensors differ by at most this share of their largest value, or of the largest value of all."""
+    assert found.keys() == expected.keys()
+    largest = scale or max(value.abs().max() for value in expected.values())
+    for name, value in expected.items():
+        assert (found[name] - value).abs().max() <= tolerance * largest, name
+
+
+def part(tensors, prefix):
+    return {name: value for name, value in tensors.items() if name.startswith(prefix)}
+
+
+@pytest.mark.parametrize(("family", "settings"), RUNS)
+def test_a_step_equals_that_of_the_engine(family, settings, rooms, tmp_path):
+    short = [setting for setting in SHORT if not setting.startswith("schedule")]
+    settings = [*short, *settings, "schedule.steps=1", "schedule.warmup=0"]
+    engine_train(family, rooms, tmp_path / "engine", settings)
+    torch_train(family, rooms, tmp_path / "torch", settings)
+    expected, found = weights(tmp_path / "engine", "optimizer"), weights(tmp_path / "torch", "optimizer")
+    # The first moment is a tenth of the clipped gradient. A rounding error may switch a ReLU of the convolutions.
+    assert_close(part(found, "first."), part(expected, "first."), 5e-3)
+    assert_close(part(found, "second."), part(expected, "second."), 5e-3)
+    expected, found = weights(tmp_path / "engine"), weights(tmp_path / "torch")
+    assert found.keys() == expected.keys()
+    # torch adds up the statistics of channels-last maps in single precision, one value after the other.
+    for name, value in expected.items():
+        assert (found[name] - value).abs().max() <= 1e-3 * value.abs().max() + 1e-5, name
+
+
+@pytest.mark.parametrize(("family", "settings"), RUNS)
+def test_a_training_equals_that_of_the_engine(family, settings, rooms, tmp_path):
+    settings = [*SHORT, *settings]
+    engine_train(family, rooms, tmp_path / "engine", settings)
+    torch_train(family, rooms, tmp_path / "torch", settings)
+    for mine, theirs in zip(log_of(tmp_path / "torch"), log_of(tmp_path / "engine"), strict=True):
+        for name in theirs.keys() - {"seconds", "clips_per_second", "data_wait", "sigreg"}:
+            assert mine[name] == pytest.approx(theirs[name], rel=0.05, abs=1e-5), name
+    state = [json.loads((tmp_path / run / "checkpoint/state.json").read_text()) for run in ("torch", "engine")]
+    assert state[0]["step"] == state[1]["step"] == 6
+    manifests = [json.loads((tmp_path / run / "checkpoint/manifest.json").read_text()) for run in ("torch", "engine")]
+    assert manifests[0]["config"] == manifests[1]["config"] and manifests[0]["hashes"].keys() == manifests[1]["hashes"].keys()
+    assert swm.wm.load(str(tmp_path / "torch")).card["family"] == family
+
+
+@pytest.mark.parametrize("family", ["pldm", "gciql"])
+def test_engine_and_torch_continue_each_others_trainings(family, rooms, tmp_path):
+    settings = [*SHORT, "optim.ema=0.5"]
+    engine_train(family, rooms, tmp_path / "whole", settings)
+    options = {"data": rooms, "preset": "tiny", "settings": settings, "device": "cpu"}
+    Trainer(Options(family, out=str(tmp_path / "run"), **options)).train(until=3)
+    engine_train(family, rooms, tmp_path / "run", settings, "--resume")
+    Trainer(Options(family, out=str(tmp_path / "start"), **options)).train(until=3)
+    for name in ("weights", "raw"):
+        found, expected = weights(tmp_path / "run", name), weights(tmp_path / "whole", name)
+        assert distance(found, expected) < 0.02 * distance(weights(tmp_path / "start", name), expected)
+    with pytest.raises(ValueError, match="holds a training run"):
+        Trainer(Options(family, out=str(tmp_path / "run"), **options))
+
+
+def test_a_continued_training_equals_a_whole_one(rooms, tmp_path):
+    settings = [*SHORT, "model.predictor.dropout=0.2", "optim.ema=0.9"]
+    torch_train("lewm", rooms, tmp_path / "whole", settings)
+    options = {"data": rooms, "preset": "tiny", "settings": settings, "device": "cpu", "out": str(tmp_path / "run")}
+    Trainer(Options("lewm", **options)).train(until=4)
+    Trainer(Options("lewm", resume=True, **options)).train()
+    for name in ("weights", "raw", "optimizer"):
+        found, expected = weights(tmp_path / "run", name), weights(tmp_path / "whole", name)
+        assert all(torch.equal(found[key], value) for key, value in expected.items()) and found.keys() == expected.keys()
+    assert [row["step"] for row in log_of(tmp_path / "run")] == [2, 4, 6]
+    with pytest.raises(ValueError, match="stored 10, requested 11"):
+        settings[0] = "data.batch_size=11"
+        Trainer(Options("lewm", resume=True, **options))
+
+
+def test_the_engine_plans_with_what_torch_trained(rooms, tmp_path):
+    run = torch_train("lewm", rooms, tmp_path / "run", SHORT, amp="bf16", compile="eager")
+    module, engine = load_pretrained(run), swm.wm.load(run)
+    world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(64, 64), max_episode_steps=10)
+    for model in (module, engine):
+        world.set_policy(swm.policy.WorldModelPolicy(swm.planning.CEMSolver(model, num_samples=8, n_steps=2, topk=4)))
+        assert 0 <= world.evaluate(episodes=2, seed=0)["success_rate"] <= 100
+
+
+def test_a_class_of_the_user_is_trained(rooms, tmp_path):
+    class Halved(swm.wm.LeWM):
+        calls = 0
+
+        def _features(self, frames):
+            Halved.calls += 1
+            return super()._features(frames) / 2
+
+    torch_train("lewm", rooms, tmp_path / "run", SHORT, kind=Halved)
+    assert Halved.calls == 6
+
+
+#: Computes the gradients of batches, whose slices the processes have, and saves the sums.
+PROGRAM = """
+import sys, torch
+from stable_worldmodel.train import Options, Trainer
+
+torch.set_num_threads(1)
+data, folder, cases, *settings = sys.argv[1:]
+found = {}
+for family, count in (case.split(":") for case in cases.split(",")):
+    run = f"{folder}/{family}-{count}"
+    trainer = Trainer(Options(family, data, out=run, preset="tiny", device="cpu", settings=settings))
+    steps, count, ranks = trainer.config["data"]["num_steps"], int(count), trainer.ranks
+    torch.manual_seed(0)
+    lengths = {"pixels": steps, "goal_pixels": 1, "policy_goal_pixels": 1}
+    whole = {name: torch.randint(0, 256, (10, length, 3, 64, 64), dtype=torch.uint8) for name, length in lengths.items()}
+    whole["action"] = torch.randn(10, steps, 2 * trainer.model.action_block)
+    sizes = [count // ranks.size + (rank < count % ranks.size) for rank in range(ranks.size)]
+    begin = sum(sizes[: ranks.rank])
+    batch = {name: value[begin : begin + sizes[ranks.rank]] for name, value in whole.items()}
+    trainer._train_mode()
+    trainer._seed(0)
+    computed = trainer.losses(batch, ranks.sizes(len(batch["pixels"]), trainer.device))
+    loss = torch.zeros(1)
+    if computed:
+        share = trainer.losses.share(sizes)
+        (computed["loss"] * share).backward()
+        loss += computed["loss"].detach() * share
+    found[run.rpartition("/")[2]] = {"loss": ranks.add_up(trainer.model, loss)} | {
+        name: value.grad for name, value in trainer.model.named_parameters() if value.grad is not None
+    }
+if ranks.rank == 0:
+    torch.save(found, f"{folder}/found.pt")
+ranks.leave()
+"""
+
+
+def launched(world_size, *arguments):
+    """Runs a program of Python in several processes with `torchrun`."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={world_size}", *arguments]
+    command = command if world_size > 1 else [sys.executable, *arguments]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+def test_gradients_do_not_depend_on_the_number_of_processes(rooms, tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text(PROGRAM)
+    cases, found = ["gcbc:10", "gciql:2", "lewm:10", "pldm:3"], {}
+    for size in (1, 2, 3, 4):
+        folder = tmp_path / str(size)
+        folder.mkdir()
+        launched(size, str(program), rooms, str(folder), ",".join(cases), *SHORT)
+        found[size] = torch.load(folder / "found.pt", weights_only=True)
+    for case in (case.replace(":", "-") for case in cases):
+        one = found[1][case]
+        largest = max(value.abs().max() for name, value in one.items() if name != "loss")
+        for size in (2, 3, 4):
+            several = found[size][case]
+            assert several.keys() == one.keys()
+            for name, expected in one.items():
+                scale = expected.abs().max() if name == "loss" else largest
+                assert (several[name] - expected).abs().max() <= 1e-5 * scale, f"{case}: {name} of {size} processes"
+
+
+def test_torchrun_trains_in_two_processes(rooms, tmp_path):
+    settings = [*SHORT, "validation.every=3", "validation.batches=2", "optim.ema=0.5"]
+    for size in (1, 2):
+        arguments = ["pldm", f"data={rooms}", f"out={tmp_path / str(size)}", "preset=tiny", "device=cpu", *settings]
+        assert launched(size, "-m", "stable_worldmodel.train", *arguments).strip().endswith(str(size))
+    assert_close(weights(tmp_path / "2"), weights(tmp_path / "1"), 1e-3)
+    for one, two in zip(log_of(tmp_path / "1"), log_of(tmp_path / "2"), strict=True):
+        assert two["step"] == one["step"] and two.get("loss") == pytest.approx(one.get("loss"), rel=1e-4)
+    assert (tmp_path / "2/best/checkpoint/weights.safetensors").is_file()
+
+
+def command(*arguments, **options):
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    return subprocess.Popen(
+        [sys.executable, "-m", "stable_worldmodel.train", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        **options,
+    )
+
+
+def test_ctrl_c_saves_the_checkpoint(rooms, tmp_path):
+    run = tmp_path / "run"
+    arguments = [
+        "gcbc",
+        f"data={rooms}",
+        f"out={run}",
+        "device=cpu",
+        "data.batch_size=4",
+        "schedule.steps=100000",
+        "log_every=1",
+    ]
+    child = command(*arguments)
+    log = run / "train.jsonl"
+    while child.poll() is None and not (log.is_file() and log.stat().st_size):
+        time.sleep(0.05)
+    child.send_signal(signal.SIGINT)
+    _, errors = child.communicate(timeout=60)
+    assert child.returncode == 130 and "resume=true" in errors
+    step = json.loads((run / "checkpoint/state.json").read_text())["step"]
+    assert step == log_of(run)[-1]["step"] > 0
+    trainer = Trainer(parsed("gcbc", [*arguments[1:], "resume=true"]))
+    assert trainer.step == step
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        ([], 2, "usage"),
+        (["lewm"], 2, "data=PATH"),
+        (["lewm", "data=nothing"], 1, "nothing"),
+        (["lewm", "data"], 2, "KEY=VALUE"),
+        (["tdmpc2", "data=nothing"], 2, "swm train"),
+        (["lewm", "data=nothing", "amp=half"], 2, "bf16"),
+        (["lewm", "data=nothing", "resume=maybe"], 2, "true or false"),
+        (["lewm", "data=nothing", "threads=many"], 2, "whole number"),
+        (["lewm", "data=nothing", "device=fast"], 2, "device"),
+    ],
+)
+def test_wrong_arguments_are_refused_with_the_reason(arguments, code, message, capsys):
+    from stable_worldmodel.train.__main__ import main
+
+    assert main(arguments) == code
+    printed = capsys.readouterr()
+    assert message in printed.err + printed.out
+
+
+def test_unknown_settings_are_refused(rooms, tmp_path):
+    with pytest.raises(ValueError, match="model.latnt.*latent"):
+        torch_train("lewm", rooms, tmp_path / "run", ["model.latnt=4"])
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_loss_that_is_not_finite_ends_the_training(rooms, tmp_path):
+    with pytest.raises(FloatingPointError, match="optim.lr"):
+        torch_train("gcbc", rooms, tmp_path / "run", ["optim.lr=1e30", "schedule.warmup=0", "data.batch_size=4"])
+    assert np.isfinite(swm.wm.load(str(tmp_path / "run")).card["action_std"]).all()
+
+
+def test_hydra_runs_several_trainings(rooms, tmp_path):
+    pytest.importorskip("hydra")
+    sweep = [
+        "--multirun",
+        "model.latent=3,4",
+        "model.encoder.pyramid.dim=32",
+        "seed=1",
+        f"hydra.sweep.dir={tmp_path / 'sweep'}",
+    ]
+    child = command("lewm", f"data={rooms}", "preset=tiny", "device=cpu", *SHORT, *sweep, cwd=tmp_path)
+    printed, errors = child.communicate(timeout=300)
+    assert child.returncode == 0, errors
+    for job, latent in enumerate((3, 4)):
+        module = load_pretrained(tmp_path / f"sweep/{job}/run")
+        assert module.stored.config["model"]["latent"] == latent and module.stored.config["seed"] == 1
+        assert module.stored.config["model"]["encoder"]["pyramid"]["dim"] == 32
+
+
+def test_without_hydra_its_flags_are_refused(rooms):
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    program = "import sys; sys.modules['hydra'] = None; from stable_worldmodel.train.__main__ import main; "
+    program += "sys.exit(main(['lewm', 'data=x', '--multirun']))"
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
+    assert done.returncode == 2 and "pip install hydra-core" in done.stderr

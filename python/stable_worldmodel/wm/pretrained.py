@@ -94,7 +94,7 @@ class Pretrained(nn.Module):
         if self.stored is None:
             raise ValueError(
                 f"{type(self).__name__}.save_pretrained: the module has no configuration of the engine; load it with "
-                "from_pretrained, or create it with swm.wm.begin"
+                "from_pretrained, or create it with stable_worldmodel.train.Trainer"
             )
         return write(run_path(path), self.stored, self.checkpoint_weights(), replace=overwrite)
 

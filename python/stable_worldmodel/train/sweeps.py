@@ -38,6 +38,8 @@ def run(family: str, arguments: Sequence[str], train: Callable[[Options], None])
         raise ValueError(f"{flags}: flags are those of Hydra, which is not installed: pip install hydra-core") from error
 
     named = [_DATASET + argument[4:] if argument.startswith("data=") else argument for argument in arguments]
+    # Hydra takes flags before overrides only.
+    named.sort(key=lambda argument: "=" in argument and not argument.startswith("-"))
     preset = next((argument.partition("=")[2] for argument in named if argument.startswith("preset=")), None)
     own = {item.name: item.default for item in fields(Options) if item.name not in ("family", "data", "settings")}
     config = {_DATASET: "???", **own, **json.loads(_engine.training_config(family, preset, []))}

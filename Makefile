@@ -19,7 +19,7 @@ SWM := $(CARGO_TARGET_DIR)/release/swm
 SUDO := $(shell [ "$$(id -u)" = 0 ] || command -v sudo)
 CARGO := cargo
 
-.PHONY: help demo test test-python test-browser check build tests wheel wheel-portable gpu assets setup setup-python reference bench deny nightly clean
+.PHONY: help demo test test-python test-browser check build tests wheel wheel-portable gpu docs assets setup setup-python reference bench deny nightly clean
 
 help:
 	@echo 'make demo       collect, train, plan, evaluate and report on a laptop CPU'
@@ -29,6 +29,7 @@ help:
 	@echo 'make wheel      the Python package: $(WHEELS)'
 	@echo 'make wheel-portable   the same with the FFmpeg it uses inside, for other machines: $(WHEELS)/portable'
 	@echo 'make gpu        the same with models on a GPU through Vulkan: $(CARGO_TARGET_DIR)-gpu/release/swm'
+	@echo 'make docs       the documentation as static pages: $(CACHE)/docs/book/index.html'
 	@echo 'make assets     MuJoCo, its models and meshes, into $(SWM_ASSETS)'
 	@echo 'make nightly    what takes longer: fuzzers, sanitizer, models of threads, long tests; one part: PART=fuzz'
 	@echo 'make deny       licences and sources of the dependencies'
@@ -81,6 +82,16 @@ wheel-portable: wheel
 # The program with models on a GPU through Vulkan, in a folder of its own: other features compile other libraries.
 gpu: setup
 	CARGO_TARGET_DIR=$(CARGO_TARGET_DIR)-gpu $(CARGO) build --release -p swm --bins --features vulkan
+
+# The guides, tutorials and registries as static pages, with the Python and the Rust interface, all without network
+# access (`cargo xtask book`). Frames of 3-D environments are shown if their assets are installed.
+MDBOOK_VERSION := 0.5.4
+docs: build wheel
+	@mdbook --version 2>/dev/null | grep -qx 'mdbook v$(MDBOOK_VERSION)' || \
+	  $(CARGO) install --locked --root $(CACHE)/tools mdbook --version $(MDBOOK_VERSION) --no-default-features --features search
+	SWM=$(SWM) $(CARGO) xtask book $(CACHE)/docs
+	python3 -m venv $(CACHE)/venv-docs && $(CACHE)/venv-docs/bin/python -m pip install --quiet pdoc==16.0.0 $(WHEELS)/*.whl
+	$(CACHE)/venv-docs/bin/pdoc --output-directory $(CACHE)/docs/book/python-api stable_worldmodel
 
 bench: assets
 	SWM_REFERENCE_PYTHON=$(CACHE)/reference/bin/python $(SWM) bench envs

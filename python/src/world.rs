@@ -23,6 +23,10 @@ use swm::envs::wrappers::{GoalFrame, Stack, WRAPPERS};
 use swm::eval::{CollectConfig, EvalConfig, PolicyChoice, Starts, Videos, WorldConfig, episode_key, reset_seed};
 use swm::gym::GymEnv;
 
+/// What to do about a dataset that exists.
+const EXISTS: &str =
+    "continue it with mode=\"resume\" or mode=\"append\", replace it with mode=\"overwrite\", or choose another name";
+
 /// A batch of environments of one kind.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
 pub struct World {
@@ -311,7 +315,7 @@ impl World {
                 None => Some(swm::home::target(&path.unwrap_or_default(), format.as_deref())?),
             };
             if let Some(location) = &location {
-                manifest.not_finite = collect_target::check(location, mode, &manifest, false)?;
+                manifest.not_finite = collect_target::check(location, mode, &manifest, false, EXISTS)?;
             }
             let writer: Box<dyn swm::data::Writer> = match (writer, &location) {
                 (Some(writer), _) => Box::new(ForeignWriter::new(writer, 0)),

@@ -6,12 +6,14 @@
 // The printing lints are for libraries; this is a command-line program.
 #![allow(clippy::print_stdout, clippy::print_stderr, reason = "a command-line program prints")]
 
+mod book;
 mod columns;
 mod cycles;
 mod deletes;
 mod features;
 mod graph;
 mod layers;
+mod links;
 mod nightly;
 mod registries;
 mod sizes;
@@ -32,6 +34,9 @@ const CHECKS: &[Check] = &[
     ("fmt", "the code is formatted", fmt),
     ("words", "no refused word (words.toml)", || verdict("words", &word_list()?.violations(&prose()?))),
     ("typos", "no misspelt word (the program `typos`)", typos),
+    ("links", "every link of a page leads to a file and a heading", || {
+        verdict("links", &links::violations(&root(), &source::files(&root(), &[".md"])?))
+    }),
     ("sizes", "no file of more than 500 lines", || verdict("sizes", &sizes::violations(&sources()?))),
     ("cycles", "no import cycle of more than four files", || verdict("cycles", &cycles::violations(&sources()?))),
     ("columns", "only swm-core spells the standard columns", || verdict("columns", &columns::violations(&sources()?))),
@@ -53,6 +58,7 @@ fn main() -> ExitCode {
     let words: Vec<String> = std::env::args().skip(1).collect();
     let outcome = match words.iter().map(String::as_str).collect::<Vec<_>>()[..] {
         ["check"] => CHECKS.iter().try_for_each(|(_, _, run)| run()),
+        ["book", folder] => book::book(&root(), std::path::Path::new(folder)),
         ["nightly"] => nightly::nightly(None),
         ["nightly", part] => nightly::nightly(Some(part)),
         ["help" | "--help" | "-h"] => {
@@ -79,7 +85,7 @@ fn main() -> ExitCode {
 fn usage() -> String {
     let rows: Vec<String> = CHECKS.iter().map(|(name, proves, _)| format!("  {name:<11}{proves}")).collect();
     format!(
-        "usage: cargo xtask COMMAND\n\n  nightly    long checks, in parts; `nightly PART` runs one (docs/nightly.md)\n  \
+        "usage: cargo xtask COMMAND\n\n  book       the documentation as static pages: `book DIR` (`make docs`)\n  nightly    long checks, in parts; `nightly PART` runs one (docs/nightly.md)\n  \
          check      all of the following, cheapest first\n{}",
         rows.join("\n")
     )

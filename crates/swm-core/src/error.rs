@@ -80,7 +80,7 @@ pub enum Error {
         fix: String,
     },
     /// A file operation failed.
-    #[error("{}: {action}: {source}{}", .path.display(), disk_hint(.source))]
+    #[error("{}: {action}: {}{}", .path.display(), without_code(.source), disk_hint(.source))]
     Io {
         /// The file or folder.
         path: PathBuf,
@@ -172,9 +172,14 @@ impl Error {
         Self::external(context, text.unwrap_or("the panic has no message"))
     }
 
-    /// Whether user input caused the error, which is exit code 2 of the command line.
+    /// Whether user input caused the error, which is exit code 2 of the command line. A file that does not exist is one
+    /// that the user named.
     pub fn is_usage(&self) -> bool {
-        matches!(self, Self::UnknownName { .. } | Self::OutOfSpace { .. } | Self::Config { .. })
+        match self {
+            Self::UnknownName { .. } | Self::OutOfSpace { .. } | Self::Config { .. } => true,
+            Self::Io { source, .. } => source.kind() == std::io::ErrorKind::NotFound,
+            _ => false,
+        }
     }
 }
 
@@ -208,6 +213,8 @@ pub fn nearest<'a>(given: &str, known: impl IntoIterator<Item = &'a str>) -> Vec
         .filter(|(score, _)| *score > 0.75)
         .collect();
     scored.sort_by(|a, b| b.0.total_cmp(&a.0).then_with(|| a.1.cmp(b.1)));
+    // Experts of several environments have one name.
+    scored.dedup_by(|a, b| a.1 == b.1);
     scored.into_iter().take(3).map(|(_, name)| name.to_owned()).collect()
 }
 
@@ -216,6 +223,12 @@ fn nearest_clause(names: &[String]) -> String {
         [] => String::new(),
         names => format!(" (did you mean {}?)", names.join(", ")),
     }
+}
+
+/// The message of the operating system without its number.
+fn without_code(source: &std::io::Error) -> String {
+    let text = source.to_string();
+    text.split_once(" (os error ").map_or_else(|| text.clone(), |(message, _)| message.to_owned())
 }
 
 fn disk_hint(source: &std::io::Error) -> &'static str {
@@ -242,11 +255,20 @@ mod tests {
     }
 
     #[test]
+    fn missing_files_are_usage_errors_in_words() {
+        let error = Error::io("a.json", "opening the file", std::io::Error::from_raw_os_error(2));
+        assert_eq!(error.to_string(), "a.json: opening the file: No such file or directory");
+        assert!(error.is_usage());
+        assert!(!Error::io("a", "writing", std::io::Error::from_raw_os_error(28)).is_usage());
+    }
+
+    #[test]
     fn unknown_names_suggest_similar_names() {
         let known = ["swm/PushT-v1", "swm/TwoRoom-v1"];
         assert_eq!(nearest("pusht", known), ["swm/PushT-v1"]);
         assert_eq!(nearest("swm/TowRoom-v1", known)[0], "swm/TwoRoom-v1");
         assert!(nearest("quux", known).is_empty());
+        assert_eq!(nearest("exprt", ["expert", "explore", "expert"])[..2], ["expert", "explore"]);
         let message = Error::unknown("environment", "pusht", known, "`swm envs` lists them").to_string();
         assert_eq!(message, "unknown environment 'pusht' (did you mean swm/PushT-v1?); `swm envs` lists them");
     }

@@ -43,7 +43,7 @@ pub(crate) const SAVED_DATA_FILES: &[&str] = &[
 ];
 
 /// Logs and reports of failures, as patterns of [`files::delete`].
-const LOG_FILES: &[&str] = &["train.jsonl", "events.out.tfevents.*.swm", "failed-batch.safetensors"];
+const LOG_FILES: &[&str] = &["run.json", "train.jsonl", "events.out.tfevents.*.swm", "failed-batch.safetensors"];
 
 /// The folders of a run that may hold a checkpoint; the empty name is the folder of the run.
 const CHECKPOINT_FOLDERS: &[&str] = &[

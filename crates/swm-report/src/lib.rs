@@ -25,6 +25,7 @@ mod study;
 mod text;
 mod training_log;
 
+pub use charts::training::curves_svg;
 pub use leaderboard::{BoardEntry, BoardRow, BoardTable, Leaderboard, write_leaderboard};
 pub use page::{ReportOptions, render, write_report, write_report_with};
 pub use read::{parse_results, read_results};

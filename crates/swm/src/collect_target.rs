@@ -8,7 +8,8 @@ use swm_eval::continuation::check_continues;
 
 /// Checks, before any episode is played, that a collection with this manifest may be written to a location.
 /// `mix_renderers` permits frames of another renderer than the renderer of the stored frames. Returns the numbers of NaN
-/// and infinite values of the episodes that remain in the dataset, by column.
+/// and infinite values of the episodes that remain in the dataset, by column. `advice` says, in the caller's words, what to
+/// do about a dataset that exists.
 ///
 /// # Errors
 /// When a dataset exists and `mode` is [`WriteMode::Create`], or the dataset cannot be continued with this manifest.
@@ -17,6 +18,7 @@ pub fn check(
     mode: WriteMode,
     new: &Manifest,
     mix_renderers: bool,
+    advice: &str,
 ) -> Result<BTreeMap<String, u64>> {
     let exists = match location.path() {
         Some(path) => path.exists() && !swm_data::has_no_dataset(path),
@@ -36,11 +38,7 @@ pub fn check(
             }
             Ok(not_finite)
         }
-        WriteMode::Create => Err(Error::config(
-            format!("dataset {location}"),
-            "it exists already",
-            "continue it (--resume, mode=\"append\"), replace it (--overwrite, mode=\"overwrite\"), or choose another name",
-        )),
+        WriteMode::Create => Err(Error::config(format!("dataset {location}"), "it exists already", advice)),
     }
 }
 

@@ -56,7 +56,8 @@ pub fn create(location: impl Into<Location>, schema: &Schema, options: WriteOpti
     let named = || FORMATS.rows.iter().find(|format| format.has_suffix(&location));
     let Some(format) = detect(&location).or_else(named) else {
         let problem = format!("{location} has no suffix of a known format");
-        let fix = format!("use a name that ends in .{}", lance::ENTRY.suffixes[0]);
+        let suffixes: Vec<String> = FORMATS.rows.iter().map(|format| format!(".{}", format.suffixes[0])).collect();
+        let fix = format!("use a name that ends in {}, or name the format (--format)", suffixes.join(", "));
         return Err(Error::config("dataset path", problem, fix));
     };
     format.create(&location, schema, options)

@@ -47,21 +47,41 @@ pub(crate) fn preset_text(presets: &[Preset], preset: &str) -> Result<String> {
 pub(crate) fn parse<C: DeserializeOwned + Serialize>(text: &str, settings: &[String], presets: &[&str]) -> Result<C> {
     merge(text, settings, &known_keys::<C>(presets))?.extract().map_err(|error| {
         let key = if error.path.is_empty() { "configuration".to_owned() } else { error.path.join(".") };
-        Error::config(
-            key,
-            in_toml_words(&error.kind),
-            "give a value of the right type (`--print-config` shows all settings)",
-        )
+        Error::config(key, in_words(&error.kind), "`--print-config` shows all settings with valid values")
     })
 }
 
-/// Returns what is wrong with a value, without the name of a Rust type.
-fn in_toml_words(kind: &figment::error::Kind) -> String {
+/// Returns the message for a value that has the wrong type, in the words of TOML instead of those of Rust.
+fn in_words(kind: &figment::error::Kind) -> String {
     use figment::error::Kind;
     match kind {
-        Kind::InvalidType(given, expected) if expected.starts_with("struct ") => {
-            format!("is {given}, and must be a table of settings")
+        Kind::InvalidType(given, expected) | Kind::InvalidValue(given, expected) => {
+            let expected = match expected.as_str() {
+                "f64" | "f32" => "a number",
+                "usize" | "u64" | "u32" | "u16" | "u8" => "a whole number from 0",
+                "i64" | "i32" | "isize" => "a whole number",
+                "a boolean" | "bool" => "true or false",
+                text if text.starts_with("struct ") || text == "a map" => "a table of settings",
+                text => text,
+            };
+            format!("is {}, expected {expected}", actual_in_words(given))
         }
+        other => other.to_string(),
+    }
+}
+
+/// Returns a value of a configuration as it was given.
+fn actual_in_words(given: &figment::error::Actual) -> String {
+    use figment::error::Actual;
+    match given {
+        Actual::Bool(value) => value.to_string(),
+        Actual::Unsigned(value) => value.to_string(),
+        Actual::Signed(value) => value.to_string(),
+        Actual::Float(value) => value.to_string(),
+        Actual::Char(value) => format!("'{value}'"),
+        Actual::Str(value) => format!("'{}'", value.chars().take(60).collect::<String>()),
+        Actual::Seq => "a list".to_owned(),
+        Actual::Map => "a group of settings".to_owned(),
         other => other.to_string(),
     }
 }

@@ -93,6 +93,9 @@ impl CollectArgs {
     }
 }
 
+/// What to do about a dataset that exists.
+const EXISTS: &str = "continue it with --resume, replace it with --overwrite, or choose another name";
+
 /// Parses `I/N`.
 fn shard(text: &str) -> std::result::Result<Shard, String> {
     let parts = text.split_once('/').and_then(|(index, count)| Some((index.parse().ok()?, count.parse().ok()?)));
@@ -200,7 +203,7 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
     let (mut world, mut policy, weights) = collection.prepare()?;
     let mut manifest = collection.manifest(&world, weights)?;
     manifest.not_finite = match (collection.shard, collection.mode) {
-        (None, mode) => collect_target::check(location, mode, &manifest, collection.mix_renderers)?,
+        (None, mode) => collect_target::check(location, mode, &manifest, collection.mix_renderers, EXISTS)?,
         (Some(shard), WriteMode::Append) => collect_target::not_finite_of_shard(location, shard)?,
         (Some(_), _) => BTreeMap::new(),
     };

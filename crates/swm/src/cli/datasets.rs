@@ -22,7 +22,7 @@ pub struct PreviewArgs {
     /// Number of episodes, spread over the dataset
     #[arg(long, default_value_t = 4)]
     episodes: usize,
-    /// An image column; may be repeated (default: all, side by side)
+    /// A column of images, depth or segmentation; may be repeated (default: all)
     #[arg(long)]
     column: Vec<String>,
     /// Frames per second of the videos
@@ -109,7 +109,11 @@ fn list(as_json: bool) -> anyhow::Result<()> {
 pub fn formats(as_json: bool) -> anyhow::Result<()> {
     let rows = data::FORMATS.rows.iter();
     if as_json {
-        return emit_json(&rows.map(|format| json!({"id": format.id, "summary": format.summary})).collect::<Vec<_>>());
+        return emit_json(
+            &rows
+                .map(|format| json!({"id": format.id, "summary": format.summary, "suffixes": format.suffixes}))
+                .collect::<Vec<_>>(),
+        );
     }
     emit(&table(&["format", "description"], rows.map(|format| vec![format.id.to_owned(), format.summary.to_owned()])));
     Ok(())

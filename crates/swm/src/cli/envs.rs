@@ -1,11 +1,11 @@
 //! `swm envs` and `swm fovs`: list environments and their factors of variation.
 
 use super::{emit, emit_json, eprint, table};
-use crate::{ENVS, describe, gym};
+use crate::{ENVS, describe, gym, mujoco};
 use clap::Args;
 use serde_json::{Map, Value, json};
-use std::collections::BTreeSet;
 use swm_core::{EnvChoice, Origin};
+use swm_mujoco::assets::Status;
 
 /// Arguments of `swm envs`.
 #[derive(Args)]
@@ -33,32 +33,19 @@ pub fn envs(args: &EnvsArgs, as_json: bool) -> anyhow::Result<()> {
         });
         return emit_json(&all.collect::<Map<String, Value>>());
     }
-    let mut missing = BTreeSet::new();
-    let rows: Vec<Vec<String>> = ENVS
-        .rows
-        .iter()
-        .map(|row| {
-            let (action, factors) = match row.env() {
-                Ok(env) => {
-                    let spec = env.spec();
-                    (spec.action_space.describe(), spec.variation_space.factors().len().to_string())
-                }
-                Err(error) => {
-                    missing.insert(error.to_string());
-                    ("missing".to_owned(), String::new())
-                }
-            };
-            vec![
-                row.id.to_owned(),
-                action,
-                factors,
-                row.experts.iter().map(|e| e.id).collect::<Vec<_>>().join(", "),
-                row.summary.to_owned(),
-            ]
-        })
-        .collect();
-    emit(&table(&["environment", "action", "factors", "experts", "task"], rows));
-    missing.iter().for_each(|error| eprint(&format!("missing: {error}\n")));
+    // From the registry alone: to make a MuJoCo environment, its model is compiled.
+    let rows = ENVS.rows.iter().map(|row| {
+        let experts: Vec<&str> = row.experts.iter().map(|expert| expert.id).collect();
+        vec![row.id.to_owned(), experts.join(", "), row.summary.to_owned()]
+    });
+    emit(&table(&["environment", "experts", "task"], rows));
+    emit("\n`swm envs ENV` shows actions, columns, options and cameras, `swm fovs ENV` the factors of variation.\n");
+    let missing: Vec<&str> =
+        mujoco::assets::status().filter(|(_, status)| *status == Status::Absent).map(|(asset, _)| asset.name).collect();
+    if !missing.is_empty() {
+        let names = missing.join(", ");
+        eprint(&format!("3-D environments need assets that are not installed ({names}): run `swm assets install`\n"));
+    }
     emit("\nThird-party environments of Gymnasium work too, such as:\n");
     emit(&table(
         &["environment", "description"],

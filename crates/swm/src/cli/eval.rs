@@ -6,6 +6,7 @@ use super::output_folder;
 use super::planner::PlannerArgs;
 use super::progress::control;
 use super::results_tables::summary;
+use super::run_record;
 use super::wrappers::WrapperArgs;
 use super::{Context, emit, emit_json};
 use crate::resolver::HomeResolver;
@@ -302,6 +303,7 @@ pub fn run(
     let results = results?;
     let file = output.join("results.json");
     write_json(&file, &results)?;
+    run_record::write(output, false)?;
     Ok((results, file))
 }
 

@@ -6,10 +6,10 @@ use crate::home::open_dataset;
 use clap::Args;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
-use swm_core::columns::is_stored_as;
+use swm_core::columns::{REWARD, SUCCESS, is_stored_as};
 use swm_core::results::Summary;
 use swm_core::{Manifest, Result};
-use swm_data::{Reader, checksum};
+use swm_data::{Reader, StepRange, checksum, column_stats};
 
 /// Arguments of `swm inspect`.
 #[derive(Args)]
@@ -49,14 +49,19 @@ pub fn inspect(args: &InspectArgs, as_json: bool) -> anyhow::Result<()> {
     let on_disk = |name: &str| footprint.iter().find(|(part, _)| stored(part, name)).map(|(_, size)| *size);
     let columns = reader.schema().columns().iter().map(|column| {
         let size = on_disk(&column.name);
+        let range = contents["ranges"].get(&column.name);
+        let value = |key: &str| range.map_or_else(String::new, |range| short(&range[key]));
         vec![
             column.name.clone(),
-            column.dtype.name().to_owned(),
-            format!("{:?}", column.shape),
+            format!("{}{}", column.dtype.name(), shape(&column.shape)),
+            value("min"),
+            value("mean"),
+            value("max"),
             size.map_or("–".to_owned(), bytes),
         ]
     });
-    emit(&table(&["column", "type", "row shape", "on disk"], columns));
+    emit(&table(&["column", "type", "min", "mean", "max", "on disk"], columns));
+    emit(&outcomes(&contents));
     let columns = reader.schema().columns();
     let others = footprint.iter().filter(|(part, _)| !columns.iter().any(|column| stored(part, &column.name)));
     for (part, size) in others {
@@ -85,12 +90,90 @@ fn contents(reader: &dyn Reader, with_checksum: bool) -> Result<Value> {
     contents["footprint"] = json!(reader.footprint()?.into_iter().collect::<BTreeMap<_, _>>());
     contents["unread"] = json!(reader.unread());
     contents["constants"] = json!(constants(reader)?);
+    add_values(reader, &mut contents)?;
     contents["content_hash"] = json!(reader.content_hash()?);
     contents["manifest"] = json!(reader.manifest());
     if with_checksum {
         contents["checksum"] = json!(checksum(reader)?);
     }
     Ok(contents)
+}
+
+/// The most rows whose values are read without being asked: a second of reading.
+const MAX_ROWS: usize = 2_000_000;
+
+/// Adds the range of every numeric column of at most [`MAX_ELEMENTS`] elements, and the success rate and the return of the
+/// episodes where the dataset has these columns. Large datasets have none of them.
+fn add_values(reader: &dyn Reader, contents: &mut Value) -> Result<()> {
+    let rows: usize = reader.episodes().iter().map(|episode| episode.length).sum();
+    if rows == 0 || rows > MAX_ROWS {
+        return Ok(());
+    }
+    let mut ranges = serde_json::Map::new();
+    for column in reader.schema().columns().iter().filter(|column| !column.is_image() && column.len() <= MAX_ELEMENTS) {
+        // A column without any value, such as the actions of episodes with one row, has no range.
+        let Ok(stats) = column_stats(reader, &column.name, None) else { continue };
+        let least = stats.min.iter().copied().fold(f64::INFINITY, f64::min);
+        let most = stats.max.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let mean = stats.mean.iter().sum::<f64>() / stats.mean.len().max(1) as f64;
+        ranges.insert(column.name.clone(), json!({"min": least, "mean": mean, "max": most}));
+    }
+    contents["ranges"] = Value::Object(ranges);
+    let returns = per_episode(reader, REWARD, |rewards| rewards.iter().filter(|reward| !reward.is_nan()).sum())?;
+    if let Some(returns) = returns {
+        contents["return"] = json!(Summary::of(&returns));
+    }
+    let solved = per_episode(reader, SUCCESS, |success| f64::from(u8::from(success.iter().any(|&one| one > 0.0))))?;
+    if let Some(solved) = solved {
+        contents["successful_episodes"] = json!(solved.iter().sum::<f64>() as usize);
+    }
+    Ok(())
+}
+
+/// The most elements of a column whose range is shown: depth images and the like have more.
+const MAX_ELEMENTS: usize = 1024;
+
+/// Returns a value of each episode, computed from a scalar column; `None` without such a column.
+fn per_episode(reader: &dyn Reader, column: &str, value: impl Fn(&[f64]) -> f64) -> Result<Option<Vec<f64>>> {
+    let Some(spec) = reader.schema().columns().iter().find(|spec| spec.name == column && spec.len() == 1) else {
+        return Ok(None);
+    };
+    let episodes = reader.episodes();
+    let ranges: Vec<StepRange> =
+        episodes.iter().enumerate().map(|(position, episode)| StepRange::new(position, 0, episode.length)).collect();
+    let batch = reader.read(&[&spec.name], &ranges)?;
+    let mut row = 0;
+    let values = episodes.iter().map(|episode| {
+        let rows =
+            (row..row + episode.length).map(|row| batch.row(row).to_f64(&spec.name)).collect::<Result<Vec<_>>>()?;
+        row += episode.length;
+        Ok(value(&rows.concat()))
+    });
+    values.collect::<Result<Vec<f64>>>().map(Some)
+}
+
+/// Describes how many episodes succeed, and their return.
+fn outcomes(contents: &Value) -> String {
+    let mut text = String::new();
+    if let (Some(solved), Some(all)) = (contents["successful_episodes"].as_u64(), contents["episodes"].as_u64()) {
+        text +=
+            &format!("successful episodes: {solved} of {all} ({:.0} %)\n", 100.0 * solved as f64 / all.max(1) as f64);
+    }
+    let found = &contents["return"];
+    if !found.is_null() {
+        text += &format!("return of an episode: mean {}, median {}\n", short(&found["mean"]), short(&found["median"]));
+    }
+    text
+}
+
+/// Formats a value with four significant digits.
+fn short(value: &Value) -> String {
+    super::plot::short(value.as_f64().unwrap_or(f64::NAN))
+}
+
+/// Formats the shape of a row: nothing for a scalar.
+fn shape(shape: &[usize]) -> String {
+    if shape.is_empty() { String::new() } else { format!(" {shape:?}") }
 }
 
 /// Names and sizes of the first episode's constants.

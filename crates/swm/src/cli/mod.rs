@@ -20,6 +20,7 @@ mod models;
 mod output;
 mod output_folder;
 mod planner;
+mod plot;
 mod probe;
 mod progress;
 mod pull;
@@ -27,6 +28,8 @@ mod recipes;
 mod report;
 mod reproduce;
 mod results_tables;
+mod run_record;
+mod shell;
 mod signals;
 mod solvers;
 pub mod study;
@@ -35,7 +38,7 @@ mod training_curves;
 mod wrappers;
 mod zoo;
 
-use clap::{Parser, Subcommand};
+use clap::{FromArgMatches as _, Parser, Subcommand};
 use output::{emit, emit_json, eprint, table};
 use std::backtrace::{Backtrace, BacktraceStatus};
 use std::error::Error as _;
@@ -55,7 +58,9 @@ pub struct Cli {
     /// Print one JSON document on standard output instead of tables
     #[arg(long, global = true)]
     json: bool,
-    /// Worker threads (default: one per core); results do not depend on their number
+    /// Worker threads (default: one per core)
+    ///
+    /// Results do not depend on their number.
     #[arg(long, global = true, default_value_t = 0, hide_default_value = true, value_name = "N")]
     threads: usize,
     /// Renderer of 3-D environments: egl, cpu or auto
@@ -74,7 +79,7 @@ enum Command {
     /// List an environment's factors of variation
     #[command(after_help = "Example: swm fovs swm/TwoRoom-v1")]
     Fovs(envs::FovsArgs),
-    /// List, install and verify third-party assets that environments require
+    /// List, install and verify assets that environments require
     ///
     /// Assets are MuJoCo with its models, Gymnasium, the Atari games and Craftax.
     #[command(after_help = "Example: swm assets install mujoco")]
@@ -82,7 +87,7 @@ enum Command {
     /// List the visual wrappers and their settings
     #[command(after_help = "Example: swm wrappers")]
     Wrappers,
-    /// List the solvers, their kinds of actions, and their requirements of a model
+    /// List the solvers, and what they require of a model
     #[command(after_help = "Example: swm solvers --json")]
     Solvers,
     /// Run a policy and store its episodes
@@ -97,13 +102,13 @@ enum Command {
     /// Show the contents of a dataset
     #[command(after_help = "Example: swm inspect rooms --checksum")]
     Inspect(inspect::InspectArgs),
-    /// Write videos and a contact sheet of some episodes of a dataset
+    /// Write videos and a contact sheet of some episodes
     #[command(after_help = "Example: swm preview rooms --output preview --episodes 4")]
     Preview(datasets::PreviewArgs),
-    /// Write a dataset in another format or codec, and verify the result
+    /// Write a dataset in another format, and verify the result
     #[command(after_help = "Example: swm convert rooms rooms-jpeg --codec jpeg")]
     Convert(convert::ConvertArgs),
-    /// Find defects of a dataset and the models it can train; repair it
+    /// Find defects of a dataset, and the models it can train
     #[command(after_help = "Example: swm doctor rooms --repair rooms-repaired")]
     Doctor(doctor::DoctorArgs),
     /// List the models and their presets
@@ -112,6 +117,9 @@ enum Command {
     /// Train a model on a dataset or in an environment
     #[command(after_help = "Example: swm train lewm --data rooms --output lewm-rooms optim.lr=3e-4")]
     Train(train::TrainArgs),
+    /// Draw training curves in the terminal, and as SVG
+    #[command(after_help = "Example: swm plot lewm-rooms pldm-rooms --metric loss --output curves.svg")]
+    Plot(plot::PlotArgs),
     /// List the recipes of `swm train --recipe`, or print one
     #[command(after_help = "Example: swm recipes two-room/pldm")]
     Recipes(recipes::RecipesArgs),
@@ -121,10 +129,10 @@ enum Command {
     /// Download pretrained weights from the Hugging Face hub
     #[command(after_help = "Example: swm pull facebook/dinov2-small")]
     Pull(pull::PullArgs),
-    /// List the checkpoints; show, verify, pack, import, export or remove one
+    /// List the checkpoints; show, verify, pack or remove one
     #[command(after_help = "Example: swm checkpoints show lewm-rooms")]
     Checkpoints(checkpoints::CheckpointsArgs),
-    /// Predict columns or reconstruct images from a checkpoint's latents
+    /// Predict columns or images from a checkpoint's latents
     #[command(after_help = "Example: swm probe lewm-rooms --data rooms --columns state")]
     Probe(probe::ProbeArgs),
     /// Evaluate checkpoints, experts and the random-policy floor
@@ -133,7 +141,7 @@ enum Command {
     /// Repeat an evaluation from its results and list the differences
     #[command(after_help = "Example: swm reproduce results")]
     Reproduce(reproduce::ReproduceArgs),
-    /// Submit results to a leaderboard, verify an entry, or build its pages
+    /// Submit to a leaderboard, verify an entry, or build its pages
     #[command(after_help = "Example: swm leaderboard build leaderboard --output site")]
     Leaderboard(leaderboard::LeaderboardArgs),
     /// Run a study: many evaluations with one table
@@ -148,12 +156,25 @@ enum Command {
     /// Write one self-contained HTML page of results
     #[command(after_help = "Example: swm report results --output report --training lewm-rooms")]
     Report(report::ReportArgs),
-    /// Measure speed, compared with the reference implementation if installed
+    /// Measure speed, compared with the reference if installed
     #[command(after_help = "Example: swm bench envs swm/PushT-v1")]
     Bench(bench::BenchArgs),
+    /// Print the completions of a shell
+    #[command(after_help = "Example: swm completions bash")]
+    Completions(shell::CompletionsArgs),
+    /// Write a manual page for each command
+    #[command(after_help = "Example: swm man --output man1")]
+    Man(shell::ManArgs),
     /// Collect, train, plan, evaluate and report within minutes
     #[command(after_help = "Example: swm demo --output demo")]
     Demo(demo::DemoArgs),
+}
+
+impl Cli {
+    /// The arguments of `swm train`; `None` for another command.
+    pub(crate) fn into_train(self) -> Option<train::TrainArgs> {
+        if let Command::Train(args) = self.command { Some(args) } else { None }
+    }
 }
 
 /// The global options and the interrupt flag, for long-running commands.
@@ -169,7 +190,9 @@ pub struct Context {
 /// Runs the command line with these arguments, the program's name first. Returns the exit code: 0 for success, 1 for a
 /// failure or lost output, 2 for wrong usage, 130 for an interrupted run.
 pub fn run(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) -> u8 {
-    let code = match Cli::try_parse_from(arguments) {
+    let arguments: Vec<OsString> = arguments.into_iter().map(Into::into).collect();
+    run_record::remember(&arguments);
+    let code = match parse(arguments) {
         Ok(cli) => cli.run(),
         Err(error) => print_usage(&error),
     };
@@ -180,6 +203,13 @@ pub fn run(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) -> 
             code.max(1)
         }
     }
+}
+
+/// Parses a command line, the program's name first.
+fn parse(arguments: Vec<OsString>) -> clap::error::Result<Cli> {
+    let mut command = shell::command();
+    let mut matches = command.try_get_matches_from_mut(arguments)?;
+    Cli::from_arg_matches_mut(&mut matches).map_err(|error| error.format(&mut command))
 }
 
 /// Prints help, a version, or an error in the arguments.
@@ -247,6 +277,9 @@ impl Cli {
             Command::Inspect(args) => inspect::inspect(&args, json),
             Command::Preview(args) => datasets::preview(&args, json),
             Command::Models => models::models(json),
+            Command::Plot(args) => plot::plot(&args, json),
+            Command::Completions(args) => shell::completions(&args),
+            Command::Man(args) => shell::man(&args, json),
             Command::Recipes(args) => recipes::recipes(&args, json),
             Command::Zoo => zoo::zoo(json),
             Command::Checkpoints(args) => checkpoints::checkpoints(&args, &Context::new(json, self.threads)?),

@@ -2,7 +2,7 @@
 
 use super::progress::{control, print_summary};
 use super::recipes::{self, RecipeRun};
-use super::{Context, emit, emit_json};
+use super::{Context, emit, emit_json, eprint, run_record};
 use crate::home;
 use clap::Args;
 use serde_json::{Value, json};
@@ -10,13 +10,15 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use swm_core::{EnvPool, Error, Origin, Result};
 use swm_data::Reader;
-use swm_models::{FAMILIES, FamilyEntry, OnlineRun, TrainOptions, TrainRun, TrainSummary, TrainableConfig, device};
+use swm_models::{
+    FAMILIES, FamilyEntry, OnlineRun, StoredCheckpoint, TrainOptions, TrainRun, TrainSummary, TrainableConfig, device,
+};
 
 /// Arguments of `swm train`.
 #[derive(Args)]
 pub struct TrainArgs {
     /// The model; `swm models` lists them
-    #[arg(required_unless_present = "recipe")]
+    #[arg(required_unless_present_any = ["recipe", "resume"])]
     model: Option<String>,
     /// Run a recipe instead: collect, train, evaluate, report
     ///
@@ -48,7 +50,7 @@ pub struct TrainArgs {
     /// Device: cpu, vulkan[:I], cuda[:I] or auto
     #[arg(long, default_value = "cpu")]
     device: String,
-    /// Continue an interrupted run
+    /// Continue an interrupted run; with --output alone, as it was started
     #[arg(long)]
     resume: bool,
     /// Print the complete config and exit
@@ -64,6 +66,9 @@ pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
     if let (Some(recipe), Some(output)) = (&args.recipe, &args.output) {
         let settings = args.model.iter().chain(&args.settings).map(String::as_str).collect();
         return recipes::run(&RecipeRun { recipe, output: Path::new(output), settings, trust: args.trust }, context);
+    }
+    if args.model.is_none() {
+        return train(&args.started()?, context);
     }
     if args.print_config {
         let config = args.config()?;
@@ -100,9 +105,20 @@ pub fn run_args(args: &TrainArgs, context: &Context) -> anyhow::Result<(PathBuf,
     }
     let encoder = args.encoder.as_deref().map(home::find_checkpoint).transpose()?;
     let (reader, out) = args.dataset_and_output()?;
+    record(&out, args.resume)?;
     let setup = TrainRun { reader, encoder: encoder.as_deref(), out: &out, options };
     let summary = run(&*config, setup, context)?;
     Ok((summary.checkpoint.clone(), json!(summary)))
+}
+
+/// Writes the record of a run before its first step, so that the run can be continued from it. A folder that holds another
+/// run keeps its record: the training refuses it.
+fn record(out: &Path, resume: bool) -> Result<()> {
+    if !resume && out.join(run_record::FILE).exists() && StoredCheckpoint::read(out).is_ok() {
+        return Ok(());
+    }
+    std::fs::create_dir_all(out).map_err(|error| Error::io(out, "creating the folder", error))?;
+    run_record::write(out, resume)
 }
 
 /// Trains online in an environment.
@@ -124,6 +140,7 @@ fn train_online(
         format!("{}-{env}", args.model())
     });
     let out = home::new_checkpoint(&name)?;
+    record(&out, args.resume)?;
     let setup = OnlineRun { environments: &environments, out: &out, options };
     let Some(summary) = config.train_online(setup, &mut control(context)) else {
         let problem = format!("{} trains on datasets only", args.model());
@@ -147,6 +164,39 @@ fn train_online(
 }
 
 impl TrainArgs {
+    /// Returns the arguments with which the run in the output folder was started, to continue it.
+    ///
+    /// # Errors
+    /// When there is no such run, or its record names what only the user may name: a URI, or an environment that loads
+    /// code.
+    fn started(&self) -> Result<Self> {
+        let fix = "name the model and the dataset as well: swm train MODEL --data DATASET --output RUN --resume";
+        let Some(output) = &self.output else {
+            return Err(Error::config("--resume", "neither a model nor a run is given", "name the run with --output"));
+        };
+        let folder = home::find_checkpoint(output)?;
+        let path = folder.join(run_record::FILE);
+        let record = run_record::read(&folder)?;
+        let started = record.first().and_then(|(cli, from)| Some((cli.into_train()?, from)));
+        let Some((started, from)) = started.filter(|(started, _)| started.model.is_some()) else {
+            return Err(Error::corrupt(path, "it holds no command line of a training", fix));
+        };
+        let origin = Origin::file(&path, false);
+        if let Some(env) = &started.env {
+            crate::env(env, &origin)?;
+        }
+        // A path that the command line named from another folder.
+        let data = started.data.map(|data| match from.join(&data) {
+            moved if !Path::new(&data).exists() && moved.exists() => moved.to_string_lossy().into_owned(),
+            _ => data,
+        });
+        if let Some(data) = data.as_ref().filter(|data| data.contains("://")) {
+            origin.check_user(&format!("the dataset {data}"), "which opens a connection", Some("--data"))?;
+        }
+        eprint(&format!("continuing: {}\n", record.commands[0].command.join(" ")));
+        Ok(Self { data, output: Some(output.clone()), resume: true, print_config: false, ..started })
+    }
+
     /// Returns the family of the model.
     fn family(&self) -> Result<&'static FamilyEntry> {
         FAMILIES.get(self.model())

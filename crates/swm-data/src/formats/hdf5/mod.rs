@@ -73,7 +73,17 @@ const BACKEND: Option<Backend> = None;
 
 fn detect(location: &Location) -> bool {
     let folder = location.path().filter(|path| path.is_dir());
-    ENTRY.has_suffix(location) || folder.is_some_and(|path| !files_in(path).is_empty())
+    ENTRY.has_suffix(location)
+        || folder.is_some_and(|path| !files_in(path).is_empty())
+        || location.path().is_some_and(has_signature)
+}
+
+/// Whether a file begins as HDF5 files do.
+fn has_signature(path: &Path) -> bool {
+    const SIGNATURE: &[u8] = b"\x89HDF\r\n\x1a\n";
+    let mut start = [0; SIGNATURE.len()];
+    let opened = path.is_file().then(|| std::fs::File::open(path).ok()).flatten();
+    opened.is_some_and(|mut file| std::io::Read::read_exact(&mut file, &mut start).is_ok()) && start == SIGNATURE
 }
 
 /// Returns whether a file is empty, or its creation was killed or has not finished.

@@ -18,7 +18,6 @@ use swm_core::{Batch, Error, Manifest, Result, Schema};
 
 /// Creates, continues or replaces a file.
 pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
-    super::ENTRY.check_suffix(location)?;
     let location = super::file(location)?;
     let path = location.local("hdf5")?;
     for name in [EPISODE_IDX, STEP_IDX] {

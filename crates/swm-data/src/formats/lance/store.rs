@@ -59,6 +59,7 @@ fn lance_error(label: &Path, action: &str, error: &lance_core::Error) -> Error {
     let text = error.to_string();
     // Lance takes damage for a fault of its own, and asks for a report.
     let text = without_position(text.split_once("/lance/issues. ").map_or(text.as_str(), |(_, found)| found));
+    let text = without_kind(text);
     // Lance converts some system errors to text, which still contains their code.
     let code =
         text.split("(os error ").nth(1).and_then(|rest| rest.split(')').next()).and_then(|number| number.parse().ok());
@@ -71,7 +72,9 @@ fn lance_error(label: &Path, action: &str, error: &lance_core::Error) -> Error {
             format!("{action}: {text}"),
             "this version cannot be read; rewrite the table with a current Lance",
         ),
-        (_, lance_core::Error::IO { .. }) if remote => Error::external(format!("{}: {action}", label.display()), text),
+        (_, lance_core::Error::IO { .. }) if remote => {
+            Error::external(format!("{}: {action}", label.display()), format!("{text}{}", credentials_hint(text)))
+        }
         _ => damaged(label, format!("{action}: {text}")),
     }
 }
@@ -87,13 +90,38 @@ fn without_position(text: &str) -> &str {
     text.rsplit_once(", ").filter(|(_, end)| is_position(end)).map_or(text, |(found, _)| found)
 }
 
+/// Removes the kind of error at the start of a message, such as `LanceError(IO): `.
+fn without_kind(text: &str) -> &str {
+    text.strip_prefix("LanceError(").and_then(|rest| rest.split_once("): ")).map_or(text, |(_, text)| text)
+}
+
+/// Returns the advice for an object store that refused a request, or whose client found no credentials and asked the
+/// metadata server of a cloud machine for them.
+fn credentials_hint(text: &str) -> &'static str {
+    let refused = ["169.254.169.254", "metadata.google.internal", "401", "403", "redential"];
+    match refused.iter().any(|part| text.contains(part)) {
+        true => {
+            "; the store needs credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, GOOGLE_SERVICE_ACCOUNT, or \
+             AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY (docs/data.md)"
+        }
+        false => "",
+    }
+}
+
 /// Folders that may exist if a writer was killed before the first commit of a table.
 pub const FOLDERS: [&str; 4] = ["_versions", "_transactions", "_shards", "data"];
 
-/// Whether a location is a Lance table: its name ends in `.lance`, or it is a folder that contains such a table.
+/// Whether a location is a Lance table: its name ends in `.lance`, or it is a folder with versions of a table, or one that
+/// contains such a table.
 pub fn detect(location: &Location) -> bool {
     ENTRY.has_suffix(location)
+        || location.path().is_some_and(is_table)
         || location.path().is_some_and(|path| tables_in(path).is_ok_and(|tables| !tables.is_empty()))
+}
+
+/// Whether a folder is a table, whatever its name.
+fn is_table(folder: &Path) -> bool {
+    folder.join("_versions").is_dir()
 }
 
 fn tables_in(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
@@ -110,7 +138,7 @@ fn tables_in(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
 
 /// The location of the table: `location` itself, or the only table in that folder.
 fn table(location: &Location) -> Result<Location> {
-    let is_folder = |path: &&Path| !location.has_suffix("lance") && path.is_dir();
+    let is_folder = |path: &&Path| !location.has_suffix("lance") && path.is_dir() && !is_table(path);
     let Some(path) = location.path().filter(is_folder) else { return Ok(location.clone()) };
     let tables = tables_in(path).map_err(|e| Error::io(path, "listing the folder", e))?;
     match &tables[..] {
@@ -501,6 +529,9 @@ mod tests {
 
     #[test]
     fn lance_errors_keep_the_system_error_code() {
+        let text = "LanceError(IO): Generic S3 error: PUT http://169.254.169.254/: 403, crates/x/store.rs:379:30";
+        assert_eq!(without_kind(without_position(text)), "Generic S3 error: PUT http://169.254.169.254/: 403");
+        assert!(credentials_hint(text).contains("AWS_ACCESS_KEY_ID") && credentials_hint("timeout").is_empty());
         let full = lance_core::Error::io("failed to persist: No space left on device (os error 28)".to_owned());
         let error = lance_error(Path::new("x.lance"), "writing", &full);
         assert!(matches!(&error, Error::Io { source, .. } if source.kind() == ErrorKind::StorageFull));

@@ -38,7 +38,10 @@ const MAX_QUEUED: usize = 2;
 /// Creates, continues or replaces a table.
 pub fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
     options.codec.check()?;
-    ENTRY.check_suffix(location)?;
+    // A new table is recognised by its versions, whatever its name; a folder that is none must not become one.
+    if location.path().is_none_or(Path::exists) {
+        ENTRY.check_suffix(location)?;
+    }
     let store = Store::new(location)?;
     store.check_writable()?;
     schema::columns_to_write(schema)?;

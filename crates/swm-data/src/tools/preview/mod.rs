@@ -1,7 +1,10 @@
 //! Previews of datasets: one video per selected episode, and a contact sheet of all selected episodes. Every frame
-//! shows the labelled images of all cameras side by side.
+//! shows the labelled images of all cameras side by side, depth and segmentation in colour, above the action, the reward and
+//! whether the goal is reached.
 
+mod colours;
 mod label;
+mod layout;
 mod sheet;
 mod video;
 
@@ -10,8 +13,9 @@ pub(crate) use video::VideoFile;
 pub use video::{check_mp4, integer_scale, write_mp4, write_mp4_scaled};
 
 use crate::dataset::{Reader, StepRange};
+use layout::FrameLayout;
 use std::path::{Path, PathBuf};
-use swm_core::{Batch, ColumnSpec, Error, Result, limits};
+use swm_core::{Error, Result, limits};
 use swm_image::{check_png, write_png};
 
 /// Settings of a preview.
@@ -19,7 +23,7 @@ use swm_image::{check_png, write_png};
 pub struct PreviewOptions {
     /// Number of episodes, which are spread evenly over the dataset.
     pub episodes: usize,
-    /// The image columns to show; all if empty.
+    /// The columns to show, which hold images, depth or segmentation; all of these if empty.
     pub columns: Vec<String>,
     /// Frame rate of the videos, in frames per second.
     pub fps: u32,
@@ -33,9 +37,6 @@ impl Default for PreviewOptions {
 
 /// Number of frames per episode on the contact sheet.
 const SHEET_COLUMNS: usize = 8;
-
-/// Target side of enlarged images, in pixels.
-const ENLARGED_SIDE: usize = 256;
 
 /// Number of rows decoded at once, which limits the memory.
 const ROWS: usize = 32;
@@ -62,19 +63,18 @@ pub fn preview(
     check_png(&contact_sheet_path)?;
     std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, "creating the folder", e))?;
     let (mut written, mut sheet) = (vec![], vec![]);
-    let scale = integer_scale(layout.width, layout.height, ENLARGED_SIDE);
     for (done, &episode) in chosen.iter().enumerate() {
         let index = reader.episodes()[episode].index;
         let path = video_of(episode);
         let length = reader.episodes()[episode].length;
         let last = length - 1;
-        let mut video = VideoFile::begin(&path, layout.width, layout.height, options.fps, scale)?;
+        let mut video = VideoFile::begin(&path, layout.width, layout.height, options.fps, 1)?;
         let on_sheet: Vec<usize> = (0..SHEET_COLUMNS).map(|i| i * last / (SHEET_COLUMNS - 1)).collect();
         for start in (0..length).step_by(ROWS) {
             let rows = ROWS.min(length - start);
             let batch = reader.read(&layout.names(), &[StepRange::new(episode, start, rows)])?;
             for row in 0..rows {
-                let image = layout.draw(&batch, row, &format!("episode {index} step {}", start + row));
+                let image = layout.draw(&batch, row, &format!("episode {index} step {}", start + row))?;
                 video.add(&image)?;
                 // Short episodes repeat frames on the sheet.
                 let times = on_sheet.iter().filter(|&&step| step == start + row).count();
@@ -103,68 +103,4 @@ fn chosen(reader: &dyn Reader, count: usize) -> Result<Vec<usize>> {
         ));
     }
     Ok((0..count).map(|i| all[i * all.len() / count]).collect())
-}
-
-/// Layout of a preview frame: the images of all cameras side by side below their labels.
-struct FrameLayout {
-    cameras: Vec<ColumnSpec>,
-    width: usize,
-    height: usize,
-    /// Side of a letter's point in pixels.
-    point: usize,
-}
-
-/// Pixels between two cameras.
-const GAP: usize = 2;
-
-impl FrameLayout {
-    fn new(reader: &dyn Reader, names: &[String]) -> Result<Self> {
-        let schema = reader.schema();
-        let cameras: Vec<ColumnSpec> = if names.is_empty() {
-            schema.columns().iter().filter(|column| column.is_image()).cloned().collect()
-        } else {
-            names.iter().map(|name| schema.column(name).cloned()).collect::<Result<_>>()?
-        };
-        if let Some(column) = cameras.iter().find(|column| !column.is_image()) {
-            return Err(Error::mismatch(
-                format!("previewing column '{}'", column.name),
-                format!("{} {:?}", column.dtype.name(), column.shape),
-                "images: uint8 [height, width, 3]",
-            ));
-        }
-        let tallest = cameras.iter().map(|camera| camera.shape[0]).max();
-        let Some(tallest) = tallest else {
-            return Err(Error::config("preview", "the dataset has no images", "collect it with an image size"));
-        };
-        let point = (tallest / 112).max(1);
-        let lines = 1 + usize::from(cameras.len() > 1);
-        let wide: usize = cameras.iter().map(|camera| camera.shape[1]).sum::<usize>() + GAP * (cameras.len() - 1);
-        // The title must fit, even if images are small.
-        let width = wide.max(label::width("episode 0000 step 0000", point));
-        Ok(Self { width, height: tallest + lines * label::height(point), point, cameras })
-    }
-
-    fn names(&self) -> Vec<&str> {
-        self.cameras.iter().map(|camera| camera.name.as_str()).collect()
-    }
-
-    fn draw(&self, batch: &Batch, row: usize, title: &str) -> Vec<u8> {
-        let mut rgb = vec![0; self.width * self.height * 3];
-        label::draw(&mut rgb, self.width, (0, 0), self.width, self.point, title);
-        let line = label::height(self.point);
-        let (mut left, top) = (0, if self.cameras.len() > 1 { 2 * line } else { line });
-        for (index, camera) in self.cameras.iter().enumerate() {
-            let width = camera.shape[1];
-            if self.cameras.len() > 1 {
-                label::draw(&mut rgb, self.width, (left, line), left + width, self.point, &camera.name);
-            }
-            let image = &batch.bytes(index)[row * camera.row_bytes()..][..camera.row_bytes()];
-            for (y, pixels) in image.chunks_exact(width * 3).enumerate() {
-                let at = ((top + y) * self.width + left) * 3;
-                rgb[at..at + pixels.len()].copy_from_slice(pixels);
-            }
-            left += width + GAP;
-        }
-        rgb
-    }
 }

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
 
-SIDE, GAP, LABEL, FRAMES = 224, 4, 26, 120
+SIDE, GAP, LABEL, FRAMES = 224, 4, 26, 100
 FONT = Path(__file__).parents[2] / "crates/swm-report/fonts/Roboto-subset.ttf"
 
 
@@ -52,7 +52,7 @@ def main(scenes, rooms, output):
                     draw.text((left + 2, top + 4), names[column], fill=(27, 36, 48), font=font)
                 page.paste(frames[min(at, len(frames) - 1)], (left, top + LABEL))
         pages.append(page)
-    pages[0].save(output, save_all=True, append_images=pages[1:], duration=66, loop=0, quality=62, method=6)
+    pages[0].save(output, save_all=True, append_images=pages[1:], duration=66, loop=0, quality=60, method=3)
 
 
 if __name__ == "__main__":

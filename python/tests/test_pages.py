@@ -23,8 +23,8 @@ PAGES = [
 ]
 #: The program; by default the one of the installed package.
 PROGRAM = [os.environ["SWM"]] if "SWM" in os.environ else [sys.executable, "-m", "stable_worldmodel"]
-#: The largest number of episodes, after a `--episodes` or `episodes=`, and the number of training steps.
-EPISODES, STEPS = 12, 4
+#: The largest number of collected and of other episodes, and the number of training steps.
+COLLECTED, EPISODES, STEPS = 60, 12, 4
 #: The capsules that come with the program.
 ZOO = ROOT / "zoo"
 
@@ -34,11 +34,11 @@ def blocks(page):
     return re.findall(r"^```(\w+)\n(.*?)^```$", (ROOT / page).read_text(), re.MULTILINE | re.DOTALL)
 
 
-def smaller(text):
+def smaller(text, episodes=EPISODES):
     """The text with fewer episodes and epochs."""
 
     def fewer(match):
-        return f"{match[1]}{min(int(match[2]), EPISODES)}"
+        return f"{match[1]}{min(int(match[2]), episodes)}"
 
     text = re.sub(r"((?:--episodes |\bepisodes=))(\d+)", fewer, text)
     return re.sub(r"range\(\d+\):\n    for batch in loader", "range(1):\n    for batch in loader", text)
@@ -46,10 +46,10 @@ def smaller(text):
 
 def command(line):
     """The arguments of a command, with fewer episodes and training steps."""
-    words = shlex.split(smaller(line))
+    words = shlex.split(smaller(line, COLLECTED if line.startswith("swm collect") else EPISODES))
     assert words[0] == "swm", f"a block of commands has the line {line}"
     if words[1] == "train" and "--resume" not in words:
-        words = [word for word in words if not word.startswith("schedule.steps=")] + [f"schedule.steps={STEPS}"]
+        words = [word for word in words if not word.startswith("schedule.steps=")] + [f"schedule.steps={STEPS}", "log_every=1"]
     return [*PROGRAM, *words[1:]]
 
 

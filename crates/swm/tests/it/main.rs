@@ -20,6 +20,7 @@ mod python;
 mod recipes;
 mod study;
 mod study_shipped;
+mod terminal;
 mod trust;
 mod zoo;
 

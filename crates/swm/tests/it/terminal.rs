@@ -1,0 +1,74 @@
+//! Tests of what the terminal offers beside the pipeline: completions, manual pages, curves, records of runs, and datasets
+//! recognised by their content.
+
+use crate::{Swm, text};
+
+/// Collects a dataset and trains a model of a few steps on it.
+fn trained(swm: &Swm) {
+    let rooms =
+        ["collect", "swm/TwoRoom-v1", "-o", "rooms", "--policy", "explore", "--episodes", "10", "--image", "64"];
+    swm.json(&rooms);
+    let settings = ["schedule.steps=4", "data.batch_size=8", "log_every=1"];
+    swm.json(&[&["train", "pldm", "--data", "rooms", "-o", "model"], &settings[..]].concat());
+}
+
+#[test]
+fn a_run_continues_from_its_folder_alone() {
+    let swm = Swm::new();
+    trained(&swm);
+    let summary = swm.json(&["train", "--output", "model", "--resume"]);
+    assert_eq!(summary["steps"], 4, "{summary}");
+    let record = std::fs::read(swm.path("checkpoints/model/run.json")).expect("reading run.json");
+    let record: serde_json::Value = serde_json::from_slice(&record).expect("run.json is JSON");
+    let [first, second] = &record["commands"].as_array().expect("a list")[..] else { panic!("{record}") };
+    assert!(first["command"].to_string().contains("rooms") && second["command"].to_string().contains("--resume"));
+    assert!(first["started"].as_str().is_some_and(|date| date.ends_with('Z')) && first["version"].is_string());
+    swm.fails(&["train", "--output", "nothing", "--resume"], 2, &["unknown checkpoint 'nothing'"]);
+    swm.fails(&["train", "--resume"], 2, &["--output"]);
+    // A record names no connection that the user has not chosen.
+    let record = record.to_string().replace("\"rooms\"", "\"s3://bucket/rooms.lance\"");
+    std::fs::write(swm.path("checkpoints/model/run.json"), record).expect("writing run.json");
+    swm.fails(&["train", "--output", "model", "--resume"], 2, &["s3://bucket/rooms.lance", "--data"]);
+}
+
+#[test]
+fn curves_are_drawn_and_written() {
+    let swm = Swm::new();
+    trained(&swm);
+    let drawn = swm.run(&["plot", "model", "--output", "curves.svg"]);
+    assert!(text(&drawn.stdout).contains("loss over step"), "{}", text(&drawn.stderr));
+    let svg = std::fs::read_to_string(swm.path("curves.svg")).expect("reading the figure");
+    assert!(svg.starts_with("<svg ") && svg.contains("loss over step"));
+    swm.fails(&["plot", "model", "--metric", "los"], 2, &["did you mean loss", "--list"]);
+    std::fs::write(swm.path("notes.svg"), "mine").expect("writing a file");
+    swm.fails(&["plot", "model", "--output", "notes.svg"], 2, &["notes.svg"]);
+}
+
+#[test]
+fn datasets_are_recognised_by_their_content() {
+    let swm = Swm::new();
+    swm.json(&["collect", "swm/TwoRoom-v1", "-o", "rooms", "--policy", "expert", "--episodes", "3", "--image", "32"]);
+    for (format, name) in [("hdf5", "./one"), ("lance", "./two"), ("lerobot", "./three"), ("folder", "./four")] {
+        swm.json(&["convert", "rooms", name, "--format", format]);
+        let found = swm.json(&["inspect", name]);
+        assert_eq!(found["episodes"], 3, "{format}");
+        assert_eq!(found["ranges"]["action"]["max"].as_f64().map(|most| most <= 1.0), Some(true), "{found}");
+    }
+    assert_eq!(swm.json(&["inspect", "rooms"])["successful_episodes"], 3);
+    swm.fails(&["convert", "rooms", "rooms.xyz"], 2, &[".lance", ".h5", "--format"]);
+}
+
+#[test]
+fn shells_and_man_know_the_commands() {
+    let swm = Swm::new();
+    for shell in ["bash", "zsh", "fish"] {
+        let script = text(&swm.run(&["completions", shell]).stdout);
+        assert!(script.contains("goal-offset"), "{shell}");
+    }
+    let written = text(&swm.run(&["man", "--output", "pages"]).stdout);
+    assert!(written.contains("swm-study-run.1") && swm.path("pages/swm-eval.1").is_file(), "{written}");
+    let help = text(&swm.run(&["--help"]).stdout);
+    for group in ["Data:", "Train:", "Evaluate:", "System:"] {
+        assert!(help.contains(group), "{help}");
+    }
+}

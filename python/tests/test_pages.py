@@ -24,7 +24,7 @@ PAGES = [
 #: The program; by default the one of the installed package.
 PROGRAM = [os.environ["SWM"]] if "SWM" in os.environ else [sys.executable, "-m", "stable_worldmodel"]
 #: The largest number of collected and of other episodes, and the number of training steps.
-COLLECTED, EPISODES, STEPS = 60, 12, 4
+COLLECTED, EPISODES, STEPS = 60, 4, 4
 #: The capsules that come with the program.
 ZOO = ROOT / "zoo"
 
@@ -47,6 +47,8 @@ def smaller(text, episodes=EPISODES):
 def command(line):
     """The arguments of a command, with fewer episodes and training steps."""
     words = shlex.split(smaller(line, COLLECTED if line.startswith("swm collect") else EPISODES))
+    if words[0] == "mkdir":
+        return words
     assert words[0] == "swm", f"a block of commands has the line {line}"
     if words[1] == "train" and "--resume" not in words:
         words = [word for word in words if not word.startswith("schedule.steps=")] + [f"schedule.steps={STEPS}", "log_every=1"]

@@ -42,7 +42,7 @@ pub fn file_name(id: &str) -> String {
 /// Returns the page of an environment. `images` are the paths of its frames from the page; `notes` is that of
 /// the page with its equations and its differences from the reference.
 pub fn environment(id: &str, env: &Value, images: &[String], notes: Option<&str>) -> String {
-    let mut text = format!("# `{id}`\n\n{}.\n\n", string(&env["summary"]));
+    let mut text = format!("# `{id}`\n\n{}.\n\n", sentence(&env["summary"]));
     if let Some(missing) = env["missing"].as_str() {
         let _ = write!(text, "This page was made without the assets of the environment ({missing}).\n\n");
         return text;
@@ -50,8 +50,14 @@ pub fn environment(id: &str, env: &Value, images: &[String], notes: Option<&str>
     let shown: Vec<String> =
         images.iter().map(|image| format!("![Initial state, all factors sampled]({image})")).collect();
     if !shown.is_empty() {
-        text += &shown.join(" ");
-        text += "\n\n";
+        // A table keeps the images in one row.
+        let _ = write!(
+            text,
+            "|{}\n|{}\n| {} |\n\n",
+            " |".repeat(shown.len()),
+            " --- |".repeat(shown.len()),
+            shown.join(" | ")
+        );
     }
     let _ = write!(text, "    swm collect {id} --output data --policy random --episodes 10 --image 64\n\n");
     let experts: Vec<String> = list(&env["experts"])
@@ -104,14 +110,15 @@ fn factors(env: &Value) -> String {
             continue;
         }
         let at_reset = if sampled.contains(&key) { "yes" } else { "" };
-        let _ = writeln!(text, "| `{key}` | {} | {} | {at_reset} |", space(factor), values(&factor["init_value"]));
+        let _ =
+            writeln!(text, "| `{key}` | {} | {} | {at_reset} |", cell(&space(factor)), values(&factor["init_value"]));
     }
     text
 }
 
 /// Returns the page of a solver.
 pub fn solver(id: &str, solver: &Value) -> String {
-    let mut text = format!("# `{id}`\n\n{}.\n\n", string(&solver["summary"]).trim_end_matches('.'));
+    let mut text = format!("# `{id}`\n\n{}.\n\n", sentence(&solver["summary"]));
     let needs: Vec<String> = list(&solver["needs"]).iter().map(string).collect();
     text += "| | |\n| --- | --- |\n";
     for (name, value) in [
@@ -135,7 +142,7 @@ pub fn solver(id: &str, solver: &Value) -> String {
 
 /// Returns the page of a visual wrapper.
 pub fn wrapper(id: &str, wrapper: &Value) -> String {
-    let mut text = format!("# `{id}`\n\n{}.\n\n", string(&wrapper["summary"]).trim_end_matches('.'));
+    let mut text = format!("# `{id}`\n\n{}.\n\n", sentence(&wrapper["summary"]));
     let parameters = entries(&wrapper["parameters"]);
     let example = parameters.iter().find(|(_, parameter)| !parameter["default"].is_null());
     let example = example.map_or(String::new(), |(key, parameter)| format!(",{key}={}", values(&parameter["default"])));
@@ -169,7 +176,7 @@ pub fn format(id: &str, format: &Value) -> String {
     format!(
         "# `{id}`\n\n{}.\n\n| | |\n| --- | --- |\n| suffixes | {} |\n\n    swm convert rooms rooms-{id} --format {id}\n\n\
          What works with every format is described in [Datasets](../data.md).\n",
-        string(&format["summary"]).trim_end_matches('.'),
+        sentence(&format["summary"]),
         or_none(&suffixes.join(", "))
     )
 }
@@ -198,7 +205,7 @@ fn space(space: &Value) -> String {
         "MultiDiscrete" => format!("integers below {}", values(&space["nvec"])),
         _ => {
             let shape = values(&space["shape"]);
-            let shape = if shape.is_empty() { String::new() } else { format!(", shape \\[{shape}\\]") };
+            let shape = if shape.is_empty() { String::new() } else { format!(", shape [{shape}]") };
             format!("{} to {}{shape}", bound(&space["low"], "−∞"), bound(&space["high"], "∞"))
         }
     }
@@ -260,6 +267,13 @@ pub fn string(value: &Value) -> String {
     }
 }
 
+/// Returns a summary as the beginning of a sentence, without its full stop.
+fn sentence(summary: &Value) -> String {
+    let text = string(summary);
+    let mut letters = text.trim_end_matches('.').chars();
+    letters.next().map_or_else(String::new, |first| first.to_uppercase().chain(letters).collect())
+}
+
 fn list(value: &Value) -> &[Value] {
     value.as_array().map_or(&[], Vec::as_slice)
 }
@@ -286,7 +300,7 @@ mod tests {
     #[test]
     fn spaces_are_described_in_words() {
         let unit = json!({"type": "Box", "shape": [2], "low": [-1.0, -1.0], "high": [1.0, 1.0]});
-        assert_eq!(space(&unit), "−1 to 1, shape \\[2\\]");
+        assert_eq!(space(&unit), "−1 to 1, shape [2]");
         let half = json!({"type": "Box", "shape": [], "low": 0.5, "high": null});
         assert_eq!(space(&half), "0.5 to ∞");
         assert_eq!(space(&json!({"type": "Discrete", "n": 3, "start": 1})), "1 to 3");

@@ -23,8 +23,9 @@ fn previews_show_every_camera() {
         assert_eq!(fuzz::files(&out).len(), 4, "no other file remains");
         let png = std::io::BufReader::new(std::fs::File::open(&written[3]).expect("opening a file"));
         let png = png::Decoder::new(png).read_info().expect("reading the PNG header");
-        // Each of the eight frames in a row has two lines of text above two images. The title is wider than the images.
-        let frame = (22 * 4 + 1, 16 + 2 * 7);
+        // Each of the eight frames in a row has two lines of text above two images, which are enlarged eightfold, and three
+        // below them.
+        let frame = (2 * 24 * 8 + 2, 16 * 8 + 5 * 7);
         assert_eq!((png.info().width, png.info().height), (8 * (frame.0 + 2) + 2, 3 * (frame.1 + 2) + 2));
         let one = PreviewOptions { columns: vec!["goal".to_owned()], ..options };
         assert_eq!(preview(&*reader, &out, &one, |_| ()).expect("writing the preview").len(), 4);

@@ -82,7 +82,7 @@ fn output_folders_are_checked_before_the_work() {
     no_work("file", 2, &["is not a folder"]);
     no_work("file/below", 1, &["file/below"]);
     no_work("occupied", 2, &["results.json", "is a folder"]);
-    no_work("/proc/swm", 1, &["/proc/swm"]);
+    no_work("/proc/swm", 2, &["/proc/swm"]);
 
     swm.json(EVAL);
     swm.fails(&["reproduce", "found", "-o", "found"], 2, &["would be replaced"]);

@@ -75,7 +75,7 @@ fn trains_evaluates_and_reports() {
     assert!(!page.contains("<h2>Training</h2>"), "curves of other weights");
 
     swm.fails(&["eval", "small", "--env", "swm/PushT-v1"], 2, &["trained on swm/TwoRoom-v1"]);
-    swm.fails(&["report", "nowhere"], 1, &["nowhere"]);
+    swm.fails(&["report", "nowhere"], 2, &["nowhere"]);
 
     // An unknown model family, and truncated weights.
     let file = find(&swm.path("checkpoints/small"), "config.json");

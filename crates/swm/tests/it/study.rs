@@ -328,7 +328,7 @@ fn report_of_a_study_replaces_only_its_own_files() {
     swm.json(&["study", "report", "out", "--output", "page", "--title", "Second"]);
     let second = contents(&swm.path("page"));
     assert!(first["index.html"] != second["index.html"] && first["table.csv"] == second["table.csv"]);
-    swm.fails(&["study", "report", "nowhere"], 1, &["nowhere"]);
+    swm.fails(&["study", "report", "nowhere"], 2, &["nowhere"]);
 }
 
 #[test]

@@ -83,15 +83,12 @@ wheel-portable: wheel
 gpu: setup
 	CARGO_TARGET_DIR=$(CARGO_TARGET_DIR)-gpu $(CARGO) build --release -p swm --bins --features vulkan
 
-# The guides, tutorials and registries as static pages, with the Python and the Rust interface, all without network
-# access (`cargo xtask book`). Frames of 3-D environments are shown if their assets are installed.
+# The guides, tutorials and registries as static pages that need no network (`cargo xtask book`). Frames of 3-D environments are shown if their assets are installed.
 MDBOOK_VERSION := 0.5.4
-docs: build wheel
+docs: build
 	@mdbook --version 2>/dev/null | grep -qx 'mdbook v$(MDBOOK_VERSION)' || \
 	  $(CARGO) install --locked --root $(CACHE)/tools mdbook --version $(MDBOOK_VERSION) --no-default-features --features search
 	SWM=$(SWM) $(CARGO) xtask book $(CACHE)/docs
-	python3 -m venv $(CACHE)/venv-docs && $(CACHE)/venv-docs/bin/python -m pip install --quiet pdoc==16.0.0 $(WHEELS)/*.whl
-	$(CACHE)/venv-docs/bin/pdoc --output-directory $(CACHE)/docs/book/python-api stable_worldmodel
 
 bench: assets
 	SWM_REFERENCE_PYTHON=$(CACHE)/reference/bin/python $(SWM) bench envs

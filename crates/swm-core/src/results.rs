@@ -9,7 +9,9 @@ mod breaking;
 mod consistency;
 mod counting;
 mod discrimination;
+mod displacement;
 mod family;
+mod gap;
 mod paired;
 mod played;
 mod prediction;
@@ -19,6 +21,7 @@ mod searches;
 mod seeds;
 mod shapley;
 mod statistics;
+mod stopping;
 mod study;
 mod table;
 mod until;
@@ -27,8 +30,10 @@ pub use autopsy::{Arm, ArmRuns, Autopsy, Contribution, Estimate, Finding, Ingred
 pub use breaking::{BreakingPoint, Crossing, Evaluated, Level, Ray, Side};
 pub use counting::Counting;
 pub use discrimination::{Density, Discrimination, ErrorAndSuccess, Predicts};
+pub use displacement::ByDisplacement;
 pub use family::{Family, Verdict};
-pub use paired::{Comparison, MAX_ALL_PAIRS, Paired, pairs};
+pub use gap::Gap;
+pub use paired::{Comparing, Comparison, MAX_ALL_PAIRS, Paired, pairs};
 pub use played::{ClusteredMean, Played, PlayedErrors, PlayedTrajectory};
 pub use prediction::{Group, Prediction, Trajectory};
 pub use ranking::{Rank, Ranking};
@@ -36,7 +41,8 @@ pub use searches::{Band, Searches};
 pub use seeds::{Interquartile, OverSeeds, TRAINING_SEED};
 pub use shapley::{Coalition, Game};
 pub use statistics::{Proportion, Summary};
-pub use study::{Published, Registration, StudyResults, StudyRow};
+pub use stopping::Stopping;
+pub use study::{ImageRank, Published, Registration, StudyResults, StudyRow};
 pub use table::{StudyTable, TableColumn, TableRow};
 pub use until::Until;
 
@@ -65,6 +71,9 @@ pub struct Results {
     /// fixed number, are not to be shown.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub sequential: bool,
+    /// How the evaluation ended, if its results decided the number of episodes: its intervals are confidence sequences.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stopping: Option<Stopping>,
 }
 
 /// The results of one policy under one condition.

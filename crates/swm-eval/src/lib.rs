@@ -6,6 +6,7 @@
 //! - [`request`]: all settings of an evaluation as one value. [`runner`] evaluates the policies of a request on the
 //!   same starts, [`reproduce`] repeats an evaluation from its results, and [`replay`] some of its episodes.
 //! - [`baselines`]: policies that need no training and show what a success rate means.
+//! - [`until`]: evaluates more and more starts until a rule is met.
 //! - [`study`]: many evaluations with one table.
 //! - [`prediction`]: the prediction errors of a model on recorded trajectories.
 //!
@@ -30,6 +31,7 @@ pub mod starts;
 mod starts_hash;
 pub mod study;
 mod success_criterion;
+pub mod until;
 mod video_recording;
 pub mod world;
 

@@ -27,6 +27,8 @@ struct Episode {
     /// The observations at model steps: at most one more than the horizon.
     observations: Batch,
     goal: Option<Batch>,
+    /// The distance to the goal at the start, in the environment's unit.
+    displacement: f64,
     /// The actions of all steps, at most horizon times frameskip.
     actions: Vec<f32>,
     /// The number of steps that were played.
@@ -66,7 +68,8 @@ impl PlayedRecording {
             batch
         };
         let (observations, goal) = (row(&self.columns), self.of_goal.as_deref().map(row));
-        self.episodes.insert(episode, Episode { observations, goal, actions: vec![], steps: 0 });
+        let displacement = pool.env(slot).goal_distance();
+        self.episodes.insert(episode, Episode { observations, goal, displacement, actions: vec![], steps: 0 });
     }
 
     /// Keeps an action, before its step.
@@ -129,7 +132,8 @@ impl PlayedRecording {
                 });
             }
             let start = result.start.unwrap_or([*index, 0]);
-            trajectories.push(PlayedTrajectory { start, success: result.success, errors, optimism });
+            let displacement = Some(episode.displacement).filter(|displacement| displacement.is_finite());
+            trajectories.push(PlayedTrajectory { start, success: result.success, errors, optimism, displacement });
         }
         Ok(Played { trajectories })
     }

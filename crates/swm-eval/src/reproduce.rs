@@ -76,6 +76,10 @@ pub fn reproduce(
 ) -> Result<Reproduction> {
     let request = requested(old)?;
     let results = request.run(&Checked { resolver, manifest: &old.manifest }, options, control)?;
+    let results = match &old.stopping {
+        Some(stopping) => results.stopped(stopping.until, stopping.most),
+        None => results,
+    };
     Ok(Reproduction { differences: differences(old, &results), results })
 }
 
@@ -145,9 +149,9 @@ fn differing_starts(old: &Results, request: &EvalRequest, resolver: &dyn Resolve
 }
 
 /// A resolver that rejects data and weights whose hashes differ from the hashes in the old results.
-struct Checked<'a> {
-    resolver: &'a dyn Resolver,
-    manifest: &'a Manifest,
+pub(crate) struct Checked<'a> {
+    pub(crate) resolver: &'a dyn Resolver,
+    pub(crate) manifest: &'a Manifest,
 }
 
 impl Checked<'_> {

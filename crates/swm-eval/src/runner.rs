@@ -12,7 +12,7 @@ use crate::world::{World, WorldConfig};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
-use swm_core::results::{Comparison, Counting, Played, Proportion, Run, Searches};
+use swm_core::results::{Comparison, Counting, Played, Proportion, Run, Searches, Timing};
 use swm_core::run::{Control, Event, Stage};
 use swm_core::{Env, Error, Manifest, PlanTrace, Policy, Result, Results, VariationRequest};
 use swm_data::Reader;
@@ -227,6 +227,7 @@ impl EvalRequest {
             comparisons: Comparison::all(&runs, request.counting),
             runs,
             sequential: false,
+            stopping: None,
         })
     }
 
@@ -324,6 +325,17 @@ impl EvalRequest {
         }
     }
 
+    /// Whether results are those of this request, with any number of episodes.
+    ///
+    /// # Errors
+    /// When the results contain no request that this version reads, or this request is invalid.
+    pub(crate) fn is_of(&self, results: &Results) -> Result<bool> {
+        let (found, requested) = (Self::of(&results.manifest)?, self.with_floor()?);
+        // The runner writes the time limit that it used.
+        let budget = requested.budget.or(found.budget);
+        Ok(found == Self { budget, episodes: found.episodes, ..requested })
+    }
+
     fn manifest(&self) -> Result<Manifest> {
         let config = serde_json::to_value(self).map_err(|e| Error::external("writing an evaluation's request", e))?;
         Ok(Manifest::new("evaluate", self.seed, config))
@@ -353,7 +365,9 @@ fn joined(earlier: &Run, later: Run, counting: Counting) -> Run {
     let strict = earlier.strict.zip(later.strict);
     let strict = strict.map(|(a, b)| Proportion::wilson(a.successes + b.successes, a.n + b.n));
     let episodes = earlier.episodes.iter().cloned().chain(later.episodes).collect();
-    Run { strict, ..Run::new(&later.condition, &later.policy, counting, episodes, later.timing) }
+    let wall_seconds = earlier.timing.wall_seconds + later.timing.wall_seconds;
+    let run = Run::new(&later.condition, &later.policy, counting, episodes, Timing { wall_seconds, ..later.timing });
+    Run { strict, videos: earlier.videos.clone(), ..run }
 }
 
 /// The summary of a run, for [`Event::Finished`].

@@ -37,7 +37,7 @@ impl<'g, 'a> Gaps<'g, 'a> {
         let of = |reference: &'g Row<'a>| {
             let gaps = shifted().filter_map(|condition| {
                 let same = |row: &&Row<'a>| is_same_policy(results, reference, row);
-                let paired = |row: &Row<'a>| Paired::of_runs(row.run, reference.run, group.counting);
+                let paired = |row: &Row<'a>| group.comparing()(row.run, reference.run, group.counting);
                 let table = condition.rows.iter().filter(same).find_map(paired)?;
                 Some(Gap { condition: condition.name, table })
             });

@@ -5,13 +5,15 @@ use crate::plot::{Ink, inks};
 use crate::text::{escape, shorten};
 use std::path::PathBuf;
 use swm_core::Results;
-use swm_core::results::{Comparison, Counting, Family, Paired, Proportion, Run, Verdict, pairs};
+use swm_core::results::{Comparing, Comparison, Counting, Family, Paired, Proportion, Run, Stopping, Verdict, pairs};
 
 /// All runs in one environment with the same protocol and counting.
 pub(crate) struct Group<'a> {
     pub env: &'a str,
     pub protocol: &'a str,
     pub counting: Counting,
+    /// How the runs of a results file ended whose results decided their number of episodes, and that number.
+    pub stopped: Vec<(Stopping, usize)>,
     pub conditions: Vec<Condition<'a>>,
 }
 
@@ -54,9 +56,10 @@ impl<'a> Group<'a> {
             let same = |g: &Self| (g.env, g.protocol, g.counting) == (&*result.env, &*result.protocol, counting);
             let index = groups.iter().position(same).unwrap_or_else(|| {
                 let (env, protocol) = (&*result.env, &*result.protocol);
-                groups.push(Self { env, protocol, counting, conditions: vec![] });
+                groups.push(Self { env, protocol, counting, stopped: vec![], conditions: vec![] });
                 groups.len() - 1
             });
+            groups[index].stopped.extend(result.stopping.map(|stopping| (stopping, result.episodes())));
             let conditions = &mut groups[index].conditions;
             for run in &result.runs {
                 let at = conditions.iter().position(|c| c.name == run.condition).unwrap_or_else(|| {
@@ -81,6 +84,11 @@ impl<'a> Group<'a> {
             }
         }
         groups
+    }
+
+    /// The comparison of two runs. If the results of one file decided its number of episodes, all comparisons hold at any number.
+    pub(crate) fn comparing(&self) -> Comparing {
+        if self.stopped.is_empty() { Paired::of_runs } else { Paired::sequential }
     }
 
     /// All runs, by condition.
@@ -137,13 +145,13 @@ impl<'a> Condition<'a> {
     }
 
     /// Compares the pairs of runs that played the same starts; `None` without pairs.
-    fn compare(&self, counting: Counting) -> Option<Compared<'_, 'a>> {
+    fn compare(&self, by: Comparing, counting: Counting) -> Option<Compared<'_, 'a>> {
         let runs: Vec<&Run> = self.rows.iter().map(|row| row.run).collect();
         let is_reference = |row: &Row<'_>| row.is_floor() || self.best().is_some_and(|best| best.is(row));
         let pairs = pairs(&runs).map(|(later, earlier)| (&self.rows[later], &self.rows[earlier]));
         let mut pairs: Vec<Pair<'_, 'a>> = pairs
             .filter_map(|(a, b)| {
-                let table = Comparison::of(a.run, b.run, counting)?.table;
+                let table = Comparison::by(by, a.run, b.run, counting)?.table;
                 Some(Pair { a, b, table, is_first: is_reference(a) || is_reference(b) })
             })
             .collect();
@@ -172,7 +180,8 @@ pub(crate) struct Pair<'g, 'a> {
 impl<'g, 'a> Compared<'g, 'a> {
     /// The comparisons of every condition of a group that has some.
     pub(crate) fn all(group: &'g Group<'a>) -> Vec<Self> {
-        group.conditions.iter().filter_map(|condition| condition.compare(group.counting)).collect()
+        let of = |condition: &'g Condition<'a>| condition.compare(group.comparing(), group.counting);
+        group.conditions.iter().filter_map(of).collect()
     }
 
     /// The comparisons of a condition, if it has some.

@@ -26,7 +26,7 @@ mod text;
 mod training_log;
 
 pub use charts::training::curves_svg;
-pub use leaderboard::{BoardEntry, BoardRow, BoardTable, Leaderboard, write_leaderboard};
+pub use leaderboard::{BoardEntry, BoardPages, BoardRow, BoardTable, Leaderboard, Move, write_leaderboard};
 pub use page::{ReportOptions, render, write_report, write_report_with};
 pub use read::{parse_results, read_results};
 pub use study::{StudyPage, TablePage, write_study, write_table};

@@ -5,7 +5,7 @@
 //! Which levels these are depends on the outcomes. The intervals are therefore corrected for all 32 levels that could have
 //! been evaluated, so that those of the levels that were evaluated hold together with 95 %.
 
-use super::{Counting, Family, Paired, Proportion, Run, Verdict, betting};
+use super::{Comparing, Counting, Family, Paired, Proportion, Run, Verdict, betting};
 use serde::{Deserialize, Serialize};
 
 /// The factor that a study changes along a ray.
@@ -103,7 +103,7 @@ impl BreakingPoint {
         unshifted: &Run,
         levels: &[Evaluated<'_>],
         counting: Counting,
-        compare: fn(&Run, &Run, Counting) -> Option<Paired>,
+        compare: Comparing,
     ) -> Option<Self> {
         let mut levels = levels.to_vec();
         levels.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -247,7 +247,7 @@ fn side([low, high]: [f64; 2], threshold: f64) -> Side {
 }
 
 /// The pairs of conditions, the earlier one first, between which success is shown to rise.
-fn rises(runs: &[&Run], counting: Counting, compare: fn(&Run, &Run, Counting) -> Option<Paired>) -> Vec<[String; 2]> {
+fn rises(runs: &[&Run], counting: Counting, compare: Comparing) -> Vec<[String; 2]> {
     let pairs = (0..runs.len()).flat_map(|later| (0..later).map(move |earlier| [earlier, later]));
     let mut compared: Vec<([usize; 2], Paired)> =
         pairs.filter_map(|[i, j]| Some(([i, j], compare(runs[j], runs[i], counting)?))).collect();

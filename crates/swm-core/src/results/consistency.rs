@@ -12,13 +12,14 @@ impl Results {
     /// # Errors
     /// When a value differs; the text names the run, the stated value and the value of its episodes.
     pub fn check(&self) -> Result<(), String> {
-        self.runs.iter().try_for_each(|run| check_run(run, self.counting))?;
+        self.runs.iter().try_for_each(|run| check_run(run, self.counting, self.interval()))?;
+        self.check_stopping()?;
         if self.comparisons.is_empty() {
             return Ok(());
         }
         // All runs make the family of a comparison, not only those of the stated comparisons.
         let mut expected: BTreeMap<[&str; 3], &Paired> = BTreeMap::new();
-        let all = Comparison::all(&self.runs, self.counting);
+        let all = Comparison::all_by(self.comparing(), &self.runs, self.counting);
         for comparison in &all {
             expected.entry(names(comparison)).or_insert(&comparison.table);
         }
@@ -35,6 +36,22 @@ impl Results {
         }
         Ok(())
     }
+
+    /// Checks how the evaluation is said to have ended.
+    fn check_stopping(&self) -> Result<(), String> {
+        let Some(stopping) = &self.stopping else { return Ok(()) };
+        let (episodes, most) = (self.episodes(), stopping.most);
+        if episodes > most || self.runs.iter().any(|run| run.episodes.len() != episodes) {
+            return Err(format!("it states at most {most} episodes, the same for all runs, and its runs have others"));
+        }
+        let met = self.meets(stopping.until);
+        if met != stopping.met {
+            let says = |met| if met { "met" } else { "not met" };
+            let [stated, found] = [stopping.met, met].map(says);
+            return Err(format!("it states that {stopping} is {stated}, but by its episodes it is {found}"));
+        }
+        Ok(())
+    }
 }
 
 /// The condition and the policies of a comparison.
@@ -45,17 +62,20 @@ fn names(comparison: &Comparison) -> [&str; 3] {
 fn same_table(stated: &Paired, computed: &Paired) -> bool {
     let counts = |table: &Paired| [table.both, table.only_a, table.only_b, table.neither, table.comparisons];
     let values = |table: &Paired| [table.p, table.p_holm, table.design_effect, table.difference, table.low, table.high];
+    let e = |table: &Paired| [table.e.unwrap_or(f64::NAN)];
     counts(stated) == counts(computed)
+        && stated.e.is_some() == computed.e.is_some()
+        && (stated.e.is_none() || close(&e(stated), &e(computed)))
         && stated.verdict == computed.verdict
         && close(&values(stated), &values(computed))
 }
 
 /// Checks the statistics of one run.
-fn check_run(run: &Run, counting: Counting) -> Result<(), String> {
+fn check_run(run: &Run, counting: Counting, interval: fn(usize, usize) -> Proportion) -> Result<(), String> {
     let wrong = |problem: String| Err(format!("{} ({}) {problem}", run.policy, run.condition));
     let rates = |p: &Proportion| [p.rate, p.low, p.high];
     let (solved_at_start, computed, time_to_goal) = Run::statistics(counting, &run.episodes);
-    let stated = &run.success;
+    let (stated, computed) = (&run.success, interval(computed.successes, computed.n));
     if (stated.successes, stated.n) != (computed.successes, computed.n) {
         return wrong(format!(
             "states {} successes in {}, but its episodes have {} in {}",
@@ -82,7 +102,7 @@ fn check_run(run: &Run, counting: Counting) -> Result<(), String> {
                 strict.successes, strict.n
             ));
         }
-        if !close(&rates(strict), &rates(&Proportion::wilson(strict.successes, n))) {
+        if !close(&rates(strict), &rates(&interval(strict.successes, n))) {
             return wrong("states a strict success rate that its strict successes do not have".to_owned());
         }
     }

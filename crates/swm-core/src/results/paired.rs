@@ -7,6 +7,10 @@ use super::{Counting, EpisodeResult, Family, Run, Verdict, betting, score};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
+/// A paired comparison of two runs: [`Paired::of_runs`], or [`Paired::sequential`] where the outcomes decide how many episodes
+/// there are.
+pub type Comparing = fn(&Run, &Run, Counting) -> Option<Paired>;
+
 /// A paired comparison of two policies under one condition.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Comparison {
@@ -64,9 +68,14 @@ pub struct Paired {
 impl Comparison {
     /// Compares two runs of one condition, as a family of one comparison; `None` if they did not play the same starts.
     pub fn of(a: &Run, b: &Run, counting: Counting) -> Option<Self> {
+        Self::by(Paired::of_runs, a, b, counting)
+    }
+
+    /// Compares two runs as [`Comparison::of`] does, with another comparison.
+    pub fn by(compare: Comparing, a: &Run, b: &Run, counting: Counting) -> Option<Self> {
         let mut pairs = a.episodes.iter().zip(&b.episodes);
         let same = a.condition == b.condition && pairs.all(|(a, b)| a.solved_at_start == b.solved_at_start);
-        let table = same.then(|| Paired::of_runs(a, b, counting)).flatten()?;
+        let table = same.then(|| compare(a, b, counting)).flatten()?;
         Some(Self { condition: a.condition.clone(), a: a.policy.clone(), b: b.policy.clone(), table })
     }
 
@@ -74,6 +83,11 @@ impl Comparison {
     /// random-policy floor as `learned` minus `random`. A condition with many runs is limited as [`pairs`] says. The
     /// comparisons of one condition form a family.
     pub fn all(runs: &[Run], counting: Counting) -> Vec<Self> {
+        Self::all_by(Paired::of_runs, runs, counting)
+    }
+
+    /// Compares runs as [`Comparison::all`] does, with another comparison.
+    pub fn all_by(compare: Comparing, runs: &[Run], counting: Counting) -> Vec<Self> {
         let mut conditions: BTreeMap<&str, Vec<usize>> = BTreeMap::new();
         for (i, run) in runs.iter().enumerate() {
             conditions.entry(&run.condition).or_default().push(i);
@@ -84,7 +98,7 @@ impl Comparison {
             found.extend(pairs(&members).map(|(later, earlier)| (indices[later], indices[earlier])));
         }
         found.sort_unstable();
-        let compared = found.into_iter().filter_map(|(a, b)| Self::of(&runs[a], &runs[b], counting));
+        let compared = found.into_iter().filter_map(|(a, b)| Self::by(compare, &runs[a], &runs[b], counting));
         let mut compared: Vec<Self> = compared.collect();
         Self::families(&mut compared);
         compared

@@ -24,6 +24,9 @@ pub struct PlayedTrajectory {
     /// The optimism of the prediction: the squared distance from the goal's latent that the last model step reached, minus that
     /// which the model predicted for the same actions. `None` without an observation of the goal.
     pub optimism: Option<f64>,
+    /// The distance from the start to its goal, in the environment's unit; `None` where it was not recorded.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub displacement: Option<f64>,
 }
 
 /// What [`Played`] shows.
@@ -108,6 +111,7 @@ mod tests {
             success,
             errors: errors.to_vec(),
             optimism,
+            displacement: None,
         };
         let trajectories = vec![
             trajectory(0, true, &[0.1], None),

@@ -239,8 +239,10 @@ mod tests {
             floor: Proportion::wilson(0, 10),
             gap: None,
             trained_on_starts: None,
+            image_distance: None,
             prediction: None,
             played: None,
+            by_displacement: vec![],
         }
     }
 

@@ -1,6 +1,9 @@
 //! [`StudyResults`]: the success rates of all cells of a study, as read by tables and reports.
 
-use super::{BreakingPoint, Counting, ErrorAndSuccess, Family, OverSeeds, Paired, PlayedErrors, Proportion, Until};
+use super::{
+    BreakingPoint, ByDisplacement, Counting, ErrorAndSuccess, Family, OverSeeds, Paired, PlayedErrors, Proportion,
+    Until,
+};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fmt;
@@ -38,6 +41,17 @@ pub struct StudyResults {
     pub registration: Option<Registration>,
 }
 
+/// A shifted condition among all, by how much it changes the first frames.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ImageRank<'a> {
+    /// The condition.
+    pub condition: &'a str,
+    /// The mean absolute difference of the first frames' values, from 0 to 255.
+    pub distance: f64,
+    /// The gap of each policy, from -1 to 1.
+    pub gaps: BTreeMap<&'a str, f64>,
+}
+
 /// What was registered before the first result.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Registration {
@@ -60,6 +74,28 @@ impl fmt::Display for Registration {
 }
 
 impl StudyResults {
+    /// Ranks the shifted conditions by how much they change the first frames, the largest change first. Conditions of several
+    /// sources of starts, seeds or rules for counting have the mean of their rows.
+    pub fn by_image_distance(&self) -> Vec<ImageRank<'_>> {
+        let mut conditions: BTreeMap<&str, Vec<&StudyRow>> = BTreeMap::new();
+        for row in self.rows.iter().filter(|row| row.image_distance.is_some()) {
+            conditions.entry(&row.condition).or_default().push(row);
+        }
+        let mean = |values: &[f64]| (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64);
+        let mut ranks: Vec<ImageRank<'_>> = vec![];
+        for (condition, rows) in conditions {
+            let mut gaps: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
+            for row in &rows {
+                gaps.entry(&row.policy).or_default().extend(row.gap.map(|gap| gap.difference));
+            }
+            let gaps = gaps.into_iter().filter_map(|(policy, gaps)| Some((policy, mean(&gaps)?))).collect();
+            let distances: Vec<f64> = rows.iter().filter_map(|row| row.image_distance).collect();
+            ranks.extend(mean(&distances).map(|distance| ImageRank { condition, distance, gaps }));
+        }
+        ranks.sort_by(|a, b| b.distance.total_cmp(&a.distance));
+        ranks
+    }
+
     /// What the rule that ends the study means for its statistics, and how many rows of a study that is done did not meet it.
     /// Nothing without a rule.
     pub fn notes_on_rule(&self) -> Vec<String> {
@@ -111,12 +147,19 @@ pub struct StudyRow {
     /// not recorded.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub trained_on_starts: Option<bool>,
+    /// The mean absolute difference between the values of the first frames under this and under the first condition, from the
+    /// same starts: from 0 to 255. `None` for that condition, without frames, and before it is measured.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub image_distance: Option<f64>,
     /// The model's prediction errors on the recorded trajectories that the starts come from, by success, if requested.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub prediction: Option<ErrorAndSuccess>,
     /// The same for the trajectories that the policy played, and the optimism of the model.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub played: Option<PlayedErrors>,
+    /// The same for near and for far goals, if they are known.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub by_displacement: Vec<ByDisplacement>,
 }
 
 /// A success rate that a publication states.

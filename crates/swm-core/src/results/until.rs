@@ -1,12 +1,12 @@
 //! [`Until`]: the rule that ends an evaluation whose number of episodes its results decide.
 
-use super::{StudyRow, Verdict};
+use super::{Paired, Proportion, StudyRow, Verdict};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// The rule that ends a study whose number of episodes its results decide. Its text is `ci=5` or `decided=10`.
+/// The rule that ends a study or an evaluation whose number of episodes its results decide. Its text is `ci=5` or `decided=10`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(into = "String", try_from = "String")]
 pub enum Until {
@@ -23,12 +23,22 @@ impl Until {
     /// Whether the row needs no more episodes.
     pub fn is_met(self, row: &StudyRow) -> bool {
         match self {
-            Self::Width(points) => 50.0 * (row.success.high - row.success.low) <= points,
-            Self::Decided(points) => row.gap.as_ref().is_none_or(|gap| {
-                let told = matches!(gap.verdict, Verdict::Lower | Verdict::Higher);
-                told || 100.0 * gap.low.abs().max(gap.high.abs()) < points
-            }),
+            Self::Width(_) => self.is_narrow(&row.success),
+            Self::Decided(_) => row.gap.as_ref().is_none_or(|gap| self.is_decided(gap)),
         }
+    }
+
+    /// Whether the interval of a rate is narrow enough for `ci`.
+    pub(super) fn is_narrow(self, rate: &Proportion) -> bool {
+        let Self::Width(points) = self else { return true };
+        50.0 * (rate.high - rate.low) <= points
+    }
+
+    /// Whether a comparison is told apart, or shown to be too small to matter for `decided`.
+    pub(super) fn is_decided(self, table: &Paired) -> bool {
+        let Self::Decided(points) = self else { return true };
+        let told = matches!(table.verdict, Verdict::Lower | Verdict::Higher);
+        told || 100.0 * table.low.abs().max(table.high.abs()) < points
     }
 }
 

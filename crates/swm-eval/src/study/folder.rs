@@ -9,13 +9,15 @@ use swm_core::files::{self, Lock};
 use swm_core::results::Until;
 use swm_core::{Error, Result, Results};
 
-/// The folder of a study: `study.json`, and the results of each cell in `cells/ID.json`.
+/// The folder of a study: `study.json`, the results of each cell in `cells/ID.json`, and `image-distances.json`.
 pub struct StudyFolder {
     pub(super) root: PathBuf,
 }
 
 /// The name of the file with all cells.
 const STUDY: &str = "study.json";
+/// The name of the file with the image distances of all cells.
+pub(super) const IMAGE_DISTANCES: &str = "image-distances.json";
 /// The largest file of a study, in bytes.
 pub(super) const MAX_BYTES: u64 = 256 << 20;
 
@@ -38,7 +40,7 @@ impl StudyFolder {
     pub(super) fn create_with(&self, title: &str, until: Option<Until>, bytes: &[u8]) -> Result<Lock> {
         let (lock, path) = (Lock::folder(&self.root)?, self.root.join(STUDY));
         files::check_own(&path, |_| self.open().is_ok())?;
-        delete_temporary(&self.root, |name| name == STUDY)?;
+        delete_temporary(&self.root, |name| [STUDY, IMAGE_DISTANCES].contains(&name))?;
         let other = |problem: String| {
             Error::config(self.root.display().to_string(), problem, "give another folder with --output")
         };
@@ -166,15 +168,16 @@ fn delete_temporary(folder: &Path, is_written: impl Fn(&str) -> bool) -> Result<
     Ok(())
 }
 
-/// Whether results are those of the cell's request and inputs. The runner writes the time limit that it used.
+/// Whether results are those of the cell's request and inputs.
 fn answers(results: &Results, cell: &Cell) -> Result<bool> {
-    let (found, requested) = (EvalRequest::of(&results.manifest)?, cell.request.with_floor()?);
-    let budget = requested.budget.or(found.budget);
-    let episodes = if cell.sequential { found.episodes } else { requested.episodes };
-    let hashes = &results.manifest.hashes;
+    let (hashes, episodes) = (&results.manifest.hashes, EvalRequest::of(&results.manifest)?.episodes);
     let same_inputs = cell.inputs.iter().all(|(input, hash)| hashes.get(input) == Some(hash));
-    let has_all = !cell.sequential || results.runs.iter().all(|run| run.episodes.len() == episodes);
-    Ok(found == EvalRequest { budget, episodes, ..requested } && same_inputs && has_all)
+    let has_all = if cell.sequential {
+        results.runs.iter().all(|run| run.episodes.len() == episodes)
+    } else {
+        episodes == cell.request.episodes
+    };
+    Ok(cell.request.is_of(results)? && same_inputs && has_all)
 }
 
 pub(super) fn json(value: &impl serde::Serialize) -> Result<Vec<u8>> {

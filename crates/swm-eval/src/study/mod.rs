@@ -14,6 +14,7 @@
 
 mod cell;
 mod folder;
+mod image_distance;
 mod registration;
 mod rows;
 mod run;

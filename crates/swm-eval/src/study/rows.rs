@@ -4,8 +4,8 @@ use super::cell::{Cell, Study};
 use super::folder::StudyFolder;
 use std::collections::{BTreeMap, BTreeSet};
 use swm_core::results::{
-    BreakingPoint, Counting, ErrorAndSuccess, Family, OverSeeds, Paired, PlayedErrors, Proportion, Ray, Run,
-    StudyResults, StudyRow, Until,
+    BreakingPoint, ByDisplacement, Comparing, ErrorAndSuccess, Family, OverSeeds, Paired, PlayedErrors, Proportion,
+    Ray, Run, StudyResults, StudyRow, Until,
 };
 use swm_core::{Result, Results};
 
@@ -21,7 +21,11 @@ impl Study {
                 done.push((cell, results));
             }
         }
-        Ok(StudyResults { registration: folder.registration(self)?, ..self.tabulate(&done)? })
+        let (distances, mut found) = (folder.image_distances()?, self.tabulate(&done)?);
+        for row in &mut found.rows {
+            row.image_distance = distances.get(&row.cell).map(|distance| distance.mean);
+        }
+        Ok(StudyResults { registration: folder.registration(self)?, ..found })
     }
 
     /// Returns the outcomes of some cells, without the registration.
@@ -54,9 +58,11 @@ impl Study {
                 floor: rate(&floor),
                 gap: reference.and_then(|reference| self.comparing()(run, reference, results.counting)),
                 trained_on_starts: cell.trained_on_starts,
+                image_distance: None,
                 // Their intervals hold for a number of episodes that is fixed in advance.
                 prediction: run.prediction.as_ref().filter(|_| self.until.is_none()).map(ErrorAndSuccess::of),
                 played: self.until.is_none().then(|| played(run)).flatten(),
+                by_displacement: if self.until.is_none() { by_displacement(run) } else { vec![] },
             });
         }
         let families = self.correct(&mut rows)?;
@@ -163,7 +169,7 @@ impl Study {
     }
 
     /// The variables that do not belong to the conditions: those with the same values in the unshifted cells as in all.
-    fn common_variables(&self) -> BTreeSet<&str> {
+    pub(super) fn common_variables(&self) -> BTreeSet<&str> {
         let values = |only_unshifted: bool| {
             let mut values: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
             for cell in self.cells.iter().filter(|cell| !only_unshifted || cell.condition() == self.unshifted()) {
@@ -179,9 +185,6 @@ impl Study {
     }
 }
 
-/// A paired comparison of two runs.
-type Comparing = fn(&Run, &Run, Counting) -> Option<Paired>;
-
 /// The run of the cell's policy, and the success rate of the random-policy floor.
 fn runs<'a>(cell: &Cell, results: &'a Results) -> Option<(&'a Run, Proportion)> {
     let run = |name: &str| results.runs.iter().find(|run| run.policy == name);
@@ -190,11 +193,16 @@ fn runs<'a>(cell: &Cell, results: &'a Results) -> Option<(&'a Run, Proportion)> 
 }
 
 /// What cells that differ in the condition only have in common. `variables` are those that no condition has.
-fn key(cell: &Cell, variables: &BTreeSet<&str>) -> String {
+pub(super) fn key(cell: &Cell, variables: &BTreeSet<&str>) -> String {
     let request = &cell.request;
     let common: Vec<_> = cell.variables.iter().filter(|(name, _)| variables.contains(name.as_str())).collect();
     let names = (&cell.starts, cell.policy(), common);
     format!("{:?}", (names, request.seed, request.planning_seed, request.episodes, request.budget, request.counting))
+}
+
+/// The errors for near and for far goals.
+fn by_displacement(run: &Run) -> Vec<ByDisplacement> {
+    run.prediction.as_ref().zip(run.played.as_ref()).map_or(vec![], |(of, played)| ByDisplacement::of(of, played))
 }
 
 /// The errors along the trajectories that the policy played, in the unit of those along the recorded ones.

@@ -16,7 +16,7 @@ pub(super) type Work<'a> = (&'a Cell, Option<Results>, usize);
 
 impl Study {
     /// Evaluates the cells that have no results in the folder, in order, and stores each when it is done; in stages, if a rule
-    /// ends the study. Returns the number of evaluated cells.
+    /// ends the study. Then measures how much the conditions change the first frames. Returns the number of evaluated cells.
     ///
     /// The stage is `study`, its unit an episode of the policies; the random-policy floor is not counted.
     ///
@@ -30,7 +30,9 @@ impl Study {
         control: &mut Control<'_>,
     ) -> Result<usize> {
         if let Some(until) = self.until {
-            return self.run_until(until, folder, resolver, options, control);
+            let evaluated = self.run_until(until, folder, resolver, options, control)?;
+            self.measure_distances(folder, resolver, options, control)?;
+            return Ok(evaluated);
         }
         let mut missing: Vec<Work<'_>> = vec![];
         for cell in &self.cells {
@@ -39,6 +41,7 @@ impl Study {
             }
         }
         self.evaluate(&missing, folder, resolver, options, control)?;
+        self.measure_distances(folder, resolver, options, control)?;
         Ok(missing.len())
     }
 
@@ -51,7 +54,7 @@ impl Study {
         options: &RunOptions,
         control: &mut Control<'_>,
     ) -> Result<()> {
-        let played = |earlier: &Option<Results>| earlier.as_ref().map_or(0, episodes);
+        let played = |earlier: &Option<Results>| earlier.as_ref().map_or(0, Results::episodes);
         let total = work.iter().map(|(_, earlier, episodes)| episodes - played(earlier)).sum();
         control.emit(Event::Started(Stage { name: STAGE, subject: &[&self.title], total, unit: "episodes" }));
         let mut done = 0;
@@ -78,9 +81,4 @@ impl Study {
         control.emit(Event::Finished { stage: STAGE, metrics: &[("cells", work.len() as f64)] });
         Ok(())
     }
-}
-
-/// The number of episodes of results.
-pub(super) fn episodes(results: &Results) -> usize {
-    results.runs.first().map_or(0, |run| run.episodes.len())
 }

@@ -6,21 +6,14 @@
 
 use super::cell::{Cell, Study};
 use super::folder::StudyFolder;
-use super::run::{Work, episodes};
+use super::run::Work;
 use crate::request::StartsRequest;
 use crate::runner::{Resolver, RunOptions};
+use crate::until::stages;
 use std::collections::BTreeSet;
 use swm_core::results::{Run, Timing, Until};
 use swm_core::run::Control;
 use swm_core::{Result, Results};
-
-/// The number of starts of the first stage.
-const FIRST: usize = 10;
-
-/// The numbers of starts of the stages: each has half as many again as the one before, rounded up to tens.
-fn stages() -> impl Iterator<Item = usize> {
-    std::iter::successors(Some(FIRST), |n| Some((n + n / 2).next_multiple_of(10)))
-}
 
 impl Study {
     /// Evaluates the first starts of all cells, then more starts of those that the rule leaves open, up to the episodes of
@@ -44,7 +37,7 @@ impl Study {
                     continue;
                 }
                 let (earlier, wanted) = (folder.results(cell)?, stage.min(cell.request.episodes));
-                if earlier.as_ref().map_or(0, episodes) < wanted {
+                if earlier.as_ref().map_or(0, Results::episodes) < wanted {
                     work.push((cell, earlier, wanted));
                     evaluated.insert(id);
                 }
@@ -98,15 +91,4 @@ fn first(mut results: Results, n: usize) -> Results {
         }
     }
     results
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn stages_grow_by_half() {
-        let found: Vec<usize> = stages().take(12).collect();
-        assert_eq!(found, [10, 20, 30, 50, 80, 120, 180, 270, 410, 620, 930, 1400]);
-    }
 }

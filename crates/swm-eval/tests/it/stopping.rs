@@ -167,3 +167,79 @@ fn starts_of_a_dataset_and_prediction_errors_grow_too() {
 fn compat() -> swm_core::results::Counting {
     swm_core::results::Counting::Compat { envs: 2 }
 }
+
+/// Evaluates the walker under two conditions until the rule is met, and keeps the results of the last stage.
+fn evaluate(
+    until: &str,
+    episodes: usize,
+    earlier: Option<Results>,
+    kept: &mut Option<Results>,
+    control: &mut Control<'_>,
+) -> swm_core::Result<Results> {
+    let mut conditions: Vec<Condition> = vec![];
+    for cell in &study(episodes, None).cells[..2] {
+        conditions.extend(cell.request.conditions.clone());
+    }
+    let request = EvalRequest { conditions, episodes, budget: Some(3), ..request() };
+    let options = RunOptions { envs: 4, threads: 1, ..RunOptions::default() };
+    let mut keep = |results: &Results| {
+        *kept = Some(results.clone());
+        Ok(())
+    };
+    request.run_until(until.parse()?, earlier, &TestResolver::new(), &options, &mut keep, control)
+}
+
+/// Results without times.
+fn text(mut results: Results) -> String {
+    results.runs.iter_mut().for_each(|run| run.timing = Default::default());
+    serde_json::to_string(&results).expect("a document")
+}
+
+#[test]
+fn an_evaluation_that_was_interrupted_ends_in_the_same_bytes() {
+    for rule in ["ci=8", "decided"] {
+        let whole = evaluate(rule, 900, None, &mut None, &mut Control::new()).expect("an evaluation");
+        whole.check().expect("consistent results");
+        let stopping = whole.stopping.expect("a rule");
+        assert!(stopping.met && stopping.most == 900 && (20..900).contains(&whole.episodes()), "{stopping:?}");
+        let (mut kept, mut moment) = (None, 0);
+        let parts = loop {
+            let mut left = moment;
+            let mut control = Control::new().with_poll(|| {
+                left -= 1;
+                if left < 0 { Err(Error::Interrupted) } else { Ok(()) }
+            });
+            match evaluate(rule, 900, kept.clone(), &mut kept, &mut control) {
+                Err(error) => assert!(matches!(error, Error::Interrupted), "{error}"),
+                Ok(results) => break results,
+            }
+            moment += 5 + moment / 3;
+        };
+        assert_eq!(text(parts), text(whole));
+    }
+}
+
+#[test]
+fn an_evaluation_that_its_results_ended_is_reproduced_and_continued() {
+    let few = evaluate("ci=8", 30, None, &mut None, &mut Control::new()).expect("an evaluation");
+    assert!(few.stopping.is_some_and(|stopping| !stopping.met) && few.episodes() == 30);
+    let options = RunOptions { envs: 3, ..RunOptions::default() };
+    let repeated = swm_eval::reproduce(&few, &TestResolver::new(), &options, &mut Control::new()).expect("results");
+    assert!(repeated.holds() && repeated.results.stopping == few.stopping, "{:?}", repeated.differences);
+    let whole = evaluate("ci=8", 900, None, &mut None, &mut Control::new()).expect("an evaluation");
+    let more = evaluate("ci=8", 900, Some(few.clone()), &mut None, &mut Control::new()).expect("an evaluation");
+    assert_eq!(text(more), text(whole.clone()));
+    // A looser rule is met by what exists.
+    let looser = evaluate("ci=20", 900, Some(whole.clone()), &mut None, &mut Control::new()).expect("results");
+    assert!(looser.episodes() == whole.episodes() && looser.stopping.is_some_and(|stopping| stopping.met));
+    let refused = |earlier: Results, says: &str| {
+        let error = evaluate("ci=8", 900, Some(earlier), &mut None, &mut Control::new()).expect_err(says).to_string();
+        assert!(error.contains(says), "{error}");
+    };
+    refused(Results { stopping: None, ..few.clone() }, "fixed in advance");
+    let mut other = few.clone();
+    other.manifest.config["seed"] = 77.into();
+    refused(other, "another request");
+    let error = evaluate("ci=8", 20, Some(few), &mut None, &mut Control::new()).expect_err("fewer episodes");
+    assert!(error.to_string().contains("30 episodes"), "{error}");
+}

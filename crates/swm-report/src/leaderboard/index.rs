@@ -1,5 +1,6 @@
 //! The page of all tables.
 
+use super::moves::{self, Move, range};
 use super::{BoardRow, BoardTable, Leaderboard, STYLE, name};
 use crate::charts;
 use crate::group::{Condition, Group, Row};
@@ -13,11 +14,11 @@ use swm_core::{Error, Result};
 
 const NONE: &str = "<span class=\"quiet\">–</span>";
 
-/// Renders the page.
+/// Renders the page, with what moved since the last build.
 ///
 /// # Errors
 /// When a table has too many entries to compare, or drawing a chart fails.
-pub(super) fn render(board: &Leaderboard) -> Result<String> {
+pub(super) fn render(board: &Leaderboard, moves: &[Move]) -> Result<String> {
     let (entries, tables) = (board.entries.len(), board.tables.len());
     let counted = |n: usize, one: &str, many: &str| format!("{n} {}", if n == 1 { one } else { many });
     let mut envs: Vec<&str> = board.tables.iter().map(|table| table.env.as_str()).collect();
@@ -31,6 +32,7 @@ pub(super) fn render(board: &Leaderboard) -> Result<String> {
     let title = shorten(&board.title, limits::TEXT_CHARS);
     document(&Head { title: &title, lede: &lede, style: STYLE }, |html| {
         html.push_str(HOW);
+        moves::write(html, moves);
         if envs.len() > 1 {
             html.push_str("<ul>\n");
             for (i, env) in envs.iter().enumerate() {
@@ -150,10 +152,6 @@ fn write_rows(html: &mut String, board: &Leaderboard, rows: &[Ranked<'_>]) {
 }
 
 /// A rank: one number if nothing else is possible.
-fn range(rank: Rank) -> String {
-    if rank.best == rank.worst { rank.best.to_string() } else { format!("{}–{}", rank.best, rank.worst) }
-}
-
 fn rate(p: &Proportion) -> String {
     if p.n == 0 {
         return NONE.to_owned();
@@ -167,6 +165,7 @@ fn write_chart(html: &mut String, table: &BoardTable, rows: &[Ranked<'_>]) -> Re
         env: &table.env,
         protocol: "",
         counting: Counting::default(),
+        stopped: vec![],
         conditions: vec![Condition { name: "", rows: rows_to_draw(rows).map(chart_row).collect() }],
     };
     let chart = charts::success::chart(&group)?;

@@ -4,8 +4,12 @@
 
 mod entry;
 mod index;
+mod moves;
+
+pub use moves::Move;
 
 use crate::text::{escape, shorten};
+use moves::Built;
 use std::path::{Path, PathBuf};
 use swm_core::results::{Counting, Run};
 use swm_core::{Error, Result, Results, files};
@@ -85,14 +89,27 @@ impl Leaderboard {
     }
 }
 
-/// Writes the pages of a leaderboard to a folder: `index.html`, and `entries/PAGE.html` for each entry. Returns the path of
-/// the first.
+/// What a build wrote and deleted.
+#[derive(Clone, Debug)]
+pub struct BoardPages {
+    /// The path of the page with the tables.
+    pub first: PathBuf,
+    /// What moved since the last build in the folder.
+    pub moves: Vec<Move>,
+    /// The deleted pages of entries that are gone, relative to the folder.
+    pub deleted: Vec<PathBuf>,
+}
+
+/// Writes the pages of a leaderboard to a folder: `index.html`, and `entries/PAGE.html` for each entry. The first shows what moved
+/// since the last build in the folder, which `built.json` remembers. Pages of the last build whose entries are gone are deleted,
+/// unless somebody changed them.
 ///
-/// Equal leaderboards give equal bytes.
+/// Equal leaderboards after equal builds give equal bytes, and a build without changes changes no byte.
 ///
 /// # Errors
-/// When the name of a page has other characters than letters, digits and hyphens, or a file cannot be written.
-pub fn write_leaderboard(board: &Leaderboard, out_dir: &Path) -> Result<PathBuf> {
+/// When the name of a page has other characters than letters, digits and hyphens, `built.json` is not that of a build, or a file
+/// cannot be written or deleted.
+pub fn write_leaderboard(board: &Leaderboard, out_dir: &Path) -> Result<BoardPages> {
     let is_plain =
         |page: &str| !page.is_empty() && page.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'-');
     if let Some(entry) = board.entries.iter().find(|entry| !is_plain(&entry.page)) {
@@ -102,12 +119,21 @@ pub fn write_leaderboard(board: &Leaderboard, out_dir: &Path) -> Result<PathBuf>
     let folder = out_dir.join("entries");
     files::check_no_link(&folder)?;
     std::fs::create_dir_all(&folder).map_err(|source| Error::io(&folder, "creating the folder of entries", source))?;
-    let first = out_dir.join("index.html");
-    files::write(&first, index::render(board)?.as_bytes())?;
-    for (entry, page) in board.entries.iter().zip(board.pages().iter().skip(1)) {
-        files::write(&out_dir.join(page), entry::render(entry)?.as_bytes())?;
+    let last = Built::read(out_dir)?;
+    let mut pages = vec![];
+    for (entry, page) in board.entries.iter().zip(board.pages().into_iter().skip(1)) {
+        pages.push((page, entry::render(entry)?));
     }
-    Ok(first)
+    let built = Built::new(board, &pages, last.as_ref());
+    let first = out_dir.join("index.html");
+    files::write(&first, index::render(board, built.moves())?.as_bytes())?;
+    for (page, content) in &pages {
+        files::write(&out_dir.join(page), content.as_bytes())?;
+    }
+    let deleted = last.map_or(Ok(vec![]), |last| built.delete_gone(&last, out_dir))?;
+    // Last, so that a build that was interrupted is compared with the one before it.
+    built.write(out_dir)?;
+    Ok(BoardPages { first, moves: built.moves().to_vec(), deleted })
 }
 
 /// A name in a table, escaped.
@@ -157,7 +183,7 @@ mod tests {
 
     #[test]
     fn rows_are_sorted_and_ranked_as_far_as_they_are_told_apart() {
-        let html = index::render(&board()).expect("a page");
+        let html = index::render(&board(), &[]).expect("a page");
         let order: Vec<usize> = ["a&lt;b&gt;</a>", ">close</a>", ">low</a>", "</span>no-op", "</span>random"]
             .map(|name| html.find(name).unwrap_or_else(|| panic!("{name}")))
             .to_vec();
@@ -188,11 +214,54 @@ mod tests {
     }
 
     #[test]
+    fn a_build_shows_what_moved_and_deletes_the_pages_that_it_wrote() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let mut board = board();
+        for (entry, hash) in board.entries.iter_mut().zip(["h0", "h1", "h2"]) {
+            entry.hash = hash.to_owned();
+        }
+        let path = |name: &str| folder.path().join(name);
+        let read = |name: &str| std::fs::read_to_string(path(name)).expect("a file");
+        let first = write_leaderboard(&board, folder.path()).expect("pages");
+        assert!(first.moves.is_empty() && first.deleted.is_empty() && !read("index.html").contains("What moved"));
+        let (page, known) = (read("index.html"), read("built.json"));
+        let again = write_leaderboard(&board, folder.path()).expect("pages");
+        assert!(again.moves.is_empty() && read("index.html") == page && read("built.json") == known);
+        std::fs::write(path("entries/own.html"), "a page of the user").expect("a file");
+        // The entry `a<b>` leaves, and `low` moves up.
+        let gone = board.tables[0].rows.remove(1);
+        board.entries.remove(1);
+        board.tables[0].rows[1].entry = Some(1);
+        let later = write_leaderboard(&board, folder.path()).expect("pages");
+        assert_eq!(later.deleted, [PathBuf::from("entries/ab-2.html")]);
+        assert!(!path("entries/ab-2.html").exists() && path("entries/own.html").exists());
+        let moved = |policy: &str| later.moves.iter().find(|moved| moved.policy == policy).expect("a move").clone();
+        assert_eq!((moved("low").from.as_deref(), moved("low").to.as_deref()), (Some("3"), Some("2")));
+        assert_eq!((moved("a<b>").from.as_deref(), moved("a<b>").to), (Some("1–2"), None));
+        let shown = read("index.html");
+        assert!(shown.contains("What moved") && shown.contains("a&lt;b&gt;") && shown.contains("gone"), "{shown}");
+        assert_eq!(write_leaderboard(&board, folder.path()).expect("pages").moves, later.moves);
+        assert_eq!(read("index.html"), shown);
+        // A page that somebody changed stays.
+        std::fs::write(path("entries/close-3.html"), "changed").expect("a file");
+        board.entries.truncate(1);
+        board.tables[0].rows = vec![gone];
+        board.tables[0].rows[0].entry = Some(0);
+        let last = write_leaderboard(&board, folder.path()).expect("pages");
+        assert!(last.deleted.is_empty() && path("entries/close-3.html").exists(), "{:?}", last.deleted);
+        std::fs::write(path("built.json"), "{}").expect("a file");
+        assert!(write_leaderboard(&board, folder.path()).expect_err("no build").to_string().contains("remove it"));
+        let evil = known.replace("entries/ab-2.html", "../ab-2.html");
+        std::fs::write(path("built.json"), evil).expect("a file");
+        assert!(write_leaderboard(&board, folder.path()).expect_err("another folder").to_string().contains("../ab-2"));
+    }
+
+    #[test]
     fn too_many_entries_of_a_table_are_refused() {
         let mut board = board();
         let row = board.tables[0].rows[0].clone();
         board.tables[0].rows = vec![row; 201];
-        let error = index::render(&board).expect_err("too many").to_string();
+        let error = index::render(&board, &[]).expect_err("too many").to_string();
         assert!(error.contains("201 entries") && error.contains("200"), "{error}");
     }
 }

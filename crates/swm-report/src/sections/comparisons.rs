@@ -17,14 +17,20 @@ use swm_core::results::{Family, MAX_ALL_PAIRS, Paired};
 pub(super) fn write(html: &mut String, compared: &[Compared<'_, '_>], room: &mut Room) -> Result<()> {
     let Some(chart) = charts::paired::chart(compared, |pair| pair.is_first)? else { return Ok(()) };
     let limited = compared.iter().any(|family| family.pairs.len() > MAX_ALL_PAIRS * (MAX_ALL_PAIRS - 1) / 2);
+    let is_sequential = compared.iter().any(|compared| compared.family.sequential);
     let limit = format!(" With more than {MAX_ALL_PAIRS} runs, there are no others.");
     let caption = format!(
         "Points are differences of success rates over starts that both policies played, whiskers their confidence \
-         intervals (Tango’s, the inversion of the paired score test). The intervals of one condition hold together \
+         intervals ({}). The intervals of one condition hold together \
          with 95 %: intervals and p-values are corrected for the number of pairs (Bonferroni). A policy is higher or \
          lower where the interval excludes 0, and its dot is filled. “Too few” means that the starts which exactly one policy \
          solved would not decide even if the same policy had solved all of them. The chart has the comparisons with the \
          random-policy floor and with the highest success rate.{}",
+        if is_sequential {
+            "confidence sequences, where the e-value of the pairs that differ decides"
+        } else {
+            "Tango’s, the inversion of the paired score test"
+        },
         if limited { limit.as_str() } else { "" }
     );
     room.figure(html, "On the same starts", &caption, &chart);

@@ -49,6 +49,9 @@ impl<'g, 'a> Shown<'g, 'a> {
         }
         cards::write(html, group, &self.compared);
         let _ = writeln!(html, "<p class=\"note\">{}</p>", counting_words(group));
+        for (stopping, episodes) in group.stopped.iter().take(limits::SENTENCES) {
+            let _ = writeln!(html, "<p class=\"note\">{}.</p>", stopping.note(*episodes));
+        }
         success(html, group, room)?;
         html.push_str(&self.gallery.html);
         comparisons::gaps(html, &self.gaps, room)?;
@@ -92,8 +95,14 @@ impl<'g, 'a> Shown<'g, 'a> {
 fn success(html: &mut String, group: &Group<'_>, room: &mut Room) -> Result<()> {
     let runs = group.rows().count();
     let caption = format!(
-        "Points are success rates, whiskers their 95 % Wilson confidence intervals. The band is the confidence interval \
+        "Points are success rates, whiskers their 95 % {}. The band is the confidence interval \
          of the random policy under the same condition, the dashed line its success rate: the random-policy floor.{}",
+        if group.stopped.is_empty() {
+            "Wilson confidence intervals"
+        } else {
+            "confidence sequences (Wilson intervals where the \
+         number of episodes was fixed)"
+        },
         if runs > limits::CHART_ROWS {
             format!(" The first {} of {runs} runs are drawn.", limits::CHART_ROWS)
         } else {

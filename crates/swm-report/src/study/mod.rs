@@ -2,13 +2,15 @@
 //!
 //! - `table_page` is the page of a study whose cells are no evaluations.
 //! - `sheet` arranges the rows; `answer` says what they show in one sentence; `table`, `over_seeds`, `published`,
-//!   `prediction` and `breaking` write tables; `figures` chooses and draws the figures; `decay` fits a curve; this module
+//!   `prediction`, `displacement`, `image_distance` and `breaking` write tables; `figures` chooses and draws the figures; `decay` fits a curve; this module
 //!   writes the files.
 
 mod answer;
 mod breaking;
 mod decay;
+mod displacement;
 mod figures;
+mod image_distance;
 mod over_seeds;
 mod prediction;
 mod published;
@@ -141,10 +143,12 @@ fn render(page: &StudyPage, sheets: &[Sheet<'_>], figures: &[Placed]) -> Result<
                 write!(html, "<p>The command that runs the study again, or continues it:</p>\n<pre>{command}</pre>\n");
         }
         html.push_str("</section>\n");
-        breaking::write(html, &results.breaking);
+        breaking::write(html, results);
         write_figures(html, figures);
         table::write(html, sheets, results);
+        image_distance::write(html, results);
         prediction::write(html, results);
+        displacement::write(html, results);
         over_seeds::write(html, &results.over_seeds);
         published::write(html, sheets, published);
         Ok(())
@@ -211,8 +215,10 @@ mod tests {
             floor: Proportion::wilson(1, 10),
             gap: (condition != "plain").then(|| Paired::of(successes.min(9), 0, 9 - successes.min(9), 1)),
             trained_on_starts: None,
+            image_distance: None,
             prediction: None,
             played: None,
+            by_displacement: vec![],
         }
     }
 

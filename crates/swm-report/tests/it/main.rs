@@ -50,6 +50,7 @@ fn results() -> Results {
         comparisons: Comparison::all(&runs, Counting::default()),
         runs,
         sequential: false,
+        stopping: None,
     }
 }
 

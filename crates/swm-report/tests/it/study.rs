@@ -28,8 +28,10 @@ fn row(condition: &str, policy: &str, variables: &[(&str, &str)], successes: usi
         floor: Proportion::wilson(2, 50),
         gap: (condition != "in distribution").then(|| Paired::of(both, successes - both, 40 - both, 10)),
         trained_on_starts: None,
+        image_distance: None,
         prediction: None,
         played: None,
+        by_displacement: vec![],
     }
 }
 

@@ -84,6 +84,9 @@ impl EvaluationRecord {
         let Counting::Strict { .. } = request.counting else {
             return Err(wrong(format!("its counting is {}", request.counting.name())));
         };
+        if results.sequential || results.stopping.is_some() {
+            return Err(wrong("its results decided the number of episodes".to_owned()));
+        }
         let weights = |policy: &PolicyRequest| {
             let hash =
                 manifest.hashes.get(&format!("weights of {}", policy.name)).or(manifest.hashes.get("weights"))?;

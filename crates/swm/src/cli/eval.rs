@@ -2,19 +2,19 @@
 
 use super::config::{VariationArgs, count, image_size};
 use super::eval_policy::NamedPolicy;
-use super::output_folder;
 use super::planner::PlannerArgs;
 use super::progress::control;
 use super::results_tables::summary;
 use super::run_record;
 use super::wrappers::WrapperArgs;
 use super::{Context, emit, emit_json};
+use super::{eval_until, output_folder};
 use crate::resolver::HomeResolver;
 use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use swm_core::limits::{ENVS, EVALUATED_EPISODES, STEPS};
-use swm_core::results::Counting;
+use swm_core::results::{Counting, Until};
 use swm_core::{EnvChoice, Error, Key, Origin, Result, Results, files};
 use swm_data::{Part, Split};
 use swm_eval::{Condition, EvalRequest, HeldOut, RunOptions, StartsRequest};
@@ -52,9 +52,19 @@ pub struct EvalArgs {
     /// Seed of the split of the dataset
     #[arg(long, default_value_t = 0, requires = "split")]
     split_seed: u64,
-    /// Number of episodes
-    #[arg(long, default_value_t = 50, value_parser = count::<1, { EVALUATED_EPISODES.max }>)]
-    episodes: usize,
+    /// Number of episodes (default: 50; with --until the most, 2000)
+    #[arg(long, value_parser = count::<1, { EVALUATED_EPISODES.max }>)]
+    episodes: Option<usize>,
+    /// Play starts until a rule is met: ci=5, decided or decided=10
+    ///
+    /// ci=5 ends when the 95 % intervals of the success rates of all policies are at most 5 percentage points wide on each side.
+    /// decided=10 ends when every comparison and every gap is told apart from zero or shown to be below 10 points. All
+    /// intervals are confidence sequences then. results.json is written after every stage.
+    #[arg(long, value_name = "RULE", conflicts_with = "trace")]
+    until: Option<Until>,
+    /// Continue an interrupted evaluation with --until
+    #[arg(long, requires = "until")]
+    resume: bool,
     /// Seed of starts, goals, factors and plans (default: 0, or the capsule's)
     #[arg(long)]
     seed: Option<u64>,
@@ -138,6 +148,12 @@ pub enum CapsuleStarts {
 /// The time limit of episodes that start from a dataset, in steps, as in the paper's evaluations.
 const DATASET_TIME_LIMIT: usize = 50;
 
+/// The number of episodes, unless the command line says otherwise.
+const EPISODES: usize = 50;
+
+/// The largest number of episodes with `--until`, unless the command line says otherwise. `ci=5` takes at most 1400.
+const MOST_EPISODES: usize = 2000;
+
 /// The number of recorded episodes of each run, unless the command line says otherwise.
 pub const VIDEOS: usize = 3;
 
@@ -166,7 +182,11 @@ pub fn run_args(args: &EvalArgs, context: &Context) -> anyhow::Result<(Results, 
         drop(output_folder::claim(&args.output, &["traces.json"])?);
     }
     let videos = args.videos.unwrap_or(if args.no_pixels { 0 } else { VIDEOS });
-    let (results, file) = run(&request, &resolver, args.envs, (&args.output, videos), context)?;
+    let output = (args.output.as_path(), videos);
+    if let Some(until) = args.until {
+        return Ok(eval_until::run(&request, (until, args.resume), &resolver, args.envs, output, context)?);
+    }
+    let (results, file) = run(&request, &resolver, args.envs, output, context)?;
     if args.trace {
         write_json(&args.output.join("traces.json"), &traces(&resolver))?;
     }
@@ -212,7 +232,7 @@ impl EvalArgs {
             image: (!self.no_pixels).then_some(image),
             policies,
             starts: self.starts(),
-            episodes: self.episodes,
+            episodes: self.episodes.unwrap_or(if self.until.is_some() { MOST_EPISODES } else { EPISODES }),
             seed,
             budget: budget.or(self.dataset.as_ref().map(|_| DATASET_TIME_LIMIT)),
             counting: match self.protocol {
@@ -295,6 +315,7 @@ pub fn run(
 ) -> Result<(Results, PathBuf)> {
     let is_new = !output.exists();
     let _lock = output_folder::claim(output, &["results.json"])?;
+    eval_until::refuse_fixed(output)?;
     let videos = (videos > 0).then(|| (output.to_owned(), videos));
     let results = request.run(resolver, &run_options(envs, videos, context), &mut control(context));
     if results.is_err() && is_new {

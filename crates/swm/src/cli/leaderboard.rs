@@ -13,6 +13,7 @@ use std::hash::{BuildHasher as _, Hasher as _};
 use std::path::{Path, PathBuf};
 use swm_core::{Error, Result, files};
 use swm_models::capsule::Capsule;
+use swm_report::{BoardPages, Move};
 
 /// Arguments of `swm leaderboard`.
 #[derive(Args)]
@@ -217,18 +218,31 @@ fn build(args: &BuildArgs, context: &Context) -> anyhow::Result<()> {
     let pages = board.pages();
     let names: Vec<&str> = pages.iter().filter_map(|page| page.to_str()).collect();
     let _lock = output_folder::claim(&args.output, &names)?;
-    let page = swm_report::write_leaderboard(&board, &args.output)?;
+    let BoardPages { first: page, moves, deleted } = swm_report::write_leaderboard(&board, &args.output)?;
     if context.json {
         let tables = board.tables.iter().map(|table| {
             let rates = table.rows.iter().map(|row| json!({"policy": row.label, "success": row.run.success}));
             json!({"env": table.env, "condition": table.condition, "policies": rates.collect::<Vec<_>>()})
         });
-        return emit_json(&json!({"page": page, "pages": names, "tables": tables.collect::<Vec<_>>()}));
+        return emit_json(&json!({
+            "page": page,
+            "pages": names,
+            "tables": tables.collect::<Vec<_>>(),
+            "moves": moves,
+            "deleted": deleted,
+        }));
     }
     for table in &board.tables {
         let rates: Vec<String> =
             table.rows.iter().map(|row| format!("{} {}", row.label, percent(&row.run.success))).collect();
         emit(&format!("{}, {}: {}\n", table.env, table.condition, rates.join(", ")));
+    }
+    for Move { table, policy, from, to } in moves.iter().take(SHOWN) {
+        let [from, to] = [from.as_deref().unwrap_or("new"), to.as_deref().unwrap_or("gone")];
+        emit(&format!("moved: {policy} in {table}: {from} -> {to}\n"));
+    }
+    for page in &deleted {
+        emit(&format!("deleted {}, whose entry is gone\n", args.output.join(page).display()));
     }
     emit(&format!("{}\n", page.display()));
     Ok(())

@@ -14,6 +14,7 @@ mod doctor;
 mod envs;
 mod eval;
 mod eval_policy;
+mod eval_until;
 mod inspect;
 mod leaderboard;
 mod models;

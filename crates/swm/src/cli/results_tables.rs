@@ -2,11 +2,12 @@
 
 use super::table;
 use swm_core::Results;
-use swm_core::results::{Comparison, Family, Paired, Proportion, Run};
+use swm_core::results::{Comparison, Paired, Proportion, Run};
 
 /// Returns the tables of some results.
 pub fn summary(results: &Results) -> String {
-    [success(results), prediction_errors(results), gaps(results), comparisons(results)]
+    let stopping = results.stopping.map(|stopping| format!("{}\n", stopping.note(results.episodes())));
+    [success(results), stopping, prediction_errors(results), gaps(results), comparisons(results)]
         .into_iter()
         .flatten()
         .collect::<Vec<_>>()
@@ -77,22 +78,14 @@ pub fn compared(paired: &Paired) -> [String; 3] {
 /// one policy are a family.
 fn gaps(results: &Results) -> Option<String> {
     let first = &results.runs.first()?.condition;
-    let mut rows: Vec<Vec<String>> = vec![];
-    let mut notes = String::new();
-    for reference in results.runs.iter().filter(|run| run.condition == *first) {
-        let others = results.runs.iter().filter(|run| run.policy == reference.policy && run.condition != *first);
-        let gap = |run| Some((run, Paired::of_runs(run, reference, results.counting)?));
-        let mut gaps: Vec<(&Run, Paired)> = others.filter_map(gap).collect();
-        let mut tables: Vec<&mut Paired> = gaps.iter_mut().map(|(_, gap)| gap).collect();
-        let family = Family::correct(&reference.policy, &mut tables, 0);
-        notes.extend(family.map(|family| format!("{}: {family}\n", family.name)));
-        rows.extend(gaps.iter().map(|(run, gap)| {
-            let [difference, p, verdict] = compared(gap);
-            vec![run.condition.clone(), run.policy.clone(), difference, p, verdict]
-        }));
-    }
+    let (gaps, families) = results.gaps();
+    let notes = families.iter().map(|family| format!("{}: {family}\n", family.name)).collect::<String>();
+    let rows = gaps.iter().map(|gap| {
+        let [difference, p, verdict] = compared(&gap.table);
+        vec![gap.condition.clone(), gap.policy.clone(), difference, p, verdict]
+    });
     let title = format!("gap to '{first}' [95 %]");
-    (!rows.is_empty()).then(|| table(&["condition", "policy", &title, "p, corrected", "verdict"], rows) + &notes)
+    (!gaps.is_empty()).then(|| table(&["condition", "policy", &title, "p, corrected", "verdict"], rows) + &notes)
 }
 
 /// The paired comparisons of policies; `None` for fewer than two policies.

@@ -190,7 +190,7 @@ impl Entry {
         }
         let request = self.request().map_err(|error| error.to_string())?;
         check_request(&request)?;
-        if results.sequential {
+        if results.sequential || results.stopping.is_some() {
             return Err("its results decided the number of episodes, so that the intervals do not hold".to_owned());
         }
         let same = results.env == request.env

@@ -226,3 +226,30 @@ fn shifts_are_conditions_of_one_evaluation() {
         &["agent.colour", "agent.color"],
     );
 }
+
+#[test]
+fn an_evaluation_stops_by_its_rule_and_is_continued_and_reproduced() {
+    let swm = Swm::new();
+    let expert = ["eval", "expert", "--env", "swm/TwoRoom-v1", "--no-pixels", "--budget", "30"];
+    let run = |more: &[&'static str]| swm.json(&[&expert[..], more].concat());
+    let few = run(&["--until", "ci=12", "--episodes", "20", "-o", "parts"]);
+    assert_eq!((&few["stopping"]["until"], &few["stopping"]["met"]), (&"ci=12".into(), &false.into()));
+    let times = |mut found: Value| {
+        found["runs"].as_array_mut().expect("runs").iter_mut().for_each(|run| run["timing"] = Value::Null);
+        found
+    };
+    let parts = times(run(&["--until", "ci=12", "--resume", "-o", "parts"]));
+    let whole = times(run(&["--until", "ci=12", "-o", "whole"]));
+    assert_eq!(parts, whole);
+    assert!(whole["stopping"]["met"] == true && whole["comparisons"][0]["e"].as_f64().is_some_and(|e| e > 20.0));
+    let text = text(&swm.run(&[&expert[..], &["--until", "ci=12", "--resume", "-o", "whole"]].concat()).stdout);
+    assert!(text.contains("Stopped by ci=12 after") && text.contains("confidence sequences"), "{text}");
+    assert!(swm.json(&["reproduce", "whole"])["holds"] == true);
+    swm.json(&["report", "whole", "-o", "page"]);
+    let page = std::fs::read_to_string(swm.path("page/index.html")).expect("a page");
+    assert!(page.contains("Stopped by ci=12") && page.contains("e-value") && !page.contains("Tango"), "the page");
+    swm.fails(&[&expert[..], &["-o", "whole"]].concat(), 2, &["--until ci=12", "fixed number"]);
+    swm.fails(&[&expert[..], &["--resume", "-o", "whole"]].concat(), 2, &["--until"]);
+    let other = [&expert[..], &["--until", "ci=12", "--resume", "--seed", "4", "-o", "whole"]].concat();
+    swm.fails(&other, 2, &["another request"]);
+}

@@ -69,6 +69,10 @@ fn study_pairs_conditions_and_resumes_to_the_same_bytes() {
     for row in rows {
         let unshifted = row["condition"] == "in distribution";
         assert_eq!(row["gap"].is_null(), unshifted, "{row}");
+        // Hue 0 is the default; a circle of another colour covers a small part of the frame.
+        let expected = if row["condition"] == "agent at hue 0" { 0.0..=0.0 } else { 0.01..=60.0 };
+        let distance = row["image_distance"].as_f64();
+        assert!(unshifted == distance.is_none() && distance.is_none_or(|mean| expected.contains(&mean)), "{row}");
         // The agent's colour does not change what the expert does.
         assert!(unshifted || (row["gap"]["only_a"] == 0 && row["gap"]["only_b"] == 0), "{row}");
         assert!(unshifted || (row["gap"]["comparisons"] == 2 && row["gap"]["verdict"] == "too few"), "{row}");
@@ -197,7 +201,7 @@ fn temporary_files_of_a_killed_study_are_deleted() {
     std::fs::write(swm.path("out/.study.json.77.tmp"), "{").expect("writing a file");
     swm.json(&args);
     let names = contents(&swm.path("out"));
-    assert_eq!(names.len(), 7, "{:?}", names.keys());
+    assert_eq!(names.len(), 8, "{:?}", names.keys());
     for other in ["out/cells/.0123.json.77.tmp", "out/cells/.notes.tmp", "out/.0123.json.77.tmp"] {
         std::fs::write(swm.path(other), "{").expect("writing a file");
     }

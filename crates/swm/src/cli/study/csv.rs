@@ -1,6 +1,6 @@
 //! The tables of a study as comma-separated values.
 
-use swm_core::results::{Discrimination, StudyResults, StudyRow, Summary};
+use swm_core::results::{ByDisplacement, Discrimination, StudyResults, StudyRow, Summary};
 use swm_core::text::printable;
 
 /// The columns of every study, after those of its variables.
@@ -47,23 +47,31 @@ pub(super) fn cells(results: &StudyResults) -> String {
         results.rows.iter().flat_map(|row| row.variables.keys().map(String::as_str)).collect();
     variables.sort_unstable();
     variables.dedup();
+    let has_displacements = results.rows.iter().any(|row| !row.by_displacement.is_empty());
+    let has_images = results.rows.iter().any(|row| row.image_distance.is_some());
     let has_errors = results.rows.iter().any(|row| row.prediction.is_some());
     let mut header: Vec<String> =
         ["cell", "starts", "condition", "policy", "counting", "seed"].map(str::to_owned).to_vec();
     header.extend(variables.iter().map(|name| format!("variable.{name}")));
     header.extend(COLUMNS.map(str::to_owned));
+    header.extend(has_images.then(|| "image_distance".to_owned()));
     header.extend(results.until.iter().flat_map(|_| ["e", "until"].map(str::to_owned)));
     header.extend(has_errors.then_some(ERROR_COLUMNS.map(str::to_owned)).into_iter().flatten());
+    header.extend(has_displacements.then(displacement_columns).into_iter().flatten());
     let row = |row: &StudyRow| {
         let mut cells = vec![row.cell.clone(), row.starts.clone(), row.condition.clone(), row.policy.clone()];
         cells.extend([row.counting.name().to_owned(), row.seed.to_string()]);
         cells.extend(variables.iter().map(|name| row.variables.get(*name).cloned().unwrap_or_default()));
         cells.extend(of_success(row));
+        if has_images {
+            cells.push(row.image_distance.map_or(String::new(), |distance| distance.to_string()));
+        }
         if let Some(until) = results.until {
             let e = row.gap.and_then(|gap| gap.e).map(|e| e.to_string());
             cells.extend([e.unwrap_or_default(), until.to_string()]);
         }
         cells.extend(has_errors.then(|| of_errors(row)).into_iter().flatten());
+        cells.extend(has_displacements.then(|| of_displacements(row)).into_iter().flatten());
         cells
     };
     std::iter::once(header).chain(results.rows.iter().map(row)).map(|cells| line(&cells)).collect()
@@ -82,6 +90,38 @@ fn of_success(row: &StudyRow) -> Vec<String> {
     }));
     cells.push(row.trained_on_starts.map_or(String::new(), |trained| trained.to_string()));
     cells
+}
+
+/// The columns of a study with displacements: those of each group, the nearest goals first.
+fn displacement_columns() -> Vec<String> {
+    let columns = [
+        "from",
+        "to",
+        "solved",
+        "failed",
+        "auc",
+        "auc_low",
+        "auc_high",
+        "auc_played",
+        "auc_played_low",
+        "auc_played_high",
+    ];
+    let group = |group: usize| columns.map(|column| format!("displacement_{group}_{column}"));
+    (1..=ByDisplacement::GROUPS).flat_map(group).collect()
+}
+
+/// The values of [`displacement_columns`].
+fn of_displacements(row: &StudyRow) -> Vec<String> {
+    let of = |group: usize| {
+        let Some(found) = row.by_displacement.get(group) else { return vec![String::new(); 10] };
+        let area = |found: Option<Discrimination>| {
+            found
+                .map_or([const { String::new() }; 3], |found| [found.auc, found.low, found.high].map(|x| x.to_string()))
+        };
+        let counts = [found.from.to_string(), found.to.to_string(), found.solved.to_string(), found.failed.to_string()];
+        counts.into_iter().chain(area(found.recorded)).chain(area(found.played)).collect()
+    };
+    (0..ByDisplacement::GROUPS).flat_map(of).collect()
 }
 
 /// The values of [`ERROR_COLUMNS`]: errors are medians.

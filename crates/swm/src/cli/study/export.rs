@@ -3,7 +3,7 @@
 use super::csv;
 use clap::ValueEnum;
 use std::collections::BTreeMap;
-use swm_core::results::{BreakingPoint, OverSeeds, StudyResults, StudyRow, Verdict};
+use swm_core::results::{BreakingPoint, ImageRank, OverSeeds, StudyResults, StudyRow, Verdict};
 use swm_core::text::printable;
 use swm_core::{Error, Result};
 use swm_eval::{AnyStudy, StudyFolder};
@@ -147,6 +147,23 @@ impl<'a> Pivot<'a> {
         std::iter::once(header.map(str::to_owned).to_vec()).chain(rows).collect()
     }
 
+    /// The conditions by image distance, the header first; empty if none has one.
+    fn image_distances(&self) -> Vec<Vec<String>> {
+        let ranks = self.results.by_image_distance();
+        if ranks.is_empty() {
+            return vec![];
+        }
+        let gaps = self.policies.iter().map(|policy| format!("gap of {policy}, points"));
+        let header = ["condition", "image distance, 0 to 255"].map(str::to_owned).into_iter().chain(gaps);
+        let row = |rank: &ImageRank<'_>| {
+            let gap =
+                |policy: &&str| rank.gaps.get(policy).map_or("–".to_owned(), |gap| format!("{:+.1}", 100.0 * gap));
+            let distance = format!("{:.2}", rank.distance);
+            [rank.condition.to_owned(), distance].into_iter().chain(self.policies.iter().map(gap)).collect()
+        };
+        std::iter::once(header.collect()).chain(ranks.iter().map(row)).collect()
+    }
+
     /// The rows of the table, the header first.
     fn rows(&self) -> Vec<Vec<String>> {
         let header = std::iter::once("success, % [95 %]").chain(self.policies.iter().copied()).map(str::to_owned);
@@ -168,7 +185,7 @@ impl<'a> Pivot<'a> {
         };
         let mut parts = vec![table(&self.rows())];
         parts.extend(self.notes().iter().map(|note| format!("{}\n", escape_markdown(note))));
-        parts.push(table(&self.over_seeds()));
+        parts.extend([self.over_seeds(), self.image_distances()].iter().map(|rows| table(rows)));
         parts.retain(|part| !part.is_empty());
         parts.join("\n")
     }
@@ -187,9 +204,9 @@ impl<'a> Pivot<'a> {
             )
         };
         let notes = self.notes().iter().map(|note| format!("\n{}\n", latex(note))).collect::<String>();
-        let over_seeds = table(&self.over_seeds());
-        let gap = if over_seeds.is_empty() { "" } else { "\n" };
-        table(&self.rows()) + &notes + gap + &over_seeds
+        let more = [self.over_seeds(), self.image_distances()].map(|rows| table(&rows));
+        let more = more.iter().filter(|table| !table.is_empty()).map(|table| format!("\n{table}"));
+        table(&self.rows()) + &notes + &more.collect::<String>()
     }
 }
 
@@ -270,8 +287,10 @@ mod tests {
             floor: Proportion::wilson(0, 10),
             gap,
             trained_on_starts: None,
+            image_distance: None,
             prediction: None,
             played: None,
+            by_displacement: vec![],
         };
         let mut gap = Paired::of(4, 0, 5, 1);
         let families = Vec::from_iter(Family::correct("LeWM_1 · seed 0", &mut [&mut gap], 1));

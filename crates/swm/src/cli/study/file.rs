@@ -85,7 +85,8 @@ pub const OF_THE_COMMAND: &str = "the command";
 pub const POLICY: &str = "policy";
 
 /// Options that belong to a run and not to an evaluation, or that make several conditions of one.
-const RUN_OPTIONS: &[&str] = &["output", "videos", "trace", "trust", "envs", "help", "shift", "each-factor"];
+const RUN_OPTIONS: &[&str] =
+    &["output", "videos", "trace", "trust", "envs", "help", "shift", "each-factor", "until", "resume"];
 
 /// The tables of a file.
 const TABLES: &[&str] =

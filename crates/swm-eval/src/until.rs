@@ -1,0 +1,126 @@
+//! Evaluates in stages until a rule is met: [`EvalRequest::run_until`].
+//!
+//! A start is the same in all stages and its episode depends on nothing else, so results that grew equal those that were
+//! played at once, and an evaluation that was interrupted ends as one that was not.
+
+use crate::reproduce::Checked;
+use crate::request::{EvalRequest, PolicyKind, StartsRequest};
+use crate::runner::{Episodes, Resolver, RunOptions};
+use swm_core::results::{Counting, Stopping, Until};
+use swm_core::run::Control;
+use swm_core::{Error, Result, Results};
+
+/// The number of starts of the first stage.
+pub(crate) const FIRST: usize = 10;
+
+/// The numbers of starts of the stages: each has half as many again as the one before, rounded up to tens.
+pub(crate) fn stages() -> impl Iterator<Item = usize> {
+    std::iter::successors(Some(FIRST), |n| Some((n + n / 2).next_multiple_of(10)))
+}
+
+impl EvalRequest {
+    /// Evaluates the first starts, then more of them until the results meet the rule or have the episodes of this request.
+    /// All runs have the same starts.
+    ///
+    /// `earlier` are results of this request that were interrupted, and `keep` receives the results of every stage. The
+    /// statistics of all results are those of an evaluation that its results end ([`Results::stopped`]). Videos are those of
+    /// the first stage.
+    ///
+    /// # Errors
+    /// As [`EvalRequest::run`], when the rule cannot be followed, the dataset has fewer starts than this request, or `earlier`
+    /// are results of another request, data or weights.
+    pub fn run_until(
+        &self,
+        until: Until,
+        earlier: Option<Results>,
+        resolver: &dyn Resolver,
+        options: &RunOptions,
+        keep: &mut dyn FnMut(&Results) -> Result<()>,
+        control: &mut Control<'_>,
+    ) -> Result<Results> {
+        self.check_rule(until, options)?;
+        if let StartsRequest::Dataset { dataset, .. } = &self.starts {
+            self.picks(&*resolver.dataset(dataset)?)?;
+        }
+        let mut found = earlier.map(|earlier| self.continued(earlier, until)).transpose()?;
+        let mut stages = stages();
+        loop {
+            let episodes = found.as_ref().map_or(0, Results::episodes);
+            if let Some(results) = found.take_if(|results| episodes >= self.episodes || is_met(results)) {
+                return Ok(results);
+            }
+            let stage = stages.find(|stage| *stage > episodes).unwrap_or(self.episodes);
+            let request = Self { episodes: stage.min(self.episodes), ..self.clone() };
+            let results = match &found {
+                None => request.run_episodes(Episodes::All, resolver, options, control)?,
+                Some(results) => {
+                    let checked = Checked { resolver, manifest: &results.manifest };
+                    let options = RunOptions { videos: None, ..options.clone() };
+                    request.run_episodes(Episodes::After(results), &checked, &options, control)?
+                }
+            };
+            let results = results.stopped(until, self.episodes);
+            keep(&results)?;
+            found = Some(results);
+        }
+    }
+
+    /// Checks that this evaluation can end by the rule.
+    fn check_rule(&self, until: Until, options: &RunOptions) -> Result<()> {
+        let invalid = |problem: String, fix: &str| Err(Error::config("--until", problem, fix));
+        let videos = options.videos.as_ref().map_or(0, |(_, count)| *count);
+        if matches!(self.counting, Counting::Compat { .. }) && self.starts == StartsRequest::Episodic {
+            return invalid(
+                "compat counting of drawn starts counts the episodes that finish first, so none can follow later"
+                    .to_owned(),
+                "use strict counting, or take starts from a dataset",
+            );
+        }
+        if videos > FIRST {
+            let problem = format!("{videos} videos of each run, and the first stage has {FIRST} episodes");
+            return invalid(problem, "record at most as many");
+        }
+        let is_alone = self.policies.iter().all(|policy| policy.kind == PolicyKind::Random);
+        if matches!(until, Until::Decided(_)) && is_alone && self.conditions.len() == 1 {
+            return invalid(
+                "there is one policy under one condition, so nothing to compare".to_owned(),
+                "give ci=5, a second policy or a shift",
+            );
+        }
+        Ok(())
+    }
+
+    /// Checks that interrupted results are those of this request, and applies the rule to them.
+    fn continued(&self, earlier: Results, until: Until) -> Result<Results> {
+        let wrong = |problem: String, fix: &str| Err(Error::config("the results to continue", problem, fix));
+        let episodes = earlier.episodes();
+        if earlier.stopping.is_none() {
+            return wrong(
+                "have a number of episodes that was fixed in advance".to_owned(),
+                "give another folder for results that a rule ends",
+            );
+        }
+        if !self.is_of(&earlier)? || episodes != Self::of(&earlier.manifest)?.episodes {
+            return wrong("are those of another request".to_owned(), "give the same options, or another folder");
+        }
+        if episodes > self.episodes {
+            return wrong(format!("have {episodes} episodes"), "ask for at least as many");
+        }
+        Ok(earlier.stopped(until, self.episodes))
+    }
+}
+
+fn is_met(results: &Results) -> bool {
+    results.stopping.is_some_and(|Stopping { met, .. }| met)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn stages_grow_by_half() {
+        let found: Vec<usize> = stages().take(12).collect();
+        assert_eq!(found, [10, 20, 30, 50, 80, 120, 180, 270, 410, 620, 930, 1400]);
+    }
+}

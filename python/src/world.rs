@@ -363,7 +363,8 @@ impl World {
                 }
                 None => Starts::episodic(settings.episodes, settings.seed, settings.variation)?,
             };
-            let videos = settings.videos.map(|(root, prefix, count)| Videos { root, prefix, count, fps: 15 });
+            let videos =
+                settings.videos.map(|(root, prefix, count)| Videos { root, prefix, count, fps: 15, frame_strip: None });
             let config = EvalConfig {
                 policy: settings.policy,
                 condition: settings.condition,

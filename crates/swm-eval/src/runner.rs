@@ -112,6 +112,8 @@ pub struct RunOptions {
     pub threads: usize,
     /// Videos of the first episodes of every run: the folder of the results file, and the number of episodes.
     pub videos: Option<(PathBuf, usize)>,
+    /// Frame strips of this many frames instead of videos ([`frame_strip`](crate::frame_strip())).
+    pub frame_strip: Option<usize>,
 }
 
 impl EvalRequest {
@@ -256,6 +258,7 @@ impl EvalRequest {
                 prefix: format!("videos/{}-{}", slug(&policy.name), slug(&condition.name)),
                 count: *count,
                 fps: 15,
+                frame_strip: options.frame_strip,
             }),
         }
     }

@@ -6,8 +6,9 @@
 use crate::reproduce::Checked;
 use crate::request::{EvalRequest, PolicyKind, StartsRequest};
 use crate::runner::{Episodes, Resolver, RunOptions};
+use std::sync::{Mutex, PoisonError};
 use swm_core::results::{Counting, Stopping, Until};
-use swm_core::run::Control;
+use swm_core::run::{Control, Event};
 use swm_core::{Error, Result, Results};
 
 /// The number of starts of the first stage.
@@ -42,6 +43,14 @@ impl EvalRequest {
         if let StartsRequest::Dataset { dataset, .. } = &self.starts {
             self.picks(&*resolver.dataset(dataset)?)?;
         }
+        // What a stage shows would be the interval of a fixed number.
+        let outer = Mutex::new(control);
+        let lock = || outer.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut control = Control::new().with_poll(|| lock().check()).with_events(|event| match event {
+            Event::Finished { stage, .. } => lock().emit(Event::Finished { stage, metrics: &[] }),
+            event => lock().emit(event),
+        });
+        let control = &mut control;
         let mut found = earlier.map(|earlier| self.continued(earlier, until)).transpose()?;
         let mut stages = stages();
         loop {

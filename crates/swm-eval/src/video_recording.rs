@@ -1,5 +1,6 @@
 //! [`VideoRecording`]: videos of the first episodes of an evaluation, and their posters.
 
+use crate::frame_strip::side_by_side;
 use std::path::{Path, PathBuf};
 use swm_core::columns::{GOAL, PIXELS};
 use swm_core::{EnvPool, Error, Result};
@@ -16,6 +17,8 @@ pub struct Videos {
     pub count: usize,
     /// Frames per second. There is one frame for each step; very long episodes have one for every second, fourth, ... step.
     pub fps: u32,
+    /// Write a frame strip of this many frames, `*.png`, instead of a video.
+    pub frame_strip: Option<usize>,
 }
 
 impl Videos {
@@ -142,6 +145,10 @@ impl VideoRecording {
             let made = std::fs::create_dir_all(folder)
                 .map_err(|source| Error::io(folder, "creating the folder of videos", source))
                 .and_then(|()| {
+                    if let Some(count) = self.videos.frame_strip {
+                        let image = side_by_side(frames, self.size, count);
+                        return swm_data::write_png(&self.videos.poster(i), (count + 1) * width, height, &image);
+                    }
                     let slices = frames.iter().map(Vec::as_slice);
                     swm_data::write_mp4_scaled(&path, 2 * width, height, self.videos.fps, scale, slices)?;
                     frames
@@ -149,6 +156,7 @@ impl VideoRecording {
                         .map_or(Ok(()), |first| swm_data::write_png(&self.videos.poster(i), 2 * width, height, first))
                 });
             match made {
+                Ok(()) if self.videos.frame_strip.is_some() => written.push(name.replace(".mp4", ".png")),
                 Ok(()) => written.push(name),
                 Err(error) => {
                     tracing::warn!("{error}");

@@ -5,9 +5,11 @@
 
 use serde_json::{Value, json};
 use swm_core::results::{ArmRuns, Autopsy, Counting, Ingredient, game, letters, members};
+use swm_core::run::Control;
 use swm_core::{Error, Key, Result, Results};
 use swm_eval::{
-    Cell, Choice, EndCost, EvalRequest, Model, PolicyKind, PolicyRequest, StartsRequest, Study, StudyFolder,
+    Cell, Choice, EndCost, EvalRequest, Model, PolicyKind, PolicyRequest, Resolver, RunOptions, StartsRequest, Study,
+    StudyFolder, frame_strip,
 };
 use swm_plan::MpcConfig;
 
@@ -106,6 +108,59 @@ impl Plan {
         let arms: Vec<ArmRuns> = self.arms.iter().map(arm).collect::<Result<_>>()?;
         let request = &selection.request;
         Autopsy::of(&run(selection)?, &arms, request.counting, Key::new(request.seed))
+    }
+}
+
+/// A repaired start as a frame strip.
+pub struct Strip {
+    /// The index of the start.
+    pub start: usize,
+    /// The smallest set of ingredients with which it was solved.
+    pub set: Vec<Ingredient>,
+    /// A PNG file.
+    pub png: Vec<u8>,
+}
+
+impl Plan {
+    /// The most starts with a frame strip.
+    pub const STRIPS: usize = 12;
+    /// The frames of a frame strip, without the goal.
+    pub const FRAMES: usize = 7;
+
+    /// Plays the first failures that ingredients repair again, each with the first of its smallest sets and the first planning seed
+    /// that solves it. None without frames.
+    ///
+    /// # Errors
+    /// As [`Plan::autopsy`], and when playing fails.
+    pub fn strips(
+        &self,
+        found: &Autopsy,
+        folder: &StudyFolder,
+        resolver: &dyn Resolver,
+        options: &RunOptions,
+        control: &mut Control<'_>,
+    ) -> Result<Vec<Strip>> {
+        let mut strips = vec![];
+        let repaired = found.repairs.iter().filter_map(|repair| Some((repair.start, repair.sets.first()?)));
+        for (start, set) in repaired.filter(|(_, set)| !set.is_empty()).take(Self::STRIPS) {
+            let cells = self
+                .arms
+                .iter()
+                .find(|(ingredients, _)| ingredients == set)
+                .map_or(&[][..], |(_, cells)| cells.as_slice());
+            for cell in cells {
+                let results = folder.results(cell)?;
+                let mut runs = results.iter().flat_map(|results| &results.runs);
+                let run = runs.find(|run| run.policy == cell.policy());
+                if !run.and_then(|run| run.episodes.get(start)).is_some_and(|episode| episode.success) {
+                    continue;
+                }
+                let png = frame_strip(&cell.request, start, Self::FRAMES, resolver, options, control)?;
+                strips.extend(png.map(|png| Strip { start, set: set.clone(), png }));
+                break;
+            }
+        }
+        Ok(strips)
     }
 }
 

@@ -22,6 +22,7 @@ pub mod describe;
 pub mod home;
 pub mod leaderboard;
 mod library;
+mod metadata;
 pub mod resolver;
 pub mod subject;
 pub mod zoo;

@@ -253,7 +253,7 @@ fn errors_name_invalid_requests() {
     let error = Starts::choose(&reader, 1000, 2, 0).expect_err("too many starts").to_string();
     assert!(error.contains("1000") && error.contains("collect more"), "{error}");
     let no_frames = WorldConfig { envs: 1, image: None, views: vec![], max_episode_steps: None, threads: 1 };
-    let videos = Videos { root: "nowhere".into(), prefix: "v".to_owned(), count: 1, fps: 10 };
+    let videos = Videos { root: "nowhere".into(), prefix: "v".to_owned(), count: 1, fps: 10, frame_strip: None };
     let config = EvalConfig { videos: Some(videos), ..EvalConfig::default() };
     let starts = Starts::episodic(1, 0, VariationRequest::default()).expect("creating the starts");
     let mut world = World::new(&ENTRY, no_frames).expect("creating the world");
@@ -265,7 +265,13 @@ fn errors_name_invalid_requests() {
 #[test]
 fn videos_of_the_first_episodes_are_written() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
-    let videos = Videos { root: folder.path().to_owned(), prefix: "videos/walker".to_owned(), count: 2, fps: 10 };
+    let videos = Videos {
+        root: folder.path().to_owned(),
+        prefix: "videos/walker".to_owned(),
+        count: 2,
+        fps: 10,
+        frame_strip: None,
+    };
     let config = EvalConfig { videos: Some(videos), ..EvalConfig::default() };
     let starts = Starts::episodic(4, 2, VariationRequest::default()).expect("creating the starts");
     let found =

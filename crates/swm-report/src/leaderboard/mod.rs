@@ -101,13 +101,13 @@ pub struct BoardPages {
 }
 
 /// Writes the pages of a leaderboard to a folder: `index.html`, and `entries/PAGE.html` for each entry. The first shows what moved
-/// since the last build in the folder, which `built.json` remembers. Pages of the last build whose entries are gone are deleted,
+/// since the last build in the folder, which `last-build` remembers. Pages of the last build whose entries are gone are deleted,
 /// unless somebody changed them.
 ///
 /// Equal leaderboards after equal builds give equal bytes, and a build without changes changes no byte.
 ///
 /// # Errors
-/// When the name of a page has other characters than letters, digits and hyphens, `built.json` is not that of a build, or a file
+/// When the name of a page has other characters than letters, digits and hyphens, `last-build` is not that of a build, or a file
 /// cannot be written or deleted.
 pub fn write_leaderboard(board: &Leaderboard, out_dir: &Path) -> Result<BoardPages> {
     let is_plain =
@@ -224,9 +224,9 @@ mod tests {
         let read = |name: &str| std::fs::read_to_string(path(name)).expect("a file");
         let first = write_leaderboard(&board, folder.path()).expect("pages");
         assert!(first.moves.is_empty() && first.deleted.is_empty() && !read("index.html").contains("What moved"));
-        let (page, known) = (read("index.html"), read("built.json"));
+        let (page, known) = (read("index.html"), read("last-build"));
         let again = write_leaderboard(&board, folder.path()).expect("pages");
-        assert!(again.moves.is_empty() && read("index.html") == page && read("built.json") == known);
+        assert!(again.moves.is_empty() && read("index.html") == page && read("last-build") == known);
         std::fs::write(path("entries/own.html"), "a page of the user").expect("a file");
         // The entry `a<b>` leaves, and `low` moves up.
         let gone = board.tables[0].rows.remove(1);
@@ -249,10 +249,10 @@ mod tests {
         board.tables[0].rows[0].entry = Some(0);
         let last = write_leaderboard(&board, folder.path()).expect("pages");
         assert!(last.deleted.is_empty() && path("entries/close-3.html").exists(), "{:?}", last.deleted);
-        std::fs::write(path("built.json"), "{}").expect("a file");
+        std::fs::write(path("last-build"), "{}").expect("a file");
         assert!(write_leaderboard(&board, folder.path()).expect_err("no build").to_string().contains("remove it"));
         let evil = known.replace("entries/ab-2.html", "../ab-2.html");
-        std::fs::write(path("built.json"), evil).expect("a file");
+        std::fs::write(path("last-build"), evil).expect("a file");
         assert!(write_leaderboard(&board, folder.path()).expect_err("another folder").to_string().contains("../ab-2"));
     }
 

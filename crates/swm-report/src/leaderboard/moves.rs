@@ -9,8 +9,8 @@ use std::path::{Path, PathBuf};
 use swm_core::results::{Rank, Ranking, Run};
 use swm_core::{Error, Result, files, manifest};
 
-/// The file of a build.
-pub(super) const FILE: &str = "built.json";
+/// The file of a build. It does not end in `.json`, as entries do.
+pub(super) const FILE: &str = "last-build";
 /// The largest file of a build, and the largest page, in bytes.
 const MAX_BYTES: u64 = 64 << 20;
 /// The most changes that the page lists.

@@ -3,6 +3,7 @@
 use super::figures::dots;
 use super::table::NONE;
 use super::{Placed, STYLE, write_figures, write_files};
+use crate::charts;
 use crate::limits;
 use crate::page::{Head, document};
 use crate::text::{escape, number, shorten};
@@ -59,9 +60,24 @@ fn render(page: &TablePage, figures: &[Placed]) -> Result<String> {
         }
         html.push_str("</section>\n");
         write_figures(html, figures);
+        write_curves(html, results)?;
         write_rows(html, results);
         Ok(())
     })
+}
+
+/// Writes the learning curves of models that train by interaction; nothing for other tables.
+fn write_curves(html: &mut String, results: &StudyTable) -> Result<()> {
+    let panels = charts::learning::panels(results)?.concat();
+    if !panels.is_empty() && panels.len() <= limits::STUDY_FIGURES_BYTES {
+        let _ = write!(
+            html,
+            "<section>\n<h2>Learning curves</h2>\n<figure class=\"plot\">\n<div class=\"panels\">\n{panels}</div>\n\
+             <figcaption>Mean returns of evaluations without exploration, over the share of the optimizer steps. The dashed line \
+             is the random policy.</figcaption>\n</figure>\n</section>\n"
+        );
+    }
+    Ok(())
 }
 
 fn write_rows(html: &mut String, results: &StudyTable) {

@@ -4,8 +4,8 @@ use super::config::count;
 use super::eval::{run_options, write_json};
 use super::progress::control;
 use super::results_tables::percent;
-use super::{Context, emit, emit_json, eprint, study, table};
-use crate::autopsy::{Plan, SEARCH, plans};
+use super::{Context, emit, emit_json, eprint, output_folder, study, table};
+use crate::autopsy::{Plan, SEARCH, Strip, plans};
 use crate::resolver::HomeResolver;
 use clap::Args;
 use serde_json::json;
@@ -14,6 +14,7 @@ use std::time::Duration;
 use swm_core::results::{Autopsy, Estimate, Ingredient, Repair, letters};
 use swm_core::{Error, Key, Origin, Result, VariationRequest, limits};
 use swm_eval::{EvalRequest, PolicyRequest, Resolver as _, StudyFolder, World, WorldConfig};
+use swm_report::{AutopsyPage, FrameStrip};
 
 /// Arguments of `swm autopsy`.
 #[derive(Args)]
@@ -81,7 +82,9 @@ pub fn autopsy(args: &AutopsyArgs, context: &Context) -> anyhow::Result<()> {
     }
     eprint(&cost(arms, args.planning_seeds, starts, seconds));
     let _lock = folder.create(&plan.study)?;
-    plan.study.run(&folder, &resolver, &run_options(args.envs, None, context), &mut control(context))?;
+    output_folder::check(&args.output, &["index.html"])?;
+    let options = run_options(args.envs, None, context);
+    plan.study.run(&folder, &resolver, &options, &mut control(context))?;
     let found = plan.autopsy(&folder)?;
     let file = args.output.join("autopsy.json");
     let document = json!({
@@ -92,13 +95,36 @@ pub fn autopsy(args: &AutopsyArgs, context: &Context) -> anyhow::Result<()> {
         "autopsy": found,
     });
     write_json(&file, &document)?;
+    let strips = plan.strips(&found, &folder, &resolver, &options, &mut control(context))?;
+    let strips = strips.into_iter().map(|Strip { start, set, png }| FrameStrip { start, set: letters(&set), png });
+    let page = AutopsyPage {
+        title: title.clone(),
+        env: plan.request()?.env.clone(),
+        found: found.clone(),
+        strips: strips.collect(),
+        command: args.command(),
+    };
+    let page = swm_report::write_autopsy(&page, &args.output)?;
     if context.json {
         return emit_json(&document);
     }
     emit(&format!("{title} in {}\n", plan.request()?.env));
     emit(&text(&found));
-    emit(&format!("{}\n", file.display()));
+    emit(&format!("{}\n{}\n", file.display(), page.display()));
     Ok(())
+}
+
+impl AutopsyArgs {
+    /// The command that runs the autopsy again. It names a folder of its own, so that equal autopsies have equal pages.
+    fn command(&self) -> String {
+        let mut words = vec!["swm".to_owned(), "autopsy".to_owned(), self.model.clone()];
+        words.extend(self.env.iter().flat_map(|env| ["--env".to_owned(), env.clone()]));
+        words.extend(["--episodes".to_owned(), self.episodes.to_string()]);
+        words.extend(["--planning-seeds".to_owned(), self.planning_seeds.to_string()]);
+        words.extend(["--ingredients".to_owned(), self.ingredients.clone()]);
+        words.extend(self.settings.iter().cloned().chain(["-o".to_owned(), "autopsy".to_owned()]));
+        study::shell(&words)
+    }
 }
 
 /// Parses ingredients by their letters.

@@ -331,7 +331,7 @@ pub fn run(
 /// Returns the options that do not change results; `videos` is a folder, and the number of recorded episodes of each
 /// run.
 pub fn run_options(envs: usize, videos: Option<(PathBuf, usize)>, context: &Context) -> RunOptions {
-    RunOptions { envs, threads: context.threads, videos }
+    RunOptions { envs, threads: context.threads, videos, frame_strip: None }
 }
 
 /// Writes indented JSON to a file.

@@ -1,15 +1,18 @@
 //! `swm inspect`: shows the contents of a dataset.
 
+use super::capsules::CapsuleInfo;
 use super::datasets::{bytes, summary};
 use super::{emit, emit_json, table};
-use crate::home::open_dataset;
+use crate::home::{find_checkpoint, open_dataset};
+use crate::metadata::{self, Described, Stated};
 use clap::Args;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use swm_core::columns::{REWARD, SUCCESS, is_stored_as};
 use swm_core::results::Summary;
-use swm_core::{Manifest, Result};
+use swm_core::{Error, Manifest, Result};
 use swm_data::{Reader, StepRange, checksum, column_stats};
+use swm_models::capsule::Capsule;
 
 /// Arguments of `swm inspect`.
 #[derive(Args)]
@@ -21,6 +24,25 @@ pub struct InspectArgs {
     /// The checksum does not depend on format and codec.
     #[arg(long)]
     checksum: bool,
+    /// Print Croissant metadata (JSON-LD), also of a capsule
+    ///
+    /// Lists all files with their SHA-256 hashes, so all of them are read.
+    #[arg(long, conflicts_with_all = ["checksum", "datasheet"])]
+    croissant: bool,
+    /// Print a datasheet (Markdown), also of a capsule
+    ///
+    /// What the files do not say is marked as not stated.
+    #[arg(long, conflicts_with = "checksum")]
+    datasheet: bool,
+    /// Licence of the dataset, for its description
+    #[arg(long, value_name = "TEXT")]
+    licence: Option<String>,
+    /// Who made the dataset, for its description
+    #[arg(long, value_name = "TEXT")]
+    author: Option<String>,
+    /// Where it is published, for its description
+    #[arg(long, value_name = "URL")]
+    url: Option<String>,
 }
 
 /// Maximum number of bars of the histogram of lengths.
@@ -31,6 +53,22 @@ const BAR_LENGTH: usize = 40;
 
 /// Runs `swm inspect`.
 pub fn inspect(args: &InspectArgs, as_json: bool) -> anyhow::Result<()> {
+    if args.croissant || args.datasheet {
+        let described = args.described()?;
+        if args.croissant {
+            return emit_json(&metadata::croissant(&described));
+        }
+        let sheet = metadata::datasheet(&described);
+        if as_json {
+            return emit_json(&json!({"datasheet": sheet}));
+        }
+        emit(&sheet);
+        return Ok(());
+    }
+    if let Some(option) = args.stated_only() {
+        let fix = "add --croissant or --datasheet, or remove it";
+        return Err(Error::config(option, "it belongs to a description", fix).into());
+    }
     let reader = open_dataset(&args.dataset)?;
     let contents = contents(&*reader, args.checksum)?;
     if as_json {
@@ -79,6 +117,36 @@ pub fn inspect(args: &InspectArgs, as_json: bool) -> anyhow::Result<()> {
         emit(&format!("checksum of the decoded content: {checksum}\n"));
     }
     Ok(())
+}
+
+impl InspectArgs {
+    /// Describes the dataset, or the capsule if the name is that of one.
+    fn described(&self) -> Result<Described> {
+        let is_capsule = self.dataset.starts_with("zoo:") || self.dataset.ends_with(".safetensors");
+        if !is_capsule {
+            let stated = Stated { licence: self.licence.clone(), author: self.author.clone(), url: self.url.clone() };
+            return Described::dataset(&self.dataset, &*open_dataset(&self.dataset)?, stated);
+        }
+        if let Some(option) = self.stated_only().filter(|option| *option != "--url") {
+            let fix = "pack the capsule again (`swm checkpoints pack`), or remove the option";
+            return Err(Error::config(option, "the capsule states it itself", fix));
+        }
+        let path = find_checkpoint(&self.dataset)?;
+        let info = CapsuleInfo::read(&path)?;
+        let mut measured = vec![("family".to_owned(), info.family.clone()), ("packed on".to_owned(), info.packed_on)];
+        measured.push(("weights (BLAKE3)".to_owned(), info.weights));
+        if let Some(evaluation) = &info.evaluation {
+            measured.push(("success rate [95 %]".to_owned(), evaluation.success_and_floor()));
+            measured.push(("starts".to_owned(), evaluation.starts()));
+        }
+        Described::capsule(&path, &Capsule::read(&path)?, measured, self.url.clone())
+    }
+
+    /// The first given option that only a description uses.
+    fn stated_only(&self) -> Option<&'static str> {
+        let given = [("--licence", &self.licence), ("--author", &self.author), ("--url", &self.url)];
+        given.into_iter().find_map(|(name, value)| value.as_ref().map(|_| name))
+    }
 }
 
 /// Returns the contents of a dataset; with `with_checksum`, all rows are read.

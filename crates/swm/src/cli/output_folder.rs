@@ -18,8 +18,16 @@ pub fn claim(folder: &Path, names: &[&str]) -> Result<Lock> {
     }
     let lock = Lock::folder(folder)?;
     check_writable(folder)?;
-    names.iter().try_for_each(|name| files::check_own(&folder.join(name), is_own))?;
+    check(folder, names)?;
     Ok(lock)
+}
+
+/// Checks that files that a command replaces were written by this program.
+///
+/// # Errors
+/// When one of the files exists and was not.
+pub fn check(folder: &Path, names: &[&str]) -> Result<()> {
+    names.iter().try_for_each(|name| files::check_own(&folder.join(name), is_own))
 }
 
 /// Returns whether an existing output file was written by this program: a page names it, tables of a study lie beside its

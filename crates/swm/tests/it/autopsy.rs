@@ -51,6 +51,12 @@ fn autopsy_runs_its_arms_and_continues_after_a_kill() {
     let sum: f64 = contributions.iter().filter_map(|found| found["recovered"]["value"].as_f64()).sum();
     let full = arms[5]["recovered"]["value"].as_f64().expect("the arm with all ingredients");
     assert!((sum - full).abs() < 1e-9, "contributions sum to {sum}, not {full}");
+    // The page has the verdict, and a strip for each failure that an ingredient repairs.
+    let page = std::fs::read_to_string(swm.path("whole/index.html")).expect("the page");
+    let repairs = whole["autopsy"]["repairs"].as_array().expect("repairs");
+    let is_repaired = |repair: &&serde_json::Value| repair["sets"][0].as_array().is_some_and(|set| !set.is_empty());
+    assert!(page.contains("Smallest repairs") || repairs.is_empty());
+    assert_eq!(page.matches("data:image/png").count(), repairs.iter().filter(is_repaired).count());
     // A kill loses only the arm that is played.
     let mut child =
         swm.command(&args("killed")).stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("swm starts");
@@ -302,7 +308,7 @@ impl Planted {
             prediction: None,
             planning_seed,
         };
-        let options = RunOptions { envs: 32, threads: 2, videos: None };
+        let options = RunOptions { envs: 32, threads: 2, ..RunOptions::default() };
         let results = request.run(&resolver, &options, &mut Control::new()).expect("the evaluation succeeds");
         results.runs.into_iter().find(|run| run.policy == NAME).expect("the run of the policy")
     }

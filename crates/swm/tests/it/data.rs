@@ -102,3 +102,38 @@ fn bench_data_measures_loading() {
     assert_eq!(found["resident"].as_array().map(Vec::len), Some(2));
     swm.fails(&["bench", "data", "--pairs", "0"], 2, &["at least 1 pair"]);
 }
+
+#[test]
+fn datasets_and_capsules_have_croissant_metadata_and_datasheets() {
+    let swm = Swm::new();
+    swm.json(&["collect", "swm/TwoRoom-v1", "-o", "rooms.h5", "--image", "32", "--episodes", "2", "--max-steps", "5"]);
+    let described =
+        ["inspect", "rooms.h5", "--licence", "MIT", "--author", "Ada", "--url", "https://example.org/rooms"];
+    let found = swm.json(&[&described[..], &["--croissant"]].concat());
+    assert_eq!((&found["license"], &found["creator"]["name"]), (&"MIT".into(), &"Ada".into()));
+    assert_eq!((&found["name"], &found["conformsTo"]), (&"rooms".into(), &"http://mlcommons.org/croissant/1.0".into()));
+    let file = &found["distribution"][0];
+    let bytes = std::fs::metadata(swm.path("rooms.h5")).expect("the file").len();
+    assert_eq!((&file["contentUrl"], &file["contentSize"]), (&"rooms.h5".into(), &format!("{bytes} B").into()));
+    assert!(file["sha256"].as_str().is_some_and(|hash| hash.len() == 64), "{file}");
+    let columns = found["variableMeasured"].as_array().expect("columns");
+    let column = |name: &str| columns.iter().find(|column| column["name"] == name).unwrap_or_else(|| panic!("{name}"));
+    let types = [&column("action")["value"], &column("pixels")["value"]];
+    assert_eq!(types, [&serde_json::Value::from("float32 [2]"), &"uint8 [32, 32, 3]".into()]);
+    let sheet = text(&swm.run(&[&described[..], &["--datasheet"]].concat()).stdout);
+    for part in [
+        "# Datasheet: rooms",
+        "2 episodes",
+        "| action | float32 | [2] |",
+        "Licence: MIT",
+        "Not stated",
+        "swm/TwoRoom-v1",
+    ] {
+        assert!(sheet.contains(part), "{part}: {sheet}");
+    }
+    let capsule = swm.json(&["inspect", "zoo:two-room/pldm", "--croissant"]);
+    assert!(capsule["license"].is_string() && capsule["distribution"][0]["sha256"].is_string(), "{capsule}");
+    assert!(capsule["variableMeasured"].to_string().contains("success rate"), "{capsule}");
+    swm.fails(&["inspect", "zoo:two-room/pldm", "--datasheet", "--licence", "MIT"], 2, &["states it itself"]);
+    swm.fails(&["inspect", "rooms.h5", "--licence", "MIT"], 2, &["--croissant"]);
+}

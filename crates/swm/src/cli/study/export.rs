@@ -49,7 +49,7 @@ impl Format {
 }
 
 /// Escapes a cell of a Markdown table.
-pub(super) fn escape_markdown(text: &str) -> String {
+pub fn escape_markdown(text: &str) -> String {
     printable(text).replace('&', "&amp;").replace('<', "&lt;").replace('|', "\\|").replace(['\n', '\r'], " ")
 }
 

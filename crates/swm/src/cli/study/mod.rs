@@ -8,6 +8,7 @@ mod expand;
 mod export;
 mod export_table;
 mod file;
+mod online;
 mod published;
 mod report;
 mod shipped;
@@ -23,7 +24,9 @@ use super::{Context, emit, emit_json, table};
 use crate::resolver::HomeResolver;
 use any_file::{AnyFile, Size};
 use clap::{Args, Subcommand, ValueEnum as _};
+pub(super) use expand::shell;
 use export::Format;
+pub use export::escape_markdown;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -243,7 +246,7 @@ fn run(args: &RunArgs, only_register: bool, context: &Context) -> anyhow::Result
     if args.commands {
         let evaluations = expand::commands(&file, &args.settings, &resolver)?;
         for arguments in file.datasets.commands().into_iter().chain(evaluations) {
-            emit(&format!("swm {}\n", expand::shell(&arguments)));
+            emit(&format!("swm {}\n", shell(&arguments)));
         }
         return Ok(());
     }

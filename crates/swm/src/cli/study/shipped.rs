@@ -11,6 +11,7 @@ const STUDIES: &[(&str, &str)] = &[
     ("paper/colour-wheel", include_str!("../../../studies/paper/colour-wheel.toml")),
     ("paper/baselines", include_str!("../../../studies/paper/baselines.toml")),
     ("paper/shift", include_str!("../../../studies/paper/shift.toml")),
+    ("paper/online", include_str!("../../../studies/paper/online.toml")),
     ("paper/data", include_str!("../../../studies/paper/data.toml")),
     ("paper/factors-per-env", include_str!("../../../studies/paper/factors-per-env.toml")),
     ("two-room/shift", include_str!("../../../studies/two-room/shift.toml")),

@@ -1,12 +1,15 @@
 //! Studies whose cells are no evaluations: files with a `kind`.
 //!
 //! - `factors`: the number of factors of variation of every environment; no environment is stepped.
+//! - `online`: returns of models that train by interaction.
 //! - `data`: the speed, latency and size of every format of datasets, on the local disk and in an object store.
 
 use super::any_file::Size;
+use super::online::{self, OnlineSettings};
 use crate::cli::Context;
 use crate::cli::progress::control;
 use crate::{ENVS, capsule};
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
@@ -48,6 +51,7 @@ pub struct TableFile {
 enum TableKind {
     Factors,
     Data,
+    Online,
 }
 
 /// The settings of the kind `data`.
@@ -138,15 +142,14 @@ impl TableFile {
                 ("environment", factor_columns(), self.factors()?)
             }
             TableKind::Data => {
-                let names = json!(DataSettings::default());
-                let names: Vec<&str> =
-                    names.as_object().into_iter().flat_map(|all| all.keys().map(String::as_str)).collect();
-                known(&merged, &names)?;
-                let invalid =
-                    |error: toml::de::Error| Error::config("settings of the study", error.message(), "correct them");
-                let settings: DataSettings = merged.try_into().map_err(invalid)?;
+                let settings: DataSettings = settings_of(merged)?;
                 settings.check(origin, &own)?;
                 ("dataset", data_columns(), self.data(&settings, size))
+            }
+            TableKind::Online => {
+                let settings: OnlineSettings = settings_of(merged)?;
+                settings.check(if own.contains("envs") { &Origin::User } else { origin })?;
+                ("run", online::columns(), settings.cells())
             }
         };
         let study = TableStudy {
@@ -222,8 +225,18 @@ impl TableKind {
         match self {
             Self::Factors => "factors",
             Self::Data => "data",
+            Self::Online => "online",
         }
     }
+}
+
+/// Reads settings.
+fn settings_of<T: Serialize + DeserializeOwned + Default>(given: Table) -> Result<T> {
+    let names = json!(T::default());
+    let names: Vec<&str> = names.as_object().into_iter().flat_map(|all| all.keys().map(String::as_str)).collect();
+    known(&given, &names)?;
+    let invalid = |error: toml::de::Error| Error::config("settings of the study", error.message(), "correct them");
+    given.try_into().map_err(invalid)
 }
 
 /// Checks the names of settings.
@@ -287,6 +300,11 @@ pub fn run(study: &TableStudy, folder: &StudyFolder, context: &Context) -> Resul
     let _lock = folder.create_table(study)?;
     if study.kind == TableKind::Factors.name() {
         study.run(folder, "", &mut |cell, control| Ok(count_factors(&cell.request, control)), &mut control(context))?;
+        return Ok(());
+    }
+    if study.kind == TableKind::Online.name() {
+        let mut measure = |cell: &TableCell, control: &mut Control<'_>| online::measure(cell, context, control);
+        study.run(folder, "", &mut measure, &mut control(context))?;
         return Ok(());
     }
     let threads = if context.threads > 0 { context.threads } else { DataBenchConfig::default().threads };

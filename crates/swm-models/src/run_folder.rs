@@ -1,7 +1,8 @@
 //! The names of the files that training writes to the folder of a run, and the removal of a run.
 
 use std::path::{Path, PathBuf};
-use swm_core::{Result, files};
+use swm_core::Result;
+use swm_core::files::{self, Lock};
 
 /// The folder of the checkpoint inside the folder of a run.
 pub(crate) const FOLDER: &str = "checkpoint";
@@ -63,8 +64,10 @@ const CHECKPOINT_FOLDERS: &[&str] = &[
 /// that remain; the folder is removed if none remain.
 ///
 /// # Errors
-/// When the folder is a symbolic link, or a file cannot be removed.
+/// When the folder is a symbolic link, a training writes to it, or a file cannot be removed.
 pub fn remove(run: &Path) -> Result<Vec<PathBuf>> {
+    files::check_no_link(run)?;
+    let _lock = Lock::folder(run)?;
     let checkpoints =
         CHECKPOINT_FOLDERS.iter().flat_map(|folder| CHECKPOINT_FILES.iter().map(move |file| format!("{folder}{file}")));
     let saved_data = SAVED_DATA_FILES.iter().map(|file| format!("{PLAYED}*/{file}"));

@@ -34,7 +34,10 @@ impl Results {
                 return wrong("does not match the episodes");
             }
         }
-        Ok(())
+        match expected.keys().find(|names| !seen.contains(*names)) {
+            Some([condition, a, b]) => Err(format!("the comparison of {a} and {b} is left out ({condition})")),
+            None => Ok(()),
+        }
     }
 
     /// Checks how the evaluation is said to have ended.

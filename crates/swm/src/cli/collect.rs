@@ -175,7 +175,7 @@ impl<'a> Collection<'a> {
                 (_, true) => WriteMode::Overwrite,
                 _ => WriteMode::Create,
             },
-            codec: args.codec.codec(),
+            codec: args.codec.codec()?,
             wrappers: args.wrappers.clone(),
             mix_renderers: args.mix_renderers,
         })

@@ -11,10 +11,13 @@ pub struct CodecArgs {
     /// Codec of stored frames, in formats with several codecs
     #[arg(long, value_enum, default_value_t = Codec::Qoi)]
     codec: Codec,
-    /// Quality of JPEG frames, 1 to 100
-    #[arg(long, default_value_t = 95, value_parser = clap::value_parser!(u8).range(1..=100))]
-    quality: u8,
+    /// Quality of JPEG frames, 1 to 100 (default: 95)
+    #[arg(long, value_parser = clap::value_parser!(u8).range(1..=100))]
+    quality: Option<u8>,
 }
+
+/// The quality of JPEG frames, unless the command line says otherwise.
+const JPEG_QUALITY: u8 = 95;
 
 /// The codec of stored frames.
 #[derive(Clone, Copy, ValueEnum)]
@@ -29,11 +32,17 @@ enum Codec {
 
 impl CodecArgs {
     /// Returns the codec with its quality.
-    pub fn codec(&self) -> ImageCodec {
-        match self.codec {
-            Codec::Qoi => ImageCodec::Qoi,
-            Codec::Png => ImageCodec::Png,
-            Codec::Jpeg => ImageCodec::Jpeg { quality: self.quality },
+    ///
+    /// # Errors
+    /// When a quality is given for a codec without one.
+    pub fn codec(&self) -> Result<ImageCodec> {
+        match (self.codec, self.quality) {
+            (Codec::Jpeg, quality) => Ok(ImageCodec::Jpeg { quality: quality.unwrap_or(JPEG_QUALITY) }),
+            (_, Some(_)) => {
+                Err(Error::config("--quality", "only JPEG frames have one", "add --codec jpeg, or leave it out"))
+            }
+            (Codec::Qoi, None) => Ok(ImageCodec::Qoi),
+            (Codec::Png, None) => Ok(ImageCodec::Png),
         }
     }
 }

@@ -7,6 +7,7 @@ use super::{Context, emit, emit_json};
 use crate::home;
 use clap::{Args, ValueEnum};
 use std::time::Instant;
+use swm_core::Result;
 use swm_data::{ConvertMode, ConvertOptions, Converted, Location};
 
 /// Arguments of `swm convert`.
@@ -41,14 +42,17 @@ pub struct TargetArgs {
 
 impl TargetArgs {
     /// Returns the options of a conversion with these arguments.
-    pub fn options(&self, mode: ConvertMode) -> ConvertOptions {
-        ConvertOptions {
+    ///
+    /// # Errors
+    /// When a quality is given for a codec without one.
+    pub fn options(&self, mode: ConvertMode) -> Result<ConvertOptions> {
+        Ok(ConvertOptions {
             format: self.format.clone(),
             mode,
-            codec: self.codec.codec(),
+            codec: self.codec.codec()?,
             least_psnr: self.least_psnr,
             ..ConvertOptions::default()
-        }
+        })
     }
 }
 
@@ -68,7 +72,7 @@ pub fn convert(args: &ConvertArgs, context: &Context) -> anyhow::Result<()> {
         Mode::Overwrite => ConvertMode::Overwrite,
         Mode::Append => ConvertMode::Append,
     };
-    let options = ConvertOptions { verify: !args.no_verify, ..args.target_args.options(mode) };
+    let options = ConvertOptions { verify: !args.no_verify, ..args.target_args.options(mode)? };
     let source = home::find_dataset(&args.source)?;
     let target = home::target(&args.target, args.target_args.format.as_deref())?;
     let reader = swm_data::open(source)?;

@@ -48,7 +48,7 @@ pub fn doctor(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
     }
     if let Some(target) = &target {
         let start = Instant::now();
-        let options = args.target.options(ConvertMode::Resume);
+        let options = args.target.options(ConvertMode::Resume)?;
         let converted = repair(&reader, &diagnosis, target, &options, &mut control(context))?;
         if !context.json {
             emit(&convert::describe(&converted, target, start.elapsed().as_secs_f64()));

@@ -17,7 +17,7 @@ use swm_core::limits::{ENVS, EVALUATED_EPISODES, STEPS};
 use swm_core::results::{Counting, Until};
 use swm_core::{EnvChoice, Error, Key, Origin, Result, Results, files};
 use swm_data::{Part, Split};
-use swm_eval::{Condition, EvalRequest, HeldOut, RunOptions, StartsRequest};
+use swm_eval::{Condition, EvalRequest, HeldOut, PolicyKind, RunOptions, StartsRequest};
 
 /// Arguments of `swm eval`.
 #[derive(Args)]
@@ -177,6 +177,7 @@ pub fn run_args(args: &EvalArgs, context: &Context) -> anyhow::Result<(Results, 
     let resolver = HomeResolver::new(Origin::User);
     let resolver = if args.trace { resolver.tracing() } else { resolver };
     let request = args.request(&resolver, CapsuleStarts::Use)?;
+    args.check_planning(&request)?;
     // Before the work: only a traced evaluation replaces the traces.
     if args.trace {
         drop(output_folder::claim(&args.output, &["traces.json"])?);
@@ -243,6 +244,17 @@ impl EvalArgs {
             prediction: self.predict,
             planning_seed: self.planning_seed,
         })
+    }
+
+    /// Checks that a policy plans, if an option of planning is given.
+    fn check_planning(&self, request: &EvalRequest) -> Result<()> {
+        let plans = request.policies.iter().any(|policy| matches!(policy.kind, PolicyKind::Plan { .. }));
+        let option = match plans {
+            false if self.trace => "--trace",
+            false if self.planner.is_given() => "an option of planning (--solver, --horizon, --limit, …)",
+            _ => return Ok(()),
+        };
+        Err(Error::config(option, "none of the policies plans", "remove it, or name a policy that plans"))
     }
 
     /// Checks the options before the outputs of earlier steps of a recipe exist; `is_output` is whether a policy is one.

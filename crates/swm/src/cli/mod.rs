@@ -313,6 +313,7 @@ impl Context {
         {
             return Err(Error::external("starting worker threads", error));
         }
+        signals::report_large_files();
         let interrupt = signals::interrupt_flag().map_err(|error| Error::external("handling Ctrl-C", error))?;
         Ok(Self { json, threads, interrupt })
     }

@@ -35,6 +35,14 @@ pub fn interrupt_flag() -> std::io::Result<Arc<AtomicBool>> {
     Ok(Arc::clone(flag))
 }
 
+/// Ignores the signal of a file that grows beyond the limit of the process (`ulimit -f`): writing fails with an error then,
+/// which says what is kept.
+#[allow(unsafe_code, reason = "ignoring a signal is a function of the C library")]
+pub fn report_large_files() {
+    // SAFETY: `SIG_IGN` runs no code of ours.
+    unsafe { libc::signal(libc::SIGXFSZ, libc::SIG_IGN) };
+}
+
 /// The handler of [`SIGNALS`]. It works without memory and without locks, because it interrupts any code.
 #[allow(unsafe_code, reason = "functions of the C library that a handler may call")]
 extern "C" fn handle(signal: libc::c_int) {

@@ -100,6 +100,11 @@ pub fn run_args(args: &TrainArgs, context: &Context) -> anyhow::Result<(PathBuf,
         cache: home::weights()?,
         ..TrainOptions::default()
     };
+    // clap drops the requirement of --env when --data excludes it.
+    if let (None, Some(_)) = (&args.env, args.max_steps) {
+        let problem = "limits the episodes of an environment, and this training plays none";
+        anyhow::bail!(Error::config("--max-steps", problem, "remove it, or train online with --env"));
+    }
     if let Some(env) = &args.env {
         return train_online(args, env, &*config, options, context);
     }

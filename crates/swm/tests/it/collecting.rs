@@ -135,6 +135,15 @@ fn mixtures_of_policies_and_shards_have_the_same_content() {
     sharded.json(&with(&mixture, &["--shard", "0/2", "--envs", "1"]));
     sharded.json(&["datasets", "commit", "rooms"]);
     assert_eq!(content(&sharded, "rooms"), whole);
+    // The same shards again would store every episode twice.
+    sharded.fails(&with(&mixture, &["--shard", "0/2"]), 2, &["episodes of the collection", "_shards"]);
+    assert_eq!(content(&sharded, "rooms"), whole);
+    let late = Swm::new();
+    late.json(&with(&mixture, &["--shard", "0/2"]));
+    late.json(&with(&mixture, &["--shard", "1/2"]));
+    late.json(&with(&mixture, &["--overwrite"]));
+    late.fails(&["datasets", "commit", "rooms"], 2, &["episodes of the collection", "_shards"]);
+    assert_eq!(content(&late, "rooms"), whole);
     let fails = |more: &[&str], parts: &[&str]| swm.fails(&with(ROOMS, more), 2, parts);
     fails(&["--resume", "--policy", "expert:2", "--policy", "random"], &["action_noise", "0.1"]);
     fails(&["--overwrite", "--policy", "expert:0", "--policy", "random"], &["the policy 'expert'", "positive"]);

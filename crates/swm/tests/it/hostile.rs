@@ -95,3 +95,45 @@ fn hostile_numbers_are_refused() {
     swm.fails(&["bench", "train", "--clips=1152921504606846976"], 2, &["from 1 to 4096"]);
     swm.fails(&["bench", "plan", "--envs=1152921504606846976"], 2, &["from 1 to 16384"]);
 }
+
+#[test]
+fn options_without_effect_are_refused() {
+    let swm = Swm::new();
+    let collect = ["collect", "swm/TwoRoom-v1", "--image", "32", "--episodes", "2", "--max-steps", "4"];
+    let with = |more: &[&'static str]| [&collect[..], more].concat();
+    swm.fails(&with(&["-o", "rooms.lance", "--quality", "5"]), 2, &["only JPEG frames have one"]);
+    swm.fails(&with(&["-o", "rooms.h5", "--codec", "jpeg"]), 2, &["hdf5 stores frames without loss"]);
+    swm.json(&with(&["-o", "rooms.lance"]));
+    swm.fails(&["train", "lewm", "--data", "rooms.lance", "--max-steps", "3"], 2, &["--max-steps", "plays none"]);
+    let eval = ["eval", "expert", "--env", "swm/TwoRoom-v1", "--episodes", "2", "--no-pixels"];
+    for option in [&["--solver", "cem"][..], &["--horizon", "3"], &["--trace"]] {
+        swm.fails(&[&eval[..], option].concat(), 2, &["none of the policies plans"]);
+    }
+}
+
+#[test]
+fn file_beyond_the_limit_of_the_process_is_an_error() {
+    let swm = Swm::new();
+    let command = format!(
+        "ulimit -f 1; exec {} collect swm/TwoRoom-v1 --policy random --image 64 --episodes 20 --max-steps 20 -o a.h5",
+        env!("CARGO_BIN_EXE_swm")
+    );
+    let mut shell = std::process::Command::new("sh");
+    let output = shell.args(["-c", &command]).current_dir(swm.path("")).output().expect("a shell");
+    assert_eq!(output.status.code(), Some(1), "{}", text(&output.stderr));
+    assert!(text(&output.stderr).contains("File too large"), "{}", text(&output.stderr));
+}
+
+#[test]
+fn checkpoint_is_not_removed_while_it_is_written() {
+    let swm = Swm::new();
+    let run = swm.path("run");
+    fs::create_dir_all(run.join("checkpoint")).expect("a folder");
+    fs::write(run.join("checkpoint/config.json"), r#"{"family":"lewm"}"#).expect("a file");
+    let lock = fs::File::open(&run).expect("the folder");
+    lock.lock().expect("a lock");
+    swm.fails(&["checkpoints", "remove", "./run", "--yes"], 2, &["another process writes to it"]);
+    assert!(run.join("checkpoint/config.json").is_file());
+    drop(lock);
+    swm.json(&["checkpoints", "remove", "./run", "--yes"]);
+}

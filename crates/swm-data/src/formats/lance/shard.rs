@@ -97,6 +97,9 @@ pub fn create_shard(
         let known = LanceReader::of(store.clone(), Arc::clone(&old.manifest))?;
         columns = match_table_columns(&store.label, columns, old, known.schema())?;
         Logs::read(&store)?.remove_committed(&store, old);
+        if let Some(manifest) = &options.manifest {
+            check_adds(&store, &known, manifest)?;
+        }
     }
     let begun = ShardStart { columns: schema.clone(), codec: options.codec, manifest: options.manifest.clone() };
     let logs = Logs::read(&store)?;
@@ -289,11 +292,29 @@ fn with_counts(mut manifest: Manifest, shards: &[&ShardLogFiles]) -> Manifest {
     manifest
 }
 
+/// Checks that a dataset has no episodes of the collection that shards belong to: they would be stored twice.
+fn check_adds(store: &Store, known: &LanceReader, shards: &Manifest) -> Result<()> {
+    let collection = |manifest: &Manifest| {
+        let mut config = manifest.config.clone();
+        // The same seed gives the same first episodes, however many there are.
+        config.as_object_mut().and_then(|settings| settings.remove("episodes"));
+        (manifest.seed, config)
+    };
+    let same = known.manifest().is_some_and(|stored| collection(&stored) == collection(shards));
+    if !same || known.episodes().is_empty() {
+        return Ok(());
+    }
+    let problem = "it has episodes of the collection that the shards belong to already, which would be stored twice";
+    let fix = "collect with another seed or into another dataset; removing its folder _shards discards the shards";
+    Err(Error::config(format!("dataset {}", store.label.display()), problem, fix))
+}
+
 /// Commits the episodes of all shards as one version, in the order of the shards, after the existing episodes. Returns
 /// the number of added episodes. If a previous commit was killed, this call completes it.
 ///
 /// # Errors
-/// If a shard is missing or incomplete, the columns of the shards differ, or writing fails.
+/// If a shard is missing or incomplete, the columns of the shards differ, the dataset has episodes of their collection
+/// already, or writing fails.
 pub fn commit_shards(location: &Location) -> Result<usize> {
     let store = Store::new(location)?;
     for _ in 0..MAX_ATTEMPTS {
@@ -311,6 +332,9 @@ pub fn commit_shards(location: &Location) -> Result<usize> {
         let options = WriteOptions { codec: begun.codec, manifest, ..WriteOptions::default() };
         let fresh = new_table_schema(&schema::columns_to_write(&begun.columns)?, &begun.columns, &options)?;
         let stored = version.as_ref().and_then(|old| schema::manifest(&old.manifest.schema));
+        if let (Some(old), Some(manifest)) = (&version, &begun.manifest) {
+            check_adds(&store, &LanceReader::of(store.clone(), Arc::clone(&old.manifest))?, manifest)?;
+        }
         let mut table = Table::new(store.clone(), version.clone(), fresh);
         let mut next = if version.is_some() { table.refresh()? } else { 0 };
         let first = next;

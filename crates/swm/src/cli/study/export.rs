@@ -50,7 +50,9 @@ impl Format {
 
 /// Escapes a cell of a Markdown table.
 pub fn escape_markdown(text: &str) -> String {
-    printable(text).replace('&', "&amp;").replace('<', "&lt;").replace('|', "\\|").replace(['\n', '\r'], " ")
+    let text = printable(text).replace('&', "&amp;").replace('<', "&lt;").replace(['\n', '\r'], " ");
+    // Brackets would make links and images.
+    text.replace('|', "\\|").replace('[', "\\[").replace(']', "\\]")
 }
 
 /// Success rates with a row for each condition and a column for each policy.

@@ -119,7 +119,7 @@ fn recipes_are_listed_and_checked_before_they_run() {
             "budget = 10\nenv = \"swm/TwoRoom-v1\"\nshift = [\"agent.colour\"]",
             "did you mean agent.color",
         ),
-        ("policies = [\"small\"]", "policies = [\"small\", \"samll\"]", "samll"),
+        ("policies = [\"small\"]", "policies = [\"small\", \"other\"]", "other"),
         ("cem,samples=8", "cme,samples=8", "did you mean"),
     ];
     for (from, to, part) in contradictions {

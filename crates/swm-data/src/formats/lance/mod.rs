@@ -13,6 +13,7 @@
 
 mod convert;
 mod encode;
+mod errors;
 mod image_locations;
 mod manifest_file;
 mod reader;

@@ -8,9 +8,10 @@
 
 use super::ENTRY;
 use super::encode::EncodedEpisode;
+use super::errors::damaged;
 use super::reader::LanceReader;
 use super::schema;
-use super::store::{Store, Version, damaged};
+use super::store::{Store, Version};
 use super::table::{MAX_ATTEMPTS, Table};
 use super::writer::{PreparedWriter, Sink, match_table_columns, new_table_schema, too_many_conflicts};
 use crate::dataset::{Location, Reader as _};

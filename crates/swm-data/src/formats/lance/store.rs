@@ -1,5 +1,6 @@
 //! Storage of a Lance table: its location, its newest version, and commits of new versions.
 
+use super::errors::{damaged, lance_error};
 use super::{ENTRY, manifest_file};
 use crate::dataset::{Location, objects};
 use arrow_schema::Schema as ArrowSchema;
@@ -41,70 +42,6 @@ where
     match objects::block_on(future)? {
         Some(result) => result.map_err(|e| lance_error(label, action, &e)),
         None => Err(damaged(label, format!("{action}: the content is invalid"))),
-    }
-}
-
-/// An error that reports a dataset with damaged files.
-pub fn damaged(path: &Path, problem: impl Into<String>) -> Error {
-    Error::corrupt(
-        path,
-        problem,
-        "a file of the dataset is damaged or missing: restore it from a copy, or delete the dataset and collect it again",
-    )
-}
-
-/// Converts Lance's errors: errors of the operating system become [`Error::Io`], errors of a remote store keep their
-/// message, and all other errors mean that files are damaged.
-fn lance_error(label: &Path, action: &str, error: &lance_core::Error) -> Error {
-    let text = error.to_string();
-    // Lance takes damage for a fault of its own, and asks for a report.
-    let text = without_position(text.split_once("/lance/issues. ").map_or(text.as_str(), |(_, found)| found));
-    let text = without_kind(text);
-    // Lance converts some system errors to text, which still contains their code.
-    let code =
-        text.split("(os error ").nth(1).and_then(|rest| rest.split(')').next()).and_then(|number| number.parse().ok());
-    let remote = label.to_str().is_some_and(|label| label.contains("://"));
-    match (code, error) {
-        (Some(code), _) if !remote => Error::io(label, action, std::io::Error::from_raw_os_error(code)),
-        (_, lance_core::Error::NotFound { uri, .. }) => damaged(label, format!("{action}: {uri} is missing")),
-        (_, lance_core::Error::NotSupported { .. } | lance_core::Error::VersionConflict { .. }) => Error::corrupt(
-            label,
-            format!("{action}: {text}"),
-            "this version cannot be read; rewrite the table with a current Lance",
-        ),
-        (_, lance_core::Error::IO { .. }) if remote => {
-            Error::external(format!("{}: {action}", label.display()), format!("{text}{}", credentials_hint(text)))
-        }
-        _ => damaged(label, format!("{action}: {text}")),
-    }
-}
-
-/// Removes the position in Lance's own source at the end of a message, such as `, rust/lance-io/src/utils.rs:173:28`.
-fn without_position(text: &str) -> &str {
-    let is_position = |end: &str| {
-        let mut parts = end.rsplitn(3, ':');
-        let numbers = [parts.next(), parts.next()];
-        let is_number = |part: &Option<&str>| part.is_some_and(|part| part.parse::<u32>().is_ok());
-        numbers.iter().all(is_number) && parts.next().is_some_and(|file| file.ends_with(".rs"))
-    };
-    text.rsplit_once(", ").filter(|(_, end)| is_position(end)).map_or(text, |(found, _)| found)
-}
-
-/// Removes the kind of error at the start of a message, such as `LanceError(IO): `.
-fn without_kind(text: &str) -> &str {
-    text.strip_prefix("LanceError(").and_then(|rest| rest.split_once("): ")).map_or(text, |(_, text)| text)
-}
-
-/// Returns the advice for an object store that refused a request, or whose client found no credentials and asked the
-/// metadata server of a cloud machine for them.
-fn credentials_hint(text: &str) -> &'static str {
-    let refused = ["169.254.169.254", "metadata.google.internal", "401", "403", "redential"];
-    match refused.iter().any(|part| text.contains(part)) {
-        true => {
-            "; the store needs credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, GOOGLE_SERVICE_ACCOUNT, or \
-             AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY (docs/data.md)"
-        }
-        false => "",
     }
 }
 
@@ -521,20 +458,4 @@ pub fn hash_file(path: &Path) -> std::io::Result<String> {
 pub fn hash_in_name(name: &str) -> Option<&str> {
     let stem = name.strip_suffix(".lance")?;
     (stem.len() == 64 && stem.bytes().all(|b| b.is_ascii_hexdigit())).then_some(stem)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn lance_errors_keep_the_system_error_code() {
-        let text = "LanceError(IO): Generic S3 error: PUT http://169.254.169.254/: 403, crates/x/store.rs:379:30";
-        assert_eq!(without_kind(without_position(text)), "Generic S3 error: PUT http://169.254.169.254/: 403");
-        assert!(credentials_hint(text).contains("AWS_ACCESS_KEY_ID") && credentials_hint("timeout").is_empty());
-        let full = lance_core::Error::io("failed to persist: No space left on device (os error 28)".to_owned());
-        let error = lance_error(Path::new("x.lance"), "writing", &full);
-        assert!(matches!(&error, Error::Io { source, .. } if source.kind() == ErrorKind::StorageFull));
-        assert!(error.to_string().contains("free some space"));
-    }
 }

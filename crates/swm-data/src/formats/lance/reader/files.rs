@@ -2,8 +2,9 @@
 
 use super::lance_reader::{LanceReader, lock};
 use crate::dataset::objects::ObjectRanges;
+use crate::formats::lance::errors::damaged;
 use crate::formats::lance::record::{EPISODES_KEY, Record};
-use crate::formats::lance::store::{self, block_on, damaged};
+use crate::formats::lance::store::{self, block_on};
 use bytes::Bytes;
 use futures::{StreamExt as _, TryStreamExt as _};
 use lance_core::datatypes::Schema as LanceSchema;

@@ -3,9 +3,10 @@
 use super::lance_reader::{FileImages, LanceReader, RowSlot, lock, max_open_files, merged};
 use crate::dataset::objects::{self, ObjectRanges};
 use crate::formats::lance::convert::image_bytes;
+use crate::formats::lance::errors::damaged;
 use crate::formats::lance::image_locations::{ImageLocation, ImageLocations};
 use crate::formats::lance::schema::StoredColumn;
-use crate::formats::lance::store::{block_on, damaged};
+use crate::formats::lance::store::block_on;
 use rayon::prelude::*;
 use std::cell::RefCell;
 use std::os::unix::fs::FileExt as _;

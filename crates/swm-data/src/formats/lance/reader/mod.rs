@@ -17,9 +17,10 @@ pub use self::lance_reader::LanceReader;
 
 use self::lance_reader::{RecentFiles, RowSlot};
 use super::convert::{cast, image_bytes, integers};
+use super::errors::damaged;
 use super::record::{CONSTANTS_KEY, ContentHash};
 use super::schema::{self, Kind, StoredColumn};
-use super::store::{Store, damaged};
+use super::store::Store;
 use crate::dataset::Location;
 use crate::dataset::objects::BlockCache;
 use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};

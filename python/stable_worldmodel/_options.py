@@ -53,12 +53,13 @@ def indices(name: str, given: Any, count: int) -> list[int]:
     if array.dtype == bool:
         if array.shape != (count,):
             raise ValueError(f"{name}: expected a mask of {count} booleans, got the shape {array.shape}")
-        return np.flatnonzero(array).tolist()
+        array = np.flatnonzero(array)
+        return [int(index) for index in array]
     if array.size == 0:
         return []
     if array.ndim != 1 or array.dtype.kind not in "iu":
         raise TypeError(f"{name}: expected indices or a mask of booleans, got {given!r}")
-    return array.tolist()
+    return [int(index) for index in array]
 
 
 def variation(options: Mapping[str, Any] | None, spaces: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -107,7 +107,8 @@ class _EnginePolicy(BasePolicy):
         """The actions for the current infos of the world; `obs` is ignored."""
         if self.env is None:
             raise RuntimeError(f"{type(self).__name__}: it belongs to no world; call world.set_policy(policy) first")
-        return self.env._world._engine_actions(self)
+        actions: np.ndarray = self.env._world._engine_actions(self)
+        return actions
 
 
 class RandomPolicy(_EnginePolicy):
@@ -428,7 +429,9 @@ def _executed(step: np.ndarray, space: Any) -> np.ndarray:
     for size in sizes:
         choices.append(int(step[at : at + size].argmax()))
         at += size
-    return np.asarray(choices, dtype=space.dtype) + np.asarray(getattr(space, "start", 0))
+    start = np.asarray(getattr(space, "start", 0))
+    action: np.ndarray = np.asarray(choices, dtype=space.dtype) + start
+    return action
 
 
 def _scale(scaler: Any) -> tuple[list[float], list[float]] | None:

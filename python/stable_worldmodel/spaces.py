@@ -179,9 +179,9 @@ class Dict(spaces.Dict):
 
     def __init__(
         self,
-        spaces_dict: Mapping[str, spaces.Space] | None = None,
+        spaces_dict: Mapping[str, spaces.Space[Any]] | None = None,
         init_value: Mapping[str, Any] | None = None,
-        constrain_fn: Callable[[dict], bool] | None = None,
+        constrain_fn: Callable[[dict[str, Any]], bool] | None = None,
         sampling_order: Sequence[str] | None = None,
         **kwargs: Any,
     ) -> None:
@@ -353,7 +353,7 @@ def reset_variation_space(
         raise ValueError(f"some factors are outside their spaces or violate a constrain_fn: {variation_space.value}")
 
 
-def from_description(described: Mapping[str, Any]) -> spaces.Space:
+def from_description(described: Mapping[str, Any]) -> spaces.Space[Any]:
     """Builds a space from its description by the engine."""
     kind = described["type"]
     if kind == "Dict":

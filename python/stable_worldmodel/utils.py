@@ -40,12 +40,12 @@ def home() -> str:
 
 def describe(env: str) -> dict[str, Any]:
     """The description of an environment: spaces, info columns, factors of variation, options, experts."""
-    return json.loads(_engine.spec(env))
+    return dict(json.loads(_engine.spec(env)))
 
 
 def wrappers() -> dict[str, Any]:
     """The settings of every visual wrapper, by its id."""
-    return json.loads(_engine.wrappers())
+    return dict(json.loads(_engine.wrappers()))
 
 
 def exists(val: Any) -> bool:

@@ -39,9 +39,7 @@ class NamedEnv(NativeEnv):
         for key in self._defaults:
             self._variation_space.find(key)
 
-    def reset(  # type: ignore[override]
-        self, seed: int | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode. Factors, start and goal depend only on the seed, the options and `init_value`."""
         given = dict(options or {})
         if self._defaults:

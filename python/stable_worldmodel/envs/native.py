@@ -82,9 +82,7 @@ class NativeEnv(gymnasium.Env):
                 factor._value = int(factor._value)
         return space
 
-    def reset(  # type: ignore[override]
-        self, seed: int | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode. Factors, start and goal depend only on the seed and the options."""
         super().reset(seed=seed)
         if seed is None:

@@ -126,4 +126,4 @@ class ShootingCostEvaluator(nn.Module):
                 info_dict.update((key, value) for key, value in encoded.items() if str(key).endswith("goal_emb"))
         info_dict["action_candidates"] = action_candidates
         predicted = self.model.rollout(info_dict, action_candidates)
-        return info_dict if predicted is None else predicted  # type: ignore[no-any-return]
+        return info_dict if predicted is None else predicted

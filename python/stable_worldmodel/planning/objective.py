@@ -80,7 +80,7 @@ class WeightedSum(nn.Module):
 
     def forward(self, info_dict: dict[str, Any]) -> torch.Tensor:
         """The costs `(B, S)`."""
-        total: Any = sum(weight * objective(info_dict) for weight, objective in self.terms)
+        total: torch.Tensor = sum(weight * objective(info_dict) for weight, objective in self.terms)
         return total
 
 

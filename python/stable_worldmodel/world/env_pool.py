@@ -50,22 +50,24 @@ class EnvPool:
         return len(self.envs)
 
     @property
-    def single_action_space(self) -> spaces.Space:
+    def single_action_space(self) -> spaces.Space[Any]:
         """The action space of one environment."""
-        return self.envs[0].action_space
+        space: spaces.Space[Any] = self.envs[0].action_space
+        return space
 
     @cached_property
-    def action_space(self) -> spaces.Space:
+    def action_space(self) -> spaces.Space[Any]:
         """The action space of all environments together."""
         return batch_space(self.single_action_space, self.num_envs)
 
     @property
-    def single_observation_space(self) -> spaces.Space:
+    def single_observation_space(self) -> spaces.Space[Any]:
         """The observation space of one environment."""
-        return self.envs[0].observation_space
+        space: spaces.Space[Any] = self.envs[0].observation_space
+        return space
 
     @cached_property
-    def observation_space(self) -> spaces.Space:
+    def observation_space(self) -> spaces.Space[Any]:
         """The observation space of all environments together."""
         return batch_space(self.single_observation_space, self.num_envs)
 
@@ -189,22 +191,22 @@ class WorldEnvs(EnvPool):
         return self._world.num_envs
 
     @cached_property
-    def single_action_space(self) -> spaces.Space:
+    def single_action_space(self) -> spaces.Space[Any]:
         """The action space of one environment."""
         return swm_spaces.from_description(self._world.spec["action_space"])
 
     @cached_property
-    def action_space(self) -> spaces.Space:
+    def action_space(self) -> spaces.Space[Any]:
         """The action space of all environments together."""
         return batch_space(self.single_action_space, self.num_envs)
 
     @cached_property
-    def single_observation_space(self) -> spaces.Space:
+    def single_observation_space(self) -> spaces.Space[Any]:
         """The observation space of one environment."""
         return swm_spaces.from_description(self._world.spec["observation_space"])
 
     @cached_property
-    def observation_space(self) -> spaces.Space:
+    def observation_space(self) -> spaces.Space[Any]:
         """The observation space of all environments together."""
         return batch_space(self.single_observation_space, self.num_envs)
 

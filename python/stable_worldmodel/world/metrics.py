@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["Metrics"]
 
 
-class Metrics(dict):
+class Metrics(dict[str, Any]):
     """The metrics of an evaluation.
 
     Keys: `success_rate` in percent; `interval`, its 95 % Wilson interval; `random_success_rate` and `random_interval`,

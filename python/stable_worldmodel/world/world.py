@@ -60,6 +60,7 @@ class World:
 
     #: The number of environments.
     num_envs: int
+    _world: _engine.World
 
     def __init__(
         self,
@@ -162,7 +163,7 @@ class World:
     @cached_property
     def spec(self) -> dict[str, Any]:
         """The specification of the environments: spaces, info columns, factors."""
-        return json.loads(self._world.spec())
+        return dict(json.loads(self._world.spec()))
 
     @property
     def rewards(self) -> np.ndarray:
@@ -180,12 +181,12 @@ class World:
         return self.infos["truncated"][:, 0]
 
     @property
-    def single_action_space(self) -> spaces.Space:
+    def single_action_space(self) -> spaces.Space[Any]:
         """The action space of one environment."""
         return self.envs.single_action_space
 
     @property
-    def action_space(self) -> spaces.Space:
+    def action_space(self) -> spaces.Space[Any]:
         """The action space of all environments together."""
         return self.envs.action_space
 
@@ -297,7 +298,9 @@ class World:
             self.reset()
         actor = self._actor(self.policy)
         if actor is not None and isinstance(self._reset_text, str):
-            begun, self._next_episode = self._world.play(actor, int(steps), self.seed, self._next_episode, self._reset_text)
+            begun, self._next_episode = self._world.play(
+                actor, int(steps), self.seed or 0, self._next_episode, self._reset_text
+            )
             for slot, episode in begun:
                 self._episodes[slot] = episode
             self._fresh[:] = False
@@ -355,7 +358,8 @@ class World:
         """The actions `(num_envs, ..)` of a policy of the engine for the current infos."""
         active = ~(self.terminateds | self.truncateds)
         self._world.act(self._actor(policy), active.tolist())
-        return self._actions.reshape(self.envs.action_space.shape).copy()
+        shape = self.envs.action_space.shape
+        return self._actions.reshape(-1 if shape is None else shape).copy()
 
     def _checked_actions(self, policy: Any, infos: dict[str, Any], active: np.ndarray) -> np.ndarray:
         """The actions of a policy implemented in Python, checked and in the shape and type of the engine."""

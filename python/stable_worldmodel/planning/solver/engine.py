@@ -61,14 +61,14 @@ class EngineSolver:
                 raise TypeError(f"{type(self).__name__} has no setting {name!r}; it has {', '.join(names)}")
             self.settings[engine] = value
         self._solved = 0
-        self._action_space: spaces.Space | None = None
+        self._action_space: spaces.Space[Any] | None = None
         self._n_envs, self._config = 0, None
 
     def __repr__(self) -> str:
         words = [type(self.model).__name__, *(f"{name}={value!r}" for name, value in self.settings.items())]
         return f"{type(self).__name__}({', '.join(words)})"
 
-    def configure(self, *, action_space: spaces.Space, n_envs: int, config: Any) -> None:
+    def configure(self, *, action_space: spaces.Space[Any], n_envs: int, config: Any) -> None:
         """See `Solver.configure`."""
         self._action_space, self._n_envs, self._config = action_space, int(n_envs), config
 
@@ -94,7 +94,7 @@ class EngineSolver:
     @property
     def horizon(self) -> int:
         """The number of model steps in a plan."""
-        return self._configured().horizon
+        return int(self._configured().horizon)
 
     @property
     def action_dim(self) -> int:
@@ -209,9 +209,10 @@ class EngineSolver:
             raise NotConfigured(f"{type(self).__name__}: call configure(action_space=…, n_envs=…, config=…) first")
         return self._config
 
-    def _space(self) -> spaces.Space:
+    def _space(self) -> spaces.Space[Any]:
         self._configured()
-        return single(self._action_space, self._n_envs)
+        space: spaces.Space[Any] = single(self._action_space, self._n_envs)
+        return space
 
 
 def single(space: Any, envs: int) -> Any:
@@ -238,7 +239,7 @@ def last_step(value: Any) -> np.ndarray:
     return np.ascontiguousarray(value, dtype=kinds.get(value.dtype.name, value.dtype))
 
 
-def _dim(space: spaces.Space, block: int) -> int:
+def _dim(space: spaces.Space[Any], block: int) -> int:
     """The dimension of a model step of `block` actions, with one-hot vectors for discrete choices."""
     if isinstance(space, spaces.Discrete):
         return int(space.n) * block

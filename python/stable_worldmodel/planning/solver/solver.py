@@ -13,7 +13,7 @@ __all__ = ["Solver"]
 class Solver(Protocol):
     """What `WorldModelPolicy` requires of a solver. It calls `configure` and `solve`; the properties are for users."""
 
-    def configure(self, *, action_space: spaces.Space, n_envs: int, config: Any) -> None:
+    def configure(self, *, action_space: spaces.Space[Any], n_envs: int, config: Any) -> None:
         """Sets the batched action space, the number of environments and the `PlanConfig`."""
         ...
 

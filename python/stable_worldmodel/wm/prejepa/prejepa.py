@@ -150,7 +150,8 @@ class PreJEPA(PatchEncoder):
     def _next(self, frames: Tensor) -> Tensor:
         """The embedding `(B, S, 1, P, D)` of the frame after the frames `(B, S, T, P, D)`."""
         latest = frames[:, :, -self.history_size :].flatten(0, 1)
-        return self.predict(latest)[:, -1:].unflatten(0, frames.shape[:2])
+        following: Tensor = self.predict(latest)[:, -1:].unflatten(0, frames.shape[:2])
+        return following
 
     def criterion(self, info_dict: dict[str, Any], action_candidates: Tensor | None = None) -> Tensor:
         """The costs `(B, S)` of infos that hold a rollout and the goal: the mean squared error of each part, added up."""

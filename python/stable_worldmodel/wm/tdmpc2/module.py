@@ -99,7 +99,8 @@ class SimNorm(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """`(.., dim)` to `(.., dim)`."""
-        return x.unflatten(-1, (-1, self.simplex_dim)).softmax(-1).flatten(-2)
+        groups: Tensor = x.unflatten(-1, (-1, self.simplex_dim))
+        return groups.softmax(-1).flatten(-2)
 
 
 class NormedLinear(nn.Linear):

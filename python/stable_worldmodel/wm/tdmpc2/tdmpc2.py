@@ -118,7 +118,8 @@ class TDMPC2(Pretrained):
         for _ in range(horizon):
             actions.append(self._drawn(z))
             z = self.dynamics(torch.cat([z, actions[-1]], -1))
-        return torch.stack(actions, 1).unflatten(0, (num_trajs, -1)).mean(0)
+        samples: Tensor = torch.stack(actions, 1).unflatten(0, (num_trajs, -1))
+        return samples.mean(0)
 
     def _observed(self, info_dict: dict[str, Any], device: torch.device) -> Tensor:
         return self.encode({key: info_dict[key].to(device) for key in self.encoding})
@@ -167,7 +168,8 @@ class TDMPC2(Pretrained):
         values = torch.stack([two_hot_inv(q(both), self.cfg) for q in self.qs])
         mean = values.mean(0)
         penalty = float(setting(wm, "uncertainty_penalty", 0.5)) * mean.abs() * values.std(0)
-        return -(total + alive * discount * (mean - penalty)).view(envs, samples)
+        value: Tensor = total + alive * discount * (mean - penalty)
+        return -value.view(envs, samples)
 
 
 def _convolutions() -> nn.Sequential:

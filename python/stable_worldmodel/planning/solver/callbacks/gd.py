@@ -44,5 +44,5 @@ class ActionNormRecorder(Callback):
 
 def _norms(candidates: np.ndarray) -> np.ndarray:
     """The mean norm `(B,)` of candidates `(B, S, H, A)`."""
-    flat: np.ndarray = np.linalg.norm(candidates.reshape(*candidates.shape[:2], -1), axis=-1)
-    return flat.mean(1)
+    norms: np.ndarray = np.linalg.norm(candidates.reshape(*candidates.shape[:2], -1), axis=-1).mean(1)
+    return norms

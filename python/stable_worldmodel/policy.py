@@ -17,7 +17,7 @@ import numpy as np
 from . import _engine, _options
 from .buffer import HistoryBuffer
 from .planning.adapter import has_torch, prepared
-from .planning.solver.engine import EngineSolver, single
+from .planning.solver.engine import EngineSolver, NotConfigured, single
 
 if TYPE_CHECKING:
     from .world import World
@@ -76,8 +76,8 @@ class PlanConfig:
 class BasePolicy:
     """Base class of policies."""
 
-    #: The kind of the policy, for manifests and results.
-    type = "policy"
+    #: The kind of the policy, for manifests and results; the name of the class for `"base"`.
+    type = "base"
 
     def __init__(self, **kwargs: Any) -> None:
         self.env: Any = None
@@ -105,14 +105,19 @@ class _EnginePolicy(BasePolicy):
 
     def get_action(self, obs: Any, **kwargs: Any) -> np.ndarray:
         """The actions for the current infos of the world; `obs` is ignored."""
-        if self.env is None:
-            raise RuntimeError(f"{type(self).__name__}: it belongs to no world; call world.set_policy(policy) first")
+        if getattr(self.env, "_world", None) is None:
+            name = type(self).__name__
+            raise NotConfigured(f"{name}: it acts in the environments of a World; call world.set_policy(policy) first")
         actions: np.ndarray = self.env._world._engine_actions(self)
         return actions
 
 
 class RandomPolicy(_EnginePolicy):
-    """Samples actions uniformly from the action space."""
+    """Samples actions uniformly from the action space: of a World, or of any object with an `action_space`.
+
+    Args:
+        seed: Combined with the seed of each episode in a World; elsewhere the seed of the action space.
+    """
 
     type = "random"
 
@@ -120,11 +125,30 @@ class RandomPolicy(_EnginePolicy):
         super().__init__(**kwargs)
         self.seed = seed
 
+    def set_env(self, env: Any) -> None:
+        super().set_env(env)
+        if env is not None and not self._is_in_world() and self.seed is not None:
+            env.action_space.seed(self.seed)
+
     def set_seed(self, seed: int) -> None:
-        """Sets the policy's seed, which is combined with the seed of each episode."""
+        """Sets the policy's seed."""
         self.seed = seed
-        if self.env is not None:
+        if self._is_in_world():
             self.env._world._drop_actor(self)
+        elif self.env is not None:
+            self.env.action_space.seed(seed)
+
+    def get_action(self, obs: Any, **kwargs: Any) -> np.ndarray:
+        """The actions `(num_envs, ..)`; `obs` is ignored."""
+        if self.env is None or self._is_in_world():
+            return super().get_action(obs)
+        sampled: np.ndarray = self.env.action_space.sample()
+        return sampled
+
+    def _is_in_world(self) -> bool:
+        from .world.env_pool import WorldEnvs
+
+        return isinstance(self.env, WorldEnvs)
 
     def _actor(self, world: World) -> Any:
         return _engine.Actor.random(world._world, self.seed)
@@ -267,7 +291,7 @@ class MPCPolicy(BasePolicy):
         block = int(getattr(model, "action_block", 1))
         if config is None:
             config = PlanConfig(action_block=block)
-        elif hasattr(model, "_engine_model") and config.action_block != block:
+        elif isinstance(getattr(model, "_engine_model", None), _engine.Model) and config.action_block != block:
             raise ValueError(f"PlanConfig.action_block: {config.action_block}; {model} was trained with {block}")
         self.cfg = self.config = config
         self.process, self.transform = _process(process, model), dict(transform or {})
@@ -376,7 +400,9 @@ class MPCPolicy(BasePolicy):
         init: Any = None
         if self.cfg.warm_start and any(rest is not None for rest in known):
             template = next(rest for rest in known if rest is not None)
-            init = np.stack([np.zeros_like(template) if rest is None else rest for rest in known])
+            # Solvers for discrete actions take -1 as no known option.
+            unknown = np.full_like(template, -1 if isinstance(self.solver, EngineSolver) and template.dtype.kind == "i" else 0)
+            init = np.stack([unknown if rest is None else rest for rest in known])
             if has_torch():
                 import torch
 

@@ -16,6 +16,11 @@ from gymnasium import spaces
 
 __all__ = ["Box", "Dict", "Discrete", "MultiDiscrete", "RGBBox", "reset_variation_space"]
 
+
+class OutsideError(ValueError, AssertionError):
+    """A value is not in its space, or violates a condition."""
+
+
 #: The number of samples after which a condition is considered impossible.
 TRIES = 1000
 
@@ -41,9 +46,8 @@ class _Factor:
 
     def _begin(self, init_value: Any, constrain_fn: Callable[[Any], bool] | None) -> None:
         self.constrain_fn = constrain_fn
-        self._init_value = self._value = None if init_value is None else self._typed(init_value)
-        if init_value is not None and not self.contains(self._init_value):
-            raise ValueError(f"init_value {init_value!r} is not in {self}, or violates its constrain_fn")
+        # A default outside of the space is allowed; `check` reports it.
+        self._init_value = self._value = self._typed(init_value) if isinstance(init_value, (list, tuple)) else init_value
 
     def _typed(self, value: Any) -> Any:
         """The value in the type of the space, unless the conversion to integers is inexact."""
@@ -101,7 +105,7 @@ class _Factor:
     def _allowed(self, value: Any) -> Any:
         typed = self._typed(value)
         if not self.contains(typed):
-            raise ValueError(f"{value!r} is not in {self}, or violates its constrain_fn")
+            raise OutsideError(f"{value!r} is not in {self}, or violates its constrain_fn")
         return typed
 
     def set_init_value(self, value: Any) -> None:
@@ -173,8 +177,9 @@ class MultiDiscrete(_Factor, spaces.MultiDiscrete):  # type: ignore[misc]
 class Dict(spaces.Dict):
     """Factors by name, nested: a `variation_space`.
 
-    Factors are sampled in `sampling_order` (by default the order of definition), so the condition of a factor may read the
-    values of earlier factors. All factors are sampled again until the condition of the whole `Dict` holds.
+    Factors are sampled in `sampling_order`, then in the order of `spaces` (Gymnasium sorts the keys of a dict), so the
+    condition of a factor may read the values of earlier factors. All factors are sampled again until the condition of the
+    whole `Dict` holds. Spaces of Gymnasium without a value may be members; they are sampled only.
     """
 
     def __init__(
@@ -187,8 +192,7 @@ class Dict(spaces.Dict):
     ) -> None:
         members = dict(spaces_dict or {})
         super().__init__(members, **kwargs)
-        # Gymnasium sorts the keys; sampling follows the order of definition.
-        self.spaces: dict[str, Any] = dict(members)
+        self.spaces: dict[str, Any]
         self.constrain_fn = constrain_fn
         named = list(sampling_order or [])
         unknown = [key for key in named if key not in self.spaces]
@@ -202,11 +206,14 @@ class Dict(spaces.Dict):
     @property
     def init_value(self) -> dict[str, Any]:
         """The defaults, nested as the spaces are."""
-        return {key: space.init_value for key, space in self.spaces.items()}
+        return {key: space.init_value if _has_value(space) else space.sample() for key, space in self.spaces.items()}
 
     @property
     def value(self) -> dict[str, Any]:
         """The current values, nested as the spaces are."""
+        plain = [key for key, space in self.spaces.items() if not _has_value(space)]
+        if plain:
+            raise ValueError(f"{plain} are spaces of Gymnasium, which have no value; use those of stable_worldmodel.spaces")
         return {key: space.value for key, space in self.spaces.items()}
 
     @property
@@ -242,7 +249,7 @@ class Dict(spaces.Dict):
 
     def reset(self) -> None:
         """Sets every factor to its default."""
-        for space in self.spaces.values():
+        for space in filter(_has_value, self.spaces.values()):
             space.reset()
 
     def contains(self, x: Any) -> bool:
@@ -255,7 +262,7 @@ class Dict(spaces.Dict):
 
     def check(self, debug: bool = False) -> bool:
         """Whether every current value is in its space and all conditions hold."""
-        wrong = [key for key, factor in self.factors() if not factor.check()]
+        wrong = [key for key, factor in self.factors() if _has_value(factor) and not factor.check()]
         if debug and wrong:
             names = ", ".join(wrong)
             warnings.warn(f"the values of {names} are outside their spaces or violate a constrain_fn", stacklevel=2)
@@ -278,12 +285,18 @@ class Dict(spaces.Dict):
         for _ in range(max_tries):
             slow.check()
             value = {
-                key: self.spaces[key].sample(masks.get(key), set_value=set_value, probability=chances.get(key))
+                key: self._sampled(self.spaces[key], masks.get(key), set_value, chances.get(key))
                 for key in self._sampling_order
             }
             if self.constrain_fn is None or self.constrain_fn(value):
                 return {key: value[key] for key in self.spaces}
         raise RuntimeError(f"the factors' common constrain_fn did not hold in {max_tries} tries; relax it or narrow the spaces")
+
+    @staticmethod
+    def _sampled(space: Any, mask: Any, set_value: bool, probability: Any) -> Any:
+        if not _has_value(space):
+            return space.sample(mask)
+        return space.sample(mask, set_value=set_value, probability=probability)
 
     def update(self, keys: Iterable[str]) -> None:
         """Samples these factors and groups in sampling order; `all` selects every factor."""
@@ -331,6 +344,11 @@ class Dict(spaces.Dict):
         return "\n".join(lines)
 
 
+def _has_value(space: Any) -> bool:
+    """Whether a space is one of this module."""
+    return isinstance(space, (_Factor, Dict))
+
+
 def reset_variation_space(
     variation_space: Dict,
     seed: int | None = None,
@@ -350,7 +368,7 @@ def reset_variation_space(
     variation_space.update([names] if isinstance(names, str) else names)
     variation_space.set_value(options.get("variation_values") or {})
     if not variation_space.check():
-        raise ValueError(f"some factors are outside their spaces or violate a constrain_fn: {variation_space.value}")
+        raise OutsideError(f"some factors are outside their spaces or violate a constrain_fn: {variation_space.value}")
 
 
 def from_description(described: Mapping[str, Any]) -> spaces.Space[Any]:
@@ -359,7 +377,7 @@ def from_description(described: Mapping[str, Any]) -> spaces.Space[Any]:
     if kind == "Dict":
         return spaces.Dict({key: from_description(inner) for key, inner in described["spaces"].items()})
     factor = "init_value" in described
-    more = {"init_value": described["init_value"]} if factor else {}
+    more = {"init_value": _default(described)} if factor else {}
     if kind == "Discrete":
         return (Discrete if factor else spaces.Discrete)(described["n"], start=described["start"], **more)
     if kind == "MultiDiscrete":
@@ -376,6 +394,16 @@ def from_description(described: Mapping[str, Any]) -> spaces.Space[Any]:
     shape = tuple(described["shape"])
     low, high = (np.broadcast_to(side, shape).astype(dtype) for side in (low, high))
     return (Box if factor else spaces.Box)(low, high, shape=shape, dtype=dtype.type, **more)
+
+
+def _default(described: Mapping[str, Any]) -> Any:
+    """The default of a factor, in the type of its space."""
+    if described["type"] == "Discrete":
+        return int(described["init_value"])
+    kinds = {"MultiDiscrete": np.int64, "RGBBox": np.uint8}
+    dtype = kinds.get(described["type"]) or np.dtype(described["dtype"])
+    value = np.asarray(described["init_value"], dtype=dtype)
+    return value if "shape" not in described else value.reshape(tuple(described["shape"]))
 
 
 def _unbounded(bounds: Any, bound: float) -> Any:
@@ -397,6 +425,7 @@ def variation_space(factors: Mapping[str, Mapping[str, Any]], order: Sequence[st
             node[name] = from_description(factors[key])
 
     def nested(node: Mapping[str, Any]) -> Dict:
-        return Dict({key: nested(inner) if isinstance(inner, dict) else inner for key, inner in node.items()})
+        members = {key: nested(inner) if isinstance(inner, dict) else inner for key, inner in node.items()}
+        return Dict(members, sampling_order=list(node))
 
     return nested(tree)

@@ -87,7 +87,6 @@ def test_invalid_episodes_are_rejected_and_valid_ones_stored(tmp_path):
     path = tmp_path / "a.lance"
     valid = episode(0, 5)
     cases = [
-        ({**valid, "action": np.zeros((5, 2), np.float32)}, ValueError, "the last row is the final observation"),
         ({**valid, "state": np.zeros((4, 4))}, ValueError, "same number of steps"),
         ({name: array for name, array in valid.items() if name != "reward"}, ValueError, r"missing \['reward'\]"),
         ({**valid, "extra": np.zeros(5)}, ValueError, r"unexpected \['extra'\]"),

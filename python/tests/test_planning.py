@@ -118,11 +118,11 @@ def test_continuous_solvers_find_the_optimum(solver, settings, tolerance):
 @pytest.mark.parametrize(("solver", "settings"), DISCRETE, ids=["categorical-cem", "pgd"])
 def test_discrete_solvers_find_the_best_choices(solver, settings):
     actions = plan(solver(Prices(), **settings), space=CHOICES)
-    assert actions.shape == (3, 3, 3)
-    assert (actions.argmax(-1) == np.arange(3)[:, None]).all()
+    assert actions.shape == (3, 3, 1) and actions.dtype == np.int64
+    assert (actions == np.arange(3)[:, None, None]).all()
     # Two choices in one step of the model.
-    blocks = plan(solver(BlockPrices(), **settings), space=CHOICES, action_block=2).reshape(3, 3, 2, 3)
-    assert (blocks.argmax(-1) == np.arange(3)[:, None, None]).all()
+    blocks = plan(solver(BlockPrices(), **settings), space=CHOICES, action_block=2)
+    assert blocks.shape == (3, 3, 2) and (blocks == np.arange(3)[:, None, None]).all()
 
 
 class BlockPrices(Prices):
@@ -322,7 +322,7 @@ def test_wrong_model_stops_an_evaluation(defect, error, words):
         (lambda: plan(solvers.GRASPSolver(Quadratic())), ValueError, "grasp|latent"),
         (lambda: plan(solvers.LagrangianSolver(Quadratic(), tolerance=-1)), ValueError, "tolerance"),
         (lambda: plan(solvers.CEMSolver(Prices()), space=CHOICES), ValueError, "continuous actions.*swm solvers"),
-        (lambda: plan(solvers.PGDSolver(Quadratic())), ValueError, "gd|continuous"),
+        (lambda: plan(solvers.PGDSolver(Quadratic())), ValueError, "PGDSolver plans discrete actions"),
         (lambda: solvers.GradientSolver(Quadratic(), optimizer_cls=torch.optim.RMSprop), ValueError, "adam|Adam"),
         (lambda: swm.PlanConfig(horizon=2, receding_horizon=3), ValueError, "execute"),
         (lambda: swm.policy.MPCPolicy(object()), TypeError, "configure"),

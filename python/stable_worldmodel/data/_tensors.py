@@ -200,6 +200,23 @@ def _equal_lengths(arrays: dict[str, Array]) -> None:
         raise ValueError(f"the columns of an episode must have the same number of steps, got {lengths}")
 
 
+def without_last_action(arrays: dict[str, Array]) -> bool:
+    """Marks the action of the last row as missing, because no observation follows it; returns whether there was one."""
+    action = arrays.get("action")
+    if action is None or not len(action) or action.dtype.kind not in "fi":
+        return False
+    known = ~np.isnan(action[-1]) if action.dtype.kind == "f" else action[-1] != -1
+    if not known.any():
+        return False
+    arrays["action"] = action = action.copy()
+    action[-1] = _missing(action.dtype)
+    return True
+
+
+#: What a writer warns of, once, when an episode has an action in its last row.
+LAST_ACTION = "the action of an episode's last row is left out, because no observation follows it"
+
+
 def _missing(dtype: np.dtype[Any]) -> float:
     """The value of a missing action."""
     return {"f": np.nan, "i": -1}.get(dtype.kind, 0)

@@ -129,7 +129,9 @@ def get_format(name: str) -> type[Format]:
 
 
 def detect_format(path: str | os.PathLike[str]) -> type[Format] | None:
-    """The format of a path; user-defined formats take precedence."""
+    """The format of a path; user-defined formats take precedence. `lerobot://OWNER/NAME` names a LeRobot dataset."""
+    if os.fspath(path).startswith("lerobot://"):
+        return FORMATS["lerobot"]
     ordered = sorted(FORMATS.values(), key=lambda kind: kind.native)
     return next((kind for kind in ordered if kind.detect(path)), None)
 

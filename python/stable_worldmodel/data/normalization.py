@@ -126,7 +126,10 @@ class PercentileScaler(_Affine):
 
     def fit(self, X: Any) -> PercentileScaler:
         """Fits the scaler to values `(..., d)`; rows with NaN are ignored."""
-        self.q_low, self.q_high = np.percentile(_finite_rows(X), [self.low, self.high], axis=0)
+        rows = _finite_rows(X)
+        self.q_low, self.q_high = np.percentile(rows, [self.low, self.high], axis=0).astype(
+            np.result_type(rows.dtype, np.float32)
+        )
         return self
 
     def _bounds(self) -> tuple[Array | None, Array | None]:

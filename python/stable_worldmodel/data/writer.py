@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -71,7 +72,7 @@ class EpisodeWriter:
         self._codec = codec_json(codec, jpeg_quality)
         self._manifest = None if manifest is None else self._provenance(manifest)
         self._writer: Any = None
-        self._closed = False
+        self._closed = self._warned = False
         #: The columns and their types, once they are known.
         self._columns: dict[str, tuple[str, tuple[int, ...]]] = {}
         location = Path(self.path)
@@ -103,13 +104,17 @@ class EpisodeWriter:
         """Adds an episode: a list of steps or an array `(T, ...)` for each column.
 
         Row `t` holds the observation at `t` and the action taken from it. The action of the last row is missing: NaN, -1 for
-        integers, or left out.
+        integers, or one action fewer. An action in the last row is left out, with a warning, because no observation
+        follows it.
         """
         if self._closed:
             raise ValueError(f"{self.path}: the writer is closed; open another one with mode='append'")
         arrays, constants = _tensors.rows(ep_data)
         if not arrays:
             raise ValueError("an episode needs at least one numeric column")
+        if _tensors.without_last_action(arrays) and not self._warned:
+            self._warned = True
+            warnings.warn(f"{self.path}: {_tensors.LAST_ACTION}", stacklevel=2)
         if not self._columns:
             self._columns = {name: (array.dtype.name, array.shape[1:]) for name, array in arrays.items()}
         fitted = self._fitted(arrays)

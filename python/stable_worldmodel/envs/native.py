@@ -21,7 +21,7 @@ class NativeEnv(gymnasium.Env):
 
     Args:
         name: The id of the environment.
-        render_mode: `"rgb_array"` or `None`.
+        render_mode: `"rgb_array"`, or `None` for no frames.
         image_shape: `(height, width)` of frames.
         **options: Options of the environment, such as `env_type="double"`.
 
@@ -32,7 +32,7 @@ class NativeEnv(gymnasium.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 15}
 
     def __init__(
-        self, name: str, render_mode: str | None = None, image_shape: tuple[int, int] = (224, 224), **options: Any
+        self, name: str, render_mode: str | None = "rgb_array", image_shape: tuple[int, int] = (224, 224), **options: Any
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode: expected 'rgb_array' or None, got {render_mode!r}")

@@ -52,6 +52,10 @@ def prepared(info: Mapping[str, Any], process: Mapping[str, Any], transform: Map
     return out
 
 
+class CostError(ValueError, AssertionError):
+    """A model returned costs of another shape."""
+
+
 class Adapter:
     """A Python model for the engine, with numpy arrays as arguments and results.
 
@@ -148,10 +152,15 @@ class Adapter:
             timed["history_action"] = timed["action_history"] = infos["history.action"]
         self.set_infos(timed)
 
-    def set_infos(self, infos: Mapping[str, Any]) -> None:
-        """Sets the infos `(B, T, ..)`, tensors or arrays."""
+    def set_infos(self, infos: Mapping[str, Any], envs: int | None = None) -> None:
+        """Sets the infos `(B, T, ..)`: tensors, arrays, or lists and texts, which the model gets as they are.
+
+        Args:
+            infos: The infos.
+            envs: The number of environments, B; that of the first entry for `None`.
+        """
         self._infos = prepared(infos, self.process, self.transform)
-        self._envs = len(next(iter(self._infos.values())))
+        self._envs = len(next(iter(self._infos.values()))) if envs is None else envs
         self._expanded_infos.clear()
 
     def cost(self, candidates: np.ndarray) -> np.ndarray:
@@ -237,7 +246,7 @@ class Adapter:
         if tuple(getattr(cost, "shape", ())) != expected:
             got = tuple(cost.shape) if hasattr(cost, "shape") else type(cost).__name__
             name = type(self.model).__name__
-            raise ValueError(f"{name}.get_cost: expected costs of shape {expected} (environments, candidates), got {got}")
+            raise CostError(f"{name}.get_cost: expected costs of shape {expected} (environments, candidates), got {got}")
         return cost if not isinstance(cost, np.ndarray) else _torch().from_numpy(cost)
 
     def _parts(self, candidates: np.ndarray, what: str) -> Any:
@@ -263,7 +272,7 @@ class Adapter:
                 selected = self._on_device(value[rows]).unsqueeze(1)
                 infos[key] = selected.expand(-1, samples, *selected.shape[2:])
             else:
-                infos[key] = value[rows] if isinstance(value, list) else value
+                infos[key] = value[rows] if isinstance(value, list) and len(value) == self._envs else value
         if "action" not in infos and self.torch:
             infos["action"] = self._tensor(np.zeros((part.shape[0], samples, 1, dim), dtype=np.float32))
         return infos

@@ -55,7 +55,8 @@ class World:
 
     Attributes:
         infos: The info columns by name: arrays `(num_envs, 1, ..)` in the engine's memory, which every reset and step
-            overwrites. `infos[name].copy()` keeps the values of a step.
+            overwrites. `infos[name].copy()` keeps the values of a step. Factors that the `variation` of a `reset` names are in
+            the infos as `variation.KEY`.
     """
 
     #: The number of environments.
@@ -147,6 +148,8 @@ class World:
         #: The options of resets, the same for all environments or one for each.
         self._reset_text: str | list[str] = _options.reset(None, {})
         self._fresh = np.ones(self.num_envs, bool)
+        #: The factors that resets sample, which the infos contain as `variation.KEY`.
+        self._varied: list[str] = []
 
     @staticmethod
     def _is_native(env_name: str) -> bool:
@@ -237,6 +240,8 @@ class World:
             policy.set_env(self.envs)
         self.policy = policy
         self._drop_actor(policy)
+        if getattr(policy, "seed", None) is not None and callable(getattr(policy, "set_seed", None)):
+            policy.set_seed(policy.seed)
 
     def reset(
         self,
@@ -258,6 +263,8 @@ class World:
             self._reset_text = [_options.reset(given, factors) for given in options]
         else:
             self._reset_text = _options.reset(options, factors)
+        named = self._varied_by(options if isinstance(options, Sequence) else [options])
+        self._varied = self._varied if named is None else named
         single = seed is None or isinstance(seed, (int, np.integer))
         self.seed = _seed(seed if single else None)  # type: ignore[arg-type]
         self._episodes = list(range(self.num_envs))
@@ -277,9 +284,29 @@ class World:
         """Resets environments, given as pairs of slot and seed, with the options of the last `reset`."""
         if isinstance(self._reset_text, str):
             self._world.reset(starts, self._reset_text)
-            return
-        for slot, seed in starts:
-            self._world.reset([(slot, seed)], self._reset_text[slot])
+        else:
+            for slot, seed in starts:
+                self._world.reset([(slot, seed)], self._reset_text[slot])
+        self._show_factors([slot for slot, _ in starts])
+
+    def _varied_by(self, options: Sequence[Mapping[str, Any] | None]) -> list[str] | None:
+        """The factors that the options sample; `None` if they have no `variation`."""
+        given = [one["variation"] for one in options if one and one.get("variation") is not None]
+        names = {name for one in given for name in ([one] if isinstance(one, str) else one)}
+        keys = [key for key in self.spec["variation"] if names & {"all", key, *_groups(key)}]
+        return keys if given else None
+
+    def _show_factors(self, slots: Sequence[int]) -> None:
+        """Writes the sampled factors of environments to the infos."""
+        for stale in [name for name in self.infos if name.startswith("variation.") and name[10:] not in self._varied]:
+            del self.infos[stale]
+        for slot in slots if self._varied else ():
+            values = self._world.factors(slot)
+            for key in self._varied:
+                space = self.variation_space.find(key)
+                shape = (self.num_envs, 1, *(space.shape or ()))
+                column = self.infos.setdefault(f"variation.{key}", np.zeros(shape, space.dtype))
+                column[slot, 0] = np.reshape(values[key], shape[2:])
 
     def _transform(self) -> None:
         """Refreshes the transformed frames in `infos`."""
@@ -303,6 +330,7 @@ class World:
             )
             for slot, episode in begun:
                 self._episodes[slot] = episode
+            self._show_factors([slot for slot, _ in begun])
             self._fresh[:] = False
             self._transform()
             return
@@ -641,6 +669,12 @@ class World:
         self._actors.clear()
 
 
+def _groups(key: str) -> list[str]:
+    """The groups that contain a factor: `a` and `a.b` for `a.b.c`."""
+    parts = key.split(".")
+    return [".".join(parts[:end]) for end in range(1, len(parts))]
+
+
 def _random_seed() -> int:
     """A random seed of 32 bits."""
     return secrets.randbits(32)
@@ -656,7 +690,8 @@ def _seed(seed: int | None) -> int:
 
 
 def _name(policy: Any) -> str:
-    return str(getattr(policy, "type", None) or type(policy).__name__)
+    kind = getattr(policy, "type", None)
+    return type(policy).__name__ if kind in (None, "", "base") else str(kind)
 
 
 def _without_states(options: Mapping[str, Any] | None) -> Mapping[str, Any] | None:

@@ -162,9 +162,10 @@ class EverythingToInfoWrapper(gymnasium.Wrapper):
         for key in self._factors:
             space = get_in(self.env.unwrapped.variation_space, key.split("."))  # type: ignore[attr-defined]
             added[f"variation.{key}"] = space.value
+        observed = set(observation) if isinstance(observation, Mapping) else {"observation"}
         for key in added.keys() & info.keys():
             # Native environments have the values of their observation in the infos as well.
-            if not _equal(info[key], added[key]):
+            if key not in observed or not _equal(info[key], added[key]):
                 raise CollisionError(f"the infos of {self.env} have the key {key!r} already; rename it with MapKeysWrapper")
         info.update(added)
         return info
@@ -298,7 +299,7 @@ class MegaWrapper(gymnasium.Wrapper):
         pixels_transform: A function of the resized frame, a `PIL.Image`.
         goal_transform: The same for the frame of the goal.
         required_keys: Regular expressions that keys of the infos must match.
-        separate_goal: Whether the frame of the goal is resized.
+        separate_goal: Has no effect: the frame of the goal is resized if the infos have one.
         image_resample: The filter of Pillow that resizes frames, or its name: `"bilinear"`, `"nearest"`, …
         add_pixels: Whether frames are rendered.
     """
@@ -320,6 +321,6 @@ class MegaWrapper(gymnasium.Wrapper):
             required.append(r"pixels(\..*)?")
             env = AddPixelsWrapper(env, image_shape, pixels_transform, resample)
         env = EnsureInfoKeysWrapper(EverythingToInfoWrapper(env), required)
-        if add_pixels and separate_goal:
+        if add_pixels:
             env = ResizeGoalWrapper(env, image_shape, goal_transform, resample)
         super().__init__(env)

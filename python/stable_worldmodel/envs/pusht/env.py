@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from ..named import NamedEnv
 
 __all__ = ["PushT"]
@@ -39,3 +41,13 @@ class PushT(NamedEnv):
         self._refuse(block_cog=(block_cog, None), damping=(damping, None), render_action=(render_action, False))
         self._refuse(with_target=(with_target, True), relative=(relative, True))
         super().__init__(render_mode, init_value, resolution)
+
+    def eval_state(self, goal_state: Any, cur_state: Any) -> tuple[bool, float]:
+        """Whether a state `(7,)` satisfies a goal state, and the distance of the two.
+
+        The goal is satisfied if the positions of agent and block differ by less than 20 units, and the angle by less than 20
+        degrees. The distance is that of all elements.
+        """
+        off = np.asarray(cur_state, np.float64) - np.asarray(goal_state, np.float64)
+        turn = abs((off[4] + np.pi) % (2 * np.pi) - np.pi)
+        return bool(np.linalg.norm(off[:4]) < 20 and turn < np.pi / 9), float(np.linalg.norm(off))

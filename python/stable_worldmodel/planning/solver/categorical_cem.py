@@ -5,14 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
+import numpy as np
+
 from .callbacks import Callback
 from .discrete import DiscreteSolver
+from .hooks import choice_shape
 
 __all__ = ["CategoricalCEMSolver"]
 
 
 class CategoricalCEMSolver(DiscreteSolver):
     """CEM for discrete actions: refits the probability of every option.
+
+    Results of `solve` also have `probs`: a list with the final probabilities, `(B, horizon, action_block, options)`, or
+    `(B, horizon, action_simplex_dim)` if choices differ in their options.
 
     Args:
         cost, batch_size, num_samples, n_steps, topk, device, seed, callbacks: As for `CEMSolver`.
@@ -47,7 +53,20 @@ class CategoricalCEMSolver(DiscreteSolver):
         super().__init__(cost, batch_size=batch_size, device=device, seed=seed, callbacks=callbacks, **{**named, **settings})
 
     def init_probs(self, n_envs: int) -> Any:
-        """The initial probabilities, a tensor `(n_envs, horizon, action_dim)`: equal for all options of a choice."""
+        """The initial probabilities, shaped as `probs` of a result: equal for all options of a choice."""
         import torch
 
-        return torch.from_numpy(self._uniform()).to(self.dtype).expand(n_envs, self.horizon, -1).clone()
+        flat = torch.from_numpy(self._uniform()).to(self.dtype).expand(n_envs, self.horizon, -1).clone()
+        shape = choice_shape(self._options())
+        return flat if shape is None else flat.reshape(n_envs, self.horizon, *shape)
+
+    def _watched(self, adapter: Any) -> Any:
+        watched = super()._watched(adapter)
+        settings = self._all_settings()
+        initial = np.broadcast_to(self._uniform(), (self.horizon, self._plan_dim))
+        watched.choose(self._options(), float(settings["smoothing"]), initial)
+        return watched
+
+    def _outputs(self, result: dict[str, Any], watched: Any) -> dict[str, Any]:
+        found = super()._outputs(result, watched)
+        return found if watched is None else {**found, "probs": [watched.fitted()]}

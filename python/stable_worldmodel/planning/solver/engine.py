@@ -10,11 +10,11 @@ import numpy as np
 from gymnasium import spaces
 
 from ... import _engine
-from ..adapter import Adapter, has_torch
+from ..adapter import Adapter
 from .callbacks import Callback, StopSearch
-from .hooks import Watched
+from .hooks import Watched, view
 
-__all__ = ["EngineSolver", "NotConfigured", "last_step", "single"]
+__all__ = ["EngineSolver", "NotConfigured", "last_step", "single", "summed_costs"]
 
 
 class NotConfigured(RuntimeError, AttributeError):
@@ -54,6 +54,8 @@ class EngineSolver:
         self.model, self.batch_size, self.device, self.seed = model, batch_size, device, int(seed)
         known = json.loads(_engine.solvers())[self.id]
         self.settings: dict[str, Any] = {}
+        #: Arguments of the constructor that are no settings of the engine.
+        self._given: dict[str, Any] = {}
         for name, value in settings.items():
             engine = self._names.get(name, name)
             if engine not in known:
@@ -89,6 +91,7 @@ class EngineSolver:
     @property
     def n_envs(self) -> int:
         """The number of environments."""
+        self._configured()
         return self._n_envs
 
     @property
@@ -99,6 +102,11 @@ class EngineSolver:
     @property
     def action_dim(self) -> int:
         """The dimension of one model step."""
+        return self._plan_dim
+
+    @property
+    def _plan_dim(self) -> int:
+        """The dimension of one model step in the engine, with one-hot vectors for discrete choices."""
         return _dim(self._space(), self._configured().action_block)
 
     def adapter(self, process: Any = None, transform: Any = None, history: int = 1) -> Any:
@@ -112,7 +120,7 @@ class EngineSolver:
         engine = getattr(self.model, "_engine_model", None)
         if engine is not None:
             return engine
-        return Adapter(self.model, self.device, self.batch_size, process, transform, history, self.action_dim)
+        return Adapter(self.model, self.device, self.batch_size, process, transform, history, self._plan_dim)
 
     def solve(self, info_dict: dict[str, Any], init_action: Any = None) -> dict[str, Any]:
         """Plans for every row of `info_dict` `(B, T, ..)`.
@@ -126,17 +134,17 @@ class EngineSolver:
         Returns:
             A dict with `actions` `(B, horizon, action_dim)`, `costs` (for each environment, the cost of the cheapest
             candidate of the last iteration), `trace` (the record of each search) and, with callbacks, `callbacks`: the
-            history of each callback by its `output_key`.
+            history of each callback by its `output_key`. The other keys depend on the solver.
         """
         config, space = self._configured(), self._space()
-        block, horizon, dim = config.action_block, config.horizon, self.action_dim
+        block, horizon, dim = config.action_block, config.horizon, self._plan_dim
         model = self.adapter()
         if model is None:
             raise ValueError("solve: the simulator needs the environments, and solve gets infos only; use MPCPolicy")
         infos = {key: value for key, value in info_dict.items() if not isinstance(value, (list, str))}
         envs = len(next(iter(infos.values())))
         if isinstance(model, Adapter):
-            model.set_infos(infos)
+            model.set_infos(info_dict, envs)
             engine_infos: dict[str, Any] = {}
         else:
             engine_infos = {key: last_step(value) for key, value in infos.items()}
@@ -165,31 +173,42 @@ class EngineSolver:
             iterates = "iterations" in json.loads(_engine.solvers())[self.id]
             actions, costs, trace = search({**self.settings, **({"iterations": len(watched.recorded)} if iterates else {})})
         self._solved += 1
-        found: Any = actions
-        if has_torch():
-            import torch
-
-            found = torch.from_numpy(actions)
-        result = {"actions": found, "costs": costs.tolist(), "trace": json.loads(trace)}
+        result = {"actions": view(actions), "costs": costs.tolist(), "trace": json.loads(trace)}
+        result |= self._outputs(result, watched)
         if self.callbacks:
             for callback in self.callbacks:
                 callback.end_solve()
             result["callbacks"] = {callback.output_key: callback.history for callback in self.callbacks}
         return result
 
+    def _outputs(self, result: dict[str, Any], watched: Watched | None) -> dict[str, Any]:
+        """The entries of the result that only this solver has, or has otherwise; no `watched` for a checkpoint."""
+        return {}
+
+    def _all_settings(self) -> dict[str, Any]:
+        """The settings, with the engine's defaults."""
+        return {**json.loads(_engine.solvers())[self.id], **self.settings}
+
     def _watched(self, adapter: Adapter) -> Watched:
-        settings = {**json.loads(_engine.solvers())[self.id], **self.settings}
+        settings = self._all_settings()
         # Predictive sampling has no elites; its plan is the cheapest candidate.
         elites = 0 if self._descends else int(settings.get("elites", 1))
         sigma, momentum = float(settings.get("sigma", 0.0)), float(settings.get("momentum", 0.0))
-        return Watched(adapter, self.callbacks, elites, sigma, momentum)
+        space: Any = self._space()
+        limits = (space.low, space.high) if isinstance(space, spaces.Box) and self.id == "icem" else None
+        return Watched(adapter, self.callbacks, elites, sigma, momentum, limits=limits)
 
     def __getattr__(self, name: str) -> Any:
+        if isinstance(getattr(type(self), name, None), property):
+            self._configured()
         # The settings by their names in the constructor.
         engine = type(self)._names.get(name, name)
         settings = self.__dict__.get("settings", {})
         if engine in settings:
             return settings[engine]
+        given = self.__dict__.get("_given", {})
+        if name in given:
+            return given[name]
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def __call__(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
@@ -201,8 +220,8 @@ class EngineSolver:
         import torch
 
         if actions is None:
-            return torch.zeros(n_envs, self.horizon, self.action_dim, dtype=self.dtype)
-        return torch.from_numpy(_padded(actions, n_envs, self.horizon, self.action_dim)).to(self.dtype)
+            return torch.zeros(n_envs, self.horizon, self._plan_dim, dtype=self.dtype)
+        return torch.from_numpy(_padded(actions, n_envs, self.horizon, self._plan_dim)).to(self.dtype)
 
     def _configured(self) -> Any:
         if self._config is None:
@@ -213,6 +232,14 @@ class EngineSolver:
         self._configured()
         space: spaces.Space[Any] = single(self._action_space, self._n_envs)
         return space
+
+
+def summed_costs(trace: list[dict[str, Any]], samples: int) -> list[list[float]]:
+    """The sum of the costs of all candidates of all environments, in every step of a gradient solver."""
+    means = np.array([search["mean"] for search in trace], dtype=np.float64)
+    # The last entry is the comparison of the final candidates.
+    totals: list[float] = (samples * means.sum(0))[:-1].tolist()
+    return [totals]
 
 
 def single(space: Any, envs: int) -> Any:

@@ -11,7 +11,10 @@ __all__ = ["GaussianSolver"]
 
 
 class GaussianSolver(EngineSolver):
-    """Base class of the solvers that sample plans from a Gaussian."""
+    """Base class of the solvers that sample plans from a Gaussian.
+
+    Results of `solve` also have `mean` and `var`: lists with the final mean and standard deviation, `(B, horizon, dim)`.
+    """
 
     _names: ClassVar[Mapping[str, str]] = {
         "num_samples": "samples",
@@ -19,6 +22,9 @@ class GaussianSolver(EngineSolver):
         "topk": "elites",
         "var_scale": "sigma",
     }
+
+    def _outputs(self, result: dict[str, Any], watched: Any) -> dict[str, Any]:
+        return {} if watched is None else {"mean": [result["actions"]], "var": [watched.fitted()]}
 
     def init_action_distrib(self, n_envs: int, actions: Any = None) -> tuple[Any, Any]:
         """The initial mean and standard deviation, tensors `(n_envs, horizon, action_dim)`.

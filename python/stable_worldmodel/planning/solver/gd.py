@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 from .callbacks import Callback
-from .engine import EngineSolver
+from .engine import EngineSolver, summed_costs
 from .optimizer import optimizer
 
 __all__ = ["GradientSolver"]
@@ -25,6 +25,8 @@ class GradientSolver(EngineSolver):
         optimizer_kwargs: Arguments of the optimizer.
         grad_clip: The largest norm of a candidate's gradient.
         **settings: As for `CEMSolver`.
+
+    Results of `solve` also have `cost`, `[[..]]`: the sum of the costs of all candidates in every step.
     """
 
     id = "gd"
@@ -57,6 +59,10 @@ class GradientSolver(EngineSolver):
         if optimizer_cls is not None or optimizer_kwargs is not None:
             named["optimizer"] = optimizer(optimizer_cls or "sgd", optimizer_kwargs or {})
         super().__init__(cost, batch_size=batch_size, device=device, seed=seed, callbacks=callbacks, **{**named, **settings})
+        self._given = {"optimizer_cls": optimizer_cls, "optimizer_kwargs": optimizer_kwargs}
+
+    def _outputs(self, result: dict[str, Any], watched: Any) -> dict[str, Any]:
+        return {"cost": summed_costs(result["trace"], self._all_settings()["samples"])}
 
     def init_action(self, n_envs: int, actions: Any = None) -> Any:
         """The plan that the candidates are drawn around, a tensor `(n_envs, horizon, action_dim)`."""

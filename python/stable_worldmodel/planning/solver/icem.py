@@ -53,3 +53,4 @@ class ICEMSolver(GaussianSolver):
         named = {"num_samples": num_samples, "var_scale": var_scale, "n_steps": n_steps, "topk": topk}
         named |= {"noise_beta": noise_beta, "alpha": alpha, "n_elite_keep": n_elite_keep}
         super().__init__(cost, batch_size=batch_size, device=device, seed=seed, callbacks=callbacks, **{**named, **settings})
+        self._given = {"return_mean": return_mean}

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from .engine import EngineSolver
+import numpy as np
+
+from .engine import EngineSolver, summed_costs
 from .optimizer import optimizer
 
 __all__ = ["AugmentedLagrangianSolver", "LagrangianSolver"]
@@ -23,6 +25,9 @@ class LagrangianSolver(EngineSolver):
         persist_multipliers: Has no effect: the multipliers start at zero in every call, so that a plan does not depend on
             earlier ones.
         **settings: As for `CEMSolver`.
+
+    Results of `solve` also have `cost`, `[[..]]` (the sum of the costs of all candidates in every step), and
+    `constraint_violation`, `[x]`: the mean of the positive constraint values of the plans.
     """
 
     id = "lagrangian"
@@ -63,6 +68,15 @@ class LagrangianSolver(EngineSolver):
         if optimizer_cls is not None or optimizer_kwargs is not None:
             named["optimizer"] = optimizer(optimizer_cls or "adam", optimizer_kwargs or {})
         super().__init__(cost, batch_size=batch_size, device=device, seed=seed, **{**named, **settings})
+        self._given = {"optimizer_cls": optimizer_cls, "optimizer_kwargs": optimizer_kwargs}
+        self._given["persist_multipliers"] = persist_multipliers
+
+    def _outputs(self, result: dict[str, Any], watched: Any) -> dict[str, Any]:
+        found: dict[str, Any] = {"cost": summed_costs(result["trace"], self._all_settings()["samples"])}
+        if watched is not None:
+            values = watched.constrain(np.asarray(result["actions"])[:, None])
+            found["constraint_violation"] = [float(np.maximum(values, 0).mean())]
+        return found
 
     def init_action(self, actions: Any = None) -> Any:
         """The plan that the candidates are drawn around, a tensor `(n_envs, horizon, action_dim)`."""

@@ -36,3 +36,8 @@ class MPPISolver(GaussianSolver):
         named = {"num_samples": num_samples, "var_scale": var_scale, "n_steps": n_steps, "topk": topk}
         named["temperature"] = temperature
         super().__init__(cost, batch_size=batch_size, device=device, seed=seed, **{**named, **settings})
+
+    def _outputs(self, result: dict[str, Any], watched: Any) -> dict[str, Any]:
+        actions = result["actions"]
+        # The spread of the samples never changes.
+        return {"mean": [actions], "var": [0 * actions + float(self._all_settings()["sigma"])]}

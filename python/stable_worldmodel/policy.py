@@ -84,6 +84,10 @@ class BasePolicy:
         for name, value in kwargs.items():
             setattr(self, name, value)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """The attributes without the environments, which a copy gets from `set_env` or `World.set_policy`."""
+        return {**self.__dict__, "env": None}
+
     def set_env(self, env: Any) -> None:
         """Sets the environments that the policy acts in: `world.envs`."""
         self.env = env

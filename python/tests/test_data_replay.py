@@ -65,3 +65,14 @@ def test_buffer_filters_columns_loads_and_dumps(tmp_path):
     buffer.dump(tmp_path / "a.lance")
     dataset = data.load_dataset(tmp_path / "a.lance")
     np.testing.assert_array_equal(dataset.get_col_data("pixels"), buffer.get_col_data("pixels"))
+
+
+def test_an_action_in_the_last_row_is_kept():
+    buffer = data.ReplayBuffer(max_steps=20, history_len=2)
+    steps = {"state": np.arange(4.0)[:, None], "action": np.arange(4, dtype=np.float32)[:, None]}
+    buffer.write_episode(steps)
+    assert buffer[-1]["action"].ravel().tolist() == [2, 3]
+    assert np.isfinite(buffer.sample(64)["action"]).all()
+    missing = {**steps, "action": np.array([[0], [np.nan], [2], [3]], np.float32)}
+    with pytest.raises(ValueError, match="row 1 of 4"):
+        buffer.write_episode(missing)

@@ -70,6 +70,18 @@ class ReplayBuffer(Dataset):
         self._samplers: dict[tuple[int, int], Any] = {}
         self._step = 0
 
+    def __getstate__(self) -> dict[str, Any]:
+        """The attributes, with the episodes in place of the engine's memory. A copy counts its own `num_episodes_added`."""
+        gone: dict[str, Any] = {"_buffer": None, "_snapshot": None, "_samplers": {}}
+        return {**self.__dict__, **gone, "_episodes": [] if self._buffer is None else list(self.episodes())}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        episodes = state.pop("_episodes")
+        self.__dict__.update(state)
+        filter, self.key_filter = self.key_filter, None
+        self.write_episodes(episodes)
+        self.key_filter = filter
+
     def __enter__(self) -> ReplayBuffer:
         return self
 

@@ -191,7 +191,8 @@ class Loader:
         if any(isinstance(value, int) and value < 0 for value in settings.values()):
             negative = {name: value for name, value in settings.items() if isinstance(value, int) and value < 0}
             raise ValueError(f"expected no negative numbers, got {negative}")
-        self._loader = _engine.Loader(engine, json.dumps(settings))
+        self._settings = json.dumps(settings)
+        self._loader = _engine.Loader(engine, self._settings)
         #: The shape of a row of every column: the axes after the batch and the steps.
         self._shapes = {name: tuple(shape[1:]) for name, _, shape in self._loader.schema()}
         # The dataset returns some scalar columns as lists of one element, so the loader returns such lists, too.
@@ -204,6 +205,14 @@ class Loader:
         self._next = (0, 0)
         #: The epoch and batch that the latest iteration has reached.
         self._at = (0, 0)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The attributes with the position of the iteration; the process that unpickles opens the dataset again."""
+        return {**self.__dict__, "_loader": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._loader = _engine.Loader(engine_of(self.dataset), self._settings)
 
     def __len__(self) -> int:
         """The number of batches in an epoch, on every rank."""

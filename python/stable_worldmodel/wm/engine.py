@@ -40,9 +40,14 @@ class Model:
 
     def __init__(self, name: str, device: str = "cpu", objective: dict[str, Any] | None = None, *, trust: bool = False) -> None:
         self._engine_model = _engine.Model(str(name), device, json.dumps(objective), bool(trust))
+        self._arguments = (str(name), device, objective, bool(trust))
         #: The checkpoint info: `family`, `env`, `image`, `action_block`, `history`, `config`, `weights`, `action_mean` and
         #: `action_std`.
         self.card: dict[str, Any] = json.loads(self._engine_model.info)
+
+    def __reduce__(self) -> Any:
+        """The arguments: a copy loads the checkpoint again."""
+        return _opened, self._arguments
 
     @property
     def path(self) -> str:
@@ -102,6 +107,10 @@ class Model:
 
     def __repr__(self) -> str:
         return f"Model({self.card['family']}, {self.path!r})"
+
+
+def _opened(name: str, device: str, objective: dict[str, Any] | None, trust: bool) -> Model:
+    return Model(name, device, objective, trust=trust)
 
 
 def load(name: str, device: str = "cpu", **kwargs: Any) -> Model:

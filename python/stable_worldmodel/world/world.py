@@ -217,6 +217,9 @@ class World:
         self.infos, self._frames, self._actions = {}, {}, np.empty(0)
         self.__dict__.pop("_world", None)
 
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        raise TypeError("a World holds running environments and cannot be pickled; create it in the process that uses it")
+
     def __getattr__(self, name: str) -> Any:
         if name == "_world":
             raise RuntimeError("World: the world is closed; create a new world")

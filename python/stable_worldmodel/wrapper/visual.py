@@ -107,7 +107,16 @@ class VisualWrapper(gymnasium.Wrapper):
         self._settings = self.engine_settings(*values, **settings)
         self._engine_wrapper = _engine.VisualWrappers(json.dumps([[self.id, self._settings]]))
         self._seed, self._episode, self._step = seed or 0, 0, 0
+        self._episode_seed = self._seed
         self._engine_wrapper.reset(self._seed)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_engine_wrapper": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._engine_wrapper = _engine.VisualWrappers(json.dumps([[self.id, self._settings]]))
+        self._engine_wrapper.reset(self._episode_seed)
 
     @classmethod
     def engine_settings(cls, *values: Any, seed: int | None = None, **settings: Any) -> dict[str, Any]:
@@ -121,7 +130,8 @@ class VisualWrapper(gymnasium.Wrapper):
         """Starts an episode and samples the parameters that are constant during it."""
         self._episode += 1
         self._step = 0
-        self._engine_wrapper.reset(self._seed + self._episode if seed is None else seed)
+        self._episode_seed = self._seed + self._episode if seed is None else seed
+        self._engine_wrapper.reset(self._episode_seed)
         observation, info = self.env.reset(seed=seed, options=options)
         return observation, self._changed(info)
 

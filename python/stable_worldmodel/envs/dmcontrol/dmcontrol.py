@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from ..named import NamedEnv
 
 __all__ = ["DMControlWrapper"]
@@ -34,3 +36,20 @@ class DMControlWrapper(NamedEnv):
         """Starts an episode."""
         seed, self._first_seed = (self._first_seed if seed is None else seed), None
         return super().reset(seed=seed, options=options)
+
+    def render(self, width: int = 224, height: int = 224, camera_id: int | str | None = None) -> np.ndarray | None:
+        """The frame, `(height, width, 3)` of `uint8`; `None` without a render mode.
+
+        Args:
+            width, height: The size in pixels.
+            camera_id: The index or the name of a camera (`swm envs ID` lists them); the environment's own for `None`.
+        """
+        if self.render_mode is None:
+            return None
+        if camera_id is None:
+            return self._env.render(int(height), int(width), False)
+        cameras: list[str] = self._described["cameras"]
+        if not (camera_id in cameras if isinstance(camera_id, str) else -1 <= camera_id < len(cameras)):
+            raise ValueError(f"camera_id: {camera_id}; expected an index below {len(cameras)}, or one of {', '.join(cameras)}")
+        name = camera_id if isinstance(camera_id, str) else cameras[camera_id]
+        return self._env.render_view(name, int(height), int(width))

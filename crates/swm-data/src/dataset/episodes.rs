@@ -210,6 +210,18 @@ pub(crate) fn check_appendable(dataset: &impl std::fmt::Display, incoming: &Sche
 /// # Errors
 /// If the columns differ, there is no row, or an action breaks the time convention.
 pub(crate) fn check_episode(episode: &Batch, schema: &Schema) -> Result<()> {
+    check_rows(episode, schema, false)
+}
+
+/// Checks an episode as [`check_episode`], except that the last row may have an action as well.
+///
+/// # Errors
+/// If the columns differ, there is no row, or an action is missing before the last row or not finite.
+pub(crate) fn check_played_episode(episode: &Batch, schema: &Schema) -> Result<()> {
+    check_rows(episode, schema, true)
+}
+
+fn check_rows(episode: &Batch, schema: &Schema, last_may_act: bool) -> Result<()> {
     if episode.schema() != schema {
         return Err(Error::mismatch(
             "writing an episode",
@@ -235,7 +247,8 @@ pub(crate) fn check_episode(episode: &Batch, schema: &Schema) -> Result<()> {
         let action = episode.row(row).to_f64(ACTION)?;
         let is_missing = action.iter().all(|&v| if float { v.is_nan() } else { v == -1.0 });
         let last = row + 1 == rows;
-        let valid = if last { is_missing } else { !is_missing && action.iter().all(|v| v.is_finite()) };
+        let acts = !is_missing && action.iter().all(|v| v.is_finite());
+        let valid = if last { is_missing || (last_may_act && acts) } else { acts };
         if !valid {
             return Err(Error::mismatch(
                 "writing an episode",

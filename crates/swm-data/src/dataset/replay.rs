@@ -6,7 +6,7 @@
 //! Samples depend only on the key and on the buffer's content.
 
 use crate::dataset::clips::{ClipSpec, Clips};
-use crate::dataset::episodes::{EpisodeRows, check_episode};
+use crate::dataset::episodes::{EpisodeRows, check_played_episode};
 use crate::dataset::goals::{GoalSpec, Goals};
 use crate::dataset::loader::{
     BatchFiller, BatchPool, BatchRows, BatchSource, Epoch, LoadedBatch, Workers, check_batch, window,
@@ -89,14 +89,15 @@ impl ReplayBuffer {
         lock(&self.0.state).added
     }
 
-    /// Adds an episode, and evicts the oldest episodes until the new one fits.
+    /// Adds an episode, and evicts the oldest episodes until the new one fits. The last row may have an action, as in
+    /// episodes that a training loop records itself.
     ///
     /// # Errors
     /// If the columns differ from the buffer's, the episode breaks the time convention, or the episode has more
     /// rows than the buffer's capacity.
     pub fn add(&self, episode: &Batch, constants: &Constants) -> Result<()> {
         let Inner { schema, capacity, state, .. } = &*self.0;
-        check_episode(episode, schema)?;
+        check_played_episode(episode, schema)?;
         let rows = episode.rows();
         if rows > *capacity {
             let expected = format!("at most {capacity}, the buffer's capacity");

@@ -2,7 +2,9 @@
 
 use crate::sample::{check, episode, rows, schema};
 use swm_core::{Batch, Key};
-use swm_data::{ClipSpec, Constants, GoalMixture, GoalSpec, ReplayBuffer, ReplayConfig, WriteMode, WriteOptions, open};
+use swm_data::{
+    ClipSpec, Constants, GoalMixture, GoalSpec, ReplayBuffer, ReplayConfig, StepRange, WriteMode, WriteOptions, open,
+};
 
 fn config(num_steps: usize) -> ReplayConfig {
     let columns = ["state", "action", "pixels"].map(str::to_owned).to_vec();
@@ -52,9 +54,15 @@ fn evicts_the_oldest_episodes_and_snapshots_stay_unchanged() {
             .to_string()
             .contains("capacity")
     );
-    let mut broken = episode(0);
-    broken.get_mut::<f32>("action").expect("accessing the actions").fill(0.5);
-    assert!(small.add(&broken, &Constants::new()).expect_err("an action in the last row").to_string().contains("NaN"));
+    let mut given = episode(0);
+    given.get_mut::<f32>("action").expect("accessing the actions").fill(0.5);
+    small.add(&given, &Constants::new()).expect("an episode with an action in the last row");
+    let last = StepRange::new(0, given.rows() - 1, 1);
+    let read = small.snapshot().read(&["action"], &[last]).expect("reading the last action");
+    assert_eq!(read.get::<f32>("action").expect("accessing the actions"), [0.5; 2]);
+    given.get_mut::<f32>("action").expect("accessing the actions").fill(f32::NAN);
+    let refused = small.add(&given, &Constants::new()).expect_err("missing actions before the last row");
+    assert!(refused.to_string().contains("the action taken from this row's observation"), "{refused}");
     assert!(ReplayBuffer::new(&schema(), 0).is_err());
 }
 

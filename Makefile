@@ -19,11 +19,12 @@ SWM := $(CARGO_TARGET_DIR)/release/swm
 SUDO := $(shell [ "$$(id -u)" = 0 ] || command -v sudo)
 CARGO := cargo
 
-.PHONY: help demo test test-python test-browser check build tests wheel wheel-portable gpu docs assets setup setup-python reference bench deny nightly clean
+.PHONY: help demo test test-python test-neighbours test-browser check build tests wheel wheel-portable gpu docs assets setup setup-python reference bench deny nightly clean
 
 help:
 	@echo 'make demo       collect, train, plan, evaluate and report on a laptop CPU'
 	@echo 'make test       all checks and all tests'
+	@echo 'make test-neighbours   the Python package with Gymnasium, SB3, TorchRL, a PPO, DataLoader workers'
 	@echo 'make test-browser   pages in Chromium: no text is cut off or overlaps another'
 	@echo 'make build      the swm program: $(SWM)'
 	@echo 'make wheel      the Python package: $(WHEELS)'
@@ -50,6 +51,14 @@ test-python: wheel assets
 	$(CACHE)/venv-bare/bin/python python/tests/bare.py
 	$(PYTHON_VENV)/bin/python -m pip install --quiet --force-reinstall --no-deps $(WHEELS)/*.whl
 	cd python/tests && $(PYTHON_VENV)/bin/python -m pytest -q
+
+# The wheel with the packages that users combine it with, in an environment of its own: not part of `make test`.
+NEIGHBOURS := $(CACHE)/venv-neighbours-1
+test-neighbours: wheel
+	[ -e $(NEIGHBOURS)/ready ] || { python3 -m venv --clear $(NEIGHBOURS) && $(NEIGHBOURS)/bin/python -m pip install --quiet \
+	  -r python/neighbours/requirements.txt && touch $(NEIGHBOURS)/ready; }
+	$(NEIGHBOURS)/bin/python -m pip install --quiet --force-reinstall --no-deps $(WHEELS)/*.whl
+	cd python/neighbours && $(NEIGHBOURS)/bin/python -m pytest -q . ../tests/test_sb3.py ../tests/test_pickling.py ../tests/test_data_torch.py
 
 # Pages in headless Chromium, at three widths, light and dark.
 test-browser: setup

@@ -16,6 +16,10 @@ from .. import spaces as swm_spaces
 __all__ = ["NativeEnv"]
 
 
+class OptionError(TypeError, ValueError):
+    """An environment does not have an option."""
+
+
 class NativeEnv(gymnasium.Env):
     """A native environment.
 
@@ -38,7 +42,14 @@ class NativeEnv(gymnasium.Env):
             raise ValueError(f"render_mode: expected 'rgb_array' or None, got {render_mode!r}")
         #: The id with its options.
         self.name = ",".join([name, *(f"{key}={value}" for key, value in options.items())])
-        self._env = _engine.NativeEnv(self.name, "[]", False)
+        try:
+            self._env = _engine.NativeEnv(self.name, "[]", False)
+        except ValueError as error:
+            unknown = [key for key in options if f"unknown environment option {key!r}" in str(error)]
+            if unknown:
+                # What Python raises for unknown arguments: TorchRL tries `frameskip`, and goes on without it.
+                raise OptionError(f"unexpected keyword argument {unknown[0]!r}: {error}") from error
+            raise
         self._described: dict[str, Any] = json.loads(self._env.spec())
         self.render_mode = render_mode
         self.image_shape = (int(image_shape[0]), int(image_shape[1]))

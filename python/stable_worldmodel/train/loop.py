@@ -59,7 +59,7 @@ class Trainer:
         self.losses: Losses = losses(self.model, self.ranks, self._precision, self._compiled)
         self.optimizer = Optimizer(self.model, plan["parameters"], self.config["optim"])
         self.optimizer.restore(state["step"], read_safetensors(self.run / "checkpoint/optimizer.safetensors"))
-        self.scaler = torch.amp.GradScaler(self.device.type, enabled=options.amp == "fp16")  # type: ignore[attr-defined]
+        self.scaler = torch.amp.GradScaler(self.device.type, enabled=options.amp == "fp16")
         self.step: int = state["step"]
         self.best: Any = state["best"]
         self.validations_since_best: int = state["looks"]
@@ -240,7 +240,7 @@ class Trainer:
             self._write(self.run / "best", state=None)
         else:
             self.validations_since_best += 1
-        return 0 < settings["patience"] <= self.validations_since_best
+        return bool(0 < settings["patience"] <= self.validations_since_best)
 
     @contextlib.contextmanager
     def _averaged(self) -> Iterator[None]:

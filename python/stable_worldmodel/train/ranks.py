@@ -87,7 +87,7 @@ class Ranks:
         # Every rank takes part in the backward pass of a differentiable gathering, also one without rows.
         if differentiable and torch.is_grad_enabled() and not rows.requires_grad:
             rows = rows.detach().requires_grad_()
-        return _Gather.apply(rows.float() if differentiable else rows.detach().float(), list(sizes), self.rank)  # type: ignore[no-any-return, no-untyped-call]
+        return _Gather.apply(rows.float() if differentiable else rows.detach().float(), list(sizes), self.rank)  # type: ignore[no-any-return]
 
     def add_up(self, model: nn.Module, values: Tensor) -> Tensor:
         """Adds up the gradients of the model, in place, and the values of all ranks, which are returned.
@@ -101,6 +101,7 @@ class Ranks:
         has = torch.tensor([float(p.grad is not None) for p in parameters], device=values.device)
         total = torch.cat([*(part.float() for part in flat), has, values.float()])
         dist.all_reduce(total)
+        summed: Tensor
         *parts, has, summed = total.split([*(p.numel() for p in parameters), len(parameters), len(values)])
         for parameter, part, count in zip(parameters, parts, has.tolist(), strict=True):
             parameter.grad = part.view_as(parameter).to(parameter.dtype) if count else None

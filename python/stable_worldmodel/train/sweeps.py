@@ -50,7 +50,7 @@ def run(family: str, arguments: Sequence[str], train: Callable[[Options], None])
         given = []
         for override in hydra_config.overrides.task:
             key = override.lstrip("+~").partition("=")[0]
-            value = OmegaConf.to_container(OmegaConf.create({"value": OmegaConf.select(config, key)}))["value"]  # type: ignore[call-overload, index]
+            value = OmegaConf.to_container(OmegaConf.create({"value": OmegaConf.select(config, key)}))["value"]
             text = str(value) if key in own or key == _DATASET else _toml(value)
             given.append(f"{'data' if key == _DATASET else key}={text}")
         if not any(argument.startswith("out=") for argument in given) and hydra_config.mode.name == "MULTIRUN":

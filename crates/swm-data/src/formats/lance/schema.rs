@@ -194,7 +194,7 @@ pub fn columns_to_read(
         None => None,
         Some(text) => Some(
             serde_json::from_str(text)
-                .map_err(|e| super::store::damaged(folder, format!("its recorded schema is unreadable: {e}")))?,
+                .map_err(|e| super::errors::damaged(folder, format!("its recorded schema is unreadable: {e}")))?,
         ),
     };
     let mut columns = vec![];
@@ -207,7 +207,7 @@ pub fn columns_to_read(
             .as_ref()
             .and_then(|recorded| recorded.columns.columns().iter().find(|spec| columns::flat(&spec.name) == *name));
         let contradiction = |found: &str| {
-            super::store::damaged(
+            super::errors::damaged(
                 folder,
                 format!("column '{name}' holds {found}, which contradicts the recorded schema"),
             )
@@ -223,7 +223,7 @@ pub fn columns_to_read(
                         continue;
                     }
                     let (height, width) = swm_image::image_size(&bytes)
-                        .map_err(|problem| super::store::damaged(folder, format!("column '{name}': {problem}")))?;
+                        .map_err(|problem| super::errors::damaged(folder, format!("column '{name}': {problem}")))?;
                     (ColumnSpec::image(name, height, width), Kind::Image)
                 }
             },

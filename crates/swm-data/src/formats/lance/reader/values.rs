@@ -4,8 +4,8 @@
 use super::lance_reader::{LanceReader, RowSlot, lock, merged};
 use super::stored_rows::StoredRows;
 use crate::formats::lance::convert::convert;
+use crate::formats::lance::errors::damaged;
 use crate::formats::lance::schema::StoredColumn;
-use crate::formats::lance::store::damaged;
 use std::ops::Range;
 use std::sync::Arc;
 use swm_core::Result;

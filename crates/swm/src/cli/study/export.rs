@@ -50,9 +50,10 @@ impl Format {
 
 /// Escapes a cell of a Markdown table.
 pub fn escape_markdown(text: &str) -> String {
-    let text = printable(text).replace('&', "&amp;").replace('<', "&lt;").replace(['\n', '\r'], " ");
-    // Brackets would make links and images.
-    text.replace('|', "\\|").replace('[', "\\[").replace(']', "\\]")
+    let text =
+        printable(text).replace('&', "&amp;").replace('<', "&lt;").replace('|', "\\|").replace(['\n', '\r'], " ");
+    // This would be a link or an image.
+    text.replace("](", "]\\(")
 }
 
 /// Success rates with a row for each condition and a column for each policy.
@@ -346,6 +347,7 @@ mod tests {
                 && latex.contains("40.0 [17, 69] $\\downarrow$"),
             "{latex}"
         );
+        assert_eq!(escape_markdown("![a](http://b) [c]"), "![a]\\(http://b) [c]");
         let markdown = Format::Markdown.write(&results);
         assert_eq!(markdown.lines().nth(2), Some("| plain | 90.0 [60, 98] | 70.0 [40, 89] |"));
         assert!(markdown.contains("\n| red, 50 % | 40.0 [17, 69] ↓ | – |\n\n↓ lower, "), "{markdown}");

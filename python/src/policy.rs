@@ -209,7 +209,12 @@ impl Policy for PythonPolicy {
     fn act(&mut self, _infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
         let Self { call, infos, fresh } = self;
         let called = Python::attach(|py| {
-            let infos = infos.bind(py).copy()?;
+            // Copies: a policy that changes its observation must not change what the engine stores.
+            let given = PyDict::new(py);
+            for (name, column) in infos.bind(py) {
+                given.set_item(name, column.call_method0("copy")?)?;
+            }
+            let infos = given;
             let flags = |flags: &[bool]| PyArray1::from_slice(py, flags);
             let given = call.bind(py).call1((infos, flags(active), flags(fresh)))?;
             arrays::fill(actions, 0, &given)

@@ -285,3 +285,27 @@ except KeyboardInterrupt:
     assert child.communicate(timeout=60)[0].strip() == "interrupted" and child.returncode == 0
     data = swm.data.load_dataset(str(tmp_path / "long.lance"), backend="numpy")
     assert data.num_episodes > 0 and max(data.lengths) == 51 and data.get_col_data("terminated").sum() < data.num_episodes
+
+
+def test_policy_that_changes_its_observation_changes_nothing_that_is_stored(tmp_path):
+    class Policy(swm.policy.BasePolicy):
+        def __init__(self, changes):
+            super().__init__()
+            self.changes = changes
+
+        def get_action(self, obs, **_):
+            if self.changes:
+                for name in ("state", "pixels", "goal_state"):
+                    obs[name][...] = 0
+            return np.full((2, 2), 0.3, np.float32)
+
+    stored = []
+    for changes in (False, True):
+        world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(16, 16), max_episode_steps=5)
+        world.set_policy(Policy(changes))
+        path = tmp_path / f"{changes}.lance"
+        world.collect(path, episodes=2, seed=0, progress=False)
+        stored.append(swm.data.load_dataset(path))
+    for episode in range(2):
+        kept, changed = (dataset.load_episode(episode) for dataset in stored)
+        assert all(np.array_equal(kept[name], changed[name]) for name in kept), list(kept)

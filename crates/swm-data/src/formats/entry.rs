@@ -15,6 +15,8 @@ pub struct FormatEntry {
     pub suffixes: &'static [&'static str],
     /// Whether images are stored as they are, unless the user chooses a lossy codec.
     pub exact_images: bool,
+    /// Whether the user may choose the codec of images.
+    pub codecs: bool,
     /// The Cargo feature of `swm-data` that this format requires, if any.
     pub feature: Option<&'static str>,
     /// Returns whether an existing dataset, or a dataset to create, at this location has this format.

@@ -1,6 +1,6 @@
 //! Datasets that several machines write as shards.
 
-use crate::sample::{check, episode, options, schema, write};
+use crate::sample::{check, episode, manifest, options, schema, write};
 use std::path::Path;
 use swm_core::{ColumnSpec, DType, Schema};
 use swm_data::lance::{Shard, commit_shards, create_shard};
@@ -8,7 +8,9 @@ use swm_data::{CommitPolicy, Constants, Location, WriteMode, WriteOptions, Write
 
 fn shard_writer(path: &Path, mode: WriteMode, index: usize, count: usize) -> swm_core::Result<Box<dyn Writer>> {
     let commit = CommitPolicy { episodes: 2, ..CommitPolicy::default() };
-    create_shard(&Location::from(path), &schema(), WriteOptions { commit, ..options(mode) }, Shard { index, count })
+    // Other numbers of shards are other collections.
+    let options = WriteOptions { commit, manifest: Some(manifest(count as u64)), ..options(mode) };
+    create_shard(&Location::from(path), &schema(), options, Shard { index, count })
 }
 
 fn write_shard(path: &Path, index: usize, count: usize, episodes: std::ops::Range<usize>) {

@@ -1,7 +1,7 @@
 //! Datasets in object stores, against an S3 server on loopback. The address and credentials of a store come from
 //! environment variables, so tests that use a store run in child processes.
 
-use crate::sample::{check, episode, options, schema, write};
+use crate::sample::{check, episode, manifest, options, schema, write};
 use hyper_util::rt::{TokioExecutor, TokioIo};
 use s3s::auth::SimpleAuth;
 use s3s::service::S3ServiceBuilder;
@@ -108,8 +108,9 @@ fn child_that_writes_and_reads() {
 
     for index in 0..2 {
         let shard = Shard { index, count: 2 };
-        let mut writer =
-            create_shard(&location, &schema(), options(WriteMode::Create), shard).expect("creating the shard");
+        // The dataset has episodes of another collection.
+        let options = WriteOptions { manifest: Some(manifest(4)), ..options(WriteMode::Create) };
+        let mut writer = create_shard(&location, &schema(), options, shard).expect("creating the shard");
         writer.write_episode(&episode(4 + index)).expect("writing an episode");
         writer.finish().expect("finishing the dataset");
     }

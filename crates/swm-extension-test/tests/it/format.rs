@@ -13,6 +13,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
     summary: "one JSON file",
     suffixes: &["extjson"],
     exact_images: true,
+    codecs: false,
     feature: None,
     detect: |location| location.has_suffix("extjson"),
     backend: Some(Backend { open, create, remove: swm::core::files::delete_file }),

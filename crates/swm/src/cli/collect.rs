@@ -149,6 +149,7 @@ pub fn run_args(args: &CollectArgs, context: &Context) -> anyhow::Result<(Locati
 impl<'a> Collection<'a> {
     /// Returns the collection of a command line.
     fn of(args: &'a CollectArgs, location: &'a Location, threads: usize) -> Result<Self> {
+        args.codec.check_format(location, args.format.as_deref())?;
         Ok(Self {
             env: crate::env(&args.env, &Origin::User)?,
             location,

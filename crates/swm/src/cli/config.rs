@@ -3,7 +3,7 @@
 use clap::{Args, ValueEnum};
 use std::collections::BTreeMap;
 use swm_core::{Error, Result, VariationRequest};
-use swm_data::ImageCodec;
+use swm_data::{FORMATS, ImageCodec, Location};
 
 /// The codec of stored frames, for formats that support several codecs.
 #[derive(Args)]
@@ -31,6 +31,24 @@ enum Codec {
 }
 
 impl CodecArgs {
+    /// Checks that a dataset's format has codecs, if JPEG is chosen; `format` is its id, if the command names it.
+    ///
+    /// # Errors
+    /// When the format stores frames without loss.
+    pub fn check_format(&self, location: &Location, format: Option<&str>) -> Result<()> {
+        let entry = match format {
+            Some(id) => Some(FORMATS.get(id)?),
+            None => FORMATS.rows.iter().find(|entry| (entry.detect)(location)),
+        };
+        match (entry.filter(|entry| !entry.codecs), self.codec) {
+            (Some(entry), Codec::Jpeg) => {
+                let problem = format!("the format {} stores frames without loss", entry.id);
+                Err(Error::config("--codec jpeg", problem, "leave it out, or choose another format"))
+            }
+            _ => Ok(()),
+        }
+    }
+
     /// Returns the codec with its quality.
     ///
     /// # Errors

@@ -75,6 +75,7 @@ pub fn convert(args: &ConvertArgs, context: &Context) -> anyhow::Result<()> {
     let options = ConvertOptions { verify: !args.no_verify, ..args.target_args.options(mode)? };
     let source = home::find_dataset(&args.source)?;
     let target = home::target(&args.target, args.target_args.format.as_deref())?;
+    args.target_args.codec.check_format(&target, args.target_args.format.as_deref())?;
     let reader = swm_data::open(source)?;
     let start = Instant::now();
     let report = swm_data::convert(&reader, &target, &options, &mut control(context))?;

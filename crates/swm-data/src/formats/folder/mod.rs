@@ -27,6 +27,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
     summary: "folder NAME.folder of numpy's npz files and one image per step; the reference opens it",
     suffixes: &["folder"],
     exact_images: true,
+    codecs: true,
     feature: None,
     detect,
     backend: Some(Backend {

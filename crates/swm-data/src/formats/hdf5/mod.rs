@@ -60,6 +60,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
     summary: "one file NAME.h5 or NAME.hdf5; opens in h5py and in the reference",
     suffixes: &["h5", "hdf5"],
     exact_images: true,
+    codecs: false,
     feature: Some("hdf5"),
     detect,
     backend: BACKEND,

@@ -15,16 +15,11 @@ use std::time::Instant;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::files::{self, Lock};
 use swm_core::{Batch, Error, Manifest, Result, Schema};
-use swm_image::ImageCodec;
 
 /// Creates, continues or replaces a file.
 pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
     let location = super::file(location)?;
     let path = location.local("hdf5")?;
-    if let ImageCodec::Jpeg { .. } = options.codec {
-        let problem = "the format hdf5 stores frames without loss";
-        return Err(Error::config("codec jpeg", problem, "leave the codec out, or choose another format"));
-    }
     for name in [EPISODE_IDX, STEP_IDX] {
         if schema.column(name).is_ok_and(|column| column.len() != 1) {
             let problem = format!("column '{name}' must be a scalar");

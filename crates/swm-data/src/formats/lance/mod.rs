@@ -37,6 +37,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
     summary: "Lance table, one folder NAME.lance; opens in Python's lance and lancedb",
     suffixes: &["lance"],
     exact_images: true,
+    codecs: true,
     feature: None,
     detect: store::detect,
     backend: Some(Backend { open: reader::open, create: writer::create, remove: removal::remove }),

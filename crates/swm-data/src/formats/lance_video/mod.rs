@@ -24,6 +24,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
     summary: "folder NAME.lance-video of a Lance table with one MP4 per episode",
     suffixes: &["lance-video"],
     exact_images: false,
+    codecs: true,
     feature: Some("ffmpeg"),
     detect,
     backend: BACKEND,

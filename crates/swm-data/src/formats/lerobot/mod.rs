@@ -54,6 +54,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
     summary: "LeRobot dataset, versions 2.1 (read) and 3.0; a folder with meta/info.json, new ones NAME.lerobot",
     suffixes: &["lerobot"],
     exact_images: false,
+    codecs: true,
     feature: Some("lerobot"),
     detect,
     backend: BACKEND,

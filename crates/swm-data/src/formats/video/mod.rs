@@ -36,6 +36,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
     summary: "folder NAME.video of numpy's npz files and one MP4 per episode; the reference opens it",
     suffixes: &["video"],
     exact_images: false,
+    codecs: true,
     feature: Some("ffmpeg"),
     detect,
     backend: BACKEND,

@@ -235,9 +235,12 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
     Ok(collected)
 }
 
+/// The world, the policy and the hashes of the policies' weights.
+type Prepared = (World, Box<dyn Policy>, BTreeMap<String, String>);
+
 impl Collection<'_> {
     /// Checks the settings, and returns the world, the policy and the hashes of the policies' weights.
-    fn prepare(&self) -> Result<(World, Box<dyn Policy>, BTreeMap<String, String>)> {
+    fn prepare(&self) -> Result<Prepared> {
         let Collection { env, config, .. } = self;
         limits::EPISODES.check(config.episodes)?;
         limits::SHARDS.check(self.shard.map_or(0, |shard| shard.count))?;

@@ -54,16 +54,7 @@ const BAR_LENGTH: usize = 40;
 /// Runs `swm inspect`.
 pub fn inspect(args: &InspectArgs, as_json: bool) -> anyhow::Result<()> {
     if args.croissant || args.datasheet {
-        let described = args.described()?;
-        if args.croissant {
-            return emit_json(&metadata::croissant(&described));
-        }
-        let sheet = metadata::datasheet(&described);
-        if as_json {
-            return emit_json(&json!({"datasheet": sheet}));
-        }
-        emit(&sheet);
-        return Ok(());
+        return args.describe(as_json);
     }
     if let Some(option) = args.stated_only() {
         let fix = "add --croissant or --datasheet, or remove it";
@@ -120,6 +111,20 @@ pub fn inspect(args: &InspectArgs, as_json: bool) -> anyhow::Result<()> {
 }
 
 impl InspectArgs {
+    /// Prints the metadata or the datasheet.
+    fn describe(&self, as_json: bool) -> anyhow::Result<()> {
+        let described = self.described()?;
+        if self.croissant {
+            return emit_json(&metadata::croissant(&described));
+        }
+        let sheet = metadata::datasheet(&described);
+        if as_json {
+            return emit_json(&json!({"datasheet": sheet}));
+        }
+        emit(&sheet);
+        Ok(())
+    }
+
     /// Describes the dataset, or the capsule if the name is that of one.
     fn described(&self) -> Result<Described> {
         let is_capsule = self.dataset.starts_with("zoo:") || self.dataset.ends_with(".safetensors");

@@ -67,7 +67,7 @@ pub fn links(text: &str) -> Vec<Link> {
                 open.pop();
             }
             _ => {
-                for link in open.iter().map(|&at: &usize| at) {
+                for link in open.iter().copied() {
                     let label = &mut found[link].label;
                     *label = if label.start == label.end { range.clone() } else { label.start..range.end };
                 }

@@ -113,7 +113,7 @@ mod tests {
         let panels = panels(&table).expect("panels");
         assert_eq!(panels.len(), 2);
         assert!(panels[0].contains("Walker run") && panels[0].contains("sac 410, tdmpc2 510"), "{}", panels[0]);
-        panels.iter().for_each(|panel| crate::plot::check_texts(panel, 4));
+        panels.iter().for_each(|panel| plot::check_texts(panel, 4));
         let other = StudyTable { columns: vec![column("speed")], ..table };
         assert!(super::panels(&other).expect("panels").is_empty());
     }

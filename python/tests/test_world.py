@@ -308,4 +308,5 @@ def test_policy_that_changes_its_observation_changes_nothing_that_is_stored(tmp_
         stored.append(swm.data.load_dataset(path))
     for episode in range(2):
         kept, changed = (dataset.load_episode(episode) for dataset in stored)
-        assert all(np.array_equal(kept[name], changed[name]) for name in kept), list(kept)
+        for name in kept:
+            np.testing.assert_array_equal(kept[name], changed[name], err_msg=name)

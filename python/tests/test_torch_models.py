@@ -27,7 +27,7 @@ from stable_worldmodel.wm.prejepa.module import CausalPredictor  # noqa: E402
 
 GOLDEN = Path(__file__).parents[2] / "crates/swm-models/tests/golden"
 #: Further recordings, of other sizes, if there are any.
-MORE = Path(os.environ.get("SWM_GOLDEN_MODELS", "/work/shared/reference/models"))
+MORE = Path(os.environ.get("SWM_GOLDEN_MODELS", Path(__file__).parents[3] / "shared/reference/models"))
 
 
 def recorded(path):

@@ -102,7 +102,7 @@ pub struct BoardPages {
 
 /// Writes the pages of a leaderboard to a folder: `index.html`, and `entries/PAGE.html` for each entry. The first shows what moved
 /// since the last build in the folder, which `last-build` remembers. Pages of the last build whose entries are gone are deleted,
-/// unless somebody changed them.
+/// unless their content has changed since.
 ///
 /// Equal leaderboards after equal builds give equal bytes, and a build without changes changes no byte.
 ///
@@ -242,7 +242,7 @@ mod tests {
         assert!(shown.contains("What moved") && shown.contains("a&lt;b&gt;") && shown.contains("gone"), "{shown}");
         assert_eq!(write_leaderboard(&board, folder.path()).expect("pages").moves, later.moves);
         assert_eq!(read("index.html"), shown);
-        // A page that somebody changed stays.
+        // A page whose content has changed since stays.
         std::fs::write(path("entries/close-3.html"), "changed").expect("a file");
         board.entries.truncate(1);
         board.tables[0].rows = vec![gone];

@@ -236,12 +236,14 @@ def test_conversion_between_native_formats_keeps_the_content(tmp_path):
     write(tmp_path / "a.lance")
     sums = set()
     for target, kwargs in (("b.h5", {}), ("c", {"format": "folder", "codec": "png"}), ("d.lance", {"codec": "png"})):
-        report = data.convert(tmp_path / "a.lance", tmp_path / target, progress=False, least_psnr=5, **kwargs)
+        report = data.convert(tmp_path / "a.lance", tmp_path / target, progress=False, **kwargs)
         assert report["episodes"] == 4 and report["kept"] == 0
         sums.add(report["checksum"])
-        again = data.convert(tmp_path / "a.lance", tmp_path / target, progress=False, least_psnr=5, **kwargs)
+        again = data.convert(tmp_path / "a.lance", tmp_path / target, progress=False, **kwargs)
         assert again["kept"] == 4 and again["rows"] == 0
     assert len(sums) == 1
+    with pytest.raises(ValueError, match="without loss"):
+        data.convert(tmp_path / "a.lance", tmp_path / "f.h5", progress=False, least_psnr=5)
     with pytest.raises(ValueError, match="not the beginning of the source"):
         write(tmp_path / "e.lance", (3,))
         data.convert(tmp_path / "a.lance", tmp_path / "e.lance", progress=False)

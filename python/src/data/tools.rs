@@ -22,7 +22,7 @@ struct Options {
     mode: Mode,
     codec: Option<Value>,
     verify: bool,
-    least_psnr: f64,
+    least_psnr: Option<f64>,
 }
 
 #[derive(Deserialize)]

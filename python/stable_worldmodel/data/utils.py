@@ -128,7 +128,9 @@ def _progress_callback(progress: bool) -> Callable[[str, int, int], None] | None
     return report
 
 
-def _options(format: str | None, mode: str, codec: str | None, quality: int | None, verify: bool, least_psnr: float) -> str:
+def _options(
+    format: str | None, mode: str, codec: str | None, quality: int | None, verify: bool, least_psnr: float | None
+) -> str:
     if mode not in ("resume", "append", "overwrite", "error"):
         raise ValueError(f"mode: expected 'resume', 'append', 'overwrite' or 'error', got {mode!r}")
     chosen = codec_json(codec, quality)
@@ -155,7 +157,7 @@ def convert(
     codec: str | None = None,
     jpeg_quality: int | None = None,
     verify: bool = True,
-    least_psnr: float = 25.0,
+    least_psnr: float | None = None,
     **kwargs: Any,
 ) -> dict[str, Any]:
     """Writes a dataset in another format or codec, and compares the decoded contents.
@@ -176,7 +178,8 @@ def convert(
         codec: The codec of images: `"qoi"` (lossless, the default), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
         jpeg_quality: The quality of the codec `"jpeg"`, as in `codec="jpeg-QUALITY"`.
         verify: Whether to read the target and compare its content with the source.
-        least_psnr: The minimum peak signal-to-noise ratio of lossy images, in dB; a lower ratio is an error.
+        least_psnr: The minimum peak signal-to-noise ratio of lossy images, in dB (default: 25); a lower ratio is an error.
+            Refused if no image loses anything.
         **kwargs: Further arguments of the writer of a user-defined format.
 
     Returns:

@@ -80,12 +80,28 @@ fn lossy_images_must_reach_the_minimum_psnr() {
     let images = report.columns.iter().find(|column| column.column == "pixels").expect("images");
     assert!(!images.exact && images.max_error >= 1.0 && images.psnr.is_some_and(|psnr| psnr > 30.0), "{images:?}");
     assert!(report.columns.iter().filter(|column| column.column == "state").all(|column| column.exact));
-    let strict = ConvertOptions { least_psnr: 90.0, ..jpeg };
+    let strict = ConvertOptions { least_psnr: Some(90.0), ..jpeg };
     let error = run(&path, &folder.path().join("strict.lance"), &strict).expect_err("an insufficient PSNR").to_string();
     assert!(error.contains("dB") && error.contains("codec"), "{error}");
-    let unverified = ConvertOptions { verify: false, ..strict };
+    let unverified = ConvertOptions { verify: false, least_psnr: None, ..strict };
     let report = run(&path, &folder.path().join("unverified.lance"), &unverified).expect("converting the dataset");
     assert!(report.checksum.is_none() && report.columns.is_empty());
+}
+
+#[test]
+fn minimum_psnr_without_effect_is_refused() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let (path, target) = (source(folder.path()), folder.path().join("target.lance"));
+    let jpeg = ImageCodec::Jpeg { quality: 95 };
+    let given = ConvertOptions { least_psnr: Some(30.0), ..ConvertOptions::default() };
+    let refused = |options: &ConvertOptions| run(&path, &target, options).expect_err("no effect").to_string();
+    assert!(refused(&given).contains("without loss"), "{}", refused(&given));
+    let unverified = ConvertOptions { codec: jpeg, verify: false, ..given.clone() };
+    assert!(refused(&unverified).contains("nothing is verified"), "{}", refused(&unverified));
+    assert!(refused(&ConvertOptions { least_psnr: Some(f64::NAN), ..given.clone() }).contains("NaN"));
+    assert!(!target.exists());
+    run(&path, &target, &ConvertOptions { codec: jpeg, ..given.clone() }).expect("converting with losses");
+    run(&path, &target, &given).expect("continuing a target with losses");
 }
 
 #[test]
@@ -293,13 +309,13 @@ fn refused_conversion_does_not_replace_a_dataset() {
         let options = ConvertOptions {
             mode: ConvertMode::Overwrite,
             codec: quality,
-            least_psnr: 90.0,
+            least_psnr: Some(90.0),
             ..ConvertOptions::default()
         };
         let error = convert(&reader, &Location::from(&path), &options, &mut Control::new()).expect_err("lossy images");
         assert!(error.to_string().contains("signal-to-noise"), "{format}: {error}");
         assert_eq!(content(), before, "{format}");
-        let options = ConvertOptions { least_psnr: 0.0, ..options };
+        let options = ConvertOptions { least_psnr: Some(0.0), ..options };
         convert(&reader, &Location::from(&path), &options, &mut Control::new()).expect(format);
         assert_eq!(open(&path).expect("opening").episodes().len(), 2, "{format}");
     }

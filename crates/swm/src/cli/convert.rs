@@ -35,9 +35,9 @@ pub struct TargetArgs {
     pub format: Option<String>,
     #[command(flatten)]
     codec: CodecArgs,
-    /// Minimum peak signal-to-noise ratio of lossy frames, in dB
-    #[arg(long, default_value_t = ConvertOptions::default().least_psnr, value_name = "DB", value_parser = decibels)]
-    least_psnr: f64,
+    /// Minimum peak signal-to-noise ratio of lossy frames, in dB (default: 25)
+    #[arg(long, value_name = "DB", value_parser = decibels)]
+    least_psnr: Option<f64>,
 }
 
 impl TargetArgs {

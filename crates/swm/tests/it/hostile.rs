@@ -105,6 +105,7 @@ fn options_without_effect_are_refused() {
     swm.fails(&with(&["-o", "rooms.h5", "--codec", "jpeg"]), 2, &["hdf5 stores frames without loss"]);
     swm.json(&with(&["-o", "rooms.lance"]));
     swm.fails(&["train", "lewm", "--data", "rooms.lance", "--max-steps", "3"], 2, &["--max-steps", "plays none"]);
+    swm.fails(&["convert", "rooms.lance", "./a.h5", "--least-psnr", "30"], 2, &["without loss"]);
     let eval = ["eval", "expert", "--env", "swm/TwoRoom-v1", "--episodes", "2", "--no-pixels"];
     for option in [&["--solver", "cem"][..], &["--horizon", "3"], &["--trace"]] {
         swm.fails(&[&eval[..], option].concat(), 2, &["none of the policies plans"]);

@@ -4,13 +4,16 @@
 //! rounding to single precision. Images must reach a minimum peak signal-to-noise ratio.
 
 mod comparison;
+mod losses;
 
 pub use comparison::ColumnComparison;
+pub use losses::LEAST_PSNR;
 
 use crate::dataset::episodes::describe_columns;
 use crate::dataset::{CommitPolicy, Constants, Location, Reader, StepRange, WriteMode, WriteOptions};
 use crate::formats::{FORMATS, FormatEntry, create, detect, has_no_dataset, open};
 use comparison::{data_columns, dataset_hash, episode_hash};
+use losses::{check_psnr, check_ratio, has_images, is_lossy};
 use serde::Serialize;
 use std::ops::Range;
 use std::path::PathBuf;
@@ -50,8 +53,9 @@ pub struct ConvertOptions {
     pub codec: ImageCodec,
     /// Whether the target is read back and compared with the source.
     pub verify: bool,
-    /// Minimum peak signal-to-noise ratio of an image column, in decibels.
-    pub least_psnr: f64,
+    /// Minimum peak signal-to-noise ratio of an image column, in decibels; `None` is [`LEAST_PSNR`]. Only images that are
+    /// stored with losses and verified have one.
+    pub least_psnr: Option<f64>,
     /// The conditions for committing written episodes. A killed conversion rewrites uncommitted episodes.
     pub commit: CommitPolicy,
 }
@@ -63,7 +67,7 @@ impl Default for ConvertOptions {
             mode: ConvertMode::default(),
             codec: ImageCodec::default(),
             verify: true,
-            least_psnr: 25.0,
+            least_psnr: None,
             commit: CommitPolicy::default(),
         }
     }
@@ -116,9 +120,8 @@ pub fn convert(
     options: &ConvertOptions,
     control: &mut Control<'_>,
 ) -> Result<Converted> {
-    if options.least_psnr.is_nan() || options.least_psnr < 0.0 {
-        let (given, fix) = (format!("{} dB", options.least_psnr), "give a number of at least 0");
-        return Err(Error::config("least_psnr", given, fix));
+    if let Some(ratio) = options.least_psnr {
+        check_ratio(ratio, &**reader, target, options)?;
     }
     check_distinct(&**reader, target)?;
     if let Some((entry, trial)) = trial(&**reader, target, options)? {
@@ -145,9 +148,8 @@ fn trial(
         Some(id) => Some(FORMATS.get(id)?),
         None => detect(target),
     };
-    let has_images = data_columns(reader.schema()).any(|(_, column)| column.is_image());
-    let loses = |entry: &&FormatEntry| !entry.exact_images || matches!(options.codec, ImageCodec::Jpeg { .. });
-    let Some(entry) = entry.filter(loses).filter(|_| has_images && options.verify) else { return Ok(None) };
+    let is_tried = |entry: &&FormatEntry| is_lossy(entry, options) && has_images(reader) && options.verify;
+    let Some(entry) = entry.filter(is_tried) else { return Ok(None) };
     let stem = path.file_stem().unwrap_or_default().to_string_lossy();
     let suffix = path.extension().map(|suffix| format!(".{}", suffix.to_string_lossy())).unwrap_or_default();
     let trial = path.with_file_name(format!("{stem}.trial-{}{suffix}", std::process::id()));
@@ -449,18 +451,6 @@ fn start(control: &mut Control<'_>, name: &'static str, total: usize) {
 fn advance(control: &mut Control<'_>, stage: &'static str, done: usize, total: usize) -> Result<()> {
     control.progress(Progress { stage, done, total, unit: UNIT, metrics: &[] });
     control.check()
-}
-
-/// Checks the signal-to-noise ratio of image columns.
-fn check_psnr(columns: &[ColumnComparison], options: &ConvertOptions) -> Result<()> {
-    let bad = columns.iter().find(|column| column.psnr.is_some_and(|psnr| psnr < options.least_psnr));
-    bad.map_or(Ok(()), |column| {
-        Err(Error::mismatch(
-            format!("images of column '{}'", column.column),
-            format!("a signal-to-noise ratio of {:.1} dB", column.psnr.unwrap_or_default()),
-            format!("at least {} dB; choose a codec with higher quality", options.least_psnr),
-        ))
-    })
 }
 
 /// Reads all columns of an episode except index columns.

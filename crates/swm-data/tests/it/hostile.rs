@@ -180,3 +180,88 @@ fn pipes_are_refused() {
         refused(&path);
     }
 }
+
+#[test]
+fn hostile_compact_data_of_hdf5_files_is_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.h5");
+    let intact = std::fs::read(interop("hdf5-compact.h5")).expect("the file");
+    std::fs::write(&path, &intact).expect("a written file");
+    let expected = fuzz::read_everything(&path).expect("the original");
+    let (mut refused, mut changed) = (0, 0);
+    // Sizes, versions and addresses are in the headers: each becomes the largest, zero, and a power of two.
+    for at in 0..intact.len() - 8 {
+        for new in [&[0xff][..], &[0], &[0xff; 2], &[0xff; 8], &[0, 0, 0, 0, 0, 0, 0, 0x10]] {
+            if intact[at..].starts_with(new) || (new.len() == 8 && !at.is_multiple_of(4)) {
+                continue;
+            }
+            let mut bytes = intact.clone();
+            bytes[at..at + new.len()].copy_from_slice(new);
+            std::fs::write(&path, &bytes).expect("a written file");
+            match fuzz::read_everything(&path) {
+                Ok(hash) => changed += usize::from(hash != expected),
+                Err(error) => refused += usize::from(!error.to_string().is_empty()),
+            }
+        }
+    }
+    // Data in a header have no checksum: a changed value is a changed value.
+    assert!(refused > 500 && changed > 50, "{refused} refused, {changed} changed");
+}
+
+/// A sequence parameter set of H.264 for frames of this many macroblocks.
+fn parameter_set(width: u32, height: u32) -> Vec<u8> {
+    let mut bits = String::new();
+    let number = |value: u32| {
+        let digits = format!("{:b}", value + 1);
+        "0".repeat(digits.len() - 1) + &digits
+    };
+    // The id, the length of frame numbers, the kind of order, the number of references.
+    bits.extend([number(0), number(0), number(2), number(1), "0".to_owned()]);
+    bits.extend([
+        number(width - 1),
+        number(height - 1),
+        "1".to_owned(),
+        "1".to_owned(),
+        "00".to_owned(),
+        "1".to_owned(),
+    ]);
+    let padded = bits.len().next_multiple_of(8);
+    bits += &"0".repeat(padded - bits.len());
+    let byte = |at: usize| u8::from_str_radix(&bits[at..at + 8], 2).expect("eight bits");
+    [vec![0x67, 66, 0, 62], (0..padded).step_by(8).map(byte).collect()].concat()
+}
+
+#[test]
+fn frame_sizes_of_hostile_videos_reserve_no_memory() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.video");
+    crate::format_suite::write(&path, WriteMode::Create, 0..2);
+    let video = fuzz::files(&path).into_iter().find(|file| file.extension().is_some_and(|end| end == "mp4"));
+    let video = video.expect("a video");
+    let intact = std::fs::read(&video).expect("the video");
+    let expected = fuzz::read_everything(&path).expect("the original");
+    let find = |name: &[u8]| intact.windows(name.len()).position(|bytes| bytes == name).expect("a box");
+    // The size in the description of the track.
+    for size in [[0xff; 4], [0; 4], [0x40, 0, 0x40, 0], [0x10, 0, 0x10, 0]] {
+        let mut bytes = intact.clone();
+        let at = find(b"avc1") + 28;
+        bytes[at..at + 4].copy_from_slice(&size);
+        std::fs::write(&video, bytes).expect("a written video");
+        assert!(!error(&path).is_empty(), "{size:?}");
+    }
+    // The size in the parameters of the decoder, up to 1,048,576 x 1,048,576 pixels.
+    let at = find(b"avcC") + 4;
+    let length = usize::from(u16::from_be_bytes([intact[at + 6], intact[at + 7]]));
+    for [width, height] in [[1 << 16, 1 << 16], [4096, 4096], [1024, 1024], [512, 512], [1, 1 << 16]] {
+        let mut bytes = intact.clone();
+        let set = parameter_set(width, height);
+        assert!(set.len() <= length, "{} bytes", set.len());
+        bytes[at + 8..at + 8 + length].fill(0);
+        bytes[at + 8..at + 8 + set.len()].copy_from_slice(&set);
+        std::fs::write(&video, bytes).expect("a written video");
+        match fuzz::read_everything(&path) {
+            Ok(hash) => assert_eq!(hash, expected, "{width} x {height} macroblocks"),
+            Err(error) => assert!(!error.to_string().is_empty()),
+        }
+    }
+}

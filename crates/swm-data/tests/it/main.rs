@@ -4,6 +4,7 @@
 #![allow(clippy::print_stdout, reason = "reports of skipped tests and of child processes")]
 
 mod cache;
+mod commit_race;
 mod convert;
 mod damage;
 mod doctor;

@@ -445,3 +445,24 @@ fn preview_replaces_only_its_own_files() {
         preview(&*reader, &out, &PreviewOptions::default(), |_| ()).expect("a preview replaces its own files");
     }
 }
+
+#[test]
+fn removal_of_a_table_takes_data_files_of_no_version() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let path = folder.path().join("d.lance");
+    let orphan = format!("data/{}.lance", blake3::hash(b"written before a kill").to_hex());
+    let other = format!("data/{}.lance", blake3::hash(b"something else").to_hex());
+    // Without a version, as a kill before the first commit leaves it, and with one.
+    for is_committed in [false, true] {
+        if is_committed {
+            write(&path, WriteMode::Create, 1, 0..2);
+        }
+        std::fs::create_dir_all(path.join("data")).expect("creating a folder");
+        for name in [&orphan, &other, "data/thesis.lance"] {
+            std::fs::write(path.join(name), "written before a kill").expect("writing a file");
+        }
+        FORMATS.get("lance").expect("the format").remove(&path).expect("removing the dataset");
+        let expected = [&other, "data/thesis.lance"].map(|name| path.join(name));
+        assert_eq!(files(&path), expected, "{is_committed}");
+    }
+}

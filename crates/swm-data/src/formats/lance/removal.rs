@@ -1,11 +1,13 @@
 //! Deletes a table on this machine, and nothing else in its folder.
 
-use super::store::{FOLDERS, Store, is_version};
+use super::store::{FOLDERS, Store, hash_file, is_version};
 use crate::dataset::Location;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use swm_core::{Error, Result, files};
 
-/// Deletes a table: the data files of its newest version first, then its versions. Nothing is moved.
+/// Deletes a table: the data files of its newest version first, those of no version, which a kill leaves, then its
+/// versions. Nothing is moved. A data file of no version is recognised by its name, which is the hash of its content.
 ///
 /// # Errors
 /// If the newest version cannot be read, another process writes to the table, a file is a symbolic link, or a file cannot
@@ -13,17 +15,43 @@ use swm_core::{Error, Result, files};
 pub fn remove(path: &Path) -> Result<()> {
     let store = Store::new(&Location::from(path))?;
     let _lock = store.lock("")?;
-    let Some(newest) = store.latest()? else { return Ok(()) };
-    let data = newest.manifest.fragments.iter().flat_map(|fragment| &fragment.files);
+    let newest = store.latest()?;
+    store.check_no_links()?;
+    let fragments = newest.iter().flat_map(|version| version.manifest.fragments.iter());
+    let data = fragments.flat_map(|fragment| &fragment.files);
     let mut names: Vec<PathBuf> = data.map(|file| Path::new("data").join(&file.path)).collect();
-    let io = |e| Error::io(path, "listing the versions", e);
-    names.push("_versions/latest_version_hint.json".into());
-    for entry in std::fs::read_dir(path.join("_versions")).map_err(io)? {
-        let name = entry.map_err(io)?.file_name();
-        if name.to_str().is_some_and(is_version) {
-            names.push(Path::new("_versions").join(name));
+    let unnamed: Vec<PathBuf> = regular_files(path, "data")?.into_iter().filter(|name| !names.contains(name)).collect();
+    for name in unnamed {
+        let stem = name.file_stem().and_then(|stem| stem.to_str()).unwrap_or_default();
+        // The hash of other files is not computed.
+        let is_hash = stem.len() == 64 && name.extension().is_some_and(|suffix| suffix == "lance");
+        let io = |e| Error::io(path.join(&name), "hashing a data file", e);
+        if is_hash && hash_file(&path.join(&name)).map_err(io)? == stem {
+            names.push(name);
         }
+    }
+    if newest.is_some() {
+        names.push("_versions/latest_version_hint.json".into());
+        let is_version = |name: &PathBuf| name.file_name().and_then(|name| name.to_str()).is_some_and(is_version);
+        names.extend(regular_files(path, "_versions")?.into_iter().filter(is_version));
     }
     files::delete_named(path, &names)?;
     FOLDERS.iter().try_for_each(|name| files::remove_empty_folder(&path.join(name)))
+}
+
+/// The regular files in a folder of a table, as paths below the table; none if the folder does not exist.
+fn regular_files(table: &Path, folder: &str) -> Result<Vec<PathBuf>> {
+    let io = |e| Error::io(table.join(folder), "listing a folder of the table", e);
+    let entries = match std::fs::read_dir(table.join(folder)) {
+        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(vec![]),
+        entries => entries.map_err(io)?,
+    };
+    let mut names = vec![];
+    for entry in entries {
+        let entry = entry.map_err(io)?;
+        if entry.file_type().map_err(io)?.is_file() {
+            names.push(Path::new(folder).join(entry.file_name()));
+        }
+    }
+    Ok(names)
 }

@@ -18,10 +18,11 @@ use crate::dataset::{Location, Reader as _};
 use crate::dataset::{WriteMode, WriteOptions, Writer};
 use lance_table::format::Fragment;
 use lance_table::transaction::Operation;
+use object_store::ObjectMeta;
 use object_store::path::Path as StorePath;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use swm_core::{Error, Manifest, Result, Schema};
 use swm_image::ImageCodec;
@@ -178,8 +179,24 @@ struct ShardLogFiles {
 
 impl Logs {
     fn read(store: &Store) -> Result<Self> {
+        let mut listed = store.list("_shards")?;
+        for _ in 0..MAX_ATTEMPTS {
+            let logs = Self::of(store, &listed);
+            let Err(error) = logs else { return logs };
+            // A commit on another machine removes the files that were listed.
+            let remaining = store.list("_shards")?;
+            if remaining == listed {
+                return Err(error);
+            }
+            listed = remaining;
+        }
+        Err(too_many_conflicts(&store.label))
+    }
+
+    /// Reads these files.
+    fn of(store: &Store, listed: &[ObjectMeta]) -> Result<Self> {
         let mut logs = Self::default();
-        for file in store.list("_shards")? {
+        for file in listed {
             let mut components =
                 file.location.parts().map(|component| component.as_ref().to_owned()).collect::<Vec<_>>().into_iter();
             let (Some(name), Some(folder)) = (components.next_back(), components.next_back()) else { continue };
@@ -315,16 +332,38 @@ fn check_adds(store: &Store, known: &LanceReader, shards: &Manifest) -> Result<(
 ///
 /// # Errors
 /// If a shard is missing or incomplete, the columns of the shards differ, the dataset has episodes of their collection
-/// already, or writing fails.
+/// already, another process commits them meanwhile, or writing fails.
 pub fn commit_shards(location: &Location) -> Result<usize> {
     let store = Store::new(location)?;
+    // The lock would create the folder.
+    let has_shards = store.label.join("_shards").is_dir();
+    let _lock = if has_shards { store.lock("_shards")? } else { None };
+    let listed = |store: &Store| -> Result<BTreeSet<StorePath>> {
+        Ok(store.list("_shards")?.into_iter().map(|file| file.location).collect())
+    };
+    let number = |store: &Store| Ok(store.latest()?.map(|version| version.manifest.version));
+    let (logs, version) = (listed(&store)?, number(&store)?);
+    commit_logged(&store).map_err(|error| {
+        // Another machine that commits the same shards removes their logs, which are read here.
+        let is_committed = number(&store).is_ok_and(|newer| newer > version)
+            && listed(&store).is_ok_and(|remaining| !remaining.is_superset(&logs));
+        if !is_committed {
+            return error;
+        }
+        let problem = "another process committed its shards meanwhile";
+        Error::config(store.label.display().to_string(), problem, "nothing remains to be done")
+    })
+}
+
+/// Commits the shards whose logs are in the store.
+fn commit_logged(store: &Store) -> Result<usize> {
     for _ in 0..MAX_ATTEMPTS {
-        let logs = Logs::read(&store)?;
+        let logs = Logs::read(store)?;
         let version = store.latest()?;
-        if version.as_ref().is_some_and(|version| logs.remove_committed(&store, version)) {
+        if version.as_ref().is_some_and(|version| logs.remove_committed(store, version)) {
             return Ok(0);
         }
-        let shards = logs.complete(&store)?;
+        let shards = logs.complete(store)?;
         let Some(begun) = shards.first().and_then(|shard_log| shard_log.begun.as_ref()) else {
             return Err(damaged(&store.label, "a shard has no begun.json"));
         };
@@ -358,7 +397,7 @@ pub fn commit_shards(location: &Location) -> Result<usize> {
                 // If this fails, another writer has replaced the manifest.
                 table.commit(operation)?;
             }
-            logs.remove(&store);
+            logs.remove(store);
             return Ok((next - first) as usize);
         }
         for indices in fragments.iter().filter_map(|fragment| fragment.files.last()) {

@@ -14,7 +14,7 @@
 
 use crate::nn::Init;
 use crate::nn::parameters::{self, HostTensor, Named};
-use crate::run_folder::{CHECKPOINT_FILES, CONFIG, FOLDER, MANIFEST, OPTIMIZER, RAW, STATE, WEIGHTS};
+use crate::run_folder::{CHECKPOINT_PATTERNS, CONFIG, FOLDER, MANIFEST, NEW_FOLDER, OPTIMIZER, RAW, STATE, WEIGHTS};
 use crate::stored::{self, StoredCheckpoint, broken, read_tensors, read_text, with_weights};
 use crate::tensor_file;
 use crate::train::run_state::RunState;
@@ -24,7 +24,7 @@ use serde::{Deserialize, Serialize};
 use std::path::Path;
 use swm_core::{Error, Manifest, Result, files, manifest};
 
-pub use crate::stored::{check_unused, family, faults};
+pub use crate::stored::{check_unused, family, faults, is_unfinished};
 
 /// A trained model, its configuration and its provenance.
 #[derive(Clone, Debug)]
@@ -190,9 +190,28 @@ pub(crate) fn write(
     weights: &Named<HostTensor>,
     additional: &[(&str, Vec<u8>)],
 ) -> Result<String> {
-    let new = run.join(format!("{FOLDER}.new"));
-    files::delete(&new, CHECKPOINT_FILES)?;
+    let new = run.join(NEW_FOLDER);
+    files::delete(&new, CHECKPOINT_PATTERNS)?;
     std::fs::create_dir_all(&new).map_err(|error| Error::io(&new, "creating a checkpoint", error))?;
+    let written = write_new(&new, config, manifest, weights, additional);
+    if written.is_err() {
+        // On a full disk, for example. If this fails too, `swm checkpoints remove` deletes the rest.
+        let _ = files::delete(&new, CHECKPOINT_PATTERNS);
+        let _ = files::remove_empty_folder(&new);
+    }
+    let hash = written?;
+    replace(run, &new)?;
+    Ok(hash)
+}
+
+/// Writes the files of a checkpoint to the folder `new` and returns the hash of the weights.
+fn write_new(
+    new: &Path,
+    config: &impl Serialize,
+    manifest: &mut Manifest,
+    weights: &Named<HostTensor>,
+    additional: &[(&str, Vec<u8>)],
+) -> Result<String> {
     let write_file = |name: &str, bytes: &[u8]| files::write(&new.join(name), bytes);
     let config = text(config)?;
     write_file(CONFIG, config.as_bytes())?;
@@ -203,7 +222,6 @@ pub(crate) fn write(
     manifest.hashes.insert("weights".to_owned(), hash.clone());
     additional.iter().try_for_each(|(name, bytes)| write_file(name, bytes))?;
     write_file(MANIFEST, text(manifest)?.as_bytes())?;
-    replace(run, &new)?;
     Ok(hash)
 }
 
@@ -225,7 +243,7 @@ fn replace(run: &Path, new: &Path) -> Result<()> {
 /// Deletes the checkpoint in the folder `old`, moves the remaining entries to the folder `current`, and removes `old`
 /// if it is empty then. An entry whose name exists in `current` stays.
 fn move_other_files(old: &Path, current: &Path) -> Result<()> {
-    let remaining = files::delete(old, CHECKPOINT_FILES)?;
+    let remaining = files::delete(old, CHECKPOINT_PATTERNS)?;
     for path in &remaining {
         let target = current.join(path.file_name().unwrap_or_default());
         if !target.exists() {

@@ -1,11 +1,15 @@
 //! The names of the files that training writes to the folder of a run, and the removal of a run.
 
+use crate::train::failed_batch;
 use std::path::{Path, PathBuf};
-use swm_core::Result;
 use swm_core::files::{self, Lock};
+use swm_core::{Error, Result};
+use swm_data::FORMATS;
 
 /// The folder of the checkpoint inside the folder of a run.
 pub(crate) const FOLDER: &str = "checkpoint";
+/// The folder in which a checkpoint is written before it replaces [`FOLDER`].
+pub(crate) const NEW_FOLDER: &str = "checkpoint.new";
 /// Family, configuration and statistics of the dataset.
 pub(crate) const CONFIG: &str = "config.json";
 /// Provenance, and the hashes of the other files.
@@ -22,6 +26,21 @@ pub(crate) const STATE: &str = "state.json";
 pub(crate) const WORLD_MODEL: &str = "world";
 /// The files of a checkpoint.
 pub(crate) const CHECKPOINT_FILES: &[&str] = &[CONFIG, MANIFEST, WEIGHTS, RAW, OPTIMIZER, STATE];
+/// The files of a checkpoint, and what a kill leaves of [`files::write`], as patterns of [`files::delete`].
+pub(crate) const CHECKPOINT_PATTERNS: &[&str] = &[
+    CONFIG,
+    MANIFEST,
+    WEIGHTS,
+    RAW,
+    OPTIMIZER,
+    STATE,
+    ".config.json.*.tmp",
+    ".manifest.json.*.tmp",
+    ".weights.safetensors.*.tmp",
+    ".raw.safetensors.*.tmp",
+    ".optimizer.safetensors.*.tmp",
+    ".state.json.*.tmp",
+];
 
 /// The file with the weights of the checkpoint in the folder of a run.
 pub fn weights(run: &Path) -> PathBuf {
@@ -34,17 +53,8 @@ pub(crate) const PLAYED: &str = "played-";
 pub(crate) const REPLAY: &str = "replay.lance";
 /// The state of the episodes in such a folder.
 pub(crate) const COLLECTOR: &str = "place.json";
-/// The files of such a folder, as patterns of [`files::delete`].
-pub(crate) const SAVED_DATA_FILES: &[&str] = &[
-    COLLECTOR,
-    "replay.lance/data/*.lance",
-    "replay.lance/_versions/*.manifest",
-    "replay.lance/_versions/latest_version_hint.json",
-    "replay.lance/_transactions/*.txn",
-];
-
 /// Logs and reports of failures, as patterns of [`files::delete`].
-const LOG_FILES: &[&str] = &["run.json", "train.jsonl", "events.out.tfevents.*.swm", "failed-batch.safetensors"];
+const LOG_FILES: &[&str] = &["run.json", "train.jsonl", "events.out.tfevents.*.swm"];
 
 /// The folders of a run that may hold a checkpoint; the empty name is the folder of the run.
 const CHECKPOINT_FOLDERS: &[&str] = &[
@@ -60,6 +70,41 @@ const CHECKPOINT_FOLDERS: &[&str] = &[
     "world/checkpoint.old/",
 ];
 
+/// The folders with the data of an online run in the folder of a run, sorted.
+///
+/// # Errors
+/// When the folder cannot be listed.
+pub(crate) fn saved_data(run: &Path) -> Result<Vec<PathBuf>> {
+    let io = |error| Error::io(run, "listing the folder of a run", error);
+    let is_step = |step: &str| !step.is_empty() && step.bytes().all(|byte| byte.is_ascii_digit());
+    let mut folders = vec![];
+    for entry in std::fs::read_dir(run).map_err(io)? {
+        let entry = entry.map_err(io)?;
+        let name = entry.file_name();
+        let is_played = name.to_str().and_then(|name| name.strip_prefix(PLAYED)).is_some_and(is_step);
+        if is_played && entry.file_type().map_err(io)?.is_dir() {
+            folders.push(entry.path());
+        }
+    }
+    folders.sort();
+    Ok(folders)
+}
+
+/// Deletes the replay buffer and the state of the episodes in a folder of [`saved_data`], then the folder if it is empty.
+/// Of the replay buffer, only files that it names, or that are named by the hash of their content, are deleted.
+///
+/// # Errors
+/// When the replay buffer is damaged, or a file cannot be removed. A missing folder is not an error.
+pub(crate) fn remove_saved_data(folder: &Path) -> Result<()> {
+    files::check_no_link(folder)?;
+    let replay = folder.join(REPLAY);
+    if replay.exists() {
+        FORMATS.get("lance")?.remove(&replay)?;
+    }
+    files::delete(folder, &[COLLECTOR])?;
+    files::remove_empty_folder(folder)
+}
+
 /// Deletes the checkpoints, logs and replay data in the folder of a run; files with other names stay. Returns the entries
 /// that remain; the folder is removed if none remain.
 ///
@@ -68,10 +113,21 @@ const CHECKPOINT_FOLDERS: &[&str] = &[
 pub fn remove(run: &Path) -> Result<Vec<PathBuf>> {
     files::check_no_link(run)?;
     let _lock = Lock::folder(run)?;
-    let checkpoints =
-        CHECKPOINT_FOLDERS.iter().flat_map(|folder| CHECKPOINT_FILES.iter().map(move |file| format!("{folder}{file}")));
-    let saved_data = SAVED_DATA_FILES.iter().map(|file| format!("{PLAYED}*/{file}"));
+    let checkpoints = CHECKPOINT_FOLDERS
+        .iter()
+        .flat_map(|folder| CHECKPOINT_PATTERNS.iter().map(move |file| format!("{folder}{file}")));
     let logs = LOG_FILES.iter().map(ToString::to_string);
-    let patterns: Vec<String> = checkpoints.chain(saved_data).chain(logs).collect();
+    let patterns: Vec<String> = checkpoints.chain(logs).collect();
+    for folder in saved_data(run)? {
+        match remove_saved_data(&folder) {
+            // The files of a damaged replay buffer are unknown, so they stay.
+            Err(Error::Corrupt { .. }) => {}
+            removed => removed?,
+        }
+    }
+    let failed = run.join(failed_batch::FILE);
+    if failed_batch::is_own(&failed) {
+        files::delete_named(run, &[failed_batch::FILE.into()])?;
+    }
     files::delete(run, &patterns.iter().map(String::as_str).collect::<Vec<_>>())
 }

@@ -3,7 +3,7 @@
 use crate::capsule::Capsule;
 use crate::nn::Init;
 use crate::nn::parameters::{self, HostTensor, Named};
-use crate::run_folder::{CONFIG, FOLDER, MANIFEST, OPTIMIZER, PLAYED, RAW, WEIGHTS, WORLD_MODEL};
+use crate::run_folder::{CONFIG, FOLDER, MANIFEST, NEW_FOLDER, OPTIMIZER, PLAYED, RAW, WEIGHTS, WORLD_MODEL};
 use crate::train::limits;
 use crate::{tensor_file, weights};
 use burn::module::Module;
@@ -192,6 +192,14 @@ pub fn family(run: &Path) -> Option<String> {
     Some(file.get("family")?.as_str()?.to_owned())
 }
 
+/// Returns whether a run folder has no checkpoint but the beginning of one, which a killed program leaves. The
+/// configuration is written first.
+pub fn is_unfinished(run: &Path) -> bool {
+    let config =
+        || -> Option<Value> { serde_json::from_slice(&read_text(&run.join(NEW_FOLDER).join(CONFIG)).ok()?).ok() };
+    locate(run).is_none() && config().is_some_and(|config| config["family"].is_string())
+}
+
 /// Checks that a folder has no entry with a name of a checkpoint or of a training run, whatever its content, so that a
 /// checkpoint written there replaces nothing.
 ///
@@ -209,7 +217,7 @@ pub fn check_unused(run: &Path) -> Result<()> {
     }
     names.sort();
     let is_used = |name: &&String| {
-        let fixed = [CONFIG, FOLDER, "checkpoint.new", "checkpoint.old", "train.jsonl", "best", WORLD_MODEL];
+        let fixed = [CONFIG, FOLDER, NEW_FOLDER, "checkpoint.old", "train.jsonl", "best", WORLD_MODEL];
         fixed.contains(&name.as_str()) || name.starts_with(PLAYED) || is_event_file(name)
     };
     let Some(name) = names.iter().find(is_used) else { return Ok(()) };

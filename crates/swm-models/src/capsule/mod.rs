@@ -203,14 +203,19 @@ impl Capsule {
     }
 }
 
-/// Writes the checkpoint of a capsule to a run folder, and returns the hash of its weights. Replaces nothing.
+/// Writes the checkpoint of a capsule to a run folder, and returns the hash of its weights. Replaces nothing. If a file
+/// cannot be written, nothing remains of the others.
 ///
 /// # Errors
 /// As [`checkpoint::check_unused`], when another process writes to `run`, or a file cannot be written.
 pub fn export(capsule: &Capsule, run: &Path) -> Result<String> {
     let _lock = Lock::folder(run)?;
     checkpoint::check_unused(run)?;
-    checkpoint::write(run, &capsule.checkpoint, &mut capsule.manifest.clone(), &capsule.weights, &[])
+    let written = checkpoint::write(run, &capsule.checkpoint, &mut capsule.manifest.clone(), &capsule.weights, &[]);
+    if written.is_err() {
+        files::remove_empty_folder(run)?;
+    }
+    written
 }
 
 /// Returns the error for a damaged capsule.

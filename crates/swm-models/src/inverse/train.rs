@@ -125,7 +125,7 @@ fn run(
     let started = Instant::now();
     let key = Key::new(config.seed).with(FAMILY);
     let manifest = manifest(config, world_model, &*reader)?;
-    let mut log = log::Log::new(out, false)?;
+    let mut log = log::Log::new(out, 0)?;
     let loader = loader(config, world_model.config.data.frameskip, reader)?;
     let (latent, action_dim) = (world_model.config.model.latent, world_model.action_dim());
     let init = Init::new(key.with("init"), &Device::flex());

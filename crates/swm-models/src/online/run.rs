@@ -5,7 +5,7 @@ use super::collector::{Collector, CollectorState};
 use super::config::OnlineConfig;
 use super::evaluation;
 use super::shared_model::SharedModel;
-use crate::run_folder::{COLLECTOR, PLAYED, REPLAY, SAVED_DATA_FILES};
+use crate::run_folder::{self, COLLECTOR, PLAYED, REPLAY};
 use crate::train::config::LoopConfig;
 use crate::train::learner::{self, DynLearner, Learner, Update};
 use crate::train::metrics::{MetricWindow, Metrics};
@@ -124,7 +124,7 @@ fn start<'a, M: Agent>(
         explorer: policy(online.envs, true)?,
         evaluator: policy(evaluation_pool.len(), false)?,
         evaluation_pool,
-        log: log::Log::new(out, learner.state().step > 0)?,
+        log: log::Log::new(out, learner.state().step)?,
         key: Key::new(config.seed).with("online"),
         learner: Box::new(OnlineLearner { learner, shared }),
     };
@@ -360,19 +360,15 @@ impl Run<'_> {
     /// Returns the hash of the weights.
     fn save(&mut self) -> Result<String> {
         let folder = saved_data(self.out, self.step());
-        files::delete(&folder, SAVED_DATA_FILES)?;
+        run_folder::remove_saved_data(&folder)?;
         std::fs::create_dir_all(&folder).map_err(|error| Error::io(&folder, "creating a folder", error))?;
         self.data.replay.save(folder.join(REPLAY), WriteOptions::default())?;
         let path = folder.join(COLLECTOR);
         std::fs::write(&path, json!(self.data.collector.state()).to_string())
             .map_err(|error| Error::io(&path, "saving the state of the episodes", error))?;
         let weights = self.learner.learner().save(self.out)?;
-        let entries = std::fs::read_dir(self.out).map_err(|error| Error::io(self.out, "listing a run", error))?;
-        for path in entries.filter_map(|entry| Some(entry.ok()?.path())) {
-            let name = path.file_name().unwrap_or_default().to_string_lossy();
-            if name.starts_with(PLAYED) && path != folder {
-                files::delete(&path, SAVED_DATA_FILES)?;
-            }
+        for path in run_folder::saved_data(self.out)?.into_iter().filter(|path| *path != folder) {
+            run_folder::remove_saved_data(&path)?;
         }
         Ok(weights)
     }

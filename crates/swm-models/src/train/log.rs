@@ -1,6 +1,7 @@
 //! The log of a training run: JSON lines (`train.jsonl`) and a TensorBoard event file.
 
 use prost::Message;
+use serde::Deserialize;
 use std::fs::File;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
@@ -33,26 +34,33 @@ impl Writer {
 }
 
 impl Log {
-    /// Opens the log of a folder; `resume` appends to the lines of an earlier run. Each run writes a new event
-    /// file, as TensorBoard expects.
+    /// Opens the log of a folder. A run that continues after step `done` appends to the lines of the earlier run, without
+    /// those of later steps, which are trained again; 0 is a new run. Each run writes a new event file, as TensorBoard
+    /// expects.
     ///
     /// # Errors
     /// When the folder cannot be written, or a new run would replace files that no run wrote.
-    pub fn new(folder: &Path, resume: bool) -> Result<Self> {
-        if !resume {
+    pub fn new(folder: &Path, done: usize) -> Result<Self> {
+        let (lines, resume) = (folder.join("train.jsonl"), done > 0);
+        if resume {
+            remove_later_steps(folder, done)?;
+        } else {
             super::resume::check_new_run(folder)?;
         }
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let name = format!("events.out.tfevents.{}.{:09}.swm", now.as_secs(), now.subsec_nanos());
-        let mut log = Self {
-            lines: Writer::open(folder.join("train.jsonl"), resume)?,
-            events: Writer::open(folder.join(name), false)?,
-        };
+        let mut log = Self { lines: Writer::open(lines, resume)?, events: Writer::open(folder.join(name), false)? };
         log.event(Event {
             wall_time: now.as_secs_f64(),
             file_version: Some("brain.Event:2".to_owned()),
             ..Event::default()
         })?;
+        if resume {
+            // TensorBoard leaves out what earlier files of the run say of this step and later ones.
+            let session_log = Some(SessionLog { status: SessionLog::START });
+            let step = done as i64 + 1;
+            log.event(Event { wall_time: now.as_secs_f64(), step, session_log, ..Event::default() })?;
+        }
         Ok(log)
     }
 
@@ -75,14 +83,36 @@ impl Log {
         self.event(Event {
             wall_time: now.as_secs_f64(),
             step: step as i64,
-            file_version: None,
             summary: Some(Summary { value: scalars.iter().map(value).collect() }),
+            ..Event::default()
         })
     }
 
     fn event(&mut self, event: Event) -> Result<()> {
         self.events.write(&record(&event.encode_to_vec()))
     }
+}
+
+/// Removes the lines of steps after `done` from the log in a folder, and a last line that a kill cut off.
+///
+/// # Errors
+/// When the log is no regular file, or cannot be read or replaced. A missing log is created.
+pub(super) fn remove_later_steps(folder: &Path, done: usize) -> Result<()> {
+    #[derive(Deserialize)]
+    struct Line {
+        step: u64,
+    }
+    let path = folder.join("train.jsonl");
+    // Refuses a link, which replacing would remove.
+    files::open_to_write(&path, true)?;
+    let text = files::read(&path, u64::MAX)?;
+    let is_kept = |line: &&[u8]| match serde_json::from_slice::<Line>(line) {
+        Ok(Line { step }) => step <= done as u64,
+        // A line of other text is not of this program; one without an end was cut off.
+        Err(_) => line.ends_with(b"\n"),
+    };
+    let kept: Vec<u8> = text.split_inclusive(|&byte| byte == b'\n').filter(is_kept).flatten().copied().collect();
+    if kept.len() < text.len() { files::write(&path, &kept) } else { Ok(()) }
 }
 
 /// The fields of TensorFlow's `event.proto` that scalars need.
@@ -96,6 +126,19 @@ struct Event {
     file_version: Option<String>,
     #[prost(message, optional, tag = "5")]
     summary: Option<Summary>,
+    #[prost(message, optional, tag = "7")]
+    session_log: Option<SessionLog>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct SessionLog {
+    #[prost(int32, tag = "1")]
+    status: i32,
+}
+
+impl SessionLog {
+    /// A run begins or continues at the step of the event.
+    const START: i32 = 1;
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -134,7 +177,7 @@ mod tests {
     #[test]
     fn events_round_trip_with_valid_checksums() {
         let folder = tempfile::tempdir().expect("creating a temporary folder");
-        let mut log = Log::new(folder.path(), false).expect("creating the log");
+        let mut log = Log::new(folder.path(), 0).expect("creating the log");
         log.write(7, &[("loss", 0.5), ("lr", 1e-3)]).expect("writing scalars");
         let line = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("reading train.jsonl");
         assert_eq!(line, "{\"loss\":0.5,\"lr\":0.001,\"step\":7}\n");
@@ -153,6 +196,30 @@ mod tests {
         assert_eq!(found[1].step, 7);
         let values = &found[1].summary.as_ref().expect("a summary").value;
         assert_eq!((values[0].tag.as_str(), values[0].simple_value), ("train/loss", Some(0.5)));
+    }
+
+    #[test]
+    fn continued_log_has_each_step_once() {
+        let folder = tempfile::tempdir().expect("creating a temporary folder");
+        let path = folder.path().join("train.jsonl");
+        let mut log = Log::new(folder.path(), 0).expect("creating the log");
+        for step in 1..=3 {
+            log.write(step, &[("loss", 0.5)]).expect("writing scalars");
+        }
+        drop(log);
+        // A kill cut off the last line; the last checkpoint is that of step 2.
+        let text = std::fs::read_to_string(&path).expect("reading train.jsonl");
+        std::fs::write(&path, format!("{text}{{\"loss\":0.")).expect("writing train.jsonl");
+        let mut log = Log::new(folder.path(), 2).expect("continuing the log");
+        log.write(3, &[("loss", 0.25)]).expect("writing scalars");
+        let text = std::fs::read_to_string(&path).expect("reading train.jsonl");
+        let lines = ["{\"loss\":0.5,\"step\":1}", "{\"loss\":0.5,\"step\":2}", "{\"loss\":0.25,\"step\":3}"];
+        assert_eq!(text.lines().collect::<Vec<_>>(), lines);
+        let events = std::fs::read(&log.events.path).expect("reading the event file");
+        let length = |at: usize| u64::from_le_bytes(events[at..at + 8].try_into().expect("8 bytes")) as usize;
+        let second = 16 + length(0);
+        let event = Event::decode(&events[second + 12..second + 12 + length(second)]).expect("decoding the event");
+        assert_eq!((event.step, event.session_log), (3, Some(SessionLog { status: SessionLog::START })));
     }
 
     #[test]

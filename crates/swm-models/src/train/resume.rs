@@ -1,7 +1,7 @@
 //! Checks that a stored run can be continued with a given configuration and dataset, and that a new run
 //! replaces nothing that no run wrote.
 
-use crate::run_folder::{CHECKPOINT_FILES, CONFIG, FOLDER};
+use crate::run_folder::{CHECKPOINT_FILES, CONFIG, FOLDER, NEW_FOLDER};
 use crate::stored::{is_event_file, locate};
 use serde::Deserialize;
 use serde_json::Value;
@@ -39,7 +39,7 @@ pub(crate) fn check_new_run(out: &Path) -> Result<()> {
     let current = out.join(FOLDER);
     let mut foreign = is_occupied(&current) && !current.join(CONFIG).is_file();
     foreign |= locate(out).is_none() && is_occupied(&out.join("checkpoint.old"));
-    let mut places = vec![out.join("checkpoint.new")];
+    let mut places = vec![out.join(NEW_FOLDER)];
     for inner in ["best", "world"] {
         places.extend(["", ".new", ".old"].map(|end| out.join(inner).join(format!("{FOLDER}{end}"))));
     }

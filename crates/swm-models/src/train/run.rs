@@ -4,7 +4,7 @@ use super::config::{LoopConfig, TrainConfig};
 use super::dataset_info::DatasetInfo;
 use super::failed_batch;
 use super::learner::{self, DynLearner, Learner, Update};
-use super::log::Log;
+use super::log::{Log, remove_later_steps};
 use super::metrics::{MetricWindow, Metrics};
 use super::optim::ParameterGroup;
 use super::options::{TrainOptions, TrainSummary};
@@ -71,6 +71,8 @@ pub fn begin<M: Trainable>(
     if !Checkpoint::<M>::exists(out) {
         resume::check_new_run(out)?;
         learner.save(out)?;
+    } else {
+        remove_later_steps(out, learner.state().step)?;
     }
     let settings = config.loop_config();
     let part = |part| batches(&settings, loader.clone(), part, &*reader);
@@ -189,7 +191,7 @@ impl<'a> Run<'a> {
         };
         let first_step = learner.state().step;
         let batches = Batches::new(loader(Part::Train)?, first_step * config.optim.accumulate);
-        let log = Log::new(out, first_step > 0)?;
+        let log = Log::new(out, first_step)?;
         let clock = Clock { start: Instant::now(), first_step, waited: 0.0, clips_per_second: 0.0 };
         Ok(Self { config, out, learner, batches, validation, log, clock })
     }

@@ -8,7 +8,7 @@ use swm_core::{EnvPool, Result};
 use swm_models::online::{Agent, OnlineSummary, train_online};
 use swm_models::sac::Sac;
 use swm_models::tdmpc2::Tdmpc2;
-use swm_models::{TrainConfig, TrainOptions, Trainable, train};
+use swm_models::{TrainConfig, TrainOptions, Trainable, run_folder, train};
 
 const PENDULUM: &str = "swm/PendulumControl-v1";
 
@@ -170,4 +170,19 @@ fn invalid_settings_and_data_are_refused() {
     );
     let error = error.expect_err("a dataset without rewards").to_string();
     assert!(error.contains("'reward'") && error.contains("swm collect"), "{error}");
+}
+
+#[test]
+fn removed_run_keeps_files_among_its_replay_data() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let out = folder.path().join("run");
+    run(&config::<Sac>(&[]), &out, &TrainOptions::default(), 0).expect("the run");
+    let thesis = out.join("played-24/replay.lance/data/thesis.lance");
+    std::fs::write(&thesis, "thesis").expect("writing a file of the user");
+    let remaining = run_folder::remove(&out).expect("removing the run");
+    assert_eq!(remaining, [out.join("played-24")]);
+    assert_eq!(std::fs::read(&thesis).expect("reading the file of the user"), b"thesis");
+    let entries = |path: &Path| std::fs::read_dir(path).expect("listing a folder").count();
+    let data = thesis.parent().expect("the folder of the file");
+    assert_eq!((entries(data), entries(data.parent().expect("the dataset"))), (1, 1));
 }

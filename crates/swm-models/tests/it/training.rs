@@ -9,7 +9,7 @@ use swm_core::files::Lock;
 use swm_core::run::{Control, Event};
 use swm_models::lewm::{EncoderConfig, Lewm};
 use swm_models::nn::{ConvConfig, parameters};
-use swm_models::{Checkpoint, Device, TrainConfig, TrainOptions, TrainSummary, train};
+use swm_models::{Checkpoint, Device, TrainConfig, TrainOptions, TrainSummary, run_folder, train};
 
 /// A model of a few thousand parameters.
 pub fn config(overrides: &[&str]) -> TrainConfig<Lewm> {
@@ -173,4 +173,26 @@ fn non_finite_loss_stops_the_run() {
     let error = run(&config(&["optim.lr=1e30", "optim.clip=1e30"]), folder.path(), &TrainOptions::default(), 0);
     let message = error.expect_err("a loss that is not finite").to_string();
     assert!(message.contains("not finite") && message.contains("optim.lr"), "{message}");
+}
+
+#[test]
+fn failed_batch_replaces_only_a_failed_batch() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let (diverging, batch) =
+        (config(&["optim.lr=1e30", "optim.clip=1e30"]), folder.path().join("failed-batch.safetensors"));
+    let message = || run(&diverging, folder.path(), &TrainOptions::default(), 0).expect_err("divergence").to_string();
+    std::fs::write(&batch, "thesis").expect("writing a file of the user");
+    let refused = message();
+    assert!(refused.contains("could not be saved") && refused.contains("not written by this program"), "{refused}");
+    assert_eq!(std::fs::read(&batch).expect("reading the file of the user"), b"thesis");
+    run_folder::remove(folder.path()).expect("removing the run");
+    assert!(batch.exists());
+    std::fs::remove_file(&batch).expect("removing the file of the user");
+    for _ in 0..2 {
+        std::fs::create_dir_all(folder.path()).expect("creating the folder");
+        let saved = message();
+        assert!(saved.contains("the batch is in"), "{saved}");
+    }
+    run_folder::remove(folder.path()).expect("removing the run");
+    assert!(!batch.exists());
 }

@@ -276,7 +276,7 @@ fn remove(given: &str, yes: bool, as_json: bool) -> anyhow::Result<()> {
         let problem = format!("it is the capsule {} of the zoo", path.display());
         anyhow::bail!(Error::config(given, problem, "delete the file by hand"));
     }
-    if checkpoint::family(&path).is_none() {
+    if checkpoint::family(&path).is_none() && !checkpoint::is_unfinished(&path) {
         anyhow::bail!(Error::corrupt(&path, "it is not a checkpoint", "give the folder that `swm train` wrote to"));
     }
     if path.is_file() {
@@ -293,7 +293,7 @@ fn remove(given: &str, yes: bool, as_json: bool) -> anyhow::Result<()> {
     emit(&format!("removed the checkpoint {}\n", path.display()));
     if !remaining.is_empty() {
         let names: Vec<String> = remaining.iter().map(|path| path.display().to_string()).collect();
-        emit(&format!("kept {}: not written by `swm train`\n", names.join(", ")));
+        emit(&format!("kept {}: not written by `swm train`, or damaged\n", names.join(", ")));
     }
     Ok(())
 }

@@ -259,3 +259,28 @@ fn capsules_of_the_zoo_are_not_removed() {
     swm.fails(&remove, 2, &["zoo/maze/model.safetensors", "delete the file by hand"]);
     assert_untouched(&file);
 }
+
+#[test]
+fn unfinished_exports_leave_nothing_or_can_be_removed() {
+    let swm = Swm::new();
+    // The limit of a file stands for a full disk: the configuration fits, the weights do not.
+    let export = format!("ulimit -f 16; exec {} checkpoints export zoo:two-room/pldm full", env!("CARGO_BIN_EXE_swm"));
+    let mut shell = std::process::Command::new("sh");
+    let failed = shell.args(["-c", &export]).current_dir(swm.home()).output().expect("a shell");
+    assert_eq!(failed.status.code(), Some(1), "{}", crate::text(&failed.stderr));
+    assert!(!swm.path("full").exists());
+
+    // What a kill leaves.
+    swm.json(&["checkpoints", "export", "zoo:two-room/pldm", "killed"]);
+    let new = swm.path("killed/checkpoint.new");
+    fs::rename(swm.path("killed/checkpoint"), &new).expect("renaming the checkpoint");
+    fs::remove_file(new.join("manifest.json")).expect("removing a file");
+    fs::rename(new.join("weights.safetensors"), new.join(".weights.safetensors.7.tmp")).expect("renaming a file");
+    user_file(&new.join("thesis.txt"));
+    swm.json(&["checkpoints", "remove", "./killed", "--yes"]);
+    assert_untouched(&new.join("thesis.txt"));
+    assert_eq!(fs::read_dir(&new).expect("listing the folder").count(), 1);
+    // Another folder of that name is no checkpoint.
+    user_file(&swm.path("mine/checkpoint.new/config.json"));
+    swm.fails(&["checkpoints", "remove", "./mine", "--yes"], 1, &["not a checkpoint"]);
+}

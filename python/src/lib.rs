@@ -10,6 +10,7 @@
 //! - [`env`](mod@env), [`frames`]: a single environment, and visual wrappers, for Gymnasium; videos.
 //! - [`listing`]: the engine's registries, and the command line.
 //! - [`study`]: the results of studies.
+//! - [`objects`]: small files of runs that several machines share.
 //! - [`training`]: training outside the engine.
 
 mod arrays;
@@ -21,6 +22,7 @@ mod frames;
 mod gym;
 mod listing;
 mod model;
+mod objects;
 mod policy;
 mod solver;
 mod study;
@@ -52,6 +54,8 @@ mod _engine {
     use super::listing::{command, envs, formats, home, solvers, spec, wrappers};
     #[pymodule_export]
     use super::model::Model;
+    #[pymodule_export]
+    use super::objects::{cpu_level, object_list, object_read, object_write, object_write_new};
     #[pymodule_export]
     use super::policy::Actor;
     #[pymodule_export]

@@ -20,6 +20,7 @@ pub mod continuation;
 pub mod evaluate;
 mod frame_strip;
 mod nearest;
+mod parts;
 mod played;
 pub mod policy_mixture;
 pub mod prediction;

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use swm_core::{Error, Manifest, Result};
-use swm_data::lance::{Shard, shard_manifests};
+use swm_data::lance::{Shard, shard_manifest, shard_manifests};
 use swm_data::{Location, WriteMode};
 use swm_eval::continuation::check_continues;
 
@@ -20,11 +20,7 @@ pub fn check(
     mix_renderers: bool,
     advice: &str,
 ) -> Result<BTreeMap<String, u64>> {
-    let exists = match location.path() {
-        Some(path) => path.exists() && !swm_data::has_no_dataset(path),
-        None => swm_data::open(location.clone()).is_ok(),
-    };
-    if !exists {
+    if !exists(location) {
         return Ok(BTreeMap::new());
     }
     match mode {
@@ -38,7 +34,26 @@ pub fn check(
             }
             Ok(not_finite)
         }
-        WriteMode::Create => Err(Error::config(format!("dataset {location}"), "it exists already", advice)),
+        WriteMode::Create => check_new(location, advice).map(|()| BTreeMap::new()),
+    }
+}
+
+/// Checks that a location has no dataset. `advice` says what to do about one.
+///
+/// # Errors
+/// When it has one.
+pub fn check_new(location: &Location, advice: &str) -> Result<()> {
+    if exists(location) {
+        return Err(Error::config(format!("dataset {location}"), "it exists already", advice));
+    }
+    Ok(())
+}
+
+/// Whether a location has a dataset.
+fn exists(location: &Location) -> bool {
+    match location.path() {
+        Some(path) => path.exists() && !swm_data::has_no_dataset(path),
+        None => swm_data::open(location.clone()).is_ok(),
     }
 }
 
@@ -47,8 +62,7 @@ pub fn check(
 /// # Errors
 /// When the log of a shard is damaged.
 pub fn not_finite_of_shard(location: &Location, shard: Shard) -> Result<BTreeMap<String, u64>> {
-    let stored = shard_manifests(location)?.into_iter().find(|(stored, _)| *stored == shard);
-    Ok(stored.map(|(_, manifest)| manifest.not_finite).unwrap_or_default())
+    Ok(shard_manifest(location, shard)?.map(|manifest| manifest.not_finite).unwrap_or_default())
 }
 
 /// Adds the NaN and infinite values of a collection to those in its manifest.

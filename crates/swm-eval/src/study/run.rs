@@ -6,7 +6,7 @@ use crate::request::EvalRequest;
 use crate::runner::{Episodes, Resolver, RunOptions};
 use std::sync::{Mutex, PoisonError};
 use swm_core::run::{Control, Event, Progress, Stage};
-use swm_core::{Result, Results};
+use swm_core::{Error, Result, Results};
 
 /// The name of the stage.
 const STAGE: &str = "study";
@@ -43,6 +43,29 @@ impl Study {
         self.evaluate(&missing, folder, resolver, options, control)?;
         self.measure_distances(folder, resolver, options, control)?;
         Ok(missing.len())
+    }
+
+    /// Evaluates the cell with this id, unless the folder has its results. Several machines evaluate the cells of a study in
+    /// this way.
+    ///
+    /// # Errors
+    /// When there is no such cell, or as [`Study::run`].
+    pub fn run_cell(
+        &self,
+        id: &str,
+        folder: &StudyFolder,
+        resolver: &dyn Resolver,
+        options: &RunOptions,
+        control: &mut Control<'_>,
+    ) -> Result<()> {
+        for cell in &self.cells {
+            if cell.id()? == id {
+                let missing = folder.results(cell)?.is_none();
+                let work = [(cell, None, cell.request.episodes)];
+                return if missing { self.evaluate(&work, folder, resolver, options, control) } else { Ok(()) };
+            }
+        }
+        Err(Error::config(format!("--cell {id}"), "the study has no such cell", "give the id of one of its cells"))
     }
 
     /// Evaluates cells in order, and stores each when it is done.

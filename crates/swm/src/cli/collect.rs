@@ -21,7 +21,7 @@ pub struct CollectArgs {
     env: String,
     /// The dataset to write: a path or a name
     #[arg(short, long, value_name = "DATASET")]
-    output: String,
+    pub(super) output: String,
     /// The policy: random, expert, an expert's id, or a checkpoint
     ///
     /// The checkpoint must act without a solver. `swm envs ENV` lists the experts. Repeat the option with weights for a
@@ -35,7 +35,7 @@ pub struct CollectArgs {
     action_noise: f64,
     /// Number of episodes of the complete dataset
     #[arg(long, default_value_t = 100)]
-    episodes: usize,
+    pub(super) episodes: usize,
     /// Seed; an episode depends only on the seed and on the episode's index
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -58,12 +58,12 @@ pub struct CollectArgs {
     max_steps: Option<usize>,
     /// Dataset format (default: from the suffix); `swm formats` lists them
     #[arg(long, value_name = "NAME")]
-    format: Option<String>,
+    pub(super) format: Option<String>,
     /// Collect shard I of N, counted from 0, of a Lance dataset
     ///
     /// `swm datasets commit` commits the shards of all machines.
     #[arg(long, value_name = "I/N", value_parser = shard, conflicts_with = "format")]
-    shard: Option<Shard>,
+    pub(super) shard: Option<Shard>,
     /// Stop at NaN and infinite values instead of counting them
     ///
     /// Without it they are stored, and the manifest contains their number in each column.
@@ -76,10 +76,10 @@ pub struct CollectArgs {
     codec: CodecArgs,
     /// Continue an interrupted collection
     #[arg(long, conflicts_with = "overwrite")]
-    resume: bool,
+    pub(super) resume: bool,
     /// Replace an existing dataset
     #[arg(long)]
-    overwrite: bool,
+    pub(super) overwrite: bool,
     #[command(flatten)]
     wrappers: WrapperArgs,
     #[command(flatten)]
@@ -97,7 +97,7 @@ impl CollectArgs {
 const EXISTS: &str = "continue it with --resume, replace it with --overwrite, or choose another name";
 
 /// Parses `I/N`.
-fn shard(text: &str) -> std::result::Result<Shard, String> {
+pub(super) fn shard(text: &str) -> std::result::Result<Shard, String> {
     let parts = text.split_once('/').and_then(|(index, count)| Some((index.parse().ok()?, count.parse().ok()?)));
     match parts {
         Some((index, count)) if index < count => Ok(Shard { index, count }),
@@ -209,11 +209,7 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
         (Some(_), _) => BTreeMap::new(),
     };
     let writer = collection.writer(&world.collect_schema(config)?, collection.mode, manifest.clone())?;
-    // A shard has consecutive episodes, so that the committed dataset has all episodes in order.
-    let episodes = collection.shard.map_or(0..config.episodes, |Shard { index, count }| {
-        let share = |index: usize| (config.episodes as u128 * index as u128 / count as u128) as usize;
-        share(index)..share(index + 1)
-    });
+    let episodes = collection.shard.map_or(0..config.episodes, |shard| shard.episodes(config.episodes));
     let config = &CollectConfig { episodes: episodes.len(), first: episodes.start, ..config.clone() };
     let start = Instant::now();
     let collected = world.collect(&mut *policy, writer, config, &mut progress::control(context));

@@ -14,17 +14,17 @@ use swm_data::{ConvertMode, ConvertOptions, Converted, Location};
 #[derive(Args)]
 pub struct ConvertArgs {
     /// The dataset to read: a path, a URI or a name
-    source: String,
+    pub(super) source: String,
     /// The dataset to write: a path, a URI or a name
-    target: String,
+    pub(super) target: String,
     #[command(flatten)]
-    target_args: TargetArgs,
+    pub(super) target_args: TargetArgs,
     /// If the target exists: continue after its last episode, fail, replace, append
     #[arg(long, value_enum, default_value_t = Mode::Resume)]
-    mode: Mode,
+    pub(super) mode: Mode,
     /// Do not compare the target with the source
     #[arg(long)]
-    no_verify: bool,
+    pub(super) no_verify: bool,
 }
 
 /// Arguments of commands that write a dataset.
@@ -34,7 +34,7 @@ pub struct TargetArgs {
     #[arg(long, value_name = "NAME")]
     pub format: Option<String>,
     #[command(flatten)]
-    codec: CodecArgs,
+    pub(super) codec: CodecArgs,
     /// Minimum peak signal-to-noise ratio of lossy frames, in dB (default: 25)
     #[arg(long, value_name = "DB", value_parser = decibels)]
     least_psnr: Option<f64>,
@@ -56,8 +56,8 @@ impl TargetArgs {
     }
 }
 
-#[derive(Clone, Copy, ValueEnum)]
-enum Mode {
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(super) enum Mode {
     Resume,
     Error,
     Overwrite,

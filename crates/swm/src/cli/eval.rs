@@ -61,7 +61,7 @@ pub struct EvalArgs {
     /// decided=10 ends when every comparison and every gap is told apart from zero or shown to be below 10 points. All
     /// intervals are confidence sequences then. results.json is written after every stage.
     #[arg(long, value_name = "RULE", conflicts_with = "trace")]
-    until: Option<Until>,
+    pub(super) until: Option<Until>,
     /// Continue an interrupted evaluation with --until
     #[arg(long, requires = "until")]
     resume: bool,
@@ -88,7 +88,7 @@ pub struct EvalArgs {
     ///
     /// Results do not depend on their number, except with the compat protocol.
     #[arg(long, default_value_t = 16, value_parser = count::<1, { ENVS.max }>)]
-    envs: usize,
+    pub(super) envs: usize,
     /// Frame size if no checkpoint determines it: 64 or HEIGHTxWIDTH
     #[arg(long, default_value = "64", value_parser = image_size)]
     image: (usize, usize),
@@ -97,10 +97,10 @@ pub struct EvalArgs {
     no_pixels: bool,
     /// Folder of results.json and the videos
     #[arg(short, long, default_value = "results", value_name = "DIR")]
-    output: PathBuf,
+    pub(super) output: PathBuf,
     /// Number of videos per policy (default: 3; 0 without frames)
     #[arg(long, value_name = "EPISODES")]
-    videos: Option<usize>,
+    pub(super) videos: Option<usize>,
     /// Measure prediction errors over this many model steps, by success
     ///
     /// Predictions are compared with the recorded trajectories of the dataset.
@@ -108,7 +108,7 @@ pub struct EvalArgs {
     predict: Option<usize>,
     /// Write the search of every plan to traces.json
     #[arg(long)]
-    trace: bool,
+    pub(super) trace: bool,
     #[command(flatten)]
     wrappers: WrapperArgs,
     #[command(flatten)]
@@ -247,7 +247,7 @@ impl EvalArgs {
     }
 
     /// Checks that a policy plans, if an option of planning is given.
-    fn check_planning(&self, request: &EvalRequest) -> Result<()> {
+    pub(super) fn check_planning(&self, request: &EvalRequest) -> Result<()> {
         let plans = request.policies.iter().any(|policy| matches!(policy.kind, PolicyKind::Plan { .. }));
         let option = match plans {
             false if self.trace => "--trace",

@@ -18,6 +18,7 @@ mod eval_until;
 mod inspect;
 mod leaderboard;
 mod models;
+mod on_ray;
 mod output;
 mod output_folder;
 mod planner;
@@ -93,7 +94,7 @@ enum Command {
     Solvers,
     /// Run a policy and store its episodes
     #[command(after_help = "Example: swm collect swm/TwoRoom-v1 --output rooms --episodes 300")]
-    Collect(collect::CollectArgs),
+    Collect(Box<on_ray::collect::CollectCommand>),
     /// List the datasets, or commit the shards of one
     #[command(after_help = "Example: swm datasets")]
     Datasets(datasets::DatasetsArgs),
@@ -108,7 +109,7 @@ enum Command {
     Preview(datasets::PreviewArgs),
     /// Write a dataset in another format, and verify the result
     #[command(after_help = "Example: swm convert rooms rooms-jpeg --codec jpeg")]
-    Convert(convert::ConvertArgs),
+    Convert(on_ray::convert::ConvertCommand),
     /// Find defects of a dataset, and the models it can train
     #[command(after_help = "Example: swm doctor rooms --repair rooms-repaired")]
     Doctor(doctor::DoctorArgs),
@@ -117,7 +118,7 @@ enum Command {
     Models,
     /// Train a model on a dataset or in an environment
     #[command(after_help = "Example: swm train lewm --data rooms --output lewm-rooms optim.lr=3e-4")]
-    Train(train::TrainArgs),
+    Train(on_ray::train::TrainCommand),
     /// Draw training curves in the terminal, and as SVG
     #[command(after_help = "Example: swm plot lewm-rooms pldm-rooms --metric loss --output curves.svg")]
     Plot(plot::PlotArgs),
@@ -138,7 +139,7 @@ enum Command {
     Probe(probe::ProbeArgs),
     /// Evaluate checkpoints, experts and the random-policy floor
     #[command(after_help = "Example: swm eval lewm-rooms expert --episodes 100 --output results")]
-    Eval(Box<eval::EvalArgs>),
+    Eval(Box<on_ray::eval::EvalCommand>),
     /// Repeat an evaluation from its results and list the differences
     #[command(after_help = "Example: swm reproduce results")]
     Reproduce(reproduce::ReproduceArgs),
@@ -174,7 +175,7 @@ enum Command {
 impl Cli {
     /// The arguments of `swm train`; `None` for another command.
     pub(crate) fn into_train(self) -> Option<train::TrainArgs> {
-        if let Command::Train(args) = self.command { Some(args) } else { None }
+        if let Command::Train(command) = self.command { Some(command.args) } else { None }
     }
 }
 
@@ -285,13 +286,13 @@ impl Cli {
             Command::Zoo => zoo::zoo(json),
             Command::Checkpoints(args) => checkpoints::checkpoints(&args, &Context::new(json, self.threads)?),
             Command::Report(args) => report::report(&args, json),
-            Command::Convert(args) => convert::convert(&args, &Context::new(json, self.threads)?),
+            Command::Convert(args) => on_ray::convert::run(&args, &Context::new(json, self.threads)?),
             Command::Doctor(args) => doctor::doctor(&args, &Context::new(json, self.threads)?),
-            Command::Collect(args) => collect::collect(&args, &Context::new(json, self.threads)?),
-            Command::Train(args) => train::train(&args, &Context::new(json, self.threads)?),
+            Command::Collect(args) => on_ray::collect::run(&args, &Context::new(json, self.threads)?),
+            Command::Train(args) => on_ray::train::run(&args, &Context::new(json, self.threads)?),
             Command::Pull(args) => pull::pull(&args, json),
             Command::Probe(args) => probe::probe(&args, &Context::new(json, self.threads)?),
-            Command::Eval(args) => eval::eval(&args, &Context::new(json, self.threads)?),
+            Command::Eval(args) => on_ray::eval::run(&args, &Context::new(json, self.threads)?),
             Command::Leaderboard(args) => leaderboard::leaderboard(&args, &Context::new(json, self.threads)?),
             Command::Study(args) => study::study(&args, json, || Context::new(json, self.threads)),
             Command::Autopsy(args) => autopsy::autopsy(&args, &Context::new(json, self.threads)?),

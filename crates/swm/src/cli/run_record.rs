@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::sync::OnceLock;
+use std::sync::{Mutex, PoisonError};
 use std::time::{SystemTime, UNIX_EPOCH};
 use swm_core::{Error, Result, files};
 
@@ -19,8 +19,8 @@ pub const FILE: &str = "run.json";
 /// The largest file that is read.
 const MAX_BYTES: u64 = 1 << 24;
 
-/// The arguments of this process, the program's name first.
-static ARGUMENTS: OnceLock<Vec<String>> = OnceLock::new();
+/// The arguments of the command that runs, the program's name first.
+static ARGUMENTS: Mutex<Vec<String>> = Mutex::new(vec![]);
 
 /// The content of a `run.json`.
 #[derive(Default, Serialize, Deserialize)]
@@ -50,9 +50,15 @@ pub struct Invocation {
     pub assets: BTreeMap<String, String>,
 }
 
-/// Remembers the arguments of this process.
+/// Remembers the arguments of the command that runs. An embedding program runs several, one after the other.
 pub fn remember(arguments: &[OsString]) {
-    ARGUMENTS.get_or_init(|| arguments.iter().map(|argument| argument.to_string_lossy().into_owned()).collect());
+    let texts = arguments.iter().map(|argument| argument.to_string_lossy().into_owned()).collect();
+    *ARGUMENTS.lock().unwrap_or_else(PoisonError::into_inner) = texts;
+}
+
+/// Returns the arguments of the command that runs, the program's name first.
+pub fn arguments() -> Vec<String> {
+    ARGUMENTS.lock().unwrap_or_else(PoisonError::into_inner).clone()
 }
 
 /// Writes `run.json` to the folder of a run, which must exist. `continued` adds this command line to those that are there.
@@ -99,7 +105,7 @@ impl Invocation {
             .filter(|(_, status)| *status == swm_mujoco::assets::Status::Installed)
             .map(|(asset, _)| (asset.name.to_owned(), asset.version.to_owned()));
         Self {
-            command: ARGUMENTS.get().cloned().unwrap_or_default(),
+            command: arguments(),
             folder: std::env::current_dir().unwrap_or_default(),
             started: utc(SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs())),
             git: commit(),

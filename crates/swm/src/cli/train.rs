@@ -19,31 +19,31 @@ use swm_models::{
 pub struct TrainArgs {
     /// The model; `swm models` lists them
     #[arg(required_unless_present_any = ["recipe", "resume"])]
-    model: Option<String>,
+    pub(super) model: Option<String>,
     /// Run a recipe instead: collect, train, evaluate, report
     ///
     /// A name that `swm recipes` lists, or a TOML file. Finished steps are not repeated. Settings are STEP.OPTION=VALUE.
     #[arg(long, value_name = "RECIPE", requires = "output")]
     #[arg(conflicts_with_all = ["data", "preset", "env", "encoder", "device", "resume", "print_config"])]
-    recipe: Option<String>,
+    pub(super) recipe: Option<String>,
     /// Allow a recipe from a file to choose any name
     #[arg(long, requires = "recipe")]
     trust: bool,
     /// The dataset: a path or a name
     #[arg(long, value_name = "DATASET")]
-    data: Option<String>,
+    pub(super) data: Option<String>,
     /// Size and schedule: a preset or a TOML file (default: the first preset)
     #[arg(long)]
-    preset: Option<String>,
+    pub(super) preset: Option<String>,
     /// Train online in this environment instead (tdmpc2, sac)
     #[arg(long, value_name = "ENV", conflicts_with = "data")]
-    env: Option<String>,
+    pub(super) env: Option<String>,
     /// Time limit of an episode, in steps, with --env
     #[arg(long, value_name = "STEPS", requires = "env")]
     max_steps: Option<usize>,
     /// The checkpoint to write: a path or a name (default: MODEL-DATASET)
     #[arg(short, long, value_name = "CHECKPOINT")]
-    output: Option<String>,
+    pub(super) output: Option<String>,
     /// Checkpoint with the frozen encoder: a path or a name (inverse only)
     #[arg(long, value_name = "CHECKPOINT")]
     encoder: Option<String>,
@@ -52,13 +52,13 @@ pub struct TrainArgs {
     device: String,
     /// Continue an interrupted run; with --output alone, as it was started
     #[arg(long)]
-    resume: bool,
+    pub(super) resume: bool,
     /// Print the complete config and exit
     #[arg(long)]
-    print_config: bool,
+    pub(super) print_config: bool,
     /// Settings, such as optim.lr=3e-4 seed=1
     #[arg(value_name = "KEY=VALUE")]
-    settings: Vec<String>,
+    pub(super) settings: Vec<String>,
 }
 
 /// Runs `swm train`.
@@ -217,8 +217,16 @@ impl TrainArgs {
     /// # Errors
     /// When the family, the preset or a setting is unknown, or a value is invalid.
     pub fn config(&self) -> Result<Box<dyn TrainableConfig>> {
-        let family = self.family()?;
-        (family.config)(self.preset.as_deref().unwrap_or(family.presets[0].id), &self.settings)
+        self.config_with(&[])
+    }
+
+    /// Returns the configuration with more settings.
+    ///
+    /// # Errors
+    /// As [`TrainArgs::config`].
+    pub(super) fn config_with(&self, more: &[String]) -> Result<Box<dyn TrainableConfig>> {
+        let (family, settings) = (self.family()?, [&self.settings[..], more].concat());
+        (family.config)(self.preset.as_deref().unwrap_or(family.presets[0].id), &settings)
     }
 
     /// Returns the dataset and the folder of the checkpoint.

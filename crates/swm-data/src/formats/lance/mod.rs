@@ -27,7 +27,7 @@ mod table;
 mod writer;
 
 pub use salvage::salvage;
-pub use shard::{Shard, commit_shards, create_shard, shard_manifests};
+pub use shard::{Shard, commit_shards, create_shard, shard_manifest, shard_manifests};
 
 use crate::formats::entry::{Backend, FormatEntry};
 

@@ -23,6 +23,7 @@ use object_store::path::Path as StorePath;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
 use std::sync::Arc;
 use swm_core::{Error, Manifest, Result, Schema};
 use swm_image::ImageCodec;
@@ -37,6 +38,13 @@ pub struct Shard {
 }
 
 impl Shard {
+    /// The episodes of this shard among all of a dataset. They are consecutive, so that the committed dataset has all episodes
+    /// in order.
+    pub fn episodes(self, all: usize) -> Range<usize> {
+        let share = |index: usize| (all as u128 * index as u128 / self.count as u128) as usize;
+        share(self.index)..share(self.index + 1)
+    }
+
     /// The folder of the shard's log, below the table's folder.
     fn folder(self) -> String {
         format!("_shards/{}-of-{}", self.index, self.count)
@@ -104,7 +112,7 @@ pub fn create_shard(
         }
     }
     let begun = ShardStart { columns: schema.clone(), codec: options.codec, manifest: options.manifest.clone() };
-    let logs = Logs::read(&store)?;
+    let logs = Logs::read_shard(&store, shard)?;
     let (mut groups, mut episodes) = (0, 0);
     if let Some(shard_log) = logs.shards.get(&(shard.count, shard.index)) {
         match options.mode {
@@ -179,12 +187,21 @@ struct ShardLogFiles {
 
 impl Logs {
     fn read(store: &Store) -> Result<Self> {
-        let mut listed = store.list("_shards")?;
+        Self::read_in(store, "_shards")
+    }
+
+    /// Reads the log of one shard. With many shards, each reading the logs of all would be most of the requests to a store.
+    fn read_shard(store: &Store, shard: Shard) -> Result<Self> {
+        Self::read_in(store, &shard.folder())
+    }
+
+    fn read_in(store: &Store, folder: &str) -> Result<Self> {
+        let mut listed = store.list(folder)?;
         for _ in 0..MAX_ATTEMPTS {
             let logs = Self::of(store, &listed);
             let Err(error) = logs else { return logs };
             // A commit on another machine removes the files that were listed.
-            let remaining = store.list("_shards")?;
+            let remaining = store.list(folder)?;
             if remaining == listed {
                 return Err(error);
             }
@@ -299,6 +316,15 @@ pub fn shard_manifests(location: &Location) -> Result<Vec<(Shard, Manifest)>> {
     let shards = Logs::read(&Store::new(location)?)?.shards.into_iter();
     let manifests = shards.map(|((count, index), log)| Some((Shard { index, count }, log.begun?.manifest?)));
     Ok(manifests.flatten().collect())
+}
+
+/// The manifest of a shard; `None` if the shard does not exist or has none.
+///
+/// # Errors
+/// If its log is damaged or cannot be read.
+pub fn shard_manifest(location: &Location, shard: Shard) -> Result<Option<Manifest>> {
+    let logs = Logs::read_shard(&Store::new(location)?, shard)?;
+    Ok(logs.shards.into_values().find_map(|log| log.begun?.manifest))
 }
 
 /// Adds the NaN and infinite values of all shards to those in a manifest.

@@ -5,9 +5,11 @@
 
 mod comparison;
 mod losses;
+mod shard;
 
 pub use comparison::ColumnComparison;
 pub use losses::LEAST_PSNR;
+pub use shard::convert_shard;
 
 use crate::dataset::episodes::describe_columns;
 use crate::dataset::{CommitPolicy, Constants, Location, Reader, StepRange, WriteMode, WriteOptions};

@@ -12,12 +12,14 @@ mod online;
 mod published;
 mod report;
 mod shipped;
+mod resume;
 mod tables;
 mod variants;
 
 use super::config::count;
 use super::eval::run_options;
 use super::progress::control;
+use super::on_ray::{OnRayArgs, Request};
 use super::recipes::Datasets;
 use super::results_tables::{compared, percent};
 use super::{Context, emit, emit_json, table};
@@ -33,7 +35,7 @@ use std::path::{Path, PathBuf};
 use swm_core::results::{BreakingPoint, StudyResults, Until};
 use swm_core::run::Control;
 use swm_core::{Error, Origin, Result, limits};
-use swm_eval::{AnyStudy, Common, Study, StudyFolder};
+use swm_eval::{AnyStudy, Cell, Common, Study, StudyFolder};
 
 /// Arguments of `swm study`.
 #[derive(Args)]
@@ -54,6 +56,11 @@ enum StudyCommand {
     #[command(after_help = "Example: swm study run paper/factors --output factors episodes=20")]
     Run(RunArgs),
     /// Write the hash of a study before its first result
+    /// Evaluate the cells that a study's folder lacks
+    ///
+    /// The folder is all that is needed: it may come from another machine.
+    #[command(after_help = "Example: swm study resume factors")]
+    Resume(resume::ResumeArgs),
     ///
     /// The hash covers the question, all cells with the hashes of their datasets and weights, and the families. Publish it: the
     /// page of the study says whether it still is the registered one.
@@ -121,6 +128,8 @@ struct RunArgs {
     #[arg(long, value_name = "RULE")]
     until: Option<Until>,
 }
+    #[command(flatten)]
+    on: OnRayArgs,
 
 /// Runs `swm study`.
 pub fn study(args: &StudyArgs, json: bool, context: impl FnOnce() -> Result<Context>) -> anyhow::Result<()> {
@@ -128,6 +137,7 @@ pub fn study(args: &StudyArgs, json: bool, context: impl FnOnce() -> Result<Cont
         StudyCommand::List => list(json),
         StudyCommand::Run(args) => run(args, false, &context()?),
         StudyCommand::Register(args) => run(args, true, &context()?),
+        StudyCommand::Resume(args) => resume::run(args, &context()?),
         StudyCommand::Break(args) => breaking::run(args, &context()?),
         StudyCommand::Status { folder } => {
             let folder = StudyFolder::new(folder);
@@ -232,6 +242,9 @@ fn run(args: &RunArgs, only_register: bool, context: &Context) -> anyhow::Result
     let size = if args.small { Size::Small } else { Size::Paper };
     let (file, origin) = shipped::find(&args.study, size, args.trust)?;
     let file = match file {
+    if only_register || matches!(file, AnyFile::Table(_)) {
+        args.on.refuse(&[("--on", args.on.is_given())], "remove it: only evaluations run on a cluster")?;
+    }
         AnyFile::Evaluations(file) => file,
         AnyFile::Table(_) if only_register => {
             let fix = "register a study of evaluations";
@@ -259,6 +272,14 @@ fn run(args: &RunArgs, only_register: bool, context: &Context) -> anyhow::Result
     study.arguments = args.arguments();
     study = with_rule(study, args.until)?;
     let folder = StudyFolder::new(output);
+    if args.on.is_given() {
+        args.on.refuse(&[("--until", args.until.is_some())], "remove it, or run the study without --on")?;
+        let output = output.to_string_lossy();
+        let ids = study.cells.iter().map(Cell::id).collect::<Result<Vec<_>>>()?;
+        let cells = json!({"study": study, "ids": ids});
+        let replaced = &["-o", "--output"];
+        return args.on.submit(&Request { kind: "study", output: &output, replaced, cells }, context.json);
+    }
     if only_register {
         let (_lock, hash) = folder.register(&study)?;
         if context.json {

@@ -18,6 +18,8 @@ os.environ.update(
     RAY_USAGE_STATS_ENABLED="0",
     RAY_DEDUP_LOGS="0",
     RAY_raylet_start_wait_time_s="120",
+    # Jobs run the first `python` of the path.
+    PATH=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
 )
 
 import ray

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import json
+import os
 import shlex
 import sys
 import time
@@ -27,6 +28,8 @@ def submit(request: dict[str, Any], address: str) -> int:
         request: The request.
         address: The URL of the dashboard.
     """
+    for name in ("RAY_ADDRESS", "RAY_API_SERVER_ADDRESS"):
+        os.environ.pop(name, None)  # Ray would prefer them to the address
     try:
         client = JobSubmissionClient(address)
     except Exception as error:

@@ -19,11 +19,12 @@ SWM := $(CARGO_TARGET_DIR)/release/swm
 SUDO := $(shell [ "$$(id -u)" = 0 ] || command -v sudo)
 CARGO := cargo
 
-.PHONY: help demo test test-python test-neighbours test-browser check build tests wheel wheel-portable gpu docs assets setup setup-python reference bench deny nightly clean
+.PHONY: help demo test test-python test-ray test-neighbours test-browser check build tests wheel wheel-portable gpu docs assets setup setup-python reference bench deny nightly clean
 
 help:
 	@echo 'make demo       collect, train, plan, evaluate and report on a laptop CPU'
 	@echo 'make test       all checks and all tests'
+	@echo 'make test-ray   runs on a Ray cluster of this machine, with an S3 server on loopback'
 	@echo 'make test-neighbours   the Python package with Gymnasium, SB3, TorchRL, a PPO, DataLoader workers'
 	@echo 'make test-browser   pages in Chromium: no text is cut off or overlaps another'
 	@echo 'make build      the swm program: $(SWM)'
@@ -39,7 +40,7 @@ help:
 demo: build
 	$(SWM) demo
 
-test: check test-python
+test: check test-python test-ray
 	SWM_LANCE_PYTHON=$(VENV)/bin/python $(CARGO) test --release --workspace
 
 # The wheel in an environment of its own with nothing but its requirements, then its tests with PyTorch and the rest.
@@ -51,6 +52,18 @@ test-python: wheel assets
 	$(CACHE)/venv-bare/bin/python python/tests/bare.py
 	$(PYTHON_VENV)/bin/python -m pip install --quiet --force-reinstall --no-deps $(WHEELS)/*.whl
 	cd python/tests && $(PYTHON_VENV)/bin/python -m pytest -q
+
+# The wheel on a Ray cluster of three nodes on this machine, with an S3 server on loopback.
+RAY_VENV := $(CACHE)/venv-ray-1
+$(RAY_VENV)/ready: python/tests_ray/requirements.txt | setup
+	@mkdir -p $(CACHE)
+	python3 -m venv --clear $(RAY_VENV)
+	$(RAY_VENV)/bin/python -m pip install --quiet -r python/tests_ray/requirements.txt
+	touch $@
+
+test-ray: wheel $(RAY_VENV)/ready
+	$(RAY_VENV)/bin/python -m pip install --quiet --force-reinstall --no-deps $(WHEELS)/*.whl
+	cd python/tests_ray && $(RAY_VENV)/bin/python -m pytest -q .
 
 # The wheel with the packages that users combine it with, in an environment of its own: not part of `make test`.
 NEIGHBOURS := $(CACHE)/venv-neighbours-1

@@ -2,9 +2,9 @@
 
     ~/.cache/swm/venv-ray-1/bin/python python/benches/check_ray.py [collect|eval|train] [--kills 20]
 
-A real cluster of a head and three nodes of one CPU each, and a real S3 server on loopback. Each workload runs, to a new output each
-time, until a node was killed the given number of times at random moments; the driver is killed once in each run and started again.
-The small version of this is part of `make test-ray`.
+A real cluster of a head and three nodes of one CPU each, and a real S3 server on loopback. Each workload runs, to a new output
+each time, until a node was killed the given number of times at random moments; the driver is killed once in each run and
+started again. The small version of this is part of `make test-ray`.
 """
 
 from __future__ import annotations

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
         plot,
         policy,
         protocols,
-        ray,
         solver,
         spaces,
         studies,
@@ -35,6 +34,9 @@ if TYPE_CHECKING:
         wm,
         world,
         wrapper,
+    )
+    from . import (
+        ray as ray,
     )
     from .policy import PlanConfig
     from .world import Metrics, World
@@ -51,7 +53,6 @@ __all__ = [
     "plot",
     "policy",
     "protocols",
-    "ray",
     "solver",
     "spaces",
     "studies",
@@ -61,6 +62,8 @@ __all__ = [
     "wrapper",
 ]
 
+#: Modules that `import *` leaves out, because they need packages that few have.
+_OPTIONAL = ("ray",)
 #: The modules that define the exported classes.
 _MODULES = {"World": "world", "Metrics": "world", "PlanConfig": "policy"}
 
@@ -70,7 +73,7 @@ def __getattr__(name: str) -> Any:
         from ._engine import __version__
 
         return __version__
-    if name not in __all__:
+    if name not in (*__all__, *_OPTIONAL):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:
         module = importlib.import_module(f"{__name__}.{_MODULES.get(name, name)}")

@@ -47,7 +47,7 @@ pub fn parse_results(path: &Path, bytes: &[u8]) -> Result<Results> {
         let problem = format!("was written by stable-worldmodel {theirs}; this version is {ours}");
         return Err(Error::corrupt(path, problem, FIX));
     }
-    let results: Results = serde_json::from_slice(bytes).map_err(|error| {
+    let mut results: Results = serde_json::from_slice(bytes).map_err(|error| {
         Error::corrupt(path, format!("has a layout that this version does not read ({error})"), FIX)
     })?;
     check_size(path, &results)?;
@@ -55,6 +55,10 @@ pub fn parse_results(path: &Path, bytes: &[u8]) -> Result<Results> {
         let fix = "its episodes and its statistics contradict each other: evaluate again (`swm eval`)";
         Error::corrupt(path, format!("is inconsistent: {problem}"), fix)
     })?;
+    // Older versions wrote intervals that take starts from one recorded episode as independent.
+    if results.stopping.is_none() {
+        results.runs.iter_mut().for_each(|run| run.success = results.counting.rate(&run.episodes));
+    }
     Ok(results)
 }
 

@@ -2,6 +2,7 @@
 
 use super::{EpisodeResult, Proportion};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::fmt;
 
 /// The rule that decides which episodes count and which of them succeed.
@@ -43,10 +44,17 @@ impl Counting {
         }
     }
 
-    /// The success rate of these episodes.
+    /// The success rate of these episodes. Those that start from one recorded episode form a cluster.
     pub fn rate(self, episodes: &[EpisodeResult]) -> Proportion {
-        let counted = || episodes.iter().filter(|episode| self.counts(episode));
-        Proportion::wilson(counted().filter(|episode| episode.success).count(), counted().count())
+        let mut clusters: BTreeMap<(Option<usize>, usize), [usize; 2]> = BTreeMap::new();
+        for (i, episode) in episodes.iter().enumerate().filter(|(_, episode)| self.counts(episode)) {
+            let key = episode.start.map_or((None, i), |[recorded, _]| (Some(recorded), 0));
+            let [successes, n] = clusters.entry(key).or_default();
+            *successes += usize::from(episode.success);
+            *n += 1;
+        }
+        let clusters: Vec<[usize; 2]> = clusters.into_values().collect();
+        Proportion::clustered(clusters.into_iter())
     }
 
     /// The name of the rule: `strict` or `compat`.

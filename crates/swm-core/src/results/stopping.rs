@@ -89,11 +89,6 @@ impl Results {
     pub fn comparing(&self) -> Comparing {
         if self.stopping.is_some() { Paired::sequential } else { Paired::of_runs }
     }
-
-    /// The interval of a rate, as [`Results::comparing`] chooses the comparison.
-    pub(super) fn interval(&self) -> fn(usize, usize) -> Proportion {
-        if self.stopping.is_some() { Proportion::sequential } else { Proportion::wilson }
-    }
 }
 
 #[cfg(test)]

@@ -5,10 +5,13 @@
 //! [`Env::restore_from`].
 
 use crate::batch::{RowRef, Schema};
-use crate::{Env, Error, ResetOptions, Result, columns};
+use crate::{Env, Error, Key, ResetOptions, Result, columns};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
+
+/// The most draws of the sampled factors of an episode.
+pub const TRIES: u64 = 100;
 
 /// A start and a goal from a dataset: two rows, whose columns have [`columns::flat`] names.
 #[derive(Clone, Copy)]
@@ -95,12 +98,26 @@ pub fn required_columns(env: &dyn Env, stored: &Schema, callables: &[Callable]) 
 /// Starts an episode at a row of a dataset: by [`DatasetStartEnv::reset_from`] if the environment implements it,
 /// otherwise by [`Env::reset`], which sets everything that the rows do not contain, followed by [`Env::restore_from`].
 ///
+/// Sampled factors that contradict the recorded start, such as a wall where the agent stands, are drawn again: they follow
+/// their distribution among the values that the start allows.
+///
 /// # Errors
-/// As [`DatasetStartEnv::reset_from`], [`Env::reset`] and [`Env::restore_from`].
+/// As [`DatasetStartEnv::reset_from`], [`Env::reset`] and [`Env::restore_from`]; also when no sample of [`TRIES`] fits the
+/// start.
 pub fn reset(env: &mut dyn Env, seed: u64, options: &ResetOptions, from: DatasetStart<'_>) -> Result<()> {
     if let Some(env) = env.dataset_start_mut() {
         return env.reset_from(seed, options, from);
     }
-    env.reset(seed, options)?;
-    env.restore_from(from.start, from.goal)
+    let samples = options.variation.variation.as_ref().is_some_and(|names| !names.is_empty());
+    let mut tries = 0;
+    loop {
+        let seed =
+            if tries == 0 { seed } else { Key::new(seed).with("samples that fit the start").at(tries).seed() >> 1 };
+        env.reset(seed, options)?;
+        tries += 1;
+        match env.restore_from(from.start, from.goal) {
+            Err(Error::OutOfSpace { .. }) if samples && tries < TRIES => {}
+            restored => return restored,
+        }
+    }
 }

@@ -6,4 +6,5 @@ mod golden_classic;
 mod golden_point_agents;
 mod golden_push_t;
 mod push_t_experts;
+mod recorded_starts;
 mod wrappers;

@@ -50,6 +50,6 @@ pub use request::{Choice, Condition, EndCost, EvalRequest, HeldOut, Model, Polic
 pub use runner::{ResolvedPolicy, Resolver, RunOptions};
 pub use seeding::{episode_key, reset_seed};
 pub use starts::Starts;
-pub use study::{AnyStudy, Cell, Common, Study, StudyFolder, TableCell, TableStudy};
+pub use study::{AnyStudy, Cell, Common, Measured, Study, StudyFolder, TableCell, TableStudy};
 pub use video_recording::Videos;
 pub use world::{World, WorldConfig};

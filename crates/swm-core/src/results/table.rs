@@ -49,6 +49,10 @@ pub struct TableRow {
     /// The machine on which the values were measured; empty for values that do not depend on it.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub machine: String,
+    /// Paths in a plane that all rows share, such as the latents of each episode along two principal components; a path of
+    /// one point is a dot.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub paths: Vec<Vec<[f64; 2]>>,
 }
 
 impl TableColumn {

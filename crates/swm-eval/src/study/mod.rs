@@ -23,4 +23,4 @@ mod table;
 
 pub use cell::{Cell, Common, Study};
 pub use folder::StudyFolder;
-pub use table::{AnyStudy, TableCell, TableStudy};
+pub use table::{AnyStudy, Measured, TableCell, TableStudy};

@@ -57,8 +57,23 @@ pub enum AnyStudy {
     Table(TableStudy),
 }
 
-/// Returns the values of a cell; `None` if it cannot be measured here.
-pub type Measure<'a> = dyn FnMut(&TableCell, &mut Control<'_>) -> Result<Option<Vec<f64>>> + 'a;
+/// What was measured of a cell.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Measured {
+    /// A value for each column that is not published.
+    pub values: Vec<f64>,
+    /// The paths of [`TableRow::paths`].
+    pub paths: Vec<Vec<[f64; 2]>>,
+}
+
+impl From<Vec<f64>> for Measured {
+    fn from(values: Vec<f64>) -> Self {
+        Self { values, paths: vec![] }
+    }
+}
+
+/// Returns what was measured of a cell; `None` if it cannot be measured here.
+pub type Measure<'a> = dyn FnMut(&TableCell, &mut Control<'_>) -> Result<Option<Measured>> + 'a;
 
 /// The values of a cell, as stored.
 #[derive(Serialize, Deserialize)]
@@ -67,6 +82,8 @@ struct Stored {
     #[serde(default, skip_serializing_if = "String::is_empty")]
     machine: String,
     values: Vec<f64>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    paths: Vec<Vec<[f64; 2]>>,
 }
 
 impl TableCell {
@@ -130,8 +147,10 @@ impl TableStudy {
         let columns = self.columns.iter().filter(|column| !column.published).count();
         for (done, cell) in missing.into_iter().enumerate() {
             control.check()?;
-            if let Some(values) = measure(cell, control)? {
-                if values.len() != columns || !values.iter().all(|value| value.is_finite()) {
+            if let Some(measured) = measure(cell, control)? {
+                let Measured { values, paths } = &measured;
+                let mut all = values.iter().chain(paths.iter().flatten().flatten());
+                if values.len() != columns || !all.all(|value| value.is_finite()) {
                     let problem = format!("has the values {values:?}");
                     return Err(Error::config(
                         cell.name.clone(),
@@ -139,7 +158,7 @@ impl TableStudy {
                         format!("expected {columns} finite numbers"),
                     ));
                 }
-                folder.store_values(cell, machine, values)?;
+                folder.store_values(cell, machine, measured)?;
                 added += 1;
             }
             control.progress(Progress { stage: STAGE, done: done + 1, total, unit: "rows", metrics: &[] });
@@ -158,10 +177,12 @@ impl TableStudy {
         for cell in &self.cells {
             let stored = folder.stored(cell)?;
             done += usize::from(stored.is_some());
-            let machine = stored.as_ref().map_or(String::new(), |stored| stored.machine.clone());
-            let ours = stored.map_or(vec![None; columns], |stored| stored.values.into_iter().map(Some).collect());
+            let (machine, ours, paths) = match stored {
+                Some(Stored { machine, values, paths, .. }) => (machine, values.into_iter().map(Some).collect(), paths),
+                None => (String::new(), vec![None; columns], vec![]),
+            };
             let values = [ours, cell.published.clone()].concat();
-            rows.push(TableRow { cell: cell.id()?, name: cell.name.clone(), values, machine });
+            rows.push(TableRow { cell: cell.id()?, name: cell.name.clone(), values, machine, paths });
         }
         Ok(StudyTable {
             title: self.title.clone(),
@@ -219,8 +240,9 @@ impl StudyFolder {
         Ok(Some(stored))
     }
 
-    fn store_values(&self, cell: &TableCell, machine: &str, values: Vec<f64>) -> Result<()> {
-        let stored = Stored { request: cell.request.clone(), machine: machine.to_owned(), values };
+    fn store_values(&self, cell: &TableCell, machine: &str, measured: Measured) -> Result<()> {
+        let Measured { values, paths } = measured;
+        let stored = Stored { request: cell.request.clone(), machine: machine.to_owned(), values, paths };
         files::write(&self.values_path(cell)?, &json(&stored)?)
     }
 
@@ -260,7 +282,7 @@ mod tests {
         let mut run = |possible: bool| {
             let mut measure = |cell: &TableCell, _: &mut Control<'_>| {
                 asked.push(cell.name.clone());
-                Ok((possible || cell.name != "bb").then(|| vec![cell.name.len() as f64]))
+                Ok((possible || cell.name != "bb").then(|| vec![cell.name.len() as f64].into()))
             };
             study.run(&folder, "", &mut measure, &mut Control::new()).expect("filling the rows")
         };
@@ -279,7 +301,7 @@ mod tests {
                 cells: vec![TableCell { request: json!(values.len()), ..study.cells[0].clone() }],
                 ..study.clone()
             };
-            other.run(&folder, "", &mut |_, _| Ok(Some(values.clone())), &mut Control::new())
+            other.run(&folder, "", &mut |_, _| Ok(Some(values.clone().into())), &mut Control::new())
         };
         assert!(wrong(vec![f64::NAN]).is_err() && wrong(vec![1.0, 2.0]).is_err() && wrong(vec![]).is_err());
         let twice = TableStudy { cells: vec![study.cells[0].clone(), study.cells[0].clone()], ..study };

@@ -18,5 +18,5 @@ pub use cost::Tdmpc2Cost;
 pub use family::ENTRY;
 pub use import::{Published, export, import};
 pub use model::{Gaussian, Observation, Tdmpc2};
-pub use planner::Tdmpc2Policy;
+pub use planner::{Tdmpc2Policy, latent};
 pub use rollouts::Rollouts;

@@ -226,7 +226,10 @@ impl Policy for Tdmpc2Policy {
 }
 
 /// Returns the latent of the observation in a row of the infos, `[latent]`.
-pub(super) fn latent(config: &Tdmpc2Config, model: &Tdmpc2, infos: &Batch, row: usize) -> Result<Vec<f32>> {
+///
+/// # Errors
+/// When the infos lack a column that the model observes.
+pub fn latent(config: &Tdmpc2Config, model: &Tdmpc2, infos: &Batch, row: usize) -> Result<Vec<f32>> {
     let observation = observe_row(config, model, infos.row(row))?;
     Ok(model.encode(observation).into_data().into_f32_vec())
 }

@@ -99,6 +99,7 @@ mod tests {
             name: name.to_owned(),
             values: values.to_vec(),
             machine: String::new(),
+            paths: vec![],
         };
         let table = StudyTable {
             columns: ["random policy", "after 50 %", "after 100 %"].map(column).to_vec(),

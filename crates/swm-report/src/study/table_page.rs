@@ -1,6 +1,6 @@
 //! The page of a study whose cells are no evaluations: figures and one table.
 
-use super::figures::dots;
+use super::figures::{dots, paths};
 use super::table::NONE;
 use super::{Placed, STYLE, write_figures, write_files};
 use crate::charts;
@@ -29,7 +29,8 @@ pub struct TablePage {
 /// # Errors
 /// When a file cannot be written.
 pub fn write_table(page: &TablePage, out_dir: &Path) -> Result<PathBuf> {
-    let drawn = dots::draw(&page.results)?.into_iter().take(limits::FIGURES).enumerate();
+    let drawn =
+        paths::draw(&page.results)?.into_iter().chain(dots::draw(&page.results)?).take(limits::FIGURES).enumerate();
     let placed = drawn.map(|(i, drawn)| Placed {
         file: format!("{}-{}", drawn.name, i + 1),
         drawn,
@@ -138,6 +139,7 @@ mod tests {
             name: "<b>evil</b>".to_owned(),
             values: vec![Some(1.5), None, None],
             machine: "a machine".to_owned(),
+            paths: vec![],
         };
         let results = StudyTable {
             title: "Formats".to_owned(),

@@ -141,6 +141,7 @@ pub(super) fn table() -> TablePage {
         name: ["lance", "hdf5", "a format with a very long name", "lerobot"][i].to_owned(),
         values: (0..9).map(|j| (j % 4 != i).then_some(1234.5678 / (i + j + 1) as f64)).collect(),
         machine: "a processor with two cores".to_owned(),
+        paths: vec![],
     };
     let results = StudyTable {
         title: "Formats".to_owned(),

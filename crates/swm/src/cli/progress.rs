@@ -35,6 +35,10 @@ pub fn control(context: &Context) -> Control<'static> {
                 print_summary(stage, &format!("{subject}: {success}"));
             }
         }
+        Event::Log(line) => {
+            let print = || eprint(&format!("{line}\n"));
+            shown.as_ref().map_or_else(print, |stage| stage.bar.suspend(print));
+        }
         _ => {}
     })
 }

@@ -56,6 +56,7 @@ fn twenty_kills_of_every_study_end_in_the_same_bytes() {
         killed(study, &["episodes=6"], 20);
     }
     killed("paper/factors-per-env", &[], 20);
+    killed("paper/drift", &["episodes=2", "steps=50", "frames=300"], 20);
 }
 
 #[test]
@@ -117,6 +118,58 @@ fn formats_are_measured_and_an_object_store_only_where_it_is_named() {
     swm.json(&["study", "report", "data"]);
     assert!(swm.path("data/report/figures/dots-1.svg").exists());
     swm.fails(&[&args[..], &["sizes=3"]].concat(), 2, &["sizes", "did you mean size"]);
+}
+
+/// A study of latents, with a small model and few episodes.
+const DRIFT: &str = r#"
+kind = "drift"
+title = "Drift"
+question = "Does the actor drift?"
+[defaults]
+env = "swm/PushT-v1"
+dataset = "few-states"
+train = ["model.encoding=[{column=\"state\",latent=16}]"]
+steps = 20
+episodes = 3
+max-steps = 20
+frames = 200
+[[collect]]
+name = "few-states"
+env = "swm/PushT-v1"
+policy = "expert"
+episodes = 20
+max-steps = 30
+no-pixels = true
+"#;
+
+#[test]
+fn drift_is_measured_in_the_latents_of_a_trained_model() {
+    let swm = Swm::new();
+    std::fs::write(swm.path("drift.toml"), DRIFT).expect("writing the study");
+    swm.fails(&["study", "run", "drift.toml", "--output", "out"], 2, &["few-states", "--trust"]);
+    let run = ["study", "run", "drift.toml", "--output", "out", "--trust"];
+    let table = swm.json(&run);
+    let rows = table["rows"].as_array().expect("rows");
+    let names: Vec<&str> = rows.iter().filter_map(|row| row["name"].as_str()).collect();
+    assert_eq!(names, ["held-out episodes", "expert", "TD-MPC2's actor", "TD-MPC2's planner", "random policy"]);
+    let values = |row: usize| -> Vec<f64> {
+        rows[row]["values"].as_array().into_iter().flatten().filter_map(serde_json::Value::as_f64).collect()
+    };
+    assert!((0..5).all(|row| values(row).len() == 7 && values(row).iter().all(|value| *value >= 0.0)), "{table}");
+    // 1 % of the held-out frames are outside, by definition.
+    assert!(values(0)[5] < 5.0, "{table}");
+    let paths = |row: usize| rows[row]["paths"].as_array().map_or(0, Vec::len);
+    assert!(paths(0) > 10, "a dot for each held-out frame");
+    assert_eq!([paths(1), paths(2), paths(4)], [3, 3, 3], "a path for each episode");
+    let first = contents(&swm.path("out"));
+    swm.json(&run);
+    assert!(contents(&swm.path("out")) == first, "a second run changes nothing");
+    swm.json(&["study", "report", "out"]);
+    assert!(swm.path("out/report/figures/paths-1.svg").exists());
+    // Another empty home gives the same values: nothing depends on what was there.
+    let other = Swm::new();
+    std::fs::write(other.path("drift.toml"), DRIFT).expect("writing the study");
+    assert_eq!(other.json(&run)["rows"], table["rows"]);
 }
 
 /// A study that collects its dataset.

@@ -167,6 +167,7 @@ mod tests {
             name: name.to_owned(),
             values: values.to_vec(),
             machine: String::new(),
+            paths: vec![],
         };
         let table = StudyTable {
             columns: vec![column("a", "ms"), column("b", "MB"), column("c", "kg"), column("a, published", "ms")],

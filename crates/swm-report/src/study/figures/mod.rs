@@ -4,6 +4,7 @@
 //! - `dots`: the values of a study whose cells are no evaluations;
 //! - `drop`: the gap of each condition, as a dot with its interval;
 //! - `line`: success against a variable with numbers, with a fitted decay;
+//! - `paths`: the paths of rows in a plane, such as latents along two principal components;
 //! - `wheel`: success over a hue and another variable;
 //! - `heat`: success of conditions by policies, for more conditions than `drop` shows.
 
@@ -13,6 +14,7 @@ mod drop;
 mod heat;
 mod legend;
 mod line;
+pub(super) mod paths;
 mod scale;
 #[cfg(test)]
 mod tests;

@@ -119,6 +119,7 @@ mod tests {
             name: name.to_owned(),
             values: values.to_vec(),
             machine: String::new(),
+            paths: vec![],
         };
         let results = StudyTable {
             subject: "dataset".to_owned(),

@@ -4,6 +4,7 @@ mod any_file;
 mod breaking;
 mod colour;
 mod csv;
+mod drift;
 mod expand;
 mod export;
 mod export_table;
@@ -320,6 +321,9 @@ fn run_table(
     }
     let mut study = file.study(size, &args.settings, origin)?;
     study.arguments = args.arguments();
+    let datasets = file.datasets(size)?;
+    datasets.check_origin(origin)?;
+    datasets.make(origin, context)?;
     let folder = StudyFolder::new(output);
     tables::run(&study, &folder, context)?;
     export_table::show(&study.results(&folder)?, context.json)

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use swm_core::results::{Counting, TableColumn};
 use swm_core::run::{Control, Event};
 use swm_core::{EnvChoice, EnvPool, Error, Origin, RandomPolicy, Result, VariationRequest};
-use swm_eval::{EvalConfig, Starts, TableCell, World, WorldConfig};
+use swm_eval::{EvalConfig, Measured, Starts, TableCell, World, WorldConfig};
 use swm_models::{FAMILIES, OnlineRun, TrainOptions, device};
 
 /// The number of evaluations of a run, at equal distances in optimizer steps.
@@ -141,7 +141,7 @@ fn short(env: &str) -> String {
 ///
 /// # Errors
 /// When training fails or is interrupted.
-pub(super) fn measure(cell: &TableCell, context: &Context, control: &mut Control<'_>) -> Result<Option<Vec<f64>>> {
+pub(super) fn measure(cell: &TableCell, context: &Context, control: &mut Control<'_>) -> Result<Option<Measured>> {
     let request = &cell.request;
     let text = |key: &str| request[key].as_str().unwrap_or_default();
     let number = |key: &str| request[key].as_u64().unwrap_or_default() as usize;
@@ -182,7 +182,7 @@ pub(super) fn measure(cell: &TableCell, context: &Context, control: &mut Control
     }
     let mut values = vec![random(&choice, number("episodes"), limit, context, control)?];
     values.extend(returns(&out, request)?);
-    Ok(Some(values))
+    Ok(Some(values.into()))
 }
 
 /// The mean return of the random policy.

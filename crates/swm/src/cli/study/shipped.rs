@@ -12,6 +12,7 @@ const STUDIES: &[(&str, &str)] = &[
     ("paper/baselines", include_str!("../../../studies/paper/baselines.toml")),
     ("paper/shift", include_str!("../../../studies/paper/shift.toml")),
     ("paper/online", include_str!("../../../studies/paper/online.toml")),
+    ("paper/drift", include_str!("../../../studies/paper/drift.toml")),
     ("paper/data", include_str!("../../../studies/paper/data.toml")),
     ("paper/factors-per-env", include_str!("../../../studies/paper/factors-per-env.toml")),
     ("two-room/shift", include_str!("../../../studies/two-room/shift.toml")),

@@ -2,12 +2,15 @@
 //!
 //! - `factors`: the number of factors of variation of every environment; no environment is stepped.
 //! - `online`: returns of models that train by interaction.
+//! - `drift`: how far the latents of policies lie from those that a model was trained on.
 //! - `data`: the speed, latency and size of every format of datasets, on the local disk and in an object store.
 
 use super::any_file::Size;
+use super::drift::{self, DriftSettings, Trained};
 use super::online::{self, OnlineSettings};
 use crate::cli::Context;
 use crate::cli::progress::control;
+use crate::cli::recipes::Datasets;
 use crate::{ENVS, capsule};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -20,7 +23,7 @@ use swm_core::run::{Control, Event};
 use swm_core::{Error, Origin, Result};
 use swm_data::{ClipSpec, Location};
 use swm_envs::wrappers::WRAPPERS;
-use swm_eval::{StudyFolder, TableCell, TableStudy};
+use swm_eval::{Measured, StudyFolder, TableCell, TableStudy};
 use toml::Table;
 
 /// The file of such a study.
@@ -35,6 +38,9 @@ pub struct TableFile {
     /// Where the published values come from.
     #[serde(default)]
     source: String,
+    /// The datasets that the study collects.
+    #[serde(default)]
+    collect: Option<toml::Value>,
     #[serde(default)]
     defaults: Table,
     /// What replaces the defaults at the small size.
@@ -45,12 +51,16 @@ pub struct TableFile {
     published: BTreeMap<String, Vec<f64>>,
 }
 
+/// The name of the tables of datasets.
+const COLLECT: &str = "collect";
+
 /// What the cells of a study are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 enum TableKind {
     Factors,
     Data,
+    Drift,
     Online,
 }
 
@@ -120,6 +130,7 @@ impl TableFile {
         let mut merged = self.defaults.clone();
         if size == Size::Small {
             merged.extend(self.small.clone());
+            merged.remove(COLLECT);
         }
         let mut own = BTreeSet::new();
         for setting in settings {
@@ -151,6 +162,11 @@ impl TableFile {
                 settings.check(if own.contains("envs") { &Origin::User } else { origin })?;
                 ("run", online::columns(), settings.cells())
             }
+            TableKind::Drift => {
+                let settings: DriftSettings = settings_of(merged)?;
+                settings.check(if own.contains("env") { &Origin::User } else { origin })?;
+                ("policy", drift::columns(), settings.cells(&self.datasets(size)?.commands()))
+            }
         };
         let study = TableStudy {
             kind: self.kind.name().to_owned(),
@@ -168,6 +184,15 @@ impl TableFile {
         };
         study.check()?;
         Ok(study)
+    }
+
+    /// The datasets that the study collects at a size.
+    ///
+    /// # Errors
+    /// When a table is invalid.
+    pub fn datasets(&self, size: Size) -> Result<Datasets> {
+        let tables = if size == Size::Small { self.small.get(COLLECT) } else { self.collect.as_ref() };
+        tables.map_or(Ok(Datasets::default()), |tables| Datasets::parse(&self.title, tables.clone()))
     }
 
     /// A row for every environment of the registry, then for third-party environments with published numbers.
@@ -225,6 +250,7 @@ impl TableKind {
         match self {
             Self::Factors => "factors",
             Self::Data => "data",
+            Self::Drift => "drift",
             Self::Online => "online",
         }
     }
@@ -302,6 +328,18 @@ pub fn run(study: &TableStudy, folder: &StudyFolder, context: &Context) -> Resul
         study.run(folder, "", &mut |cell, control| Ok(count_factors(&cell.request, control)), &mut control(context))?;
         return Ok(());
     }
+    if study.kind == TableKind::Drift.name() {
+        let mut trained = None;
+        let mut measure = |cell: &TableCell, control: &mut Control<'_>| {
+            if trained.is_none() {
+                trained = Some(Trained::new(cell, context, control)?);
+            }
+            let row = cell.request["row"].as_str().unwrap_or_default();
+            trained.as_ref().map(|trained| trained.measure(row, context, control)).transpose()
+        };
+        study.run(folder, "", &mut measure, &mut control(context))?;
+        return Ok(());
+    }
     if study.kind == TableKind::Online.name() {
         let mut measure = |cell: &TableCell, control: &mut Control<'_>| online::measure(cell, context, control);
         study.run(folder, "", &mut measure, &mut control(context))?;
@@ -317,7 +355,7 @@ pub fn run(study: &TableStudy, folder: &StudyFolder, context: &Context) -> Resul
 }
 
 /// The numbers of native factors, and of these and all wrappers; `None` for an environment whose libraries are missing.
-fn count_factors(request: &Value, control: &mut Control<'_>) -> Option<Vec<f64>> {
+fn count_factors(request: &Value, control: &mut Control<'_>) -> Option<Measured> {
     let native = match request["env"].as_str().map(|id| (id, ENVS.get(id).and_then(|entry| entry.env()))) {
         // Third-party environments declare no factors.
         None => 0,
@@ -327,7 +365,7 @@ fn count_factors(request: &Value, control: &mut Control<'_>) -> Option<Vec<f64>>
             return None;
         }
     };
-    Some(vec![native as f64, (native + WRAPPERS.rows.len()) as f64])
+    Some(vec![native as f64, (native + WRAPPERS.rows.len()) as f64].into())
 }
 
 /// Measures a row. `bench` holds the dataset of the last environment.
@@ -336,7 +374,7 @@ fn measure(
     threads: usize,
     bench: &mut Option<(String, FormatBench)>,
     control: &mut Control<'_>,
-) -> Result<Option<Vec<f64>>> {
+) -> Result<Option<Measured>> {
     let text = |key: &str| request[key].as_str().unwrap_or_default();
     let remote = request["remote"].as_str();
     if remote == Some("") {
@@ -373,7 +411,7 @@ fn measure(
     };
     let cost = made.measure(text("layout"), remote.as_ref(), control)?;
     *bench = Some((env, made));
-    Ok(Some(vec![cost.clips_per_second, cost.cached_clips_per_second, cost.latency_ms, cost.megabytes]))
+    Ok(Some(vec![cost.clips_per_second, cost.cached_clips_per_second, cost.latency_ms, cost.megabytes].into()))
 }
 
 #[cfg(test)]

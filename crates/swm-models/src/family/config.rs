@@ -18,6 +18,12 @@ pub trait TrainableConfig {
     /// Never for a configuration that was loaded.
     fn to_toml(&self) -> Result<String>;
 
+    /// Returns the configuration as TOML, with the documentation of each setting as a comment above it.
+    ///
+    /// # Errors
+    /// As [`TrainableConfig::to_toml`].
+    fn to_commented_toml(&self) -> Result<String>;
+
     /// Returns the configuration as JSON.
     fn to_json(&self) -> Value;
 
@@ -50,6 +56,10 @@ pub trait TrainableConfig {
 impl<M: ModelFamily> TrainableConfig for TrainConfig<M> {
     fn to_toml(&self) -> Result<String> {
         Self::to_toml(self)
+    }
+
+    fn to_commented_toml(&self) -> Result<String> {
+        Self::to_commented_toml(self)
     }
 
     fn to_json(&self) -> Value {

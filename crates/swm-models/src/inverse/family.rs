@@ -8,6 +8,7 @@ use crate::family::{CheckpointInfo, FamilyEntry, LoadedModel, OnlineRun, TrainRu
 use crate::lewm::Lewm;
 use crate::online::OnlineSummary;
 use crate::probe::ImageEncoder;
+use crate::train::described::describe;
 use crate::train::{Preset, TrainOptions, TrainSummary, Trainable as _, TrainingPlan};
 use serde_json::{Value, json};
 use std::path::Path;
@@ -35,6 +36,10 @@ pub const ENTRY: FamilyEntry = FamilyEntry {
 impl TrainableConfig for InverseConfig {
     fn to_toml(&self) -> Result<String> {
         Self::to_toml(self)
+    }
+
+    fn to_commented_toml(&self) -> Result<String> {
+        Ok(describe(&Self::to_toml(self)?, "InverseConfig", &[]))
     }
 
     fn to_json(&self) -> Value {

@@ -1,6 +1,7 @@
 //! [`TrainConfig`]: all settings that a training run's results depend on.
 
 use super::checks::{check_finite, check_sizes, limits};
+use super::described::describe;
 use super::optim::OptimConfig;
 use super::presets::{parse, preset_text};
 use super::schedule::ScheduleConfig;
@@ -131,6 +132,15 @@ impl<M: Trainable> TrainConfig<M> {
     /// Never, if [`TrainConfig::load`] returned the configuration.
     pub fn to_toml(&self) -> Result<String> {
         toml::to_string_pretty(self).map_err(|error| Error::external("writing a configuration", error))
+    }
+
+    /// The configuration as TOML, with the documentation of each setting as a comment above it.
+    ///
+    /// # Errors
+    /// As [`TrainConfig::to_toml`].
+    pub fn to_commented_toml(&self) -> Result<String> {
+        let own = [std::any::type_name::<M::Config>(), std::any::type_name::<M::Loss>()];
+        Ok(describe(&self.to_toml()?, "TrainConfig", &[("M::Config", own[0]), ("M::Loss", own[1])]))
     }
 
     /// Checks that the settings fit each other.

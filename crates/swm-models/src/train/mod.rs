@@ -9,6 +9,7 @@
 pub mod checks;
 pub mod config;
 mod dataset_info;
+pub(crate) mod described;
 pub(crate) mod failed_batch;
 pub(crate) mod learner;
 pub mod log;

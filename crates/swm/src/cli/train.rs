@@ -53,7 +53,7 @@ pub struct TrainArgs {
     /// Continue an interrupted run; with --output alone, as it was started
     #[arg(long)]
     pub(super) resume: bool,
-    /// Print the complete config and exit
+    /// Print the complete config, with what each setting means, and exit
     #[arg(long)]
     pub(super) print_config: bool,
     /// Settings, such as optim.lr=3e-4 seed=1
@@ -75,7 +75,7 @@ pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
         if context.json {
             return emit_json(&config.to_json());
         }
-        emit(&config.to_toml()?);
+        emit(&config.to_commented_toml()?);
         return Ok(());
     }
     let (checkpoint, summary) = run_args(args, context)?;

@@ -2,6 +2,7 @@
 
 use crate::sample::{options, schema};
 use crate::{fuzz, sample};
+use swm_core::{Batch, ColumnSpec, DType, Schema};
 use swm_data::{PreviewOptions, WriteMode, create, open, preview};
 
 #[test]
@@ -23,13 +24,43 @@ fn previews_show_every_camera() {
         assert_eq!(fuzz::files(&out).len(), 4, "no other file remains");
         let png = std::io::BufReader::new(std::fs::File::open(&written[3]).expect("opening a file"));
         let png = png::Decoder::new(png).read_info().expect("reading the PNG header");
-        // Each of the eight frames in a row has two lines of text above two images, which are enlarged eightfold, and three
+        // Each of the frames, eight of an episode in two rows, has two lines of text above two images, which are enlarged eightfold, and three
         // below them.
         let frame = (2 * 24 * 8 + 2, 16 * 8 + 5 * 7);
-        assert_eq!((png.info().width, png.info().height), (8 * (frame.0 + 2) + 2, 3 * (frame.1 + 2) + 2));
+        assert_eq!((png.info().width, png.info().height), (4 * (frame.0 + 2) + 2, 6 * (frame.1 + 2) + 2));
         let one = PreviewOptions { columns: vec!["goal".to_owned()], ..options };
         assert_eq!(preview(&*reader, &out, &one, |_| ()).expect("writing the preview").len(), 4);
         let wrong = PreviewOptions { columns: vec!["state".to_owned()], ..PreviewOptions::default() };
         assert!(preview(&*reader, &out, &wrong, |_| ()).expect_err("a numeric column").to_string().contains("images"));
     }
+}
+
+#[test]
+fn three_cameras_are_a_grid() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let cameras = ["pixels", "front", "wrist"];
+    let columns = cameras.iter().map(|name| ColumnSpec::image(*name, 192, 192));
+    let columns = columns.chain([ColumnSpec::new("action", DType::Float32, [1])]);
+    let schema = Schema::new(columns).expect("creating the schema");
+    let path = folder.path().join("d.lance");
+    let mut writer = create(&path, &schema, options(WriteMode::Create)).expect("creating the dataset");
+    let mut episode = Batch::zeros(&schema, 3);
+    for (camera, level) in [60, 120, 180].into_iter().enumerate() {
+        episode.bytes_mut(camera).fill(level);
+    }
+    episode.get_mut::<f32>("action").expect("the action").copy_from_slice(&[0.0, 1.0, f32::NAN]);
+    writer.write_episode(&episode).expect("writing an episode");
+    writer.finish().expect("finishing the dataset");
+    let reader = open(&path).expect("opening the dataset");
+    let written = preview(&*reader, &folder.path().join("out"), &PreviewOptions::default(), |_| ()).expect("a preview");
+    let png = std::io::BufReader::new(std::fs::File::open(&written[1]).expect("opening a file"));
+    let mut png = png::Decoder::new(png).read_info().expect("reading the PNG header");
+    let mut pixels = vec![0; png.output_buffer_size().expect("a size")];
+    let info = png.next_frame(&mut pixels).expect("reading the image");
+    assert!(info.width < 2000 && info.height < 2000, "{} x {}", info.width, info.height);
+    // The first frame has two cameras side by side, and the third below.
+    let (wide, line) = (info.width as usize, 7);
+    let level = |x: usize, y: usize| pixels[(y * wide + x) * 3];
+    let (first, second) = (2 * line + 100, 3 * line + 192 + 100);
+    assert_eq!([level(100, first), level(300, first), level(100, second), level(300, second)], [60, 120, 180, 0]);
 }

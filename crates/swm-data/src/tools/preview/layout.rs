@@ -12,7 +12,8 @@ const GAP: usize = 2;
 /// The most elements of an action that are shown.
 const ACTION_ELEMENTS: usize = 6;
 
-/// Layout of a preview frame: the images of all cameras side by side below their labels, and the values of the step below.
+/// Layout of a preview frame: the images of all cameras below their labels, two side by side and more in a grid, and the values
+/// of the step below.
 pub(super) struct FrameLayout {
     cameras: Vec<ColumnSpec>,
     /// The columns whose values stand below the images.
@@ -25,6 +26,10 @@ pub(super) struct FrameLayout {
     pub height: usize,
     /// Side of a letter's point in pixels.
     point: usize,
+    /// The number of cameras side by side.
+    columns: usize,
+    /// Width and height of the cell of a camera, in pixels.
+    cell: [usize; 2],
 }
 
 impl FrameLayout {
@@ -55,12 +60,19 @@ impl FrameLayout {
             .filter_map(|name| schema.columns().iter().find(|column| column.name == name && !column.is_image()))
             .cloned()
             .collect();
-        let lines = 1 + usize::from(cameras.len() > 1) + values.len();
-        let wide: usize =
-            cameras.iter().map(|camera| camera.shape[1] * scale).sum::<usize>() + GAP * (cameras.len() - 1);
+        let columns = if cameras.len() <= 2 {
+            cameras.len()
+        } else {
+            cameras.len().isqrt() + usize::from(!is_square(cameras.len()))
+        };
+        let widest = cameras.iter().map(|camera| camera.shape[1] * scale).max().unwrap_or_default();
+        let named = usize::from(cameras.len() > 1) * label::height(point);
+        let cell = [widest + GAP, named + tallest + GAP];
+        let rows = cameras.len().div_ceil(columns);
         // The title must fit, even if images are narrow.
-        let width = wide.max(label::width("episode 0000 step 0000", point));
-        Ok(Self { width, height: tallest + lines * label::height(point), point, scale, cameras, values })
+        let width = (columns * cell[0] - GAP).max(label::width("episode 0000 step 0000", point));
+        let height = rows * cell[1] - GAP + (1 + values.len()) * label::height(point);
+        Ok(Self { width, height, point, scale, cameras, values, columns, cell })
     }
 
     /// The columns that a frame needs.
@@ -73,13 +85,16 @@ impl FrameLayout {
         let mut rgb = vec![0; self.width * self.height * 3];
         label::draw(&mut rgb, self.width, (0, 0), self.width, self.point, title);
         let line = label::height(self.point);
-        let (mut left, top) = (0, if self.cameras.len() > 1 { 2 * line } else { line });
-        let mut bottom = top;
+        let named = if self.cameras.len() > 1 { line } else { 0 };
+        let bottom = line + self.cameras.len().div_ceil(self.columns) * self.cell[1] - GAP;
         for (index, camera) in self.cameras.iter().enumerate() {
             let (height, width) = (camera.shape[0] * self.scale, camera.shape[1] * self.scale);
-            if self.cameras.len() > 1 {
-                label::draw(&mut rgb, self.width, (left, line), left + width, self.point, &camera.name);
+            let left = index % self.columns * self.cell[0];
+            let top = line + index / self.columns * self.cell[1];
+            if named > 0 {
+                label::draw(&mut rgb, self.width, (left, top), left + width, self.point, &camera.name);
             }
+            let top = top + named;
             let image = in_colour(camera, &batch.bytes(index)[row * camera.row_bytes()..][..camera.row_bytes()]);
             for y in 0..height {
                 let from = &image[y / self.scale * camera.shape[1]..][..camera.shape[1]];
@@ -88,8 +103,6 @@ impl FrameLayout {
                     square.as_chunks_mut::<3>().0.fill(*pixel);
                 }
             }
-            left += width + GAP;
-            bottom = bottom.max(top + height);
         }
         for (index, column) in self.values.iter().enumerate() {
             let text = format!("{} {}", column.name, in_words(&column.name, &batch.row(row).to_f64(&column.name)?));
@@ -97,6 +110,11 @@ impl FrameLayout {
         }
         Ok(rgb)
     }
+}
+
+/// Whether a number is a square.
+fn is_square(number: usize) -> bool {
+    number.isqrt().pow(2) == number
 }
 
 /// Whether a column can be shown: images, depth or segmentation.

@@ -37,6 +37,8 @@ impl Default for PreviewOptions {
 
 /// Number of frames per episode on the contact sheet.
 const SHEET_COLUMNS: usize = 8;
+/// The width of a contact sheet that is not exceeded, if a frame is narrower.
+const SHEET_WIDTH: usize = 2000;
 
 /// Number of rows decoded at once, which limits the memory.
 const ROWS: usize = 32;
@@ -85,7 +87,10 @@ pub fn preview(
         written.push(path);
         progress(done + 1);
     }
-    let image = contact_sheet(layout.width, layout.height, &sheet, SHEET_COLUMNS, 1)?;
+    // Frames of several cameras are wide: an episode then takes several lines of the sheet.
+    let mut fit = (0..=SHEET_COLUMNS.ilog2()).map(|halvings| SHEET_COLUMNS >> halvings);
+    let columns = fit.find(|columns| columns * layout.width <= SHEET_WIDTH).unwrap_or(1);
+    let image = contact_sheet(layout.width, layout.height, &sheet, columns, 1)?;
     write_png(&contact_sheet_path, image.width, image.height, &image.rgb)?;
     written.push(contact_sheet_path);
     Ok(written)

@@ -35,6 +35,7 @@ mod shell;
 mod signals;
 mod solvers;
 pub mod study;
+mod trackers;
 mod train;
 mod training_curves;
 mod wrappers;

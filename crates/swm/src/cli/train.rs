@@ -2,6 +2,7 @@
 
 use super::progress::{control, print_summary};
 use super::recipes::{self, RecipeRun};
+use super::trackers::{Tracker, Trackers};
 use super::{Context, emit, emit_json, eprint, run_record};
 use crate::home;
 use clap::Args;
@@ -53,6 +54,11 @@ pub struct TrainArgs {
     /// Continue an interrupted run; with --output alone, as it was started
     #[arg(long)]
     pub(super) resume: bool,
+    /// Send metrics to trackers as well, such as wandb,trackio
+    ///
+    /// They run in the Python of $SWM_PYTHON, with their own settings.
+    #[arg(long, value_enum, value_name = "TRACKER,…", value_delimiter = ',')]
+    log: Vec<Tracker>,
     /// Print the complete config, with what each setting means, and exit
     #[arg(long)]
     pub(super) print_config: bool,
@@ -111,8 +117,11 @@ pub fn run_args(args: &TrainArgs, context: &Context) -> anyhow::Result<(PathBuf,
     let encoder = args.encoder.as_deref().map(home::find_checkpoint).transpose()?;
     let (reader, out) = args.dataset_and_output()?;
     record(&out, args.resume)?;
+    let trackers = Trackers::start(&args.log, &out, &config.to_json())?;
     let setup = TrainRun { reader, encoder: encoder.as_deref(), out: &out, options };
-    let summary = run(&*config, setup, context)?;
+    let summary = run(&*config, setup, context);
+    drop(trackers);
+    let summary = summary?;
     Ok((summary.checkpoint.clone(), json!(summary)))
 }
 
@@ -146,8 +155,11 @@ fn train_online(
     });
     let out = home::new_checkpoint(&name)?;
     record(&out, args.resume)?;
+    let trackers = Trackers::start(&args.log, &out, &config.to_json())?;
     let setup = OnlineRun { environments: &environments, out: &out, options };
-    let Some(summary) = config.train_online(setup, &mut control(context)) else {
+    let summary = config.train_online(setup, &mut control(context));
+    drop(trackers);
+    let Some(summary) = summary else {
         let problem = format!("{} trains on datasets only", args.model());
         anyhow::bail!(Error::config("--env", problem, "give a dataset with --data, or train tdmpc2 or sac"));
     };
@@ -199,7 +211,9 @@ impl TrainArgs {
             origin.check_user(&format!("the dataset {data}"), "which opens a connection", Some("--data"))?;
         }
         eprint(&format!("continuing: {}\n", record.commands[0].command.join(" ")));
-        Ok(Self { data, output: Some(output.clone()), resume: true, print_config: false, ..started })
+        // A tracker starts a program, which only the user may ask for.
+        let log = self.log.clone();
+        Ok(Self { data, output: Some(output.clone()), resume: true, print_config: false, log, ..started })
     }
 
     /// Returns the family of the model.

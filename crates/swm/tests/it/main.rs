@@ -23,6 +23,7 @@ mod study_shipped;
 mod terminal;
 mod trust;
 mod zoo;
+mod trackers;
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

@@ -252,7 +252,7 @@ impl Cli {
             Err(error) => {
                 // An error of this engine is one complete line; other errors are printed with their causes.
                 let own = error.downcast_ref::<Error>();
-                eprint(&own.map_or_else(|| format!("error: {error:#}\n"), |own| format!("error: {own}\n")));
+                output::print_error(&own.map_or_else(|| format!("{error:#}"), ToString::to_string));
                 match own {
                     Some(Error::Interrupted) => 130,
                     Some(error) if error.is_usage() => 2,

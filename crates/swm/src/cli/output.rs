@@ -4,9 +4,10 @@
 //! standard output that fails is remembered; the command finishes its work and then exits with an error, because its
 //! output is lost. A closed pipe is not an error: `swm envs | head` has all that it needs.
 
+use comfy_table::{Attribute, Cell, Color};
 use std::borrow::Cow;
 use std::fmt::Write as _;
-use std::io::{Error, ErrorKind, Write};
+use std::io::{Error, ErrorKind, IsTerminal, Write};
 use std::sync::{Mutex, PoisonError};
 use swm_core::text::printable;
 
@@ -28,6 +29,18 @@ pub fn emit_json(value: &impl serde::Serialize) -> anyhow::Result<()> {
 /// Prints to standard error. There is no other stream to report a failure to.
 pub fn eprint(text: &str) {
     std::io::stderr().write_all(printable(text).as_bytes()).ok();
+}
+
+/// Prints an error, a complete sentence, to standard error.
+pub fn print_error(text: &str) {
+    let label = if is_coloured(&std::io::stderr()) { "\x1b[1;31merror:\x1b[0m" } else { "error:" };
+    std::io::stderr().write_all(format!("{label} {}\n", printable(text)).as_bytes()).ok();
+}
+
+/// Whether texts on a stream have colours: on a terminal, unless `NO_COLOR` is set (no-color.org) or the terminal has none.
+fn is_coloured(stream: &impl IsTerminal) -> bool {
+    let is_set = |name: &str| std::env::var_os(name).is_some_and(|value| !value.is_empty());
+    stream.is_terminal() && !is_set("NO_COLOR") && std::env::var_os("TERM").is_none_or(|name| name != "dumb")
 }
 
 /// Returns the failure of standard output, if its content is lost: none after a closed pipe.
@@ -73,17 +86,51 @@ pub fn table(header: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> St
     table.set_style(comfy_table::TableComponent::HeaderLines, '─');
     table.set_style(comfy_table::TableComponent::MiddleHeaderIntersections, '─');
     table.set_content_arrangement(comfy_table::ContentArrangement::Dynamic);
-    table.set_header(header.to_vec());
+    let coloured = is_coloured(&std::io::stdout());
+    let bold = |cell: Cell| if coloured { cell.add_attribute(Attribute::Bold) } else { cell };
+    table.set_header(header.iter().map(|name| bold(Cell::new(name))));
     for row in rows {
         // Escaped here and not in the finished table, so that columns have the widths of the escaped cells.
-        table.add_row(row.iter().map(|cell| printable(cell)));
+        table.add_row(row.iter().map(|cell| {
+            let shown = Cell::new(printable(cell));
+            match emphasis(cell).filter(|_| coloured) {
+                Some(Emphasis::Colour(colour)) => shown.fg(colour),
+                Some(Emphasis::Dim) => shown.add_attribute(Attribute::Dim),
+                None => shown,
+            }
+        }));
     }
     format!("{table}\n")
+}
+
+/// How a cell stands out.
+#[derive(Debug, PartialEq)]
+enum Emphasis {
+    Colour(Color),
+    Dim,
+}
+
+/// How a cell stands out: verdicts by what they say, and missing values.
+fn emphasis(cell: &str) -> Option<Emphasis> {
+    match cell {
+        "higher" => Some(Emphasis::Colour(Color::Green)),
+        "lower" => Some(Emphasis::Colour(Color::Red)),
+        "not told apart" | "too few" | "–" => Some(Emphasis::Dim),
+        _ => None,
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn tables_of_pipes_have_no_colours() {
+        assert_eq!(emphasis("lower"), Some(Emphasis::Colour(Color::Red)));
+        assert_eq!((emphasis("–"), emphasis("lower than")), (Some(Emphasis::Dim), None));
+        let file = std::fs::File::open("/dev/null").expect("a file");
+        assert!(!is_coloured(&file));
+    }
 
     #[test]
     fn json_with_control_characters_stays_the_same_document() {

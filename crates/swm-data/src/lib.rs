@@ -3,10 +3,13 @@
 //! - [`dataset`]: the contracts [`Reader`] and [`Writer`], and the code that uses them: clips, goals, [`Loader`],
 //!   cache, [`ReplayBuffer`], [`Split`], statistics, views, [`Location`]. This module does not depend on any format.
 //! - [`formats`]: a module for each format on disk, and the registry [`FORMATS`]. [`lance`] is the default.
+//! - [`hub`]: datasets and checkpoints of the Hugging Face hub.
 //! - [`tools`]: [`convert`](mod@convert) between formats, [`doctor`], [`preview`](mod@preview).
 
 pub mod dataset;
 pub mod formats;
+#[cfg(feature = "hub")]
+pub mod hub;
 pub mod tools;
 
 pub use dataset::{

@@ -1,12 +1,15 @@
 //! Folders of named datasets and checkpoints: `$STABLEWM_HOME` (default `~/.stable_worldmodel`) with `datasets/`,
-//! `checkpoints/` and `weights/`.
+//! `checkpoints/`, `weights/` and `hub/`, the cache of `hf://` URIs.
 
 use crate::zoo;
 use std::iter::once;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use swm_core::run::Control;
 use swm_core::{Error, Result};
+use swm_data::hub::{Hub, HubUri, RepoKind, check_no_pointer};
 use swm_data::{FORMATS, Location, Reader};
+use swm_models::StoredCheckpoint;
 
 /// The format of new datasets whose name has no suffix.
 const DEFAULT_FORMAT: &str = "lance";
@@ -43,6 +46,60 @@ pub fn weights() -> Result<PathBuf> {
     Ok(home()?.join("weights"))
 }
 
+/// Returns the folder of files of the Hugging Face hub.
+///
+/// # Errors
+/// As [`home`].
+pub fn hub_cache() -> Result<PathBuf> {
+    Ok(home()?.join("hub"))
+}
+
+/// Makes the control of a download.
+type MakeControl = Box<dyn Fn() -> Control<'static> + Send + Sync>;
+
+/// The control of downloads that a name causes, and the URIs with their commits.
+static DOWNLOADS: OnceLock<MakeControl> = OnceLock::new();
+static PINNED: Mutex<Vec<String>> = Mutex::new(vec![]);
+
+/// Shows the progress of downloads that names cause with the controls that `make` makes, and stops them as these say.
+pub fn show_downloads(make: impl Fn() -> Control<'static> + Send + Sync + 'static) {
+    // A program that embeds the command line may have set another one.
+    let _ = DOWNLOADS.set(Box::new(make));
+}
+
+/// Returns the URIs of the hub that this process has read, with their commits.
+pub fn pinned_uris() -> Vec<String> {
+    PINNED.lock().unwrap_or_else(PoisonError::into_inner).clone()
+}
+
+/// Downloads what a URI of the hub names, if it is not cached; returns its path and the URI with its commit.
+fn pull(given: &str, kind: RepoKind) -> Result<(PathBuf, String)> {
+    let uri = HubUri::parse(given, kind)?;
+    let mut control = DOWNLOADS.get().map_or_else(Control::new, |make| make());
+    let pulled = Hub::new(&hub_cache()?)?.pull(&uri, &mut control)?;
+    let mut pinned = PINNED.lock().unwrap_or_else(PoisonError::into_inner);
+    if !pinned.contains(&pulled.pinned) {
+        pinned.push(pulled.pinned.clone());
+    }
+    Ok((pulled.path, pulled.pinned))
+}
+
+/// Returns the name of a dataset with the commit that its revision has now, if it is a URI of the hub; other names as they are.
+///
+/// # Errors
+/// When the hub does not have it, or cannot be reached.
+pub fn pinned_dataset(given: &str) -> Result<String> {
+    if HubUri::is_uri(given) { Ok(pull(given, RepoKind::Dataset)?.1) } else { Ok(given.to_owned()) }
+}
+
+/// As [`pinned_dataset`], for a checkpoint.
+///
+/// # Errors
+/// As [`pinned_dataset`].
+pub fn pinned_checkpoint(given: &str) -> Result<String> {
+    if HubUri::is_uri(given) { Ok(pull(given, RepoKind::Model)?.1) } else { Ok(given.to_owned()) }
+}
+
 /// The file name suffixes of all dataset formats. A named dataset is found without its suffix.
 fn suffixes() -> impl Iterator<Item = &'static str> {
     FORMATS.rows.iter().flat_map(|format| format.suffixes).copied()
@@ -63,20 +120,28 @@ pub fn dataset(given: &str) -> Result<PathBuf> {
     named(given, datasets, DEFAULT_FORMAT)
 }
 
-/// Returns the location of a dataset given as a path, as a URI, or as a name in [`datasets`].
+/// Returns the location of a dataset given as a path, as a URI, or as a name in [`datasets`]. A dataset of the hub is downloaded
+/// if it is not cached.
 ///
 /// # Errors
 /// When the text is empty, or a URI of an unknown scheme.
 pub fn location(given: &str) -> Result<Location> {
     check_name("dataset", given)?;
+    if HubUri::is_uri(given) {
+        return Ok(pull(given, RepoKind::Dataset)?.0.into());
+    }
     if given.contains("://") { Location::parse(given) } else { Ok(dataset(given)?.into()) }
 }
 
-/// Returns the path of a checkpoint given as a path, as a name in [`checkpoints`], or as `zoo:NAME`.
+/// Returns the path of a checkpoint given as a path, as a name in [`checkpoints`], as `zoo:NAME`, or as a URI of the hub, which
+/// is downloaded if it is not cached.
 ///
 /// # Errors
-/// As [`home`], if it is a name, and when the [zoo](zoo) has no such capsule.
+/// As [`home`], if it is a name, and when the [zoo](zoo) or the hub has no such checkpoint.
 pub fn checkpoint(given: &str) -> Result<PathBuf> {
+    if HubUri::is_uri(given) {
+        return checkpoint_in(pull(given, RepoKind::Model)?.0);
+    }
     match given.strip_prefix(zoo::PREFIX) {
         Some(name) => zoo::find(name),
         None => named(given, checkpoints, ""),
@@ -89,7 +154,31 @@ pub fn checkpoint(given: &str) -> Result<PathBuf> {
 /// When the text is empty.
 pub fn new_checkpoint(given: &str) -> Result<PathBuf> {
     check_name("checkpoint", given)?;
+    check_not_on_hub(given)?;
     named(given, checkpoints, "")
+}
+
+/// A downloaded checkpoint: the path itself, or the only capsule of a folder that holds no run.
+fn checkpoint_in(path: PathBuf) -> Result<PathBuf> {
+    if path.is_file() || StoredCheckpoint::read(&path).is_ok() {
+        return Ok(path);
+    }
+    let entries = std::fs::read_dir(&path).into_iter().flatten().flatten().map(|entry| entry.path());
+    let capsules: Vec<PathBuf> =
+        entries.filter(|path| path.extension().is_some_and(|suffix| suffix == "safetensors")).collect();
+    match &capsules[..] {
+        [only] => Ok(only.clone()),
+        _ => Ok(path),
+    }
+}
+
+/// Returns an error for a URI of the hub, to which nothing is written but by `swm push`.
+fn check_not_on_hub(given: &str) -> Result<()> {
+    if HubUri::is_uri(given) {
+        let fix = format!("write it to a name or a path, then `swm push PATH {given}`");
+        return Err(Error::config(given, "is on the hub, which is written to by uploads only", fix));
+    }
+    Ok(())
 }
 
 /// Opens a dataset given as a path, as a URI, or as a name in [`datasets`].
@@ -97,7 +186,13 @@ pub fn new_checkpoint(given: &str) -> Result<PathBuf> {
 /// # Errors
 /// When the dataset does not exist (the message names the closest name), or is damaged.
 pub fn open_dataset(given: &str) -> Result<Arc<dyn Reader>> {
-    swm_data::open(find_dataset(given)?)
+    let location = find_dataset(given)?;
+    let opened = swm_data::open(location.clone());
+    match (&opened, location.path()) {
+        // What Git left in place of a large file says more than an error of the format.
+        (Err(_), Some(path)) => check_no_pointer(path).and(opened),
+        _ => opened,
+    }
 }
 
 /// Returns the location of an existing dataset given as a path, as a URI, or as a name in [`datasets`].
@@ -120,7 +215,11 @@ pub fn find_dataset(given: &str) -> Result<Location> {
 pub fn find_checkpoint(given: &str) -> Result<PathBuf> {
     check_name("checkpoint", given)?;
     let path = checkpoint(given)?;
-    if path.exists() { Ok(path) } else { Err(unknown("checkpoint", given, &path, checkpoints())) }
+    if !path.exists() {
+        return Err(unknown("checkpoint", given, &path, checkpoints()));
+    }
+    check_no_pointer(&path)?;
+    Ok(path)
 }
 
 /// Returns an error for an empty name: the path that it stands for is the folder of all names.
@@ -163,6 +262,7 @@ pub fn names_in(folder: &Path) -> Vec<String> {
 /// # Errors
 /// As [`location`], and when the format is unknown.
 pub fn target(given: &str, format: Option<&str>) -> Result<Location> {
+    check_not_on_hub(given)?;
     match format {
         Some(format) if !given.contains("://") => {
             check_name("dataset", given)?;

@@ -57,7 +57,13 @@ type Traces = Arc<Mutex<Vec<(String, PlanRecord)>>>;
 impl HomeResolver {
     /// Creates a resolver of requests whose names `origin` chose.
     pub fn new(origin: Origin) -> Self {
-        Self { origin, env: None, wrapping: RefCell::default(), checkpoints: RefCell::default(), traces: None }
+        Self {
+            origin,
+            env: None,
+            wrapping: RefCell::default(),
+            checkpoints: RefCell::default(),
+            traces: None,
+        }
     }
 
     /// Traces the plans of policies.
@@ -104,6 +110,7 @@ impl HomeResolver {
         if let Some(loaded) = self.checkpoints.borrow().get(Path::new(given)) {
             return Ok(Rc::clone(loaded));
         }
+        self.check_local("checkpoint", given)?;
         let path = home::find_checkpoint(given)?;
         if let Some(loaded) = self.checkpoints.borrow().get(&path) {
             return Ok(Rc::clone(loaded));
@@ -111,6 +118,32 @@ impl HomeResolver {
         let loaded: Rc<dyn LoadedModel> = Rc::from(load(&path, &Device::flex())?);
         self.checkpoints.borrow_mut().insert(path, Rc::clone(&loaded));
         Ok(loaded)
+    }
+
+    /// Refuses a URI that a file chose.
+    fn check_local(&self, kind: &str, name: &str) -> Result<()> {
+        if name.contains("://") {
+            self.origin.check_user(&format!("the {kind} '{name}'"), "which opens a network connection", None)?;
+        }
+        Ok(())
+    }
+
+    /// Returns the name of a dataset; a URI of the hub gets its commit.
+    ///
+    /// # Errors
+    /// When a file chose a URI, or the hub does not have it.
+    pub fn pinned_dataset(&self, given: &str) -> Result<String> {
+        self.check_local("dataset", given)?;
+        home::pinned_dataset(given)
+    }
+
+    /// As [`HomeResolver::pinned_dataset`], for a checkpoint.
+    ///
+    /// # Errors
+    /// As [`HomeResolver::pinned_dataset`].
+    pub fn pinned_checkpoint(&self, given: &str) -> Result<String> {
+        self.check_local("checkpoint", given)?;
+        home::pinned_checkpoint(given)
     }
 
     fn wrapping(&self, request: &EvalRequest) -> Result<Wrapping> {
@@ -217,9 +250,7 @@ impl Resolver for HomeResolver {
     }
 
     fn dataset(&self, name: &str) -> Result<Arc<dyn Reader>> {
-        if name.contains("://") {
-            self.origin.check_user(&format!("the dataset '{name}'"), "which opens a network connection", None)?;
-        }
+        self.check_local("dataset", name)?;
         home::open_dataset(name)
     }
 

@@ -150,7 +150,7 @@ fn patient<T: ObjectStore>(url: &Url, inner: T) -> Arc<dyn ObjectStore> {
 
 /// Installs ring as the cryptography provider of the process, unless a provider is installed already.
 #[cfg(feature = "tls")]
-fn provide_tls() {
+pub(crate) fn provide_tls() {
     // An error means that another provider is installed already.
     let _ = rustls::crypto::ring::default_provider().install_default();
 }

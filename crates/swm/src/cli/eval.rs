@@ -232,7 +232,7 @@ impl EvalArgs {
             wrap_goal: self.wrappers.wrap_goal,
             image: (!self.no_pixels).then_some(image),
             policies,
-            starts: self.starts(),
+            starts: self.starts(resolver)?,
             episodes: self.episodes.unwrap_or(if self.until.is_some() { MOST_EPISODES } else { EPISODES }),
             seed,
             budget: budget.or(self.dataset.as_ref().map(|_| DATASET_TIME_LIMIT)),
@@ -276,14 +276,14 @@ impl EvalArgs {
         Ok(())
     }
 
-    fn starts(&self) -> StartsRequest {
-        let Some(dataset) = &self.dataset else { return StartsRequest::Episodic };
+    fn starts(&self, resolver: &HomeResolver) -> Result<StartsRequest> {
+        let Some(dataset) = &self.dataset else { return Ok(StartsRequest::Episodic) };
         let split = Split { seed: self.split_seed, ..Split::default() };
-        StartsRequest::Dataset {
-            dataset: dataset.clone(),
+        Ok(StartsRequest::Dataset {
+            dataset: resolver.pinned_dataset(dataset)?,
             goal_offset: self.goal_offset,
             held_out: self.split.map(|part| HeldOut { part, split }),
-        }
+        })
     }
 
     /// Returns the condition of all factors that the arguments set, and then that condition with each shift.

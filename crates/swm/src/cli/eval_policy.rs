@@ -57,6 +57,10 @@ impl NamedPolicy {
         if given == "simulator" {
             return Ok(without_checkpoint(NamedKind::Simulator));
         }
+        // The commit of a checkpoint on the hub is part of the request.
+        let pinned = resolver.pinned_checkpoint(given)?;
+        let name = Path::new(given).file_name().map_or(given.to_owned(), |name| name.to_string_lossy().into_owned());
+        let given = pinned.as_str();
         let loaded = resolver.checkpoint(given)?;
         let info = loaded.info()?;
         let direct = PolicyKind::Direct { checkpoint: given.to_owned(), settings: Value::Null };
@@ -69,7 +73,6 @@ impl NamedPolicy {
             },
             None => NamedKind::Direct(direct),
         };
-        let name = Path::new(given).file_name().map_or(given.to_owned(), |name| name.to_string_lossy().into_owned());
         let path = home::checkpoint(given)?;
         let capsule = path.is_file().then(|| Capsule::read(&path)).transpose()?;
         let evaluation = capsule.and_then(|capsule| capsule.evaluation);

@@ -129,9 +129,14 @@ enum Command {
     /// List the capsules that `zoo:NAME` finds
     #[command(after_help = "Example: swm zoo")]
     Zoo,
-    /// Download pretrained weights from the Hugging Face hub
-    #[command(after_help = "Example: swm pull facebook/dinov2-small")]
+    /// Download a dataset, a checkpoint or weights from the hub
+    ///
+    /// The hub is Hugging Face's, or the one at the address in HF_ENDPOINT.
+    #[command(after_help = "Example: swm pull hf://datasets/lerobot/pusht")]
     Pull(pull::PullArgs),
+    /// Upload a dataset or a checkpoint to the hub
+    #[command(after_help = "Example: swm push rooms hf://datasets/OWNER/NAME --private")]
+    Push(pull::PushArgs),
     /// List the checkpoints; show, verify, pack or remove one
     #[command(after_help = "Example: swm checkpoints show lewm-rooms")]
     Checkpoints(checkpoints::CheckpointsArgs),
@@ -182,6 +187,7 @@ impl Cli {
 
 /// The global options and the interrupt flag, for long-running commands.
 pub struct Context {
+#[derive(Clone)]
     /// Whether to print JSON.
     pub json: bool,
     /// The thread budget of environments, decoders and matrix products; 0 for one thread per core.
@@ -291,7 +297,8 @@ impl Cli {
             Command::Doctor(args) => doctor::doctor(&args, &Context::new(json, self.threads)?),
             Command::Collect(args) => on_ray::collect::run(&args, &Context::new(json, self.threads)?),
             Command::Train(args) => on_ray::train::run(&args, &Context::new(json, self.threads)?),
-            Command::Pull(args) => pull::pull(&args, json),
+            Command::Pull(args) => pull::pull(&args, &Context::new(json, self.threads)?),
+            Command::Push(args) => pull::push(&args, &Context::new(json, self.threads)?),
             Command::Probe(args) => probe::probe(&args, &Context::new(json, self.threads)?),
             Command::Eval(args) => on_ray::eval::run(&args, &Context::new(json, self.threads)?),
             Command::Leaderboard(args) => leaderboard::leaderboard(&args, &Context::new(json, self.threads)?),
@@ -317,7 +324,10 @@ impl Context {
         }
         signals::report_large_files();
         let interrupt = signals::interrupt_flag().map_err(|error| Error::external("handling Ctrl-C", error))?;
-        Ok(Self { json, threads, interrupt })
+        let context = Self { json, threads, interrupt };
+        let of_downloads = context.clone();
+        crate::home::show_downloads(move || progress::control(&of_downloads));
+        Ok(context)
     }
 }
 

@@ -16,7 +16,7 @@ const GROUPS: &[(&str, &[&str])] = &[
         "Data",
         &["envs", "fovs", "wrappers", "collect", "datasets", "inspect", "preview", "convert", "doctor", "formats"],
     ),
-    ("Train", &["models", "train", "plot", "recipes", "zoo", "checkpoints", "pull", "probe"]),
+    ("Train", &["models", "train", "plot", "recipes", "zoo", "checkpoints", "pull", "push", "probe"]),
     ("Evaluate", &["eval", "solvers", "reproduce", "report", "study", "autopsy", "leaderboard"]),
     ("System", &["demo", "assets", "bench", "completions", "man"]),
 ];

@@ -10,6 +10,8 @@ mod finite;
 mod foreign;
 mod gym;
 mod hostile;
+mod hub;
+mod hub_server;
 mod kills;
 mod leaderboard;
 mod limits;

@@ -1,0 +1,333 @@
+//! [`Client`]: requests to the hub, and its errors in words.
+
+use super::{HubFile, HubUri, RepoKind};
+use crate::dataset::objects;
+use reqwest::header::{AUTHORIZATION, CONTENT_TYPE, HeaderMap, HeaderName, HeaderValue, LINK};
+use reqwest::{Method, Response, StatusCode};
+use serde::Deserialize;
+use serde_json::Value;
+use std::future::Future;
+use std::path::PathBuf;
+use std::time::Duration;
+use swm_core::{Error, Result};
+use url::Url;
+
+/// The time to connect, and the time without a byte of an answer.
+const CONNECT: Duration = Duration::from_secs(10);
+const READ: Duration = Duration::from_secs(60);
+/// The largest answer that is read as a whole, in bytes.
+const MAX_ANSWER: usize = 256 << 20;
+/// The most pages of a list of files.
+const MAX_PAGES: usize = 1000;
+/// The variable with the token.
+const TOKEN: &str = "HF_TOKEN";
+/// The header with the hub's kind of error, and that with its message.
+const ERROR_CODE: &str = "x-error-code";
+const ERROR_MESSAGE: &str = "x-error-message";
+
+/// A connection to the hub.
+#[derive(Clone)]
+pub(super) struct Client {
+    http: reqwest::Client,
+    endpoint: Url,
+    token: Option<String>,
+}
+
+/// The body of a request.
+#[derive(Clone, Default)]
+pub(super) struct Body {
+    pub bytes: Vec<u8>,
+    pub content_type: &'static str,
+}
+
+impl Client {
+    pub fn from_env() -> Result<Self> {
+        let variable = |name: &str| std::env::var(name).ok().filter(|value| !value.is_empty());
+        let endpoint = variable("HF_ENDPOINT").unwrap_or_else(|| "https://huggingface.co".to_owned());
+        let file = variable("HF_TOKEN_PATH").map(PathBuf::from).or_else(|| {
+            let home = variable("HF_HOME").map(PathBuf::from);
+            let home = home.or_else(|| Some(PathBuf::from(variable("HOME")?).join(".cache").join("huggingface")));
+            Some(home?.join("token"))
+        });
+        let of_file = || std::fs::read_to_string(file.as_ref()?).ok();
+        let token = variable(TOKEN).or_else(of_file).map(|token| token.trim().to_owned());
+        Self::new(&endpoint, token.filter(|token| !token.is_empty()))
+    }
+
+    pub fn new(endpoint: &str, token: Option<String>) -> Result<Self> {
+        let invalid = |problem: String| Error::config("HF_ENDPOINT", problem, "give the address of a hub, https://…");
+        let parsed =
+            Url::parse(endpoint.trim_end_matches('/')).map_err(|error| invalid(format!("{endpoint}: {error}")))?;
+        if !["http", "https"].contains(&parsed.scheme()) {
+            return Err(invalid(format!("{endpoint}: is no address of a web server")));
+        }
+        objects::provide_tls();
+        let http = reqwest::Client::builder()
+            .connect_timeout(CONNECT)
+            .read_timeout(READ)
+            .user_agent(concat!("stable-worldmodel/", env!("CARGO_PKG_VERSION")))
+            .build()
+            .map_err(|error| Error::external("making a client of the hub", error))?;
+        Ok(Self { http, endpoint: parsed, token })
+    }
+
+    /// The address without a slash at its end.
+    pub fn endpoint(&self) -> &str {
+        self.endpoint.as_str().trim_end_matches('/')
+    }
+
+    /// The address of a repository's API, such as `…/api/datasets/OWNER/NAME`.
+    pub fn api(&self, uri: &HubUri) -> String {
+        let kind = if uri.kind == RepoKind::Dataset { "datasets" } else { "models" };
+        format!("{}/api/{kind}/{}", self.endpoint(), uri.repo)
+    }
+
+    /// The address of a repository, such as `…/datasets/OWNER/NAME`.
+    pub fn page(&self, uri: &HubUri) -> String {
+        let kind = if uri.kind == RepoKind::Dataset { "datasets/" } else { "" };
+        format!("{}/{kind}{}", self.endpoint(), uri.repo)
+    }
+
+    /// The commit of a revision.
+    pub fn commit(&self, uri: &HubUri) -> Result<String> {
+        #[derive(Deserialize)]
+        struct Found {
+            sha: String,
+        }
+        let url = format!("{}/revision/{}", self.api(uri), encoded(&uri.revision));
+        let found: Found = self.json(Method::GET, &url, Body::default(), uri)?;
+        if super::uri::is_commit(&found.sha) {
+            return Ok(found.sha);
+        }
+        Err(Error::corrupt(url, "its answer has no commit", "check the address of the hub"))
+    }
+
+    /// The files of a repository at a commit.
+    pub fn files(&self, uri: &HubUri, commit: &str) -> Result<Vec<HubFile>> {
+        #[derive(Deserialize)]
+        struct Entry {
+            #[serde(rename = "type")]
+            kind: String,
+            path: String,
+            #[serde(default)]
+            size: u64,
+            lfs: Option<Lfs>,
+        }
+        #[derive(Deserialize)]
+        struct Lfs {
+            oid: String,
+            size: u64,
+        }
+        let mut url = format!("{}/tree/{commit}?recursive=true&expand=false", self.api(uri));
+        let mut files = vec![];
+        for _ in 0..MAX_PAGES {
+            let (headers, bytes) = self.bytes(Method::GET, &url, Body::default(), uri)?;
+            let entries: Vec<Entry> = parsed(&url, &bytes)?;
+            for entry in entries.into_iter().filter(|entry| entry.kind == "file") {
+                if !super::uri::is_inside(&entry.path) {
+                    let problem = format!("it lists a file outside of the repository: '{}'", entry.path.escape_debug());
+                    return Err(Error::corrupt(&url, problem, "do not use this hub"));
+                }
+                let (size, sha256) = entry.lfs.map_or((entry.size, None), |lfs| {
+                    (lfs.size, Some(lfs.oid.trim_start_matches("sha256:").to_owned()))
+                });
+                files.push(HubFile { path: entry.path, size, sha256 });
+            }
+            match next_page(&headers) {
+                Some(next) if next.starts_with(self.endpoint()) => url = next,
+                _ => return Ok(files),
+            }
+        }
+        Err(Error::corrupt(
+            url,
+            format!("its list of files has more than {MAX_PAGES} pages"),
+            "name a smaller repository",
+        ))
+    }
+
+    /// Sends a request with the token and reads the answer as JSON.
+    pub fn json<T: serde::de::DeserializeOwned>(
+        &self,
+        method: Method,
+        url: &str,
+        body: Body,
+        uri: &HubUri,
+    ) -> Result<T> {
+        let (_, bytes) = self.bytes(method, url, body, uri)?;
+        parsed(url, &bytes)
+    }
+
+    /// Sends a request with the token; returns the headers and the body of the answer.
+    pub fn bytes(&self, method: Method, url: &str, body: Body, uri: &HubUri) -> Result<(HeaderMap, Vec<u8>)> {
+        let answer = self.send(method, url, body, HeaderMap::new(), true)?;
+        self.check(&answer, uri)?;
+        let headers = answer.headers().clone();
+        Ok((headers, whole(url, answer)?))
+    }
+
+    /// Sends a request. `trusted` adds the token, which only the hub's own host receives: redirections to others lose it.
+    pub fn send(&self, method: Method, url: &str, body: Body, headers: HeaderMap, trusted: bool) -> Result<Response> {
+        let mut request = self.http.request(method, url).headers(headers);
+        if !body.content_type.is_empty() {
+            request = request.header(CONTENT_TYPE, body.content_type).body(body.bytes);
+        }
+        if let Some(token) = self.token.as_ref().filter(|_| trusted && self.is_own(url)) {
+            request = request.header(AUTHORIZATION, authorization(token)?);
+        }
+        let url = url.to_owned();
+        run(&url.clone(), async move { request.send().await.map_err(|error| unreachable(&url, &error)) })
+    }
+
+    /// Whether an address belongs to the hub.
+    fn is_own(&self, url: &str) -> bool {
+        Url::parse(url).is_ok_and(|url| url.origin() == self.endpoint.origin())
+    }
+
+    /// Checks the status of an answer about a repository.
+    pub fn check(&self, answer: &Response, uri: &HubUri) -> Result<()> {
+        let status = answer.status();
+        if status.is_success() {
+            return Ok(());
+        }
+        let header = |name: &str| answer.headers().get(name).and_then(|value| value.to_str().ok()).unwrap_or_default();
+        let (code, message) = (header(ERROR_CODE), header(ERROR_MESSAGE));
+        let page = self.page(uri);
+        let login = match &self.token {
+            None => format!("set {TOKEN} to a token of your account (the hub's settings make them)"),
+            Some(_) => format!("check that the token in {TOKEN} may read it"),
+        };
+        let named = uri.at("main").to_string();
+        let fail = |problem: &str, fix: String| Err(Error::config(named.clone(), problem, fix));
+        match (code, status) {
+            ("GatedRepo", _) => {
+                fail("is gated: its owner asks readers to accept terms", format!("accept them at {page}, then {login}"))
+            }
+            ("RevisionNotFound", _) => {
+                fail(&format!("has no revision '{}'", uri.revision), format!("{page} lists its branches and tags"))
+            }
+            ("EntryNotFound", _) => fail(&format!("has no '{}'", uri.path), format!("{page} lists its files")),
+            ("RepoNotFound", _) | (_, StatusCode::NOT_FOUND) => {
+                fail("does not exist, or is private", format!("check its name; {login}"))
+            }
+            (_, StatusCode::UNAUTHORIZED) => fail("does not exist, is private, or the token is wrong", login),
+            (_, StatusCode::FORBIDDEN) => {
+                fail("may not be accessed with this token", format!("check what the token in {TOKEN} may do"))
+            }
+            _ => {
+                let words = if message.is_empty() { String::new() } else { format!(": {message}") };
+                Err(Error::external(
+                    answer.url().as_str(),
+                    format!("the hub answered {status}{words}; try again later"),
+                ))
+            }
+        }
+    }
+}
+
+/// The header with a token, which no log shows.
+fn authorization(token: &str) -> Result<HeaderValue> {
+    let mut value = HeaderValue::from_str(&format!("Bearer {token}"))
+        .map_err(|_| Error::config(TOKEN, "the token has characters that no token has", "copy it again"))?;
+    value.set_sensitive(true);
+    Ok(value)
+}
+
+/// Runs a request on the threads of object stores.
+pub(super) fn run<T: Send + 'static>(
+    url: &str,
+    request: impl Future<Output = Result<T>> + Send + 'static,
+) -> Result<T> {
+    objects::block_on(request)?.unwrap_or_else(|| Err(Error::external(url, "the HTTP client panicked")))
+}
+
+/// An error of a connection.
+pub(super) fn unreachable(url: &str, error: &reqwest::Error) -> Error {
+    let host = Url::parse(url).ok().and_then(|url| url.host_str().map(str::to_owned)).unwrap_or_default();
+    // The innermost cause says what happened.
+    let mut cause: &dyn std::error::Error = error;
+    while let Some(source) = cause.source() {
+        cause = source;
+    }
+    Error::external(format!("the hub ({host})"), format!("{cause}; check the network connection, then run it again"))
+}
+
+/// Reads the body of an answer.
+pub(super) fn whole(url: &str, mut answer: Response) -> Result<Vec<u8>> {
+    let label = url.to_owned();
+    run(url, async move {
+        let mut bytes = vec![];
+        while let Some(chunk) = answer.chunk().await.map_err(|error| unreachable(&label, &error))? {
+            if bytes.len() + chunk.len() > MAX_ANSWER {
+                return Err(Error::corrupt(label, "its answer is too long", "check the address of the hub"));
+            }
+            bytes.extend_from_slice(&chunk);
+        }
+        Ok(bytes)
+    })
+}
+
+pub(super) fn parsed<T: serde::de::DeserializeOwned>(url: &str, bytes: &[u8]) -> Result<T> {
+    serde_json::from_slice(bytes).map_err(|error| {
+        let problem = format!("its answer is not that of a hub ({error})");
+        Error::corrupt(url, problem, "check the address of the hub (HF_ENDPOINT)")
+    })
+}
+
+/// The address of the next page: `<URL>; rel="next"`.
+fn next_page(headers: &HeaderMap) -> Option<String> {
+    let links = headers.get(LINK)?.to_str().ok()?;
+    let next = links.split(',').find(|link| link.contains("rel=\"next\""))?;
+    Some(next.split_once('<')?.1.split_once('>')?.0.to_owned())
+}
+
+/// A revision or a path as a part of an address.
+pub(super) fn encoded(name: &str) -> String {
+    let keeps = |byte: u8| byte.is_ascii_alphanumeric() || b"-_.~".contains(&byte);
+    name.bytes().map(|byte| if keeps(byte) { char::from(byte).to_string() } else { format!("%{byte:02X}") }).collect()
+}
+
+/// A path as a part of an address, with its slashes.
+pub(super) fn encoded_path(path: &str) -> String {
+    path.split('/').map(encoded).collect::<Vec<_>>().join("/")
+}
+
+/// A JSON body.
+pub(super) fn json_body(value: &Value) -> Body {
+    Body { bytes: value.to_string().into_bytes(), content_type: "application/json" }
+}
+
+/// One header.
+pub(super) fn header(name: &str, value: &str) -> Result<(HeaderName, HeaderValue)> {
+    let invalid =
+        || Error::external("the hub", format!("it asks for the header '{}', which is invalid", name.escape_debug()));
+    let name = HeaderName::try_from(name).map_err(|_| invalid())?;
+    Ok((name, HeaderValue::try_from(value).map_err(|_| invalid())?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tokens_go_to_the_host_of_the_hub_only() {
+        let client = Client::new("http://127.0.0.1:1234/", Some("hf_secret".to_owned())).expect("a client");
+        assert!(client.is_own("http://127.0.0.1:1234/api/models/a/b"));
+        for other in ["http://127.0.0.1:1235/a", "https://127.0.0.1:1234/a", "http://evil/127.0.0.1:1234", "nothing"] {
+            assert!(!client.is_own(other), "{other}");
+        }
+        assert!(authorization("a\nb").is_err());
+        assert!(!format!("{:?}", authorization("hf_secret").expect("a header")).contains("hf_secret"));
+        for wrong in ["huggingface", "ftp://host"] {
+            assert!(Client::new(wrong, None).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn addresses_are_encoded() {
+        assert_eq!(encoded("refs/pr/1"), "refs%2Fpr%2F1");
+        assert_eq!(encoded_path("a b/ü.json"), "a%20b/%C3%BC.json");
+        let mut headers = HeaderMap::new();
+        headers.insert(LINK, HeaderValue::from_static("<http://h/a?cursor=1>; rel=\"next\""));
+        assert_eq!(next_page(&headers).as_deref(), Some("http://h/a?cursor=1"));
+    }
+}

@@ -1,0 +1,341 @@
+//! [`Hub::push`]: uploads files as one commit.
+
+use super::client::{Body, Client, header, json_body, parsed, whole};
+use super::download::sha256;
+use super::{Hub, HubUri, RepoKind};
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use reqwest::Method;
+use reqwest::header::HeaderMap;
+use serde::Deserialize;
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{Read as _, Seek as _, SeekFrom};
+use std::path::{Path, PathBuf};
+use swm_core::run::{Control, Event, Progress, Stage};
+use swm_core::{Error, Result};
+
+/// The name of the stage.
+const STAGE: &str = "push";
+/// The bytes of a file from which the hub decides how it is stored.
+const SAMPLE: usize = 512;
+/// The most files of one commit, and the most that one request names.
+const MAX_FILES: usize = 25_000;
+const MAX_NAMED: usize = 256;
+/// The largest file that is part of the commit itself, in bytes.
+const MAX_REGULAR: u64 = 10 << 20;
+/// The largest file that is sent in one request, in bytes; the hub asks for parts of larger ones.
+const MAX_WHOLE: u64 = 5 << 30;
+/// The media type of Git LFS.
+const LFS_TYPE: &str = "application/vnd.git-lfs+json";
+
+/// How files are uploaded.
+#[derive(Clone, Debug, Default)]
+pub struct PushOptions {
+    /// Whether a repository that is made for them is private.
+    pub private: bool,
+    /// The title of the commit.
+    pub message: String,
+}
+
+/// What [`Hub::push`] uploaded.
+#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
+pub struct Pushed {
+    /// The URI with its commit.
+    pub pinned: String,
+    /// The page of the commit.
+    pub page: String,
+    /// The number of files of the commit.
+    pub files: usize,
+    /// Their size, in bytes.
+    pub bytes: u64,
+    /// The bytes of large files that the hub did not have.
+    pub uploaded: u64,
+}
+
+/// A file to upload.
+struct Upload {
+    local: PathBuf,
+    path: String,
+    size: u64,
+    sha256: String,
+    sample: String,
+}
+
+/// Where the parts of a large file are sent.
+#[derive(Deserialize)]
+struct Action {
+    href: String,
+    #[serde(default)]
+    header: BTreeMap<String, Value>,
+}
+
+impl Hub {
+    /// Uploads a file or a folder to a path of a repository, which is made if it does not exist. All files make one commit; large
+    /// ones that the hub has already are not sent again, so an interrupted upload continues.
+    ///
+    /// # Errors
+    /// When there is nothing to upload, the token may not write, a file is too large, or the hub cannot be reached.
+    pub fn push(&self, from: &Path, to: &HubUri, options: &PushOptions, control: &mut Control<'_>) -> Result<Pushed> {
+        if to.is_pinned() {
+            let fix = "name a branch, or none for main";
+            return Err(Error::config(to.to_string(), "is a commit, which cannot be changed", fix));
+        }
+        let uploads = uploads(from, &to.path, control)?;
+        let (total, bytes) = (uploads.len(), uploads.iter().map(|upload| upload.size).sum());
+        self.client.create(to, options.private)?;
+        let large = self.client.large(to, &uploads)?;
+        let name = to.to_string();
+        control.emit(Event::Started(Stage { name: STAGE, subject: &[&name], total, unit: "files" }));
+        let (mut lines, mut uploaded) = (vec![], 0);
+        let summary = if options.message.is_empty() { "Upload with stable-worldmodel" } else { &options.message };
+        lines.push(json!({"key": "header", "value": {"summary": summary, "description": ""}}));
+        for (done, upload) in uploads.iter().enumerate() {
+            control.check()?;
+            if large.contains(&upload.path) {
+                uploaded += self.client.send_large(to, upload, control)?;
+                let value = json!({"path": upload.path, "algo": "sha256", "oid": upload.sha256, "size": upload.size});
+                lines.push(json!({"key": "lfsFile", "value": value}));
+            } else {
+                let content = std::fs::read(&upload.local).map_err(|error| reading(&upload.local, error))?;
+                let value = json!({"path": upload.path, "encoding": "base64", "content": STANDARD.encode(content)});
+                lines.push(json!({"key": "file", "value": value}));
+            }
+            control.progress(Progress { stage: STAGE, done: done + 1, total, unit: "files", metrics: &[] });
+        }
+        let (commit, page) = self.client.commit_files(to, &lines)?;
+        control.emit(Event::Finished { stage: STAGE, metrics: &[("files", total as f64)] });
+        Ok(Pushed { pinned: to.at(&commit).to_string(), page, files: total, bytes, uploaded })
+    }
+}
+
+impl Client {
+    /// Makes a repository if it does not exist.
+    fn create(&self, to: &HubUri, private: bool) -> Result<()> {
+        let (owner, name) = to.repo.split_once('/').unwrap_or_default();
+        let kind = if to.kind == RepoKind::Dataset { "dataset" } else { "model" };
+        let url = format!("{}/api/repos/create", self.endpoint());
+        let body = json!({"name": name, "organization": owner, "type": kind, "private": private});
+        let answer = self.send(Method::POST, &url, json_body(&body), HeaderMap::new(), true)?;
+        // It exists already.
+        if answer.status() == reqwest::StatusCode::CONFLICT {
+            return Ok(());
+        }
+        self.check_write(&answer, to)
+    }
+
+    /// Checks the status of an answer to a request that writes.
+    fn check_write(&self, answer: &reqwest::Response, to: &HubUri) -> Result<()> {
+        use reqwest::StatusCode;
+        if [StatusCode::UNAUTHORIZED, StatusCode::FORBIDDEN].contains(&answer.status()) {
+            let fix = "set HF_TOKEN to a token of your account with permission to write";
+            return Err(Error::config(to.to_string(), "the hub does not let you write to it", fix));
+        }
+        self.check(answer, to)
+    }
+
+    /// The paths of files that the hub stores outside of Git.
+    fn large(&self, to: &HubUri, uploads: &[Upload]) -> Result<Vec<String>> {
+        #[derive(Deserialize)]
+        struct Answer {
+            files: Vec<Decided>,
+        }
+        #[derive(Deserialize)]
+        #[serde(rename_all = "camelCase")]
+        struct Decided {
+            path: String,
+            upload_mode: String,
+        }
+        let url = format!("{}/preupload/{}", self.api(to), super::client::encoded(&to.revision));
+        let mut large = vec![];
+        for uploads in uploads.chunks(MAX_NAMED) {
+            let file = |upload: &Upload| json!({"path": upload.path, "size": upload.size, "sample": upload.sample});
+            let body = json!({"files": uploads.iter().map(file).collect::<Vec<_>>()});
+            let answer = self.send(Method::POST, &url, json_body(&body), HeaderMap::new(), true)?;
+            self.check_write(&answer, to)?;
+            let answer: Answer = parsed(&url, &whole(&url, answer)?)?;
+            large.extend(answer.files.into_iter().filter(|file| file.upload_mode == "lfs").map(|file| file.path));
+        }
+        // A commit with a very large file inside would be refused.
+        large.extend(uploads.iter().filter(|upload| upload.size > MAX_REGULAR).map(|upload| upload.path.clone()));
+        Ok(large)
+    }
+
+    /// Sends a large file, unless the hub has it; returns the bytes that were sent.
+    fn send_large(&self, to: &HubUri, upload: &Upload, control: &mut Control<'_>) -> Result<u64> {
+        #[derive(Deserialize)]
+        struct Answer {
+            objects: Vec<Object>,
+        }
+        #[derive(Deserialize)]
+        struct Object {
+            #[serde(default)]
+            actions: BTreeMap<String, Action>,
+            error: Option<Value>,
+        }
+        let url = format!("{}.git/info/lfs/objects/batch", self.page(to));
+        let object = json!({"oid": upload.sha256, "size": upload.size});
+        let body = json!({
+            "operation": "upload",
+            "transfers": ["basic", "multipart"],
+            "objects": [object],
+            "hash_algo": "sha256",
+            "ref": {"name": format!("refs/heads/{}", to.revision)},
+        });
+        let body = Body { content_type: LFS_TYPE, ..json_body(&body) };
+        let accept = HeaderMap::from_iter([header("accept", LFS_TYPE)?]);
+        let answer = self.send(Method::POST, &url, body, accept, true)?;
+        self.check_write(&answer, to)?;
+        let answer: Answer = parsed(&url, &whole(&url, answer)?)?;
+        let Some(found) = answer.objects.into_iter().next() else {
+            return Err(Error::corrupt(url, "its answer names no file", "check the address of the hub"));
+        };
+        if let Some(error) = found.error {
+            let message = error["message"].as_str().unwrap_or("no reason given").to_owned();
+            return Err(Error::external(format!("uploading {}", upload.path), message));
+        }
+        // Without an action, the hub has the file already.
+        let Some(action) = found.actions.get("upload") else { return Ok(0) };
+        let part_size = action.header.get("chunk_size").and_then(number);
+        match part_size.filter(|size| *size > 0) {
+            Some(part_size) => self.send_parts(upload, action, part_size, control)?,
+            None if upload.size > MAX_WHOLE => {
+                let problem = format!("has {} bytes, more than one request can send", upload.size);
+                return Err(Error::config(upload.local.display().to_string(), problem, "split the dataset"));
+            }
+            None => {
+                let headers = action.header.iter().filter_map(|(name, value)| Some((name, value.as_str()?)));
+                let headers = headers.map(|(name, value)| header(name, value)).collect::<Result<HeaderMap>>()?;
+                self.put(&action.href, upload, 0, upload.size, headers)?;
+            }
+        }
+        if let Some(verify) = found.actions.get("verify") {
+            let body = Body { content_type: LFS_TYPE, ..json_body(&object) };
+            let answer = self.send(Method::POST, &verify.href, body, HeaderMap::new(), true)?;
+            self.check_write(&answer, to)?;
+        }
+        Ok(upload.size)
+    }
+
+    /// Sends a file in parts of a size, whose addresses are the headers with numbers as names.
+    fn send_parts(&self, upload: &Upload, action: &Action, size: u64, control: &mut Control<'_>) -> Result<()> {
+        let numbered = |(name, value): (&String, &Value)| Some((name.parse::<u64>().ok()?, value.as_str()?.to_owned()));
+        let addresses: BTreeMap<u64, String> = action.header.iter().filter_map(numbered).collect();
+        let mut parts = vec![];
+        for (index, address) in addresses.values().enumerate() {
+            control.check()?;
+            let first = index as u64 * size;
+            let last = (first + size).min(upload.size);
+            let etag = self.put(address, upload, first, last, HeaderMap::new())?;
+            parts.push(json!({"partNumber": index + 1, "etag": etag}));
+        }
+        if addresses.len() as u64 != upload.size.div_ceil(size) {
+            let problem = format!("it asks for {} parts of {size} bytes of {}", addresses.len(), upload.size);
+            return Err(Error::corrupt(&action.href, problem, "check the address of the hub"));
+        }
+        let body = Body { content_type: LFS_TYPE, ..json_body(&json!({"oid": upload.sha256, "parts": parts})) };
+        let answer = self.send(Method::POST, &action.href, body, HeaderMap::new(), true)?;
+        accepted(&answer, upload)
+    }
+
+    /// Sends a part of a file to a storage, without the token; returns its tag.
+    fn put(&self, address: &str, upload: &Upload, first: u64, last: u64, headers: HeaderMap) -> Result<String> {
+        let io = |error| reading(&upload.local, error);
+        let mut file = File::open(&upload.local).map_err(io)?;
+        file.seek(SeekFrom::Start(first)).map_err(io)?;
+        let mut bytes = vec![];
+        file.take(last.saturating_sub(first)).read_to_end(&mut bytes).map_err(io)?;
+        let body = Body { bytes, content_type: "application/octet-stream" };
+        let answer = self.send(Method::PUT, address, body, headers, false)?;
+        accepted(&answer, upload)?;
+        let tag = answer.headers().get("etag").and_then(|tag| tag.to_str().ok()).unwrap_or_default();
+        Ok(tag.to_owned())
+    }
+
+    /// Makes the commit; returns its hash and its page.
+    fn commit_files(&self, to: &HubUri, lines: &[Value]) -> Result<(String, String)> {
+        #[derive(Deserialize)]
+        #[serde(rename_all = "camelCase")]
+        struct Answer {
+            commit_oid: String,
+            #[serde(default)]
+            commit_url: String,
+        }
+        let url = format!("{}/commit/{}", self.api(to), super::client::encoded(&to.revision));
+        let bytes = lines.iter().map(|line| format!("{line}\n")).collect::<String>().into_bytes();
+        let body = Body { bytes, content_type: "application/x-ndjson" };
+        let answer = self.send(Method::POST, &url, body, HeaderMap::new(), true)?;
+        self.check_write(&answer, to)?;
+        let answer: Answer = parsed(&url, &whole(&url, answer)?)?;
+        Ok((answer.commit_oid, answer.commit_url))
+    }
+}
+
+/// The files to upload, with their paths in the repository.
+fn uploads(from: &Path, to: &str, control: &mut Control<'_>) -> Result<Vec<Upload>> {
+    let mut found = vec![];
+    collect(from, to, &mut found)?;
+    if found.is_empty() {
+        return Err(Error::config(from.display().to_string(), "has no files", "give a file, or a folder with files"));
+    }
+    if found.len() > MAX_FILES {
+        let problem = format!("has more than {MAX_FILES} files");
+        let fix = "convert the dataset to Lance or HDF5, which have few";
+        return Err(Error::config(from.display().to_string(), problem, fix));
+    }
+    found.sort();
+    let upload = |(path, local): (String, PathBuf)| {
+        control.check()?;
+        super::check_no_pointer(&local)?;
+        let (sha256, size) = sha256(&local)?;
+        let mut sample = vec![];
+        let file = File::open(&local).map_err(|error| reading(&local, error))?;
+        file.take(SAMPLE as u64).read_to_end(&mut sample).map_err(|error| reading(&local, error))?;
+        Ok(Upload { local, path, size, sha256, sample: STANDARD.encode(sample) })
+    };
+    found.into_iter().map(upload).collect()
+}
+
+/// Lists a file, or the files of a folder without hidden ones and links.
+fn collect(from: &Path, to: &str, found: &mut Vec<(String, PathBuf)>) -> Result<()> {
+    let kind = std::fs::symlink_metadata(from).map_err(|error| reading(from, error))?;
+    if kind.is_file() {
+        let name = from.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+        let path = if to.is_empty() { name } else { to };
+        if !super::uri::is_inside(path) {
+            return Err(Error::config(from.display().to_string(), "has a name that the hub cannot store", "rename it"));
+        }
+        found.push((path.to_owned(), from.to_owned()));
+    }
+    if !kind.is_dir() || found.len() > MAX_FILES {
+        return Ok(());
+    }
+    for entry in std::fs::read_dir(from).map_err(|error| reading(from, error))? {
+        let path = entry.map_err(|error| reading(from, error))?.path();
+        let Some(name) = path.file_name().and_then(|name| name.to_str()).map(str::to_owned) else {
+            return Err(Error::config(path.display().to_string(), "has a name that is not Unicode", "rename it"));
+        };
+        if !name.starts_with('.') {
+            let inside = if to.is_empty() { name } else { format!("{to}/{name}") };
+            collect(&path, &inside, found)?;
+        }
+    }
+    Ok(())
+}
+
+fn reading(path: &Path, error: std::io::Error) -> Error {
+    Error::io(path, "reading the file", error)
+}
+
+fn accepted(answer: &reqwest::Response, upload: &Upload) -> Result<()> {
+    if answer.status().is_success() {
+        return Ok(());
+    }
+    let problem = format!("the storage of the hub answered {}; run it again to continue", answer.status());
+    Err(Error::external(format!("uploading {}", upload.path), problem))
+}
+
+fn number(value: &Value) -> Option<u64> {
+    value.as_u64().or_else(|| value.as_str()?.parse().ok())
+}

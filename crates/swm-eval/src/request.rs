@@ -161,6 +161,18 @@ pub enum Model {
         /// The cost of a plan.
         cost: EndCost,
     },
+    /// A trained world model whose plans are judged by the state that a probe reads from the last latent, instead of by the
+    /// distance of latents.
+    Probe {
+        /// The world model: its name or path.
+        checkpoint: String,
+        /// The dataset that the probe is fitted on.
+        dataset: String,
+        /// The columns that it reads.
+        columns: Vec<String>,
+        /// Whether plans are played in the environment, and the model encodes what they lead to, instead of predicting it.
+        true_dynamics: bool,
+    },
 }
 
 /// The cost of a plan that is simulated in the environment.
@@ -177,7 +189,9 @@ impl Model {
     /// The name or path of the trained world model; `None` for the environment alone.
     pub fn checkpoint(&self) -> Option<&str> {
         match self {
-            Self::Checkpoint(checkpoint) | Self::TrueDynamics { checkpoint, .. } => Some(checkpoint),
+            Self::Checkpoint(checkpoint) | Self::TrueDynamics { checkpoint, .. } | Self::Probe { checkpoint, .. } => {
+                Some(checkpoint)
+            }
             Self::Simulator { .. } => None,
         }
     }

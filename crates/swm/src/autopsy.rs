@@ -16,6 +16,15 @@ use swm_plan::MpcConfig;
 /// By how much a search is larger.
 pub const SEARCH: u64 = 10;
 
+/// The probe that reads states from latents: the dataset that it is fitted on, and the columns.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ProbeSource {
+    /// The dataset: a path or a name.
+    pub dataset: String,
+    /// The columns that the probe reads.
+    pub columns: Vec<String>,
+}
+
 /// An autopsy to run.
 pub struct Plan {
     /// The selection first, then one cell for each arm and planning seed.
@@ -24,16 +33,23 @@ pub struct Plan {
     pub ingredients: Vec<Ingredient>,
     /// For each arm, its ingredients and the cells of its runs.
     pub arms: Vec<(Vec<Ingredient>, Vec<Cell>)>,
+    /// The probe, if it is an ingredient.
+    pub probe: Option<ProbeSource>,
 }
 
 impl Plan {
     /// The autopsy of the only cell of a study, whose policy plans in a trained world model. Ingredients that change nothing
-    /// about the policy are left out; the distance needs the true dynamics.
+    /// about the policy are left out; the distance needs the true dynamics, and the probe distance needs a probe.
     ///
     /// # Errors
     /// When the policy does not plan in a trained world model, arms would play different starts, there are too few planning
     /// seeds, or no ingredient is left.
-    pub fn new(base: Study, ingredients: &[Ingredient], planning_seeds: usize) -> Result<Self> {
+    pub fn new(
+        base: Study,
+        ingredients: &[Ingredient],
+        planning_seeds: usize,
+        probe: Option<ProbeSource>,
+    ) -> Result<Self> {
         let (cell, policy) = only(&base)?;
         if !(Autopsy::MIN_SEEDS..=Study::MAX_CELLS / 64).contains(&planning_seeds) {
             let fix = format!("give {} to {}", Autopsy::MIN_SEEDS, Study::MAX_CELLS / 64);
@@ -50,18 +66,18 @@ impl Plan {
         }
         let mut changing = vec![];
         for ingredient in Ingredient::ALL.into_iter().filter(|ingredient| ingredients.contains(ingredient)) {
-            if with(&policy.kind, &[ingredient])? != policy.kind {
+            if with(&policy.kind, &[ingredient], probe.as_ref())? != policy.kind {
                 changing.push(ingredient);
             }
         }
         if changing.is_empty() {
-            let fix = "name at least one of S, R, D and E; R changes a policy that executes several steps of a plan";
+            let fix = "name at least one of S, R, D, C and E; R changes a policy that executes several steps of a plan";
             return Err(Error::config("ingredients of an autopsy", "none changes the policy", fix));
         }
         let mut arms = vec![];
         for coalition in game(&changing).coalitions() {
             let set = members(&changing, coalition);
-            let kind = with(&policy.kind, &set)?;
+            let kind = with(&policy.kind, &set, probe.as_ref())?;
             let name =
                 if set.is_empty() { policy.name.clone() } else { format!("{} + {}", policy.name, letters(&set)) };
             let cell = |seed: usize| {
@@ -76,7 +92,7 @@ impl Plan {
         let cells = std::iter::once(cell.clone()).chain(arms.iter().flat_map(|(_, cells)| cells.clone())).collect();
         let study = Study { cells, ..base };
         study.check()?;
-        Ok(Self { study, ingredients: changing, arms })
+        Ok(Self { study, ingredients: changing, arms, probe })
     }
 
     /// The request of the policy without ingredients.
@@ -178,11 +194,11 @@ fn only(study: &Study) -> Result<(&Cell, &PolicyRequest)> {
     Err(Error::mismatch("an autopsy", format!("{} evaluations", study.cells.len()), "one evaluation of one policy"))
 }
 
-/// The policy with some ingredients.
+/// The policy with some ingredients; `probe` is what the ingredient of this name uses.
 ///
 /// # Errors
-/// When it does not plan in a trained world model, or its search cannot be larger.
-pub fn with(kind: &PolicyKind, set: &[Ingredient]) -> Result<PolicyKind> {
+/// When it does not plan in a trained world model, its search cannot be larger, or there is no probe.
+pub fn with(kind: &PolicyKind, set: &[Ingredient], probe: Option<&ProbeSource>) -> Result<PolicyKind> {
     let PolicyKind::Plan { model: Model::Checkpoint(checkpoint), solver, mpc, objective } = kind else {
         let problem = "the policy does not plan in a trained world model";
         return Err(Error::config(
@@ -193,10 +209,23 @@ pub fn with(kind: &PolicyKind, set: &[Ingredient]) -> Result<PolicyKind> {
     };
     let has = |ingredient| set.contains(&ingredient);
     let true_dynamics = |cost| Model::TrueDynamics { checkpoint: checkpoint.clone(), cost };
-    let model = match (has(Ingredient::Dynamics), has(Ingredient::Distance)) {
-        (false, false) => Model::Checkpoint(checkpoint.clone()),
-        (true, false) => true_dynamics(EndCost::Latent),
-        (_, true) => true_dynamics(EndCost::Success),
+    let probed = |true_dynamics| {
+        let Some(ProbeSource { dataset, columns }) = probe else {
+            let fix = "name a dataset to fit the probe on, with --probe-data";
+            return Err(Error::config(
+                "ingredients of an autopsy",
+                "C needs a probe, and there is no dataset for it",
+                fix,
+            ));
+        };
+        let (checkpoint, dataset, columns) = (checkpoint.clone(), dataset.clone(), columns.clone());
+        Ok(Model::Probe { checkpoint, dataset, columns, true_dynamics })
+    };
+    let model = match (has(Ingredient::Dynamics), has(Ingredient::Probe), has(Ingredient::Distance)) {
+        (false, false, false) => Model::Checkpoint(checkpoint.clone()),
+        (true, false, false) => true_dynamics(EndCost::Latent),
+        (dynamics, true, false) => probed(dynamics)?,
+        (_, _, true) => true_dynamics(EndCost::Success),
     };
     let solver = if has(Ingredient::Search) { larger(solver)? } else { solver.clone() };
     let mut mpc = mpc.clone();
@@ -229,7 +258,7 @@ pub fn plans(kind: &PolicyKind, limit: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use Ingredient::{Distance, Dynamics, Replanning, Search};
+    use Ingredient::{Distance, Dynamics, Probe, Replanning, Search};
 
     fn kind() -> PolicyKind {
         PolicyKind::Plan {
@@ -242,7 +271,7 @@ mod tests {
 
     #[test]
     fn ingredients_change_their_part_of_a_policy_only() {
-        let with = |set: &[Ingredient]| with(&kind(), set).expect("an arm");
+        let with = |set: &[Ingredient]| with(&kind(), set, None).expect("an arm");
         assert_eq!(with(&[]), kind());
         let PolicyKind::Plan { model, solver, mpc, .. } = with(&[Search, Replanning]) else { panic!("no plan") };
         assert_eq!(solver.settings, json!({"samples": 300, "iterations": 4, "elites": 5}));
@@ -253,8 +282,19 @@ mod tests {
             assert_eq!(model, Model::TrueDynamics { checkpoint: "rooms".to_owned(), cost });
             assert_eq!((solver.settings["samples"].as_u64(), mpc["receding_horizon"].as_u64()), (Some(30), Some(2)));
         }
+        let probe = ProbeSource { dataset: "rooms".to_owned(), columns: vec!["state".to_owned()] };
+        for (set, expected) in [(&[Probe][..], false), (&[Dynamics, Probe], true)] {
+            let PolicyKind::Plan { model: Model::Probe { true_dynamics, columns, .. }, .. } =
+                super::with(&kind(), set, Some(&probe)).expect("an arm")
+            else {
+                panic!("no probe")
+            };
+            assert_eq!((true_dynamics, columns), (expected, probe.columns.clone()));
+        }
+        let error = super::with(&kind(), &[Probe], None).expect_err("no probe").to_string();
+        assert!(error.contains("--probe-data"), "{error}");
         assert_eq!((plans(&kind(), 50), plans(&with(&[Replanning]), 51)), (5, 11));
-        let error = super::with(&PolicyKind::Random, &[]).expect_err("no planning").to_string();
+        let error = super::with(&PolicyKind::Random, &[], None).expect_err("no planning").to_string();
         assert!(error.contains("a LeWM or a PLDM"), "{error}");
     }
 }

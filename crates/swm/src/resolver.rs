@@ -2,6 +2,8 @@
 //! names. Environments, wrappers and solvers belong to this build; datasets and checkpoints are in the [home
 //! folder](crate::home).
 
+mod probing;
+
 use crate::home;
 use serde::de::DeserializeOwned;
 use std::cell::RefCell;
@@ -19,6 +21,7 @@ use swm_eval::{
     Choice, EndCost, EvalRequest, MixturePolicy, Model, NoOpPolicy, PolicyChoice, PolicyKind, PolicyRequest, Predictor,
     ResolvedPolicy, Resolver, World,
 };
+use swm_models::probe::StateProbe;
 use swm_models::{CheckpointInfo, Device, LoadedModel, load};
 use swm_plan::objective::ObjectiveConfig;
 use swm_plan::{
@@ -39,6 +42,8 @@ pub struct HomeResolver {
     wrapping: RefCell<Option<Wrapping>>,
     /// The loaded checkpoints, by path.
     checkpoints: RefCell<BTreeMap<PathBuf, Rc<dyn LoadedModel>>>,
+    /// The fitted probes, by checkpoint, dataset and columns.
+    probes: RefCell<BTreeMap<ProbeKey, Arc<StateProbe>>>,
     /// The traced plans; `None` without tracing.
     traces: Option<Traces>,
 }
@@ -51,6 +56,9 @@ struct Wrapping {
     goal: GoalFrame,
 }
 
+/// The checkpoint, the dataset and the columns of a probe.
+type ProbeKey = (String, String, Vec<String>);
+
 /// Plans, each with the name of its policy.
 type Traces = Arc<Mutex<Vec<(String, PlanRecord)>>>;
 
@@ -62,6 +70,7 @@ impl HomeResolver {
             env: None,
             wrapping: RefCell::default(),
             checkpoints: RefCell::default(),
+            probes: RefCell::default(),
             traces: None,
         }
     }
@@ -277,6 +286,10 @@ impl Resolver for HomeResolver {
                     Model::Checkpoint(given) => self.model_policy(&request.name, given, planner, world),
                     Model::TrueDynamics { checkpoint, cost } => {
                         self.true_dynamics_policy(&request.name, (checkpoint, *cost), planner, world)
+                    }
+                    Model::Probe { checkpoint, dataset, columns, true_dynamics } => {
+                        let source = (checkpoint.as_str(), dataset.as_str(), columns.as_slice());
+                        self.probe_policy(&request.name, source, *true_dynamics, planner, world)
                     }
                 }
             }

@@ -27,14 +27,16 @@ pub enum Ingredient {
     Replanning,
     /// D: the true dynamics. Plans are simulated in the environment, and the cost is that of the resulting frame.
     Dynamics,
-    /// E: the environment's distance to the goal by its success criterion, instead of the distance of latents. It can be
-    /// computed of simulated states only, and so comes after the true dynamics.
+    /// C: the distance of the states that a probe reads from latents, instead of the distance of latents.
+    Probe,
+    /// E: the environment's distance to the goal by its success criterion, instead of the distance of latents or of probed
+    /// states. It can be computed of simulated states only, and so comes after the true dynamics, and after the probe.
     Distance,
 }
 
 impl Ingredient {
     /// All ingredients, in the order of tables.
-    pub const ALL: [Self; 4] = [Self::Search, Self::Replanning, Self::Dynamics, Self::Distance];
+    pub const ALL: [Self; 5] = [Self::Search, Self::Replanning, Self::Dynamics, Self::Probe, Self::Distance];
 
     /// The letter in tables.
     pub fn letter(self) -> char {
@@ -42,6 +44,7 @@ impl Ingredient {
             Self::Search => 'S',
             Self::Replanning => 'R',
             Self::Dynamics => 'D',
+            Self::Probe => 'C',
             Self::Distance => 'E',
         }
     }
@@ -52,6 +55,7 @@ impl Ingredient {
             Self::Search => "search x 10",
             Self::Replanning => "replan every step",
             Self::Dynamics => "true dynamics",
+            Self::Probe => "probe distance",
             Self::Distance => "true distance",
         }
     }
@@ -62,13 +66,14 @@ impl Ingredient {
             Self::Search => "the search does not find the plans that its cost prefers",
             Self::Replanning => "plans are executed for too long before the next one",
             Self::Dynamics => "the model predicts wrong latents for the actions of plans",
+            Self::Probe => "latents contain the state, but their distance does not say how far the goal is",
             Self::Distance => "a small distance of latents does not mean that the goal is near",
         }
     }
 
     /// Whether this ingredient can be added only after another one.
     fn is_after(self, other: Self) -> bool {
-        (self, other) == (Self::Distance, Self::Dynamics)
+        self == Self::Distance && matches!(other, Self::Dynamics | Self::Probe)
     }
 }
 

@@ -2,12 +2,14 @@
 //!
 //! - [`state`]: regression of the columns of a dataset on latents, [linear](ridge) and with a small network, scored on
 //!   held-out episodes, and compared with a regression on a baseline such as the position of the agent.
+//! - [`StateProbe`]: the same regression for planning by the states that it reads ([`ProbedCost`]).
 //! - [`supervised`]: regression of the columns on images with an encoder that is trained with them, a ceiling for latents.
 //! - [`reconstruction`]: reconstruction of images from latents.
 //!
 //! If the linear map predicts a state, the latents represent the state linearly; if only the network predicts the
 //! state, the representation is nonlinear. A planner cannot use a state that neither regression predicts.
 
+mod cost;
 mod fit;
 pub mod reconstruction;
 pub mod ridge;
@@ -17,6 +19,7 @@ pub mod state;
 pub mod supervised;
 mod targets;
 
+pub use cost::{ProbedCost, ProbedLatents, StateProbe};
 pub use fit::FitConfig;
 pub use reconstruction::{ReconstructionConfig, ReconstructionReport, reconstruct_images};
 pub use state::{Baseline, Score, StateConfig, StateReport, read_state};

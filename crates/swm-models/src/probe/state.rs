@@ -196,7 +196,7 @@ impl Tables {
 }
 
 /// The nonlinear regression.
-struct Network {
+pub(super) struct Network {
     model: Mlp,
     from: Scale,
     to: Scale,
@@ -207,7 +207,7 @@ impl Network {
     ///
     /// # Shapes
     /// `x` is `[count, inputs]`, `y` is `[count, outputs]`.
-    fn fit(
+    pub fn fit(
         (x, y, count): (&[f32], &[f32], usize),
         config: &StateConfig,
         key: Key,
@@ -229,7 +229,7 @@ impl Network {
         Ok(Self { model, from, to })
     }
 
-    fn predict(&self, x: &[f32]) -> Vec<f32> {
+    pub fn predict(&self, x: &[f32]) -> Vec<f32> {
         let width = self.from.width();
         let x = self.from.apply(x);
         let chunks: Vec<Vec<f32>> = x

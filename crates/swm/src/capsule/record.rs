@@ -224,7 +224,7 @@ pub fn check_cost(request: &EvalRequest) -> std::result::Result<(), String> {
 /// Returns the name of the checkpoint that a policy uses.
 pub fn trained(kind: &PolicyKind) -> Option<&str> {
     match kind {
-        PolicyKind::Plan { model: Model::TrueDynamics { .. }, .. } => None,
+        PolicyKind::Plan { model: Model::TrueDynamics { .. } | Model::Probe { .. }, .. } => None,
         kind => kind.checkpoint(),
     }
 }

@@ -5,7 +5,7 @@ use super::eval::{run_options, write_json};
 use super::progress::control;
 use super::results_tables::percent;
 use super::{Context, emit, emit_json, eprint, output_folder, study, table};
-use crate::autopsy::{Plan, SEARCH, Strip, plans};
+use crate::autopsy::{Plan, ProbeSource, SEARCH, Strip, plans};
 use crate::resolver::HomeResolver;
 use clap::Args;
 use serde_json::json;
@@ -33,12 +33,19 @@ pub struct AutopsyArgs {
     /// Planning seeds per arm, besides the one that selects the failures
     #[arg(long, value_name = "COUNT", default_value_t = Autopsy::MIN_SEEDS)]
     planning_seeds: usize,
-    /// Ingredients: some of the letters S, R, D and E
+    /// Ingredients: some of the letters S, R, D, C and E
     ///
-    /// S: ten times as many candidates. R: a new plan after every model step. D: the true dynamics. E, after D: the true distance
-    /// to the goal. Fewer ingredients cost less time and explain less.
+    /// S: ten times as many candidates. R: a new plan after every model step. D: the true dynamics. C: the distance of states
+    /// that a probe reads from latents. E, after D and C: the true distance to the goal. Fewer ingredients cost less time and
+    /// explain less.
     #[arg(long, value_name = "LETTERS", default_value = "SRDE")]
     ingredients: String,
+    /// The dataset on which the probe of C is fitted (default: that of the starts)
+    #[arg(long, value_name = "DATASET")]
+    probe_data: Option<String>,
+    /// Columns that the probe of C reads
+    #[arg(long, value_name = "COLUMN,…", value_delimiter = ',', default_value = "state")]
+    probe_columns: Vec<String>,
     /// Folder of the autopsy, which is that of a study
     #[arg(short, long, default_value = "autopsy", value_name = "DIR")]
     output: PathBuf,
@@ -69,7 +76,7 @@ pub fn autopsy(args: &AutopsyArgs, context: &Context) -> anyhow::Result<()> {
     let settings: Vec<String> =
         env.chain([format!("episodes={}", args.episodes)]).chain(args.settings.iter().cloned()).collect();
     let base = study::single([&title, &question, &name, &args.model], &settings, &resolver, &mut control(context))?;
-    let plan = Plan::new(base, &ingredients, args.planning_seeds)?;
+    let plan = Plan::new(base, &ingredients, args.planning_seeds, args.probe(&ingredients))?;
     let folder = StudyFolder::new(&args.output);
     let seconds = estimate(&plan, &folder, &resolver, context)?;
     let (arms, starts) = (plan.arms.len(), plan.request()?.episodes);
@@ -115,6 +122,14 @@ pub fn autopsy(args: &AutopsyArgs, context: &Context) -> anyhow::Result<()> {
 }
 
 impl AutopsyArgs {
+    /// The probe, if it is an ingredient and there is a dataset for it.
+    fn probe(&self, ingredients: &[Ingredient]) -> Option<ProbeSource> {
+        let of_starts = || self.settings.iter().find_map(|setting| setting.strip_prefix("dataset=").map(str::to_owned));
+        let dataset =
+            self.probe_data.clone().or_else(of_starts).filter(|_| ingredients.contains(&Ingredient::Probe))?;
+        Some(ProbeSource { dataset, columns: self.probe_columns.clone() })
+    }
+
     /// The command that runs the autopsy again. It names a folder of its own, so that equal autopsies have equal pages.
     fn command(&self) -> String {
         let mut words = vec!["swm".to_owned(), "autopsy".to_owned(), self.model.clone()];
@@ -122,6 +137,10 @@ impl AutopsyArgs {
         words.extend(["--episodes".to_owned(), self.episodes.to_string()]);
         words.extend(["--planning-seeds".to_owned(), self.planning_seeds.to_string()]);
         words.extend(["--ingredients".to_owned(), self.ingredients.clone()]);
+        words.extend(self.probe_data.iter().flat_map(|data| ["--probe-data".to_owned(), data.clone()]));
+        if self.probe_columns != ["state"] {
+            words.extend(["--probe-columns".to_owned(), self.probe_columns.join(",")]);
+        }
         words.extend(self.settings.iter().cloned().chain(["-o".to_owned(), "autopsy".to_owned()]));
         study::shell(&words)
     }
@@ -133,7 +152,7 @@ fn ingredients(given: &str) -> Result<Vec<Ingredient>> {
         let found = Ingredient::ALL.into_iter().find(|ingredient| ingredient.letter() == letter.to_ascii_uppercase());
         found.ok_or_else(|| {
             let problem = format!("there is no ingredient '{letter}'");
-            Error::config("--ingredients", problem, "choose some of S, R, D and E, such as SRD")
+            Error::config("--ingredients", problem, "choose some of S, R, D, C and E, such as SRD")
         })
     };
     given.chars().filter(|c| *c != ',').map(find).collect()
@@ -169,8 +188,9 @@ fn estimate(plan: &Plan, folder: &StudyFolder, resolver: &HomeResolver, context:
         let model: Vec<Ingredient> =
             set.iter().copied().filter(|ingredient| *ingredient >= Ingredient::Dynamics).collect();
         let EvalRequest { policies, .. } = request;
-        let kind =
-            |set: &[Ingredient]| policies.first().map(|policy| crate::autopsy::with(&policy.kind, set)).transpose();
+        let kind = |set: &[Ingredient]| {
+            policies.first().map(|policy| crate::autopsy::with(&policy.kind, set, plan.probe.as_ref())).transpose()
+        };
         let known = timed.iter().find(|(known, _)| *known == model).map(|(_, seconds)| *seconds);
         let seconds = match (known, kind(&model)?) {
             (Some(seconds), _) => seconds,

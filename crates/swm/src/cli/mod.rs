@@ -158,7 +158,8 @@ enum Command {
     /// Find out why a planning world model fails
     ///
     /// Plays the same starts with parts of the planning replaced: S ten times as many candidates, R a new plan after every
-    /// model step, D the true dynamics, E the true distance to the goal. docs/autopsy.md explains what the answer means.
+    /// model step, D the true dynamics, C the distance of states that a probe reads from latents, E the true distance to the
+    /// goal. docs/autopsy.md explains what the answer means.
     #[command(after_help = "Example: swm autopsy zoo:two-room/lewm --env swm/TwoRoom-v1 --output autopsy budget=100")]
     Autopsy(autopsy::AutopsyArgs),
     /// Write one self-contained HTML page of results

@@ -24,6 +24,9 @@ use swm::models::{CheckpointInfo, LoadedModel};
 use swm::plan::ActionScale;
 use swm::resolver::HomeResolver;
 
+/// The ingredients without a probe.
+const FOUR: [Ingredient; 4] = [Ingredient::Search, Ingredient::Replanning, Ingredient::Dynamics, Ingredient::Distance];
+
 /// Options that make an autopsy take seconds.
 const FAST: [&str; 7] = [
     "--episodes=4",
@@ -82,7 +85,7 @@ fn autopsies_that_explain_nothing_are_refused() {
     let error = text(&unknown.stderr);
     assert!(!unknown.status.success() && error.contains("nowhere") && !error.contains("file of the study"), "{error}");
     fails(&["expert"], &["does not plan in a trained world model"]);
-    fails(&["zoo:two-room/pldm", "--ingredients", "SX"], &["'X'", "S, R, D and E"]);
+    fails(&["zoo:two-room/pldm", "--ingredients", "SX"], &["'X'", "S, R, D, C and E"]);
     fails(&["zoo:two-room/pldm", "--ingredients", "SE"], &["add D"]);
     // The capsule already plans after every model step.
     fails(&["zoo:two-room/pldm", "--ingredients", "R"], &["none changes the policy"]);
@@ -298,7 +301,7 @@ impl Planted {
             wrappers: vec![],
             wrap_goal: false,
             image: None,
-            policies: vec![PolicyRequest { name: NAME.to_owned(), kind: with(&kind, set).expect("an arm") }],
+            policies: vec![PolicyRequest { name: NAME.to_owned(), kind: with(&kind, set, None).expect("an arm") }],
             starts: StartsRequest::Episodic,
             episodes,
             seed,
@@ -315,8 +318,8 @@ impl Planted {
 
     /// The run that selects the failures, and the runs of all arms.
     fn play(self, episodes: usize, seed: u64) -> (Run, Vec<ArmRuns>) {
-        let arms = game(&Ingredient::ALL).coalitions().into_iter().map(|coalition| {
-            let ingredients = members(&Ingredient::ALL, coalition);
+        let arms = game(&FOUR).coalitions().into_iter().map(|coalition| {
+            let ingredients = members(&FOUR, coalition);
             let runs =
                 (1..=3).map(|planning_seed| self.run(&ingredients, Some(planning_seed), episodes, seed)).collect();
             ArmRuns { ingredients, runs }
@@ -423,4 +426,26 @@ fn planted_faults_are_found_and_healthy_policies_are_not_accused() {
         }
     }
     assert!(wrong.is_empty(), "too many wrong findings: {wrong:?}");
+}
+
+#[test]
+fn a_probe_is_an_ingredient_with_a_dataset() {
+    let swm = Swm::new();
+    swm.json(&[
+        "collect",
+        "swm/TwoRoom-v1",
+        "--output=rooms",
+        "--policy=explore",
+        "--episodes=30",
+        "--image=64",
+        "--max-steps=30",
+    ]);
+    let autopsy = ["autopsy", "zoo:two-room/lewm", "--ingredients=DC", "--episodes=6", "--output=out"];
+    let quick = ["budget=10", "solver=cem,samples=4,iterations=1,elites=2"];
+    let args = [&autopsy[..], &quick].concat();
+    swm.fails(&args, 2, &["C needs a probe", "--probe-data"]);
+    let found = swm.json(&[&args[..], &["--probe-data=rooms"]].concat());
+    let arms = found["autopsy"]["arms"].as_array().expect("arms");
+    let sets: Vec<&serde_json::Value> = arms.iter().map(|arm| &arm["ingredients"]).collect();
+    assert_eq!(serde_json::json!(sets), serde_json::json!([[], ["dynamics"], ["probe"], ["dynamics", "probe"]]));
 }

@@ -1,8 +1,11 @@
 //! Tests of autopsies on outcomes with planted faults.
 
-use super::Ingredient::{Distance, Dynamics, Replanning, Search};
+use super::Ingredient::{Distance, Dynamics, Probe, Replanning, Search};
 use super::*;
 use crate::results::Timing;
+
+/// The ingredients without a probe.
+const FOUR: [Ingredient; 4] = [Search, Replanning, Dynamics, Distance];
 
 /// A run of starts that were drawn, or that come from recorded episodes with `per_episode` starts each.
 fn run(solved: &[bool], per_episode: usize) -> Run {
@@ -40,7 +43,7 @@ fn drawn(ingredients: &[Ingredient], rate: impl Fn(&[Ingredient]) -> f64, key: K
 
 /// The number of 100 drawn autopsies with a finding.
 fn count(rate: impl Fn(&[Ingredient]) -> f64, is_counted: impl Fn(&Finding) -> bool) -> usize {
-    let finding = |trial| drawn(&Ingredient::ALL, &rate, Key::new(trial)).finding;
+    let finding = |trial| drawn(&FOUR, &rate, Key::new(trial)).finding;
     (0..100).filter(|&trial| is_counted(&finding(trial))).count()
 }
 
@@ -134,4 +137,18 @@ fn faults_that_need_two_ingredients_are_joint() {
     let joint = count(rate, |finding| *finding == Finding::Joint(vec![Search, Dynamics]));
     let culprits = count(rate, |finding| matches!(finding, Finding::Culprit(_)));
     assert!(joint >= 85 && culprits <= 15, "{joint} joint, {culprits} culprits");
+}
+
+#[test]
+fn the_true_distance_comes_after_dynamics_and_probe() {
+    let sets: Vec<String> = game(&[Dynamics, Probe, Distance])
+        .coalitions()
+        .into_iter()
+        .map(|coalition| letters(&members(&[Dynamics, Probe, Distance], coalition)))
+        .collect();
+    assert_eq!(sets, ["–", "D", "C", "DC", "DCE"]);
+    // The culprit of a model whose latents contain the state, but bent.
+    let rate = |set: &[Ingredient]| if set.contains(&Probe) { 0.95 } else { 0.3 };
+    let found = drawn(&[Dynamics, Probe, Distance], rate, Key::new(1));
+    assert_eq!(found.finding, Finding::Culprit(Probe), "{found:#?}");
 }

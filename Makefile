@@ -19,7 +19,7 @@ SWM := $(CARGO_TARGET_DIR)/release/swm
 SUDO := $(shell [ "$$(id -u)" = 0 ] || command -v sudo)
 CARGO := cargo
 
-.PHONY: help demo test test-python test-ray test-neighbours test-browser check build tests wheel wheel-portable gpu docs assets setup setup-python reference bench deny nightly clean
+.PHONY: help demo test test-python test-ray test-neighbours test-browser check build tests wheel wheel-portable gpu docs assets setup setup-python reference bench deny release nightly clean
 
 help:
 	@echo 'make demo       collect, train, plan, evaluate and report on a laptop CPU'
@@ -34,6 +34,7 @@ help:
 	@echo 'make docs       the documentation as static pages: $(CACHE)/docs/book/index.html'
 	@echo 'make assets     MuJoCo, its models and meshes, into $(SWM_ASSETS)'
 	@echo 'make nightly    what takes longer: fuzzers, sanitizer, models of threads, long tests; one part: PART=fuzz'
+	@echo 'make release    the program, the wheel, the source distribution, SBOM and checksums: $(CACHE)/release'
 	@echo 'make deny       licences and sources of the dependencies'
 	@echo 'make bench      our benchmarks, against the reference where `make reference` installed it'
 
@@ -105,12 +106,17 @@ wheel-portable: wheel
 gpu: setup
 	CARGO_TARGET_DIR=$(CARGO_TARGET_DIR)-gpu $(CARGO) build --release -p swm --bins --features vulkan
 
-# The guides, tutorials and registries as static pages that need no network (`cargo xtask book`). Frames of 3-D environments are shown if their assets are installed.
+# The guides, tutorials, registries and both interfaces as static pages that need no network (`cargo xtask book`). Frames of 3-D environments are
+# shown if their assets are installed. pdoc reads the interface of the Python package from the installed wheel, rustdoc that of the facade.
 MDBOOK_VERSION := 0.5.4
-docs: build
+PDOC_VERSION := 16.0.0
+docs: build wheel
 	@mdbook --version 2>/dev/null | grep -qx 'mdbook v$(MDBOOK_VERSION)' || \
 	  $(CARGO) install --locked --root $(CACHE)/tools mdbook --version $(MDBOOK_VERSION) --no-default-features --features search
-	SWM=$(SWM) $(CARGO) xtask book $(CACHE)/docs
+	$(PYTHON_VENV)/bin/python -m pip install --quiet pdoc==$(PDOC_VERSION)
+	$(PYTHON_VENV)/bin/python -m pip install --quiet --force-reinstall --no-deps $(WHEELS)/*.whl
+	$(CARGO) doc --release --no-deps -p swm -p swm-core -p swm-eval -p swm-plan -p swm-models -p swm-data
+	SWM=$(SWM) SWM_PDOC=$(PYTHON_VENV)/bin/python SWM_RUSTDOC=$(CARGO_TARGET_DIR)/doc $(CARGO) xtask book $(CACHE)/docs
 
 bench: assets
 	SWM_REFERENCE_PYTHON=$(CACHE)/reference/bin/python $(SWM) bench envs
@@ -168,6 +174,13 @@ export PATH := $(CACHE)/tools/bin:$(PATH)
 deny: setup
 	@$(CARGO) deny --version >/dev/null 2>&1 || $(CARGO) install --locked --root $(CACHE)/tools cargo-deny
 	$(CARGO) deny check licenses bans sources
+
+# What a release consists of, in $(CACHE)/release: the program with its list of dependencies inside (cargo auditable), the wheel, the source
+# distribution, a list of all dependencies (SBOM), checksums. Not part of CI.
+release: setup deny wheel
+	@$(CARGO) auditable --version >/dev/null 2>&1 || $(CARGO) install --locked --root $(CACHE)/tools cargo-auditable
+	@command -v auditable2cdx >/dev/null || $(CARGO) install --locked --root $(CACHE)/tools auditable2cdx
+	CARGO="$(CARGO)" PYTHON_VENV=$(PYTHON_VENV) WHEELS=$(WHEELS) sh xtask/release.sh $(CACHE)/release
 
 # At most two hours after `tests` compiled everything. Parts that passed on the same commit are skipped; the page
 # docs/nightly.md has a row for each.

@@ -39,11 +39,14 @@ pub fn book(root: &Path, folder: &Path) -> Result<()> {
         let text = rewritten(root, &source, path, &read(root, path)?, &names)?;
         write(&source, &names[path], &text)?;
     }
+    let interfaces = Interfaces::of_environment();
+    interfaces.link(&source, &names)?;
     for page in groups.iter().flat_map(|group| &group.pages) {
         write(&source, &page.path, &page.text)?;
     }
     std::fs::copy(root.join("docs/book.toml"), folder.join("book.toml")).context("copying docs/book.toml")?;
     build(folder)?;
+    interfaces.write(&folder.join("book"))?;
     check::site(&folder.join("book"))?;
     println!("{}", folder.join("book/index.html").display());
     Ok(())
@@ -121,6 +124,68 @@ fn rewritten(root: &Path, source: &Path, path: &str, text: &str, names: &BTreeMa
         done = link.range.end;
     }
     Ok(out + &text[done..])
+}
+
+/// The interfaces whose pages other tools make.
+struct Interfaces {
+    /// A Python with pdoc and the package.
+    pdoc: Option<PathBuf>,
+    /// The folder that `cargo doc` wrote.
+    rustdoc: Option<PathBuf>,
+}
+
+impl Interfaces {
+    /// Those that `$SWM_PDOC` and `$SWM_RUSTDOC` name.
+    fn of_environment() -> Self {
+        let path = |name: &str| std::env::var_os(name).map(PathBuf::from);
+        Self { pdoc: path("SWM_PDOC"), rustdoc: path("SWM_RUSTDOC") }
+    }
+
+    /// Adds links to the pages about the Python package and about the architecture.
+    fn link(&self, source: &Path, names: &BTreeMap<String, String>) -> Result<()> {
+        let of_python = self.pdoc.is_some().then_some(("python/README.md", PYTHON, "of the Python package"));
+        let of_rust = self.rustdoc.is_some().then_some(("ARCHITECTURE.md", RUST, "of the crates"));
+        for (page, target, what) in [of_python, of_rust].into_iter().flatten() {
+            let Some(name) = names.get(page) else { bail!("{SUMMARY} does not name {page}") };
+            let text = std::fs::read_to_string(source.join(name))?;
+            let up = "../".repeat(name.matches('/').count());
+            write(source, name, &format!("{text}\n## Interface\n\n[The complete interface {what}]({up}{target})\n"))?;
+        }
+        Ok(())
+    }
+
+    /// Writes the pages into the finished book.
+    fn write(&self, book: &Path) -> Result<()> {
+        if let Some(python) = &self.pdoc {
+            let mut command = Command::new(python);
+            let folder = book.join("interface/python");
+            command
+                .args(["-m", "pdoc", "--docformat", "google", "--output-directory"])
+                .arg(folder)
+                .arg("stable_worldmodel");
+            let output = command.output().with_context(|| format!("starting {}", python.display()))?;
+            if !output.status.success() {
+                bail!("pdoc: {}", String::from_utf8_lossy(&output.stderr));
+            }
+        }
+        if let Some(folder) = &self.rustdoc {
+            copy_folder(folder, &book.join("interface/rust"))?;
+        }
+        Ok(())
+    }
+}
+
+/// The first pages of the interfaces in the book.
+const PYTHON: &str = "interface/python/stable_worldmodel.html";
+const RUST: &str = "interface/rust/swm/index.html";
+
+fn copy_folder(from: &Path, to: &Path) -> Result<()> {
+    for entry in std::fs::read_dir(from).with_context(|| format!("reading {}", from.display()))? {
+        let path = entry?.path();
+        let to = to.join(path.file_name().unwrap_or_default());
+        if path.is_dir() { copy_folder(&path, &to)? } else { copy(&path, &to)? }
+    }
+    Ok(())
 }
 
 /// Runs mdBook, whose warnings are errors.

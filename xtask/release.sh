@@ -1,0 +1,28 @@
+#!/bin/sh
+# Makes the files of a release in a folder, which is replaced: `make release` calls this.
+set -eu
+OUT=$1
+TARGET=$CARGO_TARGET_DIR-release
+VERSION=$(sed -n 's/^version = "\(.*\)"$/\1/p' Cargo.toml | head -1)
+HOST=$(rustc -vV | sed -n 's/^host: //p')
+NAME=stable-worldmodel-$VERSION-$HOST
+rm -rf "$OUT"
+mkdir -p "$OUT/$NAME"
+
+# Another wrapper of rustc compiles the crates of the workspace again, so the program has a target folder of its own.
+CARGO_TARGET_DIR=$TARGET $CARGO auditable build --release --locked -p swm --bins
+cp "$TARGET/release/swm" "$OUT/$NAME/"
+strip "$OUT/$NAME/swm"
+# The list of dependencies has to survive strip.
+auditable2cdx "$OUT/$NAME/swm" > "$OUT/$NAME.cdx.json"
+cp README.md CHANGELOG.md CITATION.cff LICENSE* "$OUT/$NAME/"
+cp -r zoo "$OUT/$NAME/"
+for shell in bash zsh fish; do "$OUT/$NAME/swm" completions $shell > "$OUT/$NAME/swm.$shell"; done
+"$OUT/$NAME/swm" man --output "$OUT/$NAME/man" > /dev/null
+tar --create --xz --sort=name --owner=0 --group=0 --numeric-owner --mtime='@0' --directory "$OUT" --file "$OUT/$NAME.tar.xz" "$NAME"
+rm -r "${OUT:?}/$NAME"
+
+cp "$WHEELS"/*.whl "$OUT/"
+"$PYTHON_VENV/bin/maturin" sdist --manifest-path python/Cargo.toml --out "$OUT"
+(cd "$OUT" && sha256sum -- * > SHA256SUMS && sha256sum --check --quiet SHA256SUMS)
+ls -l "$OUT"

@@ -1,10 +1,100 @@
-//! Models of the loader's prefetch queue.
+//! Models of the loader's prefetch queue and of the pool's worker threads.
 //!
-//! The queue is the only code of the engine that waits on a condition variable across the threads of a computation: the
-//! pool of environments has no synchronisation of its own (rayon divides its slots), and workers of Gymnasium answer
-//! over a socket. The models compile the file of the queue itself, with loom's primitives in the place of the standard
-//! library's. A `cfg(loom)` in `swm-data` would also reach its dependencies: tokio, for example, has another interface
-//! under it.
+//! These are the only code of the engine that waits on a condition variable across the threads of a computation: rayon
+//! divides other work, and workers of Gymnasium answer over a socket. The models compile the files themselves, with loom's
+//! primitives in the place of the standard library's. A `cfg(loom)` in `swm-data` would also reach its dependencies: tokio,
+//! for example, has another interface under it.
+
+/// The primitives that the pool's worker threads import.
+#[cfg(test)]
+mod sync {
+    pub use loom::sync::atomic::{AtomicUsize, Ordering};
+    pub use loom::sync::{Arc, Condvar, Mutex, MutexGuard};
+    pub use loom::{hint, thread};
+    use std::sync::PoisonError;
+
+    /// No spinning: loom runs every interleaving of the sleep that follows it.
+    pub const SPINS: usize = 0;
+
+    pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+        mutex.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+#[path = "../../crates/swm-core/src/worker_threads.rs"]
+mod worker_threads;
+
+#[cfg(test)]
+mod pool_models {
+    use crate::worker_threads::WorkerThreads;
+    use loom::cell::UnsafeCell;
+    use loom::sync::atomic::{AtomicUsize, Ordering};
+
+    /// Items that threads take one by one, as the pool's slots. loom reports a thread that writes an item while another
+    /// one reads or writes it.
+    struct Items {
+        taken: AtomicUsize,
+        items: [UnsafeCell<usize>; 2],
+    }
+
+    // SAFETY: the counter gives every item to one thread.
+    unsafe impl Sync for Items {}
+
+    impl Items {
+        fn new() -> Self {
+            Self { taken: AtomicUsize::new(0), items: std::array::from_fn(|_| UnsafeCell::new(0)) }
+        }
+
+        fn work(&self) {
+            loop {
+                let index = self.taken.fetch_add(1, Ordering::Relaxed);
+                let Some(item) = self.items.get(index) else { break };
+                // SAFETY: only this thread has the index.
+                item.with_mut(|item| unsafe { *item += 1 });
+            }
+        }
+
+        fn done(&self) -> Vec<usize> {
+            // SAFETY: the threads have left the work.
+            self.items.iter().map(|item| item.with(|item| unsafe { *item })).collect()
+        }
+    }
+
+    fn check(model: impl Fn() + Send + Sync + 'static) {
+        let mut builder = loom::model::Builder::new();
+        builder.preemption_bound = Some(3);
+        builder.check(model);
+    }
+
+    #[test]
+    fn every_item_is_worked_on_once_and_no_thread_stays_inside() {
+        check(|| {
+            let mut workers = WorkerThreads::new(1).expect("a thread");
+            // The items of the first call are dropped before the second: a thread that stayed inside would use them.
+            for _ in 0..2 {
+                let items = Items::new();
+                workers.run(1, &|| items.work()).expect("no panic");
+                assert_eq!(items.done(), [1, 1]);
+            }
+        });
+    }
+
+    #[test]
+    fn two_threads_join_in_or_come_too_late() {
+        check(|| {
+            let mut workers = WorkerThreads::new(2).expect("threads");
+            let items = Items::new();
+            workers.run(2, &|| items.work()).expect("no panic");
+            assert_eq!(items.done(), [1, 1]);
+        });
+    }
+
+    #[test]
+    fn threads_end_without_work() {
+        check(|| drop(WorkerThreads::new(2).expect("threads")));
+    }
+}
 
 /// The modules that the queue imports.
 #[cfg(test)]

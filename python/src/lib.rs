@@ -23,6 +23,7 @@ mod gym;
 mod listing;
 mod model;
 mod objects;
+mod observer;
 mod policy;
 mod solver;
 mod study;

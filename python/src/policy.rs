@@ -2,6 +2,7 @@
 
 use crate::cost::planning_model;
 use crate::errors::{from_py_err, json, to_py_err};
+use crate::observer::PythonObserver;
 use crate::world::World;
 use crate::{arrays, solver};
 use numpy::PyArray1;
@@ -9,6 +10,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use std::collections::BTreeMap;
 use std::sync::{Mutex, MutexGuard, PoisonError};
+use swm::core::run::Interrupt;
 use swm::core::{Batch, EnvPool, Key, Named as _, Policy, RandomPolicy, Result};
 use swm::eval::PolicyChoice;
 use swm::plan::{ActionScale, MpcConfig, MpcPolicy, TraceLog};
@@ -87,8 +89,9 @@ impl Actor {
     }
 
     /// Creates a planning policy. `model` is a [`crate::model::Model`], an adapter of `stable_worldmodel.planning`, or
-    /// `None` for the simulator.
+    /// `None` for the simulator. `observer` reads the iterations of its searches: see [`PythonObserver`].
     #[staticmethod]
+    #[pyo3(signature = (world, solver, settings, mpc, scale, model, seed, observer=None))]
     #[allow(clippy::too_many_arguments, reason = "one argument for each option in Python")]
     fn planning(
         py: Python<'_>,
@@ -99,6 +102,7 @@ impl Actor {
         scale: Option<(Vec<f32>, Vec<f32>)>,
         model: Option<&Bound<'_, PyAny>>,
         seed: Option<u64>,
+        observer: Option<Py<PyAny>>,
     ) -> PyResult<Self> {
         let world = world.lock()?;
         let (spec, slots) = (world.spec().clone(), world.pool().len());
@@ -113,6 +117,10 @@ impl Actor {
         let log = TraceLog::default();
         let policy = py.detach(|| MpcPolicy::new(search, cost, mpc, scale, &spec, slots)).map_err(to_py_err)?;
         let policy = policy.traced(log.clone());
+        let policy = match observer {
+            Some(observer) => policy.observed(Box::new(PythonObserver::new(observer))),
+            None => policy,
+        };
         let policy: Box<dyn Policy> = if model.python { Box::new(OnThisThread(policy)) } else { Box::new(policy) };
         Ok(Self { log: Some(log), hashes: hash_of(model.weights), ..Self::new(policy, seed) })
     }
@@ -156,6 +164,16 @@ impl Policy for Seeded {
         self.policy.act(infos, active, actions)
     }
 
+    fn act_until(
+        &mut self,
+        infos: &Batch,
+        active: &[bool],
+        actions: &mut Batch,
+        interrupt: &dyn Interrupt,
+    ) -> Result<()> {
+        self.policy.act_until(infos, active, actions, interrupt)
+    }
+
     fn observe_envs(&mut self, envs: &EnvPool, active: &[bool]) -> Result<()> {
         self.policy.observe_envs(envs, active)
     }
@@ -179,6 +197,16 @@ impl Policy for OnThisThread {
 
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
         solver::on_this_thread(|| self.0.act(infos, active, actions))
+    }
+
+    fn act_until(
+        &mut self,
+        infos: &Batch,
+        active: &[bool],
+        actions: &mut Batch,
+        interrupt: &dyn Interrupt,
+    ) -> Result<()> {
+        solver::on_this_thread(|| self.0.act_until(infos, active, actions, interrupt))
     }
 
     fn observe_envs(&mut self, envs: &EnvPool, active: &[bool]) -> Result<()> {

@@ -2,15 +2,17 @@
 
 use crate::arrays;
 use crate::cost::PythonCost;
-use crate::errors::{json, to_py_err};
+use crate::errors::{json, signal_poll, to_py_err};
 use crate::model::Model;
+use crate::observer::PythonObserver;
 use crate::world::plan_key;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use serde_json::Value;
-use swm::core::{Error, Key, PlanProblem, PlanSpace, Solver};
-use swm::plan::SOLVERS;
+use swm::core::run::Control;
+use swm::core::{Error, Key, PlanProblem, PlanSpace, SearchObserver, Solver};
+use swm::plan::{BetweenIterations, SOLVERS};
 
 /// Runs `work` in a thread pool that consists of the current thread.
 ///
@@ -41,12 +43,12 @@ pub fn make(solver: &str, settings: &str) -> PyResult<Box<dyn Solver>> {
 /// search traces as JSON.
 ///
 /// `low` and `high` are the bounds of the elements of a model step with continuous actions; `choices` holds the number
-/// of options of each discrete choice.
+/// of options of each discrete choice. `observer` reads the iterations: see [`PythonObserver`].
 ///
 /// # Shapes
 /// `infos`: `[envs, ..]`; `init` and actions: `[envs, horizon, dim]`; costs: `[envs]`.
 #[pyfunction]
-#[pyo3(signature = (solver, settings, model, infos, envs, horizon, low, high, choices, init, seed, call))]
+#[pyo3(signature = (solver, settings, model, infos, envs, horizon, low, high, choices, init, seed, call, observer=None))]
 #[allow(clippy::too_many_arguments, reason = "one argument for each option in Python")]
 pub fn solve<'py>(
     py: Python<'py>,
@@ -62,6 +64,7 @@ pub fn solve<'py>(
     init: Option<&Bound<'py, PyAny>>,
     seed: u64,
     call: u64,
+    observer: Option<Py<PyAny>>,
 ) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>, String)> {
     let mut solver = make(solver, settings)?;
     let space = match &choices {
@@ -71,19 +74,31 @@ pub fn solve<'py>(
     let dim = space.dim();
     let init = init.map(|init| arrays::f32_values("init_action", init, &[envs, horizon, dim])).transpose()?;
     let keys: Vec<Key> = (0..envs).map(|row| plan_key(seed).at(call).at(row as u64)).collect();
-    let problem = PlanProblem { horizon, space, keys: &keys, init: init.as_deref(), deadline: None };
+    let problem = PlanProblem { horizon, space, keys: &keys, init: init.as_deref(), deadline: None, observer: None };
+    let observer = observer.map(PythonObserver::new);
+    let observer = observer.as_ref().map(|observer| observer as &dyn SearchObserver);
+    let mut control = Control::new().with_poll(signal_poll());
     let plan = if let Ok(model) = model.cast::<Model>() {
         let (mut cost, _) = model.get().cost_model()?;
         let batch = arrays::batch(infos)?;
         py.detach(|| {
             cost.observe(&batch, &(0..envs).collect::<Vec<_>>())?;
-            solver.solve(&mut *cost, problem)
+            control.install(None, |interrupt| {
+                let between = BetweenIterations { interrupt: Some(interrupt), observer };
+                solver.solve(&mut *cost, PlanProblem { observer: between.observer(), ..problem })
+            })
         })
     } else {
         let mut cost = PythonCost::new(model)?;
         model.call_method1("observe", (infos,))?;
         cost.observed(envs);
-        py.detach(|| on_this_thread(|| solver.solve(&mut cost, problem)))
+        py.detach(|| {
+            control.on_this_thread(|interrupt| {
+                let between = BetweenIterations { interrupt: Some(interrupt), observer };
+                let problem = PlanProblem { observer: between.observer(), ..problem };
+                on_this_thread(|| solver.solve(&mut cost, problem))
+            })
+        })
     };
     let plan = plan.map_err(to_py_err)?;
     let trace = serde_json::to_string(&plan.trace).map_err(|e| to_py_err(Error::external("writing a trace", e)))?;

@@ -181,7 +181,8 @@ impl World {
     fn act(&self, py: Python<'_>, actor: &Actor, active: Vec<bool>) -> PyResult<()> {
         let (mut world, mut policy) = (self.lock()?, actor.lock()?);
         let (world, policy) = (&mut *world, &mut **policy);
-        py.detach(|| world.act(policy, &active)).map_err(to_py_err)
+        let mut control = Control::new().with_poll(signal_poll());
+        py.detach(|| world.act_until(policy, &active, &mut control)).map_err(to_py_err)
     }
 
     /// Steps the active slots with the current actions.
@@ -207,19 +208,19 @@ impl World {
         let (mut world, mut policy) = (self.lock()?, actor.lock()?);
         let (world, policy) = (&mut *world, &mut **policy);
         let mut begun = vec![];
-        let mut poll = signal_poll();
+        let mut control = Control::new().with_poll(signal_poll());
         py.detach(|| {
             let schema = world.pool().infos().schema();
             let flags = [schema.index(TERMINATED)?, schema.index(TRUNCATED)?];
             let mut active = vec![true; world.pool().len()];
             for _ in 0..steps {
-                poll()?;
+                control.check()?;
                 let infos = world.pool().infos();
                 for (slot, active) in active.iter_mut().enumerate() {
                     *active = flags.iter().all(|&flag| infos.bytes(flag)[slot] == 0);
                 }
                 if active.contains(&true) {
-                    world.act(policy, &active)?;
+                    world.act_until(policy, &active, &mut control)?;
                     world.advance(&active)?;
                 }
                 if active.contains(&false) {

@@ -59,6 +59,7 @@ def solve(
     init: _Array | None,
     seed: int,
     call: int,
+    observer: Any = None,
 ) -> tuple[_Array, _Array, str]: ...
 
 class World:
@@ -134,6 +135,7 @@ class Actor:
         scale: tuple[list[float], list[float]] | None,
         model: Any,
         seed: int | None,
+        observer: Any = None,
     ) -> Actor: ...
     def take_plans(self) -> str: ...
     @staticmethod

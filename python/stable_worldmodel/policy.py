@@ -328,8 +328,8 @@ class MPCPolicy(BasePolicy):
         if not isinstance(self.solver, EngineSolver) or (scale is None and "action" in self.process):
             return None
         in_engine = self.solver.model == "simulator" or hasattr(self.solver.model, "_engine_model")
-        if self.solver.callbacks or (world.transforms and not in_engine):
-            # Callbacks and transforms of frames are functions in Python, so the solver is called from here.
+        if world.transforms and not in_engine:
+            # Transforms of frames are functions in Python, so the solver is called from here.
             return None
         model = self.solver.adapter(self.process, self.transform, self.cfg.history_len)
         if isinstance(model, _engine.Model) and (self.process or self.transform):
@@ -337,8 +337,9 @@ class MPCPolicy(BasePolicy):
         cfg = asdict(self.cfg)
         cfg["history"] = cfg.pop("history_len")
         settings = json.dumps(self.solver.settings)
-        seed = self.solver.seed
-        return _engine.Actor.planning(world._world, self.solver.id, settings, json.dumps(cfg), scale, model, seed)
+        seed, observer = self.solver.seed, self.solver._observer() if self.solver.callbacks else None
+        plan = json.dumps(cfg)
+        return _engine.Actor.planning(world._world, self.solver.id, settings, plan, scale, model, seed, observer)
 
     # Planning in Python, for user-defined solvers.
 

@@ -121,6 +121,55 @@ def test_ctrl_c_stops_an_evaluation(policy):
         child.kill()
 
 
+#: A search that takes hours, with a callback that says when it has begun.
+LONG_PLAN = """
+import sys
+import gymnasium
+import numpy as np
+import stable_worldmodel as swm
+from stable_worldmodel.planning.solver.callbacks import Callback
+
+class Begun(Callback):
+    def compute(self, step, **state):
+        if step == 0:
+            print("ready", flush=True)
+
+class Mine:
+    def get_cost(self, infos, candidates):
+        return (candidates ** 2).sum((2, 3))
+
+model = Mine() if sys.argv[1] == "python" else "simulator"
+solver = swm.solver.CEMSolver(model, n_steps=10_000, num_samples=5_000, callbacks=[Begun()])
+try:
+    if sys.argv[2] == "world":
+        world = swm.World("swm/PushT-v1", num_envs=2, image_shape=(32, 32))
+        world.set_policy(swm.policy.MPCPolicy(solver, swm.PlanConfig(10, 10)))
+        world.reset(seed=0)
+        if sys.argv[1] == "python":
+            world.evaluate(episodes=2, seed=0, progress=False)
+        else:
+            world.step()
+    else:
+        space = gymnasium.spaces.Box(-1, 1, (2, 2), np.float32)
+        solver.configure(action_space=space, n_envs=2, config=swm.PlanConfig(10, 10))
+        solver.solve({"state": np.zeros((2, 1, 2), np.float32)})
+except KeyboardInterrupt:
+    print("interrupted", flush=True)
+"""
+
+
+@pytest.mark.parametrize(("model", "caller"), [("simulator", "world"), ("python", "world"), ("python", "solve")])
+def test_ctrl_c_stops_a_search(model, caller):
+    pytest.importorskip("torch")
+    child = subprocess.Popen([sys.executable, "-c", LONG_PLAN, model, caller], stdout=subprocess.PIPE, text=True)
+    try:
+        assert child.stdout.readline().strip() == "ready"
+        os.kill(child.pid, signal.SIGINT)
+        assert child.communicate(timeout=20)[0].strip() == "interrupted" and child.returncode == 0
+    finally:
+        child.kill()
+
+
 # Environments in worker processes.
 
 

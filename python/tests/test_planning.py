@@ -312,7 +312,6 @@ def test_wrong_model_stops_an_evaluation(defect, error, words):
         (lambda: plan(solvers.CEMSolver()), ValueError, "model"),
         (lambda: plan(solvers.CEMSolver(object())), TypeError, "get_cost"),
         (lambda: solvers.CEMSolver(Quadratic(), samples_n=3), TypeError, "num_samples"),
-        (lambda: solvers.LagrangianSolver(Constrained(), callbacks=[print]), TypeError, "trace"),
         (lambda: solvers.CEMSolver(Quadratic(), model=Quadratic()), TypeError, "two names"),
         (lambda: solvers.CEMSolver(Quadratic()).solve(infos()), RuntimeError, "configure"),
         (lambda: plan(solvers.CEMSolver(Quadratic(), batch_size=0)), ValueError, "batch_size"),

@@ -207,6 +207,97 @@ def test_callbacks_run_in_a_world():
     assert len(metrics["seeds"]) == 2 and len(recorder.history) == 1 and len(recorder.history[0]) == 3
 
 
+class Keep(hooks.Callback):
+    """Keeps the state of every iteration, and ends the search after `stop` of them."""
+
+    def __init__(self, stop=None):
+        super().__init__()
+        self.states, self.stop = [], stop
+
+    def compute(self, **state):
+        self.states.append(state)
+        if len(self.states) == self.stop:
+            raise hooks.StopSearch
+        return float(state["costs"].min())
+
+
+def test_callbacks_read_the_lagrangian_search():
+    class Limited(ToTarget):
+        def get_constraints(self, info_dict, action_candidates):
+            return action_candidates[..., 0] - 0.2
+
+    few = {"n_steps": 4, "n_outer_steps": 3, "num_samples": 2, "seed": 3}
+    keep = Keep()
+    found = configured(planning.LagrangianSolver(Limited(), callbacks=[keep], **few)).solve(infos())
+    plain = configured(planning.LagrangianSolver(Limited(), **few)).solve(infos())
+    assert torch.equal(found["actions"], plain["actions"]) and [state["step"] for state in keep.states] == list(range(12))
+    assert keep.states[0]["gradient"].shape == (3, 2, 3, 2) and found["callbacks"]["Keep"] == [keep.history[0]]
+    # The constraint is active where the target is beyond the limit, at 0.5, and only there.
+    multipliers = found["multipliers"]
+    assert torch.equal(multipliers, plain["multipliers"]) and multipliers.shape == (3, 3)
+    assert (multipliers[0] > 0).all() and (multipliers[1:] == 0).all()
+    stopped = configured(planning.LagrangianSolver(Limited(), callbacks=[Keep(stop=4)], **few)).solve(infos())
+    short = configured(planning.LagrangianSolver(Limited(), **{**few, "n_outer_steps": 1})).solve(infos())
+    assert torch.equal(stopped["actions"], short["actions"])
+
+
+def test_callbacks_read_the_search_of_grasp():
+    class Adds(torch.nn.Module):
+        latent_dim = 2
+
+        def encode(self, info_dict):
+            return info_dict["state"][:, -1]
+
+        def encode_goal(self, info_dict):
+            return info_dict["goal"][:, -1]
+
+        def predict(self, latents, actions):
+            return latents + actions
+
+    few = {"n_steps": 6, "sync_every": 3, "sync_iterations": 2}
+    keep = Keep()
+    found = configured(planning.GRASPSolver(Adds(), callbacks=[keep], **few)).solve(infos())
+    plain = configured(planning.GRASPSolver(Adds(), **few)).solve(infos())
+    assert torch.equal(found["actions"], plain["actions"])
+    # Six iterations, and two steps in each of the two synchronisations.
+    assert [state["step"] for state in keep.states] == list(range(10)) and keep.states[0]["costs"].shape == (3, 1)
+    # At the start, the plan is zero and the states lie on the line to the goal: the loss of three steps of a third of the
+    # way each, and twice the distance to the goal, which no step reduces.
+    first = 3 * (TARGETS / 3).square().sum(1) + 2 * torch.tensor([1.0, 4 / 9, 1 / 9]).sum() * TARGETS.square().sum(1)
+    assert torch.allclose(keep.states[0]["costs"][:, 0], first, rtol=1e-5)
+    calls = Keep(stop=2)
+    configured(planning.GRASPSolver(Adds(), callbacks=[calls], **few)).solve(infos())
+    assert len(calls.states) == 2
+
+
+def test_callbacks_read_searches_inside_of_the_engine():
+    def played(callbacks):
+        solver = planning.CEMSolver("simulator", num_samples=16, n_steps=3, topk=4, seed=1, callbacks=callbacks)
+        policy = swm.policy.WorldModelPolicy(solver, swm.PlanConfig(2, 2))
+        world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(16, 16), max_episode_steps=6)
+        outcome = world.evaluate(policy=policy, episodes=2, seed=0, floor=False, progress=False)
+        return outcome["steps"].tolist(), [plan["best"] for plan in policy.plans]
+
+    keep = Keep()
+    steps, best = played([keep])
+    assert (steps, best) == played([]), "callbacks change no plan"
+    # Both environments are planned for together; the states of the last search are those of the last two plans.
+    assert len(keep.history) == 1 and len(keep.history[0]) == 3
+    last = torch.stack([state["costs"].min(1).values for state in keep.states[-3:]])
+    assert last.T.tolist() == best[-len(last.T) :] and keep.states[-1]["candidates"].shape[1:] == (16, 2, 2)
+    assert torch.equal(keep.states[-1]["costs"].gather(1, keep.states[-1]["topk_inds"]), keep.states[-1]["topk_vals"])
+
+    class Wrong(Exception):
+        pass
+
+    class Raises(hooks.Callback):
+        def compute(self, **state):
+            raise Wrong("in the callback")
+
+    with pytest.raises(Wrong, match="in the callback"):
+        played([Raises()])
+
+
 def test_constructors_have_the_defaults_of_the_engine():
     known = json.loads(_engine.solvers())
     for solver in (

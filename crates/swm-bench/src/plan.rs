@@ -192,7 +192,7 @@ impl<'a> Planning<'a> {
             self.plans += 1;
             let space = PlanSpace::Continuous { low: &self.low, high: &self.high };
             let horizon = self.config.horizon;
-            let problem = PlanProblem { horizon, space, keys: &keys, init: None, deadline: None };
+            let problem = PlanProblem { horizon, space, keys: &keys, init: None, deadline: None, observer: None };
             self.cem.solve(&mut self.model, problem)?;
             let elapsed = begun.elapsed().as_secs_f64();
             if elapsed >= seconds {

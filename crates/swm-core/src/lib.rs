@@ -42,9 +42,11 @@ pub mod requirements;
 pub mod results;
 pub mod run;
 pub mod space;
+mod sync;
 pub mod text;
 pub mod thread_budget;
 pub mod variation;
+mod worker_threads;
 
 pub use batch::{Batch, ColumnSpec, DType, Element, RowMut, RowRef, Schema};
 pub use camera_view::{CameraView, Modality};
@@ -57,8 +59,8 @@ pub use key::{Key, Rng};
 pub use manifest::Manifest;
 pub use origin::Origin;
 pub use plan::{
-    Candidates, Constrained, CostModel, DifferentiableCost, LatentDynamics, Plan, PlanProblem, PlanSpace, PlanTrace,
-    Solver,
+    Candidates, Constrained, CostModel, DifferentiableCost, Iteration, LatentDynamics, Plan, PlanProblem, PlanSpace,
+    PlanTrace, SearchObserver, Solver,
 };
 pub use policy::{Policy, RandomPolicy};
 pub use pool::EnvPool;

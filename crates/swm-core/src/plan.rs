@@ -5,6 +5,8 @@
 
 use crate::{Batch, Env, Key, Result};
 use serde::Serialize;
+use std::fmt;
+use std::ops::ControlFlow;
 use std::time::Instant;
 
 /// Candidate action sequences of several environments.
@@ -189,12 +191,56 @@ pub struct PlanProblem<'a> {
     /// The time at which the solver stops and returns the best plan found. Solvers check the deadline after every
     /// iteration. The plan of a search that stopped early depends on the machine's speed.
     pub deadline: Option<Instant>,
+    /// Reads every iteration and may stop the search. Without one, an iteration costs what it costs anyway; with one,
+    /// plans are the same, unless it stops the search.
+    pub observer: Option<&'a dyn SearchObserver>,
 }
 
 impl PlanProblem<'_> {
     /// Whether the deadline has passed.
     pub fn is_late(&self) -> bool {
         self.deadline.is_some_and(|deadline| Instant::now() >= deadline)
+    }
+
+    /// Shows an iteration to the observer, if there is one, and returns whether it wants the search to go on.
+    ///
+    /// # Errors
+    /// The error of the observer, which ends the search without a plan.
+    pub fn observed<'i>(&self, iteration: impl FnOnce() -> Iteration<'i>) -> Result<bool> {
+        self.observer.map_or(Ok(true), |observer| Ok(observer.iteration(&iteration())?.is_continue()))
+    }
+}
+
+/// One iteration of a search, as a [`SearchObserver`] reads it.
+#[derive(Clone, Debug)]
+pub struct Iteration<'a> {
+    /// The index of the iteration.
+    pub index: usize,
+    /// The candidates of all environments.
+    pub candidates: Candidates<'a>,
+    /// The cost of every candidate, `[envs, samples]`.
+    pub costs: &'a [f32],
+    /// The indices of the elites of every environment, cheapest first, `[envs, elites]`; empty if the solver has none.
+    pub elites: Vec<usize>,
+    /// The gradient of each cost with respect to its candidate, `[envs, samples, horizon, dim]`, from solvers that
+    /// compute it.
+    pub gradient: Option<&'a [f32]>,
+}
+
+/// Reads the iterations of a search, between one and the next.
+///
+/// All environments that are planned for together share one search, so they share its iterations.
+pub trait SearchObserver: Sync {
+    /// Reads an iteration. `Break` ends the search after it: the plan is the one of the iterations so far.
+    ///
+    /// # Errors
+    /// An error ends the search without a plan; an interrupted run returns [`crate::Error::Interrupted`].
+    fn iteration(&self, iteration: &Iteration<'_>) -> Result<ControlFlow<()>>;
+}
+
+impl fmt::Debug for dyn SearchObserver + '_ {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("SearchObserver")
     }
 }
 
@@ -209,7 +255,7 @@ pub struct Plan {
     pub trace: Vec<PlanTrace>,
 }
 
-/// The trace of one environment's search: one value per iteration.
+/// The trace of one environment's search: one value per iteration, unless said otherwise.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct PlanTrace {
     /// The lowest cost of the iteration.
@@ -223,6 +269,9 @@ pub struct PlanTrace {
     /// The value is at most 0, or at most the solver's tolerance, when all constraints are satisfied.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub violation: Vec<f32>,
+    /// The multipliers of the constraints after the search, `[constraints]`, if the solver has multipliers.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub multipliers: Vec<f32>,
 }
 
 /// A search for action sequences of low cost.

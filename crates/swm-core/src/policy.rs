@@ -5,8 +5,13 @@
 
 use crate::batch::{Batch, DType, RowMut, RowRef};
 use crate::parallelism::Parallelism;
+use crate::run::Interrupt;
 use crate::{EnvPool, EnvSpec, Error, Key, Result, Rng, columns};
-use std::time::Instant;
+use std::time::Duration;
+
+/// The shortest work of experts that may be shared: the policy enters the pool of threads for it, which takes longer than
+/// what [`ExpertPolicy`] measures itself.
+const HAND_OVER: Duration = Duration::from_micros(50);
 
 /// Chooses the actions of the environments of a pool.
 pub trait Policy: Send {
@@ -26,6 +31,20 @@ pub trait Policy: Send {
     /// When the policy does not support an environment.
     fn observe_envs(&mut self, _envs: &EnvPool, _active: &[bool]) -> Result<()> {
         Ok(())
+    }
+
+    /// As [`Policy::act`], for policies that may act for long, such as planners: checks `interrupt` from time to time.
+    ///
+    /// # Errors
+    /// As [`Policy::act`], and the error of `interrupt`.
+    fn act_until(
+        &mut self,
+        infos: &Batch,
+        active: &[bool],
+        actions: &mut Batch,
+        _interrupt: &dyn Interrupt,
+    ) -> Result<()> {
+        self.act(infos, active, actions)
     }
 
     /// Whether [`Policy::act`] uses several threads. If not, `act` runs on the calling thread.
@@ -100,7 +119,7 @@ impl ExpertPolicy {
     /// A policy of these experts, one per slot.
     pub fn new(spec: &EnvSpec, experts: Vec<Box<dyn Expert>>) -> Self {
         let slot_expert = |expert| ExpertSlot { expert, action: vec![0.0; spec.action_dim()], failed: None };
-        Self { slots: experts.into_iter().map(slot_expert).collect(), parallelism: Parallelism::default() }
+        Self { slots: experts.into_iter().map(slot_expert).collect(), parallelism: Parallelism::above(HAND_OVER) }
     }
 }
 
@@ -117,17 +136,16 @@ impl Policy for ExpertPolicy {
                 write_action(&mut row, column, &slot_expert.action);
             }
         };
-        let start = Instant::now();
         let serial = !self.uses_threads();
+        let clock = self.parallelism.clock(self.slots.len());
         if serial {
-            for (slot, slot_expert) in self.slots.iter_mut().enumerate() {
-                work(slot, actions.row_mut(slot), slot_expert);
-            }
+            actions.zip_mut(&mut self.slots, work);
         } else {
             actions.par_zip_mut(&mut self.slots, work);
         }
-        let workers = if serial { 1 } else { rayon::current_num_threads() };
-        self.parallelism.record(start, workers, self.slots.len());
+        if let Some(clock) = clock {
+            self.parallelism.record(serial, self.slots.len(), clock.elapsed());
+        }
         self.slots.iter_mut().find_map(|slot_expert| slot_expert.failed.take()).map_or(Ok(()), Err)
     }
 

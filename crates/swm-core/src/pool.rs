@@ -4,14 +4,22 @@
 //! `terminated`, `truncated`, `success`, `step_idx`, and, if the pool renders, `pixels`, `goal` and further camera
 //! views. The output of an environment depends on its seed and its actions only, not on the number of threads or
 //! environments.
+//!
+//! The calling thread is one of the pool's threads. Small work stays on it: how long work takes in either way is
+//! measured while the pool runs (`parallelism.rs`), so a pool of several threads is not slower than one of one thread.
 
 use crate::batch::{Batch, ColumnSpec, DType, RowMut, Schema};
 use crate::columns::{self, ColumnIndices};
 use crate::parallelism::Parallelism;
 use crate::thread_budget;
+use crate::worker_threads::WorkerThreads;
 use crate::{Action, CameraView, Env, EnvSpec, Error, FrameMut, PendingCall, ResetOptions, Result, limits};
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::Duration;
+
+/// The shortest work that may be shared: less than waking a thread takes.
+const HAND_OVER: Duration = Duration::from_micros(3);
 
 /// The reset of one slot.
 #[derive(Clone)]
@@ -87,7 +95,10 @@ pub struct EnvPool {
     columns: PoolColumns,
     threads: Arc<rayon::ThreadPool>,
     max_episode_steps: usize,
-    parallelism: Parallelism,
+    /// The threads that step with the calling thread; started when work is shared for the first time.
+    workers: Option<WorkerThreads>,
+    steps: Parallelism,
+    resets: Parallelism,
 }
 
 struct Slot {
@@ -151,7 +162,9 @@ impl EnvPool {
             columns,
             threads,
             max_episode_steps,
-            parallelism: Parallelism::default(),
+            workers: None,
+            steps: Parallelism::above(HAND_OVER),
+            resets: Parallelism::above(HAND_OVER),
         })
     }
 
@@ -185,7 +198,7 @@ impl EnvPool {
         &self.columns.views
     }
 
-    /// The worker threads.
+    /// The threads of the policies that act in the pool's environments, as many as the pool has itself.
     pub fn threads(&self) -> &Arc<rayon::ThreadPool> {
         &self.threads
     }
@@ -214,11 +227,17 @@ impl EnvPool {
                 slot.dispatch(PendingCall::Reset(reset.seed, &reset.options));
             }
         }
-        self.for_each_slot(Some(resets.len()), |i, slot, columns, row| {
+        let way = Way::measured(&self.resets, resets.len());
+        let clock = self.resets.clock(resets.len());
+        let done = self.for_each_slot("resetting an environment", way, |i, slot, columns, row| {
             let Some(reset) = by_slot[i] else { return Ok(()) };
             slot.env.reset(reset.seed, &reset.options)?;
             slot.start(columns, row)
-        })
+        });
+        if let Some(clock) = clock {
+            self.resets.record(way == Way::Serial, resets.len(), clock.elapsed());
+        }
+        done
     }
 
     /// Changes environments in place by `change`, such as a restore or a new goal, then observes and renders them as
@@ -231,7 +250,7 @@ impl EnvPool {
         slots: &[usize],
         change: impl Fn(usize, &mut dyn Env) -> Result<()> + Sync,
     ) -> Result<()> {
-        self.for_each_slot(Some(slots.len()), |i, slot, columns, row| {
+        self.for_each_slot("changing an environment", Way::Shared(slots.len()), |i, slot, columns, row| {
             if !slots.contains(&i) {
                 return Ok(());
             }
@@ -265,8 +284,8 @@ impl EnvPool {
             ));
         }
         let limit = self.max_episode_steps;
-        let start = Instant::now();
         let stepping = active.iter().filter(|&&active| active).count();
+        let mut clock = self.steps.clock(stepping);
         let action = |i| match dtype {
             DType::Float32 => Action::Continuous(actions.row(i).at::<f32>(column)),
             _ => Action::Discrete(actions.row(i).at::<i64>(column)),
@@ -277,8 +296,11 @@ impl EnvPool {
         }
         // Environments in worker processes step in parallel while one thread waits for them. Frames are resized in this
         // process, so steps with frames use several threads.
-        let serial = self.parallelism.is_serial(stepping) || (dispatched && self.columns.frames.is_none());
-        let stepped = self.for_each_slot((!serial).then_some(stepping), |i, slot, columns, row| {
+        let mut way = Way::measured(&self.steps, stepping);
+        if dispatched && self.columns.frames.is_none() {
+            (way, clock) = (Way::Serial, None);
+        }
+        let stepped = self.for_each_slot("stepping an environment", way, |i, slot, columns, row| {
             if !active[i] {
                 return Ok(());
             }
@@ -290,33 +312,45 @@ impl EnvPool {
             row.set(columns.standard.truncated, &[u8::from(transition.truncated)]);
             slot.observe(columns, row)
         });
-        self.parallelism.record(start, if serial { 1 } else { self.threads.current_num_threads() }, stepping);
+        if let Some(clock) = clock {
+            self.steps.record(way == Way::Serial, stepping, clock.elapsed());
+        }
         stepped
     }
 
-    /// Runs `work` on every slot and returns the error of the failed slot with the lowest index. `busy` is the number
-    /// of slots that have work; the threads are divided among these slots. With `None`, `work` runs on the calling
-    /// thread.
+    /// Runs `work`, which does `what`, on every slot and returns the error of the failed slot with the lowest index. A
+    /// panic is an error as well.
     fn for_each_slot(
         &mut self,
-        busy: Option<usize>,
+        what: &str,
+        way: Way,
         work: impl Fn(usize, &mut Slot, &PoolColumns, &mut RowMut<'_>) -> Result<()> + Sync,
     ) -> Result<()> {
-        let (columns, slots, infos) = (&self.columns, &mut self.slots, &mut self.infos);
-        match busy {
-            None => {
-                for (i, slot) in slots.iter_mut().enumerate() {
-                    slot.failed = work(i, slot, columns, &mut infos.row_mut(i)).err();
-                }
+        let threads = self.threads.current_num_threads();
+        let Self { columns, slots, infos, workers, .. } = self;
+        let work = |i: usize, mut row: RowMut<'_>, slot: &mut Slot| {
+            let done = catch_unwind(AssertUnwindSafe(|| work(i, slot, columns, &mut row)));
+            slot.failed = done.unwrap_or_else(|panic| Err(Error::panicked(what, &*panic))).err();
+        };
+        match way {
+            Way::Shared(busy) if threads > 1 && busy >= threads => {
+                let workers = match workers {
+                    Some(workers) => workers,
+                    None => workers.insert(
+                        WorkerThreads::new(threads - 1).map_err(|e| Error::external("starting worker threads", e))?,
+                    ),
+                };
+                let divided = infos.divided_zip_mut(slots, work);
+                workers.run(threads - 1, &divided).map_err(|panic| Error::panicked(what, &*panic))?;
             }
-            Some(busy) => {
-                let threads = self.threads.current_num_threads().div_ceil(busy.max(1));
-                self.threads.install(|| {
-                    infos.par_zip_mut(slots, |i, mut row, slot| {
-                        slot.failed = thread_budget::with(threads, || work(i, slot, columns, &mut row)).err();
-                    });
-                });
+            // An environment may draw a frame on several threads of the rayon pool.
+            Way::Shared(busy) if threads > 1 => {
+                let budget = threads.div_ceil(busy.max(1));
+                let work =
+                    |i: usize, row: RowMut<'_>, slot: &mut Slot| thread_budget::with(budget, || work(i, row, slot));
+                self.threads.install(|| infos.par_zip_mut(slots, work));
             }
+            Way::Shared(_) | Way::Serial => infos.zip_mut(slots, work),
         }
         match self.slots.iter_mut().find_map(|slot| slot.failed.take()) {
             None => Ok(()),
@@ -325,6 +359,22 @@ impl EnvPool {
                 Err(error)
             }
         }
+    }
+}
+
+/// How work is divided among threads.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Way {
+    /// The calling thread does all of it.
+    Serial,
+    /// The calling thread shares it. The value is the number of slots that have work.
+    Shared(usize),
+}
+
+impl Way {
+    /// The faster way for `busy` slots.
+    fn measured(parallelism: &Parallelism, busy: usize) -> Self {
+        if parallelism.is_serial(busy) { Self::Serial } else { Self::Shared(busy) }
     }
 }
 
@@ -363,3 +413,6 @@ impl Slot {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -5,8 +5,10 @@
 
 use crate::{Error, Result};
 use std::path::Path;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{RecvTimeoutError, channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
 /// An event that a run reports to its caller.
 ///
@@ -121,6 +123,64 @@ impl<'a> Control<'a> {
         self.poll.as_mut().map_or(Ok(()), |poll| poll())
     }
 
+    /// Runs `work` on the threads of `threads` (those of rayon's global pool for `None`), with an interrupt that this
+    /// control sets. If there is a poll, this thread calls it meanwhile, because some callers learn of signals in one
+    /// thread only.
+    ///
+    /// # Errors
+    /// The error of [`Control::check`] if that interrupted the work, else the error of `work`.
+    pub fn install<T: Send>(
+        &mut self,
+        threads: Option<&rayon::ThreadPool>,
+        work: impl FnOnce(&dyn Interrupt) -> Result<T> + Send,
+    ) -> Result<T> {
+        self.check()?;
+        if self.poll.is_none() {
+            let never = AtomicBool::new(false);
+            let flag = self.interrupt.as_deref().unwrap_or(&never);
+            return match threads {
+                Some(threads) => threads.install(|| work(flag)),
+                None => work(flag),
+            };
+        }
+        let stop = AtomicBool::new(false);
+        let (done, result) = channel();
+        let stop = &stop;
+        let work = move || drop(done.send(work(stop)));
+        let mut wait = || {
+            let mut failed = None;
+            loop {
+                match result.recv_timeout(POLL_INTERVAL) {
+                    Ok(result) => return failed.map_or(result, Err),
+                    Err(RecvTimeoutError::Timeout) => {
+                        failed = failed.or_else(|| self.check().err());
+                        stop.store(failed.is_some(), Ordering::Relaxed);
+                    }
+                    // The work panicked, and so does the end of the scope.
+                    Err(RecvTimeoutError::Disconnected) => return Err(Error::Interrupted),
+                }
+            }
+        };
+        match threads {
+            Some(threads) => threads.in_place_scope(|scope| {
+                scope.spawn(move |_| work());
+                wait()
+            }),
+            None => rayon::in_place_scope(|scope| {
+                scope.spawn(move |_| work());
+                wait()
+            }),
+        }
+    }
+
+    /// Runs `work` on this thread, with an interrupt that checks this control.
+    ///
+    /// # Errors
+    /// The error of `work`.
+    pub fn on_this_thread<T>(&mut self, work: impl FnOnce(&dyn Interrupt) -> Result<T>) -> Result<T> {
+        work(&Mutex::new(self))
+    }
+
     /// Sends an event to the sink, if there is one.
     pub fn emit(&mut self, event: Event<'_>) {
         if let Some(sink) = &mut self.events {
@@ -131,6 +191,31 @@ impl<'a> Control<'a> {
     /// Emits [`Event::Progress`].
     pub fn progress(&mut self, progress: Progress<'_>) {
         self.emit(Event::Progress(progress));
+    }
+}
+
+/// The time between two polls while other threads work.
+const POLL_INTERVAL: Duration = Duration::from_millis(50);
+
+/// Tells work on any thread whether it is to stop.
+pub trait Interrupt: Sync {
+    /// Returns an error if the work is to stop.
+    ///
+    /// # Errors
+    /// [`Error::Interrupted`], or the error of a poll.
+    fn check(&self) -> Result<()>;
+}
+
+/// A flag that is set to stop the work.
+impl Interrupt for AtomicBool {
+    fn check(&self) -> Result<()> {
+        if self.load(Ordering::Relaxed) { Err(Error::Interrupted) } else { Ok(()) }
+    }
+}
+
+impl Interrupt for Mutex<&mut Control<'_>> {
+    fn check(&self) -> Result<()> {
+        self.lock().unwrap_or_else(PoisonError::into_inner).check()
     }
 }
 
@@ -162,6 +247,48 @@ mod tests {
         assert!(matches!(control.check(), Err(Error::Interrupted)));
         drop(control);
         assert_eq!(polls, 2, "an interrupted run does not poll");
+    }
+
+    /// Works until it is interrupted; returns the number of checks.
+    fn endless(interrupt: &dyn Interrupt) -> Result<usize> {
+        loop {
+            interrupt.check()?;
+            std::thread::yield_now();
+        }
+    }
+
+    #[test]
+    fn a_flag_and_a_poll_interrupt_work_on_other_threads_and_on_this_one() {
+        let threads = crate::pool::threads(2).expect("creating the thread pool");
+        let here = std::thread::current().id();
+        let flag = Arc::new(AtomicBool::new(false));
+        let mut flagged = Control::new().with_interrupt(Arc::clone(&flag));
+        let done = flagged.install(Some(&threads), |interrupt| interrupt.check().map(|()| std::thread::current().id()));
+        assert!(done.expect("no interrupt") != here, "the work runs in the pool");
+        let set = flagged.install(Some(&threads), |interrupt| {
+            flag.store(true, Ordering::Relaxed);
+            endless(interrupt)
+        });
+        assert!(matches!(set, Err(Error::Interrupted)));
+        assert!(matches!(flagged.on_this_thread(endless), Err(Error::Interrupted)));
+
+        let polls = |mut left: usize| {
+            Control::new().with_poll(move || {
+                assert_eq!(std::thread::current().id(), here, "signals arrive in this thread");
+                left = left.checked_sub(1).ok_or_else(|| Error::external("polling", "a signal"))?;
+                Ok(())
+            })
+        };
+        assert_eq!(polls(9).install(Some(&threads), |_| Ok(7)).expect("the work is done first"), 7);
+        let everywhere = [
+            polls(2).install(Some(&threads), endless),
+            polls(2).install(None, endless),
+            polls(2).on_this_thread(endless),
+        ];
+        for failed in everywhere {
+            assert!(matches!(failed, Err(Error::External { .. })), "the error of the poll: {failed:?}");
+        }
+        assert!(polls(0).install(Some(&threads), |_| -> Result<()> { unreachable!("interrupted before") }).is_err());
     }
 
     #[test]

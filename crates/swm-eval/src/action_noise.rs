@@ -3,6 +3,7 @@
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 use swm_core::columns::ACTION;
+use swm_core::run::Interrupt;
 use swm_core::{Batch, EnvPool, EnvSpec, Error, Key, Policy, Result, Rng, Space};
 
 /// A policy whose actions get independent Gaussian noise and are clipped to the action space. The noise of an episode
@@ -53,15 +54,18 @@ impl Policy for NoisyPolicy<'_> {
 
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
         self.policy.act(infos, active, actions)?;
-        let column = actions.schema().index(ACTION)?;
-        for slot in (0..active.len()).filter(|&slot| active[slot]) {
-            let rng = &mut self.rngs[slot];
-            for (value, &(low, high)) in actions.row_mut(slot).at::<f32>(column).iter_mut().zip(&self.bounds) {
-                let noise = self.std * rng.sample::<f64, _>(StandardNormal);
-                *value = (f64::from(*value) + noise).clamp(low, high) as f32;
-            }
-        }
-        Ok(())
+        self.add_noise(active, actions)
+    }
+
+    fn act_until(
+        &mut self,
+        infos: &Batch,
+        active: &[bool],
+        actions: &mut Batch,
+        interrupt: &dyn Interrupt,
+    ) -> Result<()> {
+        self.policy.act_until(infos, active, actions, interrupt)?;
+        self.add_noise(active, actions)
     }
 
     fn observe_envs(&mut self, envs: &EnvPool, active: &[bool]) -> Result<()> {
@@ -74,5 +78,20 @@ impl Policy for NoisyPolicy<'_> {
 
     fn take_latencies(&mut self) -> Vec<f64> {
         self.policy.take_latencies()
+    }
+}
+
+impl NoisyPolicy<'_> {
+    /// Adds noise to the actions of the active slots.
+    fn add_noise(&mut self, active: &[bool], actions: &mut Batch) -> Result<()> {
+        let column = actions.schema().index(ACTION)?;
+        for slot in (0..active.len()).filter(|&slot| active[slot]) {
+            let rng = &mut self.rngs[slot];
+            for (value, &(low, high)) in actions.row_mut(slot).at::<f32>(column).iter_mut().zip(&self.bounds) {
+                let noise = self.std * rng.sample::<f64, _>(StandardNormal);
+                *value = (f64::from(*value) + noise).clamp(low, high) as f32;
+            }
+        }
+        Ok(())
     }
 }

@@ -2,6 +2,7 @@
 
 use rand::Rng as _;
 use serde::{Deserialize, Serialize};
+use swm_core::run::Interrupt;
 use swm_core::{Batch, EnvPool, Error, Key, Policy, Result};
 
 /// The policies of a collection: one, or a mixture from which every episode draws one.
@@ -161,6 +162,16 @@ impl Policy for MixturePolicy {
 
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
         self.each(active, |policy, slots| policy.act(infos, slots, actions))
+    }
+
+    fn act_until(
+        &mut self,
+        infos: &Batch,
+        active: &[bool],
+        actions: &mut Batch,
+        interrupt: &dyn Interrupt,
+    ) -> Result<()> {
+        self.each(active, |policy, slots| policy.act_until(infos, slots, actions, interrupt))
     }
 
     fn observe_envs(&mut self, envs: &EnvPool, active: &[bool]) -> Result<()> {

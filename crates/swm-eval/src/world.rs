@@ -179,6 +179,20 @@ impl World {
         }
     }
 
+    /// As [`World::act`]; `control` interrupts a policy that takes long, such as a planner between two iterations.
+    ///
+    /// # Errors
+    /// When the policy fails, and the error of `control`.
+    pub fn act_until(&mut self, policy: &mut dyn Policy, active: &[bool], control: &mut Control<'_>) -> Result<()> {
+        policy.observe_envs(&self.pool, active)?;
+        let (infos, actions) = (self.pool.infos(), &mut self.actions);
+        if policy.uses_threads() {
+            control.install(Some(self.pool.threads()), |interrupt| policy.act_until(infos, active, actions, interrupt))
+        } else {
+            control.on_this_thread(|interrupt| policy.act_until(infos, active, actions, interrupt))
+        }
+    }
+
     /// Plays the episodes of `play`. A free slot starts the next episode.
     pub(crate) fn play(
         &mut self,
@@ -216,7 +230,7 @@ impl World {
             if !active.contains(&true) {
                 break;
             }
-            self.act(policy, &active)?;
+            self.act_until(policy, &active, control)?;
             for slot in (0..slots).filter(|&slot| active[slot]) {
                 play.acted(slot, &self.pool, &self.actions);
             }

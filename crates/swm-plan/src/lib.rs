@@ -17,7 +17,7 @@ pub mod simulator;
 pub mod solvers;
 
 pub use entry::{ActionKind, Family, Need, SolverEntry};
-pub use mpc::{ActionScale, MpcConfig, MpcPolicy, PlanRecord, TraceLog};
+pub use mpc::{ActionScale, BetweenIterations, MpcConfig, MpcPolicy, PlanObserver, PlanRecord, TraceLog};
 pub use objective::Penalised;
 pub use simulator::{Score, SimulatedLatents, SimulatorCost};
 pub use solvers::{

@@ -139,7 +139,8 @@ impl LewmSubject {
         self.cost.observe(&self.infos, &[0])?;
         let (low, high) = (vec![-1.0; self.action_dim()], vec![1.0; self.action_dim()]);
         let space = PlanSpace::Continuous { low: &low, high: &high };
-        let problem = PlanProblem { horizon: HORIZON, space, keys: &[Key::new(0)], init: None, deadline: None };
+        let keys = [Key::new(0)];
+        let problem = PlanProblem { horizon: HORIZON, space, keys: &keys, init: None, deadline: None, observer: None };
         self.cem.solve(&mut self.cost, problem).map(|_| ())
     }
 

@@ -39,7 +39,7 @@ const PARTS: &[Part] = &[
     },
     Part {
         name: "loom",
-        what: "the loader's queue under all interleavings of its threads (`loom/`)",
+        what: "the loader's queue and the pool's worker threads under all interleavings of their threads (`loom/`)",
         minutes: 4,
         run: |run| {
             let target = run.target("loom");

@@ -13,7 +13,7 @@ pub use schema::{ColumnSpec, DType, Element, Schema};
 
 use crate::{Error, Result};
 use buffer::Buffer;
-use rows::{ColumnStart, RowsMut};
+use rows::{ColumnStart, ItemsMut, RowsMut};
 
 /// Named, typed, row-major arrays with a common number of rows.
 ///
@@ -174,6 +174,35 @@ impl Batch {
         assert_eq!(items.len(), self.rows, "the number of items must equal the number of rows");
         let shared = self.rows_mut();
         items.par_iter_mut().with_max_len(1).enumerate().for_each(|(row, item)| f(row, shared.row(row), item));
+    }
+
+    /// Calls `f(row index, row, item)` for every row and the item of the same index, on this thread.
+    ///
+    /// # Panics
+    /// When the number of items differs from the number of rows.
+    pub fn zip_mut<T>(&mut self, items: &mut [T], mut f: impl FnMut(usize, RowMut<'_>, &mut T)) {
+        assert_eq!(items.len(), self.rows, "the number of items must equal the number of rows");
+        let rows = self.rows_mut();
+        items.iter_mut().enumerate().for_each(|(index, item)| f(index, rows.row(index), item));
+    }
+
+    /// Returns a function that calls `f(row index, row, item)` for the next row and its item until no row is left.
+    /// Several threads call the function at once, and each row goes to one of them.
+    ///
+    /// # Panics
+    /// When the number of items differs from the number of rows.
+    pub(crate) fn divided_zip_mut<'a, T: Send>(
+        &'a mut self,
+        items: &'a mut [T],
+        f: impl Fn(usize, RowMut<'_>, &mut T) + Sync + 'a,
+    ) -> impl Fn() + Sync + 'a {
+        assert_eq!(items.len(), self.rows, "the number of items must equal the number of rows");
+        let (rows, items) = (self.rows_mut(), ItemsMut::new(items));
+        move || {
+            while let Some((index, item)) = items.take() {
+                f(index, rows.row(index), item);
+            }
+        }
     }
 
     /// Copies row `row` of `from`, a batch of the same schema, to row `to`.

@@ -77,12 +77,14 @@ impl<'a> RowRef<'a> {
 }
 
 pub use shared::RowMut;
-pub(super) use shared::{ColumnStart, RowsMut};
+pub(super) use shared::{ColumnStart, ItemsMut, RowsMut};
 
 /// Disjoint rows of one batch, written by several threads at once.
 #[allow(unsafe_code, reason = "threads write disjoint rows of one buffer, which safe slices cannot express by column")]
 mod shared {
     use super::{Element, Schema, assert_type};
+    use std::marker::PhantomData;
+    use std::sync::atomic::{AtomicUsize, Ordering};
 
     /// The address of a column's first byte.
     #[derive(Clone, Copy)]
@@ -115,6 +117,35 @@ mod shared {
         pub fn row(&self, row: usize) -> RowMut<'a> {
             assert!(row < self.rows, "row {row} is outside a batch of {} rows", self.rows);
             RowMut { schema: self.schema, starts: self.starts, row }
+        }
+    }
+
+    /// The items of a slice, which several threads take one by one. Every item is taken once.
+    pub(in crate::batch) struct ItemsMut<'a, T> {
+        start: *mut T,
+        len: usize,
+        taken: AtomicUsize,
+        items: PhantomData<&'a mut [T]>,
+    }
+
+    // SAFETY: threads share an `ItemsMut` to take items, and an item goes to one thread, which `T: Send` allows.
+    unsafe impl<T: Send> Sync for ItemsMut<'_, T> {}
+
+    impl<'a, T> ItemsMut<'a, T> {
+        pub fn new(items: &'a mut [T]) -> Self {
+            Self { start: items.as_mut_ptr(), len: items.len(), taken: AtomicUsize::new(0), items: PhantomData }
+        }
+
+        /// Takes the next item, with its index; `None` if all are taken.
+        pub fn take(&self) -> Option<(usize, &'a mut T)> {
+            if self.taken.load(Ordering::Relaxed) >= self.len {
+                // Without this, many calls at the end could wrap the counter.
+                return None;
+            }
+            let index = self.taken.fetch_add(1, Ordering::Relaxed);
+            // SAFETY: the index is inside the slice, which is mutably borrowed for `'a`; the counter returns every index
+            // once, so no other reference to this item exists.
+            (index < self.len).then(|| (index, unsafe { &mut *self.start.add(index) }))
         }
     }
 

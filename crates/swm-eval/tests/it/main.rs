@@ -3,6 +3,7 @@
 mod collecting;
 mod counting;
 mod evaluating;
+mod interrupting;
 mod lance;
 mod line;
 mod memory;

@@ -24,10 +24,12 @@ use super::action_scale::ActionScale;
 use super::config::MpcConfig;
 use super::guarded_model::{GuardedModel, catch_panic};
 use super::history::History;
+use super::observer::{BetweenIterations, PlanObserver};
 use super::trace_log::{PlanRecord, TraceLog};
 use std::time::Instant;
+use swm_core::run::Interrupt;
 use swm_core::{Action, Batch, ColumnSpec, CostModel, EnvPool, EnvSpec, Error, Key, Plan, PlanProblem};
-use swm_core::{Policy, Result, Solver};
+use swm_core::{Policy, Result, SearchObserver, Solver};
 
 /// A policy that plans with a solver and a model.
 pub struct MpcPolicy {
@@ -41,6 +43,7 @@ pub struct MpcPolicy {
     history: Option<History>,
     latencies: Vec<f64>,
     log: Option<TraceLog>,
+    observer: Option<Box<dyn PlanObserver>>,
     scratch: Scratch,
 }
 
@@ -111,6 +114,7 @@ impl MpcPolicy {
             history,
             latencies: vec![],
             log: None,
+            observer: None,
             scratch: Scratch { executed: vec![0.0; width], ..Scratch::default() },
         })
     }
@@ -122,8 +126,15 @@ impl MpcPolicy {
         self
     }
 
+    /// Shows every search to `observer`.
+    #[must_use]
+    pub fn observed(mut self, observer: Box<dyn PlanObserver>) -> Self {
+        self.observer = Some(observer);
+        self
+    }
+
     /// Plans for all slots in `scratch.replan` in one call.
-    fn replan(&mut self, infos: &Batch) -> Result<()> {
+    fn replan(&mut self, infos: &Batch, interrupt: Option<&dyn Interrupt>) -> Result<()> {
         let begun = Instant::now();
         let deadline = self.config.deadline(begun);
         let Scratch { replan, keys, init, .. } = &mut self.scratch;
@@ -141,8 +152,17 @@ impl MpcPolicy {
             init.extend_from_slice(&slot.warm);
         }
         let (horizon, space) = (self.config.horizon, self.codec.space());
-        let problem = PlanProblem { horizon, space, keys, init: Some(init), deadline };
+        let between =
+            BetweenIterations { interrupt, observer: self.observer.as_deref().map(|it| it as &dyn SearchObserver) };
+        let observer = between.observer();
+        let problem = PlanProblem { horizon, space, keys, init: Some(init), deadline, observer };
+        if let Some(observer) = &self.observer {
+            observer.begin(replan)?;
+        }
         let plan = catch_panic("the solver", "planning", || self.solver.solve(&mut model, problem))?;
+        if let Some(observer) = &self.observer {
+            observer.end()?;
+        }
         check_plan(&plan, replan.len(), horizon, space.dim())?;
 
         let together = replan.len();
@@ -232,6 +252,35 @@ impl Policy for MpcPolicy {
     }
 
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
+        self.act_with(infos, active, actions, None)
+    }
+
+    fn act_until(
+        &mut self,
+        infos: &Batch,
+        active: &[bool],
+        actions: &mut Batch,
+        interrupt: &dyn Interrupt,
+    ) -> Result<()> {
+        self.act_with(infos, active, actions, Some(interrupt))
+    }
+
+    /// Returns the seconds that each plan took, including the encoding of the present observation. The time of a call
+    /// is divided equally among its environments.
+    fn take_latencies(&mut self) -> Vec<f64> {
+        std::mem::take(&mut self.latencies)
+    }
+}
+
+impl MpcPolicy {
+    /// As [`Policy::act_until`].
+    fn act_with(
+        &mut self,
+        infos: &Batch,
+        active: &[bool],
+        actions: &mut Batch,
+        interrupt: Option<&dyn Interrupt>,
+    ) -> Result<()> {
         self.check_slots(&[infos.rows(), active.len(), actions.rows()])?;
         let column = actions.schema().index("action")?;
         let given = &actions.schema().columns()[column];
@@ -248,7 +297,7 @@ impl Policy for MpcPolicy {
             }
         }
         if !self.scratch.replan.is_empty() {
-            self.replan(infos)?;
+            self.replan(infos, interrupt)?;
         }
         let width = self.codec.width();
         let Scratch { decoded, executed, .. } = &mut self.scratch;
@@ -266,11 +315,5 @@ impl Policy for MpcPolicy {
             slot.done += width;
         }
         Ok(())
-    }
-
-    /// Returns the seconds that each plan took, including the encoding of the present observation. The time of a call
-    /// is divided equally among its environments.
-    fn take_latencies(&mut self) -> Vec<f64> {
-        std::mem::take(&mut self.latencies)
     }
 }

@@ -6,7 +6,7 @@
 use super::optimizer::{Memory, Optimizer};
 use super::population::Population;
 use super::problem::{UNWRITTEN, check_costs, differentiable};
-use swm_core::{CostModel, Error, Plan, PlanProblem, PlanTrace, Result};
+use swm_core::{CostModel, Error, Iteration, Plan, PlanProblem, PlanTrace, Result};
 
 /// The optimizer and the noise of one step.
 #[derive(Clone, Copy)]
@@ -64,9 +64,11 @@ impl<'p> Descent<'p> {
         })
     }
 
-    /// Takes up to `steps` steps; returns whether time is left before the deadline.
+    /// Takes up to `steps` steps; returns whether the search goes on: time is left before the deadline, and the observer
+    /// of the problem has not ended it.
     ///
-    /// `prepare` runs after costs and gradients are computed; it records the trace and adjusts the gradient.
+    /// `prepare` runs after costs and gradients are computed; it records the trace and adjusts the gradient. The observer
+    /// reads the gradient before it is adjusted.
     ///
     /// # Errors
     /// When the model fails, a cost or a gradient is missing or not finite, or `prepare` fails.
@@ -79,13 +81,29 @@ impl<'p> Descent<'p> {
     ) -> Result<bool> {
         for _ in 0..steps {
             self.differentiate(cost)?;
+            let goes_on = self.observed(&self.population.costs)?;
             prepare(self, cost)?;
             self.step(step);
-            if self.problem.is_late() {
+            if !goes_on || self.problem.is_late() {
                 return Ok(false);
             }
         }
         Ok(true)
+    }
+
+    /// Shows the candidates with `costs` and their gradient to the observer of the problem; returns whether the search
+    /// goes on.
+    ///
+    /// # Errors
+    /// The error of the observer.
+    pub fn observed(&self, costs: &[f32]) -> Result<bool> {
+        self.problem.observed(|| Iteration {
+            index: self.steps,
+            candidates: self.population.candidates(),
+            costs,
+            elites: vec![],
+            gradient: Some(&self.gradient),
+        })
     }
 
     /// Computes the cost and the gradient of every candidate.

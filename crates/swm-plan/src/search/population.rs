@@ -6,7 +6,7 @@ use super::problem::evaluate;
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 use rayon::prelude::*;
-use swm_core::{Candidates, CostModel, Error, Key, Plan, PlanProblem, PlanTrace, Result, limits};
+use swm_core::{Candidates, CostModel, Error, Iteration, Key, Plan, PlanProblem, PlanTrace, Result, limits};
 
 /// Candidate action sequences of several environments, and their costs.
 pub struct Population {
@@ -141,6 +141,26 @@ impl Population {
         Elites::select(&self.actions[env * n * len..][..n * len], &self.costs[env * n..][..n], k, order)
     }
 
+    /// Shows an iteration to the observer of the problem; returns whether the search goes on. `elites` are the indices of
+    /// each environment's elites, cheapest first.
+    ///
+    /// # Errors
+    /// The error of the observer.
+    pub fn observed<'a>(
+        &self,
+        problem: &PlanProblem<'_>,
+        index: usize,
+        elites: impl Iterator<Item = &'a [usize]>,
+    ) -> Result<bool> {
+        problem.observed(|| Iteration {
+            index,
+            candidates: self.candidates(),
+            costs: &self.costs,
+            elites: elites.flatten().copied().collect(),
+            gradient: None,
+        })
+    }
+
     /// The index of the cheapest candidate of every environment; the first of several with the same cost.
     pub fn cheapest(&self) -> Vec<usize> {
         let lowest = |costs: &[f32]| (1..costs.len()).fold(0, |best, i| if costs[i] < costs[best] { i } else { best });
@@ -167,7 +187,8 @@ impl Population {
     }
 }
 
-/// Calls `iteration` for 0, 1, … until all iterations are done or the deadline has passed, but at least once.
+/// Calls `iteration` for 0, 1, … until all iterations are done, it returns false, or the deadline has passed, but at
+/// least once.
 ///
 /// The function enters the thread pool once for each plan, because every entry from outside the pool takes as long as
 /// drawing a population.
@@ -177,15 +198,14 @@ impl Population {
 pub fn iterate(
     iterations: usize,
     problem: &PlanProblem<'_>,
-    mut iteration: impl FnMut(usize) -> Result<()> + Send,
+    mut iteration: impl FnMut(usize) -> Result<bool> + Send,
 ) -> Result<()> {
     if problem.keys.is_empty() {
         return Ok(());
     }
     rayon::scope(|_| {
         for i in 0..iterations {
-            iteration(i)?;
-            if problem.is_late() {
+            if !iteration(i)? || problem.is_late() {
                 break;
             }
         }

@@ -25,7 +25,8 @@
 //!   candidate); values that are not finite are errors.
 //!
 //! As in the reference, the optimizer's memory is cleared whenever the multipliers change. The trace has an entry
-//! before every step and one for the plan: the cost and the violation of the candidate that is the best at this step.
+//! before every step and one for the plan: the cost and the violation of the candidate that is the best at this step, and
+//! the last multipliers.
 
 use crate::entry::{ActionKind, Family, Need, SolverEntry, defaults, make};
 use crate::search::{Adam, Descent, Optimizer, Settings, Step, UNWRITTEN, constrained, continuous, misfit};
@@ -119,6 +120,9 @@ impl Solver for AugmentedLagrangian {
         descent.population.evaluate(cost, descent.steps)?;
         duals.evaluate(cost, &descent)?;
         let best = duals.record(&mut descent, self.tolerance);
+        for (trace, multipliers) in descent.trace.iter_mut().zip(duals.multipliers.chunks_exact(duals.constraints)) {
+            trace.multipliers.extend_from_slice(multipliers);
+        }
         Ok(descent.population.plan(&best, descent.trace))
     }
 

@@ -99,7 +99,7 @@ impl Solver for CategoricalCem {
                 write_mode(probabilities, choices, mode);
                 elites.record(trace, spread(probabilities, choices));
             });
-            Ok(())
+            population.observed(&problem, iteration, distributions.iter().map(|it| &it.order[..self.elites]))
         })?;
         let (modes, trace): (Vec<_>, Vec<_>) = distributions.into_iter().map(|it| (it.mode, it.trace)).unzip();
         let costs = trace.iter().filter_map(|trace| trace.best.last().copied()).collect();
@@ -233,7 +233,8 @@ mod tests {
     fn initial_guess_gets_half_of_the_probability() {
         let space = PlanSpace::Discrete { choices: &[2, 2] };
         let init = [1.0, 0.0, 0.0, 0.0, 0.5, 1.5, 0.0, 1.0];
-        let problem = PlanProblem { horizon: 2, space, keys: &[Key::new(0)], init: Some(&init), deadline: None };
+        let problem =
+            PlanProblem { horizon: 2, space, keys: &[Key::new(0)], init: Some(&init), deadline: None, observer: None };
         let distribution = &Categorical::initial(&problem, &[2, 2])[0];
         assert_eq!(distribution.probabilities, [0.75, 0.25, 0.5, 0.5, 0.375, 0.625, 0.25, 0.75]);
         assert_eq!(distribution.mode, [1.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 1.0]);

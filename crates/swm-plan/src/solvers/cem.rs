@@ -77,7 +77,7 @@ impl Solver for Cem {
                 elites.refit(0.0, mean, std);
                 elites.record(trace, average(std));
             });
-            Ok(())
+            population.observed(&problem, iteration, gaussians.iter().map(|gaussian| &gaussian.order[..self.elites]))
         })?;
         Ok(Gaussian::into_plan(gaussians))
     }

@@ -85,7 +85,7 @@ impl Solver for ICem {
                 elites.refit(self.momentum, mean, std);
                 elites.record(trace, average(std));
             });
-            Ok(())
+            population.observed(&problem, iteration, gaussians.iter().map(|gaussian| &gaussian.order[..self.elites]))
         })?;
         Ok(Gaussian::into_plan(gaussians))
     }

@@ -73,7 +73,7 @@ impl Solver for Mppi {
                 elites.weighted_mean(weights, mean);
                 elites.record(trace, average(std));
             });
-            Ok(())
+            population.observed(&problem, iteration, gaussians.iter().map(|gaussian| &gaussian.order[..self.elites]))
         })?;
         Ok(Gaussian::into_plan(gaussians))
     }

@@ -60,7 +60,7 @@ impl Solver for PredictiveSampling {
                 ranked.record(trace, self.sigma);
                 mean.copy_from_slice(ranked.best());
             });
-            Ok(())
+            population.observed(&problem, iteration, gaussians.iter().map(|gaussian| &gaussian.order[..self.samples]))
         })?;
         Ok(Gaussian::into_plan(gaussians))
     }

@@ -130,7 +130,7 @@ impl DifferentiableCost for Bowl {
 const FREE: PlanSpace<'static> = PlanSpace::Continuous { low: &[f32::NEG_INFINITY; 2], high: &[f32::INFINITY; 2] };
 
 fn solve(solver: &mut dyn Solver, model: &mut dyn CostModel, keys: &[Key]) -> Result<Plan> {
-    solver.solve(model, PlanProblem { horizon: 3, space: FREE, keys, init: None, deadline: None })
+    solver.solve(model, PlanProblem { horizon: 3, space: FREE, keys, init: None, deadline: None, observer: None })
 }
 
 #[test]
@@ -170,7 +170,8 @@ fn projected_gradient_descent_equals_the_reference() {
     let mut pgd = Pgd { samples: 1, iterations: 4, ..Pgd::default() };
     let start = [0.0, 0.0, 1.0, 1.0, 0.0, 0.0];
     let space = PlanSpace::Discrete { choices: &[3] };
-    let problem = PlanProblem { horizon: 2, space, keys: &[Key::new(0)], init: Some(&start), deadline: None };
+    let problem =
+        PlanProblem { horizon: 2, space, keys: &[Key::new(0)], init: Some(&start), deadline: None, observer: None };
     let plan = pgd.solve(&mut { CHOICE }, problem).expect("the solver returns a plan");
     assert_near(&plan.trace[0].best[..4], &golden.costs, 1e-6);
     let chosen: Vec<f32> =
@@ -208,7 +209,7 @@ fn augmented_lagrangian_equals_the_reference() {
 fn trace_records_the_violation_of_the_plan() {
     // No action within these bounds adds up to at most a half.
     let space = PlanSpace::Continuous { low: &[0.3, 0.4], high: &[9.0, 9.0] };
-    let problem = PlanProblem { horizon: 3, space, keys: &[Key::new(0)], init: None, deadline: None };
+    let problem = PlanProblem { horizon: 3, space, keys: &[Key::new(0)], init: None, deadline: None, observer: None };
     let mut solver = AugmentedLagrangian { samples: 8, ..AugmentedLagrangian::default() };
     let plan = solver.solve(&mut Bowl { limited: true, ..BOWL }, problem).expect("the solver returns a plan");
     let violation = plan.trace[0].violation.last().expect("the trace has violations");
@@ -316,8 +317,14 @@ fn gradient_descent_requires_a_gradient() {
 fn deadline_ends_the_search() {
     for &(id, name, _) in NOISY {
         let (toy, keys) = (toy(name), [Key::new(0)]);
-        let problem =
-            |deadline| PlanProblem { horizon: toy.horizon, space: toy.space, keys: &keys, init: None, deadline };
+        let problem = |deadline| PlanProblem {
+            horizon: toy.horizon,
+            space: toy.space,
+            keys: &keys,
+            init: None,
+            deadline,
+            observer: None,
+        };
         let mut solver =
             (SOLVERS.get(id).expect("a registered solver").make)(&serde_json::json!({})).expect("creating the solver");
         let stopped =

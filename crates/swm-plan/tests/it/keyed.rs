@@ -7,9 +7,10 @@ use swm_core::{Plan, PlanTrace};
 use swm_plan::{SOLVERS, SolverEntry};
 
 /// The bits of actions, costs and trace of each environment.
-fn bits(plan: &Plan, envs: usize) -> Vec<Vec<u32>> {
+pub fn bits(plan: &Plan, envs: usize) -> Vec<Vec<u32>> {
     let len = plan.actions.len() / envs;
-    let trace = |PlanTrace { best, mean, spread, violation }: &PlanTrace| [&best[..], mean, spread, violation].concat();
+    let trace =
+        |PlanTrace { best, mean, spread, violation, .. }: &PlanTrace| [&best[..], mean, spread, violation].concat();
     let env =
         |env: usize| [&plan.actions[env * len..][..len], &plan.costs[env..=env], &trace(&plan.trace[env])].concat();
     (0..envs).map(|i| env(i).into_iter().map(f32::to_bits).collect()).collect()
@@ -22,7 +23,7 @@ fn plan(row: &SolverEntry, toy: &'static Toy, envs: &[usize]) -> Vec<Vec<u32>> {
 }
 
 /// The first toy a solver can solve.
-fn toy_for(row: &SolverEntry) -> &'static Toy {
+pub fn toy_for(row: &SolverEntry) -> &'static Toy {
     TOYS.iter().find(|toy| solves(row, toy)).expect("a toy for this solver")
 }
 

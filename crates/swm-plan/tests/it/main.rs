@@ -7,6 +7,7 @@ mod keyed;
 mod lqr;
 mod mpc;
 mod objective;
+mod observing;
 mod perfect;
 mod sampling;
 mod simulator;

@@ -329,7 +329,7 @@ fn try_solve(
     let keys: Vec<Key> = envs.iter().map(|&env| Key::new(3).at(env as u64)).collect();
     let (low, high) = (vec![f32::NEG_INFINITY; dim], vec![f32::INFINITY; dim]);
     let space = PlanSpace::Continuous { low: &low, high: &high };
-    let problem = PlanProblem { horizon, space, keys: &keys, init: None, deadline: None };
+    let problem = PlanProblem { horizon, space, keys: &keys, init: None, deadline: None, observer: None };
     solver.solve(model, problem)
 }
 

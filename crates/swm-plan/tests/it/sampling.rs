@@ -16,7 +16,8 @@ fn make(id: &str, settings: &Value) -> Box<dyn Solver> {
 }
 
 fn plan(id: &str, toy: &'static Toy, init: Option<&[f32]>, deadline: Option<Instant>) -> Plan {
-    let problem = PlanProblem { horizon: toy.horizon, space: toy.space, keys: &[Key::new(1)], init, deadline };
+    let problem =
+        PlanProblem { horizon: toy.horizon, space: toy.space, keys: &[Key::new(1)], init, deadline, observer: None };
     make(id, &json!({})).solve(&mut Model::new(toy, &[0]), problem).expect("the solver returns a plan")
 }
 
@@ -75,7 +76,14 @@ fn candidates_stay_within_bounds() {
     for (row, _) in sampling_solvers().filter(|(row, _)| row.actions == ActionKind::Continuous) {
         let mut model = LargestAction(0.0);
         let space = PlanSpace::Continuous { low: &[-0.3, -0.5], high: &[0.25, 0.5] };
-        let problem = PlanProblem { horizon: 3, space, keys: &[Key::new(0)], init: Some(&[9.0; 6]), deadline: None };
+        let problem = PlanProblem {
+            horizon: 3,
+            space,
+            keys: &[Key::new(0)],
+            init: Some(&[9.0; 6]),
+            deadline: None,
+            observer: None,
+        };
         let plan = make(row.id, &json!({})).solve(&mut model, problem).expect("the solver returns a plan");
         assert_eq!(model.0, 0.5, "{}", row.id);
         // The plan must be within the bounds even though all costs are equal.
@@ -137,7 +145,7 @@ fn errors_name_invalid_problems() {
     let quadratic = toy("quadratic");
     let message = |id: &str, horizon, space, init: Option<&[f32]>| {
         let keys = [Key::new(0), Key::new(1)];
-        let problem = PlanProblem { horizon, space, keys: &keys, init, deadline: None };
+        let problem = PlanProblem { horizon, space, keys: &keys, init, deadline: None, observer: None };
         make(id, &json!({}))
             .solve(&mut Model::new(quadratic, &[0, 1]), problem)
             .expect_err("the input is invalid")

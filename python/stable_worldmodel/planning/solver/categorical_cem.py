@@ -9,7 +9,7 @@ import numpy as np
 
 from .callbacks import Callback
 from .discrete import DiscreteSolver
-from .hooks import choice_shape
+from .hooks import Observer, choice_shape
 
 __all__ = ["CategoricalCEMSolver"]
 
@@ -60,12 +60,12 @@ class CategoricalCEMSolver(DiscreteSolver):
         shape = choice_shape(self._options())
         return flat if shape is None else flat.reshape(n_envs, self.horizon, *shape)
 
-    def _watched(self, adapter: Any) -> Any:
-        watched = super()._watched(adapter)
+    def _observer(self) -> Observer:
+        observer = super()._observer()
         settings = self._all_settings()
         initial = np.broadcast_to(self._uniform(), (self.horizon, self._plan_dim))
-        watched.choose(self._options(), float(settings["smoothing"]), initial)
-        return watched
+        observer.choose(self._options(), float(settings["smoothing"]), initial)
+        return observer
 
     def _outputs(self, result: dict[str, Any], watched: Any) -> dict[str, Any]:
         found = super()._outputs(result, watched)

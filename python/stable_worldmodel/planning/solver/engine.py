@@ -11,8 +11,8 @@ from gymnasium import spaces
 
 from ... import _engine
 from ..adapter import Adapter
-from .callbacks import Callback, StopSearch
-from .hooks import Watched, view
+from .callbacks import Callback
+from .hooks import Observer, Watched, view
 
 __all__ = ["EngineSolver", "NotConfigured", "last_step", "single", "summed_costs"]
 
@@ -28,8 +28,6 @@ class EngineSolver:
     id: ClassVar[str]
     #: The engine's names of settings, by their names in the constructor.
     _names: ClassVar[Mapping[str, str]] = {}
-    #: Whether callbacks can run between the iterations.
-    _has_callbacks: ClassVar[bool] = True
     #: Whether the solver follows a gradient.
     _descends: ClassVar[bool] = False
 
@@ -46,8 +44,6 @@ class EngineSolver:
     ) -> None:
         if cost is not None and model is not None:
             raise TypeError(f"{type(self).__name__}: cost and model are two names of the same argument; give one")
-        if callbacks and not self._has_callbacks:
-            raise TypeError(f"callbacks: {type(self).__name__} calls none; read solve(…)['trace']")
         model = cost if model is None else model
         #: The callbacks, which run after every iteration.
         self.callbacks = list(callbacks or ())
@@ -150,34 +146,30 @@ class EngineSolver:
             engine_infos = {key: last_step(value) for key, value in infos.items()}
         low, high, choices = _bounds(space, block, model)
         init = None if init_action is None else _padded(init_action, envs, horizon, dim)
-        watched: Any = None
-        if isinstance(model, Adapter):
-            watched = self._watched(model)
-        elif self.callbacks:
-            raise TypeError(f"callbacks: {type(self.model).__name__} is planned with inside of the engine; wrap its get_cost")
-
-        def search(settings: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, str]:
-            given = model if watched is None else watched
-            limits = low, high, choices
-            return _engine.solve(
-                self.id, json.dumps(settings), given, engine_infos, envs, horizon, *limits, init, self.seed, self._solved
-            )
-
-        for callback in self.callbacks:
-            callback.reset()
-            callback.start_batch()
-        try:
-            actions, costs, trace = search(self.settings)
-        except StopSearch:
-            watched.replay()
-            iterates = "iterations" in json.loads(_engine.solvers())[self.id]
-            actions, costs, trace = search({**self.settings, **({"iterations": len(watched.recorded)} if iterates else {})})
+        observer = self._observer()
+        watched: Any = Watched(model, observer) if isinstance(model, Adapter) else None
+        given = model if watched is None else watched
+        observer.begin(envs)
+        actions, costs, trace = _engine.solve(
+            self.id,
+            json.dumps(self.settings),
+            given,
+            engine_infos,
+            envs,
+            horizon,
+            low,
+            high,
+            choices,
+            init,
+            self.seed,
+            self._solved,
+            observer if self.callbacks else None,
+        )
+        observer.end()
         self._solved += 1
         result = {"actions": view(actions), "costs": costs.tolist(), "trace": json.loads(trace)}
         result |= self._outputs(result, watched)
         if self.callbacks:
-            for callback in self.callbacks:
-                callback.end_solve()
             result["callbacks"] = {callback.output_key: callback.history for callback in self.callbacks}
         return result
 
@@ -189,14 +181,15 @@ class EngineSolver:
         """The settings, with the engine's defaults."""
         return {**json.loads(_engine.solvers())[self.id], **self.settings}
 
-    def _watched(self, adapter: Adapter) -> Watched:
+    def _observer(self) -> Observer:
+        """What reads the iterations of a search."""
         settings = self._all_settings()
         # Predictive sampling has no elites; its plan is the cheapest candidate.
         elites = 0 if self._descends else int(settings.get("elites", 1))
         sigma, momentum = float(settings.get("sigma", 0.0)), float(settings.get("momentum", 0.0))
         space: Any = self._space()
         limits = (space.low, space.high) if isinstance(space, spaces.Box) and self.id == "icem" else None
-        return Watched(adapter, self.callbacks, elites, sigma, momentum, limits=limits)
+        return Observer(self.callbacks, elites, sigma, momentum, limits)
 
     def __getattr__(self, name: str) -> Any:
         if isinstance(getattr(type(self), name, None), property):

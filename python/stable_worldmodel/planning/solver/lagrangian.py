@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from .engine import EngineSolver, summed_costs
+from .hooks import view
 from .optimizer import optimizer
 
 __all__ = ["AugmentedLagrangianSolver", "LagrangianSolver"]
@@ -23,15 +24,16 @@ class LagrangianSolver(EngineSolver):
         n_outer_steps: Updates of the multipliers.
         rho_init, rho_max, rho_scale: The first penalty, the largest penalty, and its growth in an update.
         persist_multipliers: Has no effect: the multipliers start at zero in every call, so that a plan does not depend on
-            earlier ones.
-        **settings: As for `CEMSolver`.
+            earlier ones. The last multipliers are in the result.
+        **settings: As for `CEMSolver`, and `callbacks`.
 
-    Results of `solve` also have `cost`, `[[..]]` (the sum of the costs of all candidates in every step), and
-    `constraint_violation`, `[x]`: the mean of the positive constraint values of the plans.
+    Results of `solve` also have `cost`, `[[..]]` (the sum of the costs of all candidates in every step),
+    `constraint_violation`, `[x]` (the mean of the positive constraint values of the plans), and `multipliers`,
+    `(B, constraints)`, those after the search. Callbacks get the costs and the gradient of the cost, without the
+    constraints.
     """
 
     id = "lagrangian"
-    _has_callbacks = False
     _descends = True
     _names: ClassVar[Mapping[str, str]] = {
         "num_samples": "samples",
@@ -73,6 +75,8 @@ class LagrangianSolver(EngineSolver):
 
     def _outputs(self, result: dict[str, Any], watched: Any) -> dict[str, Any]:
         found: dict[str, Any] = {"cost": summed_costs(result["trace"], self._all_settings()["samples"])}
+        multipliers = [search["multipliers"] for search in result["trace"]]
+        found["multipliers"] = view(np.array(multipliers, np.float32))
         if watched is not None:
             values = watched.constrain(np.asarray(result["actions"])[:, None])
             found["constraint_violation"] = [float(np.maximum(values, 0).mean())]

@@ -35,7 +35,7 @@
 //! gradient descent is as good or better.
 //!
 //! The cost of a plan is only known after a rollout. So the trace has an entry before every step of a synchronisation,
-//! and one for the plan.
+//! and one for the plan. Observers get the loss above as the cost of an iteration, and the cost in a synchronisation.
 
 mod virtual_states;
 
@@ -131,18 +131,22 @@ impl Solver for Grasp {
         for k in 0..self.iterations {
             let (gamma, sigma) = (self.goal_weight.at(k % phase, phase), self.state_noise.at(k % phase, phase));
             states.differentiate(cost, &mut descent, gamma, k)?;
+            let goes_on = problem.observer.is_none() || descent.observed(&states.losses(gamma))?;
             descent.step(action_step);
             self.state_optimizer.step(&mut state_memory, &mut states.values, &states.gradient);
             states.perturb(&problem, sigma, k);
-            if problem.is_late() {
+            if !goes_on || problem.is_late() {
                 break;
             }
             if self.sync_every > 0 && k > 0 && (k + 1) % self.sync_every == 0 {
                 descent.forget();
-                descent.run(cost, self.sync_iterations, sync_step, |descent, _| {
+                let goes_on = descent.run(cost, self.sync_iterations, sync_step, |descent, _| {
                     descent.record();
                     Ok(())
                 })?;
+                if !goes_on {
+                    break;
+                }
                 descent.forget();
                 state_memory.clear();
             }

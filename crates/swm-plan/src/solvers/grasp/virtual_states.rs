@@ -88,6 +88,23 @@ impl VirtualStates {
         descent.check_gradient()
     }
 
+    /// The loss of every environment at the last [`VirtualStates::differentiate`], `[envs]`.
+    pub fn losses(&self, gamma: f32) -> Vec<f32> {
+        let (all, steps) = ((self.horizon + 1) * self.latent, self.horizon * self.latent);
+        let envs = self.from.chunks_exact(steps).zip(self.next.chunks_exact(steps)).zip(self.values.chunks_exact(all));
+        let loss = |((from, next), states): ((&[f32], &[f32]), &[f32])| {
+            let goal = &states[steps..];
+            let square = |a: f32, b: f32| f64::from(a - b).powi(2);
+            // `from` holds the states of the gradient; the goal follows them.
+            let after = from[self.latent..].iter().chain(goal);
+            let terms = next.iter().zip(after).enumerate();
+            terms
+                .map(|(i, (&next, &z))| square(next, z) + f64::from(gamma) * square(next, goal[i % self.latent]))
+                .sum::<f64>() as f32
+        };
+        envs.map(loss).collect()
+    }
+
     /// Adds noise with the standard deviation `sigma` to the states between start and goal.
     pub fn perturb(&mut self, problem: &PlanProblem<'_>, sigma: f32, k: usize) {
         if sigma > 0.0 {

@@ -142,7 +142,8 @@ pub fn draw(env: usize, n: usize, scale: f64) -> Vec<f64> {
 /// Solves a toy for several environments, each with its own key.
 pub fn solve(solver: &mut dyn Solver, model: &mut dyn CostModel, toy: &Toy, envs: &[usize]) -> Result<Plan> {
     let keys: Vec<Key> = envs.iter().map(|&env| Key::new(5).with("plan").at(env as u64)).collect();
-    let problem = PlanProblem { horizon: toy.horizon, space: toy.space, keys: &keys, init: None, deadline: None };
+    let problem =
+        PlanProblem { horizon: toy.horizon, space: toy.space, keys: &keys, init: None, deadline: None, observer: None };
     solver.solve(model, problem)
 }
 

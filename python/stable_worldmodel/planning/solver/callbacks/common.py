@@ -10,7 +10,7 @@ __all__ = ["BestCostRecorder", "Callback", "MeanCostRecorder", "StopSearch"]
 
 
 class StopSearch(Exception):
-    """Raised by a callback to end the search: the plan is the one of the iterations so far."""
+    """Raised by a callback to end the search after this iteration: the plan is the one of the iterations so far."""
 
 
 class Callback:

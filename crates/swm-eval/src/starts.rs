@@ -85,7 +85,7 @@ impl Starts {
         let mut ranges = Vec::with_capacity(2 * picks.len());
         for &[episode, step] in &picks {
             let found = reader.episodes().get(episode).ok_or_else(|| no_episode(reader, episode))?;
-            if step + goal_offset >= found.length {
+            if step.saturating_add(goal_offset) >= found.length {
                 return Err(Error::mismatch(
                     format!("choosing a start in episode {episode}"),
                     format!("step {step} with its goal {goal_offset} steps later"),

@@ -74,6 +74,19 @@ impl<'a> Sheet<'a> {
         self.rows.get(&[condition, policy, counting]).copied()
     }
 
+    /// The rows of a condition, by the indices of policy and counting.
+    pub(super) fn rows_of(&self, condition: usize) -> impl Iterator<Item = ([usize; 2], &'a StudyRow)> + '_ {
+        let rows = self.rows.range([condition, 0, 0]..[condition + 1, 0, 0]);
+        rows.map(|([_, policy, counting], row)| ([*policy, *counting], *row))
+    }
+
+    /// The indices of the policies that have a row of a condition.
+    pub(super) fn policies_of(&self, condition: usize) -> Vec<usize> {
+        let mut policies: Vec<usize> = self.rows_of(condition).map(|([policy, _], _)| policy).collect();
+        policies.dedup();
+        policies
+    }
+
     /// The name of the source of starts.
     pub(super) fn starts(&self) -> Option<&'a String> {
         self.rows.values().next().map(|row| &row.starts)
@@ -81,8 +94,7 @@ impl<'a> Sheet<'a> {
 
     /// The values of the variables of a condition.
     pub(super) fn variables(&self, condition: usize) -> Option<&'a BTreeMap<String, String>> {
-        let mut rows = self.rows.range([condition, 0, 0]..[condition + 1, 0, 0]);
-        rows.next().map(|(_, row)| &row.variables)
+        self.rows_of(condition).next().map(|(_, row)| &row.variables)
     }
 
     /// The indices of the conditions that are shifted.

@@ -67,8 +67,7 @@ fn write_leaks(html: &mut String, rows: &[StudyRow]) {
 
 /// The conditions and policies that have a row.
 fn rows<'s>(sheet: &'s Sheet<'_>) -> impl Iterator<Item = [usize; 2]> + 's {
-    let pairs = (0..sheet.conditions.len()).flat_map(|i| (0..sheet.policies.len()).map(move |j| [i, j]));
-    pairs.filter(|[i, j]| (0..sheet.countings.len()).any(|counting| sheet.row(*i, *j, counting).is_some()))
+    (0..sheet.conditions.len()).flat_map(|i| sheet.policies_of(i).into_iter().map(move |j| [i, j]))
 }
 
 /// Writes the table of a sheet until the page has `most` bytes, and returns the number of rows that are left out.
@@ -98,7 +97,7 @@ fn one(html: &mut String, sheet: &Sheet<'_>, most: usize) -> usize {
         html.push_str("<tr>");
         let shown = |name: &str| escape(&shorten(name, limits::STUDY_NAME_CHARS));
         if last != Some(condition) {
-            let span = (0..sheet.policies.len()).filter(|j| has_row(sheet, condition, *j)).count();
+            let span = sheet.policies_of(condition).len();
             let name = shown(sheet.conditions[condition]);
             let _ = write!(html, "<th scope=\"rowgroup\" rowspan=\"{span}\">{name}</th>");
         }
@@ -111,10 +110,6 @@ fn one(html: &mut String, sheet: &Sheet<'_>, most: usize) -> usize {
     }
     html.push_str(if last.is_some() { "</tbody>\n</table>\n</div>\n" } else { "</table>\n</div>\n" });
     left_out
-}
-
-fn has_row(sheet: &Sheet<'_>, condition: usize, policy: usize) -> bool {
-    (0..sheet.countings.len()).any(|counting| sheet.row(condition, policy, counting).is_some())
 }
 
 /// Writes the rates and gaps of every counting, then the numbers of episodes and the floors.

@@ -35,6 +35,16 @@ fn videos_outside_the_folder_are_not_embedded() {
 }
 
 #[test]
+fn comparisons_that_are_left_out_hide_nothing() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let given = results();
+    assert!(!given.comparisons.is_empty());
+    let page_of = |results| page(&[(folder.path().join("results.json"), results)], &folder.path().join("report"));
+    let without = page_of(swm_core::Results { comparisons: vec![], ..given.clone() });
+    assert!(without == page_of(given), "the page compares the episodes, whatever the file states");
+}
+
+#[test]
 fn pipes_and_folders_are_not_read_as_videos() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let pipe = folder.path().join("pipe.mp4");

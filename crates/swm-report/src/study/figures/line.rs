@@ -58,7 +58,7 @@ pub(super) fn draw(sheet: &Sheet<'_>, counting: usize, variable: &str, values: &
         return Ok(vec![]);
     }
     let shows_floor = !series.iter().any(|series| series.policy.ink == Ink::Floor);
-    let floor = |condition: usize| (0..sheet.policies.len()).find_map(|policy| sheet.row(condition, policy, counting));
+    let floor = |condition: usize| sheet.rows_of(condition).find(|([_, of], _)| *of == counting).map(|(_, row)| row);
     let floor = all.iter().filter(|_| shows_floor).filter_map(|(x, condition)| Some((*x, floor(*condition)?.floor)));
     let floor = floor.filter(|(_, floor)| is_drawable(floor)).map(|(x, floor)| (x, floor.rate)).collect();
     let lines = Lines { variable: shorten(variable, 60), series, floor, is_fitted: !sheet.sequential };

@@ -56,6 +56,9 @@ pub fn escape_markdown(text: &str) -> String {
     text.replace("](", "]\\(")
 }
 
+/// The most entries of a table with a column for each policy. A study whose conditions have a policy each would have 10^8.
+const MOST_ENTRIES: usize = 200_000;
+
 /// Success rates with a row for each condition and a column for each policy.
 struct Pivot<'a> {
     results: &'a StudyResults,
@@ -156,19 +159,28 @@ impl<'a> Pivot<'a> {
         if ranks.is_empty() {
             return vec![];
         }
-        let gaps = self.policies.iter().map(|policy| format!("gap of {policy}, points"));
+        let policies = &self.policies[..self.policies.len().min(MOST_ENTRIES / ranks.len())];
+        let gaps = policies.iter().map(|policy| format!("gap of {policy}, points"));
         let header = ["condition", "image distance, 0 to 255"].map(str::to_owned).into_iter().chain(gaps);
         let row = |rank: &ImageRank<'_>| {
             let gap =
                 |policy: &&str| rank.gaps.get(policy).map_or("–".to_owned(), |gap| format!("{:+.1}", 100.0 * gap));
             let distance = format!("{:.2}", rank.distance);
-            [rank.condition.to_owned(), distance].into_iter().chain(self.policies.iter().map(gap)).collect()
+            [rank.condition.to_owned(), distance].into_iter().chain(policies.iter().map(gap)).collect()
         };
         std::iter::once(header.collect()).chain(ranks.iter().map(row)).collect()
     }
 
-    /// The rows of the table, the header first.
+    /// The rows of the table, the header first. If the table would have more than [`MOST_ENTRIES`], it has a row for each
+    /// cell instead.
     fn rows(&self) -> Vec<Vec<String>> {
+        if self.conditions.len().saturating_mul(self.policies.len()) > MOST_ENTRIES {
+            let header = ["condition", "policy", "success, % [95 %]"].map(str::to_owned).to_vec();
+            let row = |&(condition, policy): &(usize, usize)| {
+                vec![self.conditions[condition].clone(), self.policies[policy].to_owned(), self.cell(condition, policy)]
+            };
+            return std::iter::once(header).chain(self.cells.keys().map(row)).collect();
+        }
         let header = std::iter::once("success, % [95 %]").chain(self.policies.iter().copied()).map(str::to_owned);
         let row = |(condition, name): (usize, &String)| {
             let cells = (0..self.policies.len()).map(|policy| self.cell(condition, policy));
@@ -328,6 +340,24 @@ mod tests {
         let markdown = Format::Markdown.write(&results);
         assert!(markdown.contains("| condition 0, seed 0 | 90.0 [60, 98] | – |\n"), "a row of the first cells");
         assert!(start.elapsed() < Duration::from_secs(10), "{:?}", start.elapsed());
+    }
+
+    #[test]
+    fn table_of_many_conditions_and_policies_has_a_row_for_each_cell() {
+        let small = results();
+        let row = |index: usize| StudyRow {
+            condition: format!("condition {index}"),
+            policy: format!("policy {index}"),
+            image_distance: Some(1.0),
+            ..small.rows[0].clone()
+        };
+        let results = StudyResults { rows: (0..10_000).map(row).collect(), ..small.clone() };
+        for format in [Format::Latex, Format::Markdown] {
+            let table = format.write(&results);
+            assert!(table.len() < 8_000_000 && table.contains("condition 9999"), "{} bytes", table.len());
+        }
+        let markdown = Format::Markdown.write(&results);
+        assert!(markdown.contains("| condition 7 | policy 7 | 90.0 [60, 98] |\n"), "a row for each cell");
     }
 
     #[test]

@@ -93,12 +93,12 @@ fn recipes_are_listed_and_checked_before_they_run() {
         swm.fails(&["train", "--recipe", "bad.toml", "-o", "bad"], code, parts);
         assert!(!swm.path("bad").exists(), "{to}");
     };
-    refused("episodes = 12", "episode = 12", 2, &["[[collect]] 'rooms'", "--episodes"]);
+    refused("episodes = 12", "episode = 12", 2, &["[[collect]] 'rooms' of the recipe (line ", "--episodes"]);
     refused("budget = 10", "budget = \"ten\"", 2, &["[[eval]] 'found'", "ten"]);
     refused("steps = 2", "setps = 2", 2, &["did you mean"]);
     refused("model = \"lewm\"", "model = \"lwem\"", 2, &["did you mean lewm"]);
     refused("name = \"small\"", "name = \"../small\"", 2, &["'../small'"]);
-    refused("name = \"small\"", "name = \"rooms\"", 2, &["two steps have the name 'rooms'"]);
+    refused("name = \"small\"", "name = \"rooms\"", 2, &["two steps have the name 'rooms' (line "]);
     refused("image = 32", "output = \"/tmp/x\"", 2, &["'output', which a recipe may not"]);
     refused("image = 32", "\"output=/tmp/x\" = 1", 2, &["which is no option"]);
     refused("policies = [\"small\"]", "policies = [\"--trust\"]\ntrust = true", 2, &["'trust'"]);

@@ -24,7 +24,7 @@ impl Datasets {
     pub fn parse(at: &str, tables: Value) -> Result<Self> {
         let text = |text: &str| Value::String(text.to_owned());
         let table = Table::from_iter([("summary".to_owned(), text("datasets")), ("collect".to_owned(), tables)]);
-        let steps = Recipe::parse(at, &table.to_string())?;
+        let steps = Recipe::parse_part(at, &table.to_string())?;
         for step in &steps.collect {
             let arguments = steps.arguments(Kind::Collect, step, Path::new("datasets"));
             parse::<CollectArgs>(Kind::Collect, step, &arguments)?;

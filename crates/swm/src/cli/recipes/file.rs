@@ -3,6 +3,7 @@
 //! A step is a table of options of `swm collect`, `swm train` or `swm eval`, without their dashes. `name` names its output;
 //! options of later steps refer to it. `hash` is the expected hash of a dataset or of weights.
 
+use super::lines::Lines;
 use crate::cli::train::TrainArgs;
 use clap::{Args, Parser};
 use serde::{Deserialize, Serialize};
@@ -53,6 +54,9 @@ pub struct Step {
     /// Arguments and options of the command.
     #[serde(flatten)]
     pub options: BTreeMap<String, Value>,
+    /// Where the step is in its file.
+    #[serde(skip)]
+    pub lines: Lines,
 }
 
 /// The command of a step.
@@ -114,14 +118,30 @@ impl Step {
 }
 
 impl Recipe {
-    /// Reads a recipe. `what` names it in errors.
+    /// Reads the file of a recipe. `what` names it in errors, with the line.
     ///
     /// # Errors
     /// When the text is not a recipe, a name is used twice or is not a plain file name, or an option is reserved.
     pub fn parse(what: &str, text: &str) -> Result<Self> {
+        Self::parse_with(what, text, true)
+    }
+
+    /// Reads a recipe whose text is a part of another file, so that its lines say nothing.
+    ///
+    /// # Errors
+    /// As [`Recipe::parse`].
+    pub fn parse_part(what: &str, text: &str) -> Result<Self> {
+        Self::parse_with(what, text, false)
+    }
+
+    fn parse_with(what: &str, text: &str, has_lines: bool) -> Result<Self> {
         let invalid =
             |problem: String| Error::config(format!("recipe {what}"), problem, "docs/zoo.md describes recipes");
-        let recipe: Self = toml::from_str(text).map_err(|error| invalid(error.to_string()))?;
+        let mut recipe: Self = toml::from_str(text).map_err(|error| invalid(error.to_string()))?;
+        let parts = [("collect", &mut recipe.collect), ("train", &mut recipe.train), ("eval", &mut recipe.eval)];
+        for (kind, steps) in parts.into_iter().filter(|_| has_lines) {
+            steps.iter_mut().zip(Lines::of(text, kind)).for_each(|(step, lines)| step.lines = lines);
+        }
         let count = recipe.steps().count();
         if count > MAX_STEPS {
             return Err(invalid(format!("it has {count} steps, and at most {MAX_STEPS} are allowed")));
@@ -131,6 +151,10 @@ impl Recipe {
             let name = step.name.as_str();
             let is_plain = name.starts_with(|c: char| c.is_ascii_alphanumeric())
                 && name.chars().all(|c| c.is_ascii_alphanumeric() || "-_".contains(c));
+            let invalid = |problem: String| {
+                let line = step.lines.of_problem(&problem);
+                invalid(problem + &line)
+            };
             if !is_plain || name.len() > 64 {
                 return Err(invalid(format!("the name '{name}' has other characters than letters, digits, - and _")));
             }
@@ -305,7 +329,7 @@ pub fn parse<T: Args>(kind: Kind, step: &Step, arguments: &[String]) -> Result<T
         let lines: Vec<&str> = text.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
         let problem =
             lines.iter().take_while(|line| !line.starts_with("Usage")).copied().collect::<Vec<_>>().join("; ");
-        let what = format!("[[{}]] '{}' of the recipe", kind.name(), step.name);
+        let what = format!("[[{}]] '{}' of the recipe{}", kind.name(), step.name, step.lines.of_problem(&problem));
         Error::config(what, problem, format!("`swm {} --help` lists the options", kind.name()))
     })
 }

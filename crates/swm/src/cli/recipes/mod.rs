@@ -2,10 +2,11 @@
 
 mod datasets;
 mod file;
+mod lines;
 mod run;
 
 pub use datasets::Datasets;
-pub use run::{RecipeRun, run};
+pub use run::{RecipeRun, pretrained_weights, run};
 
 use super::{emit, emit_json, table};
 use clap::Args;

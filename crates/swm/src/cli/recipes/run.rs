@@ -135,8 +135,10 @@ pub fn check(recipe: &Recipe, folder: &Path) -> Result<()> {
             // Its hint lists names.
             Error::UnknownName { .. } => error,
             error => {
-                let what = format!("[[{}]] '{}' of the recipe", kind.name(), step.name);
-                Error::config(what, error.to_string(), "correct its options")
+                let problem = error.to_string();
+                let line = step.lines.of_problem(&problem);
+                let what = format!("[[{}]] '{}' of the recipe{line}", kind.name(), step.name);
+                Error::config(what, problem, "correct its options")
             }
         })?;
     }
@@ -152,9 +154,7 @@ fn check_weights(recipe: &Recipe, request: &RecipeRun<'_>, origin: &Origin) -> R
     for step in &recipe.train {
         let arguments = recipe.arguments(Kind::Train, step, request.output);
         let config = parse::<TrainArgs>(Kind::Train, step, &arguments)?.config()?.to_json();
-        let mut found = vec![];
-        weights("", &config, &mut found);
-        for (key, from) in found {
+        for (key, from) in pretrained_weights(&config) {
             let own = format!("{}.{key}=", step.name);
             // What is no file is looked for on the hub of models, but the weights of an earlier step are made later.
             let is_made =
@@ -169,6 +169,13 @@ fn check_weights(recipe: &Recipe, request: &RecipeRun<'_>, origin: &Origin) -> R
         }
     }
     Ok(())
+}
+
+/// Returns the dotted keys of the pretrained weights in a configuration, with their values.
+pub fn pretrained_weights(config: &Value) -> Vec<(String, String)> {
+    let mut found = vec![];
+    weights("", config, &mut found);
+    found
 }
 
 /// Appends the dotted keys of all texts named `weights` in a configuration, with their values, to `found`.

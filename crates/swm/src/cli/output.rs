@@ -7,8 +7,9 @@
 use comfy_table::{Attribute, Cell, Color};
 use std::borrow::Cow;
 use std::fmt::Write as _;
+use std::hash::{BuildHasher as _, Hasher as _, RandomState};
 use std::io::{Error, ErrorKind, IsTerminal, Write};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, OnceLock, PoisonError};
 use swm_core::text::printable;
 
 /// The first failure of a write to standard output.
@@ -16,7 +17,19 @@ static FAILURE: Mutex<Option<Error>> = Mutex::new(None);
 
 /// Prints to standard output.
 pub fn emit(text: &str) {
-    write_out(&printable(text));
+    write_out(&with_escapes(&printable(text)));
+}
+
+/// What stands for the escape character of a terminal in the texts of [`table`], until they are printed. Names in other texts
+/// cannot contain it: it has a number that is drawn when the program starts.
+fn escape() -> &'static str {
+    static ESCAPE: OnceLock<String> = OnceLock::new();
+    ESCAPE.get_or_init(|| format!("<{:016x}>", RandomState::new().build_hasher().finish()))
+}
+
+/// Puts the escape characters of tables in their places.
+fn with_escapes(text: &str) -> Cow<'_, str> {
+    if text.contains(escape()) { Cow::Owned(text.replace(escape(), "\x1b")) } else { Cow::Borrowed(text) }
 }
 
 /// Prints one JSON document to standard output. JSON has its own escapes for control characters.
@@ -100,7 +113,8 @@ pub fn table(header: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> St
             }
         }));
     }
-    format!("{table}\n")
+    // All cells are escaped, so that every escape character is one of the table.
+    format!("{table}\n").replace('\x1b', escape())
 }
 
 /// How a cell stands out.
@@ -128,6 +142,8 @@ mod tests {
     fn tables_of_pipes_have_no_colours() {
         assert_eq!(emphasis("lower"), Some(Emphasis::Colour(Color::Red)));
         assert_eq!((emphasis("–"), emphasis("lower than")), (Some(Emphasis::Dim), None));
+        assert_eq!(with_escapes(&printable(&format!("a{}[1mb", escape()))), "a\x1b[1mb");
+        assert!(!with_escapes(&printable("a\x1b[1mb")).contains('\x1b'));
         let file = std::fs::File::open("/dev/null").expect("a file");
         assert!(!is_coloured(&file));
     }

@@ -2,7 +2,8 @@
 
     python benches/bench_pool.py [--swm PATH] [--pairs 3]
 
-Both sides step with random actions, in turns; the ratio is the median over the pairs of turns.
+Both sides step with random actions, in turns; the ratio is the median over the pairs of turns. The cost of a call is what
+`world.step(1)` takes more than one of the steps of `world.step(1000)`, which the engine takes without Python.
 """
 
 import argparse
@@ -32,6 +33,25 @@ def python(env: str, envs: int, side: int | None, seconds: float, chunk: int) ->
     return steps / (time.perf_counter() - begun)
 
 
+def call_cost(env: str, envs: int, side: int | None, turns: int = 15, steps: int = 1000) -> tuple[float, float]:
+    """The median seconds of a call of `World.step` over the engine's step, and of that step."""
+    shape = None if side is None else (side, side)
+    world = swm.World(env, num_envs=envs, image_shape=shape, add_pixels=side is not None, max_episode_steps=EPISODE)
+    world.set_policy(swm.policy.RandomPolicy())
+    world.reset(seed=0)
+    world.step(200)
+    costs, engine = [], []
+    for _ in range(turns):
+        begun = time.perf_counter()
+        for _ in range(steps):
+            world.step(1)
+        between = time.perf_counter()
+        world.step(steps)
+        engine.append((time.perf_counter() - between) / steps)
+        costs.append((between - begun) / steps - engine[-1])
+    return statistics.median(costs), statistics.median(engine)
+
+
 def command(program: str, env: str, envs: int, side: int | None) -> float:
     words = [program, "--json", "bench", "envs", env, "--num-envs", str(envs), "--pairs", "1", "--episodes", "0"]
     words += ["--episode-steps", str(EPISODE), "--sizes", str(side or 64)]
@@ -47,6 +67,10 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=3.0)
     parser.add_argument("--chunk", type=int, default=1, help="steps in one call")
     given = parser.parse_args()
+    for env, envs, side in [("swm/TwoRoom-v1", 8, None), *CASES]:
+        cost, engine = call_cost(env, envs, side)
+        size = f"{side} px" if side else "no frames"
+        print(f"{env}, {envs} environments, {size}: a call costs {1e6 * cost:.1f} us over the engine's {1e6 * engine:.1f} us")
     for env, envs, side in CASES:
         rates, command_rates = [], []
         for _ in range(given.pairs):

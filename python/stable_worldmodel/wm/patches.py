@@ -5,7 +5,7 @@ Shapes: B clips, T frames, P patches of a frame, D features of a patch.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
@@ -76,8 +76,10 @@ class PatchEncoder(Pretrained):
             return encoder.patches(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])  # type: ignore[no-any-return]
         output = self._encoded(frames.flatten(0, 1))
         hidden = getattr(output, "last_hidden_state", None)
-        # The first token stands for the whole image.
-        patches = output.logits.unsqueeze(1) if hidden is None else hidden[:, 1:]
+        if hidden is None:
+            patches = output.logits.unsqueeze(1)
+        else:
+            patches = hidden[:, _other_tokens(encoder, frames.shape[-2:], hidden.shape[1]) :]
         return patches.unflatten(0, frames.shape[:2])  # type: ignore[no-any-return]
 
     def _video_patches(self, frames: Tensor) -> Tensor:
@@ -87,3 +89,19 @@ class PatchEncoder(Pretrained):
             torch.cat([frames[:, : t + 1], frames[:, t : t + 1].expand(-1, steps - t - 1, -1, -1, -1)], 1) for t in range(steps)
         ]
         return torch.stack([self._encoded(video).last_hidden_state for video in videos], 1)
+
+
+def _other_tokens(encoder: Any, size: Sequence[int], tokens: int) -> int:
+    """The number of tokens before those of the patches: of the whole image and registers, or none.
+
+    Args:
+        encoder: The encoder; one whose `config` has no `patch_size` has one such token.
+        size: Height and width of the frames.
+        tokens: All tokens of a frame.
+    """
+    patch = getattr(getattr(encoder, "config", None), "patch_size", None)
+    if patch is None:
+        return 1
+    height, width = (patch, patch) if isinstance(patch, int) else patch
+    others = tokens - (size[0] // height) * (size[1] // width)
+    return others if 0 <= others < tokens else 1

@@ -55,7 +55,7 @@ def create_backbone(name: str) -> nn.Module:
 
     Args:
         name: A key of `BACKBONES`, or a name on the Hugging Face hub. The classifier of a ResNet is replaced by a layer
-            normalisation, so that its `logits` are features.
+            normalisation, so that its `logits` are features. A masked autoencoder encodes all patches, in their order.
     """
     try:
         import transformers
@@ -68,8 +68,16 @@ def create_backbone(name: str) -> nn.Module:
         network.classifier[1] = nn.LayerNorm(network.config.hidden_sizes[-1])
         return network  # type: ignore[no-any-return]
     network = transformers.AutoModel.from_pretrained(name)
+    if hasattr(getattr(network, "embeddings", None), "random_masking"):
+        network.embeddings.random_masking = _unmasked
     # Models of images and texts have an encoder for each.
     return getattr(network, "vision_model", network)  # type: ignore[no-any-return]
+
+
+def _unmasked(sequence: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    """The masking of a masked autoencoder that keeps all patches `(B, P, D)`: the patches, the mask, and their order."""
+    order = torch.arange(sequence.shape[1], device=sequence.device).expand(len(sequence), -1)
+    return sequence, torch.zeros_like(order, dtype=sequence.dtype), order
 
 
 class Embedder(nn.Module):

@@ -187,8 +187,8 @@ impl Cli {
 }
 
 /// The global options and the interrupt flag, for long-running commands.
-pub struct Context {
 #[derive(Clone)]
+pub struct Context {
     /// Whether to print JSON.
     pub json: bool,
     /// The thread budget of environments, decoders and matrix products; 0 for one thread per core.

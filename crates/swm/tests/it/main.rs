@@ -23,9 +23,9 @@ mod recipes;
 mod study;
 mod study_shipped;
 mod terminal;
+mod trackers;
 mod trust;
 mod zoo;
-mod trackers;
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

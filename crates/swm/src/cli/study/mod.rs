@@ -12,15 +12,15 @@ mod file;
 mod online;
 mod published;
 mod report;
-mod shipped;
 mod resume;
+mod shipped;
 mod tables;
 mod variants;
 
 use super::config::count;
 use super::eval::run_options;
-use super::progress::control;
 use super::on_ray::{OnRayArgs, Request};
+use super::progress::control;
 use super::recipes::Datasets;
 use super::results_tables::{compared, percent};
 use super::{Context, emit, emit_json, table};
@@ -56,12 +56,12 @@ enum StudyCommand {
     /// program. An interrupted study continues.
     #[command(after_help = "Example: swm study run paper/factors --output factors episodes=20")]
     Run(RunArgs),
-    /// Write the hash of a study before its first result
     /// Evaluate the cells that a study's folder lacks
     ///
     /// The folder is all that is needed: it may come from another machine.
     #[command(after_help = "Example: swm study resume factors")]
     Resume(resume::ResumeArgs),
+    /// Write the hash of a study before its first result
     ///
     /// The hash covers the question, all cells with the hashes of their datasets and weights, and the families. Publish it: the
     /// page of the study says whether it still is the registered one.
@@ -128,17 +128,17 @@ struct RunArgs {
     /// intervals are confidence sequences then.
     #[arg(long, value_name = "RULE")]
     until: Option<Until>,
-}
     #[command(flatten)]
     on: OnRayArgs,
+}
 
 /// Runs `swm study`.
 pub fn study(args: &StudyArgs, json: bool, context: impl FnOnce() -> Result<Context>) -> anyhow::Result<()> {
     match &args.command {
         StudyCommand::List => list(json),
         StudyCommand::Run(args) => run(args, false, &context()?),
-        StudyCommand::Register(args) => run(args, true, &context()?),
         StudyCommand::Resume(args) => resume::run(args, &context()?),
+        StudyCommand::Register(args) => run(args, true, &context()?),
         StudyCommand::Break(args) => breaking::run(args, &context()?),
         StudyCommand::Status { folder } => {
             let folder = StudyFolder::new(folder);
@@ -242,10 +242,10 @@ pub(super) fn single(
 fn run(args: &RunArgs, only_register: bool, context: &Context) -> anyhow::Result<()> {
     let size = if args.small { Size::Small } else { Size::Paper };
     let (file, origin) = shipped::find(&args.study, size, args.trust)?;
-    let file = match file {
     if only_register || matches!(file, AnyFile::Table(_)) {
         args.on.refuse(&[("--on", args.on.is_given())], "remove it: only evaluations run on a cluster")?;
     }
+    let file = match file {
         AnyFile::Evaluations(file) => file,
         AnyFile::Table(_) if only_register => {
             let fix = "register a study of evaluations";
@@ -272,7 +272,6 @@ fn run(args: &RunArgs, only_register: bool, context: &Context) -> anyhow::Result
     let mut study: Study = expand::study(&file, &args.settings, &resolver, &mut control(context))?;
     study.arguments = args.arguments();
     study = with_rule(study, args.until)?;
-    let folder = StudyFolder::new(output);
     if args.on.is_given() {
         args.on.refuse(&[("--until", args.until.is_some())], "remove it, or run the study without --on")?;
         let output = output.to_string_lossy();
@@ -281,6 +280,7 @@ fn run(args: &RunArgs, only_register: bool, context: &Context) -> anyhow::Result
         let replaced = &["-o", "--output"];
         return args.on.submit(&Request { kind: "study", output: &output, replaced, cells }, context.json);
     }
+    let folder = StudyFolder::new(output);
     if only_register {
         let (_lock, hash) = folder.register(&study)?;
         if context.json {

@@ -48,10 +48,10 @@ pub struct Invocation {
     pub os: String,
     /// Versions of third-party assets that are installed, such as MuJoCo.
     pub assets: BTreeMap<String, String>,
-}
     /// The datasets and checkpoints of the hub that were read, with their commits.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub hub: Vec<String>,
+}
 
 /// Remembers the arguments of the command that runs. An embedding program runs several, one after the other.
 pub fn remember(arguments: &[OsString]) {
@@ -116,6 +116,7 @@ impl Invocation {
             cpu: format!("{}{cpu}, {threads} threads", cpu_level()),
             os: system(),
             assets: assets.collect(),
+            hub: crate::home::pinned_uris(),
         }
     }
 }
@@ -125,7 +126,6 @@ fn commit() -> Option<String> {
     let mut git = Command::new("git");
     git.args(["describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]).stdin(Stdio::null());
     let output = git.output().ok().filter(|output| output.status.success())?;
-            hub: crate::home::pinned_uris(),
     Some(String::from_utf8_lossy(&output.stdout).trim().to_owned())
 }
 

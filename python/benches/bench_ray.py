@@ -7,6 +7,7 @@
 - `cost`: what a cell costs: the process of a command, records in the store, an episode of Push-T and its bytes.
 - `requests`: the requests to an S3 server that shards and their commit make.
 - `commit`: the commit of shards that 1,000 writers left, of which each has one episode.
+- `limits`: what 1,000 workers do with these costs, as the table of `docs/ray.md`.
 
 A real cluster of a head and three nodes (`ray.cluster_utils`); an S3 server on loopback where a store is measured.
 """
@@ -166,12 +167,49 @@ def requests(shards: int = 20) -> None:
     server.shutdown()
 
 
+#: What the other parts measured, in seconds, bytes, requests and cells a second, and a store that answers a request in 20 ms.
+COSTS = {
+    "start": 0.12,
+    "episode": 0.092,
+    "bytes": 0.31e6,
+    "shard_requests": 7,
+    "records": 2,
+    # One write in sequence, and ten reads and deletions of which 64 run at a time.
+    "commit_requests": 1 + 10 / 64,
+    "driver": 213,
+    "latency": 0.02,
+}
+
+
+def limits(costs: dict[str, float]) -> None:
+    """Prints what 1,000 workers do, computed from measured costs."""
+    workers, shard, episodes = 1000, 50, 1_000_000
+    seconds = costs["start"] + shard * costs["episode"] + (costs["shard_requests"] + costs["records"]) * costs["latency"]
+    cells, shards = workers / seconds, episodes / shard
+    rows = [
+        ("a cell of 50 episodes", f"{seconds:.1f} s"),
+        ("episodes an hour", f"{3600 * shard * cells:,.0f}"),
+        ("cells a second (the driver can start)", f"{cells:.0f} ({costs['driver']:.0f})"),
+        ("bytes to the store", f"{shard * cells * costs['bytes'] / 1e9:.2f} GB/s"),
+        ("requests to the store", f"{cells * (costs['shard_requests'] + costs['records']):.0f} a second"),
+        ("1,000,000 episodes are collected in", f"{shards / cells / 60:.0f} min"),
+        (
+            f"and their {shards:,.0f} shards committed in",
+            f"{shards * costs['commit_requests'] * costs['latency'] / 60:.0f} min",
+        ),
+    ]
+    for what, value in rows:
+        print(f"| {what} | {value} |")
+
+
 def main() -> None:
     """Runs the measurements that are named, or all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("parts", nargs="*", default=["cells", "queue", "cost", "requests", "commit"])
     parser.add_argument("--number", type=int, default=10_000, help="cells in the queue")
     parser.add_argument("--writers", type=int, default=1000, help="shards of the commit")
+    for name, value in COSTS.items():
+        parser.add_argument(f"--{name.replace('_', '-')}", type=float, default=value, help="a cost for `limits`")
     given = parser.parse_args()
     parts = {
         "cells": cells,
@@ -179,6 +217,7 @@ def main() -> None:
         "cost": cost,
         "requests": requests,
         "commit": lambda: commit(given.writers),
+        "limits": lambda: limits({name: getattr(given, name) for name in COSTS}),
     }
     for part in given.parts:
         parts[part]()

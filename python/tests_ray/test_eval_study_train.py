@@ -87,6 +87,8 @@ def test_a_sweep_has_the_weights_of_single_trainings(cluster, s3, rooms, tmp_pat
         printed("train", "lewm", "--data", path, "--preset", "tiny", "-o", one, *settings, f"seed={seed}")
         weights = "checkpoint/weights.safetensors"
         assert Folder(f"{output}/seed={seed}").read(weights) == (one / weights).read_bytes()
+    refused = swm("checkpoints", "remove", f"{output}/seed=0", "--yes")
+    assert refused.returncode == 2 and "is a URI, of which this machine has a copy only" in refused.stderr
     # Commands read checkpoints from where the cluster wrote them.
     assert printed("checkpoints", "show", f"{output}/seed=1") == printed("checkpoints", "show", tmp_path / "seed-1") | {
         key: value for key, value in printed("checkpoints", "show", f"{output}/seed=1").items() if key in ("path", "name")

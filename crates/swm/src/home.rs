@@ -1,7 +1,7 @@
 //! Folders of named datasets and checkpoints: `$STABLEWM_HOME` (default `~/.stable_worldmodel`) with `datasets/`,
 //! `checkpoints/`, `weights/` and `hub/`, the cache of `hf://` URIs.
 
-use crate::zoo;
+use crate::{remote_checkpoint, zoo};
 use std::iter::once;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
@@ -142,6 +142,9 @@ pub fn checkpoint(given: &str) -> Result<PathBuf> {
     if HubUri::is_uri(given) {
         return checkpoint_in(pull(given, RepoKind::Model)?.0);
     }
+    if given.contains("://") {
+        return remote_checkpoint::fetch(given);
+    }
     match given.strip_prefix(zoo::PREFIX) {
         Some(name) => zoo::find(name),
         None => named(given, checkpoints, ""),
@@ -155,6 +158,10 @@ pub fn checkpoint(given: &str) -> Result<PathBuf> {
 pub fn new_checkpoint(given: &str) -> Result<PathBuf> {
     check_name("checkpoint", given)?;
     check_not_on_hub(given)?;
+    if given.contains("://") {
+        let fix = "write it to a name or a path; `swm train --on ray` stores runs at URIs (docs/ray.md)";
+        return Err(Error::config(given, "is a URI, and a checkpoint is written to a folder", fix));
+    }
     named(given, checkpoints, "")
 }
 
@@ -220,6 +227,18 @@ pub fn find_checkpoint(given: &str) -> Result<PathBuf> {
     }
     check_no_pointer(&path)?;
     Ok(path)
+}
+
+/// As [`find_checkpoint`], for a checkpoint that is changed: one on this machine.
+///
+/// # Errors
+/// As [`find_checkpoint`], and when it is a URI.
+pub fn own_checkpoint(given: &str) -> Result<PathBuf> {
+    if given.contains("://") {
+        let fix = "name a checkpoint on this machine; a run on Ray is continued by the command that began it";
+        return Err(Error::config(given, "is a URI, of which this machine has a copy only", fix));
+    }
+    find_checkpoint(given)
 }
 
 /// Returns an error for an empty name: the path that it stands for is the folder of all names.

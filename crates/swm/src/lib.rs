@@ -23,6 +23,7 @@ pub mod home;
 pub mod leaderboard;
 mod library;
 mod metadata;
+mod remote_checkpoint;
 pub mod resolver;
 pub mod subject;
 pub mod zoo;

@@ -271,7 +271,7 @@ fn export(given: &str, folder: &Path, format: Option<ExportFormat>, as_json: boo
 }
 
 fn remove(given: &str, yes: bool, as_json: bool) -> anyhow::Result<()> {
-    let path = home::find_checkpoint(given)?;
+    let path = home::own_checkpoint(given)?;
     if given.starts_with(zoo::PREFIX) {
         let problem = format!("it is the capsule {} of the zoo", path.display());
         anyhow::bail!(Error::config(given, problem, "delete the file by hand"));

@@ -191,7 +191,7 @@ impl TrainArgs {
         let Some(output) = &self.output else {
             return Err(Error::config("--resume", "neither a model nor a run is given", "name the run with --output"));
         };
-        let folder = home::find_checkpoint(output)?;
+        let folder = home::own_checkpoint(output)?;
         let path = folder.join(run_record::FILE);
         let record = run_record::read(&folder)?;
         let started = record.first().and_then(|(cli, from)| Some((cli.into_train()?, from)));

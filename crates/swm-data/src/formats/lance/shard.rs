@@ -213,17 +213,18 @@ impl Logs {
     /// Reads these files.
     fn of(store: &Store, listed: &[ObjectMeta]) -> Result<Self> {
         let mut logs = Self::default();
-        for file in listed {
+        let contents = store.read_all(listed.iter().map(|file| file.location.clone()).collect())?;
+        for (file, content) in listed.iter().zip(contents) {
             let mut components =
                 file.location.parts().map(|component| component.as_ref().to_owned()).collect::<Vec<_>>().into_iter();
             let (Some(name), Some(folder)) = (components.next_back(), components.next_back()) else { continue };
             let Some(shard) = Shard::parse(&folder) else { continue };
             let shard_log = logs.shards.entry((shard.count, shard.index)).or_default();
             match name.as_str() {
-                "begun.json" => shard_log.begun = Some(parse(store, &file.location)?),
-                "done.json" => shard_log.done = Some(parse(store, &file.location)?),
+                "begun.json" => shard_log.begun = Some(parse(store, &file.location, &content)?),
+                "done.json" => shard_log.done = Some(parse(store, &file.location, &content)?),
                 // Files are listed by name, so groups are in order.
-                _ => shard_log.groups.push(parse(store, &file.location)?),
+                _ => shard_log.groups.push(parse(store, &file.location, &content)?),
             }
         }
         Ok(logs)
@@ -245,9 +246,7 @@ impl Logs {
 
     /// Removes the logs but not the data files.
     fn remove(&self, store: &Store) {
-        for file in store.list("_shards").unwrap_or_default() {
-            store.remove(&file.location);
-        }
+        store.remove_all(store.list("_shards").unwrap_or_default().into_iter().map(|file| file.location).collect());
     }
 
     /// All shards in order, if they are complete and have the same columns.
@@ -304,8 +303,8 @@ impl ShardLogFiles {
     }
 }
 
-fn parse<T: DeserializeOwned>(store: &Store, path: &StorePath) -> Result<T> {
-    serde_json::from_slice(&store.read(path)?).map_err(|e| damaged(&store.label, format!("{path} is unreadable: {e}")))
+fn parse<T: DeserializeOwned>(store: &Store, path: &StorePath, content: &[u8]) -> Result<T> {
+    serde_json::from_slice(content).map_err(|e| damaged(&store.label, format!("{path} is unreadable: {e}")))
 }
 
 /// The existing shards with their manifests, in order. Shards without a manifest are skipped.
@@ -399,7 +398,7 @@ fn commit_logged(store: &Store) -> Result<usize> {
         let fresh = new_table_schema(&schema::columns_to_write(&begun.columns)?, &begun.columns, &options)?;
         let stored = version.as_ref().and_then(|old| schema::manifest(&old.manifest.schema));
         if let (Some(old), Some(manifest)) = (&version, &begun.manifest) {
-            check_adds(&store, &LanceReader::of(store.clone(), Arc::clone(&old.manifest))?, manifest)?;
+            check_adds(store, &LanceReader::of(store.clone(), Arc::clone(&old.manifest))?, manifest)?;
         }
         let mut table = Table::new(store.clone(), version.clone(), fresh);
         let mut next = if version.is_some() { table.refresh()? } else { 0 };

@@ -5,7 +5,7 @@ use super::{ENTRY, manifest_file};
 use crate::dataset::{Location, objects};
 use arrow_schema::Schema as ArrowSchema;
 use bytes::Bytes;
-use futures::TryStreamExt as _;
+use futures::{StreamExt as _, TryStreamExt as _};
 use lance_core::cache::LanceCache;
 use lance_encoding::decoder::DecoderPlugins;
 use lance_file::reader::{FileReader, FileReaderOptions};
@@ -359,11 +359,11 @@ impl Store {
         Ok(files)
     }
 
-    /// Reads a whole file.
+    /// Reads whole files, several at the same time, in the given order.
     ///
     /// # Errors
     /// If the file does not exist or reading fails.
-    pub fn read(&self, path: &StorePath) -> Result<Bytes> {
+    pub fn read_all(&self, paths: Vec<StorePath>) -> Result<Vec<Bytes>> {
         if !self.remote {
             check_regular(&self.local(path))?;
         }

@@ -365,10 +365,14 @@ impl Store {
     /// If the file does not exist or reading fails.
     pub fn read_all(&self, paths: Vec<StorePath>) -> Result<Vec<Bytes>> {
         if !self.remote {
-            check_regular(&self.local(path))?;
+            paths.iter().try_for_each(|path| check_regular(&self.local(path)))?;
         }
-        let (objects, path) = (Arc::clone(&self.objects), path.clone());
-        block_on(&self.label, "reading a file", async move { Ok(objects.inner.get(&path).await?.bytes().await?) })
+        let objects = Arc::clone(&self.objects);
+        let read = move |path: StorePath| {
+            let objects = Arc::clone(&objects);
+            async move { Ok::<_, lance_core::Error>(objects.inner.get(&path).await?.bytes().await?) }
+        };
+        block_on(&self.label, "reading files", futures::stream::iter(paths).map(read).buffered(REQUESTS).try_collect())
     }
 
     /// Writes a whole file, which becomes visible when it is complete.
@@ -404,6 +408,26 @@ impl Store {
         let removed = block_on(&self.label, "removing a file", async move { objects.delete(&removed_path).await });
         if let Err(error) = removed {
             tracing::warn!(file = %path, "an unused file of the dataset could not be removed: {error}");
+        }
+    }
+
+    /// Removes files that are no longer used, several at the same time. As [`Store::remove`], it ignores failures.
+    pub fn remove_all(&self, paths: Vec<StorePath>) {
+        let objects = Arc::clone(&self.objects);
+        let remove = move |path: StorePath| {
+            let objects = Arc::clone(&objects);
+            async move {
+                if let Err(error) = objects.delete(&path).await {
+                    tracing::warn!(file = %path, "an unused file of the dataset could not be removed: {error}");
+                }
+            }
+        };
+        let all = async move {
+            futures::stream::iter(paths).for_each_concurrent(REQUESTS, remove).await;
+            Ok(())
+        };
+        if let Err(error) = block_on(&self.label, "removing files", all) {
+            tracing::warn!("unused files of the dataset could not be removed: {error}");
         }
     }
 

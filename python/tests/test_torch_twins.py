@@ -84,6 +84,7 @@ ACTING = [
     ("gcbc", {"model__encoder": CONV}),
     ("gcbc", {"model__encoder": VIT, "model__history": 2, "data__num_steps": 2}),
     ("gcivl", {"model__head__depth": 4}),
+    ("gcivl", {"model__metric": 6, "model__history": 2, "data__num_steps": 3}),
     ("gciql", {"model__encoder": CONV}),
 ]
 

@@ -39,7 +39,7 @@ class Losses:
     """
 
     #: The names of the losses, the one to minimise first.
-    names: ClassVar[tuple[str, ...]] = ("loss",)
+    names: tuple[str, ...] = ("loss",)
     #: Whether every rank computes the losses of the whole batch; otherwise those of its slice.
     whole_batch: ClassVar[bool] = False
 
@@ -141,17 +141,25 @@ def _windows(x: Tensor, history: int, offset: int) -> Tensor:
 
 
 class LeWMLosses(Joint):
-    """LeWM: SIGReg (Maes et al., 2026)."""
+    """LeWM: SIGReg (Maes et al., 2026), and optionally straight paths of latents."""
 
-    names = ("loss", "prediction", "sigreg")
+    names: tuple[str, ...] = ("loss", "prediction", "sigreg")
 
     def compile(self, compiled: Callable[[Any], Any]) -> None:
         super().compile(compiled)
+        #: The weight of straight paths.
+        self.straight = float(self.settings.get("temp_straight", 0.0))
+        if self.straight:
+            self.names = (*self.names, "temp_straight")
         self.sigreg = SIGReg(self.settings["knots"], self.settings["directions"])
 
     def regularise(self, z: Tensor, actions: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         sigreg = self.sigreg.to(z.device)(z.transpose(0, 1))
-        return self.settings["weight"] * sigreg, {"sigreg": sigreg}
+        total, terms = self.settings["weight"] * sigreg, {"sigreg": sigreg}
+        if self.straight:
+            terms["temp_straight"] = TemporalStraighteningLoss()(z)
+            total = total + self.straight * terms["temp_straight"]
+        return total, terms
 
 
 class PLDMLosses(Joint):

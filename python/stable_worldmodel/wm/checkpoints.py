@@ -16,8 +16,8 @@ from ._weights import load_into, read_capsule, read_safetensors
 from .encoders import encoder_of
 from .frames import Frames
 from .gcrl import GCRL
+from .gcrl.module import MetricValuePredictor, QPredictor, WithTarget
 from .gcrl.module import Predictor as Head
-from .gcrl.module import QPredictor, WithTarget
 from .lewm import LeWM
 from .lewm.module import MLP, Embedder, Predictor
 from .pldm import PLDM
@@ -197,11 +197,18 @@ def _gcrl(kind: Callable[..., Any], stored: Stored, weights: Mapping[str, Tensor
         "dropout": sizes["dropout"],
         "emb_dropout": sizes["emb_dropout"],
     }
+    value: Any = None
+    if model.get("metric", 0) > 0:
+        value = WithTarget(MetricValuePredictor, embed_dim=model["metric"], **common)
+        # It is part of published weights, and not used.
+        value.student.pos_embedding_goal.requires_grad_(False)
+    elif family != "gcbc":
+        value = WithTarget(Head, out_dim=1, pool_type="mean", **common)
     critic = {"action_dim": actions, "q_hidden_dim": model.get("critic", 256), "pool_type": "mean"}
     made = kind(
         encoder.requires_grad_(not model["frozen"]),
         Head(out_dim=actions, **common),
-        WithTarget(Head, out_dim=1, pool_type="mean", **common) if family != "gcbc" else None,
+        value,
         WithTarget(QPredictor, **critic, **common) if family == "gciql" else None,
         history_size=model["history"],
     )

@@ -31,6 +31,9 @@ pub struct GcrlConfig {
     /// Hidden features of the critic's head, for families with a critic.
     #[serde(default = "critic")]
     pub critic: usize,
+    /// Dimensions of the space in which the value of GCIVL is a negative distance, as in HILP; 0 for a value that is none.
+    #[serde(default)]
+    pub metric: usize,
 }
 
 /// Returns the published number of hidden features of the critic's head.
@@ -50,6 +53,21 @@ impl GcrlConfig {
         PatchGrid { frames: self.history, patches, dim: self.encoder.patch_dim() }
     }
 
+    /// Checks that the value is no metric, for a family without that option.
+    ///
+    /// # Errors
+    /// When the value is a metric.
+    pub(super) fn check_no_metric(&self, family: &str) -> Result<()> {
+        if self.metric == 0 {
+            return Ok(());
+        }
+        Err(Error::config(
+            "model.metric",
+            format!("{}, but {family} has no value that is a metric", self.metric),
+            "train gcivl, or leave the setting out",
+        ))
+    }
+
     /// Checks the configuration.
     ///
     /// # Errors
@@ -64,6 +82,7 @@ impl GcrlConfig {
             ("model.head.dim_head", dim_head, 1, limits::FEATURES),
             ("model.head.mlp", mlp, 1, limits::FEATURES),
             ("model.critic", self.critic, 1, limits::FEATURES),
+            ("model.metric", self.metric, 0, limits::FEATURES),
         ])?;
         if depth < 3 {
             return Err(Error::config(

@@ -6,7 +6,7 @@
 use super::config::GcrlConfig;
 use super::loss::LOG_STD;
 use super::model::{Gcbc, Gciql, Gcivl};
-use super::train::GoalConditioned;
+use super::train::{GoalConditioned, METRIC_FAMILIES};
 use super::transformer::TransformerConfig;
 use crate::checkpoint::Checkpoint;
 use crate::nn::parameters::{self, HostTensor, Named};
@@ -58,7 +58,8 @@ where
     }
     config.data.frameskip = action_dim / dim;
     config.data.num_steps = config.data.num_steps - config.model.history + sizes.history;
-    config.model = GcrlConfig { weights: path.display().to_string(), ..sizes };
+    let metric = if METRIC_FAMILIES.contains(&M::FAMILY) { sizes.metric } else { 0 };
+    config.model = GcrlConfig { weights: path.display().to_string(), metric, ..sizes };
     config.check()?;
     let init = Init::for_weights(&found.weights, &Device::flex());
     let initial = M::new(&config, &dataset_info, &init)?;
@@ -180,6 +181,7 @@ impl StoredWeights<'_> {
                 emb_dropout: 0.0,
             },
             critic,
+            metric: self.axis_size("value_predictor.student.embed_proj.bias", 0).unwrap_or(0),
         })
     }
 }
@@ -254,6 +256,10 @@ where
         let mut network = class(kind, "mean");
         if kind == "QPredictor" {
             (network["action_dim"], network["q_hidden_dim"]) = (json!(action_dim), json!(sizes.critic));
+        } else if sizes.metric > 0 {
+            network = class("MetricValuePredictor", "attention");
+            network["embed_dim"] = json!(sizes.metric);
+            network.as_object_mut().map(|network| network.remove("pool_type"));
         } else {
             network["out_dim"] = json!(1);
         }
@@ -283,8 +289,9 @@ fn state<M: GoalConditioned>(model: &M, sizes: &GcrlConfig, naming: Naming) -> N
         if let Some(layer) = name.strip_suffix(".0.to_q.weight")
             && let Some(index) = layer.rsplit('.').next().and_then(|index| index.parse::<usize>().ok())
         {
-            let pools = layer.starts_with("action_predictor.") && index + 1 == sizes.head.depth;
-            if pools || index.is_multiple_of(2) {
+            let is_metric = sizes.metric > 0 && layer.starts_with("value_predictor.");
+            let pools = (is_metric || layer.starts_with("action_predictor.")) && index + 1 == sizes.head.depth;
+            if pools || is_metric || index.is_multiple_of(2) {
                 weights.insert(format!("{layer}.0.causal_mask"), mask(if pools { grid.frames } else { keys }));
             }
         }

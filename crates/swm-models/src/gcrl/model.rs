@@ -2,7 +2,7 @@
 //! published parameter names.
 
 use super::config::GcrlConfig;
-use super::heads::{Critic, Head};
+use super::heads::{Critic, Head, ValueHead};
 use super::transformer::Pool;
 use crate::nn::{Backbone, Init, parameters};
 use burn::module::{Module, Param};
@@ -31,7 +31,7 @@ pub struct Gcivl {
     /// The logarithm of the actions' standard deviation.
     pub log_stds: Param<Tensor<1>>,
     /// The value head, which computes the value of a state.
-    pub value_predictor: WithTarget<Head>,
+    pub value_predictor: WithTarget<ValueHead>,
     #[module(skip)]
     pub(super) config: GcrlConfig,
 }
@@ -46,7 +46,7 @@ pub struct Gciql {
     /// The logarithm of the actions' standard deviation.
     pub log_stds: Param<Tensor<1>>,
     /// The value head, which computes the value of a state.
-    pub value_predictor: WithTarget<Head>,
+    pub value_predictor: WithTarget<ValueHead>,
     /// The critic, which computes the value of an action.
     pub critic_predictor: WithTarget<Critic>,
     #[module(skip)]
@@ -100,9 +100,9 @@ impl<'a> Builder<'a> {
         self.init.constant([self.action_dim], 0.0)
     }
 
-    fn value(&self) -> WithTarget<Head> {
+    fn value(&self) -> WithTarget<ValueHead> {
         let init = self.init.of("value_predictor");
-        WithTarget::new(Head::new(&init, &self.config.head, self.config.patch_grid(), Pool::Mean, 1))
+        WithTarget::new(ValueHead::new(&init, &self.config.head, self.config.patch_grid(), self.config.metric))
     }
 
     fn critic(&self) -> WithTarget<Critic> {

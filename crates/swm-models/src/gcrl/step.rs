@@ -4,7 +4,7 @@
 //! respect to values and encoder, so the gradients are those of the two phases of the published algorithms.
 
 use super::cells::CellPass;
-use super::heads::{Critic, Head};
+use super::heads::{Critic, Head, ValueHead};
 use super::loss::{self, ValueLoss};
 use super::model::{Gcbc, Gciql, Gcivl};
 use crate::nn::{Backbone, BatchStatistics, DropoutRng, Named, conv, parameters};
@@ -236,7 +236,7 @@ fn head_inputs<'a>(encoders: &Encoders<'a>, clips: &Clips, relabelled: &Relabell
 ///
 /// # Shapes
 /// Returns `[clips, history, 1]`.
-fn bootstrap(teacher: &Head, inputs: &HeadInputs, relabelled: &Relabelled, settings: &ValueLoss) -> Tensor<3> {
+fn bootstrap(teacher: &ValueHead, inputs: &HeadInputs, relabelled: &Relabelled, settings: &ValueLoss) -> Tensor<3> {
     let next = teacher.forward(&inputs.next, &inputs.goal.clone().inner(), &mut DropoutRng::disabled());
     let not_reached = -relabelled.reached.clone() + 1.0;
     (next * settings.discount - 1.0) * not_reached

@@ -75,6 +75,7 @@ impl Trainable for Gcbc {
 
     fn check(config: &TrainConfig<Self>) -> Result<()> {
         config.model.check()?;
+        config.model.check_no_metric(Self::FAMILY)?;
         check_frames(config.data.num_steps, config.model.history)?;
         goals(&config.loss.goals, GOAL, &config.model).check(&clip(config.data.num_steps, config.data.frameskip))
     }
@@ -123,6 +124,9 @@ impl Trainable for Gcbc {
     }
 }
 
+/// The families whose value may be a metric.
+pub(super) const METRIC_FAMILIES: &[&str] = &["gcivl"];
+
 macro_rules! value_learner {
     ($model:ty, $family:literal, $summary:literal, [$($target:ident),*]) => {
         impl Trainable for $model {
@@ -134,6 +138,9 @@ macro_rules! value_learner {
 
             fn check(config: &TrainConfig<Self>) -> Result<()> {
                 config.model.check()?;
+                if !METRIC_FAMILIES.contains(&Self::FAMILY) {
+                    config.model.check_no_metric(Self::FAMILY)?;
+                }
                 config.loss.check()?;
                 check_frames(config.data.num_steps, config.model.history + 1)?;
                 let clip = clip(config.data.num_steps, config.data.frameskip);

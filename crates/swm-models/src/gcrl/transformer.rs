@@ -35,6 +35,8 @@ pub enum Pool {
     Attention,
     /// The mean of the patches, as published for values.
     Mean,
+    /// As `Attention`, in a transformer that does not attend to a goal: all other layers are among the frames.
+    SelfAttention,
 }
 
 /// The sizes of a transformer's input.
@@ -115,7 +117,8 @@ impl TransformerConfig {
         let layer = |index| {
             let init = init.of("layer").at(index);
             let role = match pool {
-                Pool::Attention if index + 1 == self.depth => Role::Pool,
+                Pool::Attention | Pool::SelfAttention if index + 1 == self.depth => Role::Pool,
+                Pool::SelfAttention => Role::Frames,
                 _ if index % 2 == 0 => Role::Frames,
                 _ => Role::Goal,
             };

@@ -6,12 +6,30 @@
 //! trapezoid rule under a Gaussian window. Value and gradient are computed in one pass on the CPU. The characteristic
 //! functions at equidistant knots are powers of one complex number, so a projection costs one sine and one cosine.
 
+use burn::tensor::Tensor;
 use rand_distr::{Distribution as _, StandardNormal};
 use rayon::prelude::*;
 use swm_core::Key;
 
 /// The largest argument of the characteristic functions.
 const LAST_KNOT: f32 = 3.0;
+
+/// The lower bound of the length of a latent difference in [`straightening`].
+const LENGTH_EPSILON: f64 = 1e-8;
+
+/// Computes the temporal straightening loss (arXiv 2603.12231): the negative cosine between consecutive differences of
+/// latents, averaged, from -1 for straight paths to 1.
+///
+/// # Shapes
+/// `differences` is `[clips, steps - 1, latent]` with at least two differences; returns `[1]`.
+pub fn straightening(differences: Tensor<3>) -> Tensor<1> {
+    let [clips, count, latent] = differences.dims();
+    let part = |from: usize, to: usize| differences.clone().slice([0..clips, from..to, 0..latent]);
+    let (before, after) = (part(0, count - 1), part(1, count));
+    let length = |difference: Tensor<3>| difference.square().sum_dim(2).clamp_min(LENGTH_EPSILON.powi(2)).sqrt();
+    let cosine = (before.clone() * after.clone()).sum_dim(2) / (length(before) * length(after));
+    cosine.mean().neg()
+}
 
 /// Draws random directions of unit length.
 ///

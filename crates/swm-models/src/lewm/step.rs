@@ -9,7 +9,7 @@ use burn::tensor::{Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use swm_core::Rng;
 
-/// The weight and the settings of SIGReg.
+/// The settings of the loss: SIGReg, and optionally straight paths of latents.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SigregConfig {
@@ -19,6 +19,9 @@ pub struct SigregConfig {
     pub directions: usize,
     /// The number of points at which characteristic functions are compared.
     pub knots: usize,
+    /// Weight of straight paths; 0 leaves the term out.
+    #[serde(default)]
+    pub temp_straight: f32,
 }
 
 /// A batch of normalised clips.
@@ -32,12 +35,14 @@ pub struct TrainBatch {
 /// The loss of a batch and the terms of the loss.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Losses {
-    /// `prediction + weight * sigreg`.
+    /// `prediction + weight * sigreg + temp_straight weight * temp_straight`.
     pub total: f64,
     /// Mean squared error of the predicted latents.
     pub prediction: f64,
     /// The SIGReg statistic.
     pub sigreg: f64,
+    /// The straightening loss, if it has a weight.
+    pub temp_straight: Option<f64>,
 }
 
 /// Losses and gradients of a batch.
@@ -64,7 +69,7 @@ pub fn step(
     shards: usize,
     noise: Option<&mut Rng>,
 ) -> LewmStep {
-    let (mut host, mut sigreg) = (vec![], 0.0);
+    let (mut host, mut sigreg, mut temp_straight) = (vec![], 0.0, None);
     let step = joint::step(model, batch, shards, noise, |latents| {
         let shape = latents.dims();
         host = latents.clone().inner().into_data().into_f32_vec();
@@ -72,13 +77,18 @@ pub fn step(
         sigreg = value;
         let gradient = Tensor::<3>::from_data(TensorData::new(gradient, shape), &latents.device()).autodiff();
         // Autodiff receives a linear function of the latents whose gradient equals the gradient of the statistic.
-        (latents.clone() * gradient).sum() * config.weight
+        let mut regulariser = (latents.clone() * gradient).sum() * config.weight;
+        if config.temp_straight != 0.0 {
+            let [clips, steps, dim] = latents.dims();
+            let part = |from: usize, to: usize| latents.clone().slice([0..clips, from..to, 0..dim]);
+            let straight = loss::straightening(part(1, steps) - part(0, steps - 1));
+            temp_straight = Some(f64::from(straight.clone().inner().into_scalar::<f32>()));
+            regulariser = regulariser + straight * config.temp_straight;
+        }
+        regulariser
     });
     let JointStep { prediction, gradients, buffers, .. } = step;
-    LewmStep {
-        losses: Losses { total: prediction + f64::from(config.weight) * sigreg, prediction, sigreg },
-        gradients,
-        buffers,
-        latents: host,
-    }
+    let straight = f64::from(config.temp_straight) * temp_straight.unwrap_or_default();
+    let total = prediction + f64::from(config.weight) * sigreg + straight;
+    LewmStep { losses: Losses { total, prediction, sigreg, temp_straight }, gradients, buffers, latents: host }
 }

@@ -9,7 +9,7 @@ use crate::train::{
 };
 use burn::tensor::{Device, Tensor};
 use swm_core::columns::{ACTION, PIXELS};
-use swm_core::{Batch, Result, Schema};
+use swm_core::{Batch, Error, Result, Schema};
 use swm_data::{ClipSpec, LoaderConfig};
 
 impl Trainable for Lewm {
@@ -37,6 +37,7 @@ impl Trainable for Lewm {
 
     fn check(config: &TrainConfig<Self>) -> Result<()> {
         check(&config.model, &config.data)?;
+        check_straightening(config.loss.temp_straight, &config.data)?;
         check_sizes(&[
             ("loss.directions", config.loss.directions, 1, limits::FEATURES),
             ("loss.knots", config.loss.knots, 2, limits::FEATURES),
@@ -63,7 +64,8 @@ impl Trainable for Lewm {
         let noise = training.then_some(&mut noise);
         let LewmStep { losses, gradients, buffers, .. } =
             step::step(self, &batch, &config.loss, &directions, config.shards, noise);
-        let metrics = vec![("loss", losses.total), ("prediction", losses.prediction), ("sigreg", losses.sigreg)];
+        let mut metrics = vec![("loss", losses.total), ("prediction", losses.prediction), ("sigreg", losses.sigreg)];
+        metrics.extend(losses.temp_straight.map(|straight| ("temp_straight", straight)));
         Ok(StepOutput { metrics, gradients, buffers })
     }
 
@@ -77,6 +79,18 @@ impl Trainable for Lewm {
 pub(crate) fn check(model: &LewmConfig, data: &DataConfig) -> Result<()> {
     model.check()?;
     checks::clip_covers_history(data.num_steps, model.predictor.history)
+}
+
+/// Checks that clips have two differences of latents, if straight paths have a weight.
+pub(crate) fn check_straightening(weight: f32, data: &DataConfig) -> Result<()> {
+    if weight == 0.0 || weight.is_finite() && data.num_steps > 2 {
+        return Ok(());
+    }
+    Err(Error::config(
+        "loss.temp_straight",
+        format!("weight {weight}, and clips of {} frames; two consecutive latent differences need 3", data.num_steps),
+        "give a finite weight and data.num_steps of at least 3, or the weight 0",
+    ))
 }
 
 /// Returns the loader configuration for clips of images and actions.

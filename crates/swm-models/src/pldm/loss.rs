@@ -2,6 +2,7 @@
 //! et al. 2022), over the batch and over time, temporal alignment, and optionally straight latent paths (arXiv
 //! 2603.12231). The inverse-dynamics term is computed with [`super::Idm`].
 
+use crate::lewm::loss::straightening;
 use burn::tensor::{Tensor, activation};
 use serde::{Deserialize, Serialize};
 
@@ -46,8 +47,6 @@ pub struct Terms {
 
 /// The value that is added to a variance before the square root.
 const VARIANCE_EPSILON: f64 = 1e-4;
-/// The lower bound of the length of a latent difference in the cosine.
-const LENGTH_EPSILON: f64 = 1e-8;
 
 impl Terms {
     /// Computes the terms.
@@ -60,14 +59,7 @@ impl Terms {
         let by_time = centred.clone().swap_dims(0, 1);
         let frames = |from: usize, to: usize| z.clone().slice([0..clips, from..to, 0..latent]);
         let differences = frames(1, steps) - frames(0, steps - 1);
-        let straight = (steps > 2).then(|| {
-            let part = |from: usize, to: usize| differences.clone().slice([0..clips, from..to, 0..latent]);
-            let (before, after) = (part(0, steps - 2), part(1, steps - 1));
-            let length =
-                |difference: Tensor<3>| difference.square().sum_dim(2).clamp_min(LENGTH_EPSILON.powi(2)).sqrt();
-            let cosine = (before.clone() * after.clone()).sum_dim(2) / (length(before) * length(after));
-            cosine.mean().neg()
-        });
+        let straight = (steps > 2).then(|| straightening(differences.clone()));
         Self {
             std: spread(by_time.clone()),
             std_t: spread(centred.clone()),

@@ -7,7 +7,7 @@ use crate::lewm::{LewmConfig, train as lewm};
 use crate::nn::{Init, Named};
 use crate::train::{DatasetInfo, Preset, StepContext, StepOutput, TrainConfig, Trainable, check_sizes, limits};
 use burn::tensor::Tensor;
-use swm_core::{Batch, Error, Result, Schema};
+use swm_core::{Batch, Result, Schema};
 use swm_data::LoaderConfig;
 
 impl Trainable for Pldm {
@@ -40,14 +40,7 @@ impl Trainable for Pldm {
             ("model.latent", config.model.latent, 2, limits::FEATURES),
             ("loss.idm_hidden", config.loss.idm_hidden, 1, limits::FEATURES),
         ])?;
-        if config.loss.temp_straight != 0.0 && config.data.num_steps < 3 {
-            return Err(Error::config(
-                "loss.temp_straight",
-                format!("clips of {} frames have no two consecutive latent differences", config.data.num_steps),
-                "give data.num_steps of at least 3, or the weight 0",
-            ));
-        }
-        Ok(())
+        lewm::check_straightening(config.loss.temp_straight, &config.data)
     }
 
     fn image_size(config: &LewmConfig) -> Option<usize> {

@@ -47,6 +47,7 @@ impl Golden {
             }),
             head: self.head(),
             critic: self.size("critic_hidden"),
+            metric: 0,
         }
     }
 

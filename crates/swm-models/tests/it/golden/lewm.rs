@@ -126,6 +126,7 @@ fn training_losses_and_gradients_equal_the_reference() {
             weight: golden.config["sigreg_weight"].as_f64().expect("a weight") as f32,
             directions: golden.size("num_proj"),
             knots: golden.size("knots"),
+            temp_straight: 0.0,
         };
         for shards in [1, 3] {
             let batch = TrainBatch { patches: golden.patches("i.pixels"), actions: golden.tensor("i.action") };

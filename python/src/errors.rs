@@ -1,9 +1,11 @@
-//! Conversion between engine errors and Python exceptions, and Python's signals in the engine's loops.
+//! Conversion between engine errors and Python exceptions; Python's signals and progress in the engine's loops.
 
 use pyo3::exceptions::{PyFileNotFoundError, PyKeyboardInterrupt, PyOSError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use swm::core::Error;
+use swm::core::run::{Control, Event};
 
 /// Converts an engine error to a Python exception. Returns an exception that passed through the engine unchanged.
 pub fn to_py_err(error: Error) -> PyErr {
@@ -49,4 +51,31 @@ pub fn signal_poll() -> impl FnMut() -> swm::core::Result<()> {
 /// `ValueError` if the text is not JSON of this type.
 pub fn json<T: serde::de::DeserializeOwned>(what: &str, text: &str) -> PyResult<T> {
     serde_json::from_str(text).map_err(|error| PyValueError::new_err(format!("{what}: {error}")))
+}
+
+/// Creates a run control that runs Python's signal handlers and calls `progress(done, total, steps)` at most ten times
+/// a second. An exception from either stops the run.
+pub fn control<'a>(progress: Option<Py<PyAny>>) -> Control<'a> {
+    let failed = Arc::new(Mutex::new(None));
+    let callback_error = Arc::clone(&failed);
+    let mut poll = signal_poll();
+    let control =
+        Control::new().with_poll(move || match failed.lock().unwrap_or_else(PoisonError::into_inner).take() {
+            Some(error) => Err(from_py_err(error)),
+            None => poll(),
+        });
+    let Some(call) = progress else { return control };
+    let mut last: Option<Instant> = None;
+    control.with_events(move |event| {
+        let Event::Progress(at) = event else { return };
+        if !at.is_done() && last.is_some_and(|last| last.elapsed() < Duration::from_millis(100)) {
+            return;
+        }
+        last = Some(Instant::now());
+        let steps = at.metric("steps").unwrap_or_default() as usize;
+        let outcome = Python::attach(|py| call.call1(py, (at.done, at.total, steps)).map(drop));
+        if let Err(error) = outcome {
+            callback_error.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
+        }
+    })
 }

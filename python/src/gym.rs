@@ -3,6 +3,7 @@
 use crate::errors::from_py_err;
 use pyo3::prelude::*;
 use pyo3::types::{PyByteArray, PyBytes, PyModule};
+use std::cell::Cell;
 use swm::gym::{BRIDGE, CRAFTAX, Description, Failure, Request, Transport};
 
 /// A [`Transport`] to an environment in this interpreter.
@@ -18,6 +19,33 @@ impl InProcess {
     /// Creates a transport to the environment that `make` creates.
     pub fn new(make: Py<PyAny>) -> Self {
         Self { make, bridge: None, memory: None }
+    }
+}
+
+thread_local! {
+    /// The number of calls of environments that run on this thread, each inside the one before it.
+    static CALLS: Cell<usize> = const { Cell::new(0) };
+}
+
+/// Whether this thread runs an environment. No other thread can run one then: environments of one process run one at a
+/// time.
+pub fn is_in_call() -> bool {
+    CALLS.get() > 0
+}
+
+/// Counts a call of an environment.
+struct Call;
+
+impl Call {
+    fn begin() -> Self {
+        CALLS.set(CALLS.get() + 1);
+        Self
+    }
+}
+
+impl Drop for Call {
+    fn drop(&mut self) {
+        CALLS.set(CALLS.get() - 1);
     }
 }
 
@@ -51,6 +79,7 @@ impl Transport for InProcess {
                 return Err(Failure::Lost("the environment was not described yet".to_owned()));
             };
             let payload = PyBytes::new(py, request.payload());
+            let _call = Call::begin();
             bridge.bind(py).call_method1("handle", (request.op(), payload)).map(drop).map_err(refused)
         })
     }

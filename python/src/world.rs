@@ -2,8 +2,9 @@
 
 use crate::arrays;
 use crate::data::foreign::ForeignWriter;
-use crate::errors::{from_py_err, json, signal_poll, to_py_err};
-use crate::gym::InProcess;
+use crate::data::process::Owned;
+use crate::errors::{control, from_py_err, json, signal_poll, to_py_err};
+use crate::gym::{InProcess, is_in_call};
 use crate::policy::Actor;
 use pyo3::exceptions::PyIndexError;
 use pyo3::prelude::*;
@@ -11,12 +12,11 @@ use pyo3::types::{PyBytes, PyDict};
 use serde_json::{Map, Value};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
-use std::time::{Duration, Instant};
 use swm::collect_target;
 use swm::core::columns::{TERMINATED, TRUNCATED};
 use swm::core::pool::Reset;
 use swm::core::results::Counting;
-use swm::core::run::{Control, Event};
+use swm::core::run::Control;
 use swm::core::{Callable, CameraView, Env, Error, Key, Manifest, Origin, ResetOptions, Snapshot, VariationRequest};
 use swm::data::{ImageCodec, Location, WriteMode, WriteOptions};
 use swm::envs::wrappers::{GoalFrame, Stack, WRAPPERS};
@@ -30,8 +30,10 @@ const EXISTS: &str =
 /// A batch of environments of one kind.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
 pub struct World {
-    world: Mutex<swm::eval::World>,
+    world: Owned<Mutex<swm::eval::World>>,
     envs: usize,
+    /// Whether the environments are Gymnasium environments of this interpreter.
+    in_process: bool,
 }
 
 /// The stack of visual wrappers of a JSON list of `[id, settings]`, shared by all environments.
@@ -49,9 +51,10 @@ impl World {
     /// Locks the world of the engine.
     ///
     /// # Errors
-    /// If another thread, or a policy of a running call, uses the world.
+    /// If another thread, or a policy of a running call, uses the world, or this process was forked from the one that made
+    /// it.
     pub fn lock(&self) -> PyResult<MutexGuard<'_, swm::eval::World>> {
-        match self.world.try_lock() {
+        match self.world.get("world").map_err(to_py_err)?.try_lock() {
             Ok(world) => Ok(world),
             // A reset replaces the state that a panic left in the environments.
             Err(TryLockError::Poisoned(poisoned)) => Ok(poisoned.into_inner()),
@@ -61,6 +64,21 @@ impl World {
                 "wait until that call returns; a policy gets the infos as its argument",
             ))),
         }
+    }
+
+    /// Locks the world of the engine to run its environments.
+    ///
+    /// # Errors
+    /// As [`World::lock`], and if another environment of this interpreter calls this: the world's threads would wait for its
+    /// end.
+    fn lock_to_run(&self) -> PyResult<MutexGuard<'_, swm::eval::World>> {
+        let world = self.lock()?;
+        if self.in_process && world.pool().threads().current_num_threads() > 1 && is_in_call() {
+            let problem = "it is used in the step or reset of another environment of this process, and environments of one \
+                           process run one at a time";
+            return Err(to_py_err(Error::config("world", problem, "create it with threads=1 or workers=True")));
+        }
+        Ok(world)
     }
 }
 
@@ -87,7 +105,7 @@ impl World {
             let chosen = swm::env(&env, &Origin::User)?;
             swm::eval::World::of(|| Ok(stack.wrap(chosen.env()?, goal)), config)
         });
-        Ok(Self { world: Mutex::new(world.map_err(to_py_err)?), envs })
+        Ok(Self { world: Owned::new(Mutex::new(world.map_err(to_py_err)?)), envs, in_process: false })
     }
 
     /// Creates a world of Gymnasium environments in this interpreter. `make()` creates one environment and returns its
@@ -114,7 +132,7 @@ impl World {
             };
             swm::eval::World::of(made, config)
         });
-        Ok(Self { world: Mutex::new(world.map_err(to_py_err)?), envs })
+        Ok(Self { world: Owned::new(Mutex::new(world.map_err(to_py_err)?)), envs, in_process: true })
     }
 
     /// The specification of the environments as JSON.
@@ -164,7 +182,7 @@ impl World {
                 self.envs
             )));
         }
-        let mut world = self.lock()?;
+        let mut world = self.lock_to_run()?;
         let world = &mut *world;
         let resets: Vec<Reset> =
             starts.iter().map(|&(slot, seed)| Reset { slot, seed, options: options.clone() }).collect();
@@ -187,7 +205,7 @@ impl World {
 
     /// Steps the active slots with the current actions.
     fn advance(&self, py: Python<'_>, active: Vec<bool>) -> PyResult<()> {
-        let mut world = self.lock()?;
+        let mut world = self.lock_to_run()?;
         let world = &mut *world;
         py.detach(|| world.advance(&active)).map_err(to_py_err)
     }
@@ -205,7 +223,7 @@ impl World {
         mut next: usize,
         options: &str,
     ) -> PyResult<(Vec<(usize, usize)>, usize)> {
-        let (mut world, mut policy) = (self.lock()?, actor.lock()?);
+        let (mut world, mut policy) = (self.lock_to_run()?, actor.lock()?);
         let (world, policy) = (&mut *world, &mut **policy);
         let mut begun = vec![];
         let mut control = Control::new().with_poll(signal_poll());
@@ -258,7 +276,7 @@ impl World {
 
     /// Restores a snapshot in a slot.
     fn restore(&self, py: Python<'_>, slot: usize, state: Vec<u8>) -> PyResult<()> {
-        let mut world = self.lock()?;
+        let mut world = self.lock_to_run()?;
         let world = &mut *world;
         let snapshot = Snapshot(state);
         py.detach(|| world.modify(&[slot], |_, env| env.restore(&snapshot))).map_err(to_py_err)
@@ -286,7 +304,7 @@ impl World {
             _ => WriteMode::Create,
         };
         let codec: ImageCodec = codec.map_or(Ok(ImageCodec::default()), |text| json("codec", text))?;
-        let (mut world, mut policy) = (self.lock()?, actor.lock()?);
+        let (mut world, mut policy) = (self.lock_to_run()?, actor.lock()?);
         let (world, policy) = (&mut *world, &mut **policy);
         let collected = py.detach(|| {
             let config = CollectConfig {
@@ -345,7 +363,7 @@ impl World {
         progress: Option<Py<PyAny>>,
     ) -> PyResult<String> {
         let settings: Evaluation = json("evaluation", config)?;
-        let (mut world, mut policy) = (self.lock()?, actor.lock()?);
+        let (mut world, mut policy) = (self.lock_to_run()?, actor.lock()?);
         let (world, policy) = (&mut *world, &mut **policy);
         let run = py.detach(|| {
             let starts = match dataset {
@@ -433,34 +451,6 @@ struct Evaluation {
     goal_offset: usize,
     callables: Vec<Callable>,
     videos: Option<(PathBuf, String, usize)>,
-}
-
-/// Creates a run control that runs Python's signal handlers and calls `progress(done, total, steps)` at most ten times
-/// a second. An exception from either stops the run.
-fn control<'a>(progress: Option<Py<PyAny>>) -> Control<'a> {
-    let failed = Arc::new(Mutex::new(None));
-    let callback_error = Arc::clone(&failed);
-    let mut poll = signal_poll();
-    let control = Control::new().with_poll(move || {
-        match failed.lock().unwrap_or_else(std::sync::PoisonError::into_inner).take() {
-            Some(error) => Err(from_py_err(error)),
-            None => poll(),
-        }
-    });
-    let Some(call) = progress else { return control };
-    let mut last: Option<Instant> = None;
-    control.with_events(move |event| {
-        let Event::Progress(at) = event else { return };
-        if !at.is_done() && last.is_some_and(|last| last.elapsed() < Duration::from_millis(100)) {
-            return;
-        }
-        last = Some(Instant::now());
-        let steps = at.metric("steps").unwrap_or_default() as usize;
-        let outcome = Python::attach(|py| call.call1(py, (at.done, at.total, steps)).map(drop));
-        if let Err(error) = outcome {
-            callback_error.lock().unwrap_or_else(std::sync::PoisonError::into_inner).get_or_insert(error);
-        }
-    })
 }
 
 /// Parses the options of a reset from JSON.

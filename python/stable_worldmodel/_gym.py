@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from . import _engine
 from .wrapper.visual import engine_wrappers
+
+
+#: Only one thread loads the module of the bridge: Python lists a module before its code has run.
+_LOADING = threading.RLock()
 
 
 def open_world(
@@ -32,7 +37,8 @@ def open_world(
     in_engine = engine_wrappers(wrappers)
     in_python = [] if in_engine is not None else list(wrappers)
     try:
-        bridge = _engine.bridge(env_name.startswith("swm/Craftax"))
+        with _LOADING:
+            bridge = _engine.bridge(env_name.startswith("swm/Craftax"))
     except ModuleNotFoundError as error:
         raise _missing("craftax", error) from error
     envs: list[Any] = []

@@ -62,6 +62,31 @@ def indices(name: str, given: Any, count: int) -> list[int]:
     return [int(index) for index in array]
 
 
+def starts(episodes: Any, steps: Any) -> list[list[int]]:
+    """The pairs of an episode and a step from which evaluations start.
+
+    Raises:
+        ValueError: When the sequences have other lengths, or values that are no whole numbers of at least 0.
+    """
+    found = []
+    for name, given in (("episodes_idx", episodes), ("start_steps", steps)):
+        try:
+            values = np.asarray(given)
+        except ValueError:
+            values = np.asarray(None)
+        whole = values.ndim == 1 and values.dtype.kind in "iuf" and bool(np.all((values >= 0) & (values == np.round(values))))
+        if not whole or np.any(values >= 1 << 62):
+            raise ValueError(f"{name}: {given!r}; expected a sequence of whole numbers of at least 0")
+        found.append([int(value) for value in values])
+    if len(found[0]) != len(found[1]):
+        raise ValueError(
+            f"episodes_idx, start_steps: they have {len(found[0])} and {len(found[1])} values; give a step for each episode"
+        )
+    if not found[0]:
+        raise ValueError("episodes_idx, start_steps: they are empty; give at least one start, or neither")
+    return [list(pair) for pair in zip(*found, strict=True)]
+
+
 def variation(options: Mapping[str, Any] | None, spaces: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """The variation request in `options`.
 
@@ -96,7 +121,7 @@ def reset(options: Mapping[str, Any] | None, spaces: Mapping[str, Mapping[str, A
     """All options of a reset, as JSON."""
     options = options or {}
     given = {
-        name: None if options.get(name) is None else np.asarray(options[name], dtype=np.float64).ravel().tolist()
+        name: None if options.get(name) is None else _numbers(f"options[{name!r}]", options[name]).tolist()
         for name in ("state", "goal_state")
     }
     return json.dumps({"variation": variation(options, spaces), **given})
@@ -143,11 +168,19 @@ def _known(key: str, spaces: Mapping[str, Any]) -> str:
     return scale if name == "size" and key not in spaces and scale in spaces else key
 
 
-def _floats(key: str, value: Any, space: Mapping[str, Any] | None) -> list[float]:
+def _numbers(name: str, value: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """The value as finite numbers, in one dimension."""
     try:
         values = np.asarray(value, dtype=np.float64).ravel()
     except (TypeError, ValueError) as error:
-        raise ValueError(f"options['variation_values'][{key!r}]: expected numbers, got {value!r}") from error
+        raise ValueError(f"{name}: expected numbers, got {value!r}") from error
+    if not np.all(np.isfinite(values)):
+        raise ValueError(f"{name}: expected finite numbers, got {value!r}")
+    return values
+
+
+def _floats(key: str, value: Any, space: Mapping[str, Any] | None) -> list[float]:
+    values = _numbers(f"options['variation_values'][{key!r}]", value)
     fractions = np.any(values != np.round(values)) and np.all((values >= 0) & (values <= 1))
     if space is not None and space["type"] == "RGBBox" and fractions:
         values = np.round(255 * values)

@@ -64,11 +64,13 @@ def log_of(run):
 RUNS = [
     # The random directions of SIGReg are drawn differently.
     ("lewm", ["loss.weight=0.0"]),
+    ("lewm", ["loss.weight=0.0", "loss.temp_straight=0.5", "data.num_steps=4"]),
     ("pldm", [CONV, "model.predictor.history=2", "optim.ema=0.5"]),
     ("pldm", ["loss.std_t=1.0", "loss.cov_t=1.0", "loss.temp_straight=0.5"]),
     ("gcbc", ["validation.every=3", "validation.batches=2"]),
     ("gcbc", [CONV, "optim.accumulate=2"]),
     ("gcivl", []),
+    ("gcivl", ["model.metric=6", "model.head.depth=4", "model.history=2", "data.num_steps=3"]),
     ("gcivl", [CONV, "model.history=2", "data.num_steps=3"]),
     ("gciql", []),
 ]
@@ -341,3 +343,21 @@ def test_without_hydra_its_flags_are_refused(rooms):
     program += "sys.exit(main(['lewm', 'data=x', '--multirun']))"
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
     assert done.returncode == 2 and "pip install hydra-core" in done.stderr
+
+
+def test_a_second_training_in_a_folder_is_refused(rooms, tmp_path):
+    import fcntl
+
+    out = tmp_path / "run"
+    options = Options("gcbc", rooms, out=str(out), preset="tiny", device="cpu", settings=SHORT)
+    trainer = Trainer(options)
+    # The lock that the engine's trainings take.
+    held = os.open(out, os.O_RDONLY)
+    fcntl.flock(held, fcntl.LOCK_EX)
+    with pytest.raises(ValueError, match="another process writes to it"):
+        trainer.train()
+    os.close(held)
+    # A kill after step 3 lost a line in the middle; the checkpoint is that of step 0.
+    (out / "train.jsonl").write_text('{"step": 1, "loss": 1.0}\n{"step": 2, "lo')
+    Trainer(Options(**{**vars(options), "resume": True})).train()
+    assert [line["step"] for line in log_of(out)] == [2, 4, 6]

@@ -21,6 +21,43 @@ pub fn is_forked() -> bool {
     *LOADING_PROCESS.get_or_init(std::process::id) != std::process::id()
 }
 
+/// A value with threads, files or locks of the process that made it. A forked process can neither use the value nor drop it,
+/// because it does not have the threads and would write to the same files: there, the value is leaked.
+pub struct Owned<T> {
+    /// `None` while it is dropped only.
+    value: Option<T>,
+    process: u32,
+}
+
+impl<T> Owned<T> {
+    /// Makes this process the owner of a value.
+    pub fn new(value: T) -> Self {
+        Self { value: Some(value), process: std::process::id() }
+    }
+
+    /// Returns the value; `what` names it in errors.
+    ///
+    /// # Errors
+    /// In a process that was forked after the value was made.
+    pub fn get(&self, what: &str) -> Result<&T> {
+        match &self.value {
+            Some(value) if self.process == std::process::id() => Ok(value),
+            _ => {
+                let problem = "it was created before this process was forked";
+                Err(Error::config(what, problem, "create it in the process that uses it"))
+            }
+        }
+    }
+}
+
+impl<T> Drop for Owned<T> {
+    fn drop(&mut self) {
+        if self.process != std::process::id() {
+            std::mem::forget(self.value.take());
+        }
+    }
+}
+
 /// Runs `work` without the GIL; in a forked process, on the thread pool of that process.
 ///
 /// # Errors

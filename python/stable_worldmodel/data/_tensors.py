@@ -85,16 +85,33 @@ def _from_torch(tensor: Any) -> Array:
     return cast(Array, tensor.numpy())
 
 
+def _check_numbering(name: str, value: Any) -> None:
+    """Refuses a column that has a name of `NUMBERING` and holds something else."""
+    try:
+        numbers = np.asarray(to_numpy(value), dtype=np.float64).reshape(-1)
+        fits = bool(np.all(np.diff(numbers) == (1 if name == "step_idx" else 0)))
+    except (TypeError, ValueError):
+        fits = False
+    if not fits:
+        expected = "the numbers of consecutive steps" if name == "step_idx" else "one number"
+        raise ValueError(
+            f"column {name!r}: its values would be lost, because datasets number episodes and steps themselves;"
+            f" rename the column, or give {expected}"
+        )
+
+
 def rows(episode: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, str | bytes]]:
     """Splits an episode into arrays `(T, ...)` of types that can be stored, and text constants.
 
-    Images `(T, C, H, W)` become `(T, H, W, C)`. Text is stored once per episode. `action` may have one row fewer than the
+    `episode_idx` and `step_idx` are left out, because datasets number episodes and steps; other values of these names are
+    errors. Images `(T, C, H, W)` become `(T, H, W, C)`. Text is stored once per episode. `action` may have one row fewer than the
     other columns, because no action follows the final observation.
     """
     arrays: dict[str, Array] = {}
     constants: dict[str, str | bytes] = {}
     for name, value in episode.items():
         if name in NUMBERING:
+            _check_numbering(name, value)
             continue
         if name == EPISODE:
             if value:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
+import os
 import signal
 import threading
 import time
@@ -128,12 +130,14 @@ class Trainer:
         Raises:
             KeyboardInterrupt: After Ctrl-C; the checkpoint is saved, and `resume` continues.
             FloatingPointError: If the loss is not finite; the last checkpoint is kept.
+            ValueError: If another process trains in the folder.
         """
         steps, log_every, save_every = self.config["schedule"]["steps"], self.config["log_every"], self.config["save_every"]
         begin, first, window = time.monotonic(), self.step, []
         batches = self._batches()
         stopped_early = False
-        with _interruptions() as interrupted:
+        alone = _locked(self.run) if self.ranks.rank == 0 else contextlib.nullcontext()
+        with alone, _interruptions() as interrupted:
             while self.step < (steps if until is None else min(until, steps)) and not stopped_early:
                 metrics, stop = self._update(batches, interrupted.is_set())
                 window.append(metrics)
@@ -147,7 +151,7 @@ class Trainer:
                 if stop:
                     self.save()
                     raise KeyboardInterrupt
-        return self.save()
+            return self.save()
 
     def _batches(self) -> Iterator[dict[str, Tensor]]:
         """The batches from the current step on."""
@@ -287,6 +291,25 @@ class Trainer:
         if self.ranks.rank == 0:
             with open(self.run / "train.jsonl", "a", encoding="utf-8") as file:
                 file.write(json.dumps({"step": self.step, **values}) + "\n")
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keeps other writers away from a folder, as the engine's trainings do."""
+    file = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ValueError(
+                f"{folder}: another process writes to it; wait until that process has ended, or choose another folder"
+            ) from error
+        except OSError:
+            # Some network file systems have no locks.
+            pass
+        yield
+    finally:
+        os.close(file)
 
 
 def _device(name: str) -> torch.device:

@@ -613,7 +613,7 @@ class World:
             if (episodes_idx is None) != (start_steps is None):
                 raise ValueError("episodes_idx, start_steps: give both or neither")
             if episodes_idx is not None and start_steps is not None:
-                picks = [[int(e), int(s)] for e, s in zip(episodes_idx, start_steps, strict=True)]
+                picks = _options.starts(episodes_idx, start_steps)
                 episodes = len(picks)
         elif episodes_idx is not None or start_steps is not None or goal_offset is not None:
             raise ValueError("episodes_idx, start_steps, goal_offset: they select rows of a dataset; pass dataset=…")

@@ -40,7 +40,7 @@ fn three_cameras_are_a_grid() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let cameras = ["pixels", "front", "wrist"];
     let columns = cameras.iter().map(|name| ColumnSpec::image(*name, 192, 192));
-    let columns = columns.chain([ColumnSpec::new("action", DType::Float32, [1])]);
+    let columns = columns.chain([ColumnSpec::new("action", DType::Float32, [1])]).collect::<Vec<_>>();
     let schema = Schema::new(columns).expect("creating the schema");
     let path = folder.path().join("d.lance");
     let mut writer = create(&path, &schema, options(WriteMode::Create)).expect("creating the dataset");

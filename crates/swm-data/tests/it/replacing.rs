@@ -9,7 +9,9 @@ use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use swm_core::columns::{self, ACTION};
 use swm_core::{Batch, ColumnSpec, DType, Schema};
-use swm_data::{FORMATS, Location, PreviewOptions, StepRange, WriteMode, WriteOptions, create, open, preview};
+use swm_data::{
+    FORMATS, Location, PreviewOptions, StepRange, WriteMode, WriteOptions, create, has_no_dataset, open, preview,
+};
 
 /// The formats whose datasets are folders.
 const FOLDER_FORMATS: [&str; 5] = ["lance", "lance-video", "folder", "video", "lerobot"];
@@ -247,6 +249,13 @@ fn what_a_writer_leaves_before_its_first_commit_is_continued_and_replaced() {
         write(&path, WriteMode::Append, 1, 0..2);
         check(&*open(&path).expect("opening"), 0);
     }
+    let path = folder.path().join("d.lance");
+    std::fs::create_dir_all(path.join("data")).expect("creating a folder");
+    assert!(has_no_dataset(&path));
+    std::fs::write(path.join(format!("data/{}.lance", "0".repeat(64))), "killed").expect("writing a file");
+    assert!(has_no_dataset(&path));
+    std::fs::write(path.join("data/thesis.lance"), "thesis").expect("writing a file");
+    assert!(!has_no_dataset(&path));
 }
 
 #[test]

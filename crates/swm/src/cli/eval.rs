@@ -327,6 +327,7 @@ pub fn run(
 ) -> Result<(Results, PathBuf)> {
     let is_new = !output.exists();
     let _lock = output_folder::claim(output, &["results.json"])?;
+    run_record::check(output)?;
     eval_until::refuse_fixed(output)?;
     let videos = (videos > 0).then(|| (output.to_owned(), videos));
     let results = request.run(resolver, &run_options(envs, videos, context), &mut control(context));

@@ -4,6 +4,7 @@ use super::Context;
 use super::eval::{run_options, write_json};
 use super::output_folder;
 use super::progress::control;
+use super::run_record;
 use crate::resolver::HomeResolver;
 use std::path::{Path, PathBuf};
 use swm_core::results::Until;
@@ -22,9 +23,18 @@ pub fn run(
 ) -> Result<(Results, PathBuf)> {
     let (is_new, file) = (!output.exists(), output.join("results.json"));
     let _lock = output_folder::claim(output, &["results.json"])?;
+    run_record::check(output)?;
     let earlier = (resume && file.exists()).then(|| swm_report::read_results(&file)).transpose()?;
     let options = run_options(envs, (videos > 0).then(|| (output.to_owned(), videos)), context);
-    let mut keep = |results: &Results| write_json(&file, results);
+    // Continuing adds a command line to the record, once there are results.
+    let mut is_recorded = false;
+    let mut keep = |results: &Results| {
+        write_json(&file, results)?;
+        if !std::mem::replace(&mut is_recorded, true) {
+            run_record::write(output, resume)?;
+        }
+        Ok(())
+    };
     let results = request.run_until(until, earlier, resolver, &options, &mut keep, &mut control(context));
     if results.is_err() && is_new {
         files::remove_empty_folder(output)?;

@@ -136,7 +136,14 @@ fn submit(args: &SubmitArgs, context: &Context) -> anyhow::Result<()> {
                 })
             };
             let unnamed = Submission { author: "?".to_owned(), licence: "?".to_owned(), ..submission.clone() };
-            let capsule = capsule(&Entry::new(unnamed)?.checkpoint()?)?;
+            let name = Entry::new(unnamed)?.checkpoint()?;
+            if name.contains("://") {
+                // The results may be those of a stranger.
+                let fix = "give --author and --licence";
+                let problem = "is on a server, which is not asked for its author and licence";
+                return Err(Error::config(format!("the checkpoint '{name}'"), problem, fix).into());
+            }
+            let capsule = capsule(&name)?;
             let (author, licence) =
                 capsule.map_or((None, None), |capsule| (capsule.description.author, capsule.description.licence));
             let (author, licence) =

@@ -3,13 +3,14 @@
 //! A manifest holds what determines a result, so that equal runs have equal manifests. This file holds the rest, and no
 //! hash includes it.
 
+mod git;
+
 use super::Cli;
 use crate::capsule::cpu_level;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
 use std::sync::{Mutex, PoisonError};
 use std::time::{SystemTime, UNIX_EPOCH};
 use swm_core::{Error, Result, files};
@@ -64,13 +65,21 @@ pub fn arguments() -> Vec<String> {
     ARGUMENTS.lock().unwrap_or_else(PoisonError::into_inner).clone()
 }
 
+/// Checks, before the work, that `run.json` can be written to a folder.
+///
+/// # Errors
+/// When the folder has a file of this name that is no record of a run.
+pub fn check(folder: &Path) -> Result<()> {
+    files::check_own(&folder.join(FILE), |path| read_file(path).is_ok())
+}
+
 /// Writes `run.json` to the folder of a run, which must exist. `continued` adds this command line to those that are there.
 ///
 /// # Errors
 /// When the folder has a file of this name that is no record of a run, or cannot be written to.
 pub fn write(folder: &Path, continued: bool) -> Result<()> {
+    check(folder)?;
     let path = folder.join(FILE);
-    files::check_own(&path, |path| read_file(path).is_ok())?;
     let mut record = if continued && path.exists() { read_file(&path)? } else { RunRecord::default() };
     record.commands.push(Invocation::now());
     let text = serde_json::to_string_pretty(&record).map_err(|error| Error::external("writing run.json", error))?;
@@ -111,7 +120,7 @@ impl Invocation {
             command: arguments(),
             folder: std::env::current_dir().unwrap_or_default(),
             started: utc(SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs())),
-            git: commit(),
+            git: git::commit(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             cpu: format!("{}{cpu}, {threads} threads", cpu_level()),
             os: system(),
@@ -119,14 +128,6 @@ impl Invocation {
             hub: crate::home::pinned_uris(),
         }
     }
-}
-
-/// The commit of the repository around the current folder.
-fn commit() -> Option<String> {
-    let mut git = Command::new("git");
-    git.args(["describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]).stdin(Stdio::null());
-    let output = git.output().ok().filter(|output| output.status.success())?;
-    Some(String::from_utf8_lossy(&output.stdout).trim().to_owned())
 }
 
 /// The name of the processor, on Linux.

@@ -9,6 +9,7 @@ use clap::Args;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use swm_core::files::Lock;
 use swm_core::{EnvPool, Error, Origin, Result};
 use swm_data::Reader;
 use swm_models::{
@@ -131,7 +132,8 @@ fn record(out: &Path, resume: bool) -> Result<()> {
     if !resume && out.join(run_record::FILE).exists() && StoredCheckpoint::read(out).is_ok() {
         return Ok(());
     }
-    std::fs::create_dir_all(out).map_err(|error| Error::io(out, "creating the folder", error))?;
+    // Another training that runs in the folder keeps its record as well.
+    let _lock = Lock::folder(out)?;
     run_record::write(out, resume)
 }
 
@@ -195,7 +197,9 @@ impl TrainArgs {
         let path = folder.join(run_record::FILE);
         let record = run_record::read(&folder)?;
         let started = record.first().and_then(|(cli, from)| Some((cli.into_train()?, from)));
-        let Some((started, from)) = started.filter(|(started, _)| started.model.is_some()) else {
+        // A recipe writes to a folder of its own, in which it continues by itself.
+        let is_training = |started: &Self| started.model.is_some() && started.recipe.is_none();
+        let Some((started, from)) = started.filter(|(started, _)| is_training(started)) else {
             return Err(Error::corrupt(path, "it holds no command line of a training", fix));
         };
         let origin = Origin::file(&path, false);
@@ -203,17 +207,32 @@ impl TrainArgs {
             crate::env(env, &origin)?;
         }
         // A path that the command line named from another folder.
-        let data = started.data.map(|data| match from.join(&data) {
+        let data = started.data.clone().map(|data| match from.join(&data) {
             moved if !Path::new(&data).exists() && moved.exists() => moved.to_string_lossy().into_owned(),
             _ => data,
         });
-        if let Some(data) = data.as_ref().filter(|data| data.contains("://")) {
-            origin.check_user(&format!("the dataset {data}"), "which opens a connection", Some("--data"))?;
+        for (kind, name, option) in [("dataset", &data, "--data"), ("encoder", &started.encoder, "--encoder")] {
+            if let Some(name) = name.as_ref().filter(|name| name.contains("://")) {
+                origin.check_user(&format!("the {kind} {name}"), "which opens a connection", Some(option))?;
+            }
         }
-        eprint(&format!("continuing: {}\n", record.commands[0].command.join(" ")));
+        if StoredCheckpoint::read(&folder).is_err() {
+            // The run begins, and what is no file would be looked for on the hub of models.
+            for (key, from) in recipes::pretrained_weights(&started.config()?.to_json()) {
+                if !Path::new(&from).is_file() {
+                    origin.check_user(
+                        &format!("the pretrained weights '{from}'"),
+                        "which may be downloaded",
+                        Some(&key),
+                    )?;
+                }
+            }
+        }
+        eprint(&format!("continuing: {}\n", shorten(record.commands[0].command.join(" "))));
+        let output = Some(output.clone());
         // A tracker starts a program, which only the user may ask for.
         let log = self.log.clone();
-        Ok(Self { data, output: Some(output.clone()), resume: true, print_config: false, log, ..started })
+        Ok(Self { data, output, resume: true, print_config: false, trust: false, log, ..started })
     }
 
     /// Returns the family of the model.
@@ -278,4 +297,13 @@ pub fn run(config: &dyn TrainableConfig, setup: TrainRun<'_>, context: &Context)
         return Err(Error::Interrupted);
     }
     Ok(summary)
+}
+
+/// Returns the beginning of a command line that is too long for a terminal.
+fn shorten(command: String) -> String {
+    const MOST: usize = 2000;
+    match command.char_indices().nth(MOST) {
+        Some((end, _)) => format!("{} ...", &command[..end]),
+        None => command,
+    }
 }

@@ -19,13 +19,15 @@ pub fn of_checkpoint(policy: &str, checkpoint: &Path) -> Training {
 }
 
 /// Finds the training logs of the policies in results: those beside checkpoints whose weights have the hash that the
-/// results state. A capsule, and a checkpoint that is not on this machine, has none.
+/// results state. A capsule, and a checkpoint that is not on this machine, has none: results may be those of a stranger, and
+/// open no connection.
 pub fn of_results(results: &[(PathBuf, Results)]) -> Vec<Training> {
     let mut found: Vec<(String, PathBuf)> = vec![];
     for (_, results) in results {
         let Ok(request) = EvalRequest::of(&results.manifest) else { continue };
         for policy in &request.policies {
-            let run = checkpoint_of(policy).and_then(|given| home::find_checkpoint(given).ok());
+            let given = checkpoint_of(policy).filter(|given| !given.contains("://"));
+            let run = given.and_then(|given| home::find_checkpoint(given).ok());
             let Some(run) = run.filter(|run| log_of(run).is_file() && has_weights(run, policy, results)) else {
                 continue;
             };

@@ -95,6 +95,13 @@ fn outputs_do_not_replace_files_of_the_user() {
     swm.json(&eval("results"));
     swm.json(&["report", "results", "-o", "page"]);
     swm.json(&["report", "results", "-o", "page"]);
+    // The record of the run is checked before the work as well.
+    user_file(&swm.path("recorded/run.json"));
+    for until in [&[][..], &["--until", "ci=20"]] {
+        swm.fails(&[&eval("recorded")[..], until].concat(), 2, &["run.json", "not written by this program"]);
+        assert!(!swm.path("recorded/results.json").exists());
+    }
+    assert_untouched(&swm.path("recorded/run.json"));
     fs::create_dir_all(swm.path("mine")).expect("creating a folder");
     fs::write(swm.path("mine/results.json"), r#"{"my": "thesis", "swm_version": 1}"#).expect("writing a file");
     swm.fails(&eval("mine"), 2, &["results.json", "not written by this program"]);

@@ -102,3 +102,102 @@ fn current_folder_hides_no_module() {
     let output = swm.run(&["envs", "CartPole-v1"]);
     assert!(output.status.success() && !swm.path("imported").exists(), "{}", text(&output.stderr));
 }
+
+#[test]
+fn record_of_a_run_chooses_no_recipe_and_no_weights() {
+    let swm = Swm::new();
+    fs::write(swm.path("evil_mod.py"), MODULE).expect("a module");
+    fs::create_dir_all(swm.path("run")).expect("a folder");
+    let recipe =
+        "summary = \"s\"\n[[collect]]\nname = \"a\"\nenv = \"evil_mod:Cart-v0\"\nepisodes = 1\nno-pixels = true\n";
+    fs::write(swm.path("run/evil.toml"), recipe).expect("a recipe");
+    swm.json(&["collect", "swm/TwoRoom-v1", "-o", "rooms", "--episodes", "2", "--image", "32", "--max-steps", "20"]);
+    let resume = |command: &[&str], code: i32, parts: &[&str]| {
+        let command = json!({
+            "command": command, "folder": swm.home(), "started": "", "git": null, "version": "", "cpu": "", "os": "",
+            "assets": {},
+        });
+        fs::write(swm.path("run/run.json"), json!({"commands": [command]}).to_string()).expect("a record");
+        swm.fails(&["train", "--output", "./run", "--resume"], code, &[&["run.json"], parts].concat());
+        assert!(!swm.path("imported").exists() && !swm.path("run/checkpoint").exists());
+    };
+    let train = ["swm", "train", "--recipe", "run/evil.toml", "--trust", "-o", "run", "a.seed=1"];
+    resume(&train, 1, &["no command line of a training"]);
+    let train = ["swm", "train", "sac", "--env", "evil_mod:Cart-v0", "-o", "run"];
+    resume(&train, 2, &["'evil_mod:Cart-v0'", "imports a Python module"]);
+    let train = ["swm", "train", "inverse", "--data", "rooms", "--encoder", "s3://bucket/run", "-o", "run"];
+    resume(&train, 2, &["s3://bucket/run", "opens a connection"]);
+    let train = ["swm", "train", "dino_wm", "--data", "rooms", "-o", "run", "model.weights=nobody/nothing"];
+    resume(&train, 2, &["nobody/nothing", "may be downloaded"]);
+}
+
+#[test]
+fn results_on_a_server_open_no_connection() {
+    let swm = Swm::new();
+    swm.json(&[
+        "demo",
+        "-o",
+        "demo",
+        "--episodes",
+        "2",
+        "--eval-episodes",
+        "2",
+        "schedule.steps=2",
+        "schedule.warmup=1",
+    ]);
+    let file = swm.path("demo/results/results.json");
+    let text = fs::read_to_string(&file).expect("the results");
+    let name = "demo/pldm-rooms\"";
+    assert!(text.contains(name), "{text}");
+    let server = std::net::TcpListener::bind("127.0.0.1:0").expect("a server");
+    server.set_nonblocking(true).expect("a server that does not wait");
+    let uri = format!("http://{}/run", server.local_addr().expect("its address"));
+    fs::write(&file, text.replace(name, &format!("{uri}\""))).expect("the results");
+    swm.json(&["report", "demo/results", "-o", "page"]);
+    swm.fails(&["leaderboard", "submit", "demo/results", "-o", "entry.json"], 2, &["on a server", "--author"]);
+    assert!(server.accept().is_err(), "a connection was opened");
+}
+
+#[test]
+fn repository_of_a_stranger_starts_no_program() {
+    let swm = Swm::new();
+    let git = |arguments: &[&str]| {
+        let mut git = std::process::Command::new("git");
+        git.args(["-c", "user.name=A", "-c", "user.email=a@b"]).args(arguments).current_dir(swm.home());
+        let output = git.output().expect("git");
+        assert!(output.status.success(), "git {arguments:?}: {}", text(&output.stderr));
+        text(&output.stdout)
+    };
+    git(&["init", "--quiet"]);
+    fs::write(swm.path("code.py"), "pass\n").expect("a file");
+    git(&["add", "code.py"]);
+    git(&["commit", "--quiet", "--message", "code"]);
+    let commit = git(&["rev-parse", "HEAD"]).trim().to_owned();
+    let recorded = || {
+        results(&swm, "swm/TwoRoom-v1");
+        let record: Value =
+            serde_json::from_slice(&fs::read(swm.path("results/run.json")).expect("the record")).expect("JSON");
+        record["commands"][0]["git"].as_str().expect("a commit").to_owned()
+    };
+    assert_eq!(recorded(), commit);
+    fs::write(swm.path("code.py"), "print()\n").expect("a changed file");
+    assert_eq!(recorded(), format!("{commit}-dirty"));
+
+    let marker = swm.path("started");
+    let program = swm.path("program.sh");
+    fs::write(&program, format!("#!/bin/sh\ntouch '{}'\ncat\n", marker.display())).expect("a program");
+    let executable = std::os::unix::fs::PermissionsExt::from_mode(0o755);
+    fs::set_permissions(&program, executable).expect("making it executable");
+    let path = program.to_str().expect("a path");
+    git(&["config", "core.fsmonitor", path]);
+    fs::copy(&program, swm.path(".git/hooks/post-index-change")).expect("a hook");
+    assert_eq!(recorded(), format!("{commit}-dirty"));
+    assert!(!marker.exists(), "a monitor or a hook was started");
+    git(&["config", "--unset", "core.fsmonitor"]);
+    fs::remove_file(swm.path(".git/hooks/post-index-change")).expect("removing the hook");
+    let _ = fs::remove_file(&marker);
+    git(&["config", "filter.evil.clean", path]);
+    fs::write(swm.path(".gitattributes"), "* filter=evil\n").expect("attributes");
+    assert_eq!(recorded(), commit);
+    assert!(!marker.exists(), "a filter was started");
+}

@@ -28,6 +28,7 @@ mod writer;
 
 pub use salvage::salvage;
 pub use shard::{Shard, commit_shards, create_shard, shard_manifest, shard_manifests};
+pub(super) use store::is_unfinished;
 
 use crate::formats::entry::{Backend, FormatEntry};
 

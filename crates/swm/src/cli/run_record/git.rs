@@ -1,0 +1,41 @@
+//! The commit of the repository around the current folder.
+//!
+//! A repository may come from a stranger, in an archive. Its configuration can name programs that git starts: monitors of the
+//! file system, hooks, filters of contents, and transports that fetch missing objects. None of them is started here.
+
+use std::process::{Command, Stdio};
+
+/// Settings that override those of the repository.
+const SETTINGS: [&str; 3] = ["core.fsmonitor=false", "core.hooksPath=/dev/null", "protocol.allow=never"];
+
+/// Returns the commit, with `-dirty` if tracked files differ from it; `None` outside of a repository. In a repository with
+/// filters of its own, which a comparison of files would start, it says nothing of differences.
+pub fn commit() -> Option<String> {
+    let describe = ["describe", "--always", "--abbrev=40", "--exclude=*"];
+    let dirty = (!has_filters()).then_some("--dirty");
+    let output = git(&describe).args(dirty).output().ok().filter(|output| output.status.success())?;
+    Some(String::from_utf8_lossy(&output.stdout).trim().to_owned())
+}
+
+/// Whether the configuration of the repository itself has filters, or cannot be read. Those of the user are the user's own.
+fn has_filters() -> bool {
+    let list = ["config", "--includes", "--show-scope", "--name-only", "--get-regexp", r"^filter\."];
+    let Ok(output) = git(&list).output() else { return true };
+    match output.status.code() {
+        // Nothing matches.
+        Some(1) => false,
+        Some(0) => {
+            let text = String::from_utf8_lossy(&output.stdout);
+            !text.lines().all(|line| line.starts_with("global") || line.starts_with("system"))
+        }
+        _ => true,
+    }
+}
+
+fn git(arguments: &[&str]) -> Command {
+    let mut git = Command::new("git");
+    git.args(SETTINGS.iter().flat_map(|setting| ["-c", setting])).args(arguments).stdin(Stdio::null());
+    // Without these, git writes the index, for which a hook runs, and fetches objects that are missing.
+    git.env("GIT_OPTIONAL_LOCKS", "0").env("GIT_NO_LAZY_FETCH", "1").env("GIT_TERMINAL_PROMPT", "0");
+    git
+}

@@ -33,9 +33,9 @@ fn sampled_factors_fit_the_recorded_start() {
         (0..30).map(|seed| axis(&mut *env, position, seed, sampled()).expect("a start")).collect()
     };
     assert_eq!(axes([60.0, 60.0]), BTreeSet::from([0, 1]), "both walls leave room for this start");
-    assert_eq!(axes([60.0, 112.0]), BTreeSet::from([1]), "the horizontal wall would touch this one");
+    assert_eq!(axes([70.0, 110.0]), BTreeSet::from([1]), "the horizontal wall would touch this one");
     let pinned =
         VariationRequest { variation: Some(vec![]), variation_values: [("wall.axis".to_owned(), vec![0.0])].into() };
-    let error = axis(&mut *env, [60.0, 112.0], 0, pinned).expect_err("a pinned wall is not drawn again").to_string();
+    let error = axis(&mut *env, [70.0, 110.0], 0, pinned).expect_err("a pinned wall is not drawn again").to_string();
     assert!(error.contains("agent.position"), "{error}");
 }

@@ -144,6 +144,7 @@ fn structures() -> Structures {
     let mut structures = Structures::new();
     for source in SOURCES {
         let (mut name, mut text): (Option<String>, Vec<&str>) = (None, vec![]);
+        let mut renamed = None;
         for line in source.lines() {
             let item = line.strip_prefix("pub struct ").or_else(|| line.strip_prefix("pub enum "));
             if let Some(rest) = item {
@@ -153,8 +154,12 @@ fn structures() -> Structures {
             } else if line == "}" {
                 name = None;
             } else if let (Some(name), Some((field, of))) = (&name, declared(line.trim())) {
+                let field = renamed.take().map_or(field, str::to_owned);
                 let field = (field, Field { of: of.to_owned(), text: first_sentence(&text.join(" ")) });
                 structures.entry(name.clone()).or_default().extend([field]);
+            }
+            if let Some(rest) = line.trim().strip_prefix("#[serde(rename = \"") {
+                renamed = rest.split('"').next();
             }
             match line.trim().strip_prefix("///") {
                 Some(words) => text.push(words.trim()),

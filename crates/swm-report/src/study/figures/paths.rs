@@ -173,7 +173,7 @@ mod tests {
             paths,
         };
         let dots = (0..2000).map(|i| vec![[f64::from(i % 50) / 10.0, f64::from(i / 50) / 10.0]]).collect();
-        let line = |end: f64| (0..500).map(|i| [f64::from(i) / 500.0 * end, 1.0]).collect();
+        let line = |end: f64| (0..500).map(|i| [f64::from(i) / 499.0 * end, 1.0]).collect();
         let table = StudyTable {
             rows: vec![
                 row("held-out", dots),

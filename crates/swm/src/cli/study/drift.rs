@@ -306,7 +306,7 @@ mod tests {
             cells.iter().map(|cell| checkpoint_folder(&cell.request).expect("a folder")).collect();
         assert!(folders.iter().all(|folder| *folder == folders[0]), "all rows have one model");
         for (wrong, part) in [
-            (DriftSettings { steps: 0, ..settings.clone() }, "at least 1 step"),
+            (DriftSettings { steps: 0, ..settings.clone() }, "schedule.steps: 0"),
             (DriftSettings { dataset: "s3://bucket/a".to_owned(), ..settings.clone() }, "[[collect]]"),
             (DriftSettings { train: vec!["optim.rl=1".to_owned()], ..settings.clone() }, "optim"),
             (DriftSettings { env: "swm/PushT-v2".to_owned(), ..settings.clone() }, "PushT-v1"),

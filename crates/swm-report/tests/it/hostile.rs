@@ -40,7 +40,7 @@ fn comparisons_that_are_left_out_hide_nothing() {
     let given = results();
     assert!(!given.comparisons.is_empty());
     let page_of = |results| page(&[(folder.path().join("results.json"), results)], &folder.path().join("report"));
-    let without = page_of(swm_core::Results { comparisons: vec![], ..given.clone() });
+    let without = page_of(Results { comparisons: vec![], ..given.clone() });
     assert!(without == page_of(given), "the page compares the episodes, whatever the file states");
 }
 

@@ -34,7 +34,7 @@ def test_lists_and_small_types_are_converted(tmp_path):
         "action": [[0.0, 1.0]] * 3,
         "half": np.ones(4, dtype=np.float16),
         "small": np.arange(4, dtype=np.int8),
-        "step_idx": [9, 9, 9, 9],
+        "step_idx": [9, 10, 11, 12],
     }
     with data.open_writer(path) as writer:
         writer.write_episode(given)

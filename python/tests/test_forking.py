@@ -8,9 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-from stable_worldmodel import World, data
+from stable_worldmodel import World, data, policy
 
-#: A Gymnasium environment, registered when its module is imported, whose step uses another world if it has one.
+#: A Gymnasium environment, and one whose step uses another world, registered when their module is imported.
 COUNTING = """
 import gymnasium
 import numpy as np
@@ -19,22 +19,29 @@ import numpy as np
 class Counting(gymnasium.Env):
     observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
     action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
-    inner = None
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         return np.zeros(1, np.float32), {}
 
     def step(self, action):
-        if Counting.inner is not None:
-            Counting.inner.step()
         return np.zeros(1, np.float32), 0.0, False, False, {}
 
     def render(self):
         return np.zeros((32, 32, 3), np.uint8)
 
 
+class Nested(Counting):
+    inner = None
+
+    def step(self, action):
+        if Nested.inner is not None:
+            Nested.inner.step()
+        return super().step(action)
+
+
 gymnasium.register("Counting-v0", Counting, max_episode_steps=5)
+gymnasium.register("Nested-v0", Nested, max_episode_steps=5)
 """
 
 
@@ -107,12 +114,12 @@ def test_gymnasium_world_inside_the_step_of_another(tmp_path, threads, words):
 import json
 import counting
 import stable_worldmodel as swm
-outer, inner = swm.World("Counting-v0", num_envs=4), swm.World("Counting-v0", num_envs=2, threads={threads})
+outer, inner = swm.World("Nested-v0", num_envs=4), swm.World("Counting-v0", num_envs=2, threads={threads})
 for world in (inner, outer):
     world.set_policy(swm.policy.RandomPolicy())
     world.reset(seed=0)
 said = "no error"
-counting.Counting.inner = inner
+counting.Nested.inner = inner
 try:
     outer.step()
 except Exception as error:
@@ -156,8 +163,8 @@ def test_columns_with_the_names_of_numbers_are_not_left_out_silently(tmp_path):
 
 def test_wrong_starts_and_factors_have_clear_errors(tmp_path):
     world = World("swm/TwoRoom-v1", num_envs=1)
-    world.set_policy("expert")
-    world.collect(tmp_path / "d.lance", episodes=2, seed=0)
+    world.set_policy(policy.ExpertPolicy())
+    world.collect(tmp_path / "d.lance", episodes=2, seed=0, progress=False)
     for episodes, steps, words in (
         ([0, 1], [0], "2 and 1 values"),
         ([0], [-1], "start_steps"),

@@ -284,7 +284,7 @@ def doctor(
         `episodes`, `rows`, `problems` (their number), `findings` (each with `severity`, `what`, `episodes`), `sound` (the
         indices of intact episodes), `models`, and `repaired` (as :func:`convert` returns it, or `None`).
     """
-    options = _options(format, "resume", codec, jpeg_quality, True, 25.0)
+    options = _options(format, "resume", codec, jpeg_quality, True, None)
     target = None if repair is None else os.fspath(repair)
     return dict(json.loads(_engine.doctor(resolve(dataset), target, options, _progress_callback(progress))))
 

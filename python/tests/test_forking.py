@@ -1,4 +1,4 @@
-"""Worlds and writers in processes that were forked after they were made, and Gymnasium worlds in several threads."""
+"""Environments and writers in processes that were forked after they were made, and Gymnasium environments in several threads."""
 
 import json
 import os

@@ -10,7 +10,6 @@ from typing import Any
 from . import _engine
 from .wrapper.visual import engine_wrappers
 
-
 #: Only one thread loads the module of the bridge: Python lists a module before its code has run.
 _LOADING = threading.RLock()
 

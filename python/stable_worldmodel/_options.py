@@ -184,4 +184,5 @@ def _floats(key: str, value: Any, space: Mapping[str, Any] | None) -> list[float
     fractions = np.any(values != np.round(values)) and np.all((values >= 0) & (values <= 1))
     if space is not None and space["type"] == "RGBBox" and fractions:
         values = np.round(255 * values)
-    return values.tolist()
+    found: list[float] = values.tolist()
+    return found

@@ -1,4 +1,4 @@
-"""Environments and writers in processes that were forked after they were made, and Gymnasium environments in several threads."""
+"""Environments and writers in processes that were forked after they were made, and Gymnasium environments in threads."""
 
 import json
 import os

@@ -104,8 +104,8 @@ def rows(episode: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, str | 
     """Splits an episode into arrays `(T, ...)` of types that can be stored, and text constants.
 
     `episode_idx` and `step_idx` are left out, because datasets number episodes and steps; other values of these names are
-    errors. Images `(T, C, H, W)` become `(T, H, W, C)`. Text is stored once per episode. `action` may have one row fewer than the
-    other columns, because no action follows the final observation.
+    errors. Images `(T, C, H, W)` become `(T, H, W, C)`. Text is stored once per episode. `action` may have one row fewer than
+    the other columns, because no action follows the final observation.
     """
     arrays: dict[str, Array] = {}
     constants: dict[str, str | bytes] = {}

@@ -80,7 +80,7 @@ fn pulls_pin_the_commit_and_continue_broken_downloads() {
     assert!(text(&output.stderr).contains("downloaded before"), "{}", text(&output.stderr));
 
     setup.fails(&["pull", "hf://lab/rooms@v9"], None, &["no revision 'v9'"]);
-    setup.fails(&["pull", "hf://lab/rooms/REDME.md"], None, &["REDME.md", "README.md"]);
+    setup.fails(&["pull", "hf://lab/rooms/README.mdx"], None, &["README.mdx", "README.md"]);
     setup.fails(&["pull", "hf://lab/none"], None, &["does not exist, or is private", "HF_TOKEN"]);
     setup.fails(&["pull", "hf://lab/../rooms"], None, &["hf://lab/../rooms"]);
     setup.fails(&["pull", "hf://lab/rooms", "file"], None, &["hf://lab/rooms/file"]);

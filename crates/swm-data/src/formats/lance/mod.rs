@@ -26,9 +26,9 @@ mod store;
 mod table;
 mod writer;
 
+pub(super) use removal::is_unfinished;
 pub use salvage::salvage;
 pub use shard::{Shard, commit_shards, create_shard, shard_manifest, shard_manifests};
-pub(super) use store::is_unfinished;
 
 use crate::formats::entry::{Backend, FormatEntry};
 

@@ -1,7 +1,9 @@
-//! Deletes a table on this machine, and nothing else in its folder.
+//! Deletes a table on this machine, and nothing else in its folder; recognises the rest of one that was never committed.
 
+use super::ENTRY;
 use super::store::{FOLDERS, Store, hash_file, is_version};
 use crate::dataset::Location;
+use std::ffi::OsString;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use swm_core::{Error, Result, files};
@@ -54,4 +56,27 @@ fn regular_files(table: &Path, folder: &str) -> Result<Vec<PathBuf>> {
         }
     }
     Ok(names)
+}
+
+/// Whether a folder with the suffix of a table holds only what a writer leaves that was killed, or whose disk was full, before
+/// its first commit: data files, named by the hash of their content, and no version. The logs of shards are no such rest.
+pub fn is_unfinished(folder: &Path) -> bool {
+    let names = |folder: &Path| -> std::io::Result<Vec<OsString>> {
+        std::fs::read_dir(folder)?.map(|entry| entry.map(|entry| entry.file_name())).collect()
+    };
+    // Hidden files and temporary files of the object store begin like the file that they become.
+    let is_data = |name: &OsString| {
+        name.to_str().is_some_and(|name| {
+            name.len() > 64 && name.is_char_boundary(64) && {
+                let (hash, rest) = name.split_at(64);
+                hash.bytes().all(|byte| byte.is_ascii_hexdigit()) && rest.starts_with(".lance")
+            }
+        })
+    };
+    let holds_only_data = || -> std::io::Result<bool> {
+        Ok(names(folder)?.iter().all(|name| name == "data" || name == "_versions")
+            && (!folder.join("_versions").exists() || names(&folder.join("_versions"))?.is_empty())
+            && (!folder.join("data").exists() || names(&folder.join("data"))?.iter().all(is_data)))
+    };
+    ENTRY.has_suffix(&Location::from(folder)) && folder.is_dir() && holds_only_data().unwrap_or(false)
 }

@@ -14,6 +14,9 @@ const BLOCK: usize = 5;
 const STEADY: u32 = 256;
 /// The calls of a trial: a block, and a first call, which wakes the threads and is not counted.
 const TRIAL: u32 = BLOCK as u32 + 1;
+/// The weights of a block of the way in use, and of a trial, in what is known of a way.
+const STEADY_WEIGHT: f32 = 1.0 / 8.0;
+const TRIAL_WEIGHT: f32 = 1.0 / 4.0;
 /// The most doubts, and the blocks of normal use after which there is one less.
 const MOST_DOUBTS: u32 = 6;
 const CALM: u32 = 64;
@@ -75,7 +78,7 @@ impl Way {
         if self.is_known() && !is_trial {
             (self.sum, self.count) = (self.sum + each, self.count + 1);
             if self.count == STEADY {
-                self.set(self.sum / STEADY as f32);
+                self.learn(self.sum / STEADY as f32, STEADY_WEIGHT);
                 return true;
             }
             return false;
@@ -84,16 +87,19 @@ impl Way {
         self.filled += 1;
         if self.filled == BLOCK {
             self.block.sort_unstable_by(f32::total_cmp);
-            self.set(self.block[BLOCK / 2]);
+            self.learn(self.block[BLOCK / 2], TRIAL_WEIGHT);
         } else if nanos > LONG && !self.is_known() {
-            self.set(each);
+            self.learn(each, 1.0);
         }
         false
     }
 
-    fn set(&mut self, nanos: f32) {
+    /// Moves the known duration towards that of a block, by a share of the difference. A share below 1 keeps one call that
+    /// waited for the system from deciding alone.
+    fn learn(&mut self, nanos: f32, share: f32) {
+        let known = if self.is_known() { self.known + share * (nanos - self.known) } else { nanos };
         // The smallest positive number stands for a duration below the resolution of the clock.
-        self.known = nanos.max(f32::MIN_POSITIVE);
+        self.known = known.max(f32::MIN_POSITIVE);
         (self.filled, self.sum, self.count) = (0, 0.0, 0);
     }
 

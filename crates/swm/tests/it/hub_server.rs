@@ -184,14 +184,7 @@ impl HubServer {
                 let Some(index) = commit_of(revision) else {
                     return Answer::error("404 Not Found", "RevisionNotFound");
                 };
-                // Two files a page.
-                let page: usize =
-                    query.split('&').find_map(|pair| pair.strip_prefix("cursor=")?.parse().ok()).unwrap_or(0);
-                let files: Vec<Value> = found.commits[index].iter().map(|(path, bytes)| entry(path, bytes)).collect();
-                let next = (2 * page + 2 < files.len())
-                    .then(|| format!("<{}{path}?recursive=true&cursor={}>; rel=\"next\"", self.address, page + 1));
-                let shown: Vec<&Value> = files.iter().skip(2 * page).take(2).collect();
-                Answer { headers: next.map(|next| ("link", next)).into_iter().collect(), ..Answer::json(&json!(shown)) }
+                page(&found.commits[index], path, query, &self.address)
             }
             ("GET", ["resolve", revision, file]) => {
                 let Some(index) = commit_of(revision) else {
@@ -209,14 +202,7 @@ impl HubServer {
                 Answer { status: "302 Found", headers: vec![("location", to)], ..Answer::ok(vec![]) }
             }
             _ if !may_write => Answer::error("403 Forbidden", ""),
-            ("POST", ["preupload", "main"]) => {
-                let body: Value = serde_json::from_slice(&request.body).expect("JSON");
-                let decided = body["files"].as_array().into_iter().flatten().map(|file| {
-                    let is_large = file["size"].as_u64().is_some_and(|size| size >= LARGE as u64);
-                    json!({"path": file["path"], "uploadMode": if is_large { "lfs" } else { "regular" }, "shouldIgnore": false})
-                });
-                Answer::json(&json!({"files": decided.collect::<Vec<_>>()}))
-            }
+            ("POST", ["preupload", "main"]) => preupload(&request.body),
             ("POST", ["info", "lfs", "objects/batch"]) => {
                 state.batch(&request.body, &self.storage, &self.address, &name)
             }
@@ -225,6 +211,26 @@ impl HubServer {
             _ => Answer::error("404 Not Found", ""),
         }
     }
+}
+
+/// Two files of a commit, and the address of the next ones.
+fn page(files: &BTreeMap<String, Vec<u8>>, path: &str, query: &str, address: &str) -> Answer {
+    let page: usize = query.split('&').find_map(|pair| pair.strip_prefix("cursor=")?.parse().ok()).unwrap_or(0);
+    let files: Vec<Value> = files.iter().map(|(path, bytes)| entry(path, bytes)).collect();
+    let next = (2 * page + 2 < files.len())
+        .then(|| format!("<{address}{path}?recursive=true&cursor={}>; rel=\"next\"", page + 1));
+    let shown: Vec<&Value> = files.iter().skip(2 * page).take(2).collect();
+    Answer { headers: next.map(|next| ("link", next)).into_iter().collect(), ..Answer::json(&json!(shown)) }
+}
+
+/// How each file is uploaded.
+fn preupload(body: &[u8]) -> Answer {
+    let body: Value = serde_json::from_slice(body).expect("JSON");
+    let decided = body["files"].as_array().into_iter().flatten().map(|file| {
+        let is_large = file["size"].as_u64().is_some_and(|size| size >= LARGE as u64);
+        json!({"path": file["path"], "uploadMode": if is_large { "lfs" } else { "regular" }, "shouldIgnore": false})
+    });
+    Answer::json(&json!({"files": decided.collect::<Vec<_>>()}))
 }
 
 impl State {

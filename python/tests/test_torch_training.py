@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -29,6 +30,7 @@ SHORT = [
     "log_every=2",
     "shards=1",
 ]
+PIXELS = 'model.encoding=[{column="pixels",latent=16},{column="state",latent=8}]'
 CONV = "model.encoder={conv={channels=[6,8],hidden=12,dim=10}}"
 
 
@@ -36,6 +38,15 @@ CONV = "model.encoder={conv={channels=[6,8],hidden=12,dim=10}}"
 def rooms(tmp_path_factory):
     path = tmp_path_factory.mktemp("data") / "rooms.lance"
     world = swm.World("swm/TwoRoom-v1", num_envs=3, image_shape=(64, 64), max_episode_steps=25)
+    world.collect(path, episodes=12, seed=0, progress=False, policy=swm.policy.RandomPolicy(seed=0))
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def swings(tmp_path_factory):
+    """Episodes with rewards."""
+    path = tmp_path_factory.mktemp("data") / "swings.lance"
+    world = swm.World("swm/PendulumControl-v1", num_envs=3, image_shape=(64, 64), max_episode_steps=25)
     world.collect(path, episodes=12, seed=0, progress=False, policy=swm.policy.RandomPolicy(seed=0))
     return str(path)
 
@@ -73,7 +84,16 @@ RUNS = [
     ("gcivl", ["model.metric=6", "model.head.depth=4", "model.history=2", "data.num_steps=3"]),
     ("gcivl", [CONV, "model.history=2", "data.num_steps=3"]),
     ("gciql", []),
+    ("dino_wm", ["validation.every=3", "validation.batches=2"]),
+    ("dino_wm", [CONV, "model.predictor.history=2", "optim.accumulate=2"]),
+    ("dino_wm", ["model.decoder=8", 'model.columns=[{name="proprio",dim=3},{name="action",dim=4}]', "optim.ema=0.5"]),
+    # The noise of the policy's actions is drawn differently.
+    ("tdmpc2", ["loss.entropy=0.0", "optim.accumulate=2"]),
+    ("tdmpc2", ["loss.entropy=0.0", "model.termination=true", "optim.ema=0.5"]),
+    ("tdmpc2", ["loss.entropy=0.0", PIXELS, "model.image=64", "model.critics=2"]),
 ]
+#: What a log has of other random numbers.
+DRAWN = {"lewm": {"sigreg"}, "tdmpc2": {"entropy", "policy", "q"}}
 
 
 def assert_close(found, expected, tolerance, scale=None):
@@ -89,11 +109,12 @@ def part(tensors, prefix):
 
 
 @pytest.mark.parametrize(("family", "settings"), RUNS)
-def test_a_step_equals_that_of_the_engine(family, settings, rooms, tmp_path):
+def test_a_step_equals_that_of_the_engine(family, settings, rooms, swings, tmp_path):
+    data = swings if family == "tdmpc2" else rooms
     short = [setting for setting in SHORT if not setting.startswith("schedule")]
     settings = [*short, *settings, "schedule.steps=1", "schedule.warmup=0"]
-    engine_train(family, rooms, tmp_path / "engine", settings)
-    torch_train(family, rooms, tmp_path / "torch", settings)
+    engine_train(family, data, tmp_path / "engine", settings)
+    torch_train(family, data, tmp_path / "torch", settings)
     expected, found = weights(tmp_path / "engine", "optimizer"), weights(tmp_path / "torch", "optimizer")
     # The first moment is a tenth of the clipped gradient. A rounding error may switch a ReLU of the convolutions.
     assert_close(part(found, "first."), part(expected, "first."), 5e-3)
@@ -106,12 +127,13 @@ def test_a_step_equals_that_of_the_engine(family, settings, rooms, tmp_path):
 
 
 @pytest.mark.parametrize(("family", "settings"), RUNS)
-def test_a_training_equals_that_of_the_engine(family, settings, rooms, tmp_path):
+def test_a_training_equals_that_of_the_engine(family, settings, rooms, swings, tmp_path):
+    data = swings if family == "tdmpc2" else rooms
     settings = [*SHORT, *settings]
-    engine_train(family, rooms, tmp_path / "engine", settings)
-    torch_train(family, rooms, tmp_path / "torch", settings)
+    engine_train(family, data, tmp_path / "engine", settings)
+    torch_train(family, data, tmp_path / "torch", settings)
     for mine, theirs in zip(log_of(tmp_path / "torch"), log_of(tmp_path / "engine"), strict=True):
-        for name in theirs.keys() - {"seconds", "clips_per_second", "data_wait", "sigreg"}:
+        for name in theirs.keys() - {"seconds", "clips_per_second", "data_wait"} - DRAWN.get(family, set()):
             assert mine[name] == pytest.approx(theirs[name], rel=0.05, abs=1e-5), name
     state = [json.loads((tmp_path / run / "checkpoint/state.json").read_text()) for run in ("torch", "engine")]
     assert state[0]["step"] == state[1]["step"] == 6
@@ -120,13 +142,33 @@ def test_a_training_equals_that_of_the_engine(family, settings, rooms, tmp_path)
     assert swm.wm.load(str(tmp_path / "torch")).card["family"] == family
 
 
-@pytest.mark.parametrize("family", ["pldm", "gciql"])
-def test_engine_and_torch_continue_each_others_trainings(family, rooms, tmp_path):
+@pytest.mark.parametrize(("steps", "entropy"), [(40, 0.0), (1, 1.0)])
+def test_the_policy_of_tdmpc2_gets_the_engines_gradient(steps, entropy, swings, tmp_path):
+    # The noise of actions is drawn differently: values depend little on it, and so do entropies of a new policy.
+    settings = ["data.batch_size=256", "model.critics=2", "optim.lr=5e-3", "optim.epsilon=1e-2", "loss.value=10.0"]
+    settings += [f"schedule.steps={steps + 1}", f"loss.entropy={entropy}"]
+    options = {"data": swings, "preset": "tiny", "device": "cpu", "settings": settings}
+    Trainer(Options("tdmpc2", out=str(tmp_path / "engine"), **options)).train(until=steps)
+    shutil.copytree(tmp_path / "engine", tmp_path / "torch")
+    before = weights(tmp_path / "torch", "optimizer")
+    engine_train("tdmpc2", swings, tmp_path / "engine", settings, "--resume")
+    Trainer(Options("tdmpc2", out=str(tmp_path / "torch"), resume=True, **options)).train()
+    runs = (weights(tmp_path / run, "optimizer") for run in ("engine", "torch"))
+    expected, found = ({name: run[name] - 0.9 * value for name, value in before.items()} for run in runs)
+    for prefix, tolerance in (("first.pi.", 0.1), ("first.qs.", 0.01), ("first.dynamics.", 0.01)):
+        expected_part, found_part = part(expected, prefix), part(found, prefix)
+        norm = sum(value.square().sum().item() for value in expected_part.values()) ** 0.5
+        assert 0 < distance(found_part, expected_part) < tolerance * norm, prefix
+
+
+@pytest.mark.parametrize("family", ["pldm", "gciql", "dino_wm", "tdmpc2"])
+def test_engine_and_torch_continue_each_others_trainings(family, rooms, swings, tmp_path):
+    data = swings if family == "tdmpc2" else rooms
     settings = [*SHORT, "optim.ema=0.5"]
-    engine_train(family, rooms, tmp_path / "whole", settings)
-    options = {"data": rooms, "preset": "tiny", "settings": settings, "device": "cpu"}
+    engine_train(family, data, tmp_path / "whole", settings)
+    options = {"data": data, "preset": "tiny", "settings": settings, "device": "cpu"}
     Trainer(Options(family, out=str(tmp_path / "run"), **options)).train(until=3)
-    engine_train(family, rooms, tmp_path / "run", settings, "--resume")
+    engine_train(family, data, tmp_path / "run", settings, "--resume")
     Trainer(Options(family, out=str(tmp_path / "start"), **options)).train(until=3)
     for name in ("weights", "raw"):
         found, expected = weights(tmp_path / "run", name), weights(tmp_path / "whole", name)
@@ -135,25 +177,31 @@ def test_engine_and_torch_continue_each_others_trainings(family, rooms, tmp_path
         Trainer(Options(family, out=str(tmp_path / "run"), **options))
 
 
-def test_a_continued_training_equals_a_whole_one(rooms, tmp_path):
-    settings = [*SHORT, "model.predictor.dropout=0.2", "optim.ema=0.9"]
-    torch_train("lewm", rooms, tmp_path / "whole", settings)
-    options = {"data": rooms, "preset": "tiny", "settings": settings, "device": "cpu", "out": str(tmp_path / "run")}
-    Trainer(Options("lewm", **options)).train(until=4)
-    Trainer(Options("lewm", resume=True, **options)).train()
+@pytest.mark.parametrize(
+    ("family", "dropout"), [("lewm", "model.predictor"), ("dino_wm", "model.predictor"), ("tdmpc2", "model")]
+)
+def test_a_continued_training_equals_a_whole_one(family, dropout, rooms, swings, tmp_path):
+    data = swings if family == "tdmpc2" else rooms
+    settings = [*SHORT, f"{dropout}.dropout=0.2", "optim.ema=0.9"]
+    torch_train(family, data, tmp_path / "whole", settings)
+    options = {"data": data, "preset": "tiny", "settings": settings, "device": "cpu", "out": str(tmp_path / "run")}
+    Trainer(Options(family, **options)).train(until=4)
+    Trainer(Options(family, resume=True, **options)).train()
     for name in ("weights", "raw", "optimizer"):
         found, expected = weights(tmp_path / "run", name), weights(tmp_path / "whole", name)
         assert all(torch.equal(found[key], value) for key, value in expected.items()) and found.keys() == expected.keys()
     assert [row["step"] for row in log_of(tmp_path / "run")] == [2, 4, 6]
     with pytest.raises(ValueError, match="stored 10, requested 11"):
         settings[0] = "data.batch_size=11"
-        Trainer(Options("lewm", resume=True, **options))
+        Trainer(Options(family, resume=True, **options))
 
 
-def test_the_engine_plans_with_what_torch_trained(rooms, tmp_path):
-    run = torch_train("lewm", rooms, tmp_path / "run", SHORT, amp="bf16", compile="eager")
+@pytest.mark.parametrize("family", ["lewm", "dino_wm", "tdmpc2"])
+def test_the_engine_plans_with_what_torch_trained(family, rooms, swings, tmp_path):
+    data, env = (swings, "swm/PendulumControl-v1") if family == "tdmpc2" else (rooms, "swm/TwoRoom-v1")
+    run = torch_train(family, data, tmp_path / "run", SHORT, amp="bf16", compile="eager")
     module, engine = load_pretrained(run), swm.wm.load(run)
-    world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(64, 64), max_episode_steps=10)
+    world = swm.World(env, num_envs=2, image_shape=(64, 64), max_episode_steps=10)
     for model in (module, engine):
         world.set_policy(swm.policy.WorldModelPolicy(swm.planning.CEMSolver(model, num_samples=8, n_steps=2, topk=4)))
         assert 0 <= world.evaluate(episodes=2, seed=0)["success_rate"] <= 100
@@ -181,18 +229,20 @@ data, folder, cases, *settings = sys.argv[1:]
 found = {}
 for family, count in (case.split(":") for case in cases.split(",")):
     run = f"{folder}/{family}-{count}"
-    trainer = Trainer(Options(family, data, out=run, preset="tiny", device="cpu", settings=settings))
+    more = ["loss.entropy=0.0", "model.dropout=0.0"] if family == "tdmpc2" else []
+    trainer = Trainer(Options(family, data, out=run, preset="tiny", device="cpu", settings=[*settings, *more]))
     steps, count, ranks = trainer.config["data"]["num_steps"], int(count), trainer.ranks
     torch.manual_seed(0)
     lengths = {"pixels": steps, "goal_pixels": 1, "policy_goal_pixels": 1}
     whole = {name: torch.randint(0, 256, (10, length, 3, 64, 64), dtype=torch.uint8) for name, length in lengths.items()}
     whole["action"] = torch.randn(10, steps, 2 * trainer.model.action_block)
+    whole |= {"state": torch.randn(10, steps, 2), "reward": torch.randn(10, steps, 1), "terminated": torch.zeros(10, steps, 1)}
     sizes = [count // ranks.size + (rank < count % ranks.size) for rank in range(ranks.size)]
     begin = sum(sizes[: ranks.rank])
     batch = {name: value[begin : begin + sizes[ranks.rank]] for name, value in whole.items()}
-    trainer._train_mode()
+    trainer.losses.train_mode()
     trainer._seed(0)
-    computed = trainer.losses(batch, ranks.sizes(len(batch["pixels"]), trainer.device))
+    computed = trainer.losses(batch, ranks.sizes(len(batch["action"]), trainer.device))
     loss = torch.zeros(1)
     if computed:
         share = trainer.losses.share(sizes)
@@ -220,7 +270,7 @@ def launched(world_size, *arguments):
 def test_gradients_do_not_depend_on_the_number_of_processes(rooms, tmp_path):
     program = tmp_path / "program.py"
     program.write_text(PROGRAM)
-    cases, found = ["gcbc:10", "gciql:2", "lewm:10", "pldm:3"], {}
+    cases, found = ["gcbc:10", "gciql:2", "lewm:10", "pldm:3", "dino_wm:3", "tdmpc2:3"], {}
     for size in (1, 2, 3, 4):
         folder = tmp_path / str(size)
         folder.mkdir()
@@ -292,7 +342,7 @@ def test_ctrl_c_saves_the_checkpoint(rooms, tmp_path):
         (["lewm"], 2, "data=PATH"),
         (["lewm", "data=nothing"], 1, "nothing"),
         (["lewm", "data"], 2, "KEY=VALUE"),
-        (["tdmpc2", "data=nothing"], 2, "swm train"),
+        (["inverse", "data=nothing"], 2, "swm train"),
         (["lewm", "data=nothing", "amp=half"], 2, "bf16"),
         (["lewm", "data=nothing", "resume=maybe"], 2, "true or false"),
         (["lewm", "data=nothing", "threads=many"], 2, "whole number"),

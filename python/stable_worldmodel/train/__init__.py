@@ -23,7 +23,7 @@ def train(family: str, data: Any, kind: Any = None, *, settings: Any = (), **opt
     """Trains a model, and returns the folder of its checkpoint.
 
     Args:
-        family: The model: `lewm`, `pldm`, `gcbc`, `gcivl` or `gciql`.
+        family: The model: `lewm`, `pldm`, `dino_wm`, `tdmpc2`, `gcbc`, `gcivl` or `gciql`.
         data: The dataset: a path or a name.
         kind: A class derived from that of the family, for models with other methods.
         settings: Settings of the configuration, such as `["model.latent=4"]`.

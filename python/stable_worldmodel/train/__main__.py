@@ -12,7 +12,7 @@ USAGE = """Train a baseline in torch
 usage: python -m stable_worldmodel.train FAMILY data=PATH [OPTION=VALUE ...]
                                          [KEY=VALUE ...]
 
-families: lewm, pldm, gcbc, gcivl, gciql
+families: lewm, pldm, dino_wm, tdmpc2, gcbc, gcivl, gciql
 
 options:
   data=DATASET   The dataset: a path or a name

@@ -165,7 +165,7 @@ class Trainer:
     def _update(self, batches: Iterator[dict[str, Tensor]], interrupt: bool) -> tuple[dict[str, float], bool]:
         """A step of the optimizer: its metrics, and whether a rank was interrupted."""
         model, accumulate = self.model, self.config["optim"].get("accumulate", 1)
-        self._train_mode()
+        self.losses.train_mode()
         self.optimizer.zero_grad()
         names = self.losses.names
         total = torch.zeros(len(names) + 1, device=self.device)
@@ -174,7 +174,7 @@ class Trainer:
             begin = time.monotonic()
             batch = next(batches)
             self.waited += time.monotonic() - begin
-            sizes = self.ranks.sizes(len(batch["pixels"]), self.device)
+            sizes = self.ranks.sizes(len(batch["action"]), self.device)
             share = self.losses.share(sizes)
             self._seed(self.step * accumulate + index)
             self.losses.accumulate(index, accumulate)
@@ -200,11 +200,6 @@ class Trainer:
         self.step += 1
         return metrics, stop > 0
 
-    def _train_mode(self) -> None:
-        self.model.train()
-        if self.config["model"].get("frozen"):
-            self.model.encoder.eval()
-
     def _seed(self, batch: int) -> None:
         """Makes random numbers depend on the batch only. Ranks that compute the whole batch draw the same."""
         own = 0 if self.losses.whole_batch else self.ranks.rank
@@ -224,7 +219,7 @@ class Trainer:
         with self._averaged(), torch.no_grad(), self.losses.validating():
             self.validation.set_epoch(0)
             for index, batch in zip(range(settings["batches"]), self.validation, strict=False):
-                sizes = self.ranks.sizes(len(batch["pixels"]), self.device)
+                sizes = self.ranks.sizes(len(batch["action"]), self.device)
                 self._seed(-1 - index)
                 found = self.losses(batch, sizes)
                 share = self.losses.share(sizes)

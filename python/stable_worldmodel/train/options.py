@@ -18,7 +18,7 @@ class Options:
     """A training.
 
     Attributes:
-        family: The model: `lewm`, `pldm`, `gcbc`, `gcivl` or `gciql`.
+        family: The model: `lewm`, `pldm`, `dino_wm`, `tdmpc2`, `gcbc`, `gcivl` or `gciql`.
         data: The dataset: a path or a name.
         out: The checkpoint to write: a path or a name; `FAMILY-DATASET` for `None`.
         preset: The name of a configuration, or a TOML file; the first one of the family for `None`.

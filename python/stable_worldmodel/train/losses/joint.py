@@ -1,0 +1,91 @@
+"""The losses of LeWM and PLDM, whose encoder and predictor are trained together.
+
+Shapes: B clips of a batch on all ranks, T steps, D the latent dimension, A the dimension of a model step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from torch import Tensor
+
+from ...wm.jepa import JEPA
+from ...wm.loss import PLDMLoss, SIGReg, TemporalStraighteningLoss
+from .base import Losses, windows
+
+__all__ = ["Joint", "LeWMLosses", "PLDMLosses"]
+
+
+class Joint(Losses):
+    """Base class of LeWM and PLDM: the squared error of predicted latents and a regulariser of all latents.
+
+    Every rank encodes its slice. The features of all ranks are gathered, because normalisations and regularisers depend on
+    the whole batch.
+    """
+
+    whole_batch = True
+    model: JEPA
+
+    def compile(self, compiled: Callable[[Any], Any]) -> None:
+        self._encode, self._predict = compiled(self.model._features), compiled(self.model.predictor)
+
+    def __call__(self, batch: Mapping[str, Tensor], sizes: Sequence[int]) -> dict[str, Tensor]:
+        model, pixels = self.model, batch["pixels"]
+        count, steps, device = len(pixels), pixels.shape[1], pixels.device
+        with self.precision():
+            features = self._encode(model.frames(pixels).flatten(0, 1)) if count else None
+        gathered = self.ranks.gather(features, [size * steps for size in sizes], device)
+        actions = self.ranks.gather(self.actions(batch) if count else None, sizes, device, differentiable=False)
+        history = self._history(steps)
+        with self.precision():
+            z = model.projector(gathered).unflatten(0, (-1, steps))
+            predicted = self._predict(windows(z, history, 0), model.action_encoder(windows(actions, history, 0)))
+            predicted = model.pred_proj(predicted.flatten(0, 1)).unflatten(0, (-1, history))
+        z = z.float()
+        prediction = (predicted.float() - windows(z, history, 1)).square().mean()
+        regulariser, terms = self.regularise(z, actions)
+        return {"loss": prediction + regulariser, "prediction": prediction, **terms}
+
+    def _history(self, steps: int) -> int:
+        return min(int(self.model.predictor.num_frames), steps - 1)  # type: ignore[arg-type]
+
+    def regularise(self, z: Tensor, actions: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """The regulariser of the latents `(B, T, D)`, and its terms."""
+        raise NotImplementedError
+
+
+class LeWMLosses(Joint):
+    """LeWM: SIGReg (Maes et al., 2026), and optionally straight paths of latents."""
+
+    names: tuple[str, ...] = ("loss", "prediction", "sigreg")
+
+    def compile(self, compiled: Callable[[Any], Any]) -> None:
+        super().compile(compiled)
+        #: The weight of straight paths.
+        self.straight = float(self.settings.get("temp_straight", 0.0))
+        if self.straight:
+            self.names = (*self.names, "temp_straight")
+        self.sigreg = SIGReg(self.settings["knots"], self.settings["directions"])
+
+    def regularise(self, z: Tensor, actions: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        sigreg = self.sigreg.to(z.device)(z.transpose(0, 1))
+        total, terms = self.settings["weight"] * sigreg, {"sigreg": sigreg}
+        if self.straight:
+            terms["temp_straight"] = TemporalStraighteningLoss()(z)
+            total = total + self.straight * terms["temp_straight"]
+        return total, terms
+
+
+class PLDMLosses(Joint):
+    """PLDM: variance, covariance, temporal alignment, and inverse dynamics (Sobal et al., 2025)."""
+
+    names = ("loss", "prediction", "std", "std_t", "cov", "cov_t", "temp_align", "idm", "temp_straight")
+
+    def regularise(self, z: Tensor, actions: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        idm: Any = self.model.idm
+        found = PLDMLoss()(z, idm(z), actions[:, :-1])
+        terms = {name.removesuffix("_loss"): term for name, term in found.items()}
+        terms["temp_straight"] = TemporalStraighteningLoss()(z) if z.shape[1] > 2 else z.new_zeros(())
+        total: Any = sum(self.settings[name] * term for name, term in terms.items() if self.settings[name])
+        return total, terms

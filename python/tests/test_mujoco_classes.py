@@ -152,3 +152,164 @@ def test_environments_survive_pickling(make):
     twin = pickle.loads(pickle.dumps(env))
     action = env.action_space.sample()
     same(env.step(action)[4], twin.step(action)[4])
+
+
+def unnamed(info):
+    """Infos without the name of the environment."""
+    return {key: value for key, value in info.items() if key != "env_name"}
+
+
+def current(env):
+    """The infos of the current state."""
+    return env._get_info()
+
+
+@pytest.mark.parametrize("name", DOMAINS)
+def test_states_of_dm_control_are_read_and_set(name):
+    env = domain(name)()
+    env.reset(seed=1)
+    for _ in range(4):
+        *_, info = env.step(env.action_space.sample())
+    assert env.info["env_name"] == domain(name).__name__.removesuffix("DMControlWrapper")
+    same(info, unnamed(env.info))
+    qpos, qvel = info["qpos"].copy(), 0.5 * info["qvel"]
+    qpos[-1] += 0.1
+    env.set_state(qpos, qvel)
+    assert np.array_equal(env.info["qpos"], qpos) and np.array_equal(env.info["qvel"], qvel)
+    assert np.array_equal(env.info["goal_state"], info["goal_state"])
+    for wrong in ((qpos[1:], qvel), (qpos, np.full_like(qvel, np.nan))):
+        with pytest.raises(ValueError):
+            env.set_state(*wrong)
+    with pytest.raises(ValueError, match="environment_kwargs"):
+        env.compile_model(environment_kwargs={"flat_observation": True})
+
+
+def test_factors_are_changed_in_an_episode_or_for_the_next():
+    env = domain("walker")()
+    env.reset(seed=1)
+    env.step(env.action_space.sample())
+    before, color = env.info, np.array([0.1, 0.2, 0.3])
+    env.set_gravity([0, 0, -5.0])
+    env.variation_space["agent"]["color"].set_value(color)
+    assert not np.array_equal(env._env.factors()["agent.color"], color)
+    env.apply_runtime_variations()
+    assert np.array_equal(env._env.factors()["agent.color"], color) and env._env.factors()["gravity.z"] == [-5.0]
+    same(unnamed(before), unnamed(env.info))
+    env.compile_model(seed=3)
+    assert np.array_equal(env.variation_space["agent"]["color"].value, color) and env.info["score"] == 0
+    env.mark_dirty()
+    env.reset(seed=3)
+    assert env.variation_space["gravity"]["z"].value == [-9.81]
+    for gravity in ([0, 0, 50.0], [0, 0]):
+        with pytest.raises(ValueError):
+            env.set_gravity(gravity)
+    with pytest.raises(ValueError, match="no factors of gravity"):
+        domain("finger")().set_gravity([0, 0, -5])
+
+
+def test_the_reacher_matches_positions():
+    env = domain("reacher")(task="qpos_match")
+    _, info = env.reset(seed=0, options={"target_qpos": [0.3, 0.4]})
+    assert np.array_equal(info["goal_state"], [0.3, 0.4, 0, 0]) and not info["success"]
+    env.set_state([0.3, 0.4], [0, 0])
+    assert env.info["success"]
+    env.set_target_qpos([1.3, 0.4])
+    assert not env.info["success"]
+    with pytest.raises(ValueError, match="expected \\(2,\\)"):
+        env.set_target_qpos([1.3])
+    with pytest.raises(ValueError, match="qpos_match"):
+        domain("reacher")().set_target_qpos([0, 0])
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [(CubeEnv, {"env_type": "double", "reward_task_id": 2}), (CubeEnv, {"multiview": True}), (SceneEnv, {"reward_task_id": 1})],
+)
+def test_read_outs_of_tables_are_those_of_steps(kind, options):
+    env = kind(**options)
+    env.reset(seed=0)
+    for _ in range(6):
+        observation, reward, *_, info = env.step(env.action_space.sample())
+        assert np.array_equal(env.compute_observation(), observation) and env.compute_reward() == reward
+    found = env.get_step_info()
+    assert found["env_name"] == type(env).__name__.removesuffix("Env")
+    same(info, unnamed(found))
+    same(info, unnamed(env.get_reset_info()))
+    objects = {}
+    env.add_object_info(objects)
+    assert np.array_equal(objects["privileged/block_0_pos"], info["privileged/block_0_pos"])
+    # The oracle sees the objects as the observation does: cubes follow the arm, the drawer and the window are last.
+    oracle = env.compute_oracle_observation()
+    assert np.allclose(oracle[:3], observation[19:22])
+    if isinstance(env, SceneEnv):
+        assert np.array_equal(oracle[3:5], info["button_states"]) and np.allclose(oracle[5:], observation[[36, 38]])
+    frames = env.render_multiview()
+    if env._multiview:
+        assert np.array_equal(frames["front_pixels"], env.render()) and not np.array_equal(*frames.values())
+    else:
+        assert np.array_equal(frames, env.render("front_pixels"))
+    assert not np.array_equal(env.render("side_pixels"), env.render())
+    with pytest.raises(TypeError, match="camera"):
+        env.render("front", 64)
+
+
+def test_goals_of_cubes_are_set():
+    env = CubeEnv("double")
+    env.reset(seed=0)
+    before = current(env)
+    observation, info = env.set_new_target()
+    assert np.array_equal(info["state"], before["state"]) and np.array_equal(observation, env.compute_observation())
+    assert (
+        not np.array_equal(info["goal/block_pos"], before["goal/block_pos"]) and env.set_new_target(return_info=False) is None
+    )
+    env.set_target_pos(1, before["privileged/block_1_pos"], before["privileged/block_1_quat"])
+    env.set_target_pos(0, before["privileged/block_0_pos"] + [0.2, 0, 0])
+    assert np.allclose(current(env)["goal/block_yaw"][1], before["privileged/block_1_yaw"]) and env.compute_reward() == 0
+    env.set_target_pos(0, before["privileged/block_0_pos"])
+    assert env.compute_reward() == 1 and current(env)["success"]
+    for wrong in ((2, [0, 0, 0]), (0, [0, 0])):
+        with pytest.raises(ValueError):
+            env.set_target_pos(*wrong)
+
+
+def test_goals_and_states_of_scenes_are_set():
+    env = SceneEnv(reward_task_id=1)
+    env.reset(seed=0)
+    now = current(env)
+    # Buttons that hold, and a drawer and a window at their goals, all but the cube.
+    qpos = now["qpos"].copy()
+    qpos[23:25] = -0.16, 0.2
+    env.set_state(qpos, 0 * now["qvel"], button_state_0=1, button_state_1=0)
+    env.set_cube_target_pos(0, now["privileged/block_0_pos"] + [0.2, 0, 0])
+    for button, state in ((0, 1), (1, 0)):
+        env.set_target_button_state(button, state)
+    env.set_target_drawer_pos(-0.16)
+    env.set_target_window_pos(0.2)
+    now = current(env)
+    assert list(now["button_states"]) == list(now["goal/button_states"]) == [1, 0]
+    assert now["privileged/drawer_pos"] == now["goal/drawer_pos"] == -0.16
+    assert now["privileged/window_pos"] == now["goal/window_pos"] == 0.2
+    assert env.compute_reward() == -1 and not now["success"]
+    env.set_cube_target_pos(0, now["privileged/block_0_pos"])
+    assert env.compute_reward() == 0 and current(env)["success"]
+    env.set_target_window_pos(0.0)
+    assert env.compute_reward() == -1
+    for wrong in ((2, 0), (0, 2)):
+        with pytest.raises(ValueError):
+            env.set_target_button_state(*wrong)
+    with pytest.raises(TypeError, match="button_state_0"):
+        env.set_state(qpos, now["qvel"], button_state_7=1)
+    # Options come first, as in the reference.
+    assert np.array_equal(env.reset({"variation": ["cube"]}, seed=2)[0], env.reset(options={"variation": ["cube"]}, seed=2)[0])
+
+
+def test_mazes_are_changed():
+    env = MazeEnv()
+    env.reset(seed=0)
+    position = current(env)["xy"] + [0.3, 0.1]
+    env.set_state(position, [0, 0])
+    assert np.allclose(current(env)["xy"], position)
+    env.variation_space["wall"]["color"].set_value(np.array([0.1, 0.2, 0.3]))
+    env.mark_dirty()
+    env.compile_model()
+    assert np.allclose(env._env.factors()["wall.color"], [0.1, 0.2, 0.3])

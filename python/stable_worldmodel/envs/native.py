@@ -55,6 +55,8 @@ class NativeEnv(gymnasium.Env):
         self.image_shape = (int(image_shape[0]), int(image_shape[1]))
         self.action_space = swm_spaces.from_description(self._described["action_space"])
         self.observation_space = swm_spaces.from_description(self._described["observation_space"])
+        #: Whether `variation_space` has the values of the current episode.
+        self._factors_read = False
         columns = self._env.reset(0, _options.reset(None, {}))
         self._start = columns["state"]
         if isinstance(self.observation_space, gymnasium.spaces.Dict) and not self.observation_space.spaces:
@@ -84,8 +86,11 @@ class NativeEnv(gymnasium.Env):
 
     @property
     def variation_space(self) -> swm_spaces.Dict:
-        """The factors of variation, with the values of the current episode."""
+        """The factors of variation, with the values of the current episode until a program sets others."""
         space = self._variation_space
+        if self._factors_read:
+            return space
+        self._factors_read = True
         for key, value in self._env.factors().items():
             factor = space.find(key)
             factor._value = np.asarray(value).reshape(factor.shape or ()).astype(factor.dtype)
@@ -99,6 +104,7 @@ class NativeEnv(gymnasium.Env):
         if seed is None:
             seed = int(self.np_random.integers(2**62))
         columns = self._env.reset(seed, _options.reset(options, self._described["variation"]))
+        self._factors_read = False
         self._start = columns["state"]
         return self._observation(columns), self._info(columns, self._env.is_success())
 
@@ -136,22 +142,34 @@ class NativeEnv(gymnasium.Env):
     def restore(self, state: bytes) -> tuple[Any, dict[str, Any]]:
         """Restores a snapshot. Later steps repeat the steps after the snapshot bit for bit."""
         columns = self._env.restore(state)
+        self._factors_read = False
         return self._observation(columns), self._info(columns, self._env.is_success())
 
     def restore_from(self, start: Mapping[str, Any], goal: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
         """Restores the state of the dataset row `start`, with the state of the row `goal` as the goal."""
         rows = ({key: np.asarray(value)[None] for key, value in row.items()} for row in (start, goal))
         columns = self._env.restore_from(*rows)
+        self._factors_read = False
         return self._observation(columns), self._info(columns, self._env.is_success())
 
     # Evaluations from a dataset call these methods if Gymnasium wrappers contain the environment.
 
     def _set_state(self, state: Any) -> None:
         self._start = np.asarray(state)
-        self._set_goal_state(state)
+        self._set_goal_state(self._columns().get("goal_state", state))
 
     def _set_goal_state(self, goal_state: Any) -> None:
         self.restore_from({"state": self._start}, {"state": np.asarray(goal_state)})
+
+    def _columns(self) -> dict[str, Any]:
+        """The columns of the current state."""
+        return self._env.restore(self._env.snapshot())
+
+    def _get_obs(self) -> Any:
+        return self._observation(self._columns())
+
+    def _get_info(self) -> dict[str, Any]:
+        return self._info(self._columns(), self._env.is_success())
 
     def _observation(self, columns: Mapping[str, np.ndarray]) -> Any:
         space = self.observation_space

@@ -6,12 +6,22 @@ from typing import Any
 
 import numpy as np
 
-from ..named import NamedEnv
+from ..mujoco import MujocoEnv
 
-__all__ = ["DMControlWrapper"]
+__all__ = ["DMControlWrapper", "get_obs_shape"]
 
 
-class DMControlWrapper(NamedEnv):
+def get_obs_shape(env: Any) -> tuple[int]:
+    """The shape of the observation of an environment of dm_control, whose arrays are joined.
+
+    Args:
+        env: The environment, with `observation_spec()`.
+    """
+    sizes = (int(np.prod(getattr(spec, "shape", ()))) for spec in env.observation_spec().values())
+    return (sum(sizes),)
+
+
+class DMControlWrapper(MujocoEnv):
     """An environment of the DeepMind Control suite in the engine.
 
     Args:
@@ -36,6 +46,28 @@ class DMControlWrapper(NamedEnv):
         """Starts an episode."""
         seed, self._first_seed = (self._first_seed if seed is None else seed), None
         return super().reset(seed=seed, options=options)
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """The infos of the current state, and `env_name`."""
+        return {"env_name": type(self).__name__.replace("DMControlWrapper", ""), **self._get_info()}
+
+    def set_gravity(self, gravity: Any) -> None:
+        """Sets the factors of gravity `(3,)`, in m/s², for the rest of the episode; the state stays as it is.
+
+        Raises:
+            ValueError: If the environment has no such factors, or a value is out of their range.
+        """
+        given = np.asarray(gravity, np.float64).reshape(-1)
+        keys = ["gravity.x", "gravity.y", "gravity.z"]
+        if "gravity.z" not in self._described["variation"]:
+            raise ValueError(f"set_gravity: {self.id} has no factors of gravity")
+        if len(given) != 3:
+            raise ValueError(f"set_gravity: {gravity!r}; expected three values")
+        for key, value in zip(keys, given, strict=True):
+            factor = self.variation_space.find(key)
+            factor.set_value(np.full(factor.shape, value, factor.dtype))
+        self.apply_runtime_variations()
 
     def render(self, width: int = 224, height: int = 224, camera_id: int | str | None = None) -> np.ndarray | None:
         """The frame, `(height, width, 3)` of `uint8`; `None` without a render mode.

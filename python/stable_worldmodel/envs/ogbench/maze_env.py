@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..named import NamedEnv
+from ..mujoco import MujocoEnv
 
 __all__ = ["MazeEnv"]
 
 
-class MazeEnv(NamedEnv):
+class MazeEnv(MujocoEnv):
     """A point or an ant in a maze: `swm/OGBMaze-v0`.
 
     Args:

@@ -3,13 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ..named import NamedEnv
 
-__all__ = ["PushT"]
+__all__ = ["Body", "PushT"]
+
+
+@dataclass(frozen=True)
+class Body:
+    """The pose of a body at the time it was read.
+
+    Attributes:
+        position: The position `(x, y)` in units of the table, whose side is 512.
+        angle: The angle in radians.
+        velocity: The velocity `(x, y)` in units per second.
+    """
+
+    position: tuple[float, float]
+    angle: float = 0.0
+    velocity: tuple[float, float] = (0.0, 0.0)
 
 
 class PushT(NamedEnv):
@@ -41,6 +57,31 @@ class PushT(NamedEnv):
         self._refuse(block_cog=(block_cog, None), damping=(damping, None), render_action=(render_action, False))
         self._refuse(with_target=(with_target, True), relative=(relative, True))
         super().__init__(render_mode, init_value, resolution)
+
+    @property
+    def agent(self) -> Body:
+        """The disc."""
+        x, y, *_, dx, dy = self._state()
+        return Body((x, y), velocity=(dx, dy))
+
+    @property
+    def block(self) -> Body:
+        """The block."""
+        _, _, x, y, angle, *_ = self._state()
+        return Body((x, y), angle)
+
+    @property
+    def goal_state(self) -> np.ndarray:
+        """The goal state `(7,)`."""
+        return self._columns()["goal_state"]  # type: ignore[no-any-return]
+
+    @property
+    def goal_pose(self) -> np.ndarray:
+        """The position and the angle of the block at the goal, `(3,)`."""
+        return self.goal_state[2:5]
+
+    def _state(self) -> list[float]:
+        return [float(value) for value in self._columns()["state"]]
 
     def eval_state(self, goal_state: Any, cur_state: Any) -> tuple[bool, float]:
         """Whether a state `(7,)` satisfies a goal state, and the distance of the two.

@@ -1,0 +1,163 @@
+"""`ExpertPolicy`: acts with a policy that Stable-Baselines3 trained with SAC.
+
+The files are read as data: weights without pickled objects, and statistics with an unpickler that creates arrays and plain
+records only. Stable-Baselines3 is not needed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import zipfile
+from typing import Any
+
+import numpy as np
+
+from ...policy import BasePolicy
+
+__all__ = ["ExpertPolicy", "SB3Normalizer"]
+
+#: What creates arrays in a pickle file; every other class is read as a record of its attributes.
+_ARRAYS = {
+    ("numpy", "ndarray"),
+    ("numpy", "dtype"),
+    *(
+        (f"numpy.{core}.{module}", name)
+        for core in ("core", "_core")
+        for module, names in (("multiarray", ("_reconstruct", "scalar")), ("numeric", ("_frombuffer",)))
+        for name in names
+    ),
+}
+#: The activations of the hidden layers that are known.
+_ACTIVATIONS = ("ELU", "GELU", "LeakyReLU", "ReLU", "SiLU", "Tanh")
+
+
+class _Record:
+    """An object of a pickle file whose class is not imported."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None: ...
+
+    def __setstate__(self, state: Any) -> None:
+        if isinstance(state, dict):
+            self.__dict__.update(state)
+
+
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        return super().find_class(module, name) if (module, name) in _ARRAYS else _Record
+
+
+class SB3Normalizer:
+    """Normalises observations with the statistics that `VecNormalize` of Stable-Baselines3 saved.
+
+    Args:
+        stats_path: The file that `VecNormalize.save` wrote.
+        clip_obs: The largest normalised value.
+        epsilon: Added to the variance.
+
+    Raises:
+        ValueError: If the file has no such statistics.
+    """
+
+    def __init__(self, stats_path: str | os.PathLike[str], clip_obs: float = 10.0, epsilon: float = 1e-8) -> None:
+        try:
+            with open(stats_path, "rb") as file:
+                statistics = _Unpickler(file).load().obs_rms
+            self.mean, self.var = (np.asarray(getattr(statistics, name), np.float64) for name in ("mean", "var"))
+        except (AttributeError, EOFError, IndexError, TypeError, ValueError, pickle.UnpicklingError) as error:
+            raise ValueError(
+                f"{stats_path}: it holds no statistics of VecNormalize ({error}); save them with its save"
+            ) from error
+        self.clip_obs, self.epsilon = clip_obs, epsilon
+
+    def __call__(self, obs: np.ndarray) -> np.ndarray:
+        """The normalised observations."""
+        return self.normalize(obs)
+
+    def normalize(self, obs: np.ndarray) -> np.ndarray:
+        """The normalised observations."""
+        scaled = (np.asarray(obs) - self.mean) / np.sqrt(self.var + self.epsilon)
+        return np.clip(scaled, -self.clip_obs, self.clip_obs)
+
+
+class ExpertPolicy(BasePolicy):
+    """Draws actions from the policy of SAC.
+
+    Args:
+        ckpt_path: The `.zip` file that `SAC.save` of Stable-Baselines3 wrote.
+        vec_normalize_path: The file that `VecNormalize.save` wrote.
+        noise_std: The standard deviation of the noise added to actions.
+        seed: The seed of the actions and their noise.
+        device: The device of torch.
+
+    Raises:
+        ValueError: If the file has no policy of SAC with linear layers.
+    """
+
+    type = "expert"
+
+    def __init__(
+        self,
+        ckpt_path: str | os.PathLike[str],
+        vec_normalize_path: str | os.PathLike[str],
+        noise_std: float = 0.0,
+        seed: int | None = None,
+        device: str = "cpu",
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(**kwargs)
+        import torch
+
+        self.device, self.noise_std, self.rng = torch.device(device), noise_std, np.random.default_rng(seed)
+        self.model = _policy(ckpt_path).to(self.device)
+        self.normalizer = SB3Normalizer(vec_normalize_path)
+        #: The seeds of torch are drawn from the policy's.
+        self._generator = torch.Generator(self.device).manual_seed(int(self.rng.integers(2**62)))
+
+    def get_action(self, info_dict: dict[str, Any], **kwargs: Any) -> np.ndarray:  # type: ignore[override]
+        """The actions `(num_envs, A)` for infos whose `observation` is `(num_envs, D)` or `(num_envs, 1, D)`."""
+        import torch
+
+        if "observation" not in info_dict:
+            raise KeyError("observation: the infos lack it; the policy acts on the observations of dm_control")
+        observation = np.asarray(info_dict["observation"])
+        observation = observation.reshape(-1, observation.shape[-1])
+        with torch.no_grad():
+            inputs = torch.as_tensor(self.normalizer(observation), dtype=torch.float32, device=self.device)
+            mean, log_std = self.model(inputs).chunk(2, -1)
+            noise = torch.randn(mean.shape, generator=self._generator, device=self.device)
+            actions: np.ndarray = (mean + log_std.clamp(-20, 2).exp() * noise).tanh().cpu().numpy()
+        if self.noise_std > 0:
+            actions = actions + self.rng.normal(0, self.noise_std, actions.shape)
+        clipped: np.ndarray = np.clip(actions, -1.0, 1.0).astype(np.float32)
+        return clipped
+
+
+def _policy(path: str | os.PathLike[str]) -> Any:
+    """The network of a policy: observations `(B, D)` to means and logarithms of standard deviations `(B, 2 * A)`."""
+    import torch
+    from torch import nn
+
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open("policy.pth") as file:
+            weights = torch.load(file, map_location="cpu", weights_only=True)
+            settings = json.loads(archive.read("data"))
+    except (zipfile.BadZipFile, KeyError, ValueError, RuntimeError, pickle.UnpicklingError) as error:
+        raise ValueError(f"{path}: it is no model of Stable-Baselines3 ({error}); save one with SAC.save") from error
+    found = {name.removeprefix("actor."): value for name, value in weights.items() if name.startswith("actor.")}
+    hidden = sorted(
+        {int(name.split(".")[1]) for name in found if name.startswith("latent_pi.") and name.endswith(".weight")},
+    )
+    if not hidden or "mu.weight" not in found or "log_std.weight" not in found:
+        raise ValueError(f"{path}: it holds no policy of SAC with linear layers; train one with SAC('MlpPolicy', …)")
+    activation = str((settings.get("policy_kwargs") or {}).get("activation_fn", "ReLU")).rpartition(".")[2].rstrip("'>")
+    if activation not in _ACTIVATIONS:
+        raise ValueError(f"{path}: the activation {activation!r} is unknown; expected one of {', '.join(_ACTIVATIONS)}")
+    layers: list[nn.Module] = []
+    heads = {part: torch.cat([found[f"{head}.{part}"] for head in ("mu", "log_std")]) for part in ("weight", "bias")}
+    for parts in (*({part: found[f"latent_pi.{i}.{part}"] for part in heads} for i in hidden), heads):
+        layer = nn.Linear(*reversed(parts["weight"].shape))
+        layer.load_state_dict(parts)
+        layers += [layer, getattr(nn, activation)()]
+    return nn.Sequential(*layers[:-1]).requires_grad_(False)

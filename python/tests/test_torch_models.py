@@ -7,6 +7,7 @@ published models at small sizes; the engine's models are compared with the same 
 import json
 import os
 import struct
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -303,3 +304,11 @@ def test_goal_conditioned_policies_act():
     assert model.predict_values(info["embed"], info["goal_embed"]).shape == (4, 1, 1)
     with pytest.raises(ValueError, match="embed"):
         model.encode(info)
+
+
+def test_encoders_of_timm_say_what_to_install(monkeypatch):
+    from stable_worldmodel.wm.prejepa.module import create_backbone
+
+    monkeypatch.setitem(sys.modules, "timm", None)
+    with pytest.raises(ModuleNotFoundError, match="timm/vit_tiny_patch16_224.*pip install timm"):
+        create_backbone("timm/vit_tiny_patch16_224")

@@ -19,6 +19,7 @@ __all__ = [
     "Embedder",
     "FeedForward",
     "PatchDecoder",
+    "TimmEncoder",
     "Transformer",
     "create_backbone",
 ]
@@ -51,12 +52,18 @@ BACKBONES = {
 
 
 def create_backbone(name: str) -> nn.Module:
-    """Loads a pretrained image encoder with `transformers`.
+    """Loads a pretrained image encoder with `transformers`, or with `timm`.
 
     Args:
         name: A key of `BACKBONES`, or a name on the Hugging Face hub. The classifier of a ResNet is replaced by a layer
-            normalisation, so that its `logits` are features. A masked autoencoder encodes all patches, in their order.
+            normalisation, so that its `logits` are features. A masked autoencoder encodes all patches, in their order. Names
+            such as `timm/vit_small_patch16_224.augreg_in1k` are those of `timm`, which gives a `TimmEncoder`.
+
+    Raises:
+        ModuleNotFoundError: If `transformers` or `timm` is not installed.
     """
+    if name.startswith("timm/"):
+        return TimmEncoder(name.removeprefix("timm/"))
     try:
         import transformers
     except ModuleNotFoundError as error:
@@ -72,6 +79,39 @@ def create_backbone(name: str) -> nn.Module:
         network.embeddings.random_masking = _unmasked
     # Models of images and texts have an encoder for each.
     return getattr(network, "vision_model", network)  # type: ignore[no-any-return]
+
+
+class TimmEncoder(nn.Module):
+    """An image encoder of `timm` without its classifier: a transformer, or a convolutional network.
+
+    Args:
+        name: The name of the model and of its weights.
+        **settings: Further arguments of `timm.create_model`, such as `pretrained=False`.
+    """
+
+    def __init__(self, name: str, **settings: Any) -> None:
+        super().__init__()
+        try:
+            import timm
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError(f"{error}; the encoder timm/{name} needs it: pip install timm") from error
+        settings = {"pretrained": True, "num_classes": 0, **settings}
+        try:
+            # Images may have another size than those of the training.
+            self.network: Any = timm.create_model(name, dynamic_img_size=True, **settings)
+        except TypeError:
+            self.network = timm.create_model(name, **settings)
+
+    def patches(self, images: Tensor) -> Tensor:
+        """Images `(B, 3, H, W)` to the features of the patches, or of the places of the last map, `(B, P, D)`."""
+        (features,) = self.network.forward_intermediates(
+            images, indices=1, norm=True, output_fmt="NCHW", intermediates_only=True
+        )
+        return features.flatten(2).transpose(1, 2)  # type: ignore[no-any-return]
+
+    def forward(self, x: Tensor) -> Tensor:
+        """As `patches`."""
+        return self.patches(x)
 
 
 def _unmasked(sequence: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:

@@ -48,3 +48,26 @@ def test_datasets_are_converted_merged_and_shown(tmp_path, monkeypatch, capfd):
     cli.preview(one, num=1)
     assert (tmp_path / "a_preview" / "episode_0.mp4").stat().st_size > 500
     assert "a_preview" in capfd.readouterr().out
+
+
+def command(monkeypatch, *arguments):
+    """Runs the command line, and returns its exit code."""
+    from stable_worldmodel.__main__ import main
+
+    monkeypatch.setattr("sys.argv", ["swm", *arguments])
+    with pytest.raises(SystemExit) as end:
+        main()
+    return end.value.code
+
+
+def test_the_command_takes_spellings_of_the_reference(tmp_path, monkeypatch, capfd):
+    assert command(monkeypatch, "fovs", "PushT-v1") == 0 and "block.angle" in capfd.readouterr().out
+    assert command(monkeypatch, "fovs", "--json", "swm/PushT-v1") == 0 and "block.angle" in capfd.readouterr().out
+    assert command(monkeypatch, "fovs", "PushTT-v1") != 0 and "swm/PushT-v1" in capfd.readouterr().err
+    one = written(tmp_path / "a.lance", 10)
+    assert command(monkeypatch, "convert", one, "--dest-format", "video") == 0
+    assert swm.data.load_dataset(tmp_path / "a_video").num_episodes == 1
+    assert command(monkeypatch, "convert", one, str(tmp_path / "c.h5"), "-f", "hdf5") == 0
+    assert command(monkeypatch, "convert", one, str(tmp_path / "d.h5"), "--format", "hdf5") == 0
+    assert command(monkeypatch, "convert", one, "--dest-format=no-such-format") == 1
+    assert "no-such-format" in capfd.readouterr().err

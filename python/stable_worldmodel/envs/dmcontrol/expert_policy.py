@@ -65,7 +65,10 @@ class SB3Normalizer:
             with open(stats_path, "rb") as file:
                 statistics = _Unpickler(file).load().obs_rms
             self.mean, self.var = (np.asarray(getattr(statistics, name), np.float64) for name in ("mean", "var"))
-        except (AttributeError, EOFError, IndexError, TypeError, ValueError, pickle.UnpicklingError) as error:
+        except OSError:
+            raise
+        # Damaged and hostile files raise anything.
+        except Exception as error:
             raise ValueError(
                 f"{stats_path}: it holds no statistics of VecNormalize ({error}); save them with its save"
             ) from error
@@ -143,7 +146,9 @@ def _policy(path: str | os.PathLike[str]) -> Any:
         with zipfile.ZipFile(path) as archive, archive.open("policy.pth") as file:
             weights = torch.load(file, map_location="cpu", weights_only=True)
             settings = json.loads(archive.read("data"))
-    except (zipfile.BadZipFile, KeyError, ValueError, RuntimeError, pickle.UnpicklingError) as error:
+    except OSError:
+        raise
+    except Exception as error:
         raise ValueError(f"{path}: it is no model of Stable-Baselines3 ({error}); save one with SAC.save") from error
     found = {name.removeprefix("actor."): value for name, value in weights.items() if name.startswith("actor.")}
     hidden = sorted(

@@ -207,16 +207,18 @@ def test_the_engine_plans_with_what_torch_trained(family, rooms, swings, tmp_pat
         assert 0 <= world.evaluate(episodes=2, seed=0)["success_rate"] <= 100
 
 
-def test_a_class_of_the_user_is_trained(rooms, tmp_path):
-    class Halved(swm.wm.LeWM):
-        calls = 0
+@pytest.mark.parametrize(("kind", "method"), [("LeWM", "_features"), ("PreJEPA", "predict"), ("TDMPC2", "encode")])
+def test_a_class_of_the_user_is_trained(kind, method, rooms, swings, tmp_path):
+    family, data = {"LeWM": ("lewm", rooms), "PreJEPA": ("dino_wm", rooms), "TDMPC2": ("tdmpc2", swings)}[kind]
+    base, calls = getattr(swm.wm, kind), []
 
-        def _features(self, frames):
-            Halved.calls += 1
-            return super()._features(frames) / 2
+    def halved(self, *arguments):
+        calls.append(arguments)
+        return getattr(base, method)(self, *arguments) / 2
 
-    torch_train("lewm", rooms, tmp_path / "run", SHORT, kind=Halved)
-    assert Halved.calls == 6
+    torch_train(family, data, tmp_path / "run", SHORT, kind=type("Halved", (base,), {method: halved}))
+    # TD-MPC2 encodes the first frames and those after them.
+    assert len(calls) == (12 if kind == "TDMPC2" else 6)
 
 
 #: Computes the gradients of batches, whose slices the processes have, and saves the sums.

@@ -44,7 +44,7 @@ def test_push_t_is_read_and_set():
     observation, *_, info = env.step(env.action_space.sample())
     state, goal = info["state"], info["goal_state"]
     assert all(np.array_equal(env._get_obs()[key], value) for key, value in observation.items())
-    assert all(np.array_equal(env._get_info()[key], value) for key, value in info.items())
+    assert all(np.array_equal(env._get_info()[key], value) for key, value in info.items()) and info["env_name"] == "PushT"
     assert np.allclose([*env.agent.position, *env.block.position, env.block.angle, *env.agent.velocity], state)
     assert np.array_equal(env.goal_state, goal) and np.array_equal(env.goal_pose, goal[2:5])
     moved = state.copy()
@@ -169,11 +169,11 @@ def test_classes_of_craftax_are_the_environments_of_the_bridge(monkeypatch):
     module = SimpleNamespace(register=lambda: monkeypatch.setitem(gymnasium.registry, id, spec))
     monkeypatch.setattr(_engine, "bridge", lambda with_craftax: monkeypatch.setitem(sys.modules, "swm_craftax", module))
     env = craftax.CraftaxClassicSymbolicWrapper(seed=5, render_mode="rgb_array")
-    assert env.reset()[1] == {"env_name": "Craftax-Classic-Symbolic-v1"} and env._env.seed == 5
+    assert env.reset()[1] == {"env_name": "CraftaxClassicSymbolicWrapper"} and env._env.seed == 5
     assert env.reset()[1] == env.info and env._env.seed is None
     observation, reward, terminated, truncated, info = env.step(2)
     assert observation[0] == 2 and reward == 1 and not terminated and not truncated
-    assert info == {"env_name": "Craftax-Classic-Symbolic-v1", "score": 2} and env.unwrapped is env
+    assert info == {"env_name": "CraftaxClassicSymbolicWrapper", "score": 2} and env.unwrapped is env
     assert env.render().shape == (63, 63, 3) and craftax.CraftaxClassicSymbolicWrapper().render() is None
     with pytest.raises(ValueError, match="obs_shape"):
         craftax.CraftaxWrapper("Craftax-Classic-Symbolic-v1", (3,))

@@ -29,7 +29,14 @@ def assets():
         pytest.skip(str(error))
 
 
+def unnamed(info):
+    """Infos without the name of the environment."""
+    return {key: value for key, value in info.items() if key != "env_name"}
+
+
 def same(one, other):
+    """Asserts that infos are equal. Those of the classes have the environment's name as well."""
+    one, other = unnamed(one), unnamed(other)
     assert one.keys() == other.keys()
     assert all(np.array_equal(np.asarray(one[key]), np.asarray(other[key]), equal_nan=True) for key in one)
 
@@ -154,11 +161,6 @@ def test_environments_survive_pickling(make):
     same(env.step(action)[4], twin.step(action)[4])
 
 
-def unnamed(info):
-    """Infos without the name of the environment."""
-    return {key: value for key, value in info.items() if key != "env_name"}
-
-
 def current(env):
     """The infos of the current state."""
     return env._get_info()
@@ -170,8 +172,8 @@ def test_states_of_dm_control_are_read_and_set(name):
     env.reset(seed=1)
     for _ in range(4):
         *_, info = env.step(env.action_space.sample())
-    assert env.info["env_name"] == domain(name).__name__.removesuffix("DMControlWrapper")
-    same(info, unnamed(env.info))
+    assert env.info["env_name"] == info["env_name"] == domain(name).__name__.removesuffix("DMControlWrapper")
+    same(info, env.info)
     qpos, qvel = info["qpos"].copy(), 0.5 * info["qvel"]
     qpos[-1] += 0.1
     env.set_state(qpos, qvel)
@@ -194,7 +196,7 @@ def test_factors_are_changed_in_an_episode_or_for_the_next():
     assert not np.array_equal(env._env.factors()["agent.color"], color)
     env.apply_runtime_variations()
     assert np.array_equal(env._env.factors()["agent.color"], color) and env._env.factors()["gravity.z"] == [-5.0]
-    same(unnamed(before), unnamed(env.info))
+    same(before, env.info)
     env.compile_model(seed=3)
     assert np.array_equal(env.variation_space["agent"]["color"].value, color) and env.info["score"] == 0
     env.mark_dirty()
@@ -232,9 +234,9 @@ def test_read_outs_of_tables_are_those_of_steps(kind, options):
         observation, reward, *_, info = env.step(env.action_space.sample())
         assert np.array_equal(env.compute_observation(), observation) and env.compute_reward() == reward
     found = env.get_step_info()
-    assert found["env_name"] == type(env).__name__.removesuffix("Env")
-    same(info, unnamed(found))
-    same(info, unnamed(env.get_reset_info()))
+    assert found["env_name"] == info["env_name"] == type(env).__name__.removesuffix("Env")
+    same(info, found)
+    same(info, env.get_reset_info())
     objects = {}
     env.add_object_info(objects)
     assert np.array_equal(objects["privileged/block_0_pos"], info["privileged/block_0_pos"])
@@ -308,6 +310,7 @@ def test_mazes_are_changed():
     env.reset(seed=0)
     position = current(env)["xy"] + [0.3, 0.1]
     env.set_state(position, [0, 0])
+    assert current(env)["env_name"] == "PointMaze"
     assert np.allclose(current(env)["xy"], position)
     env.variation_space["wall"]["color"].set_value(np.array([0.1, 0.2, 0.3]))
     env.mark_dirty()

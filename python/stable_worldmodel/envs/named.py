@@ -35,6 +35,8 @@ class NamedEnv(NativeEnv):
     ) -> None:
         given = {name: value for name, value in (options or {}).items() if value is not None}
         super().__init__(self.id, render_mode=render_mode, image_shape=(resolution, resolution), **given)
+        #: The name in infos, such as `PushT` or `Walker`.
+        self.env_name = self.id.rpartition("/")[2].partition("-")[0].removeprefix("OGB").removesuffix("DMControl")
         self._defaults = _flat(init_value or {})
         for key in self._defaults:
             self._variation_space.find(key)
@@ -50,6 +52,9 @@ class NamedEnv(NativeEnv):
             values = {key: self._defaults[key] for key in chosen}
             given["variation_values"] = {**values, **(given.get("variation_values") or {})}
         return super().reset(seed=seed, options=given)
+
+    def _info(self, columns: dict[str, Any], success: bool) -> dict[str, Any]:
+        return {"env_name": self.env_name, **super()._info(columns, success)}
 
     @classmethod
     def _refuse(cls, **settings: tuple[Any, Any]) -> None:

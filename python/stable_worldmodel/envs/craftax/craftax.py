@@ -67,8 +67,8 @@ class CraftaxWrapper(gymnasium.Env[np.ndarray, int]):
         if tuple(obs_shape) != self.observation_space.shape:
             raise ValueError(f"obs_shape: {tuple(obs_shape)}; observations have the shape {self.observation_space.shape}")
         self.render_mode, self.variation_space = render_mode, None
-        #: The name of the environment in infos.
-        self.env_name = env_name
+        #: The name in infos: Craftax's, or that of a derived class.
+        self.env_name = env_name if type(self) is CraftaxWrapper else type(self).__name__
         self._first_seed: int | None = seed
         self._last: dict[str, Any] = {}
 

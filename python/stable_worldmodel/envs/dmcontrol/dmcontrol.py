@@ -49,8 +49,8 @@ class DMControlWrapper(MujocoEnv):
 
     @property
     def info(self) -> dict[str, Any]:
-        """The infos of the current state, and `env_name`."""
-        return {"env_name": type(self).__name__.replace("DMControlWrapper", ""), **self._get_info()}
+        """The infos of the current state."""
+        return self._get_info()
 
     def set_gravity(self, gravity: Any) -> None:
         """Sets the factors of gravity `(3,)`, in m/s², for the rest of the episode; the state stays as it is.

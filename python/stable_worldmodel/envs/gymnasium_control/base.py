@@ -34,3 +34,4 @@ class GymControlWrapper(NamedEnv):
             raise ValueError(f"env_id: {env_id!r}; expected one of {', '.join(self._IDS)}")
         self.id = self._IDS[env_id]  # type: ignore[misc]
         super().__init__(render_mode, options=kwargs)
+        self.env_name = env_id

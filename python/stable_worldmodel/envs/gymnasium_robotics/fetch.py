@@ -36,3 +36,4 @@ class FetchWrapper(NamedEnv):
             name = name.replace("-v", "Dict-v")
         self.id = f"swm/{name}"  # type: ignore[misc]
         super().__init__(render_mode, init_value, resolution, kwargs)
+        self.env_name = env_id

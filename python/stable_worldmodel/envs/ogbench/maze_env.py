@@ -34,3 +34,4 @@ class MazeEnv(MujocoEnv):
         self._refuse(width=(width, height), maze_env_type=(maze_env_type, "maze"))
         options = {"loco_env_type": loco_env_type, "maze_type": maze_type, "ob_type": ob_type, **kwargs}
         super().__init__(options.pop("render_mode", "rgb_array"), resolution=height, options=options)
+        self.env_name = f"{loco_env_type.capitalize()}Maze"

@@ -56,12 +56,12 @@ class TableEnv(MujocoEnv):
         return [bool(distance <= _TOLERANCE) for distance in distances]
 
     def get_reset_info(self) -> dict[str, Any]:
-        """The infos of the current state, and `env_name`."""
-        return {"env_name": type(self).__name__.removesuffix("Env"), **self._get_info()}
+        """The infos of the current state."""
+        return self._get_info()
 
     def get_step_info(self) -> dict[str, Any]:
-        """The infos of the current state, and `env_name`."""
-        return self.get_reset_info()
+        """The infos of the current state."""
+        return self._get_info()
 
     def add_object_info(self, ob_info: dict[str, Any]) -> None:
         """Adds the positions and states of the objects, and their goals."""

@@ -28,7 +28,7 @@ impl Folder {
 
     /// The file of an interrupted download. `part` names its content, so that an equal file of another commit continues it.
     pub fn partial(&self, commit: &str, file: &HubFile) -> PathBuf {
-        let content = file.sha256.clone().filter(|hash| hash.bytes().all(|byte| byte.is_ascii_hexdigit()));
+        let content = file.sha256.clone().filter(|hash| super::uri::is_sha256(hash));
         let name = content.unwrap_or_else(|| format!("{commit}-{}", blake3::hash(file.path.as_bytes()).to_hex()));
         self.0.join("partial").join(name)
     }
@@ -44,7 +44,8 @@ impl Folder {
     }
 
     fn reference(&self, revision: &str) -> PathBuf {
-        self.0.join("refs").join(revision)
+        // A branch can have the name of another one and a slash.
+        self.0.join("refs").join(super::client::encoded(revision))
     }
 
     /// The files of a commit, if they were listed before.
@@ -68,4 +69,21 @@ fn write(path: &Path, bytes: &[u8]) -> Result<()> {
     let folder = path.parent().unwrap_or(path);
     std::fs::create_dir_all(folder).map_err(|error| Error::io(folder, "creating a folder", error))?;
     files::write(path, bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_branch_can_have_the_name_of_another_one_and_a_slash() -> Result<()> {
+        let cache = tempfile::tempdir().expect("a folder");
+        let folder = Folder::of(cache.path(), &HubUri::parse("hf://a/b", RepoKind::Model)?);
+        let commit = "0123456789abcdef0123456789abcdef01234567";
+        for revision in ["main", "main/x", "refs/pr/1"] {
+            folder.remember_commit(revision, commit)?;
+            assert_eq!(folder.known_commit(revision).as_deref(), Some(commit));
+        }
+        Ok(())
+    }
 }

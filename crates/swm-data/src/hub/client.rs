@@ -2,13 +2,14 @@
 
 use super::{HubFile, HubUri, RepoKind};
 use crate::dataset::objects;
-use reqwest::header::{AUTHORIZATION, CONTENT_TYPE, HeaderMap, HeaderName, HeaderValue, LINK};
+use reqwest::header::{AUTHORIZATION, CONTENT_LENGTH, CONTENT_TYPE, HeaderMap, HeaderName, HeaderValue, LINK};
 use reqwest::{Method, Response, StatusCode};
 use serde::Deserialize;
 use serde_json::Value;
 use std::future::Future;
 use std::path::PathBuf;
 use std::time::Duration;
+use swm_core::run::Control;
 use swm_core::{Error, Result};
 use url::Url;
 
@@ -17,8 +18,9 @@ const CONNECT: Duration = Duration::from_secs(10);
 const READ: Duration = Duration::from_secs(60);
 /// The largest answer that is read as a whole, in bytes.
 const MAX_ANSWER: usize = 256 << 20;
-/// The most pages of a list of files.
+/// The most pages of a list of files, and the most files.
 const MAX_PAGES: usize = 1000;
+const MAX_LISTED: usize = 1_000_000;
 /// The variable with the token.
 const TOKEN: &str = "HF_TOKEN";
 /// The header with the hub's kind of error, and that with its message.
@@ -34,10 +36,23 @@ pub(super) struct Client {
 }
 
 /// The body of a request.
-#[derive(Clone, Default)]
+#[derive(Default)]
 pub(super) struct Body {
-    pub bytes: Vec<u8>,
+    pub content: Content,
     pub content_type: &'static str,
+}
+
+/// The content of a body.
+pub(super) enum Content {
+    Bytes(Vec<u8>),
+    /// This many bytes, made while they are sent.
+    Blocks(u64, Box<dyn Iterator<Item = std::io::Result<Vec<u8>>> + Send>),
+}
+
+impl Default for Content {
+    fn default() -> Self {
+        Self::Bytes(vec![])
+    }
 }
 
 impl Client {
@@ -103,7 +118,7 @@ impl Client {
     }
 
     /// The files of a repository at a commit.
-    pub fn files(&self, uri: &HubUri, commit: &str) -> Result<Vec<HubFile>> {
+    pub fn files(&self, uri: &HubUri, commit: &str, control: &mut Control<'_>) -> Result<Vec<HubFile>> {
         #[derive(Deserialize)]
         struct Entry {
             #[serde(rename = "type")]
@@ -119,9 +134,11 @@ impl Client {
             size: u64,
         }
         let mut url = format!("{}/tree/{commit}?recursive=true&expand=false", self.api(uri));
-        let mut files = vec![];
+        let (mut files, mut read) = (vec![], 0);
         for _ in 0..MAX_PAGES {
+            control.check()?;
             let (headers, bytes) = self.bytes(Method::GET, &url, Body::default(), uri)?;
+            read += bytes.len();
             let entries: Vec<Entry> = parsed(&url, &bytes)?;
             for entry in entries.into_iter().filter(|entry| entry.kind == "file") {
                 if !super::uri::is_inside(&entry.path) {
@@ -129,20 +146,26 @@ impl Client {
                     return Err(Error::corrupt(&url, problem, "do not use this hub"));
                 }
                 let (size, sha256) = entry.lfs.map_or((entry.size, None), |lfs| {
-                    (lfs.size, Some(lfs.oid.trim_start_matches("sha256:").to_owned()))
+                    (lfs.size, Some(lfs.oid.trim_start_matches("sha256:").to_ascii_lowercase()))
                 });
+                if let Some(hash) = sha256.as_ref().filter(|hash| !super::uri::is_sha256(hash)) {
+                    let problem = format!("it lists '{}', which is no SHA-256 hash", hash.escape_debug());
+                    return Err(Error::corrupt(&url, problem, "check the address of the hub (HF_ENDPOINT)"));
+                }
                 files.push(HubFile { path: entry.path, size, sha256 });
             }
             match next_page(&headers) {
-                Some(next) if next.starts_with(self.endpoint()) => url = next,
-                _ => return Ok(files),
+                Some(_) if files.len() > MAX_LISTED || read > MAX_ANSWER => break,
+                Some(next) if self.is_own(&next) => url = next,
+                Some(next) => {
+                    let problem = format!("its list of files continues at another address: '{}'", next.escape_debug());
+                    return Err(Error::corrupt(url, problem, "do not use this hub"));
+                }
+                None => return Ok(files),
             }
         }
-        Err(Error::corrupt(
-            url,
-            format!("its list of files has more than {MAX_PAGES} pages"),
-            "name a smaller repository",
-        ))
+        let problem = format!("its list of files has more than {MAX_PAGES} pages, or {MAX_LISTED} files");
+        Err(Error::corrupt(url, problem, "name a smaller repository"))
     }
 
     /// Sends a request with the token and reads the answer as JSON.
@@ -169,7 +192,13 @@ impl Client {
     pub fn send(&self, method: Method, url: &str, body: Body, headers: HeaderMap, trusted: bool) -> Result<Response> {
         let mut request = self.http.request(method, url).headers(headers);
         if !body.content_type.is_empty() {
-            request = request.header(CONTENT_TYPE, body.content_type).body(body.bytes);
+            request = request.header(CONTENT_TYPE, body.content_type);
+            request = match body.content {
+                Content::Bytes(bytes) => request.body(bytes),
+                Content::Blocks(length, blocks) => request
+                    .header(CONTENT_LENGTH, length)
+                    .body(reqwest::Body::wrap_stream(futures::stream::iter(blocks))),
+            };
         }
         if let Some(token) = self.token.as_ref().filter(|_| trusted && self.is_own(url)) {
             request = request.header(AUTHORIZATION, authorization(token)?);
@@ -293,7 +322,7 @@ pub(super) fn encoded_path(path: &str) -> String {
 
 /// A JSON body.
 pub(super) fn json_body(value: &Value) -> Body {
-    Body { bytes: value.to_string().into_bytes(), content_type: "application/json" }
+    Body { content: Content::Bytes(value.to_string().into_bytes()), content_type: "application/json" }
 }
 
 /// One header.
@@ -312,7 +341,10 @@ mod tests {
     fn tokens_go_to_the_host_of_the_hub_only() {
         let client = Client::new("http://127.0.0.1:1234/", Some("hf_secret".to_owned())).expect("a client");
         assert!(client.is_own("http://127.0.0.1:1234/api/models/a/b"));
-        for other in ["http://127.0.0.1:1235/a", "https://127.0.0.1:1234/a", "http://evil/127.0.0.1:1234", "nothing"] {
+        let disguised = "http://127.0.0.1:1234@evil/a";
+        for other in
+            [disguised, "http://127.0.0.1:1235/a", "https://127.0.0.1:1234/a", "http://evil/127.0.0.1:1234", "nothing"]
+        {
             assert!(!client.is_own(other), "{other}");
         }
         assert!(authorization("a\nb").is_err());

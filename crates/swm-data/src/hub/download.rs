@@ -8,6 +8,7 @@ use reqwest::{Method, Response, StatusCode};
 use sha2::{Digest as _, Sha256};
 use std::fs::{File, OpenOptions};
 use std::io::{Read as _, Write as _};
+use std::ops::Range;
 use std::path::Path;
 use swm_core::files::{self, Lock};
 use swm_core::run::{Control, Event, Progress, Stage};
@@ -15,8 +16,10 @@ use swm_core::{Error, Result};
 
 /// The name of the stage.
 const STAGE: &str = "pull";
-/// How often a download continues after its connection broke without a further byte.
+/// How often a download is tried, without those tries that bring [`PROGRESS`].
 const ATTEMPTS: usize = 4;
+/// The bytes that a connection must bring before it breaks, to be no failed try.
+const PROGRESS: u64 = 1 << 20;
 /// The bytes that are read of a file at once.
 const BLOCK: usize = 1 << 20;
 
@@ -56,7 +59,7 @@ impl Hub {
         let listed = match folder.known_files(commit) {
             Some(listed) => listed,
             None => {
-                let listed = self.client.files(&pinned, commit)?;
+                let listed = self.client.files(&pinned, commit, control)?;
                 folder.remember_files(commit, &listed)?;
                 listed
             }
@@ -97,31 +100,36 @@ impl Hub {
             std::fs::create_dir_all(folder).map_err(|error| Error::io(folder, "creating a folder", error))?;
         }
         let url = format!("{}/resolve/{}/{}", self.client.page(pinned), pinned.revision, encoded_path(&file.path));
-        let (mut transferred, mut attempts) = (0, 0);
+        let size_of_part = || std::fs::metadata(&part).map_or(0, |found| found.len());
+        if size_of_part() > file.size {
+            files::delete_file(&part)?;
+        }
+        // A server that sends the same bytes again makes no progress.
+        let (mut transferred, mut attempts, mut most) = (0, 0, size_of_part());
         loop {
-            let before = std::fs::metadata(&part).map_or(0, |found| found.len());
-            if before > file.size {
-                files::delete_file(&part)?;
-                continue;
-            }
+            let before = size_of_part();
             let outcome = if before == file.size && before > 0 {
                 Ok(())
             } else {
-                transfer(&self.client, pinned, &url, before, &part, control)
+                transfer(&self.client, pinned, &url, before..file.size, &part, control)
             };
-            let now = std::fs::metadata(&part).map_or(0, |found| found.len());
+            let now = size_of_part();
             transferred += now.saturating_sub(before);
             match outcome {
                 Ok(()) if now == file.size => break,
                 Err(error) if !matches!(error, Error::External { .. }) => return Err(error),
                 outcome => {
-                    attempts = if now > before { 0 } else { attempts + 1 };
+                    attempts = if now >= most + PROGRESS { 0 } else { attempts + 1 };
+                    most = most.max(now);
                     if attempts >= ATTEMPTS {
                         let short = || {
-                            let problem = format!("the connection ended after {now} of {} bytes", file.size);
+                            let problem = format!("the server sent {most} of {} bytes in several tries", file.size);
                             Error::external(url.clone(), format!("{problem}; run it again to continue"))
                         };
                         return Err(outcome.err().unwrap_or_else(short));
+                    }
+                    if let Err(error) = outcome {
+                        control.emit(Event::Log(&format!("{error}; trying again")));
                     }
                 }
             }
@@ -132,11 +140,18 @@ impl Hub {
     }
 }
 
-/// Appends what a file lacks from byte `from` on.
-fn transfer(client: &Client, uri: &HubUri, url: &str, from: u64, part: &Path, control: &mut Control<'_>) -> Result<()> {
+/// Appends what a file lacks, which are the bytes `missing`.
+fn transfer(
+    client: &Client,
+    uri: &HubUri,
+    url: &str,
+    missing: Range<u64>,
+    part: &Path,
+    control: &mut Control<'_>,
+) -> Result<()> {
     let mut headers = HeaderMap::new();
-    if from > 0 {
-        let range = HeaderValue::try_from(format!("bytes={from}-"));
+    if missing.start > 0 {
+        let range = HeaderValue::try_from(format!("bytes={}-", missing.start));
         headers.extend(range.ok().map(|range| (RANGE, range)));
     }
     let mut answer = client.send(Method::GET, url, Body::default(), headers, true)?;
@@ -149,14 +164,19 @@ fn transfer(client: &Client, uri: &HubUri, url: &str, from: u64, part: &Path, co
     let io = |error| Error::io(part, "saving a download", error);
     let mut out =
         OpenOptions::new().create(true).write(true).append(continues).truncate(!continues).open(part).map_err(io)?;
+    let mut left = if continues { missing.end - missing.start } else { missing.end };
     loop {
         control.check()?;
         let (next, rest) = chunk(url, answer)?;
-        match next {
-            Some(bytes) => out.write_all(&bytes).map_err(io)?,
-            None => return out.sync_all().map_err(io),
-        }
-        answer = rest;
+        let Some(bytes) = next else { return out.sync_all().map_err(io) };
+        let Some(after) = left.checked_sub(bytes.len() as u64) else {
+            drop(out);
+            files::delete_file(part)?;
+            let problem = format!("the server sends more than the {} bytes that the hub lists", missing.end);
+            return Err(Error::corrupt(url, problem, "tell the owner of the repository; do not use this hub"));
+        };
+        out.write_all(&bytes).map_err(io)?;
+        (left, answer) = (after, rest);
     }
 }
 

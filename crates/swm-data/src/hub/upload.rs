@@ -1,6 +1,6 @@
 //! [`Hub::push`]: uploads files as one commit.
 
-use super::client::{Body, Client, header, json_body, parsed, whole};
+use super::client::{Body, Client, Content, header, json_body, parsed, whole};
 use super::download::sha256;
 use super::{Hub, HubUri, RepoKind};
 use base64::Engine as _;
@@ -27,6 +27,10 @@ const MAX_NAMED: usize = 256;
 const MAX_REGULAR: u64 = 10 << 20;
 /// The largest file that is sent in one request, in bytes; the hub asks for parts of larger ones.
 const MAX_WHOLE: u64 = 5 << 30;
+/// The largest commit that is made before it is sent, in bytes.
+const MAX_HELD: u64 = 32 << 20;
+/// The bytes that are read of a file at once.
+const BLOCK: u64 = 1 << 18;
 /// The media type of Git LFS.
 const LFS_TYPE: &str = "application/vnd.git-lfs+json";
 
@@ -52,6 +56,13 @@ pub struct Pushed {
     pub bytes: u64,
     /// The bytes of large files that the hub did not have.
     pub uploaded: u64,
+}
+
+/// A line of a commit. Files that are part of the commit are read while it is sent.
+struct Line {
+    json: String,
+    /// The file whose content belongs into `json`, and its size.
+    file: Option<(PathBuf, u64)>,
 }
 
 /// A file to upload.
@@ -90,21 +101,21 @@ impl Hub {
         control.emit(Event::Started(Stage { name: STAGE, subject: &[&name], total, unit: "files" }));
         let (mut lines, mut uploaded) = (vec![], 0);
         let summary = if options.message.is_empty() { "Upload with stable-worldmodel" } else { &options.message };
-        lines.push(json!({"key": "header", "value": {"summary": summary, "description": ""}}));
+        lines.push(Line::new(&json!({"key": "header", "value": {"summary": summary, "description": ""}}), None));
         for (done, upload) in uploads.iter().enumerate() {
             control.check()?;
             if large.contains(&upload.path) {
                 uploaded += self.client.send_large(to, upload, control)?;
                 let value = json!({"path": upload.path, "algo": "sha256", "oid": upload.sha256, "size": upload.size});
-                lines.push(json!({"key": "lfsFile", "value": value}));
+                lines.push(Line::new(&json!({"key": "lfsFile", "value": value}), None));
             } else {
-                let content = std::fs::read(&upload.local).map_err(|error| reading(&upload.local, error))?;
-                let value = json!({"path": upload.path, "encoding": "base64", "content": STANDARD.encode(content)});
-                lines.push(json!({"key": "file", "value": value}));
+                let value = json!({"path": upload.path, "encoding": "base64", "content": ""});
+                let file = Some((upload.local.clone(), upload.size));
+                lines.push(Line::new(&json!({"key": "file", "value": value}), file));
             }
             control.progress(Progress { stage: STAGE, done: done + 1, total, unit: "files", metrics: &[] });
         }
-        let (commit, page) = self.client.commit_files(to, &lines)?;
+        let (commit, page) = self.client.commit_files(to, lines)?;
         control.emit(Event::Finished { stage: STAGE, metrics: &[("files", total as f64)] });
         Ok(Pushed { pinned: to.at(&commit).to_string(), page, files: total, bytes, uploaded })
     }
@@ -222,17 +233,17 @@ impl Client {
     fn send_parts(&self, upload: &Upload, action: &Action, size: u64, control: &mut Control<'_>) -> Result<()> {
         let numbered = |(name, value): (&String, &Value)| Some((name.parse::<u64>().ok()?, value.as_str()?.to_owned()));
         let addresses: BTreeMap<u64, String> = action.header.iter().filter_map(numbered).collect();
+        if addresses.len() as u64 != upload.size.div_ceil(size) {
+            let problem = format!("it asks for {} parts of {size} bytes of {}", addresses.len(), upload.size);
+            return Err(Error::corrupt(&action.href, problem, "check the address of the hub"));
+        }
         let mut parts = vec![];
         for (index, address) in addresses.values().enumerate() {
             control.check()?;
             let first = index as u64 * size;
-            let last = (first + size).min(upload.size);
+            let last = first.saturating_add(size).min(upload.size);
             let etag = self.put(address, upload, first, last, HeaderMap::new())?;
             parts.push(json!({"partNumber": index + 1, "etag": etag}));
-        }
-        if addresses.len() as u64 != upload.size.div_ceil(size) {
-            let problem = format!("it asks for {} parts of {size} bytes of {}", addresses.len(), upload.size);
-            return Err(Error::corrupt(&action.href, problem, "check the address of the hub"));
         }
         let body = Body { content_type: LFS_TYPE, ..json_body(&json!({"oid": upload.sha256, "parts": parts})) };
         let answer = self.send(Method::POST, &action.href, body, HeaderMap::new(), true)?;
@@ -244,9 +255,9 @@ impl Client {
         let io = |error| reading(&upload.local, error);
         let mut file = File::open(&upload.local).map_err(io)?;
         file.seek(SeekFrom::Start(first)).map_err(io)?;
-        let mut bytes = vec![];
-        file.take(last.saturating_sub(first)).read_to_end(&mut bytes).map_err(io)?;
-        let body = Body { bytes, content_type: "application/octet-stream" };
+        let length = last.saturating_sub(first);
+        let content = Content::Blocks(length, Box::new(blocks(file.take(length))));
+        let body = Body { content, content_type: "application/octet-stream" };
         let answer = self.send(Method::PUT, address, body, headers, false)?;
         accepted(&answer, upload)?;
         let tag = answer.headers().get("etag").and_then(|tag| tag.to_str().ok()).unwrap_or_default();
@@ -254,7 +265,7 @@ impl Client {
     }
 
     /// Makes the commit; returns its hash and its page.
-    fn commit_files(&self, to: &HubUri, lines: &[Value]) -> Result<(String, String)> {
+    fn commit_files(&self, to: &HubUri, lines: Vec<Line>) -> Result<(String, String)> {
         #[derive(Deserialize)]
         #[serde(rename_all = "camelCase")]
         struct Answer {
@@ -263,8 +274,14 @@ impl Client {
             commit_url: String,
         }
         let url = format!("{}/commit/{}", self.api(to), super::client::encoded(&to.revision));
-        let bytes = lines.iter().map(|line| format!("{line}\n")).collect::<String>().into_bytes();
-        let body = Body { bytes, content_type: "application/x-ndjson" };
+        let length = lines.iter().map(Line::length).sum();
+        let content = if length <= MAX_HELD {
+            let made = lines.iter().map(Line::bytes).collect::<std::io::Result<Vec<_>>>();
+            Content::Bytes(made.map_err(|error| Error::external("reading the files of the commit", error))?.concat())
+        } else {
+            Content::Blocks(length, Box::new(lines.into_iter().map(|line| line.bytes())))
+        };
+        let body = Body { content, content_type: "application/x-ndjson" };
         let answer = self.send(Method::POST, &url, body, HeaderMap::new(), true)?;
         self.check_write(&answer, to)?;
         let answer: Answer = parsed(&url, &whole(&url, answer)?)?;
@@ -272,10 +289,48 @@ impl Client {
     }
 }
 
+impl Line {
+    /// The empty text in `"content":""` stands for the content of the file.
+    fn new(json: &Value, file: Option<(PathBuf, u64)>) -> Self {
+        Self { json: format!("{json}\n"), file }
+    }
+
+    /// The number of bytes.
+    fn length(&self) -> u64 {
+        self.json.len() as u64 + self.file.as_ref().map_or(0, |(_, size)| size.div_ceil(3) * 4)
+    }
+
+    /// The line as it is sent.
+    fn bytes(&self) -> std::io::Result<Vec<u8>> {
+        const CONTENT: &str = "\"content\":\"";
+        let Some((path, size)) = &self.file else { return Ok(self.json.clone().into_bytes()) };
+        let mut content = vec![];
+        File::open(path)?.take(size + 1).read_to_end(&mut content)?;
+        let changed = || std::io::Error::other(format!("{} changed while it was uploaded", path.display()));
+        let (before, after) =
+            self.json.split_once(CONTENT).filter(|_| content.len() as u64 == *size).ok_or_else(changed)?;
+        Ok([before, CONTENT, &STANDARD.encode(content), after].concat().into_bytes())
+    }
+}
+
+/// The content of a file in blocks.
+fn blocks(mut file: std::io::Take<File>) -> impl Iterator<Item = std::io::Result<Vec<u8>>> {
+    std::iter::from_fn(move || {
+        let mut block = vec![];
+        match file.by_ref().take(BLOCK).read_to_end(&mut block) {
+            Ok(0) => None,
+            read => Some(read.map(|_| block)),
+        }
+    })
+}
+
 /// The files to upload, with their paths in the repository.
 fn uploads(from: &Path, to: &str, control: &mut Control<'_>) -> Result<Vec<Upload>> {
-    let mut found = vec![];
-    collect(from, to, &mut found)?;
+    let (mut found, mut left_out) = (vec![], 0);
+    collect(from, to, &mut found, &mut left_out)?;
+    if left_out > 0 {
+        control.emit(Event::Log(&format!("{left_out} links, pipes and other special files are left out")));
+    }
     if found.is_empty() {
         return Err(Error::config(from.display().to_string(), "has no files", "give a file, or a folder with files"));
     }
@@ -297,8 +352,8 @@ fn uploads(from: &Path, to: &str, control: &mut Control<'_>) -> Result<Vec<Uploa
     found.into_iter().map(upload).collect()
 }
 
-/// Lists a file, or the files of a folder without hidden ones and links.
-fn collect(from: &Path, to: &str, found: &mut Vec<(String, PathBuf)>) -> Result<()> {
+/// Lists a file, or the files of a folder without hidden ones and links, and counts the latter.
+fn collect(from: &Path, to: &str, found: &mut Vec<(String, PathBuf)>, left_out: &mut usize) -> Result<()> {
     let kind = std::fs::symlink_metadata(from).map_err(|error| reading(from, error))?;
     if kind.is_file() {
         let name = from.file_name().and_then(|name| name.to_str()).unwrap_or_default();
@@ -307,6 +362,8 @@ fn collect(from: &Path, to: &str, found: &mut Vec<(String, PathBuf)>) -> Result<
             return Err(Error::config(from.display().to_string(), "has a name that the hub cannot store", "rename it"));
         }
         found.push((path.to_owned(), from.to_owned()));
+    } else if !kind.is_dir() {
+        *left_out += 1;
     }
     if !kind.is_dir() || found.len() > MAX_FILES {
         return Ok(());
@@ -318,7 +375,7 @@ fn collect(from: &Path, to: &str, found: &mut Vec<(String, PathBuf)>) -> Result<
         };
         if !name.starts_with('.') {
             let inside = if to.is_empty() { name } else { format!("{to}/{name}") };
-            collect(&path, &inside, found)?;
+            collect(&path, &inside, found, left_out)?;
         }
     }
     Ok(())
@@ -338,4 +395,38 @@ fn accepted(answer: &reqwest::Response, upload: &Upload) -> Result<()> {
 
 fn number(value: &Value) -> Option<u64> {
     value.as_u64().or_else(|| value.as_str()?.parse().ok())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_of_a_commit_have_the_content_of_their_files() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("a");
+        for size in [0, 1, 2, 3, 1000] {
+            std::fs::write(&path, vec![7; size]).expect("a file");
+            let value = |content: &str| json!({"key": "file", "value": {"path": "\"content\":\"", "content": content}});
+            let line = Line::new(&value(""), Some((path.clone(), size as u64)));
+            let made = line.bytes().expect("a line");
+            assert_eq!(made, format!("{}\n", value(&STANDARD.encode(vec![7; size]))).into_bytes());
+            assert_eq!(made.len() as u64, line.length());
+            std::fs::write(&path, vec![7; size + 1]).expect("a file");
+            assert!(line.bytes().is_err(), "the file changed");
+        }
+    }
+
+    #[test]
+    fn files_are_read_in_blocks() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("a");
+        let content: Vec<u8> = (0..BLOCK * 2 + 5).map(|i| (i % 251) as u8).collect();
+        std::fs::write(&path, &content).expect("a file");
+        let length = content.len() as u64 - 3;
+        let read: Vec<Vec<u8>> =
+            blocks(File::open(&path).expect("a file").take(length)).collect::<std::io::Result<_>>().expect("blocks");
+        assert_eq!(read.iter().map(|block| block.len() as u64).collect::<Vec<_>>(), [BLOCK, BLOCK, 2]);
+        assert_eq!(read.concat(), content[..content.len() - 3]);
+    }
 }

@@ -106,9 +106,16 @@ pub(super) fn is_commit(text: &str) -> bool {
     text.len() == 40 && text.bytes().all(|byte| byte.is_ascii_hexdigit())
 }
 
+/// Whether a text is a SHA-256 hash in lower-case hexadecimal digits.
+pub(super) fn is_sha256(text: &str) -> bool {
+    text.len() == 64 && text.bytes().all(|byte| matches!(byte, b'0'..=b'9' | b'a'..=b'f'))
+}
+
 /// Whether a name, which may have several parts, stays inside the folder that it is joined to.
 pub(super) fn is_inside(name: &str) -> bool {
-    name.split('/').all(|part| !matches!(part, "" | "." | "..")) && !name.contains(['\\', '\0', '?', '#', ':'])
+    name.split('/').all(|part| !matches!(part, "" | "." | ".."))
+        && !name.contains(['\\', '\0', '\n', '\t', '?', '#', ':'])
+        && swm_core::text::printable(name) == name
 }
 
 #[cfg(test)]
@@ -143,6 +150,9 @@ mod tests {
             "s3://a/b",
             "hf://a@b/c",
             "hf://a/b?x",
+            "hf://a/b\n",
+            "hf://a/b/\u{1b}[2J",
+            "hf://a/b/c\u{202e}d",
         ] {
             assert!(HubUri::parse(wrong, RepoKind::Model).is_err(), "{wrong}");
         }

@@ -1,9 +1,9 @@
 //! Datasets and checkpoints of the hub: pulled, read wherever a path goes, and pushed.
 
-use crate::hub_server::{HubServer, Repository, TOKEN};
+use crate::hub_server::{HubServer, Repository, TOKEN, hash};
 use crate::{Swm, text};
 use std::path::Path;
-use std::process::Output;
+use std::process::{Output, Stdio};
 use std::sync::Arc;
 
 /// Bytes that do not repeat.
@@ -94,6 +94,62 @@ fn wrong_content_is_refused_and_not_kept() {
     setup.fails(&["pull", "hf://lab/rooms"], None, &["SHA-256", "the hub says"]);
     setup.hub.state().wrong_content = false;
     assert_eq!(setup.json(&["pull", "hf://lab/rooms"], None)["downloaded"], 5000);
+}
+
+#[test]
+fn files_of_other_sizes_than_listed_end_the_download() {
+    let setup = Setup::new();
+    setup.hub.commit("models/lab/rooms", &[("short", b"0123456789"), ("long", b"0123456789"), ("empty", b"0")]);
+    setup.hub.state().listed = [("short".to_owned(), 20), ("long".to_owned(), 5), ("empty".to_owned(), 0)].into();
+    let kept = || -> u64 {
+        let files = std::fs::read_dir(setup.swm.path("hub/models--lab--rooms/partial")).expect("a folder");
+        files.map(|file| file.expect("a file").metadata().expect("its size").len()).sum()
+    };
+    setup.fails(&["pull", "hf://lab/rooms/short"], None, &["sent 10 of 20 bytes"]);
+    setup.fails(&["pull", "hf://lab/rooms/long"], None, &["more than the 5 bytes"]);
+    setup.hub.state().endless = true;
+    setup.fails(&["pull", "hf://lab/rooms/short"], None, &["more than the 20 bytes"]);
+    setup.fails(&["pull", "hf://lab/rooms/empty"], None, &["more than the 0 bytes"]);
+    assert!(kept() <= 20, "{} bytes are kept", kept());
+    let requests = setup.hub.state().requests.iter().filter(|request| request.contains("/resolve/")).count();
+    assert!(requests < 12, "{requests} requests");
+}
+
+#[test]
+fn lists_of_files_do_not_continue_at_another_host() {
+    let setup = Setup::new();
+    setup.hub.commit("models/lab/rooms", &[("a", b"a"), ("b", b"b"), ("c", b"c")]);
+    setup.hub.state().next_host = Some("@127.0.0.1:9".to_owned());
+    setup.fails(&["pull", "hf://lab/rooms"], None, &["continues at another address", "@127.0.0.1:9"]);
+}
+
+#[test]
+fn hashes_are_those_of_files() {
+    let setup = Setup::new();
+    setup.hub.commit("models/lab/rooms", &[("a", b"a"), ("large", &content(2000))]);
+    for wrong in ["", "../../x", "abc"] {
+        setup.hub.state().wrong_oid = Some(wrong.to_owned());
+        setup.fails(&["pull", "hf://lab/rooms/large"], None, &["no SHA-256 hash"]);
+    }
+    setup.hub.state().wrong_oid = Some(hash(&content(2000)).to_uppercase());
+    setup.json(&["pull", "hf://lab/rooms/large"], None);
+}
+
+#[test]
+fn uploads_hold_no_file_in_memory() {
+    let setup = Setup::new();
+    let size = 256 << 20;
+    let file = std::fs::File::create(setup.swm.path("large.bin")).expect("a file");
+    file.set_len(size).expect("its size");
+    setup.hub.state().whole = true;
+    let mut command = setup.swm.command(&["push", "./large.bin", "hf://lab/large"]);
+    command.env("HF_ENDPOINT", &setup.hub.address).env("HF_TOKEN", TOKEN);
+    let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("swm starts");
+    setup.hub.state().uploader = Some(child.id());
+    let output = child.wait_with_output().expect("swm ends");
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    let memory = setup.hub.state().memory;
+    assert!(memory << 10 < size, "{memory} kB");
 }
 
 #[test]

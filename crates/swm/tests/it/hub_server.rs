@@ -30,6 +30,19 @@ pub(crate) struct State {
     pub break_after: Option<usize>,
     /// What the storage sends in place of a large file's content.
     pub wrong_content: bool,
+    /// Sizes that the hub lists in place of those of files.
+    pub listed: BTreeMap<String, u64>,
+    /// What the hub lists in place of the hash of large files.
+    pub wrong_oid: Option<String>,
+    /// Whether the hub sends bytes without an end for every file.
+    pub endless: bool,
+    /// The host to which the hub sends readers of its second page.
+    pub next_host: Option<String>,
+    /// Whether files are sent as a whole, whatever their size.
+    pub whole: bool,
+    /// The process that uploads, and the most memory that it had at the end of an upload, in kB.
+    pub uploader: Option<u32>,
+    pub memory: u64,
 }
 
 /// A repository.
@@ -61,6 +74,8 @@ struct Answer {
     body: Vec<u8>,
     /// Sends only so much of the body.
     breaks: Option<usize>,
+    /// Repeats the body until the reader leaves.
+    endless: bool,
 }
 
 impl HubServer {
@@ -105,6 +120,11 @@ impl HubServer {
         while let Some(request) = read(&mut reader) {
             let answer = if is_storage { self.store(&request) } else { self.answer(&request) };
             let length = answer.body.len();
+            if answer.endless {
+                let _ = out.write_all(b"HTTP/1.1 200 OK\r\nconnection: close\r\n\r\n");
+                while out.write_all(&answer.body).is_ok() {}
+                return;
+            }
             let mut head = format!("HTTP/1.1 {}\r\ncontent-length: {length}\r\n", answer.status);
             for (name, value) in &answer.headers {
                 head += &format!("{name}: {value}\r\n");
@@ -138,6 +158,11 @@ impl HubServer {
                 return Answer { headers: vec![("etag", format!("\"{part}\""))], ..Answer::ok(vec![]) };
             }
             assert_eq!(hash(&request.body), oid);
+            let process = state.uploader.map(|id| std::fs::read_to_string(format!("/proc/{id}/status")));
+            if let Some(Ok(status)) = process {
+                let most = status.lines().find_map(|line| line.strip_prefix("VmHWM:")?.split_whitespace().next());
+                state.memory = most.and_then(|most| most.parse().ok()).unwrap_or(0);
+            }
             state.objects.insert(oid, request.body.clone());
             return Answer::ok(vec![]);
         }
@@ -184,7 +209,8 @@ impl HubServer {
                 let Some(index) = commit_of(revision) else {
                     return Answer::error("404 Not Found", "RevisionNotFound");
                 };
-                page(&found.commits[index], path, query, &self.address)
+                let host = state.next_host.clone().unwrap_or_default();
+                page(&found.commits[index], &state, path, query, &format!("{}{host}", self.address))
             }
             ("GET", ["resolve", revision, file]) => {
                 let Some(index) = commit_of(revision) else {
@@ -193,6 +219,9 @@ impl HubServer {
                 let Some(bytes) = found.commits[index].get(&file.replace("%20", " ")).cloned() else {
                     return Answer::error("404 Not Found", "EntryNotFound");
                 };
+                if state.endless {
+                    return Answer { endless: true, ..Answer::ok(vec![0; 1 << 16]) };
+                }
                 if bytes.len() < LARGE {
                     return Answer::ok(bytes);
                 }
@@ -214,9 +243,9 @@ impl HubServer {
 }
 
 /// Two files of a commit, and the address of the next ones.
-fn page(files: &BTreeMap<String, Vec<u8>>, path: &str, query: &str, address: &str) -> Answer {
+fn page(files: &BTreeMap<String, Vec<u8>>, state: &State, path: &str, query: &str, address: &str) -> Answer {
     let page: usize = query.split('&').find_map(|pair| pair.strip_prefix("cursor=")?.parse().ok()).unwrap_or(0);
-    let files: Vec<Value> = files.iter().map(|(path, bytes)| entry(path, bytes)).collect();
+    let files: Vec<Value> = files.iter().map(|(path, bytes)| entry(path, bytes, state)).collect();
     let next = (2 * page + 2 < files.len())
         .then(|| format!("<{address}{path}?recursive=true&cursor={}>; rel=\"next\"", page + 1));
     let shown: Vec<&Value> = files.iter().skip(2 * page).take(2).collect();
@@ -256,7 +285,7 @@ impl State {
                 return json!({"oid": oid, "size": size});
             }
             let base = format!("{address}/{name}.git/info/lfs");
-            let upload = if size > PART {
+            let upload = if size > PART && !self.whole {
                 let parts = (0..size.div_ceil(PART))
                     .map(|i| (format!("{:05}", i + 1), json!(format!("{storage}/{oid}?part={i}"))));
                 let mut header: serde_json::Map<String, Value> = parts.collect();
@@ -313,7 +342,7 @@ impl State {
 
 impl Answer {
     fn ok(body: Vec<u8>) -> Self {
-        Self { status: "200 OK", headers: vec![], body, breaks: None }
+        Self { status: "200 OK", headers: vec![], body, breaks: None, endless: false }
     }
 
     fn json(value: &Value) -> Self {
@@ -344,10 +373,12 @@ fn route(path: &str) -> Option<(&str, String, String)> {
     Some((kind, format!("{owner}/{}", name.trim_end_matches(".git")), rest.to_owned()))
 }
 
-fn entry(path: &str, bytes: &[u8]) -> Value {
-    let mut entry = json!({"type": "file", "path": path, "size": bytes.len(), "oid": "0"});
+fn entry(path: &str, bytes: &[u8], state: &State) -> Value {
+    let size = state.listed.get(path).copied().unwrap_or(bytes.len() as u64);
+    let mut entry = json!({"type": "file", "path": path, "size": size, "oid": "0"});
     if bytes.len() >= LARGE {
-        entry["lfs"] = json!({"oid": hash(bytes), "size": bytes.len(), "pointerSize": 130});
+        let oid = state.wrong_oid.clone().unwrap_or_else(|| hash(bytes));
+        entry["lfs"] = json!({"oid": oid, "size": bytes.len(), "pointerSize": 130});
     }
     entry
 }

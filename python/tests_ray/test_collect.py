@@ -66,7 +66,7 @@ def test_a_driver_that_is_killed_and_started_again_continues(cluster, s3, rooms)
     first.wait()
     # Another machine may continue: the folder is all that is needed.
     rest = subprocess.run(
-        [sys.executable, "-m", "stable_worldmodel.ray", folder.root, "--json"], capture_output=True, text=True
+        [sys.executable, "-m", "stable_worldmodel.ray", folder.root, "--trust", "--json"], capture_output=True, text=True
     )
     assert rest.returncode == 0, rest.stderr
     assert '"cells": 13' in rest.stdout and '"ran": 13' not in rest.stdout

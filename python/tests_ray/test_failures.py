@@ -4,7 +4,7 @@ import textwrap
 
 import pytest
 import ray
-from conftest import add_node, swm
+from conftest import add_node, printed, swm
 
 import stable_worldmodel
 from stable_worldmodel.ray import driver
@@ -101,5 +101,7 @@ def test_references_to_a_run_that_is_refused_raise(cluster, tmp_path):
         swm_ray.collect("swm/Nowhere-v1", tmp_path / "a.lance")
     with pytest.raises(ray.exceptions.RayTaskError, match="level"):
         folder = Folder(str(tmp_path / "b.lance.ray"))
+        given = ["collect", "swm/TwoRoom-v1", "-o", tmp_path / "b.lance", "--episodes", 2, "--no-pixels", "--on", "ray"]
+        folder.write_json("request.json", printed(*given, "--print-request"))
         folder.write_json("level.json", "m68k")
         ray.get(swm_ray.collect("swm/TwoRoom-v1", tmp_path / "b.lance", episodes=2, no_pixels=True))

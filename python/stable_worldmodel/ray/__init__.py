@@ -18,7 +18,6 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -27,7 +26,8 @@ try:
 except ImportError as error:
     raise ImportError('Ray is not installed: pip install "stable-worldmodel-rs[ray]"') from error
 
-from .driver import CellsFailed, RunRefused, execute
+from .._process import module_command
+from .driver import CellsFailed, RunRefused, execute, read_request
 from .folder import Folder
 from .local import connect
 
@@ -102,7 +102,7 @@ def submit(arguments: Sequence[str], options: Mapping[str, Any] | None = None) -
         arguments: The command and its positional arguments.
         options: More options by their names, with `_` for `-`; a list repeats an option, `True` is a flag, `None` is left out.
     """
-    command = [sys.executable, "-m", "stable_worldmodel", *arguments, *_flags(options or {}), "--on", "ray", "--print-request"]
+    command = module_command("stable_worldmodel", *arguments, *_flags(options or {}), "--on", "ray", "--print-request")
     made = subprocess.run(command, capture_output=True, text=True)
     if made.returncode:
         raise ValueError(made.stderr.strip().removeprefix("error: "))
@@ -116,7 +116,7 @@ def progress(folder: str | os.PathLike[str]) -> dict[str, int]:
     from .cells import count
 
     run = Folder(os.fspath(folder))
-    request = run.read_json("request.json")
+    request = read_request(run)
     if request is None:
         return {"done": 0, "cells": 0}
     return {"done": len(run.list("cells")), "cells": count(request)}

@@ -7,6 +7,7 @@ done. The last stage joins what the cells wrote, on a node, so that nothing larg
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -19,10 +20,23 @@ __all__ = ["count", "stages"]
 _STUDY_FILES = ("study/study.json", "study/image-distances.json?")
 
 
+#: The names of the cells of studies and trainings, which name files.
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.,=+-]*")
+
+
 def stages(request: dict[str, Any]) -> Iterator[Iterable[Cell]]:
-    """The stages of a run."""
+    """The stages of a run.
+
+    Raises:
+        ValueError: If the request has a cell whose name would leave the folder of the run or its output.
+    """
     kinds = {"collect": _ranges, "convert": _ranges, "eval": _eval, "study": _study, "train": _train}
-    return kinds[request["kind"]](request)
+    kind, cells = request["kind"], request["cells"]
+    names = cells["ids"] if kind == "study" else [run["name"] for run in cells["runs"]] if kind == "train" else []
+    for name in names:
+        if not isinstance(name, str) or not _NAME.fullmatch(name):
+            raise ValueError(f"the request names a cell {name!r}, which is no name of a file")
+    return kinds[kind](request)
 
 
 def count(request: dict[str, Any]) -> int:
@@ -108,6 +122,7 @@ def _study(request: dict[str, Any]) -> Iterator[Iterable[Cell]]:
             "files": {"study/study.json": json.dumps(study)},
             "inputs": {"study/cells": output.at("cells")},
             "outputs": {name: output.at(name.removeprefix("study/").rstrip("?")) for name in _STUDY_FILES},
+            "study": study["title"],
         }
     ]
 

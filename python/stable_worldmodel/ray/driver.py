@@ -19,7 +19,7 @@ from . import worker
 from .cells import count, stages
 from .folder import Folder
 
-__all__ = ["CellsFailed", "RunRefused", "begin", "execute"]
+__all__ = ["CellsFailed", "RunRefused", "begin", "execute", "read_request"]
 
 #: Tasks that wait in Ray at a time: enough for its autoscaler to see the demand, and few enough for the driver's memory.
 QUEUED = 2000
@@ -69,18 +69,43 @@ def execute(request: dict[str, Any]) -> dict[str, Any]:
 
 
 def begin(folder: Folder, request: dict[str, Any]) -> None:
-    """Writes the request, or checks that the folder has this one."""
-    if folder.write_new("request.json", (json.dumps(request) + "\n").encode()):
-        return
-    found = folder.read_json("request.json")
+    """Writes the request, or checks that the folder has this one.
+
+    Raises:
+        RunRefused: If the folder has another run, or files and no run.
+    """
+    found = read_request(folder)
+    if found is None:
+        if not folder.is_empty():
+            raise RunRefused(f"{folder.root} has files and no request.json: give another --run-folder, or move them away")
+        if folder.write_new("request.json", (json.dumps(request) + "\n").encode()):
+            return
+        found = read_request(folder) or {}
     # Where a run is continued, and what its cells take, decide no result.
     free = ("resources", "directory", "folder")
-    differing = [key for key in request if key not in free and (found or {}).get(key) != request[key]]
+    differing = [key for key in request if key not in free and found.get(key) != request[key]]
     if differing:
         raise RunRefused(
-            f"{folder.root} has another run: its {differing[0]} is {_short((found or {}).get(differing[0]))}, not "
+            f"{folder.root} has another run: its {differing[0]} is {_short(found.get(differing[0]))}, not "
             f"{_short(request[differing[0]])}; give the command that began it, or another --run-folder and output"
         )
+    if found != request:
+        folder.write_json("request.json", request)
+
+
+def read_request(folder: Folder) -> dict[str, Any] | None:
+    """The request in the folder of a run, if there is one.
+
+    Raises:
+        RunRefused: If it is damaged.
+    """
+    try:
+        found = folder.read_json("request.json")
+    except RuntimeError:
+        found = False
+    if found is not None and not isinstance(found, dict):
+        raise RunRefused(f"{folder.at('request.json')} is damaged: give another --run-folder and output")
+    return found
 
 
 def _short(value: Any) -> str:
@@ -99,7 +124,9 @@ def _options(resources: dict[str, float]) -> dict[str, Any]:
 
 def _check_nodes(folder: Folder, run: dict[str, Any], resources: dict[str, Any]) -> str | None:
     """Asks every node that can run a cell whether it fits, and returns the processor level that the run keeps."""
-    able = [node for node in ray.nodes() if node["Alive"] and node["Resources"].get("CPU", 0) >= resources["num_cpus"]]
+    alive = [node for node in ray.nodes() if node["Alive"]]
+    able = [node for node in alive if node["Resources"].get("CPU", 0) >= resources["num_cpus"]]
+    _warn_of_missing([node["Resources"] for node in alive], resources)
     known = folder.read_json("level.json")
     probe = ray.remote(worker.probe)
     asked = [
@@ -126,6 +153,18 @@ def _check_nodes(folder: Folder, run: dict[str, Any], resources: dict[str, Any])
     if known is None and levels:
         folder.write_json("level.json", next(iter(levels)))
     return known or next(iter(levels), None)
+
+
+def _warn_of_missing(nodes: list[dict[str, float]], resources: dict[str, Any]) -> None:
+    """Says what no node has: the cells wait for a node that has it."""
+    needed = {"CPU": resources["num_cpus"], "GPU": resources["num_gpus"], "memory": resources.get("memory", 0)}
+    needed |= resources["resources"]
+    if any(all(node.get(name, 0) >= count for name, count in needed.items()) for node in nodes):
+        return
+    most = {name: max((node.get(name, 0) for node in nodes), default=0) for name in needed}
+    missing = [f"{name}={count:g} (at most {most[name]:g})" for name, count in needed.items() if most[name] < count]
+    text = ", ".join(missing) or "all that a cell takes"
+    print(f"warning: no node has {text}; the cells wait until one joins, Ctrl-C ends the run", file=sys.stderr, flush=True)
 
 
 def _run_stage(

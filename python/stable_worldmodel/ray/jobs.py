@@ -13,6 +13,7 @@ from typing import Any
 
 from ray.job_submission import JobStatus, JobSubmissionClient
 
+from .._process import module_command
 from .driver import begin
 from .folder import Folder
 
@@ -39,7 +40,8 @@ def submit(request: dict[str, Any], address: str) -> int:
     running = [job.submission_id for job in client.list_jobs() if _is_of(job, prefix)]
     name = running[0] if running else f"{prefix}-{int(time.time())}"
     if not running:
-        command = f"python -m stable_worldmodel.ray {shlex.quote(request['folder'])} --json"
+        # `begin` has written this request, or found it there.
+        command = shlex.join(module_command("stable_worldmodel.ray", request["folder"], "--trust", "--json", python="python"))
         client.submit_job(entrypoint=command, submission_id=name, metadata={"kind": request["kind"], "run": request["folder"]})
     print(f"ray: job {name} at {address}", file=sys.stderr, flush=True)
     try:

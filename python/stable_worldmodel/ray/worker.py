@@ -21,7 +21,8 @@ from typing import Any
 
 #: A cell: `id`, `name` and `arguments` of `swm`; `files`, texts to write first, by their paths in the folder of the cell;
 #: `inputs` and `outputs`, locations by these paths, with a question mark after what may be missing; `state`, the folder of
-#: a training's checkpoints; `done_if`, a command, and the values that it prints if the work is done already.
+#: a training's checkpoints; `study`, the title of the study whose files the outputs may replace; `done_if`, a command, and the
+#: values that it prints if the work is done already.
 Cell = dict[str, Any]
 
 #: What the cells of a run share: `folder`, `version`, `level`, `directory` and `threads`.
@@ -98,7 +99,7 @@ def run_cell(cell: Cell, run: Run) -> dict[str, Any]:
 
 def _run_in(scratch: Path, cell: Cell, run: Run) -> Any:
     """Brings the files of a cell, runs its command, and stores its outputs. Returns what the command printed."""
-    from stable_worldmodel.ray.folder import Folder, TrainingState
+    from stable_worldmodel.ray.folder import Folder, Outputs, TrainingState
 
     for name, text in cell.get("files", {}).items():
         path = scratch / name
@@ -116,9 +117,10 @@ def _run_in(scratch: Path, cell: Cell, run: Run) -> Any:
         if not _is_done(cell, run):
             raise
         outcome = None
+    outputs = Outputs(Folder(run["folder"]), cell["id"], cell.get("study"))
     for name, location in cell.get("outputs", {}).items():
         if (scratch / name.rstrip("?")).exists() or not name.endswith("?"):
-            Folder(location).upload(scratch / name.rstrip("?"))
+            outputs.upload(scratch / name.rstrip("?"), Folder(location))
     return outcome
 
 
@@ -138,7 +140,9 @@ def _command(arguments: list[str], run: Run, state: Any) -> Any:
     """Runs `swm` with these arguments and returns the JSON that it prints. It ends when this process does."""
     if "--threads" not in arguments:
         arguments = [*arguments, "--threads", str(run["threads"])]
-    program = [sys.executable, "-m", "stable_worldmodel", *arguments, "--json"]
+    from stable_worldmodel._process import module_command
+
+    program = module_command("stable_worldmodel", *arguments, "--json")
     directory = run["directory"] if os.path.isdir(run["directory"]) else None
     with tempfile.TemporaryFile() as printed, tempfile.TemporaryFile() as errors:
         child = subprocess.Popen(

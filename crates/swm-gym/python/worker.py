@@ -8,13 +8,6 @@ A request is one byte for its kind, the length of its payload (4 bytes, little-e
 the same form. The first request carries the sources of the other modules and the environment to make.
 """
 
-import sys
-
-# `python -c` puts the current folder first, where a stranger's `json.py` would replace a module of the standard library.
-# Modules that this statement has not removed from the path come from the installation and from PYTHONPATH.
-if sys.path[:1] == ['']:
-    del sys.path[0]
-
 import ctypes
 import importlib.abc
 import importlib.util
@@ -24,6 +17,7 @@ import os
 import signal
 import socket
 import struct
+import sys
 import traceback
 
 HEADER = struct.Struct('<BI')

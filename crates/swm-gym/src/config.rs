@@ -2,6 +2,7 @@
 
 use crate::assets;
 use std::path::PathBuf;
+use std::process::Command;
 use std::time::Duration;
 
 /// The Python interpreter of worker processes and their timeouts.
@@ -60,7 +61,24 @@ impl Python {
     }
 }
 
+/// `python -c` puts the current folder first, where a stranger's `json.py` would replace a module of the standard library. The
+/// option `-P` leaves it out, but Python 3.10 does not know it.
+const WITHOUT_CURRENT_FOLDER: &str = "import sys\nif sys.path[:1] == ['']:\n    del sys.path[0]\n";
+
 impl Python {
+    /// Returns a command that runs a program, to which arguments can be added. The program finds the modules of the installation
+    /// and of `PYTHONPATH`, and none of the current folder. Every Python that this program starts is started so.
+    pub fn script(&self, program: &str) -> Command {
+        let mut command = Command::new(&self.program);
+        command.arg("-c").arg(format!("{WITHOUT_CURRENT_FOLDER}{program}"));
+        command
+    }
+
+    /// Returns a command that runs a module, as `python -m`, but finds no modules of the current folder.
+    pub fn module(&self, name: &str) -> Command {
+        self.script(&format!("import runpy\nrunpy.run_module('{name}', run_name='__main__', alter_sys=True)\n"))
+    }
+
     /// Returns an instruction for installing one of the [`assets::PACKAGES`].
     pub(crate) fn fix(&self, asset: &str) -> String {
         if self.origin == NAMED {

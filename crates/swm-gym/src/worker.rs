@@ -236,8 +236,8 @@ impl Process {
         let file = shared_file().map_err(|error| Error::external("making shared memory", error))?;
         let io = |error| Error::external("starting a worker", error);
         let (socket, remote) = UnixStream::pair().map_err(io)?;
-        let mut command = Command::new(&python.program);
-        command.args(["-c", WORKER, &std::process::id().to_string(), id]);
+        let mut command = python.script(WORKER);
+        command.args([&std::process::id().to_string(), id]);
         command.stdin(Stdio::from(OwnedFd::from(remote)));
         command.stdout(Stdio::from(file.try_clone().map_err(io)?)).stderr(Stdio::piped());
         // In a separate process group, a worker gets no terminal signals. This process gets them and ends its workers.

@@ -6,13 +6,16 @@ use clap::ValueEnum;
 use serde_json::{Value, json};
 use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read as _, Seek as _, SeekFrom, Write as _};
+use std::os::unix::process::{CommandExt as _, ExitStatusExt as _};
 use std::path::{Path, PathBuf};
-use std::process::{Child, ChildStdin, Command, Stdio};
+use std::process::{Child, ChildStdin, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::RecvTimeoutError;
 use std::thread::JoinHandle;
 use std::time::Duration;
 use swm_core::{Error, Result};
+use swm_gym::Python;
 
 /// Where the metrics of a training go.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -29,24 +32,39 @@ pub enum Tracker {
 
 /// The program that hands lines to a package. Its first line of input is the run, each further one a step.
 const SCRIPT: &str = r#"
-import importlib, json, sys
+import importlib, json, os, signal, sys
+# What packages print goes to standard error.
+answers = os.fdopen(os.dup(1), "w", buffering=1)
+os.dup2(2, 1)
 run = json.loads(sys.stdin.readline())
+# A package that hangs is ended.
+signal.signal(signal.SIGALRM, signal.SIG_DFL)
+signal.alarm(run["seconds"])
 try:
     package = importlib.import_module(run["package"])
 except ImportError as error:
-    print(f"missing: {error}", flush=True)
+    print("missing:", str(error).replace("\n", " "), file=answers)
     sys.exit(1)
 tracked = package.init(project=run["project"], name=run["name"], config=run["config"])
-print("ready", flush=True)
+print("ready", file=answers)
+signal.alarm(0)
 for line in sys.stdin:
     metrics = json.loads(line)
     step = metrics.pop("step", None)
+    signal.alarm(run["seconds"])
     (tracked if hasattr(tracked, "log") else package).log(metrics, step=step)
+    signal.alarm(0)
+signal.alarm(run["seconds"])
 package.finish()
 "#;
 
 /// The time between two looks at the log.
 const BETWEEN: Duration = Duration::from_millis(500);
+/// The time between two looks at whether the user stops the program.
+const LOOK: Duration = Duration::from_millis(100);
+/// The variable with the seconds after which a package that does not start, take a line or finish is ended, and its default.
+const TIMEOUT: &str = "SWM_TRACKER_TIMEOUT";
+const SECONDS: u32 = 300;
 
 /// The trackers of a training that runs. Dropping it sends the last lines and waits for the packages to finish.
 pub struct Trackers {
@@ -77,13 +95,15 @@ impl Trackers {
     /// a run that is continued, and are not sent again.
     ///
     /// # Errors
-    /// When Python or a package is missing, or a package does not start.
-    pub fn start(trackers: &[Tracker], out: &Path, config: &Value) -> Result<Self> {
+    /// When Python or a package is missing, a package does not start, or the user stops the program.
+    pub fn start(trackers: &[Tracker], out: &Path, config: &Value, interrupt: &AtomicBool) -> Result<Self> {
         let mut packages: Vec<&'static str> = trackers.iter().filter_map(|tracker| tracker.package()).collect();
         packages.dedup();
         let name = out.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
-        let processes: Vec<Process> =
-            packages.into_iter().map(|package| Process::start(package, &name, config)).collect::<Result<_>>()?;
+        let processes: Vec<Process> = packages
+            .into_iter()
+            .map(|package| Process::start(package, &name, config, interrupt))
+            .collect::<Result<_>>()?;
         let done = Arc::new(AtomicBool::new(false));
         if processes.is_empty() {
             return Ok(Self { done, follower: None });
@@ -110,40 +130,57 @@ impl Drop for Trackers {
 }
 
 impl Process {
-    fn start(package: &'static str, name: &str, config: &Value) -> Result<Self> {
-        let python = std::env::var_os("SWM_PYTHON").filter(|value| !value.is_empty());
-        let python = PathBuf::from(python.unwrap_or_else(|| "python3".into()));
+    fn start(package: &'static str, name: &str, config: &Value, interrupt: &AtomicBool) -> Result<Self> {
+        let program = std::env::var_os("SWM_PYTHON").filter(|value| !value.is_empty());
+        let program = PathBuf::from(program.unwrap_or_else(|| "python3".into()));
+        let python = Python { program, origin: "of trackers" };
         let what = format!("--log {package}");
         let failed = |problem: String| {
-            let fix = format!("install it (pip install {package}) in {}, or set $SWM_PYTHON", python.display());
+            let fix = format!("install it (pip install {package}) in {}, or set $SWM_PYTHON", python.program.display());
             Error::config(what.clone(), problem, fix)
         };
-        let mut command = Command::new(&python);
+        let mut command = python.script(SCRIPT);
+        // Packages start Python as well.
+        command.env("PYTHONSAFEPATH", "1");
         // Ctrl-C is for the training: the package then receives the last lines, and finishes.
-        std::os::unix::process::CommandExt::process_group(&mut command, 0);
-        let spawned = command.args(["-c", SCRIPT]).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn();
-        let mut child = spawned.map_err(|error| failed(format!("{} does not start: {error}", python.display())))?;
+        command.process_group(0);
+        let spawned = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn();
+        let mut child =
+            spawned.map_err(|error| failed(format!("{} does not start: {error}", python.program.display())))?;
         let mut input = child.stdin.take();
-        let run = json!({"package": package, "project": "stable-worldmodel", "name": name, "config": config});
+        let given = std::env::var(TIMEOUT).ok().and_then(|text| text.parse().ok());
+        let seconds = given.filter(|seconds| *seconds > 0).unwrap_or(SECONDS);
+        let run = json!({
+            "package": package, "project": "stable-worldmodel", "name": name, "config": config, "seconds": seconds,
+        });
         let sent = input.as_mut().map(|input| writeln!(input, "{run}"));
-        let mut answers =
-            BufReader::new(child.stdout.take().ok_or_else(|| failed("has no output".to_owned()))?).lines();
-        let mut said = vec![];
-        // Packages print lines of their own, too.
-        for line in answers.by_ref().map_while(std::io::Result::ok) {
-            if line == "ready" {
-                // The pipe has to be read to its end, or a package that prints much would wait.
-                std::thread::spawn(move || answers.map_while(std::io::Result::ok).for_each(drop));
-                return Ok(Self { package, child, input });
+        let answers = BufReader::new(child.stdout.take().ok_or_else(|| failed("has no output".to_owned()))?).lines();
+        let (sender, lines) = std::sync::mpsc::channel();
+        std::thread::spawn(move || answers.map_while(std::io::Result::ok).try_for_each(|line| sender.send(line)));
+        let answer = loop {
+            match lines.recv_timeout(LOOK) {
+                Ok(line) => break Some(line),
+                Err(RecvTimeoutError::Disconnected) => break None,
+                Err(RecvTimeoutError::Timeout) if interrupt.load(Ordering::SeqCst) => {
+                    drop((child.kill(), child.wait()));
+                    return Err(Error::Interrupted);
+                }
+                Err(RecvTimeoutError::Timeout) => {}
             }
-            said.push(line);
+        };
+        if answer.as_deref() == Some("ready") {
+            return Ok(Self { package, child, input });
         }
-        drop((sent, child.wait()));
-        let missing = said.iter().find_map(|line| line.strip_prefix("missing: "));
-        Err(missing.map_or_else(
-            || Error::external(what.clone(), "the package did not start; its message is above"),
-            |missing| failed(missing.to_owned()),
-        ))
+        drop((sent, input));
+        let ended = child.wait().ok().and_then(|status| status.signal());
+        Err(match answer.as_deref().and_then(|line| line.strip_prefix("missing: ")) {
+            Some(missing) => failed(missing.to_owned()),
+            None if ended == Some(libc::SIGALRM) => {
+                let problem = format!("the package did not start within {seconds} s (${TIMEOUT} changes this)");
+                Error::external(what.clone(), problem)
+            }
+            None => Error::external(what.clone(), "the package did not start; its message is above"),
+        })
     }
 }
 

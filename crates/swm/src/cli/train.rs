@@ -118,7 +118,7 @@ pub fn run_args(args: &TrainArgs, context: &Context) -> anyhow::Result<(PathBuf,
     let encoder = args.encoder.as_deref().map(home::find_checkpoint).transpose()?;
     let (reader, out) = args.dataset_and_output()?;
     record(&out, args.resume)?;
-    let trackers = Trackers::start(&args.log, &out, &config.to_json())?;
+    let trackers = Trackers::start(&args.log, &out, &config.to_json(), &context.interrupt)?;
     let setup = TrainRun { reader, encoder: encoder.as_deref(), out: &out, options };
     let summary = run(&*config, setup, context);
     drop(trackers);
@@ -157,7 +157,7 @@ fn train_online(
     });
     let out = home::new_checkpoint(&name)?;
     record(&out, args.resume)?;
-    let trackers = Trackers::start(&args.log, &out, &config.to_json())?;
+    let trackers = Trackers::start(&args.log, &out, &config.to_json(), &context.interrupt)?;
     let setup = OnlineRun { environments: &environments, out: &out, options };
     let summary = config.train_online(setup, &mut control(context));
     drop(trackers);

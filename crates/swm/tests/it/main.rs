@@ -16,6 +16,7 @@ mod kills;
 mod leaderboard;
 mod limits;
 mod listing;
+mod on_ray;
 mod output;
 mod pipeline;
 mod python;

@@ -147,6 +147,12 @@ fn drift_is_measured_in_the_latents_of_a_trained_model() {
     let swm = Swm::new();
     std::fs::write(swm.path("drift.toml"), DRIFT).expect("writing the study");
     swm.fails(&["study", "run", "drift.toml", "--output", "out"], 2, &["few-states", "--trust"]);
+    // The output is checked before datasets are collected.
+    std::fs::create_dir(swm.path("used")).expect("a folder");
+    std::fs::write(swm.path("used/notes.txt"), "mine").expect("a file");
+    let used = ["study", "run", "drift.toml", "--output", "used", "--trust"];
+    swm.fails(&used, 2, &["has files and no study.json"]);
+    assert!(!swm.path("datasets").exists(), "a dataset was collected");
     let run = ["study", "run", "drift.toml", "--output", "out", "--trust"];
     let table = swm.json(&run);
     let rows = table["rows"].as_array().expect("rows");

@@ -39,7 +39,7 @@ pub fn run(command: &CollectCommand, context: &Context) -> anyhow::Result<()> {
     limits::SHARDS.check(shards)?;
     let cells = json!({"shards": shards, "episodes": args.episodes});
     let replaced = &["-o", "--output", "--shards", "--format"];
-    on.submit(&Request { kind: "collect", output: &target, replaced, cells }, context.json)
+    on.submit(&Request { kind: "collect", output: &target, replaced, cells }, context)
 }
 
 /// The dataset that several machines write: a new one in the format Lance, unless the run has begun.

@@ -49,7 +49,7 @@ pub fn run(command: &ConvertCommand, context: &Context) -> anyhow::Result<()> {
     let shards = shards.unwrap_or_else(|| episodes.div_ceil(SHARD_EPISODES)).max(1);
     limits::SHARDS.check(shards)?;
     let cells = json!({"shards": shards, "episodes": episodes, "verify": !args.no_verify});
-    on.submit(&Request { kind: "convert", output: &target, replaced: &["--shards"], cells }, context.json)
+    on.submit(&Request { kind: "convert", output: &target, replaced: &["--shards"], cells }, context)
 }
 
 /// Converts the episodes of a shard.

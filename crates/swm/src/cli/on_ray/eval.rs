@@ -57,7 +57,8 @@ pub fn run(command: &EvalCommand, context: &Context) -> anyhow::Result<()> {
             let names: Vec<&str> = request.conditions.iter().map(|condition| condition.name.as_str()).collect();
             let replaced = &["-o", "--output", "--videos"];
             let cells = json!({"conditions": names});
-            return on.submit(&Request { kind: "eval", output: &output, replaced, cells }, context.json);
+            on.check_new(&output, &["results.json", run_record::FILE])?;
+            return on.submit(&Request { kind: "eval", output: &output, replaced, cells }, context);
         }
     };
     if context.json {

@@ -6,19 +6,27 @@
 pub mod collect;
 pub mod convert;
 pub mod eval;
+pub mod study;
 pub mod train;
 
-use super::{emit_json, run_record};
+use super::{Context, emit_json, run_record};
 use clap::Args;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::io::Write as _;
-use std::process::{Command, Stdio};
+use std::os::unix::process::CommandExt as _;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
 use std::str::FromStr;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
 use swm_core::{Error, Result};
 use swm_data::{Location, objects};
 use swm_gym::Python;
+
+/// The time between two looks at whether a run has ended or the user stops it.
+const LOOK: Duration = Duration::from_millis(50);
 
 /// The options of a command that can run on a Ray cluster.
 #[derive(Args, Clone, Default)]
@@ -135,11 +143,41 @@ impl OnRayArgs {
         Ok(objects::read_file(&request)?.is_some())
     }
 
+    /// Refuses an output that has one of these files or folders, unless the run was begun. The cells check again what they
+    /// replace.
+    ///
+    /// # Errors
+    /// When there is one, or the output cannot be read.
+    pub fn check_new(&self, output: &str, names: &[&str]) -> Result<()> {
+        let output = absolute(output);
+        if self.has_begun(&output)? {
+            return Ok(());
+        }
+        let found = match Location::parse(&output)? {
+            Location::Path(folder) if folder.exists() && !folder.is_dir() => {
+                return Err(Error::config(output, "is not a folder", "give a folder with --output"));
+            }
+            Location::Path(folder) => names.iter().find(|name| is_there(&folder.join(name))),
+            location @ Location::Uri(_) => {
+                let files = objects::list_files(&location)?;
+                let is_below = |file: &String, name: &str| {
+                    file.strip_prefix(name).is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
+                };
+                names.iter().find(|name| files.iter().any(|file| is_below(file, name)))
+            }
+        };
+        let fix = "move it away, or choose another output";
+        match found {
+            Some(name) => Err(Error::config(format!("{output}/{name}"), "exists and was not written by this run", fix)),
+            None => Ok(()),
+        }
+    }
+
     /// Gives the request to the Python package, and waits until it has run.
     ///
     /// # Errors
-    /// When there is no Python with Ray, or the run fails.
-    pub fn submit(&self, request: &Request<'_>, json_output: bool) -> anyhow::Result<()> {
+    /// When there is no Python with Ray, the run fails, or the user stops it.
+    pub fn submit(&self, request: &Request<'_>, context: &Context) -> anyhow::Result<()> {
         let output = absolute(request.output);
         let own = ["--on", "--resources", "--run-folder"];
         let replaced: Vec<&str> = own.iter().chain(request.replaced).copied().collect();
@@ -160,21 +198,32 @@ impl OnRayArgs {
             return emit_json(&body);
         }
         let python = python()?;
-        let mut command = Command::new(&python.program);
-        command.args(["-m", "stable_worldmodel.ray", "-"]);
+        let mut command = python.module("stable_worldmodel.ray");
+        command.arg("-");
         if let Some(Cluster::Jobs(address)) = &self.on {
             command.args(["--job", address]);
         }
-        if json_output {
+        if context.json {
             command.arg("--json");
         }
         let failed = |error| Error::external(format!("running {python}"), error);
-        let mut child = command.stdin(Stdio::piped()).spawn().map_err(failed)?;
+        let mut child = start(&mut command).map_err(failed)?;
         if let Some(mut stdin) = child.stdin.take() {
             // If the program ends before it reads, its exit code says why.
             let _ = stdin.write_all(body.to_string().as_bytes());
         }
-        match child.wait().map_err(failed)?.code() {
+        let mut told = false;
+        let status = loop {
+            if let Some(status) = child.try_wait().map_err(failed)? {
+                break status;
+            }
+            if !told && context.interrupt.load(Ordering::SeqCst) {
+                told = true;
+                interrupt(&child);
+            }
+            std::thread::sleep(LOOK);
+        };
+        match status.code() {
             Some(0) => Ok(()),
             Some(130) => Err(Error::Interrupted.into()),
             _ => {
@@ -184,6 +233,37 @@ impl OnRayArgs {
             }
         }
     }
+}
+
+/// Whether a path names anything but an empty folder.
+fn is_there(path: &Path) -> bool {
+    match std::fs::symlink_metadata(path) {
+        Ok(found) if found.is_dir() => std::fs::read_dir(path).is_ok_and(|mut entries| entries.next().is_some()),
+        found => found.is_ok(),
+    }
+}
+
+/// Starts the program that runs the cells. It ends when this process does. The signals of a terminal go to this process only,
+/// which hands them over.
+#[allow(unsafe_code, reason = "asking the kernel for a signal is a function of the C library")]
+fn start(command: &mut Command) -> std::io::Result<Child> {
+    command.stdin(Stdio::piped()).process_group(0);
+    // SAFETY: `prctl` may be called between fork and exec.
+    #[cfg(target_os = "linux")]
+    unsafe {
+        command.pre_exec(|| {
+            libc::prctl(libc::PR_SET_PDEATHSIG, libc::SIGTERM);
+            Ok(())
+        });
+    }
+    command.spawn()
+}
+
+/// Sends Ctrl-C to the program that runs the cells.
+#[allow(unsafe_code, reason = "sending a signal is a function of the C library")]
+fn interrupt(child: &Child) {
+    // SAFETY: the child has not been waited for, so its id is its own.
+    unsafe { libc::kill(child.id().cast_signed(), libc::SIGINT) };
 }
 
 /// A local path as an absolute path; a URI unchanged.
@@ -228,7 +308,7 @@ fn python() -> Result<Python> {
     let missing = |problem: String| Error::config(format!("--on ray with {python}"), problem, fix);
     let script =
         "import importlib.util as u; print(*[n for n in ('ray', 'stable_worldmodel') if u.find_spec(n) is None])";
-    let output = Command::new(&python.program).args(["-c", script]).stdin(Stdio::null()).output();
+    let output = python.script(script).stdin(Stdio::null()).output();
     let output = output.map_err(|error| missing(format!("it cannot be started ({error})")))?;
     let names = String::from_utf8_lossy(&output.stdout);
     match names.split_whitespace().next() {

@@ -46,9 +46,11 @@ pub fn run(command: &TrainCommand, context: &Context) -> anyhow::Result<()> {
         args.config_with(settings)?;
     }
     let name = |settings: &[String]| if settings.is_empty() { "run".to_owned() } else { settings.join(",") };
+    let names: Vec<String> = runs.iter().map(|run| name(run)).collect();
+    on.check_new(output, &names.iter().map(String::as_str).collect::<Vec<_>>())?;
     let runs: Vec<_> = runs.iter().map(|run| json!({"name": name(run), "settings": run})).collect();
     let replaced = &["-o", "--output", "--sweep"];
-    on.submit(&Request { kind: "train", output, replaced, cells: json!({"runs": runs}) }, context.json)
+    on.submit(&Request { kind: "train", output, replaced, cells: json!({"runs": runs}) }, context)
 }
 
 /// The settings of every run of a sweep.

@@ -243,7 +243,7 @@ impl Recipe {
         Ok(manifest::hash(text.as_bytes()))
     }
 
-    /// Checks the names in the recipe that load code, read files or open connections. Pretrained weights are checked in
+    /// Checks the names in the recipe that load code, start programs, read files or open connections. Pretrained weights are checked in
     /// the complete configuration of a training, because a preset may name them.
     ///
     /// # Errors
@@ -256,6 +256,8 @@ impl Recipe {
                         crate::env(&text, origin)?;
                     } else if key == "wrapper" && wrappers::read(&text)?.0.reads_files() {
                         origin.check_user(&format!("the wrapper '{text}'"), "which reads files", None)?;
+                    } else if key == "log" && !text.split(',').all(is_written_here) {
+                        origin.check_user(&format!("the tracker '{text}'"), "which is started", None)?;
                     } else if key == "preset" && !is_preset_name(&text) {
                         origin.check_user(&format!("the preset '{text}'"), "which is a file", None)?;
                     } else if text.contains("://") {
@@ -341,6 +343,11 @@ fn texts(value: &Value) -> Vec<String> {
         Value::String(text) => vec![text.clone()],
         other => vec![other.to_string()],
     }
+}
+
+/// Whether a log is a file of the run, which no other program writes.
+fn is_written_here(log: &str) -> bool {
+    matches!(log, "jsonl" | "tensorboard")
 }
 
 /// Returns whether a text can be the name of a preset, and no path: names have no dots and no slashes.

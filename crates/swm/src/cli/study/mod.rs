@@ -19,6 +19,7 @@ mod variants;
 
 use super::config::count;
 use super::eval::run_options;
+use super::on_ray::study::check_output;
 use super::on_ray::{OnRayArgs, Request};
 use super::progress::control;
 use super::recipes::Datasets;
@@ -268,19 +269,22 @@ fn run(args: &RunArgs, only_register: bool, context: &Context) -> anyhow::Result
     file.datasets.check_origin(&origin)?;
     // Before datasets are collected, which may take long.
     expand::check(&file, &args.settings, &resolver)?;
+    let output = output.to_string_lossy();
+    if !only_register {
+        check_output(&output, &file.title, &args.on)?;
+    }
     file.datasets.make(&origin, context)?;
     let mut study: Study = expand::study(&file, &args.settings, &resolver, &mut control(context))?;
     study.arguments = args.arguments();
     study = with_rule(study, args.until)?;
     if args.on.is_given() {
         args.on.refuse(&[("--until", args.until.is_some())], "remove it, or run the study without --on")?;
-        let output = output.to_string_lossy();
         let ids = study.cells.iter().map(Cell::id).collect::<Result<Vec<_>>>()?;
         let cells = json!({"study": study, "ids": ids});
         let replaced = &["-o", "--output"];
-        return args.on.submit(&Request { kind: "study", output: &output, replaced, cells }, context.json);
+        return args.on.submit(&Request { kind: "study", output: &output, replaced, cells }, context);
     }
-    let folder = StudyFolder::new(output);
+    let folder = StudyFolder::new(Path::new(&*output));
     if only_register {
         let (_lock, hash) = folder.register(&study)?;
         if context.json {
@@ -323,6 +327,7 @@ fn run_table(
     study.arguments = args.arguments();
     let datasets = file.datasets(size)?;
     datasets.check_origin(origin)?;
+    check_output(&output.to_string_lossy(), &study.title, &args.on)?;
     datasets.make(origin, context)?;
     let folder = StudyFolder::new(output);
     tables::run(&study, &folder, context)?;

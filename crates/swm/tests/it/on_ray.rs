@@ -1,0 +1,135 @@
+//! `--on ray`, with a program in place of Python: what is checked before the work, and how a run ends.
+
+use crate::{Swm, text};
+use std::os::unix::fs::PermissionsExt as _;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// A Python that has all packages. It writes its request and its id, and ends with 130 at Ctrl-C.
+const PYTHON: &str = "#!/bin/sh
+case \"$2\" in *find_spec*) exit 0 ;; esac
+trap 'exit 130' INT
+cat > request
+echo $$ > id.new && mv id.new id
+while :; do sleep 0.05; done
+";
+
+fn fake_python(swm: &Swm) -> PathBuf {
+    let path = swm.path("python");
+    std::fs::write(&path, PYTHON).expect("a program");
+    std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755)).expect("its mode");
+    path
+}
+
+/// Waits for a condition of another process.
+fn until(what: &str, condition: impl Fn() -> bool) {
+    let began = Instant::now();
+    while !condition() {
+        assert!(began.elapsed() < Duration::from_secs(60), "{what}");
+        std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
+/// Starts a run, and waits until Python has its request.
+fn start(swm: &Swm) -> (Child, String) {
+    let python = fake_python(swm);
+    let mut command = swm.command(&["collect", "swm/TwoRoom-v1", "-o", "./a.lance", "--no-pixels", "--on", "ray"]);
+    let child = command.env("SWM_RAY_PYTHON", python).stderr(Stdio::piped()).spawn().expect("swm starts");
+    until("Python starts", || swm.path("id").exists());
+    let id = std::fs::read_to_string(swm.path("id")).expect("the id").trim().to_owned();
+    (child, id)
+}
+
+fn kill(signal: &str, id: &str) {
+    assert!(Command::new("kill").args([signal, id]).status().expect("kill").success());
+}
+
+/// Whether a process runs: it exists and is no zombie.
+fn runs(id: &str) -> bool {
+    let status = std::fs::read_to_string(Path::new("/proc").join(id).join("stat")).unwrap_or_default();
+    !status.is_empty() && !status.contains(") Z ")
+}
+
+#[test]
+fn a_request_to_end_reaches_the_run() {
+    let swm = Swm::new();
+    let (child, id) = start(&swm);
+    kill("-TERM", &child.id().to_string());
+    let output = child.wait_with_output().expect("swm ends");
+    assert_eq!(output.status.code(), Some(130), "{}", text(&output.stderr));
+    assert!(!runs(&id));
+}
+
+#[test]
+#[cfg_attr(not(target_os = "linux"), ignore = "only Linux ends the children of a killed process")]
+fn a_run_ends_with_the_program() {
+    let swm = Swm::new();
+    let (mut child, id) = start(&swm);
+    kill("-KILL", &child.id().to_string());
+    child.wait().expect("swm ends");
+    until("Python ends", || !runs(&id));
+}
+
+#[test]
+fn files_of_the_user_in_the_output_are_refused() {
+    let swm = Swm::new();
+    swm.json(&["collect", "swm/TwoRoom-v1", "-o", "rooms", "--episodes", "2", "--image", "32", "--max-steps", "20"]);
+    let study = "title = \"T\"\nquestion = \"q?\"\n[defaults]\nenv = \"swm/TwoRoom-v1\"\nepisodes = 1\n\
+                 [[condition]]\nname = \"c\"\n[[policy]]\nname = \"p\"\npolicy = \"random\"\n";
+    std::fs::write(swm.path("study.toml"), study).expect("a study");
+    let python = fake_python(&swm);
+    let fails = |args: &[&str], part: &str| {
+        let output = swm.command(&[args, &["--on", "ray"]].concat()).env("SWM_RAY_PYTHON", &python).output();
+        let output = output.expect("swm starts");
+        let error = text(&output.stderr);
+        assert!(output.status.code() == Some(2) && error.contains(part), "{args:?}: {error}");
+        assert!(!swm.path("request").exists(), "{args:?}: the run began");
+    };
+    let eval = ["eval", "random", "--env", "swm/TwoRoom-v1", "--no-pixels", "--episodes", "1", "--budget", "2"];
+    let study = ["study", "run", "study.toml"];
+    let train = ["train", "lewm", "--data", "rooms", "--preset", "tiny", "schedule.steps=1"];
+    let sweep = [&train[..], &["--sweep", "seed=0,1"]].concat();
+    let cases: [(&[&str], &str, &str); 7] = [
+        (&eval, "results.json", "not written by this run"),
+        (&eval, "run.json", "not written by this run"),
+        (&study, "study.json", "not written by this program"),
+        (&study, "notes.txt", "has files and no study.json"),
+        (&train, "run/train.jsonl", "run: exists and was not written by this run"),
+        (&train, "run", "run: exists and was not written by this run"),
+        (&sweep, "seed=1/checkpoint/config.json", "seed=1: exists and was not written by this run"),
+    ];
+    for (index, (command, file, part)) in cases.into_iter().enumerate() {
+        let output = format!("out-{index}");
+        let path = swm.path(&output).join(file);
+        std::fs::create_dir_all(path.parent().expect("a folder")).expect("a folder");
+        std::fs::write(&path, "mine").expect("a file");
+        let link = swm.path(&format!("link-{index}"));
+        std::os::unix::fs::symlink(swm.path(&output), &link).expect("a link");
+        for output in [format!("./{output}"), link.to_string_lossy().into_owned()] {
+            fails(&[command, &["-o", &output]].concat(), part);
+        }
+        assert_eq!(std::fs::read_to_string(&path).expect("the file"), "mine");
+    }
+    std::fs::write(swm.path("file"), "mine").expect("a file");
+    fails(&[&eval[..], &["-o", "./file"]].concat(), "is not a folder");
+    // Another study.
+    let stored = "{\"title\": \"Other\", \"cells\": []}";
+    std::fs::create_dir(swm.path("other")).expect("a folder");
+    std::fs::write(swm.path("other/study.json"), stored).expect("a study");
+    fails(&[&study[..], &["-o", "./other"]].concat(), "holds the study 'Other', not 'T'");
+}
+
+#[test]
+fn modules_of_the_current_folder_are_not_imported() {
+    let swm = Swm::new();
+    for name in ["json", "importlib", "ray", "stable_worldmodel"] {
+        let source = "import pathlib; pathlib.Path(__file__).with_name('imported').touch()";
+        std::fs::write(swm.path(&format!("{name}.py")), source).expect("a module");
+    }
+    let mut command = swm.command(&["collect", "swm/TwoRoom-v1", "-o", "./a.lance", "--no-pixels", "--on", "ray"]);
+    let output = command.env("SWM_RAY_PYTHON", "/usr/bin/python3").output().expect("swm starts");
+    let error = text(&output.stderr);
+    assert!(error.contains("it has no package ray") || error.contains("cannot be started"), "{error}");
+    assert!(!swm.path("imported").exists());
+}

@@ -31,6 +31,13 @@ class Zero(swm.policy.BasePolicy):
         return np.full(self.env.action_space.shape, self.value, dtype=np.float32)
 
 
+class Complex(Zero):
+    """A policy whose actions are complex numbers."""
+
+    def get_action(self, infos, **kwargs):
+        return super().get_action(infos, **kwargs) + 1j
+
+
 def test_every_step_overwrites_the_arrays_of_infos():
     world = rooms()
     world.set_policy(swm.policy.RandomPolicy(seed=1))
@@ -221,6 +228,7 @@ def test_restored_snapshot_repeats_the_next_step():
         (lambda: rooms().evaluate(policy=swm.policy.ExpertPolicy("weakk")), ValueError, "weak"),
         (lambda: rooms().evaluate(policy=Zero(), dataset="nothing"), FileNotFoundError, "nothing"),
         (lambda: rooms().evaluate(policy=Zero(np.nan), episodes=1, seed=0), ValueError, "finite actions"),
+        (lambda: rooms().evaluate(policy=Complex(), episodes=1, seed=0), ValueError, "real actions"),
     ],
 )
 def test_wrong_arguments_raise_errors_with_the_reason(make, error, words):

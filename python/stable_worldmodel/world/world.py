@@ -405,6 +405,8 @@ class World:
             expected = self.envs.action_space.shape
             raise ValueError(f"{name}.get_action: got actions of shape {given.shape}, expected {expected}")
         given = given.reshape(want.shape)
+        if given.dtype.kind == "c":
+            raise ValueError(f"{name}.get_action: expected real actions, got complex numbers")
         if given.dtype.kind == "f" and not np.isfinite(given[active]).all():
             raise ValueError(f"{name}.get_action: expected finite actions, got {given[active]}")
         if want.dtype.kind != "f":

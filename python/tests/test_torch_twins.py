@@ -16,6 +16,10 @@ VIT = "{vit={patch=16,dim=24,depth=2,heads=2,mlp=32}}"
 DINO = "{dinov2={patch=8,dim=24,depth=2,heads=2,mlp=32,grid=8}}"
 REGISTERS = "{dinov2={patch=8,dim=24,depth=1,heads=2,mlp=32,grid=12,registers=2}}"
 CONV = "{conv={channels=[6,8],hidden=12,dim=10}}"
+KEYPOINTS = (
+    "{keypoints={filters=[{kernel=5,stride=2,channels=6},{kernel=7,stride=4,channels=4}],"
+    "sharpness=2.0,hidden=[12],dim=10}}"
+)
 STATE = '[{column="pixels",latent=16},{column="state",latent=8}]'
 
 
@@ -61,6 +65,7 @@ PLANNED = [
     ("lewm", {"model__encoder": VIT, "model__predictor__history": 2}),
     ("lewm", {"model__encoder": DINO}),
     ("lewm", {"model__encoder": CONV, "optim__ema": 0.9}),
+    ("lewm", {"model__encoder": KEYPOINTS, "model__decoder": "{hidden=9,weight=2.0}"}),
     ("pldm", {}),
     ("pldm", {"model__encoder": CONV}),
     ("dino_wm", {}),
@@ -82,6 +87,7 @@ def test_costs_equal_those_of_the_engine(family, settings, world, rooms, tmp_pat
 ACTING = [
     ("gcbc", {}),
     ("gcbc", {"model__encoder": CONV}),
+    ("gcbc", {"model__encoder": KEYPOINTS}),
     ("gcbc", {"model__encoder": VIT, "model__history": 2, "data__num_steps": 2}),
     ("gcivl", {"model__head__depth": 4}),
     ("gcivl", {"model__metric": 6, "model__history": 2, "data__num_steps": 3}),

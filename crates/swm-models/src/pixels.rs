@@ -2,7 +2,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
-use swm_core::{DType, Error, Result, Schema};
+use swm_core::{Batch, DType, Error, Result, Schema};
 
 /// The size and the normalisation of a model's images: `(byte / 255 - mean) / std` for each colour channel.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -66,6 +66,17 @@ pub fn check(side: usize, schema: &Schema, column: &str) -> Result<()> {
 /// # Errors
 /// When `rgb` is not a positive number of images of `images.side`.
 pub fn patches(images: &ImageNormalization, patch: usize, rgb: &[u8], device: &Device) -> Result<Tensor<3>> {
+    let (grid, width) = (images.side / patch, 3 * patch * patch);
+    let values = normalised(images, patch, rgb)?;
+    let frames = values.len() / (grid * grid * width);
+    Ok(Tensor::from_data(TensorData::new(values, [frames, grid * grid, width]), device))
+}
+
+/// Computes the values of [`patches`].
+///
+/// # Errors
+/// As [`patches`].
+pub(crate) fn normalised(images: &ImageNormalization, patch: usize, rgb: &[u8]) -> Result<Vec<f32>> {
     let side = images.side;
     let (frames, grid) = (images.count(rgb)?, side / patch);
     let (bytes, width) = (side * side * 3, 3 * patch * patch);
@@ -90,7 +101,54 @@ pub fn patches(images: &ImageNormalization, patch: usize, rgb: &[u8], device: &D
             }
         }
     });
-    Ok(Tensor::from_data(TensorData::new(values, [frames, grid * grid, width]), device))
+    Ok(values)
+}
+
+/// The frames of a batch: RGB bytes, or features of the part of an encoder that is not trained.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Frames<'a> {
+    /// The elements of all frames, as bytes.
+    bytes: &'a [u8],
+    /// The number of features of a frame, `[1, features]`; `None` for RGB bytes.
+    features: Option<usize>,
+    /// The bytes of a frame.
+    frame: usize,
+}
+
+impl<'a> Frames<'a> {
+    /// Returns the frames in the column `column` of a batch.
+    ///
+    /// # Errors
+    /// When the batch has no such column.
+    pub fn of(images: &ImageNormalization, batch: &'a Batch, column: &str) -> Result<Self> {
+        let spec = batch.schema().column(column)?;
+        let bytes = batch.bytes(batch.schema().index(column)?);
+        Ok(match (spec.dtype, spec.shape.last()) {
+            (DType::Float32, Some(&width)) => Self { bytes, features: Some(width), frame: width * size_of::<f32>() },
+            _ => Self { bytes, features: None, frame: images.side * images.side * 3 },
+        })
+    }
+
+    /// Returns the frames with the given indices.
+    pub fn range(self, frames: std::ops::Range<usize>) -> Self {
+        Self { bytes: &self.bytes[frames.start * self.frame..frames.end * self.frame], ..self }
+    }
+
+    /// The bytes of each frame.
+    pub fn each(self) -> std::slice::ChunksExact<'a, u8> {
+        self.bytes.chunks_exact(self.frame)
+    }
+
+    /// Converts the frames to the inputs of an encoder: patches as [`patches`], or features, `[frames, 1, features]`.
+    ///
+    /// # Errors
+    /// As [`patches`].
+    pub fn inputs(self, images: &ImageNormalization, patch: usize, device: &Device) -> Result<Tensor<3>> {
+        let Some(width) = self.features else { return patches(images, patch, self.bytes, device) };
+        let values: Vec<f32> = bytemuck::pod_collect_to_vec(self.bytes);
+        let frames = values.len() / width;
+        Ok(Tensor::from_data(TensorData::new(values, [frames, 1, width]), device))
+    }
 }
 
 /// Converts images to normalised colour planes, channels first.

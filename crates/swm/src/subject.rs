@@ -80,7 +80,7 @@ impl LewmSubject {
                 "patch": vit.patch, "vit_layers": vit.depth, "vit_heads": vit.heads, "vit_mlp": vit.mlp,
             }),
             EncoderConfig::Conv(conv) => serde_json::json!({ "channels": conv.channels, "hidden": conv.hidden }),
-            EncoderConfig::Dinov2(_) | EncoderConfig::PatchCnn(_) => {
+            EncoderConfig::Dinov2(_) | EncoderConfig::PatchCnn(_) | EncoderConfig::Keypoints(_) => {
                 return Err(Error::config(
                     "preset",
                     "the reference implementation has no such encoder",

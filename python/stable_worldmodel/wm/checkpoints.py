@@ -114,9 +114,17 @@ def _jepa(kind: Callable[..., Any], stored: Stored, weights: Mapping[str, Tensor
         _projector(latent, model["projector"], latent),
     )
     made.frames = _frames(model)
+    if model.get("decoder"):
+        made.decoder = _decoder(latent, model["decoder"]["hidden"], made.encoder)
     if any(name.startswith("idm.") for name in weights):
         made.idm = InverseDynamics(latent, stored.config["loss"]["idm_hidden"], actions)
     return made
+
+
+def _decoder(latent: int, hidden: int, encoder: Any) -> nn.Module:
+    """The decoder of latents to the features of fixed filters, which is part of the loss of `swm train` only."""
+    layers = [nn.Linear(latent, hidden), nn.GELU(), nn.Linear(hidden, hidden), nn.GELU()]
+    return nn.ModuleDict({"net": nn.Sequential(*layers, nn.Linear(hidden, encoder.norm.num_features))})
 
 
 def _projector(inputs: int, hidden: int, outputs: int) -> MLP:

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-__all__ = ["Convolutions", "Dinov2", "Pyramid", "ViT", "encoder_of"]
+__all__ = ["Convolutions", "Dinov2", "Keypoints", "Pyramid", "ViT", "encoder_of"]
 
 _ACTIVATIONS = {"relu": nn.functional.relu, "gelu": nn.functional.gelu, "silu": nn.functional.silu}
 
@@ -242,10 +242,70 @@ class Convolutions(nn.Module):
         return frames
 
 
+class Keypoints(nn.Module):
+    """Fixed random filters, the expected position of their responses (Finn et al., 2016), and linear layers.
+
+    Args:
+        image: Side of the images in pixels.
+        filters: The `kernel`, `stride` and `channels` of each size of filters, which are not trained.
+        sharpness: The factor of the responses, in standard deviations over an image, before the softmax.
+        hidden: Features of each hidden layer.
+        dim: Features of an image.
+    """
+
+    takes_frames = True
+
+    def __init__(
+        self, image: int, filters: Sequence[Mapping[str, int]], sharpness: float, hidden: Sequence[int], dim: int
+    ) -> None:
+        super().__init__()
+        self.sharpness, self.filters, self.strides, features = sharpness, nn.ModuleList(), [], 0
+        for sizes in filters:
+            bank = nn.Conv2d(3, sizes["channels"], sizes["kernel"], bias=False)
+            self.filters.append(bank.requires_grad_(False))
+            self.strides.append(sizes["stride"])
+            features += 3 * sizes["channels"]
+        self.norm = nn.BatchNorm1d(features)
+        inputs = [features, *hidden]
+        self.hidden = nn.ModuleList(nn.Linear(size, to) for size, to in zip(inputs, hidden, strict=False))
+        self.out = nn.Linear(inputs[-1], dim)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """Frames `(N, 3, H, W)` to features `(N, dim)`."""
+        banks = zip(self.filters, self.strides, strict=True)
+        x = torch.cat([self._keypoints(frames, bank, stride) for bank, stride in banks], 1)
+        x = self.norm(x)
+        for layer in self.hidden:
+            x = nn.functional.gelu(layer(x))
+        return self.out(x)  # type: ignore[no-any-return]
+
+    def patches(self, frames: Tensor) -> Tensor:
+        """Frames `(N, 3, H, W)` to the features of the image as one patch, `(N, 1, dim)`."""
+        return self(frames).unsqueeze(1)  # type: ignore[no-any-return]
+
+    def _keypoints(self, frames: Tensor, bank: Any, stride: int) -> Tensor:
+        """The expected x and y of each filter, from -1 to 1, and its largest response: `(N, 3 * channels)`."""
+        margin = bank.kernel_size[0] // 2
+        maps = nn.functional.conv2d(frames, bank.weight, stride=stride, padding=margin)
+        side, maps = maps.shape[-1], maps.flatten(2)
+        spread = maps.std(2, correction=0, keepdim=True) + 1e-4
+        maps = (maps - maps.mean(2, keepdim=True)) / spread
+        weights = (self.sharpness * maps).softmax(2).unflatten(2, (side, side))
+        places = torch.linspace(-1, 1, side, device=maps.device, dtype=maps.dtype)
+        x, y = (weights.sum(axis) @ places for axis in (2, 3))
+        return torch.cat([x, y, maps.amax(2) / 4], 1)
+
+
 def encoder_of(config: Mapping[str, Any], image: int) -> nn.Module:
-    """The encoder of a configuration of the engine: one of `vit`, `dinov2`, `pyramid` and `conv` with its settings."""
+    """The encoder of a configuration of the engine: `vit`, `dinov2`, `pyramid`, `conv` or `keypoints`, with its settings."""
     ((kind, settings),) = config.items()
-    kinds: dict[str, Any] = {"vit": ViT, "dinov2": Dinov2, "pyramid": Pyramid, "conv": Convolutions}
+    kinds: dict[str, Any] = {
+        "vit": ViT,
+        "dinov2": Dinov2,
+        "pyramid": Pyramid,
+        "conv": Convolutions,
+        "keypoints": Keypoints,
+    }
     if kind not in kinds:
         raise ValueError(f"encoder: {kind!r} has no torch module; expected one of {', '.join(kinds)}")
     return kinds[kind](image, **settings)  # type: ignore[no-any-return]

@@ -7,7 +7,7 @@ use super::cells::CellPass;
 use super::heads::{Critic, Head, ValueHead};
 use super::loss::{self, ValueLoss};
 use super::model::{Gcbc, Gciql, Gcivl};
-use crate::nn::{Backbone, BatchStatistics, DropoutRng, Named, conv, parameters};
+use crate::nn::{Backbone, BatchStatistics, DropoutRng, Named, parameters};
 use crate::train::StepOutput;
 use burn::module::Module;
 use burn::tensor::Tensor;
@@ -54,7 +54,7 @@ impl Gcbc {
         let ([frames, goal], encoding) = encoders.with_gradient(clips.frames.clone(), clips.goal.clone());
         let means = model.action_predictor.forward(&frames, &goal, rng);
         let loss = (means - clips.actions.clone().autodiff()).square().mean();
-        finish(&model, &loss, vec![("loss", scalar(&loss))], training, encoding)
+        finish((&model, &self.encoder), &loss, vec![("loss", scalar(&loss))], training, encoding)
     }
 }
 
@@ -91,7 +91,7 @@ impl Gcivl {
             ("weight", scalar(&weights.mean())),
             ("reached", scalar(&relabelled.reached.clone().mean())),
         ];
-        finish(&model, &total, metrics, training, encoding)
+        finish((&model, &self.encoder), &total, metrics, training, encoding)
     }
 }
 
@@ -137,7 +137,7 @@ impl Gciql {
             ("weight", scalar(&weights.mean())),
             ("reached", scalar(&relabelled.reached.clone().mean())),
         ];
-        finish(&model, &total, metrics, training, encoding)
+        finish((&model, &self.encoder), &total, metrics, training, encoding)
     }
 }
 
@@ -271,7 +271,7 @@ fn scalar(value: &Tensor<1>) -> f64 {
 /// Returns the output of a training step; the gradients are empty unless `training`. The buffers are the batch statistics
 /// of the encoder.
 fn finish<M: Module>(
-    model: &M,
+    (model, encoder): (&M, &Backbone),
     loss: &Tensor<1>,
     metrics: Vec<(&'static str, f64)>,
     training: bool,
@@ -284,7 +284,7 @@ fn finish<M: Module>(
         if let Some(pass) = encoding.kernels {
             gradients.extend(pass.backward(&mut all));
         }
-        conv::store(encoding.statistics, ENCODER, &mut buffers);
+        encoder.store(encoding.statistics, ENCODER, &mut buffers);
     }
     StepOutput { metrics, gradients, buffers }
 }

@@ -7,7 +7,10 @@ use super::policy::Actor;
 use super::step::{Clips, ENCODER, Relabelled};
 use crate::checkpoint::Checkpoint;
 use crate::nn::{Backbone, DropoutRng, Init, Named, parameters};
-use crate::train::{DatasetInfo, ParameterGroup, Preset, StepContext, StepOutput, TrainConfig, Trainable, shards};
+use crate::pixels::Frames;
+use crate::train::{
+    DatasetInfo, FixedPart, ParameterGroup, Preset, StepContext, StepOutput, TrainConfig, Trainable, shards,
+};
 use crate::{pixels, weights};
 use burn::tensor::{Device, Tensor, TensorData};
 use std::ops::Range;
@@ -22,6 +25,8 @@ const POLICY_GOAL: &str = "policy_goal";
 
 const TINY: &str = "64 px, a small trained convolutional encoder: minutes on two CPU cores";
 const SMALL: &str = "64 px, overlapping convolutions, for small and rotated objects: for two CPU cores";
+const KEYPOINTS: &str =
+    "64 px, keypoints of fixed random filters, encoded once per frame: trains in minutes on two CPU cores";
 const PAPER: &str = "224 px, frozen DINOv2-small, heads of 6 layers, history 3: the published size, for a GPU";
 
 macro_rules! presets {
@@ -32,6 +37,11 @@ macro_rules! presets {
                 id: "small",
                 summary: SMALL,
                 toml: include_str!(concat!("../../presets/", $family, "/small.toml")),
+            },
+            Preset {
+                id: "keypoints",
+                summary: KEYPOINTS,
+                toml: include_str!(concat!("../../presets/", $family, "/keypoints.toml")),
             },
             Preset {
                 id: "paper",
@@ -118,6 +128,10 @@ impl Trainable for Gcbc {
         })
     }
 
+    fn fixed_part(&self, config: &GcrlConfig) -> Option<FixedPart> {
+        Some(FixedPart { kernels: self.encoder.fixed_part(config.image)?, images: config.pixels() })
+    }
+
     fn after_step(mut self, _: &StepContext<'_, Self>, mut buffers: Named<Tensor<1>>) -> Self {
         self.encoder.track(ENCODER, &mut buffers);
         self
@@ -183,6 +197,10 @@ macro_rules! value_learner {
                     let (clips, relabelled) = (reader.clips(range.clone())?, reader.relabelled(range)?);
                     Ok(self.losses(&clips, &relabelled, &config.loss, &mut noise, *training))
                 })
+            }
+
+            fn fixed_part(&self, config: &GcrlConfig) -> Option<FixedPart> {
+                Some(FixedPart { kernels: self.encoder.fixed_part(config.image)?, images: config.pixels() })
             }
 
             fn after_step(mut self, context: &StepContext<'_, Self>, mut buffers: Named<Tensor<1>>) -> Self {
@@ -287,7 +305,7 @@ struct BatchReader<'a> {
     device: &'a Device,
     /// Frames of a clip.
     steps: usize,
-    frames: &'a [u8],
+    frames: Frames<'a>,
     batch: &'a Batch,
     actions: Tensor<3>,
 }
@@ -301,48 +319,44 @@ impl<'a> BatchReader<'a> {
         device: &'a Device,
     ) -> Result<Self> {
         let actions = dataset_info.actions(batch, steps, frameskip, device)?;
-        Ok(Self { config, device, steps, frames: batch.get(PIXELS)?, batch, actions })
+        let frames = Frames::of(&config.pixels(), batch, PIXELS)?;
+        Ok(Self { config, device, steps, frames, batch, actions })
     }
 
-    /// Returns the images of a range of clips from a column with `per_clip` images per clip.
-    fn clip_images<'b>(&self, images: &'b [u8], per_clip: usize, clips: &Range<usize>) -> &'b [u8] {
-        let bytes = per_clip * self.config.image * self.config.image * 3;
-        &images[clips.start * bytes..clips.end * bytes]
+    /// Returns the frames of a range of clips.
+    fn frames_of(&self, clips: &Range<usize>) -> Frames<'a> {
+        self.frames.range(clips.start * self.steps..clips.end * self.steps)
     }
 
-    fn patches(&self, images: &[u8]) -> Result<Tensor<3>> {
-        pixels::patches(&self.config.pixels(), self.config.encoder.patch(), images, self.device)
+    fn inputs(&self, frames: Frames<'_>) -> Result<Tensor<3>> {
+        frames.inputs(&self.config.pixels(), self.config.encoder.patch(), self.device)
     }
 
-    fn goals(&self, name: &str) -> Result<&[u8]> {
-        self.batch.get(&format!("{name}_pixels"))
+    /// Returns the goals of a range of clips.
+    fn goals(&self, name: &str, clips: &Range<usize>) -> Result<Frames<'a>> {
+        Ok(Frames::of(&self.config.pixels(), self.batch, &format!("{name}_pixels"))?.range(clips.clone()))
     }
 
     fn clips(&self, clips: Range<usize>) -> Result<Clips> {
         let [_, _, elements] = self.actions.dims();
         Ok(Clips {
-            frames: self.patches(self.clip_images(self.frames, self.steps, &clips))?,
-            goal: self.patches(self.clip_images(self.goals(GOAL)?, 1, &clips))?,
+            frames: self.inputs(self.frames_of(&clips))?,
+            goal: self.inputs(self.goals(GOAL, &clips)?)?,
             actions: self.actions.clone().slice([clips, 0..self.config.history, 0..elements]),
         })
     }
 
     fn relabelled(&self, clips: Range<usize>) -> Result<Relabelled> {
-        let bytes = self.config.image * self.config.image * 3;
-        let (frames, goals) =
-            (self.clip_images(self.frames, self.steps, &clips), self.clip_images(self.goals(GOAL)?, 1, &clips));
+        let goals = self.goals(GOAL, &clips)?;
         // A goal is reached if the frame equals the goal image.
-        let reached: Vec<f32> = frames
-            .chunks_exact(self.steps * bytes)
-            .zip(goals.chunks_exact(bytes))
-            .flat_map(|(clip, goal)| {
-                let history = clip.chunks_exact(bytes).take(self.config.history);
-                history.map(move |frame| if frame == goal { 1.0 } else { 0.0 })
-            })
-            .collect();
+        let mut reached: Vec<f32> = vec![];
+        for (clip, goal) in clips.clone().zip(goals.each()) {
+            let history = self.frames.range(clip * self.steps..clip * self.steps + self.config.history);
+            reached.extend(history.each().map(|frame| if frame == goal { 1.0 } else { 0.0 }));
+        }
         let shape = [clips.len(), self.config.history, 1];
         Ok(Relabelled {
-            policy_goal: self.patches(self.clip_images(self.goals(POLICY_GOAL)?, 1, &clips))?,
+            policy_goal: self.inputs(self.goals(POLICY_GOAL, &clips)?)?,
             reached: Tensor::from_data(TensorData::new(reached, shape), self.device),
         })
     }

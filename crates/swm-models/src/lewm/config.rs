@@ -5,7 +5,7 @@ pub use crate::nn::BackboneConfig as EncoderConfig;
 use crate::nn::PredictorConfig;
 use crate::train::{check_sizes, limits};
 use serde::{Deserialize, Serialize};
-use swm_core::Result;
+use swm_core::{Error, Result};
 
 /// The model configuration of a LeWM.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -28,6 +28,19 @@ pub struct LewmConfig {
     pub encoder: EncoderConfig,
     /// The predictor.
     pub predictor: PredictorConfig,
+    /// A decoder of latents, for an encoder with fixed filters; none if left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub decoder: Option<DecoderConfig>,
+}
+
+/// A decoder that computes the features of the encoder's fixed filters from a latent. It is part of the loss only.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DecoderConfig {
+    /// Hidden features.
+    pub hidden: usize,
+    /// The weight of the decoder's mean squared error in the loss.
+    pub weight: f32,
 }
 
 impl LewmConfig {
@@ -54,6 +67,18 @@ impl LewmConfig {
             ("model.predictor.emb_dropout", predictor.emb_dropout),
         ])?;
         checks::pixel_std(self.pixel_std)?;
+        if let Some(decoder) = &self.decoder {
+            check_sizes(&[("model.decoder.hidden", decoder.hidden, 1, limits::FEATURES)])?;
+            let weight = decoder.weight;
+            if !(weight.is_finite() && weight >= 0.0) {
+                return Err(Error::config("model.decoder.weight", weight.to_string(), "give a number of at least 0"));
+            }
+            if !matches!(self.encoder, EncoderConfig::Keypoints(_)) {
+                let given = "the encoder has no fixed filters, whose features are decoded";
+                let fix = "leave out model.decoder, or choose an encoder with keypoints: --preset keypoints";
+                return Err(Error::config("model.decoder", given, fix));
+            }
+        }
         self.encoder.check("model.encoder", self.image)
     }
 }

@@ -80,6 +80,7 @@ pub(crate) fn world_model(mut reference: Reference, dataset_info: &DatasetInfo) 
         projector: size("projector.hidden_dim")?,
         encoder: EncoderConfig::Vit(vit),
         predictor,
+        decoder: None,
     };
     let action_dim = size("action_encoder.input_dim")?;
     let dim = dataset_info.action.dim();

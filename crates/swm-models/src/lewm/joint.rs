@@ -9,7 +9,7 @@ use super::prediction::{self, Windows};
 use super::shard::{Differentiation, Shard};
 use super::step::TrainBatch;
 use crate::nn::parameters::{self, Named};
-use crate::nn::{BatchStatistics, conv};
+use crate::nn::{Backbone, BatchNorm, BatchStatistics};
 use burn::module::Module;
 use burn::tensor::{Gradients, Tensor};
 use rayon::prelude::*;
@@ -19,6 +19,8 @@ use swm_core::Rng;
 pub(crate) struct JointStep {
     /// Mean squared error of the predicted latents.
     pub prediction: f64,
+    /// Mean squared error of the decoded features, and its weight in the loss, if the model has a decoder.
+    pub decoding: Option<(f64, f64)>,
     /// The flattened gradient of each parameter of the model, by parameter name.
     pub gradients: Named<Tensor<1>>,
     /// All gradients, including the gradients of the regulariser's own parameters.
@@ -55,8 +57,22 @@ fn windows(x: &Tensor<3>, history: usize, offset: usize) -> Tensor<3> {
     Tensor::cat(starts.map(|s| x.clone().slice([0..clips, s + offset..s + offset + history, 0..width])).collect(), 0)
 }
 
-/// Computes prediction error and gradients of a batch. The loss is the prediction error plus `regularise(latents)`,
-/// where the latents are `[clips, steps, latent]`. `model` is outside autodiff; `shards` is at least 1.
+/// Returns the mean squared error of the features that the decoder computes from the first latent of each clip, with the weight
+/// of the error, if the model has a decoder. The features are normalised with the statistics of the batch.
+fn decoding_error(model: &Lewm, patches: &Tensor<3>, latents: &Tensor<3>) -> Option<(Tensor<1>, f64)> {
+    let (Some(decoder), Backbone::Keypoints(keypoints)) = (&model.decoder, &model.encoder) else { return None };
+    let ([clips, steps, latent], [_, rows, width]) = (latents.dims(), patches.dims());
+    let first = patches.clone().reshape([clips, steps, rows * width]).slice([0..clips, 0..1, 0..rows * width]);
+    let features = keypoints.inputs(first.reshape([clips, rows, width]));
+    let centred = features.clone() - features.mean_dim(0);
+    let variance = centred.clone().square().mean_dim(0);
+    let target = centred / (variance + BatchNorm::EPSILON).sqrt();
+    let latents = latents.clone().slice([0..clips, 0..1, 0..latent]).reshape([clips, latent]);
+    Some(((decoder.net.forward(latents) - target.autodiff()).square().mean(), decoder.weight()))
+}
+
+/// Computes prediction error and gradients of a batch. The loss is the prediction error plus `regularise(latents)`
+/// and the weighted error of the decoder, where the latents are `[clips, steps, latent]`. `model` is outside autodiff; `shards` is at least 1.
 pub(crate) fn step(
     model: &Lewm,
     batch: &TrainBatch,
@@ -80,7 +96,8 @@ pub(crate) fn step(
         .collect();
 
     let mut buffers = Named::new();
-    conv::store(encoded.iter_mut().flat_map(|shard| shard.statistics.drain(..)).collect(), ENCODER, &mut buffers);
+    let statistics = encoded.iter_mut().flat_map(|shard| shard.statistics.drain(..)).collect();
+    model.encoder.store(statistics, ENCODER, &mut buffers);
     // The projector processes the whole batch.
     let head = model.clone().train();
     let features = Tensor::cat(encoded.iter().map(|shard| shard.features.clone()).collect(), 0);
@@ -88,7 +105,12 @@ pub(crate) fn step(
     let (latents, projector_statistics) = head.projector.forward_train(features.clone());
     let [_, latent] = latents.dims();
     let latents = latents.reshape([clips, steps, latent]);
-    let regulariser = regularise(&latents);
+    let mut regulariser = regularise(&latents);
+    let mut decoding = None;
+    if let Some((error, weight)) = decoding_error(&head, &batch.patches, &latents) {
+        decoding = Some((f64::from(error.clone().inner().into_scalar::<f32>()), weight));
+        regulariser = regulariser + error * weight;
+    }
     let (history, values) = (head.predictor.config().history.min(steps - 1), latents.clone().inner());
     let inputs = Windows {
         latents: windows(&values, history, 0),
@@ -121,5 +143,5 @@ pub(crate) fn step(
         let shards = shards.into_iter().map(|shard| parameters::prefixed(ENCODER, shard));
         shards.for_each(|shard| parameters::add(&mut gradients, shard));
     }
-    JointStep { prediction: prediction.error, gradients, all, buffers }
+    JointStep { prediction: prediction.error, decoding, gradients, all, buffers }
 }

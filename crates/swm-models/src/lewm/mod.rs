@@ -18,7 +18,7 @@ pub(crate) mod shard;
 pub mod step;
 pub(crate) mod train;
 
-pub use config::{EncoderConfig, LewmConfig};
+pub use config::{DecoderConfig, EncoderConfig, LewmConfig};
 pub use cost::LewmCost;
 pub use family::ENTRY;
 pub(crate) use family::encode;

@@ -2,7 +2,7 @@
 
 use super::config::LewmConfig;
 pub use crate::nn::Backbone as Encoder;
-use crate::nn::{DropoutRng, Embedder, Init, Predictor, Projector};
+use crate::nn::{DropoutRng, Embedder, Init, Mlp, Predictor, Projector};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 
@@ -19,6 +19,24 @@ pub struct Lewm {
     pub predictor: Predictor,
     /// Maps features of the predictor to latents.
     pub pred_proj: Projector,
+    /// Maps latents to the features of the encoder's fixed filters; part of the loss only.
+    pub decoder: Option<Decoder>,
+}
+
+/// A decoder of latents.
+#[derive(Module, Debug)]
+pub struct Decoder {
+    /// The network.
+    pub net: Mlp,
+    #[module(skip)]
+    weight: f32,
+}
+
+impl Decoder {
+    /// The weight of the mean squared error in the loss.
+    pub fn weight(&self) -> f64 {
+        f64::from(self.weight)
+    }
 }
 
 impl Lewm {
@@ -33,6 +51,10 @@ impl Lewm {
             action_encoder: Embedder::new(&init.of("action_encoder"), action_dim, smoothed, config.latent),
             predictor: config.predictor.init(&init.of("predictor"), config.latent),
             pred_proj: Projector::new(&init.of("pred_proj"), config.latent, config.projector, config.latent),
+            decoder: config.decoder.as_ref().map(|decoder| Decoder {
+                net: Mlp::new(&init.of("decoder"), config.latent, decoder.hidden, config.encoder.fixed_features()),
+                weight: decoder.weight,
+            }),
         }
     }
 

@@ -35,6 +35,6 @@ pub fn planes(config: &LewmConfig, rgb: &[u8], device: &Device) -> Result<Tensor
     pixels::planes(&normalization(config), rgb, device)
 }
 
-fn normalization(config: &LewmConfig) -> ImageNormalization {
+pub(crate) fn normalization(config: &LewmConfig) -> ImageNormalization {
     ImageNormalization { side: config.image, mean: config.pixel_mean, std: config.pixel_std }
 }

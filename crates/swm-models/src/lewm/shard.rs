@@ -39,7 +39,11 @@ impl<'a> Differentiation<'a> {
     /// Whether all images must be in one shard: batch normalisation uses the statistics of the whole batch. The kernels
     /// of a convolutional encoder compute one shard on several threads.
     pub fn needs_whole_batch(&self) -> bool {
-        matches!(self, Self::Conv(_) | Self::Burn(Encoder::Conv(_)))
+        match self {
+            Self::Burn(encoder) => encoder.has_batch_statistics(),
+            Self::Vit(_) => false,
+            Self::Conv(_) => true,
+        }
     }
 }
 

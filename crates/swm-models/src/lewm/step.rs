@@ -35,7 +35,7 @@ pub struct TrainBatch {
 /// The loss of a batch and the terms of the loss.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Losses {
-    /// `prediction + weight * sigreg + temp_straight weight * temp_straight`.
+    /// The weighted sum of the other losses; the weight of the prediction error is 1.
     pub total: f64,
     /// Mean squared error of the predicted latents.
     pub prediction: f64,
@@ -43,6 +43,8 @@ pub struct Losses {
     pub sigreg: f64,
     /// The straightening loss, if it has a weight.
     pub temp_straight: Option<f64>,
+    /// Mean squared error of the decoded features, if the model has a decoder.
+    pub features: Option<f64>,
 }
 
 /// Losses and gradients of a batch.
@@ -87,8 +89,15 @@ pub fn step(
         }
         regulariser
     });
-    let JointStep { prediction, gradients, buffers, .. } = step;
+    let JointStep { prediction, decoding, gradients, buffers, .. } = step;
+    let (features, weight) = decoding.unzip();
     let straight = f64::from(config.temp_straight) * temp_straight.unwrap_or_default();
-    let total = prediction + f64::from(config.weight) * sigreg + straight;
-    LewmStep { losses: Losses { total, prediction, sigreg, temp_straight }, gradients, buffers, latents: host }
+    let decoding = features.zip(weight).map_or(0.0, |(error, weight)| error * weight);
+    let total = prediction + f64::from(config.weight) * sigreg + straight + decoding;
+    LewmStep {
+        losses: Losses { total, prediction, sigreg, temp_straight, features },
+        gradients,
+        buffers,
+        latents: host,
+    }
 }

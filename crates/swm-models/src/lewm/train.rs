@@ -4,8 +4,9 @@ use super::step::{self, LewmStep, SigregConfig, TrainBatch};
 use super::{Lewm, LewmConfig, loss, pixels};
 use crate::checks;
 use crate::nn::{Init, Named};
+use crate::pixels::Frames;
 use crate::train::{
-    DataConfig, DatasetInfo, Preset, StepContext, StepOutput, TrainConfig, Trainable, check_sizes, limits,
+    DataConfig, DatasetInfo, FixedPart, Preset, StepContext, StepOutput, TrainConfig, Trainable, check_sizes, limits,
 };
 use burn::tensor::{Device, Tensor};
 use swm_core::columns::{ACTION, PIXELS};
@@ -25,6 +26,11 @@ impl Trainable for Lewm {
             id: "small",
             summary: "64 px, overlapping convolutions, for small and rotated objects: trains in about an hour on two CPU cores",
             toml: include_str!("../../presets/lewm/small.toml"),
+        },
+        Preset {
+            id: "keypoints",
+            summary: "64 px, keypoints of fixed random filters, encoded once per frame: trains in minutes on two CPU cores",
+            toml: include_str!("../../presets/lewm/keypoints.toml"),
         },
         Preset {
             id: "paper",
@@ -66,7 +72,12 @@ impl Trainable for Lewm {
             step::step(self, &batch, &config.loss, &directions, config.shards, noise);
         let mut metrics = vec![("loss", losses.total), ("prediction", losses.prediction), ("sigreg", losses.sigreg)];
         metrics.extend(losses.temp_straight.map(|straight| ("temp_straight", straight)));
+        metrics.extend(losses.features.map(|features| ("features", features)));
         Ok(StepOutput { metrics, gradients, buffers })
+    }
+
+    fn fixed_part(&self, config: &LewmConfig) -> Option<FixedPart> {
+        fixed_part(self, config)
     }
 
     fn after_step(mut self, _: &StepContext<'_, Self>, buffers: Named<Tensor<1>>) -> Self {
@@ -93,6 +104,11 @@ pub(crate) fn check_straightening(weight: f32, data: &DataConfig) -> Result<()> 
     ))
 }
 
+/// Returns the part of the encoder that is not trained.
+pub(crate) fn fixed_part(model: &Lewm, config: &LewmConfig) -> Option<FixedPart> {
+    Some(FixedPart { kernels: model.encoder.fixed_part(config.image)?, images: pixels::normalization(config) })
+}
+
 /// Returns the loader configuration for clips of images and actions.
 pub(crate) fn loader_config(model: &LewmConfig, data: &DataConfig, schema: &Schema) -> Result<LoaderConfig> {
     pixels::check(model, schema, PIXELS)?;
@@ -109,8 +125,9 @@ pub(crate) fn prepare(
     batch: &Batch,
     device: &Device,
 ) -> Result<TrainBatch> {
+    let images = pixels::normalization(model);
     Ok(TrainBatch {
-        patches: pixels::patches(model, batch.get::<u8>(PIXELS)?, device)?,
+        patches: Frames::of(&images, batch, PIXELS)?.inputs(&images, model.encoder.patch(), device)?,
         actions: dataset_info.actions(batch, data.num_steps, data.frameskip, device)?,
     })
 }

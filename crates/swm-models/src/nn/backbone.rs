@@ -1,7 +1,9 @@
-//! [`Backbone`]: an image encoder of one of four kinds.
+//! [`Backbone`]: an image encoder of one of five kinds.
 
+use super::keypoints::KeypointKernels;
 use super::{
-    BatchStatistics, Conv, ConvConfig, Dino, DinoConfig, Init, Named, PatchCnn, PatchCnnConfig, Vit, VitConfig,
+    BatchStatistics, Conv, ConvConfig, Dino, DinoConfig, Init, Keypoints, KeypointsConfig, Named, PatchCnn,
+    PatchCnnConfig, Vit, VitConfig, keypoints,
 };
 use crate::train::{check_sizes, limits};
 use burn::module::Module;
@@ -22,6 +24,8 @@ pub enum BackboneConfig {
     PatchCnn(PatchCnnConfig),
     /// Overlapping convolutions with batch normalisation.
     Conv(ConvConfig),
+    /// Positions of the responses of fixed random filters, and trained linear layers.
+    Keypoints(KeypointsConfig),
 }
 
 /// An image encoder.
@@ -39,6 +43,8 @@ pub enum Backbone {
     PatchCnn(PatchCnn),
     /// Overlapping convolutions with batch normalisation.
     Conv(Conv),
+    /// Positions of the responses of fixed random filters, and trained linear layers.
+    Keypoints(Keypoints),
 }
 
 impl BackboneConfig {
@@ -48,7 +54,7 @@ impl BackboneConfig {
             Self::Vit(vit) => vit.patch,
             Self::Dinov2(dino) => dino.patch,
             Self::PatchCnn(cnn) => cnn.stages.first().map_or(0, |stage| stage.patch),
-            Self::Conv(_) => 1,
+            Self::Conv(_) | Self::Keypoints(_) => 1,
         }
     }
 
@@ -59,6 +65,15 @@ impl BackboneConfig {
             Self::Dinov2(dino) => dino.dim,
             Self::PatchCnn(cnn) => cnn.dim,
             Self::Conv(conv) => conv.dim,
+            Self::Keypoints(keypoints) => keypoints.dim,
+        }
+    }
+
+    /// The number of features of the part that is not trained; 0 if there is no such part.
+    pub fn fixed_features(&self) -> usize {
+        match self {
+            Self::Keypoints(keypoints) => keypoints.features(),
+            _ => 0,
         }
     }
 
@@ -74,7 +89,7 @@ impl BackboneConfig {
     pub fn patches(&self, image: usize) -> usize {
         match self {
             Self::Vit(_) | Self::Dinov2(_) => (image / self.patch().max(1)).pow(2),
-            Self::PatchCnn(_) => 1,
+            Self::PatchCnn(_) | Self::Keypoints(_) => 1,
             Self::Conv(conv) => conv.map(image).pow(2),
         }
     }
@@ -126,6 +141,10 @@ impl BackboneConfig {
                 conv.check(&format!("{at}.conv"), image)?;
                 vec![]
             }
+            Self::Keypoints(keypoints) => {
+                keypoints.check(&format!("{at}.keypoints"), image)?;
+                vec![]
+            }
         };
         check_sizes(&[("model.image", image, 1, limits::SIDE)])?;
         let mut side = image;
@@ -146,6 +165,7 @@ impl BackboneConfig {
             Self::Dinov2(dino) => Backbone::Dinov2(dino.init(init)),
             Self::PatchCnn(cnn) => Backbone::PatchCnn(cnn.init(init, image)),
             Self::Conv(conv) => Backbone::Conv(conv.init(init, image)),
+            Self::Keypoints(keypoints) => Backbone::Keypoints(keypoints.init(init)),
         }
     }
 }
@@ -161,6 +181,7 @@ impl Backbone {
             Self::Dinov2(dino) => dino.forward(patches),
             Self::PatchCnn(cnn) => cnn.forward(patches),
             Self::Conv(conv) => conv.forward(patches),
+            Self::Keypoints(keypoints) => keypoints.forward(patches),
         }
     }
 
@@ -172,12 +193,16 @@ impl Backbone {
     pub fn forward_train(&self, patches: Tensor<3>) -> (Tensor<2>, Vec<BatchStatistics>) {
         match self {
             Self::Conv(conv) => conv.forward_train(patches),
+            Self::Keypoints(keypoints) => {
+                let (features, statistics) = keypoints.forward_train(patches);
+                (features, vec![statistics])
+            }
             _ => (self.forward(patches), vec![]),
         }
     }
 
-    /// Computes the features of every patch; a [`PatchCnn`] returns the features of the image as one patch, and a
-    /// [`Conv`] returns the cells of its last feature map.
+    /// Computes the features of every patch; a [`PatchCnn`] and [`Keypoints`] return the features of the
+    /// image as one patch, and a [`Conv`] returns the cells of its last feature map.
     ///
     /// # Shapes
     /// Maps `[frames, patches, 3 * patch * patch]` to `[frames, patches, patch_dim]`.
@@ -191,6 +216,7 @@ impl Backbone {
             }
             Self::Dinov2(dino) => dino.patches(patches),
             Self::PatchCnn(cnn) => cnn.forward(patches).unsqueeze_dim(1),
+            Self::Keypoints(keypoints) => keypoints.forward(patches).unsqueeze_dim(1),
             Self::Conv(conv) => conv.cells(patches),
         }
     }
@@ -202,14 +228,42 @@ impl Backbone {
     pub fn patches_train(&self, patches: Tensor<3>) -> (Tensor<3>, Vec<BatchStatistics>) {
         match self {
             Self::Conv(conv) => conv.cells_train(patches),
+            Self::Keypoints(_) => {
+                let (features, statistics) = self.forward_train(patches);
+                (features.unsqueeze_dim(1), statistics)
+            }
             _ => (self.patches(patches), vec![]),
         }
     }
 
-    /// Updates the running statistics with batch statistics that [`store`](super::conv::store) inserted under `name`.
+    /// Inserts the batch statistics of a training pass into `buffers` under `name`, for [`Backbone::track`].
+    pub fn store(&self, statistics: Vec<BatchStatistics>, name: &str, buffers: &mut Named<Tensor<1>>) {
+        match self {
+            Self::Keypoints(_) => keypoints::store(statistics, name, buffers),
+            _ => super::conv::store(statistics, name, buffers),
+        }
+    }
+
+    /// Whether training normalises with the statistics of a batch.
+    pub fn has_batch_statistics(&self) -> bool {
+        matches!(self, Self::Conv(_) | Self::Keypoints(_))
+    }
+
+    /// The part of the encoder that is not trained, if there is one, for images with a side of `image` pixels: its features,
+    /// `[frames, 1, features]`, may be given in place of images.
+    pub fn fixed_part(&self, image: usize) -> Option<KeypointKernels> {
+        match self {
+            Self::Keypoints(keypoints) => Some(keypoints.kernels(image)),
+            _ => None,
+        }
+    }
+
+    /// Updates the running statistics with batch statistics that [`Backbone::store`] inserted under `name`.
     pub fn track(&mut self, name: &str, buffers: &mut Named<Tensor<1>>) {
-        if let Self::Conv(conv) = self {
-            conv.track(name, buffers);
+        match self {
+            Self::Conv(conv) => conv.track(name, buffers),
+            Self::Keypoints(keypoints) => keypoints.track(name, buffers),
+            _ => {}
         }
     }
 }

@@ -45,9 +45,11 @@ pub fn step(model: &Pldm, batch: &TrainBatch, weights: &PldmLoss, shards: usize,
         terms.extend(latent_terms.temp_straight.as_ref().map(|straight| ("temp_straight", value(straight))));
         sum
     });
-    let JointStep { prediction, gradients, all, buffers } = step;
-    let mut losses = vec![("loss", prediction + regulariser), ("prediction", prediction)];
+    let JointStep { prediction, decoding, gradients, all, buffers } = step;
+    let decoded = decoding.map_or(0.0, |(error, weight)| error * weight);
+    let mut losses = vec![("loss", prediction + regulariser + decoded), ("prediction", prediction)];
     losses.extend(terms);
+    losses.extend(decoding.map(|(error, _)| ("features", error)));
     let mut named = parameters::prefixed("model", gradients);
     named.extend(parameters::prefixed("idm", parameters::gradients(&idm, &all)));
     PldmStep { losses, gradients: named, buffers, latents: host }

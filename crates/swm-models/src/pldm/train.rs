@@ -5,7 +5,9 @@ use super::model::Pldm;
 use super::step::{PldmStep, step};
 use crate::lewm::{LewmConfig, train as lewm};
 use crate::nn::{Init, Named};
-use crate::train::{DatasetInfo, Preset, StepContext, StepOutput, TrainConfig, Trainable, check_sizes, limits};
+use crate::train::{
+    DatasetInfo, FixedPart, Preset, StepContext, StepOutput, TrainConfig, Trainable, check_sizes, limits,
+};
 use burn::tensor::Tensor;
 use swm_core::{Batch, Result, Schema};
 use swm_data::LoaderConfig;
@@ -24,6 +26,11 @@ impl Trainable for Pldm {
             id: "small",
             summary: "64 px, overlapping convolutions, for small and rotated objects: trains in about an hour on two CPU cores",
             toml: include_str!("../../presets/pldm/small.toml"),
+        },
+        Preset {
+            id: "keypoints",
+            summary: "64 px, keypoints of fixed random filters, encoded once per frame: trains in minutes on two CPU cores",
+            toml: include_str!("../../presets/pldm/keypoints.toml"),
         },
         Preset {
             id: "paper",
@@ -63,6 +70,10 @@ impl Trainable for Pldm {
         let noise = training.then_some(&mut noise);
         let PldmStep { losses, gradients, buffers, .. } = step(self, &batch, &config.loss, config.shards, noise);
         Ok(StepOutput { metrics: losses, gradients, buffers })
+    }
+
+    fn fixed_part(&self, config: &LewmConfig) -> Option<FixedPart> {
+        lewm::fixed_part(&self.model, config)
     }
 
     fn after_step(mut self, _: &StepContext<'_, Self>, buffers: Named<Tensor<1>>) -> Self {

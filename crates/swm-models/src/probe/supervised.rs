@@ -8,7 +8,7 @@ use super::targets::Targets;
 use super::{ImageEncoder, samples};
 use crate::lewm::shard::{Differentiation, Shard};
 use crate::nn::parameters::{self, IntoF32};
-use crate::nn::{Backbone, BackboneConfig, Init, Mlp, Named, conv};
+use crate::nn::{Backbone, BackboneConfig, Init, Mlp, Named};
 use crate::pixels::{self, ImageNormalization};
 use crate::train::StepOutput;
 use burn::module::Module;
@@ -115,7 +115,7 @@ fn losses(model: &Labelled, patches: Tensor<3>, labels: Tensor<2>) -> StepOutput
     let differentiation = Differentiation::of(&model.encoder, count, &device);
     let mut shard = Shard::forward(&differentiation, patches);
     let mut buffers = Named::new();
-    conv::store(std::mem::take(&mut shard.statistics), ENCODER, &mut buffers);
+    model.encoder.store(std::mem::take(&mut shard.statistics), ENCODER, &mut buffers);
 
     let head = model.head.clone().train();
     let features = shard.features.clone().autodiff().require_grad();

@@ -15,6 +15,7 @@ const SOURCES: &[&str] = &[
     include_str!("../nn/backbone.rs"),
     include_str!("../nn/vit.rs"),
     include_str!("../nn/conv.rs"),
+    include_str!("../nn/keypoints.rs"),
     include_str!("../nn/dino.rs"),
     include_str!("../nn/patch_cnn.rs"),
     include_str!("../nn/predictor.rs"),

@@ -3,6 +3,7 @@
 use super::config::{LoopConfig, TrainConfig};
 use super::dataset_info::DatasetInfo;
 use super::failed_batch;
+use super::fixed_features::FixedFeatures;
 use super::learner::{self, DynLearner, Learner, Update};
 use super::log::{Log, remove_later_steps};
 use super::metrics::{MetricWindow, Metrics};
@@ -49,6 +50,8 @@ pub fn train<M: Trainable>(
         let inputs = Inputs::of(config, &*reader, options)?;
         let _lock = Lock::folder(out)?;
         let (mut learner, loader) = inputs.learner(config, out, options)?;
+        let part = learner.model().fixed_part(&config.model);
+        let reader = FixedFeatures::of(reader, part, control)?;
         let run = Run::new(config.loop_config(), loader, &reader, out, options, &mut learner)?;
         run.run_steps(M::FAMILY, control)
     })

@@ -2,6 +2,7 @@
 
 use super::config::TrainConfig;
 use super::dataset_info::DatasetInfo;
+use super::fixed_features::FixedPart;
 use super::optim::ParameterGroup;
 use super::presets::Preset;
 use super::step_output::StepOutput;
@@ -62,6 +63,12 @@ pub trait Trainable: Module + Sync + 'static {
     /// When the weights cannot be fetched or do not fit.
     fn with_pretrained_weights(self, _config: &TrainConfig<Self>, _cache: &Path) -> Result<Self> {
         Ok(self)
+    }
+
+    /// The part of the encoder that is not trained, if frames may be replaced by its features: [`Trainable::step`] then
+    /// receives features in place of images.
+    fn fixed_part(&self, _config: &Self::Config) -> Option<FixedPart> {
+        None
     }
 
     /// Computes loss and gradients of one batch.

@@ -7,7 +7,8 @@ use swm_core::run::Control;
 use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Error, Key, Policy as _, Result, Schema, Space, VariationSpace};
 use swm_models::feed_forward::FeedForwardPolicy;
 use swm_models::gcrl::{Actor, Gcbc, Gciql, Gcivl, GcrlConfig, GoalConditioned};
-use swm_models::nn::{BackboneConfig, ConvConfig, Init, parameters};
+use swm_models::nn::keypoints::FilterConfig;
+use swm_models::nn::{BackboneConfig, ConvConfig, Init, KeypointsConfig, parameters};
 use swm_models::pixels::ImageNormalization;
 use swm_models::probe::{self, AnglePart, ImageEncoder, ReconstructionConfig, StateConfig};
 use swm_models::train::DatasetInfo;
@@ -122,6 +123,26 @@ fn cells_of_a_feature_map_are_the_patches_of_a_convolutional_encoder() {
     }
     check_conv::<Gcbc>();
     check_conv::<Gciql>();
+}
+
+#[test]
+fn goal_conditioned_models_learn_on_keypoints_of_frames_that_are_encoded_once() {
+    fn check_keypoints<M: GoalConditioned<Config = GcrlConfig>>() {
+        let folder = tempfile::tempdir().expect("creating a temporary folder");
+        let mut config = config::<M>(&["schedule.steps=40", "log_every=10"]);
+        let filters = vec![FilterConfig { kernel: 5, stride: 2, channels: 8 }];
+        config.model.encoder =
+            BackboneConfig::Keypoints(KeypointsConfig { filters, sharpness: 2.0, hidden: vec![16], dim: 12 });
+        let checkpoint = trained(&config, folder.path());
+        let running = &parameters::values(&checkpoint.model)["encoder.norm.running_mean"].values;
+        assert!(running.len() == 24 && running.iter().any(|mean| mean.abs() > 0.0), "{running:?}");
+        assert_eq!(M::actor(&checkpoint).latent_dim(), 12);
+        let (first, last) = first_and_last(folder.path(), "loss");
+        assert!(last < first, "{}: {last} after {first}", M::FAMILY);
+    }
+    check_keypoints::<Gcbc>();
+    check_keypoints::<Gcivl>();
+    check_keypoints::<Gciql>();
 }
 
 /// Returns a value in the first and the last line of a run's log.

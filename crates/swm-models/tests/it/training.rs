@@ -1,14 +1,16 @@
 //! Training gives the same bytes with any number of threads, interrupted or not.
 
 use crate::dots::Dots;
+use burn::tensor::{Tensor, TensorData};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use swm_core::Result;
 use swm_core::files::Lock;
 use swm_core::run::{Control, Event};
-use swm_models::lewm::{EncoderConfig, Lewm};
-use swm_models::nn::{ConvConfig, parameters};
+use swm_core::{Key, Result};
+use swm_models::lewm::{DecoderConfig, EncoderConfig, Lewm};
+use swm_models::nn::keypoints::FilterConfig;
+use swm_models::nn::{ConvConfig, Init, KeypointsConfig, parameters};
 use swm_models::{Checkpoint, Device, TrainConfig, TrainOptions, TrainSummary, run_folder, train};
 
 /// A model of a few thousand parameters.
@@ -124,10 +126,57 @@ fn conv_config() -> TrainConfig<Lewm> {
     config
 }
 
+/// A model with an encoder of keypoints and a decoder of their features.
+fn keypoints_config() -> TrainConfig<Lewm> {
+    let mut config = config(&["model.predictor.dropout=0"]);
+    let filters =
+        vec![FilterConfig { kernel: 3, stride: 2, channels: 5 }, FilterConfig { kernel: 5, stride: 4, channels: 3 }];
+    config.model.encoder =
+        EncoderConfig::Keypoints(KeypointsConfig { filters, sharpness: 2.0, hidden: vec![12], dim: 10 });
+    config.model.decoder = Some(DecoderConfig { hidden: 9, weight: 2.0 });
+    config
+}
+
+#[test]
+fn fixed_filters_are_not_trained_and_give_the_same_latents_from_frames_as_in_training() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let config = keypoints_config();
+    let out = folder.path().join("run");
+    let summary = run(&config, &out, &TrainOptions::default(), 0).expect("training the model");
+    assert!(summary.metrics.iter().any(|(name, value)| name == "features" && *value > 0.0), "{:?}", summary.metrics);
+    let model = Checkpoint::<Lewm>::load(&out, &Device::flex()).expect("loading the checkpoint").model;
+    let initial = Lewm::init(&config.model, 2 * 2, &Init::new(Key::new(config.seed).with("init"), &Device::flex()));
+    let (trained, initial) = (parameters::values(&model), parameters::values(&initial));
+    for (name, value) in trained.iter().filter(|(name, _)| name.starts_with("encoder.") || name.starts_with("decoder."))
+    {
+        assert_eq!(*value == initial[name], name.contains("filters"), "{name}");
+    }
+    let images: Vec<f32> = (0..3 * 16 * 16 * 3).map(|i| (i * 37 % 101) as f32 / 50.0 - 1.0).collect();
+    let kernels = model.encoder.fixed_part(16).expect("an encoder with fixed filters");
+    let features = TensorData::new(kernels.features(&images), [3, 1, kernels.count()]);
+    let latents = |data| model.encode(Tensor::<3>::from_data(data, &Device::flex())).into_data();
+    assert_eq!(latents(TensorData::new(images, [3, 16 * 16, 3])), latents(features));
+}
+
+#[test]
+fn decoder_without_fixed_filters_is_refused() {
+    let mut config = conv_config();
+    config.model.decoder = keypoints_config().model.decoder;
+    let error = config.check().expect_err("checking a decoder of a trained encoder");
+    assert!(error.is_usage() && error.to_string().contains("model.decoder"), "{error}");
+    let mut config = keypoints_config();
+    if let EncoderConfig::Keypoints(keypoints) = &mut config.model.encoder {
+        keypoints.filters[1].kernel = 4;
+    }
+    let error = config.check().expect_err("checking filters without a centre");
+    assert!(error.to_string().contains("choose an odd side"), "{error}");
+}
+
 #[test]
 fn results_do_not_depend_on_threads() {
     threads_give_equal_files(&config(&[]));
     threads_give_equal_files(&conv_config());
+    threads_give_equal_files(&keypoints_config());
 }
 
 fn threads_give_equal_files(config: &TrainConfig<Lewm>) {

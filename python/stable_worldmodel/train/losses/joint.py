@@ -28,6 +28,8 @@ class Joint(Losses):
     model: JEPA
 
     def compile(self, compiled: Callable[[Any], Any]) -> None:
+        if getattr(self.model, "decoder", None) is not None:
+            raise ValueError("model.decoder: it has no loss in torch; train this configuration with swm train")
         self._encode, self._predict = compiled(self.model._features), compiled(self.model.predictor)
 
     def __call__(self, batch: Mapping[str, Tensor], sizes: Sequence[int]) -> dict[str, Tensor]:

@@ -36,6 +36,7 @@ impl Golden {
                 dropout: 0.0,
                 emb_dropout: 0.0,
             },
+            decoder: None,
         }
     }
 

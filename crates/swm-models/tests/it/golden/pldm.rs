@@ -64,6 +64,7 @@ impl Golden {
                 dropout: 0.0,
                 emb_dropout: 0.0,
             },
+            decoder: None,
         }
     }
 

@@ -1,0 +1,217 @@
+//! [`Keypoints`]: an image encoder of filters with fixed random weights, of which a spatial softmax reads the positions, and
+//! trained linear layers.
+//!
+//! The filters are not trained, so that their features are computed once per frame of a dataset, and a training step
+//! computes the linear layers only.
+
+use super::parameters::host;
+use super::{Activation, BatchNorm, BatchStatistics, Init, Linear, Named};
+use crate::train::{check_sizes, limits};
+use burn::module::{Module, Param};
+use burn::tensor::{Tensor, TensorData};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use swm_core::{Error, Result};
+use swm_kernels::{FilterBank, KeypointScratch};
+
+/// The size of a [`Keypoints`] encoder.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct KeypointsConfig {
+    /// The filters.
+    pub filters: Vec<FilterConfig>,
+    /// The factor of the responses, in standard deviations over an image, before the softmax.
+    pub sharpness: f32,
+    /// The number of features of each hidden layer, first to last.
+    pub hidden: Vec<usize>,
+    /// The number of output features.
+    pub dim: usize,
+}
+
+/// Filters of one size.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FilterConfig {
+    /// The side of the filters, in pixels; odd.
+    pub kernel: usize,
+    /// The distance between two positions of a filter, in pixels.
+    pub stride: usize,
+    /// The number of filters.
+    pub channels: usize,
+}
+
+/// Random filters, the expected position of their responses, and linear layers.
+#[derive(Module, Debug)]
+pub struct Keypoints {
+    /// The filters of each size, which are not trained.
+    pub filters: Vec<Filter>,
+    /// The normalisation of the features of the filters.
+    pub norm: BatchNorm,
+    /// The hidden layers.
+    pub hidden: Vec<Linear>,
+    /// The output layer.
+    pub out: Linear,
+    #[module(skip)]
+    config: KeypointsConfig,
+}
+
+/// Filters of one size.
+#[derive(Module, Debug)]
+pub struct Filter {
+    /// The weights, `[channels, 3, kernel, kernel]`.
+    pub weight: Param<Tensor<4>>,
+}
+
+impl KeypointsConfig {
+    /// The number of features of the filters: the expected x and y, and the largest response of each.
+    pub fn features(&self) -> usize {
+        self.filters.iter().map(|filter| 3 * filter.channels).sum()
+    }
+
+    /// Checks the sizes. `at` is the dotted path of the settings, for errors.
+    ///
+    /// # Errors
+    /// When there are no filters, or a size is out of range.
+    pub fn check(&self, at: &str, image: usize) -> Result<()> {
+        if self.filters.is_empty() {
+            return Err(Error::config(
+                format!("{at}.filters"),
+                "the list is empty",
+                "give at least one size of filters",
+            ));
+        }
+        for FilterConfig { kernel, stride, channels } in &self.filters {
+            check_sizes(&[
+                (&format!("{at}.filters.kernel"), *kernel, 1, image),
+                (&format!("{at}.filters.stride"), *stride, 1, image.div_ceil(2).max(1)),
+                (&format!("{at}.filters.channels"), *channels, 1, limits::FEATURES),
+            ])?;
+            if kernel.is_multiple_of(2) {
+                let fix = "choose an odd side, so that a filter has a centre";
+                return Err(Error::config(format!("{at}.filters.kernel"), kernel.to_string(), fix));
+            }
+        }
+        if !(self.sharpness.is_finite() && self.sharpness > 0.0) {
+            return Err(Error::config(format!("{at}.sharpness"), self.sharpness.to_string(), "give a number above 0"));
+        }
+        for hidden in &self.hidden {
+            check_sizes(&[(&format!("{at}.hidden"), *hidden, 1, limits::FEATURES)])?;
+        }
+        check_sizes(&[(&format!("{at}.dim"), self.dim, 1, limits::FEATURES)])
+    }
+
+    /// Creates an encoder.
+    pub fn init(&self, init: &Init) -> Keypoints {
+        let filters = self.filters.iter().enumerate().map(|(index, filter)| {
+            let FilterConfig { kernel, channels, .. } = *filter;
+            let std = 1.0 / ((3 * kernel * kernel) as f32).sqrt();
+            let weight = init.of("filters").at(index).normal("weight", [channels, 3, kernel, kernel], std);
+            Filter { weight: weight.set_require_grad(false) }
+        });
+        let inputs: Vec<usize> = std::iter::once(self.features()).chain(self.hidden.iter().copied()).collect();
+        let hidden = self.hidden.iter().zip(&inputs).enumerate().map(|(index, (outputs, inputs))| {
+            Linear::normal(&init.of("hidden").at(index), *inputs, *outputs, (2.0 / *inputs as f32).sqrt())
+        });
+        Keypoints {
+            filters: filters.collect(),
+            norm: BatchNorm::new(&init.of("norm"), self.features()),
+            hidden: hidden.collect(),
+            out: Linear::new(&init.of("out"), inputs[self.hidden.len()], self.dim),
+            config: self.clone(),
+        }
+    }
+}
+
+impl Keypoints {
+    /// Computes the features of images, with the running statistics.
+    ///
+    /// # Shapes
+    /// Maps `[frames, side * side, 3]`, or the features of the filters `[frames, 1, features]`, to `[frames, dim]`.
+    pub fn forward(&self, images: Tensor<3>) -> Tensor<2> {
+        self.head(self.norm.forward(self.inputs(images)))
+    }
+
+    /// Computes the features of images with the statistics of the batch, which are returned.
+    ///
+    /// # Shapes
+    /// As [`Keypoints::forward`].
+    pub fn forward_train(&self, images: Tensor<3>) -> (Tensor<2>, BatchStatistics) {
+        let (x, statistics) = self.norm.forward_train(self.inputs(images));
+        (self.head(x), statistics)
+    }
+
+    fn head(&self, x: Tensor<2>) -> Tensor<2> {
+        let hidden = self.hidden.iter().fold(x, |x, layer| Activation::Gelu.forward(layer.forward(x)));
+        self.out.forward(hidden)
+    }
+
+    /// Returns the features of the filters, which are computed from pixels.
+    ///
+    /// # Shapes
+    /// Maps the images of [`Keypoints::forward`] to `[frames, features]`.
+    pub fn inputs(&self, images: Tensor<3>) -> Tensor<2> {
+        let ([frames, rows, width], device) = (images.dims(), images.device());
+        let features = self.config.features();
+        if (rows, width) == (1, features) {
+            return images.reshape([frames, features]);
+        }
+        let values = self.kernels(rows.isqrt()).features(&host(images));
+        Tensor::from_data(TensorData::new(values, [frames, features]), &device)
+    }
+
+    /// Updates the running statistics with batch statistics that [`store`] inserted under `name`.
+    pub fn track(&mut self, name: &str, buffers: &mut Named<Tensor<1>>) {
+        if let Some(statistics) = BatchStatistics::take(&norm_name(name), buffers) {
+            self.norm.track(statistics);
+        }
+    }
+
+    /// Packs the filters for images with a side of `side` pixels.
+    pub fn kernels(&self, side: usize) -> KeypointKernels {
+        let banks = self.filters.iter().zip(&self.config.filters).map(|(filter, sizes)| FilterBank {
+            kernel: sizes.kernel,
+            stride: sizes.stride,
+            weight: host(filter.weight.val()),
+        });
+        let kernels = swm_kernels::Keypoints::new(side, self.config.sharpness, &banks.collect::<Vec<_>>());
+        KeypointKernels { pixels: side * side * 3, kernels }
+    }
+}
+
+/// Inserts the statistics of an encoder's normalisation into `buffers` under `name`.
+pub fn store(statistics: Vec<BatchStatistics>, name: &str, buffers: &mut Named<Tensor<1>>) {
+    for statistics in statistics {
+        statistics.store(&norm_name(name), buffers);
+    }
+}
+
+fn norm_name(name: &str) -> String {
+    format!("{name}.norm")
+}
+
+/// The filters of an encoder, packed for images of one size.
+pub struct KeypointKernels {
+    pixels: usize,
+    kernels: swm_kernels::Keypoints,
+}
+
+impl KeypointKernels {
+    /// The number of features of an image.
+    pub fn count(&self) -> usize {
+        self.kernels.features()
+    }
+
+    /// Computes the features of images.
+    ///
+    /// # Shapes
+    /// Maps `[images, side, side, 3]` normalised pixels to `[images, features]`.
+    pub fn features(&self, pixels: &[f32]) -> Vec<f32> {
+        let count = self.count();
+        let mut features = vec![0.0; pixels.len() / self.pixels * count];
+        (features.par_chunks_mut(count).zip(pixels.par_chunks(self.pixels)))
+            .for_each_init(KeypointScratch::default, |scratch, (features, image)| {
+                self.kernels.features_of(image, scratch, features)
+            });
+        features
+    }
+}

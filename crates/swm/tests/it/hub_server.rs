@@ -219,16 +219,7 @@ impl HubServer {
                 let Some(bytes) = found.commits[index].get(&file.replace("%20", " ")).cloned() else {
                     return Answer::error("404 Not Found", "EntryNotFound");
                 };
-                if state.endless {
-                    return Answer { endless: true, ..Answer::ok(vec![0; 1 << 16]) };
-                }
-                if bytes.len() < LARGE {
-                    return Answer::ok(bytes);
-                }
-                let oid = hash(&bytes);
-                state.objects.insert(oid.clone(), bytes);
-                let to = format!("{}/{oid}", self.storage);
-                Answer { status: "302 Found", headers: vec![("location", to)], ..Answer::ok(vec![]) }
+                state.send(bytes, &self.storage)
             }
             _ if !may_write => Answer::error("403 Forbidden", ""),
             ("POST", ["preupload", "main"]) => preupload(&request.body),
@@ -263,6 +254,19 @@ fn preupload(body: &[u8]) -> Answer {
 }
 
 impl State {
+    /// A file, or the address of the storage that has it.
+    fn send(&mut self, bytes: Vec<u8>, storage: &str) -> Answer {
+        if self.endless {
+            return Answer { endless: true, ..Answer::ok(vec![0; 1 << 16]) };
+        }
+        if bytes.len() < LARGE {
+            return Answer::ok(bytes);
+        }
+        let oid = hash(&bytes);
+        self.objects.insert(oid.clone(), bytes);
+        Answer { status: "302 Found", headers: vec![("location", format!("{storage}/{oid}"))], ..Answer::ok(vec![]) }
+    }
+
     fn create(&mut self, body: &[u8]) -> Answer {
         let body: Value = serde_json::from_slice(body).expect("JSON");
         let text = |key: &str| body[key].as_str().unwrap_or_default().to_owned();

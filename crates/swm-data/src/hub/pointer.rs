@@ -36,7 +36,8 @@ fn check(path: &Path, depth: usize, left: &mut usize) -> Result<()> {
             entries.map(|entry| entry.path()).try_for_each(|path| check(&path, depth - 1, left))
         };
     }
-    if !found.is_file() || found.len() > MAX_BYTES {
+    // Files of the kernel, some of which block their reader, have no size.
+    if !found.is_file() || found.len() == 0 || found.len() > MAX_BYTES {
         return Ok(());
     }
     let mut bytes = vec![];

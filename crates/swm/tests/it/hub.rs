@@ -153,6 +153,18 @@ fn uploads_hold_no_file_in_memory() {
 }
 
 #[test]
+fn links_that_are_not_uploaded_are_named() {
+    let setup = Setup::new();
+    std::fs::create_dir(setup.swm.path("files")).expect("a folder");
+    std::fs::write(setup.swm.path("files/a"), b"a").expect("a file");
+    std::os::unix::fs::symlink("/etc/hostname", setup.swm.path("files/link")).expect("a link");
+    let output = setup.run(&["push", "./files", "hf://lab/files"], Some(TOKEN));
+    let said = text(&output.stderr);
+    assert!(output.status.success() && said.contains("1 links, pipes and other special files are left out"), "{said}");
+    assert!(setup.hub.newest("models/lab/files").keys().all(|path| path.ends_with('a')));
+}
+
+#[test]
 fn gated_and_private_repositories_ask_for_a_token() {
     let setup = Setup::new();
     for (name, gated) in [("models/lab/gated", true), ("models/lab/private", false)] {

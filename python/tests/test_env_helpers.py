@@ -131,6 +131,14 @@ def test_files_of_policies_are_read_as_data(trained):
     bad.write_bytes(b"text")
     with pytest.raises(ValueError, match="no statistics of VecNormalize"):
         SB3Normalizer(bad)
+    # Bytes are never taken for objects, and an index of 2**31 - 1 in the memo of a pickle reserves no memory.
+    objects = np.array([None, "text"], object)
+    bad.write_bytes(pickle.dumps(SimpleNamespace(obs_rms=SimpleNamespace(mean=objects, var=objects))))
+    with pytest.raises(ValueError, match="a mean of shape"):
+        SB3Normalizer(bad)
+    bad.write_bytes(b"\x80\x04Nr\xff\xff\xff\x7f.")
+    with pytest.raises(ValueError, match="no statistics of VecNormalize"):
+        SB3Normalizer(bad)
     for content in (Hostile(), {"critic.qf0.0.weight": torch.zeros(1)}):
         with zipfile.ZipFile(folder / "bad.zip", "w") as archive:
             with archive.open("policy.pth", "w") as file:

@@ -1,7 +1,7 @@
 """`ExpertPolicy`: acts with a policy that Stable-Baselines3 trained with SAC.
 
-The files are read as data: weights without pickled objects, and statistics with an unpickler that creates arrays and plain
-records only. Stable-Baselines3 is not needed.
+The files are read as data: weights without pickled objects, and statistics with an unpickler that creates arrays of numbers and
+plain records only, and calls nothing of another package. Stable-Baselines3 is not needed.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import re
 import zipfile
 from typing import Any
 
@@ -18,17 +19,6 @@ from ...policy import BasePolicy
 
 __all__ = ["ExpertPolicy", "SB3Normalizer"]
 
-#: What creates arrays in a pickle file; every other class is read as a record of its attributes.
-_ARRAYS = {
-    ("numpy", "ndarray"),
-    ("numpy", "dtype"),
-    *(
-        (f"numpy.{core}.{module}", name)
-        for core in ("core", "_core")
-        for module, names in (("multiarray", ("_reconstruct", "scalar")), ("numeric", ("_frombuffer",)))
-        for name in names
-    ),
-}
 #: The activations of the hidden layers that are known.
 _ACTIVATIONS = ("ELU", "GELU", "LeakyReLU", "ReLU", "SiLU", "Tanh")
 
@@ -43,9 +33,51 @@ class _Record:
             self.__dict__.update(state)
 
 
-class _Unpickler(pickle.Unpickler):
+class _Number:
+    """A data type of a pickle file.
+
+    Arrays of other types than numbers are read as empty, because flags of a type of objects could turn bytes into pointers.
+    """
+
+    def __init__(self, code: Any, *args: Any) -> None:
+        self.code, self.order = str(code), "="
+
+    def __setstate__(self, state: Any) -> None:
+        self.order = {"<": "<", ">": ">"}.get(state[1], "=")
+
+    def read(self, data: Any) -> np.ndarray:
+        if re.fullmatch("b1|[iu][1248]|f[248]", self.code) is None:
+            return np.zeros(0)
+        return np.frombuffer(data, np.dtype(self.order + self.code))
+
+
+class _Array(_Record):
+    """An array of a pickle file."""
+
+    value: np.ndarray
+
+    def __setstate__(self, state: Any) -> None:
+        _, shape, kind, by_columns, data = state
+        self.value = _shaped(data, kind, shape, "F" if by_columns else "C")
+
+
+def _shaped(data: Any, kind: _Number, shape: Any, order: str) -> np.ndarray:
+    values = kind.read(data)
+    return values.reshape(shape, order="F" if order == "F" else "C") if values.size else values
+
+
+#: What reads numbers and arrays in place of numpy's functions, by the names of those; every other name is a record.
+_READERS: dict[tuple[str, str], Any] = {("numpy", "dtype"): _Number}
+for _core in ("numpy.core", "numpy._core"):
+    _READERS[f"{_core}.multiarray", "_reconstruct"] = _Array
+    _READERS[f"{_core}.multiarray", "scalar"] = lambda kind, data: kind.read(data)[0]
+    _READERS[f"{_core}.numeric", "_frombuffer"] = _shaped
+
+
+# The unpickler in Python keeps its memo in a dictionary; the one in C reserves memory for an index that a file states.
+class _Unpickler(pickle._Unpickler):
     def find_class(self, module: str, name: str) -> Any:
-        return super().find_class(module, name) if (module, name) in _ARRAYS else _Record
+        return _READERS.get((module, name), _Record)
 
 
 class SB3Normalizer:
@@ -64,7 +96,10 @@ class SB3Normalizer:
         try:
             with open(stats_path, "rb") as file:
                 statistics = _Unpickler(file).load().obs_rms
-            self.mean, self.var = (np.asarray(getattr(statistics, name), np.float64) for name in ("mean", "var"))
+            found = (getattr(statistics, name) for name in ("mean", "var"))
+            self.mean, self.var = (np.array(getattr(x, "value", x), np.float64) for x in found)
+            if self.mean.size == 0 or self.mean.shape != self.var.shape:
+                raise ValueError(f"a mean of shape {self.mean.shape} and a variance of shape {self.var.shape}")
         except OSError:
             raise
         # Damaged and hostile files raise anything.

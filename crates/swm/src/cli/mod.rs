@@ -15,7 +15,9 @@ mod envs;
 mod eval;
 mod eval_policy;
 mod eval_until;
+mod frame;
 mod inspect;
+mod lab;
 mod leaderboard;
 mod models;
 mod on_ray;
@@ -82,6 +84,9 @@ enum Command {
     /// List an environment's factors of variation
     #[command(after_help = "Example: swm fovs swm/TwoRoom-v1")]
     Fovs(envs::FovsArgs),
+    /// Write the first frame of an episode as PNG
+    #[command(after_help = "Example: swm frame swm/PushT-v1 --seed 3 --pin block.shape=1 --output frame.png")]
+    Frame(frame::FrameArgs),
     /// List, install and verify assets that environments require
     ///
     /// Assets are MuJoCo with its models, Gymnasium, the Atari games and Craftax.
@@ -174,6 +179,11 @@ enum Command {
     /// Write a manual page for each command
     #[command(after_help = "Example: swm man --output man1")]
     Man(shell::ManArgs),
+    /// Show environments, datasets and runs in the browser
+    ///
+    /// Starts a server for this machine only, prints its URL, and opens the browser. Ctrl-C ends it.
+    #[command(after_help = "Example: swm lab --no-open --port 8080")]
+    Lab(lab::LabArgs),
     /// Collect, train, plan, evaluate and report within minutes
     #[command(after_help = "Example: swm demo --output demo")]
     Demo(demo::DemoArgs),
@@ -279,6 +289,7 @@ impl Cli {
         match self.command {
             Command::Envs(args) => envs::envs(&args, json),
             Command::Fovs(args) => envs::fovs(&args, json),
+            Command::Frame(args) => frame::frame(&args, json),
             Command::Assets(args) => assets::assets(&args, json),
             Command::Wrappers => wrappers::wrappers(json),
             Command::Solvers => solvers::solvers(json),
@@ -307,6 +318,7 @@ impl Cli {
             Command::Autopsy(args) => autopsy::autopsy(&args, &Context::new(json, self.threads)?),
             Command::Reproduce(args) => reproduce::reproduce(&args, &Context::new(json, self.threads)?),
             Command::Bench(args) => bench::bench(&args, &Context::new(json, self.threads)?),
+            Command::Lab(args) => lab::lab(&args, &Context::new(json, self.threads)?),
             Command::Demo(args) => demo::demo(&args, &Context::new(json, self.threads)?),
         }
     }

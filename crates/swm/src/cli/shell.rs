@@ -14,11 +14,14 @@ use swm_core::{Error, Result, files};
 const GROUPS: &[(&str, &[&str])] = &[
     (
         "Data",
-        &["envs", "fovs", "wrappers", "collect", "datasets", "inspect", "preview", "convert", "doctor", "formats"],
+        &[
+            "envs", "fovs", "frame", "wrappers", "collect", "datasets", "inspect", "preview", "convert", "doctor",
+            "formats",
+        ],
     ),
     ("Train", &["models", "train", "plot", "recipes", "zoo", "checkpoints", "pull", "push", "probe"]),
     ("Evaluate", &["eval", "solvers", "reproduce", "report", "study", "autopsy", "leaderboard"]),
-    ("System", &["demo", "assets", "bench", "completions", "man"]),
+    ("System", &["demo", "lab", "assets", "bench", "completions", "man"]),
 ];
 
 /// Arguments of `swm completions`.

@@ -13,6 +13,7 @@ mod hostile;
 mod hub;
 mod hub_server;
 mod kills;
+mod lab;
 mod leaderboard;
 mod limits;
 mod listing;

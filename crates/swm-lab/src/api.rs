@@ -1,0 +1,250 @@
+//! The routes of the lab, behind [`crate::access`]. All answer to `GET`; what changes something goes through the socket of a
+//! session.
+
+use crate::datasets::{self, Datasets};
+use crate::session::{self, Running, Setup, messages};
+use crate::still::StillQuery;
+use crate::{Lab, assets, runs};
+use axum::Router;
+use axum::body::Body;
+use axum::extract::{Path, Query, Request, State};
+use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use serde::{Deserialize, Serialize};
+use serde_json::json;
+use sha1::{Digest as _, Sha1};
+use std::sync::Arc;
+use swm_core::{EnvChoice, Error, Result};
+use tokio::sync::{Semaphore, watch};
+
+/// Requests that read datasets or render at the same time; others wait.
+const AT_ONCE: usize = 4;
+/// What RFC 6455 adds to the key of a handshake.
+const HANDSHAKE: &str = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11";
+
+/// What all routes share.
+#[derive(Clone)]
+pub struct Shared {
+    pub lab: Arc<Lab>,
+    pub datasets: Arc<Datasets>,
+    pub running: Running,
+    pub work: Arc<Semaphore>,
+    pub stop: watch::Receiver<bool>,
+}
+
+impl Shared {
+    pub fn new(lab: Lab, stop: watch::Receiver<bool>) -> Self {
+        Self {
+            datasets: Arc::new(Datasets::new(lab.datasets.clone())),
+            lab: Arc::new(lab),
+            running: Running::default(),
+            work: Arc::new(Semaphore::new(AT_ONCE)),
+            stop,
+        }
+    }
+
+    /// Runs work that blocks on a thread for it.
+    async fn work<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(&Self) -> Result<T> + Send + 'static,
+    ) -> Result<T, Failed> {
+        let _permit = Arc::clone(&self.work).acquire_owned().await.ok();
+        let shared = self.clone();
+        let done = tokio::task::spawn_blocking(move || work(&shared)).await;
+        let done = done.unwrap_or_else(|error| Err(Error::external("answering a request of a page", error)));
+        done.map_err(Failed)
+    }
+
+    /// The registered environment that a page names.
+    fn env(&self, id: &str) -> Result<EnvChoice> {
+        self.lab.envs.choose(id)
+    }
+}
+
+/// An error as the answer to a request.
+struct Failed(Error);
+
+impl From<Error> for Failed {
+    fn from(error: Error) -> Self {
+        Self(error)
+    }
+}
+
+impl IntoResponse for Failed {
+    fn into_response(self) -> Response {
+        let message = self.0.to_string();
+        tracing::debug!("a request failed: {message}");
+        (StatusCode::BAD_REQUEST, answer("application/json", json!({"error": message}).to_string())).into_response()
+    }
+}
+
+/// The answer of a route.
+type Answer = Result<Response, Failed>;
+
+/// The routes.
+pub fn routes(shared: Shared) -> Router {
+    Router::new()
+        .route("/api/envs", get(envs))
+        .route("/api/env", get(env))
+        .route("/api/still", get(still))
+        .route("/api/command", get(command))
+        .route("/api/live", get(live))
+        .route("/api/status", get(status))
+        .route("/api/datasets", get(list_datasets))
+        .route("/api/episodes", get(episodes))
+        .route("/api/rows", get(rows))
+        .route("/api/frame", get(frame))
+        .route("/api/runs", get(list_runs))
+        .route("/api/lines", get(lines))
+        .route("/", get(|headers: HeaderMap| async move { asset("", &headers) }))
+        .route("/{file}", get(|Path(file): Path<String>, headers: HeaderMap| async move { asset(&file, &headers) }))
+        .with_state(shared)
+}
+
+fn answer(kind: &'static str, body: impl Into<Body>) -> Response {
+    ([(header::CONTENT_TYPE, HeaderValue::from_static(kind))], body.into()).into_response()
+}
+
+fn as_json(value: &impl Serialize) -> Answer {
+    let text = serde_json::to_string(value).map_err(|error| Error::external("writing JSON", error))?;
+    Ok(answer("application/json", text))
+}
+
+fn asset(path: &str, headers: &HeaderMap) -> Response {
+    let Some(asset) = assets::find(path) else {
+        return (StatusCode::NOT_FOUND, answer("text/plain", "there is no such page; open the lab's first page\n"))
+            .into_response();
+    };
+    let accepted = headers.get(header::ACCEPT_ENCODING).and_then(|value| value.to_str().ok()).unwrap_or_default();
+    if accepted.contains("gzip") && !asset.gzip.is_empty() {
+        let encoding = [(header::CONTENT_ENCODING, HeaderValue::from_static("gzip"))];
+        return (encoding, answer(asset.kind, asset.gzip.as_slice())).into_response();
+    }
+    answer(asset.kind, asset.bytes)
+}
+
+/// All registered environments, from the registry alone.
+async fn envs(State(shared): State<Shared>) -> Answer {
+    let rows = shared.lab.envs.rows.iter().map(|row| {
+        let experts: Vec<&str> = row.experts.iter().map(|expert| expert.id).collect();
+        json!({"id": row.id, "summary": row.summary, "experts": experts})
+    });
+    as_json(&rows.collect::<Vec<_>>())
+}
+
+/// The query of a request about an environment.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct EnvQuery {
+    env: String,
+    image: Option<usize>,
+}
+
+async fn env(State(shared): State<Shared>, Query(query): Query<EnvQuery>) -> Answer {
+    let described = shared.work(move |shared| {
+        let choice = shared.env(&query.env)?;
+        Ok(messages::describe(&choice.entry, choice.env()?.spec()))
+    });
+    as_json(&described.await?)
+}
+
+async fn still(State(shared): State<Shared>, Query(query): Query<StillQuery>) -> Answer {
+    let png = shared.work(move |shared| query.still()?.png(&mut *shared.env(&query.env)?.env()?)).await?;
+    Ok(answer("image/png", png))
+}
+
+async fn command(State(shared): State<Shared>, Query(query): Query<StillQuery>) -> Answer {
+    let text = shared.work(move |shared| query.still()?.command(shared.env(&query.env)?.env()?.spec())).await?;
+    Ok(answer("text/plain; charset=utf-8", text))
+}
+
+/// Upgrades to the socket of a live environment.
+async fn live(State(shared): State<Shared>, Query(query): Query<EnvQuery>, mut request: Request) -> Answer {
+    let setup = Setup { env: shared.env(&query.env)?, side: query.image.unwrap_or(crate::still::SIDE) };
+    let headers = request.headers();
+    let is = |name, expected: &str| {
+        let value = headers.get(name).and_then(|value: &HeaderValue| value.to_str().ok()).unwrap_or_default();
+        value.split(',').any(|part| part.trim().eq_ignore_ascii_case(expected))
+    };
+    let is_handshake = is(header::UPGRADE, "websocket")
+        && is(header::CONNECTION, "upgrade")
+        && is(header::SEC_WEBSOCKET_VERSION, "13");
+    let key = headers.get(header::SEC_WEBSOCKET_KEY).filter(|_| is_handshake).cloned().ok_or_else(|| {
+        Error::config("/api/live", "the request is no WebSocket handshake of version 13", "connect with a WebSocket")
+    })?;
+    let accept = STANDARD.encode(Sha1::new().chain_update(key.as_bytes()).chain_update(HANDSHAKE).finalize());
+    let upgrade = hyper::upgrade::on(&mut request);
+    tokio::spawn(async move {
+        match upgrade.await {
+            Ok(connection) => session::run(connection, shared.lab, setup, shared.running, shared.stop).await,
+            Err(error) => tracing::debug!("a page left before its socket opened: {error}"),
+        }
+    });
+    let mut response = StatusCode::SWITCHING_PROTOCOLS.into_response();
+    let headers = response.headers_mut();
+    headers.insert(header::UPGRADE, HeaderValue::from_static("websocket"));
+    headers.insert(header::CONNECTION, HeaderValue::from_static("upgrade"));
+    let accept = HeaderValue::from_str(&accept).map_err(|error| Error::external("opening a socket", error))?;
+    headers.insert(header::SEC_WEBSOCKET_ACCEPT, accept);
+    Ok(response)
+}
+
+/// What runs: the number of live environments.
+async fn status(State(shared): State<Shared>) -> Answer {
+    as_json(&json!({"version": env!("CARGO_PKG_VERSION"), "environments": shared.running.count()}))
+}
+
+async fn list_datasets(State(shared): State<Shared>) -> Answer {
+    as_json(&shared.work(|shared| Ok(shared.datasets.list())).await?)
+}
+
+/// The query of a request about an entry of a folder.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct EntryQuery {
+    #[serde(default)]
+    folder: usize,
+    name: String,
+    #[serde(default)]
+    episode: usize,
+    #[serde(default)]
+    row: usize,
+    #[serde(default)]
+    column: String,
+    #[serde(default)]
+    offset: u64,
+}
+
+async fn episodes(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
+    let table = shared.work(move |shared| datasets::episodes(&*shared.datasets.get(query.folder, &query.name)?));
+    as_json(&table.await?)
+}
+
+async fn rows(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
+    let rows =
+        shared.work(move |shared| datasets::rows(&*shared.datasets.get(query.folder, &query.name)?, query.episode));
+    as_json(&rows.await?)
+}
+
+async fn frame(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
+    let jpeg = shared.work(move |shared| {
+        let reader = shared.datasets.get(query.folder, &query.name)?;
+        datasets::frame(&*reader, &query.column, query.episode, query.row)
+    });
+    Ok(answer("image/jpeg", jpeg.await?))
+}
+
+async fn list_runs(State(shared): State<Shared>) -> Answer {
+    let found = shared.work(|shared| {
+        let folders: Vec<_> = shared.lab.runs.paths().iter().map(|path| path.display().to_string()).collect();
+        Ok(json!({"folders": folders, "runs": runs::list(&shared.lab.runs)}))
+    });
+    as_json(&found.await?)
+}
+
+async fn lines(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
+    as_json(&shared.work(move |shared| runs::lines(&shared.lab.runs, query.folder, &query.name, query.offset)).await?)
+}

@@ -1,0 +1,213 @@
+//! Datasets: their list, the table of episodes, the values of an episode's columns, and its frames.
+
+use crate::folders::Folders;
+use serde::Serialize;
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+use swm_core::{ColumnSpec, Error, Result, columns};
+use swm_data::{FORMATS, ImageCodec, Location, Reader, StepRange};
+
+/// The largest number of elements of a value that is plotted.
+const MOST_ELEMENTS: usize = 64;
+/// The largest number of rows whose rewards are added for a table of episodes.
+const MOST_ROWS: usize = 20_000_000;
+/// The largest number of rows of an episode that is plotted.
+const MOST_STEPS: usize = 100_000;
+/// The quality of frames in the page.
+const QUALITY: u8 = 90;
+/// How long a reader is kept, so that a dataset that grows is read again.
+const KEPT: Duration = Duration::from_secs(5);
+/// The number of readers that are kept.
+const READERS: usize = 4;
+
+/// Returns whether a path is a dataset of a known format.
+fn is_dataset(path: &Path) -> bool {
+    let suffix = path.extension().and_then(|suffix| suffix.to_str()).unwrap_or_default();
+    let known = FORMATS.rows.iter().any(|format| format.suffixes.contains(&suffix));
+    let location = Location::from(path.to_owned());
+    (known || path.is_dir()) && FORMATS.rows.iter().any(|format| (format.detect)(&location))
+}
+
+/// The table of a dataset's episodes, by column; all lists have one element per episode.
+#[derive(Debug, Default, Serialize)]
+pub struct Episodes {
+    /// The index of each episode.
+    pub index: Vec<i64>,
+    /// Steps, one less than rows.
+    pub length: Vec<usize>,
+    /// The sum of rewards; empty if the dataset has none.
+    pub returns: Vec<f64>,
+    /// Whether the last observation satisfies the goal; empty if the dataset does not say.
+    pub success: Vec<bool>,
+}
+
+/// Readers of datasets in some folders.
+pub struct Datasets {
+    folders: Folders,
+    open: Mutex<Vec<Open>>,
+}
+
+/// The path of a dataset, when it was opened, and its reader.
+type Open = (PathBuf, Instant, Arc<dyn Reader>);
+
+impl Datasets {
+    /// The datasets in these folders.
+    pub fn new(folders: Folders) -> Self {
+        Self { folders, open: Mutex::new(vec![]) }
+    }
+
+    /// The datasets of all folders. One that does not open has an `error`.
+    pub fn list(&self) -> Value {
+        let found = self.folders.list(1, is_dataset).into_iter().map(|found| {
+            let mut value = match self.open(&found.path).and_then(|reader| summary(&*reader)) {
+                Ok(value) => value,
+                Err(error) => json!({"error": error.to_string()}),
+            };
+            value["folder"] = json!(found.folder);
+            value["name"] = json!(found.name);
+            value
+        });
+        let folders: Vec<_> = self.folders.paths().iter().map(|path| path.display().to_string()).collect();
+        json!({"folders": folders, "datasets": found.collect::<Vec<_>>()})
+    }
+
+    /// Opens a dataset by name.
+    ///
+    /// # Errors
+    /// When there is no such dataset, or it is damaged.
+    pub fn get(&self, folder: usize, name: &str) -> Result<Arc<dyn Reader>> {
+        self.open(&self.folders.find(folder, name, 1, is_dataset)?)
+    }
+
+    fn open(&self, path: &Path) -> Result<Arc<dyn Reader>> {
+        let lock = || self.open.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut open = lock();
+        open.retain(|(_, since, _)| since.elapsed() < KEPT);
+        if let Some((.., reader)) = open.iter().find(|(known, ..)| known == path) {
+            return Ok(Arc::clone(reader));
+        }
+        drop(open);
+        let reader = swm_data::open(Location::from(path.to_owned()))?;
+        let mut open = lock();
+        if open.len() >= READERS {
+            open.remove(0);
+        }
+        open.push((path.to_owned(), Instant::now(), Arc::clone(&reader)));
+        Ok(reader)
+    }
+}
+
+/// The environment, the columns and the counts of a dataset.
+fn summary(reader: &dyn Reader) -> Result<Value> {
+    let manifest = reader.manifest();
+    let columns = reader.schema().columns().iter().map(|column| {
+        json!({"name": column.name, "dtype": column.dtype.name(), "shape": column.shape, "image": column.is_image()})
+    });
+    Ok(json!({
+        "env": manifest.as_ref().and_then(|manifest| manifest.config["env"].as_str()),
+        "policy": manifest.as_ref().map(|manifest| &manifest.config["policy"]),
+        "kind": manifest.as_ref().map(|manifest| &manifest.kind),
+        "episodes": reader.episodes().len(),
+        "steps": reader.episodes().iter().map(|episode| episode.length).sum::<usize>(),
+        "bytes": reader.footprint()?.iter().map(|(_, bytes)| bytes).sum::<u64>(),
+        "columns": columns.collect::<Vec<_>>(),
+    }))
+}
+
+/// Reads the table of all episodes.
+///
+/// # Errors
+/// When the dataset is damaged.
+pub fn episodes(reader: &dyn Reader) -> Result<Episodes> {
+    let all = reader.episodes();
+    let rows: usize = all.iter().map(|episode| episode.length).sum();
+    let mut table = Episodes {
+        index: all.iter().map(|episode| episode.index).collect(),
+        length: all.iter().map(|episode| episode.length.saturating_sub(1)).collect(),
+        ..Episodes::default()
+    };
+    let is_scalar = |name: &str| reader.schema().column(name).is_ok_and(|column| column.len() == 1);
+    if is_scalar(columns::REWARD) && rows <= MOST_ROWS {
+        let ranges: Vec<_> = all.iter().enumerate().map(|(i, episode)| StepRange::new(i, 0, episode.length)).collect();
+        let rewards = reader.read(&[columns::REWARD], &ranges)?.to_f32(columns::REWARD)?;
+        let mut rest = &rewards[..];
+        for episode in all {
+            let (own, others) = rest.split_at(episode.length.min(rest.len()));
+            // NaN is no JSON: a reward that is missing counts as zero.
+            table.returns.push(own.iter().filter(|reward| reward.is_finite()).map(|&reward| f64::from(reward)).sum());
+            rest = others;
+        }
+    }
+    if is_scalar(columns::SUCCESS) {
+        let last = |(i, episode): (usize, &swm_data::Episode)| StepRange::new(i, episode.length.saturating_sub(1), 1);
+        let ranges: Vec<_> = all.iter().enumerate().map(last).collect();
+        let values = reader.read(&[columns::SUCCESS], &ranges)?.to_f32(columns::SUCCESS)?;
+        table.success = values.iter().map(|&value| value > 0.0).collect();
+    }
+    Ok(table)
+}
+
+/// Whether a column is plotted.
+fn is_plotted(column: &ColumnSpec) -> bool {
+    let hidden = [columns::EPISODE_IDX, columns::STEP_IDX, columns::EPISODE_SEED, columns::SEED];
+    !column.is_image() && column.len() <= MOST_ELEMENTS && !column.is_empty() && !hidden.contains(&column.name.as_str())
+}
+
+/// Reads the values of the columns of an episode that are plotted, `[rows, elements]` each. Values that are not finite are
+/// null.
+///
+/// # Errors
+/// When there is no such episode, it is too long, or the dataset is damaged.
+pub fn rows(reader: &dyn Reader, episode: usize) -> Result<Value> {
+    let length = episode_length(reader, episode)?;
+    if length > MOST_STEPS {
+        let problem = format!("it has {length} rows, more than {MOST_STEPS}");
+        return Err(Error::config(format!("episode {episode}"), problem, "read it in a program"));
+    }
+    let names: Vec<&str> = reader
+        .schema()
+        .columns()
+        .iter()
+        .filter(|column| is_plotted(column))
+        .map(|column| column.name.as_str())
+        .collect();
+    let batch = reader.read(&names, &[StepRange::new(episode, 0, length)])?;
+    let columns: Result<Vec<Value>> = names
+        .iter()
+        .map(|name| {
+            let elements = batch.schema().column(name)?.len();
+            Ok(json!({"name": name, "elements": elements, "values": batch.to_f32(name)?}))
+        })
+        .collect();
+    Ok(json!({"rows": length, "columns": columns?}))
+}
+
+/// The number of rows of an episode.
+fn episode_length(reader: &dyn Reader, episode: usize) -> Result<usize> {
+    let length = reader.episodes().get(episode).map(|episode| episode.length);
+    length.ok_or_else(|| {
+        let fix = format!("the dataset has {} episodes", reader.episodes().len());
+        Error::config(format!("episode {episode}"), "there is no such episode", fix)
+    })
+}
+
+/// Reads a frame as JPEG.
+///
+/// # Errors
+/// When there is no such frame, the column holds no images, or the stored frame is damaged.
+pub fn frame(reader: &dyn Reader, column: &str, episode: usize, row: usize) -> Result<Vec<u8>> {
+    let spec = reader.schema().column(column)?.clone();
+    let [height, width, 3] = spec.shape[..] else {
+        return Err(Error::config(format!("column '{column}'"), "it holds no images", "choose a column of images"));
+    };
+    if !spec.is_image() || row >= episode_length(reader, episode)? {
+        return Err(Error::config(format!("row {row} of '{column}'"), "there is no such frame", "choose another row"));
+    }
+    let mut rgb = vec![0; spec.row_bytes()];
+    reader.read_column(column, &[StepRange::new(episode, row, 1)], &mut rgb)?;
+    let mut jpeg = vec![];
+    ImageCodec::Jpeg { quality: QUALITY }.encode(&rgb, height, width, &mut jpeg)?;
+    Ok(jpeg)
+}

@@ -1,0 +1,111 @@
+//! Folders that the lab was started with, and their entries by name. A name is looked up in a listing and never joined to a
+//! path, and an entry that links to somewhere else is refused, so that no request reaches another folder.
+
+use std::path::{Path, PathBuf};
+use swm_core::{Error, Result};
+
+/// The largest number of entries that are listed in a folder.
+const MOST: usize = 5_000;
+
+/// Folders, in the order in which they are shown.
+#[derive(Clone, Debug, Default)]
+pub struct Folders(Vec<PathBuf>);
+
+impl Folders {
+    /// These folders. They need not exist yet.
+    pub fn new(folders: Vec<PathBuf>) -> Self {
+        Self(folders)
+    }
+
+    /// The folders.
+    pub fn paths(&self) -> &[PathBuf] {
+        &self.0
+    }
+
+    /// The entries of all folders that satisfy `wanted`, with the index of their folder, sorted by name. Entries of folders
+    /// that are not wanted are searched to this depth.
+    pub fn list(&self, depth: usize, wanted: impl Fn(&Path) -> bool) -> Vec<Found> {
+        let mut found = vec![];
+        for (index, folder) in self.0.iter().enumerate() {
+            let Ok(home) = folder.canonicalize() else { continue };
+            let mut of_folder = vec![];
+            search(&home, "", depth, &wanted, &mut of_folder);
+            of_folder.sort_by(|(a, _), (b, _)| a.cmp(b));
+            found.extend(of_folder.into_iter().map(|(name, path)| Found { folder: index, name, path }));
+        }
+        found
+    }
+
+    /// The wanted entry of this name in the folder with this index.
+    ///
+    /// # Errors
+    /// When there is no such entry.
+    pub fn find(&self, folder: usize, name: &str, depth: usize, wanted: impl Fn(&Path) -> bool) -> Result<PathBuf> {
+        let found = self.list(depth, wanted);
+        let entry = found.iter().find(|entry| entry.folder == folder && entry.name == name);
+        entry.map(|entry| entry.path.clone()).ok_or_else(|| {
+            let names = found.iter().map(|entry| entry.name.as_str());
+            Error::unknown("entry", name, names, "reload the page, which lists the folders of the lab")
+        })
+    }
+}
+
+/// An entry of a folder.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Found {
+    /// The index of its folder.
+    pub folder: usize,
+    /// The path from the folder, with `/` between the parts.
+    pub name: String,
+    /// The path.
+    pub path: PathBuf,
+}
+
+/// Adds the wanted entries of a folder. `path` is canonical, so an entry that links elsewhere does not begin with it.
+fn search(
+    path: &Path,
+    prefix: &str,
+    depth: usize,
+    wanted: &impl Fn(&Path) -> bool,
+    found: &mut Vec<(String, PathBuf)>,
+) {
+    for entry in std::fs::read_dir(path).into_iter().flatten().flatten().take(MOST) {
+        let Ok(name) = entry.file_name().into_string() else { continue };
+        let is_link = entry.file_type().map_or(true, |kind| kind.is_symlink());
+        if name.starts_with('.') || is_link {
+            continue;
+        }
+        let (name, child) = (format!("{prefix}{name}"), entry.path());
+        if wanted(&child) {
+            found.push((name, child));
+        } else if depth > 1 && child.is_dir() {
+            search(&child, &format!("{name}/"), depth - 1, wanted, found);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs;
+
+    #[test]
+    fn entries_of_the_folders_are_found_and_nothing_else() {
+        let root = tempfile::tempdir().expect("a folder");
+        let (inside, outside) = (root.path().join("inside"), root.path().join("outside"));
+        for folder in [inside.join("a"), inside.join("deep/b"), outside.join("secret")] {
+            fs::create_dir_all(&folder).expect("a folder");
+            fs::write(folder.join("log"), "").expect("a file");
+        }
+        std::os::unix::fs::symlink(outside.join("secret"), inside.join("link")).expect("a link");
+        let folders = Folders::new(vec![inside, root.path().join("missing")]);
+        let wanted = |path: &Path| path.join("log").is_file();
+        let names = |depth| folders.list(depth, wanted).into_iter().map(|entry| entry.name).collect::<Vec<_>>();
+        assert_eq!((names(1), names(2)), (vec!["a".to_owned()], vec!["a".to_owned(), "deep/b".to_owned()]));
+        assert!(folders.find(0, "deep/b", 2, wanted).is_ok());
+        for name in ["../outside/secret", "link", "a/../../outside/secret", "", ".", "/etc", "a\0"] {
+            assert!(folders.find(0, name, 2, wanted).is_err(), "{name}");
+        }
+        assert!(folders.find(1, "a", 2, wanted).is_err());
+    }
+}

@@ -1,0 +1,46 @@
+//! The lab: a local web application that shows environments, datasets and training runs as they move.
+//!
+//! - [`serve`](fn@serve): the server. It listens on the loopback address, and answers requests that carry its token only
+//!   ([`access`]).
+//! - [`still`]: one frame of an environment as PNG, the same bytes as `swm frame` writes.
+//! - [`session`]: a live environment behind a WebSocket, which a policy or a person drives, and whose episodes can be recorded.
+//! - [`datasets`] and [`runs`]: what the pages of datasets and of training curves show, from [`folders`] that the lab was
+//!   started with, and no other.
+//! - [`assets`]: the pages, built from `web/` and embedded.
+//!
+//! This crate knows no environment and no policy: [`Lab`] has the registry and the function that makes policies.
+
+pub mod access;
+mod api;
+pub mod assets;
+pub mod datasets;
+pub mod folders;
+pub mod runs;
+pub mod serve;
+pub mod session;
+pub mod still;
+
+pub use access::{Access, Token};
+pub use serve::{Options, Server, serve};
+
+use folders::Folders;
+use swm_core::registry::Registry;
+use swm_core::{EnvEntry, Policy, Result};
+use swm_eval::World;
+
+/// Makes the policy of this name for the environments of a world: `random`, or an expert.
+pub type MakePolicy = fn(&EnvEntry, &str, &World) -> Result<Box<dyn Policy>>;
+
+/// What the lab shows.
+pub struct Lab {
+    /// The environments.
+    pub envs: &'static Registry<EnvEntry>,
+    /// The policies that drive them.
+    pub policy: MakePolicy,
+    /// Folders of datasets. The first receives recorded demonstrations.
+    pub datasets: Folders,
+    /// Folders of training runs.
+    pub runs: Folders,
+    /// Threads of an environment; 0 for one per core.
+    pub threads: usize,
+}

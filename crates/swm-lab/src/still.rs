@@ -1,0 +1,153 @@
+//! One frame of an environment at the start of an episode, as PNG: what `swm frame` writes and the lab shows.
+
+use serde::Deserialize;
+use std::collections::BTreeMap;
+use swm_core::{Env, EnvSpec, Error, FrameMut, ResetOptions, Result, VariationRequest, limits};
+
+/// The side of a frame in pixels, unless a request says otherwise.
+pub const SIDE: usize = 224;
+
+/// The start of an episode, and the size of its frame.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Still {
+    /// The seed of the reset: the `episode_seed` of a dataset.
+    pub seed: u64,
+    /// Factors to sample and to pin.
+    pub variation: VariationRequest,
+    /// Whether to show the goal instead of the state.
+    pub goal: bool,
+    /// Height and width in pixels.
+    pub size: (usize, usize),
+}
+
+/// A still as the query of a URL: `seed=1&image=224&pin=agent.color=1,2,3;agent.speed=2&variation=all`.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct StillQuery {
+    /// The environment.
+    pub env: String,
+    /// The seed.
+    #[serde(default)]
+    pub seed: u64,
+    /// The side of the frame.
+    pub image: Option<usize>,
+    /// Pinned factors, `KEY=NUMBER[,NUMBER…]`, separated by `;`.
+    #[serde(default)]
+    pub pin: String,
+    /// Factors to sample, separated by `,`; `none` for none. Left out for the environment's defaults.
+    pub variation: Option<String>,
+    /// Whether to show the goal.
+    #[serde(default)]
+    pub goal: bool,
+}
+
+impl StillQuery {
+    /// Returns the still.
+    ///
+    /// # Errors
+    /// When a pin is malformed.
+    pub fn still(&self) -> Result<Still> {
+        let side = self.image.unwrap_or(SIDE);
+        Ok(Still {
+            seed: self.seed,
+            variation: request(&self.pin, self.variation.as_deref())?,
+            goal: self.goal,
+            size: (side, side),
+        })
+    }
+}
+
+/// Parses pinned and sampled factors as [`StillQuery`] has them.
+///
+/// # Errors
+/// When a pin is malformed.
+pub fn request(pins: &str, variation: Option<&str>) -> Result<VariationRequest> {
+    let mut variation_values = BTreeMap::new();
+    for pin in pins.split(';').filter(|pin| !pin.is_empty()) {
+        let wrong =
+            || Error::config(format!("pin {pin}"), "it is not KEY=NUMBER[,NUMBER…]", "write it like agent.color=1,2,3");
+        let (key, values) = pin.split_once('=').ok_or_else(wrong)?;
+        let values: Option<Vec<f64>> = values.split(',').map(|value| value.trim().parse().ok()).collect();
+        variation_values.insert(key.to_owned(), values.ok_or_else(wrong)?);
+    }
+    let variation = variation.map(|keys| match keys {
+        "none" | "" => vec![],
+        keys => keys.split(',').map(str::to_owned).collect(),
+    });
+    Ok(VariationRequest { variation, variation_values })
+}
+
+impl Still {
+    /// Renders the frame.
+    ///
+    /// # Shapes
+    /// The result is `[height, width, 3]` bytes.
+    ///
+    /// # Errors
+    /// When a factor is unknown or out of bounds, the size is too large, or the renderer fails.
+    pub fn render(&self, env: &mut dyn Env) -> Result<Vec<u8>> {
+        let (height, width) = self.size;
+        limits::IMAGE_SIDE.check(height.max(width))?;
+        if height.min(width) == 0 {
+            return Err(Error::config("frame size", format!("{height} x {width}"), "choose at least one pixel"));
+        }
+        let options = ResetOptions { variation: self.variation.clone(), ..ResetOptions::default() };
+        env.reset(self.seed, &options)?;
+        let mut rgb = vec![0; height * width * 3];
+        let frame = FrameMut::new(width, height, &mut rgb);
+        if self.goal {
+            env.render_goal(frame)?
+        } else {
+            env.render(frame)?
+        }
+        Ok(rgb)
+    }
+
+    /// Renders the frame as PNG. Equal stills give equal bytes.
+    ///
+    /// # Errors
+    /// As [`Still::render`].
+    pub fn png(&self, env: &mut dyn Env) -> Result<Vec<u8>> {
+        let rgb = self.render(env)?;
+        let side = |pixels: usize| u32::try_from(pixels).unwrap_or(u32::MAX);
+        let mut bytes = vec![];
+        let mut encoder = png::Encoder::new(&mut bytes, side(self.size.1), side(self.size.0));
+        encoder.set_color(png::ColorType::Rgb);
+        encoder.set_depth(png::BitDepth::Eight);
+        // By which `swm_data::check_png` knows a file of this program.
+        let written = encoder
+            .add_text_chunk("Software".to_owned(), "stable-worldmodel".to_owned())
+            .and_then(|()| encoder.write_header())
+            .and_then(|mut writer| writer.write_image_data(&rgb).and_then(|()| writer.finish()));
+        written.map_err(|error| Error::external("encoding a frame", error))?;
+        Ok(bytes)
+    }
+
+    /// The command line that writes this frame.
+    ///
+    /// # Errors
+    /// When a factor is unknown or a value is out of bounds: the command would fail.
+    pub fn command(&self, spec: &EnvSpec) -> Result<String> {
+        spec.variation_space.check(&self.variation)?;
+        let mut command = format!("swm frame {} --seed {}", spec.id, self.seed);
+        let (height, width) = self.size;
+        if self.size != (SIDE, SIDE) {
+            command +=
+                &if height == width { format!(" --image {height}") } else { format!(" --image {height}x{width}") };
+        }
+        if self.goal {
+            command += " --goal";
+        }
+        match self.variation.variation.as_deref() {
+            None => {}
+            Some([]) => command += " --variation none",
+            Some(keys) => command += &format!(" --variation {}", keys.join(",")),
+        }
+        for (i, (key, values)) in self.variation.variation_values.iter().enumerate() {
+            let space = &spec.variation_space.factors()[spec.variation_space.select(key)?[0]].space;
+            let values = space.format_values(values).replace(' ', "");
+            command += &format!("{} {key}={values}", if i == 0 { " --pin" } else { "" });
+        }
+        Ok(command + " --output frame.png")
+    }
+}

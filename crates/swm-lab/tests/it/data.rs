@@ -1,0 +1,119 @@
+//! Recording demonstrations, and what the page of datasets reads of them; runs that grow.
+
+use super::TestLab;
+use serde_json::json;
+use std::fs;
+use swm_core::{Action, ResetOptions, columns};
+use swm_data::{Location, StepRange, image};
+
+/// Records an episode of some steps of the hand.
+fn demonstrate(live: &mut super::Live, seed: u64, steps: usize) {
+    live.send(&json!({"type": "reset", "seed": seed, "variation": "none", "pin": "agent.position=40,40;target.position=180,180"}));
+    live.reply("started");
+    for step in 0..steps {
+        let action = if step % 2 == 0 { [1.0, 0.25] } else { [-0.5, 0.5] };
+        live.send(&json!({"type": "act", "action": action}));
+        live.send(&json!({"type": "step"}));
+        live.frame(|header| header["step"] == (step + 1) as f64);
+    }
+}
+
+#[test]
+fn demonstrations_are_recorded_with_the_columns_of_a_collection() {
+    let lab = TestLab::start();
+    let mut live = lab.live("swm/TwoRoom-v1");
+    live.send(&json!({"type": "drive", "by": "hand"}));
+    live.send(&json!({"type": "record", "dataset": "demos"}));
+    assert_eq!(live.reply("recording")["episodes"], 0);
+    demonstrate(&mut live, 5, 6);
+    live.send(&json!({"type": "discard"}));
+    live.reply("recording");
+    demonstrate(&mut live, 6, 8);
+    live.send(&json!({"type": "keep"}));
+    assert_eq!(live.reply("recording")["episodes"], 1);
+    live.send(&json!({"type": "finish"}));
+    live.reply("recording");
+    drop(live);
+    // Another session continues it.
+    let mut live = lab.live("swm/TwoRoom-v1");
+    live.send(&json!({"type": "record", "dataset": "demos"}));
+    loop {
+        if live.reply("recording")["episodes"] == 1 {
+            break;
+        }
+    }
+    demonstrate(&mut live, 7, 3);
+    live.send(&json!({"type": "keep"}));
+    while live.reply("recording")["episodes"] != 2 {}
+    live.send(&json!({"type": "finish"}));
+    live.reply("recording");
+    drop(live);
+    lab.wait_for_environments(0);
+    check_demonstrations(&lab);
+    check_page(&lab);
+    // A session of another environment does not write into it.
+    let mut other = lab.live("swm/PushT-v1");
+    other.send(&json!({"type": "record", "dataset": "demos"}));
+    let message = other.reply("failed")["message"].to_string();
+    assert!(message.contains("was not recorded in this environment"), "{message}");
+}
+
+/// The stored actions, played again from the stored seed, give the stored states.
+fn check_demonstrations(lab: &TestLab) {
+    let path = lab.home.path().join("datasets/demos.lance");
+    let reader = swm_data::open(Location::from(path)).expect("a dataset");
+    let lengths: Vec<usize> = reader.episodes().iter().map(|episode| episode.length).collect();
+    assert_eq!(lengths, [9, 4]);
+    let batch =
+        reader.read(&["action", "state", "episode_seed", "terminated"], &[StepRange::new(0, 0, 9)]).expect("rows");
+    let (actions, states) = (batch.to_f32("action").expect("actions"), batch.to_f32("state").expect("states"));
+    assert!(actions[16..].iter().all(|value| value.is_nan()), "the last action is NaN");
+    let seed = batch.row(0).to_f64(columns::EPISODE_SEED).expect("a seed");
+    assert_eq!(columns::join_seed([seed[0], seed[1], seed[2]]), 6);
+    let mut env = swm_envs::ENVS.choose("swm/TwoRoom-v1").and_then(|choice| choice.env()).expect("an environment");
+    let pins = swm_lab::still::request("agent.position=40,40;target.position=180,180", Some("none")).expect("pins");
+    env.reset(6, &ResetOptions { variation: pins, ..ResetOptions::default() }).expect("a reset");
+    let schema = swm_core::Schema::new(env.spec().columns.clone()).expect("a schema");
+    let mut seen = swm_core::Batch::zeros(&schema, 1);
+    for (t, action) in actions.chunks_exact(2).enumerate() {
+        env.observe(&mut seen.row_mut(0));
+        assert_eq!(seen.to_f32("state").expect("a state"), &states[2 * t..2 * t + 2], "row {t}");
+        if t < 8 {
+            env.step(Action::Continuous(action)).expect("a step");
+        }
+    }
+    assert!(reader.manifest().is_some_and(|manifest| manifest.kind == "record"));
+}
+
+fn check_page(lab: &TestLab) {
+    let found = lab.json("api/datasets");
+    assert_eq!((&found["datasets"][0]["name"], &found["datasets"][0]["episodes"]), (&json!("demos.lance"), &json!(2)));
+    let table = lab.json("api/episodes?name=demos.lance");
+    assert_eq!(table, json!({"index": [0, 1], "length": [8, 3], "returns": [0.0, 0.0], "success": [false, false]}));
+    let rows = lab.json("api/rows?name=demos.lance&episode=1");
+    let action =
+        rows["columns"].as_array().and_then(|columns| columns.iter().find(|column| column["name"] == "action"));
+    let action = action.expect("actions");
+    assert_eq!((&rows["rows"], &action["elements"], &action["values"][7]), (&json!(4), &json!(2), &json!(null)));
+    let (status, jpeg) = lab.get("api/frame?name=demos.lance&episode=1&row=3&column=pixels");
+    assert_eq!((status, image::image_size(&jpeg).expect("a JPEG")), (200, (32, 32)));
+    for query in ["episode=2", "episode=1&row=4&column=pixels", "column=action", "column=nothing"] {
+        let route = if query.contains("column") { "frame" } else { "rows" };
+        assert_eq!(lab.get(&format!("api/{route}?name=demos.lance&{query}")).0, 400, "{query}");
+    }
+}
+
+#[test]
+fn runs_are_listed_and_followed() {
+    let lab = TestLab::start();
+    let run = lab.home.path().join("checkpoints/lewm");
+    fs::create_dir_all(&run).expect("a folder");
+    fs::write(run.join("train.jsonl"), "{\"step\": 1, \"loss\": 2.0}\n").expect("a log");
+    let listed = lab.json("api/runs");
+    assert_eq!((&listed["runs"][0]["name"], &listed["runs"][0]["last"]["loss"]), (&json!("lewm"), &json!(2.0)));
+    let first = lab.json("api/lines?name=lewm");
+    assert_eq!(first["lines"], json!([{"step": 1, "loss": 2.0}]));
+    let offset = first["offset"].as_u64().expect("an offset");
+    fs::write(run.join("train.jsonl"), "{\"step\": 1, \"loss\": 2.0}\n{\"step\": 2, \"loss\": 1.0}\n").expect("a log");
+    assert_eq!(lab.json(&format!("api/lines?name=lewm&offset={offset}"))["lines"], json!([{"step": 2, "loss": 1.0}]));
+}

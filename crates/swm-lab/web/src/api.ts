@@ -1,0 +1,111 @@
+// The server's answers. Addresses are relative: the token is the first part of the page's path.
+
+export interface Space {
+  type: "Box" | "Discrete" | "MultiDiscrete" | "RGBBox";
+  shape?: number[];
+  dtype?: string;
+  low?: (number | null)[];
+  high?: (number | null)[];
+  n?: number;
+  nvec?: number[];
+  start?: number | number[];
+}
+
+export interface Factor {
+  key: string;
+  space: Space;
+  default: number[];
+  sampled: boolean;
+}
+
+export interface EnvRow {
+  id: string;
+  summary: string;
+  experts: string[];
+}
+
+export interface EnvInfo {
+  id: string;
+  summary: string;
+  factors: Factor[];
+  action: Space;
+  max_episode_steps: number;
+  experts: { id: string; summary: string }[];
+  options: { key: string; summary: string; values: string[] }[];
+  cameras: string[];
+}
+
+export interface Column {
+  name: string;
+  dtype: string;
+  shape: number[];
+  image: boolean;
+}
+
+export interface Dataset {
+  folder: number;
+  name: string;
+  error?: string;
+  env?: string;
+  policy?: unknown;
+  kind?: string;
+  episodes?: number;
+  steps?: number;
+  bytes?: number;
+  columns?: Column[];
+}
+
+export interface Episodes {
+  index: number[];
+  length: number[];
+  returns: number[];
+  success: boolean[];
+}
+
+export interface Rows {
+  rows: number;
+  columns: { name: string; elements: number; values: (number | null)[] }[];
+}
+
+export interface Run {
+  folder: number;
+  name: string;
+  bytes: number;
+  modified: number;
+  last: Record<string, number>;
+}
+
+export interface Lines {
+  offset: number;
+  more: boolean;
+  lines: Record<string, number>[];
+}
+
+export type Query = Record<string, string | number | boolean | undefined>;
+
+export function address(path: string, query: Query = {}): string {
+  const given = Object.entries(query).filter(([, value]) => value !== undefined);
+  const text = new URLSearchParams(given.map(([key, value]) => [key, String(value)])).toString();
+  return `api/${path}${text ? `?${text}` : ""}`;
+}
+
+async function answer(path: string, query: Query): Promise<Response> {
+  const response = await fetch(address(path, query));
+  if (response.ok) return response;
+  const text = await response.text();
+  let message = text.trim();
+  try {
+    message = JSON.parse(text).error;
+  } catch {
+    // The answer of a refused request is plain text.
+  }
+  throw new Error(message || `the lab answered ${response.status}`);
+}
+
+export async function get<T>(path: string, query: Query = {}): Promise<T> {
+  return (await answer(path, query)).json();
+}
+
+export async function text(path: string, query: Query = {}): Promise<string> {
+  return (await answer(path, query)).text();
+}

@@ -1,0 +1,202 @@
+// One episode: its frames, which a slider scrubs, and plots of its columns, which share the row.
+
+import { useEffect, useMemo, useRef, useState } from "preact/hooks";
+import type uPlot from "uplot";
+import { address, type Dataset, get, type Rows } from "./api";
+import { Chart } from "./chart";
+import { short } from "./format";
+import { type Params, patch, useKeys, useLoaded } from "./state";
+
+// Plots that are open unless the URL says otherwise.
+const FIRST = ["action", "reward", "state"];
+const FPS = 20;
+
+export function EpisodeView({ set, episode, params }: { set: Dataset; episode: number; params: Params }) {
+  const query = { folder: set.folder, name: set.name, episode };
+  const { value, error } = useLoaded(() => get<Rows>("rows", query), JSON.stringify(query));
+  const images = (set.columns ?? []).filter((column) => column.image && column.shape.length === 3);
+  const image = images.find((column) => column.name === params.column) ?? images[0];
+  const last = (value?.rows ?? 1) - 1;
+  const row = Math.max(0, Math.min(last, Number(params.row) || 0));
+  const [isPlaying, setPlaying] = useState(false);
+  const go = (to: number) => patch({ row: String(Math.max(0, Math.min(last, to))) });
+  useKeys({
+    ".": () => go(row + 1),
+    ",": () => go(row - 1),
+    " ": () => setPlaying((on) => !on),
+  });
+  const latest = useRef(row);
+  latest.current = row;
+  useEffect(() => {
+    if (!isPlaying) return;
+    const timer = setInterval(() => {
+      if (latest.current >= last) setPlaying(false);
+      else go(latest.current + 1);
+    }, 1000 / FPS);
+    return () => clearInterval(timer);
+  }, [isPlaying, last]);
+  const names = (value?.columns ?? []).map((column) => column.name).filter((name) => !isFactor(name));
+  const given = params.plots?.split(",").filter((name) => names.includes(name));
+  const shown = given ?? FIRST.filter((name) => names.includes(name));
+  const toggle = (name: string) =>
+    patch({ plots: (shown.includes(name) ? shown.filter((other) => other !== name) : [...shown, name]).join(",") || "none" });
+  return (
+    <section class="episode" aria-label={`Episode ${episode}`}>
+      <h2>
+        Episode {episode} <small>{value ? `${value.rows} rows` : ""}</small>
+      </h2>
+      {error && <p class="error">{error}</p>}
+      {image && (
+        <>
+          <Frame set={set} episode={episode} row={row} column={image.name} />
+          {images.length > 1 && (
+            <div class="chips" role="group" aria-label="Column of frames">
+              {images.map((column) => (
+                <button
+                  type="button"
+                  class="chip"
+                  key={column.name}
+                  aria-pressed={column === image}
+                  onClick={() => patch({ column: column.name })}
+                >
+                  {column.name}
+                </button>
+              ))}
+            </div>
+          )}
+        </>
+      )}
+      <div class="bar">
+        <button
+          type="button"
+          class="primary"
+          aria-label={isPlaying ? "Pause" : "Play"}
+          onClick={() => {
+            if (!isPlaying && row >= last) go(0);
+            setPlaying(!isPlaying);
+          }}
+        >
+          {isPlaying ? "❚❚" : "▶"}
+        </button>
+        <input
+          type="range"
+          class="grow"
+          min={0}
+          max={last}
+          value={row}
+          aria-label="Row"
+          onInput={(event) => go(Number(event.currentTarget.value))}
+        />
+        <output>
+          {row} / {last}
+        </output>
+      </div>
+      <div class="chips" role="group" aria-label="Columns">
+        {names.map((name) => (
+          <button type="button" class="chip" key={name} aria-pressed={shown.includes(name)} onClick={() => toggle(name)}>
+            {name}
+          </button>
+        ))}
+      </div>
+      {value && <Plots rows={value} names={shown} row={row} onRow={go} />}
+      {value && <Factors rows={value} />}
+    </section>
+  );
+}
+
+// Factors of variation are constant over an episode, so they are listed, not plotted.
+function isFactor(name: string): boolean {
+  return name.startsWith("variation.") || name.startsWith("variation_");
+}
+
+function Factors({ rows }: { rows: Rows }) {
+  const factors = rows.columns.filter((column) => isFactor(column.name));
+  if (factors.length === 0) return null;
+  return (
+    <details class="panel constants">
+      <summary>
+        Factors <small class="muted">{factors.length}</small>
+      </summary>
+      <dl>
+        {factors.map(({ name, elements, values }) => (
+          <div key={name}>
+            <dt>{name.slice("variation.".length)}</dt>
+            <dd>{values.slice(0, elements).map(short).join(", ")}</dd>
+          </div>
+        ))}
+      </dl>
+    </details>
+  );
+}
+
+// Shows the frame of a row. The last frame stays until the next one has arrived, and rows that are passed in the meantime are
+// left out.
+function Frame({ set, episode, row, column }: { set: Dataset; episode: number; row: number; column: string }) {
+  const [shown, setShown] = useState<string>();
+  const wanted = useRef("");
+  const isLoading = useRef(false);
+  wanted.current = address("frame", { folder: set.folder, name: set.name, episode, row, column });
+  const load = async () => {
+    if (isLoading.current) return;
+    isLoading.current = true;
+    for (let loaded = ""; loaded !== wanted.current; ) {
+      loaded = wanted.current;
+      const response = await fetch(loaded).catch(() => undefined);
+      if (!response?.ok) continue;
+      const url = URL.createObjectURL(await response.blob());
+      setShown((old) => {
+        if (old) URL.revokeObjectURL(old);
+        return url;
+      });
+    }
+    isLoading.current = false;
+  };
+  useEffect(() => {
+    void load();
+  }, [wanted.current]);
+  return (
+    <div class="frame">
+      {shown ? <img src={shown} alt={`Row ${row} of ${column}`} /> : <span class="loading">Loading …</span>}
+    </div>
+  );
+}
+
+function Plots({ rows, names, row, onRow }: { rows: Rows; names: string[]; row: number; onRow: (row: number) => void }) {
+  const xs = useMemo(() => Array.from({ length: rows.rows }, (_, i) => i), [rows]);
+  const series = useMemo(() => new Map(rows.columns.map((column) => [column.name, split(column, rows.rows)])), [rows]);
+  return (
+    <>
+      {names.map((name) => {
+        const values = series.get(name);
+        if (!values) return null;
+        const labels = values.map((_, i) => (values.length > 1 ? `${name}[${i}]` : name));
+        return <Plot key={name} name={name} xs={xs} values={values} labels={labels} row={row} onRow={onRow} />;
+      })}
+    </>
+  );
+}
+
+interface PlotProps {
+  name: string;
+  xs: number[];
+  values: (number | null)[][];
+  labels: string[];
+  row: number;
+  onRow: (row: number) => void;
+}
+
+function Plot({ name, xs, values, labels, row, onRow }: PlotProps) {
+  const data = useMemo(() => [xs, ...values] as uPlot.AlignedData, [xs, values]);
+  return <Chart title={name} data={data} labels={labels} xLabel="row" height={150} sync="episode" mark={row} onPick={onRow} />;
+}
+
+// Columns of a step, which the last row does not have.
+const OF_STEPS = ["reward", "terminated", "truncated"];
+
+// The values of each element, over the rows.
+function split(column: Rows["columns"][number], rows: number): (number | null)[][] {
+  const steps = OF_STEPS.includes(column.name) ? rows - 1 : rows;
+  return Array.from({ length: column.elements }, (_, element) =>
+    Array.from({ length: rows }, (_, row) => (row < steps ? column.values[row * column.elements + element] : null)),
+  );
+}

@@ -1,0 +1,50 @@
+// How a person drives an environment: the pointer on Push-T, arrow keys elsewhere, sliders and buttons for any action.
+
+import type { Space } from "./api";
+import { bounds, size } from "./variation";
+
+// Push-T's table is 512 pixels wide, and an action of 1 moves the target by 100 (its README).
+const TABLE = 512;
+const REACH = 100;
+
+export function isPointed(env: string): boolean {
+  return env.startsWith("swm/PushT-v");
+}
+
+// The action that moves Push-T's agent towards a point of the frame, in fractions of its sides.
+export function towards(point: [number, number], state: number[]): number[] {
+  return point.map((part, i) => Math.max(-1, Math.min(1, (part * TABLE - state[i]) / REACH)));
+}
+
+const ARROWS: Record<string, [number, number]> = {
+  ArrowLeft: [0, -1],
+  ArrowRight: [0, 1],
+  ArrowUp: [1, -1],
+  ArrowDown: [1, 1],
+};
+
+export function isArrow(key: string): boolean {
+  return key in ARROWS;
+}
+
+// The action of the arrow keys that are held. A discrete action has the first choice for left, the last for right.
+export function ofArrows(space: Space, held: Set<string>, rest: number[]): number[] {
+  const action = [...rest];
+  for (const key of held) {
+    const [axis, sign] = ARROWS[key] ?? [0, 0];
+    const index = Math.min(axis, size(space) - 1);
+    const [low, high] = bounds(space, index);
+    if (space.type !== "Box") action[index] = (sign < 0 ? low : high) ?? 0;
+    else if (axis < size(space)) action[index] = (sign < 0 ? low : high) ?? sign;
+  }
+  return action;
+}
+
+// The action that changes least, as the server has it.
+export function atRest(space: Space): number[] {
+  return Array.from({ length: size(space) }, (_, i) => {
+    const [low, high] = bounds(space, i);
+    if (space.type !== "Box") return low ?? 0;
+    return (low ?? 0) <= 0 && (high ?? 0) >= 0 ? 0 : ((low ?? 0) + (high ?? 0)) / 2;
+  });
+}

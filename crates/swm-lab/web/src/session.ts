@@ -1,0 +1,92 @@
+// A live environment: its socket, the newest frame, and what the server says about it.
+
+export interface Header {
+  number: number;
+  step: number;
+  reward: number;
+  total: number;
+  success: boolean;
+  terminated: boolean;
+  truncated: boolean;
+  playing: boolean;
+  recorded: number | null;
+  state: number[];
+}
+
+export interface Started {
+  seed: number;
+  factors: Record<string, number[]>;
+  command: string;
+}
+
+export interface Recording {
+  dataset: string | null;
+  episodes: number;
+  rows: number;
+  complete: boolean;
+}
+
+export interface Events {
+  frame: (header: Header, image: ImageBitmap) => void;
+  started: (started: Started) => void;
+  recording: (recording: Recording) => void;
+  failed: (message: string) => void;
+  closed: () => void;
+}
+
+export type Send = (type: string, fields?: Record<string, unknown>) => void;
+
+export interface Session {
+  send: Send;
+  close: () => void;
+}
+
+export function connect(env: string, image: number, events: Events): Session {
+  const url = new URL("api/live", location.href);
+  url.protocol = url.protocol.replace("http", "ws");
+  url.hash = "";
+  url.search = new URLSearchParams({ env, image: String(image) }).toString();
+  const socket = new WebSocket(url);
+  socket.binaryType = "arraybuffer";
+  let isOpen = true;
+  const waiting: string[] = [];
+  const send: Send = (type, fields = {}) => {
+    const text = JSON.stringify({ type, ...fields });
+    if (socket.readyState === WebSocket.OPEN) socket.send(text);
+    else if (socket.readyState === WebSocket.CONNECTING) waiting.push(text);
+  };
+  socket.onopen = () => waiting.splice(0).forEach((text) => socket.send(text));
+  socket.onclose = () => {
+    if (isOpen) events.closed();
+  };
+  const show = async (data: ArrayBuffer) => {
+    const size = new DataView(data).getUint32(0, true);
+    const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, size))) as Header;
+    const image = await createImageBitmap(new Blob([new Uint8Array(data, 4 + size)], { type: "image/jpeg" }));
+    // The server sends another frame when this one is on its way to the screen.
+    requestAnimationFrame(() => {
+      if (isOpen) {
+        events.frame(header, image);
+        send("shown");
+      }
+      image.close();
+    });
+  };
+  socket.onmessage = (message) => {
+    if (typeof message.data !== "string") {
+      void show(message.data);
+      return;
+    }
+    const reply = JSON.parse(message.data);
+    if (reply.type === "started") events.started(reply);
+    else if (reply.type === "recording") events.recording(reply);
+    else if (reply.type === "failed") events.failed(reply.message);
+  };
+  return {
+    send,
+    close: () => {
+      isOpen = false;
+      socket.close();
+    },
+  };
+}

@@ -1,0 +1,47 @@
+//! `swm frame`: the first frame of an episode as PNG.
+
+use super::config::{VariationArgs, image_size};
+use super::{emit, emit_json, output_folder};
+use clap::Args;
+use serde_json::json;
+use std::path::PathBuf;
+use swm_core::{Origin, files};
+use swm_data::check_png;
+use swm_lab::still::Still;
+
+/// Arguments of `swm frame`.
+#[derive(Args)]
+pub struct FrameArgs {
+    /// The environment, such as swm/TwoRoom-v1 or swm/OGBCube-v0,env_type=double
+    env: String,
+    /// Seed of the reset, such as the episode_seed of a dataset
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Frame size in pixels: 64 or HEIGHTxWIDTH
+    #[arg(long, default_value = "224", value_parser = image_size)]
+    image: (usize, usize),
+    /// Show the goal instead of the initial state
+    #[arg(long)]
+    goal: bool,
+    /// The PNG file to write
+    #[arg(short, long, value_name = "FILE", default_value = "frame.png")]
+    output: PathBuf,
+    #[command(flatten)]
+    variation: VariationArgs,
+}
+
+/// Runs `swm frame`.
+pub fn frame(args: &FrameArgs, as_json: bool) -> anyhow::Result<()> {
+    let variation = args.variation.request()?;
+    let choice = crate::env(&args.env, &Origin::User)?;
+    output_folder::check_file(&args.output)?;
+    check_png(&args.output)?;
+    let still = Still { seed: args.seed, variation, goal: args.goal, size: args.image };
+    let png = still.png(&mut *choice.env()?)?;
+    files::write(&args.output, &png)?;
+    if as_json {
+        return emit_json(&json!({"file": args.output, "env": choice.id(), "seed": args.seed}));
+    }
+    emit(&format!("{}\n", args.output.display()));
+    Ok(())
+}

@@ -173,8 +173,12 @@ impl Keypoints {
             stride: sizes.stride,
             weight: host(filter.weight.val()),
         });
-        let kernels = swm_kernels::Keypoints::new(side, self.config.sharpness, &banks.collect::<Vec<_>>());
-        KeypointKernels { pixels: side * side * 3, kernels }
+        let banks: Vec<FilterBank> = banks.collect();
+        let mut content =
+            serde_json::to_vec(&(&self.config.filters, self.config.sharpness)).expect("a configuration serializes");
+        banks.iter().for_each(|bank| content.extend_from_slice(bytemuck::cast_slice(&bank.weight)));
+        let kernels = swm_kernels::Keypoints::new(side, self.config.sharpness, &banks);
+        KeypointKernels { pixels: side * side * 3, kernels, hash: swm_core::manifest::hash(&content) }
     }
 }
 
@@ -193,9 +197,15 @@ fn norm_name(name: &str) -> String {
 pub struct KeypointKernels {
     pixels: usize,
     kernels: swm_kernels::Keypoints,
+    hash: String,
 }
 
 impl KeypointKernels {
+    /// The hash of the filters and their settings.
+    pub fn hash(&self) -> &str {
+        &self.hash
+    }
+
     /// The number of features of an image.
     pub fn count(&self) -> usize {
         self.kernels.features()

@@ -2,11 +2,11 @@
 
 use crate::nn::keypoints::KeypointKernels;
 use crate::pixels::{self, ImageNormalization};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use swm_core::run::{Control, Event, Progress, Stage};
 use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema, columns::PIXELS};
-use swm_data::{Constants, Episode, Irregularity, Reader, StepRange};
+use swm_data::{CacheConfig, Constants, Episode, Irregularity, Reader, StepRange};
 
 /// The stage in the events of a run.
 const STAGE: &str = "encode";
@@ -23,50 +23,52 @@ pub struct FixedPart {
     pub images: ImageNormalization,
 }
 
-/// A reader whose column of frames holds features, `[1, features]`, of the type float32.
+/// A reader whose column of frames holds features, `[1, features]`, of the type float32. Each read encodes the frames.
 pub(crate) struct FixedFeatures {
     inner: Arc<dyn Reader>,
     schema: Schema,
-    /// The first row of each episode.
-    first_rows: Vec<usize>,
-    /// The features of a row.
-    width: usize,
-    features: Vec<f32>,
+    part: FixedPart,
 }
 
 impl FixedFeatures {
-    /// Encodes the frames of a dataset. Returns the reader unchanged if `part` is `None` or the features of the dataset are
-    /// larger than 6 GiB.
+    /// Encodes the frames of a dataset, into files in `folder`, where later runs find them, or in memory. Returns the reader
+    /// unchanged if `part` is `None`, or the features are larger than 6 GiB and there is no folder.
     ///
     /// # Errors
-    /// When reading fails, or `control` stops the run.
-    pub fn of(reader: Arc<dyn Reader>, part: Option<FixedPart>, control: &mut Control<'_>) -> Result<Arc<dyn Reader>> {
-        let Some(FixedPart { kernels, images }) = part else { return Ok(reader) };
-        let (width, mut first_rows, mut rows) = (kernels.count(), vec![], 0);
-        for episode in reader.episodes() {
-            first_rows.push(rows);
-            rows += episode.length;
-        }
-        if (rows * width * size_of::<f32>()) as u64 > MOST_BYTES {
-            return Ok(reader);
-        }
-        control.emit(Event::Started(Stage { name: STAGE, subject: &[], total: rows, unit: "frames" }));
-        let mut features = Vec::with_capacity(rows * width);
-        for ranges in blocks(reader.episodes()) {
-            control.check()?;
-            let batch = reader.read(&[PIXELS], &ranges)?;
-            let pixels = pixels::normalised(&images, 1, batch.get::<u8>(PIXELS)?)?;
-            features.extend(kernels.features(&pixels));
-            let done = features.len() / width;
-            control.progress(Progress { stage: STAGE, done, total: rows, unit: "frames", metrics: &[] });
-        }
-        control.emit(Event::Finished { stage: STAGE, metrics: &[] });
+    /// When reading fails, the folder cannot be written, or `control` stops the run.
+    pub fn of(
+        reader: Arc<dyn Reader>,
+        part: Option<FixedPart>,
+        folder: Option<&Path>,
+        control: &mut Control<'_>,
+    ) -> Result<Arc<dyn Reader>> {
+        let Some(part) = part else { return Ok(reader) };
+        let width = part.kernels.count();
+        let rows: usize = reader.episodes().iter().map(|episode| episode.length).sum();
+        let bytes = rows * width * size_of::<f32>();
+        let cache = match folder {
+            Some(folder) => CacheConfig::Disk { folder: folder.to_owned(), bytes },
+            None if bytes as u64 <= MOST_BYTES => CacheConfig::Memory { bytes },
+            None => return Ok(reader),
+        };
         let column = |column: &ColumnSpec| match column.name.as_str() {
             PIXELS => ColumnSpec::new(PIXELS, DType::Float32, [1, width]),
             _ => column.clone(),
         };
         let schema = Schema::new(reader.schema().columns().iter().map(column).collect::<Vec<_>>())?;
-        Ok(Arc::new(Self { inner: reader, schema, first_rows, width, features }))
+        let features = cache.over(Arc::new(Self { inner: reader, schema, part }), &[PIXELS])?;
+        control.emit(Event::Started(Stage { name: STAGE, subject: &[], total: rows, unit: "frames" }));
+        let (mut row, mut done) = (vec![], 0);
+        for ranges in blocks(features.episodes()) {
+            control.check()?;
+            let count: usize = ranges.iter().map(|range| range.length).sum();
+            row.resize(count * width * size_of::<f32>(), 0);
+            features.read_column(PIXELS, &ranges, &mut row)?;
+            done += count;
+            control.progress(Progress { stage: STAGE, done, total: rows, unit: "frames", metrics: &[] });
+        }
+        control.emit(Event::Finished { stage: STAGE, metrics: &[] });
+        Ok(features)
     }
 }
 
@@ -103,28 +105,15 @@ impl Reader for FixedFeatures {
         if column != PIXELS {
             return self.inner.read_column(column, ranges, out);
         }
-        let bytes: &[u8] = bytemuck::cast_slice(&self.features);
-        let row = self.width * size_of::<f32>();
-        let exists = |range: &StepRange| {
-            let end = range.start.checked_add(range.length);
-            let episode = self.episodes().get(range.episode);
-            end.zip(episode).is_some_and(|(end, episode)| end <= episode.length)
-        };
-        if !ranges.iter().all(exists) || out.len() != ranges.iter().map(|range| range.length).sum::<usize>() * row {
-            let given = format!("{ranges:?} for {} bytes", out.len());
-            return Err(Error::mismatch(
-                "reading the features of frames",
-                given,
-                "rows of the dataset, and their bytes",
-            ));
+        let FixedPart { kernels, images } = &self.part;
+        let frames = self.inner.read(&[PIXELS], ranges)?;
+        let features = kernels.features(&pixels::normalised(images, 1, frames.get::<u8>(PIXELS)?)?);
+        let bytes: &[u8] = bytemuck::cast_slice(&features);
+        if out.len() != bytes.len() {
+            let (given, expected) = (format!("{} bytes", out.len()), format!("{} bytes", bytes.len()));
+            return Err(Error::mismatch("reading the features of frames", given, expected));
         }
-        let mut out = out;
-        for range in ranges {
-            let first = (self.first_rows[range.episode] + range.start) * row;
-            let (slot, rest) = out.split_at_mut(range.length * row);
-            slot.copy_from_slice(&bytes[first..first + range.length * row]);
-            out = rest;
-        }
+        out.copy_from_slice(bytes);
         Ok(())
     }
 
@@ -152,7 +141,11 @@ impl Reader for FixedFeatures {
         self.inner.footprint()
     }
 
+    /// The hash of the frames and of what encodes them.
     fn content_hash(&self) -> Result<String> {
-        self.inner.content_hash()
+        let FixedPart { kernels, images } = &self.part;
+        let ImageNormalization { side, mean, std } = images;
+        let content = (self.inner.content_hash()?, kernels.hash(), side, mean, std);
+        Ok(swm_core::manifest::hash(&serde_json::to_vec(&content).expect("numbers and text serialize")))
     }
 }

@@ -21,12 +21,16 @@ pub struct TrainOptions {
     pub prefetch: usize,
     /// The folder in which downloaded pretrained weights are cached.
     pub cache: PathBuf,
+    /// The folder in which the features of frames by a part of an encoder that is not trained are kept for later runs;
+    /// `None` keeps them in memory.
+    pub feature_cache: Option<PathBuf>,
 }
 
 impl Default for TrainOptions {
     fn default() -> Self {
         let cache = std::env::temp_dir().join("swm-weights");
-        Self { resume: false, device: Device::flex(), threads: 0, loader_threads: 1, prefetch: 4, cache }
+        let device = Device::flex();
+        Self { resume: false, device, threads: 0, loader_threads: 1, prefetch: 4, cache, feature_cache: None }
     }
 }
 

@@ -51,7 +51,7 @@ pub fn train<M: Trainable>(
         let _lock = Lock::folder(out)?;
         let (mut learner, loader) = inputs.learner(config, out, options)?;
         let part = learner.model().fixed_part(&config.model);
-        let reader = FixedFeatures::of(reader, part, control)?;
+        let reader = FixedFeatures::of(reader, part, options.feature_cache.as_deref(), control)?;
         let run = Run::new(config.loop_config(), loader, &reader, out, options, &mut learner)?;
         run.run_steps(M::FAMILY, control)
     })

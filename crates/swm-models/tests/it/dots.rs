@@ -1,5 +1,6 @@
 //! A dataset in memory: images of 16 x 16 pixels with a dot that the actions move.
 
+use std::sync::atomic::{AtomicUsize, Ordering};
 use swm_core::{Batch, ColumnSpec, DType, Error, Key, Manifest, Result, Schema};
 use swm_data::{Episode, Reader, StepRange};
 
@@ -11,6 +12,8 @@ pub struct Dots {
     rows: Batch,
     episodes: Vec<Episode>,
     seed: u64,
+    /// The frames that were read so far.
+    pub frames_read: AtomicUsize,
 }
 
 impl Dots {
@@ -37,7 +40,7 @@ impl Dots {
             }
         }
         let episodes = (0..episodes).map(|i| Episode { index: i as i64, length: LENGTH }).collect();
-        Self { rows, episodes, seed }
+        Self { rows, episodes, seed, frames_read: AtomicUsize::new(0) }
     }
 }
 
@@ -67,6 +70,7 @@ impl Reader for Dots {
             let (first, bytes) = (range.episode * LENGTH + range.start, range.length * n);
             out[at..at + bytes].copy_from_slice(&self.rows.bytes(index)[first * n..][..bytes]);
             at += bytes;
+            self.frames_read.fetch_add(if index == 0 { range.length } else { 0 }, Ordering::Relaxed);
         }
         Ok(())
     }

@@ -159,6 +159,30 @@ fn fixed_filters_are_not_trained_and_give_the_same_latents_from_frames_as_in_tra
 }
 
 #[test]
+fn later_runs_find_the_features_of_fixed_filters_in_a_folder() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let mut config = keypoints_config();
+    if let EncoderConfig::Keypoints(keypoints) = &mut config.model.encoder {
+        // Rows of 100 * 3 numbers are large enough for files.
+        keypoints.filters = vec![FilterConfig { kernel: 3, stride: 4, channels: 100 }];
+    }
+    let run = |name: &str, feature_cache: Option<&Path>, config: &TrainConfig<Lewm>| {
+        let options = TrainOptions { feature_cache: feature_cache.map(Path::to_owned), ..TrainOptions::default() };
+        let (out, dots) = (folder.path().join(name), Arc::new(Dots::new(6, 0)));
+        train(config, Arc::<Dots>::clone(&dots), &out, &options, &mut stop_after(0)).expect("training the model");
+        (files(&out), dots.frames_read.load(Ordering::Relaxed))
+    };
+    let cache = folder.path().join("cache");
+    let (in_memory, frames) = run("memory", None, &config);
+    assert_eq!(frames, 6 * 24);
+    assert_eq!(run("first", Some(&cache), &config), (in_memory.clone(), frames));
+    assert_eq!(run("second", Some(&cache), &config), (in_memory, 0));
+    // Other filters are other features.
+    config.seed = 1;
+    assert_eq!(run("other filters", Some(&cache), &config).1, frames);
+}
+
+#[test]
 fn decoder_without_fixed_filters_is_refused() {
     let mut config = conv_config();
     config.model.decoder = keypoints_config().model.decoder;

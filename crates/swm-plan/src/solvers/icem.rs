@@ -6,7 +6,9 @@
 //! and by momentum on both moments. Candidates are `[envs, samples, horizon, dim]` and clipped to the bounds. The
 //! defaults are those of the reference (`solver/icem.py`); the paper gives none.
 //!
-//! The actions of an action block are dimensions of one step, with independent noise, as in the reference.
+//! The actions of an action block are dimensions of one step, with independent noise, as in the reference, unless `block`
+//! says how many there are: then the noise is coloured from action to action. A block of five independent actions moves
+//! on average by 1/√5 of what a block of equal actions does, and demonstrations of Push-T change direction slowly.
 //!
 //! The stable-worldmodel paper omits three features of the original publication, and so does this solver: a population
 //! that shrinks from iteration to iteration, elites that are reused after a replan, and executing the best action ever
@@ -52,6 +54,9 @@ pub struct ICem {
     pub sigma: f32,
     /// The exponent of the noise's spectrum, β: 0 is white, 1 pink, 2 red.
     pub beta: f32,
+    /// The number of actions in a model step, the action block, from one to the next of which the noise is coloured; 1
+    /// draws the actions of a step independently, as the reference does.
+    pub block: usize,
     /// The weight of the previous distribution, α.
     pub momentum: f32,
     /// The number of elites that are also candidates of the next iteration.
@@ -60,7 +65,7 @@ pub struct ICem {
 
 impl Default for ICem {
     fn default() -> Self {
-        Self { samples: 300, iterations: 30, elites: 30, sigma: 1.0, beta: 2.0, momentum: 0.1, keep: 5 }
+        Self { samples: 300, iterations: 30, elites: 30, sigma: 1.0, beta: 2.0, block: 1, momentum: 0.1, keep: 5 }
     }
 }
 
@@ -68,7 +73,12 @@ impl Solver for ICem {
     fn solve(&mut self, cost: &mut dyn CostModel, problem: PlanProblem<'_>) -> Result<Plan> {
         self.check()?;
         let bounds = continuous(&ENTRY, cost, &problem)?;
-        let colour = ColouredNoise::new(self.beta, problem.horizon);
+        let dim = problem.space.dim();
+        let block = format!("{} of {dim} numbers in a model step", self.block);
+        let fix = "give the action block of the model, or 1";
+        Settings(ID).check(dim.is_multiple_of(self.block), "block", block, fix)?;
+        // `[horizon, block * action]` is `[horizon * block, action]`.
+        let colour = ColouredNoise::new(self.beta, problem.horizon * self.block);
         let mut gaussians = Gaussian::initial(&problem, bounds, self.sigma);
         let mut population = Population::new(ID, &problem, self.samples)?;
         let mut kept = vec![vec![]; gaussians.len()];
@@ -97,6 +107,7 @@ impl Solver for ICem {
         settings.elites(self.elites, 2, self.samples)?;
         settings.positive("sigma", self.sigma)?;
         settings.not_negative("beta", self.beta)?;
+        settings.at_least_one("block", self.block)?;
         settings.momentum("momentum", self.momentum)?;
         // The first candidate is always the mean, so at most `samples - 1` elites can be kept.
         settings.at_most(

@@ -103,6 +103,24 @@ fn no_environments_give_no_plans() {
 }
 
 #[test]
+fn noise_of_an_action_block_is_that_of_its_actions_as_steps() {
+    static STEPS: Toy = Toy {
+        name: "the quadratic toy, a step for each number",
+        horizon: 6,
+        space: PlanSpace::Continuous { low: &[f32::NEG_INFINITY; 1], high: &[f32::INFINITY; 1] },
+        latent: false,
+        constrained: false,
+        landscape: |env| (toy("quadratic").landscape)(env),
+    };
+    let plan = |toy: &'static Toy, settings| {
+        solve(&mut *make("icem", &settings), &mut Model::new(toy, &[0, 1]), toy, &[0, 1]).expect("planning").actions
+    };
+    let blocks = plan(toy("quadratic"), json!({ "iterations": 3, "block": 2 }));
+    assert_eq!(blocks, plan(&STEPS, json!({ "iterations": 3 })));
+    assert_ne!(blocks, plan(toy("quadratic"), json!({ "iterations": 3 })));
+}
+
+#[test]
 fn errors_name_invalid_settings() {
     let wrong = [
         ("predictive_sampling", json!({"samples": 0}), "predictive_sampling samples: 0"),
@@ -117,6 +135,8 @@ fn errors_name_invalid_settings() {
         ("icem", json!({"momentum": 1.5}), "icem momentum: 1.5; choose a number of at least 0 and below 1"),
         ("icem", json!({"momentum": -0.1}), "icem momentum"),
         ("icem", json!({"beta": -1}), "icem beta"),
+        ("icem", json!({"block": 0}), "icem block: 0; choose at least 1"),
+        ("icem", json!({"block": 5}), "icem block: 5 of 2 numbers in a model step; give the action block"),
         ("icem", json!({"keep": 31}), "icem keep: 31; choose at most 30"),
         ("icem", json!({"samples": 5, "elites": 5, "keep": 5}), "choose at most 4"),
         ("mppi", json!({"temperature": 0}), "mppi temperature: 0; choose a finite number above 0"),

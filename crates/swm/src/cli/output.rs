@@ -4,7 +4,7 @@
 //! standard output that fails is remembered; the command finishes its work and then exits with an error, because its
 //! output is lost. A closed pipe is not an error: `swm envs | head` has all that it needs.
 
-use comfy_table::{Attribute, Cell, Color};
+use comfy_table::{Attribute, Cell, Color, ColumnConstraint, Width};
 use std::borrow::Cow;
 use std::fmt::Write as _;
 use std::hash::{BuildHasher as _, Hasher as _, RandomState};
@@ -92,8 +92,33 @@ fn escaped_json(json: &str) -> Cow<'_, str> {
     Cow::Owned(escaped)
 }
 
+/// The most characters of a word that keep a column of a table wide; longer words are broken.
+const LONGEST_WORD: usize = 24;
+
+/// Returns the width of the longest word of each column.
+fn longest_words(header: &[&str], rows: &[Vec<String>]) -> Vec<usize> {
+    let longest = |text: &str| text.split_whitespace().map(|word| word.chars().count()).max().unwrap_or(0);
+    let column = |(index, name): (usize, &&str)| {
+        let cells = rows.iter().filter_map(|row| row.get(index)).map(|cell| longest(&printable(cell)));
+        cells.chain([longest(name)]).max().unwrap_or(0)
+    };
+    header.iter().enumerate().map(column).collect()
+}
+
+/// Keeps words whole, where the terminal is wide enough for the words of all columns.
+fn keep_words(table: &mut comfy_table::Table, words: &[usize]) {
+    // A space on both sides of a cell.
+    let widths: Vec<usize> = words.iter().map(|width| width.min(&LONGEST_WORD) + 2).collect();
+    if table.width().is_some_and(|width| widths.iter().sum::<usize>() <= usize::from(width)) {
+        for (column, width) in table.column_iter_mut().zip(widths) {
+            column.set_constraint(ColumnConstraint::LowerBoundary(Width::Fixed(width as u16)));
+        }
+    }
+}
+
 /// Formats rows as a table with a header.
 pub fn table(header: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> String {
+    let rows: Vec<Vec<String>> = rows.into_iter().collect();
     let mut table = comfy_table::Table::new();
     table.load_preset(comfy_table::presets::NOTHING);
     table.set_style(comfy_table::TableComponent::HeaderLines, '─');
@@ -102,7 +127,7 @@ pub fn table(header: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> St
     let coloured = is_coloured(&std::io::stdout());
     let bold = |cell: Cell| if coloured { cell.add_attribute(Attribute::Bold) } else { cell };
     table.set_header(header.iter().map(|name| bold(Cell::new(name))));
-    for row in rows {
+    for row in &rows {
         // Escaped here and not in the finished table, so that columns have the widths of the escaped cells.
         table.add_row(row.iter().map(|cell| {
             let shown = Cell::new(printable(cell));
@@ -113,6 +138,7 @@ pub fn table(header: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> St
             }
         }));
     }
+    keep_words(&mut table, &longest_words(header, &rows));
     // All cells are escaped, so that every escape character is one of the table.
     format!("{table}\n").replace('\x1b', escape())
 }
@@ -137,6 +163,22 @@ fn emphasis(cell: &str) -> Option<Emphasis> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn narrow_tables_break_lines_between_words() {
+        let (header, row) =
+            (["solver", "method"], ["predictive_sampling", "tries many guesses once"].map(str::to_owned));
+        let mut table = comfy_table::Table::new();
+        table.load_preset(comfy_table::presets::NOTHING).set_header(header);
+        table.set_content_arrangement(comfy_table::ContentArrangement::Dynamic).set_width(32).add_row(&row);
+        keep_words(&mut table, &longest_words(&header, &[row.to_vec()]));
+        let shown = table.to_string();
+        assert!(shown.contains("predictive_sampling") && shown.lines().all(|line| line.len() <= 32), "{shown}");
+        // Too narrow for all words.
+        table.set_width(20);
+        keep_words(&mut table, &longest_words(&header, &[row.to_vec()]));
+        assert!(table.to_string().lines().all(|line| line.len() <= 32), "{table}");
+    }
 
     #[test]
     fn tables_of_pipes_have_no_colours() {

@@ -26,7 +26,7 @@ pub struct TrainArgs {
     ///
     /// A name that `swm recipes` lists, or a TOML file. Finished steps are not repeated. Settings are STEP.OPTION=VALUE.
     #[arg(long, value_name = "RECIPE", requires = "output")]
-    #[arg(conflicts_with_all = ["data", "preset", "env", "encoder", "device", "resume", "print_config"])]
+    #[arg(conflicts_with_all = ["data", "preset", "env", "encoder", "device", "feature_cache", "resume", "print_config"])]
     pub(super) recipe: Option<String>,
     /// Allow a recipe from a file to choose any name
     #[arg(long, requires = "recipe")]
@@ -52,6 +52,12 @@ pub struct TrainArgs {
     /// Device: cpu, vulkan[:I], cuda[:I] or auto
     #[arg(long, default_value = "cpu")]
     device: String,
+    /// Folder that keeps the features of fixed filters for later runs
+    ///
+    /// Encoders such as keypoints have a part that is not trained. Its features of a dataset are computed once, at the
+    /// start; with this folder, the next run on the dataset finds them. Several runs may share it.
+    #[arg(long, value_name = "FOLDER", conflicts_with = "env")]
+    feature_cache: Option<PathBuf>,
     /// Continue an interrupted run; with --output alone, as it was started
     #[arg(long)]
     pub(super) resume: bool,
@@ -105,6 +111,7 @@ pub fn run_args(args: &TrainArgs, context: &Context) -> anyhow::Result<(PathBuf,
         device: device::parse(&args.device)?,
         threads: context.threads,
         cache: home::weights()?,
+        feature_cache: args.feature_cache.clone(),
         ..TrainOptions::default()
     };
     // clap drops the requirement of --env when --data excludes it.

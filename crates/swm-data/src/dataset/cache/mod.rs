@@ -19,6 +19,9 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, OnceLock};
 use swm_core::{Manifest, Result, Schema};
 
+/// The bytes from which a row is cached on its own.
+const LARGE_ROW: usize = 1 << 10;
+
 /// Storage and size limit of a cache of decoded rows.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum CacheConfig {
@@ -30,8 +33,8 @@ pub enum CacheConfig {
         /// Maximum size in bytes.
         bytes: usize,
     },
-    /// Images are cached in files, in a subfolder named after the dataset's content hash; columns without images, which
-    /// are small, are cached in memory. If several processes use the same files, one process fills them and all
+    /// Columns of images, and others with rows of at least 1 KiB, are cached in files, in a subfolder named after the
+    /// dataset's content hash; columns with smaller rows are cached in memory. If several processes use the same files, one process fills them and all
     /// processes read them.
     Disk {
         /// The folder; several datasets may share it.
@@ -61,9 +64,9 @@ impl CacheConfig {
             let index = reader.schema().index(name)?;
             let spec = &reader.schema().columns()[index];
             caches[index] = match self {
-                // Columns without images are cached as a whole if they fit into the budget, because caching their small
-                // rows one by one costs more than reading them.
-                _ if !spec.is_image() => match budget.take(rows.saturating_mul(spec.row_bytes())) {
+                // Columns with small rows are cached as a whole if they fit into the budget, because caching their rows
+                // one by one costs more than reading them.
+                _ if !spec.is_image() && spec.row_bytes() < LARGE_ROW => match budget.take(rows.saturating_mul(spec.row_bytes())) {
                     true => ColumnCache::Whole(OnceLock::new(), Mutex::default()),
                     false => ColumnCache::Uncached,
                 },

@@ -16,7 +16,7 @@ use swm_eval::{World, WorldConfig};
 use tokio::sync::{mpsc, watch};
 
 /// The quality of frames.
-const QUALITY: u8 = 88;
+const QUALITY: u8 = 92;
 /// Elements of a state that the page receives.
 const MOST_STATE: usize = 32;
 /// Steps a second before the page chooses.

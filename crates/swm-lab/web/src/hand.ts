@@ -1,5 +1,6 @@
 // How a person drives an environment: the pointer on Push-T, arrow keys elsewhere, sliders and buttons for any action.
 
+import { useEffect, useRef } from "preact/hooks";
 import type { Space } from "./api";
 import { bounds, size } from "./variation";
 
@@ -47,4 +48,27 @@ export function atRest(space: Space): number[] {
     if (space.type !== "Box") return low ?? 0;
     return (low ?? 0) <= 0 && (high ?? 0) >= 0 ? 0 : ((low ?? 0) + (high ?? 0)) / 2;
   });
+}
+
+// Calls `changed` when an arrow key is pressed or released outside of fields.
+export function useArrows(changed: (key: string, down: boolean) => void): void {
+  const current = useRef(changed);
+  current.current = changed;
+  useEffect(() => {
+    const handle = (event: KeyboardEvent) => {
+      if (!isArrow(event.key) || event.repeat) {
+        if (isArrow(event.key) && !(event.target as HTMLElement).closest("input, select")) event.preventDefault();
+        return;
+      }
+      if (event.type === "keydown" && (event.target as HTMLElement).closest("input, select, textarea, dialog")) return;
+      event.preventDefault();
+      current.current(event.key, event.type === "keydown");
+    };
+    addEventListener("keydown", handle);
+    addEventListener("keyup", handle);
+    return () => {
+      removeEventListener("keydown", handle);
+      removeEventListener("keyup", handle);
+    };
+  }, []);
 }

@@ -6,6 +6,7 @@ import { RunsPage } from "./runs";
 import { useKeys, usePlace, useTheme } from "./state";
 import "uplot/dist/uPlot.min.css";
 import "./style.css";
+import "./pages.css";
 
 const PAGES = [
   { id: "envs", name: "Environments", Page: EnvPage },

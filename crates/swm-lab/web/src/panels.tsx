@@ -37,10 +37,9 @@ interface RecorderProps {
   recording?: Recording;
   env: string;
   send: Send;
-  onStart: () => void;
 }
 
-export function Recorder({ recording, env, send, onStart }: RecorderProps) {
+export function Recorder({ recording, env, send }: RecorderProps) {
   const [name, setName] = useState(() => `demos-${env.split("/")[1].split("-")[0].toLowerCase()}`);
   if (recording?.dataset) {
     return (
@@ -68,7 +67,6 @@ export function Recorder({ recording, env, send, onStart }: RecorderProps) {
       class="bar panel"
       onSubmit={(event) => {
         event.preventDefault();
-        onStart();
         send("record", { dataset: name });
       }}
     >

@@ -1,5 +1,6 @@
 """Tests of helpers of environments: cameras, colours, read-outs of Push-T, policies of Stable-Baselines3, Craftax's classes."""
 
+import os
 import pickle
 import sys
 from collections import namedtuple
@@ -139,11 +140,41 @@ def test_files_of_policies_are_read_as_data(trained):
     bad.write_bytes(b"\x80\x04Nr\xff\xff\xff\x7f.")
     with pytest.raises(ValueError, match="no statistics of VecNormalize"):
         SB3Normalizer(bad)
-    for content in (Hostile(), {"critic.qf0.0.weight": torch.zeros(1)}):
-        with zipfile.ZipFile(folder / "bad.zip", "w") as archive:
+    # Lists that contain the list before them twice, as the name of a type and as statistics: 2**60 numbers in 400 bytes.
+    nested = b"]q\x00K\x01a0" + b"".join(b"(h%ch%clq%c0" % (i, i, i + 1) for i in range(60)) + b"h\x3c"
+    record = b"cbuiltins\nX\n)R}"
+    statistics = record + b"X\x04\x00\x00\x00mean" + nested + b"sX\x03\x00\x00\x00varK\x01sb"
+    for content in (
+        b"cnumpy\ndtype\n" + nested + b"\x85R",
+        record + b"X\x07\x00\x00\x00obs_rms" + statistics + b"sb",
+        b"\x96\x00\x00\x00\x00\x00\x01\x00\x00x",
+    ):
+        bad.write_bytes(b"\x80\x05" + content + b".")
+        with pytest.raises(ValueError, match="no statistics of VecNormalize"):
+            SB3Normalizer(bad)
+    os.mkfifo(folder / "pipe")
+    with pytest.raises(ValueError, match="not a regular file"):
+        SB3Normalizer(folder / "pipe")
+    with open(folder / "large", "wb") as file:
+        file.truncate(1 << 30)
+    with pytest.raises(ValueError, match="16777216 bytes"):
+        SB3Normalizer(folder / "large")
+    layer = {"bias": torch.zeros(1), "weight": torch.zeros(1, 1)}
+    actor = {f"actor.{name}.{part}": layer[part] for name in ("latent_pi.0", "mu", "log_std") for part in layer}
+    repeated = actor | {"actor.latent_pi.0.weight": torch.zeros(1).expand(1 << 16, 1 << 16)}
+    for content, data in (
+        (Hostile(), "{}"),
+        ({"critic.qf0.0.weight": torch.zeros(1)}, "{}"),
+        (repeated, "{}"),
+        ({**actor, "actor.mu.bias": 1}, "{}"),
+        (actor, "[]"),
+        (actor, '{"policy_kwargs": [1]}'),
+        (actor, " " * (64 << 20) + "{}"),
+    ):
+        with zipfile.ZipFile(folder / "bad.zip", "w", zipfile.ZIP_DEFLATED) as archive:
             with archive.open("policy.pth", "w") as file:
                 torch.save(content, file)
-            archive.writestr("data", "{}")
+            archive.writestr("data", data)
         with pytest.raises(ValueError, match="SAC"):
             ExpertPolicy(folder / "bad.zip", folder / "normalize.pkl")
     with pytest.raises(ValueError, match="no model of Stable-Baselines3"):

@@ -10,6 +10,7 @@ import json
 import os
 import pickle
 import re
+import struct
 import zipfile
 from typing import Any
 
@@ -18,6 +19,11 @@ import numpy as np
 from ...policy import BasePolicy
 
 __all__ = ["ExpertPolicy", "SB3Normalizer"]
+
+#: The largest file of statistics, in bytes.
+_MOST_STATISTICS = 16 << 20
+#: The largest settings of a model, in bytes.
+_MOST_SETTINGS = 64 << 20
 
 #: The activations of the hidden layers that are known.
 _ACTIVATIONS = ("ELU", "GELU", "LeakyReLU", "ReLU", "SiLU", "Tanh")
@@ -40,7 +46,10 @@ class _Number:
     """
 
     def __init__(self, code: Any, *args: Any) -> None:
-        self.code, self.order = str(code), "="
+        # Nested lists of a small file can have a text that fills the memory.
+        if not isinstance(code, str):
+            raise pickle.UnpicklingError("a data type without a name")
+        self.code, self.order = code, "="
 
     def __setstate__(self, state: Any) -> None:
         self.order = {"<": "<", ">": ">"}.get(state[1], "=")
@@ -76,8 +85,33 @@ for _core in ("numpy.core", "numpy._core"):
 
 # The unpickler in Python keeps its memo in a dictionary; the one in C reserves memory for an index that a file states.
 class _Unpickler(pickle._Unpickler):
+    dispatch = dict(pickle._Unpickler.dispatch)  # type: ignore[attr-defined]
+
     def find_class(self, module: str, name: str) -> Any:
         return _READERS.get((module, name), _Record)
+
+    def load_bytearray8(self) -> None:
+        # The one of Python reserves the bytes that the file states.
+        (length,) = struct.unpack("<Q", self.read(8))
+        self.append(bytearray(self.read(min(length, _MOST_STATISTICS))))
+
+    dispatch[pickle.BYTEARRAY8[0]] = load_bytearray8
+
+
+def _check_file(path: str | os.PathLike[str], most: int | None = None) -> None:
+    """Refuses pipes, devices and, with `most`, larger files."""
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise ValueError(f"{os.fspath(path)}: it is not a regular file; give a file")
+    if most is not None and os.path.getsize(path) > most:
+        raise ValueError(f"{os.fspath(path)}: it has more than {most} bytes, and statistics have fewer; give another file")
+
+
+def _values(statistic: Any) -> np.ndarray:
+    """The values of an array or a number."""
+    value = getattr(statistic, "value", statistic)
+    if not isinstance(value, np.ndarray | np.generic | int | float):
+        raise TypeError(f"{type(value).__name__} instead of an array")
+    return np.array(value, np.float64)
 
 
 class SB3Normalizer:
@@ -93,11 +127,11 @@ class SB3Normalizer:
     """
 
     def __init__(self, stats_path: str | os.PathLike[str], clip_obs: float = 10.0, epsilon: float = 1e-8) -> None:
+        _check_file(stats_path, _MOST_STATISTICS)
         try:
             with open(stats_path, "rb") as file:
                 statistics = _Unpickler(file).load().obs_rms
-            found = (getattr(statistics, name) for name in ("mean", "var"))
-            self.mean, self.var = (np.array(getattr(x, "value", x), np.float64) for x in found)
+            self.mean, self.var = (_values(getattr(statistics, name)) for name in ("mean", "var"))
             if self.mean.size == 0 or self.mean.shape != self.var.shape:
                 raise ValueError(f"a mean of shape {self.mean.shape} and a variance of shape {self.var.shape}")
         except OSError:
@@ -105,7 +139,7 @@ class SB3Normalizer:
         # Damaged and hostile files raise anything.
         except Exception as error:
             raise ValueError(
-                f"{stats_path}: it holds no statistics of VecNormalize ({error}); save them with its save"
+                f"{stats_path}: it holds no statistics of VecNormalize ({error!s:.200}); save them with its save"
             ) from error
         self.clip_obs, self.epsilon = clip_obs, epsilon
 
@@ -177,21 +211,35 @@ def _policy(path: str | os.PathLike[str]) -> Any:
     import torch
     from torch import nn
 
+    _check_file(path)
     try:
         with zipfile.ZipFile(path) as archive, archive.open("policy.pth") as file:
+            stored = archive.getinfo("policy.pth").file_size
+            if archive.getinfo("data").file_size > _MOST_SETTINGS:
+                raise ValueError(f"its settings have more than {_MOST_SETTINGS} bytes")
+            if stored > max(8 * os.path.getsize(path), _MOST_SETTINGS):
+                raise ValueError("its weights are more than 8 times larger than the file")
             weights = torch.load(file, map_location="cpu", weights_only=True)
             settings = json.loads(archive.read("data"))
     except OSError:
         raise
     except Exception as error:
-        raise ValueError(f"{path}: it is no model of Stable-Baselines3 ({error}); save one with SAC.save") from error
+        raise ValueError(f"{path}: it is no model of Stable-Baselines3 ({error!s:.200}); save one with SAC.save") from error
+    kwargs = (settings.get("policy_kwargs") or {}) if isinstance(settings, dict) else None
+    if not isinstance(weights, dict) or not isinstance(kwargs, dict):
+        raise ValueError(f"{path}: it is no model of Stable-Baselines3; save one with SAC.save")
     found = {name.removeprefix("actor."): value for name, value in weights.items() if name.startswith("actor.")}
+    if not all(isinstance(value, torch.Tensor) for value in found.values()):
+        raise ValueError(f"{path}: its weights are no tensors; save a model with SAC.save")
+    # A tensor may repeat an element of the file any number of times.
+    if sum(value.numel() * value.element_size() for value in found.values()) > stored:
+        raise ValueError(f"{path}: its weights are larger than the file; save a model with SAC.save")
     hidden = sorted(
         {int(name.split(".")[1]) for name in found if name.startswith("latent_pi.") and name.endswith(".weight")},
     )
     if not hidden or "mu.weight" not in found or "log_std.weight" not in found:
         raise ValueError(f"{path}: it holds no policy of SAC with linear layers; train one with SAC('MlpPolicy', …)")
-    activation = str((settings.get("policy_kwargs") or {}).get("activation_fn", "ReLU")).rpartition(".")[2].rstrip("'>")
+    activation = str(kwargs.get("activation_fn", "ReLU")).rpartition(".")[2].rstrip("'>")
     if activation not in _ACTIVATIONS:
         raise ValueError(f"{path}: the activation {activation!r} is unknown; expected one of {', '.join(_ACTIVATIONS)}")
     layers: list[nn.Module] = []

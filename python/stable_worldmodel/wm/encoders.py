@@ -251,14 +251,22 @@ class Keypoints(nn.Module):
         sharpness: The factor of the responses, in standard deviations over an image, before the softmax.
         hidden: Features of each hidden layer.
         dim: Features of an image.
+        seed: The seed of the filters, which the engine draws.
     """
 
     takes_frames = True
 
     def __init__(
-        self, image: int, filters: Sequence[Mapping[str, int]], sharpness: float, hidden: Sequence[int], dim: int
+        self,
+        image: int,
+        filters: Sequence[Mapping[str, int]],
+        sharpness: float,
+        hidden: Sequence[int],
+        dim: int,
+        seed: int = 0,
     ) -> None:
         super().__init__()
+        self.seed = seed
         self.sharpness, self.filters, self.strides, features = sharpness, nn.ModuleList(), [], 0
         for sizes in filters:
             bank = nn.Conv2d(3, sizes["channels"], sizes["kernel"], bias=False)

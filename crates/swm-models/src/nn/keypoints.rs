@@ -11,7 +11,7 @@ use burn::module::{Module, Param};
 use burn::tensor::{Tensor, TensorData};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use swm_core::{Error, Result};
+use swm_core::{Error, Key, Result};
 use swm_kernels::{FilterBank, KeypointScratch};
 
 /// The size of a [`Keypoints`] encoder.
@@ -26,6 +26,9 @@ pub struct KeypointsConfig {
     pub hidden: Vec<usize>,
     /// The number of output features.
     pub dim: usize,
+    /// The seed of the filters. It is not that of the training, so that runs with several seeds share the features.
+    #[serde(default)]
+    pub seed: u64,
 }
 
 /// Filters of one size.
@@ -102,10 +105,12 @@ impl KeypointsConfig {
 
     /// Creates an encoder.
     pub fn init(&self, init: &Init) -> Keypoints {
+        let key = Key::new(self.seed).with("init").with("encoder");
+        let of_filters = Init { key, ..init.clone() };
         let filters = self.filters.iter().enumerate().map(|(index, filter)| {
             let FilterConfig { kernel, channels, .. } = *filter;
             let std = 1.0 / ((3 * kernel * kernel) as f32).sqrt();
-            let weight = init.of("filters").at(index).normal("weight", [channels, 3, kernel, kernel], std);
+            let weight = of_filters.of("filters").at(index).normal("weight", [channels, 3, kernel, kernel], std);
             Filter { weight: weight.set_require_grad(false) }
         });
         let inputs: Vec<usize> = std::iter::once(self.features()).chain(self.hidden.iter().copied()).collect();

@@ -132,7 +132,7 @@ fn keypoints_config() -> TrainConfig<Lewm> {
     let filters =
         vec![FilterConfig { kernel: 3, stride: 2, channels: 5 }, FilterConfig { kernel: 5, stride: 4, channels: 3 }];
     config.model.encoder =
-        EncoderConfig::Keypoints(KeypointsConfig { filters, sharpness: 2.0, hidden: vec![12], dim: 10 });
+        EncoderConfig::Keypoints(KeypointsConfig { filters, sharpness: 2.0, hidden: vec![12], dim: 10, seed: 0 });
     config.model.decoder = Some(DecoderConfig { hidden: 9, weight: 2.0 });
     config
 }
@@ -177,8 +177,12 @@ fn later_runs_find_the_features_of_fixed_filters_in_a_folder() {
     assert_eq!(frames, 6 * 24);
     assert_eq!(run("first", Some(&cache), &config), (in_memory.clone(), frames));
     assert_eq!(run("second", Some(&cache), &config), (in_memory, 0));
-    // Other filters are other features.
+    // Another training has the same filters.
     config.seed = 1;
+    assert_eq!(run("another seed", Some(&cache), &config).1, 0);
+    if let EncoderConfig::Keypoints(keypoints) = &mut config.model.encoder {
+        keypoints.seed = 1;
+    }
     assert_eq!(run("other filters", Some(&cache), &config).1, frames);
 }
 

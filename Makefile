@@ -81,6 +81,7 @@ test-browser: build
 	@command -v $(SWM_CHROMIUM) >/dev/null || { $(SUDO) apt-get update -qq && \
 	  DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install -y -qq --no-install-recommends chromium; }
 	$(CARGO) test --release -p swm-report --test it browser -- --ignored
+	$(MAKE) lab-assets && git diff --exit-code --stat -- crates/swm-lab/assets
 	[ -e $(BROWSER_VENV)/ready ] || { python3 -m venv --clear $(BROWSER_VENV) && $(BROWSER_VENV)/bin/python -m pip install --quiet \
 	  -r crates/swm-lab/tests/browser/requirements.txt && touch $(BROWSER_VENV)/ready; }
 	cd crates/swm-lab/tests/browser && SWM=$(SWM) $(BROWSER_VENV)/bin/python -m pytest -q -p no:cacheprovider .

@@ -1,5 +1,5 @@
-//! The routes of the lab, behind [`crate::access`]. All answer to `GET`; what changes something goes through the socket of a
-//! session.
+//! The routes of the lab, behind [`crate::access`]. They answer to `GET` and change nothing, but one that saves episodes as a new
+//! dataset, by `POST`; all else that changes something goes through the socket of a session.
 
 use crate::datasets::{self, Datasets};
 use crate::session::{self, Running, Setup, messages};
@@ -10,18 +10,21 @@ use axum::body::Body;
 use axum::extract::{Path, Query, Request, State};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use axum::routing::get;
+use axum::routing::{get, post};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use sha1::{Digest as _, Sha1};
 use std::sync::Arc;
+use swm_core::run::Control;
 use swm_core::{EnvChoice, Error, Result};
 use tokio::sync::{Semaphore, watch};
 
 /// Requests that read datasets or render at the same time; others wait.
 const AT_ONCE: usize = 4;
+/// The largest body of a request, in bytes: a hundred thousand episodes.
+const MOST_BODY: usize = 1 << 20;
 /// What RFC 6455 adds to the key of a handshake.
 const HANDSHAKE: &str = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11";
 
@@ -97,6 +100,8 @@ pub fn routes(shared: Shared) -> Router {
         .route("/api/episodes", get(episodes))
         .route("/api/rows", get(rows))
         .route("/api/frame", get(frame))
+        .route("/api/doctor", get(doctor))
+        .route("/api/save", post(save))
         .route("/api/runs", get(list_runs))
         .route("/api/lines", get(lines))
         .route("/", get(|headers: HeaderMap| async move { asset("", &headers) }))
@@ -235,6 +240,27 @@ async fn frame(State(shared): State<Shared>, Query(query): Query<EntryQuery>) ->
         datasets::frame(&*reader, &query.column, query.episode, query.row)
     });
     Ok(answer("image/jpeg", jpeg.await?))
+}
+
+async fn doctor(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
+    let found =
+        shared.work(move |shared| shared.datasets.examine(query.folder, &query.name, &mut until_stopped(&shared.stop)));
+    as_json(&found.await?)
+}
+
+/// The body is JSON, and is read up to [`MOST_BODY`] only.
+async fn save(State(shared): State<Shared>, request: Request) -> Answer {
+    let body = axum::body::to_bytes(request.into_body(), MOST_BODY).await;
+    let too_long = |error| Error::config("the body", format!("{error}"), format!("send at most {MOST_BODY} bytes"));
+    let malformed = |error| Error::config("the body", format!("{error}"), "send folder, name, target and episodes");
+    let chosen = serde_json::from_slice(&body.map_err(too_long)?).map_err(malformed)?;
+    let saved = shared.work(move |shared| shared.datasets.save(chosen, &mut until_stopped(&shared.stop)));
+    as_json(&json!({"episodes": saved.await?}))
+}
+
+/// Stops work when the lab ends.
+fn until_stopped(stop: &watch::Receiver<bool>) -> Control<'_> {
+    Control::new().with_poll(|| if *stop.borrow() { Err(Error::Interrupted) } else { Ok(()) })
 }
 
 async fn list_runs(State(shared): State<Shared>) -> Answer {

@@ -1,13 +1,16 @@
 //! Datasets: their list, the table of episodes, the values of an episode's columns, and its frames.
 
-use crate::folders::Folders;
-use serde::Serialize;
+use crate::folders::{Folders, new_dataset};
+use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
+use swm_core::run::Control;
 use swm_core::{ColumnSpec, Error, Result, columns};
-use swm_data::{FORMATS, ImageCodec, Location, Reader, StepRange};
+use swm_data::doctor::{Diagnosis, examine, open_damaged};
+use swm_data::views::subset;
+use swm_data::{ConvertMode, ConvertOptions, FORMATS, ImageCodec, Location, Reader, StepRange};
 
 /// The largest number of elements of a value that is plotted.
 const MOST_ELEMENTS: usize = 64;
@@ -41,6 +44,20 @@ pub struct Episodes {
     pub returns: Vec<f64>,
     /// Whether the last observation satisfies the goal; empty if the dataset does not say.
     pub success: Vec<bool>,
+}
+
+/// Episodes of a dataset to save as another one.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Chosen {
+    /// The index of the dataset's folder.
+    pub folder: usize,
+    /// The dataset.
+    pub name: String,
+    /// The plain name of the new dataset.
+    pub target: String,
+    /// Positions of the episodes.
+    pub episodes: Vec<usize>,
 }
 
 /// Readers of datasets in some folders.
@@ -79,6 +96,33 @@ impl Datasets {
     /// When there is no such dataset, or it is damaged.
     pub fn get(&self, folder: usize, name: &str) -> Result<Arc<dyn Reader>> {
         self.open(&self.folders.find(folder, name, 1, is_dataset)?)
+    }
+
+    /// Examines a dataset; one that does not open is read as far as possible.
+    ///
+    /// # Errors
+    /// When there is no such dataset, no part of it can be opened, or the examination is stopped.
+    pub fn examine(&self, folder: usize, name: &str, control: &mut Control<'_>) -> Result<Diagnosis> {
+        let path = self.folders.find(folder, name, 1, is_dataset)?;
+        let (reader, lost) = open_damaged(&Location::from(path))?;
+        let mut diagnosis = examine(&*reader, &[], control)?;
+        diagnosis.add_losses(lost);
+        Ok(diagnosis)
+    }
+
+    /// Writes the chosen episodes of a dataset as a new one, in the first folder; the dataset itself stays as it is.
+    ///
+    /// # Errors
+    /// When an episode does not exist, the name is not a plain one or is taken, or reading or writing fails.
+    pub fn save(&self, chosen: Chosen, control: &mut Control<'_>) -> Result<usize> {
+        let first = self.folders.paths().first();
+        let folder =
+            first.ok_or_else(|| Error::config("saving", "the lab has no folder of datasets", "set STABLEWM_HOME"))?;
+        let target = Location::from(new_dataset(folder, &chosen.target)?);
+        let source = self.folders.find(chosen.folder, &chosen.name, 1, is_dataset)?;
+        let (reader, _) = open_damaged(&Location::from(source))?;
+        let options = ConvertOptions { mode: ConvertMode::Create, ..ConvertOptions::default() };
+        Ok(swm_data::convert(&subset(reader, chosen.episodes)?, &target, &options, control)?.episodes)
     }
 
     fn open(&self, path: &Path) -> Result<Arc<dyn Reader>> {

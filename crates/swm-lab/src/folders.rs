@@ -4,6 +4,8 @@
 use std::path::{Path, PathBuf};
 use swm_core::{Error, Result};
 
+/// The longest name of a dataset that the lab writes.
+const LONGEST: usize = 64;
 /// The largest number of entries that are listed in a folder.
 const MOST: usize = 5_000;
 
@@ -61,6 +63,19 @@ pub struct Found {
     pub path: PathBuf,
 }
 
+/// Returns the path of a dataset to write: a plain name in a folder.
+///
+/// # Errors
+/// When the name is empty, too long, or has other characters than letters, digits, `-` and `_`.
+pub fn new_dataset(folder: &Path, name: &str) -> Result<PathBuf> {
+    let valid = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
+    if name.is_empty() || name.len() > LONGEST || !name.chars().all(valid) || name.starts_with('-') {
+        let fix = format!("write 1 to {LONGEST} letters, digits, - or _");
+        return Err(Error::config("the name of a dataset", format!("'{name}' is not one"), fix));
+    }
+    Ok(folder.join(format!("{name}.lance")))
+}
+
 /// Adds the wanted entries of a folder. `path` is canonical, so an entry that links elsewhere does not begin with it.
 fn search(
     path: &Path,
@@ -107,5 +122,14 @@ mod tests {
             assert!(folders.find(0, name, 2, wanted).is_err(), "{name}");
         }
         assert!(folders.find(1, "a", 2, wanted).is_err());
+    }
+
+    #[test]
+    fn names_of_new_datasets_stay_in_the_folder() {
+        let folder = Path::new("/home/datasets");
+        assert_eq!(new_dataset(folder, "my-demos_2").expect("a path"), Path::new("/home/datasets/my-demos_2.lance"));
+        for name in ["", "..", "../a", "a/b", "/etc/passwd", ".hidden", "a.b", "s3://b", "-o", &"a".repeat(65)] {
+            assert!(new_dataset(folder, name).is_err(), "{name}");
+        }
     }
 }

@@ -1,6 +1,7 @@
 //! Demonstrations: the episodes that are played in a session, stored in a dataset with the columns of a collection.
 
-use std::path::{Path, PathBuf};
+use crate::folders::new_dataset;
+use std::path::Path;
 use swm_core::columns::{self, ColumnIndices};
 use swm_core::{Batch, DType, Error, Manifest, Result, Schema};
 use swm_data::{CommitPolicy, Location, WriteMode, WriteOptions, Writer};
@@ -8,8 +9,6 @@ use swm_eval::{CollectConfig, World};
 
 /// The kind of the manifest of recorded datasets.
 const KIND: &str = "record";
-/// The longest name of a dataset.
-const LONGEST: usize = 64;
 
 /// A dataset that is recorded, and the episode in progress.
 pub struct Recorder {
@@ -23,26 +22,13 @@ pub struct Recorder {
     complete: bool,
 }
 
-/// Returns the path of a dataset to record: a plain name in the first folder of datasets.
-///
-/// # Errors
-/// When the name is empty, too long, or has other characters than letters, digits, `-` and `_`.
-fn path_of(folder: &Path, name: &str) -> Result<PathBuf> {
-    let valid = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
-    if name.is_empty() || name.len() > LONGEST || !name.chars().all(valid) || name.starts_with('-') {
-        let fix = format!("write 1 to {LONGEST} letters, digits, - or _");
-        return Err(Error::config("the name of a dataset", format!("'{name}' is not one"), fix));
-    }
-    Ok(folder.join(format!("{name}.lance")))
-}
-
 impl Recorder {
     /// Begins to record into a dataset, which is created, or continued if it was recorded in the same environment.
     ///
     /// # Errors
     /// When the name is invalid, or names a dataset that was not recorded in this environment.
     pub fn start(folder: &Path, name: &str, world: &World) -> Result<Self> {
-        let path = path_of(folder, name)?;
+        let path = new_dataset(folder, name)?;
         let config = CollectConfig::default();
         let mut manifest = Manifest { kind: KIND.to_owned(), ..world.collect_manifest(&config) };
         for setting in ["episodes", "variation"] {
@@ -205,18 +191,4 @@ fn fill(rows: &mut Batch, column: usize, value: &[f64]) {
 
 fn convert<T>(to: &mut [T], from: &[f64], convert: impl Fn(f64) -> T) {
     to.iter_mut().zip(from).for_each(|(to, &from)| *to = convert(from));
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn names_stay_in_the_folder() {
-        let folder = Path::new("/home/datasets");
-        assert_eq!(path_of(folder, "my-demos_2").expect("a path"), Path::new("/home/datasets/my-demos_2.lance"));
-        for name in ["", "..", "../a", "a/b", "/etc/passwd", ".hidden", "a.b", "s3://b", "-o", &"a".repeat(65)] {
-            assert!(path_of(folder, name).is_err(), "{name}");
-        }
-    }
 }

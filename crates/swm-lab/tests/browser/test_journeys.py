@@ -167,14 +167,28 @@ def test_episodes_are_filtered_and_scrubbed(open_page):
     assert "row=16" in page.url
 
 
-def test_damaged_datasets_are_listed_with_their_fault(lab, open_page):
+def test_bad_episodes_are_found_and_cut(lab, open_page):
+    lab.swm("collect", "swm/TwoRoom-v1", "-o", "damaged", "--episodes", "8", "--image", "32", "--format", "folder")
+    frames = sorted((lab.home / "datasets" / "damaged.folder").rglob("*.jpeg"))
+    frames[3].write_bytes(frames[3].read_bytes()[:40])
+    page = open_page("#data?name=damaged.folder")
+    expect(page.get_by_text("8 of 8 episodes")).to_be_visible()
+    page.get_by_role("button", name="Examine").click()
+    expect(page.locator(".findings .problem")).not_to_have_count(0)
+    page.get_by_role("button", name="Cut all with problems").click()
+    expect(page.locator(".row.is-cut")).to_have_count(1)
+    page.get_by_label("Name of the new dataset").fill("intact")
+    screenshot(page, "cut")
+    page.get_by_role("button", name="Save").click()
+    expect(page.get_by_text("7 episodes are in intact.lance")).to_be_visible(timeout=30000)
+    lab.swm("doctor", "intact")
+
+
+def test_datasets_that_do_not_open_are_listed_with_their_fault(lab, open_page):
     (lab.home / "datasets" / "broken.lance" / "_versions").mkdir(parents=True)
     page = open_page("#data")
-    expect(page.get_by_role("button", name=re.compile("rooms.lance"))).to_be_visible()
-    broken = page.get_by_role("button", name=re.compile("broken.lance"))
-    if broken.count():
-        broken.click()
-        expect(page.get_by_role("alert")).to_be_visible()
+    page.get_by_role("button", name=re.compile("broken.lance")).click()
+    expect(page.get_by_role("alert")).to_be_visible()
 
 
 def test_curves_follow_a_training(lab, open_page):
@@ -209,7 +223,7 @@ def test_pages_fit_their_widths(open_page, width, theme):
     for fragment in [
         "#envs?env=swm/TwoRoom-v1&variation=all&seed=4",
         "#envs?env=swm/PushT-v1&by=hand",
-        "#data?name=rooms.lance&episode=7&row=5",
+        "#data?name=pushes.lance&episode=2&row=60",
         "#runs?runs=0:lewm|0:pldm",
     ]:
         page = open_page(fragment, width=width, height=844, theme=theme)

@@ -34,7 +34,7 @@ pub struct TestLab {
 }
 
 /// The first expert, whatever the name.
-fn expert(entry: &EnvEntry, _: &str, world: &World) -> Result<Box<dyn Policy>> {
+pub fn expert(entry: &EnvEntry, _: &str, world: &World) -> Result<Box<dyn Policy>> {
     Ok(Box::new(ExpertPolicy::new(world.spec(), vec![(entry.experts[0].make)()])))
 }
 
@@ -86,6 +86,24 @@ impl TestLab {
     /// Sends a request with the token, as a page does.
     pub fn get(&self, path: &str) -> (u16, Vec<u8>) {
         self.request(&format!("/{TOKEN}/{path}"), &[("Host", &self.host())])
+    }
+
+    /// Sends a body with the token, as a page does; returns the status and the answer.
+    pub fn post(&self, path: &str, body: &str) -> (u16, String) {
+        let mut stream = self.connect();
+        let (host, length) = (self.host(), body.len());
+        let head = format!(
+            "POST /{TOKEN}/{path} HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}\r\nConnection: close\r\n\
+             Content-Length: {length}\r\n\r\n"
+        );
+        stream.write_all(head.as_bytes()).expect("sending");
+        // The server may answer before it has read a body that is too long.
+        stream.write_all(body.as_bytes()).ok();
+        let mut answer = vec![];
+        stream.read_to_end(&mut answer).ok();
+        let answer = String::from_utf8_lossy(&answer).into_owned();
+        let (head, body) = answer.split_once("\r\n\r\n").unwrap_or((&answer, ""));
+        (head.get(9..12).and_then(|status| status.parse().ok()).unwrap_or_default(), body.to_owned())
     }
 
     /// The JSON of a successful request.

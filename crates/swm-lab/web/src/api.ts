@@ -67,6 +67,11 @@ export interface Rows {
   columns: { name: string; elements: number; values: (number | null)[] }[];
 }
 
+export interface Diagnosis {
+  findings: { severity: "problem" | "note"; what: string; episodes: number[] }[];
+  sound: number[];
+}
+
 export interface Run {
   folder: number;
   name: string;
@@ -89,8 +94,8 @@ export function address(path: string, query: Query = {}): string {
   return `api/${path}${text ? `?${text}` : ""}`;
 }
 
-async function answer(path: string, query: Query): Promise<Response> {
-  const response = await fetch(address(path, query));
+async function answer(path: string, query: Query, options?: RequestInit): Promise<Response> {
+  const response = await fetch(address(path, query), options);
   if (response.ok) return response;
   const text = await response.text();
   let message = text.trim();
@@ -108,4 +113,9 @@ export async function get<T>(path: string, query: Query = {}): Promise<T> {
 
 export async function text(path: string, query: Query = {}): Promise<string> {
   return (await answer(path, query)).text();
+}
+
+export async function post<T>(path: string, body: unknown): Promise<T> {
+  const headers = { "content-type": "application/json" };
+  return (await answer(path, {}, { method: "POST", headers, body: JSON.stringify(body) })).json();
 }

@@ -1,11 +1,13 @@
 // The page of datasets: the list, the table of episodes, and one episode with its frames and columns.
 
-import { useEffect, useMemo, useRef, useState } from "preact/hooks";
+import { useMemo, useState } from "preact/hooks";
 import { type Dataset, type Episodes, get } from "./api";
+import { Curation } from "./curation";
 import { EpisodeView } from "./episode";
-import { bytes, count, short } from "./format";
-import { Histogram } from "./histogram";
+import { Filters, order } from "./filters";
+import { bytes, count } from "./format";
 import { type Params, patch, useKeys, useLoaded } from "./state";
+import { type SortKey, Table } from "./table";
 
 interface Listed {
   folders: string[];
@@ -42,7 +44,7 @@ export function DataPage({ params }: { params: Params }) {
                 aria-current={set === chosen}
                 title={set.error ?? set.name}
                 onClick={() =>
-                  patch({ name: set.name, folder: set.folder ? String(set.folder) : undefined, episode: undefined, row: undefined })
+                  patch({ name: set.name, folder: set.folder ? String(set.folder) : undefined, episode: undefined, row: undefined, cut: undefined })
                 }
               >
                 <span>{set.name}</span>
@@ -64,19 +66,20 @@ export function DataPage({ params }: { params: Params }) {
         {error && <p class="error">{error}</p>}
       </aside>
       {chosen?.error && (
-        <p class="error" role="alert">
-          {chosen.error}
-        </p>
+        <section class="episodes">
+          <p class="error" role="alert">
+            {chosen.error}
+          </p>
+          <Curation set={chosen} cut={new Set()} count={0} onCut={() => undefined} onSaved={again} />
+        </section>
       )}
-      {chosen && !chosen.error && <DatasetView key={`${chosen.folder}:${chosen.name}`} set={chosen} params={params} />}
+      {chosen && !chosen.error && <DatasetView key={`${chosen.folder}:${chosen.name}`} set={chosen} params={params} onSaved={again} />}
       {!chosen && <p class="loading">{value ? "Choose a dataset." : "Reading the folders …"}</p>}
     </div>
   );
 }
 
-type SortKey = "index" | "length" | "returns" | "success";
-
-function DatasetView({ set, params }: { set: Dataset; params: Params }) {
+function DatasetView({ set, params, onSaved }: { set: Dataset; params: Params; onSaved: () => void }) {
   const key = `${set.folder}:${set.name}`;
   const { value: table, error } = useLoaded(
     () => get<Episodes>("episodes", { folder: set.folder, name: set.name }),
@@ -99,7 +102,18 @@ function DatasetView({ set, params }: { set: Dataset; params: Params }) {
     const next = rows[Math.min(rows.length - 1, Math.max(0, at + by))];
     if (next !== undefined) choose(next);
   };
-  useKeys({ ArrowDown: () => move(1), ArrowUp: () => move(-1) });
+  const cut = useMemo(() => new Set((params.cut ?? "").split(",").filter(Boolean).map(Number)), [params.cut]);
+  const setCut = (positions: Set<number>) => patch({ cut: [...positions].sort((a, b) => a - b).join(",") });
+  const toggle = (position: number) => {
+    const next = new Set(cut);
+    if (!next.delete(position)) next.add(position);
+    setCut(next);
+  };
+  useKeys({
+    ArrowDown: () => move(1),
+    ArrowUp: () => move(-1),
+    x: () => episode !== undefined && toggle(episode),
+  });
   return (
     <>
       <section class="episodes" aria-label="Episodes">
@@ -114,6 +128,8 @@ function DatasetView({ set, params }: { set: Dataset; params: Params }) {
               table={table}
               rows={rows}
               chosen={episode}
+              cut={cut}
+              onCut={toggle}
               sort={sort}
               descending={descending}
               onChoose={choose}
@@ -124,6 +140,7 @@ function DatasetView({ set, params }: { set: Dataset; params: Params }) {
                 })
               }
             />
+            <Curation set={set} cut={cut} count={table.index.length} onCut={setCut} onSaved={onSaved} onChoose={choose} />
           </>
         ) : (
           !error && <p class="loading">Reading episodes …</p>
@@ -135,180 +152,5 @@ function DatasetView({ set, params }: { set: Dataset; params: Params }) {
         table && <p class="loading">Choose an episode.</p>
       )}
     </>
-  );
-}
-
-// A range `LOW..HIGH`, each end optional.
-function range(text: string | undefined): [number, number] {
-  const [low, high] = (text ?? "").split("..");
-  return [low ? Number(low) : -Infinity, high ? Number(high) : Infinity];
-}
-
-// The positions of the episodes that satisfy the filters, sorted.
-function order(table: Episodes, params: Params, sort: SortKey, descending: boolean): number[] {
-  const lengths = range(params.lengths);
-  const returns = range(params.returns);
-  const within = (value: number, [low, high]: [number, number]) => value >= low && value <= high;
-  const rows = table.index
-    .map((_, i) => i)
-    .filter(
-      (i) =>
-        within(table.length[i], lengths) &&
-        (table.returns.length === 0 || within(table.returns[i], returns)) &&
-        (!params.success || table.success.length === 0 || table.success[i] === (params.success === "yes")),
-    );
-  if (sort !== "index") {
-    const values = table[sort].map(Number);
-    rows.sort((a, b) => values[a] - values[b] || a - b);
-  }
-  return descending ? rows.reverse() : rows;
-}
-
-function Filters({ table, params, shown }: { table: Episodes; params: Params; shown: number }) {
-  const solved = table.success.filter(Boolean).length;
-  return (
-    <>
-      <p class="muted" role="status">
-        {count(shown)} of {count(table.index.length)} episodes
-        {table.success.length > 0 && `, ${((100 * solved) / Math.max(1, table.success.length)).toFixed(1)} % solved`}
-      </p>
-      <div class="histograms">
-        <Histogram
-          label="length"
-          values={table.length}
-          range={params.lengths}
-          onRange={(text) => patch({ lengths: text })}
-        />
-        {table.returns.length > 0 && (
-          <Histogram
-            label="return"
-            values={table.returns}
-            range={params.returns}
-            onRange={(text) => patch({ returns: text })}
-          />
-        )}
-      </div>
-      <div class="bar">
-        <label>
-          success
-          <select
-            value={params.success ?? ""}
-            disabled={table.success.length === 0}
-            onChange={(event) => patch({ success: event.currentTarget.value })}
-          >
-            <option value="">all</option>
-            <option value="yes">solved</option>
-            <option value="no">not solved</option>
-          </select>
-        </label>
-        <Range label="length" text={params.lengths} onChange={(text) => patch({ lengths: text })} />
-        {table.returns.length > 0 && (
-          <Range label="return" text={params.returns} onChange={(text) => patch({ returns: text })} />
-        )}
-      </div>
-    </>
-  );
-}
-
-function Range({ label, text, onChange }: { label: string; text?: string; onChange: (text?: string) => void }) {
-  const [low = "", high = ""] = (text ?? "").split("..");
-  const change = (ends: [string, string]) => onChange(ends.some(Boolean) ? ends.join("..") : undefined);
-  const field = (name: string, value: string, changed: (value: string) => void) => (
-    <input
-      type="number"
-      step="any"
-      class="value"
-      placeholder={name}
-      aria-label={`${label}, ${name}`}
-      value={value}
-      onChange={(event) => changed(event.currentTarget.value)}
-    />
-  );
-  return (
-    <span class="range">
-      {label}
-      {field("min", low, (value) => change([value, high]))}
-      {field("max", high, (value) => change([low, value]))}
-    </span>
-  );
-}
-
-const ROW = 26;
-
-interface TableProps {
-  table: Episodes;
-  rows: number[];
-  chosen?: number;
-  sort: SortKey;
-  descending: boolean;
-  onChoose: (position: number) => void;
-  onSort: (key: SortKey) => void;
-}
-
-// Only the rows in view are in the document, so that the length of the list does not matter.
-function Table({ table, rows, chosen, sort, descending, onChoose, onSort }: TableProps) {
-  const body = useRef<HTMLDivElement>(null);
-  const [top, setTop] = useState(0);
-  const [height, setHeight] = useState(400);
-  useEffect(() => {
-    const at = body.current;
-    if (!at) return;
-    const resized = new ResizeObserver(() => setHeight(at.clientHeight));
-    resized.observe(at);
-    return () => resized.disconnect();
-  }, []);
-  useEffect(() => {
-    const at = chosen === undefined ? -1 : rows.indexOf(chosen);
-    if (!body.current || at < 0) return;
-    const view = body.current;
-    if (at * ROW < view.scrollTop) view.scrollTop = at * ROW;
-    else if ((at + 1) * ROW > view.scrollTop + view.clientHeight) view.scrollTop = (at + 1) * ROW - view.clientHeight;
-  }, [chosen, rows]);
-  const first = Math.max(0, Math.floor(top / ROW) - 5);
-  const last = Math.min(rows.length, Math.ceil((top + height) / ROW) + 5);
-  const columns: [SortKey, string, (i: number) => string][] = [
-    ["index", "episode", (i) => String(table.index[i])],
-    ["length", "length", (i) => String(table.length[i])],
-    ["returns", "return", (i) => short(table.returns[i])],
-    ["success", "success", (i) => (table.success.length === 0 ? "–" : table.success[i] ? "yes" : "no")],
-  ];
-  return (
-    <div class="table" role="table" aria-rowcount={rows.length + 1} aria-label="Episodes">
-      <div role="row" class="row head" aria-rowindex={1}>
-        {columns.map(([key, name]) => (
-          <span
-            role="columnheader"
-            key={key}
-            aria-sort={sort === key ? (descending ? "descending" : "ascending") : "none"}
-          >
-            <button type="button" class="quiet" onClick={() => onSort(key)}>
-              {name}
-              {sort === key ? (descending ? " ↓" : " ↑") : ""}
-            </button>
-          </span>
-        ))}
-      </div>
-      <div class="body" ref={body} tabIndex={0} onScroll={(event) => setTop(event.currentTarget.scrollTop)} role="rowgroup">
-        <div class="all" style={{ height: `${rows.length * ROW}px` }}>
-          {rows.slice(first, last).map((position, i) => (
-            <div
-              role="row"
-              class={`row ${position === chosen ? "is-chosen" : ""}`}
-              key={position}
-              aria-rowindex={first + i + 2}
-              aria-selected={position === chosen}
-              style={{ transform: `translateY(${(first + i) * ROW}px)` }}
-              onClick={() => onChoose(position)}
-            >
-              {columns.map(([key, , text]) => (
-                <span role="cell" key={key} class={key === "success" ? `success-${text(position)}` : ""}>
-                  {text(position)}
-                </span>
-              ))}
-            </div>
-          ))}
-        </div>
-      </div>
-    </div>
   );
 }

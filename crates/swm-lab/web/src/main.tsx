@@ -25,6 +25,7 @@ const SHORTCUTS = [
   ["v", "sample all factors, with the next seed"],
   ["c", "copy the command"],
   ["arrows", "drive an environment; move in a table"],
+  ["x", "cut the chosen episode"],
   ["k d", "keep or discard the recorded episode"],
 ];
 

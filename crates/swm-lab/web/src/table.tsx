@@ -1,0 +1,101 @@
+// The table of episodes.
+
+import { useEffect, useRef, useState } from "preact/hooks";
+import type { Episodes } from "./api";
+import { short } from "./format";
+
+export type SortKey = "index" | "length" | "returns" | "success";
+
+const ROW = 26;
+
+interface TableProps {
+  table: Episodes;
+  rows: number[];
+  chosen?: number;
+  cut: Set<number>;
+  onCut: (position: number) => void;
+  sort: SortKey;
+  descending: boolean;
+  onChoose: (position: number) => void;
+  onSort: (key: SortKey) => void;
+}
+
+// Only the rows in view are in the document, so that the length of the list does not matter.
+export function Table({ table, rows, chosen, cut, onCut, sort, descending, onChoose, onSort }: TableProps) {
+  const body = useRef<HTMLDivElement>(null);
+  const [top, setTop] = useState(0);
+  const [height, setHeight] = useState(400);
+  useEffect(() => {
+    const at = body.current;
+    if (!at) return;
+    const resized = new ResizeObserver(() => setHeight(at.clientHeight));
+    resized.observe(at);
+    return () => resized.disconnect();
+  }, []);
+  useEffect(() => {
+    const at = chosen === undefined ? -1 : rows.indexOf(chosen);
+    if (!body.current || at < 0) return;
+    const view = body.current;
+    if (at * ROW < view.scrollTop) view.scrollTop = at * ROW;
+    else if ((at + 1) * ROW > view.scrollTop + view.clientHeight) view.scrollTop = (at + 1) * ROW - view.clientHeight;
+  }, [chosen, rows]);
+  const first = Math.max(0, Math.floor(top / ROW) - 5);
+  const last = Math.min(rows.length, Math.ceil((top + height) / ROW) + 5);
+  const columns: [SortKey, string, (i: number) => string][] = [
+    ["index", "episode", (i) => String(table.index[i])],
+    ["length", "length", (i) => String(table.length[i])],
+    ["returns", "return", (i) => short(table.returns[i])],
+    ["success", "success", (i) => (table.success.length === 0 ? "–" : table.success[i] ? "yes" : "no")],
+  ];
+  return (
+    <div class="table" role="table" aria-rowcount={rows.length + 1} aria-label="Episodes">
+      <div role="row" class="row head" aria-rowindex={1}>
+        {columns.map(([key, name]) => (
+          <span
+            role="columnheader"
+            key={key}
+            aria-sort={sort === key ? (descending ? "descending" : "ascending") : "none"}
+          >
+            <button type="button" class="quiet" onClick={() => onSort(key)}>
+              {name}
+              {sort === key ? (descending ? " ↓" : " ↑") : ""}
+            </button>
+          </span>
+        ))}
+        <span role="columnheader" class="muted" title="Leave out of the next dataset (x)">
+          cut
+        </span>
+      </div>
+      <div class="body" ref={body} tabIndex={0} onScroll={(event) => setTop(event.currentTarget.scrollTop)} role="rowgroup">
+        <div class="all" style={{ height: `${rows.length * ROW}px` }}>
+          {rows.slice(first, last).map((position, i) => (
+            <div
+              role="row"
+              class={`row ${position === chosen ? "is-chosen" : ""} ${cut.has(position) ? "is-cut" : ""}`}
+              key={position}
+              aria-rowindex={first + i + 2}
+              aria-selected={position === chosen}
+              style={{ transform: `translateY(${(first + i) * ROW}px)` }}
+              onClick={() => onChoose(position)}
+            >
+              {columns.map(([key, , text]) => (
+                <span role="cell" key={key} class={key === "success" ? `success-${text(position)}` : ""}>
+                  {text(position)}
+                </span>
+              ))}
+              <span role="cell">
+                <input
+                  type="checkbox"
+                  aria-label={`Cut episode ${table.index[position]}`}
+                  checked={cut.has(position)}
+                  onClick={(event) => event.stopPropagation()}
+                  onChange={() => onCut(position)}
+                />
+              </span>
+            </div>
+          ))}
+        </div>
+      </div>
+    </div>
+  );
+}

@@ -20,9 +20,10 @@ pub struct Asset {
 /// Path, media type, content.
 type Embedded = (&'static str, &'static str, &'static [u8]);
 
-const FILES: [Embedded; 3] = [
+const FILES: [Embedded; 4] = [
     ("index.html", "text/html; charset=utf-8", include_bytes!("../assets/index.html")),
     ("lab.js", "text/javascript; charset=utf-8", include_bytes!("../assets/lab.js")),
+    ("licences.txt", "text/plain; charset=utf-8", include_bytes!("../assets/licences.txt")),
     ("lab.css", "text/css; charset=utf-8", include_bytes!("../assets/lab.css")),
 ];
 

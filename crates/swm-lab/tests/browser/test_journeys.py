@@ -52,6 +52,12 @@ def test_a_factor_is_varied_and_its_command_writes_the_still(lab, open_page):
     page.get_by_role("button", name="Play").click()
     wait_for_steps(page, 15)
     screenshot(page, "environments")
+    page.get_by_role("button", name="Compare").click()
+    expect(page.get_by_alt_text(re.compile("First frame with"))).to_be_visible()
+    page.get_by_role("button", name="Goal", exact=True).click()
+    expect(page.get_by_role("button", name="Stop comparing")).to_have_text("goal ×")
+    page.get_by_role("button", name="Stop comparing").click()
+    expect(page.get_by_alt_text(re.compile("First frame with"))).to_have_count(0)
     # Another page with the same address shows the same.
     again = open_page(page.url.split("/")[-1])
     expect(again.get_by_test_id("command")).to_have_text(copied)

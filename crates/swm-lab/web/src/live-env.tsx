@@ -110,7 +110,7 @@ function Versus({ src, side }: { src: string; side: number }) {
     <figure class="frame versus">
       <img src={address("still", { ...query, image: side })} alt={`First frame with ${src}`} />
       <button type="button" class="ended" onClick={() => patch({ versus: undefined })} aria-label="Stop comparing">
-        kept ×
+        {query.goal ? "goal" : "kept"} ×
       </button>
     </figure>
   );
@@ -147,8 +147,8 @@ function Command({ info, control, isCompared }: { info: EnvInfo; control: Contro
   const { live, settings, copy } = control;
   const command = live.started?.command ?? "";
   const query = still(info, settings);
-  const keep = () => {
-    const given = Object.entries(query).filter(([, value]) => value !== undefined);
+  const keep = (goal?: boolean) => {
+    const given = Object.entries({ ...query, goal }).filter(([, value]) => value !== undefined);
     patch({ versus: new URLSearchParams(given.map(([key, value]) => [key, String(value)])).toString() });
   };
   return (
@@ -167,8 +167,11 @@ function Command({ info, control, isCompared }: { info: EnvInfo; control: Contro
       >
         PNG
       </a>
-      <button type="button" onClick={keep} aria-pressed={isCompared} title="Keep this frame beside the next settings">
+      <button type="button" onClick={() => keep()} aria-pressed={isCompared} title="Keep this frame beside the next settings">
         Compare
+      </button>
+      <button type="button" onClick={() => keep(true)} title="Show the goal beside the frame">
+        Goal
       </button>
     </div>
   );

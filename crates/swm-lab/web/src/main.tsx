@@ -79,9 +79,15 @@ function App() {
             </div>
           ))}
         </dl>
-        <button type="button" onClick={() => help.current?.close()}>
-          Close
-        </button>
+        <div class="bar">
+          <button type="button" onClick={() => help.current?.close()}>
+            Close
+          </button>
+          <span class="grow" />
+          <a href="licences.txt" target="_blank" rel="noreferrer">
+            <small>Licences</small>
+          </a>
+        </div>
       </dialog>
     </>
   );

@@ -237,9 +237,9 @@ impl TrainArgs {
         }
         eprint(&format!("continuing: {}\n", shorten(record.commands[0].command.join(" "))));
         let output = Some(output.clone());
-        // A tracker starts a program, which only the user may ask for.
-        let log = self.log.clone();
-        Ok(Self { data, output, resume: true, print_config: false, trust: false, log, ..started })
+        // Only the user may ask for a tracker, which is a program, and name another folder that is written to.
+        let (log, feature_cache) = (self.log.clone(), self.feature_cache.clone());
+        Ok(Self { data, output, resume: true, print_config: false, trust: false, log, feature_cache, ..started })
     }
 
     /// Returns the family of the model.

@@ -135,6 +135,8 @@ fn recipes_are_listed_and_checked_before_they_run() {
     refused("image = 32", "wrapper = \"chroma-key,media=/dev/zero\"", 2, &["reads files"]);
     let tracked = ["the tracker 'jsonl,wandb'", "which is started", "--trust"];
     refused("model = \"lewm\"", "model = \"lewm\"\nlog = \"jsonl,wandb\"", 2, &tracked);
+    let written = ["the folder '/elsewhere'", "which is written to", "--trust"];
+    refused("model = \"lewm\"", "model = \"lewm\"\nfeature-cache = \"/elsewhere\"", 2, &written);
     swm.fails(&["train", "--recipe", "bad.toml", "-o", "bad", "room.episodes=1"], 2, &["did you mean rooms"]);
     swm.fails(&["train", "--recipe", "/dev/zero", "-o", "bad"], 2, &["ends with .toml"]);
 }

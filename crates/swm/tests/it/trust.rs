@@ -132,6 +132,27 @@ fn record_of_a_run_chooses_no_recipe_and_no_weights() {
 }
 
 #[test]
+fn record_of_a_run_chooses_no_folder_that_is_written_to() {
+    let swm = Swm::new();
+    swm.json(&["collect", "swm/TwoRoom-v1", "-o", "rooms", "--episodes", "12", "--image", "64", "--max-steps", "9"]);
+    let settings = ["schedule.steps=1", "schedule.warmup=0", "data.batch_size=8"];
+    let train = ["train", "gcbc", "--preset", "keypoints", "--data", "rooms", "-o", "./run"];
+    swm.json(&[&train[..], &settings].concat());
+    let file = swm.path("run/run.json");
+    let record = fs::read_to_string(&file).expect("the record").replacen(
+        "\"--data\"",
+        "\"--feature-cache\", \"elsewhere\", \"--data\"",
+        1,
+    );
+    assert!(record.contains("elsewhere"));
+    fs::write(&file, record).expect("the record");
+    swm.json(&["train", "--output", "./run", "--resume"]);
+    assert!(!swm.path("elsewhere").exists(), "the record chose a folder");
+    swm.json(&["train", "--output", "./run", "--resume", "--feature-cache", "mine"]);
+    assert!(swm.path("mine").is_dir());
+}
+
+#[test]
 fn results_on_a_server_open_no_connection() {
     let swm = Swm::new();
     swm.json(&[

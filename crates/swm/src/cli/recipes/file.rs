@@ -260,6 +260,8 @@ impl Recipe {
                         origin.check_user(&format!("the tracker '{text}'"), "which is started", None)?;
                     } else if key == "preset" && !is_preset_name(&text) {
                         origin.check_user(&format!("the preset '{text}'"), "which is a file", None)?;
+                    } else if key == "feature-cache" {
+                        origin.check_user(&format!("the folder '{text}'"), "which is written to", None)?;
                     } else if text.contains("://") {
                         origin.check_user(&format!("'{text}'"), "which opens a network connection", None)?;
                     }
@@ -351,7 +353,7 @@ fn is_written_here(log: &str) -> bool {
 }
 
 /// Returns whether a text can be the name of a preset, and no path: names have no dots and no slashes.
-fn is_preset_name(text: &str) -> bool {
+pub fn is_preset_name(text: &str) -> bool {
     text.chars().all(|c| c.is_ascii_alphanumeric() || "-_".contains(c))
 }
 

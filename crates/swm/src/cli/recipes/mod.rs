@@ -6,6 +6,7 @@ mod lines;
 mod run;
 
 pub use datasets::Datasets;
+pub use file::is_preset_name;
 pub use run::{RecipeRun, pretrained_weights, run};
 
 use super::{emit, emit_json, table};

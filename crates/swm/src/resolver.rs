@@ -13,7 +13,8 @@ use std::rc::Rc;
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::policy::ExpertPolicy;
 use swm_core::{
-    CostModel, Env, EnvChoice, EnvEntry, EnvSpec, Error, Named as _, Origin, Policy, RandomPolicy, Result, Solver,
+    CostModel, Env, EnvChoice, EnvEntry, EnvSpec, Error, ExpertEntry, Named as _, Origin, Policy, RandomPolicy, Result,
+    Solver,
 };
 use swm_data::Reader;
 use swm_envs::wrappers::{GoalFrame, Stack, WRAPPERS, WrapperEntry};
@@ -413,21 +414,36 @@ fn direct(
 /// When the environment has no such expert.
 pub fn scripted(entry: &EnvEntry, name: &str, world: &World) -> Result<Box<dyn Policy>> {
     let slots = world.pool().len();
-    if name == "random" {
+    let Some(expert) = find_expert(entry, name)? else {
         return Ok(Box::new(RandomPolicy::new(world.spec(), slots)));
-    }
-    let expert = match entry.experts {
-        [first, ..] if name == "expert" => first,
-        [] => {
-            let hint = format!("{} has no experts: choose random or a checkpoint", entry.id);
-            return Err(Error::unknown("policy", name, ["random"], hint));
-        }
-        experts => experts.iter().find(|expert| expert.id == name).ok_or_else(|| {
-            let known = ["random", "expert"].into_iter().chain(experts.iter().map(|expert| expert.id()));
-            Error::unknown("policy", name, known, format!("`swm envs` lists the experts of {}", entry.id))
-        })?,
     };
     Ok(Box::new(ExpertPolicy::new(world.spec(), (0..slots).map(|_| (expert.make)()).collect())))
+}
+
+/// Checks the name of an untrained policy, as [`scripted`] does, before an environment is made.
+///
+/// # Errors
+/// When the environment has no such expert.
+pub fn check_scripted(entry: &EnvEntry, name: &str) -> Result<()> {
+    find_expert(entry, name).map(drop)
+}
+
+/// Returns the expert with this name; `None` for the random policy.
+fn find_expert(entry: &EnvEntry, name: &str) -> Result<Option<&'static ExpertEntry>> {
+    if name == "random" {
+        return Ok(None);
+    }
+    match entry.experts {
+        [first, ..] if name == "expert" => Ok(Some(first)),
+        [] => {
+            let hint = format!("{} has no experts: choose random or a checkpoint", entry.id);
+            Err(Error::unknown("policy", name, ["random"], hint))
+        }
+        experts => experts.iter().find(|expert| expert.id == name).map(Some).ok_or_else(|| {
+            let known = ["random", "expert"].into_iter().chain(experts.iter().map(|expert| expert.id()));
+            Error::unknown("policy", name, known, format!("`swm envs` lists the experts of {}", entry.id))
+        }),
+    }
 }
 
 /// Returns the score of simulated plans with this name.

@@ -14,6 +14,9 @@ use swm_core::{Error, Result};
 /// The name of the stage.
 const STAGE: &str = "study";
 
+/// The most columns of a table.
+const MAX_COLUMNS: usize = 100;
+
 /// A study of rows with numbers.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TableStudy {
@@ -97,7 +100,7 @@ impl TableCell {
 }
 
 impl TableStudy {
-    /// Checks the number of cells, their published values, and that no two are equal.
+    /// Checks the numbers of cells and columns, the published values, and that no two cells are equal.
     ///
     /// # Errors
     /// When one of them is wrong.
@@ -105,6 +108,10 @@ impl TableStudy {
         if !(1..=Study::MAX_CELLS).contains(&self.cells.len()) {
             let problem = format!("it has {} cells", self.cells.len());
             return Err(Error::config("the study", problem, format!("give 1 to {} cells", Study::MAX_CELLS)));
+        }
+        if self.columns.len() > MAX_COLUMNS {
+            let problem = format!("it has {} columns", self.columns.len());
+            return Err(Error::config("the study", problem, format!("give at most {MAX_COLUMNS}")));
         }
         let published = self.columns.iter().filter(|column| column.published).count();
         let mut seen = BTreeSet::new();
@@ -304,6 +311,8 @@ mod tests {
             other.run(&folder, "", &mut |_, _| Ok(Some(values.clone().into())), &mut Control::new())
         };
         assert!(wrong(vec![f64::NAN]).is_err() && wrong(vec![1.0, 2.0]).is_err() && wrong(vec![]).is_err());
+        let wide = TableStudy { columns: vec![study.columns[0].clone(); 100_000], ..study.clone() };
+        assert!(wide.check().expect_err("too many columns").to_string().contains("100000 columns"));
         let twice = TableStudy { cells: vec![study.cells[0].clone(), study.cells[0].clone()], ..study };
         assert!(twice.check().expect_err("a row twice").to_string().contains("twice"));
     }

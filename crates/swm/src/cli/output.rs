@@ -126,7 +126,7 @@ pub fn table(header: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> St
     table.set_content_arrangement(comfy_table::ContentArrangement::Dynamic);
     let coloured = is_coloured(&std::io::stdout());
     let bold = |cell: Cell| if coloured { cell.add_attribute(Attribute::Bold) } else { cell };
-    table.set_header(header.iter().map(|name| bold(Cell::new(name))));
+    table.set_header(header.iter().map(|name| bold(Cell::new(printable(name)))));
     for row in &rows {
         // Escaped here and not in the finished table, so that columns have the widths of the escaped cells.
         table.add_row(row.iter().map(|cell| {

@@ -383,6 +383,26 @@ fn study_with_too_many_cells_is_refused_before_they_are_made() {
 }
 
 #[test]
+fn damaged_folders_of_a_study_are_errors() {
+    let swm = Swm::new();
+    let factors = "kind = \"factors\"\ntitle = \"T\"\nquestion = \"q?\"\n";
+    std::fs::write(swm.path("factors.toml"), factors).expect("a study");
+    let run = ["study", "run", "factors.toml", "--output", "out"];
+    std::fs::create_dir(swm.path("out")).expect("a folder");
+    let file = swm.path("out/study.json");
+    let made = std::process::Command::new("mkfifo").arg(&file).status().expect("mkfifo");
+    assert!(made.success());
+    swm.fails(&run, 1, &["study.json", "is not a regular file"]);
+    std::fs::remove_file(&file).expect("the pipe");
+    swm.json(&run);
+    let study = std::fs::read_to_string(&file).expect("the study");
+    std::fs::write(&file, study.replacen("\"environment\"", "\"\\u001b[31mred\"", 1)).expect("the study");
+    let shown = swm.run(&["study", "status", "out"]);
+    let shown = text(&shown.stdout);
+    assert!(shown.contains("red") && !shown.contains('\u{1b}'), "{shown:?}");
+}
+
+#[test]
 fn study_replaces_neither_files_of_the_user_nor_another_study() {
     let swm = with_study();
     std::fs::create_dir(swm.path("mine")).expect("creating a folder");

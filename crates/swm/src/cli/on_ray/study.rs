@@ -4,8 +4,11 @@ use super::{OnRayArgs, absolute};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 use std::path::Path;
-use swm_core::{Error, Result};
+use swm_core::{Error, Result, files};
 use swm_data::{Location, objects};
+
+/// The largest `study.json`, in bytes.
+const MAX_BYTES: u64 = 256 << 20;
 
 /// The fields by which a `study.json` is recognised.
 #[derive(Deserialize)]
@@ -27,7 +30,12 @@ pub fn check_output(output: &str, title: &str, on: &OnRayArgs) -> Result<()> {
     }
     let output = absolute(output);
     let other = |problem: String| Error::config(&output, problem, "give another folder with --output");
-    let Some(bytes) = objects::read_file(&Location::parse(&format!("{output}/{FILE}"))?)? else {
+    let stored = match Location::parse(&format!("{output}/{FILE}"))? {
+        Location::Path(path) if path.exists() => Some(files::read(&path, MAX_BYTES)?),
+        Location::Path(_) => None,
+        location @ Location::Uri(_) => objects::read_file(&location)?.map(|bytes| bytes.to_vec()),
+    };
+    let Some(bytes) = stored else {
         let has_files = match Location::parse(&output)? {
             Location::Path(path) if path.exists() => has_files(&path)?,
             Location::Path(_) => false,

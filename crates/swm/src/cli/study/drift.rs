@@ -4,6 +4,7 @@
 //! the same starts. Each row has the distance of their latents to the nearest latent of the training episodes, and its paths
 //! are the latents along the two principal components of those.
 
+use super::tables::Chosen;
 use crate::cli::Context;
 use crate::{home, resolver};
 use serde::{Deserialize, Serialize};
@@ -93,8 +94,11 @@ impl DriftSettings {
     ///
     /// # Errors
     /// When a name does not exist, a file names what only the user may name, or a number is out of range.
-    pub(super) fn check(&self, origin: &Origin) -> Result<()> {
-        crate::env(&self.env, origin)?;
+    pub(super) fn check(&self, chosen: &Chosen<'_>) -> Result<()> {
+        let env = crate::env(&self.env, chosen.by("env"))?;
+        resolver::check_scripted(&env.entry, &self.expert)?;
+        Starts::episodic(self.episodes, 0, VariationRequest::default())?;
+        chosen.check_preset(&self.preset)?;
         (FAMILIES.get(FAMILY)?.config)(&self.preset, &self.overrides())?;
         if self.steps == 0 || self.episodes == 0 || self.frames < 10 {
             let problem = format!("{} steps, {} episodes and {} frames", self.steps, self.episodes, self.frames);
@@ -299,7 +303,7 @@ mod tests {
     fn settings_that_no_study_can_have_are_errors() {
         let settings =
             DriftSettings { env: "swm/PushT-v1".to_owned(), dataset: "push-t".to_owned(), ..DriftSettings::default() };
-        settings.check(&Origin::User).expect("settings");
+        settings.check(&Chosen::by_user()).expect("settings");
         let cells = settings.cells(&[]);
         assert_eq!(cells.len(), 5);
         let folders: Vec<PathBuf> =
@@ -310,8 +314,10 @@ mod tests {
             (DriftSettings { dataset: "s3://bucket/a".to_owned(), ..settings.clone() }, "[[collect]]"),
             (DriftSettings { train: vec!["optim.rl=1".to_owned()], ..settings.clone() }, "optim"),
             (DriftSettings { env: "swm/PushT-v2".to_owned(), ..settings.clone() }, "PushT-v1"),
+            (DriftSettings { expert: "/etc/passwd".to_owned(), ..settings.clone() }, "/etc/passwd"),
+            (DriftSettings { episodes: 1 << 60, ..settings.clone() }, "number of evaluated episodes"),
         ] {
-            let error = wrong.check(&Origin::User).expect_err(part).to_string();
+            let error = wrong.check(&Chosen::by_user()).expect_err(part).to_string();
             assert!(error.contains(part), "{error}");
         }
     }

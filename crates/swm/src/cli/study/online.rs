@@ -1,5 +1,6 @@
 //! Studies of the kind `online`: returns and learning curves of models that train by interaction.
 
+use super::tables::{Chosen, check_cells};
 use crate::cli::Context;
 use crate::home;
 use serde::{Deserialize, Serialize};
@@ -68,10 +69,12 @@ impl OnlineSettings {
     ///
     /// # Errors
     /// When a name does not exist, a file names what only the user may name, or a number is out of range.
-    pub(super) fn check(&self, origin: &Origin) -> Result<()> {
+    pub(super) fn check(&self, chosen: &Chosen<'_>) -> Result<()> {
+        check_cells(&[self.envs.len(), self.families.len(), self.seeds.len()])?;
         for env in &self.envs {
-            crate::env(env, origin)?;
+            crate::env(env, chosen.by("envs"))?;
         }
+        chosen.check_preset(&self.preset)?;
         for family in &self.families {
             let config = (FAMILIES.get(family)?.config)(&self.preset, &self.overrides(0))?;
             drop(config);
@@ -238,7 +241,7 @@ mod tests {
     #[test]
     fn settings_that_no_run_can_have_are_errors() {
         let settings = OnlineSettings { envs: vec!["swm/PendulumControl-v1".to_owned()], ..OnlineSettings::default() };
-        settings.check(&Origin::User).expect("settings");
+        settings.check(&Chosen::by_user()).expect("settings");
         assert_eq!(settings.cells().len(), 2);
         for (wrong, part) in [
             (OnlineSettings { steps: 7, ..settings.clone() }, "multiple of 5"),
@@ -248,7 +251,7 @@ mod tests {
                 "PendulumControl-v1",
             ),
         ] {
-            let error = wrong.check(&Origin::User).expect_err(part).to_string();
+            let error = wrong.check(&Chosen::by_user()).expect_err(part).to_string();
             assert!(error.contains(part), "{error}");
         }
     }

@@ -10,7 +10,7 @@ use super::drift::{self, DriftSettings, Trained};
 use super::online::{self, OnlineSettings};
 use crate::cli::Context;
 use crate::cli::progress::control;
-use crate::cli::recipes::Datasets;
+use crate::cli::recipes::{Datasets, is_preset_name};
 use crate::{ENVS, capsule};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -20,10 +20,10 @@ use std::path::Path;
 use swm_bench::{DataBenchConfig, FormatBench};
 use swm_core::results::TableColumn;
 use swm_core::run::{Control, Event};
-use swm_core::{Error, Origin, Result};
+use swm_core::{Error, Origin, Result, limits};
 use swm_data::{ClipSpec, Location};
 use swm_envs::wrappers::WRAPPERS;
-use swm_eval::{Measured, StudyFolder, TableCell, TableStudy};
+use swm_eval::{Measured, Study, StudyFolder, TableCell, TableStudy};
 use toml::Table;
 
 /// The file of such a study.
@@ -62,6 +62,51 @@ enum TableKind {
     Data,
     Drift,
     Online,
+}
+
+/// Who chose the settings of a study.
+pub(super) struct Chosen<'a> {
+    /// Who chose the file.
+    origin: &'a Origin,
+    /// The settings of the command line, which are the user's own.
+    own: BTreeSet<&'a str>,
+}
+
+impl Chosen<'_> {
+    /// The user chose all of them.
+    #[cfg(test)]
+    pub(super) fn by_user() -> Self {
+        Self { origin: &Origin::User, own: BTreeSet::new() }
+    }
+
+    /// Who chose a setting.
+    pub(super) fn by(&self, key: &str) -> &Origin {
+        if self.own.contains(key) { &Origin::User } else { self.origin }
+    }
+
+    /// Checks that a preset is one of the program, or that the user chose its file.
+    ///
+    /// # Errors
+    /// When a file chose the file of a preset.
+    pub(super) fn check_preset(&self, preset: &str) -> Result<()> {
+        if is_preset_name(preset) {
+            return Ok(());
+        }
+        self.by("preset").check_user(&format!("the preset '{preset}'"), "which is a file", Some("preset=FILE"))
+    }
+}
+
+/// Checks the number of cells, which lists of these lengths have, before they are made.
+///
+/// # Errors
+/// When there are more than [`Study::MAX_CELLS`].
+pub(super) fn check_cells(lengths: &[usize]) -> Result<()> {
+    let cells = limits::product(lengths.iter().copied());
+    if cells > Study::MAX_CELLS {
+        let problem = format!("its lists have {cells} combinations");
+        return Err(Error::config("the study", problem, format!("give at most {}", Study::MAX_CELLS)));
+    }
+    Ok(())
 }
 
 /// The settings of the kind `data`.
@@ -147,6 +192,7 @@ impl TableFile {
                 value.unwrap_or_else(|| toml::Value::String(setting[key.len() + 1..].to_owned())),
             );
         }
+        let chosen = Chosen { origin, own };
         let (subject, columns, cells) = match self.kind {
             TableKind::Factors => {
                 known(&merged, &[])?;
@@ -154,17 +200,17 @@ impl TableFile {
             }
             TableKind::Data => {
                 let settings: DataSettings = settings_of(merged)?;
-                settings.check(origin, &own)?;
+                settings.check(&chosen)?;
                 ("dataset", data_columns(), self.data(&settings, size))
             }
             TableKind::Online => {
                 let settings: OnlineSettings = settings_of(merged)?;
-                settings.check(if own.contains("envs") { &Origin::User } else { origin })?;
+                settings.check(&chosen)?;
                 ("run", online::columns(), settings.cells())
             }
             TableKind::Drift => {
                 let settings: DriftSettings = settings_of(merged)?;
-                settings.check(if own.contains("env") { &Origin::User } else { origin })?;
+                settings.check(&chosen)?;
                 ("policy", drift::columns(), settings.cells(&self.datasets(size)?.commands()))
             }
         };
@@ -295,18 +341,18 @@ fn data_columns() -> Vec<TableColumn> {
 }
 
 impl DataSettings {
-    fn check(&self, origin: &Origin, own: &BTreeSet<&str>) -> Result<()> {
+    fn check(&self, chosen: &Chosen<'_>) -> Result<()> {
+        check_cells(&[self.envs.len(), self.layouts.len().max(self.remote_layouts.len())])?;
         if !((1..=1000).contains(&self.repeats) && self.seconds > 0.0 && self.seconds <= 3600.0) {
             let problem = format!("{} measurements of {} seconds", self.repeats, self.seconds);
             return Err(Error::config("settings of the study", problem, "give 1 to 1000 of at most 3600 seconds"));
         }
-        let of = |key: &str| if own.contains(key) { &Origin::User } else { origin };
         for env in &self.envs {
-            crate::env(env, of("envs"))?;
+            crate::env(env, chosen.by("envs"))?;
         }
         if !self.remote.is_empty() {
             let name = format!("the object store '{}'", self.remote);
-            of("remote").check_user(&name, "which opens a network connection", Some("remote=URI"))?;
+            chosen.by("remote").check_user(&name, "which opens a network connection", Some("remote=URI"))?;
             Location::parse(&self.remote)?;
         }
         for layout in self.layouts.iter().chain(&self.remote_layouts) {
@@ -459,5 +505,38 @@ mod tests {
             assert!(parts.iter().all(|part| error.contains(part)), "{error}");
         }
         assert!(study(DATA, &["remote=s3://bucket/a"], &stranger).is_ok(), "the user's own");
+    }
+
+    #[test]
+    fn presets_of_a_file_are_those_of_the_program() {
+        let stranger = Origin::file("study.toml", false);
+        let kind = |kind: &str, env: &str| {
+            format!("kind = \"{kind}\"\ntitle = \"T\"\nquestion = \"q?\"\n[defaults]\n{env}\npreset = \"/dev/zero\"\n")
+        };
+        let drift = kind("drift", "env = \"swm/PushT-v1\"\ndataset = \"states\"");
+        for text in [&drift, &kind("online", "envs = [\"swm/PendulumControl-v1\"]")] {
+            // Who names the environment does not name the file.
+            for settings in [&[] as &[&str], &["env=swm/PushT-v1"][..usize::from(*text == drift)]] {
+                let error = study(text, settings, &stranger).expect_err("a file").to_string();
+                assert!(error.contains("the preset '/dev/zero'") && error.contains("--trust"), "{error}");
+            }
+        }
+        study(&drift, &["preset=tiny"], &stranger).expect("a preset of the program");
+    }
+
+    #[test]
+    fn lists_with_countless_combinations_are_refused_before_cells_are_made() {
+        let many = |item: &str| vec![item; 100_000].join(",");
+        let envs = DATA.replace("\"swm/PushT-v1\"]", &format!("{}]", many("\"swm/PushT-v1\"")));
+        let data = envs.replace("\"hdf5\", \"video\"", &many("\"hdf5\""));
+        let [seeds, models, places] = [many("0"), many("\"sac\""), many("\"swm/PendulumControl-v1\"")];
+        let online = format!(
+            "kind = \"online\"\ntitle = \"T\"\nquestion = \"q?\"\n[defaults]\nenvs = [{places}]\nfamilies = [{models}]\n\
+             seeds = [{seeds}]\n"
+        );
+        for (text, count) in [(data, "10000000000"), (online, "1000000000000000")] {
+            let error = study(&text, &[], &Origin::User).expect_err("too many").to_string();
+            assert!(error.contains(count) && error.contains("10000"), "{error}");
+        }
     }
 }

@@ -157,6 +157,9 @@ impl EvaluationRecord {
         if [Some(record.success), record.floor].into_iter().flatten().any(|[successes, n]| successes > n) {
             return Err(wrong("it has more successes than episodes".to_owned()));
         }
+        if [Some(record.success), record.floor].into_iter().flatten().any(|[_, n]| n > request.episodes) {
+            return Err(wrong(format!("it counts more than the {} episodes of its request", request.episodes)));
+        }
         Ok(record)
     }
 

@@ -210,6 +210,7 @@ pub struct Context {
 /// Runs the command line with these arguments, the program's name first. Returns the exit code: 0 for success, 1 for a
 /// failure or lost output, 2 for wrong usage, 130 for an interrupted run.
 pub fn run(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) -> u8 {
+    signals::report_large_files();
     let arguments: Vec<OsString> = arguments.into_iter().map(Into::into).collect();
     run_record::remember(&arguments);
     let code = match parse(arguments) {
@@ -335,7 +336,6 @@ impl Context {
         {
             return Err(Error::external("starting worker threads", error));
         }
-        signals::report_large_files();
         let interrupt = signals::interrupt_flag().map_err(|error| Error::external("handling Ctrl-C", error))?;
         let context = Self { json, threads, interrupt };
         let of_downloads = context.clone();

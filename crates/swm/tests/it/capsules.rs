@@ -124,6 +124,7 @@ fn changed_records_of_a_capsule_are_found_and_hostile_ones_refused() {
     refused(&|capsule| record(capsule)["episodes"] = json!([]), "3 starts");
     refused(&|capsule| record(capsule)["episodes"][0]["number"] = json!(u64::MAX), "choosing starts");
     refused(&|capsule| record(capsule)["success"] = json!([9, 3]), "more successes than episodes");
+    refused(&|capsule| record(capsule)["success"] = json!([1u64 << 60, 1u64 << 60]), "counts more than the");
     refused(&|capsule| *record(capsule) = json!([]), "the evaluation in the capsule");
     let media = json!([{"id": "chroma-key", "settings": {"key_color": [0, 0, 0], "media": "/dev/zero"}}]);
     refused(&|capsule| record(capsule)["request"]["wrappers"] = media.clone(), "reads files");

@@ -115,14 +115,17 @@ fn options_without_effect_are_refused() {
 #[test]
 fn file_beyond_the_limit_of_the_process_is_an_error() {
     let swm = Swm::new();
-    let command = format!(
-        "ulimit -f 1; exec {} collect swm/TwoRoom-v1 --policy random --image 64 --episodes 20 --max-steps 20 -o a.h5",
-        env!("CARGO_BIN_EXE_swm")
-    );
-    let mut shell = std::process::Command::new("sh");
-    let output = shell.args(["-c", &command]).current_dir(swm.path("")).output().expect("a shell");
-    assert_eq!(output.status.code(), Some(1), "{}", text(&output.stderr));
-    assert!(text(&output.stderr).contains("File too large"), "{}", text(&output.stderr));
+    for arguments in [
+        "collect swm/TwoRoom-v1 --policy random --image 64 --episodes 20 --max-steps 20 -o a.h5",
+        "frame swm/TwoRoom-v1 -o frame.png",
+        "envs --json >envs.json",
+    ] {
+        let command = format!("ulimit -f 1; exec {} {arguments}", env!("CARGO_BIN_EXE_swm"));
+        let mut shell = std::process::Command::new("sh");
+        let output = shell.args(["-c", &command]).current_dir(swm.path("")).output().expect("a shell");
+        assert_eq!(output.status.code(), Some(1), "{arguments}: {}", text(&output.stderr));
+        assert!(text(&output.stderr).contains("File too large"), "{}", text(&output.stderr));
+    }
 }
 
 #[test]

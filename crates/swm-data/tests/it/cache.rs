@@ -126,6 +126,25 @@ fn disk_cache_serves_later_and_concurrent_readers_of_the_same_content() {
 }
 
 #[test]
+fn links_in_a_cache_are_not_written_through() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let (path, _) = dataset(folder.path());
+    let cache = CacheConfig::Disk { folder: folder.path().join("cache"), bytes: 1 << 30 };
+    let reader = Counting::open(&path);
+    read_all(&*with_cache(&reader, &cache));
+    let mine = folder.path().join("mine");
+    std::fs::write(&mine, b"mine").expect("writing a file");
+    let entry = std::fs::read_dir(folder.path().join("cache")).expect("listing the cache").flatten().next();
+    for file in std::fs::read_dir(entry.expect("a folder").path()).expect("listing a cache folder").flatten() {
+        std::fs::remove_file(file.path()).expect("removing a file");
+        std::os::unix::fs::symlink(&mine, file.path()).expect("a link");
+    }
+    let refused = cache.over(Arc::clone(&reader) as Arc<dyn Reader>, &["pixels"]).err().expect("a link");
+    assert!(refused.to_string().contains("is a symbolic link"), "{refused}");
+    assert_eq!(std::fs::read(&mine).expect("reading the file"), b"mine");
+}
+
+#[test]
 fn damaged_cache_rows_are_decoded_again() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let (path, rows) = dataset(folder.path());

@@ -18,7 +18,7 @@ use std::os::unix::fs::FileExt as _;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
-use swm_core::{ColumnSpec, Error, Result};
+use swm_core::{ColumnSpec, Error, Result, files};
 
 /// Size of a mark in bytes.
 const MARK_BYTES: usize = 8;
@@ -52,6 +52,7 @@ impl DiskRowCache {
         let name = &blake3::hash(column.name.as_bytes()).to_hex()[..16];
         let open = |suffix: &str, size: usize| {
             let path = folder.join(format!("{name}.{suffix}"));
+            files::check_no_link(&path)?;
             let io = |e| Error::io(&path, "opening the cache", e);
             let file =
                 OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path).map_err(io)?;

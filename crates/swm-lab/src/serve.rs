@@ -16,7 +16,7 @@ use std::convert::Infallible;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use swm_core::{Error, Result};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
@@ -32,6 +32,9 @@ const HEADERS: usize = 64;
 const PATIENCE: Duration = Duration::from_secs(10);
 /// How often the server looks whether it is to stop.
 const POLL: Duration = Duration::from_millis(50);
+
+/// The longest wait for environments at the end.
+const ENDING: Duration = Duration::from_secs(10);
 
 /// Where the server listens.
 #[derive(Clone)]
@@ -84,11 +87,13 @@ impl Server {
         self.address
     }
 
-    /// Answers requests until `stop` is set; then sockets are closed and environments end.
+    /// Answers requests until `stop` is set; then sockets are closed, and environments end and store what was recorded.
     pub fn run(self, stop: &AtomicBool) {
         let Self { runtime, listener, access, lab, .. } = self;
         let (stopping, stopped) = watch::channel(false);
-        let router = api::routes(Shared::new(lab, stopped));
+        let shared = Shared::new(lab, stopped);
+        let running = shared.running.clone();
+        let router = api::routes(shared);
         runtime.block_on(async {
             let connections = Arc::new(Semaphore::new(CONNECTIONS));
             let mut polls = tokio::time::interval(POLL);
@@ -110,6 +115,11 @@ impl Server {
         drop(router);
         // Requests that read a dataset meanwhile are not waited for.
         runtime.shutdown_timeout(Duration::from_secs(2));
+        // Recorded episodes are committed when their environments end.
+        let until = Instant::now() + ENDING;
+        while running.count() > 0 && Instant::now() < until {
+            std::thread::sleep(POLL);
+        }
     }
 }
 

@@ -58,6 +58,24 @@ fn demonstrations_are_recorded_with_the_columns_of_a_collection() {
     assert!(message.contains("was not recorded in this environment"), "{message}");
 }
 
+#[test]
+fn kept_episodes_are_stored_when_the_lab_ends() {
+    let mut lab = TestLab::start();
+    let mut live = lab.live("swm/TwoRoom-v1");
+    live.send(&json!({"type": "record", "dataset": "demos"}));
+    live.reply("recording");
+    demonstrate(&mut live, 1, 3);
+    live.send(&json!({"type": "keep"}));
+    while live.reply("recording")["episodes"] != 1 {}
+    demonstrate(&mut live, 2, 2);
+    // The lab ends while a page records an episode.
+    let home = std::mem::replace(&mut lab.home, tempfile::tempdir().expect("a folder"));
+    drop(lab);
+    let reader = swm_data::open(Location::from(home.path().join("datasets/demos.lance"))).expect("a dataset");
+    assert_eq!(reader.episodes().len(), 1);
+    while !matches!(live.receive(), super::Received::Closed) {}
+}
+
 /// The stored actions, played again from the stored seed, give the stored states.
 fn check_demonstrations(lab: &TestLab) {
     let path = lab.home.path().join("datasets/demos.lance");

@@ -4,7 +4,7 @@
 //! the same starts. Each row has the distance of their latents to the nearest latent of the training episodes, and its paths
 //! are the latents along the two principal components of those.
 
-use super::tables::Chosen;
+use super::chosen::Chosen;
 use crate::cli::Context;
 use crate::{home, resolver};
 use serde::{Deserialize, Serialize};

@@ -2,6 +2,7 @@
 
 mod any_file;
 mod breaking;
+mod chosen;
 mod colour;
 mod csv;
 mod drift;

@@ -1,6 +1,6 @@
 //! Studies of the kind `online`: returns and learning curves of models that train by interaction.
 
-use super::tables::{Chosen, check_cells};
+use super::chosen::{Chosen, check_cells};
 use crate::cli::Context;
 use crate::home;
 use serde::{Deserialize, Serialize};

@@ -6,11 +6,12 @@
 //! - `data`: the speed, latency and size of every format of datasets, on the local disk and in an object store.
 
 use super::any_file::Size;
+use super::chosen::{Chosen, check_cells};
 use super::drift::{self, DriftSettings, Trained};
 use super::online::{self, OnlineSettings};
 use crate::cli::Context;
 use crate::cli::progress::control;
-use crate::cli::recipes::{Datasets, is_preset_name};
+use crate::cli::recipes::Datasets;
 use crate::{ENVS, capsule};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -20,10 +21,10 @@ use std::path::Path;
 use swm_bench::{DataBenchConfig, FormatBench};
 use swm_core::results::TableColumn;
 use swm_core::run::{Control, Event};
-use swm_core::{Error, Origin, Result, limits};
+use swm_core::{Error, Origin, Result};
 use swm_data::{ClipSpec, Location};
 use swm_envs::wrappers::WRAPPERS;
-use swm_eval::{Measured, Study, StudyFolder, TableCell, TableStudy};
+use swm_eval::{Measured, StudyFolder, TableCell, TableStudy};
 use toml::Table;
 
 /// The file of such a study.
@@ -62,51 +63,6 @@ enum TableKind {
     Data,
     Drift,
     Online,
-}
-
-/// Who chose the settings of a study.
-pub(super) struct Chosen<'a> {
-    /// Who chose the file.
-    origin: &'a Origin,
-    /// The settings of the command line, which are the user's own.
-    own: BTreeSet<&'a str>,
-}
-
-impl Chosen<'_> {
-    /// The user chose all of them.
-    #[cfg(test)]
-    pub(super) fn by_user() -> Self {
-        Self { origin: &Origin::User, own: BTreeSet::new() }
-    }
-
-    /// Who chose a setting.
-    pub(super) fn by(&self, key: &str) -> &Origin {
-        if self.own.contains(key) { &Origin::User } else { self.origin }
-    }
-
-    /// Checks that a preset is one of the program, or that the user chose its file.
-    ///
-    /// # Errors
-    /// When a file chose the file of a preset.
-    pub(super) fn check_preset(&self, preset: &str) -> Result<()> {
-        if is_preset_name(preset) {
-            return Ok(());
-        }
-        self.by("preset").check_user(&format!("the preset '{preset}'"), "which is a file", Some("preset=FILE"))
-    }
-}
-
-/// Checks the number of cells, which lists of these lengths have, before they are made.
-///
-/// # Errors
-/// When there are more than [`Study::MAX_CELLS`].
-pub(super) fn check_cells(lengths: &[usize]) -> Result<()> {
-    let cells = limits::product(lengths.iter().copied());
-    if cells > Study::MAX_CELLS {
-        let problem = format!("its lists have {cells} combinations");
-        return Err(Error::config("the study", problem, format!("give at most {}", Study::MAX_CELLS)));
-    }
-    Ok(())
 }
 
 /// The settings of the kind `data`.
@@ -192,7 +148,7 @@ impl TableFile {
                 value.unwrap_or_else(|| toml::Value::String(setting[key.len() + 1..].to_owned())),
             );
         }
-        let chosen = Chosen { origin, own };
+        let chosen = Chosen::new(origin, own);
         let (subject, columns, cells) = match self.kind {
             TableKind::Factors => {
                 known(&merged, &[])?;

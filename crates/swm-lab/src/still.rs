@@ -150,4 +150,37 @@ impl Still {
         }
         Ok(command + " --output frame.png")
     }
+
+    /// The Python program whose `frame` has the pixels of this frame.
+    ///
+    /// # Errors
+    /// As [`Still::command`].
+    pub fn python(&self, spec: &EnvSpec) -> Result<String> {
+        spec.variation_space.check(&self.variation)?;
+        let (height, width) = self.size;
+        let mut parts = spec.id.split(',');
+        let id = parts.next().unwrap_or_default();
+        let options: String =
+            parts.filter_map(|part| part.split_once('=')).map(|(key, value)| format!(", {key}=\"{value}\"")).collect();
+        let size = if self.size == (SIDE, SIDE) { String::new() } else { format!(", image_shape=({height}, {width})") };
+        let mut reset = vec![];
+        if let Some(keys) = &self.variation.variation {
+            reset.push(format!("\"variation\": {keys:?}"));
+        }
+        let pins = self.variation.variation_values.iter().map(|(key, values)| {
+            let space = &spec.variation_space.factors()[spec.variation_space.select(key)?[0]].space;
+            Ok(format!("\"{key}\": [{}]", space.format_values(values)))
+        });
+        let pins = pins.collect::<Result<Vec<_>>>()?;
+        if !pins.is_empty() {
+            reset.push(format!("\"variation_values\": {{{}}}", pins.join(", ")));
+        }
+        let reset = if reset.is_empty() { String::new() } else { format!(", options={{{}}}", reset.join(", ")) };
+        let render = if self.goal { "env.unwrapped.render_goal()" } else { "env.render()" };
+        let head = "import gymnasium\nimport stable_worldmodel\n\n";
+        Ok(format!(
+            "{head}env = gymnasium.make(\"{id}\"{options}{size})\nenv.reset(seed={}{reset})\nframe = {render}\n",
+            self.seed
+        ))
+    }
 }

@@ -68,6 +68,8 @@ pub enum Reply {
         factors: serde_json::Map<String, serde_json::Value>,
         /// The command that writes the first frame.
         command: String,
+        /// The Python program that renders it.
+        python: String,
     },
     /// What is recorded.
     Recording {

@@ -239,6 +239,7 @@ impl<'a> Player<'a> {
             seed: self.seed,
             factors: factors.iter().map(|(key, value)| (key.to_owned(), json!(value))).collect(),
             command: still.command(spec)?,
+            python: still.python(spec)?,
         });
         self.report_recording();
         self.send_frame()

@@ -49,6 +49,8 @@ def test_a_factor_is_varied_and_its_command_writes_the_still(lab, open_page):
     lab.swm(*copied.split()[1:])
     still = page.request.get(lab.url + page.get_by_test_id("still").get_attribute("href")).body()
     assert (lab.home / "frame.png").read_bytes() == still
+    page.get_by_role("button", name="Python").click()
+    assert 'gymnasium.make("swm/PushT-v1")' in page.evaluate("navigator.clipboard.readText()")
     page.get_by_role("button", name="Play").click()
     wait_for_steps(page, 15)
     screenshot(page, "environments")

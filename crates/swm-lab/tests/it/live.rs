@@ -18,6 +18,10 @@ fn a_page_resets_pins_steps_and_drives() {
     let command = "swm frame swm/TwoRoom-v1 --seed 7 --image 32 --variation none --pin agent.position=60,112 agent.speed=5 \
                    --output frame.png";
     assert_eq!(started["command"], command);
+    let python = "import gymnasium\nimport stable_worldmodel\n\nenv = gymnasium.make(\"swm/TwoRoom-v1\", image_shape=(32, 32))\n\
+                  env.reset(seed=7, options={\"variation\": [], \"variation_values\": {\"agent.position\": [60, 112], \
+                  \"agent.speed\": [5]}})\nframe = env.render()\n";
+    assert_eq!(started["python"], python);
     let (first, jpeg) = live.frame(|header| header["step"] == 0.0);
     assert_eq!(first["state"], json!([60.0, 112.0]));
     assert_eq!(image::image_size(&jpeg).expect("a JPEG"), (32, 32));

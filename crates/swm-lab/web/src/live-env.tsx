@@ -157,6 +157,14 @@ function Command({ info, control, isCompared }: { info: EnvInfo; control: Contro
       <button type="button" onClick={copy} disabled={!command} title="Copy the command (c)">
         Copy
       </button>
+      <button
+        type="button"
+        onClick={() => void navigator.clipboard?.writeText(live.started?.python ?? "")}
+        disabled={!command}
+        title="Copy the Python program that renders the frame"
+      >
+        Python
+      </button>
       <a
         class="button"
         data-testid="still"

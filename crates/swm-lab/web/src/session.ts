@@ -17,6 +17,7 @@ export interface Started {
   seed: number;
   factors: Record<string, number[]>;
   command: string;
+  python: string;
 }
 
 export interface Recording {

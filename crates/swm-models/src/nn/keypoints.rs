@@ -14,6 +14,11 @@ use serde::{Deserialize, Serialize};
 use swm_core::{Error, Key, Result};
 use swm_kernels::{FilterBank, KeypointScratch};
 
+/// The most sizes of filters, and the most hidden layers.
+const MOST_LAYERS: usize = 64;
+/// The most weights of all filters: 256 MiB.
+const MOST_WEIGHTS: usize = 1 << 26;
+
 /// The size of a [`Keypoints`] encoder.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -83,6 +88,9 @@ impl KeypointsConfig {
                 "give at least one size of filters",
             ));
         }
+        for (name, count) in [("filters", self.filters.len()), ("hidden", self.hidden.len())] {
+            check_sizes(&[(&format!("the length of {at}.{name}"), count, 0, MOST_LAYERS)])?;
+        }
         for FilterConfig { kernel, stride, channels } in &self.filters {
             check_sizes(&[
                 (&format!("{at}.filters.kernel"), *kernel, 1, image),
@@ -94,6 +102,8 @@ impl KeypointsConfig {
                 return Err(Error::config(format!("{at}.filters.kernel"), kernel.to_string(), fix));
             }
         }
+        let weights = self.filters.iter().map(|filter| 3 * filter.channels * filter.kernel * filter.kernel).sum();
+        check_sizes(&[(&format!("the weights of {at}.filters"), weights, 1, MOST_WEIGHTS)])?;
         if !(self.sharpness.is_finite() && self.sharpness > 0.0) {
             return Err(Error::config(format!("{at}.sharpness"), self.sharpness.to_string(), "give a number above 0"));
         }

@@ -13,7 +13,7 @@ const STAGE: &str = "encode";
 /// The most bytes of features that are kept in memory; for a larger dataset, every batch is encoded anew.
 const MOST_BYTES: u64 = 6 << 30;
 /// The frames that are encoded together.
-const BLOCK: usize = 1024;
+const BLOCK: usize = 256;
 
 /// The part of an encoder that is not trained, with the normalisation of its images.
 pub struct FixedPart {
@@ -47,7 +47,8 @@ impl FixedFeatures {
         let rows: usize = reader.episodes().iter().map(|episode| episode.length).sum();
         let bytes = rows * width * size_of::<f32>();
         let cache = match folder {
-            Some(folder) => CacheConfig::Disk { folder: folder.to_owned(), bytes },
+            // The files are as large as the features, whatever the limit; damaged rows are computed and stored again.
+            Some(folder) => CacheConfig::Disk { folder: folder.to_owned(), bytes: usize::MAX },
             None if bytes as u64 <= MOST_BYTES => CacheConfig::Memory { bytes },
             None => return Ok(reader),
         };

@@ -198,6 +198,11 @@ fn decoder_without_fixed_filters_is_refused() {
     }
     let error = config.check().expect_err("checking filters without a centre");
     assert!(error.to_string().contains("choose an odd side"), "{error}");
+    if let EncoderConfig::Keypoints(keypoints) = &mut config.model.encoder {
+        keypoints.filters = vec![FilterConfig { kernel: 15, stride: 4, channels: 200_000 }];
+    }
+    let error = config.check().expect_err("checking filters that are too many").to_string();
+    assert!(error.contains("the weights of model.encoder.keypoints.filters: 135000000; give at most"), "{error}");
 }
 
 #[test]

@@ -18,6 +18,7 @@ use swm_core::{Error, Origin, Result, files};
 
 /// The recipes of this program: their names and texts.
 const SHIPPED: &[(&str, &str)] = &[
+    ("ogb-cube/gcbc", include_str!("../../../../../recipes/ogb-cube/gcbc.toml")),
     ("push-t/gcbc", include_str!("../../../../../recipes/push-t/gcbc.toml")),
     ("two-room/lewm", include_str!("../../../../../recipes/two-room/lewm.toml")),
     ("two-room/pldm", include_str!("../../../../../recipes/two-room/pldm.toml")),

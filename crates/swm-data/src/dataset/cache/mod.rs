@@ -66,10 +66,12 @@ impl CacheConfig {
             caches[index] = match self {
                 // Columns with small rows are cached as a whole if they fit into the budget, because caching their rows
                 // one by one costs more than reading them.
-                _ if !spec.is_image() && spec.row_bytes() < LARGE_ROW => match budget.take(rows.saturating_mul(spec.row_bytes())) {
-                    true => ColumnCache::Whole(OnceLock::new(), Mutex::default()),
-                    false => ColumnCache::Uncached,
-                },
+                _ if !spec.is_image() && spec.row_bytes() < LARGE_ROW => {
+                    match budget.take(rows.saturating_mul(spec.row_bytes())) {
+                        true => ColumnCache::Whole(OnceLock::new(), Mutex::default()),
+                        false => ColumnCache::Uncached,
+                    }
+                }
                 Self::Disk { folder, .. } => {
                     let identity = match &identity {
                         Some(identity) => identity,

@@ -85,17 +85,18 @@ for _core in ("numpy.core", "numpy._core"):
 
 # The unpickler in Python keeps its memo in a dictionary; the one in C reserves memory for an index that a file states.
 class _Unpickler(pickle._Unpickler):
-    dispatch = dict(pickle._Unpickler.dispatch)  # type: ignore[attr-defined]
+    dispatch = dict(pickle._Unpickler.dispatch)
 
     def find_class(self, module: str, name: str) -> Any:
         return _READERS.get((module, name), _Record)
 
     def load_bytearray8(self) -> None:
         # The one of Python reserves the bytes that the file states.
-        (length,) = struct.unpack("<Q", self.read(8))
-        self.append(bytearray(self.read(min(length, _MOST_STATISTICS))))
+        file: Any = self
+        (length,) = struct.unpack("<Q", file.read(8))
+        file.append(bytearray(file.read(min(length, _MOST_STATISTICS))))
 
-    dispatch[pickle.BYTEARRAY8[0]] = load_bytearray8
+    dispatch[pickle.BYTEARRAY8[0]] = load_bytearray8  # type: ignore[assignment]
 
 
 def _check_file(path: str | os.PathLike[str], most: int | None = None) -> None:
@@ -150,7 +151,8 @@ class SB3Normalizer:
     def normalize(self, obs: np.ndarray) -> np.ndarray:
         """The normalised observations."""
         scaled = (np.asarray(obs) - self.mean) / np.sqrt(self.var + self.epsilon)
-        return np.clip(scaled, -self.clip_obs, self.clip_obs)
+        normalised: np.ndarray = np.clip(scaled, -self.clip_obs, self.clip_obs)
+        return normalised
 
 
 class ExpertPolicy(BasePolicy):

@@ -94,6 +94,8 @@ fn escaped_json(json: &str) -> Cow<'_, str> {
 
 /// The most characters of a word that keep a column of a table wide; longer words are broken.
 const LONGEST_WORD: usize = 24;
+/// The width that every column gets before the words of others are kept whole.
+const NARROW: usize = 10;
 
 /// Returns the width of the longest word of each column.
 fn longest_words(header: &[&str], rows: &[Vec<String>]) -> Vec<usize> {
@@ -105,14 +107,17 @@ fn longest_words(header: &[&str], rows: &[Vec<String>]) -> Vec<usize> {
     header.iter().enumerate().map(column).collect()
 }
 
-/// Keeps words whole, where the terminal is wide enough for the words of all columns.
+/// Keeps the words of columns whole, from the first column on, as far as the terminal is wide enough.
 fn keep_words(table: &mut comfy_table::Table, words: &[usize]) {
+    let Some(mut free) = table.width().map(usize::from) else { return };
     // A space on both sides of a cell.
     let widths: Vec<usize> = words.iter().map(|width| width.min(&LONGEST_WORD) + 2).collect();
-    if table.width().is_some_and(|width| widths.iter().sum::<usize>() <= usize::from(width)) {
-        for (column, width) in table.column_iter_mut().zip(widths) {
-            column.set_constraint(ColumnConstraint::LowerBoundary(Width::Fixed(width as u16)));
+    for (index, column) in table.column_iter_mut().enumerate() {
+        let rest: usize = widths[index + 1..].iter().map(|width| width.min(&NARROW)).sum();
+        if widths[index] + rest <= free {
+            column.set_constraint(ColumnConstraint::LowerBoundary(Width::Fixed(widths[index] as u16)));
         }
+        free = free.saturating_sub(widths[index].min(free.saturating_sub(rest)));
     }
 }
 

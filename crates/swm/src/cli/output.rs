@@ -94,7 +94,7 @@ fn escaped_json(json: &str) -> Cow<'_, str> {
 
 /// The most characters of a word that keep a column of a table wide; longer words are broken.
 const LONGEST_WORD: usize = 24;
-/// The width that every column gets before the words of others are kept whole.
+/// The width that every column gets before words of other columns are kept whole.
 const NARROW: usize = 10;
 
 /// Returns the width of the longest word of each column.

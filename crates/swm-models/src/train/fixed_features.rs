@@ -57,14 +57,14 @@ impl FixedFeatures {
             _ => column.clone(),
         };
         let schema = Schema::new(reader.schema().columns().iter().map(column).collect::<Vec<_>>())?;
-        let features = cache.over(Arc::new(Self { inner: reader, schema, part }), &[PIXELS])?;
+        let features = cache.by_row(Arc::new(Self { inner: reader, schema, part }), &[PIXELS])?;
         control.emit(Event::Started(Stage { name: STAGE, subject: &[], total: rows, unit: "frames" }));
-        let (mut row, mut done) = (vec![], 0);
+        let (mut block, mut done) = (vec![], 0);
         for ranges in blocks(features.episodes()) {
             control.check()?;
             let count: usize = ranges.iter().map(|range| range.length).sum();
-            row.resize(count * width * size_of::<f32>(), 0);
-            features.read_column(PIXELS, &ranges, &mut row)?;
+            block.resize(count * width * size_of::<f32>(), 0);
+            features.read_column(PIXELS, &ranges, &mut block)?;
             done += count;
             control.progress(Progress { stage: STAGE, done, total: rows, unit: "frames", metrics: &[] });
         }

@@ -162,10 +162,6 @@ fn fixed_filters_are_not_trained_and_give_the_same_latents_from_frames_as_in_tra
 fn later_runs_find_the_features_of_fixed_filters_in_a_folder() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let mut config = keypoints_config();
-    if let EncoderConfig::Keypoints(keypoints) = &mut config.model.encoder {
-        // Rows of 100 * 3 numbers are large enough for files.
-        keypoints.filters = vec![FilterConfig { kernel: 3, stride: 4, channels: 100 }];
-    }
     let run = |name: &str, feature_cache: Option<&Path>, config: &TrainConfig<Lewm>| {
         let options = TrainOptions { feature_cache: feature_cache.map(Path::to_owned), ..TrainOptions::default() };
         let (out, dots) = (folder.path().join(name), Arc::new(Dots::new(6, 0)));

@@ -74,7 +74,7 @@ impl Solver for ICem {
         self.check()?;
         let bounds = continuous(&ENTRY, cost, &problem)?;
         let dim = problem.space.dim();
-        let block = format!("{} of {dim} numbers in a model step", self.block);
+        let block = format!("{} for {dim} dimensions of a model step", self.block);
         let fix = "give the action block of the model, or 1";
         Settings(ID).check(dim.is_multiple_of(self.block), "block", block, fix)?;
         // `[horizon, block * action]` is `[horizon * block, action]`.

@@ -136,7 +136,7 @@ fn errors_name_invalid_settings() {
         ("icem", json!({"momentum": -0.1}), "icem momentum"),
         ("icem", json!({"beta": -1}), "icem beta"),
         ("icem", json!({"block": 0}), "icem block: 0; choose at least 1"),
-        ("icem", json!({"block": 5}), "icem block: 5 of 2 numbers in a model step; give the action block"),
+        ("icem", json!({"block": 5}), "icem block: 5 for 2 dimensions of a model step; give the action block"),
         ("icem", json!({"keep": 31}), "icem keep: 31; choose at most 30"),
         ("icem", json!({"samples": 5, "elites": 5, "keep": 5}), "choose at most 4"),
         ("mppi", json!({"temperature": 0}), "mppi temperature: 0; choose a finite number above 0"),

@@ -17,10 +17,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, OnceLock};
-use swm_core::{Manifest, Result, Schema};
-
-/// The bytes from which a row is cached on its own.
-const LARGE_ROW: usize = 1 << 10;
+use swm_core::{ColumnSpec, Manifest, Result, Schema};
 
 /// Storage and size limit of a cache of decoded rows.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -33,8 +30,8 @@ pub enum CacheConfig {
         /// Maximum size in bytes.
         bytes: usize,
     },
-    /// Columns of images, and others with rows of at least 1 KiB, are cached in files, in a subfolder named after the
-    /// dataset's content hash; columns with smaller rows are cached in memory. If several processes use the same files, one process fills them and all
+    /// Images are cached in files, in a subfolder named after the dataset's content hash; columns without images, which
+    /// are small, are cached in memory. If several processes use the same files, one process fills them and all
     /// processes read them.
     Disk {
         /// The folder; several datasets may share it.
@@ -50,6 +47,24 @@ impl CacheConfig {
     /// # Errors
     /// If a column does not exist, the dataset's content cannot be hashed, or the folder cannot be written.
     pub fn over(&self, reader: Arc<dyn Reader>, columns: &[&str]) -> Result<Arc<dyn Reader>> {
+        self.wrap(reader, columns, ColumnSpec::is_image)
+    }
+
+    /// As [`CacheConfig::over`], for columns that are expensive to read: each row is cached as images are, whatever its
+    /// size.
+    ///
+    /// # Errors
+    /// As [`CacheConfig::over`].
+    pub fn by_row(&self, reader: Arc<dyn Reader>, columns: &[&str]) -> Result<Arc<dyn Reader>> {
+        self.wrap(reader, columns, |_| true)
+    }
+
+    fn wrap(
+        &self,
+        reader: Arc<dyn Reader>,
+        columns: &[&str],
+        by_row: fn(&ColumnSpec) -> bool,
+    ) -> Result<Arc<dyn Reader>> {
         let bytes = match *self {
             Self::Off => return Ok(reader),
             Self::Memory { bytes } | Self::Disk { bytes, .. } => bytes,
@@ -64,14 +79,12 @@ impl CacheConfig {
             let index = reader.schema().index(name)?;
             let spec = &reader.schema().columns()[index];
             caches[index] = match self {
-                // Columns with small rows are cached as a whole if they fit into the budget, because caching their rows
-                // one by one costs more than reading them.
-                _ if !spec.is_image() && spec.row_bytes() < LARGE_ROW => {
-                    match budget.take(rows.saturating_mul(spec.row_bytes())) {
-                        true => ColumnCache::Whole(OnceLock::new(), Mutex::default()),
-                        false => ColumnCache::Uncached,
-                    }
-                }
+                // Columns without images are cached as a whole if they fit into the budget, because caching their small
+                // rows one by one costs more than reading them.
+                _ if !by_row(spec) => match budget.take(rows.saturating_mul(spec.row_bytes())) {
+                    true => ColumnCache::Whole(OnceLock::new(), Mutex::default()),
+                    false => ColumnCache::Uncached,
+                },
                 Self::Disk { folder, .. } => {
                     let identity = match &identity {
                         Some(identity) => identity,

@@ -2,7 +2,8 @@
 //! dataset, by `POST`; all else that changes something goes through the socket of a session.
 
 use crate::datasets::{self, Datasets};
-use crate::session::{self, Running, Setup, messages};
+use crate::plans::{self, PlanSession};
+use crate::session::{self, Player, Running, Session, Setup, messages};
 use crate::still::StillQuery;
 use crate::{Lab, assets, runs};
 use axum::Router;
@@ -94,7 +95,9 @@ pub fn routes(shared: Shared) -> Router {
         .route("/api/env", get(env))
         .route("/api/still", get(still))
         .route("/api/command", get(command))
-        .route("/api/live", get(live))
+        .route("/api/live", get(open::<Player>))
+        .route("/api/plan", get(open::<PlanSession>))
+        .route("/api/planners", get(planners))
         .route("/api/status", get(status))
         .route("/api/datasets", get(list_datasets))
         .route("/api/episodes", get(episodes))
@@ -156,6 +159,15 @@ async fn env(State(shared): State<Shared>, Query(query): Query<EnvQuery>) -> Ans
     as_json(&described.await?)
 }
 
+/// The models and the solvers that fit an environment, the solvers with their defaults.
+async fn planners(State(shared): State<Shared>, Query(query): Query<EnvQuery>) -> Answer {
+    let listed = shared.work(move |shared| {
+        let env = shared.env(&query.env)?.env()?;
+        Ok(plans::listed(&*shared.lab.planning, env.spec()))
+    });
+    as_json(&listed.await?)
+}
+
 async fn still(State(shared): State<Shared>, Query(query): Query<StillQuery>) -> Answer {
     let png = shared.work(move |shared| query.still()?.png(&mut *shared.env(&query.env)?.env()?)).await?;
     Ok(answer("image/png", png))
@@ -166,8 +178,8 @@ async fn command(State(shared): State<Shared>, Query(query): Query<StillQuery>) 
     Ok(answer("text/plain; charset=utf-8", text))
 }
 
-/// Upgrades to the socket of a live environment.
-async fn live(State(shared): State<Shared>, Query(query): Query<EnvQuery>, mut request: Request) -> Answer {
+/// Upgrades to the socket of a session: a live environment, or plans in one.
+async fn open<S: Session>(State(shared): State<Shared>, Query(query): Query<EnvQuery>, mut request: Request) -> Answer {
     let setup = Setup { env: shared.env(&query.env)?, side: query.image.unwrap_or(crate::still::SIDE) };
     let headers = request.headers();
     let is = |name, expected: &str| {
@@ -178,13 +190,13 @@ async fn live(State(shared): State<Shared>, Query(query): Query<EnvQuery>, mut r
         && is(header::CONNECTION, "upgrade")
         && is(header::SEC_WEBSOCKET_VERSION, "13");
     let key = headers.get(header::SEC_WEBSOCKET_KEY).filter(|_| is_handshake).cloned().ok_or_else(|| {
-        Error::config("/api/live", "the request is no WebSocket handshake of version 13", "connect with a WebSocket")
+        Error::config("the socket", "the request is no WebSocket handshake of version 13", "connect with a WebSocket")
     })?;
     let accept = STANDARD.encode(Sha1::new().chain_update(key.as_bytes()).chain_update(HANDSHAKE).finalize());
     let upgrade = hyper::upgrade::on(&mut request);
     tokio::spawn(async move {
         match upgrade.await {
-            Ok(connection) => session::run(connection, shared.lab, setup, shared.running, shared.stop).await,
+            Ok(connection) => session::run::<S>(connection, shared.lab, setup, shared.running, shared.stop).await,
             Err(error) => tracing::debug!("a page left before its socket opened: {error}"),
         }
     });

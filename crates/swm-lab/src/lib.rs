@@ -4,17 +4,19 @@
 //!   ([`access`]).
 //! - [`still`]: one frame of an environment as PNG, the same bytes as `swm frame` writes.
 //! - [`session`]: a live environment behind a WebSocket, which a policy or a person drives, and whose episodes can be recorded.
+//! - [`plans`]: a live environment that a solver plans in, whose searches are shown, and whose steps are a tree to go back in.
 //! - [`datasets`] and [`runs`]: what the pages of datasets and of training curves show, from [`folders`] that the lab was
 //!   started with, and no other.
 //! - [`assets`]: the pages, built from `web/` and embedded.
 //!
-//! This crate knows no environment and no policy: [`Lab`] has the registry and the function that makes policies.
+//! This crate knows no environment, no model and no policy: [`Lab`] has the registry, and what makes policies and planners.
 
 pub mod access;
 mod api;
 pub mod assets;
 pub mod datasets;
 pub mod folders;
+pub mod plans;
 pub mod runs;
 pub mod serve;
 pub mod session;
@@ -37,6 +39,8 @@ pub struct Lab {
     pub envs: &'static Registry<EnvEntry>,
     /// The policies that drive them.
     pub policy: MakePolicy,
+    /// The models that plan.
+    pub planning: Box<dyn plans::Planning>,
     /// Folders of datasets. The first receives recorded demonstrations.
     pub datasets: Folders,
     /// Folders of training runs.

@@ -3,6 +3,9 @@
 //! folder](crate::home).
 
 mod probing;
+mod watching;
+
+pub use watching::WatchedPolicy;
 
 use crate::home;
 use serde::de::DeserializeOwned;

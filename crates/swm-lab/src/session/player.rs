@@ -2,7 +2,7 @@
 
 use super::messages::{Reply, Request};
 use super::recorder::Recorder;
-use super::{Frame, Setup};
+use super::{Frame, Kind, Out, Session, Setup, check_seed};
 use crate::{Lab, still};
 use serde_json::{Value, json};
 use std::sync::Arc;
@@ -13,7 +13,6 @@ use swm_core::pool::Reset;
 use swm_core::{Error, Key, Policy, ResetOptions, Result, Space, VariationRequest, columns, limits};
 use swm_data::ImageCodec;
 use swm_eval::{World, WorldConfig};
-use tokio::sync::{mpsc, watch};
 
 /// The quality of frames.
 const QUALITY: u8 = 92;
@@ -23,16 +22,6 @@ const MOST_STATE: usize = 32;
 const FPS: f64 = 30.0;
 /// The fastest that a page may choose.
 const FASTEST: f64 = 240.0;
-/// The largest seed, which every dataset can store.
-const LARGEST_SEED: u64 = i64::MAX as u64;
-
-/// The two ways out of the thread.
-pub struct Out {
-    /// The newest frame.
-    pub frames: watch::Sender<Arc<Frame>>,
-    /// Replies, in order.
-    pub replies: mpsc::Sender<Reply>,
-}
 
 /// A live environment.
 pub struct Player<'a> {
@@ -51,6 +40,24 @@ pub struct Player<'a> {
     ended: bool,
     recorder: Option<Recorder>,
     out: Out,
+}
+
+impl Session for Player<'static> {
+    type Request = Request;
+    const IS_PLAN: bool = false;
+
+    fn kind(request: &Request) -> Kind {
+        match request {
+            Request::Shown => Kind::Shown,
+            Request::Act { .. } => Kind::Replaceable,
+            _ => Kind::Ordered,
+        }
+    }
+
+    fn play(lab: &Lab, setup: Setup, out: Out, requests: &Receiver<Request>) -> Result<()> {
+        Player::new(lab, setup, out)?.run(requests);
+        Ok(())
+    }
 }
 
 impl<'a> Player<'a> {
@@ -115,15 +122,10 @@ impl<'a> Player<'a> {
             };
             if let Err(error) = outcome {
                 self.playing = false;
-                self.reply(Reply::Failed { message: error.to_string() });
+                self.out.failed(&error);
                 self.send_frame().ok();
             }
         }
-    }
-
-    /// Sends a reply; one that the page does not take in time is dropped, and the next frame shows the state.
-    fn reply(&self, reply: Reply) {
-        self.out.replies.try_send(reply).ok();
     }
 
     fn handle(&mut self, request: Request) -> Result<()> {
@@ -131,9 +133,7 @@ impl<'a> Player<'a> {
             Request::Reset { seed, pin, variation } => {
                 let variation = still::request(&pin, variation.as_deref())?;
                 self.world.spec().variation_space.check(&variation)?;
-                if seed > LARGEST_SEED {
-                    return Err(Error::config("seed", seed.to_string(), format!("choose at most {LARGEST_SEED}")));
-                }
+                check_seed(seed)?;
                 (self.seed, self.variation) = (seed, variation);
                 self.reset()
             }
@@ -177,7 +177,7 @@ impl<'a> Player<'a> {
                 let recorder = self.recorder.take().ok_or_else(nothing_recorded)?;
                 let episodes = recorder.episodes();
                 recorder.finish()?;
-                self.reply(Reply::Recording { dataset: None, episodes, rows: 0, complete: false });
+                self.out.reply(&Reply::Recording { dataset: None, episodes, rows: 0, complete: false });
                 self.send_frame()
             }
         }
@@ -194,7 +194,7 @@ impl<'a> Player<'a> {
 
     fn report_recording(&self) {
         if let Some(recorder) = &self.recorder {
-            self.reply(Reply::Recording {
+            self.out.reply(&Reply::Recording {
                 dataset: Some(recorder.name().to_owned()),
                 episodes: recorder.episodes(),
                 rows: recorder.rows(),
@@ -235,7 +235,7 @@ impl<'a> Player<'a> {
         let still =
             still::Still { seed: self.seed, variation: self.variation.clone(), goal: false, size: (side, side) };
         let factors = self.world.pool().env(0).factors();
-        self.reply(Reply::Started {
+        self.out.reply(&Reply::Started {
             seed: self.seed,
             factors: factors.iter().map(|(key, value)| (key.to_owned(), json!(value))).collect(),
             command: still.command(spec)?,

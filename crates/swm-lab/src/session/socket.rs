@@ -1,8 +1,7 @@
 //! The socket of a session: requests in, replies and frames out, and the end of both.
 
-use super::messages::{Reply, Request};
-use super::player::{Out, Player};
-use super::{Counted, Frame, IN_FLIGHT, MOST_BYTES, MOST_MALFORMED, Running, Setup};
+use super::messages::Reply;
+use super::{Counted, Frame, IN_FLIGHT, Kind, MOST_BYTES, MOST_MALFORMED, Out, Running, Session, Setup};
 use crate::Lab;
 use futures::stream::{SplitSink, SplitStream};
 use futures::{SinkExt as _, StreamExt as _};
@@ -30,8 +29,23 @@ const PING: Duration = Duration::from_secs(20);
 /// A page that sends nothing for this long, not even an answer to a ping, is gone.
 const SILENCE: Duration = Duration::from_secs(65);
 
-/// Plays an environment for the page behind a connection, until the page is gone or `stop` is set.
-pub async fn run(connection: Upgraded, lab: Arc<Lab>, setup: Setup, running: Running, stop: watch::Receiver<bool>) {
+/// Says to the thread of a session that its page is gone, when it is dropped.
+struct Leaving(Arc<AtomicBool>);
+
+impl Drop for Leaving {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
+/// Plays a session for the page behind a connection, until the page is gone or `stop` is set.
+pub async fn run<S: Session>(
+    connection: Upgraded,
+    lab: Arc<Lab>,
+    setup: Setup,
+    running: Running,
+    stop: watch::Receiver<bool>,
+) {
     let mut config = WebSocketConfig::default();
     config.max_message_size = Some(MOST_BYTES);
     config.max_frame_size = Some(MOST_BYTES);
@@ -41,16 +55,18 @@ pub async fn run(connection: Upgraded, lab: Arc<Lab>, setup: Setup, running: Run
     let (frames, newest) = watch::channel(Arc::new(Frame::default()));
     let (replies, to_send) = mpsc::channel(QUEUE);
     let (requests, taken) = sync_channel(QUEUE);
-    let out = Out { frames, replies: replies.clone() };
-    if let Err(error) = start(lab, setup, &running, out, taken) {
-        let reply = Reply::Failed { message: error.to_string() };
-        sink.send(text(&reply)).await.ok();
+    let leaving = Leaving(Arc::default());
+    let enough = Arc::<AtomicBool>::default();
+    let out = Out { frames, replies: replies.clone(), gone: Arc::clone(&leaving.0), enough: Arc::clone(&enough) };
+    if let Err(error) = start::<S>(lab, setup, &running, out, taken) {
+        sink.send(Message::text(failed(error.to_string()))).await.ok();
         sink.close().await.ok();
         return;
     }
     let credits = Arc::new(Semaphore::new(IN_FLIGHT));
     let is_alive = Arc::new(AtomicBool::new(true));
-    let reading = read(source, requests, replies, Arc::clone(&credits), Arc::clone(&is_alive));
+    let page = Page { credits: Arc::clone(&credits), is_alive: Arc::clone(&is_alive), enough };
+    let reading = read::<S>(source, requests, replies, page);
     let writing = write(sink, to_send, newest, credits, is_alive);
     // The first of the three that ends drops the others, and with them the channel that the thread waits on.
     tokio::select! {
@@ -66,25 +82,21 @@ async fn stopped(mut stop: watch::Receiver<bool>) {
 }
 
 /// Starts the thread of the environment. It ends when `requests` closes.
-fn start(
+fn start<S: Session>(
     lab: Arc<Lab>,
     setup: Setup,
     running: &Running,
     out: Out,
-    requests: Receiver<Request>,
+    requests: Receiver<S::Request>,
 ) -> swm_core::Result<()> {
-    let counted = running.start()?;
+    let counted = running.start(S::IS_PLAN)?;
     let (replies, frames) = (out.replies.clone(), out.frames.clone());
     let play = move || {
         let _counted: Counted = counted;
-        let played = catch_unwind(AssertUnwindSafe(|| {
-            let mut player = Player::new(&lab, setup, out)?;
-            player.run(&requests);
-            Ok(())
-        }));
+        let played = catch_unwind(AssertUnwindSafe(|| S::play(&lab, setup, out, &requests)));
         let played = played.unwrap_or_else(|panic| Err(Error::panicked("the environment panicked", &*panic)));
         if let Err(error) = played {
-            replies.try_send(Reply::Failed { message: error.to_string() }).ok();
+            replies.try_send(failed(error.to_string())).ok();
         }
         // The slot closes after the last reply.
         drop(frames);
@@ -93,13 +105,22 @@ fn start(
     thread.map(drop).map_err(|error| Error::external("starting the thread of an environment", error))
 }
 
-/// Takes requests until the page is gone, sends too many malformed ones, or its environment has ended.
-async fn read(
-    mut source: SplitStream<Stream>,
-    requests: SyncSender<Request>,
-    replies: mpsc::Sender<Reply>,
+/// What the page tells outside of the order of messages.
+struct Page {
+    /// Frames that may be sent.
     credits: Arc<Semaphore>,
+    /// Whether the page sent anything since the last ping.
     is_alive: Arc<AtomicBool>,
+    /// Whether it asks to end a search.
+    enough: Arc<AtomicBool>,
+}
+
+/// Takes requests until the page is gone, sends too many malformed ones, or its environment has ended.
+async fn read<S: Session>(
+    mut source: SplitStream<Stream>,
+    requests: SyncSender<S::Request>,
+    replies: mpsc::Sender<String>,
+    page: Page,
 ) {
     let mut malformed = 0;
     loop {
@@ -114,27 +135,19 @@ async fn read(
             }
             None => return,
         };
-        is_alive.store(true, Ordering::Relaxed);
+        page.is_alive.store(true, Ordering::Relaxed);
         let text = match &message {
             Message::Text(text) => text.as_str(),
             Message::Close(_) => return,
             Message::Ping(_) | Message::Pong(_) => continue,
             _ => "",
         };
-        let problem = match serde_json::from_str(text) {
-            Ok(Request::Shown) => {
-                if credits.available_permits() < IN_FLIGHT {
-                    credits.add_permits(1);
-                }
-                continue;
-            }
-            Ok(request) => match requests.try_send(request) {
-                Ok(()) => continue,
-                // Requests of hands arrive faster than a slow environment takes them; the next one replaces them.
-                Err(TrySendError::Full(Request::Act { .. })) => continue,
-                Err(TrySendError::Full(_)) => "the environment is busy; try again".to_owned(),
+        let problem = match serde_json::from_str::<S::Request>(text) {
+            Ok(request) => match take::<S>(request, &requests, &page) {
+                Taken::Yes => continue,
+                Taken::Busy => "the environment is busy; try again".to_owned(),
                 // `write` sends the reply that says why the environment has ended, and closes the socket.
-                Err(TrySendError::Disconnected(_)) => std::future::pending().await,
+                Taken::Ended => std::future::pending().await,
             },
             Err(error) => {
                 malformed += 1;
@@ -142,17 +155,49 @@ async fn read(
                 format!("malformed message: {error}")
             }
         };
-        replies.try_send(Reply::Failed { message: problem }).ok();
+        replies.try_send(failed(problem)).ok();
         if malformed >= MOST_MALFORMED {
             return;
         }
     }
 }
 
+/// What became of a request.
+enum Taken {
+    Yes,
+    Busy,
+    Ended,
+}
+
+/// Hands a request to the thread of the session, or does at once what it asks for.
+fn take<S: Session>(request: S::Request, requests: &SyncSender<S::Request>, page: &Page) -> Taken {
+    let kind = S::kind(&request);
+    match kind {
+        Kind::Shown => {
+            if page.credits.available_permits() < IN_FLIGHT {
+                page.credits.add_permits(1);
+            }
+            return Taken::Yes;
+        }
+        Kind::EndsSearch => {
+            page.enough.store(true, Ordering::Relaxed);
+            return Taken::Yes;
+        }
+        Kind::Ordered | Kind::Replaceable => {}
+    }
+    match requests.try_send(request) {
+        Ok(()) => Taken::Yes,
+        // Requests of hands arrive faster than a slow environment takes them; the next one replaces them.
+        Err(TrySendError::Full(_)) if kind == Kind::Replaceable => Taken::Yes,
+        Err(TrySendError::Full(_)) => Taken::Busy,
+        Err(TrySendError::Disconnected(_)) => Taken::Ended,
+    }
+}
+
 /// Sends replies and the newest frames until the page takes no more.
 async fn write(
     mut sink: SplitSink<Stream, Message>,
-    mut replies: mpsc::Receiver<Reply>,
+    mut replies: mpsc::Receiver<String>,
     mut newest: watch::Receiver<Arc<Frame>>,
     credits: Arc<Semaphore>,
     is_alive: Arc<AtomicBool>,
@@ -163,7 +208,7 @@ async fn write(
         let message = tokio::select! {
             biased;
             reply = replies.recv() => match reply {
-                Some(reply) => text(&reply),
+                Some(reply) => Message::text(reply),
                 None => return,
             },
             frame = next_frame(&mut newest, &credits) => match frame {
@@ -171,7 +216,7 @@ async fn write(
                 None => {
                     // The environment has ended; the last reply says why.
                     while let Ok(reply) = replies.try_recv() {
-                        sink.send(text(&reply)).await.ok();
+                        sink.send(Message::text(reply)).await.ok();
                     }
                     sink.close().await.ok();
                     return;
@@ -199,6 +244,7 @@ async fn next_frame(newest: &mut watch::Receiver<Arc<Frame>>, credits: &Semaphor
     Some(Arc::clone(&newest.borrow_and_update()))
 }
 
-fn text(reply: &Reply) -> Message {
-    Message::text(serde_json::to_string(reply).unwrap_or_default())
+/// The reply that a request failed, as JSON.
+fn failed(message: String) -> String {
+    serde_json::to_string(&Reply::Failed { message }).unwrap_or_default()
 }

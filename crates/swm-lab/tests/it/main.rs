@@ -3,6 +3,8 @@
 
 mod data;
 mod live;
+mod planning;
+mod plans;
 mod refusals;
 
 use serde_json::Value;
@@ -44,6 +46,7 @@ impl TestLab {
         let lab = Lab {
             envs: &swm_envs::ENVS,
             policy: expert,
+            planning: Box::new(planning::Simulated),
             datasets: Folders::new(vec![home.path().join("datasets")]),
             runs: Folders::new(vec![home.path().join("checkpoints")]),
             threads: 1,
@@ -116,10 +119,15 @@ impl TestLab {
 
     /// Opens the socket of an environment.
     pub fn live(&self, env: &str) -> Live {
+        self.session("live", env)
+    }
+
+    /// Opens a socket.
+    pub fn session(&self, route: &str, env: &str) -> Live {
         let mut stream = self.connect();
         let host = self.host();
         let head = format!(
-            "GET /{TOKEN}/api/live?env={env}&image=32 HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}\r\nUpgrade: websocket\r\n\
+            "GET /{TOKEN}/api/{route}?env={env}&image=32 HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}\r\nUpgrade: websocket\r\n\
              Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
         );
         stream.write_all(head.as_bytes()).expect("sending");

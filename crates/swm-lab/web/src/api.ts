@@ -86,6 +86,27 @@ export interface Lines {
   lines: Record<string, number>[];
 }
 
+export interface Model {
+  name: string;
+  family: string;
+  block: number | null;
+  image: number | null;
+  history: number;
+}
+
+export interface Solver {
+  id: string;
+  summary: string;
+  family: string;
+  needs: string[];
+  defaults: Record<string, unknown>;
+}
+
+export interface Planners {
+  models: Model[];
+  solvers: Solver[];
+}
+
 export type Query = Record<string, string | number | boolean | undefined>;
 
 export function address(path: string, query: Query = {}): string {

@@ -11,6 +11,8 @@ interface Props {
   // The x values, then the values of each series.
   data: uPlot.AlignedData;
   labels: string[];
+  // The colour of each series, if not those of the list.
+  colours?: string[];
   xLabel: string;
   height: number;
   isLog?: boolean;
@@ -26,7 +28,7 @@ export function Chart(props: Props) {
   const plot = useRef<uPlot | undefined>(undefined);
   const latest = useRef(props);
   latest.current = props;
-  const shape = JSON.stringify([props.labels, props.title, props.isLog, props.height, props.sync]);
+  const shape = JSON.stringify([props.labels, props.colours, props.title, props.isLog, props.height, props.sync]);
 
   useEffect(() => {
     const at = root.current;
@@ -55,7 +57,7 @@ export function Chart(props: Props) {
 }
 
 function options(props: { current: Props }, at: HTMLElement): uPlot.Options {
-  const { title, labels, xLabel, height, isLog, sync } = props.current;
+  const { title, labels, colours = COLOURS, xLabel, height, isLog, sync } = props.current;
   const style = getComputedStyle(at);
   const colour = (name: string) => style.getPropertyValue(name).trim();
   const axis = {
@@ -75,7 +77,7 @@ function options(props: { current: Props }, at: HTMLElement): uPlot.Options {
       { label: xLabel },
       ...labels.map((label, i) => ({
         label,
-        stroke: COLOURS[i % COLOURS.length],
+        stroke: colours[i % colours.length],
         width: 1.5,
         points: { show: false },
         spanGaps: true,

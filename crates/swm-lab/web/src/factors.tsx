@@ -52,7 +52,7 @@ export function FactorRow({ factor, value, pinned, sampled, onPin, onSample }: P
   );
 }
 
-function Control({ factor, value, onChange }: { factor: Factor; value: number[]; onChange: (v: number[]) => void }) {
+export function Control({ factor, value, onChange }: { factor: Factor; value: number[]; onChange: (v: number[]) => void }) {
   const { space, key } = factor;
   if (space.type === "RGBBox") {
     return (

@@ -28,7 +28,7 @@ export function LiveEnv({ info, params }: { info: EnvInfo; params: Params }) {
         </div>
         <Transport info={info} control={control} />
         <Readout header={live.header} fps={live.fps} limit={info.max_episode_steps} />
-        <Problems control={control} />
+        <Problems live={live} />
         {settings.by === "hand" && (
           <Actions
             space={info.action}
@@ -116,7 +116,14 @@ function Versus({ src, side }: { src: string; side: number }) {
   );
 }
 
-function Problems({ control: { live } }: { control: Control }) {
+interface Connection {
+  error?: string;
+  isClosed: boolean;
+  dismiss: () => void;
+  reconnect: () => void;
+}
+
+export function Problems({ live }: { live: Connection }) {
   return (
     <>
       {live.error && (

@@ -2,24 +2,29 @@ import { render } from "preact";
 import { useEffect, useRef } from "preact/hooks";
 import { DataPage } from "./data";
 import { EnvPage } from "./env";
+import { PlansPage } from "./plans";
 import { RunsPage } from "./runs";
 import { useKeys, usePlace, useTheme } from "./state";
 import "uplot/dist/uPlot.min.css";
 import "./style.css";
 import "./pages.css";
+import "./plans.css";
 
 const PAGES = [
   { id: "envs", name: "Environments", Page: EnvPage },
   { id: "data", name: "Data", Page: DataPage },
+  { id: "plans", name: "Plans", Page: PlansPage },
   { id: "runs", name: "Runs", Page: RunsPage },
 ];
 
 const SHORTCUTS = [
-  ["1 2 3", "environments, data, runs"],
+  ["1 2 3 4", "environments, data, plans, runs"],
   ["?", "this list"],
   ["Space", "play or pause"],
-  [".", "one step (environments), next row (data)"],
-  [",", "previous row (data)"],
+  [".", "one step (environments, plans), next row (data)"],
+  [",", "previous row (data), back one step (plans)"],
+  ["d", "execute the plan and search the next one (plans)"],
+  ["[ ]", "previous and next iteration of the search (plans)"],
   ["r", "reset with the same seed"],
   ["n", "reset with the next seed"],
   ["v", "sample all factors, with the next seed"],
@@ -37,7 +42,7 @@ function App() {
   const go = (index: number) => () => {
     location.hash = `#${PAGES[index].id}`;
   };
-  useKeys({ "1": go(0), "2": go(1), "3": go(2), "?": () => help.current?.showModal() });
+  useKeys({ "1": go(0), "2": go(1), "3": go(2), "4": go(3), "?": () => help.current?.showModal() });
   useEffect(() => {
     document.title = `${found.name} · swm lab`;
   }, [found]);

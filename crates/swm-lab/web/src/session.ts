@@ -42,8 +42,27 @@ export interface Session {
   close: () => void;
 }
 
+interface Socket<H> {
+  frame: (header: H, image: ImageBitmap) => void;
+  reply: (reply: { type: string } & Record<string, unknown>) => void;
+  closed: () => void;
+}
+
 export function connect(env: string, image: number, events: Events): Session {
-  const url = new URL("api/live", location.href);
+  return open<Header>("live", env, image, {
+    frame: events.frame,
+    closed: events.closed,
+    reply: (reply) => {
+      if (reply.type === "started") events.started(reply as unknown as Started);
+      else if (reply.type === "recording") events.recording(reply as unknown as Recording);
+      else if (reply.type === "failed") events.failed(String(reply.message));
+    },
+  });
+}
+
+// Opens the socket of a session. Messages that are sent before it is open wait.
+export function open<H>(route: string, env: string, image: number, events: Socket<H>): Session {
+  const url = new URL(`api/${route}`, location.href);
   url.protocol = url.protocol.replace("http", "ws");
   url.hash = "";
   url.search = new URLSearchParams({ env, image: String(image) }).toString();
@@ -62,7 +81,7 @@ export function connect(env: string, image: number, events: Events): Session {
   };
   const show = async (data: ArrayBuffer) => {
     const size = new DataView(data).getUint32(0, true);
-    const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, size))) as Header;
+    const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, size))) as H;
     const image = await createImageBitmap(new Blob([new Uint8Array(data, 4 + size)], { type: "image/jpeg" }));
     // The server sends another frame when this one is on its way to the screen.
     requestAnimationFrame(() => {
@@ -78,10 +97,7 @@ export function connect(env: string, image: number, events: Events): Session {
       void show(message.data);
       return;
     }
-    const reply = JSON.parse(message.data);
-    if (reply.type === "started") events.started(reply);
-    else if (reply.type === "recording") events.recording(reply);
-    else if (reply.type === "failed") events.failed(reply.message);
+    events.reply(JSON.parse(message.data));
   };
   return {
     send,

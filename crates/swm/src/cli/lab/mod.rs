@@ -1,9 +1,12 @@
 //! `swm lab`: the local web application (docs/lab.md).
 
+mod planning;
+
 use super::{Context, emit, emit_json, eprint};
 use crate::resolver::scripted;
 use crate::{ENVS, home};
 use clap::Args;
+use planning::HomePlanning;
 use serde_json::json;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
@@ -46,11 +49,13 @@ pub fn lab(args: &LabArgs, context: &Context) -> anyhow::Result<()> {
         }
         Ok(Folders::new(std::iter::once(first).chain(others.iter().cloned()).collect()))
     };
+    let runs = folders(home::checkpoints()?, &args.runs)?;
     let lab = Lab {
         envs: &ENVS,
         policy: scripted,
+        planning: Box::new(HomePlanning::new(runs.clone())),
         datasets: folders(home::datasets()?, &args.data)?,
-        runs: folders(home::checkpoints()?, &args.runs)?,
+        runs,
         threads: context.threads,
     };
     let server = serve(lab, &options)?;

@@ -142,16 +142,26 @@ fn one(headers: &HeaderMap, name: header::HeaderName) -> Option<&str> {
     if values.next().is_some() { None } else { value.to_str().ok() }
 }
 
+/// The policy of a report in a frame of the lab: no script, no connection, and an origin of its own, so that it cannot reach
+/// the lab. Links open other pages.
+pub const REPORT: &str = "sandbox allow-popups allow-popups-to-escape-sandbox; default-src 'none'; \
+                          style-src 'unsafe-inline'; img-src data:; media-src data:; font-src data:; base-uri 'none'; \
+                          form-action 'none'; frame-ancestors 'self'";
+
 /// Adds the headers that bind a page to this server: no script, style, image or connection of another origin, no frame around
-/// the page, no address in a `Referer`.
+/// the page, no address in a `Referer`. A report keeps its own policy.
 pub fn add_headers(headers: &mut HeaderMap) {
     const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; \
-                          connect-src 'self'; font-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+                          connect-src 'self'; font-src 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'; \
+                          frame-ancestors 'none'";
+    let is_report = headers.contains_key(header::CONTENT_SECURITY_POLICY);
+    let policies = [(header::CONTENT_SECURITY_POLICY, POLICY), (header::X_FRAME_OPTIONS, "DENY")];
+    for (name, value) in policies.into_iter().filter(|_| !is_report) {
+        headers.insert(name, HeaderValue::from_static(value));
+    }
     let fixed = [
-        (header::CONTENT_SECURITY_POLICY, POLICY),
         (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
         (header::REFERRER_POLICY, "no-referrer"),
-        (header::X_FRAME_OPTIONS, "DENY"),
         (header::HeaderName::from_static("cross-origin-opener-policy"), "same-origin"),
         (header::HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
     ];

@@ -1,11 +1,12 @@
-//! The routes of the lab, behind [`crate::access`]. They answer to `GET` and change nothing, but one that saves episodes as a new
-//! dataset, by `POST`; all else that changes something goes through the socket of a session.
+//! The routes of the lab, behind [`crate::access`]. They answer to `GET` and change nothing, but those that save episodes as a
+//! new dataset, and start and stop trainings, by `POST`; all else that changes something goes through the socket of a session.
 
 use crate::datasets::{self, Datasets};
 use crate::plans::{self, PlanSession};
 use crate::session::{self, Player, Running, Session, Setup, messages};
 use crate::still::StillQuery;
-use crate::{Lab, assets, runs};
+use crate::trainings::{self, Trainings};
+use crate::{Lab, access, assets, reports, runs};
 use axum::Router;
 use axum::body::Body;
 use axum::extract::{Path, Query, Request, State};
@@ -14,6 +15,7 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use sha1::{Digest as _, Sha1};
@@ -35,6 +37,8 @@ pub struct Shared {
     pub lab: Arc<Lab>,
     pub datasets: Arc<Datasets>,
     pub running: Running,
+    pub trainings: Trainings,
+    pub reports: Arc<reports::Known>,
     pub work: Arc<Semaphore>,
     pub stop: watch::Receiver<bool>,
 }
@@ -45,6 +49,8 @@ impl Shared {
             datasets: Arc::new(Datasets::new(lab.datasets.clone())),
             lab: Arc::new(lab),
             running: Running::default(),
+            trainings: Trainings::default(),
+            reports: Arc::default(),
             work: Arc::new(Semaphore::new(AT_ONCE)),
             stop,
         }
@@ -107,6 +113,11 @@ pub fn routes(shared: Shared) -> Router {
         .route("/api/save", post(save))
         .route("/api/runs", get(list_runs))
         .route("/api/lines", get(lines))
+        .route("/api/reports", get(list_reports))
+        .route("/api/report", get(report))
+        .route("/api/trainings", get(list_trainings))
+        .route("/api/train", post(train))
+        .route("/api/stop", post(stop))
         .route("/", get(|headers: HeaderMap| async move { asset("", &headers) }))
         .route("/{file}", get(|Path(file): Path<String>, headers: HeaderMap| async move { asset(&file, &headers) }))
         .with_state(shared)
@@ -260,14 +271,66 @@ async fn doctor(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -
     as_json(&found.await?)
 }
 
-/// The body is JSON, and is read up to [`MOST_BODY`] only.
-async fn save(State(shared): State<Shared>, request: Request) -> Answer {
+/// Reads a body of JSON, up to [`MOST_BODY`]; `fields` names what it has.
+async fn body<T: DeserializeOwned>(request: Request, fields: &str) -> Result<T, Failed> {
     let body = axum::body::to_bytes(request.into_body(), MOST_BODY).await;
     let too_long = |error| Error::config("the body", format!("{error}"), format!("send at most {MOST_BODY} bytes"));
-    let malformed = |error| Error::config("the body", format!("{error}"), "send folder, name, target and episodes");
-    let chosen = serde_json::from_slice(&body.map_err(too_long)?).map_err(malformed)?;
+    let malformed = |error| Error::config("the body", format!("{error}"), format!("send {fields}"));
+    Ok(serde_json::from_slice(&body.map_err(too_long)?).map_err(malformed)?)
+}
+
+async fn save(State(shared): State<Shared>, request: Request) -> Answer {
+    let chosen = body(request, "folder, name, target and episodes").await?;
     let saved = shared.work(move |shared| shared.datasets.save(chosen, &mut until_stopped(&shared.stop)));
     as_json(&json!({"episodes": saved.await?}))
+}
+
+async fn list_reports(State(shared): State<Shared>) -> Answer {
+    let listed = shared.work(|shared| {
+        let folders: Vec<_> = shared.lab.results.paths().iter().map(|path| path.display().to_string()).collect();
+        let all = shared.reports.list(&*shared.lab.reports, &shared.lab.results);
+        Ok(json!({"folders": folders, "reports": all}))
+    });
+    as_json(&listed.await?)
+}
+
+/// The page of results or of a study, under a policy of its own.
+async fn report(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
+    let page =
+        shared.work(move |shared| reports::page(&*shared.lab.reports, &shared.lab.results, query.folder, &query.name));
+    let mut response = answer("text/html; charset=utf-8", page.await?);
+    response.headers_mut().insert(header::CONTENT_SECURITY_POLICY, HeaderValue::from_static(access::REPORT));
+    Ok(response)
+}
+
+/// The families that can be trained, and the trainings that were started.
+async fn list_trainings(State(shared): State<Shared>) -> Answer {
+    let listed = shared
+        .work(|shared| Ok(json!({"families": shared.lab.training.families(), "trainings": shared.trainings.list()})));
+    as_json(&listed.await?)
+}
+
+async fn train(State(shared): State<Shared>, request: Request) -> Answer {
+    let wanted: trainings::Request = body(request, "family, preset, folder, dataset, name, steps and seed").await?;
+    let started = shared.work(move |shared| {
+        let data = shared.datasets.path(wanted.folder, &wanted.dataset)?;
+        shared.trainings.start(&*shared.lab.training, &wanted, &data, &shared.lab.runs)
+    });
+    started.await?;
+    as_json(&json!({}))
+}
+
+/// The body of a request to stop a training.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Stopped {
+    name: String,
+}
+
+async fn stop(State(shared): State<Shared>, request: Request) -> Answer {
+    let Stopped { name } = body(request, "name").await?;
+    shared.work(move |shared| shared.trainings.stop(&*shared.lab.training, &name)).await?;
+    as_json(&json!({}))
 }
 
 /// Stops work when the lab ends.

@@ -98,6 +98,14 @@ impl Datasets {
         self.open(&self.folders.find(folder, name, 1, is_dataset)?)
     }
 
+    /// The path of a dataset.
+    ///
+    /// # Errors
+    /// When there is no such dataset.
+    pub fn path(&self, folder: usize, name: &str) -> Result<PathBuf> {
+        self.folders.find(folder, name, 1, is_dataset)
+    }
+
     /// Examines a dataset; one that does not open is read as far as possible.
     ///
     /// # Errors

@@ -66,14 +66,23 @@ pub struct Found {
 /// Returns the path of a dataset to write: a plain name in a folder.
 ///
 /// # Errors
-/// When the name is empty, too long, or has other characters than letters, digits, `-` and `_`.
+/// As [`check_name`].
 pub fn new_dataset(folder: &Path, name: &str) -> Result<PathBuf> {
+    check_name("the name of a dataset", name)?;
+    Ok(folder.join(format!("{name}.lance")))
+}
+
+/// Checks a plain name, which stays in its folder. `what` has it.
+///
+/// # Errors
+/// When the name is empty, too long, or has other characters than letters, digits, `-` and `_`.
+pub fn check_name(what: &str, name: &str) -> Result<()> {
     let valid = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
     if name.is_empty() || name.len() > LONGEST || !name.chars().all(valid) || name.starts_with('-') {
         let fix = format!("write 1 to {LONGEST} letters, digits, - or _");
-        return Err(Error::config("the name of a dataset", format!("'{name}' is not one"), fix));
+        return Err(Error::config(what, format!("'{name}' is not one"), fix));
     }
-    Ok(folder.join(format!("{name}.lance")))
+    Ok(())
 }
 
 /// Adds the wanted entries of a folder. `path` is canonical, so an entry that links elsewhere does not begin with it.

@@ -7,6 +7,8 @@
 //! - [`plans`]: a live environment that a solver plans in, whose searches are shown, and whose steps are a tree to go back in.
 //! - [`datasets`] and [`runs`]: what the pages of datasets and of training curves show, from [`folders`] that the lab was
 //!   started with, and no other.
+//! - [`reports`]: results and studies, and their pages.
+//! - [`trainings`]: trainings that pages start and stop.
 //! - [`assets`]: the pages, built from `web/` and embedded.
 //!
 //! This crate knows no environment, no model and no policy: [`Lab`] has the registry, and what makes policies and planners.
@@ -17,10 +19,12 @@ pub mod assets;
 pub mod datasets;
 pub mod folders;
 pub mod plans;
+pub mod reports;
 pub mod runs;
 pub mod serve;
 pub mod session;
 pub mod still;
+pub mod trainings;
 
 pub use access::{Access, Token};
 pub use serve::{Options, Server, serve};
@@ -41,9 +45,15 @@ pub struct Lab {
     pub policy: MakePolicy,
     /// The models that plan.
     pub planning: Box<dyn plans::Planning>,
+    /// What trains.
+    pub training: Box<dyn trainings::Training>,
+    /// What makes pages of results and studies.
+    pub reports: Box<dyn reports::Reports>,
+    /// Folders of results and studies.
+    pub results: Folders,
     /// Folders of datasets. The first receives recorded demonstrations.
     pub datasets: Folders,
-    /// Folders of training runs.
+    /// Folders of training runs. The first receives those that pages start.
     pub runs: Folders,
     /// Threads of an environment; 0 for one per core.
     pub threads: usize,

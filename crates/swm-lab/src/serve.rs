@@ -87,12 +87,12 @@ impl Server {
         self.address
     }
 
-    /// Answers requests until `stop` is set; then sockets are closed, and environments end and store what was recorded.
+    /// Answers requests until `stop` is set; then sockets are closed, environments end and store what was recorded, and trainings stop.
     pub fn run(self, stop: &AtomicBool) {
         let Self { runtime, listener, access, lab, .. } = self;
         let (stopping, stopped) = watch::channel(false);
         let shared = Shared::new(lab, stopped);
-        let running = shared.running.clone();
+        let (running, trainings, lab) = (shared.running.clone(), shared.trainings.clone(), Arc::clone(&shared.lab));
         let router = api::routes(shared);
         runtime.block_on(async {
             let connections = Arc::new(Semaphore::new(CONNECTIONS));
@@ -120,6 +120,7 @@ impl Server {
         while running.count() > 0 && Instant::now() < until {
             std::thread::sleep(POLL);
         }
+        trainings.end(&*lab.training);
     }
 }
 

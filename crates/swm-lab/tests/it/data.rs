@@ -137,7 +137,7 @@ fn runs_are_listed_and_followed() {
 }
 
 /// A dataset of some episodes of Two-Room without frames.
-fn collect(lab: &TestLab, episodes: usize) {
+pub fn collect(lab: &TestLab, episodes: usize) {
     use swm_eval::{CollectConfig, World, WorldConfig};
     let folder = lab.home.path().join("datasets");
     fs::create_dir_all(&folder).expect("a folder");

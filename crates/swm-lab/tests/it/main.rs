@@ -6,6 +6,8 @@ mod live;
 mod planning;
 mod plans;
 mod refusals;
+mod reports;
+mod trainings;
 
 use serde_json::Value;
 use std::fmt::Write as _;
@@ -47,6 +49,9 @@ impl TestLab {
             envs: &swm_envs::ENVS,
             policy: expert,
             planning: Box::new(planning::Simulated),
+            training: Box::new(trainings::Shell),
+            reports: Box::new(reports::Files),
+            results: Folders::new(vec![home.path().to_owned()]),
             datasets: Folders::new(vec![home.path().join("datasets")]),
             runs: Folders::new(vec![home.path().join("checkpoints")]),
             threads: 1,

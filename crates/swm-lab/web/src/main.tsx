@@ -3,6 +3,7 @@ import { useEffect, useRef } from "preact/hooks";
 import { DataPage } from "./data";
 import { EnvPage } from "./env";
 import { PlansPage } from "./plans";
+import { ReportsPage } from "./reports";
 import { RunsPage } from "./runs";
 import { useKeys, usePlace, useTheme } from "./state";
 import "uplot/dist/uPlot.min.css";
@@ -15,10 +16,11 @@ const PAGES = [
   { id: "data", name: "Data", Page: DataPage },
   { id: "plans", name: "Plans", Page: PlansPage },
   { id: "runs", name: "Runs", Page: RunsPage },
+  { id: "results", name: "Results", Page: ReportsPage },
 ];
 
 const SHORTCUTS = [
-  ["1 2 3 4", "environments, data, plans, runs"],
+  ["1 … 5", "environments, data, plans, runs, results"],
   ["?", "this list"],
   ["Space", "play or pause"],
   [".", "one step (environments, plans), next row (data)"],
@@ -42,7 +44,7 @@ function App() {
   const go = (index: number) => () => {
     location.hash = `#${PAGES[index].id}`;
   };
-  useKeys({ "1": go(0), "2": go(1), "3": go(2), "4": go(3), "?": () => help.current?.showModal() });
+  useKeys({ "1": go(0), "2": go(1), "3": go(2), "4": go(3), "5": go(4), "?": () => help.current?.showModal() });
   useEffect(() => {
     document.title = `${found.name} · swm lab`;
   }, [found]);

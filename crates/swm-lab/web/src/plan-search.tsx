@@ -4,6 +4,7 @@ import { useMemo } from "preact/hooks";
 import type uPlot from "uplot";
 import { Chart } from "./chart";
 import { short } from "./format";
+import { ImaginationPanel } from "./plan-imagination";
 import { Fan } from "./plan-stage";
 import type { Search } from "./plan-session";
 
@@ -65,6 +66,7 @@ export function SearchPanel({ search, iteration, onIteration }: Props) {
         onPick={onIteration}
       />
       <Ends search={search} iteration={iteration} />
+      {search.imagination && <ImaginationPanel imagination={search.imagination} />}
       {search.explained !== null && (
         <figure class="fan-only">
           <Fan search={search} iteration={iteration} />

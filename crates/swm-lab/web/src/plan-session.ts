@@ -43,6 +43,18 @@ export interface Path {
   lines: [number, number][][];
 }
 
+// Latents that a model predicts of the cheapest candidates, and those of the frames of what happens.
+export interface Imagination {
+  block: number;
+  lines: { true: [number, number][]; imagined: [number, number][] }[];
+  goal: [number, number];
+  explained: number;
+  error: number[];
+  moved: number[];
+  true_to_goal: number[];
+  imagined_to_goal: number[];
+}
+
 export interface Search {
   seconds: number;
   best: (number | null)[];
@@ -54,6 +66,7 @@ export interface Search {
   explained: number | null;
   paths: Path[];
   ends: { iteration: number; rank: number; cost: number; jpeg: string }[];
+  imagination?: Imagination | null;
 }
 
 export interface Bounds {

@@ -84,10 +84,10 @@ export function PlanSettings({ rows, info, planners, params }: Props) {
   const counts = Object.entries(solver?.defaults ?? {}).filter(([, value]) => typeof value === "number");
   return (
     <aside class="list planner" aria-label="Planner">
-      <div class="field">
+      <div class="field is-wide">
         <Choice label="environment" value={env} options={rows.map(({ id }) => id)} onChange={(value) => patch({ env: value, ...ofEnv })} />
       </div>
-      <div class="field">
+      <div class="field is-wide">
         <Choice
           label="model"
           value={now.model}

@@ -6,6 +6,7 @@ import { get, type Lines, type Run } from "./api";
 import { Chart, COLOURS } from "./chart";
 import { ago, short } from "./format";
 import { type Params, patch, useLoaded } from "./state";
+import { TrainingPanel, type Trainings } from "./training";
 
 interface Listed {
   folders: string[];
@@ -17,9 +18,9 @@ interface Log {
   lines: Record<string, number>[];
 }
 
-// How often logs are read, and the list of runs, in milliseconds.
+// How often logs and trainings are read, and the list of runs, in milliseconds.
 const FOLLOW = 1500;
-const LIST = 5000;
+const LIST = 3000;
 // A run whose log was written in the last seconds is shown as running.
 const RUNNING = 30;
 
@@ -28,6 +29,8 @@ const keyOf = (run: Run) => `${run.folder}:${run.name}`;
 export function RunsPage({ params }: { params: Params }) {
   const { value, error, again } = useStaying(useLoaded(() => get<Listed>("runs"), "runs"));
   useInterval(again, LIST);
+  const trainings = useStaying(useLoaded(() => get<Trainings>("trainings"), "trainings"));
+  useInterval(trainings.again, FOLLOW);
   const [filter, setFilter] = useState("");
   const runs = value?.runs ?? [];
   const chosen = (params.runs ?? "").split("|").filter(Boolean);
@@ -39,6 +42,11 @@ export function RunsPage({ params }: { params: Params }) {
     patch({ runs: next.join("|") });
   };
   const logs = useLogs(selected);
+  const started = (name: string) => {
+    patch({ runs: [...chosen, `0:${name}`].join("|") });
+    trainings.again();
+    again();
+  };
   return (
     <div class="runs">
       <aside class="list" aria-label="Runs">
@@ -72,6 +80,7 @@ export function RunsPage({ params }: { params: Params }) {
           </p>
         )}
         {error && <p class="error">{error}</p>}
+        <TrainingPanel listed={trainings.value} onStarted={started} onChange={trainings.again} />
       </aside>
       <section class="curves" aria-label="Training curves">
         {selected.length > 0 ? <Curves runs={selected} logs={logs} params={params} /> : <p class="loading">Choose runs.</p>}
@@ -98,13 +107,13 @@ function summary(run: Run): string {
 }
 
 // Keeps the last value while another is loaded.
-function useStaying<T>(loaded: { value?: T; error?: string; again: () => void }) {
+export function useStaying<T>(loaded: { value?: T; error?: string; again: () => void }) {
   const last = useRef(loaded.value);
   if (loaded.value !== undefined) last.current = loaded.value;
   return { ...loaded, value: last.current };
 }
 
-function useInterval(call: () => void, milliseconds: number): void {
+export function useInterval(call: () => void, milliseconds: number): void {
   const current = useRef(call);
   current.current = call;
   useEffect(() => {

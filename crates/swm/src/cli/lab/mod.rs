@@ -1,12 +1,15 @@
 //! `swm lab`: the local web application (docs/lab.md).
 
 mod planning;
+mod reports;
+mod training;
 
 use super::{Context, emit, emit_json, eprint};
 use crate::resolver::scripted;
 use crate::{ENVS, home};
 use clap::Args;
 use planning::HomePlanning;
+use reports::Pages;
 use serde_json::json;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
@@ -14,6 +17,7 @@ use std::process::{Command, Stdio};
 use swm_core::{Error, Result};
 use swm_lab::folders::Folders;
 use swm_lab::{Lab, Options, Token, serve};
+use training::OwnProgram;
 
 /// Arguments of `swm lab`.
 #[derive(Args)]
@@ -38,6 +42,9 @@ pub struct LabArgs {
     /// Another folder of training runs; may be repeated
     #[arg(long, value_name = "DIR")]
     runs: Vec<PathBuf>,
+    /// Another folder of results and studies; may be repeated
+    #[arg(long, value_name = "DIR")]
+    results: Vec<PathBuf>,
 }
 
 /// Runs `swm lab` until Ctrl-C.
@@ -54,6 +61,9 @@ pub fn lab(args: &LabArgs, context: &Context) -> anyhow::Result<()> {
         envs: &ENVS,
         policy: scripted,
         planning: Box::new(HomePlanning::new(runs.clone())),
+        reports: Box::new(Pages),
+        results: folders(home::home()?, &args.results)?,
+        training: Box::new(OwnProgram { threads: context.threads }),
         datasets: folders(home::datasets()?, &args.data)?,
         runs,
         threads: context.threads,

@@ -32,6 +32,7 @@ use clap::{Args, Subcommand, ValueEnum as _};
 pub(super) use expand::shell;
 use export::Format;
 pub use export::escape_markdown;
+pub(super) use report::write_page;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

@@ -6,7 +6,7 @@ use crate::cli::{emit, emit_json, output_folder};
 use clap::Args;
 use serde_json::json;
 use std::path::{Path, PathBuf};
-use swm_core::{Error, files};
+use swm_core::{Error, Result, files};
 use swm_eval::{AnyStudy, StudyFolder};
 use swm_report::{StudyPage, TablePage};
 
@@ -30,27 +30,11 @@ const TABLES: [(&str, Format); 3] =
 /// Runs `swm study report`.
 pub fn report(args: &ReportArgs, as_json: bool) -> anyhow::Result<()> {
     let folder = StudyFolder::new(&args.folder);
-    let study = folder.open()?;
     let output = args.output.clone().unwrap_or_else(|| args.folder.join("report"));
     let names: Vec<&str> = std::iter::once("index.html").chain(TABLES.map(|(name, _)| name)).collect();
     let _lock = output_folder::claim(&output, &names)?;
     check_figures(&output)?;
-    let title = args.title.clone();
-    let (tables, path) = match &study {
-        AnyStudy::Evaluations(study) => {
-            let results = study.results(&folder)?;
-            let tables = TABLES.map(|(name, format)| (name, format.write(&results)));
-            let command = command(if study.ray.is_some() { "break" } else { "run" }, &study.arguments);
-            let page = StudyPage { results, published: study.published.clone(), title, command };
-            (tables, swm_report::write_study(&page, &output)?)
-        }
-        AnyStudy::Table(study) => {
-            let results = study.results(&folder)?;
-            let tables = TABLES.map(|(name, format)| (name, format.write_table(&results)));
-            let page = TablePage { results, title, command: command("run", &study.arguments) };
-            (tables, swm_report::write_table(&page, &output)?)
-        }
-    };
+    let (tables, path) = write_page(&folder, args.title.clone(), &output)?;
     for (name, text) in tables {
         files::write(&output.join(name), text.as_bytes())?;
     }
@@ -59,6 +43,31 @@ pub fn report(args: &ReportArgs, as_json: bool) -> anyhow::Result<()> {
     }
     emit(&format!("{}\n", path.display()));
     Ok(())
+}
+
+/// The names and the contents of the tables beside a page.
+type Tables = [(&'static str, String); 3];
+
+/// Writes the page of a study and its figures to a folder; returns the tables and the path of the page.
+///
+/// # Errors
+/// When the study or its results are damaged, or writing fails.
+pub fn write_page(folder: &StudyFolder, title: Option<String>, output: &Path) -> Result<(Tables, PathBuf)> {
+    Ok(match &folder.open()? {
+        AnyStudy::Evaluations(study) => {
+            let results = study.results(folder)?;
+            let tables = TABLES.map(|(name, format)| (name, format.write(&results)));
+            let command = command(if study.ray.is_some() { "break" } else { "run" }, &study.arguments);
+            let page = StudyPage { results, published: study.published.clone(), title, command };
+            (tables, swm_report::write_study(&page, output)?)
+        }
+        AnyStudy::Table(study) => {
+            let results = study.results(folder)?;
+            let tables = TABLES.map(|(name, format)| (name, format.write_table(&results)));
+            let page = TablePage { results, title, command: command("run", &study.arguments) };
+            (tables, swm_report::write_table(&page, output)?)
+        }
+    })
 }
 
 /// The command that runs the study again. It names a folder of its own, so that equal studies have equal pages.
@@ -70,7 +79,7 @@ fn command(command: &str, arguments: &[String]) -> Option<String> {
 }
 
 /// Checks that the folder of figures does not exist, or lies beside a page of this program.
-fn check_figures(output: &Path) -> swm_core::Result<()> {
+fn check_figures(output: &Path) -> Result<()> {
     let figures = output.join("figures");
     files::check_no_link(&figures)?;
     if !figures.exists() || output.join("index.html").exists() {

@@ -1,0 +1,260 @@
+//! Trainings that pages start: processes of the program itself, which write in the first folder of runs.
+//!
+//! They are stopped as Ctrl-C stops them: at the next safe point, so that they can be continued. A page that leaves does not
+//! stop them; the end of the lab does.
+
+use crate::folders::{Folders, check_name};
+use serde::{Deserialize, Serialize};
+use std::collections::VecDeque;
+use std::os::unix::process::CommandExt as _;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+use swm_core::{Error, Result, text};
+
+/// Trainings that run at the same time.
+const MOST: usize = 2;
+/// Ended trainings that are listed.
+const MOST_ENDED: usize = 20;
+/// The largest number of steps.
+const MOST_STEPS: usize = 10_000_000;
+/// The end of what a training reports that is kept, in bytes.
+const TAIL: usize = 2_000;
+/// The longest wait for trainings when the lab ends.
+const ENDING: Duration = Duration::from_secs(60);
+/// How often it is looked whether they have ended.
+const POLL: Duration = Duration::from_millis(50);
+
+/// A model family that can be trained on a dataset.
+#[derive(Clone, Debug, Serialize)]
+pub struct Family {
+    /// The id.
+    pub id: String,
+    /// One sentence about it.
+    pub summary: String,
+    /// Its presets: the id and what it is for.
+    pub presets: Vec<(String, String)>,
+}
+
+/// A training that a page asks for.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Request {
+    /// The id of the family.
+    pub family: String,
+    /// The id of the preset.
+    pub preset: String,
+    /// The index of the dataset's folder.
+    pub folder: usize,
+    /// The dataset.
+    pub dataset: String,
+    /// The plain name of the run.
+    pub name: String,
+    /// Steps.
+    pub steps: usize,
+    /// The seed.
+    pub seed: u32,
+}
+
+/// What the program knows of trainings.
+pub trait Training: Send + Sync {
+    /// The families that can be trained on a dataset alone.
+    fn families(&self) -> Vec<Family>;
+
+    /// The program that trains on the dataset at `data` and writes to the folder `output`. The request is valid.
+    ///
+    /// # Errors
+    /// When the program is not found.
+    fn command(&self, request: &Request, data: &Path, output: &Path) -> Result<Command>;
+
+    /// Asks a process to stop, as Ctrl-C does.
+    ///
+    /// # Errors
+    /// When the system refuses.
+    fn interrupt(&self, process: &Child) -> Result<()>;
+}
+
+/// How a training is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum State {
+    /// It runs.
+    Running,
+    /// It was asked to stop, and has not ended.
+    Stopping,
+    /// It was stopped.
+    Stopped,
+    /// It is done.
+    Finished,
+    /// It has failed.
+    Failed,
+}
+
+/// A training of the list.
+#[derive(Clone, Debug, Serialize)]
+pub struct Listed {
+    /// The name of the run.
+    pub name: String,
+    /// The family.
+    pub family: String,
+    /// How it is.
+    pub state: State,
+    /// The last lines that it reported, if it has failed.
+    pub message: String,
+}
+
+/// A training that was started.
+struct Started {
+    name: String,
+    family: String,
+    process: Child,
+    state: State,
+    tail: Arc<Mutex<VecDeque<u8>>>,
+}
+
+/// The trainings that pages started, the newest last.
+#[derive(Clone, Default)]
+pub struct Trainings(Arc<Mutex<Vec<Started>>>);
+
+impl Trainings {
+    /// The trainings, each as it is now.
+    fn lock(&self) -> MutexGuard<'_, Vec<Started>> {
+        let mut all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        all.iter_mut().for_each(Started::look);
+        while all.iter().filter(|started| started.has_ended()).count() > MOST_ENDED {
+            let oldest = all.iter().position(Started::has_ended).unwrap_or_default();
+            all.remove(oldest);
+        }
+        all
+    }
+
+    /// The trainings, the newest first.
+    pub fn list(&self) -> Vec<Listed> {
+        self.lock().iter().rev().map(Started::listed).collect()
+    }
+
+    /// Starts a training.
+    ///
+    /// # Errors
+    /// When the request is invalid, the run exists, or too many run.
+    pub fn start(&self, training: &dyn Training, request: &Request, data: &Path, runs: &Folders) -> Result<()> {
+        check(training, request)?;
+        let no_folder = || Error::config("a training", "the lab has no folder of runs", "set STABLEWM_HOME");
+        let output = runs.paths().first().ok_or_else(no_folder)?.join(&request.name);
+        if output.symlink_metadata().is_ok() {
+            let problem = "there is a run of this name";
+            return Err(Error::config(format!("run {}", request.name), problem, "choose another name"));
+        }
+        let mut all = self.lock();
+        if all.iter().filter(|started| !started.has_ended()).count() >= MOST {
+            let problem = format!("{MOST} run already");
+            return Err(Error::config("a training", problem, "stop one, or wait until one is done"));
+        }
+        let mut command = training.command(request, data, &output)?;
+        // Ctrl-C in a terminal reaches the lab alone, which then asks the training to stop once: twice is at once.
+        command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).process_group(0);
+        let mut process = command.spawn().map_err(|error| Error::external("starting a training", error))?;
+        let tail = Arc::<Mutex<VecDeque<u8>>>::default();
+        if let Some(reports) = process.stderr.take() {
+            let tail = Arc::clone(&tail);
+            std::thread::spawn(move || keep_tail(reports, &tail));
+        }
+        let (name, family) = (request.name.clone(), request.family.clone());
+        all.push(Started { name, family, process, state: State::Running, tail });
+        Ok(())
+    }
+
+    /// Asks a training to stop.
+    ///
+    /// # Errors
+    /// When no training of this name runs.
+    pub fn stop(&self, training: &dyn Training, name: &str) -> Result<()> {
+        let mut all = self.lock();
+        let running = all.iter_mut().find(|started| started.name == name && started.state == State::Running);
+        let none = || Error::config(format!("training {name}"), "it does not run", "reload the page");
+        running.ok_or_else(none)?.stop(training)
+    }
+
+    /// Stops all trainings, and waits for them. One that does not end is killed.
+    pub fn end(&self, training: &dyn Training) {
+        for started in self.lock().iter_mut().filter(|started| started.state == State::Running) {
+            started.stop(training).ok();
+        }
+        let until = Instant::now() + ENDING;
+        while self.lock().iter().any(|started| !started.has_ended()) {
+            if Instant::now() >= until {
+                self.lock().iter_mut().for_each(|started| drop(started.process.kill()));
+            }
+            std::thread::sleep(POLL);
+        }
+    }
+}
+
+impl Started {
+    fn has_ended(&self) -> bool {
+        !matches!(self.state, State::Running | State::Stopping)
+    }
+
+    /// Looks whether it has ended.
+    fn look(&mut self) {
+        if self.has_ended() {
+            return;
+        }
+        let Ok(Some(status)) = self.process.try_wait() else { return };
+        self.state = match self.state {
+            State::Stopping => State::Stopped,
+            _ if status.success() => State::Finished,
+            _ => State::Failed,
+        };
+    }
+
+    fn stop(&mut self, training: &dyn Training) -> Result<()> {
+        training.interrupt(&self.process)?;
+        self.state = State::Stopping;
+        Ok(())
+    }
+
+    fn listed(&self) -> Listed {
+        let message = match self.state {
+            State::Failed => {
+                let tail: Vec<u8> = self.tail.lock().unwrap_or_else(PoisonError::into_inner).iter().copied().collect();
+                let reported = String::from_utf8_lossy(&tail);
+                let lines: Vec<&str> = reported.lines().rev().take(3).collect();
+                text::printable(&lines.into_iter().rev().collect::<Vec<_>>().join(" ")).into_owned()
+            }
+            _ => String::new(),
+        };
+        Listed { name: self.name.clone(), family: self.family.clone(), state: self.state, message }
+    }
+}
+
+/// Checks everything that a page chose but the dataset, which is looked up.
+fn check(training: &dyn Training, request: &Request) -> Result<()> {
+    check_name("the name of a run", &request.name)?;
+    let families = training.families();
+    let family = families.iter().find(|family| family.id == request.family).ok_or_else(|| {
+        let known = families.iter().map(|family| family.id.as_str());
+        Error::unknown("model", &request.family, known, "reload the page, which lists the models")
+    })?;
+    if !family.presets.iter().any(|(id, _)| *id == request.preset) {
+        let known = family.presets.iter().map(|(id, _)| id.as_str());
+        return Err(Error::unknown("preset", &request.preset, known, "reload the page, which lists the presets"));
+    }
+    if !(1..=MOST_STEPS).contains(&request.steps) {
+        let fix = format!("choose 1 to {MOST_STEPS}");
+        return Err(Error::config("the steps of a training", request.steps.to_string(), fix));
+    }
+    Ok(())
+}
+
+/// Keeps the end of what a process reports, until it ends.
+fn keep_tail(mut reports: impl std::io::Read, tail: &Mutex<VecDeque<u8>>) {
+    let mut bytes = [0; 1024];
+    while let Ok(count @ 1..) = reports.read(&mut bytes) {
+        let mut tail = tail.lock().unwrap_or_else(PoisonError::into_inner);
+        tail.extend(&bytes[..count]);
+        let surplus = tail.len().saturating_sub(TAIL);
+        tail.drain(..surplus);
+    }
+}

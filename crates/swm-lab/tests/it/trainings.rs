@@ -1,0 +1,128 @@
+//! Trainings that pages start and stop, with a shell in place of the program.
+
+use super::TestLab;
+use serde_json::{Value, json};
+use std::path::Path;
+use std::process::{Child, Command};
+use swm_core::{Error, Result};
+use swm_lab::trainings::{Family, Request, Training};
+
+/// Writes a log, and runs until it is asked to stop, or fails at once for the preset `broken`.
+pub struct Shell;
+
+impl Training for Shell {
+    fn families(&self) -> Vec<Family> {
+        let presets = ["tiny", "broken"].map(|id| (id.to_owned(), String::new())).to_vec();
+        vec![Family { id: "gcbc".to_owned(), summary: String::new(), presets }]
+    }
+
+    fn command(&self, request: &Request, data: &Path, output: &Path) -> Result<Command> {
+        let mut command = Command::new("sh");
+        let script = match request.preset.as_str() {
+            "tiny" => {
+                r#"trap 'echo "{\"step\": 2, \"loss\": 1.0}" >> "$2/train.jsonl"; exit 130' INT
+                mkdir -p "$2"; echo "{\"step\": 1, \"loss\": 2.0, \"seed\": $3}" > "$2/train.jsonl"
+                [ -d "$1" ] || exit 1
+                while :; do sleep 0.02; done"#
+            }
+            _ => "echo 'error: the data is broken' >&2; exit 1",
+        };
+        command.args(["-c", script, "sh"]).arg(data).arg(output).arg(request.seed.to_string());
+        Ok(command)
+    }
+
+    fn interrupt(&self, process: &Child) -> Result<()> {
+        let done = Command::new("kill").args(["-INT", &process.id().to_string()]).status();
+        done.map(drop).map_err(|error| Error::external("stopping", error))
+    }
+}
+
+/// The body of a request to train on recorded demonstrations.
+fn request(change: Value) -> String {
+    let mut body = json!({
+        "family": "gcbc", "preset": "tiny", "folder": 0, "dataset": "rooms.lance", "name": "cloned", "steps": 10, "seed": 5,
+    });
+    for (key, value) in change.as_object().expect("fields") {
+        body[key] = value.clone();
+    }
+    body.to_string()
+}
+
+/// Waits until a training has this state; returns it.
+fn wait_for(lab: &TestLab, name: &str, state: &str) -> Value {
+    let until = std::time::Instant::now() + super::PATIENCE;
+    loop {
+        let listed = lab.json("api/trainings");
+        let all = listed["trainings"].as_array().expect("trainings");
+        if let Some(found) = all.iter().find(|one| one["name"] == name && one["state"] == state) {
+            return found.clone();
+        }
+        assert!(std::time::Instant::now() < until, "{listed}");
+        std::thread::yield_now();
+    }
+}
+
+fn wait_for_log(lab: &TestLab, name: &str, lines: usize) {
+    let log = lab.home.path().join("checkpoints").join(name).join("train.jsonl");
+    let until = std::time::Instant::now() + super::PATIENCE;
+    while std::fs::read_to_string(&log).map_or(0, |text| text.lines().count()) < lines {
+        assert!(std::time::Instant::now() < until, "no {lines} lines");
+        std::thread::yield_now();
+    }
+}
+
+#[test]
+fn trainings_start_stop_and_end_with_the_lab() {
+    let mut lab = TestLab::start();
+    super::data::collect(&lab, 2);
+    assert_eq!(lab.json("api/trainings")["families"][0]["id"], "gcbc");
+    assert_eq!(lab.post("api/train", &request(json!({}))), (200, "{}".to_owned()));
+    wait_for_log(&lab, "cloned", 1);
+    assert_eq!(lab.json("api/lines?name=cloned")["lines"][0]["seed"], 5);
+    let (status, message) = lab.post("api/train", &request(json!({})));
+    assert!(status == 400 && message.contains("choose another name"), "{message}");
+    assert_eq!(lab.post("api/train", &request(json!({"name": "broken", "preset": "broken"}))).0, 200);
+    assert_eq!(wait_for(&lab, "broken", "failed")["message"], "error: the data is broken");
+    assert_eq!(lab.post("api/train", &request(json!({"name": "second"}))).0, 200);
+    let (status, message) = lab.post("api/train", &request(json!({"name": "third"})));
+    assert!(status == 400 && message.contains("2 run already"), "{message}");
+    wait_for_log(&lab, "second", 1);
+    assert_eq!(lab.post("api/stop", r#"{"name": "cloned"}"#).0, 200);
+    wait_for(&lab, "cloned", "stopped");
+    assert_eq!(lab.json("api/lines?name=cloned")["lines"][1]["step"], 2, "it stopped at a safe point");
+    assert_eq!(lab.post("api/stop", r#"{"name": "cloned"}"#).0, 400);
+    // The lab ends, and with it the second training.
+    let home = std::mem::replace(&mut lab.home, tempfile::tempdir().expect("a folder"));
+    drop(lab);
+    let log = std::fs::read_to_string(home.path().join("checkpoints/second/train.jsonl")).expect("a log");
+    assert_eq!(log.lines().count(), 2, "{log}");
+}
+
+#[test]
+fn requests_to_train_reach_no_other_folder_and_no_other_program() {
+    let lab = TestLab::start();
+    super::data::collect(&lab, 1);
+    for change in [
+        json!({"name": "../escape"}),
+        json!({"name": "/tmp/escape"}),
+        json!({"name": "-o"}),
+        json!({"name": ""}),
+        json!({"dataset": "../datasets/rooms.lance"}),
+        json!({"dataset": "hf://datasets/a/b"}),
+        json!({"folder": 1}),
+        json!({"family": "--recipe"}),
+        json!({"preset": "/etc/passwd"}),
+        json!({"preset": "tiny.toml"}),
+        json!({"steps": 0}),
+        json!({"steps": 1_000_000_000}),
+        json!({"seed": -1}),
+        json!({"settings": ["data.path=/etc"]}),
+    ] {
+        assert_eq!(lab.post("api/train", &request(change.clone())).0, 400, "{change}");
+    }
+    for body in ["", "[]", r#"{"name": "cloned", "signal": 9}"#, r#"{"name": 1}"#] {
+        assert_eq!(lab.post("api/stop", body).0, 400, "{body}");
+    }
+    assert!(!lab.home.path().join("checkpoints").exists() && !lab.home.path().join("escape").exists());
+    assert_eq!(lab.json("api/trainings")["trainings"], json!([]));
+}

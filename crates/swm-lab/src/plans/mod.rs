@@ -4,9 +4,10 @@
 //! - [`Planning`]: what the program knows of models; this crate receives it as data.
 //! - [`messages`]: requests and replies. `session`: the thread that answers them.
 //! - `watch`: reads the iterations of a search. `scratch`: plays candidates in a private environment. `projection`: paths
-//!   in the plane. `search`: all of it as one JSON document.
+//!   in the plane. `imagination`: what a model predicts beside what happens. `search`: all of it as one JSON document.
 //! - [`tree`]: the steps that were played, with snapshots.
 
+mod imagination;
 pub mod messages;
 mod projection;
 mod scratch;
@@ -21,7 +22,7 @@ pub use settings::Settings;
 
 use serde::Serialize;
 use serde_json::json;
-use swm_core::{EnvSpec, Policy, Result};
+use swm_core::{EnvSpec, Policy, Predictor, Result};
 use swm_eval::World;
 use swm_plan::{ActionKind, ActionScale, PlanObserver, SOLVERS};
 
@@ -62,6 +63,8 @@ pub struct Planner {
     pub policy: Box<dyn Policy>,
     /// The scale of its actions.
     pub scale: ActionScale,
+    /// The model for predictions that are compared with what happens, if it offers them.
+    pub predictor: Option<Box<dyn Predictor>>,
 }
 
 /// The models and the solvers that fit an environment, the solvers with their default settings and what they need.

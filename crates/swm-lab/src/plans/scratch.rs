@@ -48,6 +48,36 @@ impl Scratch {
         ImageCodec::Jpeg { quality: QUALITY }.encode(&rgb, side, side, bytes)
     }
 
+    /// Renders a snapshot, or its goal, into RGB bytes.
+    ///
+    /// # Errors
+    /// As [`Scratch::render`].
+    pub fn pixels(&mut self, snapshot: &Snapshot, goal: bool, side: usize, rgb: &mut [u8]) -> Result<()> {
+        self.env.restore(snapshot)?;
+        let frame = FrameMut::new(side, side, rgb);
+        if goal { self.env.render_goal(frame) } else { self.env.render(frame) }
+    }
+
+    /// Renders the present state into RGB bytes.
+    ///
+    /// # Errors
+    /// As [`Scratch::render`].
+    pub fn pixels_now(&mut self, side: usize, rgb: &mut [u8]) -> Result<()> {
+        self.env.render(FrameMut::new(side, side, rgb))
+    }
+
+    /// Takes the steps of some plan values from the present state.
+    ///
+    /// # Errors
+    /// When the environment fails.
+    pub fn go_on(&mut self, codec: &Codec, actions: &[f32]) -> Result<()> {
+        let mut decoded = Decoded::default();
+        for planned in actions.chunks_exact(codec.width()) {
+            self.env.step(codec.decode(planned, &mut decoded))?;
+        }
+        Ok(())
+    }
+
     /// Renders a snapshot, or its goal, as JPEG in Base64.
     ///
     /// # Errors
@@ -116,8 +146,19 @@ impl Codec {
         bounds.map(|(low, high)| ((high - low) as usize + 1, low as i64)).collect()
     }
 
+    /// Returns the actions of a box in the environment's units, clipped to it.
+    pub fn scaled(&self, planned: &[f32]) -> Vec<f32> {
+        let (mut decoded, mut all) = (Decoded::default(), vec![]);
+        for planned in planned.chunks_exact(self.width()) {
+            if let Action::Continuous(values) = self.decode(planned, &mut decoded) {
+                all.extend_from_slice(values);
+            }
+        }
+        all
+    }
+
     /// Plan values of an action.
-    fn width(&self) -> usize {
+    pub fn width(&self) -> usize {
         match self.space {
             Space::Box { .. } => self.space.len(),
             _ => self.options().iter().map(|(count, _)| count).sum(),

@@ -40,6 +40,6 @@ impl Planners for Simulated {
         pairing(&settings.solver, &mut cost, ActionKind::of(&spec.action_space))?;
         let solver = (SOLVERS.get(&settings.solver)?.make)(&serde_json::Value::Object(settings.settings.clone()))?;
         let policy = MpcPolicy::new(solver, Box::new(cost), config, scale.clone(), &spec, 1)?.observed(observer);
-        Ok(Planner { policy: Box::new(policy), scale })
+        Ok(Planner { policy: Box::new(policy), scale, predictor: None })
     }
 }

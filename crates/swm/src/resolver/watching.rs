@@ -2,7 +2,7 @@
 
 use super::{HomeResolver, Planner, check_trained_on, parse_score};
 use serde_json::Value;
-use swm_core::{CostModel, Error, Policy, Result};
+use swm_core::{CostModel, Error, Policy, Predictor, Result};
 use swm_eval::{Choice, Model, World};
 use swm_plan::{ActionScale, PlanObserver, SimulatorCost};
 
@@ -12,6 +12,8 @@ pub struct WatchedPolicy {
     pub policy: Box<dyn Policy>,
     /// The scale.
     pub scale: ActionScale,
+    /// The world model, if it offers predictions.
+    pub predictor: Option<Box<dyn Predictor>>,
 }
 
 impl HomeResolver {
@@ -28,6 +30,7 @@ impl HomeResolver {
         observer: Box<dyn PlanObserver>,
     ) -> Result<WatchedPolicy> {
         let (spec, planner) = (world.spec(), Planner::new(solver, mpc, &Value::Null)?);
+        let mut predictor = None;
         let (cost, scale): (Box<dyn CostModel>, ActionScale) = match model {
             Model::Simulator { score } => {
                 let (scale, score) = (ActionScale::unscaled(spec), parse_score(score)?);
@@ -42,6 +45,7 @@ impl HomeResolver {
                     let problem = format!("a {} model acts and does not predict", info.family);
                     Error::config(format!("checkpoint {given}"), problem, "choose another model")
                 })?;
+                predictor = loaded.predictor();
                 (cost, info.dataset_info.action)
             }
             _ => {
@@ -50,6 +54,6 @@ impl HomeResolver {
             }
         };
         let policy = planner.policy(cost, scale.clone(), world)?.observed(observer);
-        Ok(WatchedPolicy { policy: Box::new(policy), scale })
+        Ok(WatchedPolicy { policy: Box::new(policy), scale, predictor })
     }
 }

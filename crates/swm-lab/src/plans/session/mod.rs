@@ -2,6 +2,7 @@
 
 mod shown;
 
+use super::imagination::Imagination;
 use super::messages::{Reply, Request};
 use super::scratch::{Codec, Scratch};
 use super::tree::{Node, Tree};
@@ -16,7 +17,7 @@ use std::time::{Duration, Instant};
 use swm_core::policy::write_action;
 use swm_core::pool::Reset;
 use swm_core::run::Control;
-use swm_core::{EnvSpec, Error, Key, ResetOptions, Result, VariationRequest, columns, limits};
+use swm_core::{EnvSpec, Error, Key, Policy, ResetOptions, Result, VariationRequest, columns, limits};
 use swm_eval::{World, WorldConfig};
 
 /// Steps a second before the page chooses.
@@ -36,7 +37,8 @@ enum Mode {
 
 /// A planner with what the session knows of it.
 struct InUse {
-    planner: Planner,
+    policy: Box<dyn Policy>,
+    imagination: Option<Imagination>,
     codec: Codec,
     /// Environment steps of a plan that are executed.
     steps: usize,
@@ -255,10 +257,14 @@ impl<'a> PlanSession<'a> {
             self.restore()?;
         }
         let observer = Box::new(self.watch.clone());
-        let planner = self.planners.planner(settings, &model, &self.world, observer)?;
-        let codec = Codec::new(&self.spec().action_space, planner.scale.clone());
+        let Planner { policy, scale, predictor } = self.planners.planner(settings, &model, &self.world, observer)?;
+        let codec = Codec::new(&self.spec().action_space, scale);
+        let imagination = match (predictor, model.image) {
+            (Some(predictor), Some(side)) => Imagination::new(predictor, side)?,
+            _ => None,
+        };
         let steps = config.receding_horizon * config.action_block;
-        let had_one = self.in_use.replace(InUse { planner, codec, steps }).is_some();
+        let had_one = self.in_use.replace(InUse { policy, imagination, codec, steps }).is_some();
         if had_one && self.tree.nodes().len() > 1 {
             let model = if settings.model == SIMULATOR { "" } else { settings.model.as_str() };
             let text = format!("{model} {}, horizon {}", settings.solver_text(), settings.horizon);
@@ -275,7 +281,7 @@ impl<'a> PlanSession<'a> {
         (self.left, self.has_action) = (0, false);
         let key = Key::new(self.seed).at(self.tree.node().step as u64);
         if let Some(in_use) = &mut self.in_use {
-            in_use.planner.policy.begin(0, key);
+            in_use.policy.begin(0, key);
         }
     }
 
@@ -317,7 +323,7 @@ impl<'a> PlanSession<'a> {
         let begun = Instant::now();
         let mut control = Control::new().with_interrupt(Arc::clone(&self.out.gone));
         let Some(in_use) = &mut self.in_use else { return Ok(()) };
-        let acted = self.world.act_until(&mut *in_use.planner.policy, &[true], &mut control);
+        let acted = self.world.act_until(&mut *in_use.policy, &[true], &mut control);
         self.is_searching = false;
         if acted.is_err() {
             self.begin();
@@ -325,12 +331,17 @@ impl<'a> PlanSession<'a> {
         }
         self.has_action = true;
         let Some(searched) = self.watch.take() else { return Ok(()) };
-        let Some(in_use) = &self.in_use else { return Ok(()) };
+        let Some(in_use) = &mut self.in_use else { return Ok(()) };
         self.left = in_use.steps;
         let cost = searched.costs.last().map(|costs| costs.best);
         let seconds = begun.elapsed().as_secs_f64();
-        let played = (&mut self.scratch, self.tree.snapshot(), &in_use.codec);
-        let plan = search::describe(&searched, seconds, played, self.positions)?.to_string();
+        let (start, codec) = (self.tree.snapshot(), &in_use.codec);
+        let mut plan = search::describe(&searched, seconds, (&mut self.scratch, start, codec), self.positions)?;
+        if let (Some(imagination), Some(last)) = (&mut in_use.imagination, searched.kept.last()) {
+            let cheapest: Vec<_> = last.candidates.iter().filter(|one| one.rank.is_some()).collect();
+            plan["imagination"] = imagination.compare(&cheapest, (&mut self.scratch, start, codec))?;
+        }
+        let plan = plan.to_string();
         self.tree.set_plan(&plan, cost);
         self.send_plan(&plan);
         Ok(())

@@ -127,8 +127,8 @@ impl Planners for HomePlanners<'_> {
         };
         let solver = Choice { id: settings.solver.clone(), settings: Value::Object(settings.settings.clone()) };
         let mpc = json!(settings.mpc(model, world.spec())?);
-        let WatchedPolicy { policy, scale } =
+        let WatchedPolicy { policy, scale, predictor } =
             self.resolver.watched_policy(&planned_in, (&solver, &mpc), world, observer)?;
-        Ok(Planner { policy, scale })
+        Ok(Planner { policy, scale, predictor })
     }
 }

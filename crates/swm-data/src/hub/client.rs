@@ -2,20 +2,32 @@
 
 use super::{HubFile, HubUri, RepoKind};
 use crate::dataset::objects;
-use reqwest::header::{AUTHORIZATION, CONTENT_LENGTH, CONTENT_TYPE, HeaderMap, HeaderName, HeaderValue, LINK};
+use bytes::Bytes;
+use futures::future::{Either, select};
+use reqwest::header::{
+    AUTHORIZATION, CONTENT_LENGTH, CONTENT_TYPE, HeaderMap, HeaderName, HeaderValue, LINK, LOCATION,
+};
+use reqwest::redirect::Policy;
 use reqwest::{Method, Response, StatusCode};
 use serde::Deserialize;
 use serde_json::Value;
 use std::future::Future;
 use std::path::PathBuf;
+use std::pin::pin;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 use swm_core::run::Control;
 use swm_core::{Error, Result};
 use url::Url;
 
-/// The time to connect, and the time without a byte of an answer.
+/// The time to connect, and the time in which nothing is sent and nothing is answered.
 const CONNECT: Duration = Duration::from_secs(10);
 const READ: Duration = Duration::from_secs(60);
+/// The bytes of a body that are sent at once.
+const BLOCK: usize = 1 << 18;
+/// The most redirections of a request.
+const MAX_REDIRECTIONS: usize = 10;
 /// The largest answer that is read as a whole, in bytes.
 const MAX_ANSWER: usize = 256 << 20;
 /// The most pages of a list of files, and the most files.
@@ -46,8 +58,11 @@ pub(super) struct Body {
 pub(super) enum Content {
     Bytes(Vec<u8>),
     /// This many bytes, made while they are sent.
-    Blocks(u64, Box<dyn Iterator<Item = std::io::Result<Vec<u8>>> + Send>),
+    Blocks(u64, Blocks),
 }
+
+/// The blocks of a body.
+pub(super) type Blocks = Box<dyn Iterator<Item = std::io::Result<Bytes>> + Send>;
 
 impl Default for Content {
     fn default() -> Self {
@@ -77,9 +92,10 @@ impl Client {
             return Err(invalid(format!("{endpoint}: is no address of a web server")));
         }
         objects::provide_tls();
+        // Redirections are followed in `send`: those of reqwest send the token to the second address of another host.
         let http = reqwest::Client::builder()
             .connect_timeout(CONNECT)
-            .read_timeout(READ)
+            .redirect(Policy::none())
             .user_agent(concat!("stable-worldmodel/", env!("CARGO_PKG_VERSION")))
             .build()
             .map_err(|error| Error::external("making a client of the hub", error))?;
@@ -188,23 +204,48 @@ impl Client {
         Ok((headers, whole(url, answer)?))
     }
 
-    /// Sends a request. `trusted` adds the token, which only the hub's own host receives: redirections to others lose it.
+    /// Sends a request, and follows redirections. `trusted` adds the token to requests to the hub's own host.
     pub fn send(&self, method: Method, url: &str, body: Body, headers: HeaderMap, trusted: bool) -> Result<Response> {
-        let mut request = self.http.request(method, url).headers(headers);
-        if !body.content_type.is_empty() {
-            request = request.header(CONTENT_TYPE, body.content_type);
-            request = match body.content {
-                Content::Bytes(bytes) => request.body(bytes),
-                Content::Blocks(length, blocks) => request
-                    .header(CONTENT_LENGTH, length)
-                    .body(reqwest::Body::wrap_stream(futures::stream::iter(blocks))),
-            };
+        let (bytes, mut blocks) = match body.content {
+            Content::Bytes(bytes) => (Bytes::from(bytes), None),
+            Content::Blocks(length, blocks) => (Bytes::new(), Some((length, blocks))),
+        };
+        let is_repeatable = blocks.is_none();
+        let mut url = url.to_owned();
+        for _ in 0..=MAX_REDIRECTIONS {
+            let mut request = self.http.request(method.clone(), &url).headers(headers.clone());
+            let sent = (!body.content_type.is_empty()).then(Arc::<AtomicUsize>::default);
+            if let Some(counted) = sent.clone() {
+                let (length, blocks) = blocks.take().unwrap_or_else(|| (bytes.len() as u64, in_blocks(bytes.clone())));
+                let blocks = blocks.inspect(move |_| _ = counted.fetch_add(1, Ordering::Relaxed));
+                request = request.header(CONTENT_TYPE, body.content_type).header(CONTENT_LENGTH, length);
+                request = request.body(reqwest::Body::wrap_stream(futures::stream::iter(blocks)));
+            }
+            if let Some(token) = self.token.as_ref().filter(|_| trusted && self.is_own(&url)) {
+                request = request.header(AUTHORIZATION, authorization(token)?);
+            }
+            let to = url.clone();
+            let answer = run(&url, async move { patiently(&to, sent.as_deref(), request.send()).await })?;
+            match self.redirection(&method, &answer).filter(|_| is_repeatable) {
+                Some(next) => url = next,
+                None => return Ok(answer),
+            }
         }
-        if let Some(token) = self.token.as_ref().filter(|_| trusted && self.is_own(url)) {
-            request = request.header(AUTHORIZATION, authorization(token)?);
-        }
-        let url = url.to_owned();
-        run(&url.clone(), async move { request.send().await.map_err(|error| unreachable(&url, &error)) })
+        Err(Error::external(url, format!("more than {MAX_REDIRECTIONS} redirections; check the address of the hub")))
+    }
+
+    /// The address to which an answer sends a request. What is written stays at the hub's own host.
+    fn redirection(&self, method: &Method, answer: &Response) -> Option<String> {
+        let keeps_method = [StatusCode::TEMPORARY_REDIRECT, StatusCode::PERMANENT_REDIRECT].contains(&answer.status());
+        let moves =
+            [StatusCode::MOVED_PERMANENTLY, StatusCode::FOUND, StatusCode::SEE_OTHER].contains(&answer.status());
+        let next = answer.url().join(answer.headers().get(LOCATION)?.to_str().ok()?).ok()?;
+        let is_web = ["http", "https"].contains(&next.scheme());
+        let follows = match *method {
+            Method::GET => (keeps_method || moves) && is_web,
+            _ => keeps_method && self.is_own(next.as_str()),
+        };
+        follows.then(|| next.into())
     }
 
     /// Whether an address belongs to the hub.
@@ -269,15 +310,72 @@ pub(super) fn run<T: Send + 'static>(
     objects::block_on(request)?.unwrap_or_else(|| Err(Error::external(url, "the HTTP client panicked")))
 }
 
+/// Waits for a part of an answer, and gives up after a minute in which nothing came and none of the blocks that `sent` counts
+/// was sent. Where nothing is sent, a message says after some seconds that there is no answer.
+async fn patiently<T>(
+    url: &str,
+    sent: Option<&AtomicUsize>,
+    part: impl Future<Output = reqwest::Result<T>>,
+) -> Result<T> {
+    let name = named(url);
+    let answer = async {
+        match sent {
+            Some(_) => part.await,
+            None => objects::answer_or_report(&name, READ, part).await,
+        }
+    };
+    match unless_stalled(READ, sent, answer).await {
+        Some(answer) => answer.map_err(|error| unreachable(url, &error)),
+        None => {
+            let problem = format!("nothing was received for {} s", READ.as_secs());
+            Err(Error::external(named(url), format!("{problem}; check the network connection, then run it again")))
+        }
+    }
+}
+
+/// Waits for an answer; `None` after a time in which `sent` did not change.
+async fn unless_stalled<T>(limit: Duration, sent: Option<&AtomicUsize>, answer: impl Future<Output = T>) -> Option<T> {
+    let stalled = async {
+        let count = || sent.map_or(0, |sent| sent.load(Ordering::Relaxed));
+        let mut before = None;
+        while before != Some(count()) {
+            before = Some(count());
+            tokio::time::sleep(limit).await;
+        }
+    };
+    match select(pin!(answer), pin!(stalled)).await {
+        Either::Left((answer, _)) => Some(answer),
+        Either::Right(_) => None,
+    }
+}
+
+/// The content of a body in blocks.
+fn in_blocks(mut bytes: Bytes) -> Blocks {
+    Box::new(std::iter::from_fn(move || {
+        let block = bytes.split_to(bytes.len().min(BLOCK));
+        (!block.is_empty()).then_some(Ok(block))
+    }))
+}
+
+/// The hub in messages.
+fn named(url: &str) -> String {
+    let host = Url::parse(url).ok().and_then(|url| url.host_str().map(str::to_owned)).unwrap_or_default();
+    format!("the hub ({host})")
+}
+
 /// An error of a connection.
 pub(super) fn unreachable(url: &str, error: &reqwest::Error) -> Error {
-    let host = Url::parse(url).ok().and_then(|url| url.host_str().map(str::to_owned)).unwrap_or_default();
     // The innermost cause says what happened.
     let mut cause: &dyn std::error::Error = error;
     while let Some(source) = cause.source() {
         cause = source;
     }
-    Error::external(format!("the hub ({host})"), format!("{cause}; check the network connection, then run it again"))
+    Error::external(named(url), format!("{cause}; check the network connection, then run it again"))
+}
+
+/// The next bytes of an answer.
+pub(super) async fn next_chunk(url: &str, answer: &mut Response) -> Result<Option<Bytes>> {
+    patiently(url, None, answer.chunk()).await
 }
 
 /// Reads the body of an answer.
@@ -285,7 +383,7 @@ pub(super) fn whole(url: &str, mut answer: Response) -> Result<Vec<u8>> {
     let label = url.to_owned();
     run(url, async move {
         let mut bytes = vec![];
-        while let Some(chunk) = answer.chunk().await.map_err(|error| unreachable(&label, &error))? {
+        while let Some(chunk) = next_chunk(&label, &mut answer).await? {
             if bytes.len() + chunk.len() > MAX_ANSWER {
                 return Err(Error::corrupt(label, "its answer is too long", "check the address of the hub"));
             }
@@ -352,6 +450,25 @@ mod tests {
         for wrong in ["huggingface", "ftp://host"] {
             assert!(Client::new(wrong, None).is_err(), "{wrong}");
         }
+    }
+
+    #[test]
+    fn uploads_last_as_long_as_blocks_are_sent() {
+        let (limit, sent) = (Duration::from_millis(1), AtomicUsize::new(0));
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().expect("a runtime");
+        let upload = async {
+            for _ in 0..5 {
+                sent.fetch_add(1, Ordering::Relaxed);
+                tokio::time::sleep(limit).await;
+            }
+            7
+        };
+        assert_eq!(runtime.block_on(async { unless_stalled(limit, Some(&sent), upload).await }), Some(7));
+        let silent = std::future::pending::<()>();
+        assert_eq!(runtime.block_on(async { unless_stalled(limit, Some(&sent), silent).await }), None);
+        let blocks: Vec<usize> =
+            in_blocks(vec![0; BLOCK + 1].into()).map(|block| block.expect("a block").len()).collect();
+        assert_eq!(blocks, [BLOCK, 1]);
     }
 
     #[test]

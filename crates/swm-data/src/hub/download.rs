@@ -1,7 +1,7 @@
 //! [`Hub::pull`]: downloads, which continue where they were interrupted.
 
 use super::cache::Folder;
-use super::client::{Body, Client, encoded_path, run, unreachable};
+use super::client::{Body, Client, encoded_path, next_chunk, run};
 use super::{Hub, HubFile, HubUri, Pulled};
 use reqwest::header::{HeaderMap, HeaderValue, RANGE};
 use reqwest::{Method, Response, StatusCode};
@@ -184,7 +184,7 @@ fn transfer(
 fn chunk(url: &str, mut answer: Response) -> Result<(Option<bytes::Bytes>, Response)> {
     let label = url.to_owned();
     run(url, async move {
-        let bytes = answer.chunk().await.map_err(|error| unreachable(&label, &error))?;
+        let bytes = next_chunk(&label, &mut answer).await?;
         Ok((bytes, answer))
     })
 }

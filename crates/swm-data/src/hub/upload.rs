@@ -5,6 +5,7 @@ use super::download::sha256;
 use super::{Hub, HubUri, RepoKind};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
+use bytes::Bytes;
 use reqwest::Method;
 use reqwest::header::HeaderMap;
 use serde::Deserialize;
@@ -279,12 +280,19 @@ impl Client {
             let made = lines.iter().map(Line::bytes).collect::<std::io::Result<Vec<_>>>();
             Content::Bytes(made.map_err(|error| Error::external("reading the files of the commit", error))?.concat())
         } else {
-            Content::Blocks(length, Box::new(lines.into_iter().map(|line| line.bytes())))
+            Content::Blocks(length, Box::new(lines.into_iter().map(|line| line.bytes().map(Bytes::from))))
         };
         let body = Body { content, content_type: "application/x-ndjson" };
         let answer = self.send(Method::POST, &url, body, HeaderMap::new(), true)?;
         self.check_write(&answer, to)?;
         let answer: Answer = parsed(&url, &whole(&url, answer)?)?;
+        if !super::uri::is_commit(&answer.commit_oid) {
+            return Err(Error::corrupt(
+                url,
+                "its answer has no commit",
+                "check on the hub whether the files are there",
+            ));
+        }
         Ok((answer.commit_oid, answer.commit_url))
     }
 }
@@ -314,12 +322,12 @@ impl Line {
 }
 
 /// The content of a file in blocks.
-fn blocks(mut file: std::io::Take<File>) -> impl Iterator<Item = std::io::Result<Vec<u8>>> {
+fn blocks(mut file: std::io::Take<File>) -> impl Iterator<Item = std::io::Result<Bytes>> {
     std::iter::from_fn(move || {
         let mut block = vec![];
         match file.by_ref().take(BLOCK).read_to_end(&mut block) {
             Ok(0) => None,
-            read => Some(read.map(|_| block)),
+            read => Some(read.map(|_| block.into())),
         }
     })
 }
@@ -424,7 +432,7 @@ mod tests {
         let content: Vec<u8> = (0..BLOCK * 2 + 5).map(|i| (i % 251) as u8).collect();
         std::fs::write(&path, &content).expect("a file");
         let length = content.len() as u64 - 3;
-        let read: Vec<Vec<u8>> =
+        let read: Vec<Bytes> =
             blocks(File::open(&path).expect("a file").take(length)).collect::<std::io::Result<_>>().expect("blocks");
         assert_eq!(read.iter().map(|block| block.len() as u64).collect::<Vec<_>>(), [BLOCK, BLOCK, 2]);
         assert_eq!(read.concat(), content[..content.len() - 3]);

@@ -116,6 +116,25 @@ fn files_of_other_sizes_than_listed_end_the_download() {
 }
 
 #[test]
+fn the_token_stays_at_the_hub_after_two_redirections() {
+    let setup = Setup::new();
+    setup.hub.commit("models/lab/rooms", &[("large", &content(2000))]);
+    // The storage sends readers to a second address of its own, and panics if it receives a token.
+    setup.hub.state().moves = true;
+    assert_eq!(setup.json(&["pull", "hf://lab/rooms/large"], Some(TOKEN))["downloaded"], 2000);
+    let requests = setup.hub.state().requests.iter().filter(|request| request.starts_with("storage")).count();
+    assert_eq!(requests, 2);
+}
+
+#[test]
+fn an_upload_ends_with_a_commit() {
+    let setup = Setup::new();
+    std::fs::write(setup.swm.path("file"), content(100)).expect("writing a file");
+    setup.hub.state().wrong_commit = Some("main".to_owned());
+    setup.fails(&["push", "./file", "hf://lab/rooms"], Some(TOKEN), &["its answer has no commit"]);
+}
+
+#[test]
 fn lists_of_files_do_not_continue_at_another_host() {
     let setup = Setup::new();
     setup.hub.commit("models/lab/rooms", &[("a", b"a"), ("b", b"b"), ("c", b"c")]);

@@ -34,6 +34,10 @@ pub(crate) struct State {
     pub listed: BTreeMap<String, u64>,
     /// What the hub lists in place of the hash of large files.
     pub wrong_oid: Option<String>,
+    /// Whether the storage sends readers to another address of its own.
+    pub moves: bool,
+    /// The commit that the hub answers to an upload, in place of the one that it made.
+    pub wrong_commit: Option<String>,
     /// Whether the hub sends bytes without an end for every file.
     pub endless: bool,
     /// The host to which the hub sends readers of its second page.
@@ -165,6 +169,10 @@ impl HubServer {
             }
             state.objects.insert(oid, request.body.clone());
             return Answer::ok(vec![]);
+        }
+        if let Some(name) = path.strip_prefix('/').filter(|_| state.moves && !part.starts_with("moved")) {
+            let headers = vec![("location", format!("/{name}?moved"))];
+            return Answer { status: "302 Found", headers, ..Answer::ok(vec![]) };
         }
         let Some(mut body) = state.objects.get(&oid).cloned() else { return Answer::error("404 Not Found", "") };
         if state.wrong_content {
@@ -339,7 +347,7 @@ impl State {
         }
         let commits = &mut self.repositories.get_mut(name).expect("a repository").commits;
         commits.push(files);
-        let sha = sha(name, commits.len() - 1);
+        let sha = self.wrong_commit.clone().unwrap_or_else(|| sha(name, commits.len() - 1));
         Answer::json(&json!({"success": true, "commitOid": sha, "commitUrl": format!("{address}/{name}/commit/{sha}")}))
     }
 }

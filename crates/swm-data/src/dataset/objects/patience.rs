@@ -61,7 +61,12 @@ impl<T> fmt::Display for Patience<T> {
 
 /// Waits for an answer, and reports when there is none.
 async fn answer<R>(name: &str, request: impl Future<Output = R>) -> R {
-    answer_within(QUIET, request, |waited| report(name, waited)).await
+    answer_or_report(name, READ, request).await
+}
+
+/// Waits for an answer that is given up after `limit`, and reports when there is none.
+pub(crate) async fn answer_or_report<R>(name: &str, limit: Duration, request: impl Future<Output = R>) -> R {
+    answer_within(QUIET, request, |waited| report(name, limit, waited)).await
 }
 
 /// Waits for an answer, and calls `on_quiet` when there is none within `quiet`, and every ten seconds after that.
@@ -79,7 +84,7 @@ async fn answer_within<R>(quiet: Duration, request: impl Future<Output = R>, mut
 }
 
 /// Logs that a server does not answer, unless a message was logged shortly before.
-fn report(name: &str, waited: Duration) {
+fn report(name: &str, limit: Duration, waited: Duration) {
     static START: LazyLock<Instant> = LazyLock::new(Instant::now);
     /// The time of the next message, in milliseconds after `START`.
     static NEXT: AtomicU64 = AtomicU64::new(0);
@@ -90,7 +95,7 @@ fn report(name: &str, waited: Duration) {
         tracing::warn!(
             "{name} has not answered for {} s; a request is given up after {} s",
             waited.as_secs(),
-            READ.as_secs()
+            limit.as_secs()
         );
     }
 }

@@ -322,6 +322,37 @@ fn refused_conversion_does_not_replace_a_dataset() {
     let left: Vec<_> =
         folder.path().read_dir().expect("listing").map(|entry| entry.expect("an entry").path()).collect();
     assert_eq!(left.len(), 6, "{left:?}");
+    // What a kill leaves of a trial does not stay.
+    for format in ["lance", "video"] {
+        let (path, trial) =
+            (folder.path().join(format!("old.{format}")), folder.path().join(format!(".old.trial.{format}")));
+        write(&trial, WriteMode::Create, 3, 0..1);
+        let options = ConvertOptions {
+            mode: ConvertMode::Overwrite,
+            codec: ImageCodec::Jpeg { quality: 90 },
+            least_psnr: Some(0.0),
+            ..ConvertOptions::default()
+        };
+        convert(&reader, &Location::from(&path), &options, &mut Control::new()).expect(format);
+        assert!(!trial.exists(), "{format}");
+    }
+}
+
+#[test]
+fn conversions_continue_datasets_without_episodes() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let from = folder.path().join("source.lance");
+    write(&from, WriteMode::Create, 1, 0..2);
+    for format in ["lance", "lance-video", "folder", "video", "lerobot", "h5"] {
+        let path = folder.path().join(format!("to.{format}"));
+        // A conversion that is killed before its first commit leaves the empty dataset of its writer.
+        create(&path, &schema(), options(WriteMode::Create)).expect("creating the dataset").finish().expect("an end");
+        for mode in [ConvertMode::Resume, ConvertMode::Append] {
+            let options = ConvertOptions { mode, least_psnr: None, ..ConvertOptions::default() };
+            run(&from, &path, &options).unwrap_or_else(|error| panic!("{format}: {error}"));
+        }
+        assert_eq!(open(&path).expect("opening").episodes().len(), 4, "{format}");
+    }
 }
 
 #[test]

@@ -24,7 +24,7 @@ use std::sync::mpsc::{Receiver, SyncSender, channel, sync_channel};
 use std::thread::{Builder, scope};
 use swm_core::columns::ACTION;
 use swm_core::run::{Control, Event, Progress, Stage};
-use swm_core::{Batch, DType, Error, Result, Schema, files};
+use swm_core::{Batch, DType, Error, Result, Schema};
 use swm_image::ImageCodec;
 
 /// The unit of progress.
@@ -127,8 +127,8 @@ pub fn convert(
     }
     check_distinct(&**reader, target)?;
     if let Some((entry, trial)) = trial(&**reader, target, options)? {
-        let options =
-            ConvertOptions { mode: ConvertMode::Create, format: Some(entry.id.to_owned()), ..options.clone() };
+        // The trial of a conversion that was killed is replaced.
+        let options = ConvertOptions { format: Some(entry.id.to_owned()), ..options.clone() };
         let tried = convert_into(reader, &Location::from(&trial), &options, control);
         let removed = entry.remove(&trial);
         tried.and(removed)?;
@@ -136,8 +136,8 @@ pub fn convert(
     convert_into(reader, target, options, control)
 }
 
-/// Returns the format and a free path beside the target, where a conversion is tried before it replaces a dataset: images may
-/// lose more than the options allow, which is known after all of them are written. `None` if that cannot happen.
+/// Returns the format and a hidden path beside the target, where a conversion is tried before it replaces a dataset: images
+/// may lose more than the options allow, which is known after all of them are written. `None` if that cannot happen.
 fn trial(
     reader: &dyn Reader,
     target: &Location,
@@ -154,9 +154,7 @@ fn trial(
     let Some(entry) = entry.filter(is_tried) else { return Ok(None) };
     let stem = path.file_stem().unwrap_or_default().to_string_lossy();
     let suffix = path.extension().map(|suffix| format!(".{}", suffix.to_string_lossy())).unwrap_or_default();
-    let trial = path.with_file_name(format!("{stem}.trial-{}{suffix}", std::process::id()));
-    files::check_free(&trial)?;
-    Ok(Some((entry, trial)))
+    Ok(Some((entry, path.with_file_name(format!(".{stem}.trial{suffix}")))))
 }
 
 #[allow(clippy::too_many_lines, reason = "compare, copy and verify share the report")]
@@ -183,6 +181,8 @@ fn convert_into(
         ConvertMode::Resume | ConvertMode::Append => open_existing(target, format)?,
         ConvertMode::Create | ConvertMode::Overwrite => None,
     };
+    // Without episodes, which a kill leaves, a dataset may lack columns: those of videos.
+    let existing = existing.filter(|existing| !existing.episodes().is_empty());
     let mut hashes = vec![None; all];
     // Position of the source's first episode in the target, and of the first episode that is not in the target.
     let (mut base, mut first) = (0, 0);

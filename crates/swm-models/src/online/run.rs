@@ -109,6 +109,7 @@ fn start<'a, M: Agent>(
     let resumed = Learner::resume(config, &dataset_info, &manifest, out, options)?;
     let saved = resumed.as_ref().map(|learner| saved_data(out, learner.state().step));
     let data = Data::new(&config.loop_config(), online, loader_config, pool, &recorded, saved)?;
+    let saved = resumed.as_ref().map(|learner| (learner.state().step, data.collector.steps));
     let learner = match resumed {
         Some(learner) => learner,
         None => Learner::start(config, dataset_info, manifest, &options.device)?,
@@ -126,6 +127,7 @@ fn start<'a, M: Agent>(
         evaluation_pool,
         log: log::Log::new(out, learner.state().step)?,
         key: Key::new(config.seed).with("online"),
+        saved,
         learner: Box::new(OnlineLearner { learner, shared }),
     };
     Ok(Box::new(move |control| run.go(M::FAMILY, control)))
@@ -181,6 +183,8 @@ struct Run<'a> {
     evaluator: Box<dyn Policy>,
     log: log::Log,
     key: Key,
+    /// The optimizer steps and the environment steps of the data in the folder of the run.
+    saved: Option<(usize, usize)>,
 }
 
 /// Measurements of a run.
@@ -356,17 +360,21 @@ impl Run<'_> {
     }
 
     /// Saves the replay buffer and the collector, then the checkpoint, so that the data of every checkpoint
-    /// exist.
+    /// exist. Data that the checkpoint in the folder has already stay, because a kill could come before they are written again.
     /// Returns the hash of the weights.
     fn save(&mut self) -> Result<String> {
         let folder = saved_data(self.out, self.step());
-        run_folder::remove_saved_data(&folder)?;
-        std::fs::create_dir_all(&folder).map_err(|error| Error::io(&folder, "creating a folder", error))?;
-        self.data.replay.save(folder.join(REPLAY), WriteOptions::default())?;
-        let path = folder.join(COLLECTOR);
-        std::fs::write(&path, json!(self.data.collector.state()).to_string())
-            .map_err(|error| Error::io(&path, "saving the state of the episodes", error))?;
+        let present = Some((self.step(), self.data.collector.steps));
+        if self.saved != present {
+            run_folder::remove_saved_data(&folder)?;
+            std::fs::create_dir_all(&folder).map_err(|error| Error::io(&folder, "creating a folder", error))?;
+            self.data.replay.save(folder.join(REPLAY), WriteOptions::default())?;
+            let path = folder.join(COLLECTOR);
+            std::fs::write(&path, json!(self.data.collector.state()).to_string())
+                .map_err(|error| Error::io(&path, "saving the state of the episodes", error))?;
+        }
         let weights = self.learner.learner().save(self.out)?;
+        self.saved = present;
         for path in run_folder::saved_data(self.out)?.into_iter().filter(|path| *path != folder) {
             run_folder::remove_saved_data(&path)?;
         }

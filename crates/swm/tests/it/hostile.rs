@@ -1,9 +1,12 @@
 //! A table of hostile arguments: each command refuses them with a message, without a panic, an abort or a hang.
 
 use crate::{Swm, text};
-use std::ffi::OsStr;
+use std::collections::BTreeMap;
+use std::ffi::{OsStr, OsString};
 use std::fs;
 use std::os::unix::ffi::OsStrExt as _;
+use std::os::unix::fs::MetadataExt as _;
+use std::path::Path;
 use std::process::Stdio;
 
 /// Commands that read one name or path.
@@ -126,6 +129,26 @@ fn file_beyond_the_limit_of_the_process_is_an_error() {
         assert_eq!(output.status.code(), Some(1), "{arguments}: {}", text(&output.stderr));
         assert!(text(&output.stderr).contains("File too large"), "{}", text(&output.stderr));
     }
+}
+
+#[test]
+fn continuing_a_finished_online_run_leaves_its_replay_data_in_place() {
+    let swm = Swm::new();
+    let train = "train sac --preset tiny --env swm/PendulumControl-v1 --max-steps 20 -o ./run schedule.steps=4 \
+                 online.warmup=40 data.batch_size=8 online.evaluate_episodes=1";
+    let train: Vec<&str> = train.split_whitespace().collect();
+    swm.json(&train);
+    // A kill between the deletion and the new copy would leave a checkpoint without its data.
+    let data = swm.path("run/played-4");
+    let before = (inodes(&data), inodes(&data.join("replay.lance/data")));
+    swm.json(&[&train[..], &["--resume"]].concat());
+    assert_eq!((inodes(&data), inodes(&data.join("replay.lance/data"))), before);
+}
+
+/// The entries of a folder, with the numbers of their files.
+fn inodes(folder: &Path) -> BTreeMap<OsString, u64> {
+    let entries = fs::read_dir(folder).expect("a folder").flatten();
+    entries.map(|entry| (entry.file_name(), entry.metadata().expect("its metadata").ino())).collect()
 }
 
 #[test]

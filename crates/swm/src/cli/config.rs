@@ -82,7 +82,7 @@ impl VariationArgs {
     /// Returns the factors of variation for every reset.
     ///
     /// # Errors
-    /// When a pinned value is not `KEY=NUMBER[,NUMBER…]`, or a factor is pinned twice.
+    /// When a pinned value is not `KEY=NUMBER[,NUMBER…]` with finite numbers, or a factor is pinned twice.
     pub fn request(&self) -> Result<VariationRequest> {
         let mut variation_values = BTreeMap::new();
         for pin in &self.pin {
@@ -94,8 +94,9 @@ impl VariationArgs {
                 )
             };
             let (key, values) = pin.split_once('=').ok_or_else(wrong)?;
-            let values: std::result::Result<Vec<f64>, _> = values.split(',').map(|v| v.trim().parse()).collect();
-            let values = values.map_err(|_| wrong())?;
+            let parse = |value: &str| value.trim().parse().ok().filter(|value: &f64| value.is_finite());
+            let values: Option<Vec<f64>> = values.split(',').map(parse).collect();
+            let values = values.ok_or_else(wrong)?;
             if variation_values.insert(key.to_owned(), values).is_some() {
                 let is_first = |other: &&String| other.split_once('=').is_some_and(|(other, _)| other == key);
                 let first = self.pin.iter().find(is_first).unwrap_or(pin);

@@ -13,6 +13,7 @@ use swm_core::{Error, Result};
 /// When the folder cannot be created or written to, another process writes to it, or one of the files exists and was not
 /// written by this program.
 pub fn claim(folder: &Path, names: &[&str]) -> Result<Lock> {
+    check_local(folder)?;
     if folder.exists() && !folder.is_dir() {
         return Err(Error::config(folder.display().to_string(), "is not a folder", "give a folder with --output"));
     }
@@ -20,6 +21,23 @@ pub fn claim(folder: &Path, names: &[&str]) -> Result<Lock> {
     check_writable(folder)?;
     check(folder, names)?;
     Ok(lock)
+}
+
+/// Checks that an output is a path of this machine, and no URI, which would become a folder such as `s3:`.
+///
+/// # Errors
+/// When it is a URI.
+pub fn check_local(output: &Path) -> Result<()> {
+    let given = output.to_string_lossy();
+    let is_scheme = |scheme: &str| !scheme.is_empty() && scheme.bytes().all(|byte| byte.is_ascii_alphanumeric());
+    match given.split_once("://") {
+        Some((scheme, _)) if is_scheme(scheme) => Err(Error::config(
+            given,
+            "is a URI, and the output is a folder of this machine",
+            "give a path with --output",
+        )),
+        _ => Ok(()),
+    }
 }
 
 /// Checks that files that a command replaces were written by this program.

@@ -83,10 +83,13 @@ fn output_folders_are_checked_before_the_work() {
     no_work("file/below", 1, &["file/below"]);
     no_work("occupied", 2, &["results.json", "is a folder"]);
     no_work("/proc/swm", 2, &["/proc/swm"]);
+    no_work("s3://bucket/found", 2, &["s3://bucket/found", "is a URI"]);
 
     swm.json(EVAL);
     swm.fails(&["reproduce", "found", "-o", "found"], 2, &["would be replaced"]);
     swm.fails(&["report", "found", "-o", "file"], 2, &["is not a folder"]);
+    swm.fails(&["report", "found", "-o", "file://x"], 2, &["is a URI"]);
+    assert!(!swm.path("s3:").exists() && !swm.path("file:").exists());
 
     let lock = fs::File::open(swm.path("found")).expect("the folder");
     lock.lock().expect("the lock");

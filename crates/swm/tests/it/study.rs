@@ -2,6 +2,7 @@
 
 use crate::{Swm, text};
 use std::collections::BTreeMap;
+use std::os::unix::ffi::OsStrExt as _;
 use std::path::Path;
 use std::process::Stdio;
 use std::time::Duration;
@@ -333,6 +334,21 @@ fn report_of_a_study_replaces_only_its_own_files() {
     let second = contents(&swm.path("page"));
     assert!(first["index.html"] != second["index.html"] && first["table.csv"] == second["table.csv"]);
     swm.fails(&["study", "report", "nowhere"], 2, &["nowhere"]);
+}
+
+#[test]
+fn studies_are_written_to_the_folder_that_is_named() {
+    let swm = with_study();
+    swm.fails(&["study", "run", "study.toml", "--output", "gs://bucket/x"], 2, &["gs://bucket/x", "is a URI"]);
+    let mut command = swm.command(&["study", "run", "study.toml", "--output"]);
+    let output = command.arg(std::ffi::OsStr::from_bytes(b"\xff\xfe")).output().expect("swm starts");
+    assert!(output.status.code() == Some(2) && text(&output.stderr).contains("no valid UTF-8"));
+    // An infinite value would be no JSON, and the study could not be read again.
+    let infinite = STUDY.replace("hsv({hue},1,1)", "1e400,0,0");
+    std::fs::write(swm.path("infinite.toml"), infinite).expect("writing the study");
+    swm.fails(&["study", "run", "infinite.toml", "--output", "out"], 2, &["1e400,0,0", "it is not KEY=NUMBER"]);
+    let left: Vec<_> = std::fs::read_dir(swm.path("")).expect("a folder").flatten().map(|e| e.file_name()).collect();
+    assert!(!swm.path("out").exists() && !swm.path("gs:").exists(), "{left:?}");
 }
 
 #[test]

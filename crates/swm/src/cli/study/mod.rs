@@ -25,7 +25,7 @@ use super::on_ray::{OnRayArgs, Request};
 use super::progress::control;
 use super::recipes::Datasets;
 use super::results_tables::{compared, percent};
-use super::{Context, emit, emit_json, table};
+use super::{Context, emit, emit_json, output_folder, table};
 use crate::resolver::HomeResolver;
 use any_file::{AnyFile, Size};
 use clap::{Args, Subcommand, ValueEnum as _};
@@ -226,6 +226,10 @@ pub(super) fn single(
         options,
         ..file::Table::default()
     };
+    if let Some(given) = settings.iter().find(|setting| setting.starts_with("policy=")) {
+        let problem = format!("the model is '{policy}', and evaluated alone");
+        return Err(Error::config(given, problem, "remove the setting, or give another model"));
+    }
     let options = BTreeMap::from([(file::POLICY.to_owned(), vec![policy.to_owned()])]);
     let file = file::StudyFile {
         title: title.to_owned(),
@@ -268,12 +272,12 @@ fn run(args: &RunArgs, only_register: bool, context: &Context) -> anyhow::Result
         return Ok(());
     }
     let Some(output) = &args.output else { return Ok(()) };
+    let output = args.output_text(output)?;
     file.datasets.check_origin(&origin)?;
     // Before datasets are collected, which may take long.
     expand::check(&file, &args.settings, &resolver)?;
-    let output = output.to_string_lossy();
     if !only_register {
-        check_output(&output, &file.title, &args.on)?;
+        check_output(output, &file.title, &args.on)?;
     }
     file.datasets.make(&origin, context)?;
     let mut study: Study = expand::study(&file, &args.settings, &resolver, &mut control(context))?;
@@ -284,9 +288,9 @@ fn run(args: &RunArgs, only_register: bool, context: &Context) -> anyhow::Result
         let ids = study.cells.iter().map(Cell::id).collect::<Result<Vec<_>>>()?;
         let cells = json!({"study": study, "ids": ids});
         let replaced = &["-o", "--output"];
-        return args.on.submit(&Request { kind: "study", output: &output, replaced, cells }, context);
+        return args.on.submit(&Request { kind: "study", output, replaced, cells }, context);
     }
-    let folder = StudyFolder::new(Path::new(&*output));
+    let folder = StudyFolder::new(Path::new(output));
     if only_register {
         let (_lock, hash) = folder.register(&study)?;
         if context.json {
@@ -329,7 +333,7 @@ fn run_table(
     study.arguments = args.arguments();
     let datasets = file.datasets(size)?;
     datasets.check_origin(origin)?;
-    check_output(&output.to_string_lossy(), &study.title, &args.on)?;
+    check_output(args.output_text(output)?, &study.title, &args.on)?;
     datasets.make(origin, context)?;
     let folder = StudyFolder::new(output);
     tables::run(&study, &folder, context)?;
@@ -337,6 +341,15 @@ fn run_table(
 }
 
 impl RunArgs {
+    /// The output as text, which paths of a cluster are. Without one, it is a folder of this machine.
+    fn output_text<'a>(&self, output: &'a Path) -> Result<&'a str> {
+        if !self.on.is_given() {
+            output_folder::check_local(output)?;
+        }
+        let fix = "give another folder with --output";
+        output.to_str().ok_or_else(|| Error::config(output.display().to_string(), "is no valid UTF-8", fix))
+    }
+
     /// The name of the study, its size and its settings, for the command that runs it again.
     fn arguments(&self) -> Vec<String> {
         let small = self.small.then(|| "--small".to_owned());

@@ -66,6 +66,7 @@ const TIMED_ENVS: usize = 2;
 /// Runs `swm autopsy`.
 pub fn autopsy(args: &AutopsyArgs, context: &Context) -> anyhow::Result<()> {
     let ingredients = ingredients(&args.ingredients)?;
+    output_folder::check_local(&args.output)?;
     let own_env = args.env.iter();
     let resolver = own_env.fold(HomeResolver::new(Origin::User), |resolver, env| resolver.with_env(env));
     let name =
@@ -155,7 +156,16 @@ fn ingredients(given: &str) -> Result<Vec<Ingredient>> {
             Error::config("--ingredients", problem, "choose some of S, R, D, C and E, such as SRD")
         })
     };
-    given.chars().filter(|c| *c != ',').map(find).collect()
+    let mut found = vec![];
+    for letter in given.chars().filter(|c| *c != ',') {
+        let ingredient = find(letter)?;
+        if found.contains(&ingredient) {
+            let problem = format!("the ingredient '{letter}' is given twice");
+            return Err(Error::config("--ingredients", problem, "give every letter once"));
+        }
+        found.push(ingredient);
+    }
+    Ok(found)
 }
 
 /// Returns the most seconds that the arms without results take: plans are timed with each model, and a larger search takes

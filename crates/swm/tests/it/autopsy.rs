@@ -92,6 +92,8 @@ fn autopsies_that_explain_nothing_are_refused() {
     fails(&["zoo:two-room/pldm", "--planning-seeds", "2"], &["give 3 to"]);
     fails(&["zoo:two-room/pldm", "solver=cem", "solver=icem"], &["solver"]);
     fails(&["zoo:two-room/pldm", "protocol=compat"], &["use protocol=strict"]);
+    fails(&["zoo:two-room/pldm", "policy=random"], &["policy=random", "'zoo:two-room/pldm'"]);
+    fails(&["zoo:two-room/pldm", "--ingredients", "SDs"], &["'s' is given twice"]);
     let estimate = swm.json(&["autopsy", "zoo:two-room/pldm", "--estimate", "--ingredients=SD", "--episodes=2"]);
     assert!(estimate["seconds"].as_f64().is_some_and(|seconds| seconds > 0.0), "{estimate}");
     assert!(estimate["arms"] == 4 && !swm.path("autopsy").exists());

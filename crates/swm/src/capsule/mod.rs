@@ -8,7 +8,7 @@ mod verify;
 
 pub use pack::{PackRequest, pack};
 pub use record::{EvaluationRecord, RecordedEpisode};
-pub(crate) use record::{check_cost, trained};
+pub(crate) use record::{check_cost, is_hash, trained};
 pub use verify::{Verification, verify};
 
 /// The name of the capsule's own model in the request that it holds.

@@ -160,6 +160,9 @@ impl EvaluationRecord {
         if [Some(record.success), record.floor].into_iter().flatten().any(|[_, n]| n > request.episodes) {
             return Err(wrong(format!("it counts more than the {} episodes of its request", request.episodes)));
         }
+        if let Some(text) = record.hashes.values().chain([&record.weights]).find(|text| !is_hash(text)) {
+            return Err(wrong(format!("'{}' is no hash", text.escape_debug())));
+        }
         Ok(record)
     }
 
@@ -207,6 +210,11 @@ fn choose(run: &Run) -> Vec<usize> {
     numbers.extend(failed.into_iter().take(failures));
     numbers.sort_unstable();
     numbers
+}
+
+/// Whether a text has the form of a BLAKE3 hash.
+pub fn is_hash(text: &str) -> bool {
+    text.len() == 64 && text.bytes().all(|byte| byte.is_ascii_hexdigit())
 }
 
 /// Checks what an episode of a request from a file costs.

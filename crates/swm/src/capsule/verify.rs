@@ -3,6 +3,7 @@
 use super::{EvaluationRecord, MODEL, RecordedEpisode, cpu_level};
 use crate::resolver::HomeResolver;
 use serde::Serialize;
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::rc::Rc;
 use swm_core::run::Control;
@@ -64,21 +65,25 @@ pub fn verify(path: &Path, trust: bool, options: &RunOptions, control: &mut Cont
     }
     if let Some(evaluation) = &capsule.evaluation {
         let resolver = HomeResolver::new(origin).with_checkpoint(MODEL, model);
-        verification.replay(evaluation, &resolver, options, control)?;
+        verification.replay(evaluation, &capsule.manifest.hashes, &resolver, options, control)?;
     }
     Ok(verification)
 }
 
 impl Verification {
-    /// Plays the episodes of an evaluation again.
+    /// Plays the episodes of an evaluation again. `hashes` are those of the capsule's manifest.
     fn replay(
         &mut self,
         evaluation: &Evaluation,
+        hashes: &BTreeMap<String, String>,
         resolver: &HomeResolver,
         options: &RunOptions,
         control: &mut Control<'_>,
     ) -> Result<()> {
         let record = EvaluationRecord::read(evaluation)?;
+        if !["weights", "packed"].iter().any(|name| hashes.get(*name) == Some(&record.weights)) {
+            self.faults.push("its evaluation is that of other weights".to_owned());
+        }
         let (numbers, starts) = record.numbers();
         let recorded = EvaluationRecord::recorded(evaluation, &numbers, &starts);
         let replay = record.request.replay(recorded, resolver, options, control)?;

@@ -1,6 +1,6 @@
 //! [`Entry`]: the results of one trained policy as a file that others verify.
 
-use crate::capsule::{check_cost, cpu_level, trained};
+use crate::capsule::{check_cost, cpu_level, is_hash, trained};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::path::Path;
@@ -268,11 +268,6 @@ fn check_runs(request: &EvalRequest, runs: &[Run]) -> std::result::Result<(), St
         )),
         None => Ok(()),
     }
-}
-
-/// Whether a text has the form of a BLAKE3 hash.
-fn is_hash(text: &str) -> bool {
-    text.len() == 64 && text.bytes().all(|byte| byte.is_ascii_hexdigit())
 }
 
 /// Returns the name of the policy with weights.

@@ -126,6 +126,9 @@ fn changed_records_of_a_capsule_are_found_and_hostile_ones_refused() {
     refused(&|capsule| record(capsule)["success"] = json!([9, 3]), "more successes than episodes");
     refused(&|capsule| record(capsule)["success"] = json!([1u64 << 60, 1u64 << 60]), "counts more than the");
     refused(&|capsule| *record(capsule) = json!([]), "the evaluation in the capsule");
+    refused(&|capsule| record(capsule)["weights"] = json!("trust me"), "'trust me' is no hash");
+    refused(&|capsule| record(capsule)["hashes"]["starts"] = json!("/etc/passwd"), "'/etc/passwd' is no hash");
+    refused(&|capsule| record(capsule)["weights"] = json!("0".repeat(64)), "is that of other weights");
     let media = json!([{"id": "chroma-key", "settings": {"key_color": [0, 0, 0], "media": "/dev/zero"}}]);
     refused(&|capsule| record(capsule)["request"]["wrappers"] = media.clone(), "reads files");
 

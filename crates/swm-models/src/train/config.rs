@@ -182,6 +182,7 @@ impl LoopConfig {
     /// Checks the settings of the optimizer and of the validation.
     fn check(&self) -> Result<()> {
         self.optim.check()?;
+        self.schedule.check()?;
         if self.validation.every > 0 && !self.data.hold_out {
             return Err(Error::config(
                 "validation.every",

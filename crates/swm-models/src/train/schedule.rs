@@ -1,6 +1,7 @@
 //! The learning rate over time: linear warm-up, then cosine decay (Loshchilov and Hutter 2017, SGDR, without restarts).
 
 use serde::{Deserialize, Serialize};
+use swm_core::{Error, Result};
 
 /// Linear warm-up to the peak learning rate, then half a cosine down to a floor.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -15,6 +16,21 @@ pub struct ScheduleConfig {
 }
 
 impl ScheduleConfig {
+    /// Checks that no learning rate is negative.
+    ///
+    /// # Errors
+    /// When the floor is not from 0 to 1.
+    pub fn check(&self) -> Result<()> {
+        if (0.0..=1.0).contains(&self.floor) {
+            return Ok(());
+        }
+        Err(Error::config(
+            "schedule.floor",
+            self.floor.to_string(),
+            "give a share of the peak learning rate, from 0 to 1",
+        ))
+    }
+
     /// Returns the learning rate of a step (the first step is 0) as a fraction of the peak.
     ///
     /// The fraction of step `t` is `(t + 1) / warmup` during the warm-up, then `floor + (1 - floor) (1 + cos πp) / 2`

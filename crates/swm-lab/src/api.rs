@@ -109,6 +109,7 @@ pub fn routes(shared: Shared) -> Router {
         .route("/api/episodes", get(episodes))
         .route("/api/rows", get(rows))
         .route("/api/frame", get(frame))
+        .route("/api/distribution", get(distribution))
         .route("/api/doctor", get(doctor))
         .route("/api/save", post(save))
         .route("/api/runs", get(list_runs))
@@ -118,6 +119,7 @@ pub fn routes(shared: Shared) -> Router {
         .route("/api/trainings", get(list_trainings))
         .route("/api/train", post(train))
         .route("/api/stop", post(stop))
+        .route("/api/bench", post(measured))
         .route("/", get(|headers: HeaderMap| async move { asset("", &headers) }))
         .route("/{file}", get(|Path(file): Path<String>, headers: HeaderMap| async move { asset(&file, &headers) }))
         .with_state(shared)
@@ -244,6 +246,10 @@ struct EntryQuery {
     column: String,
     #[serde(default)]
     offset: u64,
+    #[serde(default)]
+    x: usize,
+    #[serde(default)]
+    y: usize,
 }
 
 async fn episodes(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
@@ -263,6 +269,14 @@ async fn frame(State(shared): State<Shared>, Query(query): Query<EntryQuery>) ->
         datasets::frame(&*reader, &query.column, query.episode, query.row)
     });
     Ok(answer("image/jpeg", jpeg.await?))
+}
+
+async fn distribution(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
+    let found = shared.work(move |shared| {
+        let reader = shared.datasets.get(query.folder, &query.name)?;
+        crate::distribution::distribution(&*reader, &query.column, [query.x, query.y])
+    });
+    as_json(&found.await?)
 }
 
 async fn doctor(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
@@ -330,6 +344,14 @@ struct Stopped {
 async fn stop(State(shared): State<Shared>, request: Request) -> Answer {
     let Stopped { name } = body(request, "name").await?;
     shared.work(move |shared| shared.trainings.stop(&*shared.lab.training, &name)).await?;
+    as_json(&json!({}))
+}
+
+/// Hands what the page of a benchmark measured to the benchmark.
+async fn measured(State(shared): State<Shared>, request: Request) -> Answer {
+    let given = body(request, "what was measured").await?;
+    let none = || Error::config("measurements", "this is no benchmark", "run `swm bench lab`");
+    shared.lab.measured.as_ref().ok_or_else(none)?.send(given).ok();
     as_json(&json!({}))
 }
 

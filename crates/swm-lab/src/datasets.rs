@@ -13,7 +13,7 @@ use swm_data::views::subset;
 use swm_data::{ConvertMode, ConvertOptions, FORMATS, ImageCodec, Location, Reader, StepRange};
 
 /// The largest number of elements of a value that is plotted.
-const MOST_ELEMENTS: usize = 64;
+pub const MOST_ELEMENTS: usize = 64;
 /// The largest number of rows whose rewards are added for a table of episodes.
 const MOST_ROWS: usize = 20_000_000;
 /// The largest number of rows of an episode that is plotted.

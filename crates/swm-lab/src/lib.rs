@@ -5,7 +5,7 @@
 //! - [`still`]: one frame of an environment as PNG, the same bytes as `swm frame` writes.
 //! - [`session`]: a live environment behind a WebSocket, which a policy or a person drives, and whose episodes can be recorded.
 //! - [`plans`]: a live environment that a solver plans in, whose searches are shown, and whose steps are a tree to go back in.
-//! - [`datasets`] and [`runs`]: what the pages of datasets and of training curves show, from [`folders`] that the lab was
+//! - [`datasets`], [`distribution`] and [`runs`]: what the pages of datasets and of training curves show, from [`folders`] that the lab was
 //!   started with, and no other.
 //! - [`reports`]: results and studies, and their pages.
 //! - [`trainings`]: trainings that pages start and stop.
@@ -17,6 +17,7 @@ pub mod access;
 mod api;
 pub mod assets;
 pub mod datasets;
+pub mod distribution;
 pub mod folders;
 pub mod plans;
 pub mod reports;
@@ -30,6 +31,7 @@ pub use access::{Access, Token};
 pub use serve::{Options, Server, serve};
 
 use folders::Folders;
+use std::sync::mpsc::Sender;
 use swm_core::registry::Registry;
 use swm_core::{EnvEntry, Policy, Result};
 use swm_eval::World;
@@ -57,4 +59,6 @@ pub struct Lab {
     pub runs: Folders,
     /// Threads of an environment; 0 for one per core.
     pub threads: usize,
+    /// Receives what the page of the benchmark measured; `None` unless this is a benchmark.
+    pub measured: Option<Sender<serde_json::Value>>,
 }

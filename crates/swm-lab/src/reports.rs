@@ -104,13 +104,7 @@ impl Known {
         listed.collect()
     }
 
-    fn summary(
-        &self,
-        reports: &dyn Reports,
-        kind: Kind,
-        path: PathBuf,
-        modified: SystemTime,
-    ) -> Read {
+    fn summary(&self, reports: &dyn Reports, kind: Kind, path: PathBuf, modified: SystemTime) -> Read {
         let key = (path, modified);
         // A study fills in without a change of its first file.
         if kind == Kind::Results

@@ -8,11 +8,22 @@ import os
 import shutil
 import subprocess
 import time
+from pathlib import Path
 
 import pytest
 from playwright.sync_api import sync_playwright
 
 SWM = os.environ.get("SWM", "swm")
+SCREENSHOTS = os.environ.get("SWM_SCREENSHOTS")
+
+
+def screenshot(page, name, **options):
+    """Stores a screenshot of the documentation, if `SWM_SCREENSHOTS` names a folder for them."""
+    if SCREENSHOTS:
+        page.mouse.move(0, 0)
+        page.evaluate("window.scrollTo(0, 0)")
+        page.wait_for_timeout(300)
+        page.screenshot(path=Path(SCREENSHOTS) / f"lab-{name}.png", **options)
 
 
 class Lab:

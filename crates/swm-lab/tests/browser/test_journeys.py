@@ -4,23 +4,11 @@
 """
 
 import json
-import os
 import re
-from pathlib import Path
 
 import pytest
-from conftest import wait_until
+from conftest import screenshot, wait_until
 from playwright.sync_api import expect
-
-SCREENSHOTS = os.environ.get("SWM_SCREENSHOTS")
-
-
-def screenshot(page, name):
-    """Stores a screenshot of the documentation, if one is wanted."""
-    if SCREENSHOTS:
-        page.mouse.move(0, 0)
-        page.wait_for_timeout(300)
-        page.screenshot(path=Path(SCREENSHOTS) / f"lab-{name}.png")
 
 
 def value(page, name):
@@ -164,6 +152,7 @@ def test_episodes_are_filtered_and_scrubbed(open_page):
     assert length >= 20
     image = page.locator(".episode img")
     first = image.get_attribute("src")
+    expect(page.locator(".episode output")).to_have_text(f"0 / {length}")
     page.get_by_label("Row").fill("15")
     expect(page.locator(".episode output")).to_have_text(f"15 / {length}")
     wait_until(lambda: image.get_attribute("src") != first)
@@ -173,6 +162,18 @@ def test_episodes_are_filtered_and_scrubbed(open_page):
     expect(page.locator(".episode output")).to_have_text(f"16 / {length}")
     expect(page.get_by_label("Chart of action")).to_be_visible()
     assert "row=16" in page.url
+
+
+def test_columns_are_histograms_and_episodes_show_their_frames(open_page):
+    page = open_page("#data?name=pushes.lance")
+    page.get_by_label("first and last frames").check()
+    expect(page.get_by_alt_text("Last frame of episode 3")).to_be_visible()
+    wait_until(lambda: page.get_by_alt_text("Last frame of episode 3").evaluate("image => image.naturalWidth") == 64)
+    page.get_by_role("button", name="Columns").click()
+    expect(page.get_by_label("Histogram of state[4]")).to_be_visible()
+    page.locator(".coverage select").first.select_option("action")
+    expect(page.get_by_label("Coverage of action[0] and action[1]")).to_be_visible()
+    screenshot(page, "coverage", full_page=True)
 
 
 def test_bad_episodes_are_found_and_cut(lab, open_page):
@@ -232,6 +233,7 @@ def test_pages_fit_their_widths(open_page, width, theme):
         "#envs?env=swm/TwoRoom-v1&variation=all&seed=4",
         "#envs?env=swm/PushT-v1&by=hand",
         "#data?name=pushes.lance&episode=2&row=60",
+        "#plans?env=swm/TwoRoom-v1&seed=3",
         "#runs?runs=0:lewm|0:pldm",
     ]:
         page = open_page(fragment, width=width, height=844, theme=theme)

@@ -115,6 +115,16 @@ fn check_page(lab: &TestLab) {
     assert_eq!((&rows["rows"], &action["elements"], &action["values"][7]), (&json!(4), &json!(2), &json!(null)));
     let (status, jpeg) = lab.get("api/frame?name=demos.lance&episode=1&row=3&column=pixels");
     assert_eq!((status, image::image_size(&jpeg).expect("a JPEG")), (200, (32, 32)));
+    let found = lab.json("api/distribution?name=demos.lance&column=action&x=0&y=1");
+    assert_eq!((&found["rows"], &found["of"], &found["axes"]), (&json!(13), &json!(13), &json!([0, 1])));
+    let first = &found["elements"][0];
+    assert_eq!((&first["low"], &first["high"], &first["missing"]), (&json!(-0.5), &json!(1.0), &json!(2)));
+    // The steps of the hand have two actions: two cells of the map.
+    let map = found["map"].as_array().expect("a map");
+    assert_eq!((&map[0][39], &map[39][0]), (&json!(6), &json!(5)));
+    for query in ["column=pixels", "column=nothing", "column=action&x=2", "column=action&x=-1"] {
+        assert_eq!(lab.get(&format!("api/distribution?name=demos.lance&{query}")).0, 400, "{query}");
+    }
     for query in ["episode=2", "episode=1&row=4&column=pixels", "column=action", "column=nothing"] {
         let route = if query.contains("column") { "frame" } else { "rows" };
         assert_eq!(lab.get(&format!("api/{route}?name=demos.lance&{query}")).0, 400, "{query}");

@@ -55,6 +55,7 @@ impl TestLab {
             datasets: Folders::new(vec![home.path().join("datasets")]),
             runs: Folders::new(vec![home.path().join("checkpoints")]),
             threads: 1,
+            measured: None,
         };
         let token = Token::parse(TOKEN).expect("a token");
         let options = Options { address: IpAddr::V4(Ipv4Addr::LOCALHOST), port: 0, token };

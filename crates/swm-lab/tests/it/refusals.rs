@@ -38,7 +38,7 @@ fn paths_outside_the_folders_are_errors() {
         .expect("a link");
     let absolute = secret.parent().expect("a parent").display().to_string();
     for name in ["../secret", "..%2Fsecret", "link", "%2e%2e/secret", "", ".", &absolute, "a%00b"] {
-        for route in ["lines", "episodes", "rows", "frame"] {
+        for route in ["lines", "episodes", "rows", "frame", "distribution", "report"] {
             let (status, body) = lab.get(&format!("api/{route}?name={name}"));
             assert_eq!(status, 400, "{route} {name}: {}", String::from_utf8_lossy(&body));
         }
@@ -80,6 +80,7 @@ fn other_methods_and_long_heads_are_refused() {
     assert!(["431", ""].contains(&status(long).as_str()));
     let many: String = (0..200).map(|i| format!("X-{i}: 1\r\n")).collect();
     assert!(["431", ""].contains(&status(format!("GET /{TOKEN}/ HTTP/1.1\r\nHost: {host}\r\n{many}\r\n")).as_str()));
+    assert_eq!(lab.post("api/bench", "{}").0, 400, "only a benchmark takes measurements");
     assert_eq!(status("\0\u{1}garbage\r\n\r\n".to_owned()), "400");
     assert_eq!(lab.get("api/envs").0, 200, "the lab lives");
 }

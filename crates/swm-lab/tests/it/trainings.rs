@@ -126,3 +126,37 @@ fn requests_to_train_reach_no_other_folder_and_no_other_program() {
     assert!(!lab.home.path().join("checkpoints").exists() && !lab.home.path().join("escape").exists());
     assert_eq!(lab.json("api/trainings")["trainings"], json!([]));
 }
+
+#[test]
+fn fuzzed_bodies_start_no_other_training() {
+    use rand::Rng as _;
+    let lab = TestLab::start();
+    super::data::collect(&lab, 1);
+    for i in 0..1_000 {
+        let mut rng = swm_core::Key::new(i).with("fuzz of bodies").rng();
+        let (route, body) = match i % 3 {
+            0 => ("train", request(json!({"preset": "broken"}))),
+            1 => ("stop", r#"{"name": "cloned"}"#.to_owned()),
+            _ => ("save", r#"{"folder": 0, "name": "rooms.lance", "target": "cut", "episodes": [9]}"#.to_owned()),
+        };
+        let mut bytes = body.into_bytes();
+        for _ in 0..rng.random_range(1..4) {
+            let at = rng.random_range(0..bytes.len());
+            match rng.random_range(0..3) {
+                0 => bytes[at] = rng.random_range(32..127),
+                1 => drop(bytes.remove(at)),
+                _ => bytes.insert(at, b"{}[],:\"0-9eE./"[rng.random_range(0..14)]),
+            }
+        }
+        let status = lab.post(&format!("api/{route}"), &String::from_utf8_lossy(&bytes)).0;
+        assert!([200, 400].contains(&status), "{status}");
+    }
+    let listed = lab.json("api/trainings");
+    for training in listed["trainings"].as_array().expect("trainings") {
+        let name = training["name"].as_str().expect("a name");
+        assert!(name.chars().all(|c| c.is_ascii_alphanumeric() || "-_".contains(c)), "{name}");
+    }
+    let names: Vec<_> =
+        std::fs::read_dir(lab.home.path()).expect("the home").flatten().map(|e| e.file_name()).collect();
+    assert_eq!(names, ["datasets"], "nothing is written beside it");
+}

@@ -1,7 +1,8 @@
 // The page of datasets: the list, the table of episodes, and one episode with its frames and columns.
 
 import { useMemo, useState } from "preact/hooks";
-import { type Dataset, type Episodes, get } from "./api";
+import { address, type Dataset, type Episodes, get } from "./api";
+import { Coverage } from "./coverage";
 import { Curation } from "./curation";
 import { EpisodeView } from "./episode";
 import { Filters, order } from "./filters";
@@ -109,6 +110,9 @@ function DatasetView({ set, params, onSaved }: { set: Dataset; params: Params; o
     if (!next.delete(position)) next.add(position);
     setCut(next);
   };
+  const image = set.columns?.find((column) => column.image && column.shape.length === 3)?.name;
+  const thumbnail = (position: number, row: number) =>
+    address("frame", { folder: set.folder, name: set.name, episode: position, row, column: image });
   useKeys({
     ArrowDown: () => move(1),
     ArrowUp: () => move(-1),
@@ -124,8 +128,19 @@ function DatasetView({ set, params, onSaved }: { set: Dataset; params: Params; o
         {table ? (
           <>
             <Filters table={table} params={params} shown={rows.length} />
+            {image && (
+              <label>
+                <input
+                  type="checkbox"
+                  checked={params.thumbs === "1"}
+                  onChange={(event) => patch({ thumbs: event.currentTarget.checked ? "1" : undefined })}
+                />
+                first and last frames
+              </label>
+            )}
             <Table
               table={table}
+              thumbnail={params.thumbs === "1" && image ? thumbnail : undefined}
               rows={rows}
               chosen={episode}
               cut={cut}
@@ -141,6 +156,7 @@ function DatasetView({ set, params, onSaved }: { set: Dataset; params: Params; o
               }
             />
             <Curation set={set} cut={cut} count={table.index.length} onCut={setCut} onSaved={onSaved} onChoose={choose} />
+            <Coverage set={set} params={params} />
           </>
         ) : (
           !error && <p class="loading">Reading episodes …</p>

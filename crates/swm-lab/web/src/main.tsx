@@ -1,5 +1,6 @@
 import { render } from "preact";
 import { useEffect, useRef } from "preact/hooks";
+import { BenchPage } from "./bench";
 import { DataPage } from "./data";
 import { EnvPage } from "./env";
 import { PlansPage } from "./plans";
@@ -18,6 +19,9 @@ const PAGES = [
   { id: "runs", name: "Runs", Page: RunsPage },
   { id: "results", name: "Results", Page: ReportsPage },
 ];
+
+// No link leads to it.
+const HIDDEN = [{ id: "bench", name: "Bench", Page: BenchPage }];
 
 const SHORTCUTS = [
   ["1 … 5", "environments, data, plans, runs, results"],
@@ -40,7 +44,7 @@ function App() {
   const { page, params } = usePlace();
   const [theme, nextTheme] = useTheme();
   const help = useRef<HTMLDialogElement>(null);
-  const found = PAGES.find(({ id }) => id === page) ?? PAGES[0];
+  const found = [...PAGES, ...HIDDEN].find(({ id }) => id === page) ?? PAGES[0];
   const go = (index: number) => () => {
     location.hash = `#${PAGES[index].id}`;
   };

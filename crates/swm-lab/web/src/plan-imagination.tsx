@@ -17,6 +17,9 @@ export function ImaginationPanel({ imagination }: { imagination: Imagination }) 
     return [steps, imagination.imagined_to_goal, imagination.true_to_goal, error] as uPlot.AlignedData;
   }, [imagination]);
   const last = error.length - 1;
+  // Paths that are flat need no square.
+  const heights = [goal, ...lines.flatMap((line) => [...line.true, ...line.imagined])].map(([, y]) => SIDE * y);
+  const [top, bottom] = [Math.min(...heights) - 60, Math.max(...heights) + 60];
   return (
     <section class="imagination" aria-label="Imagination">
       <Chart
@@ -28,7 +31,7 @@ export function ImaginationPanel({ imagination }: { imagination: Imagination }) 
         height={150}
       />
       <figure class="fan-only">
-        <svg class="fan" viewBox={`0 0 ${SIDE} ${SIDE}`} role="img" aria-label="Imagined and true latents of the cheapest candidates">
+        <svg class="fan" viewBox={`0 ${top} ${SIDE} ${bottom - top}`} role="img" aria-label="Imagined and true latents of the cheapest candidates">
           {lines.map((line, i) => (
             <g key={i} class={i === 0 ? "is-first" : ""}>
               <polyline class="true" points={points(line.true)} />

@@ -23,8 +23,9 @@ export function SearchPanel({ search, iteration, onIteration }: Props) {
   const data = useMemo(() => {
     if (!search) return undefined;
     const xs = search.best.map((_, i) => i);
+    const elites = search.iterations.some((iteration) => iteration.elites > 0) ? [search.elites] : [];
     return {
-      costs: [xs, search.best, search.elites, search.mean] as uPlot.AlignedData,
+      costs: [xs, search.best, ...elites, search.mean] as uPlot.AlignedData,
       spread: [xs, search.spread] as uPlot.AlignedData,
     };
   }, [search]);
@@ -47,7 +48,7 @@ export function SearchPanel({ search, iteration, onIteration }: Props) {
       <Chart
         title="cost"
         data={data.costs}
-        labels={["best", hasElites ? "elites" : "all", "mean"]}
+        labels={hasElites ? ["best", "elites", "mean"] : ["best", "mean"]}
         xLabel="iteration"
         height={170}
         sync="search"
@@ -108,7 +109,8 @@ function Costs({ search, iteration, onIteration }: { search: Search; iteration: 
         ))}
       </svg>
       <figcaption>
-        costs of the candidates, {short(low)} to {short(high)}; elites in colour
+        costs of the candidates, {short(low)} to {short(high)}
+        {search.iterations.some(({ elites }) => elites > 0) ? "; elites in colour" : ""}
       </figcaption>
     </figure>
   );

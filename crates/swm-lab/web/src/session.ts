@@ -43,6 +43,7 @@ export interface Session {
 }
 
 interface Socket<H> {
+  arrived?: () => void;
   frame: (header: H, image: ImageBitmap) => void;
   reply: (reply: { type: string } & Record<string, unknown>) => void;
   closed: () => void;
@@ -94,6 +95,7 @@ export function open<H>(route: string, env: string, image: number, events: Socke
   };
   socket.onmessage = (message) => {
     if (typeof message.data !== "string") {
+      events.arrived?.();
       void show(message.data);
       return;
     }

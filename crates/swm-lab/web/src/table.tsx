@@ -6,7 +6,9 @@ import { short } from "./format";
 
 export type SortKey = "index" | "length" | "returns" | "success";
 
-const ROW = 26;
+// The height of a row in pixels, without and with frames.
+const PLAIN = 26;
+const WITH_FRAMES = 64;
 
 interface TableProps {
   table: Episodes;
@@ -18,10 +20,13 @@ interface TableProps {
   descending: boolean;
   onChoose: (position: number) => void;
   onSort: (key: SortKey) => void;
+  // The address of a frame of an episode, if frames are shown.
+  thumbnail?: (position: number, row: number) => string;
 }
 
 // Only the rows in view are in the document, so that the length of the list does not matter.
-export function Table({ table, rows, chosen, cut, onCut, sort, descending, onChoose, onSort }: TableProps) {
+export function Table({ table, rows, chosen, cut, onCut, sort, descending, onChoose, onSort, thumbnail }: TableProps) {
+  const rowHeight = thumbnail ? WITH_FRAMES : PLAIN;
   const body = useRef<HTMLDivElement>(null);
   const [top, setTop] = useState(0);
   const [height, setHeight] = useState(400);
@@ -36,11 +41,11 @@ export function Table({ table, rows, chosen, cut, onCut, sort, descending, onCho
     const at = chosen === undefined ? -1 : rows.indexOf(chosen);
     if (!body.current || at < 0) return;
     const view = body.current;
-    if (at * ROW < view.scrollTop) view.scrollTop = at * ROW;
-    else if ((at + 1) * ROW > view.scrollTop + view.clientHeight) view.scrollTop = (at + 1) * ROW - view.clientHeight;
-  }, [chosen, rows]);
-  const first = Math.max(0, Math.floor(top / ROW) - 5);
-  const last = Math.min(rows.length, Math.ceil((top + height) / ROW) + 5);
+    if (at * rowHeight < view.scrollTop) view.scrollTop = at * rowHeight;
+    else if ((at + 1) * rowHeight > view.scrollTop + view.clientHeight) view.scrollTop = (at + 1) * rowHeight - view.clientHeight;
+  }, [chosen, rows, rowHeight]);
+  const first = Math.max(0, Math.floor(top / rowHeight) - 5);
+  const last = Math.min(rows.length, Math.ceil((top + height) / rowHeight) + 5);
   const columns: [SortKey, string, (i: number) => string][] = [
     ["index", "episode", (i) => String(table.index[i])],
     ["length", "length", (i) => String(table.length[i])],
@@ -48,7 +53,7 @@ export function Table({ table, rows, chosen, cut, onCut, sort, descending, onCho
     ["success", "success", (i) => (table.success.length === 0 ? "–" : table.success[i] ? "yes" : "no")],
   ];
   return (
-    <div class="table" role="table" aria-rowcount={rows.length + 1} aria-label="Episodes">
+    <div class={`table ${thumbnail ? "has-frames" : ""}`} role="table" aria-rowcount={rows.length + 1} aria-label="Episodes">
       <div role="row" class="row head" aria-rowindex={1}>
         {columns.map(([key, name]) => (
           <span
@@ -67,7 +72,7 @@ export function Table({ table, rows, chosen, cut, onCut, sort, descending, onCho
         </span>
       </div>
       <div class="body" ref={body} tabIndex={0} onScroll={(event) => setTop(event.currentTarget.scrollTop)} role="rowgroup">
-        <div class="all" style={{ height: `${rows.length * ROW}px` }}>
+        <div class="all" style={{ height: `${rows.length * rowHeight}px` }}>
           {rows.slice(first, last).map((position, i) => (
             <div
               role="row"
@@ -75,12 +80,22 @@ export function Table({ table, rows, chosen, cut, onCut, sort, descending, onCho
               key={position}
               aria-rowindex={first + i + 2}
               aria-selected={position === chosen}
-              style={{ transform: `translateY(${(first + i) * ROW}px)` }}
+              style={{ transform: `translateY(${(first + i) * rowHeight}px)`, height: `${rowHeight}px` }}
               onClick={() => onChoose(position)}
             >
               {columns.map(([key, , text]) => (
                 <span role="cell" key={key} class={key === "success" ? `success-${text(position)}` : ""}>
                   {text(position)}
+                  {key === "index" && thumbnail && (
+                    <>
+                      <img src={thumbnail(position, 0)} alt={`First frame of episode ${table.index[position]}`} loading="lazy" />
+                      <img
+                        src={thumbnail(position, table.length[position])}
+                        alt={`Last frame of episode ${table.index[position]}`}
+                        loading="lazy"
+                      />
+                    </>
+                  )}
                 </span>
               ))}
               <span role="cell">

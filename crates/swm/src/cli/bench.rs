@@ -48,6 +48,11 @@ enum BenchCommand {
     /// Renderers use one thread, or as many as --threads permits.
     #[command(after_help = "Example: swm bench render --sizes 64")]
     Render(RenderArgs),
+    /// Measure frames per second and latency of the lab in a browser
+    ///
+    /// The page is opened in a Chromium without a window. Frames are those of an expert, or of random actions.
+    #[command(after_help = "Example: swm bench lab swm/PushT-v1 swm/HumanoidDMControl-v0")]
+    Lab(super::lab::LabBenchArgs),
 }
 
 #[derive(Args)]
@@ -288,6 +293,7 @@ pub fn bench(args: &BenchArgs, context: &Context) -> anyhow::Result<()> {
         BenchCommand::Train(args) => train(args, context),
         BenchCommand::Data(args) => data(args, context),
         BenchCommand::Render(args) => render(args, context),
+        BenchCommand::Lab(args) => super::lab::bench(args, context),
     }
 }
 

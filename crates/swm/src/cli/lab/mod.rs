@@ -1,5 +1,6 @@
 //! `swm lab`: the local web application (docs/lab.md).
 
+mod bench;
 mod planning;
 mod reports;
 mod training;
@@ -18,6 +19,8 @@ use swm_core::{Error, Result};
 use swm_lab::folders::Folders;
 use swm_lab::{Lab, Options, Token, serve};
 use training::OwnProgram;
+
+pub use bench::{LabBenchArgs, bench};
 
 /// Arguments of `swm lab`.
 #[derive(Args)]
@@ -67,6 +70,7 @@ pub fn lab(args: &LabArgs, context: &Context) -> anyhow::Result<()> {
         datasets: folders(home::datasets()?, &args.data)?,
         runs,
         threads: context.threads,
+        measured: None,
     };
     let server = serve(lab, &options)?;
     let url = server.url();

@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use std::time::{Duration, Instant};
 use swm_core::{Result, Snapshot};
 
-/// The longest time for playing candidates; iterations that are not reached in it have no paths.
+/// The longest time for playing candidates; those that are not reached in it have no paths.
 const BUDGET: Duration = Duration::from_millis(1500);
 /// The most points of a path.
 const MOST_POINTS: usize = 60;
@@ -36,11 +36,11 @@ pub fn describe(
 ) -> Result<Value> {
     let begun = Instant::now();
     let (mut played, mut ends) = (vec![], vec![]);
-    for (order, kept) in by_importance(&searched.kept).into_iter().enumerate() {
-        if order > 0 && begun.elapsed() > BUDGET {
-            break;
-        }
+    'iterations: for (order, kept) in by_importance(&searched.kept).into_iter().enumerate() {
         for candidate in &kept.candidates {
+            if !played.is_empty() && begun.elapsed() > BUDGET {
+                break 'iterations;
+            }
             let states = scratch.play(start, codec, &candidate.actions)?;
             let most = if order == 0 { ENDS } else { 1 };
             if candidate.rank.is_some_and(|rank| rank < most) {

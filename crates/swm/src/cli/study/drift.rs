@@ -97,6 +97,10 @@ impl DriftSettings {
     pub(super) fn check(&self, chosen: &Chosen<'_>) -> Result<()> {
         let env = crate::env(&self.env, chosen.by("env"))?;
         resolver::check_scripted(&env.entry, &self.expert)?;
+        if self.expert == "random" {
+            let fix = "name an expert of the environment (`swm envs` lists them)";
+            return Err(Error::config("settings of the study", "expert is random, which has a row of its own", fix));
+        }
         Starts::episodic(self.episodes, 0, VariationRequest::default())?;
         chosen.check_preset(&self.preset)?;
         (FAMILIES.get(FAMILY)?.config)(&self.preset, &self.overrides())?;
@@ -315,6 +319,7 @@ mod tests {
             (DriftSettings { train: vec!["optim.rl=1".to_owned()], ..settings.clone() }, "optim"),
             (DriftSettings { env: "swm/PushT-v2".to_owned(), ..settings.clone() }, "PushT-v1"),
             (DriftSettings { expert: "/etc/passwd".to_owned(), ..settings.clone() }, "/etc/passwd"),
+            (DriftSettings { expert: "random".to_owned(), ..settings.clone() }, "expert is random"),
             (DriftSettings { episodes: 1 << 60, ..settings.clone() }, "number of evaluated episodes"),
         ] {
             let error = wrong.check(&Chosen::by_user()).expect_err(part).to_string();

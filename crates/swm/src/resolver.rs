@@ -26,7 +26,7 @@ use swm_eval::{
     ResolvedPolicy, Resolver, World,
 };
 use swm_models::probe::StateProbe;
-use swm_models::{CheckpointInfo, Device, LoadedModel, load};
+use swm_models::{CheckpointInfo, Device, LoadedModel, device, load};
 use swm_plan::objective::ObjectiveConfig;
 use swm_plan::{
     ActionKind, ActionScale, MpcConfig, MpcPolicy, PlanRecord, SOLVERS, Score, SimulatedLatents, SimulatorCost,
@@ -50,6 +50,8 @@ pub struct HomeResolver {
     probes: RefCell<BTreeMap<ProbeKey, Arc<StateProbe>>>,
     /// The traced plans; `None` without tracing.
     traces: Option<Traces>,
+    /// The device of the models.
+    device: Device,
 }
 
 /// Wrappers, and whether they apply to the frame of the goal.
@@ -76,12 +78,18 @@ impl HomeResolver {
             checkpoints: RefCell::default(),
             probes: RefCell::default(),
             traces: None,
+            device: Device::flex(),
         }
     }
 
     /// Traces the plans of policies.
     pub fn tracing(self) -> Self {
         Self { traces: Some(Traces::default()), ..self }
+    }
+
+    /// Loads checkpoints on a device.
+    pub fn on(self, device: Device) -> Self {
+        Self { device, ..self }
     }
 
     /// Accepts requests for the environment with this id, because the user named it.
@@ -128,7 +136,7 @@ impl HomeResolver {
         if let Some(loaded) = self.checkpoints.borrow().get(&path) {
             return Ok(Rc::clone(loaded));
         }
-        let loaded: Rc<dyn LoadedModel> = Rc::from(load(&path, &Device::flex())?);
+        let loaded: Rc<dyn LoadedModel> = Rc::from(load(&path, &self.device)?);
         self.checkpoints.borrow_mut().insert(path, Rc::clone(&loaded));
         Ok(loaded)
     }
@@ -224,7 +232,7 @@ impl HomeResolver {
             }
         };
         let policy = planner.policy(cost, scale, world)?;
-        Ok(with_provenance(self.traced(name, policy), info))
+        Ok(self.with_provenance(self.traced(name, policy), info))
     }
 
     /// Makes a policy that plans with a checkpoint.
@@ -237,7 +245,17 @@ impl HomeResolver {
             Error::config(format!("checkpoint {given}"), problem, "evaluate it without a solver")
         })?;
         let policy = planner.policy(cost, info.dataset_info.action.clone(), world)?;
-        Ok(with_provenance(self.traced(name, policy), info))
+        Ok(self.with_provenance(self.traced(name, policy), info))
+    }
+
+    /// Adds the checkpoint's hash and libraries, and the device of the computation, to a policy.
+    fn with_provenance(&self, policy: ResolvedPolicy, info: CheckpointInfo) -> ResolvedPolicy {
+        ResolvedPolicy {
+            weights: Some(info.weights),
+            libraries: info.manifest.libraries,
+            device: Some(device::name_after(&self.device, &info.manifest.device)),
+            ..policy
+        }
     }
 
     /// Records the plans of a policy if this resolver traces.
@@ -281,7 +299,7 @@ impl Resolver for HomeResolver {
             }
             PolicyKind::Direct { checkpoint: given, .. } => {
                 let (policy, info) = direct(&*self.checkpoint(given)?, given, spec, slots)?;
-                Ok(with_provenance(ResolvedPolicy::from(policy), info))
+                Ok(self.with_provenance(ResolvedPolicy::from(policy), info))
             }
             PolicyKind::Plan { model, solver, mpc, objective } => {
                 let planner = Planner::new(solver, mpc, objective)?;
@@ -343,16 +361,6 @@ impl Planner {
         let mut cost = self.objective.apply(cost)?;
         pairing(&self.id, &mut *cost, ActionKind::of(&spec.action_space))?;
         MpcPolicy::new(self.solver, cost, self.mpc, scale, spec, world.pool().len())
-    }
-}
-
-/// Adds the checkpoint's hash, libraries and device to a policy.
-fn with_provenance(policy: ResolvedPolicy, info: CheckpointInfo) -> ResolvedPolicy {
-    ResolvedPolicy {
-        weights: Some(info.weights),
-        libraries: info.manifest.libraries,
-        device: Some(info.manifest.device),
-        ..policy
     }
 }
 

@@ -13,7 +13,7 @@ use crate::checks;
 use crate::nn::parameters::IntoF32;
 use crate::train::DatasetInfo;
 use burn::module::Module;
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Tensor, TensorData};
 use rayon::prelude::*;
 use swm_core::columns::{GOAL, PIXELS};
 use swm_core::{Batch, Candidates, CostModel, DifferentiableCost, Error, Result, Schema};
@@ -69,7 +69,7 @@ impl DinoWmCost {
 
     /// Encodes the current frame, the recorded history and the goal of one environment.
     fn context(&self, infos: &Batch, env: usize) -> Result<PlanContext> {
-        let (row, device) = (infos.row(env), Device::flex());
+        let (row, device) = (infos.row(env), self.model.device());
         // One image per call: features must not depend on the number of images in a call.
         let encode = |rgb: &[u8]| Ok::<_, Error>(self.model.backbone.patches(self.config.image_patches(rgb, &device)?));
         let column = |name: &str, values: &[f32]| normalised(&self.dataset_info, name, values, [1, 1], &device);
@@ -129,7 +129,7 @@ impl PlanContext {
         let [samples, _, elements] = candidates.dims();
         let [_, frames, patches, dim] = self.start.dims();
         let past = TensorData::new(self.past.repeat(samples), [samples, frames - 1, elements]);
-        let past = Tensor::<3>::from_data(past, &Device::flex());
+        let past = Tensor::<3>::from_data(past, &self.start.device());
         let (start, past, goal) = (self.start.clone(), past, self.goal.clone());
         let (start, past, goal) =
             if differentiated { (start.autodiff(), past.autodiff(), goal.autodiff()) } else { (start, past, goal) };
@@ -168,7 +168,7 @@ impl CostModel for DinoWmCost {
             costs.par_chunks_mut(CHUNK_SIZE).zip(actions.par_chunks(CHUNK_SIZE * candidate_len)).for_each(
                 |(costs, actions)| {
                     let data = TensorData::new(actions.to_vec(), [costs.len(), horizon, dim]);
-                    let found = context.cost(model, Tensor::from_data(data, &Device::flex()));
+                    let found = context.cost(model, Tensor::from_data(data, &context.start.device()));
                     costs.copy_from_slice(&found.into_data().into_f32_vec());
                 },
             );
@@ -200,7 +200,7 @@ impl DifferentiableCost for DinoWmCost {
                 let chunks = costs.par_chunks_mut(CHUNK_SIZE).zip(gradient.par_chunks_mut(CHUNK_SIZE * candidate_len));
                 chunks.zip(actions.par_chunks(CHUNK_SIZE * candidate_len)).for_each(|((costs, gradient), actions)| {
                     let data = TensorData::new(actions.to_vec(), [costs.len(), horizon, dim]);
-                    let leaf = Tensor::<3>::from_data(data, &Device::flex()).autodiff().require_grad();
+                    let leaf = Tensor::<3>::from_data(data, &context.start.device()).autodiff().require_grad();
                     let found = context.cost(&model, leaf.clone());
                     costs.copy_from_slice(&found.clone().inner().into_data().into_f32_vec());
                     match leaf.grad(&found.sum().backward()) {

@@ -7,7 +7,6 @@ use crate::nn::parameters::host;
 use crate::probe::ImageEncoder;
 use crate::train::{DatasetInfo, TrainConfig};
 use crate::weights::Naming;
-use burn::tensor::Device;
 use std::path::Path;
 use swm_core::requirements::{DatasetRequirements, RequiredObservations};
 use swm_core::{CostModel, Result};
@@ -56,6 +55,6 @@ impl ImageEncoder for Checkpoint<DinoWm> {
     }
 
     fn encode(&self, rgb: &[u8]) -> Result<Vec<f32>> {
-        Ok(host(self.model.backbone.patches(self.config.model.image_patches(rgb, &Device::flex())?)))
+        Ok(host(self.model.backbone.patches(self.config.model.image_patches(rgb, &self.model.device())?)))
     }
 }

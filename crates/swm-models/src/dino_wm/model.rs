@@ -6,7 +6,7 @@ use super::predictor::FramePredictor;
 use crate::nn::mlp::PointwiseConv;
 use crate::nn::{Activation, Backbone, DropoutRng, Init, Linear, ModuleDict};
 use burn::module::Module;
-use burn::tensor::Tensor;
+use burn::tensor::{Device, Tensor};
 use std::ops::Range;
 use swm_core::columns::PIXELS;
 
@@ -72,6 +72,11 @@ impl PatchDecoder {
 }
 
 impl DinoWm {
+    /// Returns the device of the weights.
+    pub fn device(&self) -> Device {
+        self.predictor.pos_embedding.val().device()
+    }
+
     /// Creates a model with random weights. `widths` holds the number of elements per frame of each column in
     /// `config.columns`.
     pub fn init(config: &DinoWmConfig, widths: &[usize], init: &Init) -> Self {

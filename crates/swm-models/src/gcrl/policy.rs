@@ -9,7 +9,7 @@ use crate::nn::parameters::IntoF32;
 use crate::nn::{Backbone, DropoutRng};
 use crate::pixels;
 use crate::probe::ImageEncoder;
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Tensor;
 use std::collections::VecDeque;
 use swm_core::columns::{GOAL, PIXELS};
 use swm_core::{EnvSpec, Result, RowRef, Schema};
@@ -49,7 +49,7 @@ impl Actor {
     /// `rgb` is `[frames, image, image, 3]`; returns `[frames, patches, dim]`.
     fn patches(&self, rgb: &[u8]) -> Result<Tensor<3>> {
         let (pixels, patch) = (self.config.pixels(), self.config.encoder.patch());
-        Ok(self.encoder.patches(pixels::patches(&pixels, patch, rgb, &Device::flex())?))
+        Ok(self.encoder.patches(pixels::patches(&pixels, patch, rgb, &self.head.pos_embedding.val().device())?))
     }
 }
 

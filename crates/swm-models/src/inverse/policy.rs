@@ -4,7 +4,7 @@ use super::InverseCheckpoint;
 use crate::feed_forward::{ActionNetwork, FeedForwardPolicy};
 use crate::lewm::{encode, pixels};
 use crate::nn::parameters::host;
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Tensor, TensorData};
 use swm_core::columns::{GOAL, PIXELS};
 use swm_core::{Result, RowRef, Schema};
 use swm_plan::ActionScale;
@@ -34,6 +34,8 @@ impl ActionNetwork for InverseCheckpoint {
             None => pair.extend_from_slice(goal.insert(encode(GOAL)?)),
         }
         let width = pair.len();
-        Ok(host(self.model.forward(Tensor::from_data(TensorData::new(pair, [1, width]), &Device::flex()))))
+        Ok(host(
+            self.model.forward(Tensor::from_data(TensorData::new(pair, [1, width]), &self.world_model.model.device())),
+        ))
     }
 }

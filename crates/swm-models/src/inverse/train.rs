@@ -3,6 +3,7 @@
 use super::InverseCheckpoint;
 use super::checkpoint::FAMILY;
 use crate::checkpoint::Checkpoint;
+use crate::device;
 use crate::lewm::{Lewm, pixels};
 use crate::nn::parameters::{self, IntoF32};
 use crate::nn::{Init, Mlp};
@@ -128,7 +129,8 @@ fn run(
     let mut log = log::Log::new(out, 0)?;
     let loader = loader(config, world_model.config.data.frameskip, reader)?;
     let (latent, action_dim) = (world_model.config.model.latent, world_model.action_dim());
-    let init = Init::new(key.with("init"), &Device::flex());
+    let device = world_model.model.device();
+    let init = Init::new(key.with("init"), &device);
     let mut model = Mlp::new(&init, 2 * latent, config.hidden, action_dim);
     init.check()?;
     let mut optimizer = AdamW::new(config.optim.clone());
@@ -147,7 +149,7 @@ fn run(
         let pairs = Pairs::draw(world_model, config.offset, &*batch?, key.with("goals").at(step as u64))?;
         let factor = config.schedule.lr_factor(step);
         let norm;
-        (model, loss, norm) = optimizer_step(model, &mut optimizer, factor, pairs)?;
+        (model, loss, norm) = optimizer_step(model, &mut optimizer, factor, pairs, &device)?;
         step += 1;
         let (elapsed, lr) = (started.elapsed().as_secs_f64(), config.optim.lr * factor);
         clips_per_second = (step * config.batch_size) as f64 / elapsed;
@@ -186,7 +188,7 @@ fn run(
 fn manifest(config: &InverseConfig, world_model: &Checkpoint<Lewm>, reader: &dyn Reader) -> Result<Manifest> {
     let mut manifest = Manifest::new("train", config.seed, serde_json::to_value(config).unwrap_or_default());
     manifest.libraries = world_model.manifest.libraries.clone();
-    manifest.device = world_model.manifest.device.clone();
+    manifest.device = device::name_after(&world_model.model.device(), &world_model.manifest.device);
     manifest.hashes.insert("dataset".to_owned(), reader.content_hash()?);
     manifest.hashes.insert("encoder".to_owned(), world_model.hash().to_owned());
     Ok(manifest)
@@ -227,11 +229,12 @@ impl Pairs {
         let (config, dim) = (&world_model.config.model, world_model.dataset_info.action.dim());
         let (latent, action_dim) = (config.latent, world_model.action_dim());
         let frame = config.image * config.image * 3;
+        let device = world_model.model.device();
         let encoded: Result<Vec<Vec<f32>>> = batch
             .get::<u8>(PIXELS)?
             .par_chunks(FRAMES_PER_CALL * frame)
             .map(|frames| {
-                let patches = pixels::patches(config, frames, &Device::flex())?;
+                let patches = pixels::patches(config, frames, &device)?;
                 Ok(world_model.model.encode(patches).into_data().into_f32_vec())
             })
             .collect();
@@ -260,10 +263,16 @@ impl Pairs {
 
 /// Takes one optimizer step with the learning rate times `factor`; returns the new network, the loss before the step
 /// and the norm of the gradient.
-fn optimizer_step(model: Mlp, optimizer: &mut AdamW, factor: f64, pairs: Pairs) -> Result<(Mlp, f64, f64)> {
+fn optimizer_step(
+    model: Mlp,
+    optimizer: &mut AdamW,
+    factor: f64,
+    pairs: Pairs,
+    device: &Device,
+) -> Result<(Mlp, f64, f64)> {
     let tensor = |values: Vec<f32>| {
         let width = values.len() / pairs.count;
-        Tensor::<2>::from_data(TensorData::new(values, [pairs.count, width]), &Device::flex())
+        Tensor::<2>::from_data(TensorData::new(values, [pairs.count, width]), device)
     };
     let trained = model.clone().train();
     let predicted = trained.forward(tensor(pairs.latents).autodiff());

@@ -12,6 +12,7 @@ use super::pixels;
 use super::rollout::Rollout;
 use crate::checkpoint::Checkpoint;
 use crate::checks;
+use crate::device::within_memory;
 use crate::nn::parameters::IntoF32;
 use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
@@ -171,13 +172,16 @@ impl CostModel for LewmCost {
         };
         // The candidates of each environment are split separately, so that no chunk spans two environments.
         let (contexts, chunk_size) = (&self.contexts, predictor.chunk_size(samples));
-        costs.par_chunks_mut(samples).zip(actions.par_chunks(samples * horizon * dim)).zip(contexts).for_each(
-            |((costs, actions), context)| {
-                let chunks = costs.par_chunks_mut(chunk_size).zip(actions.par_chunks(chunk_size * horizon * dim));
-                chunks.for_each(|(costs, actions)| context.cost(&predictor, actions, horizon, costs));
-            },
-        );
-        Ok(())
+        let compute = || {
+            costs.par_chunks_mut(samples).zip(actions.par_chunks(samples * horizon * dim)).zip(contexts).for_each(
+                |((costs, actions), context)| {
+                    let chunks = costs.par_chunks_mut(chunk_size).zip(actions.par_chunks(chunk_size * horizon * dim));
+                    chunks.for_each(|(costs, actions)| context.cost(&predictor, actions, horizon, costs));
+                },
+            );
+            Ok(())
+        };
+        within_memory(&self.model.device(), "the solver's samples (--solver cem,samples=…)", compute)
     }
 
     fn differentiable(&mut self) -> Option<&mut dyn DifferentiableCost> {

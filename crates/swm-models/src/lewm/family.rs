@@ -8,7 +8,6 @@ use crate::nn::parameters::host;
 use crate::probe::ImageEncoder;
 use crate::train::{DatasetInfo, TrainConfig};
 use crate::weights::Naming;
-use burn::tensor::Device;
 use std::path::Path;
 use swm_core::requirements::{DatasetRequirements, RequiredObservations};
 use swm_core::{CostModel, Predictor, Result};
@@ -75,5 +74,5 @@ impl ImageEncoder for Checkpoint<Lewm> {
 /// # Errors
 /// When the bytes are not a whole number of images.
 pub(crate) fn encode(model: &Lewm, config: &LewmConfig, rgb: &[u8]) -> Result<Vec<f32>> {
-    Ok(host(model.encode(pixels::patches(config, rgb, &Device::flex())?)))
+    Ok(host(model.encode(pixels::patches(config, rgb, &model.device())?)))
 }

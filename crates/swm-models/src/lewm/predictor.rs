@@ -2,8 +2,8 @@
 
 use super::host_encoder::HostEncoder;
 use super::{Lewm, LewmConfig, Rollout, pixels};
+use crate::device::is_cpu;
 use crate::nn::parameters::{IntoF32, host};
-use burn::tensor::Device;
 use rayon::prelude::*;
 use swm_core::columns::PIXELS;
 use swm_core::{Batch, Error, Predictor, Result};
@@ -13,7 +13,8 @@ use swm_plan::ActionScale;
 /// own row or trajectory only.
 pub struct LewmPredictor {
     model: Lewm,
-    /// The encoder laid out for the CPU kernels; `None` if there are no kernels for it.
+    /// The encoder laid out for the CPU kernels; `None` if there are no kernels for it, or the model is on
+    /// another device.
     encoder: Option<HostEncoder>,
     config: LewmConfig,
     rollout: Rollout,
@@ -24,7 +25,7 @@ pub struct LewmPredictor {
 impl LewmPredictor {
     /// Creates the predictor of a trained model whose model step is `frameskip` environment steps.
     pub fn new(model: &Lewm, config: &LewmConfig, scale: ActionScale, frameskip: usize) -> Self {
-        let encoder = HostEncoder::new(model, config);
+        let encoder = is_cpu(&model.device()).then(|| HostEncoder::new(model, config)).flatten();
         Self { rollout: Rollout::new(model), model: model.clone(), encoder, config: config.clone(), scale, frameskip }
     }
 }
@@ -44,11 +45,12 @@ impl Predictor for LewmPredictor {
 
     fn encode(&mut self, rows: &Batch, latents: &mut [f32]) -> Result<()> {
         let (config, model, encoder) = (&self.config, &self.model, &self.encoder);
+        let device = model.device();
         pixels::check(config, rows.schema(), PIXELS)?;
         let bytes = config.image * config.image * 3;
         let work = latents.par_chunks_exact_mut(config.latent).zip(rows.get::<u8>(PIXELS)?.par_chunks_exact(bytes));
         work.try_for_each(|(latent, rgb)| {
-            let patches = pixels::patches(config, rgb, &Device::flex())?;
+            let patches = pixels::patches(config, rgb, &device)?;
             latent.copy_from_slice(&match encoder {
                 Some(encoder) => encoder.encode(&patches.into_data().into_f32_vec()),
                 None => host(model.encode(patches)),

@@ -13,6 +13,7 @@ use super::step_output::StepOutput;
 use super::trainable::{StepContext, Trainable};
 use super::{metrics::Metrics, resume};
 use crate::checkpoint::{Checkpoint, TrainState};
+use crate::device::within_memory;
 use crate::nn::{Init, parameters};
 use burn::tensor::Device;
 use std::path::Path;
@@ -181,7 +182,9 @@ impl<M: Trainable> DynLearner for Learner<'_, M> {
 
     fn loss_and_gradients(&self, batch: &Batch, key: Key, training: bool) -> Result<StepOutput> {
         let model = if training { &self.model } else { self.average.as_ref().unwrap_or(&self.model) };
-        model.step(&self.context(key, training), batch)
+        let setting =
+            "data.batch_size (optim.accumulate keeps the clips of an optimizer step) or the sizes of the model";
+        within_memory(self.device, setting, || model.step(&self.context(key, training), batch))
     }
 
     fn update(&mut self, output: StepOutput, key: Key) -> Update {

@@ -1,7 +1,6 @@
 //! Errors of damaged and unsuitable checkpoints name the problem.
 
 use crate::training::{config, run};
-use burn::tensor::Device;
 use std::path::Path;
 use swm_models::lewm::Lewm;
 use swm_models::{Checkpoint, TrainOptions};
@@ -16,11 +15,11 @@ fn edit(path: &Path, change: impl FnOnce(&mut serde_json::Value)) {
 fn damaged_checkpoints_are_refused() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let trained = folder.path().join("run");
-    let load = |path: &Path| Checkpoint::<Lewm>::load(path, &Device::flex());
+    let load = |path: &Path| Checkpoint::<Lewm>::load(path, &crate::device());
     let message = |path: &Path| load(path).expect_err("loading must fail").to_string();
     assert!(message(&trained).contains("no checkpoint"));
 
-    run(&config(&["schedule.steps=1"]), &trained, &TrainOptions::default(), 0).expect("training the model");
+    run(&config(&["schedule.steps=1"]), &trained, &crate::options(), 0).expect("training the model");
     let checkpoint = load(&trained).expect("loading the undamaged checkpoint");
     assert_eq!(checkpoint.dataset_info.env.as_deref(), Some("test/Dots-v0"));
     assert_eq!(checkpoint.hash().len(), 64);
@@ -60,8 +59,8 @@ fn damaged_checkpoints_are_refused() {
 #[test]
 fn resuming_with_another_configuration_is_refused() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
-    run(&config(&["schedule.steps=1"]), folder.path(), &TrainOptions::default(), 0).expect("training the model");
-    let resume = TrainOptions { resume: true, ..TrainOptions::default() };
+    run(&config(&["schedule.steps=1"]), folder.path(), &crate::options(), 0).expect("training the model");
+    let resume = TrainOptions { resume: true, ..crate::options() };
     let error = run(&config(&["schedule.steps=1", "optim.lr=2e-3"]), folder.path(), &resume, 0);
     let message = error.expect_err("another configuration").to_string();
     assert!(message.contains("optim.lr: stored 0.001, requested 0.002"), "{message}");

@@ -2,7 +2,6 @@
 //! environments.
 
 use crate::dots::{Dots, SIDE, draw};
-use burn::tensor::Device;
 use std::path::Path;
 use std::sync::Arc;
 use swm_core::run::Control;
@@ -18,12 +17,12 @@ const HORIZON: usize = 3;
 const DIM: usize = 4;
 
 /// The setting of a model that observes images, positions and actions.
-const POSITIONS: &str = "model.columns=[{ name = \"position\", dim = 3 }, { name = \"action\", dim = 5 }]";
+pub const POSITIONS: &str = "model.columns=[{ name = \"position\", dim = 3 }, { name = \"action\", dim = 5 }]";
 /// The setting of a model that observes images and actions.
-const IMAGES: &str = "model.columns=[{ name = \"action\", dim = 5 }]";
+pub const IMAGES: &str = "model.columns=[{ name = \"action\", dim = 5 }]";
 
 /// A model of a few thousand parameters.
-fn config(overrides: &[&str]) -> Result<TrainConfig<DinoWm>> {
+pub fn config(overrides: &[&str]) -> Result<TrainConfig<DinoWm>> {
     let small = [
         "model.image=16",
         "model.encoder.vit.patch=8",
@@ -46,7 +45,7 @@ fn config(overrides: &[&str]) -> Result<TrainConfig<DinoWm>> {
 }
 
 fn run(config: &TrainConfig<DinoWm>, out: &Path, threads: usize) -> Result<TrainSummary> {
-    let options = TrainOptions { threads, ..TrainOptions::default() };
+    let options = TrainOptions { threads, ..crate::options() };
     train(config, Arc::new(Dots::new(6, 0)), out, &options, &mut Control::new())
 }
 
@@ -62,8 +61,9 @@ fn results_do_not_depend_on_threads_and_the_encoder_is_frozen() {
     let one = run(&config, &folder.path().join("1"), 1).expect("training the model");
     let two = run(&config, &folder.path().join("2"), 2).expect("training the model");
     assert_eq!(one.weights, two.weights);
-    let loaded = Checkpoint::<DinoWm>::load(&folder.path().join("1"), &Device::flex()).expect("loading the checkpoint");
-    let init = Init::new(Key::new(config.seed).with("init"), &Device::flex());
+    let loaded =
+        Checkpoint::<DinoWm>::load(&folder.path().join("1"), &crate::device()).expect("loading the checkpoint");
+    let init = Init::new(Key::new(config.seed).with("init"), &crate::device());
     let fresh = DinoWm::new(&config, &loaded.dataset_info, &init).expect("creating the model");
     let (before, after) = (parameters::values(&fresh), parameters::values(&loaded.model));
     for (name, value) in &before {
@@ -116,7 +116,7 @@ fn checkpoint(overrides: &[&str]) -> Checkpoint<DinoWm> {
     let config = config(overrides).expect("loading the configuration");
     let dataset_info = dataset_info(&config);
     let model =
-        DinoWm::new(&config, &dataset_info, &Init::new(Key::new(3), &Device::flex())).expect("creating the model");
+        DinoWm::new(&config, &dataset_info, &Init::new(Key::new(3), &crate::device())).expect("creating the model");
     Checkpoint { model, config, dataset_info, manifest: Manifest::new("train", 0, serde_json::Value::Null) }
 }
 

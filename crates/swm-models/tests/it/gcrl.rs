@@ -12,7 +12,7 @@ use swm_models::nn::{BackboneConfig, ConvConfig, Init, KeypointsConfig, paramete
 use swm_models::pixels::ImageNormalization;
 use swm_models::probe::{self, AnglePart, ImageEncoder, ReconstructionConfig, StateConfig};
 use swm_models::train::DatasetInfo;
-use swm_models::{Checkpoint, Device, TrainConfig, TrainOptions, TrainSummary, Trainable, train};
+use swm_models::{Checkpoint, TrainConfig, TrainOptions, TrainSummary, Trainable, train};
 use swm_plan::ActionScale;
 
 const SMALL: &[&str] = &[
@@ -29,7 +29,7 @@ const SMALL: &[&str] = &[
     "log_every=4",
 ];
 
-fn config<M: GoalConditioned<Config = GcrlConfig>>(overrides: &[&str]) -> TrainConfig<M> {
+pub fn config<M: GoalConditioned<Config = GcrlConfig>>(overrides: &[&str]) -> TrainConfig<M> {
     let overrides = crate::overridden(SMALL, overrides);
     TrainConfig::load("tiny", &overrides).expect("loading the configuration")
 }
@@ -39,8 +39,8 @@ fn run<M: Trainable>(config: &TrainConfig<M>, out: &Path, options: &TrainOptions
 }
 
 fn trained<M: Trainable>(config: &TrainConfig<M>, out: &Path) -> Checkpoint<M> {
-    run(config, out, &TrainOptions::default()).expect("training the model");
-    Checkpoint::load(out, &Device::flex()).expect("loading the checkpoint")
+    run(config, out, &crate::options()).expect("training the model");
+    Checkpoint::load(out, &crate::device()).expect("loading the checkpoint")
 }
 
 /// The specification of an environment with a dot; the tests do not step the environment.
@@ -99,7 +99,7 @@ fn results_do_not_depend_on_threads() {
         let config = config::<M>(overrides);
         let weights = [("one", 1), ("three", 3)].map(|(name, threads)| {
             let out = folder.path().join(name);
-            run(&config, &out, &TrainOptions { threads, ..TrainOptions::default() }).expect("training the model");
+            run(&config, &out, &TrainOptions { threads, ..crate::options() }).expect("training the model");
             std::fs::read(out.join("checkpoint/weights.safetensors")).expect("reading the weights")
         });
         assert_eq!(weights[0], weights[1], "{}", M::FAMILY);
@@ -184,7 +184,7 @@ fn target_networks_lag_and_frozen_encoders_do_not_change() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let config = config::<Gcivl>(&["loss.target=0.5"]);
     let dataset_info = DatasetInfo { action: ActionScale::identity(2), columns: Default::default(), env: None };
-    let init = Init::new(Key::new(config.seed).with("init"), &Device::flex());
+    let init = Init::new(Key::new(config.seed).with("init"), &crate::device());
     let first = Gcivl::new(&config, &dataset_info, &init).expect("creating the model");
     let last = trained(&config, folder.path()).model;
     let (first, last) = (parameters::values(&first), parameters::values(&last));
@@ -258,9 +258,8 @@ fn invalid_settings_data_and_environments_are_refused() {
     // The images of the dataset have another size than the images of the model.
     let mut large = config::<Gcbc>(&[]);
     large.model.image = 32;
-    let error = run(&large, &folder.path().join("large"), &TrainOptions::default())
-        .expect_err("training must fail")
-        .to_string();
+    let error =
+        run(&large, &folder.path().join("large"), &crate::options()).expect_err("training must fail").to_string();
     assert!(error.contains("[16, 16, 3]") && error.contains("model.image"), "{error}");
 
     let checkpoint = trained(&config::<Gcbc>(&[]), &folder.path().join("run"));
@@ -274,8 +273,9 @@ fn invalid_settings_data_and_environments_are_refused() {
     let error = policy.act(&without_goal, &[true], &mut actions(1)).expect_err("infos without a goal").to_string();
     assert!(error.contains("'goal'"), "{error}");
     // The checkpoint belongs to another family.
-    let error =
-        Checkpoint::<Gciql>::load(&folder.path().join("run"), &Device::flex()).expect_err("another family").to_string();
+    let error = Checkpoint::<Gciql>::load(&folder.path().join("run"), &crate::device())
+        .expect_err("another family")
+        .to_string();
     assert!(error.contains("gcbc") && error.contains("gciql"), "{error}");
 }
 

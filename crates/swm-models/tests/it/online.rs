@@ -13,7 +13,7 @@ use swm_models::{TrainConfig, TrainOptions, Trainable, run_folder, train};
 const PENDULUM: &str = "swm/PendulumControl-v1";
 
 /// Networks of a few hundred parameters, episodes of 20 steps.
-fn config<M: Trainable>(settings: &[&str]) -> TrainConfig<M> {
+pub fn config<M: Trainable>(settings: &[&str]) -> TrainConfig<M> {
     let family: &[&str] = match M::FAMILY {
         "sac" => &["model.hidden=8"],
         _ => &[
@@ -95,7 +95,7 @@ fn check_threads<M: Agent>() {
     let config = config::<M>(&[]);
     let out = |name: &str| folder.path().join(name);
     for (name, threads) in [("one", 1), ("three", 3)] {
-        let options = TrainOptions { threads, ..TrainOptions::default() };
+        let options = TrainOptions { threads, ..crate::options() };
         let summary = run(&config, &out(name), &options, 0).expect("training the model");
         assert_eq!((summary.steps, summary.interrupted), (24, false));
         // The warm-up makes 60 environment steps; each of the 12 later rounds makes one step of 3 environments.
@@ -105,7 +105,7 @@ fn check_threads<M: Agent>() {
     assert_eq!(files(&out("one")), files(&out("three")));
     assert_eq!(lines(&out("one")), lines(&out("three")));
     let other = self::config::<M>(&["seed=1"]);
-    run(&other, &out("other"), &TrainOptions::default(), 0).expect("training the model");
+    run(&other, &out("other"), &crate::options(), 0).expect("training the model");
     assert_ne!(files(&out("other"))[1], files(&out("one"))[1]);
 }
 
@@ -120,7 +120,7 @@ fn resumed_online_run_gives_the_files_of_an_uninterrupted_run() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let (complete, resumed) = (folder.path().join("complete"), folder.path().join("resumed"));
     let config = config::<Sac>(&[]);
-    let options = TrainOptions::default();
+    let options = crate::options();
     run(&config, &complete, &options, 0).expect("training the model");
     let first = run(&config, &resumed, &options, 10).expect("training the model");
     assert_eq!((first.steps, first.interrupted), (10, true));
@@ -141,7 +141,7 @@ fn invalid_settings_and_data_are_refused() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let refused = |config: &TrainConfig<Sac>, id: &'static str| {
         let out = folder.path().join("refused");
-        let error = train_online(config, &pools(id, None), &out, &TrainOptions::default(), &mut Control::new());
+        let error = train_online(config, &pools(id, None), &out, &crate::options(), &mut Control::new());
         error.expect_err("the call must fail").to_string()
     };
     let discrete = refused(&config(&[]), "swm/CartPoleControl-v1");
@@ -165,7 +165,7 @@ fn invalid_settings_and_data_are_refused() {
         &config::<Tdmpc2>(&[]),
         without_rewards,
         &folder.path().join("dots"),
-        &TrainOptions::default(),
+        &crate::options(),
         &mut Control::new(),
     );
     let error = error.expect_err("a dataset without rewards").to_string();
@@ -176,7 +176,7 @@ fn invalid_settings_and_data_are_refused() {
 fn removed_run_keeps_files_among_its_replay_data() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let out = folder.path().join("run");
-    run(&config::<Sac>(&[]), &out, &TrainOptions::default(), 0).expect("the run");
+    run(&config::<Sac>(&[]), &out, &crate::options(), 0).expect("the run");
     let thesis = out.join("played-24/replay.lance/data/thesis.lance");
     std::fs::write(&thesis, "thesis").expect("writing a file of the user");
     let remaining = run_folder::remove(&out).expect("removing the run");

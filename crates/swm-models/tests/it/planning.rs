@@ -2,21 +2,20 @@
 
 use crate::dots::{SIDE, draw};
 use crate::training::config;
-use burn::tensor::Device;
 use swm_core::{Batch, Candidates, ColumnSpec, CostModel, DType, Key, Manifest, Schema};
-use swm_models::Checkpoint;
 use swm_models::lewm::{Lewm, LewmCost};
 use swm_models::train::DatasetInfo;
+use swm_models::{Checkpoint, Device};
 use swm_plan::ActionScale;
 
 const ENVS: usize = 3;
-const SAMPLES: usize = 37;
-const HORIZON: usize = 4;
-const DIM: usize = 4;
+pub const SAMPLES: usize = 37;
+pub const HORIZON: usize = 4;
+pub const DIM: usize = 4;
 
-fn checkpoint() -> Checkpoint<Lewm> {
+pub fn checkpoint(device: &Device) -> Checkpoint<Lewm> {
     let config = config(&[]);
-    let model = Lewm::init(&config.model, DIM, &swm_models::nn::Init::new(Key::new(3), &Device::flex()));
+    let model = Lewm::init(&config.model, DIM, &swm_models::nn::Init::new(Key::new(3), device));
     // Modulations are zero-initialised, so actions have no effect before training.
     let mut values = swm_models::nn::parameters::values(&model);
     for (name, tensor) in &mut values {
@@ -32,7 +31,7 @@ fn checkpoint() -> Checkpoint<Lewm> {
     Checkpoint { model, config, dataset_info, manifest }
 }
 
-fn infos(history: bool) -> Batch {
+pub fn infos(history: bool) -> Batch {
     let mut columns = vec![ColumnSpec::image("pixels", SIDE, SIDE), ColumnSpec::image("goal", SIDE, SIDE)];
     if history {
         columns.push(ColumnSpec::new("history.length", DType::Int32, []));
@@ -53,7 +52,7 @@ fn infos(history: bool) -> Batch {
     infos
 }
 
-fn candidates() -> Vec<f32> {
+pub fn candidates() -> Vec<f32> {
     use rand::Rng as _;
     let mut rng = Key::new(9).rng();
     (0..ENVS * SAMPLES * HORIZON * DIM).map(|_| rng.random_range(-1.0..1.0f32)).collect()
@@ -63,7 +62,7 @@ fn costs(infos: &Batch, envs: &[usize], threads: usize) -> Vec<f32> {
     let per_env = SAMPLES * HORIZON * DIM;
     let all = candidates();
     let actions: Vec<f32> = envs.iter().flat_map(|&env| all[env * per_env..][..per_env].to_vec()).collect();
-    let mut cost = LewmCost::new(&checkpoint());
+    let mut cost = LewmCost::new(&checkpoint(&crate::device()));
     let mut costs = vec![f32::NAN; envs.len() * SAMPLES];
     swm_core::pool::threads(threads).expect("creating the thread pool").install(|| {
         cost.observe(infos, envs).expect("observing the environments");
@@ -98,7 +97,7 @@ fn history_changes_the_cost() {
 
 #[test]
 fn invalid_candidates_and_observations_are_refused() {
-    let mut cost = LewmCost::new(&checkpoint());
+    let mut cost = LewmCost::new(&checkpoint(&crate::device()));
     cost.observe(&infos(false), &[0]).expect("observing the environments");
     let actions = vec![0.0; 6];
     let wrong = Candidates { actions: &actions, envs: 1, samples: 1, horizon: 2, dim: 3 };
@@ -115,7 +114,7 @@ fn invalid_candidates_and_observations_are_refused() {
 
 /// Returns a cost that has observed environments 0 and 1 with their histories.
 fn observed() -> LewmCost {
-    let mut cost = LewmCost::new(&checkpoint());
+    let mut cost = LewmCost::new(&checkpoint(&crate::device()));
     cost.observe(&infos(true), &[0, 1]).expect("observing the environments");
     cost
 }
@@ -159,7 +158,7 @@ fn gradients_do_not_depend_on_other_environments_or_threads() {
     let run = |envs: &[usize], threads: usize| {
         let actions: Vec<f32> =
             envs.iter().flat_map(|&env| all[env * samples * width..][..samples * width].to_vec()).collect();
-        let mut model = LewmCost::new(&checkpoint());
+        let mut model = LewmCost::new(&checkpoint(&crate::device()));
         let (mut costs, mut slopes) = (vec![0.0; envs.len() * samples], vec![0.0; actions.len()]);
         swm_core::pool::threads(threads).expect("creating the thread pool").install(|| {
             model.observe(&infos(true), envs).expect("observing the environments");

@@ -1,7 +1,6 @@
 //! PLDM: training does not depend on threads and reduces the loss; invalid settings are refused.
 
 use crate::dots::Dots;
-use burn::tensor::Device;
 use std::path::Path;
 use std::sync::Arc;
 use swm_core::Result;
@@ -10,7 +9,7 @@ use swm_models::pldm::Pldm;
 use swm_models::{Checkpoint, TrainConfig, TrainOptions, TrainSummary, train};
 
 /// A model of a few thousand parameters.
-fn config(overrides: &[&str]) -> Result<TrainConfig<Pldm>> {
+pub fn config(overrides: &[&str]) -> Result<TrainConfig<Pldm>> {
     let small = [
         "model.image=16",
         "model.latent=4",
@@ -38,7 +37,7 @@ fn config(overrides: &[&str]) -> Result<TrainConfig<Pldm>> {
 }
 
 fn run(config: &TrainConfig<Pldm>, out: &Path, threads: usize) -> TrainSummary {
-    let options = TrainOptions { threads, ..TrainOptions::default() };
+    let options = TrainOptions { threads, ..crate::options() };
     train(config, Arc::new(Dots::new(6, 0)), out, &options, &mut Control::new()).expect("training the model")
 }
 
@@ -48,7 +47,7 @@ fn results_do_not_depend_on_threads() {
     let config = config(&[]).expect("loading the configuration");
     let (one, two) = (run(&config, &folder.path().join("1"), 1), run(&config, &folder.path().join("2"), 2));
     assert_eq!(one.weights, two.weights);
-    let loaded = Checkpoint::<Pldm>::load(&folder.path().join("1"), &Device::flex()).expect("loading the checkpoint");
+    let loaded = Checkpoint::<Pldm>::load(&folder.path().join("1"), &crate::device()).expect("loading the checkpoint");
     assert_eq!((loaded.hash(), loaded.config.loss.idm_hidden), (one.weights.as_str(), 16));
 }
 
@@ -85,7 +84,7 @@ fn invalid_settings_are_refused() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let large = config(&["model.image=32"]).expect("loading the configuration");
     let reader = Arc::new(Dots::new(2, 0));
-    let trained = train(&large, reader, folder.path(), &TrainOptions::default(), &mut Control::new());
+    let trained = train(&large, reader, folder.path(), &crate::options(), &mut Control::new());
     let message = trained.expect_err("images of 16 pixels").to_string();
     assert!(message.contains("[32, 32, 3]") && message.contains("model.image"), "{message}");
 }

@@ -11,7 +11,7 @@ use swm_core::{Key, Result};
 use swm_models::lewm::{DecoderConfig, EncoderConfig, Lewm};
 use swm_models::nn::keypoints::FilterConfig;
 use swm_models::nn::{ConvConfig, Init, KeypointsConfig, parameters};
-use swm_models::{Checkpoint, Device, TrainConfig, TrainOptions, TrainSummary, run_folder, train};
+use swm_models::{Checkpoint, TrainConfig, TrainOptions, TrainSummary, run_folder, train};
 
 /// A model of a few thousand parameters.
 pub fn config(overrides: &[&str]) -> TrainConfig<Lewm> {
@@ -66,7 +66,7 @@ fn resumed_run_gives_the_files_of_an_uninterrupted_run() {
     // 6 episodes of 17 clips give 6 batches of 16 clips. The first epoch therefore ends after step 6, which the resumed
     // run makes.
     let config = config(&[]);
-    let options = TrainOptions::default();
+    let options = crate::options();
     let summary = run(&config, &complete, &options, 0).expect("training the model");
     assert!((summary.steps, summary.interrupted) == (10, false));
     let first = run(&config, &resumed, &options, 5).expect("training the model");
@@ -93,12 +93,12 @@ fn resumed_run_gives_the_files_of_an_uninterrupted_run() {
 fn running_statistics_of_the_encoder_are_stored_and_resumed() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let (complete, resumed) = (folder.path().join("complete"), folder.path().join("resumed"));
-    let (config, options) = (conv_config(), TrainOptions::default());
+    let (config, options) = (conv_config(), crate::options());
     run(&config, &complete, &options, 0).expect("training the model");
     run(&config, &resumed, &options, 5).expect("training the model");
     run(&config, &resumed, &TrainOptions { resume: true, ..options }, 0).expect("training the model");
     assert_eq!(files(&complete), files(&resumed));
-    let checkpoint = Checkpoint::<Lewm>::load(&complete, &Device::flex()).expect("loading the checkpoint");
+    let checkpoint = Checkpoint::<Lewm>::load(&complete, &crate::device()).expect("loading the checkpoint");
     let weights = parameters::values(&checkpoint.model);
     for stage in 0..2 {
         let running = |name: &str| &weights[&format!("encoder.stages.{stage}.norm.{name}")].values;
@@ -112,11 +112,11 @@ fn second_training_into_a_folder_is_refused() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let out = folder.path().join("run");
     let first = Lock::folder(&out).expect("locking the folder for another process");
-    let error = run(&config(&[]), &out, &TrainOptions::default(), 0).expect_err("training into a locked folder");
+    let error = run(&config(&[]), &out, &crate::options(), 0).expect_err("training into a locked folder");
     assert!(error.is_usage() && error.to_string().contains(&out.display().to_string()), "{error}");
     assert_eq!(out.read_dir().expect("listing the folder").count(), 0, "the second run writes nothing");
     drop(first);
-    assert!(run(&config(&[]), &out, &TrainOptions::default(), 1).expect("training the model").interrupted);
+    assert!(run(&config(&[]), &out, &crate::options(), 1).expect("training the model").interrupted);
 }
 
 /// A model with an encoder of overlapping convolutions.
@@ -127,7 +127,7 @@ fn conv_config() -> TrainConfig<Lewm> {
 }
 
 /// A model with an encoder of keypoints and a decoder of their features.
-fn keypoints_config() -> TrainConfig<Lewm> {
+pub fn keypoints_config() -> TrainConfig<Lewm> {
     let mut config = config(&["model.predictor.dropout=0"]);
     let filters =
         vec![FilterConfig { kernel: 3, stride: 2, channels: 5 }, FilterConfig { kernel: 5, stride: 4, channels: 3 }];
@@ -142,10 +142,10 @@ fn fixed_filters_are_not_trained_and_give_the_same_latents_from_frames_as_in_tra
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let config = keypoints_config();
     let out = folder.path().join("run");
-    let summary = run(&config, &out, &TrainOptions::default(), 0).expect("training the model");
+    let summary = run(&config, &out, &crate::options(), 0).expect("training the model");
     assert!(summary.metrics.iter().any(|(name, value)| name == "features" && *value > 0.0), "{:?}", summary.metrics);
-    let model = Checkpoint::<Lewm>::load(&out, &Device::flex()).expect("loading the checkpoint").model;
-    let initial = Lewm::init(&config.model, 2 * 2, &Init::new(Key::new(config.seed).with("init"), &Device::flex()));
+    let model = Checkpoint::<Lewm>::load(&out, &crate::device()).expect("loading the checkpoint").model;
+    let initial = Lewm::init(&config.model, 2 * 2, &Init::new(Key::new(config.seed).with("init"), &crate::device()));
     let (trained, initial) = (parameters::values(&model), parameters::values(&initial));
     for (name, value) in trained.iter().filter(|(name, _)| name.starts_with("encoder.") || name.starts_with("decoder."))
     {
@@ -154,7 +154,7 @@ fn fixed_filters_are_not_trained_and_give_the_same_latents_from_frames_as_in_tra
     let images: Vec<f32> = (0..3 * 16 * 16 * 3).map(|i| (i * 37 % 101) as f32 / 50.0 - 1.0).collect();
     let kernels = model.encoder.fixed_part(16).expect("an encoder with fixed filters");
     let features = TensorData::new(kernels.features(&images), [3, 1, kernels.count()]);
-    let latents = |data| model.encode(Tensor::<3>::from_data(data, &Device::flex())).into_data();
+    let latents = |data| model.encode(Tensor::<3>::from_data(data, &crate::device())).into_data();
     assert_eq!(latents(TensorData::new(images, [3, 16 * 16, 3])), latents(features));
 }
 
@@ -163,7 +163,7 @@ fn later_runs_find_the_features_of_fixed_filters_in_a_folder() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let mut config = keypoints_config();
     let run = |name: &str, feature_cache: Option<&Path>, config: &TrainConfig<Lewm>| {
-        let options = TrainOptions { feature_cache: feature_cache.map(Path::to_owned), ..TrainOptions::default() };
+        let options = TrainOptions { feature_cache: feature_cache.map(Path::to_owned), ..crate::options() };
         let (out, dots) = (folder.path().join(name), Arc::new(Dots::new(6, 0)));
         train(config, Arc::<Dots>::clone(&dots), &out, &options, &mut stop_after(0)).expect("training the model");
         (files(&out), dots.frames_read.load(Ordering::Relaxed))
@@ -212,7 +212,7 @@ fn threads_give_equal_files(config: &TrainConfig<Lewm>) {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let mut all = vec![];
     for (name, threads, loader_threads) in [("one", 1, 0), ("two", 2, 1), ("three", 3, 2)] {
-        let options = TrainOptions { threads, loader_threads, ..TrainOptions::default() };
+        let options = TrainOptions { threads, loader_threads, ..crate::options() };
         run(config, &folder.path().join(name), &options, 0).expect("training the model");
         all.push(files(&folder.path().join(name)));
     }
@@ -220,7 +220,7 @@ fn threads_give_equal_files(config: &TrainConfig<Lewm>) {
     assert_eq!(all[0], all[2]);
     let mut other = config.clone();
     other.seed = 1;
-    run(&other, &folder.path().join("other"), &TrainOptions::default(), 0).expect("training the model");
+    run(&other, &folder.path().join("other"), &crate::options(), 0).expect("training the model");
     assert_ne!(files(&folder.path().join("other"))[1], all[0][1]);
 }
 
@@ -233,7 +233,7 @@ fn training_reduces_the_loss() {
 
 fn loss_is_reduced(config: &TrainConfig<Lewm>) {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
-    run(config, folder.path(), &TrainOptions::default(), 0).expect("training the model");
+    run(config, folder.path(), &crate::options(), 0).expect("training the model");
     let lines = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("reading train.jsonl");
     let value = |line: &str, name: &str| {
         serde_json::from_str::<serde_json::Value>(line).expect("parsing the JSON")[name].as_f64().expect(name)
@@ -248,7 +248,7 @@ fn loss_is_reduced(config: &TrainConfig<Lewm>) {
 #[test]
 fn non_finite_loss_stops_the_run() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
-    let error = run(&config(&["optim.lr=1e30", "optim.clip=1e30"]), folder.path(), &TrainOptions::default(), 0);
+    let error = run(&config(&["optim.lr=1e30", "optim.clip=1e30"]), folder.path(), &crate::options(), 0);
     let message = error.expect_err("a loss that is not finite").to_string();
     assert!(message.contains("not finite") && message.contains("optim.lr"), "{message}");
 }
@@ -258,7 +258,7 @@ fn failed_batch_replaces_only_a_failed_batch() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let (diverging, batch) =
         (config(&["optim.lr=1e30", "optim.clip=1e30"]), folder.path().join("failed-batch.safetensors"));
-    let message = || run(&diverging, folder.path(), &TrainOptions::default(), 0).expect_err("divergence").to_string();
+    let message = || run(&diverging, folder.path(), &crate::options(), 0).expect_err("divergence").to_string();
     std::fs::write(&batch, "thesis").expect("writing a file of the user");
     let refused = message();
     assert!(refused.contains("could not be saved") && refused.contains("not written by this program"), "{refused}");

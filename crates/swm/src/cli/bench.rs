@@ -1,7 +1,7 @@
 //! `swm bench`: measures speed, compared with the reference implementation where it is installed.
 
 use super::config::{count, seconds};
-use super::{Context, emit, emit_json, eprint, table};
+use super::{Context, devices, emit, emit_json, eprint, table};
 use crate::ENVS;
 use crate::subject::LewmSubject;
 use clap::{Args, Subcommand};
@@ -14,7 +14,6 @@ use swm_core::limits::{ENVS as PARALLEL, IMAGE_SIDE};
 use swm_core::run::Control;
 use swm_core::{EnvChoice, Origin};
 use swm_data::Location;
-use swm_models::device;
 use swm_mujoco::render::{Choice as Renderer, name, with};
 
 /// Arguments of `swm bench`.
@@ -242,7 +241,7 @@ fn lewm(
     name: &str,
     context: &Context,
 ) -> anyhow::Result<ModelBenchReport> {
-    let device = device::parse(name)?;
+    let device = devices::open(name)?;
     let weights = tempfile::NamedTempFile::new()?;
     Ok(swm_core::pool::threads(context.threads)?.install(|| {
         let mut subject = LewmSubject::new(preset, iterations, clips, &device)?;

@@ -2,6 +2,7 @@
 
 use super::collect::{self, Collection};
 use super::config::count;
+use super::devices::DeviceArgs;
 use super::output_folder;
 use super::results_tables::summary;
 use super::wrappers::WrapperArgs;
@@ -45,6 +46,8 @@ pub struct DemoArgs {
     /// Parallel environments of the evaluation; results do not depend on their number
     #[arg(long, default_value_t = 50)]
     envs: usize,
+    #[command(flatten)]
+    device: DeviceArgs,
     /// Training settings, such as schedule.steps=500
     #[arg(value_name = "KEY=VALUE")]
     settings: Vec<String>,
@@ -78,6 +81,7 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
     let mut config = TrainConfig::<Pldm>::load("tiny", &args.settings)?;
     config.seed = args.seed;
     let side = config.model.image;
+    let device = args.device.open()?;
     let _lock = claim(&output)?;
     // The other steps replace the files of an earlier demo themselves; training refuses the folder of another run.
     let _ = run_folder::remove(&model)?;
@@ -85,12 +89,12 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
     collect_rooms(args, &data, side, context)?;
 
     eprint("2/4 train: a small PLDM learns to predict its next observations\n");
-    let options = TrainOptions { threads: context.threads, ..TrainOptions::default() };
+    let options = TrainOptions { threads: context.threads, device: device.clone(), ..TrainOptions::default() };
     let reader = home::open_dataset(&data.to_string_lossy())?;
     train::run(&config, swm_models::TrainRun { reader, encoder: None, out: &model, options }, context)?;
 
     eprint("3/4 plan and evaluate: CEM with the model, compared with the random-policy floor\n");
-    let resolver = HomeResolver::new(Origin::User).tracing();
+    let resolver = HomeResolver::new(Origin::User).on(device).tracing();
     let request = request(args, &model, side, &resolver)?;
     let (found, file) = eval::run(&request, &resolver, args.envs, (&results, eval::VIDEOS), context)?;
 

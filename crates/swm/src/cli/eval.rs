@@ -1,6 +1,7 @@
 //! `swm eval`: evaluates policies and the random-policy floor from the same starts.
 
 use super::config::{VariationArgs, count, image_size};
+use super::devices::DeviceArgs;
 use super::eval_policy::NamedPolicy;
 use super::planner::PlannerArgs;
 use super::progress::control;
@@ -125,6 +126,8 @@ pub struct EvalArgs {
     each_factor: bool,
     #[command(flatten)]
     planner: PlannerArgs,
+    #[command(flatten)]
+    pub(super) device: DeviceArgs,
 }
 
 /// The rule for counting episodes.
@@ -174,7 +177,7 @@ pub fn eval(args: &EvalArgs, context: &Context) -> anyhow::Result<()> {
 /// Runs the evaluation of a command line and writes its results.
 pub fn run_args(args: &EvalArgs, context: &Context) -> anyhow::Result<(Results, PathBuf)> {
     // The request checks the one name that a checkpoint chooses: its environment.
-    let resolver = HomeResolver::new(Origin::User);
+    let resolver = HomeResolver::new(Origin::User).on(args.device.open()?);
     let resolver = if args.trace { resolver.tracing() } else { resolver };
     let request = args.request(&resolver, CapsuleStarts::Use)?;
     args.check_planning(&request)?;

@@ -10,6 +10,7 @@ mod config;
 mod convert;
 mod datasets;
 mod demo;
+mod devices;
 mod doctor;
 mod envs;
 mod eval;
@@ -122,6 +123,9 @@ enum Command {
     /// List the models and their presets
     #[command(after_help = "Example: swm models")]
     Models,
+    /// List the devices that models can compute on
+    #[command(after_help = "Example: swm devices")]
+    Devices,
     /// Train a model on a dataset or in an environment
     #[command(after_help = "Example: swm train lewm --data rooms --output lewm-rooms optim.lr=3e-4")]
     Train(on_ray::train::TrainCommand),
@@ -294,6 +298,7 @@ impl Cli {
             Command::Assets(args) => assets::assets(&args, json),
             Command::Wrappers => wrappers::wrappers(json),
             Command::Solvers => solvers::solvers(json),
+            Command::Devices => devices::devices(json),
             Command::Datasets(args) => datasets::datasets(&args, json),
             Command::Formats => datasets::formats(json),
             Command::Inspect(args) => inspect::inspect(&args, json),

@@ -2,7 +2,7 @@
 //! encoder that is trained with labels.
 
 use super::progress::control;
-use super::{Context, emit, emit_json, output_folder, table};
+use super::{Context, devices, emit, emit_json, output_folder, table};
 use crate::home;
 use clap::Args;
 use serde_json::json;
@@ -10,10 +10,10 @@ use std::path::PathBuf;
 use swm_core::Error;
 use swm_core::columns::POS_AGENT;
 use swm_data::{Reader, check_png, write_png};
+use swm_models::TrainConfig;
 use swm_models::lewm::{Lewm, LewmConfig};
 use swm_models::pixels::ImageNormalization;
 use swm_models::probe::{self, AnglePart, FitConfig, ReconstructionConfig, Score, StateConfig, StateReport};
-use swm_models::{Device, TrainConfig};
 
 /// Arguments of `swm probe`. Probes are fitted on the training episodes of the dataset, and evaluated on its validation
 /// episodes.
@@ -46,6 +46,11 @@ pub struct ProbeArgs {
     /// Seed of frames, initial weights and batches
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// Device of the checkpoint's encoder: cpu, vulkan[:I], cuda[:I] or auto
+    ///
+    /// Probes are fitted on the CPU.
+    #[arg(long, default_value = "cpu", conflicts_with = "supervised")]
+    device: String,
 }
 
 /// Runs `swm probe`.
@@ -55,7 +60,7 @@ pub fn probe(args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
     }
     let checkpoint = args.checkpoint.as_deref().unwrap_or_default();
     let run = home::find_checkpoint(checkpoint)?;
-    let loaded = swm_models::load(&run, &Device::flex())?;
+    let loaded = swm_models::load(&run, &devices::open(&args.device)?)?;
     let Some(encoder) = loaded.encoder() else {
         let problem = format!("a {} model has no image encoder", loaded.info()?.family);
         return Err(Error::config(checkpoint, problem, "probe a model with an image encoder").into());

@@ -19,7 +19,7 @@ const GROUPS: &[(&str, &[&str])] = &[
             "formats",
         ],
     ),
-    ("Train", &["models", "train", "plot", "recipes", "zoo", "checkpoints", "pull", "push", "probe"]),
+    ("Train", &["models", "devices", "train", "plot", "recipes", "zoo", "checkpoints", "pull", "push", "probe"]),
     ("Evaluate", &["eval", "solvers", "reproduce", "report", "study", "autopsy", "leaderboard"]),
     ("System", &["demo", "lab", "assets", "bench", "completions", "man"]),
 ];

@@ -1,5 +1,6 @@
 //! `swm train`: trains a model on a dataset or online in an environment, or runs a recipe.
 
+use super::devices::DeviceArgs;
 use super::progress::{control, print_summary};
 use super::recipes::{self, RecipeRun};
 use super::trackers::{Tracker, Trackers};
@@ -13,7 +14,7 @@ use swm_core::files::Lock;
 use swm_core::{EnvPool, Error, Origin, Result};
 use swm_data::Reader;
 use swm_models::{
-    FAMILIES, FamilyEntry, OnlineRun, StoredCheckpoint, TrainOptions, TrainRun, TrainSummary, TrainableConfig, device,
+    FAMILIES, FamilyEntry, OnlineRun, StoredCheckpoint, TrainOptions, TrainRun, TrainSummary, TrainableConfig,
 };
 
 /// Arguments of `swm train`.
@@ -49,9 +50,8 @@ pub struct TrainArgs {
     /// Checkpoint with the frozen encoder: a path or a name (inverse only)
     #[arg(long, value_name = "CHECKPOINT")]
     encoder: Option<String>,
-    /// Device: cpu, vulkan[:I], cuda[:I] or auto
-    #[arg(long, default_value = "cpu")]
-    device: String,
+    #[command(flatten)]
+    device: DeviceArgs,
     /// Folder that keeps the features of fixed filters for later runs
     ///
     /// Encoders such as keypoints have a part that is not trained. Its features of a dataset are computed once, at the
@@ -108,7 +108,7 @@ pub fn run_args(args: &TrainArgs, context: &Context) -> anyhow::Result<(PathBuf,
     }
     let options = TrainOptions {
         resume: args.resume,
-        device: device::parse(&args.device)?,
+        device: args.device.open()?,
         threads: context.threads,
         cache: home::weights()?,
         feature_cache: args.feature_cache.clone(),

@@ -1,6 +1,6 @@
 //! Policies that plan by the states that a probe reads from the latents of a world model.
 
-use super::{HomeResolver, Planner, check_trained_on, with_provenance};
+use super::{HomeResolver, Planner, check_trained_on};
 use crate::home;
 use std::sync::Arc;
 use swm_core::run::Control;
@@ -41,7 +41,7 @@ impl HomeResolver {
             Box::new(ProbedCost::new(model, probe, scale.clone(), block)?)
         };
         let policy = planner.policy(cost, scale, world)?;
-        Ok(with_provenance(self.traced(name, policy), info))
+        Ok(self.with_provenance(self.traced(name, policy), info))
     }
 
     /// Returns a probe; it is fitted at the first call.

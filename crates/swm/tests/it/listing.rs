@@ -48,6 +48,7 @@ fn listing_commands_print_the_registered_names() {
         (&["datasets"], &["no datasets"]),
         (&["checkpoints"], &["no checkpoints"]),
         (&["models"], &["lewm", "tiny", "paper"]),
+        (&["devices"], &["cpu (flex)", "auto: "]),
         (&["formats"], &["lance"]),
         (&["solvers"], &["cem", "samples=300"]),
         (&["wrappers"], &["noise", "chroma-key"]),

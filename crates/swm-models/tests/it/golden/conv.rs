@@ -2,7 +2,6 @@
 
 use super::{Golden, check, files, values};
 use burn::module::Module;
-use burn::tensor::Device;
 use swm_core::Key;
 use swm_models::nn::{Conv, ConvConfig, Init, conv, parameters};
 
@@ -16,7 +15,7 @@ fn conv_features_statistics_and_gradients_equal_pytorch() {
             let channels = channels.iter().map(|count| count.as_u64().expect("a number of channels") as usize);
             ConvConfig { channels: channels.collect(), hidden: golden.size("hidden"), dim: golden.size("dim") }
         };
-        let model = config.init(&Init::new(Key::new(0), &Device::flex()), golden.size("image"));
+        let model = config.init(&Init::new(Key::new(0), &crate::device()), golden.size("image"));
         let weights = golden.group("w.");
         let published = weights.iter().map(|(name, weight)| (name.clone(), weight.shape.clone())).collect();
         assert_eq!(parameters::shapes(&model), published, "names and shapes of PyTorch's weights");

@@ -1,7 +1,7 @@
 //! DINO-WM: predictor, frames, rollouts, losses and gradients.
 
 use super::{Golden, check, files, values};
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Tensor;
 use swm_core::Key;
 use swm_models::dino_wm::step::{TrainBatch, step};
 use swm_models::dino_wm::{ColumnConfig, DinoWm, DinoWmConfig, FramePredictor, FramePredictorConfig};
@@ -29,7 +29,7 @@ fn predictor_equals_the_reference() {
             emb_dropout: 0.0,
         };
         let predictor: FramePredictor =
-            config.init(&Init::new(Key::new(0), &Device::flex()), size("num_patches"), size("dim"));
+            config.init(&Init::new(Key::new(0), &crate::device()), size("num_patches"), size("dim"));
         let weights = without_masks(golden.group("w."));
         let published: Named<Vec<usize>> =
             weights.iter().map(|(name, weight)| (name.clone(), weight.shape.clone())).collect();
@@ -81,7 +81,7 @@ impl Golden {
 
     fn dino_wm(&self) -> DinoWm {
         let dims: Vec<usize> = self.columns().iter().map(|(_, dim, _)| *dim).collect();
-        let model = DinoWm::init(&self.dino_wm_config(), &dims, &Init::new(Key::new(0), &Device::flex()));
+        let model = DinoWm::init(&self.dino_wm_config(), &dims, &Init::new(Key::new(0), &crate::device()));
         let weights = without_masks(self.group("w."));
         let published: Named<Vec<usize>> =
             weights.iter().map(|(name, weight)| (name.clone(), weight.shape.clone())).collect();

@@ -3,7 +3,7 @@
 
 use super::{Golden, TOLERANCE, check, error, files, values};
 use burn::module::Module;
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Tensor;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use swm_core::Key;
@@ -121,7 +121,7 @@ fn heads_and_expectile_losses_equal_the_reference() {
     for file in files("gcrl") {
         println!("{}", file.display());
         let golden = Golden::read(&file);
-        let init = Init::new(Key::new(0), &Device::flex());
+        let init = Init::new(Key::new(0), &crate::device());
         let grid = PatchGrid {
             frames: golden.size("num_frames"),
             patches: golden.size("num_patches"),
@@ -149,7 +149,7 @@ fn gcbc_losses_equal_the_reference() {
     for file in files("gcbc") {
         println!("{}", file.display());
         let golden = Golden::read(&file);
-        let model = Gcbc::init(&golden.gcrl(), golden.size("action_dim"), &Init::new(Key::new(0), &Device::flex()));
+        let model = Gcbc::init(&golden.gcrl(), golden.size("action_dim"), &Init::new(Key::new(0), &crate::device()));
         let model = golden.fill("w.", model);
         golden.compare(&model.losses(&golden.clips(), &mut DropoutRng::disabled(), true));
     }
@@ -160,7 +160,7 @@ fn gcivl_losses_equal_the_reference() {
     for file in files("gcivl") {
         println!("{}", file.display());
         let golden = Golden::read(&file);
-        let model = Gcivl::init(&golden.gcrl(), golden.size("action_dim"), &Init::new(Key::new(0), &Device::flex()));
+        let model = Gcivl::init(&golden.gcrl(), golden.size("action_dim"), &Init::new(Key::new(0), &crate::device()));
         let model = golden.fill("w.", model);
         let (clips, relabelled, settings) = (golden.clips(), golden.relabelled(), golden.value_loss());
         golden.compare(&model.losses(&clips, &relabelled, &settings, &mut DropoutRng::disabled(), true));
@@ -172,7 +172,7 @@ fn gciql_losses_equal_the_reference() {
     for file in files("gciql") {
         println!("{}", file.display());
         let golden = Golden::read(&file);
-        let model = Gciql::init(&golden.gcrl(), golden.size("action_dim"), &Init::new(Key::new(0), &Device::flex()));
+        let model = Gciql::init(&golden.gcrl(), golden.size("action_dim"), &Init::new(Key::new(0), &crate::device()));
         let model = golden.fill("w.", model);
         let (clips, relabelled, settings) = (golden.clips(), golden.relabelled(), golden.value_loss());
         golden.compare(&model.losses(&clips, &relabelled, &settings, &mut DropoutRng::disabled(), true));

@@ -1,7 +1,7 @@
 //! LeWM: outputs, rollouts, costs, losses and gradients.
 
 use super::{Golden, TOLERANCE, check, error, files, values};
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Tensor;
 use swm_core::Key;
 use swm_models::lewm::host_encoder::HostEncoder;
 use swm_models::lewm::step::{SigregConfig, TrainBatch, step};
@@ -41,7 +41,7 @@ impl Golden {
     }
 
     fn model(&self) -> Lewm {
-        let model = Lewm::init(&self.config(), self.size("action_dim"), &Init::new(Key::new(0), &Device::flex()));
+        let model = Lewm::init(&self.config(), self.size("action_dim"), &Init::new(Key::new(0), &crate::device()));
         let weights = self.group("w.");
         for (name, shape) in parameters::shapes(&model) {
             assert_eq!(weights.get(&name).map(|w| &w.shape), Some(&shape), "the shape of the published weight {name}");

@@ -12,7 +12,7 @@ mod tdmpc2;
 mod vit;
 mod weights;
 
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Tensor, TensorData};
 use safetensors::SafeTensors;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -57,7 +57,7 @@ impl Golden {
     pub fn tensor<const D: usize>(&self, name: &str) -> Tensor<D> {
         let host = self.get(name);
         let shape: [usize; D] = host.shape.clone().try_into().expect("a tensor of rank D");
-        Tensor::from_data(TensorData::new(host.values.clone(), shape), &Device::flex())
+        Tensor::from_data(TensorData::new(host.values.clone(), shape), &crate::device())
     }
 
     fn group(&self, prefix: &str) -> Named<HostTensor> {
@@ -102,7 +102,7 @@ impl Golden {
         let (host, grid) = (self.get(name), image / patch);
         let frames = host.values.len() / (3 * image * image);
         let frames_tensor =
-            Tensor::<1>::from_data(TensorData::new(host.values.clone(), [host.values.len()]), &Device::flex());
+            Tensor::<1>::from_data(TensorData::new(host.values.clone(), [host.values.len()]), &crate::device());
         frames_tensor.reshape([frames, 3, grid, patch, grid, patch]).permute([0, 2, 4, 1, 3, 5]).reshape([
             frames,
             grid * grid,

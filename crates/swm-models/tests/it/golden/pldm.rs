@@ -1,7 +1,6 @@
 //! PLDM: outputs, rollouts, costs, every term of the loss and gradients.
 
 use super::{Golden, TOLERANCE, check, error, files, values};
-use burn::tensor::Device;
 use swm_core::Key;
 use swm_models::lewm::step::TrainBatch;
 use swm_models::lewm::{EncoderConfig, LewmConfig, Rollout};
@@ -71,7 +70,7 @@ impl Golden {
     fn pldm(&self) -> Pldm {
         let (action_dim, hidden) = (self.size("action_dim"), self.size("idm_hidden"));
         let model =
-            Pldm::init(&self.world_model_config(), action_dim, hidden, &Init::new(Key::new(0), &Device::flex()));
+            Pldm::init(&self.world_model_config(), action_dim, hidden, &Init::new(Key::new(0), &crate::device()));
         let weights = self.group("w.");
         let published: Named<Vec<usize>> =
             weights.iter().map(|(name, weight)| (name.clone(), weight.shape.clone())).collect();

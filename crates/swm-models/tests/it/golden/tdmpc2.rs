@@ -1,7 +1,7 @@
 //! TD-MPC2: latents, predictions, values and costs; losses and gradients of a training step.
 
 use super::{Golden, TOLERANCE, check, error, files, values};
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Tensor;
 use swm_models::Checkpoint;
 use swm_models::nn::{DropoutRng, Ensemble, Named, parameters, two_hot};
 use swm_models::tdmpc2::step::{Draws, Tdmpc2Step, TrainBatch, step};
@@ -16,7 +16,7 @@ impl Golden {
 
     fn tdmpc2(&self) -> (Tdmpc2, Published) {
         let published = Published::read(&self.text).expect("reading the published configuration");
-        (published.with(&self.group("w."), &Device::flex()).expect("published weights"), published)
+        (published.with(&self.group("w."), &crate::device()).expect("published weights"), published)
     }
 }
 

@@ -2,7 +2,7 @@
 
 use super::{Golden, check, files, values};
 use burn::module::Module;
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Tensor;
 use swm_core::Key;
 use swm_models::nn::{Dino, DinoConfig, Init, Vit, VitConfig, parameters};
 
@@ -36,7 +36,7 @@ fn vit_tokens_equal_the_reference() {
             heads: size("heads"),
             mlp: size("mlp"),
         };
-        let vit = config.init(&Init::new(Key::new(0), &Device::flex()), size("image"));
+        let vit = config.init(&Init::new(Key::new(0), &crate::device()), size("image"));
         compare(&golden, vit, Vit::tokens);
     }
 }
@@ -56,6 +56,6 @@ fn dinov2_tokens_equal_the_reference() {
             grid: size("grid"),
             registers: size("registers"),
         };
-        compare(&golden, config.init(&Init::new(Key::new(0), &Device::flex())), Dino::tokens);
+        compare(&golden, config.init(&Init::new(Key::new(0), &crate::device())), Dino::tokens);
     }
 }

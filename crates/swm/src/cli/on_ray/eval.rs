@@ -38,7 +38,7 @@ pub fn run(command: &EvalCommand, context: &Context) -> anyhow::Result<()> {
     let videos = args.videos.is_some_and(|count| count > 0);
     let refused = [("--until", args.until.is_some()), ("--trace", args.trace), ("--videos", videos)];
     on.refuse(&refused, "remove it, or evaluate without --on")?;
-    let resolver = HomeResolver::new(Origin::User);
+    let resolver = HomeResolver::new(Origin::User).on(args.device.open()?);
     let request = args.request(&resolver, CapsuleStarts::Use)?;
     args.check_planning(&request)?;
     let options = eval::run_options(args.envs, None, context);

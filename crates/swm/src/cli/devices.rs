@@ -1,0 +1,52 @@
+//! `swm devices`: lists the devices that models can compute on; and opening the device of `--device`.
+
+use super::{emit, emit_json, eprint, table};
+use serde_json::json;
+use swm_core::Result;
+use swm_models::Device;
+use swm_models::device::{self, Choice, Kind};
+
+/// The flag `--device`.
+#[derive(clap::Args)]
+pub struct DeviceArgs {
+    /// Device of the models: cpu, vulkan[:I], cuda[:I] or auto
+    ///
+    /// `swm devices` lists them. auto is the first GPU that passes a test computation, else the CPU.
+    #[arg(long, default_value = "cpu")]
+    pub device: String,
+}
+
+/// Lists the devices, and what `auto` chooses.
+pub fn devices(as_json: bool) -> anyhow::Result<()> {
+    let all = device::list();
+    let Choice { description, .. } = device::choose("auto")?;
+    if as_json {
+        return emit_json(&json!({ "devices": all, "auto": description }));
+    }
+    let rows = all.into_iter().map(|found| {
+        let kind = if found.kind == Kind::Cpu { String::new() } else { found.kind.to_string() };
+        vec![found.id, kind, found.name, found.driver]
+    });
+    emit(&table(&["device", "kind", "name", "driver"], rows));
+    emit(&format!("auto: {description}\n"));
+    Ok(())
+}
+
+impl DeviceArgs {
+    /// Opens the device, and says which it is unless it is the CPU that was asked for.
+    ///
+    /// # Errors
+    /// As [`device::choose`].
+    pub fn open(&self) -> Result<Device> {
+        open(&self.device)
+    }
+}
+
+/// As [`DeviceArgs::open`], for the name of a device.
+pub fn open(name: &str) -> Result<Device> {
+    let Choice { device, description } = device::choose(name)?;
+    if name != "cpu" {
+        eprint(&format!("device: {description}\n"));
+    }
+    Ok(device)
+}

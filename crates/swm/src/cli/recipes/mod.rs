@@ -20,7 +20,9 @@ use swm_core::{Error, Origin, Result, files};
 const SHIPPED: &[(&str, &str)] = &[
     ("ogb-cube/gcbc", include_str!("../../../../../recipes/ogb-cube/gcbc.toml")),
     ("push-t/gcbc", include_str!("../../../../../recipes/push-t/gcbc.toml")),
+    ("reacher/lewm", include_str!("../../../../../recipes/reacher/lewm.toml")),
     ("two-room/lewm", include_str!("../../../../../recipes/two-room/lewm.toml")),
+    ("two-room/lewm-straight", include_str!("../../../../../recipes/two-room/lewm-straight.toml")),
     ("two-room/pldm", include_str!("../../../../../recipes/two-room/pldm.toml")),
 ];
 

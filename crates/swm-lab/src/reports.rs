@@ -1,4 +1,4 @@
-//! Results and studies: folders with a `results.json` or a `study.json`, and the page that the program makes of each.
+//! Results, studies and autopsies: folders with a `results.json`, a `study.json` or an `autopsy.json`, and the page of each.
 //!
 //! A page is shown in a frame of its own, whose policy permits no script, no connection, and no access to the lab.
 
@@ -25,6 +25,8 @@ pub enum Kind {
     Results,
     /// A `study.json`.
     Study,
+    /// An `autopsy.json`.
+    Autopsy,
 }
 
 impl Kind {
@@ -33,12 +35,13 @@ impl Kind {
         match self {
             Self::Results => "results.json",
             Self::Study => "study.json",
+            Self::Autopsy => "autopsy.json",
         }
     }
 
     /// What a folder holds; `None` for any other folder.
     fn of(path: &Path) -> Option<Self> {
-        [Self::Study, Self::Results].into_iter().find(|kind| path.join(kind.file()).is_file())
+        [Self::Autopsy, Self::Study, Self::Results].into_iter().find(|kind| path.join(kind.file()).is_file())
     }
 }
 

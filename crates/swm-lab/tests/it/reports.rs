@@ -37,6 +37,8 @@ fn reports_are_listed_and_cannot_reach_the_lab() {
     write("results/lewm/results.json", "<script>alert(1)</script>");
     write("studies/factors/study.json", "factors");
     write("studies/broken/results.json", "");
+    write("studies/why/autopsy.json", "why it fails");
+    write("studies/why/study.json", "the arms");
     write("datasets/raw/results.json", "no report");
     fs::create_dir_all(lab.home.path().join("secret")).expect("a folder");
     std::os::unix::fs::symlink("/etc", lab.home.path().join("results/link")).expect("a link");
@@ -49,7 +51,8 @@ fn reports_are_listed_and_cannot_reach_the_lab() {
         [
             row("results/lewm", "results", false),
             row("studies/broken", "results", true),
-            row("studies/factors", "study", false)
+            row("studies/factors", "study", false),
+            row("studies/why", "autopsy", false)
         ]
     );
     let mut stream = lab.connect();

@@ -9,7 +9,7 @@ import { type Params, patch, useLoaded } from "./state";
 interface Report {
   folder: number;
   name: string;
-  kind: "results" | "study";
+  kind: "results" | "study" | "autopsy";
   modified: number;
   title: string;
   lines: string[];
@@ -44,7 +44,7 @@ export function ReportsPage({ params }: { params: Params }) {
               <button type="button" aria-current={report === chosen} onClick={() => patch({ report: keyOf(report) })}>
                 <span>{report.name}</span>
                 <small>
-                  {report.kind === "study" ? "study, " : ""}
+                  {report.kind === "results" ? "" : `${report.kind}, `}
                   {report.title}, {ago(Date.now() / 1000 - report.modified)}
                 </small>
                 {report.lines.map((line) => (

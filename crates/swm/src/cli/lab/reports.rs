@@ -1,21 +1,45 @@
-//! The pages of results and studies in the lab: those of `swm report` and `swm study report`.
+//! The pages of results, studies and autopsies in the lab: those of `swm report`, `swm study report` and `swm autopsy`.
 
 use crate::cli::study;
 use crate::cli::training_curves::of_results;
+use serde::Deserialize;
 use std::path::Path;
-use swm_core::{Error, Result};
+use swm_core::results::Autopsy;
+use swm_core::{Error, Result, files};
 use swm_eval::{AnyStudy, StudyFolder};
 use swm_lab::reports::{Kind, Reports, Summary};
 use swm_report::ReportOptions;
 
+/// The largest page of an autopsy that is shown, in bytes.
+const MOST_BYTES: u64 = 64 << 20;
 /// Runs of results that a list shows.
 const MOST_LINES: usize = 8;
 
 /// Makes the pages of the command line.
 pub struct Pages;
 
+/// What a list shows of an `autopsy.json`.
+#[derive(Deserialize)]
+struct FoundAutopsy {
+    model: String,
+    env: String,
+    autopsy: Autopsy,
+}
+
+/// Summarises an autopsy.
+fn autopsy(file: &Path) -> Result<Summary> {
+    let damaged = |error| Error::corrupt(file, format!("is not an autopsy ({error})"), "run the autopsy again");
+    let found: FoundAutopsy = serde_json::from_slice(&files::read(file, MOST_BYTES)?).map_err(damaged)?;
+    let failures = format!("{} of {} starts fail", found.autopsy.repairs.len(), found.autopsy.starts);
+    let title = format!("{} in {}", found.model, found.env);
+    Ok(Summary { title, lines: vec![failures, found.autopsy.finding.to_string()] })
+}
+
 impl Reports for Pages {
     fn summary(&self, kind: Kind, folder: &Path) -> Result<Summary> {
+        if kind == Kind::Autopsy {
+            return autopsy(&folder.join(kind.file()));
+        }
         if kind == Kind::Study {
             let (found, cells) = (StudyFolder::new(folder).open()?, folder.join("cells"));
             let (title, count) = match &found {
@@ -36,6 +60,12 @@ impl Reports for Pages {
     }
 
     fn page(&self, kind: Kind, folder: &Path) -> Result<String> {
+        if kind == Kind::Autopsy {
+            // Its frames were rendered when it was made: the page is the stored one.
+            let page = folder.join("index.html");
+            let damaged = |error| Error::corrupt(&page, format!("is no text ({error})"), "run the autopsy again");
+            return String::from_utf8(files::read(&page, MOST_BYTES)?).map_err(damaged);
+        }
         if kind == Kind::Study {
             // The page of a study has files of figures beside it, which a page in the lab does not show.
             let scratch = tempfile::tempdir().map_err(|error| Error::external("making a folder for a page", error))?;

@@ -8,12 +8,16 @@
 use axum::http::{HeaderMap, HeaderValue, StatusCode, Uri, header};
 use rand::RngCore as _;
 use std::net::IpAddr;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
 use swm_core::{Error, Result};
 
 /// The shortest token that a user may choose, in characters.
 const SHORTEST: usize = 16;
 /// The longest token, in characters.
 const LONGEST: usize = 128;
+/// The time between two lines about refused requests.
+const QUIET: Duration = Duration::from_secs(1);
 
 /// The secret part of the lab's address.
 #[derive(Clone)]
@@ -62,6 +66,33 @@ pub struct Access {
     pub token: Token,
     /// Whether the server listens on a loopback address only.
     pub is_local: bool,
+    /// The refused requests, for the log.
+    pub refusals: Arc<Refusals>,
+}
+
+/// Counts refused requests, so that a flood of them writes one line a second.
+#[derive(Default)]
+pub struct Refusals(Mutex<Logged>);
+
+#[derive(Default)]
+struct Logged {
+    /// When the last line was written.
+    at: Option<Instant>,
+    /// How many requests had no line since.
+    left_out: usize,
+}
+
+impl Refusals {
+    /// Counts a request. Returns how many had no line before, if this one gets a line.
+    pub fn count(&self, now: Instant) -> Option<usize> {
+        let mut logged = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if logged.at.is_some_and(|at| now.saturating_duration_since(at) < QUIET) {
+            logged.left_out += 1;
+            return None;
+        }
+        logged.at = Some(now);
+        Some(std::mem::take(&mut logged.left_out))
+    }
 }
 
 /// Why a request is refused.
@@ -175,6 +206,15 @@ pub fn add_headers(headers: &mut HeaderMap) {
 mod tests {
     use super::*;
 
+    #[test]
+    fn a_flood_of_refusals_has_a_line_a_second() {
+        let (refusals, start) = (Refusals::default(), Instant::now());
+        assert_eq!(refusals.count(start), Some(0));
+        assert!((1..100).all(|i| refusals.count(start + Duration::from_millis(10 * i)).is_none()));
+        assert_eq!(refusals.count(start + Duration::from_secs(1)), Some(99));
+        assert_eq!(refusals.count(start + Duration::from_secs(3)), Some(0));
+    }
+
     fn check(access: &Access, uri: &str, headers: &[(&'static str, &str)]) -> std::result::Result<String, Refusal> {
         let mut map = HeaderMap::new();
         for (name, value) in headers {
@@ -186,7 +226,7 @@ mod tests {
     #[test]
     fn own_hosts_origins_and_the_token_are_accepted_only() {
         let token = Token::parse("0123456789abcdef").expect("a token");
-        let local = Access { token: token.clone(), is_local: true };
+        let local = Access { token: token.clone(), is_local: true, refusals: Arc::default() };
         let uri = "/0123456789abcdef/api/envs?x=1";
         for host in ["127.0.0.1:8000", "localhost:9", "[::1]:8000", "127.0.0.1"] {
             assert_eq!(check(&local, uri, &[("host", host)]), Ok("/api/envs?x=1".to_owned()), "{host}");
@@ -213,7 +253,7 @@ mod tests {
         for uri in ["/", "/api/envs", "/0123456789abcdee/api/envs", "/0123456789abcdef", "//0123456789abcdef/"] {
             assert_eq!(check(&local, uri, &[("host", "localhost")]), Err(Refusal::Token), "{uri}");
         }
-        let open = Access { token, is_local: false };
+        let open = Access { token, is_local: false, refusals: Arc::default() };
         assert!(check(&open, uri, &[("host", "10.0.0.1:8000")]).is_ok());
         assert_eq!(check(&open, uri, &[("host", "evil.example:8000")]), Err(Refusal::Host));
     }

@@ -3,6 +3,7 @@
 
 use crate::datasets::{self, Datasets};
 use crate::plans::{self, PlanSession};
+use crate::serve::PATIENCE;
 use crate::session::{self, Player, Running, Session, Setup, messages};
 use crate::still::StillQuery;
 use crate::trainings::{self, Trainings};
@@ -287,7 +288,8 @@ async fn doctor(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -
 
 /// Reads a body of JSON, up to [`MOST_BODY`]; `fields` names what it has.
 async fn body<T: DeserializeOwned>(request: Request, fields: &str) -> Result<T, Failed> {
-    let body = axum::body::to_bytes(request.into_body(), MOST_BODY).await;
+    let body = tokio::time::timeout(PATIENCE, axum::body::to_bytes(request.into_body(), MOST_BODY));
+    let body = body.await.map_err(|_| Error::config("the body", "it did not arrive", "send it at once"))?;
     let too_long = |error| Error::config("the body", format!("{error}"), format!("send at most {MOST_BODY} bytes"));
     let malformed = |error| Error::config("the body", format!("{error}"), format!("send {fields}"));
     Ok(serde_json::from_slice(&body.map_err(too_long)?).map_err(malformed)?)

@@ -66,10 +66,17 @@ pub struct Found {
 /// Returns the path of a dataset to write: a plain name in a folder.
 ///
 /// # Errors
-/// As [`check_name`].
+/// As [`check_name`], or when the dataset, or a part of it, is a symbolic link: what it names would be written elsewhere.
 pub fn new_dataset(folder: &Path, name: &str) -> Result<PathBuf> {
     check_name("the name of a dataset", name)?;
-    Ok(folder.join(format!("{name}.lance")))
+    let path = folder.join(format!("{name}.lance"));
+    let parts = std::fs::read_dir(&path).into_iter().flatten().flatten().map(|part| part.path());
+    let mut all = std::iter::once(path.clone()).chain(parts);
+    if let Some(link) = all.find(|path| path.symlink_metadata().is_ok_and(|metadata| metadata.is_symlink())) {
+        let problem = format!("{} is a symbolic link", link.display());
+        return Err(Error::config("the name of a dataset", problem, "choose another name"));
+    }
+    Ok(path)
 }
 
 /// Checks a plain name, which stays in its folder. `what` has it.
@@ -131,6 +138,21 @@ mod tests {
             assert!(folders.find(0, name, 2, wanted).is_err(), "{name}");
         }
         assert!(folders.find(1, "a", 2, wanted).is_err());
+    }
+
+    #[test]
+    fn links_are_no_new_datasets() {
+        let root = tempfile::tempdir().expect("a folder");
+        let (home, outside) = (root.path().join("home"), root.path().join("outside"));
+        fs::create_dir_all(home.join("own.lance")).expect("a folder");
+        fs::create_dir_all(&outside).expect("a folder");
+        assert!(new_dataset(&home, "own").is_ok());
+        std::os::unix::fs::symlink(&outside, home.join("linked.lance")).expect("a link");
+        std::os::unix::fs::symlink(&outside, home.join("own.lance/data")).expect("a link");
+        for name in ["linked", "own"] {
+            let error = new_dataset(&home, name).expect_err("a link").to_string();
+            assert!(error.contains("symbolic link"), "{error}");
+        }
     }
 
     #[test]

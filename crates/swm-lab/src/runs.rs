@@ -42,8 +42,9 @@ pub struct Lines {
     pub lines: Vec<Map<String, Value>>,
 }
 
+/// Whether a folder has a log, which is no link.
 fn is_run(path: &Path) -> bool {
-    path.join(LOG).is_file()
+    path.join(LOG).symlink_metadata().is_ok_and(|metadata| metadata.is_file())
 }
 
 /// The runs of the folders, sorted by name.
@@ -121,5 +122,10 @@ mod tests {
         fs::write(&log, "{\"step\": 1}\n").expect("a log");
         assert_eq!(lines(&folders, 0, "study/lewm", next.offset).expect("lines").lines.len(), 1);
         assert!(lines(&folders, 0, "../lewm", 0).is_err());
+        // A log that is a link is none.
+        fs::rename(&log, root.path().join("elsewhere")).expect("a log");
+        std::os::unix::fs::symlink(root.path().join("elsewhere"), &log).expect("a link");
+        assert!(lines(&folders, 0, "study/lewm", 0).is_err());
+        assert!(list(&folders).is_empty());
     }
 }

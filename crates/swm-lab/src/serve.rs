@@ -28,8 +28,8 @@ const CONNECTIONS: usize = 256;
 const HEAD: usize = 32 << 10;
 /// The largest number of headers of a request.
 const HEADERS: usize = 64;
-/// The time in which the head of a request has to arrive.
-const PATIENCE: Duration = Duration::from_secs(10);
+/// The time in which the head of a request has to arrive, and its body.
+pub const PATIENCE: Duration = Duration::from_secs(10);
 /// How often the server looks whether it is to stop.
 const POLL: Duration = Duration::from_millis(50);
 
@@ -70,7 +70,8 @@ pub fn serve(lab: Lab, options: &Options) -> Result<Server> {
     };
     let listener = runtime.block_on(TcpListener::bind(address)).map_err(failed)?;
     let address = listener.local_addr().map_err(failed)?;
-    let access = Access { token: options.token.clone(), is_local: options.address.is_loopback() };
+    let access =
+        Access { token: options.token.clone(), is_local: options.address.is_loopback(), refusals: Arc::default() };
     // Compressed before the first request.
     assets::all();
     Ok(Server { runtime, listener, address, access, lab })
@@ -168,15 +169,19 @@ async fn connection(stream: TcpStream, access: Access, router: Router) {
 fn check(access: &Access, request: Request<Incoming>) -> std::result::Result<Request<Body>, Refusal> {
     let checked = access.check(request.uri(), request.headers());
     let uri = checked.inspect_err(|refusal| {
-        // The path is left out: it may hold the token.
-        tracing::warn!("refused a {} request: {}", request.method(), refusal.message().trim_end());
+        if let Some(left_out) = access.refusals.count(Instant::now()) {
+            let others = if left_out == 0 { String::new() } else { format!(" ({left_out} others before)") };
+            // The path is left out: it may hold the token.
+            tracing::warn!("refused a {} request{others}: {}", request.method(), refusal.message().trim_end());
+        }
     })?;
     let mut request = request.map(Body::new);
     *request.uri_mut() = uri;
     Ok(request)
 }
 
-/// The answer to a refused request.
+/// The answer to a refused request, after which the connection is closed: a stranger holds none.
 fn refused(refusal: Refusal) -> Response {
-    (refusal.status(), [(header::CONTENT_TYPE, "text/plain; charset=utf-8")], refusal.message()).into_response()
+    let headers = [(header::CONTENT_TYPE, "text/plain; charset=utf-8"), (header::CONNECTION, "close")];
+    (refusal.status(), headers, refusal.message()).into_response()
 }

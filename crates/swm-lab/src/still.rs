@@ -86,11 +86,7 @@ impl Still {
     /// # Errors
     /// When a factor is unknown or out of bounds, the size is too large, or the renderer fails.
     pub fn render(&self, env: &mut dyn Env) -> Result<Vec<u8>> {
-        let (height, width) = self.size;
-        limits::IMAGE_SIDE.check(height.max(width))?;
-        if height.min(width) == 0 {
-            return Err(Error::config("frame size", format!("{height} x {width}"), "choose at least one pixel"));
-        }
+        let (height, width) = self.checked_size()?;
         let options = ResetOptions { variation: self.variation.clone(), ..ResetOptions::default() };
         env.reset(self.seed, &options)?;
         let mut rgb = vec![0; height * width * 3];
@@ -123,14 +119,24 @@ impl Still {
         Ok(bytes)
     }
 
+    /// Returns height and width.
+    fn checked_size(&self) -> Result<(usize, usize)> {
+        let (height, width) = self.size;
+        limits::IMAGE_SIDE.check(height.max(width))?;
+        if height.min(width) == 0 {
+            return Err(Error::config("frame size", format!("{height} x {width}"), "choose at least one pixel"));
+        }
+        Ok((height, width))
+    }
+
     /// The command line that writes this frame.
     ///
     /// # Errors
-    /// When a factor is unknown or a value is out of bounds: the command would fail.
+    /// When a factor is unknown, or a value or the size is out of bounds: the command would fail.
     pub fn command(&self, spec: &EnvSpec) -> Result<String> {
         spec.variation_space.check(&self.variation)?;
+        let (height, width) = self.checked_size()?;
         let mut command = format!("swm frame {} --seed {}", spec.id, self.seed);
-        let (height, width) = self.size;
         if self.size != (SIDE, SIDE) {
             command +=
                 &if height == width { format!(" --image {height}") } else { format!(" --image {height}x{width}") };
@@ -157,7 +163,7 @@ impl Still {
     /// As [`Still::command`].
     pub fn python(&self, spec: &EnvSpec) -> Result<String> {
         spec.variation_space.check(&self.variation)?;
-        let (height, width) = self.size;
+        let (height, width) = self.checked_size()?;
         let mut parts = spec.id.split(',');
         let id = parts.next().unwrap_or_default();
         let options: String =

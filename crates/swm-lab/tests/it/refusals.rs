@@ -54,7 +54,9 @@ fn paths_outside_the_folders_are_errors() {
     for query in
         ["image=100000", "image=0", "image=-1", "pin=agent.color=1", "pin=x", "seed=-1", "variation=nothing", "shell=1"]
     {
-        assert_eq!(lab.get(&format!("api/still?env=swm/PushT-v1&{query}")).0, 400, "{query}");
+        for route in ["still", "command"] {
+            assert_eq!(lab.get(&format!("api/{route}?env=swm/PushT-v1&{query}")).0, 400, "{route} {query}");
+        }
     }
 }
 
@@ -83,6 +85,24 @@ fn other_methods_and_long_heads_are_refused() {
     assert_eq!(lab.post("api/bench", "{}").0, 400, "only a benchmark takes measurements");
     assert_eq!(status("\0\u{1}garbage\r\n\r\n".to_owned()), "400");
     assert_eq!(lab.get("api/envs").0, 200, "the lab lives");
+}
+
+#[test]
+fn connections_without_the_token_are_not_held() {
+    let lab = TestLab::start();
+    // More connections than the lab holds; each sends many requests at once and reads no answer.
+    let requests = format!("GET /x/ HTTP/1.1\r\nHost: {}\r\n\r\n", lab.host()).repeat(2000);
+    let connections: Vec<_> = (0..300)
+        .map(|_| {
+            let mut stream = lab.connect();
+            stream.write_all(requests.as_bytes()).ok();
+            stream
+        })
+        .collect();
+    assert_eq!(lab.get("api/envs").0, 200, "the lab answers while they are open");
+    let mut answer = vec![];
+    (&connections[0]).read_to_end(&mut answer).ok();
+    assert!(String::from_utf8_lossy(&answer).matches("HTTP/1.1 403").count() <= 1, "an answer ends the connection");
 }
 
 #[test]

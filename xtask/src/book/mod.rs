@@ -44,7 +44,10 @@ pub fn book(root: &Path, folder: &Path) -> Result<()> {
     for page in groups.iter().flat_map(|group| &group.pages) {
         write(&source, &page.path, &page.text)?;
     }
-    std::fs::copy(root.join("docs/book.toml"), folder.join("book.toml")).context("copying docs/book.toml")?;
+    for name in ["book.toml", "book.css"] {
+        std::fs::copy(root.join("docs").join(name), folder.join(name))
+            .with_context(|| format!("copying docs/{name}"))?;
+    }
     build(folder)?;
     interfaces.write(&folder.join("book"))?;
     check::site(&folder.join("book"))?;

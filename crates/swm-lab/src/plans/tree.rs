@@ -63,7 +63,7 @@ pub struct Tree {
 }
 
 impl Tree {
-    /// A tree of one step. Its id is not used in this session before.
+    /// A tree of one step. Its id is new.
     pub fn new(root: Node, snapshot: Snapshot, id: usize) -> Self {
         let mut tree = Self { all: BTreeMap::new(), present: id, next: id, branches: 0, bytes: 0 };
         tree.insert(Node { parent: None, ..root }, snapshot);

@@ -7,6 +7,7 @@ import { nearest } from "./plan-search";
 import { type Branch, type Path, type Plans, pathTo, type Search } from "./plan-session";
 import { patch } from "./state";
 import { Choice } from "./transport";
+import { Values } from "./values";
 
 const SPEEDS = [1, 2, 5, 10, 20, 30, 60];
 // Sides of the drawing.
@@ -164,18 +165,5 @@ export function PlanReadout({ plans, limit }: { plans: Plans; limit: number }) {
     ["goal", header?.success ? "reached" : "not reached"],
     ["left of the plan", `${header?.left ?? 0} steps`],
   ];
-  return (
-    <dl class="readout">
-      {values.map(([name, value]) => (
-        <div key={name} class={name === "goal" && header?.success ? "is-success" : ""}>
-          <dt>{name}</dt>
-          <dd>{value}</dd>
-        </div>
-      ))}
-      <div class="state" title={header?.state.map(short).join(", ")}>
-        <dt>state</dt>
-        <dd>{header?.state.map(short).join(" ") ?? "–"}</dd>
-      </div>
-    </dl>
-  );
+  return <Values values={values} success={header?.success} state={header?.state} />;
 }

@@ -5,6 +5,7 @@ import type { Control } from "./control";
 import { short } from "./format";
 import type { Header } from "./session";
 import { patch } from "./state";
+import { Values } from "./values";
 
 const SIDES = [64, 96, 128, 224, 320, 448];
 const SPEEDS = [1, 5, 10, 20, 30, 60, 120];
@@ -91,18 +92,5 @@ export function Readout({ header, fps, limit }: { header?: Header; fps: number; 
     ["goal", header?.success ? "reached" : "not reached"],
     ["frames/s", String(header?.playing ? fps : 0)],
   ];
-  return (
-    <dl class="readout">
-      {values.map(([name, value]) => (
-        <div key={name} class={name === "goal" && header?.success ? "is-success" : ""}>
-          <dt>{name}</dt>
-          <dd>{value}</dd>
-        </div>
-      ))}
-      <div class="state" title={header?.state.map(short).join(", ")}>
-        <dt>state</dt>
-        <dd>{header?.state.map(short).join(" ") ?? "–"}</dd>
-      </div>
-    </dl>
-  );
+  return <Values values={values} success={header?.success} state={header?.state} />;
 }

@@ -255,6 +255,25 @@ pub fn delete_file(path: &Path) -> Result<()> {
     }
 }
 
+/// Deletes the temporary files that a kill during [`write`] leaves, of the files with these names. The caller holds the
+/// [`Lock`] of the folder: the temporary file of a writer that still runs looks the same.
+///
+/// # Errors
+/// When the folder cannot be read, or a file cannot be deleted.
+pub fn delete_temporary(folder: &Path, is_written: impl Fn(&str) -> bool) -> Result<()> {
+    let io = |error| Error::io(folder, "reading the folder", error);
+    for entry in std::fs::read_dir(folder).map_err(io)? {
+        let entry = entry.map_err(io)?;
+        let name = entry.file_name();
+        let parts = name.to_str().and_then(|name| name.strip_prefix('.')?.strip_suffix(".tmp")?.rsplit_once('.'));
+        let is_temporary = |(written, process): (&str, &str)| is_written(written) && process.parse::<u32>().is_ok();
+        if parts.is_some_and(is_temporary) {
+            delete_file(&entry.path())?;
+        }
+    }
+    Ok(())
+}
+
 /// Removes a folder if it exists and is empty. A symbolic link is no folder.
 ///
 /// # Errors
@@ -287,6 +306,19 @@ mod tests {
         let path = std::env::temp_dir().join(format!("swm-files-{name}-{}", std::process::id()));
         fs::create_dir_all(&path).expect("creating the folder");
         path
+    }
+
+    #[test]
+    fn temporary_files_of_killed_writers_are_deleted() {
+        let root = folder("temporary");
+        for name in [".results.json.12.tmp", ".results.json.x.tmp", ".thesis.12.tmp", "results.json"] {
+            fs::write(root.join(name), name).expect("writing a file");
+        }
+        delete_temporary(&root, |name| name == "results.json").expect("deleting");
+        let mut left: Vec<_> = fs::read_dir(&root).expect("reading").flatten().map(|entry| entry.file_name()).collect();
+        left.sort();
+        assert_eq!(left, [".results.json.x.tmp", ".thesis.12.tmp", "results.json"]);
+        fs::remove_dir_all(root).expect("cleaning up");
     }
 
     #[test]

@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use swm_core::columns::{self, ACTION};
+use swm_core::files::Lock;
 use swm_core::{Batch, ColumnSpec, DType, Schema};
 use swm_data::{
     FORMATS, Location, PreviewOptions, StepRange, WriteMode, WriteOptions, create, has_no_dataset, open, preview,
@@ -450,6 +451,10 @@ fn preview_replaces_only_its_own_files() {
         }
     }
     let out = folder.path().join("preview");
+    let other = Lock::folder(&out).expect("another preview");
+    let error = preview(&*reader, &out, &PreviewOptions::default(), |_| ()).expect_err("a folder of another preview");
+    assert!(error.to_string().contains("another process writes to it"), "{error}");
+    drop(other);
     for _ in 0..2 {
         preview(&*reader, &out, &PreviewOptions::default(), |_| ()).expect("a preview replaces its own files");
     }

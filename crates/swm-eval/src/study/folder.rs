@@ -40,7 +40,7 @@ impl StudyFolder {
     pub(super) fn create_with(&self, title: &str, until: Option<Until>, bytes: &[u8]) -> Result<Lock> {
         let (lock, path) = (Lock::folder(&self.root)?, self.root.join(STUDY));
         files::check_own(&path, |_| self.open().is_ok())?;
-        delete_temporary(&self.root, |name| [STUDY, IMAGE_DISTANCES].contains(&name))?;
+        files::delete_temporary(&self.root, |name| [STUDY, IMAGE_DISTANCES].contains(&name))?;
         let other = |problem: String| {
             Error::config(self.root.display().to_string(), problem, "give another folder with --output")
         };
@@ -66,7 +66,7 @@ impl StudyFolder {
         files::write(&path, bytes)?;
         let cells = self.root.join("cells");
         std::fs::create_dir_all(&cells).map_err(|error| Error::io(&cells, "creating the folder", error))?;
-        delete_temporary(&cells, |name| name.ends_with(".json"))?;
+        files::delete_temporary(&cells, |name| name.ends_with(".json"))?;
         Ok(lock)
     }
 
@@ -151,21 +151,6 @@ impl StudyFolder {
     pub(super) fn cell_path(&self, id: &str) -> PathBuf {
         self.root.join("cells").join(format!("{id}.json"))
     }
-}
-
-/// Deletes the temporary files that a kill during [`files::write`] leaves of the files with these names.
-fn delete_temporary(folder: &Path, is_written: impl Fn(&str) -> bool) -> Result<()> {
-    let io = |error| Error::io(folder, "reading the folder", error);
-    for entry in std::fs::read_dir(folder).map_err(io)? {
-        let entry = entry.map_err(io)?;
-        let name = entry.file_name();
-        let parts = name.to_str().and_then(|name| name.strip_prefix('.')?.strip_suffix(".tmp")?.rsplit_once('.'));
-        let is_temporary = |(written, process): (&str, &str)| is_written(written) && process.parse::<u32>().is_ok();
-        if parts.is_some_and(is_temporary) {
-            files::delete_file(&entry.path())?;
-        }
-    }
-    Ok(())
 }
 
 /// Whether results are those of the cell's request and inputs.

@@ -94,6 +94,11 @@ pub(super) fn decode(path: &Path, bytes: &[u8]) -> Result<Capsule> {
     let Document { checkpoint, manifest, description, evaluation, .. } =
         serde_json::from_value(document).map_err(|error| damaged(path, error.to_string()))?;
     let failed = |problem: String| damaged(path, problem);
+    // What is shown of a training is its manifest, what is loaded its configuration.
+    let shown = Some(&manifest.config).filter(|config| manifest.kind == "train" && !config.is_null());
+    if shown.is_some() && checkpoint.get("config") != shown {
+        return Err(failed("the configuration in its manifest differs from that of its checkpoint".to_owned()));
+    }
     let inputs = take_batch(&mut tensors, INPUT).map_err(failed)?;
     let inputs = inputs.ok_or_else(|| failed("it has no reference batch".to_owned()))?;
     let (starts, rows) =

@@ -67,6 +67,7 @@ impl InverseConfig {
     pub fn check(&self) -> Result<()> {
         check_finite(self)?;
         self.optim.check()?;
+        self.schedule.check()?;
         let OptimConfig { accumulate, ema, .. } = self.optim;
         if (accumulate, ema) != (1, 0.0) {
             let given = format!("accumulate={accumulate}, ema={ema}");

@@ -210,6 +210,7 @@ fn contradicting_tensors_are_refused() {
     refused(&|capsule| drop(capsule.manifest.hashes.remove("weights")), "hash of its weights");
     refused(&|capsule| capsule.checkpoint["family"] = json!("dreamer"), "dreamer");
     refused(&|capsule| capsule.checkpoint = Value::Null, "unknown");
+    refused(&|capsule| capsule.manifest.config = json!({ "seed": 7 }), "configuration in its manifest");
     let rows = |rows: usize| Batch::zeros(&Schema::new([ColumnSpec::new("x", DType::U8, [])]).expect("a schema"), rows);
     let evaluation = |starts: Batch| Some(Evaluation { record: json!({}), starts, rows: None });
     refused(&|capsule| capsule.evaluation = evaluation(rows(65)), "1 to 64 equal rows");

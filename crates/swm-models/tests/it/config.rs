@@ -29,6 +29,8 @@ fn errors_name_invalid_settings() {
     assert!(message("data.num_steps=1").contains("at least 2"));
     for setting in ["schedule.floor=-1", "schedule.floor=2"] {
         assert!(message(setting).contains("schedule.floor"), "{}", message(setting));
+        let inverse = swm_models::inverse::InverseConfig::load(&[setting.to_owned()]);
+        assert!(inverse.expect_err(setting).to_string().contains("schedule.floor"));
     }
     for setting in
         ["optim.clip=-1", "optim.clip=0", "optim.weight_decay=-1", "optim.betas=[2, 0.5]", "optim.betas=[0.9, 1]"]

@@ -7,7 +7,8 @@ use swm_core::files::{self, Lock};
 use swm_core::{Error, Result};
 
 /// Creates the folder that a command writes these files to, and keeps other writers away until the lock is dropped. A
-/// command calls this before its work, so that hours of it are not lost because its results cannot be written.
+/// command calls this before its work, so that hours of it are not lost because its results cannot be written. Deletes what a
+/// killed command left of writing these files.
 ///
 /// # Errors
 /// When the folder cannot be created or written to, another process writes to it, or one of the files exists and was not
@@ -20,6 +21,7 @@ pub fn claim(folder: &Path, names: &[&str]) -> Result<Lock> {
     let lock = Lock::folder(folder)?;
     check_writable(folder)?;
     check(folder, names)?;
+    files::delete_temporary(folder, |name| names.contains(&name))?;
     Ok(lock)
 }
 

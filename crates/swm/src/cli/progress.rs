@@ -18,29 +18,68 @@ const SHOWN_METRICS: usize = 4;
 
 /// Returns a control that shows the stages of a run and stops the run at Ctrl-C.
 pub fn control(context: &Context) -> Control<'static> {
-    let mut shown: Option<StageDisplay> = None;
+    let mut stages = Stages::default();
     Control::new().with_interrupt(Arc::clone(&context.interrupt)).with_events(move |event| match event {
-        Event::Started(stage) => {
-            shown = Some(StageDisplay::new(stage.name, stage.subject.join(", "), stage.total));
-        }
+        Event::Started(stage) => stages.start(stage.name, stage.subject.join(", "), stage.total),
         Event::Progress(progress) => {
-            let stage = shown.get_or_insert_with(|| StageDisplay::new(progress.stage, String::new(), progress.total));
+            let stage = stages.current(progress.stage, progress.total);
             let message = stage.message(&progress);
             stage.update(progress.done, message);
         }
         Event::Finished { stage, metrics } => {
-            // Dropping the display clears the bar, which must precede the summary.
-            let subject = shown.take().map(|finished| finished.subject.clone()).unwrap_or_default();
+            let subject = stages.finish(stage);
             if let Some(success) = success_rate(metrics) {
                 print_summary(stage, &format!("{subject}: {success}"));
             }
         }
         Event::Log(line) => {
             let print = || eprint(&format!("{line}\n"));
-            shown.as_ref().map_or_else(print, |stage| stage.bar.suspend(print));
+            stages.0.last().map_or_else(print, |stage| stage.bar.suspend(print));
         }
         _ => {}
     })
+}
+
+/// The stages that have started and not finished, the innermost last: a row of a study is a training or an evaluation with
+/// stages of its own. Only the innermost is shown.
+#[derive(Default)]
+struct Stages(Vec<StageDisplay>);
+
+impl Stages {
+    fn start(&mut self, name: &'static str, subject: String, total: usize) {
+        if let Some(outer) = self.0.last() {
+            outer.bar.set_draw_target(ProgressDrawTarget::hidden());
+        }
+        self.0.push(StageDisplay::new(name, subject, total));
+    }
+
+    /// Returns the stage of this name, without the stages inside it, which have ended. A stage that did not start starts.
+    fn current(&mut self, name: &'static str, total: usize) -> &mut StageDisplay {
+        if let Some(place) = self.0.iter().rposition(|stage| stage.name == name) {
+            self.0.truncate(place + 1);
+        } else {
+            self.start(name, String::new(), total);
+        }
+        let last = self.0.len() - 1;
+        let stage = &mut self.0[last];
+        if stage.bar.is_hidden() {
+            stage.bar.set_draw_target(draw_target());
+        }
+        stage
+    }
+
+    /// Clears a stage and those inside it, and returns its subject.
+    fn finish(&mut self, name: &str) -> String {
+        let Some(place) = self.0.iter().rposition(|stage| stage.name == name) else { return String::new() };
+        let subject = std::mem::take(&mut self.0[place].subject);
+        self.0.truncate(place);
+        subject
+    }
+}
+
+/// Where bars are drawn: nowhere unless standard error is a terminal.
+fn draw_target() -> ProgressDrawTarget {
+    if std::io::stderr().is_terminal() { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() }
 }
 
 /// Prints the summary of a finished stage.
@@ -67,8 +106,7 @@ impl StageDisplay {
     /// Shows a stage with `total` units of work.
     pub fn new(name: &'static str, subject: String, total: usize) -> Self {
         let is_terminal = std::io::stderr().is_terminal();
-        let target = if is_terminal { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
-        let bar = ProgressBar::with_draw_target(Some(total as u64), target);
+        let bar = ProgressBar::with_draw_target(Some(total as u64), draw_target());
         if let Ok(style) =
             ProgressStyle::with_template("{prefix:>9} {bar:20.cyan/dim} {pos}/{len} eta {eta} {wide_msg}")
         {
@@ -136,6 +174,22 @@ mod tests {
             [("loss", 0.5), ("validation_loss", 0.25), ("lr", 1e-3), ("clips_per_second", 12.0), ("data_wait", 0.5)];
         let progress = Progress { stage: "train", done: 1, total: 2, unit: "steps", metrics: &metrics };
         assert_eq!(training_message(&progress), "loss 0.5000, held out 0.2500, 12 clips/s, waits 50 %");
+    }
+
+    #[test]
+    fn a_stage_inside_another_keeps_counts_of_its_own() {
+        let mut stages = Stages::default();
+        stages.start("study", "drift".to_owned(), 4);
+        stages.start("evaluate", "actor".to_owned(), 20);
+        stages.current("evaluate", 20).update(20, String::new());
+        assert_eq!(stages.finish("evaluate"), "actor");
+        let study = stages.current("study", 4);
+        study.update(1, String::new());
+        assert_eq!((study.bar.position(), study.bar.length()), (1, Some(4)));
+        // A stage that failed did not finish.
+        stages.start("train", String::new(), 9);
+        assert_eq!((stages.finish("study").as_str(), stages.0.len()), ("drift", 0));
+        assert_eq!(stages.finish("study"), "");
     }
 
     #[test]

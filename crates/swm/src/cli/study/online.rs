@@ -5,6 +5,7 @@ use crate::cli::Context;
 use crate::home;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 use swm_core::results::{Counting, TableColumn};
@@ -30,6 +31,8 @@ pub(super) struct OnlineSettings {
     families: Vec<String>,
     /// The preset of every family.
     preset: String,
+    /// More settings of the training configuration, by family.
+    train: BTreeMap<String, Vec<String>>,
     /// Training seeds.
     seeds: Vec<u64>,
     /// Optimizer steps.
@@ -48,6 +51,7 @@ impl Default for OnlineSettings {
             envs: vec![],
             families: vec!["tdmpc2".to_owned(), "sac".to_owned()],
             preset: "tiny".to_owned(),
+            train: BTreeMap::new(),
             seeds: vec![0],
             steps: 6000,
             warmup: 800,
@@ -57,11 +61,13 @@ impl Default for OnlineSettings {
     }
 }
 
-/// The columns: the random policy's return, and that of each evaluation.
+/// The columns: the random policy's return, that of each evaluation, and the published one.
 pub(super) fn columns() -> Vec<TableColumn> {
     let column = |name: String| TableColumn { name, unit: "return".to_owned(), published: false };
     let after = |i: usize| column(format!("after {} %", 100 * i / EVALUATIONS));
-    std::iter::once(column("random policy".to_owned())).chain((1..=EVALUATIONS).map(after)).collect()
+    let published = TableColumn { published: true, ..column("published".to_owned()) };
+    let random = std::iter::once(column("random policy".to_owned()));
+    random.chain((1..=EVALUATIONS).map(after)).chain([published]).collect()
 }
 
 impl OnlineSettings {
@@ -75,8 +81,12 @@ impl OnlineSettings {
             crate::env(env, chosen.by("envs"))?;
         }
         chosen.check_preset(&self.preset)?;
+        if let Some(family) = self.train.keys().find(|family| !self.families.contains(family)) {
+            let families = self.families.iter().map(String::as_str);
+            return Err(Error::unknown("family", family, families, "train has settings of the families of the study"));
+        }
         for family in &self.families {
-            let config = (FAMILIES.get(family)?.config)(&self.preset, &self.overrides(0))?;
+            let config = (FAMILIES.get(family)?.config)(&self.preset, &self.overrides(family, 0))?;
             drop(config);
         }
         if self.steps == 0 || !self.steps.is_multiple_of(EVALUATIONS) || self.episodes == 0 {
@@ -87,27 +97,28 @@ impl OnlineSettings {
         Ok(())
     }
 
-    /// A row for each environment, family and training seed.
-    pub(super) fn cells(&self) -> Vec<TableCell> {
+    /// A row for each environment, family and training seed. `published` returns the values of a row without its seed.
+    pub(super) fn cells(&self, published: impl Fn(&str) -> Vec<Option<f64>>) -> Vec<TableCell> {
         let mut cells = vec![];
         for env in &self.envs {
             for family in &self.families {
+                let run = format!("{}, {family}", short(env));
                 for seed in &self.seeds {
                     let seeded = if self.seeds.len() > 1 { format!(", seed {seed}") } else { String::new() };
                     cells.push(TableCell {
-                        name: format!("{}, {family}{seeded}", short(env)),
+                        name: format!("{run}{seeded}"),
                         request: json!({
                             "kind": "online",
                             "env": env,
                             "family": family,
                             "preset": self.preset,
                             "seed": seed,
-                            "settings": self.overrides(*seed),
+                            "settings": self.overrides(family, *seed),
                             "episodes": self.episodes,
                             "max-steps": self.max_steps,
                             "version": env!("CARGO_PKG_VERSION"),
                         }),
-                        published: vec![],
+                        published: published(&run),
                     });
                 }
             }
@@ -116,9 +127,9 @@ impl OnlineSettings {
     }
 
     /// The settings of the training configuration.
-    fn overrides(&self, seed: u64) -> Vec<String> {
+    fn overrides(&self, family: &str, seed: u64) -> Vec<String> {
         let every = self.steps / EVALUATIONS;
-        vec![
+        let own = [
             format!("seed={seed}"),
             format!("schedule.steps={}", self.steps),
             format!("log_every={every}"),
@@ -126,7 +137,8 @@ impl OnlineSettings {
             format!("online.warmup={}", self.warmup),
             format!("online.evaluate_every={every}"),
             format!("online.evaluate_episodes={}", self.episodes),
-        ]
+        ];
+        self.train.get(family).into_iter().flatten().cloned().chain(own).collect()
     }
 }
 
@@ -173,13 +185,10 @@ pub(super) fn measure(cell: &TableCell, context: &Context, control: &mut Control
         cache: home::weights()?,
         ..TrainOptions::default()
     };
-    let mut inner = Control::new().with_poll(|| control.check());
-    let Some(summary) = config.train_online(OnlineRun { environments: &environments, out: &out, options }, &mut inner)
-    else {
+    let Some(summary) = config.train_online(OnlineRun { environments: &environments, out: &out, options }, control) else {
         let problem = format!("{} trains on datasets only", text("family"));
         return Err(Error::config("families", problem, "give tdmpc2 or sac"));
     };
-    drop(inner);
     if summary?.interrupted {
         return Err(Error::Interrupted);
     }
@@ -242,9 +251,15 @@ mod tests {
     fn settings_that_no_run_can_have_are_errors() {
         let settings = OnlineSettings { envs: vec!["swm/PendulumControl-v1".to_owned()], ..OnlineSettings::default() };
         settings.check(&Chosen::by_user()).expect("settings");
-        assert_eq!(settings.cells().len(), 2);
+        let cells = settings.cells(|run| vec![(run == "PendulumControl-v1, sac").then_some(-150.0)]);
+        assert_eq!(cells.iter().map(|cell| cell.published[0]).collect::<Vec<_>>(), [None, Some(-150.0)]);
+        let train = |family: &str| [(family.to_owned(), vec!["model.hidden=8".to_owned()])].into();
+        let own = OnlineSettings { train: train("sac"), ..settings.clone() };
+        own.check(&Chosen::by_user()).expect("settings of a family");
+        assert_eq!(own.cells(|_| vec![None])[1].request["settings"][0], "model.hidden=8");
         for (wrong, part) in [
             (OnlineSettings { steps: 7, ..settings.clone() }, "multiple of 5"),
+            (OnlineSettings { train: train("lewm"), ..settings.clone() }, "unknown family 'lewm'"),
             (OnlineSettings { families: vec!["sax".to_owned()], ..settings.clone() }, "sac"),
             (
                 OnlineSettings { envs: vec!["swm/PendulumControl-v2".to_owned()], ..settings.clone() },

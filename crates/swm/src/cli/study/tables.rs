@@ -162,7 +162,7 @@ impl TableFile {
             TableKind::Online => {
                 let settings: OnlineSettings = settings_of(merged)?;
                 settings.check(&chosen)?;
-                ("run", online::columns(), settings.cells())
+                ("run", online::columns(), settings.cells(|run| self.published_of(run, 1)))
             }
             TableKind::Drift => {
                 let settings: DriftSettings = settings_of(merged)?;

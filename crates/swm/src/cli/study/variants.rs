@@ -125,13 +125,21 @@ fn size(variables: &BTreeMap<String, String>) -> usize {
     variables.iter().map(|(name, value)| 2 * TEXT_OVERHEAD + name.len() + value.len()).sum()
 }
 
-/// Replaces every `{NAME}` of a text by the value of the variable, in one pass: a `{NAME}` in a value stays as it is.
+/// Replaces every `{NAME}` of a text by the value of the variable, in one pass: a `{NAME}` in a value stays as it is, and so
+/// do braces around anything but a name, such as those of a setting.
+///
+/// # Errors
+/// When no variable has such a name, or the texts are too long.
 fn fill(text: &str, variables: &BTreeMap<String, String>, budget: &mut Budget, at: &str) -> Result<String> {
     budget.take(TEXT_OVERHEAD, at)?;
     let (mut filled, mut rest) = (String::new(), text);
     while let Some((head, tail)) = rest.split_once('}') {
-        let place = head.rsplit_once('{').and_then(|(before, name)| Some((before, variables.get(name)?.as_str())));
-        let (before, value) = place.unwrap_or((head, "}"));
+        let (before, value) = match head.rsplit_once('{') {
+            Some((before, name)) if is_name(name) => {
+                (before, variables.get(name).ok_or_else(|| unknown(name, variables, at))?.as_str())
+            }
+            _ => (head, "}"),
+        };
         budget.take(before.len() + value.len(), at)?;
         filled.push_str(before);
         filled.push_str(value);
@@ -142,9 +150,36 @@ fn fill(text: &str, variables: &BTreeMap<String, String>, budget: &mut Budget, a
     Ok(filled)
 }
 
+/// Whether a text in braces is meant as the name of a variable.
+fn is_name(text: &str) -> bool {
+    text.starts_with(|c: char| c.is_ascii_alphabetic())
+        && text.chars().all(|c| c.is_ascii_alphanumeric() || ['-', '_', '.'].contains(&c))
+}
+
+fn unknown(name: &str, variables: &BTreeMap<String, String>, at: &str) -> Error {
+    let known = variables.keys().map(String::as_str);
+    Error::unknown(
+        "variable",
+        name,
+        known,
+        format!("{at} has '{{{name}}}'; variables are declared by each = {{ NAME = [VALUE, VALUE] }}"),
+    )
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_unknown_variable_is_an_error_with_the_nearest_name() {
+        let variables = BTreeMap::from([("colour".to_owned(), "red".to_owned())]);
+        let error = |text: &str, variables: &BTreeMap<_, _>| {
+            fill(text, variables, &mut Budget::default(), "study.toml:7").expect_err(text).to_string()
+        };
+        let misspelt = error("agent.color={color}", &variables);
+        assert!(misspelt.contains("study.toml:7") && misspelt.contains("did you mean colour?"), "{misspelt}");
+        assert!(error("{x}", &BTreeMap::new()).contains("each = "));
+    }
 
     #[test]
     fn variables_are_replaced_once() {
@@ -154,9 +189,10 @@ mod tests {
         for (text, expected) in [
             ("{a}{b} {b}", "{b}1 1"),
             ("{{b}}", "{1}"),
-            ("{d} }{ {b", "{d} }{ {b"),
+            ("{d=1} }{ {b", "{d=1} }{ {b"),
             ("{a{b}c}", "{a1c}"),
             ("{b{c}", "{b}"),
+            ("{}{2}", "{}{2}"),
             ("", ""),
             ("é{b}é", "é1é"),
         ] {

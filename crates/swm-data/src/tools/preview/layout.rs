@@ -134,8 +134,12 @@ fn kind(column: &ColumnSpec) -> Option<&'static str> {
     }
 }
 
-/// Returns the pixels of a row.
-fn in_colour(column: &ColumnSpec, bytes: &[u8]) -> Vec<[u8; 3]> {
+/// Returns the pixels of a value of a column: of an image, or colours of depth (from the nearest to the farthest of the value) and of
+/// segmentation.
+///
+/// # Shapes
+/// `bytes` are those of one row; the result is `[height * width]`.
+pub fn in_colour(column: &ColumnSpec, bytes: &[u8]) -> Vec<[u8; 3]> {
     let values = bytes.as_chunks::<4>().0;
     match kind(column) {
         Some(DEPTH) => colours::depths(&values.iter().map(|value| f32::from_ne_bytes(*value)).collect::<Vec<_>>()),

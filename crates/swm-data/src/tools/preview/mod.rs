@@ -8,6 +8,7 @@ mod layout;
 mod sheet;
 mod video;
 
+pub use layout::in_colour;
 pub use sheet::contact_sheet;
 pub(crate) use video::VideoFile;
 pub use video::{check_mp4, integer_scale, write_mp4, write_mp4_scaled};
@@ -15,6 +16,7 @@ pub use video::{check_mp4, integer_scale, write_mp4, write_mp4_scaled};
 use crate::dataset::{Reader, StepRange};
 use layout::FrameLayout;
 use std::path::{Path, PathBuf};
+use swm_core::files::Lock;
 use swm_core::{Error, Result, limits};
 use swm_image::{check_png, write_png};
 
@@ -47,8 +49,9 @@ const ROWS: usize = 32;
 /// `progress` with the number of finished episodes.
 ///
 /// # Errors
-/// If the dataset has no images, lacks one of the columns or is damaged, the contact sheet would be too large, one of the
-/// files exists and was not written by this program, or the folder cannot be written.
+/// If the dataset has no images, lacks one of the columns or is damaged, the contact sheet would be too large, another
+/// process writes to the folder, one of the files exists and was not written by this program, or the folder cannot be
+/// written.
 pub fn preview(
     reader: &dyn Reader,
     folder: &Path,
@@ -60,10 +63,11 @@ pub fn preview(
     limits::SHEET_BYTES.check(limits::product([chosen.len(), SHEET_COLUMNS, layout.width, layout.height, 3]))?;
     let video_of = |episode: usize| folder.join(format!("episode_{}.mp4", reader.episodes()[episode].index));
     let contact_sheet_path = folder.join("contact_sheet.png");
+    // Two previews would take the half-written files of the other for files of the user.
+    let _lock = Lock::folder(folder)?;
     // Before any work, so that a refusal leaves no part of a preview.
     chosen.iter().try_for_each(|&episode| check_mp4(&video_of(episode)))?;
     check_png(&contact_sheet_path)?;
-    std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, "creating the folder", e))?;
     let (mut written, mut sheet) = (vec![], vec![]);
     for (done, &episode) in chosen.iter().enumerate() {
         let index = reader.episodes()[episode].index;

@@ -65,6 +65,8 @@ enum Planes {
     Grey,
     /// Green, blue and red planes.
     Gbr,
+    /// One plane of pixels of four bytes: blue, green, red and an unused one.
+    Bgrz,
 }
 
 /// Returns the layout of the 8-bit formats that are converted directly, and whether samples use the full range. Frames
@@ -79,6 +81,7 @@ fn planes(format: Pixel) -> Option<(Planes, bool)> {
         Pixel::YUVJ444P => (Planes::Yuv(0, 0), true),
         Pixel::GRAY8 => (Planes::Grey, false),
         Pixel::GBRP => (Planes::Gbr, true),
+        Pixel::BGRZ => (Planes::Bgrz, true),
         _ => return None,
     })
 }
@@ -98,7 +101,7 @@ pub fn to_rgb(frame: &frame::Video, width: usize, height: usize, out: &mut [u8])
     }
     let matrix = Matrix::new(frame.color_space(), full || frame.color_range() == Range::JPEG);
     let plane = |i: usize| Plane { bytes: frame.data(i), stride: frame.stride(i) };
-    let chroma_step = if planes == Planes::Grey { 0 } else { 1 };
+    let chroma_step = if matches!(planes, Planes::Grey | Planes::Bgrz) { 0 } else { 1 };
     convert(&matrix, planes, &[plane(0), plane(chroma_step), plane(2 * chroma_step)], width, out);
     true
 }
@@ -130,7 +133,7 @@ vectorize! {
 fn convert_rows(matrix: &Matrix, kind: Planes, planes: &[Plane<'_>; 3], width: usize, out: &mut [u8]) {
     let [first, second, third] = *planes;
     for (t, out) in out.chunks_exact_mut(width * 3).enumerate() {
-        let row = first.row(t, width);
+        let row = first.row(t, if kind == Planes::Bgrz { width * 4 } else { width });
         match kind {
             Planes::Yuv(0, down) => {
                 let (u, v) = (second.row(t >> down, width), third.row(t >> down, width));
@@ -142,6 +145,7 @@ fn convert_rows(matrix: &Matrix, kind: Planes, planes: &[Plane<'_>; 3], width: u
             }
             Planes::Grey => grey_row(matrix, row, out),
             Planes::Gbr => interleave(third.row(t, width), row, second.row(t, width), out),
+            Planes::Bgrz => reorder(row, out),
         }
     }
 }
@@ -149,6 +153,13 @@ fn convert_rows(matrix: &Matrix, kind: Planes, planes: &[Plane<'_>; 3], width: u
 #[inline(always)]
 fn interleave(r: &[u8], g: &[u8], b: &[u8], out: &mut [u8]) {
     for (((out, r), g), b) in out.as_chunks_mut::<3>().0.iter_mut().zip(r).zip(g).zip(b) {
+        *out = [*r, *g, *b];
+    }
+}
+
+#[inline(always)]
+fn reorder(bgrz: &[u8], out: &mut [u8]) {
+    for (out, [b, g, r, _]) in out.as_chunks_mut::<3>().0.iter_mut().zip(bgrz.as_chunks::<4>().0) {
         *out = [*r, *g, *b];
     }
 }
@@ -212,13 +223,21 @@ fn clamp(value: i16, fraction: u32) -> u8 {
 }
 
 /// Converts RGB pixels to a frame of [`Pixel::YUV420P`] (BT.601, 16 to 235) or [`Pixel::YUV444P`], or copies them to
-/// a frame of [`Pixel::RGB24`]. A shared chroma sample is the mean over its pixels.
+/// a frame of [`Pixel::RGB24`] or [`Pixel::BGRZ`]. A shared chroma sample is the mean over its pixels.
 pub fn from_rgb(rgb: &[u8], frame: &mut frame::Video) {
     let (width, height) = (frame.width() as usize, frame.height() as usize);
     let rows = rgb.chunks_exact(width * 3);
     if frame.format() == Pixel::RGB24 {
         let stride = frame.stride(0);
         frame.data_mut(0).chunks_mut(stride).zip(rows).for_each(|(to, from)| to[..from.len()].copy_from_slice(from));
+        return;
+    }
+    if frame.format() == Pixel::BGRZ {
+        let stride = frame.stride(0);
+        for (to, from) in frame.data_mut(0).chunks_mut(stride).zip(rows) {
+            let pixels = to.as_chunks_mut::<4>().0.iter_mut().zip(from.as_chunks::<3>().0);
+            pixels.for_each(|(to, [r, g, b])| *to = [*b, *g, *r, 0]);
+        }
         return;
     }
     let (red, blue) = luma_weights(Space::Unspecified);

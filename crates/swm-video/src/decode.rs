@@ -2,6 +2,7 @@
 //! is decoded once, and runs are decoded in parallel.
 
 use crate::colour;
+use crate::header;
 use crate::mp4::{self, Codec, Index};
 use crate::reducer::Reducer;
 use ffmpeg_next::codec::{self, Compliance, Flags, threading};
@@ -270,6 +271,7 @@ impl Decoder {
             Codec::Hevc => codec::Id::HEVC,
             Codec::Vp9 => codec::Id::VP9,
             Codec::Av1 => codec::Id::AV1,
+            Codec::Ffv1 => codec::Id::FFV1,
         };
         // FFmpeg's own AV1 decoder needs special hardware.
         let named = (index.codec == Codec::Av1).then(|| decoder::find_by_name("libdav1d")).flatten();
@@ -280,7 +282,7 @@ impl Decoder {
             ));
         };
         let mut context = codec::Context::new_with_codec(found);
-        set_extradata(&mut context, &index.extradata);
+        header::set(&mut context, index);
         // One thread, because runs are decoded in parallel. Strict compliance, because otherwise FFmpeg assumes that
         // frames are not reordered when a stream does not state the reordering depth. Damaged frames are errors and are
         // not concealed.
@@ -291,8 +293,7 @@ impl Decoder {
         context.set_flags(Flags::OUTPUT_CORRUPT);
         let mut decoder = context.decoder();
         decoder.check(Check::CRC | Check::BITSTREAM | Check::BUFFER | Check::EXPLODE);
-        // Damaged headers may state any size. Encoded frames are padded to whole blocks, so the limit exceeds the frame
-        // size.
+        // Damaged headers may state any size. The limit exceeds that of frames, which are padded to whole blocks.
         let mut options = Dictionary::new();
         options.set("max_pixels", &((index.width + 256) * (index.height + 256)).to_string());
         let inner = decoder.open_as_with(found, options).and_then(|opened| opened.video());
@@ -402,28 +403,6 @@ impl Decoder {
             duplicates.iter_mut().for_each(|job| job.out.copy_from_slice(out));
             *missing = missing.saturating_sub(end - begin);
         }
-    }
-}
-
-/// Passes the codec parameters from the file's header to the decoder.
-#[allow(unsafe_code, reason = "sets a field of FFmpeg's context that `ffmpeg-next` does not offer")]
-fn set_extradata(context: &mut codec::Context, bytes: &[u8]) {
-    if bytes.is_empty() {
-        return;
-    }
-    let Ok(length) = i32::try_from(bytes.len()) else { return };
-    // `ffmpeg-next` sets `extradata` only when libavformat, whose parsers must not read damaged files, opens the file.
-    // SAFETY: the memory comes from FFmpeg's allocator, has the zeroed padding that decoders read, is filled within its
-    // length, and then belongs to the context, which frees it. The context is not open yet and has no extradata.
-    unsafe {
-        let memory = ffi::av_mallocz(bytes.len() + ffi::AV_INPUT_BUFFER_PADDING_SIZE as usize).cast::<u8>();
-        if memory.is_null() {
-            return;
-        }
-        std::ptr::copy_nonoverlapping(bytes.as_ptr(), memory, bytes.len());
-        let context = context.as_mut_ptr();
-        (*context).extradata = memory;
-        (*context).extradata_size = length;
     }
 }
 

@@ -1,4 +1,5 @@
-//! Encoding of frames as an MP4 file with H.264.
+//! Encoding of frames as an MP4 file: H.264 by x264, or by OpenH264 where FFmpeg was built without parts under the GPL; lossless
+//! frames then as FFV1.
 
 use crate::colour;
 use crate::mp4;
@@ -51,25 +52,69 @@ impl Encoding {
         Self { quality: Quality::Crf(18), gop: 250, small: true }
     }
 
-    /// Returns the name of the encoder, its pixel format and its options.
-    fn settings(self, even: bool) -> (&'static str, Pixel, Vec<(&'static str, String)>) {
-        let pixels = if even { Pixel::YUV420P } else { Pixel::YUV444P };
+    /// Returns the settings of the encoders that can be used, the preferred one first.
+    fn candidates(self, width: usize, height: usize) -> Vec<Settings> {
         match self.quality {
-            // Encodes RGB without conversion to YUV.
-            Quality::Lossless => {
-                ("libx264rgb", Pixel::RGB24, vec![("qp", "0".to_owned()), ("preset", "veryfast".to_owned())])
-            }
+            Quality::Lossless => vec![Settings::x264_lossless(width, height), Settings::ffv1(width, height)],
             Quality::Crf(crf) => {
-                let mut options = vec![("crf", crf.to_string()), ("preset", "medium".to_owned())];
-                if let Some(instructions) = instruction_set() {
-                    options.push(("x264-params", format!("asm={instructions}")));
-                }
-                if !self.small {
-                    options.push(("tune", "fastdecode".to_owned()));
-                }
-                ("libx264", pixels, options)
+                let open = Settings::open_h264(crf, width, height);
+                // Training data keep their size, and people's players know no FFV1.
+                let open =
+                    if self.small || open.size == (width, height) { open } else { Settings::ffv1(width, height) };
+                vec![Settings::x264(crf, self.small, width, height), open]
             }
         }
+    }
+}
+
+/// An encoder with its settings.
+#[derive(Clone, Debug)]
+struct Settings {
+    encoder: &'static str,
+    pixels: Pixel,
+    /// FFmpeg's writer of the file. That of `mp4` knows no FFV1; `mov` differs in the names of brands.
+    container: &'static str,
+    /// Width and height of the encoded frames, whose last rows and columns are repeated where frames are smaller.
+    size: (usize, usize),
+    options: Vec<(&'static str, String)>,
+}
+
+impl Settings {
+    /// Encodes RGB without conversion to YUV.
+    fn x264_lossless(width: usize, height: usize) -> Self {
+        let options = vec![("qp", "0".to_owned()), ("preset", "veryfast".to_owned())];
+        Self { encoder: "libx264rgb", pixels: Pixel::RGB24, container: "mp4", size: (width, height), options }
+    }
+
+    fn x264(crf: u8, small: bool, width: usize, height: usize) -> Self {
+        let even = width.is_multiple_of(2) && height.is_multiple_of(2);
+        let mut options = vec![("crf", crf.to_string()), ("preset", "medium".to_owned())];
+        if let Some(instructions) = instruction_set() {
+            options.push(("x264-params", format!("asm={instructions}")));
+        }
+        if !small {
+            options.push(("tune", "fastdecode".to_owned()));
+        }
+        let pixels = if even { Pixel::YUV420P } else { Pixel::YUV444P };
+        Self { encoder: "libx264", pixels, container: "mp4", size: (width, height), options }
+    }
+
+    /// A constant quantiser, which is what a constant rate factor is on average. OpenH264 takes even sides of at least 16 pixels.
+    fn open_h264(crf: u8, width: usize, height: usize) -> Self {
+        let quantiser = crf.clamp(1, 51).to_string();
+        let options = vec![("rc_mode", "quality".to_owned()), ("qmin", quantiser.clone()), ("qmax", quantiser)];
+        let side = |pixels: usize| pixels.max(16).next_multiple_of(2);
+        let size = (side(width), side(height));
+        Self { encoder: "libopenh264", pixels: Pixel::YUV420P, container: "mp4", size, options }
+    }
+
+    /// Version 3 with checksums. Small frames are one slice, which makes them smaller; FFmpeg divides larger ones.
+    fn ffv1(width: usize, height: usize) -> Self {
+        let mut options = vec![("level", "3".to_owned()), ("slicecrc", "1".to_owned())];
+        if width <= 352 && height <= 288 {
+            options.push(("slices", "1".to_owned()));
+        }
+        Self { encoder: "ffv1", pixels: Pixel::BGRZ, container: "mov", size: (width, height), options }
     }
 }
 
@@ -124,6 +169,8 @@ pub struct Encoder {
     output: format::context::Output,
     file: Memory,
     frame: frame::Video,
+    /// Width and height of the given frames.
+    given: (usize, usize),
     packet: Packet,
     /// Time units of the encoder and of the file.
     units: [Rational; 2],
@@ -131,27 +178,46 @@ pub struct Encoder {
 
 impl Encoder {
     /// Begins a video of `width` × `height` pixels.
+    ///
+    /// # Errors
+    /// When FFmpeg lacks an encoder of this quality, or the encoder refuses the settings.
     pub fn new(width: usize, height: usize, fps: u32, encoding: Encoding) -> Result<Self> {
         crate::prepare();
-        let even = width.is_multiple_of(2) && height.is_multiple_of(2);
-        let (name, pixels, settings) = encoding.settings(even);
-        let Some(codec) = encoder::find_by_name(name) else {
-            let problem = format!("this machine's FFmpeg has no encoder {name}; install an FFmpeg that has it");
+        let candidates = encoding.candidates(width, height);
+        let Some(settings) = candidates.iter().find(|settings| encoder::find_by_name(settings.encoder).is_some())
+        else {
+            let names: Vec<&str> = candidates.iter().map(|settings| settings.encoder).collect();
+            let names = names.join(" or ");
+            let problem = format!("this machine's FFmpeg has no encoder {names}; install an FFmpeg that has one");
             return Err(Error::external("encoding a video", problem));
         };
+        Self::with(settings, width, height, fps, encoding)
+    }
+
+    /// Begins a video with an encoder.
+    fn with(settings: &Settings, width: usize, height: usize, fps: u32, encoding: Encoding) -> Result<Self> {
+        let name = settings.encoder;
+        if name == "ffv1" && width.min(height) < 2 {
+            // FFmpeg writes black frames, without an error.
+            let problem = format!("{width} x {height} pixels, and FFV1 stores no side of a single pixel");
+            return Err(Error::config("video", problem, "use larger frames, or a format without videos"));
+        }
+        let codec = encoder::find_by_name(name);
+        let codec =
+            codec.ok_or_else(|| Error::external("encoding a video", format!("FFmpeg has no encoder {name}")))?;
         let side = |n: usize| {
             u32::try_from(n).map_err(|_| Error::config("video", format!("a side of {n} pixels"), "use smaller frames"))
         };
-        let (wide, high) = (side(width)?, side(height)?);
+        let (wide, high) = (side(settings.size.0)?, side(settings.size.1)?);
         let file = Memory::default();
         let stream = format::context::StreamIo::from_write_seek(file.clone()).map_err(failed)?;
-        let mut output = format::output_to_stream(stream, None, Some("mp4")).map_err(failed)?;
+        let mut output = format::output_to_stream(stream, None, Some(settings.container)).map_err(failed)?;
         let mut context = codec::Context::new_with_codec(codec).encoder().video().map_err(failed)?;
         context.set_width(wide);
         context.set_height(high);
-        context.set_format(pixels);
+        context.set_format(settings.pixels);
         // Players guess the colour space from the frame size unless the file states it.
-        if pixels != Pixel::RGB24 {
+        if ![Pixel::RGB24, Pixel::BGRZ].contains(&settings.pixels) {
             context.set_colorspace(Space::SMPTE170M);
             context.set_color_range(Range::MPEG);
         }
@@ -166,7 +232,7 @@ impl Encoder {
         context.set_threading(threading::Config::count(1));
         context.set_flags(Flags::BITEXACT | Flags::GLOBAL_HEADER);
         let mut options = Dictionary::new();
-        settings.iter().for_each(|(key, value)| options.set(key, value));
+        settings.options.iter().for_each(|(key, value)| options.set(key, value));
         let encoder = context.open_as_with(codec, options).map_err(failed)?;
         let mut stream = output.add_stream_with(&encoder).map_err(failed)?;
         stream.set_time_base(rate.invert());
@@ -175,15 +241,21 @@ impl Encoder {
         options.set("fflags", "+bitexact");
         drop(output.write_header_with(options).map_err(failed)?);
         let unit = output.stream(0).map_or(rate.invert(), |stream| stream.time_base());
-        let frame = frame::Video::new(pixels, wide, high);
-        Ok(Self { encoder, output, file, frame, packet: Packet::empty(), units: [rate.invert(), unit] })
+        let frame = frame::Video::new(settings.pixels, wide, high);
+        let units = [rate.invert(), unit];
+        Ok(Self { encoder, output, file, frame, given: (width, height), packet: Packet::empty(), units })
     }
 
     /// Adds the next frame, `[height, width, 3]` bytes. `index` counts frames from 0.
     pub fn add_frame(&mut self, rgb: &[u8], index: i64) -> Result<()> {
         // The encoder may still use the last frame's memory.
         let mut frame = frame::Video::new(self.frame.format(), self.frame.width(), self.frame.height());
-        colour::from_rgb(rgb, &mut frame);
+        let size = (frame.width() as usize, frame.height() as usize);
+        if size == self.given {
+            colour::from_rgb(rgb, &mut frame);
+        } else {
+            colour::from_rgb(&enlarged(rgb, self.given, size), &mut frame);
+        }
         frame.set_pts(Some(index));
         self.frame = frame;
         self.encoder.send_frame(&self.frame).map_err(failed)?;
@@ -220,6 +292,12 @@ impl Encoder {
     }
 }
 
+/// Returns frames of a larger size, `[height, width, 3]`, whose last rows and columns are repeated.
+fn enlarged(rgb: &[u8], (width, height): (usize, usize), (wide, high): (usize, usize)) -> Vec<u8> {
+    let pixel = |x: usize, y: usize| &rgb[(y.min(height - 1) * width + x.min(width - 1)) * 3..][..3];
+    (0..wide * high).flat_map(|at| pixel(at % wide, at / wide)).copied().collect()
+}
+
 /// A file in memory that FFmpeg writes to.
 #[derive(Clone, Default)]
 struct Memory(Arc<Mutex<Cursor<Vec<u8>>>>);
@@ -243,5 +321,80 @@ impl Write for Memory {
 impl Seek for Memory {
     fn seek(&mut self, to: SeekFrom) -> std::io::Result<u64> {
         self.lock().seek(to)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{DecoderPool, FrameRequest, Source, Video};
+
+    fn test_frames(width: usize, height: usize) -> Vec<Vec<u8>> {
+        let at = |frame: usize, i: usize| [i % width * 4 + frame, i / width * 4, (i * i + frame * 7) % 251];
+        (0..11).map(|frame| (0..width * height).flat_map(|i| at(frame, i).map(|value| value as u8)).collect()).collect()
+    }
+
+    /// Encodes frames with an encoder, and returns the size of the video and its decoded frames in an order that seeks.
+    fn decoded(settings: &Settings, width: usize, height: usize, encoding: Encoding) -> ((usize, usize), Vec<Vec<u8>>) {
+        let mut encoder = Encoder::with(settings, width, height, 25, encoding).expect("the encoder");
+        for (index, frame) in (0..).zip(test_frames(width, height)) {
+            encoder.add_frame(&frame, index).expect("a frame");
+        }
+        let file = encoder.finish().expect("the file");
+        let video = Video::open(Source::Memory("a.mp4".into(), file.into())).expect("the video");
+        let size = video.size();
+        let mut frames = vec![vec![0; size.0 * size.1 * 3]; video.frames()];
+        let requests = frames.iter_mut().enumerate().rev();
+        let requests = requests.map(|(frame, out)| FrameRequest { video: &video, frame, out }).collect();
+        DecoderPool::default().read(requests).expect("the frames");
+        (size, frames)
+    }
+
+    #[test]
+    fn ffv1_is_lossless_at_every_size() {
+        for (width, height) in [(64, 64), (63, 33), (2, 3), (17, 2), (400, 300)] {
+            let encoding = Encoding::training(ImageCodec::Qoi);
+            let (size, frames) = decoded(&Settings::ffv1(width, height), width, height, encoding);
+            assert_eq!(size, (height, width));
+            assert!(frames == test_frames(width, height), "{width} x {height}");
+        }
+        crate::prepare();
+        let encoding = Encoding::training(ImageCodec::Qoi);
+        let refused = Encoder::with(&Settings::ffv1(1, 5), 1, 5, 25, encoding).err().map(|error| error.to_string());
+        assert!(refused.is_some_and(|error| error.contains("1 x 5 pixels")));
+    }
+
+    #[test]
+    fn open_h264_is_close_and_enlarges_odd_sizes() {
+        crate::prepare();
+        if encoder::find_by_name("libopenh264").is_none() {
+            return;
+        }
+        for (width, height, encoded) in [(64, 48, (48, 64)), (63, 9, (16, 64))] {
+            let (size, frames) = decoded(
+                &Settings::open_h264(18, width, height),
+                width,
+                height,
+                Encoding { quality: Quality::Crf(18), ..Encoding::viewing() },
+            );
+            assert_eq!((size, frames.len()), (encoded, 11));
+            // The slow part of the test frames is red and green; blue is noise.
+            let given = &test_frames(width, height)[5];
+            let error = |i: usize| {
+                let (x, y) = (i % width, i / width);
+                given[i * 3 + 1].abs_diff(frames[5][(y * size.1 + x) * 3 + 1])
+            };
+            let worst = (0..width * height).map(error).max();
+            assert!(worst < Some(60), "{worst:?}");
+        }
+    }
+
+    #[test]
+    fn training_data_keep_odd_sizes_without_x264() {
+        let odd = Encoding::training(ImageCodec::Jpeg { quality: 95 }).candidates(63, 64);
+        assert_eq!(odd[1].encoder, "ffv1");
+        let even = Encoding::training(ImageCodec::Jpeg { quality: 95 }).candidates(64, 64);
+        assert_eq!((even[1].encoder, even[1].size), ("libopenh264", (64, 64)));
+        assert_eq!(Encoding::viewing().candidates(63, 64)[1].size, (64, 64));
     }
 }

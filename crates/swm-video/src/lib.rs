@@ -11,6 +11,7 @@ mod cache;
 mod colour;
 mod decode;
 mod encode;
+mod header;
 mod mp4;
 mod reducer;
 

@@ -21,6 +21,7 @@ pub enum Codec {
     Hevc,
     Vp9,
     Av1,
+    Ffv1,
 }
 
 /// An encoded frame, which MP4 calls a sample.
@@ -339,8 +340,12 @@ fn description(stsd: &[u8]) -> Result<(Codec, Arc<[u8]>, usize, usize)> {
         b"hvc1" | b"hev1" => (Codec::Hevc, b"hvcC"),
         b"vp09" => (Codec::Vp9, b"vpcC"),
         b"av01" => (Codec::Av1, b"av1C"),
+        b"FFV1" => (Codec::Ffv1, b"glbl"),
         other => {
-            return Err(format!("has the codec '{}', which is none of H.264, H.265, VP9, AV1", other.escape_ascii()));
+            return Err(format!(
+                "has the codec '{}', which is none of H.264, H.265, VP9, AV1, FFV1",
+                other.escape_ascii()
+            ));
         }
     };
     let (fixed, boxes) = entry.split_at_checked(ENTRY).ok_or("has a codec description that is cut short")?;

@@ -100,6 +100,7 @@ pub fn routes(shared: Shared) -> Router {
     Router::new()
         .route("/api/envs", get(envs))
         .route("/api/env", get(env))
+        .route("/api/wrappers", get(wrappers))
         .route("/api/still", get(still))
         .route("/api/command", get(command))
         .route("/api/live", get(open::<Player>))
@@ -173,6 +174,11 @@ async fn env(State(shared): State<Shared>, Query(query): Query<EnvQuery>) -> Ans
     as_json(&described.await?)
 }
 
+/// The wrappers that a page may choose.
+async fn wrappers(State(shared): State<Shared>) -> Answer {
+    as_json(&shared.lab.wrapping.listed())
+}
+
 /// The models and the solvers that fit an environment, the solvers with their defaults.
 async fn planners(State(shared): State<Shared>, Query(query): Query<EnvQuery>) -> Answer {
     let listed = shared.work(move |shared| {
@@ -183,13 +189,19 @@ async fn planners(State(shared): State<Shared>, Query(query): Query<EnvQuery>) -
 }
 
 async fn still(State(shared): State<Shared>, Query(query): Query<StillQuery>) -> Answer {
-    let png = shared.work(move |shared| query.still()?.png(&mut *shared.env(&query.env)?.env()?)).await?;
-    Ok(answer("image/png", png))
+    let png = shared.work(move |shared| {
+        let still = query.still()?;
+        still.png(&mut *still.rendering.env(&shared.env(&query.env)?, &*shared.lab.wrapping)?)
+    });
+    Ok(answer("image/png", png.await?))
 }
 
 async fn command(State(shared): State<Shared>, Query(query): Query<StillQuery>) -> Answer {
-    let text = shared.work(move |shared| query.still()?.command(shared.env(&query.env)?.env()?.spec())).await?;
-    Ok(answer("text/plain; charset=utf-8", text))
+    let text = shared.work(move |shared| {
+        let still = query.still()?;
+        still.command(still.rendering.env(&shared.env(&query.env)?, &*shared.lab.wrapping)?.spec())
+    });
+    Ok(answer("text/plain; charset=utf-8", text.await?))
 }
 
 /// Upgrades to the socket of a session: a live environment, or plans in one.

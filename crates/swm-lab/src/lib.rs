@@ -3,6 +3,7 @@
 //! - [`serve`](fn@serve): the server. It listens on the loopback address, and answers requests that carry its token only
 //!   ([`access`]).
 //! - [`still`]: one frame of an environment as PNG, the same bytes as `swm frame` writes.
+//! - [`rendering`]: which camera view of an environment is shown, and the wrappers of its frames.
 //! - [`session`]: a live environment behind a WebSocket, which a policy or a person drives, and whose episodes can be recorded.
 //! - [`plans`]: a live environment that a solver plans in, whose searches are shown, and whose steps are a tree to go back in.
 //! - [`datasets`], [`distribution`] and [`runs`]: what the pages of datasets and of training curves show, from [`folders`] that the lab was
@@ -20,6 +21,7 @@ pub mod datasets;
 pub mod distribution;
 pub mod folders;
 pub mod plans;
+pub mod rendering;
 pub mod reports;
 pub mod runs;
 pub mod serve;
@@ -43,6 +45,8 @@ pub type MakePolicy = fn(&EnvEntry, &str, &World) -> Result<Box<dyn Policy>>;
 pub struct Lab {
     /// The environments.
     pub envs: &'static Registry<EnvEntry>,
+    /// The wrappers of their frames.
+    pub wrapping: Box<dyn rendering::Wrapping>,
     /// The policies that drive them.
     pub policy: MakePolicy,
     /// The models that plan.

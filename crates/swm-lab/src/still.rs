@@ -1,8 +1,9 @@
 //! One frame of an environment at the start of an episode, as PNG: what `swm frame` writes and the lab shows.
 
+use crate::rendering::Rendering;
 use serde::Deserialize;
 use std::collections::BTreeMap;
-use swm_core::{Env, EnvSpec, Error, FrameMut, ResetOptions, Result, VariationRequest, limits};
+use swm_core::{Env, EnvSpec, Error, ResetOptions, Result, VariationRequest, limits};
 
 /// The side of a frame in pixels, unless a request says otherwise.
 pub const SIDE: usize = 224;
@@ -18,6 +19,8 @@ pub struct Still {
     pub goal: bool,
     /// Height and width in pixels.
     pub size: (usize, usize),
+    /// The camera view and the wrappers.
+    pub rendering: Rendering,
 }
 
 /// A still as the query of a URL: `seed=1&image=224&pin=agent.color=1,2,3;agent.speed=2&variation=all`.
@@ -39,13 +42,21 @@ pub struct StillQuery {
     /// Whether to show the goal.
     #[serde(default)]
     pub goal: bool,
+    /// The camera view: `CAMERA`, `depth`, `segmentation` or `CAMERA:depth`.
+    pub view: Option<String>,
+    /// Wrappers, `NAME[,KEY=VALUE…]`, separated by `;`.
+    #[serde(default)]
+    pub wrappers: String,
+    /// Whether wrappers change the goal, too.
+    #[serde(default)]
+    pub wrap_goal: bool,
 }
 
 impl StillQuery {
     /// Returns the still.
     ///
     /// # Errors
-    /// When a pin is malformed.
+    /// When a pin is malformed, or as [`Rendering::parse`].
     pub fn still(&self) -> Result<Still> {
         let side = self.image.unwrap_or(SIDE);
         Ok(Still {
@@ -53,6 +64,7 @@ impl StillQuery {
             variation: request(&self.pin, self.variation.as_deref())?,
             goal: self.goal,
             size: (side, side),
+            rendering: Rendering::parse(self.view.as_deref(), &self.wrappers, self.wrap_goal)?,
         })
     }
 }
@@ -78,7 +90,7 @@ pub fn request(pins: &str, variation: Option<&str>) -> Result<VariationRequest> 
 }
 
 impl Still {
-    /// Renders the frame.
+    /// Renders the frame of an environment that [`Rendering::env`] made.
     ///
     /// # Shapes
     /// The result is `[height, width, 3]` bytes.
@@ -89,14 +101,7 @@ impl Still {
         let (height, width) = self.checked_size()?;
         let options = ResetOptions { variation: self.variation.clone(), ..ResetOptions::default() };
         env.reset(self.seed, &options)?;
-        let mut rgb = vec![0; height * width * 3];
-        let frame = FrameMut::new(width, height, &mut rgb);
-        if self.goal {
-            env.render_goal(frame)?
-        } else {
-            env.render(frame)?
-        }
-        Ok(rgb)
+        self.rendering.render(env, self.goal, (height, width))
     }
 
     /// Renders the frame as PNG. Equal stills give equal bytes.
@@ -144,6 +149,7 @@ impl Still {
         if self.goal {
             command += " --goal";
         }
+        command += &self.rendering.options();
         match self.variation.variation.as_deref() {
             None => {}
             Some([]) => command += " --variation none",
@@ -157,11 +163,14 @@ impl Still {
         Ok(command + " --output frame.png")
     }
 
-    /// The Python program whose `frame` has the pixels of this frame.
+    /// The Python program whose `frame` has the pixels of this frame; `None` for a frame of another view or with wrappers.
     ///
     /// # Errors
     /// As [`Still::command`].
-    pub fn python(&self, spec: &EnvSpec) -> Result<String> {
+    pub fn python(&self, spec: &EnvSpec) -> Result<Option<String>> {
+        if self.rendering != Rendering::default() {
+            return Ok(None);
+        }
         spec.variation_space.check(&self.variation)?;
         let (height, width) = self.checked_size()?;
         let mut parts = spec.id.split(',');
@@ -184,9 +193,9 @@ impl Still {
         let reset = if reset.is_empty() { String::new() } else { format!(", options={{{}}}", reset.join(", ")) };
         let render = if self.goal { "env.unwrapped.render_goal()" } else { "env.render()" };
         let head = "import gymnasium\nimport stable_worldmodel\n\n";
-        Ok(format!(
+        Ok(Some(format!(
             "{head}env = gymnasium.make(\"{id}\"{options}{size})\nenv.reset(seed={}{reset})\nframe = {render}\n",
             self.seed
-        ))
+        )))
     }
 }

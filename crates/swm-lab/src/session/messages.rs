@@ -8,7 +8,7 @@ use swm_core::{EnvEntry, EnvSpec};
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Request {
-    /// Starts an episode. `pin` and `variation` have the form of [`crate::still::StillQuery`].
+    /// Starts an episode. All fields have the form of [`crate::still::StillQuery`].
     Reset {
         /// The seed.
         seed: u64,
@@ -18,6 +18,15 @@ pub enum Request {
         /// Factors to sample; the environment's defaults if left out.
         #[serde(default)]
         variation: Option<String>,
+        /// The camera view; the colour of the default camera if left out.
+        #[serde(default)]
+        view: Option<String>,
+        /// Wrappers of the frames.
+        #[serde(default)]
+        wrappers: String,
+        /// Whether wrappers change the goal, too.
+        #[serde(default)]
+        wrap_goal: bool,
     },
     /// Steps at the chosen speed, or stops.
     Play {
@@ -68,8 +77,8 @@ pub enum Reply {
         factors: serde_json::Map<String, serde_json::Value>,
         /// The command that writes the first frame.
         command: String,
-        /// The Python program that renders it.
-        python: String,
+        /// The Python program that renders it; none for another view or with wrappers.
+        python: Option<String>,
     },
     /// What is recorded.
     Recording {
@@ -117,8 +126,15 @@ mod tests {
     fn unknown_messages_and_fields_are_errors() {
         let parse = |text: &str| serde_json::from_str::<Request>(text).ok();
         assert_eq!(parse(r#"{"type": "play", "on": true}"#), Some(Request::Play { on: true }));
-        let reset = Request::Reset { seed: 7, pin: "a=1".to_owned(), variation: None };
-        assert_eq!(parse(r#"{"type": "reset", "seed": 7, "pin": "a=1"}"#), Some(reset));
+        let reset = Request::Reset {
+            seed: 7,
+            pin: "a=1".to_owned(),
+            variation: None,
+            view: Some("depth".to_owned()),
+            wrappers: String::new(),
+            wrap_goal: false,
+        };
+        assert_eq!(parse(r#"{"type": "reset", "seed": 7, "pin": "a=1", "view": "depth"}"#), Some(reset));
         for text in [
             "",
             "[]",

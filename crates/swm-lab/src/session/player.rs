@@ -3,6 +3,7 @@
 use super::messages::{Reply, Request};
 use super::recorder::Recorder;
 use super::{Frame, Kind, Out, Session, Setup, check_seed};
+use crate::rendering::{Rendering, colours};
 use crate::{Lab, still};
 use serde_json::{Value, json};
 use std::sync::Arc;
@@ -33,6 +34,7 @@ pub struct Player<'a> {
     hand: Vec<f64>,
     seed: u64,
     variation: VariationRequest,
+    rendering: Rendering,
     playing: bool,
     interval: Duration,
     total: f64,
@@ -67,13 +69,8 @@ impl<'a> Player<'a> {
     /// When the environment lacks assets, or the frame size is out of range.
     pub fn new(lab: &'a Lab, setup: Setup, out: Out) -> Result<Self> {
         limits::IMAGE_SIDE.check(setup.side)?;
-        let config = WorldConfig {
-            envs: 1,
-            image: Some((setup.side, setup.side)),
-            threads: lab.threads,
-            ..WorldConfig::default()
-        };
-        let world = World::new(setup.env.clone(), config)?;
+        let rendering = Rendering::default();
+        let world = world(lab, &setup, &rendering)?;
         let hand = at_rest(&world.spec().action_space);
         let mut player = Self {
             lab,
@@ -83,6 +80,7 @@ impl<'a> Player<'a> {
             hand,
             seed: 0,
             variation: VariationRequest::default(),
+            rendering,
             playing: false,
             interval: Duration::from_secs_f64(1.0 / FPS),
             total: 0.0,
@@ -130,10 +128,11 @@ impl<'a> Player<'a> {
 
     fn handle(&mut self, request: Request) -> Result<()> {
         match request {
-            Request::Reset { seed, pin, variation } => {
+            Request::Reset { seed, pin, variation, view, wrappers, wrap_goal } => {
                 let variation = still::request(&pin, variation.as_deref())?;
                 self.world.spec().variation_space.check(&variation)?;
                 check_seed(seed)?;
+                self.render_as(Rendering::parse(view.as_deref(), &wrappers, wrap_goal)?)?;
                 (self.seed, self.variation) = (seed, variation);
                 self.reset()
             }
@@ -183,13 +182,40 @@ impl<'a> Player<'a> {
         }
     }
 
+    /// Renders in this way from now on. What cannot be rendered leaves the environment as it is.
+    fn render_as(&mut self, rendering: Rendering) -> Result<()> {
+        if rendering == self.rendering {
+            return Ok(());
+        }
+        if self.recorder.is_some() {
+            let problem = "a recording has one camera view and one stack of wrappers";
+            return Err(Error::config("the view", problem, "finish the recording first"));
+        }
+        let mut world = world(self.lab, &self.setup, &rendering)?;
+        // Environments check camera views when they render.
+        world.restart(&[Reset { slot: 0, seed: self.seed, options: ResetOptions::default() }])?;
+        (self.world, self.rendering) = (world, rendering);
+        Ok(())
+    }
+
     /// Records from now on; another recording is ended.
     fn record(&mut self, dataset: &str) -> Result<()> {
         let no_folder = || Error::config("recording", "the lab has no folder of datasets", "set STABLEWM_HOME");
         let folder = self.lab.datasets.paths().first().ok_or_else(no_folder)?;
         self.recorder.take().map_or(Ok(()), Recorder::finish)?;
-        self.recorder = Some(Recorder::start(folder, dataset, &self.world)?);
+        self.recorder = Some(Recorder::start(folder, dataset, &self.world, &self.settings()?)?);
         self.reset()
+    }
+
+    /// What the manifest of a recording says of its wrappers.
+    fn settings(&self) -> Result<serde_json::Map<String, Value>> {
+        let Rendering { wrappers, wrap_goal, .. } = &self.rendering;
+        let mut settings = serde_json::Map::new();
+        if !wrappers.is_empty() {
+            settings.insert("wrappers".to_owned(), self.lab.wrapping.manifest(wrappers)?);
+            settings.insert("wrap_goal".to_owned(), json!(wrap_goal));
+        }
+        Ok(settings)
     }
 
     fn report_recording(&self) {
@@ -232,8 +258,13 @@ impl<'a> Player<'a> {
             recorder.begin(&self.world, self.seed);
         }
         let (spec, side) = (self.world.spec(), self.setup.side);
-        let still =
-            still::Still { seed: self.seed, variation: self.variation.clone(), goal: false, size: (side, side) };
+        let still = still::Still {
+            seed: self.seed,
+            variation: self.variation.clone(),
+            goal: false,
+            size: (side, side),
+            rendering: self.rendering.clone(),
+        };
         let factors = self.world.pool().env(0).factors();
         self.out.reply(&Reply::Started {
             seed: self.seed,
@@ -276,10 +307,11 @@ impl<'a> Player<'a> {
         self.number += 1;
         let header = self.header()?.to_string();
         let infos = self.world.pool().infos();
-        let pixels = infos.bytes(infos.schema().index(columns::PIXELS)?);
+        let column = infos.schema().index(&self.rendering.column())?;
+        let pixels = colours(&infos.schema().columns()[column], infos.bytes(column));
         let mut bytes = u32::try_from(header.len()).unwrap_or_default().to_le_bytes().to_vec();
         bytes.extend(header.as_bytes());
-        ImageCodec::Jpeg { quality: QUALITY }.encode(pixels, self.setup.side, self.setup.side, &mut bytes)?;
+        ImageCodec::Jpeg { quality: QUALITY }.encode(&pixels, self.setup.side, self.setup.side, &mut bytes)?;
         self.out.frames.send_replace(Arc::new(Frame { bytes }));
         Ok(())
     }
@@ -303,6 +335,18 @@ impl<'a> Player<'a> {
             "state": state,
         }))
     }
+}
+
+/// Makes the environment that is shown in this way.
+fn world(lab: &Lab, setup: &Setup, rendering: &Rendering) -> Result<World> {
+    let config = WorldConfig {
+        envs: 1,
+        image: Some((setup.side, setup.side)),
+        views: rendering.views(),
+        threads: lab.threads,
+        ..WorldConfig::default()
+    };
+    World::of(|| rendering.env(&setup.env, &*lab.wrapping), config)
 }
 
 /// The error of a request about a recording when there is none.

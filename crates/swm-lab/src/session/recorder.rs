@@ -1,6 +1,7 @@
 //! Demonstrations: the episodes that are played in a session, stored in a dataset with the columns of a collection.
 
 use crate::folders::new_dataset;
+use serde_json::{Map, Value};
 use std::path::Path;
 use swm_core::columns::{self, ColumnIndices};
 use swm_core::{Batch, DType, Error, Manifest, Result, Schema};
@@ -23,11 +24,12 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// Begins to record into a dataset, which is created, or continued if it was recorded in the same environment.
+    /// Begins to record into a dataset, which is created, or continued if it was recorded in the same environment. `settings` are
+    /// further ones of its manifest.
     ///
     /// # Errors
     /// When the name is invalid, or names a dataset that was not recorded in this environment.
-    pub fn start(folder: &Path, name: &str, world: &World) -> Result<Self> {
+    pub fn start(folder: &Path, name: &str, world: &World, settings: &Map<String, Value>) -> Result<Self> {
         let path = new_dataset(folder, name)?;
         let config = CollectConfig::default();
         let mut manifest = Manifest { kind: KIND.to_owned(), ..world.collect_manifest(&config) };
@@ -35,6 +37,9 @@ impl Recorder {
             manifest.config.as_object_mut().and_then(|config| config.remove(setting));
         }
         manifest.config["policy"] = serde_json::json!("demonstrations");
+        for (key, value) in settings {
+            manifest.config[key] = value.clone();
+        }
         let location = Location::from(path.clone());
         if path.exists() && !swm_data::has_no_dataset(&path) {
             check_own(&location, &manifest)?;
@@ -118,7 +123,7 @@ impl Recorder {
         Ok(())
     }
 
-    /// Stores the episode in progress.
+    /// Stores the episode in progress, and waits until it is stored.
     ///
     /// # Errors
     /// When there is no step to store, or writing fails.
@@ -145,6 +150,8 @@ impl Recorder {
             self.rows.row_mut(row).set(seed_column, &columns::split_seed(seed));
         }
         self.writer.write_episode_with(&self.rows, &world.pool().env(0).constants())?;
+        // What the page calls kept survives a kill.
+        self.writer.sync()?;
         self.discard();
         Ok(())
     }

@@ -51,6 +51,13 @@ fn requests_that_fail_say_why_and_leave_the_environment_as_it_is() {
         (json!({"type": "reset", "seed": u64::MAX}), "choose at most"),
         (json!({"type": "act", "action": [2.0, 0.0]}), "outside its space"),
         (json!({"type": "act", "action": [0.0]}), "outside its space"),
+        (json!({"type": "reset", "seed": 1, "view": "depth"}), "cannot render depth"),
+        (json!({"type": "reset", "seed": 1, "view": "top:deep"}), "camera modality"),
+        (json!({"type": "reset", "seed": 1, "wrappers": "blurr"}), "did you mean blur"),
+        (json!({"type": "reset", "seed": 1, "wrappers": "noise,std=$(ls)"}), "outside its space"),
+        (json!({"type": "reset", "seed": 1, "wrappers": "chroma-key,media=/etc/passwd,key_color=1/2/3"}), "reads files"),
+        (json!({"type": "reset", "seed": 1, "wrappers": "blur;".repeat(65)}), "number of wrappers"),
+        (json!({"type": "reset", "seed": 1, "view": "top", "wrappers": "blur"}), "wrappers do not change the view"),
         (json!({"type": "speed", "fps": 0.0}), "steps a second"),
         (json!({"type": "record", "dataset": "../escape"}), "is not one"),
         (json!({"type": "keep"}), "nothing is recorded"),
@@ -134,8 +141,10 @@ fn oversized_messages_close_the_socket_and_the_lab_lives() {
 /// A message made of a valid one by random changes, or of random bytes.
 fn fuzzed(i: u64) -> Message {
     use rand::Rng as _;
-    const VALID: [&str; 6] = [
+    const VALID: [&str; 8] = [
         r#"{"type": "reset", "seed": 3, "pin": "agent.color=1,2,3", "variation": "all"}"#,
+        r#"{"type": "reset", "seed": 3, "wrappers": "noise,std=8;blur,kernel=5", "wrap_goal": true}"#,
+        r#"{"type": "reset", "seed": 3, "view": "top:depth", "wrappers": ""}"#,
         r#"{"type": "act", "action": [0.5, -0.5]}"#,
         r#"{"type": "speed", "fps": 30.0}"#,
         r#"{"type": "drive", "by": "expert"}"#,

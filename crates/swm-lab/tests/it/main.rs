@@ -6,6 +6,7 @@ mod live;
 mod planning;
 mod plans;
 mod refusals;
+mod rendering;
 mod reports;
 mod trainings;
 
@@ -47,6 +48,7 @@ impl TestLab {
         let home = tempfile::tempdir().expect("a folder");
         let lab = Lab {
             envs: &swm_envs::ENVS,
+            wrapping: Box::new(rendering::Registered),
             policy: expert,
             planning: Box::new(planning::Simulated),
             training: Box::new(trainings::Shell),

@@ -107,6 +107,12 @@ export interface Planners {
   solvers: Solver[];
 }
 
+export interface Wrapper {
+  id: string;
+  summary: string;
+  parameters: Record<string, { summary: string; allowed: string; default: unknown }>;
+}
+
 export type Query = Record<string, string | number | boolean | undefined>;
 
 export function address(path: string, query: Query = {}): string {

@@ -27,7 +27,7 @@ export function EnvPage({ params }: { params: Params }) {
 
 // Another environment has other factors.
 export function chooseEnv(env: string): void {
-  patch({ env, pin: undefined, variation: undefined, by: undefined, versus: undefined });
+  patch({ env, pin: undefined, variation: undefined, by: undefined, versus: undefined, view: undefined, beside: undefined });
 }
 
 function EnvList({ rows, id }: { rows: EnvRow[]; id: string }) {

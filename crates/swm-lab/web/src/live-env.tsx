@@ -2,45 +2,63 @@
 
 import { useRef } from "preact/hooks";
 import { address, type EnvInfo } from "./api";
-import { type Control, type Settings, useControl } from "./control";
+import { type Control, showBeside, type Side, stillOf, useControl } from "./control";
 import { chooseEnv } from "./env";
 import { FactorRow } from "./factors";
+import { short } from "./format";
 import { isPointed } from "./hand";
 import { Actions, Recorder } from "./panels";
+import { Views, Wrappers } from "./rendering";
 import { type Params, patch } from "./state";
 import { Choice, Readout, Transport } from "./transport";
 import { formatPins, formatSampled } from "./variation";
 
+// Differing factors that are listed.
+const MOST_DIFFERENT = 6;
+
 export function LiveEnv({ info, params }: { info: EnvInfo; params: Params }) {
   const canvas = useRef<HTMLCanvasElement>(null);
-  const control = useControl(info, params, canvas);
-  const { live, settings } = control;
+  const second = useRef<HTMLCanvasElement>(null);
+  const control = useControl(info, params, canvas, second);
+  const { live, settings, beside, edited } = control;
+  const { rendering } = edited.settings;
   return (
     <>
       <section class="stage" aria-label={info.id}>
         <h1>
           {info.id} <small>{info.summary}</small>
         </h1>
-        <Options info={info} />
+        <div class="bar">
+          <Options info={info} />
+          <Views info={info} view={rendering.view} onView={(view) => control.change({ view, wrap: undefined, wrapgoal: undefined })} />
+        </div>
         <div class="frames">
-          <Frame info={info} control={control} canvas={canvas} />
+          <Frame info={info} control={control} side={control} canvas={canvas} name={beside && "left"} />
+          {beside && <Frame info={info} control={control} side={beside} canvas={second} name="right" />}
           {params.versus && <Versus src={params.versus} side={settings.side} />}
         </div>
+        {beside && <Difference left={control} right={beside} />}
         <Transport info={info} control={control} />
         <Readout header={live.header} fps={live.fps} limit={info.max_episode_steps} />
+        {beside && <Readout header={beside.live.header} fps={beside.live.fps} limit={info.max_episode_steps} />}
         <Problems live={live} />
+        {beside && <Problems live={beside.live} />}
         {settings.by === "hand" && (
           <Actions
             space={info.action}
             action={control.hand}
             onAct={control.act}
-            hint={isPointed(info.id) ? "Drag on the frame." : "Hold the arrow keys."}
+            hint={`${isPointed(info.id) ? "Drag on the frame" : "Hold the arrow keys"}, or use a gamepad.`}
           />
         )}
+        <Wrappers
+          rendering={rendering}
+          onChange={(wrappers, goal) => control.change({ wrap: wrappers.join(";"), wrapgoal: goal ? "1" : undefined })}
+        />
         <Recorder recording={live.recording} env={info.id} send={live.send} />
-        <Command info={info} control={control} isCompared={Boolean(params.versus)} />
+        <Command info={info} control={control} params={params} />
       </section>
-      <Factors info={info} control={control} />
+      <Factors info={info} control={control} params={params} />
     </>
   );
 }
@@ -56,7 +74,7 @@ function Options({ info }: { info: EnvInfo }) {
     chooseEnv([id, ...other.map((option) => `${option.key}=${all[option.key]}`)].join(","));
   };
   return (
-    <div class="bar">
+    <>
       {info.options.map(({ key, values }) => (
         <Choice
           key={key}
@@ -66,18 +84,20 @@ function Options({ info }: { info: EnvInfo }) {
           onChange={(value) => change(key, value)}
         />
       ))}
-    </div>
+    </>
   );
 }
 
 interface FrameProps {
   info: EnvInfo;
   control: Control;
+  side: Side;
   canvas: { current: HTMLCanvasElement | null };
+  name?: string;
 }
 
-function Frame({ info, control, canvas }: FrameProps) {
-  const { header } = control.live;
+function Frame({ info, control, side, canvas, name }: FrameProps) {
+  const { header } = side.live;
   const move = (event: PointerEvent) => {
     const box = canvas.current?.getBoundingClientRect();
     if (box) control.point([(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height]);
@@ -85,11 +105,14 @@ function Frame({ info, control, canvas }: FrameProps) {
   const release = () => control.point(undefined);
   const outcome = header?.success ? "goal reached" : header?.truncated ? "time limit" : "ended";
   return (
-    <div class={`frame ${isPointed(info.id) ? "is-pointed" : ""}`}>
+    <div
+      class={`frame ${isPointed(info.id) ? "is-pointed" : ""} ${name ? "is-side" : ""} ${name && side.live === control.edited.live ? "is-edited" : ""}`}
+      data-name={name}
+    >
       <canvas
         ref={canvas}
         role="img"
-        aria-label={`Frame of ${info.id} at step ${header?.step ?? 0}`}
+        aria-label={`${name ? `${name} f` : "F"}rame of ${info.id} at step ${header?.step ?? 0}`}
         onPointerDown={(event) => {
           event.currentTarget.setPointerCapture(event.pointerId);
           move(event);
@@ -98,7 +121,25 @@ function Frame({ info, control, canvas }: FrameProps) {
         onPointerUp={release}
         onPointerCancel={release}
       />
-      {control.ended && <div class={`ended ${header?.success ? "is-success" : ""}`}>{outcome}</div>}
+      {side.ended && <div class={`ended ${header?.success ? "is-success" : ""}`}>{outcome}</div>}
+    </div>
+  );
+}
+
+// The factors in which two settings differ.
+function Difference({ left, right }: { left: Side; right: Side }) {
+  const [a, b] = [left, right].map((side) => side.live.started?.factors ?? {});
+  const keys = Object.keys(a).filter((key) => b[key] && String(a[key]) !== String(b[key]));
+  const words = (values: number[]) => values.map(short).join(", ");
+  return (
+    <div class="bar difference" role="status" aria-label="Difference">
+      {keys.length === 0 && <span class="muted">No factor differs.</span>}
+      {keys.slice(0, MOST_DIFFERENT).map((key) => (
+        <span key={key}>
+          {key}: <b>{words(a[key])}</b> | <b>{words(b[key])}</b>
+        </span>
+      ))}
+      {keys.length > MOST_DIFFERENT && <span class="muted">and {keys.length - MOST_DIFFERENT} more</span>}
     </div>
   );
 }
@@ -146,18 +187,14 @@ export function Problems({ live }: { live: Connection }) {
   );
 }
 
-function still(info: EnvInfo, { seed, pin, variation }: Settings) {
-  return { env: info.id, seed, pin: pin || undefined, variation };
-}
-
-function Command({ info, control, isCompared }: { info: EnvInfo; control: Control; isCompared: boolean }) {
-  const { live, settings, copy } = control;
-  const command = live.started?.command ?? "";
-  const query = still(info, settings);
-  const keep = (goal?: boolean) => {
-    const given = Object.entries({ ...query, goal }).filter(([, value]) => value !== undefined);
-    patch({ versus: new URLSearchParams(given.map(([key, value]) => [key, String(value)])).toString() });
-  };
+function Command({ info, control, params }: { info: EnvInfo; control: Control; params: Params }) {
+  const { edited, copy } = control;
+  const { settings, live } = edited;
+  const { command = "", python } = live.started ?? {};
+  const given = Object.entries({ env: info.id, ...stillOf(settings) }).filter(([, value]) => value !== undefined && value !== "" && value !== false);
+  const query = Object.fromEntries(given);
+  const keep = (goal?: boolean) =>
+    patch({ versus: new URLSearchParams([...given, ...(goal ? [["goal", true]] : [])].map(([key, value]) => [String(key), String(value)])).toString() });
   return (
     <div class="command" aria-label="Command">
       <code data-testid="command">{command}</code>
@@ -166,9 +203,9 @@ function Command({ info, control, isCompared }: { info: EnvInfo; control: Contro
       </button>
       <button
         type="button"
-        onClick={() => void navigator.clipboard?.writeText(live.started?.python ?? "")}
-        disabled={!command}
-        title="Copy the Python program that renders the frame"
+        onClick={() => void navigator.clipboard?.writeText(python ?? "")}
+        disabled={!python}
+        title={python === null ? "Only the colour of the default camera without wrappers has a program" : "Copy the Python program that renders the frame"}
       >
         Python
       </button>
@@ -182,19 +219,28 @@ function Command({ info, control, isCompared }: { info: EnvInfo; control: Contro
       >
         PNG
       </a>
-      <button type="button" onClick={() => keep()} aria-pressed={isCompared} title="Keep this frame beside the next settings">
+      <button type="button" onClick={() => keep()} aria-pressed={Boolean(params.versus)} title="Keep this frame beside the next settings">
         Compare
       </button>
-      <button type="button" onClick={() => keep(true)} title="Show the goal beside the frame">
+      <button
+        type="button"
+        onClick={() => (control.beside ? patch({ beside: undefined, edit: undefined }) : showBeside(params))}
+        aria-pressed={Boolean(control.beside)}
+        title="Other settings live beside these, with the same seed and the same driver"
+      >
+        Side by side
+      </button>
+      <button type="button" onClick={() => keep(true)} disabled={Boolean(settings.rendering.view)} title="Show the goal beside the frame">
         Goal
       </button>
     </div>
   );
 }
 
-function Factors({ info, control }: { info: EnvInfo; control: Control }) {
-  const { pins, sampled } = control.settings;
-  const values = control.live.started?.factors ?? {};
+function Factors({ info, control, params }: { info: EnvInfo; control: Control; params: Params }) {
+  const { edited } = control;
+  const { pins, sampled } = edited.settings;
+  const values = edited.live.started?.factors ?? {};
   const without = (key: string) => {
     const { [key]: _, ...others } = pins;
     return others;
@@ -203,7 +249,7 @@ function Factors({ info, control }: { info: EnvInfo; control: Control }) {
     const keys = new Set(sampled);
     if (on) keys.add(key);
     else keys.delete(key);
-    patch({ variation: formatSampled(info.factors, keys), pin: formatPins(without(key)) });
+    control.change({ variation: formatSampled(info.factors, keys), pin: formatPins(without(key)) });
   };
   return (
     <aside class="factors" aria-label="Factors of variation">
@@ -213,10 +259,25 @@ function Factors({ info, control }: { info: EnvInfo; control: Control }) {
         <button type="button" onClick={control.randomise} title="Sample all, with the next seed (v)">
           Randomise
         </button>
-        <button type="button" onClick={() => patch({ pin: undefined, variation: undefined })}>
+        <button type="button" onClick={() => control.change({ pin: undefined, variation: undefined })}>
           Defaults
         </button>
       </div>
+      {control.beside && (
+        <div class="control segments" role="radiogroup" aria-label="Whose settings">
+          {["left", "right"].map((name) => (
+            <button
+              type="button"
+              role="radio"
+              key={name}
+              aria-checked={(params.edit === "right") === (name === "right")}
+              onClick={() => patch({ edit: name === "right" ? name : undefined })}
+            >
+              {name}
+            </button>
+          ))}
+        </div>
+      )}
       {groups(info).map(([group, factors]) => (
         <details open key={group}>
           <summary>{group}</summary>
@@ -228,7 +289,7 @@ function Factors({ info, control }: { info: EnvInfo; control: Control }) {
               pinned={factor.key in pins}
               sampled={sampled.has(factor.key)}
               onPin={(value) =>
-                patch({ pin: formatPins(value ? { ...without(factor.key), [factor.key]: value } : without(factor.key)) })
+                control.change({ pin: formatPins(value ? { ...without(factor.key), [factor.key]: value } : without(factor.key)) })
               }
               onSample={(on) => sample(factor.key, on)}
             />

@@ -11,6 +11,7 @@ import "uplot/dist/uPlot.min.css";
 import "./style.css";
 import "./pages.css";
 import "./plans.css";
+import "./wrappers.css";
 
 const PAGES = [
   { id: "envs", name: "Environments", Page: EnvPage },

@@ -1,9 +1,9 @@
 // A plan session: its socket, the steps that were played, and the search that is shown.
 
-import { type RefObject } from "preact";
-import { useCallback, useEffect, useRef, useState } from "preact/hooks";
+import type { RefObject } from "preact";
 import type { Model } from "./api";
-import { open, type Send, type Session } from "./session";
+import type { Reply } from "./session";
+import { type Actions, type Connected, useSession } from "./use-session";
 
 export interface PlanHeader {
   number: number;
@@ -75,7 +75,7 @@ export interface Bounds {
   most_bytes: number;
 }
 
-export interface Plans {
+interface State extends Connected {
   header?: PlanHeader;
   nodes: Map<number, Node>;
   bounds?: Bounds;
@@ -86,19 +86,11 @@ export interface Plans {
   ready?: { model: Model; block: number; command: string };
   goal?: string;
   peeked: Map<number, string>;
-  error?: string;
-  isClosed: boolean;
-  send: Send;
-  reconnect: () => void;
-  dismiss: () => void;
 }
 
-type State = Omit<Plans, "send" | "reconnect" | "dismiss">;
-type Reply = { type: string } & Record<string, unknown>;
+export type Plans = State & Actions;
 
 const NONE: State = { nodes: new Map(), peeked: new Map(), isClosed: false };
-// How often the page shows what arrived, in milliseconds; frames themselves are drawn as they come.
-const REFRESH = 60;
 
 const image = (jpeg: unknown) => `data:image/jpeg;base64,${jpeg}`;
 
@@ -132,51 +124,16 @@ function after(state: State, reply: Reply): State {
       return { ...state, goal: image(reply.jpeg) };
     case "peeked":
       return { ...state, peeked: new Map(state.peeked).set(reply.node as number, image(reply.jpeg)) };
-    case "failed":
-      return { ...state, error: String(reply.message) };
     default:
       return state;
   }
 }
 
 export function usePlans(env: string, side: number, canvas: RefObject<HTMLCanvasElement | null>): Plans {
-  const [state, setState] = useState<State>(NONE);
-  const [attempt, setAttempt] = useState(0);
-  const session = useRef<Session | undefined>(undefined);
-  useEffect(() => {
-    let now: State = NONE;
-    let timer = 0;
-    const publish = () => {
-      timer = 0;
-      setState(now);
-    };
-    const change = (next: State) => {
-      now = next;
-      timer ||= setTimeout(publish, REFRESH);
-    };
-    setState(NONE);
-    session.current = open<PlanHeader>("plan", env, side, {
-      frame: (header, bitmap) => {
-        const to = canvas.current;
-        if (to) {
-          if (to.width !== bitmap.width) to.width = bitmap.width;
-          if (to.height !== bitmap.height) to.height = bitmap.height;
-          to.getContext("2d")?.drawImage(bitmap, 0, 0);
-        }
-        change({ ...now, header, searching: header.searching ? now.searching : undefined });
-      },
-      reply: (reply) => change(after(now, reply)),
-      closed: () => change({ ...now, isClosed: true }),
-    });
-    return () => {
-      clearTimeout(timer);
-      session.current?.close();
-    };
-  }, [env, side, attempt]);
-  const send: Send = useCallback((type, fields) => session.current?.send(type, fields), []);
-  const reconnect = useCallback(() => setAttempt((n) => n + 1), []);
-  const dismiss = useCallback(() => setState((old) => ({ ...old, error: undefined })), []);
-  return { ...state, send, reconnect, dismiss };
+  return useSession<PlanHeader, State>("plan", env, side, canvas, NONE, {
+    frame: (state, header) => ({ ...state, header, searching: header.searching ? state.searching : undefined }),
+    reply: after,
+  });
 }
 
 // The steps from the first one to a step.

@@ -17,7 +17,7 @@ export interface Started {
   seed: number;
   factors: Record<string, number[]>;
   command: string;
-  python: string;
+  python: string | null;
 }
 
 export interface Recording {
@@ -27,14 +27,6 @@ export interface Recording {
   complete: boolean;
 }
 
-export interface Events {
-  frame: (header: Header, image: ImageBitmap) => void;
-  started: (started: Started) => void;
-  recording: (recording: Recording) => void;
-  failed: (message: string) => void;
-  closed: () => void;
-}
-
 export type Send = (type: string, fields?: Record<string, unknown>) => void;
 
 export interface Session {
@@ -42,23 +34,13 @@ export interface Session {
   close: () => void;
 }
 
+export type Reply = { type: string } & Record<string, unknown>;
+
 interface Socket<H> {
   arrived?: () => void;
   frame: (header: H, image: ImageBitmap) => void;
-  reply: (reply: { type: string } & Record<string, unknown>) => void;
+  reply: (reply: Reply) => void;
   closed: () => void;
-}
-
-export function connect(env: string, image: number, events: Events): Session {
-  return open<Header>("live", env, image, {
-    frame: events.frame,
-    closed: events.closed,
-    reply: (reply) => {
-      if (reply.type === "started") events.started(reply as unknown as Started);
-      else if (reply.type === "recording") events.recording(reply as unknown as Recording);
-      else if (reply.type === "failed") events.failed(String(reply.message));
-    },
-  });
 }
 
 // Opens the socket of a session. Messages that are sent before it is open wait.

@@ -11,7 +11,7 @@ const SIDES = [64, 96, 128, 224, 320, 448];
 const SPEEDS = [1, 5, 10, 20, 30, 60, 120];
 
 export function Transport({ info, control }: { info: EnvInfo; control: Control }) {
-  const { isPlaying, settings, live } = control;
+  const { isPlaying, settings, send } = control;
   const drivers = [...info.experts.map((expert) => expert.id), "random", "hand"];
   const seed = (text: string) => patch({ seed: String(Math.max(0, Math.floor(Number(text) || 0))) });
   return (
@@ -25,7 +25,7 @@ export function Transport({ info, control }: { info: EnvInfo; control: Control }
       >
         {isPlaying ? "❚❚" : "▶"}
       </button>
-      <button type="button" onClick={() => live.send("step")} aria-label="Step" title="One step (.)">
+      <button type="button" onClick={() => send("step")} aria-label="Step" title="One step (.)">
         ▸|
       </button>
       <button type="button" onClick={control.reset} title="Reset with the same seed (r)">

@@ -1,12 +1,14 @@
 //! `swm frame`: the first frame of an episode as PNG.
 
 use super::config::{VariationArgs, image_size};
+use super::wrappers::WrapperArgs;
 use super::{emit, emit_json, output_folder};
 use clap::Args;
 use serde_json::json;
 use std::path::PathBuf;
-use swm_core::{Origin, files};
+use swm_core::{CameraView, Origin, files};
 use swm_data::check_png;
+use swm_lab::rendering::Rendering;
 use swm_lab::still::Still;
 
 /// Arguments of `swm frame`.
@@ -23,6 +25,13 @@ pub struct FrameArgs {
     /// Show the goal instead of the initial state
     #[arg(long)]
     goal: bool,
+    /// The camera view: CAMERA, depth, segmentation, or CAMERA:depth
+    ///
+    /// Depth and segmentation have the colours of `swm preview`.
+    #[arg(long, value_name = "VIEW", conflicts_with_all = ["goal", "wrappers"])]
+    view: Option<String>,
+    #[command(flatten)]
+    wrappers: WrapperArgs,
     /// The PNG file to write
     #[arg(short, long, value_name = "FILE", default_value = "frame.png")]
     output: PathBuf,
@@ -36,8 +45,12 @@ pub fn frame(args: &FrameArgs, as_json: bool) -> anyhow::Result<()> {
     let choice = crate::env(&args.env, &Origin::User)?;
     output_folder::check_file(&args.output)?;
     check_png(&args.output)?;
-    let still = Still { seed: args.seed, variation, goal: args.goal, size: args.image };
-    let png = still.png(&mut *choice.env()?)?;
+    let view = args.view.as_deref().map_or_else(|| Ok(CameraView::default()), CameraView::parse)?;
+    let WrapperArgs { wrappers, wrap_goal } = args.wrappers.clone();
+    let rendering = Rendering { view, wrappers, wrap_goal };
+    let still = Still { seed: args.seed, variation, goal: args.goal, size: args.image, rendering };
+    let (stack, goal) = args.wrappers.stack()?;
+    let png = still.png(&mut *stack.wrap(choice.env()?, goal))?;
     files::write(&args.output, &png)?;
     if as_json {
         return emit_json(&json!({"file": args.output, "env": choice.id(), "seed": args.seed}));

@@ -3,6 +3,7 @@
 use super::planning::HomePlanning;
 use super::reports::Pages;
 use super::training::OwnProgram;
+use super::wrapping::OwnWrappers;
 use crate::ENVS;
 use crate::cli::config::{count, seconds};
 use crate::cli::{Context, emit, emit_json, table};
@@ -53,6 +54,7 @@ pub fn bench(args: &LabBenchArgs, context: &Context) -> anyhow::Result<()> {
     let runs = Folders::default();
     let lab = Lab {
         envs: &ENVS,
+        wrapping: Box::new(OwnWrappers),
         policy: scripted,
         planning: Box::new(HomePlanning::new(runs.clone())),
         reports: Box::new(Pages),

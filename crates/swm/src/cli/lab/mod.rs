@@ -4,6 +4,7 @@ mod bench;
 mod planning;
 mod reports;
 mod training;
+mod wrapping;
 
 use super::{Context, emit, emit_json, eprint};
 use crate::resolver::scripted;
@@ -19,6 +20,7 @@ use swm_core::{Error, Result};
 use swm_lab::folders::Folders;
 use swm_lab::{Lab, Options, Token, serve};
 use training::OwnProgram;
+use wrapping::OwnWrappers;
 
 pub use bench::{LabBenchArgs, bench};
 
@@ -62,6 +64,7 @@ pub fn lab(args: &LabArgs, context: &Context) -> anyhow::Result<()> {
     let runs = folders(home::checkpoints()?, &args.runs)?;
     let lab = Lab {
         envs: &ENVS,
+        wrapping: Box::new(OwnWrappers),
         policy: scripted,
         planning: Box::new(HomePlanning::new(runs.clone())),
         reports: Box::new(Pages),

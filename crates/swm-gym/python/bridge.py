@@ -97,8 +97,14 @@ def column_dtype(dtype):
 
 
 def store(view, value, name):
-    """Writes a value into a column. An integer column must hold the value itself, not a rounded or wrapped one."""
+    """Writes a value into a column: of the column's shape, and in an integer column itself, not rounded or wrapped."""
     value = np.asarray(value)
+    # numpy would repeat a value along the axes of the column, parse strings, and drop imaginary parts.
+    same = value.size == view.size and (value.size == 1 or value.shape[-view.ndim :] == view.shape)
+    if not same:
+        raise ValueError(f"'{name}' has shape {value.shape}, and its space declares {view.shape}")
+    if value.dtype.kind not in 'biuf':
+        raise ValueError(f"'{name}' has the type {value.dtype}: return real numbers, as its space declares")
     if value.dtype != view.dtype and view.dtype.kind != 'f' and not np.can_cast(value.dtype, view.dtype):
         with np.errstate(invalid='ignore'):
             exact = value.dtype.kind in 'biuf' and np.array_equal(value.astype(view.dtype), value)
@@ -107,7 +113,7 @@ def store(view, value, name):
                 f"'{name}' is {value.tolist()} ({value.dtype}), which a column of {view.dtype} cannot hold:"
                 ' return values of the type that its space declares, below 2^63'
             )
-    view[...] = value
+    view[...] = value.reshape(view.shape)
 
 
 def box(low, high, shape, dtype):
@@ -568,6 +574,8 @@ class Bridge:
         success = info.get('success', info.get('is_success'))
         if success is None or success != success:
             success = terminated
+        elif np.asarray(success).dtype.kind not in 'biuf':
+            raise ValueError(f"info['success'] is {success!r}: return True or False")
         distance = info.get('goal_distance', math.inf)
         HEAD.pack_into(self.buffer, 0, float(reward), float(distance), bool(terminated), bool(truncated), bool(success))
 

@@ -3,7 +3,7 @@
 use crate::RgbImage;
 use crate::codec::check_pixels;
 use png::{Compression, EncodingError, Filter, Transformations};
-use std::io::{BufReader, BufWriter, Cursor, Read as _};
+use std::io::{BufReader, Cursor, Read as _};
 use std::path::Path;
 use swm_core::{Error, Result, files};
 
@@ -128,8 +128,8 @@ pub fn write_png(path: &Path, width: usize, height: usize, rgb: &[u8]) -> Result
     };
     let (wide, high) = (side(width)?, side(height)?);
     check_png(path)?;
-    let file = files::open_to_write(path, false)?;
-    let mut encoder = png::Encoder::new(BufWriter::new(file), wide, high);
+    let mut bytes = vec![];
+    let mut encoder = png::Encoder::new(&mut bytes, wide, high);
     encoder.set_color(png::ColorType::Rgb);
     encoder.set_depth(png::BitDepth::Eight);
     let failed = |error: EncodingError| match error {
@@ -139,7 +139,9 @@ pub fn write_png(path: &Path, width: usize, height: usize, rgb: &[u8]) -> Result
     encoder.add_text_chunk(SOFTWARE[0].to_owned(), SOFTWARE[1].to_owned()).map_err(failed)?;
     let mut writer = encoder.write_header().map_err(failed)?;
     writer.write_image_data(rgb).map_err(failed)?;
-    writer.finish().map_err(failed)
+    writer.finish().map_err(failed)?;
+    // As a whole: half of a file has no mark of this program, and would not be replaced.
+    files::write(path, &bytes)
 }
 
 #[cfg(test)]
@@ -156,6 +158,6 @@ mod tests {
         assert!(write_png(&path, 4, 4, &rgb).is_err());
         let missing =
             write_png(&folder.path().join("missing/a.png"), 5, 4, &rgb).expect_err("a missing folder").to_string();
-        assert!(missing.contains("opening the file to write"), "{missing}");
+        assert!(missing.contains("writing the file"), "{missing}");
     }
 }

@@ -90,6 +90,15 @@ pub trait Writer: Send {
         self.write_episode_with(episode, &Constants::new())
     }
 
+    /// Commits the written episodes and waits until they are stored. Formats that store an episode when it is written do
+    /// nothing.
+    ///
+    /// # Errors
+    /// When storing fails.
+    fn sync(&mut self) -> Result<()> {
+        Ok(())
+    }
+
     /// Number of episodes in the dataset, including those that are not committed yet.
     fn episodes(&self) -> usize;
 

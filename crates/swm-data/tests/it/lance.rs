@@ -32,6 +32,20 @@ fn written_episodes_round_trip() {
     assert!(on_disk > 5_000, "{on_disk}");
 }
 
+/// The default policy commits after seconds or megabytes.
+#[test]
+fn synced_episodes_are_stored_while_the_writer_is_open() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let path = folder.path().join("d.lance");
+    let mut writer = create(&path, &schema(), options(WriteMode::Create)).expect("creating the dataset");
+    for index in 0..3 {
+        writer.write_episode(&episode(index)).expect("writing");
+        writer.sync().expect("committing");
+        assert_eq!(open(&path).expect("opening the dataset").episodes().len(), index + 1);
+    }
+    writer.finish().expect("finishing");
+}
+
 #[test]
 fn reads_row_ranges_in_the_requested_order() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");

@@ -343,6 +343,35 @@ class Wide(gymnasium.Env):
         return self.value if self.t == 2 else np.float64([self.t]), 0.0, False, False, {}
 
 
+class Loose(gymnasium.Env):
+    """Declares three numbers, and returns something else at step 2."""
+
+    action_space = spaces.Discrete(2)
+    observation_space = spaces.Box(-9, 9, (3,), np.float32)
+    VALUES = {
+        'scalar': np.float32(7),
+        'one': np.float32([7]),
+        'column': np.float32([[1], [2], [3]]),
+        'complex': np.array([1 + 5j, 2, 3]),
+        'text': np.array(['1', '2', '3']),
+        'row': np.float32([[1, 2, 3]]),
+    }
+
+    def __init__(self, value):
+        self.value, self.t = value, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return np.zeros(3, np.float32), {'success': False}
+
+    def step(self, action):
+        self.t += 1
+        observation = self.VALUES.get(self.value, np.zeros(3, np.float32)) if self.t == 2 else np.zeros(3, np.float32)
+        return observation, 0.0, False, False, {'success': 'no' if self.t == 2 and self.value == 'success' else False}
+
+
+gymnasium.register('Loose-v0', Loose, max_episode_steps=1_000_000)
 gymnasium.register('Wide-v0', Wide, max_episode_steps=1_000_000)
 gymnasium.register('Counter-v0', Counter, max_episode_steps=1_000_000)
 gymnasium.register('Room-v0', Room, max_episode_steps=30)

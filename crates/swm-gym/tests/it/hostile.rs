@@ -74,6 +74,25 @@ fn environment_cannot_shrink_the_shared_memory() {
     }
 }
 
+/// numpy would repeat one number along an axis, drop imaginary parts and parse strings.
+#[test]
+fn observations_of_another_shape_or_type_are_errors() {
+    let Some(config) = config() else { return };
+    let shaped = ["scalar", "one", "column"].map(|value| (value, "shape"));
+    for (value, shown) in shaped.into_iter().chain([("complex", "complex"), ("text", "<U1"), ("success", "'no'")]) {
+        let mut env = make(&format!("tests.it.environments:Loose-v0,value={value}"), &config);
+        env.reset(0, &ResetOptions::default()).expect("a reset");
+        env.step(Action::Discrete(&[0])).expect("three numbers");
+        let error = env.step(Action::Discrete(&[0])).expect_err(value).to_string();
+        assert!(error.contains(shown), "{value}: {error}");
+    }
+    let mut env = make("tests.it.environments:Loose-v0,value=row", &config);
+    env.reset(0, &ResetOptions::default()).expect("a reset");
+    for _ in 0..3 {
+        env.step(Action::Discrete(&[0])).expect("a leading axis of one element is left out");
+    }
+}
+
 #[test]
 fn values_that_a_column_cannot_hold_are_errors() {
     let Some(config) = config() else { return };

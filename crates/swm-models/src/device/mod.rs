@@ -128,6 +128,10 @@ pub fn choose(name: &str) -> Result<Choice> {
         return Ok(automatic());
     }
     let (backend, index) = match name.split_once(':') {
+        Some(("auto", _)) => {
+            let fix = "write auto, or a device of `swm devices` such as vulkan:1";
+            return Err(Error::config("--device", format!("'{name}' has an index, and auto chooses one"), fix));
+        }
         None => (name, None),
         Some((backend, index)) => {
             let invalid = |_| {
@@ -294,6 +298,7 @@ mod tests {
         assert_eq!(name(&parse("cpu").expect("parsing 'cpu'")), "cpu (flex)");
         let message = |name: &str| parse(name).expect_err("an invalid device is accepted").to_string();
         assert!(message("cdua").contains("did you mean cuda"), "{}", message("cdua"));
+        assert!(message("auto:1").contains("auto chooses one"), "{}", message("auto:1"));
         assert!(message("cpu:x").contains("not a GPU index"), "{}", message("cpu:x"));
         assert!(message("cpu:1").contains("there is one CPU"), "{}", message("cpu:1"));
         if !cfg!(feature = "cuda") {

@@ -20,7 +20,27 @@ pub trait Agent: Trainable {
         spec: &EnvSpec,
         slots: usize,
         explore: bool,
-    ) -> Result<Box<dyn Policy>>;
+    ) -> Result<Box<dyn AgentPolicy>>;
+}
+
+/// The policy of an agent. What it remembers of the running episodes is saved with a run, so that a continued run acts as an
+/// uninterrupted one.
+pub trait AgentPolicy: Policy {
+    /// Returns what the policy remembers of the episode in each slot, beyond its key; empty if it remembers nothing.
+    fn memory(&self) -> Vec<Vec<f32>> {
+        vec![]
+    }
+
+    /// Takes up what [`Self::memory`] returned, after [`Policy::begin`] of every slot.
+    ///
+    /// # Errors
+    /// When the memory has another shape.
+    fn recall(&mut self, memory: &[Vec<f32>]) -> Result<()> {
+        if memory.is_empty() {
+            return Ok(());
+        }
+        Err(Error::mismatch("continuing a training run", "a policy with a memory", "one without"))
+    }
 }
 
 /// Creates the policy of a trained agent, which does not explore.
@@ -29,7 +49,7 @@ pub trait Agent: Trainable {
 /// When the model does not fit the environment.
 pub fn policy<M: Agent>(checkpoint: &Checkpoint<M>, spec: &EnvSpec, slots: usize) -> Result<Box<dyn Policy>> {
     let model = SharedModel::new(checkpoint.model.clone());
-    M::policy(&checkpoint.config, &checkpoint.dataset_info, model, spec, slots, false)
+    Ok(M::policy(&checkpoint.config, &checkpoint.dataset_info, model, spec, slots, false)?)
 }
 
 /// Checks that a dataset has rewards to learn from.

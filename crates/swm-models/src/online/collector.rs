@@ -55,6 +55,12 @@ pub(super) struct CollectorState {
     next: u64,
     /// The index and the actions of every running episode; the environments are restored by repeating the actions.
     running: Vec<(u64, Vec<f32>)>,
+    /// The returns that are in no line of the log yet.
+    #[serde(default)]
+    returns: Vec<f64>,
+    /// What the policy remembers of the running episodes.
+    #[serde(default)]
+    pub(super) memory: Vec<Vec<f32>>,
 }
 
 impl Collector {
@@ -191,10 +197,16 @@ impl Collector {
         self.pool.reset(&resets)
     }
 
-    /// Returns the state from which a collector can continue.
-    pub fn state(&self) -> CollectorState {
+    /// Returns the state from which a collector can continue with a policy that has this memory.
+    pub fn state(&self, memory: Vec<Vec<f32>>) -> CollectorState {
         let running = self.running.iter().map(|running| (running.episode, running.actions.clone()));
-        CollectorState { steps: self.steps, next: self.next, running: running.collect() }
+        CollectorState {
+            steps: self.steps,
+            next: self.next,
+            running: running.collect(),
+            returns: self.returns.clone(),
+            memory,
+        }
     }
 
     /// Restores the state of a collector with the same key: repeats the actions of the running episodes.
@@ -235,7 +247,7 @@ impl Collector {
         }
         self.active.fill(true);
         (self.steps, self.next) = (state.steps, state.next);
-        self.returns.clear();
+        self.returns.clone_from(&state.returns);
         Ok(())
     }
 }

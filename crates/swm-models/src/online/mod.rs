@@ -19,7 +19,7 @@ mod shared_model;
 mod stochastic_policy;
 
 pub(crate) use agent::check_rewards;
-pub use agent::{Agent, policy};
+pub use agent::{Agent, AgentPolicy, policy};
 pub use config::OnlineConfig;
 pub use planner_config::PlannerConfig;
 pub use run::{OnlineSummary, train_online};

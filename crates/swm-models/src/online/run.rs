@@ -1,6 +1,6 @@
 //! [`train_online`]: the loop that alternates interaction, learning, evaluation and saving.
 
-use super::agent::Agent;
+use super::agent::{Agent, AgentPolicy};
 use super::collector::{Collector, CollectorState};
 use super::config::OnlineConfig;
 use super::evaluation;
@@ -108,7 +108,7 @@ fn start<'a, M: Agent>(
     manifest.libraries.extend(burn);
     let resumed = Learner::resume(config, &dataset_info, &manifest, out, options)?;
     let saved = resumed.as_ref().map(|learner| saved_data(out, learner.state().step));
-    let data = Data::new(&config.loop_config(), online, loader_config, pool, &recorded, saved)?;
+    let (data, memory) = Data::new(&config.loop_config(), online, loader_config, pool, &recorded, saved)?;
     let saved = resumed.as_ref().map(|learner| (learner.state().step, data.collector.steps));
     let learner = match resumed {
         Some(learner) => learner,
@@ -127,6 +127,7 @@ fn start<'a, M: Agent>(
         evaluation_pool,
         log: log::Log::new(out, learner.state().step)?,
         key: Key::new(config.seed).with("online"),
+        memory,
         saved,
         learner: Box::new(OnlineLearner { learner, shared }),
     };
@@ -177,12 +178,14 @@ struct Run<'a> {
     /// The policy of the warm-up.
     random: Box<dyn Policy>,
     /// The policy after the warm-up.
-    explorer: Box<dyn Policy>,
+    explorer: Box<dyn AgentPolicy>,
     evaluation_pool: EnvPool,
     /// The policy of evaluations, which does not explore.
-    evaluator: Box<dyn Policy>,
+    evaluator: Box<dyn AgentPolicy>,
     log: log::Log,
     key: Key,
+    /// What the explorer of an interrupted run remembered.
+    memory: Vec<Vec<f32>>,
     /// The optimizer steps and the environment steps of the data in the folder of the run.
     saved: Option<(usize, usize)>,
 }
@@ -203,7 +206,8 @@ struct Meter {
 }
 
 impl Data {
-    /// Creates the data of a new run, or restores the data that an earlier run saved in the folder `saved`.
+    /// Creates the data of a new run, or restores the data that an earlier run saved in the folder `saved`. Also returns the
+    /// memory of that run's policy.
     fn new(
         config: &LoopConfig,
         online: &OnlineConfig,
@@ -211,15 +215,20 @@ impl Data {
         pool: EnvPool,
         schema: &Schema,
         saved: Option<PathBuf>,
-    ) -> Result<Self> {
+    ) -> Result<(Self, Vec<Vec<f32>>)> {
         let replay = match &saved {
             Some(folder) => ReplayBuffer::restore(&*swm_data::open(folder.join(REPLAY))?, online.capacity)?,
             None => ReplayBuffer::new(schema, online.capacity)?,
         };
         let key = Key::new(config.seed).with("online").with("episode");
         let mut collector = Collector::new(pool, &replay, schema, online.segment, key)?;
+        let mut memory = vec![];
         match &saved {
-            Some(folder) => collector.restore(&read_collector(folder)?)?,
+            Some(folder) => {
+                let state = read_collector(folder)?;
+                collector.restore(&state)?;
+                memory = state.memory;
+            }
             None => collector.start()?,
         }
         let loader = replay.loader(ReplayConfig {
@@ -230,7 +239,7 @@ impl Data {
             threads: 0,
             ..ReplayConfig::default()
         })?;
-        Ok(Self { collector, replay, loader })
+        Ok((Self { collector, replay, loader }, memory))
     }
 }
 
@@ -250,6 +259,7 @@ impl Run<'_> {
             if learns && !warm {
                 warm = true;
                 self.data.collector.begin_policy(&mut *self.explorer);
+                self.explorer.recall(&std::mem::take(&mut self.memory))?;
             }
             let start = Instant::now();
             self.data.collector.step(if warm { &mut *self.explorer } else { &mut *self.random })?;
@@ -370,7 +380,8 @@ impl Run<'_> {
             std::fs::create_dir_all(&folder).map_err(|error| Error::io(&folder, "creating a folder", error))?;
             self.data.replay.save(folder.join(REPLAY), WriteOptions::default())?;
             let path = folder.join(COLLECTOR);
-            std::fs::write(&path, json!(self.data.collector.state()).to_string())
+            let state = self.data.collector.state(self.explorer.memory());
+            std::fs::write(&path, json!(state).to_string())
                 .map_err(|error| Error::io(&path, "saving the state of the episodes", error))?;
         }
         let weights = self.learner.learner().save(self.out)?;

@@ -1,5 +1,6 @@
 //! [`StochasticPolicy`]: a policy that draws actions from a network's distribution, without planning.
 
+use super::agent::AgentPolicy;
 use super::shared_model::SharedModel;
 use crate::checkpoint::Checkpoint;
 use crate::train::{DatasetInfo, TrainConfig, Trainable};
@@ -72,6 +73,8 @@ impl<M: StochasticActor> StochasticPolicy<M> {
         Self::new(&checkpoint.config, &checkpoint.dataset_info, model, spec, slots, false)
     }
 }
+
+impl<M: StochasticActor> AgentPolicy for StochasticPolicy<M> {}
 
 impl<M: StochasticActor> Policy for StochasticPolicy<M> {
     fn begin(&mut self, slot: usize, key: Key) {

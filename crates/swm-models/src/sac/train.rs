@@ -5,11 +5,11 @@ use super::model::Sac;
 use super::step::{Transitions, step};
 use crate::nn::parameters::{self, IntoF32 as _};
 use crate::nn::{Init, Named, normal};
-use crate::online::{Agent, SharedModel, StochasticActor, StochasticPolicy};
+use crate::online::{Agent, AgentPolicy, SharedModel, StochasticActor, StochasticPolicy};
 use crate::train::{DatasetInfo, ParameterGroup, Preset, StepContext, StepOutput, TrainConfig, Trainable};
 use burn::tensor::{Tensor, TensorData};
 use swm_core::columns::{ACTION, REWARD, TERMINATED};
-use swm_core::{Batch, EnvSpec, Error, Key, Policy, Result, RowRef, Schema};
+use swm_core::{Batch, EnvSpec, Error, Key, Result, RowRef, Schema};
 use swm_data::{ClipSpec, LoaderConfig};
 
 impl Trainable for Sac {
@@ -153,7 +153,7 @@ impl Agent for Sac {
         spec: &EnvSpec,
         slots: usize,
         explore: bool,
-    ) -> Result<Box<dyn Policy>> {
+    ) -> Result<Box<dyn AgentPolicy>> {
         Ok(Box::new(StochasticPolicy::new(config, dataset_info, model, spec, slots, explore)?))
     }
 }

@@ -14,7 +14,7 @@ use super::train::observe_row;
 use crate::Checkpoint;
 use crate::nn::normal;
 use crate::nn::parameters::IntoF32 as _;
-use crate::online::{PlannerConfig, SharedModel};
+use crate::online::{AgentPolicy, PlannerConfig, SharedModel};
 use crate::train::{DatasetInfo, TrainConfig};
 use rand::Rng as _;
 use rayon::prelude::*;
@@ -222,6 +222,28 @@ impl Policy for Tdmpc2Policy {
     /// Returns the seconds of each plan: the time of a call is divided equally among the environments.
     fn take_latencies(&mut self) -> Vec<f64> {
         std::mem::take(&mut self.latencies)
+    }
+}
+
+impl AgentPolicy for Tdmpc2Policy {
+    /// The initial means of the next searches, a slot each.
+    fn memory(&self) -> Vec<Vec<f32>> {
+        self.slots.iter().map(|slot| slot.mean.clone()).collect()
+    }
+
+    fn recall(&mut self, memory: &[Vec<f32>]) -> Result<()> {
+        if memory.is_empty() {
+            return Ok(());
+        }
+        let lengths = |means: &mut dyn Iterator<Item = usize>| means.collect::<Vec<_>>();
+        let given = lengths(&mut memory.iter().map(Vec::len));
+        let expected = lengths(&mut self.slots.iter().map(|slot| slot.mean.len()));
+        if given != expected {
+            let given = format!("plans of {given:?} values");
+            return Err(Error::mismatch("continuing a training run", given, format!("{expected:?}")));
+        }
+        self.slots.iter_mut().zip(memory).for_each(|(slot, mean)| slot.mean.clone_from(mean));
+        Ok(())
     }
 }
 

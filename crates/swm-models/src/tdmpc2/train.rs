@@ -6,7 +6,7 @@ use super::planner::Tdmpc2Policy;
 use super::step::{Draws, TrainBatch, step};
 use crate::nn::parameters::{self, IntoF32 as _};
 use crate::nn::{Init, Named, normal};
-use crate::online::{Agent, SharedModel, StochasticActor, StochasticPolicy};
+use crate::online::{Agent, AgentPolicy, SharedModel, StochasticActor, StochasticPolicy};
 use crate::pixels::{self, ImageNormalization};
 use crate::train::{
     DatasetInfo, ParameterGroup, Preset, StepContext, StepOutput, TrainConfig, Trainable, check_sizes, limits,
@@ -14,7 +14,7 @@ use crate::train::{
 use burn::module::Param;
 use burn::tensor::{Device, Tensor, TensorData};
 use swm_core::columns::{ACTION, PIXELS, REWARD, TERMINATED};
-use swm_core::{Batch, EnvSpec, Error, Key, Policy, Result, RowRef, Schema};
+use swm_core::{Batch, EnvSpec, Error, Key, Result, RowRef, Schema};
 use swm_data::{ClipSpec, LoaderConfig};
 
 impl Trainable for Tdmpc2 {
@@ -196,7 +196,7 @@ impl Agent for Tdmpc2 {
         spec: &EnvSpec,
         slots: usize,
         explore: bool,
-    ) -> Result<Box<dyn Policy>> {
+    ) -> Result<Box<dyn AgentPolicy>> {
         Ok(match config.online.as_ref().and_then(|online| online.planner.as_ref()) {
             Some(planner) => Box::new(Tdmpc2Policy::new(planner, config, dataset_info, model, spec, slots, explore)?),
             None => Box::new(StochasticPolicy::new(config, dataset_info, model, spec, slots, explore)?),

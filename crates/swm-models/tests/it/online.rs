@@ -117,9 +117,15 @@ fn online_results_do_not_depend_on_threads() {
 
 #[test]
 fn resumed_online_run_gives_the_files_of_an_uninterrupted_run() {
+    check_resuming::<Sac>();
+    // Its policy remembers its last plan.
+    check_resuming::<Tdmpc2>();
+}
+
+fn check_resuming<M: Agent>() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let (complete, resumed) = (folder.path().join("complete"), folder.path().join("resumed"));
-    let config = config::<Sac>(&[]);
+    let config = config::<M>(&[]);
     let options = crate::options();
     run(&config, &complete, &options, 0).expect("training the model");
     let first = run(&config, &resumed, &options, 10).expect("training the model");
@@ -130,7 +136,7 @@ fn resumed_online_run_gives_the_files_of_an_uninterrupted_run() {
     let second = run(&config, &resumed, &resume, 0).expect("training the model");
     assert_eq!((second.steps, second.interrupted), (24, false));
     assert_eq!(files(&complete), files(&resumed));
-    let other = run(&self::config::<Sac>(&["optim.lr=1e-4"]), &resumed, &resume, 0)
+    let other = run(&self::config::<M>(&["optim.lr=1e-4"]), &resumed, &resume, 0)
         .expect_err("another configuration")
         .to_string();
     assert!(other.contains("optim.lr"), "{other}");

@@ -68,10 +68,10 @@ pub fn write_study(page: &StudyPage, out_dir: &Path) -> Result<PathBuf> {
 fn write_files(out_dir: &Path, html: &str, figures: &[Placed]) -> Result<PathBuf> {
     let folder = out_dir.join("figures");
     files::check_no_link(&folder)?;
-    std::fs::create_dir_all(&folder).map_err(|source| Error::io(&folder, "creating the folder of figures", source))?;
     // The page is written first: it tells that the folder is this program's own.
     let path = out_dir.join("index.html");
     files::write(&path, html.as_bytes())?;
+    std::fs::create_dir_all(&folder).map_err(|source| Error::io(&folder, "creating the folder of figures", source))?;
     for figure in figures {
         files::write(&folder.join(format!("{}.svg", figure.file)), figure.drawn.drawing.svg.as_bytes())?;
         files::write(&folder.join(format!("{}.png", figure.file)), &figure.drawn.drawing.png)?;

@@ -153,6 +153,7 @@ impl PreparedWriter {
             group: vec![],
             bytes: 0,
             stored: self.episodes,
+            waiting: None,
             shared: Arc::clone(&shared),
         };
         let thread = std::thread::Builder::new()
@@ -246,13 +247,20 @@ impl Shared {
     }
 }
 
+/// What the committing thread receives.
+enum Message {
+    Episode(EncodedEpisode),
+    /// Commits the episodes so far, then answers.
+    Commit(SyncSender<()>),
+}
+
 struct LanceWriter {
     folder: PathBuf,
     incoming: Schema,
     columns: Vec<StoredColumn>,
     codec: ImageCodec,
     episodes: usize,
-    queue: Option<SyncSender<EncodedEpisode>>,
+    queue: Option<SyncSender<Message>>,
     thread: Option<JoinHandle<()>>,
     shared: Arc<Shared>,
     /// Whether the caller received the failure.
@@ -265,11 +273,19 @@ impl Writer for LanceWriter {
         episodes::check_episode(episode, &self.incoming)?;
         let encoded = EncodedEpisode::new(&self.columns, episode, self.codec, constants)?;
         let queue = self.queue.as_ref();
-        if queue.is_none_or(|queue| queue.send(encoded).is_err()) {
+        if queue.is_none_or(|queue| queue.send(Message::Episode(encoded)).is_err()) {
             return Err(self.failed());
         }
         self.episodes += 1;
         Ok(())
+    }
+
+    fn sync(&mut self) -> Result<()> {
+        let (done, committed) = sync_channel(1);
+        let queue = self.queue.as_ref();
+        // A failed thread drops the sender of the answer.
+        let is_sent = queue.is_some_and(|queue| queue.send(Message::Commit(done)).is_ok());
+        if is_sent && committed.recv().is_ok() { Ok(()) } else { Err(self.failed()) }
     }
 
     fn episodes(&self) -> usize {
@@ -326,25 +342,37 @@ struct Committer {
     bytes: usize,
     /// Number of stored episodes.
     stored: usize,
+    /// Who waits for the present commit.
+    waiting: Option<SyncSender<()>>,
     shared: Arc<Shared>,
 }
 
 impl Committer {
-    fn run(mut self, episodes: &Receiver<EncodedEpisode>) {
-        if let Err(error) = self.receive(episodes) {
+    fn run(mut self, messages: &Receiver<Message>) {
+        if let Err(error) = self.receive(messages) {
             *self.shared.failure() = Some(with_stored(error, self.stored));
         }
     }
 
-    fn receive(&mut self, episodes: &Receiver<EncodedEpisode>) -> Result<()> {
+    fn receive(&mut self, messages: &Receiver<Message>) -> Result<()> {
         let mut due = None;
         loop {
             let received = match due {
-                None => episodes.recv().map_err(|_| RecvTimeoutError::Disconnected),
-                Some(due) => episodes.recv_timeout(Instant::saturating_duration_since(&due, Instant::now())),
+                None => messages.recv().map_err(|_| RecvTimeoutError::Disconnected),
+                Some(due) => messages.recv_timeout(Instant::saturating_duration_since(&due, Instant::now())),
             };
             match received {
-                Ok(episode) => {
+                Ok(Message::Commit(done)) => {
+                    // Dropped with the committer if this fails, after the failure is known.
+                    self.waiting = Some(done);
+                    self.commit()?;
+                    due = None;
+                    if let Some(done) = self.waiting.take() {
+                        // The writer waits for it.
+                        let _ = done.send(());
+                    }
+                }
+                Ok(Message::Episode(episode)) => {
                     self.bytes += episode.bytes();
                     self.group.push(episode);
                     due.get_or_insert_with(|| Instant::now() + self.policy.interval);

@@ -1,7 +1,8 @@
 """Datasets: reading, loading, writing, converting and examining episodes.
 
 - `load_dataset` opens a dataset of any format for a torch `DataLoader`; `Loader` yields shuffled batches directly.
-- `open_writer` stores episodes; `convert`, `doctor` and `inspect` convert, examine and describe datasets.
+- `open_writer` stores episodes; `convert`, `doctor` and `inspect` convert, examine and describe datasets; `export` writes
+  episodes for the viewer of Rerun.
 - `register_format` adds a user-defined format to these functions.
 - `MergeDataset`, `ConcatDataset`, `GoalDataset`, `ReplayBuffer`: datasets derived from other datasets or a collection.
 """
@@ -45,7 +46,7 @@ from .normalization import (
     column_normalizer,
     get_scaler,
 )
-from .utils import convert, doctor, ensure_dir_exists, get_cache_dir, inspect, load_dataset, merge
+from .utils import convert, doctor, ensure_dir_exists, export, get_cache_dir, inspect, load_dataset, merge
 from .writer import EpisodeWriter
 
 __all__ = [
@@ -85,6 +86,7 @@ __all__ = [
     "detect_format",
     "doctor",
     "ensure_dir_exists",
+    "export",
     "get_cache_dir",
     "get_format",
     "get_scaler",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,17 @@ from .format import FORMATS, detect_format, get_format, validate_write_mode
 from .normalization import column_normalizer
 from .writer import codec_json
 
-__all__ = ["column_normalizer", "convert", "doctor", "ensure_dir_exists", "get_cache_dir", "inspect", "load_dataset", "merge"]
+__all__ = [
+    "column_normalizer",
+    "convert",
+    "doctor",
+    "ensure_dir_exists",
+    "export",
+    "get_cache_dir",
+    "inspect",
+    "load_dataset",
+    "merge",
+]
 
 
 def get_cache_dir(override_root: str | Path | None = None, sub_folder: str | None = None) -> Path:
@@ -142,6 +152,34 @@ def _options(
         "least_psnr": least_psnr,
     }
     return json.dumps(settings)
+
+
+def export(
+    source: str | os.PathLike[str],
+    file: str | os.PathLike[str] = "episodes.rrd",
+    *,
+    episodes: int = 4,
+    columns: Sequence[str] = (),
+) -> None:
+    """Writes episodes for the viewer of Rerun, with the package `rerun-sdk`; `swm export` on the command line.
+
+        export("pusht.lance", "pusht.rrd", episodes=8)
+
+    Args:
+        source: A path, a URI or a name.
+        file: The file to write, which ends in `.rrd`. A recording of this package is replaced.
+        episodes: The number of episodes, spread over the dataset.
+        columns: The columns to write; all of them if empty.
+
+    Raises:
+        RuntimeError: If nothing was written; the reason is on standard error.
+    """
+    # The package is looked for in this interpreter.
+    os.environ.setdefault("SWM_PYTHON", sys.executable)
+    chosen = [argument for column in columns for argument in ("--column", column)]
+    arguments = ["export", os.fspath(source), "--output", os.fspath(file), "--episodes", str(episodes), *chosen]
+    if _engine.command(["swm", *arguments]):
+        raise RuntimeError(f"{os.fspath(file)}: not written; the reason is on standard error")
 
 
 def convert(

@@ -16,6 +16,7 @@ mod envs;
 mod eval;
 mod eval_policy;
 mod eval_until;
+mod export;
 mod frame;
 mod inspect;
 mod lab;
@@ -117,6 +118,12 @@ enum Command {
     /// Write a dataset in another format, and verify the result
     #[command(after_help = "Example: swm convert rooms rooms-jpeg --codec jpeg")]
     Convert(on_ray::convert::ConvertCommand),
+    /// Write episodes for the viewer of Rerun
+    ///
+    /// Frames, depth, segmentation, and every other column over the steps; a table of the factors of each episode. The Python
+    /// package rerun-sdk writes the file, in the Python of $SWM_PYTHON or python3.
+    #[command(after_help = "Example: swm export rooms --episodes 8 --output episodes.rrd")]
+    Export(export::ExportArgs),
     /// Find defects of a dataset, and the models it can train
     #[command(after_help = "Example: swm doctor rooms --repair rooms-repaired")]
     Doctor(doctor::DoctorArgs),
@@ -312,6 +319,7 @@ impl Cli {
             Command::Checkpoints(args) => checkpoints::checkpoints(&args, &Context::new(json, self.threads)?),
             Command::Report(args) => report::report(&args, json),
             Command::Convert(args) => on_ray::convert::run(&args, &Context::new(json, self.threads)?),
+            Command::Export(args) => export::export(&args, &Context::new(json, self.threads)?),
             Command::Doctor(args) => doctor::doctor(&args, &Context::new(json, self.threads)?),
             Command::Collect(args) => on_ray::collect::run(&args, &Context::new(json, self.threads)?),
             Command::Train(args) => on_ray::train::run(&args, &Context::new(json, self.threads)?),

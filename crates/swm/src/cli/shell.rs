@@ -15,8 +15,8 @@ const GROUPS: &[(&str, &[&str])] = &[
     (
         "Data",
         &[
-            "envs", "fovs", "frame", "wrappers", "collect", "datasets", "inspect", "preview", "convert", "doctor",
-            "formats",
+            "envs", "fovs", "frame", "wrappers", "collect", "datasets", "inspect", "preview", "convert", "export",
+            "doctor", "formats",
         ],
     ),
     ("Train", &["models", "devices", "train", "plot", "recipes", "zoo", "checkpoints", "pull", "push", "probe"]),

@@ -6,6 +6,7 @@ mod capsules;
 mod collecting;
 mod data;
 mod deletion;
+mod export;
 mod finite;
 mod foreign;
 mod gym;

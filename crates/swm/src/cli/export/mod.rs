@@ -76,7 +76,7 @@ pub fn export(args: &ExportArgs, context: &Context) -> anyhow::Result<()> {
     let replaced = unfinished.persist(&args.output);
     replaced.map_err(|error| Error::io(&args.output, "writing the recording", error.error))?;
     if context.json {
-        return Ok(emit_json(&json!({"file": args.output, "episodes": episodes.len(), "left_out": left_out}))?);
+        return emit_json(&json!({"file": args.output, "episodes": episodes.len(), "left_out": left_out}));
     }
     let file = args.output.display();
     emit(&format!("{} episodes in {file}; `rerun {file}` shows them\n", episodes.len()));
@@ -104,6 +104,9 @@ enum Kind {
     /// A row of the table about the episode.
     Fact,
 }
+
+/// A column, and what it becomes.
+type Exported = (ColumnSpec, Kind);
 
 impl Kind {
     /// `None` for a column with too many values.
@@ -134,7 +137,7 @@ impl Kind {
 }
 
 /// Returns the columns to export, and the names of those that are left out.
-fn chosen_columns(reader: &dyn Reader, names: &[String]) -> Result<(Vec<(ColumnSpec, Kind)>, Vec<String>)> {
+fn chosen_columns(reader: &dyn Reader, names: &[String]) -> Result<(Vec<Exported>, Vec<String>)> {
     let schema = reader.schema();
     let all = || schema.columns().iter().filter(|column| ![EPISODE_IDX, STEP_IDX].contains(&column.name.as_str()));
     let wanted: Vec<ColumnSpec> = match names {
@@ -216,7 +219,7 @@ impl Recording {
     }
 
     /// Adds an episode, at this position of [`Reader::episodes`].
-    fn add(&mut self, reader: &dyn Reader, episode: usize, columns: &[(ColumnSpec, Kind)]) -> Result<()> {
+    fn add(&mut self, reader: &dyn Reader, episode: usize, columns: &[Exported]) -> Result<()> {
         let length = reader.episodes()[episode].length;
         let named =
             |wanted: fn(Kind) -> bool| columns.iter().filter(move |(_, kind)| wanted(*kind)).map(|(column, _)| column);

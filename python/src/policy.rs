@@ -53,7 +53,8 @@ impl Actor {
     fn expert(world: &World, name: &str, seed: Option<u64>) -> PyResult<Self> {
         let world = world.lock()?;
         let entry = swm::env(&world.spec().id, &swm::core::Origin::User).map_err(to_py_err)?.entry;
-        Ok(Self::new(swm::resolver::scripted(&entry, name, &world).map_err(to_py_err)?, seed))
+        let (policy, weights) = swm::resolver::expert(&entry, name, &world).map_err(to_py_err)?;
+        Ok(Self { hashes: hash_of(weights), ..Self::new(policy, seed) })
     }
 
     /// Creates the policy of a checkpoint.
@@ -134,13 +135,10 @@ impl Actor {
     /// The names of an environment's experts.
     #[staticmethod]
     fn experts(env: &str) -> PyResult<Vec<&'static str>> {
-        Ok(swm::env(env, &swm::core::Origin::User)
-            .map_err(to_py_err)?
-            .entry
-            .experts
-            .iter()
-            .map(|expert| expert.id())
-            .collect())
+        let choice = swm::env(env, &swm::core::Origin::User).map_err(to_py_err)?;
+        let trained = swm::resolver::trained_expert(&choice.entry, &choice.id(), "expert").map_err(to_py_err)?;
+        let scripted = choice.entry.experts.iter().map(|expert| expert.id());
+        Ok(scripted.chain(trained.map(|_| "expert")).collect())
     }
 }
 

@@ -7,7 +7,7 @@ mod watching;
 
 pub use watching::WatchedPolicy;
 
-use crate::home;
+use crate::{home, zoo};
 use serde::de::DeserializeOwned;
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -388,12 +388,34 @@ pub fn policy_of_choice(
 /// Returns the policy with a name for a world: a [`scripted`] policy, or a checkpoint that acts without a solver. For a
 /// checkpoint, also returns the hash of the weights.
 fn policy_by_name(entry: &EnvEntry, name: &str, world: &World) -> Result<(Box<dyn Policy>, Option<String>)> {
+    let trained = trained_expert(entry, &world.spec().id, name)?;
+    let name = trained.as_deref().unwrap_or(name);
     let is_scripted = ["random", "expert"].contains(&name) || entry.experts.iter().any(|expert| expert.id == name);
     if is_scripted || !home::checkpoint(name)?.exists() {
         return Ok((scripted(entry, name, world)?, None));
     }
     let (policy, info) = checkpoint_policy(name, world.spec(), world.pool().len())?;
     Ok((policy, Some(info.weights)))
+}
+
+/// Returns the environment's expert with this name, scripted or of the zoo; for one of the zoo also the hash of its weights.
+///
+/// # Errors
+/// When the environment has no such expert.
+pub fn expert(entry: &EnvEntry, name: &str, world: &World) -> Result<(Box<dyn Policy>, Option<String>)> {
+    match trained_expert(entry, &world.spec().id, name)? {
+        Some(trained) => policy_by_name(entry, &trained, world),
+        None => Ok((scripted(entry, name, world)?, None)),
+    }
+}
+
+/// Returns the capsule of the zoo that `expert` names: where the environment `id`, with its options, has no scripted expert
+/// and the zoo has one.
+///
+/// # Errors
+/// As [`zoo::expert`].
+pub fn trained_expert(entry: &EnvEntry, id: &str, name: &str) -> Result<Option<String>> {
+    if name == "expert" && entry.experts.is_empty() { zoo::expert(id) } else { Ok(None) }
 }
 
 /// Loads a checkpoint that acts without a solver; returns its policy for `slots` environments and its description.
@@ -447,7 +469,7 @@ fn find_expert(entry: &EnvEntry, name: &str) -> Result<Option<&'static ExpertEnt
     match entry.experts {
         [first, ..] if name == "expert" => Ok(Some(first)),
         [] => {
-            let hint = format!("{} has no experts: choose random or a checkpoint", entry.id);
+            let hint = format!("{} has no expert of this name: choose random or a checkpoint", entry.id);
             Err(Error::unknown("policy", name, ["random"], hint))
         }
         experts => experts.iter().find(|expert| expert.id == name).map(Some).ok_or_else(|| {

@@ -5,6 +5,7 @@ use crate::{home, library};
 use std::collections::BTreeMap;
 use std::path::{Component, Path, PathBuf};
 use swm_core::{Error, Result};
+use swm_models::capsule::Capsule;
 
 /// The start of a name in the zoo.
 pub const PREFIX: &str = "zoo:";
@@ -74,6 +75,31 @@ pub fn find(name: &str) -> Result<PathBuf> {
     let known = capsules();
     let hint = format!("`swm zoo` lists the capsules; it searches {}", listed(&folders()));
     Err(Error::unknown("capsule", name, known.keys().map(String::as_str), hint))
+}
+
+/// The last part of the name of a capsule that plays an environment without a scripted expert: `cartpole-swingup/expert`.
+const EXPERT: &str = "/expert";
+
+/// Returns the capsules named `expert`, such as `zoo:cartpole-swingup/expert`, with the environments that they were trained on.
+///
+/// # Errors
+/// When such a capsule is damaged.
+pub fn experts() -> Result<Vec<(String, String)>> {
+    let named = capsules().into_iter().filter(|(name, _)| name.ends_with(EXPERT));
+    let read = named.map(|(name, path)| {
+        let env = Capsule::read(&path)?.env().map(str::to_owned);
+        Ok(env.map(|env| (format!("{PREFIX}{name}"), env)))
+    });
+    read.filter_map(Result::transpose).collect()
+}
+
+/// Returns the capsule that is the expert of an environment with these options, such as
+/// `swm/CartpoleDMControl-v0,task=swingup`.
+///
+/// # Errors
+/// When a capsule named `expert` is damaged.
+pub fn expert(env: &str) -> Result<Option<String>> {
+    Ok(experts()?.into_iter().find(|(_, of)| of == env).map(|(name, _)| name))
 }
 
 fn listed(folders: &[PathBuf]) -> String {

@@ -7,7 +7,7 @@ mod record;
 mod verify;
 
 pub use pack::{PackRequest, pack};
-pub use record::{EvaluationRecord, RecordedEpisode};
+pub use record::{EvaluationRecord, RecordedEpisode, Returns};
 pub(crate) use record::{check_cost, is_hash, trained};
 pub use verify::{Verification, verify};
 

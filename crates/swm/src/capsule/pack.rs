@@ -24,6 +24,8 @@ pub struct PackRequest {
     pub run: PathBuf,
     /// A `results.json` with an evaluation of the checkpoint.
     pub results: Option<PathBuf>,
+    /// A `results.json` of the checkpoint whose episodes were played to their end, for its returns.
+    pub returns: Option<PathBuf>,
     /// The licence of the weights.
     pub licence: Option<String>,
     /// Who trained the model.
@@ -48,10 +50,18 @@ pub fn pack(request: &PackRequest, options: &RunOptions, control: &mut Control<'
     let model: Rc<dyn LoadedModel> = Rc::from(load_stored(FAMILIES.rows, &rounded.stored, &Device::flex())?);
     let reference = make_reference(&*model, request)?;
     let hash = rounded.stored.manifest().hashes.get("weights").cloned().unwrap_or_default();
-    let evaluation = match &request.results {
+    let mut evaluation = match &request.results {
         Some(file) => Some(evaluate(file, request.trust, &[&hash, &evaluated], model, options, control)?),
         None => old.as_ref().and_then(|capsule| capsule.evaluation.clone()),
     };
+    if let Some(file) = &request.returns {
+        let returns = EvaluationRecord::returns_in(file, &swm_report::read_results(file)?, &[&hash, &evaluated])?;
+        let Some(evaluation) = &mut evaluation else {
+            let fix = "give the results of another evaluation as well, with strict counting: --eval";
+            return Err(Error::config(file.display().to_string(), "the capsule has no evaluation", fix));
+        };
+        evaluation.record["returns"] = json!(returns);
+    }
     let old = old.map(|capsule| capsule.description).unwrap_or_default();
     let description = Description {
         licence: request.licence.clone().or(old.licence),

@@ -31,8 +31,29 @@ pub struct EvaluationRecord {
     pub success: [usize; 2],
     /// The same for the random-policy floor.
     pub floor: Option<[usize; 2]>,
+    /// The returns of the model and of the floor in episodes that were played to their end, if they were measured.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub returns: Vec<Returns>,
     /// The recorded episodes.
     pub episodes: Vec<RecordedEpisode>,
+}
+
+/// The returns of the episodes of a policy, each the sum of the rewards of an episode.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Returns {
+    /// The mean.
+    pub mean: f64,
+    /// The standard deviation, over the number of episodes.
+    pub std: f64,
+}
+
+impl Returns {
+    fn of(run: &Run) -> Self {
+        let returns: Vec<f64> = run.episodes.iter().map(|episode| episode.total_reward).collect();
+        let n = returns.len().max(1) as f64;
+        let mean = returns.iter().sum::<f64>() / n;
+        Self { mean, std: (returns.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / n).sqrt() }
+    }
 }
 
 /// The outcome of an episode.
@@ -76,43 +97,22 @@ impl EvaluationRecord {
     /// # Errors
     /// When the results hold no run, or several runs, of the model, or were not counted strictly.
     pub(super) fn find(file: &Path, results: &Results, hashes: &[&str]) -> Result<(Self, Vec<usize>)> {
-        let wrong = |problem: String| {
-            let fix = "evaluate this checkpoint alone with strict counting (`swm eval`), and give its results.json";
-            Error::config(file.display().to_string(), problem, fix)
-        };
         let (manifest, request) = (&results.manifest, EvalRequest::of(&results.manifest)?);
         let Counting::Strict { .. } = request.counting else {
-            return Err(wrong(format!("its counting is {}", request.counting.name())));
+            return Err(unfit(file, format!("its counting is {}", request.counting.name())));
         };
-        if results.sequential || results.stopping.is_some() {
-            return Err(wrong("its results decided the number of episodes".to_owned()));
-        }
-        let weights = |policy: &PolicyRequest| {
-            let hash =
-                manifest.hashes.get(&format!("weights of {}", policy.name)).or(manifest.hashes.get("weights"))?;
-            (trained(&policy.kind).is_some() && hashes.contains(&hash.as_str())).then(|| hash.clone())
-        };
-        let found: Vec<(&PolicyRequest, String)> =
-            request.policies.iter().filter_map(|policy| Some((policy, weights(policy)?))).collect();
-        let [(policy, weights)] = &found[..] else {
-            return Err(wrong(format!("{} of its policies have the weights of this checkpoint", found.len())));
-        };
+        let Evaluated { policy, weights, run, floor } = Evaluated::find(file, results, &request, hashes)?;
         let (Some(condition), Some(kind)) = (request.conditions.first(), with_model(&policy.kind, MODEL)) else {
-            return Err(wrong("its request has no condition".to_owned()));
+            return Err(unfit(file, "its request has no condition".to_owned()));
         };
-        let is_run = |run: &&Run, policy: &PolicyRequest| run.policy == policy.name && run.condition == condition.name;
-        let run = results.runs.iter().find(|run| is_run(run, policy));
-        let run = run.ok_or_else(|| wrong(format!("it has no run of '{}'", policy.name)))?;
-        let is_floor = |policy: &&PolicyRequest| policy.kind == PolicyKind::Random;
-        let floor = request.policies.iter().find(is_floor);
-        let floor = floor.and_then(|floor| results.runs.iter().find(|run| is_run(run, floor)));
         let counts = |run: &Run| [run.success.successes, run.success.n];
         let kept = ["starts", "goals", "dataset"];
         let record = Self {
-            weights: weights.clone(),
+            weights,
             hashes: manifest.hashes.clone().into_iter().filter(|(name, _)| kept.contains(&name.as_str())).collect(),
             success: counts(run),
             floor: floor.map(counts),
+            returns: vec![],
             episodes: vec![],
             request: EvalRequest {
                 policies: vec![PolicyRequest { name: MODEL.to_owned(), kind }],
@@ -122,6 +122,21 @@ impl EvaluationRecord {
             },
         };
         Ok((record, choose(run)))
+    }
+
+    /// Returns the returns of the model with one of these hashes, and of the floor, in results.
+    ///
+    /// # Errors
+    /// As [`Self::find`], and when episodes end with a success: such a return lacks the rewards of the steps after it.
+    pub(super) fn returns_in(file: &Path, results: &Results, hashes: &[&str]) -> Result<Vec<Returns>> {
+        let request = EvalRequest::of(&results.manifest)?;
+        if matches!(request.counting, Counting::Strict { .. }) {
+            let problem = "its episodes end with a success, and their returns lack the rewards after it";
+            let fix = "evaluate with --protocol compat, which plays episodes to their end";
+            return Err(Error::config(file.display().to_string(), problem, fix));
+        }
+        let Evaluated { run, floor, .. } = Evaluated::find(file, results, &request, hashes)?;
+        Ok([Some(run), floor].into_iter().flatten().map(Returns::of).collect())
     }
 
     /// Reads and checks the record of a capsule.
@@ -160,6 +175,9 @@ impl EvaluationRecord {
         if [Some(record.success), record.floor].into_iter().flatten().any(|[_, n]| n > request.episodes) {
             return Err(wrong(format!("it counts more than the {} episodes of its request", request.episodes)));
         }
+        if record.returns.len() > 2 || record.returns.iter().any(|returns| !(returns.mean + returns.std).is_finite()) {
+            return Err(wrong(format!("it has the returns {:?}", record.returns)));
+        }
         if let Some(text) = record.hashes.values().chain([&record.weights]).find(|text| !is_hash(text)) {
             return Err(wrong(format!("'{}' is no hash", text.escape_debug())));
         }
@@ -196,6 +214,49 @@ impl EvaluationRecord {
     ) -> Recorded<'a> {
         Recorded { numbers, rows: evaluation.rows.as_ref().map(|rows| (rows, starts)) }
     }
+}
+
+/// The run of a model in results.
+struct Evaluated<'r> {
+    policy: &'r PolicyRequest,
+    weights: String,
+    run: &'r Run,
+    /// The run of the random-policy floor.
+    floor: Option<&'r Run>,
+}
+
+impl<'r> Evaluated<'r> {
+    /// Finds the run of the model with one of these hashes under the first condition.
+    ///
+    /// # Errors
+    /// When the results hold no run, or several runs, of the model, or decided the number of episodes.
+    fn find(file: &Path, results: &'r Results, request: &'r EvalRequest, hashes: &[&str]) -> Result<Self> {
+        if results.sequential || results.stopping.is_some() {
+            return Err(unfit(file, "its results decided the number of episodes".to_owned()));
+        }
+        let stored = &results.manifest.hashes;
+        let weights = |policy: &PolicyRequest| {
+            let hash = stored.get(&format!("weights of {}", policy.name)).or(stored.get("weights"))?;
+            (trained(&policy.kind).is_some() && hashes.contains(&hash.as_str())).then(|| hash.clone())
+        };
+        let found: Vec<(&PolicyRequest, String)> =
+            request.policies.iter().filter_map(|policy| Some((policy, weights(policy)?))).collect();
+        let [(policy, weights)] = &found[..] else {
+            return Err(unfit(file, format!("{} of its policies have the weights of this checkpoint", found.len())));
+        };
+        let condition = request.conditions.first().map(|condition| condition.name.as_str()).unwrap_or_default();
+        let run_of = |policy: &PolicyRequest| {
+            results.runs.iter().find(|run| run.policy == policy.name && run.condition == condition)
+        };
+        let run = run_of(policy).ok_or_else(|| unfit(file, format!("it has no run of '{}'", policy.name)))?;
+        let floor = request.policies.iter().find(|policy| policy.kind == PolicyKind::Random);
+        Ok(Self { policy, weights: weights.clone(), run, floor: floor.and_then(run_of) })
+    }
+}
+
+fn unfit(file: &Path, problem: String) -> Error {
+    let fix = "evaluate this checkpoint alone with strict counting (`swm eval`), and give its results.json";
+    Error::config(file.display().to_string(), problem, fix)
 }
 
 /// Chooses the numbers of the episodes to record.

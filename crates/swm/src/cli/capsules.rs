@@ -4,7 +4,7 @@ use super::eval::run_options;
 use super::progress::control;
 use super::results_tables::percent;
 use super::{Context, emit, emit_json, output_folder};
-use crate::capsule::{self, EvaluationRecord, PackRequest, RecordedEpisode, Verification};
+use crate::capsule::{self, EvaluationRecord, PackRequest, RecordedEpisode, Returns, Verification};
 use crate::home;
 use clap::{Args, ValueEnum};
 use serde::Serialize;
@@ -29,6 +29,11 @@ pub struct PackArgs {
     /// The capsule records the success rate, and three episodes that `verify` plays again.
     #[arg(long, value_name = "RESULTS")]
     eval: Option<PathBuf>,
+    /// Results of `swm eval --protocol compat` with this checkpoint, for its mean return
+    ///
+    /// With strict counting, an episode ends when its goal is reached, which is not what a task with rewards measures.
+    #[arg(long, value_name = "RESULTS")]
+    returns: Option<PathBuf>,
     /// Licence of the weights, such as MIT
     #[arg(long, value_name = "TEXT")]
     licence: Option<String>,
@@ -51,10 +56,11 @@ pub fn pack(args: &PackArgs, context: &Context) -> anyhow::Result<()> {
     }
     output_folder::check_file(&args.output)?;
     files::check_own(&args.output, |path| Capsule::read(path).is_ok())?;
-    let eval = args.eval.as_deref();
+    let file = |path: &PathBuf| if path.is_dir() { path.join("results.json") } else { path.clone() };
     let request = PackRequest {
         run: home::find_checkpoint(&args.checkpoint)?,
-        results: eval.map(|path| if path.is_dir() { path.join("results.json") } else { path.to_owned() }),
+        results: args.eval.as_ref().map(file),
+        returns: args.returns.as_ref().map(file),
         licence: args.licence.clone(),
         author: args.author.clone(),
         trust: args.trust,
@@ -124,6 +130,8 @@ pub struct EvaluationInfo {
     pub success: Proportion,
     /// The success rate of the random-policy floor.
     pub floor: Option<Proportion>,
+    /// The returns of the model and of the floor in episodes that were played to their end, if they were measured.
+    pub returns: Vec<Returns>,
     /// The hash of the evaluated weights.
     pub weights: String,
     /// The recorded episodes.
@@ -149,6 +157,7 @@ impl CapsuleInfo {
             success: record.success(),
             floor: record.floor(),
             weights: record.weights,
+            returns: record.returns,
             episodes: record.episodes,
         });
         Ok(Self {
@@ -175,7 +184,8 @@ impl CapsuleInfo {
             self.packed_on
         );
         if let Some(evaluation) = &self.evaluation {
-            lines.push_str(&format!("success {}; starts {}\n", evaluation.success_and_floor(), evaluation.starts()));
+            let measure = if evaluation.returns.is_empty() { "success " } else { "" };
+            lines.push_str(&format!("{measure}{}; starts {}\n", evaluation.measured(), evaluation.starts()));
         }
         lines
     }
@@ -191,8 +201,12 @@ impl EvaluationInfo {
         }
     }
 
-    /// Formats the success rate, with the random-policy floor.
-    pub fn success_and_floor(&self) -> String {
+    /// Formats the success rate, or the mean return with its standard deviation, beside that of the random-policy floor.
+    pub fn measured(&self) -> String {
+        if let [model, floor @ ..] = &self.returns[..] {
+            let floor = floor.first().map_or(String::new(), |floor| format!(", floor {:.0}", floor.mean));
+            return format!("return {:.0} ± {:.0}{floor}", model.mean, model.std);
+        }
         let floor = self.floor.map_or(String::new(), |floor| format!(", floor {}", percent(&floor)));
         format!("{} of {} episodes{floor}", percent(&self.success), self.success.n)
     }

@@ -1,7 +1,8 @@
 //! `swm envs` and `swm fovs`: list environments and their factors of variation.
 
 use super::{emit, emit_json, eprint, table};
-use crate::{ENVS, describe, gym, mujoco};
+use crate::resolver::trained_expert;
+use crate::{ENVS, describe, gym, mujoco, zoo};
 use clap::Args;
 use serde_json::{Map, Value, json};
 use swm_core::{EnvChoice, Origin};
@@ -34,9 +35,14 @@ pub fn envs(args: &EnvsArgs, as_json: bool) -> anyhow::Result<()> {
         return emit_json(&all.collect::<Map<String, Value>>());
     }
     // From the registry alone: to make a MuJoCo environment, its model is compiled.
+    let trained = zoo::experts()?;
     let rows = ENVS.rows.iter().map(|row| {
-        let experts: Vec<&str> = row.experts.iter().map(|expert| expert.id).collect();
-        vec![row.id.to_owned(), experts.join(", "), row.summary.to_owned()]
+        let mut experts: Vec<String> = row.experts.iter().map(|expert| expert.id.to_owned()).collect();
+        if experts.is_empty() {
+            let options = trained.iter().filter_map(|(_, env)| env.strip_prefix(row.id));
+            experts.extend(options.map(|options| format!("expert{options}")));
+        }
+        vec![row.id.to_owned(), experts.join("; "), row.summary.to_owned()]
     });
     emit(&table(&["environment", "experts", "task"], rows));
     emit("\n`swm envs ENV` shows actions, columns, options and cameras, `swm fovs ENV` the factors of variation.\n");
@@ -80,6 +86,9 @@ fn show(choice: &EnvChoice, as_json: bool) -> anyhow::Result<()> {
         ]
     }));
     rows.extend(row.experts.iter().map(|e| vec![format!("expert {}", e.id), e.summary.to_owned()]));
+    if let Some(trained) = trained_expert(row, &spec.id, "expert")? {
+        rows.push(vec!["expert".to_owned(), format!("trained by interaction: {trained} (`swm zoo`)")]);
+    }
     emit(&table(&[&spec.id, "value"], rows));
     Ok(())
 }

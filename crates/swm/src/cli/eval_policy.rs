@@ -3,7 +3,7 @@
 use super::planner::PlannerArgs;
 use crate::capsule::EvaluationRecord;
 use crate::home;
-use crate::resolver::{HomeResolver, parse_score};
+use crate::resolver::{HomeResolver, parse_score, trained_expert};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use swm_core::{EnvChoice, Result};
@@ -49,6 +49,11 @@ impl NamedPolicy {
             _ => None,
         };
         if let Some(kind) = baseline {
+            return Ok(without_checkpoint(NamedKind::Direct(kind)));
+        }
+        let trained = env.as_ref().map(|env| trained_expert(&env.entry, &env.id(), given)).transpose()?.flatten();
+        if let Some(trained) = trained {
+            let kind = PolicyKind::Direct { checkpoint: trained, settings: Value::Null };
             return Ok(without_checkpoint(NamedKind::Direct(kind)));
         }
         if given == "expert" || env.is_some_and(|env| env.entry.experts.iter().any(|expert| expert.id == given)) {

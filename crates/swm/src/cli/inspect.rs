@@ -141,7 +141,8 @@ impl InspectArgs {
         let mut measured = vec![("family".to_owned(), info.family.clone()), ("packed on".to_owned(), info.packed_on)];
         measured.push(("weights (BLAKE3)".to_owned(), info.weights));
         if let Some(evaluation) = &info.evaluation {
-            measured.push(("success rate [95 %]".to_owned(), evaluation.success_and_floor()));
+            let what = if evaluation.returns.is_empty() { "success rate [95 %]" } else { "return" };
+            measured.push((what.to_owned(), evaluation.measured()));
             measured.push(("starts".to_owned(), evaluation.starts()));
         }
         Described::capsule(&path, &Capsule::read(&path)?, measured, self.url.clone())

@@ -45,7 +45,7 @@ fn cells(info: &CapsuleInfo) -> Vec<String> {
     vec![
         info.family.clone(),
         or_none(info.env.clone()),
-        or_none(info.evaluation.as_ref().map(EvaluationInfo::success_and_floor)),
+        or_none(info.evaluation.as_ref().map(EvaluationInfo::measured)),
         or_none(info.evaluation.as_ref().map(EvaluationInfo::starts)),
         format!("{} kB", info.bytes / 1000),
         info.hash.chars().take(12).collect(),

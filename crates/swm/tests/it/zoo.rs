@@ -5,9 +5,11 @@ use serde_json::json;
 use std::fs;
 use std::path::{Path, PathBuf};
 use swm::capsule::{EvaluationRecord, cpu_level, verify};
+use swm::core::Origin;
 use swm::core::run::Control;
 use swm::eval::{RunOptions, StartsRequest};
 use swm::models::capsule::Capsule;
+use swm::zoo;
 use swm_simd::{CpuLevel, limit_cpu_level};
 
 /// The most bytes of all capsules in the repository.
@@ -50,7 +52,8 @@ fn capsules_of_the_repository_are_valid() {
         assert!(output.status.success(), "{name}: {}{}", text(&output.stdout), text(&output.stderr));
 
         // Without options, an evaluation plays the recorded episodes whose starts the environment draws.
-        if record.request.starts != StartsRequest::Episodic {
+        let env = || swm::env(&record.request.env, &Origin::User).and_then(|env| env.env());
+        if record.request.starts != StartsRequest::Episodic || env().is_err() {
             continue;
         }
         let episodes = 1 + record.episodes.iter().map(|episode| episode.number).max().expect("an episode");
@@ -76,6 +79,42 @@ fn capsules_of_the_repository_are_valid() {
     let listed = swm.json(&["zoo"]);
     let names: Vec<&str> = listed.as_array().expect("a list").iter().filter_map(|row| row["name"].as_str()).collect();
     assert_eq!(names, all.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>());
+}
+
+/// A capsule named `expert` plays an environment that has no scripted expert.
+#[test]
+fn expert_of_the_zoo_is_the_policy_of_its_environment() {
+    let swm = Swm::new();
+    let experts = zoo::experts().expect("the experts");
+    assert!(experts.iter().any(|(name, _)| name == "zoo:cartpole-swingup/expert"), "{experts:?}");
+    let listed = text(&swm.run(&["envs"]).stdout);
+    assert!(listed.contains("expert,task=swingup"), "{listed}");
+    for (name, env) in &experts {
+        assert_eq!(zoo::expert(env).expect("the experts").as_ref(), Some(name));
+        if swm::env(env, &Origin::User).and_then(|env| env.env()).is_err() {
+            continue;
+        }
+        let found = swm.json(&["eval", "expert", "--env", env, "--episodes", "2"]);
+        let weights = swm.json(&["checkpoints", "show", name])["capsule"]["weights"].clone();
+        assert_eq!(found["manifest"]["hashes"]["weights"], weights, "{name}");
+        swm.json(&[
+            "collect",
+            env,
+            "--policy",
+            "expert",
+            "--episodes",
+            "1",
+            "--no-pixels",
+            "-o",
+            "played.lance",
+            "--overwrite",
+        ]);
+    }
+    swm.fails(
+        &["eval", "expert", "--env", "swm/CartpoleDMControl-v0,task=balance", "--episodes", "2"],
+        2,
+        &["no expert"],
+    );
 }
 
 #[test]

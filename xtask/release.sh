@@ -3,6 +3,9 @@
 set -eu
 OUT=$1
 TARGET=$CARGO_TARGET_DIR-release
+# Dates inside packages are that of the commit, so that equal sources give equal packages.
+SOURCE_DATE_EPOCH=$(git log -1 --format=%ct)
+export SOURCE_DATE_EPOCH
 VERSION=$(sed -n 's/^version = "\(.*\)"$/\1/p' Cargo.toml | head -1)
 HOST=$(rustc -vV | sed -n 's/^host: //p')
 NAME=stable-worldmodel-$VERSION-$HOST
@@ -15,11 +18,15 @@ cp "$TARGET/release/swm" "$OUT/$NAME/"
 strip "$OUT/$NAME/swm"
 # The list of dependencies has to survive strip.
 auditable2cdx "$OUT/$NAME/swm" > "$OUT/$NAME.cdx.json"
+sh xtask/changes.sh "$VERSION" > "$OUT/$NAME/CHANGES.md"
+cp "$OUT/$NAME/CHANGES.md" "$OUT/"
 cp README.md CHANGELOG.md CITATION.cff LICENSE* "$OUT/$NAME/"
 cp -r zoo "$OUT/$NAME/"
 for shell in bash zsh fish; do "$OUT/$NAME/swm" completions $shell > "$OUT/$NAME/swm.$shell"; done
 "$OUT/$NAME/swm" man --output "$OUT/$NAME/man" > /dev/null
-tar --create --xz --sort=name --owner=0 --group=0 --numeric-owner --mtime='@0' --directory "$OUT" --file "$OUT/$NAME.tar.xz" "$NAME"
+tar --create --xz --sort=name --owner=0 --group=0 --numeric-owner --mtime="@$SOURCE_DATE_EPOCH" --directory "$OUT" --file "$OUT/$NAME.tar.xz" "$NAME"
+sh xtask/deb.sh "$OUT/$NAME" "$OUT" "$VERSION"
+cp Containerfile "$OUT/"
 rm -r "${OUT:?}/$NAME"
 
 cp "$WHEELS"/*.whl "$OUT/"

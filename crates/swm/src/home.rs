@@ -299,7 +299,8 @@ pub fn target(given: &str, format: Option<&str>) -> Result<Location> {
 /// When it is a name and there is no folder.
 fn named(given: &str, folder: fn() -> Result<PathBuf>, suffix: &str) -> Result<PathBuf> {
     let path = Path::new(given);
-    if path.components().count() > 1 || path.extension().is_some() || path.exists() {
+    // A name has no slash, not even at its end.
+    if given.contains(std::path::is_separator) || path.extension().is_some() || path.exists() {
         return Ok(path.to_owned());
     }
     Ok(folder()?.join(given).with_extension(suffix))
@@ -315,6 +316,7 @@ mod tests {
         let dataset = |given| dataset(given).expect("a path");
         assert_eq!(dataset("a/b.lance"), Path::new("a/b.lance"));
         assert_eq!(dataset("./b"), Path::new("./b"));
+        assert_eq!(dataset("b/"), Path::new("b/"));
         assert_eq!(dataset("rooms"), datasets.join("rooms.lance"));
         let target = |name, format| target(name, format).expect("a location").to_string();
         assert_eq!(target("rooms", Some("hdf5")), datasets.join("rooms.h5").to_string_lossy());

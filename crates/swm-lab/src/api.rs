@@ -110,7 +110,9 @@ pub fn routes(shared: Shared) -> Router {
         .route("/api/datasets", get(list_datasets))
         .route("/api/episodes", get(episodes))
         .route("/api/rows", get(rows))
+        .route("/api/values", get(values))
         .route("/api/frame", get(frame))
+        .route("/api/video", get(video))
         .route("/api/distribution", get(distribution))
         .route("/api/doctor", get(doctor))
         .route("/api/save", post(save))
@@ -258,6 +260,8 @@ struct EntryQuery {
     #[serde(default)]
     column: String,
     #[serde(default)]
+    entry: String,
+    #[serde(default)]
     offset: u64,
     #[serde(default)]
     x: usize,
@@ -282,6 +286,25 @@ async fn frame(State(shared): State<Shared>, Query(query): Query<EntryQuery>) ->
         datasets::frame(&*reader, &query.column, query.episode, query.row)
     });
     Ok(answer("image/jpeg", jpeg.await?))
+}
+
+/// The smallest, the largest and the mean value of an element of a column in every episode.
+async fn values(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
+    let values = shared.work(move |shared| {
+        datasets::values(&*shared.datasets.get(query.folder, &query.name)?, &query.column, query.x)
+    });
+    as_json(&values.await?)
+}
+
+/// The video of an episode, to be stored by the browser.
+async fn video(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
+    let video = shared.work(move |shared| {
+        let reader = shared.datasets.get(query.folder, &query.name)?;
+        datasets::video(reader, &query.column, query.episode)
+    });
+    let mut response = answer("video/mp4", video.await?);
+    response.headers_mut().insert(header::CONTENT_DISPOSITION, HeaderValue::from_static("attachment"));
+    Ok(response)
 }
 
 async fn distribution(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
@@ -324,8 +347,10 @@ async fn list_reports(State(shared): State<Shared>) -> Answer {
 
 /// The page of results or of a study, under a policy of its own.
 async fn report(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
-    let page =
-        shared.work(move |shared| reports::page(&*shared.lab.reports, &shared.lab.results, query.folder, &query.name));
+    let page = shared.work(move |shared| {
+        let EntryQuery { folder, name, entry, .. } = query;
+        reports::page(&*shared.lab.reports, &shared.lab.results, folder, &name, &entry)
+    });
     let mut response = answer("text/html; charset=utf-8", page.await?);
     response.headers_mut().insert(header::CONTENT_SECURITY_POLICY, HeaderValue::from_static(access::REPORT));
     Ok(response)

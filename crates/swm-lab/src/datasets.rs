@@ -7,10 +7,10 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use swm_core::run::Control;
-use swm_core::{ColumnSpec, Error, Result, columns};
+use swm_core::{ColumnSpec, Error, Result, columns, files};
 use swm_data::doctor::{Diagnosis, examine, open_damaged};
 use swm_data::views::subset;
-use swm_data::{ConvertMode, ConvertOptions, FORMATS, ImageCodec, Location, Reader, StepRange};
+use swm_data::{ConvertMode, ConvertOptions, FORMATS, ImageCodec, Location, PreviewOptions, Reader, StepRange};
 
 /// The largest number of elements of a value that is plotted.
 pub const MOST_ELEMENTS: usize = 64;
@@ -18,6 +18,11 @@ pub const MOST_ELEMENTS: usize = 64;
 const MOST_ROWS: usize = 20_000_000;
 /// The largest number of rows of an episode that is plotted.
 const MOST_STEPS: usize = 100_000;
+/// The largest number of values that are read at the same time.
+const MOST_VALUES: usize = 1 << 20;
+/// The largest number of frames of a video, and of its bytes.
+const MOST_FRAMES: usize = 5_000;
+const MOST_BYTES: u64 = 256 << 20;
 /// The quality of frames in the page.
 const QUALITY: u8 = 90;
 /// How long a reader is kept, so that a dataset that grows is read again.
@@ -199,6 +204,96 @@ pub fn episodes(reader: &dyn Reader) -> Result<Episodes> {
         table.success = values.iter().map(|&value| value > 0.0).collect();
     }
     Ok(table)
+}
+
+/// What an element of a column is in every episode; values that are not finite are left out, and `None` stands for an episode of
+/// these alone.
+#[derive(Debug, Default, Serialize)]
+pub struct Values {
+    /// The smallest value.
+    pub min: Vec<Option<f64>>,
+    /// The largest value.
+    pub max: Vec<Option<f64>>,
+    /// The mean.
+    pub mean: Vec<Option<f64>>,
+}
+
+/// Reads what an element of a column is in every episode. A factor of variation is constant, so that its first row is read.
+///
+/// # Errors
+/// When there is no such column or element, the dataset is too large, or it is damaged.
+pub fn values(reader: &dyn Reader, column: &str, element: usize) -> Result<Values> {
+    let spec = reader.schema().column(column)?;
+    let (count, is_factor) = (spec.len(), column.starts_with("variation."));
+    if spec.is_image() || count > MOST_ELEMENTS || element >= count {
+        let problem = format!("it has {count} elements, or holds images");
+        return Err(Error::config(
+            format!("element {element} of '{column}'"),
+            problem,
+            "choose another column or element",
+        ));
+    }
+    let all = reader.episodes();
+    let length = |episode: &swm_data::Episode| if is_factor { episode.length.min(1) } else { episode.length };
+    let rows: usize = all.iter().map(length).sum();
+    if rows > MOST_ROWS {
+        let problem = format!("the episodes have {rows} rows, more than {MOST_ROWS}");
+        return Err(Error::config(format!("column '{column}'"), problem, "read it in a program"));
+    }
+    let (mut found, mut ranges, mut waiting) = (Values::default(), vec![], 0);
+    for (position, episode) in all.iter().enumerate() {
+        ranges.push(StepRange::new(position, 0, length(episode)));
+        waiting += length(episode) * count;
+        if waiting >= MOST_VALUES || position + 1 == all.len() {
+            found.read(reader, column, (element, count), &ranges)?;
+            ranges.clear();
+            waiting = 0;
+        }
+    }
+    Ok(found)
+}
+
+impl Values {
+    /// Adds some episodes.
+    fn read(
+        &mut self,
+        reader: &dyn Reader,
+        column: &str,
+        (element, count): (usize, usize),
+        ranges: &[StepRange],
+    ) -> Result<()> {
+        let values = reader.read(&[column], ranges)?.to_f32(column)?;
+        let mut rest = &values[..];
+        for range in ranges {
+            let (own, others) = rest.split_at((range.length * count).min(rest.len()));
+            let own = own.iter().skip(element).step_by(count).filter(|value| value.is_finite()).map(|&v| f64::from(v));
+            let (sum, number) = own.clone().fold((0.0, 0_usize), |(sum, number), value| (sum + value, number + 1));
+            self.min.push(own.clone().reduce(f64::min));
+            self.max.push(own.reduce(f64::max));
+            self.mean.push((number > 0).then(|| sum / number as f64));
+            rest = others;
+        }
+        Ok(())
+    }
+}
+
+/// Makes the video of an episode as `swm preview` does: MP4, with the images of a column, or of all if it is empty.
+///
+/// # Errors
+/// When there is no such episode, it is too long, it has no images, or this build has no FFmpeg.
+pub fn video(reader: Arc<dyn Reader>, column: &str, episode: usize) -> Result<Vec<u8>> {
+    let length = episode_length(&*reader, episode)?;
+    if length > MOST_FRAMES {
+        let problem = format!("it has {length} rows, more than {MOST_FRAMES}");
+        return Err(Error::config(format!("the video of episode {episode}"), problem, "use swm preview"));
+    }
+    let folder = tempfile::tempdir().map_err(|error| Error::external("making a folder for a video", error))?;
+    let columns = if column.is_empty() { vec![] } else { vec![column.to_owned()] };
+    let options = PreviewOptions { episodes: 1, columns, ..PreviewOptions::default() };
+    let written = swm_data::preview(&*subset(reader, vec![episode])?, folder.path(), &options, |_| ())?;
+    let video = written.iter().find(|path| path.extension().is_some_and(|end| end == "mp4"));
+    let none = || Error::config(format!("episode {episode}"), "it has no frames", "choose another episode");
+    files::read(video.ok_or_else(none)?, MOST_BYTES)
 }
 
 /// Whether a column is plotted.

@@ -1,4 +1,5 @@
-//! Results, studies and autopsies: folders with a `results.json`, a `study.json` or an `autopsy.json`, and the page of each.
+//! Results, studies, autopsies and leaderboards: folders with a `results.json`, a `study.json`, an `autopsy.json` or the file of a built
+//! leaderboard, and the pages of each.
 //!
 //! A page is shown in a frame of its own, whose policy permits no script, no connection, and no access to the lab.
 
@@ -8,12 +9,16 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 use std::time::{SystemTime, UNIX_EPOCH};
-use swm_core::Result;
+use swm_core::{Error, Result, files};
 
 /// How deep reports are looked for.
 const DEPTH: usize = 3;
 /// The largest number of reports in a list.
 const MOST: usize = 500;
+/// The largest stored page, in bytes.
+const MOST_BYTES: u64 = 64 << 20;
+/// The folder of the pages of entries in a leaderboard.
+const ENTRIES: &str = "entries";
 /// Folders that hold no reports, and may hold many files.
 const SKIPPED: [&str; 1] = ["datasets"];
 
@@ -27,6 +32,8 @@ pub enum Kind {
     Study,
     /// An `autopsy.json`.
     Autopsy,
+    /// The pages of a leaderboard, with the file that `swm leaderboard build` leaves.
+    Leaderboard,
 }
 
 impl Kind {
@@ -36,12 +43,15 @@ impl Kind {
             Self::Results => "results.json",
             Self::Study => "study.json",
             Self::Autopsy => "autopsy.json",
+            Self::Leaderboard => "last-build",
         }
     }
 
     /// What a folder holds; `None` for any other folder.
     fn of(path: &Path) -> Option<Self> {
-        [Self::Autopsy, Self::Study, Self::Results].into_iter().find(|kind| path.join(kind.file()).is_file())
+        [Self::Autopsy, Self::Study, Self::Results, Self::Leaderboard]
+            .into_iter()
+            .find(|kind| path.join(kind.file()).is_file())
     }
 }
 
@@ -81,6 +91,8 @@ pub struct Listed {
     modified: u64,
     #[serde(flatten)]
     summary: Summary,
+    /// Its further pages.
+    pages: Vec<String>,
     /// Why it cannot be shown.
     #[serde(skip_serializing_if = "Option::is_none")]
     error: Option<String>,
@@ -100,9 +112,11 @@ impl Known {
         let found = found.into_iter().filter_map(|found| Some((Kind::of(&found.path)?, found))).take(MOST);
         let listed = found.filter_map(|(kind, found)| {
             let modified = found.path.join(kind.file()).metadata().and_then(|metadata| metadata.modified()).ok()?;
+            let path = found.path.clone();
             let (summary, error) = self.summary(reports, kind, found.path, modified);
             let since = modified.duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs());
-            Some(Listed { folder: found.folder, name: found.name, kind, modified: since, summary, error })
+            let pages = if kind == Kind::Leaderboard { entries(&path) } else { vec![] };
+            Some(Listed { folder: found.folder, name: found.name, kind, modified: since, summary, pages, error })
         });
         listed.collect()
     }
@@ -114,6 +128,10 @@ impl Known {
             && let Some(known) = self.0.lock().unwrap_or_else(PoisonError::into_inner).get(&key)
         {
             return known.clone();
+        }
+        if kind == Kind::Leaderboard {
+            let title = format!("{} entries", entries(&key.0).len());
+            return (Summary { title, lines: vec![] }, None);
         }
         let found = match reports.summary(kind, &key.0) {
             Ok(summary) => (summary, None),
@@ -132,14 +150,41 @@ fn is_skipped(path: &Path) -> bool {
     path.file_name().is_some_and(|name| SKIPPED.iter().any(|skipped| name == *skipped))
 }
 
-/// Makes the page of a report.
+/// The pages of the entries of a leaderboard, without those that are links.
+fn entries(leaderboard: &Path) -> Vec<String> {
+    let found = std::fs::read_dir(leaderboard.join(ENTRIES)).into_iter().flatten().flatten().take(MOST);
+    let names = found.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_file()));
+    let mut names: Vec<String> = names.filter_map(|entry| entry.file_name().into_string().ok()).collect();
+    names.retain(|name| name.ends_with(".html"));
+    names.sort();
+    names
+}
+
+/// Reads a page of a leaderboard: that of the tables, or of an entry.
+fn stored(leaderboard: &Path, entry: &str) -> Result<String> {
+    let page = match entries(leaderboard).into_iter().find(|name| name == entry) {
+        _ if entry.is_empty() => leaderboard.join("index.html"),
+        Some(name) => leaderboard.join(ENTRIES).join(name),
+        None => {
+            return Err(Error::config(entry, "the leaderboard has no such entry", "reload the page, which lists them"));
+        }
+    };
+    if page.symlink_metadata().is_ok_and(|metadata| metadata.is_symlink()) {
+        return Err(Error::config(page.display().to_string(), "it is a symbolic link", "build the leaderboard again"));
+    }
+    let damaged = |error| Error::corrupt(&page, format!("is no text ({error})"), "build the leaderboard again");
+    let text = String::from_utf8(files::read(&page, MOST_BYTES)?).map_err(damaged)?;
+    // The lab refuses what a page in a frame of another origin asks for: a link would lead to an error.
+    Ok(text.replace(" href=\"entries/", " data-entry=\"").replace(" href=\"../index.html", " data-entry=\""))
+}
+
+/// Makes the page of a report; `entry` is one of the further pages of a leaderboard, or empty.
 ///
 /// # Errors
 /// When there is no such report, or it is damaged.
-pub fn page(reports: &dyn Reports, folders: &Folders, folder: usize, name: &str) -> Result<String> {
+pub fn page(reports: &dyn Reports, folders: &Folders, folder: usize, name: &str, entry: &str) -> Result<String> {
     let path = folders.find(folder, name, DEPTH, |path| Kind::of(path).is_some() || is_skipped(path))?;
-    let kind = Kind::of(&path).ok_or_else(|| {
-        swm_core::Error::config(name, "it holds no results and no study", "reload the page, which lists them")
-    })?;
-    reports.page(kind, &path)
+    let kind = Kind::of(&path)
+        .ok_or_else(|| Error::config(name, "it holds no results and no study", "reload the page, which lists them"))?;
+    if kind == Kind::Leaderboard { stored(&path, entry) } else { reports.page(kind, &path) }
 }

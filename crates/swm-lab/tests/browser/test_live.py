@@ -3,26 +3,20 @@
 import re
 
 import pytest
-from playwright.sync_api import expect
-
 from conftest import screenshot, wait_until
+from playwright.sync_api import expect
 from test_journeys import value, wait_for_steps
 
 
 def steps(page):
     """The steps of both sides, as the page shows them."""
-    return [
-        int(text.split(" / ")[0])
-        for text in page.locator(".readout div:first-child dd").all_inner_texts()
-    ]
+    return [int(text.split(" / ")[0]) for text in page.locator(".readout div:first-child dd").all_inner_texts()]
 
 
 def compare_with_the_command(lab, page):
     """Runs the command of the page: its frame is the still of the page, byte for byte."""
     lab.swm(*page.get_by_test_id("command").inner_text().split()[1:])
-    still = page.request.get(
-        lab.url + page.get_by_test_id("still").get_attribute("href")
-    ).body()
+    still = page.request.get(lab.url + page.get_by_test_id("still").get_attribute("href")).body()
     assert (lab.home / "frame.png").read_bytes() == still
 
 
@@ -36,21 +30,13 @@ def test_wrappers_are_stacked_dragged_and_in_the_command(lab, open_page):
         expect(page.get_by_role("button", name=f"Remove {name}")).to_be_visible()
     page.get_by_label("noise std").fill("20")
     page.keyboard.press("Enter")
-    expect(command).to_contain_text(
-        "--wrapper noise,std=20 --wrapper cutout --wrapper blur"
-    )
+    expect(command).to_contain_text("--wrapper noise,std=20 --wrapper cutout --wrapper blur")
     compare_with_the_command(lab, page)
     # The order is changed with the keyboard, and with the mouse.
     page.get_by_role("button", name="Move noise down").press("Enter")
-    expect(command).to_contain_text(
-        "--wrapper cutout --wrapper noise,std=20 --wrapper blur"
-    )
-    page.locator(".wrappers .handle").nth(2).drag_to(
-        page.locator(".wrappers li").nth(0)
-    )
-    expect(command).to_contain_text(
-        "--wrapper blur --wrapper cutout --wrapper noise,std=20"
-    )
+    expect(command).to_contain_text("--wrapper cutout --wrapper noise,std=20 --wrapper blur")
+    page.locator(".wrappers .handle").nth(2).drag_to(page.locator(".wrappers li").nth(0))
+    expect(command).to_contain_text("--wrapper blur --wrapper cutout --wrapper noise,std=20")
     compare_with_the_command(lab, page)
     screenshot(page, "wrappers", full_page=True)
     page.get_by_label("the goal, too").check()
@@ -85,14 +71,10 @@ def test_two_settings_step_together(open_page):
     page = open_page("#envs?env=swm/PushT-v1&seed=3&fps=60", width=1400)
     page.get_by_role("button", name="Side by side").click()
     expect(page.get_by_label(re.compile("right frame"))).to_be_visible()
-    page.get_by_role("radiogroup", name="block.shape").get_by_role(
-        "radio", name="5"
-    ).click()
+    page.get_by_role("radiogroup", name="block.shape").get_by_role("radio", name="5").click()
     expect(page.get_by_label("Difference")).to_contain_text("block.shape: 2 | 5")
     expect(page.get_by_test_id("command")).to_contain_text("block.shape=5")
-    page.get_by_role("radiogroup", name="Whose settings").get_by_role(
-        "radio", name="left"
-    ).click()
+    page.get_by_role("radiogroup", name="Whose settings").get_by_role("radio", name="left").click()
     expect(page.get_by_test_id("command")).not_to_contain_text("block.shape")
     page.get_by_role("button", name="Play").click()
     wait_for_steps(page, 12)
@@ -133,7 +115,5 @@ def test_a_gamepad_drives(open_page, env, held, action):
         expect(slider).to_have_value(element)
     if any(float(element) for element in action):
         wait_until(lambda: int(value(page, "step")) > 2)
-    page.evaluate(
-        "window.pad.axes = [0, 0, 0, 0]; window.pad.buttons[12].pressed = false"
-    )
+    page.evaluate("window.pad.axes = [0, 0, 0, 0]; window.pad.buttons[12].pressed = false")
     expect(sliders[0]).to_have_value("0")

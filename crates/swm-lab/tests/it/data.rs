@@ -6,6 +6,36 @@ use std::fs;
 use swm_core::{Action, ResetOptions, columns};
 use swm_data::{Location, StepRange, image};
 
+#[test]
+fn columns_are_summarised_in_every_episode_and_an_episode_is_a_video() {
+    let lab = TestLab::start();
+    let mut live = lab.live("swm/TwoRoom-v1");
+    live.send(&json!({"type": "drive", "by": "hand"}));
+    live.send(&json!({"type": "record", "dataset": "two"}));
+    for (seed, steps) in [(1, 4), (2, 2)] {
+        demonstrate(&mut live, seed, steps);
+        live.send(&json!({"type": "keep"}));
+    }
+    while live.reply("recording")["episodes"] != 2 {}
+    live.send(&json!({"type": "finish"}));
+    while live.reply("recording")["dataset"] != serde_json::Value::Null {}
+    let values = |query: &str| lab.json(&format!("api/values?name=two.lance&{query}"));
+    // The action of the last row is missing.
+    let actions = values("column=action&x=0");
+    assert_eq!((&actions["min"], &actions["max"]), (&json!([-0.5, -0.5]), &json!([1.0, 1.0])));
+    assert_eq!(actions["mean"], json!([0.25, 0.25]));
+    assert_eq!(values("column=variation.agent.position&x=1")["max"], json!([40.0, 40.0]));
+    for query in ["column=pixels", "column=action&x=2", "column=nothing", "column=", "column=../x"] {
+        assert_eq!(lab.get(&format!("api/values?name=two.lance&{query}")).0, 400, "{query}");
+    }
+    let (status, video) = lab.get("api/video?name=two.lance&episode=1");
+    assert_eq!((status, &video[4..8]), (200, &b"ftyp"[..]), "{}", String::from_utf8_lossy(&video));
+    assert_eq!(lab.get("api/video?name=two.lance&episode=1&column=pixels").0, 200);
+    for query in ["episode=2", "episode=0&column=action", "episode=0&column=../x", "episode=-1"] {
+        assert_eq!(lab.get(&format!("api/video?name=two.lance&{query}")).0, 400, "{query}");
+    }
+}
+
 /// Records an episode of some steps of the hand.
 fn demonstrate(live: &mut super::Live, seed: u64, steps: usize) {
     live.send(&json!({"type": "reset", "seed": seed, "variation": "none", "pin": "agent.position=40,40;target.position=180,180"}));

@@ -55,7 +55,10 @@ fn requests_that_fail_say_why_and_leave_the_environment_as_it_is() {
         (json!({"type": "reset", "seed": 1, "view": "top:deep"}), "camera modality"),
         (json!({"type": "reset", "seed": 1, "wrappers": "blurr"}), "did you mean blur"),
         (json!({"type": "reset", "seed": 1, "wrappers": "noise,std=$(ls)"}), "outside its space"),
-        (json!({"type": "reset", "seed": 1, "wrappers": "chroma-key,media=/etc/passwd,key_color=1/2/3"}), "reads files"),
+        (
+            json!({"type": "reset", "seed": 1, "wrappers": "chroma-key,media=/etc/passwd,key_color=1/2/3"}),
+            "reads files",
+        ),
         (json!({"type": "reset", "seed": 1, "wrappers": "blur;".repeat(65)}), "number of wrappers"),
         (json!({"type": "reset", "seed": 1, "view": "top", "wrappers": "blur"}), "wrappers do not change the view"),
         (json!({"type": "speed", "fps": 0.0}), "steps a second"),

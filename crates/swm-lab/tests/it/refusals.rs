@@ -38,7 +38,7 @@ fn paths_outside_the_folders_are_errors() {
         .expect("a link");
     let absolute = secret.parent().expect("a parent").display().to_string();
     for name in ["../secret", "..%2Fsecret", "link", "%2e%2e/secret", "", ".", &absolute, "a%00b"] {
-        for route in ["lines", "episodes", "rows", "frame", "distribution", "report"] {
+        for route in ["lines", "episodes", "rows", "values", "frame", "video", "distribution", "report"] {
             let (status, body) = lab.get(&format!("api/{route}?name={name}"));
             assert_eq!(status, 400, "{route} {name}: {}", String::from_utf8_lossy(&body));
         }

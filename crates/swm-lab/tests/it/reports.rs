@@ -27,6 +27,29 @@ impl Reports for Files {
 }
 
 #[test]
+fn pages_of_a_leaderboard_are_shown_and_no_other_file() {
+    let lab = TestLab::start();
+    let board = lab.home.path().join("boards/site");
+    fs::create_dir_all(board.join("entries")).expect("folders");
+    let files =
+        [("last-build", "{}"), ("index.html", "<a href=\"entries/a.html\">tables</a>"), ("entries/a.html", "entry a"), ("entries/b.txt", "no page")];
+    for (file, text) in files {
+        fs::write(board.join(file), text).expect("a file");
+    }
+    fs::write(lab.home.path().join("secret.html"), "secret").expect("a file");
+    std::os::unix::fs::symlink(lab.home.path().join("secret.html"), board.join("entries/link.html")).expect("a link");
+    let listed = &lab.json("api/reports")["reports"][0];
+    assert_eq!((&listed["kind"], &listed["title"]), (&json!("leaderboard"), &json!("1 entries")));
+    assert_eq!(listed["pages"], json!(["a.html"]));
+    let page = |entry: &str| lab.get(&format!("api/report?name=boards/site&entry={entry}"));
+    assert_eq!(page(""), (200, b"<a data-entry=\"a.html\">tables</a>".to_vec()));
+    assert_eq!(page("a.html"), (200, b"entry a".to_vec()));
+    for entry in ["b.txt", "link.html", "../index.html", "../../../secret.html", "/etc/passwd", "..%2Flast-build"] {
+        assert_eq!(page(entry).0, 400, "{entry}");
+    }
+}
+
+#[test]
 fn reports_are_listed_and_cannot_reach_the_lab() {
     let lab = TestLab::start();
     let write = |file: &str, text: &str| {

@@ -62,6 +62,13 @@ export interface Episodes {
   success: boolean[];
 }
 
+// What an element of a column is in every episode.
+export interface Values {
+  min: (number | null)[];
+  max: (number | null)[];
+  mean: (number | null)[];
+}
+
 export interface Rows {
   rows: number;
   columns: { name: string; elements: number; values: (number | null)[] }[];

@@ -1,11 +1,11 @@
 // The page of datasets: the list, the table of episodes, and one episode with its frames and columns.
 
 import { useMemo, useState } from "preact/hooks";
-import { address, type Dataset, type Episodes, get } from "./api";
+import { address, type Dataset, type Episodes, get, type Values } from "./api";
 import { Coverage } from "./coverage";
 import { Curation } from "./curation";
 import { EpisodeView } from "./episode";
-import { Filters, order } from "./filters";
+import { chosenColumn, Filters, order } from "./filters";
 import { bytes, count } from "./format";
 import { type Params, patch, useKeys, useLoaded } from "./state";
 import { type SortKey, Table } from "./table";
@@ -45,7 +45,7 @@ export function DataPage({ params }: { params: Params }) {
                 aria-current={set === chosen}
                 title={set.error ?? set.name}
                 onClick={() =>
-                  patch({ name: set.name, folder: set.folder ? String(set.folder) : undefined, episode: undefined, row: undefined, cut: undefined })
+                  patch({ name: set.name, folder: set.folder ? String(set.folder) : undefined, episode: undefined, row: undefined, cut: undefined, col: undefined, element: undefined, within: undefined, beside: undefined, sort: undefined })
                 }
               >
                 <span>{set.name}</span>
@@ -87,8 +87,16 @@ function DatasetView({ set, params, onSaved }: { set: Dataset; params: Params; o
     key,
   );
   const [sort, descending] = [(params.sort as SortKey) || "index", params.order === "down"];
-  const rows = useMemo(() => (table ? order(table, params, sort, descending) : []), [
+  const ofColumn = { folder: set.folder, name: set.name, column: params.col, x: params.element ?? 0 };
+  const values = useLoaded(
+    () => (params.col ? get<Values>("values", ofColumn) : Promise.resolve(undefined)),
+    JSON.stringify(ofColumn),
+  );
+  const column = useMemo(() => chosenColumn(params, values.value), [params.col, params.stat, values.value]);
+  const rows = useMemo(() => (table ? order(table, params, sort, descending, column) : []), [
     table,
+    column,
+    params.within,
     params.success,
     params.lengths,
     params.returns,
@@ -125,9 +133,10 @@ function DatasetView({ set, params, onSaved }: { set: Dataset; params: Params; o
           {set.name} <small>{[set.env, set.kind].filter(Boolean).join(" · ")}</small>
         </h1>
         {error && <p class="error">{error}</p>}
+        {values.error && <p class="error">{values.error}</p>}
         {table ? (
           <>
-            <Filters table={table} params={params} shown={rows.length} />
+            <Filters table={table} set={set} params={params} shown={rows.length} column={column} />
             {image && (
               <label>
                 <input
@@ -142,6 +151,7 @@ function DatasetView({ set, params, onSaved }: { set: Dataset; params: Params; o
               table={table}
               thumbnail={params.thumbs === "1" && image ? thumbnail : undefined}
               rows={rows}
+              column={column}
               chosen={episode}
               cut={cut}
               onCut={toggle}

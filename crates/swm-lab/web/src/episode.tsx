@@ -16,7 +16,15 @@ export function EpisodeView({ set, episode, params }: { set: Dataset; episode: n
   const { value, error } = useLoaded(() => get<Rows>("rows", query), JSON.stringify(query));
   const images = (set.columns ?? []).filter((column) => column.image && column.shape.length === 3);
   const image = images.find((column) => column.name === params.column) ?? images[0];
-  const last = (value?.rows ?? 1) - 1;
+  const other = params.beside === undefined || Number(params.beside) === episode ? undefined : Number(params.beside);
+  const besideQuery = { ...query, episode: other };
+  const beside = useLoaded(
+    () => (other === undefined ? Promise.resolve(undefined) : get<Rows>("rows", besideQuery)),
+    JSON.stringify(besideQuery),
+  );
+  // The longer of two episodes; the shorter one rests at its end.
+  const last = Math.max(value?.rows ?? 1, beside.value?.rows ?? 1) - 1;
+  const within = (of?: Rows) => Math.min(row, (of?.rows ?? 1) - 1);
   const row = Math.max(0, Math.min(last, Number(params.row) || 0));
   const [isPlaying, setPlaying] = useState(false);
   const go = (to: number) => patch({ row: String(Math.max(0, Math.min(last, to))) });
@@ -42,13 +50,44 @@ export function EpisodeView({ set, episode, params }: { set: Dataset; episode: n
     patch({ plots: (shown.includes(name) ? shown.filter((other) => other !== name) : [...shown, name]).join(",") || "none" });
   return (
     <section class="episode" aria-label={`Episode ${episode}`}>
-      <h2>
-        Episode {episode} <small>{value ? `${value.rows} rows` : ""}</small>
-      </h2>
+      <div class="bar">
+        <h2>
+          Episode {episode} <small>{value ? `${value.rows} rows` : ""}</small>
+          {other !== undefined && (
+            <>
+              {" "}
+              beside episode {other} <small>{beside.value ? `${beside.value.rows} rows` : ""}</small>
+            </>
+          )}
+        </h2>
+        <span class="grow" />
+        {image && (
+          <a
+            class="button"
+            href={address("video", { ...query, column: image.name })}
+            download={`episode_${episode}.mp4`}
+            title="The video that swm preview writes"
+          >
+            MP4
+          </a>
+        )}
+        <button
+          type="button"
+          aria-pressed={params.beside !== undefined}
+          title="Keep this episode beside the next one that is chosen"
+          onClick={() => patch({ beside: params.beside === undefined ? String(episode) : undefined })}
+        >
+          {params.beside === undefined ? "Keep beside" : "Not beside"}
+        </button>
+      </div>
       {error && <p class="error">{error}</p>}
+      {beside.error && <p class="error">{beside.error}</p>}
       {image && (
         <>
-          <Frame set={set} episode={episode} row={row} column={image.name} />
+          <div class="pair-of-frames">
+            <Frame set={set} episode={episode} row={within(value)} column={image.name} />
+            {other !== undefined && beside.value && <Frame set={set} episode={other} row={within(beside.value)} column={image.name} />}
+          </div>
           {images.length > 1 && (
             <div class="chips" role="group" aria-label="Column of frames">
               {images.map((column) => (
@@ -99,6 +138,12 @@ export function EpisodeView({ set, episode, params }: { set: Dataset; episode: n
         ))}
       </div>
       {value && <Plots rows={value} names={shown} row={row} onRow={go} />}
+      {other !== undefined && beside.value && (
+        <>
+          <h3>Episode {other}</h3>
+          <Plots rows={beside.value} names={shown} row={within(beside.value)} onRow={go} />
+        </>
+      )}
       {value && <Factors rows={value} />}
     </section>
   );

@@ -9,10 +9,12 @@ import { type Params, patch, useLoaded } from "./state";
 interface Report {
   folder: number;
   name: string;
-  kind: "results" | "study" | "autopsy";
+  kind: "results" | "study" | "autopsy" | "leaderboard";
   modified: number;
   title: string;
   lines: string[];
+  // The pages of the entries of a leaderboard.
+  pages: string[];
   error?: string;
 }
 
@@ -41,7 +43,7 @@ export function ReportsPage({ params }: { params: Params }) {
         <ul>
           {shown.map((report) => (
             <li key={keyOf(report)}>
-              <button type="button" aria-current={report === chosen} onClick={() => patch({ report: keyOf(report) })}>
+              <button type="button" aria-current={report === chosen} onClick={() => patch({ report: keyOf(report), entry: undefined })}>
                 <span>{report.name}</span>
                 <small>
                   {report.kind === "results" ? "" : `${report.kind}, `}
@@ -64,14 +66,14 @@ export function ReportsPage({ params }: { params: Params }) {
         {loaded.error && <p class="error">{loaded.error}</p>}
       </aside>
       <section class="report" aria-label="Report">
-        {chosen ? <Page report={chosen} /> : <p class="loading">Choose results or a study.</p>}
+        {chosen ? <Page report={chosen} entry={chosen.pages.find((page) => page === params.entry)} /> : <p class="loading">Choose results or a study.</p>}
       </section>
     </div>
   );
 }
 
-function Page({ report }: { report: Report }) {
-  const page = address("report", { folder: report.folder, name: report.name });
+function Page({ report, entry }: { report: Report; entry?: string }) {
+  const page = address("report", { folder: report.folder, name: report.name, entry });
   if (report.error) {
     return (
       <p class="error" role="alert">
@@ -86,6 +88,19 @@ function Page({ report }: { report: Report }) {
           {report.name} <small>{report.title}</small>
         </h1>
         <span class="grow" />
+        {report.pages.length > 0 && (
+          <label>
+            page
+            <select aria-label="Page" value={entry ?? ""} onChange={(event) => patch({ entry: event.currentTarget.value })}>
+              <option value="">tables</option>
+              {report.pages.map((name) => (
+                <option key={name} value={name}>
+                  {name.replace(/\.html$/, "")}
+                </option>
+              ))}
+            </select>
+          </label>
+        )}
         <a class="button" href={page} target="_blank" rel="noreferrer">
           Open
         </a>

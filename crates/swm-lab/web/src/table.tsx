@@ -2,9 +2,10 @@
 
 import { useEffect, useRef, useState } from "preact/hooks";
 import type { Episodes } from "./api";
+import type { Chosen } from "./filters";
 import { short } from "./format";
 
-export type SortKey = "index" | "length" | "returns" | "success";
+export type SortKey = "index" | "length" | "returns" | "success" | "column";
 
 // The height of a row in pixels, without and with frames.
 const PLAIN = 26;
@@ -13,6 +14,8 @@ const WITH_FRAMES = 64;
 interface TableProps {
   table: Episodes;
   rows: number[];
+  // The column that episodes are filtered by.
+  column?: Chosen;
   chosen?: number;
   cut: Set<number>;
   onCut: (position: number) => void;
@@ -25,7 +28,7 @@ interface TableProps {
 }
 
 // Only the rows in view are in the document, so that the length of the list does not matter.
-export function Table({ table, rows, chosen, cut, onCut, sort, descending, onChoose, onSort, thumbnail }: TableProps) {
+export function Table({ table, rows, column, chosen, cut, onCut, sort, descending, onChoose, onSort, thumbnail }: TableProps) {
   const rowHeight = thumbnail ? WITH_FRAMES : PLAIN;
   const body = useRef<HTMLDivElement>(null);
   const [top, setTop] = useState(0);
@@ -52,8 +55,9 @@ export function Table({ table, rows, chosen, cut, onCut, sort, descending, onCho
     ["returns", "return", (i) => short(table.returns[i])],
     ["success", "success", (i) => (table.success.length === 0 ? "–" : table.success[i] ? "yes" : "no")],
   ];
+  if (column) columns.push(["column", column.name, (i) => short(column.values[i])]);
   return (
-    <div class={`table ${thumbnail ? "has-frames" : ""}`} role="table" aria-rowcount={rows.length + 1} aria-label="Episodes">
+    <div class={`table ${thumbnail ? "has-frames" : ""} ${column ? "has-column" : ""}`} role="table" aria-rowcount={rows.length + 1} aria-label="Episodes">
       <div role="row" class="row head" aria-rowindex={1}>
         {columns.map(([key, name]) => (
           <span

@@ -30,6 +30,8 @@ const TABLES: [(&str, Format); 3] =
 /// Runs `swm study report`.
 pub fn report(args: &ReportArgs, as_json: bool) -> anyhow::Result<()> {
     let folder = StudyFolder::new(&args.folder);
+    // Before the folder of the page is made, which may lie in that of the study.
+    folder.open()?;
     let output = args.output.clone().unwrap_or_else(|| args.folder.join("report"));
     let names: Vec<&str> = std::iter::once("index.html").chain(TABLES.map(|(name, _)| name)).collect();
     let _lock = output_folder::claim(&output, &names)?;

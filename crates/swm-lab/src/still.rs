@@ -137,9 +137,14 @@ impl Still {
     /// The command line that writes this frame.
     ///
     /// # Errors
-    /// When a factor is unknown, or a value or the size is out of bounds: the command would fail.
+    /// When a factor or a camera is unknown, or a value or the size is out of bounds: the command would fail.
     pub fn command(&self, spec: &EnvSpec) -> Result<String> {
         spec.variation_space.check(&self.variation)?;
+        let view = &self.rendering.view;
+        // What is copied into a shell has the names of the environment only.
+        if view.camera.as_ref().is_some_and(|camera| !spec.cameras.contains(camera)) {
+            return Err(view.unknown(spec));
+        }
         let (height, width) = self.checked_size()?;
         let mut command = format!("swm frame {} --seed {}", spec.id, self.seed);
         if self.size != (SIDE, SIDE) {

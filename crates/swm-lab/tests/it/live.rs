@@ -53,7 +53,7 @@ fn requests_that_fail_say_why_and_leave_the_environment_as_it_is() {
         (json!({"type": "act", "action": [0.0]}), "outside its space"),
         (json!({"type": "reset", "seed": 1, "view": "depth"}), "cannot render depth"),
         (json!({"type": "reset", "seed": 1, "view": "top:deep"}), "camera modality"),
-        (json!({"type": "reset", "seed": 1, "wrappers": "blurr"}), "did you mean blur"),
+        (json!({"type": "reset", "seed": 1, "wrappers": "blurs"}), "did you mean blur"),
         (json!({"type": "reset", "seed": 1, "wrappers": "noise,std=$(ls)"}), "outside its space"),
         (
             json!({"type": "reset", "seed": 1, "wrappers": "chroma-key,media=/etc/passwd,key_color=1/2/3"}),

@@ -51,9 +51,20 @@ fn paths_outside_the_folders_are_errors() {
             assert_eq!(lab.get(&format!("api/{route}?env={env}")).0, 400, "{route} {env}");
         }
     }
-    for query in
-        ["image=100000", "image=0", "image=-1", "pin=agent.color=1", "pin=x", "seed=-1", "variation=nothing", "shell=1"]
-    {
+    for query in [
+        "view=depths",
+        "view=$(ls)",
+        "view=;ls:depth",
+        "wrappers=$(ls)",
+        "image=100000",
+        "image=0",
+        "image=-1",
+        "pin=agent.color=1",
+        "pin=x",
+        "seed=-1",
+        "variation=nothing",
+        "shell=1",
+    ] {
         for route in ["still", "command"] {
             assert_eq!(lab.get(&format!("api/{route}?env=swm/PushT-v1&{query}")).0, 400, "{route} {query}");
         }

@@ -19,14 +19,14 @@ SWM := $(CARGO_TARGET_DIR)/release/swm
 SUDO := $(shell [ "$$(id -u)" = 0 ] || command -v sudo)
 CARGO := cargo
 
-.PHONY: help demo test test-python test-ray test-neighbours test-browser lab-assets check build tests wheel wheel-portable gpu docs assets setup setup-python reference bench deny release nightly clean test-gpu
+.PHONY: help demo test test-python test-ray test-lab test-neighbours test-browser chromium lab-assets check build tests wheel wheel-portable gpu docs assets setup setup-python reference bench deny release nightly clean test-gpu
 
 help:
 	@echo 'make demo       collect, train, plan, evaluate and report on a laptop CPU'
 	@echo 'make test       all checks and all tests'
 	@echo 'make test-ray   runs on a Ray cluster of this machine, with an S3 server on loopback'
 	@echo 'make test-neighbours   the Python package with Gymnasium, SB3, TorchRL, a PPO, DataLoader workers'
-	@echo 'make test-browser   pages in Chromium: no text is cut off or overlaps another'
+	@echo 'make test-browser   pages in Chromium: no text is cut off or overlaps another; all journeys through the lab'
 	@echo 'make lab-assets   the pages of swm lab, with Node and Vite; the built files are committed'
 	@echo 'make build      the swm program: $(SWM)'
 	@echo 'make wheel      the Python package: $(WHEELS)'
@@ -43,7 +43,7 @@ help:
 demo: build
 	$(SWM) demo
 
-test: check test-python test-ray
+test: check test-python test-ray test-lab
 	SWM_LANCE_PYTHON=$(VENV)/bin/python $(CARGO) test --release --workspace
 
 # The wheel in an environment of its own with nothing but its requirements, then its tests with PyTorch and the rest.
@@ -78,14 +78,27 @@ test-neighbours: wheel
 
 # Pages in headless Chromium, at three widths, light and dark; journeys through the lab.
 BROWSER_VENV := $(CACHE)/venv-browser-1
-test-browser: build
+JOURNEYS = cd crates/swm-lab/tests/browser && SWM=$(SWM) $(BROWSER_VENV)/bin/python -m pytest -q -p no:cacheprovider .
+$(BROWSER_VENV)/ready: crates/swm-lab/tests/browser/requirements.txt | setup
+	@mkdir -p $(CACHE)
+	python3 -m venv --clear $(BROWSER_VENV)
+	$(BROWSER_VENV)/bin/python -m pip install --quiet -r crates/swm-lab/tests/browser/requirements.txt
+	touch $@
+
+chromium: setup
 	@command -v $(SWM_CHROMIUM) >/dev/null || { $(SUDO) apt-get update -qq && \
 	  DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install -y -qq --no-install-recommends chromium; }
+
+test-browser: build chromium $(BROWSER_VENV)/ready
 	$(CARGO) test --release -p swm-report --test it browser -- --ignored
 	$(MAKE) lab-assets && git diff --exit-code --stat -- crates/swm-lab/assets
-	[ -e $(BROWSER_VENV)/ready ] || { python3 -m venv --clear $(BROWSER_VENV) && $(BROWSER_VENV)/bin/python -m pip install --quiet \
-	  -r crates/swm-lab/tests/browser/requirements.txt && touch $(BROWSER_VENV)/ready; }
-	cd crates/swm-lab/tests/browser && SWM=$(SWM) $(BROWSER_VENV)/bin/python -m pytest -q -p no:cacheprovider .
+	$(JOURNEYS)
+
+# The journeys of docs/lab.md: vary a factor and copy the command, record demonstrations and train on them, cut bad episodes, watch and
+# branch a plan, start a training. A browser on a loaded machine may miss a time limit, so that a failure is tried once more.
+FIVE := factor_is_varied or ten_demonstrations or bad_episodes or plan_is_watched or small_training
+test-lab: build chromium $(BROWSER_VENV)/ready
+	($(JOURNEYS) -k "$(FIVE)") || ($(JOURNEYS) -k "$(FIVE)")
 
 # The pages of the lab, from crates/swm-lab/web into crates/swm-lab/assets, which is committed and embedded in the program.
 NODE_VENV := $(CACHE)/venv-node-1

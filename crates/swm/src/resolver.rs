@@ -388,7 +388,7 @@ pub fn policy_of_choice(
 /// Returns the policy with a name for a world: a [`scripted`] policy, or a checkpoint that acts without a solver. For a
 /// checkpoint, also returns the hash of the weights.
 fn policy_by_name(entry: &EnvEntry, name: &str, world: &World) -> Result<(Box<dyn Policy>, Option<String>)> {
-    let trained = trained_expert(entry, &world.spec().id, name)?;
+    let trained = zoo::trained_expert(entry, &world.spec().id, name)?;
     let name = trained.as_deref().unwrap_or(name);
     let is_scripted = ["random", "expert"].contains(&name) || entry.experts.iter().any(|expert| expert.id == name);
     if is_scripted || !home::checkpoint(name)?.exists() {
@@ -403,19 +403,10 @@ fn policy_by_name(entry: &EnvEntry, name: &str, world: &World) -> Result<(Box<dy
 /// # Errors
 /// When the environment has no such expert.
 pub fn expert(entry: &EnvEntry, name: &str, world: &World) -> Result<(Box<dyn Policy>, Option<String>)> {
-    match trained_expert(entry, &world.spec().id, name)? {
+    match zoo::trained_expert(entry, &world.spec().id, name)? {
         Some(trained) => policy_by_name(entry, &trained, world),
         None => Ok((scripted(entry, name, world)?, None)),
     }
-}
-
-/// Returns the capsule of the zoo that `expert` names: where the environment `id`, with its options, has no scripted expert
-/// and the zoo has one.
-///
-/// # Errors
-/// As [`zoo::expert`].
-pub fn trained_expert(entry: &EnvEntry, id: &str, name: &str) -> Result<Option<String>> {
-    if name == "expert" && entry.experts.is_empty() { zoo::expert(id) } else { Ok(None) }
 }
 
 /// Loads a checkpoint that acts without a solver; returns its policy for `slots` environments and its description.

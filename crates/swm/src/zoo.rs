@@ -4,7 +4,7 @@
 use crate::{home, library};
 use std::collections::BTreeMap;
 use std::path::{Component, Path, PathBuf};
-use swm_core::{Error, Result};
+use swm_core::{EnvEntry, Error, Result};
 use swm_models::capsule::Capsule;
 
 /// The start of a name in the zoo.
@@ -100,6 +100,15 @@ pub fn experts() -> Result<Vec<(String, String)>> {
 /// When a capsule named `expert` is damaged.
 pub fn expert(env: &str) -> Result<Option<String>> {
     Ok(experts()?.into_iter().find(|(_, of)| of == env).map(|(name, _)| name))
+}
+
+/// Returns the capsule that the policy `name` means: for `expert`, where the environment `id`, with its options, has no
+/// scripted expert and the zoo has one.
+///
+/// # Errors
+/// As [`expert`].
+pub fn trained_expert(entry: &EnvEntry, id: &str, name: &str) -> Result<Option<String>> {
+    if name == "expert" && entry.experts.is_empty() { expert(id) } else { Ok(None) }
 }
 
 fn listed(folders: &[PathBuf]) -> String {

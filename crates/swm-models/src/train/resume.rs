@@ -16,7 +16,7 @@ pub(crate) fn refuse_existing(out: &Path) -> Error {
     Error::config(
         out.display().to_string(),
         "holds a training run already",
-        "continue the run with `resume`, or choose another folder",
+        "continue the run with --resume (in Python: resume=True), or choose another folder",
     )
 }
 

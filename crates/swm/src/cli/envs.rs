@@ -1,7 +1,6 @@
 //! `swm envs` and `swm fovs`: list environments and their factors of variation.
 
 use super::{emit, emit_json, eprint, table};
-use crate::resolver::trained_expert;
 use crate::{ENVS, describe, gym, mujoco, zoo};
 use clap::Args;
 use serde_json::{Map, Value, json};
@@ -86,7 +85,7 @@ fn show(choice: &EnvChoice, as_json: bool) -> anyhow::Result<()> {
         ]
     }));
     rows.extend(row.experts.iter().map(|e| vec![format!("expert {}", e.id), e.summary.to_owned()]));
-    if let Some(trained) = trained_expert(row, &spec.id, "expert")? {
+    if let Some(trained) = zoo::trained_expert(row, &spec.id, "expert")? {
         rows.push(vec!["expert".to_owned(), format!("trained by interaction: {trained} (`swm zoo`)")]);
     }
     emit(&table(&[&spec.id, "value"], rows));

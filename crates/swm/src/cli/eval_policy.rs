@@ -3,7 +3,8 @@
 use super::planner::PlannerArgs;
 use crate::capsule::EvaluationRecord;
 use crate::home;
-use crate::resolver::{HomeResolver, parse_score, trained_expert};
+use crate::resolver::{HomeResolver, parse_score};
+use crate::zoo;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use swm_core::{EnvChoice, Result};
@@ -51,7 +52,7 @@ impl NamedPolicy {
         if let Some(kind) = baseline {
             return Ok(without_checkpoint(NamedKind::Direct(kind)));
         }
-        let trained = env.as_ref().map(|env| trained_expert(&env.entry, &env.id(), given)).transpose()?.flatten();
+        let trained = env.as_ref().map(|env| zoo::trained_expert(&env.entry, &env.id(), given)).transpose()?.flatten();
         if let Some(trained) = trained {
             let kind = PolicyKind::Direct { checkpoint: trained, settings: Value::Null };
             return Ok(without_checkpoint(NamedKind::Direct(kind)));

@@ -224,7 +224,7 @@ pub struct Values {
 /// When there is no such column or element, the dataset is too large, or it is damaged.
 pub fn values(reader: &dyn Reader, column: &str, element: usize) -> Result<Values> {
     let spec = reader.schema().column(column)?;
-    let (count, is_factor) = (spec.len(), column.starts_with("variation."));
+    let (count, is_factor) = (spec.len(), column.starts_with(&columns::factor("")));
     if spec.is_image() || count > MOST_ELEMENTS || element >= count {
         let problem = format!("it has {count} elements, or holds images");
         return Err(Error::config(

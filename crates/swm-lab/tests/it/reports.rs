@@ -31,8 +31,12 @@ fn pages_of_a_leaderboard_are_shown_and_no_other_file() {
     let lab = TestLab::start();
     let board = lab.home.path().join("boards/site");
     fs::create_dir_all(board.join("entries")).expect("folders");
-    let files =
-        [("last-build", "{}"), ("index.html", "<a href=\"entries/a.html\">tables</a>"), ("entries/a.html", "entry a"), ("entries/b.txt", "no page")];
+    let files = [
+        ("last-build", "{}"),
+        ("index.html", "<a href=\"entries/a.html\">tables</a>"),
+        ("entries/a.html", "entry a"),
+        ("entries/b.txt", "no page"),
+    ];
     for (file, text) in files {
         fs::write(board.join(file), text).expect("a file");
     }

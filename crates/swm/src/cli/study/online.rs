@@ -185,7 +185,8 @@ pub(super) fn measure(cell: &TableCell, context: &Context, control: &mut Control
         cache: home::weights()?,
         ..TrainOptions::default()
     };
-    let Some(summary) = config.train_online(OnlineRun { environments: &environments, out: &out, options }, control) else {
+    let Some(summary) = config.train_online(OnlineRun { environments: &environments, out: &out, options }, control)
+    else {
         let problem = format!("{} trains on datasets only", text("family"));
         return Err(Error::config("families", problem, "give tdmpc2 or sac"));
     };

@@ -159,7 +159,7 @@ class RandomPolicy(_EnginePolicy):
 
 
 class ExpertPolicy(_EnginePolicy):
-    """A scripted expert of the environment.
+    """An expert of the environment: a scripted one, or the capsule of the zoo that is named `expert`.
 
     Args:
         name: One of `swm.envs.experts(ID)`; `"expert"` selects the first one.

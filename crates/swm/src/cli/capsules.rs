@@ -29,7 +29,7 @@ pub struct PackArgs {
     /// The capsule records the success rate, and three episodes that `verify` plays again.
     #[arg(long, value_name = "RESULTS")]
     eval: Option<PathBuf>,
-    /// Results of `swm eval --protocol compat` with this checkpoint, for its mean return
+    /// Results of `swm eval --protocol compat`, for the mean return
     ///
     /// With strict counting, an episode ends when its goal is reached, which is not what a task with rewards measures.
     #[arg(long, value_name = "RESULTS")]

@@ -460,7 +460,7 @@ fn find_expert(entry: &EnvEntry, name: &str) -> Result<Option<&'static ExpertEnt
     match entry.experts {
         [first, ..] if name == "expert" => Ok(Some(first)),
         [] => {
-            let hint = format!("{} has no expert of this name: choose random or a checkpoint", entry.id);
+            let hint = format!("{} has no experts: choose random or a checkpoint", entry.id);
             Err(Error::unknown("policy", name, ["random"], hint))
         }
         experts => experts.iter().find(|expert| expert.id == name).map(Some).ok_or_else(|| {

@@ -136,7 +136,7 @@ impl Actor {
     #[staticmethod]
     fn experts(env: &str) -> PyResult<Vec<&'static str>> {
         let choice = swm::env(env, &swm::core::Origin::User).map_err(to_py_err)?;
-        let trained = swm::zoo::trained_expert(&choice.entry, &choice.id(), "expert").map_err(to_py_err)?;
+        let trained = swm::zoo::trained_expert(&choice.entry, &choice.id(), "expert");
         let scripted = choice.entry.experts.iter().map(|expert| expert.id());
         Ok(scripted.chain(trained.map(|_| "expert")).collect())
     }

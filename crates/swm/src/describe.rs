@@ -5,15 +5,14 @@ use crate::zoo;
 use serde_json::{Map, Value, json};
 use swm_core::{EnvEntry, EnvSpec, Named as _, Space, VariationSpace};
 
-/// Describes a registered environment: its spec, summary, options and experts, among them one of the zoo. A damaged capsule
-/// of the zoo is left out.
+/// Describes a registered environment: its spec, summary, options and experts, among them one of the zoo.
 pub fn env(row: &EnvEntry, made: &EnvSpec) -> Value {
     let mut value = spec(made);
     value["summary"] = json!(row.summary);
     value["options"] =
         row.options.iter().map(|o| json!({"key": o.key, "summary": o.summary, "values": o.values})).collect();
     let scripted = row.experts.iter().map(|e| json!({"id": e.id(), "summary": e.summary}));
-    let trained = zoo::trained_expert(row, &made.id, "expert").ok().flatten();
+    let trained = zoo::trained_expert(row, &made.id, "expert");
     let trained = trained.map(|name| json!({"id": "expert", "summary": format!("trained by interaction: {name}")}));
     value["experts"] = scripted.chain(trained).collect();
     value

@@ -388,7 +388,7 @@ pub fn policy_of_choice(
 /// Returns the policy with a name for a world: a [`scripted`] policy, or a checkpoint that acts without a solver. For a
 /// checkpoint, also returns the hash of the weights.
 fn policy_by_name(entry: &EnvEntry, name: &str, world: &World) -> Result<(Box<dyn Policy>, Option<String>)> {
-    let trained = zoo::trained_expert(entry, &world.spec().id, name)?;
+    let trained = zoo::trained_expert(entry, &world.spec().id, name);
     let name = trained.as_deref().unwrap_or(name);
     let is_scripted = ["random", "expert"].contains(&name) || entry.experts.iter().any(|expert| expert.id == name);
     if is_scripted || !home::checkpoint(name)?.exists() {
@@ -403,7 +403,7 @@ fn policy_by_name(entry: &EnvEntry, name: &str, world: &World) -> Result<(Box<dy
 /// # Errors
 /// When the environment has no such expert.
 pub fn expert(entry: &EnvEntry, name: &str, world: &World) -> Result<(Box<dyn Policy>, Option<String>)> {
-    match zoo::trained_expert(entry, &world.spec().id, name)? {
+    match zoo::trained_expert(entry, &world.spec().id, name) {
         Some(trained) => policy_by_name(entry, &trained, world),
         None => Ok((scripted(entry, name, world)?, None)),
     }

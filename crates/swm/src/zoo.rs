@@ -80,35 +80,21 @@ pub fn find(name: &str) -> Result<PathBuf> {
 /// The last part of the name of a capsule that plays an environment without a scripted expert: `cartpole-swingup/expert`.
 const EXPERT: &str = "/expert";
 
-/// Returns the capsules named `expert`, such as `zoo:cartpole-swingup/expert`, with the environments that they were trained on.
-///
-/// # Errors
-/// When such a capsule is damaged.
-pub fn experts() -> Result<Vec<(String, String)>> {
+/// Returns the capsules named `expert`, such as `zoo:cartpole-swingup/expert`, with the environments that they were trained on. A
+/// damaged capsule is left out; `swm zoo` shows its error.
+pub fn experts() -> Vec<(String, String)> {
     let named = capsules().into_iter().filter(|(name, _)| name.ends_with(EXPERT));
-    let read = named.map(|(name, path)| {
-        let env = Capsule::read(&path)?.env().map(str::to_owned);
-        Ok(env.map(|env| (format!("{PREFIX}{name}"), env)))
-    });
-    read.filter_map(Result::transpose).collect()
+    let of = |(name, path): (String, PathBuf)| {
+        Some((format!("{PREFIX}{name}"), Capsule::read(&path).ok()?.env()?.to_owned()))
+    };
+    named.filter_map(of).collect()
 }
 
-/// Returns the capsule that is the expert of an environment with these options, such as
-/// `swm/CartpoleDMControl-v0,task=swingup`.
-///
-/// # Errors
-/// When a capsule named `expert` is damaged.
-pub fn expert(env: &str) -> Result<Option<String>> {
-    Ok(experts()?.into_iter().find(|(_, of)| of == env).map(|(name, _)| name))
-}
-
-/// Returns the capsule that the policy `name` means: for `expert`, where the environment `id`, with its options, has no
-/// scripted expert and the zoo has one.
-///
-/// # Errors
-/// As [`expert`].
-pub fn trained_expert(entry: &EnvEntry, id: &str, name: &str) -> Result<Option<String>> {
-    if name == "expert" && entry.experts.is_empty() { expert(id) } else { Ok(None) }
+/// Returns the capsule that the policy `name` means: for `expert`, where the environment `id`, with its options such as
+/// `swm/CartpoleDMControl-v0,task=swingup`, has no scripted expert and the zoo has one.
+pub fn trained_expert(entry: &EnvEntry, id: &str, name: &str) -> Option<String> {
+    let is_asked = name == "expert" && entry.experts.is_empty();
+    is_asked.then(experts)?.into_iter().find(|(_, env)| env == id).map(|(name, _)| name)
 }
 
 fn listed(folders: &[PathBuf]) -> String {

@@ -52,7 +52,7 @@ impl NamedPolicy {
         if let Some(kind) = baseline {
             return Ok(without_checkpoint(NamedKind::Direct(kind)));
         }
-        let trained = env.as_ref().map(|env| zoo::trained_expert(&env.entry, &env.id(), given)).transpose()?.flatten();
+        let trained = env.as_ref().and_then(|env| zoo::trained_expert(&env.entry, &env.id(), given));
         if let Some(trained) = trained {
             let kind = PolicyKind::Direct { checkpoint: trained, settings: Value::Null };
             return Ok(without_checkpoint(NamedKind::Direct(kind)));

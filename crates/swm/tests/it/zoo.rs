@@ -85,12 +85,13 @@ fn capsules_of_the_repository_are_valid() {
 #[test]
 fn expert_of_the_zoo_is_the_policy_of_its_environment() {
     let swm = Swm::new();
-    let experts = zoo::experts().expect("the experts");
+    let experts = zoo::experts();
     assert!(experts.iter().any(|(name, _)| name == "zoo:cartpole-swingup/expert"), "{experts:?}");
     let listed = text(&swm.run(&["envs"]).stdout);
     assert!(listed.contains("expert,task=swingup"), "{listed}");
     for (name, env) in &experts {
-        assert_eq!(zoo::expert(env).expect("the experts").as_ref(), Some(name));
+        let entry = swm::env(env, &Origin::User).expect(env).entry;
+        assert_eq!(zoo::trained_expert(&entry, env, "expert").as_ref(), Some(name));
         if swm::env(env, &Origin::User).and_then(|env| env.env()).is_err() {
             continue;
         }

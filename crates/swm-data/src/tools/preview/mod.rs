@@ -59,7 +59,7 @@ pub fn preview(
     mut progress: impl FnMut(usize),
 ) -> Result<Vec<PathBuf>> {
     let layout = FrameLayout::new(reader, &options.columns)?;
-    let chosen = chosen(reader, options.episodes)?;
+    let chosen = spread_episodes(reader, options.episodes, "preview")?;
     limits::SHEET_BYTES.check(limits::product([chosen.len(), SHEET_COLUMNS, layout.width, layout.height, 3]))?;
     let video_of = |episode: usize| folder.join(format!("episode_{}.mp4", reader.episodes()[episode].index));
     let contact_sheet_path = folder.join("contact_sheet.png");
@@ -100,16 +100,16 @@ pub fn preview(
     Ok(written)
 }
 
-/// Positions of episodes spread evenly over the dataset.
-fn chosen(reader: &dyn Reader, count: usize) -> Result<Vec<usize>> {
+/// Returns the positions of `count` episodes with rows, spread evenly over the dataset; of all if it has fewer. `what` is the
+/// command, for the error.
+///
+/// # Errors
+/// When there is no such episode, or `count` is 0.
+pub fn spread_episodes(reader: &dyn Reader, count: usize, what: &str) -> Result<Vec<usize>> {
     let all: Vec<usize> = (0..reader.episodes().len()).filter(|&i| reader.episodes()[i].length > 0).collect();
     let count = count.min(all.len());
     if count == 0 {
-        return Err(Error::config(
-            "preview",
-            "there is no episode to show",
-            "collect episodes, or request at least one",
-        ));
+        return Err(Error::config(what, "there is no episode to show", "collect episodes, or request at least one"));
     }
     Ok((0..count).map(|i| all[i * all.len() / count]).collect())
 }

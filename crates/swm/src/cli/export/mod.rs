@@ -20,6 +20,7 @@ use swm_core::columns::{
     TRUNCATED,
 };
 use swm_core::{Batch, ColumnSpec, DType, Error, Result, files};
+use swm_data::preview::spread_episodes;
 use swm_data::{ImageCodec, Reader, StepRange};
 use swm_gym::Python;
 
@@ -57,7 +58,7 @@ pub fn export(args: &ExportArgs, context: &Context) -> anyhow::Result<()> {
     files::check_own(&args.output, is_own)?;
     let reader = open_dataset(&args.dataset)?;
     let (columns, left_out) = chosen_columns(&*reader, &args.column)?;
-    let episodes = chosen_episodes(&*reader, args.episodes)?;
+    let episodes = spread_episodes(&*reader, args.episodes, "export")?;
     let folder = args.output.parent().filter(|folder| *folder != Path::new("")).unwrap_or_else(|| Path::new("."));
     // The recording replaces an older one when it is complete.
     // The permissions of a file that a user makes.
@@ -152,20 +153,6 @@ fn chosen_columns(reader: &dyn Reader, names: &[String]) -> Result<(Vec<Exported
         }
     }
     Ok((chosen, left_out))
-}
-
-/// Returns the positions of episodes that are spread evenly over the dataset.
-fn chosen_episodes(reader: &dyn Reader, count: usize) -> Result<Vec<usize>> {
-    let all: Vec<usize> = (0..reader.episodes().len()).filter(|&i| reader.episodes()[i].length > 0).collect();
-    let count = count.min(all.len());
-    if count == 0 {
-        return Err(Error::config(
-            "export",
-            "there is no episode to write",
-            "collect episodes, or request at least one",
-        ));
-    }
-    Ok((0..count).map(|i| all[i * all.len() / count]).collect())
 }
 
 /// A recording that the Python package writes.

@@ -19,7 +19,7 @@ SWM := $(CARGO_TARGET_DIR)/release/swm
 SUDO := $(shell [ "$$(id -u)" = 0 ] || command -v sudo)
 CARGO := cargo
 
-.PHONY: help demo test test-python test-ray test-lab test-neighbours test-browser chromium lab-assets check build tests wheel wheel-portable gpu docs assets setup setup-python reference bench deny release nightly clean test-gpu
+.PHONY: help demo test test-python test-ray test-lab test-neighbours test-browser chromium lab-assets check build tests wheel wheel-portable wheel-zoo gpu docs assets setup setup-python reference bench deny release nightly clean test-gpu
 
 help:
 	@echo 'make demo       collect, train, plan, evaluate and report on a laptop CPU'
@@ -31,12 +31,13 @@ help:
 	@echo 'make build      the swm program: $(SWM)'
 	@echo 'make wheel      the Python package: $(WHEELS)'
 	@echo 'make wheel-portable   the same for any Linux with glibc $(GLIBC), with a small FFmpeg inside: $(WHEELS)/portable'
+	@echo 'make wheel-zoo    the capsules of the zoo as a Python package, for the extra `zoo`: $(ZOO_WHEEL)'
 	@echo 'make gpu        the same with models on a GPU through Vulkan: $(CARGO_TARGET_DIR)-gpu/release/swm'
 	@echo 'make test-gpu   models, training and planning on a Vulkan device; without a GPU on a software device; DEVICE=vulkan:1'
 	@echo 'make docs       the documentation as static pages: $(CACHE)/docs/book/index.html'
 	@echo 'make assets     MuJoCo, its models and meshes, into $(SWM_ASSETS)'
 	@echo 'make nightly    what takes longer: fuzzers, sanitizer, models of threads, long tests; one part: PART=fuzz'
-	@echo 'make release    the program, a Debian package, the portable wheel, the source distribution, SBOM, checksums: $(CACHE)/release'
+	@echo 'make release    the program, a Debian package, the wheels, the source distribution, SBOM, checksums: $(CACHE)/release'
 	@echo 'make deny       licences and sources of the dependencies'
 	@echo 'make bench      our benchmarks, against the reference where `make reference` installed it'
 
@@ -120,14 +121,15 @@ build: setup
 tests: setup
 	$(CARGO) build --release --workspace --bins --tests
 
+# With the whole zoo, so that one file is enough on the machine that builds it, and for the tests.
 wheel: setup $(PYTHON_VENV)/ready
-	@rm -rf $(WHEELS) python/stable_worldmodel/share
-	@mkdir -p python/stable_worldmodel/share/swm && cp -r zoo python/stable_worldmodel/share/swm/
+	@rm -rf $(WHEELS) && sh xtask/share.sh
 	$(PYTHON_VENV)/bin/maturin build --release --manifest-path python/Cargo.toml --out $(WHEELS) --compatibility linux \
 	  --auditwheel skip --interpreter $(PYTHON_VENV)/bin/python
 
 # For any x86-64 Linux with this glibc and nothing else: a small FFmpeg without parts under the GPL is inside (xtask/portable_ffmpeg.sh), and
-# zig links against the old glibc. Rust's own libraries ask for no newer one, so that only this last step differs from `wheel`.
+# zig links against the old glibc. Rust's own libraries ask for no newer one, so that only this last step differs from `wheel`. Of the zoo it
+# contains one capsule and the experts; the data wheel has all capsules (`wheel-zoo`).
 GLIBC := 2.28
 PORTABLE := $(CACHE)/portable
 PORTABLE_VENV := $(CACHE)/venv-portable-1
@@ -138,8 +140,15 @@ $(PORTABLE_VENV)/ready:
 	touch $@
 
 wheel-portable: wheel $(PORTABLE_VENV)/ready
-	@command -v nasm >/dev/null || { $(SUDO) apt-get update -qq && $(SUDO) apt-get install -y -qq --no-install-recommends nasm; }
+	@command -v nasm >/dev/null && command -v dpkg-source >/dev/null || { $(SUDO) apt-get update -qq && \
+	  DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install -y -qq --no-install-recommends nasm dpkg-dev; }
 	PATH=$(PORTABLE_VENV)/bin:$$PATH GLIBC=$(GLIBC) sh xtask/portable_wheel.sh $(PORTABLE) $(WHEELS)/portable
+
+# The data wheel: the capsules of the zoo as the Python package that the extra `zoo` requires.
+ZOO_WHEEL := $(WHEELS)-zoo
+wheel-zoo: setup
+	rm -rf $(ZOO_WHEEL)
+	SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) python3 -m pip wheel --quiet --no-deps --wheel-dir $(ZOO_WHEEL) python/zoo
 
 # The program with models on a GPU through Vulkan, in a folder of its own: other features compile other libraries.
 GPU_TARGET := $(CARGO_TARGET_DIR)-gpu
@@ -227,12 +236,12 @@ deny: setup
 	$(CARGO) deny check licenses bans sources
 
 # What a release consists of, in $(CACHE)/release: the program with its list of dependencies inside (cargo auditable), as an archive and as a
-# Debian package, the portable wheel, the source distribution, a list of all dependencies (SBOM), what changed, a container file, checksums.
-# Not part of CI.
-release: setup deny wheel-portable
+# Debian package, the portable wheel, the data wheel, the source distribution, a list of all dependencies (SBOM), what changed, a container
+# file, checksums. Not part of CI.
+release: setup deny wheel-portable wheel-zoo
 	@$(CARGO) auditable --version >/dev/null 2>&1 || $(CARGO) install --locked --root $(CACHE)/tools cargo-auditable
 	@command -v auditable2cdx >/dev/null || $(CARGO) install --locked --root $(CACHE)/tools auditable2cdx
-	CARGO="$(CARGO)" PYTHON_VENV=$(PYTHON_VENV) WHEELS=$(WHEELS)/portable sh xtask/release.sh $(CACHE)/release
+	CARGO="$(CARGO)" PYTHON_VENV=$(PYTHON_VENV) WHEELS="$(WHEELS)/portable $(ZOO_WHEEL)" sh xtask/release.sh $(CACHE)/release
 
 # At most two hours after `tests` compiled everything. Parts that passed on the same commit are skipped; the page
 # docs/nightly.md has a row for each.

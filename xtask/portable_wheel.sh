@@ -12,12 +12,12 @@ sh xtask/portable_ffmpeg.sh "$PORTABLE" "$ZIG" "$GLIBC"
 mkdir -p "$PORTABLE/bin"
 printf '#!/bin/sh\nexec cargo-zigbuild zig cc -- -g -target x86_64-linux-gnu.%s -L "%s" "$@"\n' "$GLIBC" "$PORTABLE/ffmpeg/lib" > "$PORTABLE/bin/linker"
 chmod +x "$PORTABLE/bin/linker"
-mkdir -p python/stable_worldmodel/share/licences
+trap 'sh xtask/share.sh' EXIT
+sh xtask/share.sh small
 cp "$PORTABLE"/ffmpeg/licences/* python/stable_worldmodel/share/licences/
 rm -rf "$OUT" "$PORTABLE/linked"
 CARGO_ZIGBUILD_ZIG_PATH=$ZIG maturin build --release --manifest-path python/Cargo.toml --out "$PORTABLE/linked" --compatibility linux \
   --auditwheel skip --interpreter "$(command -v python)" -- -C linker="$PORTABLE/bin/linker"
 LD_LIBRARY_PATH=$PORTABLE/ffmpeg/lib auditwheel repair --plat "$PLATFORM" --wheel-dir "$OUT" "$PORTABLE"/linked/*.whl
-rm -r python/stable_worldmodel/share/licences
 auditwheel show "$OUT"/*.whl
 ls -l "$OUT"

@@ -29,7 +29,7 @@ sh xtask/deb.sh "$OUT/$NAME" "$OUT" "$VERSION"
 cp Containerfile "$OUT/"
 rm -r "${OUT:?}/$NAME"
 
-cp "$WHEELS"/*.whl "$OUT/"
-"$PYTHON_VENV/bin/maturin" sdist --manifest-path python/Cargo.toml --out "$OUT"
+for folder in $WHEELS; do cp "$folder"/*.whl "$OUT/"; done
+sh xtask/sdist.sh "$PYTHON_VENV/bin/maturin" "$OUT"
 (cd "$OUT" && sha256sum -- * > SHA256SUMS && sha256sum --check --quiet SHA256SUMS)
 ls -l "$OUT"

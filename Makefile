@@ -239,6 +239,8 @@ deny: setup
 # Debian package, the portable wheel, the data wheel, the source distribution, a list of all dependencies (SBOM), what changed, a container
 # file, checksums. Not part of CI.
 release: setup deny wheel-portable wheel-zoo
+	@command -v lintian >/dev/null || { $(SUDO) apt-get update -qq && \
+	  DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install -y -qq --no-install-recommends lintian; }
 	@$(CARGO) auditable --version >/dev/null 2>&1 || $(CARGO) install --locked --root $(CACHE)/tools cargo-auditable
 	@command -v auditable2cdx >/dev/null || $(CARGO) install --locked --root $(CACHE)/tools auditable2cdx
 	CARGO="$(CARGO)" PYTHON_VENV=$(PYTHON_VENV) WHEELS="$(WHEELS)/portable $(ZOO_WHEEL)" sh xtask/release.sh $(CACHE)/release

@@ -17,24 +17,24 @@ install -D -m 644 "$FOLDER/swm.bash" "$ROOT/usr/share/bash-completion/completion
 install -D -m 644 "$FOLDER/swm.zsh" "$ROOT/usr/share/zsh/vendor-completions/_swm"
 install -D -m 644 "$FOLDER/swm.fish" "$ROOT/usr/share/fish/vendor_completions.d/swm.fish"
 for page in "$FOLDER"/man/*.1; do install -D -m 644 "$page" "$ROOT/usr/share/man/man1/$(basename "$page")"; done
-for model in $(cd "$FOLDER/zoo" && find . -type f); do install -D -m 644 "$FOLDER/zoo/$model" "$ROOT/usr/share/swm/zoo/$model"; done
+for file in $(cd "$FOLDER" && find share -type f); do install -D -m 644 "$FOLDER/$file" "$ROOT/usr/$file"; done
 install -D -m 644 "$FOLDER/README.md" "$DOC/README.md"
 {
   echo 'Format: https://www.debian.org/doc/packaging-manuals/copyright-format/1.0/'
   echo "Upstream-Name: $NAME"
   printf '\nFiles: *\nCopyright: The stable-worldmodel developers\nLicense: Expat or Apache-2.0\n'
-  for licence in LICENSE-MIT:Expat LICENSE-APACHE:Apache-2.0; do
-    printf '\nLicense: %s\n' "${licence##*:}"
-    sed -e 's/[[:space:]]*$//' -e 's/^$/./' -e 's/^/ /' "$FOLDER/${licence%%:*}"
-  done
+  printf '\nLicense: Expat\n'
+  sed -e 's/[[:space:]]*$//' -e 's/^$/./' -e 's/^/ /' "$FOLDER/LICENSE-MIT"
+  printf '\nLicense: Apache-2.0\n On Debian systems, the text is in /usr/share/common-licenses/Apache-2.0.\n'
 } > "$DOC/copyright"
-# Packages have a changelog of their own form; the text is that of the release.
+# Packages have a changelog of their own form, with short lines. The text is that of the release.
+install -m 644 "$FOLDER/CHANGES.md" "$DOC/CHANGES.md"
 {
   printf '%s (%s) unstable; urgency=medium\n\n' "$NAME" "$VERSION"
-  sed -n -e 's/^- /  * /p' -e t -e 's/^  /    /p' "$FOLDER/CHANGES.md"
+  printf '  * Release %s: CHANGES.md.gz in this folder lists what changed.\n' "$VERSION"
   printf '\n -- The stable-worldmodel developers <noreply@example.org>  %s\n' "$(date --utc --rfc-email --date="@$SOURCE_DATE_EPOCH")"
 } > "$DOC/changelog"
-gzip -9 --no-name "$DOC/changelog" "$ROOT"/usr/share/man/man1/*.1
+gzip -9 --no-name "$DOC/changelog" "$DOC/CHANGES.md" "$ROOT"/usr/share/man/man1/*.1
 
 # The libraries that the program is linked with, as packages of this release of Debian.
 mkdir -p "$WORK/debian" "$ROOT/DEBIAN"

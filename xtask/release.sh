@@ -21,11 +21,14 @@ auditable2cdx "$OUT/$NAME/swm" > "$OUT/$NAME.cdx.json"
 sh xtask/changes.sh "$VERSION" > "$OUT/$NAME/CHANGES.md"
 cp "$OUT/$NAME/CHANGES.md" "$OUT/"
 cp README.md CHANGELOG.md CITATION.cff LICENSE* "$OUT/$NAME/"
-cp -r zoo "$OUT/$NAME/"
+# Where the program looks for it.
+mkdir -p "$OUT/$NAME/share/swm"
+cp -r zoo "$OUT/$NAME/share/swm/"
 for shell in bash zsh fish; do "$OUT/$NAME/swm" completions $shell > "$OUT/$NAME/swm.$shell"; done
 "$OUT/$NAME/swm" man --output "$OUT/$NAME/man" > /dev/null
 tar --create --xz --sort=name --owner=0 --group=0 --numeric-owner --mtime="@$SOURCE_DATE_EPOCH" --directory "$OUT" --file "$OUT/$NAME.tar.xz" "$NAME"
 sh xtask/deb.sh "$OUT/$NAME" "$OUT" "$VERSION"
+lintian --allow-root --fail-on error,warning "$OUT"/*.deb
 cp Containerfile "$OUT/"
 rm -r "${OUT:?}/$NAME"
 

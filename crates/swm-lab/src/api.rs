@@ -358,8 +358,10 @@ async fn report(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -
 
 /// The families that can be trained, and the trainings that were started.
 async fn list_trainings(State(shared): State<Shared>) -> Answer {
-    let listed = shared
-        .work(|shared| Ok(json!({"families": shared.lab.training.families(), "trainings": shared.trainings.list()})));
+    let listed = shared.work(|shared| {
+        let training = &*shared.lab.training;
+        Ok(json!({"families": training.families(), "trainings": shared.trainings.list(training)}))
+    });
     as_json(&listed.await?)
 }
 

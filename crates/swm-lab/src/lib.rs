@@ -17,6 +17,7 @@
 pub mod access;
 mod api;
 pub mod assets;
+mod connections;
 pub mod datasets;
 pub mod distribution;
 pub mod folders;

@@ -2,6 +2,7 @@
 
 use crate::access::{self, Access, Refusal, Token};
 use crate::api::{self, Shared};
+use crate::connections::{Connections, Place};
 use crate::{Lab, assets};
 use axum::Router;
 use axum::body::Body;
@@ -14,16 +15,15 @@ use hyper::service::service_fn;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use std::convert::Infallible;
 use std::net::{IpAddr, SocketAddr};
+use std::pin::pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 use swm_core::{Error, Result};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
+use tokio::sync::{oneshot, watch};
 use tower_service::Service as _;
 
-/// Connections at the same time; others wait.
-const CONNECTIONS: usize = 256;
 /// The largest head of a request, in bytes.
 const HEAD: usize = 32 << 10;
 /// The largest number of headers of a request.
@@ -96,17 +96,13 @@ impl Server {
         let (running, trainings, lab) = (shared.running.clone(), shared.trainings.clone(), Arc::clone(&shared.lab));
         let router = api::routes(shared);
         runtime.block_on(async {
-            let connections = Arc::new(Semaphore::new(CONNECTIONS));
+            let connections = Connections::new();
             let mut polls = tokio::time::interval(POLL);
             loop {
                 tokio::select! {
-                    accepted = accept(&listener, &connections) => {
-                        let Some((stream, permit)) = accepted else { continue };
-                        let (access, router) = (access.clone(), router.clone());
-                        tokio::spawn(async move {
-                            connection(stream, access, router).await;
-                            drop(permit);
-                        });
+                    accepted = accept(&listener) => {
+                        let Some(stream) = accepted else { continue };
+                        tokio::spawn(connection(stream, access.clone(), router.clone(), connections.add()));
                     }
                     _ = polls.tick() => if stop.load(Ordering::Relaxed) { break },
                 }
@@ -126,12 +122,11 @@ impl Server {
 }
 
 /// Waits for a connection. An error, such as too many open files, is waited out.
-async fn accept(listener: &TcpListener, connections: &Arc<Semaphore>) -> Option<(TcpStream, OwnedSemaphorePermit)> {
-    let permit = Arc::clone(connections).acquire_owned().await.ok()?;
+async fn accept(listener: &TcpListener) -> Option<TcpStream> {
     match listener.accept().await {
         Ok((stream, _)) => {
             stream.set_nodelay(true).ok();
-            Some((stream, permit))
+            Some(stream)
         }
         Err(error) => {
             tracing::warn!("accepting a connection failed: {error}");
@@ -141,13 +136,22 @@ async fn accept(listener: &TcpListener, connections: &Arc<Semaphore>) -> Option<
     }
 }
 
-/// Answers the requests of a connection.
-async fn connection(stream: TcpStream, access: Access, router: Router) {
+/// Answers the requests of a connection, until it ends or gives way to newer ones.
+async fn connection(
+    stream: TcpStream,
+    access: Access,
+    router: Router,
+    (place, admitted): (Place, oneshot::Receiver<()>),
+) {
+    let place = Arc::new(place);
     let service = service_fn(move |request: Request<Incoming>| {
-        let (access, mut router) = (access.clone(), router.clone());
+        let (access, mut router, place) = (access.clone(), router.clone(), Arc::clone(&place));
         async move {
             let mut response = match check(&access, request) {
-                Ok(request) => router.call(request).await.unwrap_or_else(|never| match never {}),
+                Ok(request) => {
+                    place.admit().await;
+                    router.call(request).await.unwrap_or_else(|never| match never {})
+                }
                 Err(refusal) => refused(refusal),
             };
             access::add_headers(response.headers_mut());
@@ -156,7 +160,14 @@ async fn connection(stream: TcpStream, access: Access, router: Router) {
     });
     let mut builder = http1::Builder::new();
     builder.timer(TokioTimer::new()).header_read_timeout(PATIENCE).max_buf_size(HEAD).max_headers(HEADERS);
-    let served = builder.serve_connection(TokioIo::new(stream), service).with_upgrades().await;
+    let mut serving = pin!(builder.serve_connection(TokioIo::new(stream), service).with_upgrades());
+    let served = tokio::select! {
+        served = &mut serving => served,
+        known = admitted => match known {
+            Ok(()) => serving.await,
+            Err(_) => return tracing::debug!("an unknown connection was closed, because newer ones came"),
+        },
+    };
     if let Err(error) = served {
         tracing::debug!("a connection failed: {error}");
     }

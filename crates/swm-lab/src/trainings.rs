@@ -6,9 +6,9 @@
 use crate::folders::{Folders, check_name};
 use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
-use std::os::unix::process::CommandExt as _;
-use std::path::Path;
-use std::process::{Child, Command, Stdio};
+use std::os::unix::process::{CommandExt as _, ExitStatusExt as _};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 use swm_core::{Error, Result, text};
@@ -25,6 +25,10 @@ const TAIL: usize = 2_000;
 const ENDING: Duration = Duration::from_secs(60);
 /// How often it is looked whether they have ended.
 const POLL: Duration = Duration::from_millis(50);
+/// The exit code of a program that was interrupted.
+const INTERRUPTED: i32 = 130;
+/// The signal of Ctrl-C, which ends a program that does not handle it yet.
+const SIGINT: i32 = 2;
 
 /// A model family that can be trained on a dataset.
 #[derive(Clone, Debug, Serialize)]
@@ -73,6 +77,9 @@ pub trait Training: Send + Sync {
     /// # Errors
     /// When the system refuses.
     fn interrupt(&self, process: &Child) -> Result<()>;
+
+    /// Whether a training that was stopped left something in its folder that continues.
+    fn can_continue(&self, output: &Path) -> bool;
 }
 
 /// How a training is.
@@ -100,7 +107,7 @@ pub struct Listed {
     pub family: String,
     /// How it is.
     pub state: State,
-    /// The last lines that it reported, if it has failed.
+    /// The last lines that it reported, if it has failed; that nothing continues, if it was stopped too early for that.
     pub message: String,
 }
 
@@ -108,6 +115,7 @@ pub struct Listed {
 struct Started {
     name: String,
     family: String,
+    output: PathBuf,
     process: Child,
     state: State,
     tail: Arc<Mutex<VecDeque<u8>>>,
@@ -130,8 +138,8 @@ impl Trainings {
     }
 
     /// The trainings, the newest first.
-    pub fn list(&self) -> Vec<Listed> {
-        self.lock().iter().rev().map(Started::listed).collect()
+    pub fn list(&self, training: &dyn Training) -> Vec<Listed> {
+        self.lock().iter().rev().map(|started| started.listed(training)).collect()
     }
 
     /// Starts a training.
@@ -142,11 +150,13 @@ impl Trainings {
         check(training, request)?;
         let no_folder = || Error::config("a training", "the lab has no folder of runs", "set STABLEWM_HOME");
         let output = runs.paths().first().ok_or_else(no_folder)?.join(&request.name);
-        if output.symlink_metadata().is_ok() {
-            let problem = "there is a run of this name";
+        // Held until the training is listed: of two requests for one name, the second finds the first.
+        let mut all = self.lock();
+        let is_running = all.iter().any(|started| started.output == output && !started.has_ended());
+        if is_running || output.symlink_metadata().is_ok() {
+            let problem = if is_running { "a training of this name runs" } else { "there is a run of this name" };
             return Err(Error::config(format!("run {}", request.name), problem, "choose another name"));
         }
-        let mut all = self.lock();
         if all.iter().filter(|started| !started.has_ended()).count() >= MOST {
             let problem = format!("{MOST} run already");
             return Err(Error::config("a training", problem, "stop one, or wait until one is done"));
@@ -161,7 +171,7 @@ impl Trainings {
             std::thread::spawn(move || keep_tail(reports, &tail));
         }
         let (name, family) = (request.name.clone(), request.family.clone());
-        all.push(Started { name, family, process, state: State::Running, tail });
+        all.push(Started { name, family, output, process, state: State::Running, tail });
         Ok(())
     }
 
@@ -202,9 +212,10 @@ impl Started {
             return;
         }
         let Ok(Some(status)) = self.process.try_wait() else { return };
-        self.state = match self.state {
-            State::Stopping => State::Stopped,
+        // A training that was asked to stop may be done before, or fail.
+        self.state = match status {
             _ if status.success() => State::Finished,
+            _ if was_interrupted(status) => State::Stopped,
             _ => State::Failed,
         };
     }
@@ -215,7 +226,7 @@ impl Started {
         Ok(())
     }
 
-    fn listed(&self) -> Listed {
+    fn listed(&self, training: &dyn Training) -> Listed {
         let message = match self.state {
             State::Failed => {
                 let tail: Vec<u8> = self.tail.lock().unwrap_or_else(PoisonError::into_inner).iter().copied().collect();
@@ -223,10 +234,19 @@ impl Started {
                 let lines: Vec<&str> = reported.lines().rev().take(3).collect();
                 text::printable(&lines.into_iter().rev().collect::<Vec<_>>().join(" ")).into_owned()
             }
+            State::Stopped if !training.can_continue(&self.output) => {
+                let again = if self.output.exists() { "start it again under another name" } else { "start it again" };
+                format!("it was stopped before it stored anything, so that there is nothing to continue: {again}")
+            }
             _ => String::new(),
         };
         Listed { name: self.name.clone(), family: self.family.clone(), state: self.state, message }
     }
+}
+
+/// Whether a program ended because it was asked to, as by Ctrl-C.
+fn was_interrupted(status: ExitStatus) -> bool {
+    status.code() == Some(INTERRUPTED) || status.signal() == Some(SIGINT)
 }
 
 /// Checks everything that a page chose but the dataset, which is looked up.

@@ -117,6 +117,27 @@ fn connections_without_the_token_are_not_held() {
 }
 
 #[test]
+fn half_open_connections_delay_no_answer() {
+    let lab = TestLab::start();
+    let half = |number: usize| {
+        let mut stream = lab.connect();
+        if number % 2 == 1 {
+            stream.write_all(format!("GET /{TOKEN}/api/envs HTTP/1.1\r\nHo").as_bytes()).expect("sending");
+        }
+        stream
+    };
+    let mut connections: Vec<_> = (0..300).map(half).collect();
+    assert_eq!(lab.get("api/envs").0, 200);
+    // The answer did not wait until the heads were late: newer connections are still open, of which this is an old one.
+    let mut waiting = connections.swap_remove(251);
+    let rest = format!("st: {}\r\nConnection: close\r\n\r\n", lab.host());
+    let mut answer = vec![];
+    waiting.write_all(rest.as_bytes()).and_then(|()| waiting.read_to_end(&mut answer)).expect("an answer");
+    assert!(answer.starts_with(b"HTTP/1.1 200"), "{}", String::from_utf8_lossy(&answer));
+    assert!(matches!(connections[1].read(&mut [0]), Ok(0) | Err(_)), "the oldest ones are closed");
+}
+
+#[test]
 fn answers_bind_pages_to_the_lab() {
     let lab = TestLab::start();
     let mut stream = lab.connect();

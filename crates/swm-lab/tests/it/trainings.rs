@@ -7,12 +7,13 @@ use std::process::{Child, Command};
 use swm_core::{Error, Result};
 use swm_lab::trainings::{Family, Request, Training};
 
-/// Writes a log, and runs until it is asked to stop, or fails at once for the preset `broken`.
+/// Writes a log, and runs until it is asked to stop. The preset `broken` fails at once, `early` stores nothing, `failing` fails
+/// when it is asked to stop.
 pub struct Shell;
 
 impl Training for Shell {
     fn families(&self) -> Vec<Family> {
-        let presets = ["tiny", "broken"].map(|id| (id.to_owned(), String::new())).to_vec();
+        let presets = ["tiny", "broken", "early", "failing"].map(|id| (id.to_owned(), String::new())).to_vec();
         vec![Family { id: "gcbc".to_owned(), summary: String::new(), presets }]
     }
 
@@ -25,6 +26,12 @@ impl Training for Shell {
                 [ -d "$1" ] || exit 1
                 while :; do sleep 0.02; done"#
             }
+            "early" => "trap 'exit 130' INT; while :; do sleep 0.02; done",
+            "failing" => {
+                r#"trap 'echo "error: the disk is full" >&2; exit 1' INT
+                mkdir -p "$2"; echo "{\"step\": 1}" > "$2/train.jsonl"
+                while :; do sleep 0.02; done"#
+            }
             _ => "echo 'error: the data is broken' >&2; exit 1",
         };
         command.args(["-c", script, "sh"]).arg(data).arg(output).arg(request.seed.to_string());
@@ -34,6 +41,10 @@ impl Training for Shell {
     fn interrupt(&self, process: &Child) -> Result<()> {
         let done = Command::new("kill").args(["-INT", &process.id().to_string()]).status();
         done.map(drop).map_err(|error| Error::external("stopping", error))
+    }
+
+    fn can_continue(&self, output: &Path) -> bool {
+        output.join("train.jsonl").is_file()
     }
 }
 
@@ -88,7 +99,7 @@ fn trainings_start_stop_and_end_with_the_lab() {
     assert!(status == 400 && message.contains("2 run already"), "{message}");
     wait_for_log(&lab, "second", 1);
     assert_eq!(lab.post("api/stop", r#"{"name": "cloned"}"#).0, 200);
-    wait_for(&lab, "cloned", "stopped");
+    assert_eq!(wait_for(&lab, "cloned", "stopped")["message"], "", "it can be continued");
     assert_eq!(lab.json("api/lines?name=cloned")["lines"][1]["step"], 2, "it stopped at a safe point");
     assert_eq!(lab.post("api/stop", r#"{"name": "cloned"}"#).0, 400);
     // The lab ends, and with it the second training.
@@ -96,6 +107,35 @@ fn trainings_start_stop_and_end_with_the_lab() {
     drop(lab);
     let log = std::fs::read_to_string(home.path().join("checkpoints/second/train.jsonl")).expect("a log");
     assert_eq!(log.lines().count(), 2, "{log}");
+}
+
+#[test]
+fn second_training_of_a_name_is_refused_before_the_first_has_a_folder() {
+    let lab = TestLab::start();
+    super::data::collect(&lab, 1);
+    let early = request(json!({"preset": "early"}));
+    let answers: Vec<(u16, String)> = std::thread::scope(|scope| {
+        let both = [(), ()].map(|()| scope.spawn(|| lab.post("api/train", &early)));
+        both.map(|one| one.join().expect("an answer")).into()
+    });
+    let refused: Vec<_> = answers.iter().filter(|(status, _)| *status == 400).collect();
+    assert!(refused.len() == 1 && refused[0].1.contains("a training of this name runs"), "{answers:?}");
+    assert_eq!(lab.json("api/trainings")["trainings"].as_array().map(Vec::len), Some(1));
+    // Nothing was stored, so that the name is free again.
+    assert_eq!(lab.post("api/stop", r#"{"name": "cloned"}"#).0, 200);
+    let stopped = wait_for(&lab, "cloned", "stopped");
+    assert!(stopped["message"].as_str().is_some_and(|text| text.contains("nothing to continue")), "{stopped}");
+    assert_eq!(lab.post("api/train", &early).0, 200);
+}
+
+#[test]
+fn training_that_fails_after_it_was_asked_to_stop_has_failed() {
+    let lab = TestLab::start();
+    super::data::collect(&lab, 1);
+    assert_eq!(lab.post("api/train", &request(json!({"preset": "failing"}))).0, 200);
+    wait_for_log(&lab, "cloned", 1);
+    assert_eq!(lab.post("api/stop", r#"{"name": "cloned"}"#).0, 200);
+    assert_eq!(wait_for(&lab, "cloned", "failed")["message"], "error: the disk is full");
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! Trainings that pages of the lab start: this program as `swm train`, in a process of its own.
 
+use crate::cli::run_record;
 use std::path::Path;
 use std::process::{Child, Command};
 use swm_core::{Error, Result};
@@ -55,5 +56,10 @@ impl Training for OwnProgram {
             0 => Ok(()),
             _ => Err(failed(std::io::Error::last_os_error())),
         }
+    }
+
+    fn can_continue(&self, output: &Path) -> bool {
+        // `swm train --resume` begins a run that has its record and no checkpoint yet.
+        run_record::read(output).is_ok()
     }
 }

@@ -572,9 +572,9 @@ class Bridge:
         for view, value in self.held:
             view[...] = np.reshape(value, view.shape)
         success = info.get('success', info.get('is_success'))
-        if success is None or success != success:
+        if success is None:
             success = terminated
-        elif np.asarray(success).dtype.kind not in 'biuf':
+        elif np.asarray(success).dtype.kind not in 'biuf' or success != success:
             raise ValueError(f"info['success'] is {success!r}: return True or False")
         distance = info.get('goal_distance', math.inf)
         HEAD.pack_into(self.buffer, 0, float(reward), float(distance), bool(terminated), bool(truncated), bool(success))

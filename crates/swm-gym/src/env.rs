@@ -127,13 +127,13 @@ impl GymEnv {
                 }
                 Err(failure) => {
                     self.stage = Stage::Broken;
-                    self.episode = None;
+                    let steps = self.episode.take().map_or(0, |now| now.actions.len() / self.layout.action.len());
                     let what = match env_call {
-                        EnvCall::Reset => "its reset",
-                        EnvCall::Step => "its step",
-                        EnvCall::Render => "its render",
+                        EnvCall::Reset => "its reset".to_owned(),
+                        EnvCall::Step => format!("its step {steps}"),
+                        EnvCall::Render => "its render".to_owned(),
                     };
-                    return Err(failure.explain(&self.layout.spec.id, what, lost));
+                    return Err(failure.explain(&self.layout.spec.id, &what, lost));
                 }
             }
         }

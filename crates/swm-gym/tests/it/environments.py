@@ -368,7 +368,8 @@ class Loose(gymnasium.Env):
     def step(self, action):
         self.t += 1
         observation = self.VALUES.get(self.value, np.zeros(3, np.float32)) if self.t == 2 else np.zeros(3, np.float32)
-        return observation, 0.0, False, False, {'success': 'no' if self.t == 2 and self.value == 'success' else False}
+        success = {'success': 'no', 'nan': float('nan')}.get(self.value, False) if self.t == 2 else False
+        return observation, 0.0, False, False, {'success': success}
 
 
 gymnasium.register('Loose-v0', Loose, max_episode_steps=1_000_000)

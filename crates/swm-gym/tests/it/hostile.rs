@@ -79,12 +79,15 @@ fn environment_cannot_shrink_the_shared_memory() {
 fn observations_of_another_shape_or_type_are_errors() {
     let Some(config) = config() else { return };
     let shaped = ["scalar", "one", "column"].map(|value| (value, "shape"));
-    for (value, shown) in shaped.into_iter().chain([("complex", "complex"), ("text", "<U1"), ("success", "'no'")]) {
+    for (value, shown) in
+        shaped.into_iter().chain([("complex", "complex"), ("text", "<U1"), ("success", "'no'"), ("nan", "nan")])
+    {
         let mut env = make(&format!("tests.it.environments:Loose-v0,value={value}"), &config);
         env.reset(0, &ResetOptions::default()).expect("a reset");
         env.step(Action::Discrete(&[0])).expect("three numbers");
         let error = env.step(Action::Discrete(&[0])).expect_err(value).to_string();
-        assert!(error.contains(shown), "{value}: {error}");
+        assert!(error.contains(shown) && error.contains("Loose-v0,value="), "{value}: {error}");
+        assert!(error.contains("its step 2 raised"), "{value}: {error}");
     }
     let mut env = make("tests.it.environments:Loose-v0,value=row", &config);
     env.reset(0, &ResetOptions::default()).expect("a reset");

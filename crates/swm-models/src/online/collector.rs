@@ -3,6 +3,7 @@
 //! The last observation of a segment is the first observation of the next segment, so that no transition is lost. No
 //! clip of several steps spans two segments.
 
+use crate::train::metrics::null_is_nan;
 use serde::{Deserialize, Serialize};
 use swm_core::columns::{ACTION, REWARD, TERMINATED, TRUNCATED};
 use swm_core::pool::Reset;
@@ -30,7 +31,7 @@ pub(super) struct Collector {
     next: u64,
     /// Environment steps done.
     pub steps: usize,
-    /// Undiscounted returns of the episodes that ended since the returns were last taken.
+    /// Undiscounted returns of the last episodes that ended: those of one step.
     pub returns: Vec<f64>,
 }
 
@@ -55,8 +56,8 @@ pub(super) struct CollectorState {
     next: u64,
     /// The index and the actions of every running episode; the environments are restored by repeating the actions.
     running: Vec<(u64, Vec<f32>)>,
-    /// The returns that are in no line of the log yet.
-    #[serde(default)]
+    /// The returns of the last episodes that ended.
+    #[serde(default, deserialize_with = "null_is_nan")]
     returns: Vec<f64>,
     /// What the policy remembers of the running episodes.
     #[serde(default)]
@@ -165,6 +166,9 @@ impl Collector {
                 running.length = 0;
             }
             if episode_ended {
+                if ended.is_empty() {
+                    self.returns.clear();
+                }
                 self.returns.push(running.total);
                 ended.push(slot);
             }

@@ -8,7 +8,7 @@ use super::shared_model::SharedModel;
 use crate::run_folder::{self, COLLECTOR, PLAYED, REPLAY};
 use crate::train::config::LoopConfig;
 use crate::train::learner::{self, DynLearner, Learner, Update};
-use crate::train::metrics::{MetricWindow, Metrics};
+use crate::train::metrics::Metrics;
 use crate::train::run::STAGE;
 use crate::train::run_state::is_due;
 use crate::train::{DatasetInfo, TrainConfig, TrainOptions, failed_batch, log};
@@ -197,10 +197,6 @@ struct Meter {
     first_step: usize,
     /// Seconds spent on interaction.
     interaction_seconds: f64,
-    /// Metrics since the last line of the log.
-    window: MetricWindow,
-    /// The mean return of the last episodes that ended.
-    collected_return: Option<f64>,
     /// The mean return of the last evaluation.
     evaluated_return: Option<f64>,
 }
@@ -264,9 +260,6 @@ impl Run<'_> {
             let start = Instant::now();
             self.data.collector.step(if warm { &mut *self.explorer } else { &mut *self.random })?;
             meter.interaction_seconds += start.elapsed().as_secs_f64();
-            if !self.data.collector.returns.is_empty() {
-                meter.collected_return = Some(mean(&std::mem::take(&mut self.data.collector.returns)));
-            }
             if !learns {
                 continue;
             }
@@ -303,7 +296,7 @@ impl Run<'_> {
     /// Makes one optimizer step, evaluates if an evaluation is due, and reports the metrics.
     fn train_step(&mut self, meter: &mut Meter, control: &mut Control<'_>) -> Result<()> {
         let Update { metrics, lr, gradient_norm } = self.update()?;
-        meter.window.add(&metrics, gradient_norm);
+        self.learner.learner_mut().state_mut().window.add(&metrics, gradient_norm);
         let (done, steps) = (self.step(), self.config.schedule.steps);
         let elapsed = meter.start.elapsed().as_secs_f64();
         let clips_per_second = ((done - meter.first_step) * self.config.data.batch_size) as f64 / elapsed;
@@ -311,7 +304,8 @@ impl Run<'_> {
             meter.evaluated_return = Some(self.evaluate()?);
         }
         let env_steps = self.data.collector.steps as f64;
-        let collected_return = meter.collected_return.map(|value| ("return", value));
+        let returns = &self.data.collector.returns;
+        let collected_return = (!returns.is_empty()).then(|| ("return", mean(returns)));
         let interaction = meter.interaction_seconds / elapsed;
         let mut shown = metrics;
         shown.push(("env_steps", env_steps));
@@ -321,7 +315,7 @@ impl Run<'_> {
         shown.extend([("clips_per_second", clips_per_second), ("data_wait", interaction)]);
         control.progress(Progress { stage: STAGE, done, total: steps, unit: "steps", metrics: &shown });
         if is_due(self.config.log_every, done, steps) {
-            let (mut line, norm) = meter.window.take();
+            let (mut line, norm) = self.learner.learner_mut().state_mut().window.take();
             line.extend([("gradient_norm", norm), ("env_steps", env_steps)]);
             line.extend(collected_return);
             line.extend([("clips_per_second", clips_per_second), ("playing", interaction), ("seconds", elapsed)]);
@@ -412,14 +406,7 @@ impl Run<'_> {
 
 impl Meter {
     fn new(first_step: usize) -> Self {
-        Self {
-            start: Instant::now(),
-            first_step,
-            interaction_seconds: 0.0,
-            window: MetricWindow::default(),
-            collected_return: None,
-            evaluated_return: None,
-        }
+        Self { start: Instant::now(), first_step, interaction_seconds: 0.0, evaluated_return: None }
     }
 }
 

@@ -203,7 +203,7 @@ impl<'a> Run<'a> {
         let steps = self.config.schedule.steps;
         control.emit(Event::Started(Stage { name: STAGE, subject: &[family], total: steps, unit: "steps" }));
         self.clock.start = Instant::now();
-        let (mut window, mut last) = (MetricWindow::default(), vec![]);
+        let mut last = vec![];
         let (mut stop, mut stopped_early, mut validation) = (None, false, None);
         while self.learner.state().step < steps && !stopped_early {
             if let Err(error) = control.check() {
@@ -213,7 +213,7 @@ impl<'a> Run<'a> {
             let Update { metrics, lr, gradient_norm } = self.step()?;
             let done = self.learner.state().step;
             let elapsed = self.clock.tick(done, &self.config);
-            window.add(&metrics, gradient_norm);
+            self.learner.state_mut().window.add(&metrics, gradient_norm);
             if is_due(self.config.validation.every, done, steps) {
                 let loss = self.validate()?;
                 validation = Some(loss);
@@ -226,7 +226,7 @@ impl<'a> Run<'a> {
             shown.extend(rates);
             control.progress(Progress { stage: STAGE, done, total: steps, unit: "steps", metrics: &shown });
             if is_due(self.config.log_every, done, steps) || stopped_early {
-                let (means, norm) = window.take();
+                let (means, norm) = self.learner.state_mut().window.take();
                 last.clone_from(&means);
                 self.log_line(done, means, lr, norm, rates, elapsed)?;
             }

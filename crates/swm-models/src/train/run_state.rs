@@ -1,5 +1,6 @@
 //! [`RunState`]: the progress of a run, stored in its checkpoint as `state.json`.
 
+use super::metrics::MetricWindow;
 use serde::{Deserialize, Serialize};
 
 /// The progress of a run. With the tensors of the checkpoint, it determines how the run continues.
@@ -13,6 +14,9 @@ pub(crate) struct RunState {
     /// The number of validations since the best validation.
     #[serde(default, rename = "looks")]
     pub validations_since_best: usize,
+    /// The metrics since the last line of the log.
+    #[serde(default, skip_serializing_if = "MetricWindow::is_empty")]
+    pub window: MetricWindow,
 }
 
 /// Returns whether an action that repeats every `every` steps, and happens after the last step, is due after `done` of

@@ -69,23 +69,18 @@ fn resumed_run_gives_the_files_of_an_uninterrupted_run() {
     let options = crate::options();
     let summary = run(&config, &complete, &options, 0).expect("training the model");
     assert!((summary.steps, summary.interrupted) == (10, false));
-    let first = run(&config, &resumed, &options, 5).expect("training the model");
-    assert!((first.steps, first.interrupted) == (5, true));
+    // Between two lines of the log.
+    let first = run(&config, &resumed, &options, 4).expect("training the model");
+    assert!((first.steps, first.interrupted) == (4, true));
     let refused = run(&config, &resumed, &options, 0).expect_err("the folder holds a run").to_string();
     assert!(refused.contains("resume"), "{refused}");
     let resume = TrainOptions { resume: true, ..options };
     let second = run(&config, &resumed, &resume, 0).expect("training the model");
     assert_eq!((second.steps, &second.weights), (10, &summary.weights));
     assert_eq!(files(&complete), files(&resumed));
-    let lines = std::fs::read_to_string(resumed.join("train.jsonl")).expect("reading train.jsonl");
-    let steps: Vec<u64> = lines
-        .lines()
-        .map(|line| {
-            serde_json::from_str::<serde_json::Value>(line).expect("parsing the JSON")["step"]
-                .as_u64()
-                .expect("the step is an integer")
-        })
-        .collect();
+    let lines = crate::online::lines(&resumed);
+    assert_eq!(lines, crate::online::lines(&complete), "each line averages the steps since the line before");
+    let steps: Vec<_> = lines.iter().map(|line| line["step"].as_u64().expect("the step is an integer")).collect();
     assert_eq!(steps, [5, 10]);
 }
 

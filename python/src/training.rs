@@ -10,12 +10,16 @@ use pyo3::types::PyDict;
 use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::PathBuf;
+use swm::cli::record_training;
 use swm::core::{Error, Manifest, Result};
 use swm::data::LoaderConfig;
 use swm::models::nn::parameters::{HostTensor, Named};
 use swm::models::store::{Parts, StateParts, store};
 use swm::models::train::TrainingPlan;
 use swm::models::{FAMILIES, TrainOptions, TrainableConfig};
+
+/// What trains, in `run.json`.
+const PROGRAM: &str = "stable_worldmodel.train (torch)";
 
 /// The complete configuration of a family, a preset with `key=value` settings, as JSON.
 #[pyfunction]
@@ -30,8 +34,10 @@ fn config(family: &str, preset: Option<&str>, settings: &[String]) -> Result<Box
 
 /// Writes the checkpoint from which a run begins, or with `resume` checks the one from which it continues. Returns the
 /// rest of what the run needs, as JSON: `parameters` (clipping group and factor of the learning rate by name),
-/// and the loaders `training` and `validation`.
+/// and the loaders `training` and `validation`. `run.json` gets `command`, the command line of `swm train` that continues the
+/// run.
 #[pyfunction]
+#[allow(clippy::too_many_arguments, reason = "the settings of a training, as Python passes them")]
 pub fn begin_training(
     py: Python<'_>,
     family: &str,
@@ -40,12 +46,16 @@ pub fn begin_training(
     dataset: &Dataset,
     out: PathBuf,
     resume: bool,
+    command: Vec<String>,
 ) -> PyResult<String> {
     let begun = detached(py, || {
         let options = TrainOptions { resume, cache: swm::home::weights()?, ..TrainOptions::default() };
-        config(family, preset, &settings)?.begin(dataset.reader()?, &out, &options).unwrap_or_else(|| {
-            let problem = "it is trained by the engine only";
-            Err(Error::config(family, problem, "train it with swm.wm.train, or `swm train`"))
+        let config = config(family, preset, &settings)?;
+        record_training(&out, (command, PROGRAM), resume, || {
+            config.begin(dataset.reader()?, &out, &options).unwrap_or_else(|| {
+                let problem = "it is trained by the engine only";
+                Err(Error::config(family, problem, "train it with swm.wm.train, or `swm train`"))
+            })
         })
     });
     let TrainingPlan { parameters, training, validation } = begun.map_err(to_py_err)?;

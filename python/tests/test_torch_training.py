@@ -177,6 +177,33 @@ def test_engine_and_torch_continue_each_others_trainings(family, rooms, swings, 
         Trainer(Options(family, out=str(tmp_path / "run"), **options))
 
 
+def test_the_program_continues_a_run_without_its_model_and_dataset(rooms, tmp_path, monkeypatch):
+    given = ["gcbc", f"data={os.path.relpath(rooms, tmp_path)}", "out=./run", "preset=tiny", "device=cpu", *SHORT]
+    monkeypatch.chdir(tmp_path)
+    Trainer(parsed(given[0], given[1:])).train(until=3)
+    shutil.copytree("run", "named")
+    engine_train("gcbc", rooms, tmp_path / "named", SHORT, "--resume")
+    # The dataset is found from another folder as well, whose name it was given in.
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    swm.wm.engine._command(["swm", "train", "--output", str(tmp_path / "run"), "--resume"])
+    found, expected = weights(tmp_path / "run"), weights(tmp_path / "named")
+    assert all(torch.equal(found[name], value) for name, value in expected.items()) and found.keys() == expected.keys()
+    assert [row["step"] for row in log_of(tmp_path / "run")][-1] == 6
+    first, second = json.loads((tmp_path / "run/run.json").read_text())["commands"]
+    assert first["command"][:3] == ["swm", "train", "gcbc"] and first["program"] == "stable_worldmodel.train (torch)"
+    assert second["command"] == ["swm", "train", "--output", str(tmp_path / "run"), "--resume"] and "program" not in second
+    assert first.keys() - {"program"} == second.keys() and first["folder"] == str(tmp_path)
+
+
+def test_a_file_of_the_user_in_place_of_the_record_is_kept(rooms, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/run.json").write_text('{"mine": 1}')
+    with pytest.raises(ValueError, match="run.json.*not written by this program"):
+        torch_train("gcbc", rooms, tmp_path / "run", SHORT)
+    assert (tmp_path / "run/run.json").read_text() == '{"mine": 1}' and len(list((tmp_path / "run").iterdir())) == 1
+
+
 @pytest.mark.parametrize(
     ("family", "dropout"), [("lewm", "model.predictor"), ("dino_wm", "model.predictor"), ("tdmpc2", "model")]
 )

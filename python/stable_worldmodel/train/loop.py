@@ -74,8 +74,8 @@ class Trainer:
         options = self.options
         resume = options.resume and (self.run / "checkpoint").is_dir()
         settings = list(options.settings)
-        plan = _engine.begin_training(options.family, options.preset, settings, engine_of(dataset), str(self.run), resume)
-        return json.loads(plan)
+        dataset, out, command = engine_of(dataset), str(self.run), options.command()
+        return json.loads(_engine.begin_training(options.family, options.preset, settings, dataset, out, resume, command))
 
     def _restored(self) -> Any:
         """The state of the run; the trained weights, if the checkpoint holds their average, replace the average."""

@@ -50,7 +50,17 @@ class Options:
         """The folder of the checkpoint."""
         from ..wm.pretrained import run_path
 
-        return run_path(self.out or f"{self.family}-{Path(self.data).stem}")
+        return run_path(self._name)
+
+    def command(self) -> list[str]:
+        """The command of `swm train` with this model, dataset and configuration, which continues the training as well."""
+        preset = [] if self.preset is None else ["--preset", str(self.preset)]
+        return ["swm", "train", self.family, "--data", self.data, *preset, "--output", self._name, *self.settings]
+
+    @property
+    def _name(self) -> str:
+        """The path or the name of the checkpoint."""
+        return str(self.out or f"{self.family}-{Path(self.data).stem}")
 
 
 def parsed(family: str, arguments: Sequence[str]) -> Options:

@@ -13,7 +13,8 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 use std::time::{SystemTime, UNIX_EPOCH};
-use swm_core::{Error, Result, files};
+use swm_core::files::{self, Lock};
+use swm_core::{Error, Result};
 
 /// The name of the file.
 pub const FILE: &str = "run.json";
@@ -35,6 +36,10 @@ pub struct RunRecord {
 pub struct Invocation {
     /// The arguments, the program's name first.
     pub command: Vec<String>,
+    /// What did the work in place of this program, such as `stable_worldmodel.train (torch)`. The command is then the one that
+    /// continues it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub program: Option<String>,
     /// The folder in which it ran.
     pub folder: PathBuf,
     /// When it began, in UTC.
@@ -78,10 +83,35 @@ pub fn check(folder: &Path) -> Result<()> {
 /// # Errors
 /// When the folder has a file of this name that is no record of a run, or cannot be written to.
 pub fn write(folder: &Path, continued: bool) -> Result<()> {
+    append(folder, Invocation::now(), continued)
+}
+
+/// Writes `run.json` to the folder of a training that another program runs, after `begin` has begun or continued it.
+///
+/// `command` is the command line of `swm train` with the same model, dataset and settings: `swm train --output RUN --resume`
+/// repeats it. `program` is what trains.
+///
+/// # Errors
+/// Before the work, when the folder has a file of this name that is no record of a run; those of `begin`; when the folder
+/// cannot be written to.
+pub fn record_training<T>(
+    folder: &Path,
+    (command, program): (Vec<String>, &str),
+    continued: bool,
+    begin: impl FnOnce() -> Result<T>,
+) -> Result<T> {
+    check(folder)?;
+    let begun = begin()?;
+    let _lock = Lock::folder(folder)?;
+    append(folder, Invocation { command, program: Some(program.to_owned()), ..Invocation::now() }, continued)?;
+    Ok(begun)
+}
+
+fn append(folder: &Path, invocation: Invocation, continued: bool) -> Result<()> {
     check(folder)?;
     let path = folder.join(FILE);
     let mut record = if continued && path.exists() { read_file(&path)? } else { RunRecord::default() };
-    record.commands.push(Invocation::now());
+    record.commands.push(invocation);
     let text = serde_json::to_string_pretty(&record).map_err(|error| Error::external("writing run.json", error))?;
     files::write(&path, (text + "\n").as_bytes())
 }
@@ -118,6 +148,7 @@ impl Invocation {
             .map(|(asset, _)| (asset.name.to_owned(), asset.version.to_owned()));
         Self {
             command: arguments(),
+            program: None,
             folder: std::env::current_dir().unwrap_or_default(),
             started: utc(SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs())),
             git: git::commit(),
@@ -182,5 +213,12 @@ mod tests {
         assert_eq!(read(folder.path()).expect("a record").commands.len(), 2);
         std::fs::write(folder.path().join(FILE), "{\"mine\": 1}").expect("writing a file");
         assert!(write(folder.path(), false).is_err());
+        let mut begun = false;
+        let begin = || {
+            begun = true;
+            Ok(())
+        };
+        assert!(record_training(folder.path(), (vec![], "torch"), false, begin).is_err());
+        assert!(!begun, "refused before the work");
     }
 }

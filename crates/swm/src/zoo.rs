@@ -2,9 +2,9 @@
 //! [`folders`] that has it.
 
 use crate::{home, library};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Component, Path, PathBuf};
-use swm_core::{EnvEntry, Error, Result};
+use swm_core::{EnvEntry, Error, Result, files};
 use swm_models::capsule::Capsule;
 
 /// The start of a name in the zoo.
@@ -16,15 +16,32 @@ const SUFFIX: &str = "safetensors";
 /// The zoo relative to the folder of an installation.
 const SHARE: &str = "share/swm/zoo";
 
+/// The Python package of the engine, and the data wheel, which is installed beside it and contains capsules only
+/// (`python/zoo`).
+const PACKAGE: &str = "stable_worldmodel";
+const DATA_PACKAGE: &str = "stable_worldmodel_zoo";
+
+/// The file of a zoo that lists the capsules which only the data wheel has, a name a line.
+const IN_DATA_WHEEL: &str = "data-wheel.txt";
+
+/// The most bytes of that file.
+const MAX_LIST: u64 = 1 << 20;
+
+/// What a user does to get these capsules.
+pub const INSTALL_ALL: &str = "pip install \"stable-worldmodel-rs[zoo]\"";
+
 /// The deepest folder of a zoo that is listed: `ENVIRONMENT/MODEL.safetensors`.
 const DEPTH: usize = 2;
 
 /// Returns the folders that are searched, in order: `$SWM_ZOO`; `zoo/` in the home folder; `share/swm/zoo` in the Python
-/// package, in the folder of the program, and in that folder's parent; `zoo/` of the source tree that the program was
-/// built from. Folders that do not exist are left out.
+/// package, and the data wheel beside it; `share/swm/zoo` in the folder of the program, and in that folder's parent; `zoo/`
+/// of the source tree that the program was built from. Folders that do not exist are left out.
 pub fn folders() -> Vec<PathBuf> {
     let library = library::path();
-    let package = library.as_deref().and_then(Path::parent).map(|folder| folder.join(SHARE));
+    // A program that is found through `$PATH` has a name without a folder.
+    let package = library.as_deref().and_then(Path::parent).filter(|folder| !folder.as_os_str().is_empty());
+    let data = package.filter(|folder| folder.ends_with(PACKAGE)).map(|folder| folder.with_file_name(DATA_PACKAGE));
+    let package = package.map(|folder| folder.join(SHARE)).into_iter().chain(data);
     let program = std::env::current_exe().ok();
     let beside =
         program.iter().flat_map(|program| program.ancestors().skip(1).take(2)).map(|folder| folder.join(SHARE));
@@ -59,10 +76,20 @@ fn add(folder: &Path, prefix: &str, depth: usize, found: &mut BTreeMap<String, P
     }
 }
 
+/// Returns the names of the capsules that are not installed and that the data wheel has, as the zoo of a Python package without
+/// them lists them.
+pub fn in_data_wheel() -> BTreeSet<String> {
+    let found = capsules();
+    let lists = folders().into_iter().filter_map(|folder| files::read(&folder.join(IN_DATA_WHEEL), MAX_LIST).ok());
+    let names = lists
+        .flat_map(|list| String::from_utf8_lossy(&list).lines().map(|line| line.trim().to_owned()).collect::<Vec<_>>());
+    names.filter(|name| !name.is_empty() && !found.contains_key(name)).collect()
+}
+
 /// Returns the path of the capsule with this name, without the prefix.
 ///
 /// # Errors
-/// When no folder of the zoo has it; the message names the closest name.
+/// When no folder of the zoo has it; the message names the closest name, or the data wheel.
 pub fn find(name: &str) -> Result<PathBuf> {
     let is_plain = Path::new(name).components().all(|part| matches!(part, Component::Normal(_)));
     let mut paths = folders().into_iter().map(|folder| folder.join(format!("{name}.{SUFFIX}")));
@@ -71,6 +98,10 @@ pub fn find(name: &str) -> Result<PathBuf> {
         && let Some(path) = paths.find(|path| path.is_file())
     {
         return Ok(path);
+    }
+    if in_data_wheel().contains(name) {
+        let hint = format!("the Python package stable-worldmodel-rs-zoo has it, which is not installed: {INSTALL_ALL}");
+        return Err(Error::UnknownName { kind: "capsule", given: name.to_owned(), nearest: vec![], hint });
     }
     let known = capsules();
     let hint = format!("`swm zoo` lists the capsules; it searches {}", listed(&folders()));

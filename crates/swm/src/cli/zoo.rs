@@ -23,7 +23,8 @@ pub fn zoo(as_json: bool) -> anyhow::Result<()> {
         });
         return emit_json(&rows.collect::<Vec<_>>());
     }
-    if found.is_empty() {
+    let missing = zoo::in_data_wheel();
+    if found.is_empty() && missing.is_empty() {
         emit("no capsules; `swm checkpoints pack` writes one, and docs/zoo.md says which folders are searched\n");
         return Ok(());
     }
@@ -36,6 +37,10 @@ pub fn zoo(as_json: bool) -> anyhow::Result<()> {
         line
     });
     emit(&table(&["capsule", "model", "environment", "success [95 %]", "starts and goals", "size", "hash"], lines));
+    if !missing.is_empty() {
+        let names: Vec<String> = missing.iter().map(|name| format!("{}{name}", zoo::PREFIX)).collect();
+        emit(&format!("not installed: {} ({})\n", names.join(", "), zoo::INSTALL_ALL));
+    }
     Ok(())
 }
 

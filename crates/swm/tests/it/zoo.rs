@@ -4,6 +4,7 @@ use crate::{Swm, text};
 use serde_json::json;
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 use swm::capsule::{EvaluationRecord, cpu_level, verify};
 use swm::core::Origin;
 use swm::core::run::Control;
@@ -147,5 +148,63 @@ fn folders_of_the_zoo_are_searched_in_order() {
     );
     for name in ["zoo:../zoo/maze/model", "zoo:", "zoo:/etc/passwd", "zoo:maze/../maze/model"] {
         swm.fails(&["checkpoints", "show", name], 2, &["unknown capsule"]);
+    }
+}
+
+/// The engine of a Python package finds the data wheel beside it, and names it for the capsules that only it has.
+#[test]
+fn data_wheel_is_found_beside_the_package() {
+    let swm = Swm::new();
+    let zoo = swm.path("site/stable_worldmodel/share/swm/zoo");
+    fs::create_dir_all(&zoo).expect("a folder");
+    fs::write(zoo.join("data-wheel.txt"), "maze/large\nmaze/other\n").expect("a file");
+    let program = swm.path("site/stable_worldmodel/swm");
+    std::os::unix::fs::symlink(env!("CARGO_BIN_EXE_swm"), &program).expect("a link");
+    let run = |args: &[&str]| {
+        let mut command = Command::new(&program);
+        let output = command.args(args).env("STABLEWM_HOME", swm.home()).env_remove("SWM_ZOO").output();
+        output.expect("swm starts")
+    };
+    let missing = run(&["checkpoints", "show", "zoo:maze/large"]);
+    let error = text(&missing.stderr);
+    assert_eq!(missing.status.code(), Some(2), "{error}");
+    assert!(error.contains("stable-worldmodel-rs-zoo") && error.contains("pip install"), "{error}");
+    let listed = text(&run(&["zoo"]).stdout);
+    assert!(listed.contains("not installed: zoo:maze/large, zoo:maze/other"), "{listed}");
+
+    let data = swm.path("site/stable_worldmodel_zoo/maze");
+    fs::create_dir_all(&data).expect("a folder");
+    fs::copy(&repository()[0].1, data.join("large.safetensors")).expect("a copied file");
+    let found = run(&["checkpoints", "show", "zoo:maze/large"]);
+    assert!(found.status.success(), "{}", text(&found.stderr));
+    let listed = text(&run(&["zoo"]).stdout);
+    assert!(listed.contains("not installed: zoo:maze/other ("), "{listed}");
+}
+
+/// A program that is found through `$PATH` does not take capsules of the current folder.
+#[test]
+fn current_folder_is_no_zoo() {
+    let swm = Swm::new();
+    let planted = swm.path("here/share/swm/zoo/maze");
+    fs::create_dir_all(&planted).expect("a folder");
+    fs::copy(&repository()[0].1, planted.join("planted.safetensors")).expect("a copied file");
+    let program = Path::new(env!("CARGO_BIN_EXE_swm"));
+    let mut command = Command::new("swm");
+    command.arg("zoo").env("PATH", program.parent().expect("a folder")).current_dir(swm.path("here"));
+    let output = command.env("STABLEWM_HOME", swm.home()).output().expect("swm starts");
+    assert!(output.status.success() && !text(&output.stdout).contains("maze/planted"), "{}", text(&output.stdout));
+}
+
+/// The version is declared in the workspace; files that Cargo does not read repeat it.
+#[test]
+fn other_files_have_the_version_of_the_engine() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+    let version = env!("CARGO_PKG_VERSION");
+    for (file, line) in [
+        ("CITATION.cff", format!("version: {version}")),
+        ("python/pyproject.toml", format!("zoo = [\"stable-worldmodel-rs-zoo=={version}\"]")),
+    ] {
+        let text = fs::read_to_string(root.join(file)).expect(file);
+        assert!(text.lines().any(|found| found == line), "{file} has no line `{line}`");
     }
 }

@@ -56,7 +56,7 @@ impl Installable {
         let known = || Self::all().map(Self::name);
         Self::all()
             .find(|item| item.name() == name)
-            .ok_or_else(|| Error::unknown("asset", name, known(), "`swm assets list` lists them"))
+            .ok_or_else(|| Error::unknown("asset", name, known(), "`swm assets list` lists the assets"))
     }
 
     fn name(self) -> &'static str {

@@ -2,6 +2,7 @@
 
 use super::eval::run_options;
 use super::progress::control;
+use super::report::results_file;
 use super::results_tables::percent;
 use super::{Context, emit, emit_json, output_folder};
 use crate::capsule::{self, EvaluationRecord, PackRequest, RecordedEpisode, Returns, Verification};
@@ -56,11 +57,10 @@ pub fn pack(args: &PackArgs, context: &Context) -> anyhow::Result<()> {
     }
     output_folder::check_file(&args.output)?;
     files::check_own(&args.output, |path| Capsule::read(path).is_ok())?;
-    let file = |path: &PathBuf| if path.is_dir() { path.join("results.json") } else { path.clone() };
     let request = PackRequest {
         run: home::find_checkpoint(&args.checkpoint)?,
-        results: args.eval.as_ref().map(file),
-        returns: args.returns.as_ref().map(file),
+        results: args.eval.as_deref().map(results_file).transpose()?,
+        returns: args.returns.as_deref().map(results_file).transpose()?,
         licence: args.licence.clone(),
         author: args.author.clone(),
         trust: args.trust,
@@ -238,7 +238,11 @@ pub fn export_as(given: &str, folder: &Path, format: Option<ExportFormat>) -> Re
         }
         ExportFormat::Reference => loaded.export(folder).unwrap_or_else(|| {
             let problem = format!("the reference implementation has no {}", loaded.info()?.family);
-            let fix = "its weights are in weights.safetensors";
+            let weights = path.join("weights.safetensors");
+            let fix = match path.is_file() {
+                true => "export it with --format checkpoint".to_owned(),
+                false => format!("its weights are in {}", weights.display()),
+            };
             Err(Error::config(format!("checkpoint {given}"), problem, fix))
         }),
     }

@@ -2,6 +2,7 @@
 
 use super::eval::run_options;
 use super::progress::control;
+use super::report::results_file;
 use super::results_tables::percent;
 use super::{Context, emit, emit_json, output_folder};
 use crate::home;
@@ -116,8 +117,8 @@ pub fn leaderboard(args: &LeaderboardArgs, context: &Context) -> anyhow::Result<
 }
 
 fn submit(args: &SubmitArgs, context: &Context) -> anyhow::Result<()> {
-    let file = if args.results.is_dir() { args.results.join("results.json") } else { args.results.clone() };
     output_folder::check_file(&args.output)?;
+    let file = results_file(&args.results)?;
     files::check_own(&args.output, |path| Entry::read(path).is_ok())?;
     let submission = Submission {
         results: swm_report::read_results(&file)?,

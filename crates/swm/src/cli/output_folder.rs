@@ -33,11 +33,9 @@ pub fn check_local(output: &Path) -> Result<()> {
     let given = output.to_string_lossy();
     let is_scheme = |scheme: &str| !scheme.is_empty() && scheme.bytes().all(|byte| byte.is_ascii_alphanumeric());
     match given.split_once("://") {
-        Some((scheme, _)) if is_scheme(scheme) => Err(Error::config(
-            given,
-            "is a URI, and the output is a folder of this machine",
-            "give a path with --output",
-        )),
+        Some((scheme, _)) if is_scheme(scheme) => {
+            Err(Error::config(given, "is a URI, and the output is a path of this machine", "give a path"))
+        }
         _ => Ok(()),
     }
 }
@@ -106,12 +104,24 @@ const MAX_OUTPUT_BYTES: u64 = 1 << 30;
 /// Checks, before the work, that a command can write its one output file.
 ///
 /// # Errors
-/// When the path is a folder, or its folder does not exist or cannot be written to.
+/// When the path is a URI or a folder, or its folder does not exist or cannot be written to.
 pub fn check_file(path: &Path) -> Result<()> {
+    check_local(path)?;
+    let given = || path.display().to_string();
     if path.is_dir() {
-        return Err(Error::config(path.display().to_string(), "is a folder", "give the path of a file"));
+        return Err(Error::config(given(), "is a folder, and the output is a file", "give the path of a file"));
     }
-    check_writable(path.parent().filter(|folder| *folder != Path::new("")).unwrap_or_else(|| Path::new(".")))
+    let folder = path.parent().filter(|folder| *folder != Path::new("")).unwrap_or_else(|| Path::new("."));
+    let shown = folder.display();
+    if !folder.exists() {
+        let fix = format!("create it (mkdir -p {shown}), or give a path in another folder");
+        return Err(Error::config(given(), format!("the folder {shown} does not exist"), fix));
+    }
+    if !folder.is_dir() {
+        let fix = "give a path in a folder";
+        return Err(Error::config(given(), format!("{shown} is a file, and not a folder"), fix));
+    }
+    check_writable(folder)
 }
 
 fn check_writable(folder: &Path) -> Result<()> {

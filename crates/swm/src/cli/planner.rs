@@ -77,7 +77,11 @@ impl PlannerArgs {
             ActionKind::Continuous => SOLVERS.get("cem")?,
             ActionKind::Discrete => {
                 SOLVERS.rows.iter().find(|row| row.actions == actions && row.needs.is_empty()).ok_or_else(|| {
-                    Error::config("--solver", "no solver plans discrete actions", "`swm solvers` lists them")
+                    Error::config(
+                        "--solver",
+                        "no solver plans discrete actions without settings",
+                        "name one (`swm solvers` lists them)",
+                    )
                 })?
             }
         };

@@ -6,7 +6,7 @@ use super::{emit, emit_json};
 use crate::home;
 use clap::Args;
 use serde_json::json;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use swm_core::{Error, Results};
 use swm_report::{ReportOptions, Training};
 
@@ -29,17 +29,33 @@ pub struct ReportArgs {
     training: Option<String>,
 }
 
+/// Returns the `results.json` that a command names, by its path or by its folder.
+///
+/// # Errors
+/// When it does not exist.
+pub(super) fn results_file(given: &Path) -> swm_core::Result<PathBuf> {
+    let (file, problem) = match given.is_dir() {
+        true => (given.join("results.json"), "has no results.json"),
+        false => (given.to_owned(), "does not exist"),
+    };
+    if !file.exists() {
+        let fix = "give a results.json, or the folder that `swm eval --output` wrote";
+        return Err(Error::config(given.display().to_string(), problem, fix));
+    }
+    Ok(file)
+}
+
 /// Runs `swm report`.
 pub fn report(args: &ReportArgs, as_json: bool) -> anyhow::Result<()> {
     let read: swm_core::Result<Vec<(PathBuf, Results)>> = args
         .results
         .iter()
         .map(|path| {
-            let file = if path.is_dir() { path.join("results.json") } else { path.clone() };
+            let file = results_file(path)?;
             let results = swm_report::read_results(&file)?;
             if results.sequential {
                 let problem = "its study ran with --until, so the intervals for a fixed number of episodes do not hold";
-                let fix = "show the study: `swm study report`";
+                let fix = "show the whole study: `swm study report FOLDER`";
                 return Err(Error::config(file.display().to_string(), problem, fix));
             }
             Ok((file, results))

@@ -3,6 +3,7 @@
 use super::eval::{run_options, write_json};
 use super::output_folder;
 use super::progress::control;
+use super::report::results_file;
 use super::results_tables::summary;
 use super::{Context, emit, emit_json};
 use crate::resolver::HomeResolver;
@@ -36,7 +37,7 @@ pub struct ReproduceArgs {
 
 /// Repeats an evaluation; fails if the results differ.
 pub fn reproduce(args: &ReproduceArgs, context: &Context) -> anyhow::Result<()> {
-    let file = if args.results.is_dir() { args.results.join("results.json") } else { args.results.clone() };
+    let file = results_file(&args.results)?;
     let old = swm_report::read_results(&file)?;
     let _lock = args.output.as_deref().map(|folder| claim(folder, &file)).transpose()?;
     let options = run_options(args.envs, None, context);

@@ -18,6 +18,7 @@ mod lab;
 mod leaderboard;
 mod limits;
 mod listing;
+mod messages;
 mod on_ray;
 mod output;
 mod pipeline;

@@ -99,6 +99,25 @@ fn output_folders_are_checked_before_the_work() {
 }
 
 #[test]
+fn folder_of_an_output_file_is_checked_before_the_work() {
+    let swm = Swm::new();
+    fs::write(swm.path("file"), "").expect("a file");
+    for (args, name) in [
+        (&["leaderboard", "submit", "nothing", "-o"][..], "entry.json"),
+        (&["frame", "swm/TwoRoom-v1", "-o"], "frame.png"),
+        (&["checkpoints", "pack", "nothing", "-o"], "model.safetensors"),
+    ] {
+        let fails = |folder: &str, parts: &[&str]| {
+            swm.fails(&[args, &[format!("{folder}/{name}").as_str()]].concat(), 2, parts);
+        };
+        fails("missing/deeper", &["the folder missing/deeper does not exist", "mkdir -p missing/deeper"]);
+        fails("file", &["file is a file, and not a folder"]);
+        fails("s3://bucket", &["is a URI", "give a path"]);
+    }
+    assert!(!swm.path("missing").exists());
+}
+
+#[test]
 fn videos_are_not_written_through_files_and_links() {
     let swm = Swm::new();
     let eval = ["eval", "expert", "--env", "swm/TwoRoom-v1", "--episodes", "1", "--budget", "3", "--image", "32"];

@@ -2,7 +2,7 @@
 
 use super::colour;
 use super::expand;
-use super::file::{POLICY, StudyFile, Table, Values};
+use super::file::{OF_THE_COMMAND, POLICY, StudyFile, Table, Values};
 use super::{show, with_rule};
 use crate::cli::Context;
 use crate::cli::config::count;
@@ -104,9 +104,9 @@ impl BreakArgs {
     /// The index of the factor.
     fn factor(&self, space: &VariationSpace) -> Result<usize> {
         let names = || space.factors().iter().map(|factor| factor.key.as_str());
-        let found = space
-            .find(&self.factor)
-            .ok_or_else(|| Error::unknown("factor of variation", &self.factor, names(), "`swm fovs ENV` lists them"))?;
+        let found = space.find(&self.factor).ok_or_else(|| {
+            Error::unknown("factor of variation", &self.factor, names(), "`swm fovs ENV` lists the factors")
+        })?;
         if space.defaults().iter().any(|key| space.select(key).is_ok_and(|chosen| chosen.contains(&found))) {
             let problem = "the environment draws it in every episode, so there is no default to start from";
             let fix = "give a factor that has one value in distribution";
@@ -154,7 +154,7 @@ impl BreakArgs {
             .file_name()
             .map_or_else(|| self.policy.clone(), |name| name.to_string_lossy().into());
         let table = |name: String, change: Option<f64>, option: Option<(&str, String)>| Table {
-            at: "swm study break".to_owned(),
+            at: OF_THE_COMMAND.to_owned(),
             name,
             options: option.into_iter().map(|(key, value)| (key.to_owned(), vec![value])).collect::<BTreeMap<_, _>>(),
             each: change

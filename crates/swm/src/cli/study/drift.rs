@@ -196,7 +196,7 @@ impl Trained {
         let distances: Vec<Vec<f64>> = episodes.iter().map(|latents| self.support.distances(latents)).collect();
         let all: Vec<f32> = episodes.concat();
         if all.is_empty() {
-            return Err(Error::config(row, "every start is solved already", "choose another seed"));
+            return Err(Error::config(row, "every start is solved already", "set another seed, such as seed=1"));
         }
         let at = |share: &usize| {
             let of = |distances: &Vec<f64>| Some(distances[(distances.len().checked_sub(1)? * share + 50) / 100]);

@@ -129,8 +129,10 @@ fn combinations(file: &StudyFile, settings: &[String], resolver: &HomeResolver) 
     let sizes = [&defaults, &starts, &conditions, &policies].map(Vec::len);
     let cells = sizes.into_iter().fold(1, usize::saturating_mul);
     if cells > Study::MAX_CELLS {
-        let problem =
-            format!("{} defaults x {} starts x {} conditions x {} policies", sizes[0], sizes[1], sizes[2], sizes[3]);
+        let problem = format!(
+            "{} defaults x {} starts x {} conditions x {} policies are {cells} cells",
+            sizes[0], sizes[1], sizes[2], sizes[3]
+        );
         return Err(Error::config("the study", problem, format!("give at most {} cells", Study::MAX_CELLS)));
     }
     for variants in [&defaults, &starts, &conditions, &policies] {
@@ -170,12 +172,12 @@ fn request(all: &Variant, condition: &str, policy: &str, resolver: &HomeResolver
     let args = parsed.map_err(|error| {
         let text = error.render().to_string();
         let line = text.lines().next().unwrap_or_default().trim_start_matches("error: ").to_owned();
-        Error::config("options", line, "the options are those of `swm eval`")
+        Error::config("the options of a cell", line, "`swm eval --help` describes the options")
     })?;
     let mut request = args.request(resolver, CapsuleStarts::Ignore)?;
     let [only] = &mut request.policies[..] else {
-        let problem = format!("its options make {} policies", request.policies.len());
-        return Err(Error::config("the policy", problem, "give one policy and one solver; `each` makes several"));
+        let problem = format!("its options make {} policies, and a cell has one", request.policies.len());
+        return Err(Error::config("the policy", problem, "give one policy and one solver; `each` makes several cells"));
     };
     if only.kind != PolicyKind::Random {
         policy.clone_into(&mut only.name);

@@ -162,7 +162,8 @@ impl StudyFile {
             "policy" => self.policies = source.tables(value)?,
             "published" => self.published = published::read(source, value)?,
             other => {
-                let what = Error::unknown("table", other, TABLES.iter().copied(), "docs/studies.md lists them");
+                let hint = format!("the tables are {}", TABLES.join(", "));
+                let what = Error::unknown("table", other, TABLES.iter().copied(), hint);
                 return Err(Error::config(source.at(key.span().start), what.to_string(), "correct the file"));
             }
         }

@@ -83,7 +83,8 @@ impl OnlineSettings {
         chosen.check_preset(&self.preset)?;
         if let Some(family) = self.train.keys().find(|family| !self.families.contains(family)) {
             let families = self.families.iter().map(String::as_str);
-            return Err(Error::unknown("family", family, families, "train has settings of the families of the study"));
+            let hint = format!("the setting `train` is for the families of the study: {}", self.families.join(", "));
+            return Err(Error::unknown("family", family, families, hint));
         }
         for family in &self.families {
             let config = (FAMILIES.get(family)?.config)(&self.preset, &self.overrides(family, 0))?;

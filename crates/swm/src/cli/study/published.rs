@@ -28,7 +28,8 @@ fn table(source: &Source<'_>, value: &Spanned<DeValue<'_>>) -> Result<Vec<Publis
             "starts" => starts = Some(source.text_of(value)?),
             "rates" => rates = Some(value),
             other => {
-                let what = Error::unknown("name", other, NAMES.iter().copied(), "docs/studies.md explains them");
+                let hint = format!("the names are {}", NAMES.join(", "));
+                let what = Error::unknown("name", other, NAMES.iter().copied(), hint);
                 return Err(Error::config(source.at(key.span().start), what.to_string(), "correct the file"));
             }
         }

@@ -6,14 +6,13 @@
 //! - `data`: the speed, latency and size of every format of datasets, on the local disk and in an object store.
 
 use super::any_file::Size;
-use super::chosen::{Chosen, check_cells};
+use super::chosen::{Chosen, check_cells, known, settings_of};
 use super::drift::{self, DriftSettings, Trained};
 use super::online::{self, OnlineSettings};
 use crate::cli::Context;
 use crate::cli::progress::control;
 use crate::cli::recipes::Datasets;
 use crate::{ENVS, capsule};
-use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
@@ -258,24 +257,6 @@ impl TableKind {
     }
 }
 
-/// Reads settings.
-fn settings_of<T: Serialize + DeserializeOwned + Default>(given: Table) -> Result<T> {
-    let names = json!(T::default());
-    let names: Vec<&str> = names.as_object().into_iter().flat_map(|all| all.keys().map(String::as_str)).collect();
-    known(&given, &names)?;
-    let invalid = |error: toml::de::Error| Error::config("settings of the study", error.message(), "correct them");
-    given.try_into().map_err(invalid)
-}
-
-/// Checks the names of settings.
-fn known(settings: &Table, names: &[&str]) -> Result<()> {
-    match settings.keys().find(|key| !names.contains(&key.as_str())) {
-        Some(key) if names.is_empty() => Err(Error::config(key, "this study has no settings", "remove it")),
-        Some(key) => Err(Error::unknown("setting", key, names.iter().copied(), "docs/studies.md lists them")),
-        None => Ok(()),
-    }
-}
-
 fn column(name: &str, unit: &str) -> TableColumn {
     TableColumn { name: name.to_owned(), unit: unit.to_owned(), published: false }
 }
@@ -311,12 +292,10 @@ impl DataSettings {
             chosen.by("remote").check_user(&name, "which opens a network connection", Some("remote=URI"))?;
             Location::parse(&self.remote)?;
         }
-        for layout in self.layouts.iter().chain(&self.remote_layouts) {
-            if !FormatBench::layouts().any(|known| known == layout) {
-                return Err(Error::unknown("layout", layout, FormatBench::layouts(), "choose one of them"));
-            }
-        }
-        Ok(())
+        let layouts: Vec<&str> = FormatBench::layouts().collect();
+        let unknown = self.layouts.iter().chain(&self.remote_layouts).find(|name| !layouts.contains(&name.as_str()));
+        let hint = format!("the layouts are '{}'", layouts.join("', '"));
+        unknown.map_or(Ok(()), |layout| Err(Error::unknown("layout", layout, layouts.iter().copied(), hint)))
     }
 }
 

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -62,6 +63,14 @@ def cluster(s3, tmp_path_factory):
 def add_node(cluster: Cluster, **options):
     """Adds a node of one CPU."""
     return cluster.add_node(**{"num_cpus": 1, "object_store_memory": STORE, **options})
+
+
+def until(condition, seconds=120):
+    """Waits for a condition of the cluster."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "the condition was not met"
+        time.sleep(0.05)
 
 
 def swm(*arguments, **environment) -> subprocess.CompletedProcess:

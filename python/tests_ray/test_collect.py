@@ -4,22 +4,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 import ray
-from conftest import add_node, content_hash, printed, swm
+from conftest import add_node, content_hash, printed, swm, until
 
 import stable_worldmodel.ray as swm_ray
 from stable_worldmodel.ray.folder import Folder
-
-
-def until(condition, seconds=120):
-    """Waits for a condition of the cluster."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "the condition was not met"
-        time.sleep(0.05)
 
 
 def test_a_collection_in_an_object_store_has_the_hash_of_one_process(cluster, s3, rooms):

@@ -4,7 +4,7 @@ import textwrap
 
 import pytest
 import ray
-from conftest import add_node, printed, swm
+from conftest import add_node, printed, swm, until
 
 import stable_worldmodel
 from stable_worldmodel.ray import driver
@@ -105,3 +105,50 @@ def test_references_to_a_run_that_is_refused_raise(cluster, tmp_path):
         folder.write_json("request.json", printed(*given, "--print-request"))
         folder.write_json("level.json", "m68k")
         ray.get(swm_ray.collect("swm/TwoRoom-v1", tmp_path / "b.lance", episodes=2, no_pixels=True))
+
+
+def test_a_run_ends_whose_resources_no_node_has(cluster, tmp_path, run, capsys):
+    with pytest.raises(RunRefused) as raised:
+        run(str(tmp_path / "run"), {"good": ["envs"]}, resources={"cpu": 1, "fpga": 2}, wait=1)
+    text = str(raised.value)
+    assert "no node has cpu=1, fpga=2" in text and "the largest one has cpu=1, fpga=0" in text
+    assert "within 1 s" in text and "--resources" in text and "--wait" in text
+    assert "waiting 1 s for one to join" in capsys.readouterr().err
+    # What another run takes decides nothing: the same folder continues.
+    assert run(str(tmp_path / "run"), {"good": ["envs"]})["ran"] == 1
+    # On the command line.
+    arguments = ["collect", "swm/TwoRoom-v1", "-o", tmp_path / "a.lance", "--episodes", 2, "--no-pixels", "--on", "ray"]
+    done = swm(*arguments, "--resources", "gpu=1", "--wait", 0)
+    assert done.returncode == 2 and "no node has cpu=1, gpu=1" in done.stderr, done.stderr
+
+
+def test_cells_wait_for_a_node_that_joins(cluster, tmp_path):
+    import stable_worldmodel.ray as swm_ray
+
+    output = tmp_path / "a.lance"
+    options = {"episodes": 2, "no_pixels": True, "resources": {"cpu": 1, "fpga": 1}, "wait": 300}
+    done = swm_ray.collect("swm/TwoRoom-v1", output, **options)
+    # The run has begun, and its cells wait.
+    until(lambda: Folder(f"{output}.ray").read_json("level.json"))
+    node = add_node(cluster, resources={"fpga": 1})
+    try:
+        assert ray.get(done)["cells"] == 2
+        record = Folder(f"{output}.ray").read_json("cells/000000.json")
+        assert node.node_id[:8] in record["node"]
+    finally:
+        cluster.remove_node(node)
+
+
+def test_the_time_begins_anew_while_an_autoscaler_starts_nodes(cluster, monkeypatch):
+    from stable_worldmodel.ray import supply
+
+    starts, now = [True, True, False], [0.0]
+    monkeypatch.setattr(supply.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(supply, "_nodes_start", lambda: starts.pop(0))
+    waiting = supply.Supply({"fpga": 1}, 10)
+    for second in (0, 20, 40):
+        now[0] = float(second)
+        waiting.check()
+    now[0] = 60.0
+    with pytest.raises(RunRefused, match="fpga=1"):
+        waiting.check()

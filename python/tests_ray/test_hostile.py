@@ -10,7 +10,7 @@ import pytest
 from conftest import printed, swm
 
 from stable_worldmodel.ray import cells
-from stable_worldmodel.ray.driver import RunRefused, begin, execute
+from stable_worldmodel.ray.driver import RunRefused, begin
 from stable_worldmodel.ray.folder import Folder, Outputs, TrainingState
 
 #: A module that leaves a file when it is imported.
@@ -149,13 +149,3 @@ def test_files_of_the_user_in_the_output_are_refused_before_the_work(rooms, tmp_
             assert done.returncode == 2 and "was not written by this" in done.stderr, done.stderr
     assert all(path.read_text() == "mine" for path in user.rglob("*") if path.is_file())
     assert not Path(f"{user}.ray").exists()
-
-
-def test_missing_resources_are_named(cluster, tmp_path, monkeypatch, capsys):
-    from stable_worldmodel.ray import driver
-
-    monkeypatch.setattr(driver, "stages", lambda _: [])
-    monkeypatch.setattr(driver, "count", lambda _: 0)
-    request = printed("collect", "swm/TwoRoom-v1", "-o", tmp_path / "a.lance", "--on", "ray", "--print-request")
-    execute(request | {"resources": {"cpu": 1, "fpga": 2}})
-    assert "no node has fpga=2 (at most 0)" in capsys.readouterr().err

@@ -40,7 +40,7 @@ def collect(env: str, output: str | os.PathLike[str], **options: Any) -> ray.Obj
     Args:
         env: The environment.
         output: The Lance dataset to write: a URI, or a path on a disk that all nodes share.
-        **options: Options of `swm collect` with `_` for `-`, `shards`, `resources` (a dict) and `run_folder`.
+        **options: Options of `swm collect` with `_` for `-`, `shards`, `resources` (a dict), `wait` and `run_folder`.
 
     Returns:
         A reference to a dict: `output`, `folder`, `cells`, `ran` and `seconds`.
@@ -69,6 +69,7 @@ def study(
     small: bool = False,
     trust: bool = False,
     resources: Mapping[str, float] | None = None,
+    wait: int | None = None,
     run_folder: str | None = None,
     **settings: Any,
 ) -> ray.ObjectRef:
@@ -77,7 +78,8 @@ def study(
 
     arguments = ["study", "run", os.fspath(study), "--output", os.fspath(output)]
     arguments += [f"{name.replace('_', '-')}={_toml(value)}" for name, value in settings.items()]
-    return submit(arguments, {"small": small, "trust": trust, "resources": resources, "run_folder": run_folder})
+    options = {"small": small, "trust": trust, "resources": resources, "wait": wait, "run_folder": run_folder}
+    return submit(arguments, options)
 
 
 def train(

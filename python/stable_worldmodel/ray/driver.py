@@ -18,6 +18,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 from . import worker
 from .cells import count, stages
 from .folder import Folder
+from .supply import WAIT_SECONDS, RunRefused, Supply, task_options
 
 __all__ = ["CellsFailed", "RunRefused", "begin", "execute", "read_request"]
 
@@ -36,10 +37,6 @@ PROGRESS_SECONDS = 5.0
 ray.cloudpickle.register_pickle_by_value(worker)
 
 
-class RunRefused(RuntimeError):
-    """The run cannot begin or continue."""
-
-
 class CellsFailed(RuntimeError):
     """Some cells failed after all retries; the others are done and kept."""
 
@@ -51,20 +48,21 @@ def execute(request: dict[str, Any]) -> dict[str, Any]:
         request: What `swm COMMAND --on ray` wrote.
 
     Raises:
-        RunRefused: If the folder has another run, or a node does not fit.
+        RunRefused: If the folder has another run, a node does not fit, or none has what a cell takes and none joins in time.
         CellsFailed: If cells failed after all retries.
     """
     folder, began = Folder(request["folder"]), time.monotonic()
     begin(folder, request)
-    resources = _options(request["resources"])
+    resources = task_options(request["resources"])
+    supply = Supply(request["resources"], request.get("wait", WAIT_SECONDS))
     run = {key: request[key] for key in ("folder", "version", "directory")}
     run["threads"] = max(1, int(resources["num_cpus"]))
     run["level"] = _check_nodes(folder, run, resources)
-    total, ran, finished = count(request), 0, {name.removesuffix(".json") for name in folder.list("cells")}
-    progress = _Progress(total)
+    ran, finished = 0, {name.removesuffix(".json") for name in folder.list("cells")}
+    progress = _Progress(count(request))
     for cells in stages(request):
-        ran += _run_stage(cells, finished, run, resources, progress)
-    summary = {"output": request["output"], "folder": request["folder"], "cells": total, "ran": ran}
+        ran += _run_stage(cells, finished, run, resources, supply, progress)
+    summary = {"output": request["output"], "folder": request["folder"], "cells": progress.done, "ran": ran}
     return summary | {"seconds": round(time.monotonic() - began, 3)}
 
 
@@ -82,7 +80,7 @@ def begin(folder: Folder, request: dict[str, Any]) -> None:
             return
         found = read_request(folder) or {}
     # Where a run is continued, and what its cells take, decide no result.
-    free = ("resources", "directory", "folder")
+    free = ("resources", "wait", "directory", "folder")
     differing = [key for key in request if key not in free and found.get(key) != request[key]]
     if differing:
         raise RunRefused(
@@ -113,20 +111,9 @@ def _short(value: Any) -> str:
     return text if len(text) <= 300 else f"{text[:300]}…"
 
 
-def _options(resources: dict[str, float]) -> dict[str, Any]:
-    """What a cell takes, as options of a Ray task."""
-    others = {name: count for name, count in resources.items() if name not in ("cpu", "gpu", "memory")}
-    options: dict[str, Any] = {"num_cpus": resources.get("cpu", 1), "num_gpus": resources.get("gpu", 0), "resources": others}
-    if "memory" in resources:
-        options["memory"] = resources["memory"]
-    return options
-
-
 def _check_nodes(folder: Folder, run: dict[str, Any], resources: dict[str, Any]) -> str | None:
     """Asks every node that can run a cell whether it fits, and returns the processor level that the run keeps."""
-    alive = [node for node in ray.nodes() if node["Alive"]]
-    able = [node for node in alive if node["Resources"].get("CPU", 0) >= resources["num_cpus"]]
-    _warn_of_missing([node["Resources"] for node in alive], resources)
+    able = [node for node in ray.nodes() if node["Alive"] and node["Resources"].get("CPU", 0) >= resources["num_cpus"]]
     known = folder.read_json("level.json")
     probe = ray.remote(worker.probe)
     asked = [
@@ -155,25 +142,18 @@ def _check_nodes(folder: Folder, run: dict[str, Any], resources: dict[str, Any])
     return known or next(iter(levels), None)
 
 
-def _warn_of_missing(nodes: list[dict[str, float]], resources: dict[str, Any]) -> None:
-    """Says what no node has: the cells wait for a node that has it."""
-    needed = {"CPU": resources["num_cpus"], "GPU": resources["num_gpus"], "memory": resources.get("memory", 0)}
-    needed |= resources["resources"]
-    if any(all(node.get(name, 0) >= count for name, count in needed.items()) for node in nodes):
-        return
-    most = {name: max((node.get(name, 0) for node in nodes), default=0) for name in needed}
-    missing = [f"{name}={count:g} (at most {most[name]:g})" for name, count in needed.items() if most[name] < count]
-    text = ", ".join(missing) or "all that a cell takes"
-    print(f"warning: no node has {text}; the cells wait until one joins, Ctrl-C ends the run", file=sys.stderr, flush=True)
-
-
 def _run_stage(
-    cells: Iterable[worker.Cell], finished: set[str], run: dict[str, Any], resources: dict[str, Any], progress: _Progress
+    cells: Iterable[worker.Cell],
+    finished: set[str],
+    run: dict[str, Any],
+    resources: dict[str, Any],
+    supply: Supply,
+    progress: _Progress,
 ) -> int:
     """Runs the cells of a stage that are not done, and returns their number."""
     task = ray.remote(worker.run_cell).options(max_retries=RETRIES, retry_exceptions=True, **resources)
     shared = ray.put(run)
-    missing, running, failed, ran = iter(cells), {}, [], 0
+    missing, running, failed, ran, waits = iter(cells), {}, [], 0, True
     while True:
         for cell in missing:
             if cell["id"] in finished:
@@ -185,8 +165,13 @@ def _run_stage(
         if not running:
             break
         try:
-            ray.wait(list(running), timeout=PROGRESS_SECONDS)
+            if waits:
+                supply.check()
+            else:
+                supply.served()
+            ray.wait(list(running), timeout=min(PROGRESS_SECONDS, max(0.1, supply.seconds)))
             ready, _ = ray.wait(list(running), num_returns=len(running), timeout=0)
+            waits = not ready
             for ref in ready:
                 name = running.pop(ref)
                 problem = _problem(ref, name)

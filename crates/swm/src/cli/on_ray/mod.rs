@@ -40,6 +40,12 @@ pub struct OnRayArgs {
     /// What one cell takes, such as gpu=1,cpu=4 (default: cpu=1)
     #[arg(long, value_name = "NAME=COUNT", requires = "on")]
     resources: Option<Resources>,
+    /// Seconds to wait for a node that has the resources (default: 60)
+    ///
+    /// The run ends with an error if no node of the cluster has them and none joins in this time. While an autoscaler starts
+    /// nodes, the time begins anew.
+    #[arg(long, value_name = "SECONDS", requires = "on")]
+    wait: Option<u32>,
     /// Folder of the run's records: a path on a shared disk, or a URI
     ///
     /// Default: the output with the suffix .ray
@@ -179,11 +185,11 @@ impl OnRayArgs {
     /// When there is no Python with Ray, the run fails, or the user stops it.
     pub fn submit(&self, request: &Request<'_>, context: &Context) -> anyhow::Result<()> {
         let output = absolute(request.output);
-        let own = ["--on", "--resources", "--run-folder"];
+        let own = ["--on", "--resources", "--wait", "--run-folder"];
         let replaced: Vec<&str> = own.iter().chain(request.replaced).copied().collect();
         let resources =
             self.resources.clone().map_or_else(|| BTreeMap::from([("cpu".to_owned(), 1.0)]), |given| given.0);
-        let body = json!({
+        let mut body = json!({
             "layout": 1,
             "kind": request.kind,
             "version": env!("CARGO_PKG_VERSION"),
@@ -194,6 +200,9 @@ impl OnRayArgs {
             "resources": resources,
             "cells": request.cells,
         });
+        if let Some(seconds) = self.wait {
+            body["wait"] = json!(seconds);
+        }
         if self.print_request {
             return emit_json(&body);
         }

@@ -2,6 +2,7 @@
 
 import json
 
+import pytest
 import ray
 from conftest import content_hash, printed, swm
 
@@ -39,18 +40,88 @@ def without_times(results):
     """Results without what differs between equal evaluations."""
     for run in results["runs"]:
         run.pop("timing")
-        run.pop("videos")
     return results
 
 
-def test_an_evaluation_has_the_results_of_one_process(cluster, s3, tmp_path):
+def videos_of(folder):
+    """The videos of an evaluation and their posters: their bytes by name."""
+    return {name: folder.read(f"videos/{name}") for name in folder.list("videos")}
+
+
+def test_an_evaluation_has_the_results_and_videos_of_one_process(cluster, s3, tmp_path):
     flags = [part for name, value in EVALUATION.items() for part in flag(name, value)]
-    printed("eval", "expert", "no-op", "--env", "swm/TwoRoom-v1", "-o", tmp_path / "one", "--videos", "0", *flags)
-    output = f"{s3}/colours"
-    done = swm_ray.evaluate(["expert", "no-op"], output, env="swm/TwoRoom-v1", **EVALUATION)
+    printed("eval", "expert", "no-op", "--env", "swm/TwoRoom-v1", "-o", tmp_path / "one", *flags)
+    output = Folder(f"{s3}/colours")
+    done = swm_ray.evaluate(["expert", "no-op"], output.root, env="swm/TwoRoom-v1", **EVALUATION)
     assert ray.get(done)["cells"] == 4
     one = json.loads((tmp_path / "one" / "results.json").read_text())
-    assert without_times(Folder(output).read_json("results.json")) == without_times(one)
+    assert without_times(output.read_json("results.json")) == without_times(one)
+    expected = videos_of(Folder(str(tmp_path / "one")))
+    names = {name for run in one["runs"] for name in run["videos"]}
+    assert names and {f"videos/{name}" for name in expected} == names | {name.replace(".mp4", ".png") for name in names}
+    assert videos_of(output) == expected
+    # No videos on request.
+    done = swm_ray.evaluate("no-op", f"{s3}/plain", env="swm/TwoRoom-v1", episodes=1, budget=2, image=32, videos=0)
+    assert ray.get(done)["cells"] == 2 and videos_of(Folder(f"{s3}/plain")) == {}
+
+
+def test_an_evaluation_has_the_traces_of_one_process(cluster, s3, tmp_path):
+    options = {"episodes": 2, "envs": 2, "budget": 6, "image": 32, "seed": 3, "shift": "agent.color=0,0,255", "videos": 0}
+    options |= {"solver": "cem,samples=8,iterations=2,elites=4", "horizon": 2}
+    flags = [part for name, value in options.items() for part in flag(name, value)]
+    printed("eval", "simulator", "--env", "swm/TwoRoom-v1", "-o", tmp_path / "one", "--trace", *flags)
+    output = Folder(f"{s3}/traced")
+    assert ray.get(swm_ray.evaluate("simulator", output.root, env="swm/TwoRoom-v1", trace=True, **options))["cells"] == 3
+    one = Folder(str(tmp_path / "one"))
+    assert without_times(output.read_json("results.json")) == without_times(one.read_json("results.json"))
+    found, expected = ([untimed(plan) for plan in folder.read_json("traces.json")] for folder in (output, one))
+    assert found == expected and len(found) > 2
+    # Other files of this name are refused before the work.
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "traces.json").write_text("mine")
+    done = swm("eval", "simulator", "--env", "swm/TwoRoom-v1", "--trace", "-o", tmp_path / "mine", "--on", "ray", *flags)
+    assert done.returncode == 2 and "traces.json: exists and was not written by this run" in done.stderr, done.stderr
+
+
+def untimed(plan):
+    """A traced plan without its times."""
+    return {key: value for key, value in plan.items() if not key.endswith("seconds")}
+
+
+@pytest.mark.parametrize(
+    ("rule", "policies", "episodes"),
+    [("ci=30", ["expert", "no-op"], 60), ("decided", ["expert", "no-op"], 60), ("ci=1", ["no-op"], 25)],
+)
+def test_an_evaluation_that_its_results_end_has_those_of_one_process(rule, policies, episodes, cluster, s3, tmp_path):
+    options = {"until": rule, "episodes": episodes, "envs": 5, "budget": 12, "image": 32, "videos": 2, "seed": 4}
+    options |= {"shift": "agent.color=0,0,255"}
+    flags = [part for name, value in options.items() for part in flag(name, value)]
+    printed("eval", *policies, "--env", "swm/TwoRoom-v1", "-o", tmp_path / "one", *flags)
+    output = Folder(f"{s3}/until-{rule}")
+    summary = ray.get(swm_ray.evaluate(policies, output.root, env="swm/TwoRoom-v1", **options))
+    one = Folder(str(tmp_path / "one"))
+    expected = one.read_json("results.json")
+    assert without_times(output.read_json("results.json")) == without_times(expected)
+    assert videos_of(output) == videos_of(one) != {}
+    stages = Folder(summary["folder"]).list("parts/stages")
+    played = len(expected["runs"][0]["episodes"])
+    assert max(int(name.split("/")[0]) for name in stages) == played
+    assert summary["cells"] == 3 * (len(stages) // 2) + 1
+    assert swm_ray.progress(summary["folder"]) == {"done": summary["cells"], "cells": summary["cells"]}
+    # The same call finds everything done.
+    assert ray.get(swm_ray.evaluate(policies, output.root, env="swm/TwoRoom-v1", **options))["ran"] == 0
+
+
+def test_rules_that_cannot_end_an_evaluation_are_refused_before_the_work(tmp_path):
+    given = ["eval", "random", "--env", "swm/TwoRoom-v1", "--image", 32, "--on", "ray", "-o", tmp_path / "out"]
+    for flags, problem in (
+        (["--until", "decided"], "nothing to compare"),
+        (["--until", "ci=5", "--videos", 11], "the first stage has 10 episodes"),
+        (["--until", "ci=5", "--resume"], "--resume: has no effect together with --on"),
+    ):
+        done = swm(*given, *flags)
+        assert done.returncode == 2 and problem in done.stderr, done.stderr
+    assert not list(tmp_path.iterdir())
 
 
 def flag(name, value):
@@ -73,6 +144,52 @@ def test_a_study_has_the_files_of_one_process(cluster, s3, tmp_path):
     assert done.returncode == 0, done.stderr
     assert swm_package.studies.read(shared).is_done
     assert swm_package.studies.read(shared).export() == swm_package.studies.read(one).export()
+
+
+#: A study of each kind whose rows run on a cluster.
+TABLES = {
+    "factors": 'kind = "factors"\ntitle = "T"\nquestion = "q?"\n[published]\n"swm/TwoRoom-v1" = [1, 2]\n"other" = [3, 4]\n',
+    "online": """
+kind = "online"
+title = "Returns"
+question = "Which returns are reached?"
+
+[defaults]
+envs = ["swm/PendulumControl-v1"]
+families = ["sac"]
+preset = "tiny"
+seeds = [0, 1]
+steps = 20
+warmup = 20
+episodes = 1
+max-steps = 20
+""",
+}
+
+
+@pytest.mark.parametrize("kind", TABLES)
+def test_a_table_has_the_rows_of_one_process(kind, cluster, s3, tmp_path):
+    (tmp_path / "table.toml").write_text(TABLES[kind])
+    one, many = Folder(str(tmp_path / "one")), Folder(f"{s3}/table-{kind}")
+    # Another home, so that each trains its models itself.
+    done = swm("study", "run", tmp_path / "table.toml", "-o", one.root, STABLEWM_HOME=str(tmp_path / "home"))
+    assert done.returncode == 0, done.stderr
+    summary = ray.get(swm_ray.study(tmp_path / "table.toml", many.root))
+    cells = one.read_json("study.json")["cells"]
+    assert summary["cells"] == len(cells) + 1 > 2
+    names = [name for name in one.list() if not name.startswith(".")]
+    assert len(names) == len(cells) + 1
+    assert {name: many.read(name) for name in many.list()} == {name: one.read(name) for name in names}
+    # A folder of rows is another's word for what they load.
+    done = swm("study", "resume", one.root)
+    assert done.returncode == 2 and "--trust" in done.stderr, done.stderr
+
+
+@pytest.mark.parametrize(("kind", "problem"), [("data", "the speed of one machine"), ("drift", "share one training")])
+def test_tables_of_one_machine_are_refused(kind, problem, tmp_path):
+    done = swm("study", "run", f"paper/{kind}", "--small", "-o", tmp_path / "out", "--on", "ray")
+    assert done.returncode == 2 and problem in done.stderr, done.stderr
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_sweep_has_the_weights_of_single_trainings(cluster, s3, rooms, tmp_path):

@@ -40,9 +40,6 @@ impl EvalRequest {
         control: &mut Control<'_>,
     ) -> Result<Results> {
         self.check_rule(until, options)?;
-        if let StartsRequest::Dataset { dataset, .. } = &self.starts {
-            self.picks(&*resolver.dataset(dataset)?)?;
-        }
         // What a stage shows would be the interval of a fixed number.
         let outer = Mutex::new(control);
         let lock = || outer.lock().unwrap_or_else(PoisonError::into_inner);
@@ -52,30 +49,59 @@ impl EvalRequest {
         });
         let control = &mut control;
         let mut found = earlier.map(|earlier| self.continued(earlier, until)).transpose()?;
-        let mut stages = stages();
+        let stages = self.stages();
         loop {
             let episodes = found.as_ref().map_or(0, Results::episodes);
             if let Some(results) = found.take_if(|results| episodes >= self.episodes || is_met(results)) {
                 return Ok(results);
             }
-            let stage = stages.find(|stage| *stage > episodes).unwrap_or(self.episodes);
-            let request = Self { episodes: stage.min(self.episodes), ..self.clone() };
-            let results = match &found {
-                None => request.run_episodes(Episodes::All, resolver, options, control)?,
-                Some(results) => {
-                    let checked = Checked { resolver, manifest: &results.manifest };
-                    let options = RunOptions { videos: None, ..options.clone() };
-                    request.run_episodes(Episodes::After(results), &checked, &options, control)?
-                }
-            };
+            let stage = stages.iter().find(|stage| **stage > episodes).copied().unwrap_or(self.episodes);
+            let results = self.run_stage(stage, found.as_ref(), resolver, options, control)?;
             let results = results.stopped(until, self.episodes);
             keep(&results)?;
             found = Some(results);
         }
     }
 
+    /// The numbers of starts after which a rule is applied; the last one is the number of episodes of this request.
+    pub fn stages(&self) -> Vec<usize> {
+        stages().take_while(|stage| *stage < self.episodes).chain([self.episodes]).collect()
+    }
+
+    /// Evaluates the first `episodes` starts; those that `earlier` has, results of the stage before, are not played again.
+    /// Videos are those of the first stage. The statistics of the results are those of a fixed number of episodes.
+    ///
+    /// # Errors
+    /// As [`EvalRequest::run`], when the dataset has fewer starts than this request, or `earlier` are results of another
+    /// request, data or weights.
+    pub fn run_stage(
+        &self,
+        episodes: usize,
+        earlier: Option<&Results>,
+        resolver: &dyn Resolver,
+        options: &RunOptions,
+        control: &mut Control<'_>,
+    ) -> Result<Results> {
+        if let StartsRequest::Dataset { dataset, .. } = &self.starts {
+            self.picks(&*resolver.dataset(dataset)?)?;
+        }
+        let request = Self { episodes: episodes.min(self.episodes), ..self.clone() };
+        let Some(earlier) = earlier else { return request.run_episodes(Episodes::All, resolver, options, control) };
+        if !self.is_of(earlier)? {
+            let fix = "give the results of the stage before";
+            return Err(Error::config("the results to continue", "are those of another request", fix));
+        }
+        let checked = Checked { resolver, manifest: &earlier.manifest };
+        let options = RunOptions { videos: None, ..options.clone() };
+        request.run_episodes(Episodes::After(earlier), &checked, &options, control)
+    }
+
     /// Checks that this evaluation can end by the rule.
-    fn check_rule(&self, until: Until, options: &RunOptions) -> Result<()> {
+    ///
+    /// # Errors
+    /// When the counting allows no more episodes, there are more videos than episodes of the first stage, or nothing is
+    /// compared.
+    pub fn check_rule(&self, until: Until, options: &RunOptions) -> Result<()> {
         let invalid = |problem: String, fix: &str| Err(Error::config("--until", problem, fix));
         let videos = options.videos.as_ref().map_or(0, |(_, count)| *count);
         if matches!(self.counting, Counting::Compat { .. }) && self.starts == StartsRequest::Episodic {

@@ -114,14 +114,20 @@ def submit(arguments: Sequence[str], options: Mapping[str, Any] | None = None) -
 
 
 def progress(folder: str | os.PathLike[str]) -> dict[str, int]:
-    """How many cells of a run are `done`, of how many `cells`, from its folder."""
+    """How many cells of a run are `done`, of how many `cells`, from its folder.
+
+    While an evaluation with `until` runs, `cells` is the largest number that it may have.
+    """
     from .cells import count
 
     run = Folder(os.fspath(folder))
     request = read_request(run)
     if request is None:
         return {"done": 0, "cells": 0}
-    return {"done": len(run.list("cells")), "cells": count(request)}
+    done = run.list("cells")
+    # The rule of an evaluation has ended it.
+    ended = "stages" in request["cells"] and "join.json" in done
+    return {"done": len(done), "cells": len(done) if ended else count(request)}
 
 
 def _flags(options: Mapping[str, Any]) -> list[str]:

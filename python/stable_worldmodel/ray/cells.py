@@ -40,12 +40,14 @@ def stages(request: dict[str, Any]) -> Iterator[Iterable[Cell]]:
 
 
 def count(request: dict[str, Any]) -> int:
-    """The number of cells."""
+    """The number of cells; the largest number, if the results of an evaluation end it."""
     kind, cells = request["kind"], request["cells"]
     if kind == "train":
         return len(cells["runs"])
     if kind in ("collect", "convert"):
         return int(cells["shards"]) + 1 + bool(cells.get("verify"))
+    if "stages" in cells:
+        return len(cells["stages"]) * (len(cells["conditions"]) + 1) + 1
     return len(cells["conditions"] if kind == "eval" else cells["ids"]) + 1
 
 
@@ -76,55 +78,109 @@ def _ranges(request: dict[str, Any]) -> Iterator[Iterable[Cell]]:
 
 
 def _eval(request: dict[str, Any]) -> Iterator[Iterable[Cell]]:
-    """Conditions of an evaluation, and their results in one file."""
+    """Conditions of an evaluation, and their results in one file; with `--until`, stages that a cell ends."""
+    parts, cells = Folder(request["folder"]).at("parts"), request["cells"]
+    if "stages" not in cells:
+        yield (_part(request, index, name, f"{index:06d}", "results") for index, name in enumerate(cells["conditions"]))
+        yield [_join(request, {"parts": parts})]
+        return
+    before = None
+    for episodes in cells["stages"]:
+        yield _stage(request, int(episodes), before)
+        here = f"stages/{int(episodes):06d}"
+        decision = {"id": f"stage-{int(episodes):06d}", "name": f"the rule after {episodes} episodes"}
+        joined = _join(request, {"parts/results": f"{parts}/{here}"}, "--stage", str(episodes))
+        yield [{**joined, **decision, "outputs": {}}]
+        before = here
+        if _ends(request, decision["id"]):
+            break
+    yield [_join(request, {"parts/results": f"{parts}/{before}", "parts/videos?": f"{parts}/videos"}, "--stage", str(episodes))]
+
+
+def _part(request: dict[str, Any], index: int, name: str, identity: str, results: str) -> Cell:
+    """A condition of an evaluation."""
     parts = Folder(request["folder"]).at("parts")
-    yield (
-        {
-            "id": f"{index:06d}",
-            "name": f"condition '{name}'",
-            "arguments": [*request["arguments"], "--part", str(index), "--output", f"{SCRATCH}/out"],
-            "outputs": {"out/results.json": f"{parts}/{index:06d}.json"},
-        }
-        for index, name in enumerate(request["cells"]["conditions"])
-    )
-    yield [
-        {
-            "id": "join",
-            "name": "results of all conditions",
-            "arguments": [*request["arguments"], "--join", f"{SCRATCH}/parts", "--output", f"{SCRATCH}/out"],
-            "inputs": {"parts": parts},
-            "outputs": {"out": request["output"]},
-        }
-    ]
+    return {
+        "id": identity,
+        "name": f"condition '{name}'",
+        "arguments": [*request["arguments"], "--part", str(index), "--output", f"{SCRATCH}/out"],
+        "outputs": {
+            "out/results.json": f"{parts}/{results}/{index:06d}.json",
+            "out/traces.json?": f"{parts}/traces/{index:06d}.json",
+            "out/videos?": f"{parts}/videos/{index:06d}",
+        },
+    }
+
+
+def _stage(request: dict[str, Any], episodes: int, before: str | None) -> Iterator[Cell]:
+    """The conditions of a stage of an evaluation, which continue the results of the stage before."""
+    parts = Folder(request["folder"]).at("parts")
+    for index, name in enumerate(request["cells"]["conditions"]):
+        cell = _part(request, index, name, f"stage-{episodes:06d}-{index:06d}", f"stages/{episodes:06d}")
+        cell["name"] += f", {episodes} episodes"
+        cell["arguments"] += ["--stage", str(episodes)]
+        if before is not None:
+            cell["arguments"] += ["--after", f"{SCRATCH}/before.json"]
+            cell["inputs"] = {"before.json": f"{parts}/{before}/{index:06d}.json"}
+        yield cell
+
+
+def _join(request: dict[str, Any], inputs: dict[str, str], *more: str) -> Cell:
+    """The results of all conditions in one file, with their videos and traces."""
+    return {
+        "id": "join",
+        "name": "results of all conditions",
+        "arguments": [*request["arguments"], "--join", f"{SCRATCH}/parts", *more, "--output", f"{SCRATCH}/out"],
+        "inputs": inputs,
+        "outputs": {"out": request["output"]},
+    }
+
+
+def _ends(request: dict[str, Any], cell: str) -> bool:
+    """Whether a cell found that the results meet the rule of `--until`, or that there are no more episodes."""
+    record = Folder(request["folder"]).read_json(f"cells/{cell}.json")
+    outcome = record.get("outcome") if isinstance(record, dict) else None
+    if not isinstance(outcome, dict) or not isinstance(outcome.get("ends"), bool):
+        raise RuntimeError(f"the record of the cell {cell} is damaged; remove it and run the command again")
+    return bool(outcome["ends"])
 
 
 def _study(request: dict[str, Any]) -> Iterator[Iterable[Cell]]:
-    """Cells of a study, and its image distances and results."""
+    """Cells of a study, each an evaluation or a row of a table, and its file and its image distances."""
     study, ids = request["cells"]["study"], request["cells"]["ids"]
-    output = Folder(request["output"])
+    output, is_table = Folder(request["output"]), "kind" in study
+    alone = study if is_table else study | {"published": []}
     yield (
         {
             "id": identity,
-            "name": f"{cell['request']['conditions'][0]['name']}, {cell['request']['policies'][0]['name']} ({identity})",
-            "arguments": ["study", "resume", f"{SCRATCH}/study", "--trust", "--cell", identity],
-            "files": {"study/study.json": json.dumps(study | {"cells": [cell], "published": []})},
+            "name": f"{_described(cell)} ({identity})",
+            "arguments": ["study", "resume", f"{SCRATCH}/study", "--trust", *([] if is_table else ["--cell", identity])],
+            "files": {"study/study.json": json.dumps(alone | {"cells": [cell]})},
             # What another run evaluated, perhaps on one machine, is not evaluated again.
             "inputs": {f"study/cells/{identity}.json?": output.at(f"cells/{identity}.json")},
-            "outputs": {f"study/cells/{identity}.json": output.at(f"cells/{identity}.json")},
+            # A row of a table stays empty on a node that cannot measure it.
+            "outputs": {f"study/cells/{identity}.json{'?' * is_table}": output.at(f"cells/{identity}.json")},
         }
         for identity, cell in zip(ids, study["cells"], strict=True)
     )
     yield [
         {
             "id": "join",
-            "name": "image distances of the study",
+            "name": "the study with all its cells",
             "arguments": ["study", "resume", f"{SCRATCH}/study", "--trust"],
             "files": {"study/study.json": json.dumps(study)},
-            "inputs": {"study/cells": output.at("cells")},
+            # No row of a table may have been measured.
+            "inputs": {f"study/cells{'?' * is_table}": output.at("cells")},
             "outputs": {name: output.at(name.removeprefix("study/").rstrip("?")) for name in _STUDY_FILES},
             "study": study["title"],
         }
     ]
+
+
+def _described(cell: dict[str, Any]) -> str:
+    """The name of a row; the condition and the policy of an evaluation."""
+    request = cell["request"]
+    return str(cell["name"]) if "name" in cell else f"{request['conditions'][0]['name']}, {request['policies'][0]['name']}"
 
 
 def _train(request: dict[str, Any]) -> Iterator[Iterable[Cell]]:

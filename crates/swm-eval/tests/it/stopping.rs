@@ -168,6 +168,13 @@ fn compat() -> swm_core::results::Counting {
     swm_core::results::Counting::Compat { envs: 2 }
 }
 
+/// An evaluation of the walker under two conditions.
+fn two_conditions(episodes: usize) -> EvalRequest {
+    let cells = study(episodes, None).cells;
+    let conditions: Vec<Condition> = cells[..2].iter().flat_map(|cell| cell.request.conditions.clone()).collect();
+    EvalRequest { conditions, episodes, budget: Some(3), ..request() }
+}
+
 /// Evaluates the walker under two conditions until the rule is met, and keeps the results of the last stage.
 fn evaluate(
     until: &str,
@@ -176,12 +183,7 @@ fn evaluate(
     kept: &mut Option<Results>,
     control: &mut Control<'_>,
 ) -> swm_core::Result<Results> {
-    let mut conditions: Vec<Condition> = vec![];
-    for cell in &study(episodes, None).cells[..2] {
-        conditions.extend(cell.request.conditions.clone());
-    }
-    let request = EvalRequest { conditions, episodes, budget: Some(3), ..request() };
-    let options = RunOptions { envs: 4, threads: 1, ..RunOptions::default() };
+    let (request, options) = (two_conditions(episodes), RunOptions { envs: 4, threads: 1, ..RunOptions::default() });
     let mut keep = |results: &Results| {
         *kept = Some(results.clone());
         Ok(())
@@ -242,4 +244,39 @@ fn an_evaluation_that_its_results_ended_is_reproduced_and_continued() {
     refused(other, "another request");
     let error = evaluate("ci=8", 20, Some(few), &mut None, &mut Control::new()).expect_err("fewer episodes");
     assert!(error.to_string().contains("30 episodes"), "{error}");
+}
+
+#[test]
+fn stages_of_conditions_apart_join_to_the_results_of_one_process() {
+    let (resolver, episodes) = (TestResolver::new(), 100);
+    let (request, control) = (two_conditions(episodes), &mut Control::new());
+    assert_eq!(request.stages(), [10, 20, 30, 50, 80, 100]);
+    for rule in ["ci=12", "decided", "ci=0.1"] {
+        let until: Until = rule.parse().expect("a rule");
+        let whole = evaluate(rule, episodes, None, &mut None, control).expect("results");
+        let mut parts: Vec<Option<Results>> = vec![None; 2];
+        let mut joined = None;
+        for stage in request.stages() {
+            let options = RunOptions { envs: 3, threads: 1, ..RunOptions::default() };
+            for (index, part) in parts.iter_mut().enumerate() {
+                let alone = request.part(index).expect("a condition");
+                *part = Some(alone.run_stage(stage, part.as_ref(), &resolver, &options, control).expect("a stage"));
+            }
+            let found = parts.iter().flatten().cloned().collect();
+            let results = EvalRequest { episodes: stage, ..request.clone() }.join(found, &resolver, &options);
+            let results = results.expect("a stage").stopped(until, episodes);
+            let ends = results.stopping.is_some_and(|stopping| stopping.met);
+            joined = Some(results);
+            if ends {
+                break;
+            }
+        }
+        assert_eq!(text(joined.expect("stages")), text(whole), "{rule}");
+    }
+    // The results of another condition are no earlier stage.
+    let options = RunOptions { envs: 3, threads: 1, ..RunOptions::default() };
+    let [first, second] = [0, 1].map(|index| request.part(index).expect("a condition"));
+    let earlier = second.run_stage(10, None, &resolver, &options, control).expect("a stage");
+    let error = first.run_stage(20, Some(&earlier), &resolver, &options, control).expect_err("another condition");
+    assert!(error.to_string().contains("another request"), "{error}");
 }

@@ -65,7 +65,7 @@ pub struct EvalArgs {
     pub(super) until: Option<Until>,
     /// Continue an interrupted evaluation with --until
     #[arg(long, requires = "until")]
-    resume: bool,
+    pub(super) resume: bool,
     /// Seed of starts, goals, factors and plans (default: 0, or the capsule's)
     #[arg(long)]
     seed: Option<u64>,
@@ -160,6 +160,9 @@ const MOST_EPISODES: usize = 2000;
 /// The number of recorded episodes of each run, unless the command line says otherwise.
 pub const VIDEOS: usize = 3;
 
+/// The file of the searches of all plans.
+pub(super) const TRACES: &str = "traces.json";
+
 /// The name of the condition without any shift.
 const IN_DISTRIBUTION: &str = "in distribution";
 
@@ -183,21 +186,30 @@ pub fn run_args(args: &EvalArgs, context: &Context) -> anyhow::Result<(Results, 
     args.check_planning(&request)?;
     // Before the work: only a traced evaluation replaces the traces.
     if args.trace {
-        drop(output_folder::claim(&args.output, &["traces.json"])?);
+        drop(output_folder::claim(&args.output, &[TRACES])?);
     }
-    let videos = args.videos.unwrap_or(if args.no_pixels { 0 } else { VIDEOS });
-    let output = (args.output.as_path(), videos);
+    let output = (args.output.as_path(), args.video_count());
     if let Some(until) = args.until {
         return Ok(eval_until::run(&request, (until, args.resume), &resolver, args.envs, output, context)?);
     }
     let (results, file) = run(&request, &resolver, args.envs, output, context)?;
     if args.trace {
-        write_json(&args.output.join("traces.json"), &traces(&resolver))?;
+        write_traces(&args.output, &resolver)?;
     }
     Ok((results, file))
 }
 
+/// Writes the plans that a resolver has traced.
+pub(super) fn write_traces(output: &Path, resolver: &HomeResolver) -> Result<()> {
+    write_json(&output.join(TRACES), &traces(resolver))
+}
+
 impl EvalArgs {
+    /// The number of recorded episodes of each run.
+    pub(super) fn video_count(&self) -> usize {
+        self.videos.unwrap_or(if self.no_pixels { 0 } else { VIDEOS })
+    }
+
     /// Returns the settings that determine the results.
     ///
     /// # Errors

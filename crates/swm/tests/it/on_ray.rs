@@ -90,7 +90,11 @@ fn files_of_the_user_in_the_output_are_refused() {
     let study = ["study", "run", "study.toml"];
     let train = ["train", "lewm", "--data", "rooms", "--preset", "tiny", "schedule.steps=1"];
     let sweep = [&train[..], &["--sweep", "seed=0,1"]].concat();
-    let cases: [(&[&str], &str, &str); 7] = [
+    let videos: Vec<&str> = eval.into_iter().filter(|part| *part != "--no-pixels").chain(["--videos", "1"]).collect();
+    let trace = ["eval", "simulator", "--env", "swm/TwoRoom-v1", "--trace", "--videos", "0"];
+    let cases: [(&[&str], &str, &str); 9] = [
+        (&videos, "videos/mine.txt", "videos: exists and was not written by this run"),
+        (&trace, "traces.json", "traces.json: exists and was not written by this run"),
         (&eval, "results.json", "not written by this run"),
         (&eval, "run.json", "not written by this run"),
         (&study, "study.json", "not written by this program"),

@@ -1,14 +1,16 @@
 //! `swm eval`: its conditions here, or each as a cell on a Ray cluster.
 
+use super::eval_parts::{copy_videos, joined_traces, results_in};
 use super::{OnRayArgs, Request};
-use crate::cli::eval::{self, CapsuleStarts, EvalArgs, write_json};
+use crate::cli::eval::{self, CapsuleStarts, EvalArgs, TRACES, write_json, write_traces};
+use crate::cli::progress::control;
 use crate::cli::results_tables::summary;
 use crate::cli::{Context, emit, emit_json, output_folder, run_record};
 use crate::resolver::HomeResolver;
 use clap::Args;
 use serde_json::json;
 use std::path::{Path, PathBuf};
-use swm_core::{Error, Origin, Result, Results, files};
+use swm_core::{Origin, Result, Results};
 use swm_eval::EvalRequest;
 
 /// Arguments of `swm eval`.
@@ -24,60 +26,100 @@ pub struct EvalCommand {
     /// Join the results of all conditions in this folder
     #[arg(long, hide = true, value_name = "DIR", conflicts_with_all = ["on", "part"])]
     join: Option<PathBuf>,
+    /// The number of episodes of a stage of --until
+    #[arg(long, hide = true, value_name = "EPISODES", requires = "until", conflicts_with = "on")]
+    stage: Option<usize>,
+    /// Results of the stage before
+    #[arg(long, hide = true, value_name = "FILE", requires = "stage")]
+    after: Option<PathBuf>,
 }
-
-/// The largest results of a condition, in bytes.
-const MAX_BYTES: u64 = 256 << 20;
 
 /// Runs `swm eval`.
 pub fn run(command: &EvalCommand, context: &Context) -> anyhow::Result<()> {
-    let EvalCommand { args, on, part, join } = command;
+    let EvalCommand { args, on, part, join, .. } = command;
     if !on.is_given() && part.is_none() && join.is_none() {
         return eval::eval(args, context);
     }
-    let videos = args.videos.is_some_and(|count| count > 0);
-    let refused = [("--until", args.until.is_some()), ("--trace", args.trace), ("--videos", videos)];
-    on.refuse(&refused, "remove it, or evaluate without --on")?;
+    on.refuse(&[("--resume", args.resume)], "remove it: the same command continues an interrupted run")?;
     let resolver = HomeResolver::new(Origin::User).on(args.device.open()?);
+    let resolver = if args.trace { resolver.tracing() } else { resolver };
     let request = args.request(&resolver, CapsuleStarts::Use)?;
     args.check_planning(&request)?;
-    let options = eval::run_options(args.envs, None, context);
-    let (results, file) = match (part, join) {
-        (Some(index), _) => eval::run(&request.part(*index)?, &resolver, args.envs, (&args.output, 0), context)?,
-        (None, Some(parts)) => {
-            let results = request.join(parts_in(parts, &request)?, &resolver, &options)?;
-            let _lock = output_folder::claim(&args.output, &["results.json"])?;
-            let file = args.output.join("results.json");
-            write_json(&file, &results)?;
-            run_record::write(&args.output, false)?;
-            (results, file)
-        }
-        (None, None) => {
-            let output = args.output.to_string_lossy();
-            let names: Vec<&str> = request.conditions.iter().map(|condition| condition.name.as_str()).collect();
-            let replaced = &["-o", "--output", "--videos"];
-            let cells = json!({"conditions": names});
-            on.check_new(&output, &["results.json", run_record::FILE])?;
-            return on.submit(&Request { kind: "eval", output: &output, replaced, cells }, context);
-        }
+    let results = match (part, join) {
+        (Some(index), _) => command.evaluate_part(&request.part(*index)?, &resolver, context)?,
+        (None, Some(parts)) => command.join_parts(parts, &request, &resolver, context)?,
+        (None, None) => return command.submit(&request, context),
     };
     if context.json {
-        return emit_json(&json!({"env": results.env, "runs": results.runs.len()}));
+        // Whether a stage of `--until` is the last one.
+        let ends = results.stopping.is_none_or(|stopping| stopping.met) || results.episodes() >= request.episodes;
+        return emit_json(&json!({"env": results.env, "runs": results.runs.len(), "ends": ends}));
     }
     emit(&summary(&results));
-    emit(&format!("{}\n", file.display()));
+    emit(&format!("{}\n", args.output.join("results.json").display()));
     Ok(())
 }
 
-/// Reads the results of all conditions.
-fn parts_in(folder: &Path, request: &EvalRequest) -> Result<Vec<Results>> {
-    let read = |index: usize| {
-        let path = folder.join(format!("{index:06}.json"));
-        let invalid = |problem: String| Error::corrupt(&path, problem, "remove it and run the command again");
-        let results: Results = serde_json::from_slice(&files::read(&path, MAX_BYTES)?)
-            .map_err(|error| invalid(format!("is not a results file ({error})")))?;
-        results.check().map_err(|problem| invalid(format!("is inconsistent: {problem}")))?;
+impl EvalCommand {
+    /// Hands the conditions over to a cluster.
+    fn submit(&self, request: &EvalRequest, context: &Context) -> anyhow::Result<()> {
+        let (args, output) = (&self.args, self.args.output.to_string_lossy());
+        let names: Vec<&str> = request.conditions.iter().map(|condition| condition.name.as_str()).collect();
+        let mut cells = json!({"conditions": names});
+        let videos = args.video_count();
+        if let Some(until) = args.until {
+            let recorded = (videos > 0).then(|| (args.output.clone(), videos));
+            request.check_rule(until, &eval::run_options(args.envs, recorded, context))?;
+            cells["stages"] = json!(request.stages());
+        }
+        let files = [("results.json", true), (run_record::FILE, true), ("videos", videos > 0), (TRACES, args.trace)];
+        let written: Vec<&str> =
+            files.into_iter().filter(|(_, is_written)| *is_written).map(|(name, _)| name).collect();
+        self.on.check_new(&output, &written)?;
+        self.on.submit(&Request { kind: "eval", output: &output, replaced: &["-o", "--output"], cells }, context)
+    }
+
+    /// Evaluates one condition: all episodes, or those of a stage that the stage before lacks.
+    fn evaluate_part(&self, part: &EvalRequest, resolver: &HomeResolver, context: &Context) -> Result<Results> {
+        let (args, videos) = (&self.args, self.args.video_count());
+        let Some(episodes) = self.stage else {
+            let (results, _) = eval::run(part, resolver, args.envs, (&args.output, videos), context)?;
+            if args.trace {
+                write_traces(&args.output, resolver)?;
+            }
+            return Ok(results);
+        };
+        let _lock = output_folder::claim(&args.output, &["results.json"])?;
+        let earlier = self.after.as_deref().map(swm_report::read_results).transpose()?;
+        let options = eval::run_options(args.envs, (videos > 0).then(|| (args.output.clone(), videos)), context);
+        let results = part.run_stage(episodes, earlier.as_ref(), resolver, &options, &mut control(context))?;
+        write_json(&args.output.join("results.json"), &results)?;
         Ok(results)
-    };
-    (0..request.conditions.len()).map(read).collect()
+    }
+
+    /// Joins the results of all conditions, their videos and their traces.
+    fn join_parts(
+        &self,
+        parts: &Path,
+        request: &EvalRequest,
+        resolver: &HomeResolver,
+        context: &Context,
+    ) -> Result<Results> {
+        let (args, conditions) = (&self.args, request.conditions.len());
+        let stage = EvalRequest { episodes: self.stage.unwrap_or(request.episodes), ..request.clone() };
+        let options = eval::run_options(args.envs, None, context);
+        let results = stage.join(results_in(parts, &stage)?, resolver, &options)?;
+        let results = match args.until {
+            Some(until) => results.stopped(until, request.episodes),
+            None => results,
+        };
+        let _lock = output_folder::claim(&args.output, &["results.json", TRACES])?;
+        copy_videos(parts, conditions, &args.output)?;
+        if args.trace {
+            write_json(&args.output.join(TRACES), &joined_traces(parts, conditions)?)?;
+        }
+        write_json(&args.output.join("results.json"), &results)?;
+        run_record::write(&args.output, false)?;
+        Ok(results)
+    }
 }

@@ -6,6 +6,7 @@
 pub mod collect;
 pub mod convert;
 pub mod eval;
+mod eval_parts;
 pub mod study;
 pub mod train;
 

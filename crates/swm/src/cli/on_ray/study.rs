@@ -1,4 +1,5 @@
-//! The output of a study, which other studies and other files must not be in: checked before datasets are collected.
+//! What is checked before the datasets of a study are collected: its output, which other studies and other files must not be in,
+//! and whether its cells can run on several machines.
 
 use super::{OnRayArgs, absolute};
 use serde::Deserialize;
@@ -6,6 +7,7 @@ use serde::de::IgnoredAny;
 use std::path::Path;
 use swm_core::{Error, Result, files};
 use swm_data::{Location, objects};
+use swm_eval::TableStudy;
 
 /// The largest `study.json`, in bytes.
 const MAX_BYTES: u64 = 256 << 20;
@@ -55,6 +57,23 @@ pub fn check_output(output: &str, title: &str, on: &OnRayArgs) -> Result<()> {
         return Err(other("holds a study that ran with --until".to_owned()));
     }
     Ok(())
+}
+
+/// The kinds of studies whose rows need one machine, and why.
+const ONE_MACHINE: [(&str, &str); 2] = [("data", "measure the speed of one machine"), ("drift", "share one training")];
+
+/// Checks that the rows of a table can be filled on several machines.
+///
+/// # Errors
+/// When they are comparable on one machine only, or share a training.
+pub fn check_rows(study: &TableStudy) -> Result<()> {
+    match ONE_MACHINE.iter().find(|(kind, _)| study.kind == *kind) {
+        Some((kind, why)) => {
+            let problem = format!("the rows of a study of the kind '{kind}' {why}");
+            Err(Error::config("--on", problem, "run the study without it"))
+        }
+        None => Ok(()),
+    }
 }
 
 /// Whether a folder has files, without those that a kill leaves of writing one.

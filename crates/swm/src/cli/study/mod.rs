@@ -20,7 +20,7 @@ mod variants;
 
 use super::config::count;
 use super::eval::run_options;
-use super::on_ray::study::check_output;
+use super::on_ray::study::{check_output, check_rows};
 use super::on_ray::{OnRayArgs, Request};
 use super::progress::control;
 use super::recipes::Datasets;
@@ -39,7 +39,7 @@ use std::path::{Path, PathBuf};
 use swm_core::results::{BreakingPoint, StudyResults, Until};
 use swm_core::run::Control;
 use swm_core::{Error, Origin, Result, limits};
-use swm_eval::{AnyStudy, Cell, Common, Study, StudyFolder};
+use swm_eval::{AnyStudy, Cell, Common, Study, StudyFolder, TableCell};
 
 /// Arguments of `swm study`.
 #[derive(Args)]
@@ -249,8 +249,8 @@ pub(super) fn single(
 fn run(args: &RunArgs, only_register: bool, context: &Context) -> anyhow::Result<()> {
     let size = if args.small { Size::Small } else { Size::Paper };
     let (file, origin) = shipped::find(&args.study, size, args.trust)?;
-    if only_register || matches!(file, AnyFile::Table(_)) {
-        args.on.refuse(&[("--on", args.on.is_given())], "remove it: only evaluations run on a cluster")?;
+    if only_register {
+        args.on.refuse(&[("--on", args.on.is_given())], "remove it: a study is registered on this machine")?;
     }
     let file = match file {
         AnyFile::Evaluations(file) => file,
@@ -286,9 +286,7 @@ fn run(args: &RunArgs, only_register: bool, context: &Context) -> anyhow::Result
     if args.on.is_given() {
         args.on.refuse(&[("--until", args.until.is_some())], "remove it, or run the study without --on")?;
         let ids = study.cells.iter().map(Cell::id).collect::<Result<Vec<_>>>()?;
-        let cells = json!({"study": study, "ids": ids});
-        let replaced = &["-o", "--output"];
-        return args.on.submit(&Request { kind: "study", output, replaced, cells }, context);
+        return args.submit(Path::new(output), json!({"study": study, "ids": ids}), context);
     }
     let folder = StudyFolder::new(Path::new(output));
     if only_register {
@@ -331,16 +329,29 @@ fn run_table(
     }
     let mut study = file.study(size, &args.settings, origin)?;
     study.arguments = args.arguments();
+    if args.on.is_given() {
+        check_rows(&study)?;
+    }
     let datasets = file.datasets(size)?;
     datasets.check_origin(origin)?;
     check_output(args.output_text(output)?, &study.title, &args.on)?;
     datasets.make(origin, context)?;
+    if args.on.is_given() {
+        let ids = study.cells.iter().map(TableCell::id).collect::<Result<Vec<_>>>()?;
+        return args.submit(output, json!({"study": study, "ids": ids}), context);
+    }
     let folder = StudyFolder::new(output);
     tables::run(&study, &folder, context)?;
     export_table::show(&study.results(&folder)?, context.json)
 }
 
 impl RunArgs {
+    /// Hands the cells of a study over to a cluster.
+    fn submit(&self, output: &Path, cells: Value, context: &Context) -> anyhow::Result<()> {
+        let output = self.output_text(output)?;
+        self.on.submit(&Request { kind: "study", output, replaced: &["-o", "--output"], cells }, context)
+    }
+
     /// The output as text, which paths of a cluster are. Without one, it is a folder of this machine.
     fn output_text<'a>(&self, output: &'a Path) -> Result<&'a str> {
         if !self.on.is_given() {

@@ -1,6 +1,6 @@
 //! `swm study resume`: evaluates what the folder of a study lacks.
 
-use super::show;
+use super::{export_table, show, tables};
 use crate::cli::config::count;
 use crate::cli::eval::run_options;
 use crate::cli::progress::control;
@@ -9,8 +9,8 @@ use crate::resolver::HomeResolver;
 use clap::Args;
 use serde_json::json;
 use std::path::PathBuf;
-use swm_core::{Origin, limits};
-use swm_eval::StudyFolder;
+use swm_core::{Error, Origin, limits};
+use swm_eval::{AnyStudy, StudyFolder, TableStudy};
 
 /// Arguments of `swm study resume`.
 #[derive(Args)]
@@ -33,7 +33,10 @@ pub struct ResumeArgs {
 /// Runs `swm study resume`.
 pub fn run(args: &ResumeArgs, context: &Context) -> anyhow::Result<()> {
     let folder = StudyFolder::new(&args.folder);
-    let study = folder.study()?;
+    let study = match folder.open()? {
+        AnyStudy::Evaluations(study) => study,
+        AnyStudy::Table(study) => return run_table(&study, &folder, args, context),
+    };
     let resolver = HomeResolver::new(Origin::file(args.folder.join("study.json"), args.trust));
     let _lock = folder.create(&study)?;
     let (options, control) = (run_options(args.envs, None, context), &mut control(context));
@@ -47,4 +50,21 @@ pub fn run(args: &ResumeArgs, context: &Context) -> anyhow::Result<()> {
     }
     study.run(&folder, &resolver, &options, control)?;
     show(&study.results(&folder)?, context.json)
+}
+
+/// Fills the rows that a study of another kind lacks.
+fn run_table(study: &TableStudy, folder: &StudyFolder, args: &ResumeArgs, context: &Context) -> anyhow::Result<()> {
+    let given = args.folder.display().to_string();
+    if args.cell.is_some() {
+        let problem = format!("the study is of the kind '{}', whose rows are no evaluations", study.kind);
+        return Err(Error::config("--cell", problem, "resume all rows").into());
+    }
+    if !args.trust {
+        let problem = format!("has a study of the kind '{}', whose rows may load code", study.kind);
+        let fix =
+            "give --trust if you know who wrote the folder, or run the study again: swm study run NAME --output FOLDER";
+        return Err(Error::config(given, problem, fix).into());
+    }
+    tables::run(study, folder, context)?;
+    export_table::show(&study.results(folder)?, context.json)
 }

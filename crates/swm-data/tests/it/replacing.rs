@@ -253,8 +253,11 @@ fn what_a_writer_leaves_before_its_first_commit_is_continued_and_replaced() {
     let path = folder.path().join("d.lance");
     std::fs::create_dir_all(path.join("data")).expect("creating a folder");
     assert!(has_no_dataset(&path));
-    std::fs::write(path.join(format!("data/{}.lance", "0".repeat(64))), "killed").expect("writing a file");
-    assert!(has_no_dataset(&path));
+    std::fs::create_dir(path.join("_versions")).expect("creating a folder");
+    for name in [&format!("data/{}.lance", "0".repeat(64)), "_versions/18446744073709551614.manifest#1"] {
+        std::fs::write(path.join(name), "killed").expect("writing a file");
+        assert!(has_no_dataset(&path));
+    }
     std::fs::write(path.join("data/thesis.lance"), "thesis").expect("writing a file");
     assert!(!has_no_dataset(&path));
 }
@@ -456,27 +459,39 @@ fn preview_replaces_only_its_own_files() {
     assert!(error.to_string().contains("another process writes to it"), "{error}");
     drop(other);
     for _ in 0..2 {
+        // As a kill leaves them; the last two are the user's.
+        for name in [".episode_1.mp4.77.tmp", ".contact_sheet.png.77.tmp", ".episode_9.mp4.77.tmp", ".notes.77.tmp"] {
+            std::fs::write(out.join(name), "cut off").expect("writing a file");
+        }
         preview(&*reader, &out, &PreviewOptions::default(), |_| ()).expect("a preview replaces its own files");
+        let written = ["contact_sheet.png", "episode_0.mp4", "episode_1.mp4"];
+        let left: Vec<&str> = [".episode_9.mp4.77.tmp", ".notes.77.tmp"].into_iter().chain(written).collect();
+        assert_eq!(names(&out), left.iter().map(Path::new).collect::<Vec<_>>());
     }
 }
 
 #[test]
-fn removal_of_a_table_takes_data_files_of_no_version() {
+fn removal_of_a_table_takes_what_a_kill_leaves() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.lance");
     let orphan = format!("data/{}.lance", blake3::hash(b"written before a kill").to_hex());
     let other = format!("data/{}.lance", blake3::hash(b"something else").to_hex());
+    let staged = format!("{other}#1");
+    let temporary = [staged.as_str(), "_versions/18446744073709551614.manifest#12", "_versions/.tmpa1B2c3"];
+    let of_user = ["_versions/.tmp-notes", "_versions/thesis.manifest#1", other.as_str(), "data/thesis.lance#1"];
     // Without a version, as a kill before the first commit leaves it, and with one.
     for is_committed in [false, true] {
         if is_committed {
             write(&path, WriteMode::Create, 1, 0..2);
         }
-        std::fs::create_dir_all(path.join("data")).expect("creating a folder");
-        for name in [&orphan, &other, "data/thesis.lance"] {
+        for name in ["data", "_versions"] {
+            std::fs::create_dir_all(path.join(name)).expect("creating a folder");
+        }
+        for name in temporary.into_iter().chain(of_user).chain([orphan.as_str()]) {
             std::fs::write(path.join(name), "written before a kill").expect("writing a file");
         }
         FORMATS.get("lance").expect("the format").remove(&path).expect("removing the dataset");
-        let expected = [&other, "data/thesis.lance"].map(|name| path.join(name));
+        let expected = of_user.map(|name| path.join(name));
         assert_eq!(files(&path), expected, "{is_committed}");
     }
 }

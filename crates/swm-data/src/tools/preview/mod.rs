@@ -16,7 +16,7 @@ pub use video::{check_mp4, integer_scale, write_mp4, write_mp4_scaled};
 use crate::dataset::{Reader, StepRange};
 use layout::FrameLayout;
 use std::path::{Path, PathBuf};
-use swm_core::files::Lock;
+use swm_core::files::{self, Lock};
 use swm_core::{Error, Result, limits};
 use swm_image::{check_png, write_png};
 
@@ -68,6 +68,10 @@ pub fn preview(
     // Before any work, so that a refusal leaves no part of a preview.
     chosen.iter().try_for_each(|&episode| check_mp4(&video_of(episode)))?;
     check_png(&contact_sheet_path)?;
+    files::delete_temporary(folder, |name| {
+        let path = folder.join(name);
+        path == contact_sheet_path || chosen.iter().any(|&episode| path == video_of(episode))
+    })?;
     let (mut written, mut sheet) = (vec![], vec![]);
     for (done, &episode) in chosen.iter().enumerate() {
         let index = reader.episodes()[episode].index;

@@ -114,11 +114,16 @@ impl Entry {
         if version != VERSION {
             return Err(wrong(format!("is an entry of layout {version}; this version reads {VERSION}")));
         }
-        let results = swm_report::parse_results(path, results.to_string().as_bytes())?;
+        let stored = results;
+        let results = swm_report::parse_results(path, stored.to_string().as_bytes())?;
         let entry = Self { version, policy, author, licence, processor, results, hash };
         let found = entry.content_hash()?;
         if entry.hash != found {
             return Err(wrong(format!("was edited: it states the hash {}, and its content has {found}", entry.hash)));
+        }
+        if let Some(field) = uncovered("results", &stored, &to_json(&entry.results)?) {
+            let field: String = printable(&field).chars().take(MAX_TEXT).collect();
+            return Err(wrong(format!("has '{field}', which this version does not know and the hash does not cover")));
         }
         entry.check().map_err(|problem| wrong(format!("is inconsistent: {problem}")))?;
         Ok(entry)
@@ -211,6 +216,29 @@ impl Entry {
             Some(missing) => Err(format!("its manifest has no hash of the {missing}")),
             None => results.check(),
         }
+    }
+}
+
+/// Returns the path of a field or an element of `stored` that `covered`, from which the hash is computed, lacks; `path` is that of
+/// both.
+fn uncovered(path: &str, stored: &Value, covered: &Value) -> Option<String> {
+    match (stored, covered) {
+        (Value::Object(stored), Value::Object(covered)) => stored.iter().find_map(|(name, value)| {
+            let path = format!("{path}.{name}");
+            match covered.get(name) {
+                Some(covered) => uncovered(&path, value, covered),
+                None => Some(path),
+            }
+        }),
+        (Value::Array(stored), Value::Array(covered)) => stored.iter().enumerate().find_map(|(index, value)| {
+            let path = format!("{path}[{index}]");
+            match covered.get(index) {
+                Some(covered) => uncovered(&path, value, covered),
+                None => Some(path),
+            }
+        }),
+        (Value::Object(_) | Value::Array(_), _) => Some(path.to_owned()),
+        _ => None,
     }
 }
 

@@ -184,6 +184,10 @@ fn edited_files_and_files_that_are_no_entries_are_refused() {
         (own.replacen("\"steps\": ", "\"steps\": 1", 1), "was edited"),
         (own.replacen("\"version\": 1", "\"version\": 2", 1), "layout 2"),
         (own.replacen("\"author\"", "\"who\"", 1), "unknown field"),
+        // Fields that reading leaves out, so that the hash holds.
+        (own.replacen("\"steps\": ", "\"note\": \"won\", \"steps\": ", 1), "results.runs[0].episodes[0].note"),
+        (own.replacen("\"runs\": [", "\"notes\": [1], \"runs\": [", 1), "results.notes"),
+        (own.replacen("\"device\": ", "\"place\": {}, \"device\": ", 1), "results.manifest.place"),
         ("{}".to_owned(), "missing field"),
         ("[".repeat(10_000), "no entry"),
     ] {

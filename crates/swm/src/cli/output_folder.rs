@@ -1,5 +1,6 @@
 //! The output folder of a command.
 
+use super::run_record;
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 use std::path::Path;
@@ -22,7 +23,27 @@ pub fn claim(folder: &Path, names: &[&str]) -> Result<Lock> {
     check_writable(folder)?;
     check(folder, names)?;
     files::delete_temporary(folder, |name| names.contains(&name))?;
+    if names.contains(&"results.json") {
+        delete_temporary_of_evaluation(folder)?;
+    }
     Ok(lock)
+}
+
+/// Deletes what a killed evaluation left of writing its record, its videos and their posters.
+fn delete_temporary_of_evaluation(folder: &Path) -> Result<()> {
+    files::delete_temporary(folder, |name| name == run_record::FILE)?;
+    let videos = folder.join("videos");
+    if videos.is_symlink() || !videos.is_dir() {
+        return Ok(());
+    }
+    files::delete_temporary(&videos, is_video)
+}
+
+/// Returns whether a name is that of a video of an evaluation or of its poster, such as `random-in-distribution-0.mp4`.
+fn is_video(name: &str) -> bool {
+    let stem = name.strip_suffix(".mp4").or_else(|| name.strip_suffix(".png")).unwrap_or_default();
+    let number = stem.rsplit_once('-').map_or("", |(_, number)| number);
+    !number.is_empty() && number.bytes().all(|byte| byte.is_ascii_digit())
 }
 
 /// Checks that an output is a path of this machine, and no URI, which would become a folder such as `s3:`.

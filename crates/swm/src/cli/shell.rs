@@ -74,6 +74,8 @@ pub fn man(args: &ManArgs, as_json: bool) -> anyhow::Result<()> {
     let _lock = output_folder::claim(&args.output, &[])?;
     let paths: Vec<PathBuf> = pages.iter().map(|(name, _)| args.output.join(format!("{name}.1"))).collect();
     paths.iter().try_for_each(|path| files::check_own(path, is_own))?;
+    let is_page = |name: &str| pages.iter().any(|(page, _)| name.strip_suffix(".1") == Some(page.as_str()));
+    files::delete_temporary(&args.output, is_page)?;
     for ((_, text), path) in pages.iter().zip(&paths) {
         files::write(path, text)?;
     }

@@ -152,6 +152,30 @@ fn previews_videos_and_images_do_not_replace_files_of_the_user() {
 }
 
 #[test]
+fn what_kills_leave_of_pages_and_videos_is_deleted() {
+    let swm = Swm::new();
+    let write = |name: &str| fs::write(swm.path(name), "cut off").expect("writing a file");
+    fs::create_dir_all(swm.path("man")).expect("creating a folder");
+    fs::create_dir_all(swm.path("out/videos")).expect("creating a folder");
+    let own = [
+        "man/.swm.1.77.tmp",
+        "man/.swm-study-run.1.77.tmp",
+        "out/.results.json.77.tmp",
+        "out/.run.json.77.tmp",
+        "out/videos/.random-in-distribution-0.mp4.77.tmp",
+        "out/videos/.random-in-distribution-0.png.77.tmp",
+    ];
+    let others =
+        ["man/.swm-notes.1.77.tmp", "man/.swm.1.tmp", "out/videos/.holiday.mp4.77.tmp", "out/videos/a-0.mp4.77.tmp"];
+    own.into_iter().chain(others).for_each(write);
+    swm.json(&["man", "-o", "man"]);
+    let eval = "eval random --env swm/TwoRoom-v1 --episodes 1 --budget 3 --videos 0 -o out";
+    swm.json(&eval.split(' ').collect::<Vec<_>>());
+    own.iter().for_each(|name| assert!(!swm.path(name).exists(), "{name}"));
+    others.iter().for_each(|name| assert!(swm.path(name).exists(), "{name}"));
+}
+
+#[test]
 fn demo_does_not_take_a_file_of_the_user_for_its_mark() {
     let swm = Swm::new();
     let files = ["demo/.swm-demo", "demo/results/thesis.txt"].map(|name| swm.path(name));

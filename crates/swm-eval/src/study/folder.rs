@@ -9,7 +9,8 @@ use swm_core::files::{self, Lock};
 use swm_core::results::Until;
 use swm_core::{Error, Result, Results};
 
-/// The folder of a study: `study.json`, the results of each cell in `cells/ID.json`, and `image-distances.json`.
+/// The folder of a study: `study.json`, the results of each cell in `cells/ID.json`, `image-distances.json`, and in `models` what
+/// its cells train.
 pub struct StudyFolder {
     pub(super) root: PathBuf,
 }
@@ -145,6 +146,17 @@ impl StudyFolder {
 
     fn path(&self, cell: &Cell) -> Result<PathBuf> {
         Ok(self.cell_path(&cell.id()?))
+    }
+
+    /// The folder of a model that the cells of the study train.
+    ///
+    /// # Errors
+    /// When it, or the folder of all models, is a symbolic link.
+    pub fn model(&self, name: &str) -> Result<PathBuf> {
+        let models = self.root.join("models");
+        let model = models.join(name);
+        [&models, &model].into_iter().try_for_each(|folder| files::check_no_link(folder))?;
+        Ok(model)
     }
 
     /// The file of a cell.

@@ -29,7 +29,11 @@ fn killed(study: &str, settings: &[&str], kills: u64) {
     }
     other.json(&args);
     other.json(&["study", "report", "killed"]);
-    let (whole, mut killed) = (contents(&swm.path("whole")), contents(&other.path("killed")));
+    let (mut whole, mut killed) = (contents(&swm.path("whole")), contents(&other.path("killed")));
+    // A model is beside a log of its training, which has times.
+    for files in [&mut whole, &mut killed] {
+        files.retain(|name, _| !name.starts_with("models/"));
+    }
     // The command on the page names no folder of this run, so that pages are equal, too.
     assert_eq!(killed.keys().collect::<Vec<_>>(), whole.keys().collect::<Vec<_>>(), "{study}");
     killed.retain(|name, bytes| whole.get(name) != Some(bytes));
@@ -168,6 +172,9 @@ fn drift_is_measured_in_the_latents_of_a_trained_model() {
     assert!(paths(0) > 10, "a dot for each held-out frame");
     assert_eq!([paths(1), paths(2), paths(4)], [3, 3, 3], "a path for each episode");
     let first = contents(&swm.path("out"));
+    let is_model = |name: &String| name.starts_with("models/tdmpc2-") && name.ends_with("/weights.safetensors");
+    assert!(first.keys().any(is_model), "the model is in the folder of the study");
+    assert!(!swm.path("checkpoints").exists(), "and not in the home folder");
     swm.json(&run);
     assert!(contents(&swm.path("out")) == first, "a second run changes nothing");
     swm.json(&["study", "report", "out"]);
@@ -176,6 +183,11 @@ fn drift_is_measured_in_the_latents_of_a_trained_model() {
     let other = Swm::new();
     std::fs::write(other.path("drift.toml"), DRIFT).expect("writing the study");
     assert_eq!(other.json(&run)["rows"], table["rows"]);
+    // Nothing is trained through a link.
+    std::fs::rename(swm.path("out/models"), swm.path("elsewhere")).expect("moving the models");
+    std::os::unix::fs::symlink(swm.path("elsewhere"), swm.path("out/models")).expect("a link");
+    std::fs::remove_dir_all(swm.path("out/cells")).expect("removing the rows");
+    swm.fails(&run, 2, &["out/models", "is a symbolic link"]);
 }
 
 /// A study that collects its dataset.

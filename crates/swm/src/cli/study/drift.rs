@@ -9,12 +9,11 @@ use crate::cli::Context;
 use crate::{home, resolver};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
-use std::path::PathBuf;
 use swm_core::results::{LatentSupport, TableColumn};
 use swm_core::run::{Control, Event};
 use swm_core::{Batch, EnvChoice, Error, Key, Origin, Policy, RandomPolicy, Result, VariationRequest};
 use swm_data::{Part, Reader, Split, StepRange};
-use swm_eval::{EvalConfig, Measured, Starts, TableCell, World, WorldConfig};
+use swm_eval::{EvalConfig, Measured, Starts, StudyFolder, TableCell, World, WorldConfig};
 use swm_models::online::{self, StochasticPolicy};
 use swm_models::tdmpc2::{Tdmpc2, latent};
 use swm_models::{Checkpoint, FAMILIES, TrainOptions, TrainRun, device};
@@ -154,14 +153,19 @@ impl Trained {
     ///
     /// # Errors
     /// When the dataset is missing, or training fails or is interrupted.
-    pub(super) fn new(cell: &TableCell, context: &Context, control: &mut Control<'_>) -> Result<Self> {
+    pub(super) fn new(
+        cell: &TableCell,
+        folder: &StudyFolder,
+        context: &Context,
+        control: &mut Control<'_>,
+    ) -> Result<Self> {
         let settings: DriftSettings = serde_json::from_value(cell.request["settings"].clone())
             .map_err(|error| Error::external("reading the settings of a study", error))?;
         // The study has checked who chose the id.
         let choice = crate::env(&settings.env, &Origin::User)?;
         let reader = home::open_dataset(&settings.dataset)?;
         let config = (FAMILIES.get(FAMILY)?.config)(&settings.preset, &settings.overrides())?;
-        let out = checkpoint_folder(&cell.request)?;
+        let out = folder.model(&model_name(&cell.request)?)?;
         let options = TrainOptions {
             resume: true,
             device: device::parse("cpu")?,
@@ -243,12 +247,12 @@ impl Trained {
     }
 }
 
-/// The folder of the checkpoint that all rows of a study share.
-fn checkpoint_folder(request: &Value) -> Result<PathBuf> {
+/// The name of the model that all rows of a study share.
+fn model_name(request: &Value) -> Result<String> {
     let mut shared = request.clone();
     shared["row"] = Value::Null;
     let id = TableCell { name: String::new(), request: shared, published: vec![] }.id()?;
-    home::new_checkpoint(&format!("drift-{FAMILY}-{id}"))
+    Ok(format!("{FAMILY}-{id}"))
 }
 
 /// The latents of a part of a dataset, episode by episode, at most about `frames` in all: every n-th row.
@@ -310,9 +314,8 @@ mod tests {
         settings.check(&Chosen::by_user()).expect("settings");
         let cells = settings.cells(&[]);
         assert_eq!(cells.len(), 5);
-        let folders: Vec<PathBuf> =
-            cells.iter().map(|cell| checkpoint_folder(&cell.request).expect("a folder")).collect();
-        assert!(folders.iter().all(|folder| *folder == folders[0]), "all rows have one model");
+        let models: Vec<String> = cells.iter().map(|cell| model_name(&cell.request).expect("a name")).collect();
+        assert!(models.iter().all(|model| *model == models[0]), "all rows have one model");
         for (wrong, part) in [
             (DriftSettings { steps: 0, ..settings.clone() }, "schedule.steps: 0"),
             (DriftSettings { dataset: "s3://bucket/a".to_owned(), ..settings.clone() }, "[[collect]]"),

@@ -313,7 +313,7 @@ pub fn run(study: &TableStudy, folder: &StudyFolder, context: &Context) -> Resul
         let mut trained = None;
         let mut measure = |cell: &TableCell, control: &mut Control<'_>| {
             if trained.is_none() {
-                trained = Some(Trained::new(cell, context, control)?);
+                trained = Some(Trained::new(cell, folder, context, control)?);
             }
             let row = cell.request["row"].as_str().unwrap_or_default();
             trained.as_ref().map(|trained| trained.measure(row, context, control)).transpose()

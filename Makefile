@@ -19,7 +19,7 @@ SWM := $(CARGO_TARGET_DIR)/release/swm
 SUDO := $(shell [ "$$(id -u)" = 0 ] || command -v sudo)
 CARGO := cargo
 
-.PHONY: help demo test test-python test-ray test-lab test-neighbours test-browser chromium lab-assets check build tests wheel wheel-portable wheel-zoo gpu docs assets setup setup-python reference bench deny release nightly clean test-gpu
+.PHONY: help demo test test-python test-ray test-lab test-neighbours test-browser chromium lab-assets check build tests wheel wheel-portable wheel-zoo gpu cuda docs assets setup setup-python reference bench deny release nightly clean test-gpu
 
 help:
 	@echo 'make demo       collect, train, plan, evaluate and report on a laptop CPU'
@@ -33,6 +33,7 @@ help:
 	@echo 'make wheel-portable   the same for any Linux with glibc $(GLIBC), with a small FFmpeg inside: $(WHEELS)/portable'
 	@echo 'make wheel-zoo    the capsules of the zoo as a Python package, for the extra `zoo`: $(ZOO_WHEEL)'
 	@echo 'make gpu        the same with models on a GPU through Vulkan: $(CARGO_TARGET_DIR)-gpu/release/swm'
+	@echo 'make cuda       the same, and through CUDA'
 	@echo 'make test-gpu   models, training and planning on a Vulkan device; without a GPU on a software device; DEVICE=vulkan:1'
 	@echo 'make docs       the documentation as static pages: $(CACHE)/docs/book/index.html'
 	@echo 'make assets     MuJoCo, its models and meshes, into $(SWM_ASSETS)'
@@ -154,6 +155,17 @@ wheel-zoo: setup
 GPU_TARGET := $(CARGO_TARGET_DIR)-gpu
 gpu: setup
 	CARGO_TARGET_DIR=$(GPU_TARGET) $(CARGO) build --release -p swm --bins --features vulkan
+
+# The same and CUDA. Burn compiles its kernels with LLVM 23, whose libraries come from the Python registry: a build script would download them
+# if this folder did not exist.
+LLVM_VENV := $(CACHE)/venv-llvm-1
+LLVM_FOLDER := $(HOME)/.local/share/tracel/tracel-llvm-23.1.0-4
+cuda: setup
+	@[ -e $(LLVM_FOLDER)/.tracel-llvm-installed ] || { python3 -m venv --clear $(LLVM_VENV) && \
+	  $(LLVM_VENV)/bin/python -m pip install --quiet 'mlc-llvm-static[all]==23.1.1.post0' && mkdir -p $(dir $(LLVM_FOLDER)) && \
+	  ln -s "$$($(LLVM_VENV)/bin/python -c 'import mlc_llvm_static as m; print(m.__path__[0])')/static" $(LLVM_FOLDER) && \
+	  touch $(LLVM_FOLDER)/.tracel-llvm-installed; }
+	CARGO_TARGET_DIR=$(GPU_TARGET) $(CARGO) build --release -p swm --bins --features vulkan,cuda
 
 # Outputs, losses and gradients of every model family, training, planning, checkpoints and probes on a Vulkan device, compared with the
 # recorded values and with the CPU; then a small demo. Mesa's software device stands in for a GPU (docs/gpu.md). Not in CI.

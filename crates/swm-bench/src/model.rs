@@ -1,5 +1,5 @@
-//! `bench plan` and `bench train`: the time of a LeWM for planning, evaluating candidates, encoding, and a training
-//! step.
+//! `bench plan`, `bench encode` and `bench train`: the time of a LeWM for planning, evaluating candidates, encoding, and a training
+//! step; `bench online`: the training step of SAC and TD-MPC2.
 //!
 //! The reference runs with the same weights. The reported ratio is the time of this implementation divided by the time
 //! of the reference. Deterministic outputs of this implementation and of the reference are compared.
@@ -23,6 +23,8 @@ pub enum Work {
     Cost,
     /// Encoding one frame.
     Encode,
+    /// Encoding many frames at once.
+    Frames,
     /// One training step, including the optimizer.
     Train,
 }
@@ -34,6 +36,7 @@ impl Work {
             Self::Plan => "plan",
             Self::Cost => "cost",
             Self::Encode => "encode",
+            Self::Frames => "frames",
             Self::Train => "train",
         }
     }
@@ -56,11 +59,13 @@ pub trait Subject {
 /// Settings of the benchmark.
 #[derive(Clone, Debug)]
 pub struct ModelBenchConfig {
+    /// The name of the model.
+    pub model: String,
     /// The workloads, each with the number of repetitions in a measurement.
     pub works: Vec<(Work, usize)>,
     /// The number of measurement pairs. A pair is one measurement of this implementation and one of the reference.
     pub pairs: usize,
-    /// The sizes of the model: the first argument of the script `reference/model.py`.
+    /// The sizes of the model: the first argument of the script `reference/model.py`, or of `reference/online.py`.
     pub sizes: serde_json::Value,
     /// The Python interpreter of the reference implementation, if any.
     pub python: Option<PathBuf>,
@@ -69,6 +74,8 @@ pub struct ModelBenchConfig {
 /// The result of the benchmark.
 #[derive(Clone, Debug, Serialize)]
 pub struct ModelBenchReport {
+    /// The name of the model.
+    pub model: String,
     /// The version of the reference, or the reason why it is not compared.
     pub reference: String,
     /// One entry for each workload.
@@ -93,24 +100,30 @@ pub struct ModelBenchRow {
     pub difference: Option<f32>,
 }
 
-/// Measures a model; `weights` is the file from which the reference reads the weights and the inputs of the model.
+/// Measures a model; `weights` is the file from which the reference reads the weights and the inputs of a LeWM, `None` for a family that is
+/// trained online.
 ///
 /// # Errors
 /// When there are no measurements, a workload fails, `control` stops the run, or the reference fails after its start. A reference that does not
 /// start is not an error: [`ModelBenchReport::reference`] contains the reason.
 pub fn bench_model(
     config: &ModelBenchConfig,
-    weights: &Path,
+    weights: Option<&Path>,
     subject: &mut dyn Subject,
     control: &mut Control<'_>,
 ) -> Result<ModelBenchReport> {
     if config.pairs == 0 || config.works.iter().any(|(_, count)| *count == 0) {
         return Err(Error::config("measurements of a benchmark", "0", "choose at least 1"));
     }
-    let mut report = ModelBenchReport { reference: not_compared(), rows: vec![] };
+    let model = config.model.clone();
+    let mut report = ModelBenchReport { model, reference: not_compared(), rows: vec![] };
     let mut reference = None;
     if let Some(python) = &config.python {
-        match Reference::start_model(python, &config.sizes, weights) {
+        let started = match weights {
+            Some(weights) => Reference::start_model(python, &config.sizes, weights),
+            None => Reference::start_online(python, &config.sizes),
+        };
+        match started {
             Ok(started) => {
                 report.reference.clone_from(&started.version);
                 reference = Some(started);
@@ -170,7 +183,7 @@ fn difference(ours: &[f32], theirs: &[f32]) -> Result<f32> {
 
 impl fmt::Display for ModelBenchReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(f, "LeWM; reference: {}", self.reference)?;
+        writeln!(f, "{}; reference: {}", self.model, self.reference)?;
         for row in &self.rows {
             write!(f, "{:>6} {:>9.1} ms", row.work.name(), 1e3 * row.seconds)?;
             if let (Some(share), Some(theirs)) = (row.share, Summary::of(&row.reference)) {
@@ -202,6 +215,7 @@ mod tests {
 
     fn config(python: Option<PathBuf>) -> ModelBenchConfig {
         ModelBenchConfig {
+            model: "LeWM".to_owned(),
             works: vec![(Work::Cost, 2), (Work::Train, 1)],
             pairs: 3,
             sizes: serde_json::json!({}),
@@ -211,13 +225,13 @@ mod tests {
 
     #[test]
     fn report_states_that_the_reference_is_missing() {
-        let report = bench_model(&config(None), Path::new("none"), &mut Constant, &mut Control::new())
+        let report = bench_model(&config(None), Some(Path::new("none")), &mut Constant, &mut Control::new())
             .expect("the benchmark succeeds");
         assert!(report.to_string().contains(REFERENCE_PYTHON));
         assert_eq!(report.rows.len(), 2);
         assert!(report.rows.iter().all(|row| row.ours.len() == 3 && row.share.is_none() && row.difference.is_none()));
         let no_pairs = ModelBenchConfig { pairs: 0, ..config(None) };
-        assert!(bench_model(&no_pairs, Path::new("none"), &mut Constant, &mut Control::new()).is_err());
+        assert!(bench_model(&no_pairs, Some(Path::new("none")), &mut Constant, &mut Control::new()).is_err());
     }
 
     #[cfg(unix)]
@@ -231,7 +245,7 @@ mod tests {
             if [ $what = run ]; then echo SWM 2 1.0; else echo SWM 1.0 2.5; fi; done\n";
         std::fs::write(&python, script).expect("the file is written");
         std::fs::set_permissions(&python, std::fs::Permissions::from_mode(0o755)).expect("the file is made executable");
-        let report = bench_model(&config(Some(python)), Path::new("none"), &mut Constant, &mut Control::new())
+        let report = bench_model(&config(Some(python)), Some(Path::new("none")), &mut Constant, &mut Control::new())
             .expect("the benchmark succeeds");
         assert_eq!(report.reference, "1.2.3");
         assert_eq!((report.rows[0].difference, report.rows[1].difference), (Some(0.2), None));

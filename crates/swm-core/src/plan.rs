@@ -54,6 +54,10 @@ pub trait CostModel: Send {
         Ok(())
     }
 
+    /// Lets later calls share work between environments where that is faster. The last bits of an environment's costs may then depend on
+    /// the other environments. Models without such work ignore it.
+    fn plan_together(&mut self) {}
+
     /// Returns the gradient interface of this model, if it is differentiable.
     fn differentiable(&mut self) -> Option<&mut dyn DifferentiableCost> {
         None

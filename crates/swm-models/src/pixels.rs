@@ -1,6 +1,7 @@
 //! Conversion of RGB bytes to normalised tensors.
 
-use burn::tensor::{Device, Tensor, TensorData};
+use crate::device::is_cpu;
+use burn::tensor::{Device, Int, Tensor, TensorData};
 use rayon::prelude::*;
 use swm_core::{Batch, DType, Error, Result, Schema};
 
@@ -67,9 +68,26 @@ pub fn check(side: usize, schema: &Schema, column: &str) -> Result<()> {
 /// When `rgb` is not a positive number of images of `images.side`.
 pub fn patches(images: &ImageNormalization, patch: usize, rgb: &[u8], device: &Device) -> Result<Tensor<3>> {
     let (grid, width) = (images.side / patch, 3 * patch * patch);
+    if !is_cpu(device) && images.side.is_multiple_of(2) && images.side.is_multiple_of(patch) {
+        return Ok(device_patches(images, patch, rgb, images.count(rgb)?, device));
+    }
     let values = normalised(images, patch, rgb)?;
     let frames = values.len() / (grid * grid * width);
     Ok(Tensor::from_data(TensorData::new(values, [frames, grid * grid, width]), device))
+}
+
+/// [`patches`] on a GPU: it gets the bytes, four in an integer, and converts and orders them.
+fn device_patches(images: &ImageNormalization, patch: usize, rgb: &[u8], frames: usize, device: &Device) -> Tensor<3> {
+    let grid = images.side / patch;
+    let words: Vec<i32> = rgb.as_chunks::<4>().0.iter().map(|bytes| i32::from_le_bytes(*bytes)).collect();
+    let count = words.len();
+    let words = Tensor::<1, Int>::from_data(TensorData::new(words, [count]), device);
+    let byte = |index: i32| words.clone().bitwise_right_shift_scalar(8 * index).bitwise_and_scalar(255);
+    let bytes: Tensor<2, Int> = Tensor::stack((0..4).map(byte).collect(), 1);
+    let channels = |values: [f32; 3]| Tensor::<1>::from_floats(values, device).reshape([1, 1, 1, 1, 1, 3]);
+    let values = bytes.float().reshape([frames, grid, patch, grid, patch, 3]) / 255.0;
+    let values = (values - channels(images.mean)) / channels(images.std);
+    values.permute([0, 1, 3, 5, 2, 4]).reshape([frames, grid * grid, 3 * patch * patch])
 }
 
 /// Computes the values of [`patches`].
@@ -162,4 +180,25 @@ pub fn planes(images: &ImageNormalization, rgb: &[u8], device: &Device) -> Resul
     let (side, frames) = (images.side, images.count(rgb)?);
     // A patch as large as the image has the layout of the planes.
     Ok(patches(images, side, rgb, device)?.reshape([frames, 3, side, side]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_device_orders_and_normalises_as_the_cpu() {
+        let (mean, std) = ImageNormalization::IMAGENET;
+        let images = ImageNormalization { side: 6, mean, std };
+        let rgb: Vec<u8> = (0..2 * 6 * 6 * 3).map(|i| (i * 89 % 256) as u8).collect();
+        for patch in [1, 2, 3, 6] {
+            let device = Device::flex();
+            let expected = patches(&images, patch, &rgb, &device).expect("two images");
+            let found = device_patches(&images, patch, &rgb, 2, &device);
+            assert_eq!(found.dims(), expected.dims());
+            for (a, b) in found.into_data().iter::<f32>().zip(expected.into_data().iter::<f32>()) {
+                assert!((a - b).abs() <= 1e-6 * b.abs().max(1.0), "{a} instead of {b}");
+            }
+        }
+    }
 }

@@ -26,6 +26,7 @@ mod library;
 mod metadata;
 mod remote_checkpoint;
 pub mod resolver;
+pub mod step_subject;
 pub mod subject;
 pub mod zoo;
 

@@ -356,7 +356,10 @@ impl Planner {
     }
 
     /// Makes the policy; fails if the solver cannot minimise this cost.
-    fn policy(self, cost: Box<dyn CostModel>, scale: ActionScale, world: &World) -> Result<MpcPolicy> {
+    fn policy(self, mut cost: Box<dyn CostModel>, scale: ActionScale, world: &World) -> Result<MpcPolicy> {
+        if self.mpc.fast {
+            cost.plan_together();
+        }
         let spec = world.spec();
         let mut cost = self.objective.apply(cost)?;
         pairing(&self.id, &mut *cost, ActionKind::of(&spec.action_space))?;

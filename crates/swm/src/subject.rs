@@ -6,10 +6,10 @@ use std::path::Path;
 use swm_bench::{Subject, Work};
 use swm_core::columns::{ACTION, GOAL, PIXELS};
 use swm_core::{
-    Batch, Candidates, ColumnSpec, CostModel as _, DType, Error, Key, PlanProblem, PlanSpace, Result, Schema,
-    Solver as _,
+    Batch, Candidates, ColumnSpec, CostModel as _, DType, Error, Key, PlanProblem, PlanSpace, Predictor as _, Result,
+    Schema, Solver as _,
 };
-use swm_models::lewm::{EncoderConfig, Lewm, LewmCost, pixels};
+use swm_models::lewm::{EncoderConfig, Lewm, LewmCost, LewmPredictor, pixels};
 use swm_models::nn::parameters::{self, HostTensor};
 use swm_models::nn::{Init, Named};
 use swm_models::train::{AdamW, DatasetInfo, StepContext};
@@ -21,14 +21,31 @@ const HORIZON: usize = 5;
 /// The dimension of an environment action.
 const ACTION_DIM: usize = 2;
 
+/// The work of a [`LewmSubject`].
+pub struct LewmWork<'a> {
+    /// The preset with the sizes of the model.
+    pub preset: &'a str,
+    /// Iterations of a plan.
+    pub iterations: usize,
+    /// Environments of a plan.
+    pub envs: usize,
+    /// Whether a device computes the candidates of all environments in one call.
+    pub together: bool,
+    /// Images encoded at once by [`Work::Frames`].
+    pub frames: usize,
+    /// Clips of a training batch.
+    pub clips: usize,
+}
+
 /// A LeWM with inputs for planning and training.
 pub struct LewmSubject {
     config: TrainConfig<Lewm>,
+    frames: usize,
     device: Device,
     model: Lewm,
     cost: LewmCost,
     cem: Cem,
-    /// The columns `pixels` and `goal` of one environment.
+    /// The columns `pixels` and `goal` of each environment.
     infos: Batch,
     /// Candidate action sequences, `[samples, HORIZON, frameskip * ACTION_DIM]`.
     candidates: Vec<f32>,
@@ -45,27 +62,33 @@ struct TrainingRun {
 }
 
 impl LewmSubject {
-    /// The model of a preset with a CEM of `iterations` iterations and training batches of `clips` clips.
+    /// Creates a model with random weights and the inputs of its work.
     ///
     /// # Errors
     /// When there is no such preset.
-    pub fn new(preset: &str, iterations: usize, clips: usize, device: &Device) -> Result<Self> {
-        let settings = [format!("data.batch_size={clips}"), format!("shards={}", rayon::current_num_threads())];
+    pub fn new(work: &LewmWork<'_>, device: &Device) -> Result<Self> {
+        let LewmWork { preset, iterations, envs, together, frames, clips } = *work;
+        let shards = if *device == Device::flex() { rayon::current_num_threads() } else { 1 };
+        let settings = [format!("data.batch_size={clips}"), format!("shards={shards}")];
         let config = TrainConfig::<Lewm>::load(preset, &settings)?;
         let action_dim = config.data.frameskip * ACTION_DIM;
         let model = with_modulations(Lewm::init(&config.model, action_dim, &Init::new(Key::new(0), device)));
         let mut cost = LewmCost::of(&model, &config.model, action_dim);
+        if together {
+            cost.plan_together();
+        }
         let side = config.model.image;
         let columns = [ColumnSpec::image(PIXELS, side, side), ColumnSpec::image(GOAL, side, side)];
-        let mut infos = Batch::zeros(&Schema::new(columns)?, 1);
+        let mut infos = Batch::zeros(&Schema::new(columns)?, envs);
         let mut rng = Key::new(0).with("inputs").rng();
-        for column in 0..2 {
-            rng.fill(infos.row_mut(0).at::<u8>(column));
+        for env in 0..envs {
+            let mut row = infos.row_mut(env);
+            (0..2).for_each(|column| rng.fill(row.at::<u8>(column)));
         }
         cost.observe(&infos, &[0])?;
         let cem = Cem { iterations, ..Cem::default() };
         let candidates = (0..cem.samples * HORIZON * action_dim).map(|_| rng.random_range(-1.0..1.0)).collect();
-        Ok(Self { config, device: device.clone(), model, cost, cem, infos, candidates, training: None })
+        Ok(Self { config, frames, device: device.clone(), model, cost, cem, infos, candidates, training: None })
     }
 
     /// Returns the sizes of the model and of the benchmark as JSON, for the process that runs the reference
@@ -94,7 +117,7 @@ impl LewmSubject {
             "actions": self.action_dim(),
             "history": predictor.history, "depth": predictor.depth, "heads": predictor.heads, "mlp": predictor.mlp,
             "predictor_dim": predictor.dim, "dim_head": predictor.dim_head, "dropout": predictor.dropout,
-            "iterations": self.cem.iterations, "elites": self.cem.elites, "batch": self.config.data.batch_size,
+            "envs": self.infos.rows(), "frames": self.frames, "iterations": self.cem.iterations, "elites": self.cem.elites, "batch": self.config.data.batch_size,
             "knots": self.config.loss.knots, "directions": self.config.loss.directions,
         });
         if let (Some(sizes), serde_json::Value::Object(all)) = (sizes.as_object_mut(), all) {
@@ -115,7 +138,7 @@ impl LewmSubject {
         for name in [PIXELS, GOAL] {
             let planes = pixels::planes(&self.config.model, self.infos.get::<u8>(name)?, &Device::flex())?;
             let values = planes.into_data().iter::<f32>().collect();
-            tensors.insert(format!("i.{name}"), HostTensor { shape: vec![3, side, side], values });
+            tensors.insert(format!("i.{name}"), HostTensor { shape: vec![self.infos.rows(), 3, side, side], values });
         }
         let shape = vec![self.cem.samples, HORIZON, self.action_dim()];
         tensors.insert("i.candidates".to_owned(), HostTensor { shape, values: self.candidates.clone() });
@@ -128,6 +151,7 @@ impl LewmSubject {
     }
 
     fn costs(&mut self) -> Result<Vec<f32>> {
+        self.cost.observe(&self.infos, &[0])?;
         let mut costs = vec![0.0; self.cem.samples];
         let (samples, dim) = (self.cem.samples, self.action_dim());
         let candidates = Candidates { actions: &self.candidates, envs: 1, samples, horizon: HORIZON, dim };
@@ -136,12 +160,30 @@ impl LewmSubject {
     }
 
     fn plan(&mut self) -> Result<()> {
-        self.cost.observe(&self.infos, &[0])?;
+        let envs: Vec<usize> = (0..self.infos.rows()).collect();
+        self.cost.observe(&self.infos, &envs)?;
         let (low, high) = (vec![-1.0; self.action_dim()], vec![1.0; self.action_dim()]);
         let space = PlanSpace::Continuous { low: &low, high: &high };
-        let keys = [Key::new(0)];
+        let keys: Vec<Key> = envs.iter().map(|&env| Key::new(env as u64)).collect();
         let problem = PlanProblem { horizon: HORIZON, space, keys: &keys, init: None, deadline: None, observer: None };
         self.cem.solve(&mut self.cost, problem).map(|_| ())
+    }
+
+    /// Encodes [`LewmWork::frames`] copies of an image: in one call on a device, as when planning for several environments together.
+    fn encode_frames(&self) -> Result<()> {
+        let (model, config) = (&self.model, &self.config.model);
+        let image = &self.infos.get::<u8>(PIXELS)?[..config.image.pow(2) * 3];
+        if self.device == Device::flex() {
+            let columns = [ColumnSpec::image(PIXELS, config.image, config.image)];
+            let mut rows = Batch::zeros(&Schema::new(columns)?, self.frames);
+            (0..self.frames).for_each(|row| rows.row_mut(row).at::<u8>(0).copy_from_slice(image));
+            let scale = ActionScale::identity(ACTION_DIM);
+            let mut latents = vec![0.0; self.frames * config.latent];
+            return LewmPredictor::new(model, config, scale, self.config.data.frameskip).encode(&rows, &mut latents);
+        }
+        let latents = model.encode(pixels::patches(config, &image.repeat(self.frames), &self.device)?);
+        latents.into_data();
+        Ok(())
     }
 
     fn train(&mut self) -> Result<()> {
@@ -184,7 +226,11 @@ impl Subject for LewmSubject {
     fn run(&mut self, work: Work) -> Result<Vec<f32>> {
         match work {
             Work::Cost => return self.costs(),
-            Work::Encode => return self.cost.latent_of(self.infos.get::<u8>(PIXELS)?),
+            Work::Encode => {
+                let image = self.config.model.image.pow(2) * 3;
+                return self.cost.latent_of(&self.infos.get::<u8>(PIXELS)?[..image]);
+            }
+            Work::Frames => self.encode_frames()?,
             Work::Plan => self.plan()?,
             Work::Train => self.train()?,
         }

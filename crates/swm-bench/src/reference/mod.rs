@@ -13,6 +13,7 @@ use swm_data::ClipSpec;
 const ENVS_SCRIPT: &str = include_str!("envs.py");
 const PLAN_SCRIPT: &str = include_str!("plan.py");
 const MODEL_SCRIPT: &str = include_str!("model.py");
+const ONLINE_SCRIPT: &str = include_str!("online.py");
 const DATA_SCRIPT: &str = include_str!("data.py");
 
 /// The environment variable that names a Python interpreter with the reference implementation.
@@ -73,6 +74,14 @@ impl Reference {
     /// As [`Reference::start`].
     pub fn start_model(python: &Path, sizes: &serde_json::Value, weights: &Path) -> Result<Self> {
         Self::spawn(python, MODEL_SCRIPT, &[sizes.to_string(), weights.display().to_string()])
+    }
+
+    /// Starts a process with a family that is trained online.
+    ///
+    /// # Errors
+    /// As [`Reference::start`].
+    pub fn start_online(python: &Path, sizes: &serde_json::Value) -> Result<Self> {
+        Self::spawn(python, ONLINE_SCRIPT, &[sizes.to_string()])
     }
 
     /// Starts a process that loads and converts datasets.

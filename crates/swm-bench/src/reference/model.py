@@ -2,8 +2,8 @@
 
 Arguments: the sizes as JSON, and a file of weights and inputs. Requests, one per line: `run WORK COUNT` or `outputs WORK`.
 `WORK` is `cost` (the costs of the given candidates, with start and goal already encoded), `plan` (encoding, then CEM),
-`encode` (one frame) or `train` (one step, including the optimizer). Answers are lines that start with `SWM `; other
-output of the reference is ignored.
+`encode` (one frame), `frames` (many frames at once) or `train` (one step, including the optimizer). Answers are lines that start with `SWM `; other
+output of the reference is ignored. `torch` in the sizes says how PyTorch computes: `eager` or `compile`, then `-tf32` or `-bf16`.
 
 The encoder of the reference is from another package, so this file contains a vision transformer with fused attention, and
 the convolutional encoder of the preset `small`.
@@ -28,6 +28,10 @@ from torch import nn
 c = json.loads(sys.argv[1])  # The sizes of the model and of the benchmark.
 given = torch.load(sys.argv[2], weights_only=True)
 device = torch.device(c["device"])
+how = c["torch"].split("-")
+if "tf32" in how:
+    torch.set_float32_matmul_precision("high")
+precision = torch.autocast(device.type, torch.bfloat16, enabled="bf16" in how)
 
 
 def tree(**parts):
@@ -115,30 +119,47 @@ def lewm():
     weights = {name[2:]: value for name, value in given.items() if name.startswith("w.")}
     missing, unknown = model.load_state_dict(weights, strict=False)
     assert not unknown and all(name.endswith("num_batches_tracked") for name in missing), (missing, unknown)
+    if "compile" in how:
+        for name in ("encoder", "predictor", "action_encoder", "projector", "pred_proj"):
+            getattr(model, name).compile(dynamic=False)
     return model.to(device)
 
 
 model = lewm().eval()
 pixels, goal, candidates = (given[f"i.{name}"].to(device) for name in ("pixels", "goal", "candidates"))
 samples, horizon, actions = candidates.shape
+envs = len(pixels)
 solver = CEMSolver(
     model, batch_size=1, num_samples=samples, n_steps=c["iterations"], topk=c["elites"], device=device
 )
-space = gym.spaces.Box(-1.0, 1.0, shape=(1, actions), dtype=np.float32)
-solver.configure(action_space=space, n_envs=1, config=PlanConfig(horizon=horizon, receding_horizon=horizon))
-observation = lambda: {"pixels": pixels[None, None], "goal": goal[None, None], "action": torch.zeros(1, 1, actions)}
+space = gym.spaces.Box(-1.0, 1.0, shape=(envs, actions), dtype=np.float32)
+solver.configure(action_space=space, n_envs=envs, config=PlanConfig(horizon=horizon, receding_horizon=horizon))
+observation = lambda: {"pixels": pixels[:, None], "goal": goal[:, None], "action": torch.zeros(envs, 1, actions)}
 expand = lambda x: x.to(device)[:, None].expand(1, samples, *x.shape[1:])
-known = {name: expand(value) for name, value in observation().items()}
+known = {name: expand(value[:1]) for name, value in observation().items()}
 
 
 @torch.inference_mode()
+@precision
 def cost():
-    return model.get_cost(known, candidates[None])
+    return model.get_cost(dict(known), candidates[None])
 
 
 @torch.inference_mode()
+@precision
 def encode():
-    return model.encode({"pixels": pixels[None, None]})["emb"]
+    return model.encode({"pixels": pixels[None, :1]})["emb"]
+
+
+@torch.inference_mode()
+@precision
+def frames():
+    model.encode({"pixels": pixels[None, :1].expand(c["frames"], -1, -1, -1, -1)})
+
+
+@precision
+def plan():
+    solver.solve(observation())
 
 
 class Training:
@@ -153,9 +174,11 @@ class Training:
         self.actions = torch.randn(clips, steps, actions, device=device)
 
     def __call__(self):
-        info = self.model.encode({"pixels": self.pixels, "action": self.actions})
-        latents, conditions = info["emb"], info["act_emb"]
-        predicted = self.model.predict(latents[:, :-1], conditions[:, :-1])
+        with precision:
+            info = self.model.encode({"pixels": self.pixels, "action": self.actions})
+            latents, conditions = info["emb"], info["act_emb"]
+            predicted = self.model.predict(latents[:, :-1], conditions[:, :-1]).float()
+        latents = latents.float()
         loss = (predicted - latents[:, 1:]).square().mean() + 0.09 * self.regulariser(latents.transpose(0, 1))
         loss.backward()
         nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
@@ -164,7 +187,7 @@ class Training:
         return loss.item()
 
 
-works = {"cost": cost, "encode": encode, "plan": lambda: solver.solve(observation())}
+works = {"cost": cost, "encode": encode, "frames": frames, "plan": plan}
 
 
 def run(work, count):
@@ -182,7 +205,7 @@ def answer(*words):
     print("SWM", *words, flush=True)
 
 
-answer("ready", version("stable-worldmodel"), "torch", torch.__version__)
+answer("ready", version("stable-worldmodel"), "torch", torch.__version__, c["torch"])
 for line in sys.stdin:
     command, *arguments = line.rstrip("\n").split("\t")
     if command == "run":

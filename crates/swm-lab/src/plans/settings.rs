@@ -54,6 +54,7 @@ impl Settings {
             warm_start: self.warm,
             history: model.history,
             latency_budget: None,
+            fast: false,
         };
         config.check()?;
         let steps = self.horizon.saturating_mul(config.action_block);

@@ -4,10 +4,13 @@
 //! at the start and not in the middle of a run.
 
 mod memory;
+mod precision;
 #[cfg(feature = "vulkan")]
 mod vulkan;
 
 pub(crate) use memory::within_memory;
+pub use precision::Precision;
+pub(crate) use precision::matmul;
 
 use burn::tensor::{Device, Tensor, activation};
 use serde::Serialize;
@@ -116,7 +119,8 @@ pub fn parse(name: &str) -> Result<Device> {
 }
 
 /// Opens the device with a name: `cpu`; `vulkan` or `cuda`, the first GPU of the backend; `vulkan:1`, the GPU with that index in
-/// [`list`]; or `auto`, the first GPU that passes the test computation, else the CPU.
+/// [`list`]; or `auto`, the first GPU that passes the test computation, else the CPU. After a comma, the name of a GPU may have the
+/// precision of its matrix products: `cuda:0,bf16`.
 ///
 /// `vulkan` is a software adapter only if there is no GPU, and `auto` never is: the CPU kernels are faster.
 ///
@@ -124,6 +128,32 @@ pub fn parse(name: &str) -> Result<Device> {
 /// When the name is not that of a backend, the index is no integer, this build does not contain the backend, there is no such
 /// GPU, or its driver does not pass the test computation.
 pub fn choose(name: &str) -> Result<Choice> {
+    let Some((device, precision)) = name.split_once(',') else { return choose_device(name) };
+    let Some(precision) = Precision::parse(precision) else {
+        let hint = "write the precision after a comma, such as cuda:0,bf16";
+        return Err(Error::unknown("precision", precision, Precision::names(), hint));
+    };
+    let mut choice = choose_device(device)?;
+    if is_cpu(&choice.device) {
+        if precision == Precision::Single || device == "auto" {
+            return Ok(choice);
+        }
+        let fix = format!("pass --device {device}, or a GPU of `swm devices` such as cuda:0,{precision}");
+        return Err(Error::config("--device", format!("'{name}': the CPU computes in single precision"), fix));
+    }
+    if precision != Precision::Single {
+        if let Err(problem) = test_precision(&choice.device, precision) {
+            let fix = format!("pass --device {device}, which computes in single precision");
+            return Err(Error::config("--device", format!("{} {problem}", choice.description), fix));
+        }
+        choice.description = format!("{}, {precision}", choice.description);
+    }
+    precision.choose();
+    Ok(choice)
+}
+
+/// [`choose`] for a name without precision.
+fn choose_device(name: &str) -> Result<Choice> {
     if name == "auto" {
         return Ok(automatic());
     }
@@ -267,6 +297,22 @@ fn test(device: &Device) -> std::result::Result<(), String> {
     if equal && expected.len() == found.len() { Ok(()) } else { Err("computes wrong values".to_owned()) }
 }
 
+/// Multiplies small matrices on a device in another precision and compares the product with the CPU's.
+fn test_precision(device: &Device, precision: Precision) -> std::result::Result<(), String> {
+    let compute = |device: &Device, precision: Precision| -> Vec<f32> {
+        let row: Vec<f32> = (0..64 * 64).map(|i| (i * 37 % 101) as f32 / 101.0 - 0.5).collect();
+        let x = precision.lower(Tensor::<1>::from_floats(row.as_slice(), device).reshape([64, 64]));
+        precision.raise(x.clone().matmul(x.transpose())).into_data().iter::<f32>().collect()
+    };
+    let expected = compute(&Device::flex(), Precision::Single);
+    let found = catch_unwind(AssertUnwindSafe(|| compute(device, precision)));
+    let found =
+        found.map_err(|panic| Error::panicked(&format!("does not compute in {precision}"), &*panic).to_string())?;
+    let largest = expected.iter().fold(0.0_f32, |most, value| value.abs().max(most));
+    let close = expected.iter().zip(&found).all(|(a, b)| (a - b).abs() <= 0.02 * largest);
+    if close { Ok(()) } else { Err(format!("computes wrong products in {precision}")) }
+}
+
 /// Returns whether a device is the CPU, for which there are kernels of our own.
 pub fn is_cpu(device: &Device) -> bool {
     device.clone().inner() == Device::flex()
@@ -280,7 +326,11 @@ pub fn name(device: &Device) -> String {
     let opened = OPENED.lock().unwrap_or_else(PoisonError::into_inner);
     let device = device.clone().inner();
     let found = opened.iter().filter_map(|(_, opened)| opened.as_ref().ok()).find(|(known, _)| *known == device);
-    found.map_or_else(|| format!("{device:?}"), |(_, name)| name.clone())
+    let name = found.map_or_else(|| format!("{device:?}"), |(_, name)| name.clone());
+    match Precision::chosen() {
+        Precision::Single => name,
+        precision => format!("{name}, {precision}"),
+    }
 }
 
 /// Returns the name of a device in the manifest of what is computed from an artifact whose manifest names the device `before`:
@@ -301,6 +351,9 @@ mod tests {
         assert!(message("auto:1").contains("auto chooses one"), "{}", message("auto:1"));
         assert!(message("cpu:x").contains("not a GPU index"), "{}", message("cpu:x"));
         assert!(message("cpu:1").contains("there is one CPU"), "{}", message("cpu:1"));
+        assert!(message("cpu,bf16").contains("the CPU computes in single precision"), "{}", message("cpu,bf16"));
+        assert!(message("cpu,b16").contains("did you mean bf16"), "{}", message("cpu,b16"));
+        assert!(is_cpu(&parse("cpu,f32").expect("parsing 'cpu,f32'")));
         if !cfg!(feature = "cuda") {
             assert!(message("cuda:0").contains("without cuda"), "{}", message("cuda:0"));
         }

@@ -3,18 +3,19 @@
 //!
 //! Every call evaluates candidates of one environment on one thread of the current rayon pool, and the shape of a call
 //! does not depend on the other environments. So the bytes of an environment's plan depend neither on the other
-//! environments nor on the number of threads.
+//! environments nor on the number of threads. On a GPU, [`LewmCost::plan_together`] gives this up for speed.
 
 use super::config::LewmConfig;
+use super::device_rollout::DeviceRollout;
 use super::host_encoder::HostEncoder;
 use super::model::Lewm;
 use super::pixels;
 use super::rollout::Rollout;
 use crate::checkpoint::Checkpoint;
 use crate::checks;
-use crate::device::within_memory;
+use crate::device::{Precision, within_memory};
 use crate::nn::parameters::IntoF32;
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::Device;
 use rayon::prelude::*;
 use swm_core::columns::{GOAL, PIXELS};
 use swm_core::{Batch, Candidates, CostModel, DifferentiableCost, LatentDynamics, Result};
@@ -23,12 +24,16 @@ use swm_core::{Batch, Candidates, CostModel, DifferentiableCost, LatentDynamics,
 pub struct LewmCost {
     pub(super) model: Lewm,
     host: Option<Host>,
+    /// The weights laid out for rollouts on another device.
+    device: Option<DeviceRollout>,
+    /// Whether a call to the device computes the candidates of all environments.
+    together: bool,
     pub(super) config: LewmConfig,
     pub(super) action_dim: usize,
     pub(super) contexts: Vec<PlanContext>,
 }
 
-/// The weights laid out for the CPU kernels. On other devices, the cost uses the tensors of the model.
+/// The weights laid out for the CPU kernels.
 struct Host {
     rollout: Rollout,
     encoder: Option<HostEncoder>,
@@ -55,7 +60,16 @@ impl LewmCost {
     pub fn of(model: &Lewm, config: &LewmConfig, action_dim: usize) -> Self {
         let on_host = model.device() == Device::flex();
         let host = on_host.then(|| Host { rollout: Rollout::new(model), encoder: HostEncoder::new(model, config) });
-        Self { model: model.clone(), host, config: config.clone(), action_dim, contexts: vec![] }
+        let device = (!on_host).then(|| DeviceRollout::new(model, Precision::chosen()));
+        Self {
+            model: model.clone(),
+            host,
+            device,
+            together: false,
+            config: config.clone(),
+            action_dim,
+            contexts: vec![],
+        }
     }
 
     /// Checks that the lengths of candidates and costs fit the observed environments.
@@ -78,79 +92,117 @@ impl LewmCost {
         })
     }
 
-    /// Encodes the current frame, the recorded history and the goal of one environment.
-    fn context(&self, infos: &Batch, env: usize) -> Result<PlanContext> {
+    /// Returns the frames of one environment, from the oldest recorded one to the current one and the goal, and the actions taken between
+    /// the recorded frames.
+    fn frames<'a>(&self, infos: &'a Batch, env: usize) -> Result<(Vec<&'a [u8]>, Vec<f32>)> {
         let row = infos.row(env);
-        // One image per call: a latent must not depend on the number of images in a call.
-        let mut start = vec![self.latent_of(row.get::<u8>(PIXELS)?)?];
-        let mut past = vec![];
+        let (mut frames, mut past) = (vec![], vec![]);
         if infos.schema().find("history.length").is_some() {
             let length = usize::try_from(row.get::<i32>("history.length")?[0]).unwrap_or(0);
             let length =
                 length.min(self.config.predictor.history - 1).min(infos.schema().column("history.action")?.shape[0]);
             let bytes = self.config.image * self.config.image * 3;
-            let frames = row.get::<u8>("history.pixels")?;
+            let recorded = row.get::<u8>("history.pixels")?;
             let actions = row.get::<f32>("history.action")?;
-            for frame in frames[frames.len() - length * bytes..].rchunks_exact(bytes) {
-                start.insert(0, self.latent_of(frame)?);
-            }
+            frames.extend(recorded[recorded.len() - length * bytes..].chunks_exact(bytes));
             past = actions[actions.len() - length * self.action_dim..].to_vec();
         }
-        Ok(PlanContext { start: start.concat(), past, goal: self.latent_of(row.get::<u8>(GOAL)?)? })
+        frames.extend([row.get::<u8>(PIXELS)?, row.get::<u8>(GOAL)?]);
+        Ok((frames, past))
+    }
+
+    /// Encodes the frames of one environment. One image per call: a latent must not depend on the number of images in a call.
+    fn context(&self, infos: &Batch, env: usize) -> Result<PlanContext> {
+        let (frames, past) = self.frames(infos, env)?;
+        let latents: Result<Vec<Vec<f32>>> = frames.into_iter().map(|frame| self.latent_of(frame)).collect();
+        Ok(PlanContext::new(latents?.concat(), past, self.config.latent))
+    }
+
+    /// Encodes the frames of all environments, [`DEVICE_FRAMES`] at once.
+    fn contexts_together(&self, infos: &Batch, envs: &[usize]) -> Result<Vec<PlanContext>> {
+        let parts: Result<Vec<_>> = envs.iter().map(|&env| self.frames(infos, env)).collect();
+        let parts = parts?;
+        let frames: Vec<&[u8]> = parts.iter().flat_map(|(frames, _)| frames.iter().copied()).collect();
+        let mut latents = vec![];
+        for frames in frames.chunks(DEVICE_FRAMES) {
+            let patches = pixels::patches(&self.config, &frames.concat(), &self.model.device())?;
+            latents.extend(self.model.encode(patches).into_data().into_f32_vec());
+        }
+        let mut rest = &latents[..];
+        let context = |(frames, past): (Vec<&[u8]>, Vec<f32>)| {
+            let (own, later) = rest.split_at(frames.len() * self.config.latent);
+            rest = later;
+            PlanContext::new(own.to_vec(), past, self.config.latent)
+        };
+        Ok(parts.into_iter().map(context).collect())
     }
 }
 
 impl PlanContext {
+    /// Creates a context from the latents of the frames, of which the last is the goal.
+    fn new(mut latents: Vec<f32>, past: Vec<f32>, latent: usize) -> Self {
+        let goal = latents.split_off(latents.len() - latent);
+        Self { start: latents, past, goal }
+    }
+
     /// Writes the costs of candidates.
     ///
     /// # Shapes
     /// `candidates` is `[samples, horizon, action_dim]`, `costs` is `[samples]`.
-    fn cost(&self, predictor: &RolloutModel<'_>, candidates: &[f32], horizon: usize, costs: &mut [f32]) {
+    fn cost(&self, rollout: &Rollout, candidates: &[f32], horizon: usize, costs: &mut [f32]) {
         let (samples, latent) = (costs.len(), self.goal.len());
         let steps = self.start.len() / latent - 1 + horizon;
         let mut actions = Vec::with_capacity(samples * self.past.len() + candidates.len());
-        for candidate in candidates.chunks_exact(candidates.len() / samples) {
-            actions.extend_from_slice(&self.past);
-            actions.extend_from_slice(candidate);
-        }
-        let last = predictor.last(&self.start, actions, samples, steps);
+        self.extend(&mut actions, candidates, samples);
+        let last = rollout.run(&self.start, &actions, samples, steps).pop().unwrap_or_default();
         for (cost, end) in costs.iter_mut().zip(last.chunks_exact(latent)) {
             *cost = end.iter().zip(&self.goal).map(|(a, b)| (a - b).powi(2)).sum();
         }
     }
-}
 
-/// The implementation of rollouts: the CPU kernels, or the tensors of the model.
-enum RolloutModel<'a> {
-    Host(&'a Rollout),
-    Device(&'a Lewm),
-}
-
-impl RolloutModel<'_> {
-    /// Returns the last latents of a rollout.
-    ///
-    /// # Shapes
-    /// `start` is `[frames, latent]`, `actions` is `[samples, steps, action_dim]`; returns `[samples, latent]`.
-    fn last(&self, start: &[f32], actions: Vec<f32>, samples: usize, steps: usize) -> Vec<f32> {
-        match self {
-            Self::Host(rollout) => rollout.run(start, &actions, samples, steps).pop().unwrap_or_default(),
-            Self::Device(model) => {
-                let device = model.device();
-                let latent = model.latent();
-                let (frames, width) = (start.len() / latent, actions.len() / (samples * steps));
-                let start = Tensor::<3>::from_data(TensorData::new(start.to_vec(), [1, frames, latent]), &device);
-                let actions = Tensor::from_data(TensorData::new(actions, [samples, steps, width]), &device);
-                let all = model.rollout(start.expand([samples, frames, latent]), actions);
-                all.slice([0..samples, steps..steps + 1, 0..latent]).into_data().into_f32_vec()
-            }
+    /// Appends the past actions and the actions of each candidate.
+    fn extend(&self, actions: &mut Vec<f32>, candidates: &[f32], samples: usize) {
+        for candidate in candidates.chunks_exact(candidates.len() / samples) {
+            actions.extend_from_slice(&self.past);
+            actions.extend_from_slice(candidate);
         }
     }
+}
 
-    /// Returns the number of candidates that are rolled out in one call, given `samples` candidates.
-    fn chunk_size(&self, samples: usize) -> usize {
-        match self {
-            Self::Host(_) => Rollout::chunk_size(samples),
-            Self::Device(_) => samples,
+/// The most frames that a device encodes at once.
+const DEVICE_FRAMES: usize = 256;
+/// The most rollouts of one call to a device: activations of a published model then take about 3 GB.
+const DEVICE_ROWS: usize = 20_000;
+
+impl LewmCost {
+    /// Writes the costs of candidates, computed on a device. All calls are queued before the first result is read.
+    fn device_costs(&self, rollout: &DeviceRollout, candidates: &Candidates<'_>, costs: &mut [f32]) {
+        let Candidates { actions, samples, horizon, dim, .. } = *candidates;
+        let size = samples * horizon * dim;
+        let most = if self.together { (DEVICE_ROWS / samples).max(1) } else { 1 };
+        let mut queued = vec![];
+        let mut done = 0;
+        // Environments of one call have equally many past frames.
+        for alike in self.contexts.chunk_by(|a, b| a.start.len() == b.start.len()) {
+            for group in alike.chunks(most) {
+                let (mut starts, mut goals) = (vec![], vec![]);
+                let mut sequences = Vec::with_capacity(group.len() * (samples * group[0].past.len() + size));
+                for (context, actions) in group.iter().zip(actions[done * size..].chunks_exact(size)) {
+                    starts.extend_from_slice(&context.start);
+                    goals.extend_from_slice(&context.goal);
+                    context.extend(&mut sequences, actions, samples);
+                }
+                let steps = group[0].start.len() / group[0].goal.len() - 1 + horizon;
+                queued.push(rollout.costs(starts, goals, sequences, samples, steps));
+                done += group.len();
+            }
+        }
+        let mut costs = costs;
+        for part in queued {
+            let values = part.into_data().into_f32_vec();
+            let (now, later) = costs.split_at_mut(values.len());
+            now.copy_from_slice(&values);
+            costs = later;
         }
     }
 }
@@ -158,7 +210,12 @@ impl RolloutModel<'_> {
 impl CostModel for LewmCost {
     fn observe(&mut self, infos: &Batch, envs: &[usize]) -> Result<()> {
         checks::planning_images(infos.schema(), self.config.image, self.action_dim)?;
-        let contexts: Result<Vec<PlanContext>> = envs.par_iter().map(|&env| self.context(infos, env)).collect();
+        let contexts: Result<Vec<PlanContext>> = match &self.device {
+            Some(_) if self.together => self.contexts_together(infos, envs),
+            // Calls from several threads would wait for each other.
+            Some(_) => envs.iter().map(|&env| self.context(infos, env)).collect(),
+            None => envs.par_iter().map(|&env| self.context(infos, env)).collect(),
+        };
         self.contexts = contexts?;
         Ok(())
     }
@@ -166,22 +223,31 @@ impl CostModel for LewmCost {
     fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
         self.check_sizes(&candidates, costs)?;
         let Candidates { actions, samples, horizon, dim, .. } = candidates;
-        let predictor = match &self.host {
-            Some(host) => RolloutModel::Host(&host.rollout),
-            None => RolloutModel::Device(&self.model),
-        };
-        // The candidates of each environment are split separately, so that no chunk spans two environments.
-        let (contexts, chunk_size) = (&self.contexts, predictor.chunk_size(samples));
         let compute = || {
-            costs.par_chunks_mut(samples).zip(actions.par_chunks(samples * horizon * dim)).zip(contexts).for_each(
-                |((costs, actions), context)| {
+            let Some(host) = &self.host else {
+                if let Some(rollout) = &self.device {
+                    self.device_costs(rollout, &candidates, costs);
+                }
+                return Ok(());
+            };
+            // The candidates of each environment are split separately, so that no chunk spans two environments.
+            let chunk_size = Rollout::chunk_size(samples);
+            costs
+                .par_chunks_mut(samples)
+                .zip(actions.par_chunks(samples * horizon * dim))
+                .zip(&self.contexts)
+                .for_each(|((costs, actions), context)| {
                     let chunks = costs.par_chunks_mut(chunk_size).zip(actions.par_chunks(chunk_size * horizon * dim));
-                    chunks.for_each(|(costs, actions)| context.cost(&predictor, actions, horizon, costs));
-                },
-            );
+                    chunks.for_each(|(costs, actions)| context.cost(&host.rollout, actions, horizon, costs));
+                });
             Ok(())
         };
         within_memory(&self.model.device(), "the solver's samples (--solver cem,samples=…)", compute)
+    }
+
+    /// On a GPU, a call computes the candidates of all environments. On the CPU, this has no effect.
+    fn plan_together(&mut self) {
+        self.together = true;
     }
 
     fn differentiable(&mut self) -> Option<&mut dyn DifferentiableCost> {
@@ -225,16 +291,35 @@ mod tests {
         let mut infos = Batch::zeros(&Schema::new(columns).expect("creating the schema"), 1);
         infos.row_mut(0).at::<u8>(1).fill(200);
         let actions: Vec<f32> = (0..samples * horizon * dim).map(|i| (i * 29 % 97) as f32 / 50.0 - 1.0).collect();
-        let costs = |on_host: bool| {
+        // Environments with one frame and with two, so that a call for several environments is divided.
+        let actions = actions.repeat(4);
+        let costs = |on_host: bool, together: bool| {
             let mut cost = LewmCost::of(&model, &config.model, dim);
-            cost.host = cost.host.filter(|_| on_host);
-            cost.observe(&infos, &[0]).expect("observing the environment");
-            let mut costs = vec![0.0; samples];
-            let candidates = Candidates { actions: &actions, envs: 1, samples, horizon, dim };
+            if !on_host {
+                cost.host = None;
+                cost.device = Some(DeviceRollout::new(&model, Precision::Single));
+            }
+            if together {
+                cost.plan_together();
+            }
+            cost.observe(&infos, &[0, 0, 0, 0]).expect("observing the environments");
+            for (index, context) in cost.contexts.iter_mut().enumerate() {
+                context.goal.iter_mut().for_each(|value| *value += index as f32);
+                if index < 2 {
+                    context.start.extend_from_within(..);
+                    context.past = (0..dim).map(|i| i as f32 / 4.0 - 0.5).collect();
+                }
+            }
+            let mut costs = vec![0.0; 4 * samples];
+            let candidates = Candidates { actions: &actions, envs: 4, samples, horizon, dim };
             cost.cost(candidates, &mut costs).expect("computing the costs");
             costs
         };
-        let (host, device) = (costs(true), costs(false));
+        let (host, device) = (costs(true, false), costs(false, false));
+        assert_eq!(costs(false, true).len(), device.len());
+        for (alone, together) in device.iter().zip(costs(false, true)) {
+            assert!((alone - together).abs() < 1e-5 * alone.abs(), "alone {alone}, together {together}");
+        }
         assert!(host.windows(2).all(|pair| pair[0] != pair[1]), "actions have no effect: {host:?}");
         for (host, device) in host.iter().zip(&device) {
             assert!((host - device).abs() < 1e-4 * device.abs(), "the CPU cost is {host}, the device cost is {device}");

@@ -3,6 +3,7 @@
 
 pub mod config;
 pub mod cost;
+mod device_rollout;
 mod family;
 mod gradient;
 pub mod host_encoder;

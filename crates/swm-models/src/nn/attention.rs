@@ -2,6 +2,7 @@
 //! predictors.
 
 use super::{Activation, DropoutRng, Init, LayerNorm, Linear};
+use crate::device::matmul;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
@@ -24,12 +25,12 @@ pub fn attend(
     let ([rows, queries, inner], [_, keys, _]) = (query.dims(), key.dims());
     let width = inner / heads;
     let split = |x: Tensor<3>, tokens| x.reshape([rows, tokens, heads, width]).swap_dims(1, 2);
-    let mut scores = split(query, queries).matmul(split(key, keys).transpose()) / (width as f64).sqrt();
+    let mut scores = matmul(split(query, queries), split(key, keys).transpose()) / (width as f64).sqrt();
     if let Some(mask) = mask {
         scores = scores + mask;
     }
     let weights = rng.dropout(activation::softmax(scores, 3), dropout);
-    weights.matmul(split(value, keys)).swap_dims(1, 2).reshape([rows, queries, inner])
+    matmul(weights, split(value, keys)).swap_dims(1, 2).reshape([rows, queries, inner])
 }
 
 /// Returns the additive mask of causal attention over `frames` frames: minus infinity if the key belongs to a later

@@ -1,6 +1,7 @@
 //! A linear layer in PyTorch's layout.
 
 use super::Init;
+use crate::device::matmul;
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
 
@@ -47,7 +48,7 @@ impl Linear {
         let mut shape = x.dims();
         let rows = shape[..D - 1].iter().product::<usize>();
         shape[D - 1] = outputs;
-        let mut y = x.reshape([rows, inputs]).matmul(self.weight.val().transpose());
+        let mut y = matmul(x.reshape([rows, inputs]), self.weight.val().transpose());
         if let Some(bias) = &self.bias {
             y = y + bias.val().unsqueeze();
         }

@@ -119,7 +119,8 @@ fn compare<M: Trainable>(config: &TrainConfig<M>, inputs: &(DatasetInfo, Batch))
         check(&format!("{family}: {name}"), &[*found as f32], &[*expected as f32], 1e-3);
     }
     assert_eq!(found.gradients.keys().collect::<Vec<_>>(), expected.gradients.keys().collect::<Vec<_>>(), "{family}");
-    // The gradients of parameters without effect, such as the bias of keys, are zero up to rounding.
+    // The gradients of parameters without effect, such as the bias of keys or one before a batch normalisation, are zero up to the
+    // rounding of sums that cancel.
     let largest = expected.gradients.values().flat_map(|g| &g.values).fold(0.0f32, |most, v| most.max(v.abs()));
     let compare = |what: &str, found: &Named<HostTensor>, expected: &Named<HostTensor>, floor: f32| {
         let errors = expected.iter().map(|(name, expected)| {
@@ -128,7 +129,7 @@ fn compare<M: Trainable>(config: &TrainConfig<M>, inputs: &(DatasetInfo, Batch))
         let worst = errors.max_by(|a, b| a.0.total_cmp(&b.0)).expect("a tensor");
         println!("{family}: worst {what}: {:.1e} ({})", worst.0, worst.1);
     };
-    compare("gradient", &found.gradients, &expected.gradients, 1e-3 * largest);
+    compare("gradient", &found.gradients, &expected.gradients, 1e-2 * largest);
     compare("weight", &found.weights, &expected.weights, 0.0);
 }
 

@@ -25,12 +25,24 @@ pub struct MpcConfig {
     /// the present observation and the search for all environments that are planned together. The first iteration is
     /// always finished. With a budget, results depend on the machine's speed and load.
     pub latency_budget: Option<f64>,
+    /// Plans for environments together where the model is faster so: on GPUs. The last bits of a plan may then depend on the other
+    /// environments.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub fast: bool,
 }
 
 impl Default for MpcConfig {
     /// The setting of the paper's planning experiments: 5 model steps of 5 environment steps, open loop.
     fn default() -> Self {
-        Self { horizon: 5, receding_horizon: 5, action_block: 5, warm_start: true, history: 1, latency_budget: None }
+        Self {
+            horizon: 5,
+            receding_horizon: 5,
+            action_block: 5,
+            warm_start: true,
+            history: 1,
+            latency_budget: None,
+            fast: false,
+        }
     }
 }
 

@@ -3,17 +3,20 @@
 use super::config::{count, seconds};
 use super::{Context, devices, emit, emit_json, eprint, table};
 use crate::ENVS;
-use crate::subject::LewmSubject;
+use crate::step_subject::StepSubject;
+use crate::subject::{LewmSubject, LewmWork};
 use clap::{Args, Subcommand};
 use std::sync::Arc;
 use swm_bench::{
     BenchConfig, DataBenchConfig, Drawing, ModelBenchConfig, ModelBenchReport, PlanBenchConfig, RenderBenchConfig,
-    Work, bench_data, bench_envs, bench_model, bench_plan, bench_render,
+    Subject, Work, bench_data, bench_envs, bench_model, bench_plan, bench_render,
 };
 use swm_core::limits::{ENVS as PARALLEL, IMAGE_SIDE};
 use swm_core::run::Control;
 use swm_core::{EnvChoice, Origin};
 use swm_data::Location;
+use swm_models::sac::Sac;
+use swm_models::tdmpc2::Tdmpc2;
 use swm_mujoco::render::{Choice as Renderer, name, with};
 
 /// Arguments of `swm bench`.
@@ -39,6 +42,14 @@ enum BenchCommand {
     /// Measure a training step of a LeWM of the published size
     #[command(after_help = "Example: swm bench train --device cpu")]
     Train(TrainArgs),
+    /// Measure the encoding of images by a LeWM of the published size
+    #[command(after_help = "Example: swm bench encode --frames 256")]
+    Encode(EncodeArgs),
+    /// Measure training steps of SAC and TD-MPC2 at the published sizes
+    ///
+    /// SAC is compared with Stable-Baselines3, TD-MPC2 with the reference implementation.
+    #[command(after_help = "Example: swm bench online sac")]
+    Online(OnlineArgs),
     /// Measure loading from every format, conversions, and memory over epochs
     #[command(after_help = "Example: swm bench data --formats lance,hdf5")]
     Data(DataArgs),
@@ -174,9 +185,28 @@ struct PlanArgs {
     /// Iterations per plan with a LeWM; 0 skips the LeWM
     #[arg(long, default_value_t = 30, value_parser = count::<0, 1_000_000>)]
     iterations: usize,
+    /// Environments of a plan with the LeWM
+    #[arg(long, default_value_t = 1, value_parser = count::<1, { PARALLEL.max }>)]
+    model_envs: usize,
+    /// Compute the candidates of all environments in one call to a GPU
+    #[arg(long)]
+    fast: bool,
+    #[command(flatten)]
+    on: OnArgs,
+}
+
+/// What computes a LeWM, here and in PyTorch.
+#[derive(Args)]
+struct OnArgs {
     /// Device of the LeWM: cpu, vulkan[:I], cuda[:I] or auto
+    ///
+    /// A GPU's matrix products have the precision after a comma: cuda:0,bf16.
     #[arg(long, default_value = "cpu")]
     device: String,
+    /// How PyTorch computes: eager or compile, then -tf32 or -bf16
+    #[arg(long, value_delimiter = ',', default_value = "eager",
+          value_parser = ["eager", "eager-tf32", "eager-bf16", "compile", "compile-tf32", "compile-bf16"])]
+    torch: Vec<String>,
 }
 
 /// Measures the solver alone, then planning with a LeWM.
@@ -191,11 +221,13 @@ fn plan(args: &PlanArgs, context: &Context) -> anyhow::Result<()> {
     let planner = bench_plan(&config, &mut control(context))?;
     if args.iterations > 0 {
         let works = vec![(Work::Plan, 1), (Work::Cost, 2), (Work::Encode, 10)];
-        let model = lewm("paper", works, args.iterations, 2, args.pairs, &args.device, context)?;
+        let (iterations, envs, together) = (args.iterations, args.model_envs, args.fast);
+        let work = LewmWork { preset: "paper", iterations, envs, together, frames: 1, clips: 2 };
+        let models = lewm(&work, &works, args.pairs, &args.on, context)?;
         if context.json {
-            return emit_json(&serde_json::json!({ "planner": planner, "model": model }));
+            return emit_json(&serde_json::json!({ "planner": planner, "models": models }));
         }
-        emit(&format!("{planner}{model}"));
+        emit(&format!("{planner}{envs} environments per plan with a LeWM\n{}", lines(&models)));
     } else if context.json {
         return emit_json(&serde_json::json!({ "planner": planner }));
     } else {
@@ -215,41 +247,149 @@ struct TrainArgs {
     /// Pairs of measurements: this engine and the reference implementation
     #[arg(long, default_value_t = 5, value_parser = count::<0, 1000>)]
     pairs: usize,
-    /// Device: cpu, vulkan[:I], cuda[:I] or auto
-    #[arg(long, default_value = "cpu")]
-    device: String,
+    #[command(flatten)]
+    on: OnArgs,
 }
 
 /// Measures training.
 fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
-    let report = lewm(&args.preset, vec![(Work::Train, 1)], 1, args.clips, args.pairs, &args.device, context)?;
+    let clips = args.clips;
+    let work = LewmWork { preset: &args.preset, iterations: 1, envs: 1, together: false, frames: 1, clips };
+    let reports = lewm(&work, &[(Work::Train, 1)], args.pairs, &args.on, context)?;
     if context.json {
-        return emit_json(&report);
+        return emit_json(&reports);
     }
-    let clips_per_second = report.rows.first().map_or(0.0, |row| args.clips as f64 / row.seconds);
-    emit(&format!("{report}{} clips per step: {clips_per_second:.1} clips/s\n", args.clips));
+    let seconds = reports.first().and_then(|report| report.rows.first()).map_or(f64::INFINITY, |row| row.seconds);
+    emit(&format!("{}{clips} clips per step: {:.1} clips/s\n", lines(&reports), clips as f64 / seconds));
     Ok(())
 }
 
-/// Measures a LeWM with the sizes of a preset.
-fn lewm(
-    preset: &str,
-    works: Vec<(Work, usize)>,
-    iterations: usize,
-    clips: usize,
+#[derive(Args)]
+struct EncodeArgs {
+    /// Preset of LeWM: paper or small
+    #[arg(long, default_value = "paper")]
+    preset: String,
+    /// Images encoded at once
+    #[arg(long, default_value_t = 64, value_parser = count::<1, 4096>)]
+    frames: usize,
+    /// Pairs of measurements: this engine and the reference implementation
+    #[arg(long, default_value_t = 5, value_parser = count::<0, 1000>)]
     pairs: usize,
-    name: &str,
-    context: &Context,
-) -> anyhow::Result<ModelBenchReport> {
-    let device = devices::open(name)?;
-    let weights = tempfile::NamedTempFile::new()?;
-    Ok(swm_core::pool::threads(context.threads)?.install(|| {
-        let mut subject = LewmSubject::new(preset, iterations, clips, &device)?;
-        subject.write(weights.path())?;
+    #[command(flatten)]
+    on: OnArgs,
+}
+
+/// Measures the encoding of images.
+fn encode(args: &EncodeArgs, context: &Context) -> anyhow::Result<()> {
+    let frames = args.frames;
+    let work = LewmWork { preset: &args.preset, iterations: 1, envs: 1, together: false, frames, clips: 2 };
+    let reports = lewm(&work, &[(Work::Frames, 2), (Work::Encode, 10)], args.pairs, &args.on, context)?;
+    if context.json {
+        return emit_json(&reports);
+    }
+    let seconds = reports.first().and_then(|report| report.rows.first()).map_or(f64::INFINITY, |row| row.seconds);
+    emit(&format!("{}{frames} images at once: {:.0} images/s\n", lines(&reports), frames as f64 / seconds));
+    Ok(())
+}
+
+#[derive(Args)]
+struct OnlineArgs {
+    /// The family
+    #[arg(value_parser = ["sac", "tdmpc2"])]
+    family: String,
+    /// Elements of an observation
+    #[arg(long, default_value_t = 24, value_parser = count::<1, 10_000>)]
+    observation: usize,
+    /// Elements of an action
+    #[arg(long, default_value_t = 6, value_parser = count::<1, 1000>)]
+    action: usize,
+    /// Training steps per measurement
+    #[arg(long, default_value_t = 50, value_parser = count::<1, 1_000_000>)]
+    steps: usize,
+    /// Pairs of measurements: this engine and the reference implementation
+    #[arg(long, default_value_t = 5, value_parser = count::<0, 1000>)]
+    pairs: usize,
+    /// Other settings than the preset's, such as model.hidden=128
+    #[arg(value_name = "KEY=VALUE")]
+    settings: Vec<String>,
+}
+
+/// Measures training steps of a family that is trained online.
+fn online(args: &OnlineArgs, context: &Context) -> anyhow::Result<()> {
+    let OnlineArgs { family, observation, action, steps, pairs, settings } = args;
+    let mut sizes = serde_json::json!({ "family": family, "observation": observation, "action": action });
+    let mut add = |more: serde_json::Value| {
+        if let (Some(sizes), serde_json::Value::Object(more)) = (sizes.as_object_mut(), more) {
+            sizes.extend(more);
+        }
+    };
+    let mut subject: Box<dyn Subject + Send> = if family == "sac" {
+        let subject = StepSubject::<Sac>::new(settings, *observation, *action)?;
+        let config = &subject.config;
+        add(serde_json::json!({ "hidden": config.model.hidden }));
+        add(serde_json::json!({ "batch": config.data.batch_size, "lr": config.optim.lr, "tau": config.loss.tau,
+            "discount": config.loss.discount }));
+        Box::new(subject)
+    } else {
+        let subject = StepSubject::<Tdmpc2>::new(settings, *observation, *action)?;
+        let config = &subject.config;
+        let model = &config.model;
+        add(
+            serde_json::json!({ "hidden": model.hidden, "encoder": model.encoder, "simplex": model.simplex, "critics": model.critics,
+            "bins": model.bins.count, "latent": model.encoding.iter().map(|encoding| encoding.latent).sum::<usize>(),
+            "horizon": config.data.num_steps - 1 }),
+        );
+        add(serde_json::json!({ "batch": config.data.batch_size, "lr": config.optim.lr, "tau": config.loss.tau,
+            "discount": config.loss.discount }));
+        Box::new(subject)
+    };
+    let report = swm_core::pool::threads(context.threads)?.install(|| {
         let python = PlanBenchConfig::default().python;
-        let config = ModelBenchConfig { works, pairs, sizes: subject.sizes()?, python };
-        bench_model(&config, weights.path(), &mut subject, &mut control(context))
-    })?)
+        let config = ModelBenchConfig {
+            model: family.clone(),
+            works: vec![(Work::Train, *steps)],
+            pairs: *pairs,
+            sizes,
+            python,
+        };
+        bench_model(&config, None, &mut *subject, &mut control(context))
+    })?;
+    if context.json {
+        return emit_json(&report);
+    }
+    let rate = report.rows.first().map_or(0.0, |row| 1.0 / row.seconds);
+    emit(&format!("{report}{rate:.0} training steps/s\n"));
+    Ok(())
+}
+
+/// The reports one below the other.
+fn lines(reports: &[ModelBenchReport]) -> String {
+    reports.iter().map(ToString::to_string).collect()
+}
+
+/// Measures a LeWM with the sizes of a preset; returns a report for each way in which PyTorch computes.
+fn lewm(
+    work: &LewmWork<'_>,
+    works: &[(Work, usize)],
+    pairs: usize,
+    on: &OnArgs,
+    context: &Context,
+) -> anyhow::Result<Vec<ModelBenchReport>> {
+    let device = devices::open(&on.device)?;
+    let weights = tempfile::NamedTempFile::new()?;
+    let reports = swm_core::pool::threads(context.threads)?.install(|| {
+        let mut subject = LewmSubject::new(work, &device)?;
+        subject.write(weights.path())?;
+        let mut measure = |torch: &String| {
+            let mut sizes = subject.sizes()?;
+            sizes["torch"] = serde_json::json!(torch);
+            let python = PlanBenchConfig::default().python;
+            let config = ModelBenchConfig { model: "LeWM".to_owned(), works: works.to_vec(), pairs, sizes, python };
+            bench_model(&config, Some(weights.path()), &mut subject, &mut control(context))
+        };
+        on.torch.iter().map(&mut measure).collect::<swm_core::Result<_>>()
+    })?;
+    Ok(reports)
 }
 
 #[derive(Args)]
@@ -290,6 +430,8 @@ pub fn bench(args: &BenchArgs, context: &Context) -> anyhow::Result<()> {
         BenchCommand::Envs(args) => envs(args, context),
         BenchCommand::Plan(args) => plan(args, context),
         BenchCommand::Train(args) => train(args, context),
+        BenchCommand::Encode(args) => encode(args, context),
+        BenchCommand::Online(args) => online(args, context),
         BenchCommand::Data(args) => data(args, context),
         BenchCommand::Render(args) => render(args, context),
         BenchCommand::Lab(args) => super::lab::bench(args, context),

@@ -35,6 +35,11 @@ pub struct PlannerArgs {
     /// Time limit of a plan; results then depend on the machine
     #[arg(long, value_name = "SECONDS")]
     pub latency_budget: Option<f64>,
+    /// Plan for environments together on a GPU
+    ///
+    /// It is faster, and the last bits of a plan may then depend on the other environments.
+    #[arg(long)]
+    pub fast: bool,
     /// Term of the objective: goal, control or change; may be repeated
     ///
     /// With settings, such as control,weight=0.01. Without a goal term, the model's own cost is kept and terms are
@@ -61,6 +66,7 @@ impl PlannerArgs {
             || horizons.iter().any(Option::is_some)
             || self.cold_start
             || self.latency_budget.is_some()
+            || self.fast
     }
 
     /// Returns the solvers with complete settings. Without --solver, this is the first solver for the environment's
@@ -120,6 +126,7 @@ impl PlannerArgs {
             warm_start: !self.cold_start,
             history,
             latency_budget: self.latency_budget,
+            fast: self.fast,
         };
         mpc.check()?;
         let objective = self.objective()?;

@@ -26,8 +26,8 @@ struct Unknown {
     open: VecDeque<(u64, oneshot::Sender<()>)>,
 }
 
-/// A connection's place among all; it is free when this value is dropped.
-pub struct Place {
+/// One of them, until this value is dropped.
+pub struct Connection {
     id: u64,
     all: Connections,
     permit: OnceCell<Option<OwnedSemaphorePermit>>,
@@ -40,7 +40,7 @@ impl Connections {
     }
 
     /// Adds an unknown connection. The receiver has a value once the connection is known, and an error when it is to be closed.
-    pub fn add(&self) -> (Place, oneshot::Receiver<()>) {
+    pub fn add(&self) -> (Connection, oneshot::Receiver<()>) {
         let (sender, receiver) = oneshot::channel();
         let mut unknown = self.unknown.lock().unwrap_or_else(PoisonError::into_inner);
         let id = unknown.next;
@@ -49,7 +49,7 @@ impl Connections {
             unknown.open.pop_front();
         }
         unknown.open.push_back((id, sender));
-        (Place { id, all: self.clone(), permit: OnceCell::new() }, receiver)
+        (Connection { id, all: self.clone(), permit: OnceCell::new() }, receiver)
     }
 
     /// Takes a connection out of the unknown ones; `None` if it is known or to be closed.
@@ -60,7 +60,7 @@ impl Connections {
     }
 }
 
-impl Place {
+impl Connection {
     /// Makes the connection a known one, because a request had the token. Waits while there are too many.
     pub async fn admit(&self) {
         let admitted = self.permit.get_or_init(|| async {
@@ -74,7 +74,7 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for Connection {
     fn drop(&mut self) {
         self.all.take(self.id);
     }
@@ -91,7 +91,7 @@ mod tests {
         let mut open: Vec<_> = (0..UNKNOWN).map(|_| all.add()).collect();
         open[0].0.admit().await;
         assert_eq!(open[0].1.try_recv(), Ok(()), "it is known");
-        // One place is free, so the second of these closes a connection.
+        // There is room for one more, so the second of these closes a connection.
         let mut added = [all.add(), all.add()];
         assert_eq!(open[1].1.try_recv(), Err(TryRecvError::Closed));
         for (_, receiver) in open[2..].iter_mut().chain(&mut added) {

@@ -2,7 +2,7 @@
 
 use crate::access::{self, Access, Refusal, Token};
 use crate::api::{self, Shared};
-use crate::connections::{Connections, Place};
+use crate::connections::{Connection, Connections};
 use crate::{Lab, assets};
 use axum::Router;
 use axum::body::Body;
@@ -141,15 +141,15 @@ async fn connection(
     stream: TcpStream,
     access: Access,
     router: Router,
-    (place, admitted): (Place, oneshot::Receiver<()>),
+    (client, admitted): (Connection, oneshot::Receiver<()>),
 ) {
-    let place = Arc::new(place);
+    let client = Arc::new(client);
     let service = service_fn(move |request: Request<Incoming>| {
-        let (access, mut router, place) = (access.clone(), router.clone(), Arc::clone(&place));
+        let (access, mut router, client) = (access.clone(), router.clone(), Arc::clone(&client));
         async move {
             let mut response = match check(&access, request) {
                 Ok(request) => {
-                    place.admit().await;
+                    client.admit().await;
                     router.call(request).await.unwrap_or_else(|never| match never {})
                 }
                 Err(refusal) => refused(refusal),

@@ -60,6 +60,9 @@ def test_an_evaluation_has_the_results_and_videos_of_one_process(cluster, s3, tm
     names = {name for run in one["runs"] for name in run["videos"]}
     assert names and {f"videos/{name}" for name in expected} == names | {name.replace(".mp4", ".png") for name in names}
     assert videos_of(output) == expected
+    # The record has the command of the user, not that of the last cell.
+    command = output.read_json("run.json")["commands"][0]["command"]
+    assert command[:4] == ["swm", "eval", "expert", "no-op"] and "--join" not in command
     # No videos on request.
     done = swm_ray.evaluate("no-op", f"{s3}/plain", env="swm/TwoRoom-v1", episodes=1, budget=2, image=32, videos=0)
     assert ray.get(done)["cells"] == 2 and videos_of(Folder(f"{s3}/plain")) == {}

@@ -86,6 +86,14 @@ pub fn write(folder: &Path, continued: bool) -> Result<()> {
     append(folder, Invocation::now(), continued)
 }
 
+/// Writes `run.json` with another command line than the one that runs, such as that of the run that a cell belongs to.
+///
+/// # Errors
+/// As [`write`].
+pub fn write_command(folder: &Path, command: Vec<String>) -> Result<()> {
+    append(folder, Invocation { command, ..Invocation::now() }, false)
+}
+
 /// Writes `run.json` to the folder of a training that another program runs, after `begin` has begun or continued it.
 ///
 /// `command` is the command line of `swm train` with the same model, dataset and settings: `swm train --output RUN --resume`

@@ -1,6 +1,8 @@
 //! `--on ray`, with a program in place of Python: what is checked before the work, and how a run ends.
 
 use crate::{Swm, text};
+use serde_json::Value;
+use std::collections::BTreeMap;
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -136,4 +138,61 @@ fn modules_of_the_current_folder_are_not_imported() {
     let error = text(&output.stderr);
     assert!(error.contains("it has no package ray") || error.contains("cannot be started"), "{error}");
     assert!(!swm.path("imported").exists());
+}
+
+/// The files of a folder and their contents, without what differs between equal evaluations.
+fn files_of(folder: &Path) -> BTreeMap<String, Vec<u8>> {
+    let untimed = |path: &Path| {
+        let bytes = std::fs::read(path).expect("a file");
+        let Ok(mut value) = serde_json::from_slice::<Value>(&bytes) else { return bytes };
+        let runs = value.get_mut("runs").and_then(Value::as_array_mut).into_iter().flatten();
+        for run in runs.filter_map(Value::as_object_mut) {
+            run.remove("timing");
+        }
+        for plan in value.as_array_mut().into_iter().flatten().filter_map(Value::as_object_mut) {
+            plan.retain(|name, _| !name.ends_with("seconds"));
+        }
+        value.to_string().into_bytes()
+    };
+    let mut found = BTreeMap::new();
+    for name in ["results.json", "traces.json", "videos"] {
+        let path = folder.join(name);
+        if path.is_dir() {
+            for entry in std::fs::read_dir(&path).expect("a folder").flatten() {
+                found.insert(format!("{name}/{}", entry.file_name().to_string_lossy()), untimed(&entry.path()));
+            }
+        } else {
+            found.insert(name.to_owned(), untimed(&path));
+        }
+    }
+    found
+}
+
+#[test]
+fn cells_of_an_evaluation_join_to_that_of_one_process() {
+    let swm = Swm::new();
+    let eval = ["eval", "simulator", "--env", "swm/TwoRoom-v1", "--image", "32", "--episodes", "2", "--budget", "6"];
+    let more = ["--solver", "cem,samples=4,iterations=1,elites=2", "--horizon", "2", "--shift", "agent.color=0,0,255"];
+    let eval = [&eval[..], &more, &["--trace", "--videos", "1"]].concat();
+    swm.json(&[&eval[..], &["--output", "one"]].concat());
+    for (index, name) in ["000000", "000001"].into_iter().enumerate() {
+        let part = format!("part-{index}");
+        swm.json(&[&eval[..], &["--part", &index.to_string(), "--output", &part]].concat());
+        for (from, to) in [("results.json", "results"), ("traces.json", "traces"), ("videos", "videos")] {
+            let suffix = if from == "videos" { "" } else { ".json" };
+            let to = swm.path("parts").join(to).join(format!("{name}{suffix}"));
+            std::fs::create_dir_all(to.parent().expect("a folder")).expect("a folder");
+            std::fs::rename(swm.path(&part).join(from), to).expect("a file of the cell");
+        }
+    }
+    let joined = swm.json(&[&eval[..], &["--join", "parts", "--output", "joined"]].concat());
+    assert_eq!(joined["ends"], true);
+    let (one, joined) = (files_of(&swm.path("one")), files_of(&swm.path("joined")));
+    assert_eq!(one.keys().collect::<Vec<_>>(), joined.keys().collect::<Vec<_>>());
+    assert!(one.len() == 2 + 2 * 4 && one == joined, "{:?}", one.keys());
+    // The record has the command of the user, not that of the cell.
+    let record = std::fs::read(swm.path("joined/run.json")).expect("the record");
+    let record: Value = serde_json::from_slice(&record).expect("JSON");
+    let command: Vec<&str> = std::iter::once("swm").chain(eval.iter().copied()).collect();
+    assert_eq!(record["commands"][0]["command"], serde_json::json!(command));
 }

@@ -1,7 +1,7 @@
 //! `swm eval`: its conditions here, or each as a cell on a Ray cluster.
 
 use super::eval_parts::{copy_videos, joined_traces, results_in};
-use super::{OnRayArgs, Request};
+use super::{OnRayArgs, Request, without};
 use crate::cli::eval::{self, CapsuleStarts, EvalArgs, TRACES, write_json, write_traces};
 use crate::cli::progress::control;
 use crate::cli::results_tables::summary;
@@ -119,7 +119,13 @@ impl EvalCommand {
             write_json(&args.output.join(TRACES), &joined_traces(parts, conditions)?)?;
         }
         write_json(&args.output.join("results.json"), &results)?;
-        run_record::write(&args.output, false)?;
+        run_record::write_command(&args.output, command_of_one_process(&run_record::arguments()))?;
         Ok(results)
     }
+}
+
+/// The command line of an evaluation on one machine, from that of the cell that joins its results; without the output.
+fn command_of_one_process(arguments: &[String]) -> Vec<String> {
+    let own = ["--join", "--stage", "--threads", "-o", "--output"];
+    std::iter::once("swm".to_owned()).chain(without(arguments, &own, &["--json"])).collect()
 }

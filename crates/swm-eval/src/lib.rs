@@ -47,7 +47,7 @@ pub use prediction::Predictor;
 pub use replay::{Recorded, Replay};
 pub use reproduce::{Difference, Reproduction, reproduce, reproduce_episodes};
 pub use request::{Choice, Condition, EndCost, EvalRequest, HeldOut, Model, PolicyKind, PolicyRequest, StartsRequest};
-pub use runner::{ResolvedPolicy, Resolver, RunOptions};
+pub use runner::{PROBE_DATASET, ResolvedPolicy, Resolver, RunOptions};
 pub use seeding::{episode_key, reset_seed};
 pub use starts::Starts;
 pub use study::{AnyStudy, Cell, Common, Measured, Study, StudyFolder, TableCell, TableStudy};

@@ -198,6 +198,14 @@ impl Model {
 }
 
 impl PolicyKind {
+    /// The dataset that a probe of the policy is fitted on, if it has one.
+    pub fn probe_dataset(&self) -> Option<&str> {
+        match self {
+            Self::Plan { model: Model::Probe { dataset, .. }, .. } => Some(dataset),
+            _ => None,
+        }
+    }
+
     /// The name or path of the checkpoint that the policy uses, if it uses one.
     pub fn checkpoint(&self) -> Option<&str> {
         match self {

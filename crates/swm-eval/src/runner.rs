@@ -54,12 +54,17 @@ pub trait Resolver {
     }
 }
 
+/// The name under which a manifest and a cell of a study have the hash of the dataset that a probe is fitted on.
+pub const PROBE_DATASET: &str = "probe dataset";
+
 /// A policy with its provenance.
 pub struct ResolvedPolicy {
     /// The policy.
     pub policy: Box<dyn Policy>,
     /// The hash of the policy's weights; `None` without weights.
     pub weights: Option<String>,
+    /// The hash of the content of the dataset that a probe of the policy was fitted on; `None` without a probe.
+    pub probe_dataset: Option<String>,
     /// The versions of the libraries that determine the policy's actions.
     pub libraries: BTreeMap<String, String>,
     /// The device that computes the actions, such as `cpu (flex)`; `None` for the default device.
@@ -73,7 +78,7 @@ pub type TakeSearches = Box<dyn FnMut() -> Vec<PlanTrace>>;
 
 impl From<Box<dyn Policy>> for ResolvedPolicy {
     fn from(policy: Box<dyn Policy>) -> Self {
-        Self { policy, weights: None, libraries: BTreeMap::new(), device: None, searches: None }
+        Self { policy, weights: None, probe_dataset: None, libraries: BTreeMap::new(), device: None, searches: None }
     }
 }
 
@@ -356,7 +361,13 @@ impl EvalRequest {
         if let Some(weights) = &resolved.weights {
             manifest.hashes.insert(self.weights_key(&policy.name), weights.clone());
         }
-        manifest.libraries.extend(resolved.libraries.clone());
+        if let Some(dataset) = &resolved.probe_dataset {
+            manifest.hashes.insert(PROBE_DATASET.to_owned(), dataset.clone());
+        }
+        // A checkpoint names the libraries of its training; what plays and renders here is known already.
+        for (name, version) in resolved.libraries.iter().filter(|(name, _)| *name != "renderer") {
+            manifest.libraries.entry(name.clone()).or_insert_with(|| version.clone());
+        }
         if let Some(device) = &resolved.device {
             manifest.device.clone_from(device);
         }

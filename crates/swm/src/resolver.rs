@@ -8,6 +8,7 @@ mod watching;
 pub use watching::WatchedPolicy;
 
 use crate::{home, zoo};
+use probing::FittedProbe;
 use serde::de::DeserializeOwned;
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -25,7 +26,6 @@ use swm_eval::{
     Choice, EndCost, EvalRequest, MixturePolicy, Model, NoOpPolicy, PolicyChoice, PolicyKind, PolicyRequest, Predictor,
     ResolvedPolicy, Resolver, World,
 };
-use swm_models::probe::StateProbe;
 use swm_models::{CheckpointInfo, Device, LoadedModel, device, load};
 use swm_plan::objective::ObjectiveConfig;
 use swm_plan::{
@@ -47,7 +47,7 @@ pub struct HomeResolver {
     /// The loaded checkpoints, by path.
     checkpoints: RefCell<BTreeMap<PathBuf, Rc<dyn LoadedModel>>>,
     /// The fitted probes, by checkpoint, dataset and columns.
-    probes: RefCell<BTreeMap<ProbeKey, Arc<StateProbe>>>,
+    probes: RefCell<BTreeMap<ProbeKey, FittedProbe>>,
     /// The traced plans; `None` without tracing.
     traces: Option<Traces>,
     /// The device of the models.

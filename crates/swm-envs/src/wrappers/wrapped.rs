@@ -3,8 +3,8 @@
 use super::{EpisodeFrame, VisualWrapper, parse};
 use std::collections::BTreeMap;
 use swm_core::{
-    Action, Callable, DatasetStart, DatasetStartEnv, DispatchEnv, Env, EnvSpec, Error, FactorValues, FrameMut, Key,
-    ResetOptions, Result, RowMut, RowRef, Schema, Snapshot, Transition, dataset_start, limits,
+    Action, Callable, CameraView, DatasetStart, DatasetStartEnv, DispatchEnv, Env, EnvSpec, Error, FactorValues,
+    FrameMut, Key, Modality, ResetOptions, Result, RowMut, RowRef, Schema, Snapshot, Transition, dataset_start, limits,
 };
 
 /// The treatment of the goal frame by wrappers.
@@ -151,6 +151,15 @@ impl Env for Wrapped {
         self.env.render_goal(FrameMut { rgb: &mut *frame.rgb, ..frame })?;
         if self.goal == GoalFrame::Wrapped {
             self.apply(&mut frame, EpisodeFrame::Goal);
+        }
+        Ok(())
+    }
+
+    /// Wrappers change the colours of every camera, and neither depth nor segmentation.
+    fn render_view(&mut self, view: &CameraView, height: usize, width: usize, out: &mut [u8]) -> Result<()> {
+        self.env.render_view(view, height, width, out)?;
+        if view.modality == Modality::Rgb {
+            self.apply(&mut FrameMut::new(width, height, out), EpisodeFrame::Step(self.step));
         }
         Ok(())
     }

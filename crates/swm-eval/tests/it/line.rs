@@ -69,6 +69,10 @@ impl Env for Line {
         &self.spec
     }
 
+    fn libraries(&self) -> std::collections::BTreeMap<String, String> {
+        [("engine".to_owned(), "2".to_owned())].into()
+    }
+
     fn reset(&mut self, seed: u64, options: &ResetOptions) -> Result<()> {
         self.factors = self.spec.variation_space.resolve(&options.variation, Key::new(seed))?;
         self.x = self.factors.scalar("agent.x");

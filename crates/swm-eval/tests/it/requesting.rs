@@ -47,7 +47,9 @@ impl Resolver for TestResolver {
 
     fn policy(&self, _: &PolicyRequest, _: &World) -> Result<ResolvedPolicy> {
         let walker: Box<dyn Policy> = Box::new(Walker);
-        Ok(ResolvedPolicy { weights: Some(self.weights.clone()), ..ResolvedPolicy::from(walker) })
+        let libraries = [("burn", "9"), ("engine", "1"), ("renderer", "of another machine")];
+        let libraries = libraries.map(|(name, version)| (name.to_owned(), version.to_owned())).into();
+        Ok(ResolvedPolicy { weights: Some(self.weights.clone()), libraries, ..ResolvedPolicy::from(walker) })
     }
 
     fn predictor(&self, request: &PolicyRequest) -> Result<Option<Box<dyn Predictor>>> {
@@ -110,6 +112,13 @@ fn round_trip(results: &Results) -> Results {
 fn without_timing(mut results: Results) -> String {
     results.runs.iter_mut().for_each(|run: &mut Run| run.timing = Default::default());
     serde_json::to_string(&results).expect("serialising to JSON")
+}
+
+#[test]
+fn libraries_of_an_evaluation_are_those_that_play_it_and_those_of_the_model() {
+    let results = run(&request(), 2, 1);
+    let expected = [("burn".to_owned(), "9".to_owned()), ("engine".to_owned(), "2".to_owned())];
+    assert_eq!(results.manifest.libraries, expected.into());
 }
 
 #[test]

@@ -203,15 +203,36 @@ fn device_step(step: &AdamWStep, value: Tensor<1>, gradient: Tensor<1>, old: Mom
 /// The squared gradient norm of every clipping group, and the norm of the whole gradient. Sums run in the order of
 /// names.
 fn squared_norms(gradients: &Named<Tensor<1>>, group: fn(&str) -> ParameterGroup) -> (BTreeMap<usize, f64>, f64) {
+    let on_host = gradients.values().next().is_none_or(|gradient| gradient.device() == Device::flex());
+    let sums = if on_host {
+        gradients.values().map(|gradient| sum_of_squares(&host(gradient.clone()))).collect()
+    } else {
+        device_sums_of_squares(gradients)
+    };
     let mut squares: BTreeMap<usize, f64> = BTreeMap::new();
-    for (name, gradient) in gradients {
-        let square = if gradient.device() == Device::flex() {
-            sum_of_squares(&host(gradient.clone()))
-        } else {
-            f64::from(gradient.clone().square().sum().into_scalar::<f32>())
-        };
+    for (name, square) in gradients.keys().zip(sums) {
         *squares.entry(group(name).clip).or_default() += square;
     }
     let norm = squares.values().sum::<f64>().sqrt();
     (squares, norm)
+}
+
+/// The sum of squares of every tensor. They are read together: reading one waits for all that a device was asked to do.
+fn device_sums_of_squares(gradients: &Named<Tensor<1>>) -> Vec<f64> {
+    let sums = gradients.values().map(|gradient| gradient.clone().square().sum()).collect();
+    Tensor::cat(sums, 0).into_data().into_f32_vec().into_iter().map(f64::from).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_device_sums_the_squares_of_every_gradient() {
+        let tensor = |values: &[f32]| Tensor::<1>::from_floats(values, &Device::flex());
+        let gradients = Named::from([("b".to_owned(), tensor(&[3.0, 4.0])), ("a".to_owned(), tensor(&[2.0]))]);
+        assert_eq!(device_sums_of_squares(&gradients), [4.0, 25.0]);
+        let (squares, norm) = squared_norms(&gradients, |name| ParameterGroup { clip: name.len(), lr: 1.0 });
+        assert_eq!((squares, norm), (BTreeMap::from([(1, 29.0)]), 29f64.sqrt()));
+    }
 }

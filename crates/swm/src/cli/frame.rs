@@ -27,8 +27,8 @@ pub struct FrameArgs {
     goal: bool,
     /// The camera view: CAMERA, depth, segmentation, or CAMERA:depth
     ///
-    /// Depth and segmentation have the colours of `swm preview`.
-    #[arg(long, value_name = "VIEW", conflicts_with_all = ["goal", "wrappers"])]
+    /// Depth and segmentation have the colours of `swm preview`; wrappers do not change them.
+    #[arg(long, value_name = "VIEW", conflicts_with = "goal")]
     view: Option<String>,
     #[command(flatten)]
     wrappers: WrapperArgs,

@@ -9,6 +9,9 @@ use swm_eval::{Predictor, ResolvedPolicy, World};
 use swm_models::probe::{ProbedCost, ProbedLatents, StateConfig, StateProbe};
 use swm_plan::SimulatedLatents;
 
+/// A probe, and the hash of the content of the dataset that it was fitted on.
+pub(super) type FittedProbe = (Arc<StateProbe>, String);
+
 impl HomeResolver {
     /// Makes a policy that plans as with a checkpoint, by the states that a probe reads from its latents.
     pub(super) fn probe_policy(
@@ -32,7 +35,7 @@ impl HomeResolver {
                 )
             })
         };
-        let probe = self.probe(predictor()?, (given, dataset, columns), world.spec())?;
+        let (probe, hash) = self.probe(predictor()?, (given, dataset, columns), world.spec())?;
         let (scale, block, model) = (info.dataset_info.action.clone(), planner.mpc.action_block, predictor()?);
         let cost: Box<dyn CostModel> = if true_dynamics {
             let model = Box::new(ProbedLatents { model, probe });
@@ -41,26 +44,28 @@ impl HomeResolver {
             Box::new(ProbedCost::new(model, probe, scale.clone(), block)?)
         };
         let policy = planner.policy(cost, scale, world)?;
-        Ok(self.with_provenance(self.traced(name, policy), info))
+        let policy = ResolvedPolicy { probe_dataset: Some(hash), ..self.traced(name, policy) };
+        Ok(self.with_provenance(policy, info))
     }
 
-    /// Returns a probe; it is fitted at the first call.
+    /// Returns a probe, and the hash of the content of its dataset; it is fitted at the first call.
     fn probe(
         &self,
         mut predictor: Box<dyn Predictor>,
         (given, dataset, columns): (&str, &str, &[String]),
         spec: &EnvSpec,
-    ) -> Result<Arc<StateProbe>> {
+    ) -> Result<FittedProbe> {
         let key = (given.to_owned(), dataset.to_owned(), columns.to_vec());
         if let Some(probe) = self.probes.borrow().get(&key) {
-            return Ok(Arc::clone(probe));
+            return Ok(probe.clone());
         }
         self.check_local("dataset", dataset)?;
         let reader = home::open_dataset(dataset)?;
         let angles = spec.angles.iter().map(|(column, index)| ((*column).to_owned(), *index)).collect();
         let config = StateConfig { angles, ..StateConfig::new(columns.to_vec()) };
-        let probe = Arc::new(StateProbe::fit(&mut *predictor, &*reader, &config, &mut Control::new())?);
-        self.probes.borrow_mut().insert(key, Arc::clone(&probe));
-        Ok(probe)
+        let probe = StateProbe::fit(&mut *predictor, &*reader, &config, &mut Control::new())?;
+        let fitted = (Arc::new(probe), reader.content_hash()?);
+        self.probes.borrow_mut().insert(key, fitted.clone());
+        Ok(fitted)
     }
 }

@@ -450,4 +450,13 @@ fn a_probe_is_an_ingredient_with_a_dataset() {
     let arms = found["autopsy"]["arms"].as_array().expect("arms");
     let sets: Vec<&serde_json::Value> = arms.iter().map(|arm| &arm["ingredients"]).collect();
     assert_eq!(serde_json::json!(sets), serde_json::json!([[], ["dynamics"], ["probe"], ["dynamics", "probe"]]));
+    // With another dataset of this name, arms with a probe are other cells: two arms, three planning seeds.
+    let cells = std::fs::read_dir(swm.path("out").join("cells")).expect("the cells of the autopsy");
+    let has_probe = |path: std::path::PathBuf| {
+        let text = std::fs::read_to_string(path).expect("reading a cell");
+        let results: serde_json::Value = serde_json::from_str(&text).expect("parsing a cell");
+        results["manifest"]["hashes"]["probe dataset"].is_string()
+    };
+    let probed = cells.filter(|cell| has_probe(cell.as_ref().expect("a cell").path())).count();
+    assert_eq!(probed, 6);
 }

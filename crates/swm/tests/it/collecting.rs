@@ -78,6 +78,21 @@ fn other_wrappers_do_not_continue_a_collection() {
     assert_eq!(content(&swm, "rooms").1, 4);
 }
 
+#[test]
+fn wrappers_change_the_colours_of_every_camera_and_no_depth() {
+    let swm = Swm::new();
+    let grey = ["--wrapper", "grayscale"];
+    let views = ["--view", "depth", "--view", "side_pixels", "--episodes", "1", "--max-steps", "2"];
+    swm.json(&[&["collect", "swm/OGBCube-v0", "-o", "cube", "--image", "32"], &views[..], &grey].concat());
+    let frame = |view: &str, more: &[&str]| {
+        let frame = ["frame", "swm/OGBCube-v0", "--image", "32", "-o", "frame.png", "--view", view];
+        swm.json(&[&frame[..], more].concat());
+        std::fs::read(swm.path("frame.png")).expect("reading a frame")
+    };
+    assert_ne!(frame("side_pixels", &[]), frame("side_pixels", &grey));
+    assert_eq!(frame("depth", &[]), frame("depth", &grey));
+}
+
 #[cfg(unix)]
 #[test]
 fn interrupted_collection_keeps_finished_episodes() {

@@ -9,7 +9,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use swm_core::run::Control;
 use swm_core::{Error, Result};
 use swm_data::{Part, Split};
-use swm_eval::{Cell, EvalRequest, HeldOut, PolicyKind, Resolver as _, StartsRequest, Study};
+use swm_eval::{Cell, EvalRequest, HeldOut, PROBE_DATASET, PolicyKind, Resolver as _, StartsRequest, Study};
 
 /// A cell before its names are resolved.
 struct Combination {
@@ -227,7 +227,7 @@ impl<'a> Inputs<'a> {
         Self { resolver, known: BTreeMap::new() }
     }
 
-    /// Returns the hashes of the dataset and the weights that a request names.
+    /// Returns the hashes of the datasets and the weights that a request names.
     ///
     /// # Errors
     /// When one of them does not exist or is damaged.
@@ -240,6 +240,10 @@ impl<'a> Inputs<'a> {
         if let Some(given) = checkpoint(request) {
             let hash = self.hash("weights", given, |resolver| Ok(resolver.checkpoint(given)?.info()?.weights))?;
             inputs.insert("weights".to_owned(), hash);
+        }
+        if let Some(dataset) = request.policies.iter().find_map(|policy| policy.kind.probe_dataset()) {
+            let hash = self.hash("dataset", dataset, |resolver| resolver.dataset(dataset)?.content_hash())?;
+            inputs.insert(PROBE_DATASET.to_owned(), hash);
         }
         Ok(inputs)
     }

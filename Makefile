@@ -163,7 +163,8 @@ LLVM_FOLDER := $(HOME)/.local/share/tracel/tracel-llvm-23.1.0-4
 cuda: setup
 	@[ -e $(LLVM_FOLDER)/.tracel-llvm-installed ] || { python3 -m venv --clear $(LLVM_VENV) && \
 	  $(LLVM_VENV)/bin/python -m pip install --quiet 'mlc-llvm-static[all]==23.1.1.post0' && mkdir -p $(dir $(LLVM_FOLDER)) && \
-	  ln -s "$$($(LLVM_VENV)/bin/python -c 'import mlc_llvm_static as m; print(m.__path__[0])')/static" $(LLVM_FOLDER) && \
+	  { [ -L $(LLVM_FOLDER) ] || [ ! -e $(LLVM_FOLDER) ] || { echo '$(LLVM_FOLDER) is a folder without LLVM: remove it'; exit 1; }; } && \
+	  ln -sfn "$$($(LLVM_VENV)/bin/python -c 'import mlc_llvm_static as m; print(m.__path__[0])')/static" $(LLVM_FOLDER) && \
 	  touch $(LLVM_FOLDER)/.tracel-llvm-installed; }
 	CARGO_TARGET_DIR=$(GPU_TARGET) $(CARGO) build --release -p swm --bins --features vulkan,cuda
 

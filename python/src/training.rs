@@ -18,7 +18,7 @@ use swm::models::store::{Parts, StateParts, store};
 use swm::models::train::TrainingPlan;
 use swm::models::{FAMILIES, TrainOptions, TrainableConfig};
 
-/// What trains, in `run.json`.
+/// The name of the training program in `run.json`.
 const PROGRAM: &str = "stable_worldmodel.train (torch)";
 
 /// The complete configuration of a family, a preset with `key=value` settings, as JSON.

@@ -3,7 +3,7 @@
 
 use crate::prediction::Predictor;
 use crate::request::{EvalRequest, PolicyRequest, StartsRequest};
-use crate::runner::{Episodes, ResolvedPolicy, Resolver, RunOptions};
+use crate::runner::{Episodes, PROBE_DATASET, ResolvedPolicy, Resolver, RunOptions};
 use crate::seeding::{episode_key, reset_seed};
 use crate::world::World;
 use serde::Serialize;
@@ -183,6 +183,9 @@ impl Resolver for Checked<'_> {
         if let Some(weights) = &policy.weights {
             let key = format!("weights of {}", request.name);
             self.check(weights, key.clone(), &[&key, "weights"])?;
+        }
+        if let Some(dataset) = &policy.probe_dataset {
+            self.check(dataset, PROBE_DATASET.to_owned(), &[PROBE_DATASET])?;
         }
         Ok(policy)
     }

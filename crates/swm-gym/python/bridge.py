@@ -338,6 +338,16 @@ def one_at_a_time(method):
     return waiting
 
 
+def flag(value, name):
+    """An end of an episode as a bool."""
+    if value is True or value is False:
+        return value
+    array = np.asarray(value)
+    if array.dtype.kind not in 'biuf' or array.size != 1 or array.item() not in (0, 1):
+        raise ValueError(f'{name} is {value!r}: return True or False')
+    return bool(array.item())
+
+
 class Bridge:
     """One environment and the buffer it writes into."""
 
@@ -571,13 +581,16 @@ class Bridge:
             store(view, value, f'info.{key}')
         for view, value in self.held:
             view[...] = np.reshape(value, view.shape)
+        terminated, truncated = flag(terminated, 'terminated'), flag(truncated, 'truncated')
+        if isinstance(reward, (str, bytes)):
+            raise ValueError(f'the reward is {reward!r}: return a number')
         success = info.get('success', info.get('is_success'))
         if success is None:
             success = terminated
         elif np.asarray(success).dtype.kind not in 'biuf' or success != success:
             raise ValueError(f"info['success'] is {success!r}: return True or False")
         distance = info.get('goal_distance', math.inf)
-        HEAD.pack_into(self.buffer, 0, float(reward), float(distance), bool(terminated), bool(truncated), bool(success))
+        HEAD.pack_into(self.buffer, 0, float(reward), float(distance), terminated, truncated, bool(success))
 
     def render(self):
         """Renders into the buffer."""

@@ -136,7 +136,7 @@ async fn accept(listener: &TcpListener) -> Option<TcpStream> {
     }
 }
 
-/// Answers the requests of a connection, until it ends or gives way to newer ones.
+/// Answers the requests of a connection, until it ends or is closed in favour of newer ones.
 async fn connection(
     stream: TcpStream,
     access: Access,

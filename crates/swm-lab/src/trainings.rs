@@ -10,6 +10,7 @@ use std::os::unix::process::{CommandExt as _, ExitStatusExt as _};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 use swm_core::{Error, Result, text};
 
@@ -25,6 +26,8 @@ const TAIL: usize = 2_000;
 const ENDING: Duration = Duration::from_secs(60);
 /// How often it is looked whether they have ended.
 const POLL: Duration = Duration::from_millis(50);
+/// How long the last reports of a program that has ended are waited for.
+const READING: Duration = Duration::from_secs(2);
 /// The exit code of a program that was interrupted.
 const INTERRUPTED: i32 = 130;
 /// The signal of Ctrl-C, which ends a program that does not handle it yet.
@@ -119,6 +122,9 @@ struct Started {
     process: Child,
     state: State,
     tail: Arc<Mutex<VecDeque<u8>>>,
+    /// Reads the tail, and when the program was first seen to have ended.
+    reader: Option<JoinHandle<()>>,
+    ended: Option<Instant>,
 }
 
 /// The trainings that pages started, the newest last.
@@ -166,12 +172,13 @@ impl Trainings {
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).process_group(0);
         let mut process = command.spawn().map_err(|error| Error::external("starting a training", error))?;
         let tail = Arc::<Mutex<VecDeque<u8>>>::default();
-        if let Some(reports) = process.stderr.take() {
+        let reader = process.stderr.take().map(|reports| {
             let tail = Arc::clone(&tail);
-            std::thread::spawn(move || keep_tail(reports, &tail));
-        }
+            std::thread::spawn(move || keep_tail(reports, &tail))
+        });
         let (name, family) = (request.name.clone(), request.family.clone());
-        all.push(Started { name, family, output, process, state: State::Running, tail });
+        let (state, ended) = (State::Running, None);
+        all.push(Started { name, family, output, process, state, tail, reader, ended });
         Ok(())
     }
 
@@ -212,6 +219,11 @@ impl Started {
             return;
         }
         let Ok(Some(status)) = self.process.try_wait() else { return };
+        // What it reported last may not have been read yet; a program that it started may keep the pipe open.
+        let is_read = self.reader.as_ref().is_none_or(JoinHandle::is_finished);
+        if !is_read && self.ended.get_or_insert_with(Instant::now).elapsed() < READING {
+            return;
+        }
         // A training that was asked to stop may be done before, or fail.
         self.state = match status {
             _ if status.success() => State::Finished,

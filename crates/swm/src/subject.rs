@@ -44,6 +44,8 @@ pub struct LewmSubject {
     device: Device,
     model: Lewm,
     cost: LewmCost,
+    /// Whether the cost observed all environments last, not only the first.
+    observed_all: bool,
     cem: Cem,
     /// The columns `pixels` and `goal` of each environment.
     infos: Batch,
@@ -88,7 +90,18 @@ impl LewmSubject {
         cost.observe(&infos, &[0])?;
         let cem = Cem { iterations, ..Cem::default() };
         let candidates = (0..cem.samples * HORIZON * action_dim).map(|_| rng.random_range(-1.0..1.0)).collect();
-        Ok(Self { config, frames, device: device.clone(), model, cost, cem, infos, candidates, training: None })
+        Ok(Self {
+            config,
+            frames,
+            device: device.clone(),
+            model,
+            cost,
+            observed_all: false,
+            cem,
+            infos,
+            candidates,
+            training: None,
+        })
     }
 
     /// Returns the sizes of the model and of the benchmark as JSON, for the process that runs the reference
@@ -151,7 +164,9 @@ impl LewmSubject {
     }
 
     fn costs(&mut self) -> Result<Vec<f32>> {
-        self.cost.observe(&self.infos, &[0])?;
+        if std::mem::take(&mut self.observed_all) {
+            self.cost.observe(&self.infos, &[0])?;
+        }
         let mut costs = vec![0.0; self.cem.samples];
         let (samples, dim) = (self.cem.samples, self.action_dim());
         let candidates = Candidates { actions: &self.candidates, envs: 1, samples, horizon: HORIZON, dim };
@@ -161,6 +176,7 @@ impl LewmSubject {
 
     fn plan(&mut self) -> Result<()> {
         let envs: Vec<usize> = (0..self.infos.rows()).collect();
+        self.observed_all = true;
         self.cost.observe(&self.infos, &envs)?;
         let (low, high) = (vec![-1.0; self.action_dim()], vec![1.0; self.action_dim()]);
         let space = PlanSpace::Continuous { low: &low, high: &high };

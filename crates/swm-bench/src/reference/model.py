@@ -142,7 +142,7 @@ known = {name: expand(value[:1]) for name, value in observation().items()}
 @torch.inference_mode()
 @precision
 def cost():
-    return model.get_cost(dict(known), candidates[None])
+    return model.get_cost(known, candidates[None])
 
 
 @torch.inference_mode()

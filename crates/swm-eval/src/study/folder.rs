@@ -64,8 +64,9 @@ impl StudyFolder {
                 return Err(other("has files and no study.json".to_owned()));
             }
         }
-        files::write(&path, bytes)?;
         let cells = self.root.join("cells");
+        files::check_no_link(&cells)?;
+        files::write(&path, bytes)?;
         std::fs::create_dir_all(&cells).map_err(|error| Error::io(&cells, "creating the folder", error))?;
         files::delete_temporary(&cells, |name| name.ends_with(".json"))?;
         Ok(lock)

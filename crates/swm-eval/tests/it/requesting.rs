@@ -20,6 +20,8 @@ use swm_eval::{
 pub struct TestResolver {
     data: Arc<MemoryReader>,
     weights: String,
+    /// The hash of the dataset of the walker's probe, if it has one.
+    probe: Option<String>,
 }
 
 impl TestResolver {
@@ -29,7 +31,7 @@ impl TestResolver {
 
     /// A resolver with this dataset.
     pub fn of(data: MemoryReader) -> Self {
-        Self { data: Arc::new(data), weights: "w0".to_owned() }
+        Self { data: Arc::new(data), weights: "w0".to_owned(), probe: None }
     }
 }
 
@@ -49,7 +51,8 @@ impl Resolver for TestResolver {
         let walker: Box<dyn Policy> = Box::new(Walker);
         let libraries = [("burn", "9"), ("engine", "1"), ("renderer", "of another machine")];
         let libraries = libraries.map(|(name, version)| (name.to_owned(), version.to_owned())).into();
-        Ok(ResolvedPolicy { weights: Some(self.weights.clone()), libraries, ..ResolvedPolicy::from(walker) })
+        let (weights, probe_dataset) = (Some(self.weights.clone()), self.probe.clone());
+        Ok(ResolvedPolicy { weights, probe_dataset, libraries, ..ResolvedPolicy::from(walker) })
     }
 
     fn predictor(&self, request: &PolicyRequest) -> Result<Option<Box<dyn Predictor>>> {
@@ -378,6 +381,16 @@ fn some_episodes_can_be_reproduced() {
     assert!(error.expect_err("there are 24 episodes").to_string().contains("number 24"));
     let compat = run(&EvalRequest { counting: Counting::Compat { envs: 2 }, ..request() }, 2, 1);
     assert!(again(&compat).expect_err("compat counting").to_string().contains("the whole evaluation"));
+}
+
+#[test]
+fn reproduction_with_another_dataset_of_the_probe_is_rejected() {
+    let resolver = |hash: &str| TestResolver { probe: Some(hash.to_owned()), ..TestResolver::new() };
+    let old = request().run(&resolver("p0"), &RunOptions::default(), &mut Control::new()).expect("an evaluation");
+    assert_eq!(old.manifest.hashes["probe dataset"], "p0");
+    assert!(repeat(&old, &resolver("p0")).is_ok());
+    let error = repeat(&old, &resolver("p1")).err().expect("another dataset").to_string();
+    assert!(error.contains("probe dataset") && error.contains("p1"), "{error}");
 }
 
 #[test]

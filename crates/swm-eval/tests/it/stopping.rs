@@ -52,6 +52,20 @@ fn cells(folder: &Path) -> BTreeMap<String, String> {
     entries.map(|entry| (entry.file_name().to_string_lossy().into_owned(), read(&entry.path()))).collect()
 }
 
+#[cfg(unix)]
+#[test]
+fn results_are_not_written_through_a_link() {
+    let (folder, elsewhere) = (tempfile::tempdir().expect("a folder"), tempfile::tempdir().expect("another"));
+    let study = study(20, None);
+    run(&study, folder.path(), &mut Control::new()).expect("a study");
+    let cells = folder.path().join("cells");
+    std::fs::remove_dir_all(&cells).expect("removing the results");
+    std::os::unix::fs::symlink(elsewhere.path(), &cells).expect("a link");
+    let error = run(&study, folder.path(), &mut Control::new()).expect_err("a link").to_string();
+    assert!(error.contains("is a symbolic link"), "{error}");
+    assert_eq!(elsewhere.path().read_dir().expect("a folder").count(), 0);
+}
+
 #[test]
 fn cells_stop_when_their_intervals_are_narrow_and_equal_those_played_at_once() {
     let folder = tempfile::tempdir().expect("a folder");

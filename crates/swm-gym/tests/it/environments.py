@@ -368,8 +368,12 @@ class Loose(gymnasium.Env):
     def step(self, action):
         self.t += 1
         observation = self.VALUES.get(self.value, np.zeros(3, np.float32)) if self.t == 2 else np.zeros(3, np.float32)
-        success = {'success': 'no', 'nan': float('nan')}.get(self.value, False) if self.t == 2 else False
-        return observation, 0.0, False, False, {'success': success}
+        if self.t != 2:
+            return observation, 0.0, False, False, {'success': False}
+        success = {'success': 'no', 'nan': float('nan')}.get(self.value, False)
+        ends = {'end-nan': float('nan'), 'end-text': 'False', 'end-none': None, 'end-minus': -1}
+        reward = '1' if self.value == 'reward' else 0.0
+        return observation, reward, ends.get(self.value, False), False, {'success': success}
 
 
 gymnasium.register('Loose-v0', Loose, max_episode_steps=1_000_000)

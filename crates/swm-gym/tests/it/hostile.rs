@@ -79,8 +79,16 @@ fn environment_cannot_shrink_the_shared_memory() {
 fn observations_of_another_shape_or_type_are_errors() {
     let Some(config) = config() else { return };
     let shaped = ["scalar", "one", "column"].map(|value| (value, "shape"));
-    for (value, shown) in
-        shaped.into_iter().chain([("complex", "complex"), ("text", "<U1"), ("success", "'no'"), ("nan", "nan")])
+    for (value, shown) in shaped
+        .into_iter()
+        .chain([("complex", "complex"), ("text", "<U1"), ("success", "'no'"), ("nan", "nan")])
+        .chain([
+            ("end-nan", "terminated is nan"),
+            ("end-text", "terminated is 'False'"),
+            ("end-none", "terminated is None"),
+            ("end-minus", "terminated is -1"),
+            ("reward", "the reward is '1'"),
+        ])
     {
         let mut env = make(&format!("tests.it.environments:Loose-v0,value={value}"), &config);
         env.reset(0, &ResetOptions::default()).expect("a reset");

@@ -128,10 +128,14 @@ pub fn parse(name: &str) -> Result<Device> {
 /// When the name is not that of a backend, the index is no integer, this build does not contain the backend, there is no such
 /// GPU, or its driver does not pass the test computation.
 pub fn choose(name: &str) -> Result<Choice> {
-    let Some((device, precision)) = name.split_once(',') else { return choose_device(name) };
-    let Some(precision) = Precision::parse(precision) else {
-        let hint = "write the precision after a comma, such as cuda:0,bf16";
-        return Err(Error::unknown("precision", precision, Precision::names(), hint));
+    let (device, precision) =
+        name.split_once(',').map_or((name, None), |(device, precision)| (device, Some(precision)));
+    let precision = match precision {
+        None => Precision::Single,
+        Some(given) => Precision::parse(given).ok_or_else(|| {
+            let hint = "write the precision after a comma, such as cuda:0,bf16";
+            Error::unknown("precision", given, Precision::names(), hint)
+        })?,
     };
     let mut choice = choose_device(device)?;
     if is_cpu(&choice.device) {
@@ -148,7 +152,7 @@ pub fn choose(name: &str) -> Result<Choice> {
         }
         choice.description = format!("{}, {precision}", choice.description);
     }
-    precision.choose();
+    precision.choose()?;
     Ok(choice)
 }
 
@@ -177,7 +181,8 @@ fn choose_device(name: &str) -> Result<Choice> {
     };
     if !built {
         let problem = format!("this program was built without {backend}");
-        let fix = format!("build it with `--features {backend}` (`make gpu` builds for Vulkan), or pass --device cpu");
+        let fix =
+            format!("build it with `make {}`, or pass --device cpu", if backend == "cuda" { "cuda" } else { "gpu" });
         return Err(Error::config("--device", problem, fix));
     }
     if backend == "cpu" {

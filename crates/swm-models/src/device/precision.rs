@@ -3,7 +3,8 @@
 use super::is_cpu;
 use burn::tensor::{FloatDType, Tensor};
 use std::fmt;
-use std::sync::atomic::{AtomicU8, Ordering};
+use std::sync::OnceLock;
+use swm_core::{Error, Result};
 
 /// The precision of the factors of matrix products.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -17,8 +18,8 @@ pub enum Precision {
     F16,
 }
 
-/// The precision of this process, which computes on one GPU: an index into [`Precision::ALL`].
-static CHOSEN: AtomicU8 = AtomicU8::new(0);
+/// The precision of this process on GPUs.
+static CHOSEN: OnceLock<Precision> = OnceLock::new();
 
 impl Precision {
     const ALL: [(Self, &'static str); 3] = [(Self::Single, "f32"), (Self::Bf16, "bf16"), (Self::F16, "f16")];
@@ -33,13 +34,21 @@ impl Precision {
     }
 
     /// Makes this the precision of the process.
-    pub(super) fn choose(self) {
-        CHOSEN.store(self as u8, Ordering::Relaxed);
+    ///
+    /// # Errors
+    /// When the process computes in another precision already: open models would compute in both.
+    pub(super) fn choose(self) -> Result<()> {
+        let chosen = *CHOSEN.get_or_init(|| self);
+        if chosen == self {
+            return Ok(());
+        }
+        let problem = format!("{self}, and this process computes in {chosen}");
+        Err(Error::config("the precision of the GPU", problem, format!("pass {chosen}, or start another process")))
     }
 
     /// The precision of matrix products on GPUs in this process.
     pub fn chosen() -> Self {
-        Self::ALL[usize::from(CHOSEN.load(Ordering::Relaxed))].0
+        CHOSEN.get().copied().unwrap_or_default()
     }
 
     /// Converts a factor of a matrix product to this precision.
@@ -100,11 +109,14 @@ mod tests {
     }
 
     #[test]
-    fn single_precision_changes_nothing() {
-        let x = Tensor::<2>::from_floats([[1.0, 1e-9], [0.1, 3.0]], &Device::flex());
+    fn factors_have_the_precision_and_products_are_single() {
+        let x = Tensor::<2>::from_floats([[1.0, 1.001], [0.1, 3.0]], &Device::flex());
         let values = |x: Tensor<2>| x.into_data().iter::<f32>().collect::<Vec<_>>();
-        let single = Precision::Single;
-        assert_eq!(values(single.raise(single.lower(x.clone()))), values(x.clone()));
+        let there_and_back = |precision: Precision| values(precision.raise(precision.lower(x.clone())));
+        assert_eq!(there_and_back(Precision::Single), values(x.clone()));
+        // 8 and 11 bits of precision: 1.001 is nearest to 1, and to 1 + 2^-10.
+        assert_eq!(there_and_back(Precision::Bf16)[..2], [1.0, 1.0]);
+        assert_eq!(there_and_back(Precision::F16)[..2], [1.0, 1.0 + 1.0 / 1024.0]);
         assert_eq!(values(matmul(x.clone(), x.clone())), values(x.clone().matmul(x)));
     }
 }

@@ -6,9 +6,9 @@
 //! - keys and values are cached while the window of latents grows, and recomputed only when the window slides;
 //! - the last layer and all later modules compute only the last token;
 //! - normalisations with fixed scales and shifts are folded into the linear layers after or before them;
-//! - costs are computed on the device, so that a call returns one number per candidate.
+//! - costs are computed on the device, so that a call returns one scalar per candidate.
 //!
-//! Rows are ordered by token, then by candidate. With half precision, matrix products read half-precision numbers; everything
+//! Rows are ordered by token, then by candidate. With half precision, matrix products read half-precision factors; everything
 //! else is computed in single precision.
 
 use super::model::Lewm;

@@ -31,7 +31,7 @@ pub(super) struct Collector {
     next: u64,
     /// Environment steps done.
     pub steps: usize,
-    /// Undiscounted returns of the last episodes that ended: those of one step.
+    /// Undiscounted returns of the episodes that ended at the last step at which one did.
     pub returns: Vec<f64>,
 }
 

@@ -47,7 +47,7 @@ impl MetricWindow {
     }
 }
 
-/// Reads numbers, which JSON stores as null if they are not finite.
+/// Reads values, which JSON stores as null if they are not finite.
 pub(crate) fn null_is_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<f64>, D::Error> {
     let values = Vec::<Option<f64>>::deserialize(deserializer)?;
     Ok(values.into_iter().map(|value| value.unwrap_or(f64::NAN)).collect())

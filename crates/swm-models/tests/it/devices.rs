@@ -119,17 +119,18 @@ fn compare<M: Trainable>(config: &TrainConfig<M>, inputs: &(DatasetInfo, Batch))
         check(&format!("{family}: {name}"), &[*found as f32], &[*expected as f32], 1e-3);
     }
     assert_eq!(found.gradients.keys().collect::<Vec<_>>(), expected.gradients.keys().collect::<Vec<_>>(), "{family}");
-    // The gradients of parameters without effect, such as the bias of keys or one before a batch normalisation, are zero up to the
-    // rounding of sums that cancel.
+    // The gradients of parameters without effect, such as the bias of keys, are zero up to rounding; those of a bias before a batch
+    // normalisation up to the rounding of long sums that cancel.
     let largest = expected.gradients.values().flat_map(|g| &g.values).fold(0.0f32, |most, v| most.max(v.abs()));
     let compare = |what: &str, found: &Named<HostTensor>, expected: &Named<HostTensor>, floor: f32| {
         let errors = expected.iter().map(|(name, expected)| {
+            let floor = if name.ends_with("encoder.out.bias") { 10.0 * floor } else { floor };
             (check(&format!("{family}: {what} of {name}"), &found[name].values, &expected.values, floor), name)
         });
         let worst = errors.max_by(|a, b| a.0.total_cmp(&b.0)).expect("a tensor");
         println!("{family}: worst {what}: {:.1e} ({})", worst.0, worst.1);
     };
-    compare("gradient", &found.gradients, &expected.gradients, 1e-2 * largest);
+    compare("gradient", &found.gradients, &expected.gradients, 1e-3 * largest);
     compare("weight", &found.weights, &expected.weights, 0.0);
 }
 

@@ -11,7 +11,8 @@ use swm_models::device::{self, Choice, Kind};
 pub struct DeviceArgs {
     /// Device of the models: cpu, vulkan[:I], cuda[:I] or auto
     ///
-    /// `swm devices` lists them. auto is the first GPU that passes a test computation, else the CPU.
+    /// `swm devices` lists them. auto is the first GPU that passes a test computation, else the CPU. A GPU's matrix products have the
+    /// precision after a comma: cuda:0,bf16.
     #[arg(long, default_value = "cpu")]
     pub device: String,
 }

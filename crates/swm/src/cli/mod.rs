@@ -226,6 +226,11 @@ pub fn run(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) -> 
     let arguments: Vec<OsString> = arguments.into_iter().map(Into::into).collect();
     run_record::remember(&arguments);
     let code = match parse(arguments) {
+        Ok(_) if std::time::SystemTime::now() < std::time::UNIX_EPOCH => {
+            // Libraries below take such a time for damage, or panic.
+            eprint("error: the clock of this machine is before 1970; set it\n");
+            1
+        }
         Ok(cli) => cli.run(),
         Err(error) => print_usage(&error),
     };

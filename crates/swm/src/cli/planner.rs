@@ -37,7 +37,7 @@ pub struct PlannerArgs {
     pub latency_budget: Option<f64>,
     /// Plan for environments together on a GPU
     ///
-    /// It is faster, and the last bits of a plan may then depend on the other environments.
+    /// It is faster, and the last bits of a plan may then depend on the other environments. The CPU plans for each on its own.
     #[arg(long)]
     pub fast: bool,
     /// Term of the objective: goal, control or change; may be repeated

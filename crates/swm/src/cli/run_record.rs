@@ -36,7 +36,7 @@ pub struct RunRecord {
 pub struct Invocation {
     /// The arguments, the program's name first.
     pub command: Vec<String>,
-    /// What did the work in place of this program, such as `stable_worldmodel.train (torch)`. The command is then the one that
+    /// The program that trained, if it was another than this one, such as `stable_worldmodel.train (torch)`. The command is then the one that
     /// continues it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub program: Option<String>,

@@ -43,6 +43,19 @@ pub fn report_large_files() {
     unsafe { libc::signal(libc::SIGXFSZ, libc::SIG_IGN) };
 }
 
+/// Lets a program that is started react to Ctrl-C, also if this one ignores it, as in the background of a script.
+#[allow(unsafe_code, reason = "the reaction to a signal is set by a function of the C library")]
+pub fn react_to_interrupts(command: &mut std::process::Command) {
+    use std::os::unix::process::CommandExt as _;
+    // SAFETY: `signal` may be called between fork and exec, and `SIG_DFL` runs no code of ours.
+    unsafe {
+        command.pre_exec(|| {
+            libc::signal(libc::SIGINT, libc::SIG_DFL);
+            Ok(())
+        });
+    }
+}
+
 /// The handler of [`SIGNALS`]. It works without memory and without locks, because it interrupts any code.
 #[allow(unsafe_code, reason = "functions of the C library that a handler may call")]
 extern "C" fn handle(signal: libc::c_int) {

@@ -193,6 +193,6 @@ fn cells_of_an_evaluation_join_to_that_of_one_process() {
     // The record has the command of the user, not that of the cell.
     let record = std::fs::read(swm.path("joined/run.json")).expect("the record");
     let record: Value = serde_json::from_slice(&record).expect("JSON");
-    let command: Vec<&str> = std::iter::once("swm").chain(eval.iter().copied()).collect();
+    let command: Vec<&str> = std::iter::once("swm").chain(eval.iter().copied()).chain(["--output", "joined"]).collect();
     assert_eq!(record["commands"][0]["command"], serde_json::json!(command));
 }

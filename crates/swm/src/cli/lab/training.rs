@@ -1,6 +1,6 @@
 //! Trainings that pages of the lab start: this program as `swm train`, in a process of its own.
 
-use crate::cli::run_record;
+use crate::cli::{run_record, signals};
 use std::path::Path;
 use std::process::{Child, Command};
 use swm_core::{Error, Result};
@@ -44,6 +44,7 @@ impl Training for OwnProgram {
             format!("seed={}", request.seed),
             format!("log_every={every}"),
         ]);
+        signals::react_to_interrupts(&mut command);
         Ok(command)
     }
 

@@ -119,13 +119,14 @@ impl EvalCommand {
             write_json(&args.output.join(TRACES), &joined_traces(parts, conditions)?)?;
         }
         write_json(&args.output.join("results.json"), &results)?;
-        run_record::write_command(&args.output, command_of_one_process(&run_record::arguments()))?;
+        run_record::write_command(&args.output, command_of_one_process(&run_record::arguments(), &args.output))?;
         Ok(results)
     }
 }
 
-/// The command line of an evaluation on one machine, from that of the cell that joins its results; without the output.
-fn command_of_one_process(arguments: &[String]) -> Vec<String> {
+/// The command line of an evaluation on one machine, from that of the cell that joins its results.
+fn command_of_one_process(arguments: &[String], output: &Path) -> Vec<String> {
     let own = ["--join", "--stage", "--threads", "-o", "--output"];
-    std::iter::once("swm".to_owned()).chain(without(arguments, &own, &["--json"])).collect()
+    let output = ["--output".to_owned(), output.display().to_string()];
+    std::iter::once("swm".to_owned()).chain(without(arguments, &own, &["--json"])).chain(output).collect()
 }

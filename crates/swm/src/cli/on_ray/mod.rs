@@ -10,7 +10,7 @@ mod eval_parts;
 pub mod study;
 pub mod train;
 
-use super::{Context, emit_json, run_record};
+use super::{Context, emit_json, run_record, signals};
 use clap::Args;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
@@ -258,6 +258,7 @@ fn is_there(path: &Path) -> bool {
 #[allow(unsafe_code, reason = "asking the kernel for a signal is a function of the C library")]
 fn start(command: &mut Command) -> std::io::Result<Child> {
     command.stdin(Stdio::piped()).process_group(0);
+    signals::react_to_interrupts(command);
     // SAFETY: `prctl` may be called between fork and exec.
     #[cfg(target_os = "linux")]
     unsafe {

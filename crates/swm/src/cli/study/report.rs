@@ -32,7 +32,15 @@ pub fn report(args: &ReportArgs, as_json: bool) -> anyhow::Result<()> {
     let folder = StudyFolder::new(&args.folder);
     // Before the folder of the page is made, which may lie in that of the study.
     folder.open()?;
-    let output = args.output.clone().unwrap_or_else(|| args.folder.join("report"));
+    let output = match &args.output {
+        Some(output) => output.clone(),
+        None => {
+            let own = args.folder.join("report");
+            // The folder may be of somebody else, who does not choose where the page goes.
+            files::check_no_link(&own)?;
+            own
+        }
+    };
     let names: Vec<&str> = std::iter::once("index.html").chain(TABLES.map(|(name, _)| name)).collect();
     let _lock = output_folder::claim(&output, &names)?;
     check_figures(&output)?;

@@ -2,7 +2,7 @@
 //! transitions.
 //!
 //! The losses of Q functions, policy and temperature have separate autodiff graphs. All gradients are computed at the
-//! same weights; the publication updates the Q functions before computing the policy's loss.
+//! same weights, on two threads if there are two; the publication updates the Q functions before computing the policy's loss.
 
 use super::config::SacLoss;
 use super::model::{Critics, Sac};
@@ -48,45 +48,40 @@ pub struct SacStep {
 pub fn step(model: &Sac, batch: &Transitions, config: &SacLoss) -> SacStep {
     let Transitions { observations, actions, rewards, terminated, next, noise: [next_noise, noise] } = batch;
     let temperature = f64::from(model.log_ent_coef.val().into_scalar::<f32>()).exp();
-    let mut gradients = Named::new();
-    let mut insert = |prefix: &str, new: Named<Tensor<1>>| {
-        gradients.extend(new.into_iter().map(|(name, gradient)| (format!("{prefix}.{name}"), gradient)));
+    // The two losses are computed at the same weights, so that neither waits for the other.
+    let q_functions = || {
+        let sample = model.actor.sample(next.clone(), next_noise.clone());
+        let [first, second] = model.critic_target.forward(Tensor::cat(vec![next.clone(), sample.actions], 1));
+        let soft = first.min_pair(second) - sample.log_density * temperature;
+        let target = (rewards.clone() + soft * (terminated.clone().neg() + 1.0) * config.discount).autodiff();
+        let critic = model.critic.clone().train();
+        let errors = critic
+            .forward(Tensor::cat(vec![observations.clone(), actions.clone()], 1).autodiff())
+            .map(|q| (q - target.clone()).square().mean());
+        let [first, second] = errors;
+        let loss = (first + second) * 0.5;
+        (value_of(&loss), parameters::gradients(&critic, &loss.backward()))
     };
-
-    let sample = model.actor.sample(next.clone(), next_noise.clone());
-    let [first, second] = model.critic_target.forward(Tensor::cat(vec![next.clone(), sample.actions], 1));
-    let soft = first.min_pair(second) - sample.log_density * temperature;
-    let target = (rewards.clone() + soft * (terminated.clone().neg() + 1.0) * config.discount).autodiff();
-    let critic = model.critic.clone().train();
-    let errors = critic
-        .forward(Tensor::cat(vec![observations.clone(), actions.clone()], 1).autodiff())
-        .map(|q| (q - target.clone()).square().mean());
-    let [first, second] = errors;
-    let critic_loss = (first + second) * 0.5;
-    insert("critic", parameters::gradients(&critic, &critic_loss.backward()));
-
-    let actor = model.actor.clone().train();
-    let observations = observations.clone().autodiff();
-    let sample = actor.sample(observations.clone(), noise.clone().autodiff());
-    let [first, second] = constants(&model.critic).forward(Tensor::cat(vec![observations, sample.actions], 1));
-    let q = first.min_pair(second).mean();
-    let density = sample.log_density.mean();
-    let actor_loss = density.clone() * temperature - q.clone();
-    insert("actor", parameters::gradients(&actor, &actor_loss.backward()));
+    let policy = || {
+        let actor = model.actor.clone().train();
+        let observations = observations.clone().autodiff();
+        let sample = actor.sample(observations.clone(), noise.clone().autodiff());
+        let [first, second] = constants(&model.critic).forward(Tensor::cat(vec![observations, sample.actions], 1));
+        let (q, density) = (first.min_pair(second).mean(), sample.log_density.mean());
+        let loss = density.clone() * temperature - q.clone();
+        let values = [&loss, &density, &q].map(value_of);
+        (values, parameters::gradients(&actor, &loss.backward()))
+    };
+    let ((critic, of_critic), ([actor, density, q], of_actor)) = rayon::join(q_functions, policy);
+    let mut gradients = parameters::prefixed("critic", of_critic);
+    gradients.extend(parameters::prefixed("actor", of_actor));
 
     // The temperature's loss is -ln α (ln π + H), whose gradient needs no autodiff graph.
-    let entropy = -value_of(&density);
+    let entropy = -density;
     let target_entropy = config.entropy * actions.dims()[1] as f64;
     let gradient = model.log_ent_coef.val().zeros_like() + (entropy - target_entropy);
     gradients.insert("log_ent_coef".to_owned(), gradient);
-    SacStep {
-        critic: value_of(&critic_loss),
-        actor: value_of(&actor_loss),
-        temperature,
-        entropy,
-        q: value_of(&q),
-        gradients,
-    }
+    SacStep { critic, actor, temperature, entropy, q, gradients }
 }
 
 /// Returns the Q functions as constants of an autodiff graph: gradients reach the inputs of the Q functions, not the

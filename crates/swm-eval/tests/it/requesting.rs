@@ -389,7 +389,8 @@ fn reproduction_with_another_dataset_of_the_probe_is_rejected() {
     let old = request().run(&resolver("p0"), &RunOptions::default(), &mut Control::new()).expect("an evaluation");
     assert_eq!(old.manifest.hashes["probe dataset"], "p0");
     assert!(repeat(&old, &resolver("p0")).is_ok());
-    let error = repeat(&old, &resolver("p1")).err().expect("another dataset").to_string();
+    let Err(error) = repeat(&old, &resolver("p1")) else { panic!("another dataset is accepted") };
+    let error = error.to_string();
     assert!(error.contains("probe dataset") && error.contains("p1"), "{error}");
 }
 

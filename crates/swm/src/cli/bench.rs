@@ -259,8 +259,7 @@ fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
     if context.json {
         return emit_json(&reports);
     }
-    let seconds = reports.first().and_then(|report| report.rows.first()).map_or(f64::INFINITY, |row| row.seconds);
-    emit(&format!("{}{clips} clips per step: {:.1} clips/s\n", lines(&reports), clips as f64 / seconds));
+    emit(&format!("{}{clips} clips per step: {:.1} clips/s\n", lines(&reports), rate(&reports, clips)));
     Ok(())
 }
 
@@ -287,8 +286,7 @@ fn encode(args: &EncodeArgs, context: &Context) -> anyhow::Result<()> {
     if context.json {
         return emit_json(&reports);
     }
-    let seconds = reports.first().and_then(|report| report.rows.first()).map_or(f64::INFINITY, |row| row.seconds);
-    emit(&format!("{}{frames} images at once: {:.0} images/s\n", lines(&reports), frames as f64 / seconds));
+    emit(&format!("{}{frames} images at once: {:.0} images/s\n", lines(&reports), rate(&reports, frames)));
     Ok(())
 }
 
@@ -317,32 +315,24 @@ struct OnlineArgs {
 /// Measures training steps of a family that is trained online.
 fn online(args: &OnlineArgs, context: &Context) -> anyhow::Result<()> {
     let OnlineArgs { family, observation, action, steps, pairs, settings } = args;
-    let mut sizes = serde_json::json!({ "family": family, "observation": observation, "action": action });
-    let mut add = |more: serde_json::Value| {
-        if let (Some(sizes), serde_json::Value::Object(more)) = (sizes.as_object_mut(), more) {
-            sizes.extend(more);
-        }
-    };
-    let mut subject: Box<dyn Subject + Send> = if family == "sac" {
+    let (mut sizes, mut subject): (serde_json::Value, Box<dyn Subject + Send>) = if family == "sac" {
         let subject = StepSubject::<Sac>::new(settings, *observation, *action)?;
-        let config = &subject.config;
-        add(serde_json::json!({ "hidden": config.model.hidden }));
-        add(serde_json::json!({ "batch": config.data.batch_size, "lr": config.optim.lr, "tau": config.loss.tau,
-            "discount": config.loss.discount }));
-        Box::new(subject)
+        let (model, loss) = (&subject.config.model, &subject.config.loss);
+        let sizes = serde_json::json!({ "hidden": model.hidden, "tau": loss.tau, "discount": loss.discount,
+            "batch": subject.config.data.batch_size, "lr": subject.config.optim.lr });
+        (sizes, Box::new(subject))
     } else {
         let subject = StepSubject::<Tdmpc2>::new(settings, *observation, *action)?;
-        let config = &subject.config;
-        let model = &config.model;
-        add(
-            serde_json::json!({ "hidden": model.hidden, "encoder": model.encoder, "simplex": model.simplex, "critics": model.critics,
-            "bins": model.bins.count, "latent": model.encoding.iter().map(|encoding| encoding.latent).sum::<usize>(),
-            "horizon": config.data.num_steps - 1 }),
-        );
-        add(serde_json::json!({ "batch": config.data.batch_size, "lr": config.optim.lr, "tau": config.loss.tau,
-            "discount": config.loss.discount }));
-        Box::new(subject)
+        let (model, loss) = (&subject.config.model, &subject.config.loss);
+        let latent: usize = model.encoding.iter().map(|encoding| encoding.latent).sum();
+        let sizes = serde_json::json!({ "hidden": model.hidden, "tau": loss.tau, "discount": loss.discount,
+            "batch": subject.config.data.batch_size, "lr": subject.config.optim.lr, "latent": latent, "encoder": model.encoder,
+            "simplex": model.simplex, "critics": model.critics, "bins": model.bins.count,
+            "horizon": subject.config.data.num_steps - 1 });
+        (sizes, Box::new(subject))
     };
+    sizes["family"] = serde_json::json!(family);
+    (sizes["observation"], sizes["action"]) = (serde_json::json!(observation), serde_json::json!(action));
     let report = swm_core::pool::threads(context.threads)?.install(|| {
         let python = PlanBenchConfig::default().python;
         let config = ModelBenchConfig {
@@ -360,6 +350,11 @@ fn online(args: &OnlineArgs, context: &Context) -> anyhow::Result<()> {
     let rate = report.rows.first().map_or(0.0, |row| 1.0 / row.seconds);
     emit(&format!("{report}{rate:.0} training steps/s\n"));
     Ok(())
+}
+
+/// What the first workload processes in a second, if a repetition processes `count`.
+fn rate(reports: &[ModelBenchReport], count: usize) -> f64 {
+    reports.first().and_then(|report| report.rows.first()).map_or(0.0, |row| count as f64 / row.seconds)
 }
 
 /// The reports one below the other.

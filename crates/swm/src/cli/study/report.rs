@@ -36,7 +36,7 @@ pub fn report(args: &ReportArgs, as_json: bool) -> anyhow::Result<()> {
         Some(output) => output.clone(),
         None => {
             let own = args.folder.join("report");
-            // The folder may be of somebody else, who does not choose where the page goes.
+            // A downloaded folder does not choose where the page goes.
             files::check_no_link(&own)?;
             own
         }

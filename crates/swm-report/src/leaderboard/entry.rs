@@ -27,7 +27,8 @@ pub(super) fn render(entry: &BoardEntry) -> Result<String> {
         fact("entry (BLAKE3)", &entry.hash, " class=\"hash\"");
         let _ = write!(
             html,
-            "</dl>\n<p>The command that plays all episodes again and refuses the entry if one differs; \
+            "</dl>\n<p class=\"note\">Times and the processor below are stated by the submitter: verification does not cover \
+             them.</p>\n<p>The command that plays all episodes again and refuses the entry if one differs; \
              <code>--share 0.1</code> plays a random tenth:</p>\n<pre>{}</pre>\n</section>\n",
             escape(&shorten(&entry.command, 4 * super::NAME_CHARS))
         );

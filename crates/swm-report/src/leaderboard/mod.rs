@@ -192,6 +192,8 @@ mod tests {
         let none = "<span class=\"quiet\">–</span>";
         assert_eq!(cells(&html, "rank"), ["1–2", "1–2", "3", none, none]);
         assert!(html.contains("3 comparisons of 60 pairs"));
+        // No verification plays an episode in the time that an entry states.
+        assert!(html.contains("Planning latency (stated)") && html.contains("stated by the submitter"));
         assert!(html.contains("href=\"entries/ab-2.html\"") && !html.contains("<i>Co"));
     }
 
@@ -204,7 +206,13 @@ mod tests {
             assert!(folder.path().join(page).is_file());
         }
         let html = std::fs::read_to_string(folder.path().join("entries/ab-2.html")).expect("a page");
-        for part in ["a&lt;b&gt; in swm/TwoRoom-v1", "swm leaderboard verify x.json", "../index.html", "50.0\u{a0}%"] {
+        for part in [
+            "a&lt;b&gt; in swm/TwoRoom-v1",
+            "swm leaderboard verify x.json",
+            "../index.html",
+            "50.0\u{a0}%",
+            "stated by the submitter",
+        ] {
             assert!(html.contains(part), "{part}");
         }
         assert!(!html.contains("<script") && !html.contains("<i>Co"));

@@ -39,7 +39,7 @@ impl CameraView {
     /// Parses `MODALITY`, `CAMERA` or `CAMERA:MODALITY`, where a modality is `pixels`, `depth` or `segmentation`.
     ///
     /// # Errors
-    /// When the text after the colon is not a modality.
+    /// When the text after the colon is not a modality, or the camera's name cannot be a part of the name of a column and its files.
     pub fn parse(text: &str) -> Result<Self> {
         let modality =
             |name: &str| Modality::ALL.iter().find(|(_, known)| *known == name).map(|(modality, _)| *modality);
@@ -47,9 +47,9 @@ impl CameraView {
             return Ok(Self { camera: None, modality });
         }
         match text.rsplit_once(':') {
-            None => Ok(Self { camera: Some(text.to_owned()), modality: Modality::Rgb }),
+            None => Ok(Self { camera: Some(checked(text)?), modality: Modality::Rgb }),
             Some((camera, name)) => match modality(name) {
-                Some(modality) => Ok(Self { camera: Some(camera.to_owned()), modality }),
+                Some(modality) => Ok(Self { camera: Some(checked(camera)?), modality }),
                 None => {
                     let known = Modality::ALL.map(|(_, name)| name);
                     let hint =
@@ -87,6 +87,22 @@ impl CameraView {
     }
 }
 
+/// Returns the name of a camera. The column of its view is a file in some formats.
+///
+/// # Errors
+/// When the name is empty, or has characters that no such file has.
+fn checked(camera: &str) -> Result<String> {
+    let problem = match camera {
+        "" => "the name of the camera is empty",
+        _ if camera.contains(['/', '\\']) => "the name of a camera has no slashes",
+        _ if camera.starts_with('.') => "the name of a camera does not begin with a dot",
+        _ if camera.chars().any(char::is_control) => "the name of a camera has no control characters",
+        _ => return Ok(camera.to_owned()),
+    };
+    let fix = "write CAMERA, MODALITY or CAMERA:MODALITY; `swm envs ENV` lists the cameras of an environment";
+    Err(Error::config(format!("the camera view '{camera}'"), problem, fix))
+}
+
 impl fmt::Display for CameraView {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&columns::of_camera(self.modality.name(), self.camera.as_deref()))
@@ -108,6 +124,10 @@ mod tests {
         assert_eq!(both.column(4, 6), ColumnSpec::new("segmentation.top", DType::Int32, [4, 6]));
         let error = CameraView::parse("top:dept").expect_err("an unknown modality").to_string();
         assert!(error.contains("depth"), "{error}");
+        for wrong in ["", ":depth", "../../x", "a/b:depth", "a\\b", ".x", "a\nb"] {
+            let error = CameraView::parse(wrong).expect_err(wrong).to_string();
+            assert!(error.contains("name of") && error.contains("CAMERA:MODALITY"), "{error}");
+        }
         Ok(())
     }
 }

@@ -200,6 +200,8 @@ pub fn nearest<'a>(given: &str, known: impl IntoIterator<Item = &'a str>) -> Vec
     let wanted = fold(given);
     let mut scored: Vec<(f64, &str)> = known
         .into_iter()
+        // Something of this very name may be known in another place.
+        .filter(|name| *name != given)
         .map(|name| {
             let folded = fold(name);
             let contains = folded.contains(&wanted) || wanted.contains(&folded);
@@ -268,6 +270,7 @@ mod tests {
         assert_eq!(nearest("pusht", known), ["swm/PushT-v1"]);
         assert_eq!(nearest("swm/TowRoom-v1", known)[0], "swm/TwoRoom-v1");
         assert!(nearest("quux", known).is_empty());
+        assert_eq!(nearest("rooms", ["rooms", "rooms2"]), ["rooms2"]);
         assert_eq!(nearest("exprt", ["expert", "explore", "expert"])[..2], ["expert", "explore"]);
         let message = Error::unknown("environment", "pusht", known, "`swm envs` lists them").to_string();
         assert_eq!(message, "unknown environment 'pusht' (did you mean swm/PushT-v1?); `swm envs` lists them");

@@ -1,5 +1,6 @@
 //! [`Client`]: requests to the hub, and its errors in words.
 
+use super::pace::Pace;
 use super::{HubFile, HubUri, RepoKind};
 use crate::dataset::objects;
 use bytes::Bytes;
@@ -158,7 +159,7 @@ impl Client {
             let entries: Vec<Entry> = parsed(&url, &bytes)?;
             for entry in entries.into_iter().filter(|entry| entry.kind == "file") {
                 if !super::uri::is_inside(&entry.path) {
-                    let problem = format!("it lists a file outside of the repository: '{}'", entry.path.escape_debug());
+                    let problem = format!("it lists a file that no repository has: '{}'", entry.path.escape_debug());
                     return Err(Error::corrupt(&url, problem, "do not use this hub"));
                 }
                 let (size, sha256) = entry.lfs.map_or((entry.size, None), |lfs| {
@@ -358,7 +359,7 @@ fn in_blocks(mut bytes: Bytes) -> Blocks {
 }
 
 /// The hub in messages.
-fn named(url: &str) -> String {
+pub(super) fn named(url: &str) -> String {
     let host = Url::parse(url).ok().and_then(|url| url.host_str().map(str::to_owned)).unwrap_or_default();
     format!("the hub ({host})")
 }
@@ -382,12 +383,15 @@ pub(super) async fn next_chunk(url: &str, answer: &mut Response) -> Result<Optio
 pub(super) fn whole(url: &str, mut answer: Response) -> Result<Vec<u8>> {
     let label = url.to_owned();
     run(url, async move {
-        let mut bytes = vec![];
+        let (mut bytes, mut pace) = (vec![], Pace::new());
         while let Some(chunk) = next_chunk(&label, &mut answer).await? {
             if bytes.len() + chunk.len() > MAX_ANSWER {
                 return Err(Error::corrupt(label, "its answer is too long", "check the address of the hub"));
             }
             bytes.extend_from_slice(&chunk);
+            if let Some(message) = pace.add(chunk.len(), &named(&label), None)? {
+                tracing::warn!("{message}");
+            }
         }
         Ok(bytes)
     })

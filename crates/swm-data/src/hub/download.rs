@@ -1,7 +1,8 @@
 //! [`Hub::pull`]: downloads, which continue where they were interrupted.
 
 use super::cache::Folder;
-use super::client::{Body, Client, encoded_path, next_chunk, run};
+use super::client::{Body, Client, encoded_path, named, next_chunk, run};
+use super::pace::Pace;
 use super::{Hub, HubFile, HubUri, Pulled};
 use reqwest::header::{HeaderMap, HeaderValue, RANGE};
 use reqwest::{Method, Response, StatusCode};
@@ -165,6 +166,7 @@ fn transfer(
     let mut out =
         OpenOptions::new().create(true).write(true).append(continues).truncate(!continues).open(part).map_err(io)?;
     let mut left = if continues { missing.end - missing.start } else { missing.end };
+    let (whole, name, mut pace) = (left, format!("{}: {}", named(url), uri.at("main")), Pace::new());
     loop {
         control.check()?;
         let (next, rest) = chunk(url, answer)?;
@@ -176,6 +178,9 @@ fn transfer(
             return Err(Error::corrupt(url, problem, "tell the owner of the repository; do not use this hub"));
         };
         out.write_all(&bytes).map_err(io)?;
+        if let Some(message) = pace.add(bytes.len(), &name, Some(whole))? {
+            control.emit(Event::Log(&message));
+        }
         (left, answer) = (after, rest);
     }
 }

@@ -8,6 +8,7 @@
 mod cache;
 mod client;
 mod download;
+mod pace;
 mod pointer;
 mod upload;
 mod uri;

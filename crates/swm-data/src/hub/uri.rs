@@ -111,9 +111,10 @@ pub(super) fn is_sha256(text: &str) -> bool {
     text.len() == 64 && text.bytes().all(|byte| matches!(byte, b'0'..=b'9' | b'a'..=b'f'))
 }
 
-/// Whether a name, which may have several parts, stays inside the folder that it is joined to.
+/// Whether a name, which may have several parts, stays inside the folder that it is joined to, and is no file of Git's own, whose
+/// settings name programs to start.
 pub(super) fn is_inside(name: &str) -> bool {
-    name.split('/').all(|part| !matches!(part, "" | "." | ".."))
+    name.split('/').all(|part| !matches!(part, "" | "." | "..") && !part.eq_ignore_ascii_case(".git"))
         && !name.contains(['\\', '\0', '\n', '\t', '?', '#', ':'])
         && swm_core::text::printable(name) == name
 }
@@ -133,7 +134,7 @@ mod tests {
         assert_eq!((uri.kind, parse("hf://datasets/lab/rooms").kind), (RepoKind::Model, RepoKind::Dataset));
         assert_eq!(parse("lerobot://lerobot/pusht").to_string(), "hf://datasets/lerobot/pusht");
         assert_eq!(parse("hf://a/b/").path, "");
-        for same in ["hf://a/b", "hf://a/b@v2", "hf://datasets/a/b@refs%2Fpr%2F1/c/d.json"] {
+        for same in ["hf://a/b", "hf://a/b/.gitattributes", "hf://a/b@v2", "hf://datasets/a/b@refs%2Fpr%2F1/c/d.json"] {
             assert_eq!(parse(same).to_string(), same);
         }
         let commit = "0123456789abcdef0123456789abcdef01234567";
@@ -153,6 +154,8 @@ mod tests {
             "hf://a/b\n",
             "hf://a/b/\u{1b}[2J",
             "hf://a/b/c\u{202e}d",
+            "hf://a/b/.git/config",
+            "hf://a/b/data/.GIT",
         ] {
             assert!(HubUri::parse(wrong, RepoKind::Model).is_err(), "{wrong}");
         }

@@ -143,6 +143,18 @@ fn lists_of_files_do_not_continue_at_another_host() {
 }
 
 #[test]
+fn settings_of_git_are_not_downloaded() {
+    let setup = Setup::new();
+    for (name, inner) in [("a", ".git/config"), ("b", "data/.GIT/hooks/post-checkout")] {
+        setup.hub.commit(&format!("models/lab/{name}"), &[("weights", b"w"), (inner, b"[core] fsmonitor = touch x")]);
+        setup.fails(&["pull", &format!("hf://lab/{name}")], None, &["no repository has", inner]);
+        assert!(!setup.swm.path(&format!("hub/models--lab--{name}/snapshots")).exists());
+    }
+    setup.hub.commit("models/lab/c", &[(".gitattributes", b"*.bin filter=lfs")]);
+    setup.json(&["pull", "hf://lab/c"], None);
+}
+
+#[test]
 fn hashes_are_those_of_files() {
     let setup = Setup::new();
     setup.hub.commit("models/lab/rooms", &[("a", b"a"), ("large", &content(2000))]);

@@ -177,6 +177,23 @@ def test_engine_and_torch_continue_each_others_trainings(family, rooms, swings, 
         Trainer(Options(family, out=str(tmp_path / "run"), **options))
 
 
+@pytest.mark.parametrize("first", ["engine", "torch"])
+def test_a_finished_training_of_the_other_program_is_left_as_it_is(first, rooms, tmp_path):
+    settings = ["schedule.steps=2", "data.batch_size=8"]
+    trainings = {"engine": engine_train, "torch": torch_train}
+    trainings[first]("gcbc", rooms, tmp_path / "run", settings)
+    files = [path for path in sorted((tmp_path / "run").rglob("*")) if path.is_file()]
+    before = [path.read_bytes() for path in files]
+    (second,) = set(trainings) - {first}
+    with pytest.raises(ValueError, match="finished run of") as error:
+        if second == "torch":
+            torch_train("gcbc", rooms, tmp_path / "run", settings, resume=True)
+        else:
+            engine_train("gcbc", rooms, tmp_path / "run", settings, "--resume")
+    assert "2 of 2 steps" in str(error.value)
+    assert [path.read_bytes() for path in files] == before
+
+
 def test_the_program_continues_a_run_without_its_model_and_dataset(rooms, tmp_path, monkeypatch):
     given = ["gcbc", f"data={os.path.relpath(rooms, tmp_path)}", "out=./run", "preset=tiny", "device=cpu", *SHORT]
     monkeypatch.chdir(tmp_path)

@@ -41,6 +41,7 @@ mod solvers;
 pub mod study;
 mod trackers;
 mod train;
+mod train_folder;
 mod training_curves;
 mod wrappers;
 mod zoo;

@@ -5,7 +5,7 @@
 
 mod git;
 
-use super::Cli;
+use super::{Cli, train_folder};
 use crate::capsule::cpu_level;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -100,8 +100,8 @@ pub fn write_command(folder: &Path, command: Vec<String>) -> Result<()> {
 /// repeats it. `program` is what trains.
 ///
 /// # Errors
-/// Before the work, when the folder has a file of this name that is no record of a run; those of `begin`; when the folder
-/// cannot be written to.
+/// Before the work, when the folder has a file of this name that is no record of a run, links that the training would replace, or
+/// a run that `swm train` has finished; those of `begin`; when the folder cannot be written to.
 pub fn record_training<T>(
     folder: &Path,
     (command, program): (Vec<String>, &str),
@@ -109,6 +109,10 @@ pub fn record_training<T>(
     begin: impl FnOnce() -> Result<T>,
 ) -> Result<T> {
     check(folder)?;
+    train_folder::check_links(folder)?;
+    if continued {
+        train_folder::check_unfinished(folder, "torch")?;
+    }
     let begun = begin()?;
     let _lock = Lock::folder(folder)?;
     append(folder, Invocation { command, program: Some(program.to_owned()), ..Invocation::now() }, continued)?;

@@ -4,7 +4,7 @@ use super::devices::DeviceArgs;
 use super::progress::{control, print_summary};
 use super::recipes::{self, RecipeRun};
 use super::trackers::{Tracker, Trackers};
-use super::{Context, emit, emit_json, eprint, run_record};
+use super::{Context, emit, emit_json, eprint, run_record, train_folder};
 use crate::home;
 use clap::Args;
 use serde_json::{Value, json};
@@ -135,7 +135,14 @@ pub fn run_args(args: &TrainArgs, context: &Context) -> anyhow::Result<(PathBuf,
 
 /// Writes the record of a run before its first step, so that the run can be continued from it. A folder that holds another
 /// run keeps its record: the training refuses it.
+///
+/// # Errors
+/// When the folder has links that the training would replace, or PyTorch has finished the run that is to continue.
 fn record(out: &Path, resume: bool) -> Result<()> {
+    train_folder::check_links(out)?;
+    if resume {
+        train_folder::check_unfinished(out, "burn")?;
+    }
     if !resume && out.join(run_record::FILE).exists() && StoredCheckpoint::read(out).is_ok() {
         return Ok(());
     }
@@ -287,6 +294,7 @@ impl TrainArgs {
 /// Trains on a dataset, and shows progress.
 pub fn run(config: &dyn TrainableConfig, setup: TrainRun<'_>, context: &Context) -> Result<TrainSummary> {
     let out = setup.out.to_owned();
+    train_folder::check_links(&out)?;
     let summary = config.train(setup, &mut control(context))?;
     let early = if summary.stopped_early { ", stopped early" } else { "" };
     let best = summary.best.map_or(String::new(), |(step, loss)| format!(", best {loss:.4} after step {step}"));

@@ -77,8 +77,14 @@ fn training_does_not_write_through_links() {
     assert_untouched(&thesis);
     fs::create_dir_all(swm.path("logged")).expect("creating a folder");
     std::os::unix::fs::symlink(&thesis, swm.path("logged/train.jsonl")).expect("making a link");
-    swm.fails(&train("./logged"), 1, &["train.jsonl", "not a regular file"]);
+    swm.fails(&train("./logged"), 2, &["train.jsonl", "symbolic link"]);
     assert_untouched(&thesis);
+    // A run whose checkpoint is on another disk would fail at its first checkpoint, and leave a part of it.
+    fs::rename(swm.path("linked/checkpoint"), swm.path("disk")).expect("moving the checkpoint");
+    std::os::unix::fs::symlink(swm.path("disk"), run.join("checkpoint")).expect("making a link");
+    let before = fs::read(run.join("run.json")).expect("the record");
+    swm.fails(&["train", "-o", "./linked", "--resume"], 2, &["checkpoint", "symbolic link", "in its place"]);
+    assert!(fs::read(run.join("run.json")).is_ok_and(|after| after == before) && !run.join("checkpoint.old").exists());
 }
 
 #[test]

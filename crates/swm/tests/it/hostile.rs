@@ -132,6 +132,44 @@ fn file_beyond_the_limit_of_the_process_is_an_error() {
 }
 
 #[test]
+fn small_stacks_of_the_main_thread_are_enough() {
+    let swm = Swm::new();
+    for arguments in
+        ["envs", "collect swm/TwoRoom-v1 --image 32 --episodes 1 --max-steps 4 -o ./a --format video", "doctor ./a"]
+    {
+        let command = format!("ulimit -s 64; exec {} {arguments}", env!("CARGO_BIN_EXE_swm"));
+        let mut shell = std::process::Command::new("sh");
+        let output = shell.args(["-c", &command]).current_dir(swm.path("")).output().expect("a shell");
+        assert!(output.status.success(), "{arguments}: {:?}: {}", output.status, text(&output.stderr));
+    }
+}
+
+#[test]
+fn finished_run_of_another_program_is_left_as_it_is() {
+    let swm = Swm::new();
+    swm.json(&["collect", "swm/TwoRoom-v1", "-o", "rooms.lance", "--image", "64", "--episodes", "4"]);
+    let train = ["train", "gcbc", "--data", "rooms.lance", "-o", "./run", "schedule.steps=2", "data.batch_size=4"];
+    swm.json(&train);
+    let manifest = swm.path("run/checkpoint/manifest.json");
+    let own = fs::read_to_string(&manifest).expect("the manifest");
+    fs::write(&manifest, own.replace("\"burn\"", "\"torch\"")).expect("writing the manifest");
+    let before = inodes(&swm.path("run/checkpoint"));
+    swm.fails(
+        &["train", "-o", "./run", "--resume"],
+        2,
+        &["finished run of PyTorch", "2 of 2 steps", "nothing was changed"],
+    );
+    assert_eq!(inodes(&swm.path("run/checkpoint")), before);
+    // A run that is not finished continues in the other program.
+    let state = swm.path("run/checkpoint/state.json");
+    let one = fs::read_to_string(&state).expect("the state").replace("\"step\": 2", "\"step\": 1");
+    fs::write(&state, one).expect("writing the state");
+    swm.json(&["train", "-o", "./run", "--resume"]);
+    assert!(fs::read_to_string(&manifest).expect("the manifest").contains("\"burn\""));
+    swm.json(&["train", "-o", "./run", "--resume"]);
+}
+
+#[test]
 fn continuing_a_finished_online_run_leaves_its_replay_data_in_place() {
     let swm = Swm::new();
     let train = "train sac --preset tiny --env swm/PendulumControl-v1 --max-steps 20 -o ./run schedule.steps=4 \

@@ -5,7 +5,7 @@
 //! are the latents along the two principal components of those.
 
 use super::chosen::Chosen;
-use crate::cli::Context;
+use crate::cli::{Context, train_folder};
 use crate::{home, resolver};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -166,6 +166,7 @@ impl Trained {
         let reader = home::open_dataset(&settings.dataset)?;
         let config = (FAMILIES.get(FAMILY)?.config)(&settings.preset, &settings.overrides())?;
         let out = folder.model(&model_name(&cell.request)?)?;
+        train_folder::check_links(&out)?;
         let options = TrainOptions {
             resume: true,
             device: device::parse("cpu")?,

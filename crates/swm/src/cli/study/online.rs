@@ -1,7 +1,7 @@
 //! Studies of the kind `online`: returns and learning curves of models that train by interaction.
 
 use super::chosen::{Chosen, check_cells};
-use crate::cli::Context;
+use crate::cli::{Context, train_folder};
 use crate::home;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -179,6 +179,7 @@ pub(super) fn measure(cell: &TableCell, context: &Context, control: &mut Control
     let words = cell.name.split(|c: char| !c.is_ascii_alphanumeric()).filter(|word| !word.is_empty());
     let name = words.collect::<Vec<_>>().join("-");
     let out = home::new_checkpoint(&format!("online-{}-{}", name.to_lowercase(), cell.id()?))?;
+    train_folder::check_links(&out)?;
     let options = TrainOptions {
         resume: true,
         device: device::parse("cpu")?,

@@ -78,6 +78,9 @@ pub enum StartsRequest {
         goal_offset: usize,
         /// The held-out part whose episodes are used; all episodes for `None`.
         held_out: Option<HeldOut>,
+        /// Whether no two starts come from one recorded episode, so that their outcomes are independent.
+        #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+        one_per_episode: bool,
     },
 }
 
@@ -236,6 +239,21 @@ impl EvalRequest {
             StartsRequest::Episodic => "episodic",
             StartsRequest::Dataset { .. } => "dataset",
         }
+    }
+
+    /// This request with at most one start from each recorded episode, as evaluations need whose results end them. Starts that the
+    /// environment draws stay as they are.
+    #[must_use]
+    pub fn with_one_start_per_episode(mut self) -> Self {
+        if let StartsRequest::Dataset { one_per_episode, .. } = &mut self.starts {
+            *one_per_episode = true;
+        }
+        self
+    }
+
+    /// Whether several starts may come from one recorded episode.
+    pub(crate) fn may_repeat_episodes(&self) -> bool {
+        matches!(self.starts, StartsRequest::Dataset { one_per_episode: false, .. })
     }
 
     /// Reads the request from the manifest of evaluation results.

@@ -315,14 +315,15 @@ impl EvalRequest {
     /// The rows of a dataset that are the starts; none if the environment draws them. Those of a request with fewer episodes
     /// are the first of them.
     pub(crate) fn picks(&self, reader: &dyn Reader) -> Result<Vec<[usize; 2]>> {
-        let (n, seed) = (self.episodes, self.seed);
-        match &self.starts {
-            StartsRequest::Episodic => Ok(vec![]),
-            StartsRequest::Dataset { goal_offset, held_out: None, .. } => Starts::choose(reader, n, *goal_offset, seed),
-            StartsRequest::Dataset { goal_offset, held_out: Some(HeldOut { part, split }), .. } => {
-                Starts::choose_among(reader, &split.episodes(reader, *part)?, n, *goal_offset, seed)
-            }
-        }
+        let StartsRequest::Dataset { goal_offset, held_out, one_per_episode, .. } = &self.starts else {
+            return Ok(vec![]);
+        };
+        let episodes = match held_out {
+            None => (0..reader.episodes().len()).collect(),
+            Some(HeldOut { part, split }) => split.episodes(reader, *part)?,
+        };
+        let choose = if *one_per_episode { Starts::choose_one_per_episode } else { Starts::choose_among };
+        choose(reader, &episodes, self.episodes, *goal_offset, self.seed)
     }
 
     /// The part of a dataset that the starts come from, if there is one.

@@ -206,6 +206,52 @@ impl Starts {
         Ok(picks)
     }
 
+    /// Chooses one start in each of `n` different episodes among `episodes`: the episodes uniformly, and in each a step
+    /// uniformly among those whose goal lies in it. The picks of a smaller `n` are the first of these.
+    ///
+    /// Starts of one episode tend to end equally. Statistics that hold at any number of starts need independent outcomes, which those
+    /// of different episodes are, if the episodes were recorded independently.
+    ///
+    /// # Errors
+    /// When fewer than `n` episodes have a start, or an episode does not exist.
+    pub fn choose_one_per_episode(
+        reader: &dyn Reader,
+        episodes: &[usize],
+        n: usize,
+        goal_offset: usize,
+        seed: u64,
+    ) -> Result<Vec<[usize; 2]>> {
+        // The episodes with a start, each with the number of its starts.
+        let mut left = Vec::with_capacity(episodes.len());
+        for &episode in episodes {
+            let found = reader.episodes().get(episode).ok_or_else(|| no_episode(reader, episode))?;
+            let starts = found.length.saturating_sub(goal_offset);
+            left.extend((starts > 0).then_some([episode, starts]));
+        }
+        if n > left.len() {
+            return Err(Error::config(
+                "number of evaluation starts",
+                format!(
+                    "{n}, each from an episode of its own, but {} of the dataset's {} episodes have a step with a goal \
+                     {goal_offset} steps later",
+                    left.len(),
+                    episodes.len()
+                ),
+                format!("choose at most {}, lower the goal offset, or collect more episodes", left.len()),
+            ));
+        }
+        let mut rng = Key::new(seed).with("starts, one per episode").rng();
+        let mut draw = |count: usize| rng.random_range(0..count as u64) as usize;
+        let mut picks = Vec::with_capacity(n);
+        for i in 0..n {
+            let drawn = i + draw(left.len() - i);
+            left.swap(i, drawn);
+            let [episode, starts] = left[i];
+            picks.push([episode, draw(starts)]);
+        }
+        Ok(picks)
+    }
+
     /// The number of starts.
     pub fn len(&self) -> usize {
         self.n

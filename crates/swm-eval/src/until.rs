@@ -14,6 +14,12 @@ use swm_core::{Error, Result, Results};
 /// The number of starts of the first stage.
 pub(crate) const FIRST: usize = 10;
 
+/// What is wrong with starts that a rule cannot end.
+pub(crate) const SEVERAL_STARTS: &str = "several starts may come from one recorded episode, and the statistics that hold at any number of starts need independent ones";
+/// What to do about it.
+pub(crate) const ONE_START: &str =
+    "take one start from each episode: run it again with this version, in another folder";
+
 /// The numbers of starts of the stages: each has half as many again as the one before, rounded up to tens.
 pub(crate) fn stages() -> impl Iterator<Item = usize> {
     std::iter::successors(Some(FIRST), |n| Some((n + n / 2).next_multiple_of(10)))
@@ -99,8 +105,8 @@ impl EvalRequest {
     /// Checks that this evaluation can end by the rule.
     ///
     /// # Errors
-    /// When the counting allows no more episodes, there are more videos than episodes of the first stage, or nothing is
-    /// compared.
+    /// When the counting allows no more episodes, several starts may come from one recorded episode, there are more videos than
+    /// episodes of the first stage, or nothing is compared.
     pub fn check_rule(&self, until: Until, options: &RunOptions) -> Result<()> {
         let invalid = |problem: String, fix: &str| Err(Error::config("--until", problem, fix));
         let videos = options.videos.as_ref().map_or(0, |(_, count)| *count);
@@ -110,6 +116,9 @@ impl EvalRequest {
                     .to_owned(),
                 "use strict counting, or take starts from a dataset",
             );
+        }
+        if self.may_repeat_episodes() {
+            return invalid(SEVERAL_STARTS.to_owned(), ONE_START);
         }
         if videos > FIRST {
             let problem = format!("{videos} videos of each run, and the first stage has {FIRST} episodes");

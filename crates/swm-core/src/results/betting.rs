@@ -15,7 +15,9 @@
 //!
 //! For outcomes 0 and 1 the mixture is a ratio of Beta functions. For others it is the mean over the 256 nodes of the
 //! Gauss–Chebyshev rule, which is a mixture too, so no property depends on its accuracy; up to 511 outcomes it equals the
-//! integral. With paired outcomes, x is 1 where only the first side succeeded, 0 where only the second did, and 1/2
+//! integral. Outcomes must be independent, or at least have the mean m whatever came before. Several starts from one recorded episode
+//! have not: what solves one tends to solve the next. Evaluations that their results end therefore take one start from each episode,
+//! and for a fixed number of starts the mean over each episode is one outcome. With paired outcomes, x is 1 where only the first side succeeded, 0 where only the second did, and 1/2
 //! otherwise: against equal rates, m = 1/2, only pairs that differ change the capital, and the bet is on a fair coin.
 
 use statrs::function::beta::ln_beta;
@@ -50,6 +52,20 @@ pub(super) fn mean(outcomes: Outcomes<'_>, hypothesis: f64, level: f64) -> [f64;
     let low = if only(0.0) { 0.0 } else { end(&holds, estimate, 0.0, Some(hypothesis)) };
     let high = if only(1.0) { 1.0 } else { end(&holds, estimate, 1.0, Some(hypothesis)) };
     [low, high]
+}
+
+/// Returns an interval that lies on the same side of `hypothesis` as [`mean`]'s: the estimate alone if the capital rejects the
+/// hypothesis, which takes one capital instead of a search for the ends.
+pub(super) fn against(outcomes: Outcomes<'_>, hypothesis: f64, level: f64) -> [f64; 2] {
+    if hypothesis <= 0.0 || hypothesis >= 1.0 {
+        // The capital is not finite there.
+        return mean(outcomes, hypothesis, level);
+    }
+    if log_capital(outcomes, hypothesis) < -level.ln() {
+        return [0.0, 1.0];
+    }
+    let n: usize = outcomes.iter().map(|(_, count)| count).sum();
+    [outcomes.iter().map(|(x, count)| x * *count as f64).sum::<f64>() / n.max(1) as f64; 2]
 }
 
 /// Returns the last value between `inside`, which holds, and `outside` that holds. It lies beyond `hypothesis` exactly if
@@ -226,6 +242,8 @@ mod tests {
                 let outcomes = [(1.0, a), (0.0, b), (0.5, rest)];
                 let [low, high] = mean(&outcomes, 0.5, level);
                 let rejected = log_capital(&outcomes, 0.5) >= -level.ln();
+                let side = |[low, high]: [f64; 2]| (low > 0.5, high < 0.5);
+                assert_eq!(side(against(&outcomes, 0.5, level)), side([low, high]), "{a} {b} {rest}");
                 assert_eq!(rejected, low > 0.5 || high < 0.5, "{a} {b} {rest}: {low} {high}");
                 assert!((0.0..=1.0).contains(&low) && low <= high && high <= 1.0, "{a} {b} {rest}: {low} {high}");
                 let [other_low, other_high] = mean(&[(1.0, b), (0.0, a), (0.5, rest)], 0.5, level);

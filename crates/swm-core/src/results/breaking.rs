@@ -5,8 +5,9 @@
 //! Which levels these are depends on the outcomes. The intervals are therefore corrected for all 32 levels that could have
 //! been evaluated, so that those of the levels that were evaluated hold together with 95 %.
 
-use super::{Comparing, Counting, Family, Paired, Proportion, Run, Verdict, betting};
+use super::{Comparing, Counting, EpisodeResult, Family, Paired, Run, Verdict, betting};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// The factor that a study changes along a ray.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -108,9 +109,9 @@ impl BreakingPoint {
         let mut levels = levels.to_vec();
         levels.sort_by(|a, b| a.0.total_cmp(&b.0));
         let compared = levels.iter().filter_map(|&(change, run)| {
-            let gap = compare(run, unshifted, counting)?;
             let rate = run.success.rate;
-            let (half, bound) = (side_of_half(&gap), side_of_bound(&run.success, ray.below));
+            compare(run, unshifted, counting)?;
+            let (half, bound) = (side_of_half(run, unshifted, counting), side_of_bound(run, counting, ray.below));
             Some(Level { condition: run.condition.clone(), change, rate, half, bound })
         });
         let compared: Vec<Level> = compared.collect();
@@ -122,7 +123,7 @@ impl BreakingPoint {
             if ray.ordered { Crossing::of(start, &compared, threshold, at_start, of) } else { Crossing::default() }
         };
         let half = crossing(unshifted.success.rate / 2.0, Side::Above, |level| level.half);
-        let bound = crossing(ray.below, side_of_bound(&unshifted.success, ray.below), |level| level.bound);
+        let bound = crossing(ray.below, side_of_bound(unshifted, counting, ray.below), |level| level.bound);
         let grid =
             || levels.iter().filter(|(change, _)| (change * Ray::GRID as f64).fract() == 0.0).map(|(_, run)| *run);
         let rises = if ray.ordered {
@@ -227,18 +228,39 @@ fn percent(share: f64, decimals: usize) -> String {
     if (0.0..=1.0).contains(&share) { format!("{:.decimals$}", 100.0 * share) } else { "–".to_owned() }
 }
 
-/// The side of half of the unshifted success: the mean of X − X₀ / 2 over starts, with X and X₀ the outcomes with and
-/// without the change, which is from −1/2 to 1.
-fn side_of_half(gap: &Paired) -> Side {
-    let outcomes = [(1.0, gap.only_a), (2.0 / 3.0, gap.both), (1.0 / 3.0, gap.neither), (0.0, gap.only_b)];
-    side(betting::mean(&outcomes, 1.0 / 3.0, 0.05 / Ray::LEVELS as f64), 1.0 / 3.0)
+/// The side of half of the unshifted success: the mean of X − X₀ / 2 over starts that count in both runs, with X and X₀ the
+/// outcomes with and without the change, which is from −1/2 to 1.
+fn side_of_half(run: &Run, unshifted: &Run, counting: Counting) -> Side {
+    let pairs = run.episodes.iter().zip(&unshifted.episodes);
+    let counted = pairs.filter(|(with, without)| counting.counts(with) && counting.counts(without));
+    let share = |success: bool| f64::from(u8::from(success));
+    let outcome = |(with, without): (&EpisodeResult, &EpisodeResult)| {
+        (with.start, (1.0 + 2.0 * share(with.success) - share(without.success)) / 3.0)
+    };
+    side_of_mean(counted.map(outcome), 1.0 / 3.0)
 }
 
-fn side_of_bound(success: &Proportion, bound: f64) -> Side {
-    side(betting::rate(success.successes, success.n, 0.05 / Ray::LEVELS as f64), bound)
+fn side_of_bound(run: &Run, counting: Counting, bound: f64) -> Side {
+    let counted = run.episodes.iter().filter(|episode| counting.counts(episode));
+    side_of_mean(counted.map(|episode| (episode.start, f64::from(u8::from(episode.success)))), bound)
 }
 
-fn side([low, high]: [f64; 2], threshold: f64) -> Side {
+/// The side of a threshold on which the mean of outcomes lies, each with the recorded row that its start comes from. Starts of
+/// one recorded episode are not independent, so their mean is one outcome.
+fn side_of_mean(outcomes: impl Iterator<Item = (Option<[usize; 2]>, f64)>, threshold: f64) -> Side {
+    let mut episodes: BTreeMap<(Option<usize>, usize), (f64, usize)> = BTreeMap::new();
+    for (i, (start, outcome)) in outcomes.enumerate() {
+        let (sum, count) = episodes.entry(start.map_or((None, i), |[episode, _]| (Some(episode), 0))).or_default();
+        *sum += outcome;
+        *count += 1;
+    }
+    // Equal outcomes are counted; those between 0 and 1 have the order of their bits.
+    let mut counts: BTreeMap<u64, usize> = BTreeMap::new();
+    for (sum, count) in episodes.into_values() {
+        *counts.entry((sum / count as f64).clamp(0.0, 1.0).to_bits()).or_default() += 1;
+    }
+    let outcomes: Vec<(f64, usize)> = counts.into_iter().map(|(bits, count)| (f64::from_bits(bits), count)).collect();
+    let [low, high] = betting::against(&outcomes, threshold, 0.05 / Ray::LEVELS as f64);
     match (low > threshold, high < threshold) {
         (true, _) => Side::Above,
         (_, true) => Side::Below,
@@ -318,23 +340,47 @@ mod tests {
         assert!(found.levels.iter().all(|level| level.half == Side::Undecided));
     }
 
+    /// The share of repetitions in which a level is wrongly decided, with `starts` from each recorded episode. Success is exactly
+    /// half of the unshifted success at all levels, so that every decision is wrong. What solves one start of an episode solves
+    /// all.
+    fn wrong(starts: u64, repetitions: u64) -> f64 {
+        let mut wrong = 0;
+        for repetition in 0..repetitions {
+            let run = |condition: &str, level: u64, rate: f64| {
+                let episodes = (0..60 * starts).map(|seed| {
+                    let episode = seed / starts;
+                    let mut rng = Key::new(repetition).at(level).at(episode).rng();
+                    let start = Some([episode as usize, seed as usize]);
+                    EpisodeResult { success: rng.random_bool(rate), start, ..EpisodeResult::new(seed) }
+                });
+                Run::new(condition, "model", Counting::default(), episodes.collect(), Timing::default())
+            };
+            let decided = |level: u64| {
+                let [with, without] = [run("level", 2 * level, 0.4), run("plain", 2 * level + 1, 0.8)];
+                let counting = Counting::default();
+                let sides = [side_of_half(&with, &without, counting), side_of_bound(&with, counting, 0.4)];
+                sides.iter().any(|side| *side != Side::Undecided)
+            };
+            wrong += usize::from((0..Ray::GRID as u64).any(decided));
+        }
+        wrong as f64 / repetitions as f64
+    }
+
     #[test]
     fn wrong_sides_are_at_most_the_level() {
-        // Success is exactly half of the unshifted success at all levels, so that every decision is wrong.
-        let (mut wrong, repetitions) = (0, 400);
-        for repetition in 0..repetitions {
-            let mut decided = false;
-            for level in 0..Ray::GRID as u64 {
-                let mut rng = Key::new(repetition).at(level).rng();
-                let mut counts = [0; 4];
-                for _ in 0..60 {
-                    let outcomes = [rng.random_bool(0.4), rng.random_bool(0.8)];
-                    counts[2 * usize::from(!outcomes[0]) + usize::from(!outcomes[1])] += 1;
-                }
-                decided |= side_of_half(&Paired::of(counts[0], counts[1], counts[2], counts[3])) != Side::Undecided;
-            }
-            wrong += usize::from(decided);
-        }
-        assert!((wrong as f64) < 0.05 * repetitions as f64, "{wrong} of {repetitions}");
+        assert!(wrong(1, 400) < 0.05);
+        // If starts counted as independent, about half of these would be decided.
+        assert!(wrong(5, 100) < 0.05);
+    }
+
+    #[test]
+    fn starts_of_one_episode_are_one_outcome() {
+        let episodes = |starts: usize| {
+            let of = (0..40 * starts).map(move |i| (Some([i / starts, i]), f64::from(u8::from(i / starts < 30))));
+            side_of_mean(of, 0.5)
+        };
+        assert_eq!((episodes(1), episodes(5)), (Side::Undecided, Side::Undecided));
+        let independent = (0..200).map(|i| (None, f64::from(u8::from(i < 150))));
+        assert_eq!(side_of_mean(independent, 0.5), Side::Above);
     }
 }

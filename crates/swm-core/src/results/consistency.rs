@@ -13,6 +13,7 @@ impl Results {
     /// When a value differs; the text names the run, the stated value and the value of its episodes.
     pub fn check(&self) -> Result<(), String> {
         self.runs.iter().try_for_each(|run| check_run(run, self.counting, self.stopping.is_some()))?;
+        self.check_independence()?;
         self.check_stopping()?;
         if self.comparisons.is_empty() {
             return Ok(());
@@ -38,6 +39,25 @@ impl Results {
             Some([condition, a, b]) => Err(format!("the comparison of {a} and {b} is left out ({condition})")),
             None => Ok(()),
         }
+    }
+
+    /// Checks that no two starts come from one recorded episode, if the results decided the number of episodes.
+    fn check_independence(&self) -> Result<(), String> {
+        if self.stopping.is_none() && !self.sequential {
+            return Ok(());
+        }
+        for run in &self.runs {
+            let mut seen = BTreeSet::new();
+            let mut episodes = run.episodes.iter().filter_map(|episode| Some(episode.start?[0]));
+            if let Some(episode) = episodes.find(|episode| !seen.insert(*episode)) {
+                return Err(format!(
+                    "{} ({}) has several starts of the recorded episode {episode}, and its results decided how many starts \
+                     there are, which takes independent ones; evaluate again with this version",
+                    run.policy, run.condition
+                ));
+            }
+        }
+        Ok(())
     }
 
     /// Checks how the evaluation is said to have ended.

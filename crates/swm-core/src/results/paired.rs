@@ -164,7 +164,8 @@ impl Paired {
     /// [`Paired::of_runs`], but with statistics that hold at every number of pairs: the e-value of a bet on the pairs that
     /// differ ([`betting`](super::betting)), and the confidence sequence of the difference.
     ///
-    /// Starts count as independent draws, which those of a dataset are: the statistics say nothing about other recordings.
+    /// Starts count as independent: no two of them come from one recorded episode, which [`Results::check`](super::Results::check)
+    /// makes sure of.
     pub fn sequential(a: &Run, b: &Run, counting: Counting) -> Option<Self> {
         let n = a.episodes.len().min(b.episodes.len());
         let mut table = Self::of_episodes(&a.episodes[..n], &b.episodes[..n], counting)?;

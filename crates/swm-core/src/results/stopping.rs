@@ -132,6 +132,25 @@ mod tests {
     }
 
     #[test]
+    fn several_starts_of_one_recorded_episode_are_refused() {
+        let mut stopped = results(40).stopped("decided".parse().expect("a rule"), 200);
+        let start = |results: &mut Results, start: fn(usize) -> [usize; 2]| {
+            for run in &mut results.runs {
+                run.episodes.iter_mut().enumerate().for_each(|(i, episode)| episode.start = Some(start(i)));
+            }
+        };
+        start(&mut stopped, |i| [i, 3]);
+        stopped.check().expect("one start per episode");
+        start(&mut stopped, |i| [i / 2, i]);
+        let error = stopped.check().expect_err("two starts per episode");
+        assert!(error.contains("several starts of the recorded episode 0"), "{error}");
+        // The cell of a study has the statistics of a fixed number, and its rows those of any number.
+        let mut cell = Results { sequential: true, ..results(40) };
+        start(&mut cell, |i| [i / 2, i]);
+        assert!(cell.check().is_err_and(|error| error.contains("several starts")));
+    }
+
+    #[test]
     fn a_rule_is_met_by_all_policies_or_all_comparisons() {
         let met = |n: usize, rule: &str| {
             let stopped = results(n).stopped(rule.parse().expect("a rule"), 5000);

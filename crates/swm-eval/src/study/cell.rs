@@ -1,6 +1,7 @@
 //! [`Study`] and [`Cell`]: what a study evaluates.
 
 use crate::request::{EvalRequest, StartsRequest};
+use crate::until::{ONE_START, SEVERAL_STARTS};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use swm_core::results::{Counting, Published, Ray, Until};
@@ -128,11 +129,14 @@ impl Study {
         self.until.map_or_else(|| hash(&cells), |until| hash(&(&cells, until)))
     }
 
-    /// This study with a rule that ends it: its results decide how many of the episodes of each request are played.
+    /// This study with a rule that ends it: its results decide how many of the episodes of each request are played. From each
+    /// recorded episode, one start is taken.
     #[must_use]
     pub fn until(mut self, until: Until) -> Self {
         self.until = Some(until);
-        self.cells.iter_mut().for_each(|cell| cell.sequential = true);
+        let sequential =
+            |cell: Cell| Cell { request: cell.request.with_one_start_per_episode(), sequential: true, ..cell };
+        self.cells = self.cells.into_iter().map(sequential).collect();
         self
     }
 
@@ -183,6 +187,9 @@ impl Study {
                 "compat counting of drawn starts counts the episodes that finish first, so none of them can follow later",
                 "use protocol=strict, or take starts from a dataset",
             ),
+            Some(_) if self.cells.iter().any(|cell| cell.request.may_repeat_episodes()) => {
+                invalid(SEVERAL_STARTS, ONE_START)
+            }
             Some(Until::Decided(_)) if self.cells.iter().all(|cell| cell.condition() == self.unshifted()) => {
                 invalid("the study has one condition, so no gap to decide", "give --until ci=5, or a second condition")
             }

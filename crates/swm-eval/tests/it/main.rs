@@ -8,6 +8,7 @@ mod lance;
 mod line;
 mod memory;
 mod nearest;
+mod one_start;
 mod predicting;
 mod replaying;
 mod requesting;

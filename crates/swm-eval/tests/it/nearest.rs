@@ -34,7 +34,12 @@ fn evaluate(data: &[f64], held_out: Option<HeldOut>, episodes: usize, envs: usiz
     let conditions = request().conditions;
     let request = EvalRequest {
         policies: kinds.map(|(name, kind)| PolicyRequest { name: name.to_owned(), kind }).to_vec(),
-        starts: StartsRequest::Dataset { dataset: "line".to_owned(), goal_offset: STEPS, held_out },
+        starts: StartsRequest::Dataset {
+            dataset: "line".to_owned(),
+            goal_offset: STEPS,
+            held_out,
+            one_per_episode: false,
+        },
         conditions: conditions[..1].to_vec(),
         episodes,
         ..request()

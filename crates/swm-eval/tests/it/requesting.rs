@@ -94,7 +94,7 @@ pub fn request() -> EvalRequest {
 
 fn held_out(part: Part) -> StartsRequest {
     let held_out = Some(HeldOut { part, split: Split { validation: 0.3, test: 0.3, seed: 1 } });
-    StartsRequest::Dataset { dataset: "line".to_owned(), goal_offset: 4, held_out }
+    StartsRequest::Dataset { dataset: "line".to_owned(), goal_offset: 4, held_out, one_per_episode: false }
 }
 
 fn run(request: &EvalRequest, envs: usize, threads: usize) -> Results {
@@ -164,7 +164,8 @@ fn baselines_do_nothing_or_repeat_what_was_recorded() {
     let error = request.run(&resolver, &RunOptions::default(), &mut Control::new()).expect_err("episodic starts");
     assert!(error.is_usage() && error.to_string().contains("take starts from a dataset"), "{error}");
 
-    request.starts = StartsRequest::Dataset { dataset: "line".to_owned(), goal_offset: 4, held_out: None };
+    request.starts =
+        StartsRequest::Dataset { dataset: "line".to_owned(), goal_offset: 4, held_out: None, one_per_episode: false };
     let found = run(&request, 4, 1);
     let [_, no_op, replay] = &found.runs[..] else { panic!("{} runs", found.runs.len()) };
     assert_eq!((no_op.policy.as_str(), replay.policy.as_str()), ("no-op", "replay"));
@@ -228,7 +229,12 @@ fn held_out_starts_come_from_held_out_episodes() {
     hashes.dedup();
     assert_eq!(hashes.len(), 3);
     let empty = HeldOut { part: Part::Test, split: Split { test: 0.0, ..Split::default() } };
-    let starts = StartsRequest::Dataset { dataset: "line".to_owned(), goal_offset: 3, held_out: Some(empty) };
+    let starts = StartsRequest::Dataset {
+        dataset: "line".to_owned(),
+        goal_offset: 3,
+        held_out: Some(empty),
+        one_per_episode: false,
+    };
     let error = EvalRequest { starts, ..request() }
         .run(&resolver, &RunOptions::default(), &mut Control::new())
         .expect_err("the split has no episodes");
@@ -431,7 +437,8 @@ fn results_without_a_valid_request_are_not_reproduced() {
 #[test]
 fn replayed_episodes_have_the_same_outcomes() {
     let (resolver, options) = (TestResolver::new(), RunOptions { envs: 2, ..RunOptions::default() });
-    let dataset = StartsRequest::Dataset { dataset: "line".to_owned(), goal_offset: 4, held_out: None };
+    let dataset =
+        StartsRequest::Dataset { dataset: "line".to_owned(), goal_offset: 4, held_out: None, one_per_episode: false };
     for starts in [StartsRequest::Episodic, dataset] {
         let whole = EvalRequest { starts, prediction: None, counting: Counting::default(), ..request() };
         let walker = whole.policies.iter().find(|policy| policy.kind != PolicyKind::Random).expect("a policy").clone();

@@ -150,7 +150,12 @@ fn rules_that_a_study_cannot_follow_are_errors() {
     // The dataset has fewer starts than the study may need.
     let mut few = study(100_000, Some(Until::Width(10.0)));
     for cell in &mut few.cells {
-        cell.request.starts = StartsRequest::Dataset { dataset: "line".to_owned(), goal_offset: 4, held_out: None };
+        cell.request.starts = StartsRequest::Dataset {
+            dataset: "line".to_owned(),
+            goal_offset: 4,
+            held_out: None,
+            one_per_episode: true,
+        };
     }
     let folder = tempfile::tempdir().expect("a folder");
     let error = run(&few, folder.path(), &mut Control::new()).expect_err("too few starts").to_string();
@@ -160,9 +165,10 @@ fn rules_that_a_study_cannot_follow_are_errors() {
 #[test]
 fn starts_of_a_dataset_and_prediction_errors_grow_too() {
     let folder = tempfile::tempdir().expect("a folder");
-    let mut study = study(120, Some(Until::Width(10.0)));
+    let mut study = study(50, Some(Until::Width(10.0)));
     study.cells.truncate(1);
-    let starts = StartsRequest::Dataset { dataset: "line".to_owned(), goal_offset: 4, held_out: None };
+    let starts =
+        StartsRequest::Dataset { dataset: "line".to_owned(), goal_offset: 4, held_out: None, one_per_episode: true };
     study.cells[0].request =
         EvalRequest { starts, prediction: Some(2), counting: compat(), ..study.cells[0].request.clone() };
     run(&study, folder.path(), &mut Control::new()).expect("a study");

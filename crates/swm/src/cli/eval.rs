@@ -298,6 +298,7 @@ impl EvalArgs {
             dataset: resolver.pinned_dataset(dataset)?,
             goal_offset: self.goal_offset,
             held_out: self.split.map(|part| HeldOut { part, split }),
+            one_per_episode: self.until.is_some(),
         })
     }
 

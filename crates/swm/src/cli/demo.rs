@@ -84,6 +84,8 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
     let side = config.model.image;
     let device = args.device.open()?;
     let _lock = claim(&output)?;
+    // The folder may come from a stranger, whose links name folders of the user.
+    [&data, &model, &results].into_iter().try_for_each(|path| files::check_no_link(path))?;
     // The other steps replace the files of an earlier demo themselves; training refuses the folder of another run.
     let _ = run_folder::remove(&model)?;
     eprint("1/4 collect: an exploring policy moves through two rooms\n");

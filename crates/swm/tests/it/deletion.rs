@@ -40,6 +40,18 @@ fn second_demo_keeps_files_of_the_user() {
 }
 
 #[test]
+fn demo_writes_to_no_folder_that_a_link_names() {
+    let swm = Swm::new();
+    swm.json(DEMO);
+    // Results of the user are files that this program would replace.
+    fs::rename(swm.path("demo/results"), swm.path("mine")).expect("moving the results");
+    std::os::unix::fs::symlink(swm.path("mine"), swm.path("demo/results")).expect("making a link");
+    let before = fs::read(swm.path("mine/run.json")).expect("the record");
+    swm.fails(DEMO, 2, &["demo/results", "symbolic link"]);
+    assert_eq!(fs::read(swm.path("mine/run.json")).expect("the record"), before);
+}
+
+#[test]
 fn checkpoint_removal_keeps_files_of_the_user() {
     let swm = Swm::new();
     swm.json(DEMO);

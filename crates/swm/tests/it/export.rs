@@ -20,10 +20,20 @@ fn export_names_what_is_missing_and_replaces_no_file_of_the_user() {
     std::fs::write(swm.path("mine.rrd"), "a file of the user").expect("a file");
     swm.fails(&["export", "rooms", "--output", "mine.rrd"], 2, &["was not written by this program"]);
     assert_eq!(std::fs::read_to_string(swm.path("mine.rrd")).expect("the file"), "a file of the user");
+    // What a kill left of this recording is deleted; what another program wrote, or an export that runs, stays.
+    let unfinished = |process: &str| swm.path(&format!(".episodes.rrd.{process}.tmp"));
+    std::fs::write(unfinished("11"), "RRF2 stable-worldmodel").expect("a file");
+    std::fs::write(unfinished("12"), "RRF2 stable-worldmodel").expect("a file");
+    std::fs::write(unfinished("13"), "thesis").expect("a file");
+    let _running = swm::core::files::Lock::file(&unfinished("12")).expect("a lock");
     let output = swm.command(&["export", "rooms"]).env("SWM_PYTHON", "/no/such/python").output().expect("swm starts");
     let error = text(&output.stderr);
     assert!(output.status.code() == Some(2) && error.contains("pip install rerun-sdk"), "{error}");
     assert!(error.contains("/no/such/python (named by $SWM_PYTHON)"), "{error}");
+    let left = std::fs::read_dir(swm.home()).expect("the folder").flatten().map(|file| file.path());
+    let left: std::collections::BTreeSet<_> =
+        left.filter(|path| path.extension().is_some_and(|end| end == "tmp")).collect();
+    assert_eq!(left, [unfinished("12"), unfinished("13")].into());
 }
 
 /// A Python without the package, and files of the current folder, which are no modules.
@@ -43,7 +53,7 @@ fn export_says_how_to_install_the_package() {
     let error = text(&output.stderr);
     assert!(output.status.code() == Some(2) && error.contains("pip install rerun-sdk"), "{error}");
     let left = std::fs::read_dir(swm.home()).expect("the folder").flatten();
-    assert!(!left.into_iter().any(|file| file.file_name().to_string_lossy().ends_with(".rrd")));
+    assert!(!left.into_iter().any(|file| file.file_name().to_string_lossy().contains(".rrd")));
 }
 
 #[test]

@@ -56,6 +56,13 @@ fn recipe_runs_what_is_missing_and_compares_hashes() {
     assert_eq!(changed(names[0]), before[0]);
     assert!(changed(names[1]) > before[1]);
 
+    // An output that is a link to a folder of the user is not written to.
+    fs::rename(swm.path("first/found"), swm.path("mine")).expect("moving the results");
+    std::os::unix::fs::symlink(swm.path("mine"), swm.path("first/found")).expect("making a link");
+    swm.fails(&["train", "--recipe", "small.toml", "-o", "first"], 2, &["first/found", "symbolic link"]);
+    fs::remove_file(swm.path("first/found")).expect("removing the link");
+    fs::rename(swm.path("mine"), swm.path("first/found")).expect("moving the results");
+
     // With the hashes in the recipe, another run says that they are equal.
     let expected = |hash: &str| {
         let insert = |text: &str, name: &str, hash: &str| text.replace(name, &format!("{name}\nhash = \"{hash}\""));

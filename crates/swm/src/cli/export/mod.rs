@@ -19,10 +19,12 @@ use swm_core::columns::{
     self, DEPTH, EPISODE_IDX, EPISODE_SEED, POLICY_INDEX, REWARD, SEGMENTATION, STEP_IDX, SUCCESS, TERMINATED,
     TRUNCATED,
 };
-use swm_core::{Batch, ColumnSpec, DType, Error, Result, files};
+use swm_core::files::{self, Lock};
+use swm_core::{Batch, ColumnSpec, DType, Error, Result};
 use swm_data::preview::spread_episodes;
 use swm_data::{ImageCodec, Reader, StepRange};
 use swm_gym::Python;
+use tempfile::NamedTempFile;
 
 /// Arguments of `swm export`.
 #[derive(Args)]
@@ -61,11 +63,8 @@ pub fn export(args: &ExportArgs, context: &Context) -> anyhow::Result<()> {
     let episodes = spread_episodes(&*reader, args.episodes, "export")?;
     let folder = args.output.parent().filter(|folder| *folder != Path::new("")).unwrap_or_else(|| Path::new("."));
     // The recording replaces an older one when it is complete.
-    // The permissions of a file that a user makes.
-    let readable = std::fs::Permissions::from_mode(0o666);
-    let unfinished =
-        tempfile::Builder::new().prefix(".swm-export-").suffix(".rrd").permissions(readable).tempfile_in(folder);
-    let unfinished = unfinished.map_err(|error| Error::io(folder, "writing to the folder", error))?;
+    let unfinished = unfinished_recording(folder, &args.output)?;
+    let _lock = Lock::file(unfinished.path())?;
     let mut recording = Recording::start(unfinished.path(), &args.dataset)?;
     let written = episodes.iter().try_for_each(|&episode| {
         if context.interrupt.load(Ordering::SeqCst) {
@@ -85,6 +84,28 @@ pub fn export(args: &ExportArgs, context: &Context) -> anyhow::Result<()> {
         emit(&format!("left out, because a row has more than {MAX_LINES} values: {}\n", left_out.join(", ")));
     }
     Ok(())
+}
+
+/// Creates the file in which a recording is written, and deletes those that kills left of the same recording. The file of an export
+/// that still runs is locked, and stays.
+fn unfinished_recording(folder: &Path, output: &Path) -> Result<NamedTempFile> {
+    let io = |error| Error::io(folder, "writing to the folder", error);
+    let start = format!(".{}.", output.file_name().unwrap_or_default().to_string_lossy());
+    for entry in std::fs::read_dir(folder).map_err(io)?.flatten() {
+        let name = entry.file_name();
+        let process = name.to_str().and_then(|name| name.strip_prefix(&start)?.strip_suffix(".tmp"));
+        let is_regular = || entry.metadata().is_ok_and(|found| found.is_file());
+        if process.is_some_and(|process| process.parse::<u32>().is_ok()) && is_regular() {
+            let path = entry.path();
+            let is_written = is_own(&path) || entry.metadata().is_ok_and(|found| found.len() == 0);
+            if is_written && let Ok(_lock) = Lock::file(&path) {
+                files::delete_file(&path)?;
+            }
+        }
+    }
+    // The permissions of a file that a user makes.
+    let (name, readable) = (format!("{start}{}.tmp", std::process::id()), std::fs::Permissions::from_mode(0o666));
+    tempfile::Builder::new().prefix(&name).rand_bytes(0).permissions(readable).tempfile_in(folder).map_err(io)
 }
 
 /// Returns whether a file is a recording of this program: its header names the application.

@@ -31,6 +31,7 @@ mod training;
 mod world;
 
 use pyo3::prelude::*;
+use std::path::PathBuf;
 
 /// The extension module `stable_worldmodel._engine`.
 #[pymodule]
@@ -73,6 +74,10 @@ mod _engine {
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
         data::process::record_process();
+        let finder = module.py().import("stable_worldmodel._zoo")?;
+        if let Some(folder) = finder.getattr("data_wheel")?.call0()?.extract::<Option<PathBuf>>()? {
+            swm::zoo::set_data_wheel(folder);
+        }
         module.add("__version__", env!("CARGO_PKG_VERSION"))
     }
 }

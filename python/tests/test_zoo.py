@@ -1,6 +1,10 @@
 """Tests of capsules: checkpoints in one file, and those that come with the package."""
 
+import json
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -47,3 +51,34 @@ def test_unknown_and_damaged_capsules_are_errors(tmp_path):
     damaged.write_bytes(Path(swm.wm.load(NAME).path).read_bytes()[:-1])
     with pytest.raises(Exception, match="damaged"):
         swm.wm.load(str(damaged))
+
+
+def listed(folder, *paths):
+    """The output of `swm zoo` of a new interpreter in a folder, with further folders of packages."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths))}
+    done = subprocess.run(
+        [sys.executable, "-m", "stable_worldmodel", "zoo", "--json"],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    return {capsule["name"]: Path(capsule["path"]) for capsule in json.loads(done.stdout)}
+
+
+def test_data_wheel_is_found_in_another_folder_of_packages(tmp_path):
+    """Systems may keep packages with and without compiled code apart (`lib64` and `lib`): it need not be beside the engine."""
+    other, empty = tmp_path / "lib", tmp_path / "empty"
+    path = other / "stable_worldmodel_zoo" / "maze" / "large.safetensors"
+    path.parent.mkdir(parents=True)
+    empty.mkdir()
+    shutil.copy(swm.wm.load(NAME).path, path)
+    # A folder without `__init__.py` is not the package.
+    assert "maze/large" not in listed(empty, other)
+    (other / "stable_worldmodel_zoo" / "__init__.py").touch()
+    assert listed(empty, other)["maze/large"] == path
+    assert "maze/large" not in listed(empty)
+    # The current folder holds files of strangers: neither `python -m` nor `PYTHONPATH` makes its capsules those of the zoo.
+    assert "maze/large" not in listed(other)
+    assert "maze/large" not in listed(other, other)

@@ -4,6 +4,7 @@
 use crate::{home, library};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Component, Path, PathBuf};
+use std::sync::OnceLock;
 use swm_core::{EnvEntry, Error, Result, files};
 use swm_models::capsule::Capsule;
 
@@ -16,10 +17,8 @@ const SUFFIX: &str = "safetensors";
 /// The zoo relative to the folder of an installation.
 const SHARE: &str = "share/swm/zoo";
 
-/// The Python package of the engine, and the data wheel, which is installed beside it and contains capsules only
-/// (`python/zoo`).
-const PACKAGE: &str = "stable_worldmodel";
-const DATA_PACKAGE: &str = "stable_worldmodel_zoo";
+/// The folder of the data wheel, the Python package of all capsules (`python/zoo`).
+static DATA_WHEEL: OnceLock<PathBuf> = OnceLock::new();
 
 /// The file of a zoo that lists the capsules which only the data wheel has, a name a line.
 const IN_DATA_WHEEL: &str = "data-wheel.txt";
@@ -34,14 +33,13 @@ pub const INSTALL_ALL: &str = "pip install \"stable-worldmodel-rs[zoo]\"";
 const DEPTH: usize = 2;
 
 /// Returns the folders that are searched, in order: `$SWM_ZOO`; `zoo/` in the home folder; `share/swm/zoo` in the Python
-/// package, and the data wheel beside it; `share/swm/zoo` in the folder of the program, and in that folder's parent; `zoo/`
+/// package, and the [data wheel](set_data_wheel); `share/swm/zoo` in the folder of the program, and in that folder's parent; `zoo/`
 /// of the source tree that the program was built from. Folders that do not exist are left out.
 pub fn folders() -> Vec<PathBuf> {
     let library = library::path();
     // A program that is found through `$PATH` has a name without a folder.
     let package = library.as_deref().and_then(Path::parent).filter(|folder| !folder.as_os_str().is_empty());
-    let data = package.filter(|folder| folder.ends_with(PACKAGE)).map(|folder| folder.with_file_name(DATA_PACKAGE));
-    let package = package.map(|folder| folder.join(SHARE)).into_iter().chain(data);
+    let package = package.map(|folder| folder.join(SHARE)).into_iter().chain(DATA_WHEEL.get().cloned());
     let program = std::env::current_exe().ok();
     let beside =
         program.iter().flat_map(|program| program.ancestors().skip(1).take(2)).map(|folder| folder.join(SHARE));
@@ -50,6 +48,12 @@ pub fn folders() -> Vec<PathBuf> {
     let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../zoo");
     let all = given.into_iter().chain(home).chain(package).chain(beside).chain([source]);
     all.filter(|folder| folder.is_dir()).collect()
+}
+
+/// Sets the folder of the data wheel. Only the Python interpreter knows where it has its packages, so the extension module sets it
+/// when it is loaded. Later calls change nothing.
+pub fn set_data_wheel(folder: PathBuf) {
+    let _ = DATA_WHEEL.set(folder);
 }
 
 /// Returns the capsules of all folders by name. A capsule of an earlier folder hides one of the same name in a later

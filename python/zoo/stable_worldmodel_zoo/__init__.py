@@ -1,1 +1,1 @@
-"""The capsules of the zoo, as `ENVIRONMENT/MODEL.safetensors`. The package `stable_worldmodel` finds them beside itself."""
+"""The capsules of the zoo, as `ENVIRONMENT/MODEL.safetensors`. The package `stable_worldmodel` finds them there."""

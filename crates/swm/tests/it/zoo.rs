@@ -151,9 +151,9 @@ fn folders_of_the_zoo_are_searched_in_order() {
     }
 }
 
-/// The engine of a Python package finds the data wheel beside it, and names it for the capsules that only it has.
+/// The engine of a Python package names the data wheel for the capsules that only it has. `python/tests/test_zoo.py` installs it.
 #[test]
-fn data_wheel_is_found_beside_the_package() {
+fn capsules_of_the_data_wheel_are_named() {
     let swm = Swm::new();
     let zoo = swm.path("site/stable_worldmodel/share/swm/zoo");
     fs::create_dir_all(&zoo).expect("a folder");
@@ -171,14 +171,6 @@ fn data_wheel_is_found_beside_the_package() {
     assert!(error.contains("stable-worldmodel-rs-zoo") && error.contains("pip install"), "{error}");
     let listed = text(&run(&["zoo"]).stdout);
     assert!(listed.contains("not installed: zoo:maze/large, zoo:maze/other"), "{listed}");
-
-    let data = swm.path("site/stable_worldmodel_zoo/maze");
-    fs::create_dir_all(&data).expect("a folder");
-    fs::copy(&repository()[0].1, data.join("large.safetensors")).expect("a copied file");
-    let found = run(&["checkpoints", "show", "zoo:maze/large"]);
-    assert!(found.status.success(), "{}", text(&found.stderr));
-    let listed = text(&run(&["zoo"]).stdout);
-    assert!(listed.contains("not installed: zoo:maze/other ("), "{listed}");
 }
 
 /// A program that is found through `$PATH` does not take capsules of the current folder.

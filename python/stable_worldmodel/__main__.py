@@ -19,8 +19,9 @@ def main() -> None:
     from . import _engine
 
     arguments = sys.argv[1:]
-    # `--on ray` runs in this interpreter.
+    # `--on ray` runs in this interpreter; environments, trackers and exports do unless the user names another one.
     os.environ.setdefault("SWM_RAY_PYTHON", sys.executable)
+    os.environ["SWM_OWN_PYTHON"] = sys.executable
     if arguments[:1] == ["convert"] and any(argument.partition("=")[0] in _CONVERT_OPTIONS for argument in arguments):
         sys.exit(_convert(arguments[1:]))
     if arguments[:1] == ["fovs"]:

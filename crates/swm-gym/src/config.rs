@@ -1,6 +1,7 @@
 //! [`GymConfig`]: the Python interpreter of worker processes and their timeouts.
 
 use crate::assets;
+use std::ffi::OsString;
 use std::path::PathBuf;
 use std::process::Command;
 use std::time::Duration;
@@ -48,17 +49,29 @@ pub struct Python {
 }
 
 impl Python {
-    /// `$SWM_PYTHON` if set, else the interpreter that `swm assets install` made, else `python3` on the path.
+    /// `$SWM_PYTHON` if set, else the interpreter that `swm assets install` made, else as [`Python::of_user`].
     pub fn find() -> Self {
-        if let Some(program) = std::env::var_os("SWM_PYTHON").filter(|value| !value.is_empty()) {
-            return Self { program: program.into(), origin: NAMED };
-        }
         let program = assets::python();
-        if program.is_file() {
-            return Self { program, origin: "made by `swm assets install`" };
-        }
-        Self { program: "python3".into(), origin: "found on the path" }
+        let installed = || program.is_file().then(|| Self { program, origin: "made by `swm assets install`" });
+        Self::named().or_else(installed).unwrap_or_else(Self::of_user)
     }
+
+    /// `$SWM_PYTHON` if set, else the interpreter that runs this program, as the `swm` of the Python package says, else `python3` on
+    /// the path.
+    pub fn of_user() -> Self {
+        let own = || Some(Self { program: variable("SWM_OWN_PYTHON")?.into(), origin: "which runs this program" });
+        let on_path = || Self { program: "python3".into(), origin: "found on the path" };
+        Self::named().or_else(own).unwrap_or_else(on_path)
+    }
+
+    fn named() -> Option<Self> {
+        Some(Self { program: variable("SWM_PYTHON")?.into(), origin: NAMED })
+    }
+}
+
+/// Returns the value of a variable of the environment, if it is set and not empty.
+fn variable(name: &str) -> Option<OsString> {
+    std::env::var_os(name).filter(|value| !value.is_empty())
 }
 
 /// `python -c` puts the current folder first, where a stranger's `json.py` would replace a module of the standard library. The

@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read as _, Seek as _, SeekFrom, Write as _};
 use std::os::unix::process::{CommandExt as _, ExitStatusExt as _};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Child, ChildStdin, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -131,9 +131,7 @@ impl Drop for Trackers {
 
 impl Process {
     fn start(package: &'static str, name: &str, config: &Value, interrupt: &AtomicBool) -> Result<Self> {
-        let program = std::env::var_os("SWM_PYTHON").filter(|value| !value.is_empty());
-        let program = PathBuf::from(program.unwrap_or_else(|| "python3".into()));
-        let python = Python { program, origin: "of trackers" };
+        let python = Python::of_user();
         let what = format!("--log {package}");
         let failed = |problem: String| {
             let fix = format!("install it (pip install {package}) in {}, or set $SWM_PYTHON", python.program.display());

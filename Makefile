@@ -19,7 +19,7 @@ SWM := $(CARGO_TARGET_DIR)/release/swm
 SUDO := $(shell [ "$$(id -u)" = 0 ] || command -v sudo)
 CARGO := cargo
 
-.PHONY: help demo test test-python test-ray test-lab test-neighbours test-browser chromium lab-assets check build tests wheel wheel-portable wheel-zoo gpu cuda docs assets setup setup-python reference bench deny release nightly clean test-gpu
+.PHONY: help demo test test-python test-ray test-lab test-neighbours test-browser chromium lab-assets check build tests wheel wheel-portable wheel-zoo gpu cuda docs assets setup setup-python reference bench deny release nightly clean test-gpu crates
 
 help:
 	@echo 'make demo       collect, train, plan, evaluate and report on a laptop CPU'
@@ -39,6 +39,7 @@ help:
 	@echo 'make assets     MuJoCo, its models and meshes, into $(SWM_ASSETS)'
 	@echo 'make nightly    what takes longer: fuzzers, sanitizer, models of threads, long tests; one part: PART=fuzz'
 	@echo 'make release    the program, a Debian package, the wheels, the source distribution, SBOM, checksums: $(CACHE)/release'
+	@echo 'make crates     the crates as packages of the Rust registry: $(CACHE)/crates'
 	@echo 'make deny       licences and sources of the dependencies'
 	@echo 'make bench      our benchmarks, against the reference where `make reference` installed it'
 
@@ -248,15 +249,20 @@ deny: setup
 	@$(CARGO) deny --version >/dev/null 2>&1 || $(CARGO) install --locked --root $(CACHE)/tools cargo-deny
 	$(CARGO) deny check licenses bans sources
 
+# The crates as packages of the Rust registry (docs/release.md): nothing is compiled or sent.
+crates: setup
+	sh xtask/crates.sh $(CACHE)/crates
+
 # What a release consists of, in $(CACHE)/release: the program with its list of dependencies inside (cargo auditable), as an archive and as a
 # Debian package, the portable wheel, the data wheel, the source distribution, a list of all dependencies (SBOM), what changed, a container
 # file, checksums. Not part of CI.
+AUDITABLE_VERSION := 0.7.7
 release: setup deny wheel-portable wheel-zoo
 	@command -v lintian >/dev/null || { $(SUDO) apt-get update -qq && \
 	  DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install -y -qq --no-install-recommends lintian; }
-	@$(CARGO) auditable --version >/dev/null 2>&1 || $(CARGO) install --locked --root $(CACHE)/tools cargo-auditable
+	@command -v cargo-auditable >/dev/null || $(CARGO) install --locked --root $(CACHE)/tools cargo-auditable --version $(AUDITABLE_VERSION)
 	@command -v auditable2cdx >/dev/null || $(CARGO) install --locked --root $(CACHE)/tools auditable2cdx
-	CARGO="$(CARGO)" PYTHON_VENV=$(PYTHON_VENV) WHEELS="$(WHEELS)/portable $(ZOO_WHEEL)" sh xtask/release.sh $(CACHE)/release
+	PYTHON_VENV=$(PYTHON_VENV) WHEELS="$(WHEELS)/portable $(ZOO_WHEEL)" sh xtask/release.sh $(CACHE)/release
 
 # At most two hours after `tests` compiled everything. Parts that passed on the same commit are skipped; the page
 # docs/nightly.md has a row for each.

@@ -2,7 +2,6 @@
 # Makes the files of a release in a folder, which is replaced: `make release` calls this.
 set -eu
 OUT=$1
-TARGET=$CARGO_TARGET_DIR-release
 # Dates inside packages are that of the commit, so that equal sources give equal packages.
 SOURCE_DATE_EPOCH=$(git log -1 --format=%ct)
 export SOURCE_DATE_EPOCH
@@ -12,11 +11,10 @@ NAME=stable-worldmodel-$VERSION-$HOST
 rm -rf "$OUT"
 mkdir -p "$OUT/$NAME"
 
-# Another wrapper of rustc compiles the crates of the workspace again, so the program has a target folder of its own.
-CARGO_TARGET_DIR=$TARGET $CARGO auditable build --release --locked -p swm --bins
-cp "$TARGET/release/swm" "$OUT/$NAME/"
-strip "$OUT/$NAME/swm"
-# The list of dependencies has to survive strip.
+# Only the program is compiled and linked again: all libraries are those of other builds. The option strips it, and makes Cargo do so; the list
+# of dependencies stays.
+CARGO=$PWD/xtask/auditable_cargo.sh cargo-auditable auditable rustc --release --locked -p swm --bin swm -- -C strip=symbols
+cp "$CARGO_TARGET_DIR/release/swm" "$OUT/$NAME/"
 auditable2cdx "$OUT/$NAME/swm" > "$OUT/$NAME.cdx.json"
 sh xtask/changes.sh "$VERSION" > "$OUT/$NAME/CHANGES.md"
 cp "$OUT/$NAME/CHANGES.md" "$OUT/"

@@ -18,12 +18,12 @@ use swm_core::{Error, Origin, Result, files};
 
 /// The recipes of this program: their names and texts.
 const SHIPPED: &[(&str, &str)] = &[
-    ("ogb-cube/gcbc", include_str!("../../../../../recipes/ogb-cube/gcbc.toml")),
-    ("push-t/gcbc", include_str!("../../../../../recipes/push-t/gcbc.toml")),
-    ("reacher/lewm", include_str!("../../../../../recipes/reacher/lewm.toml")),
-    ("two-room/lewm", include_str!("../../../../../recipes/two-room/lewm.toml")),
-    ("two-room/lewm-straight", include_str!("../../../../../recipes/two-room/lewm-straight.toml")),
-    ("two-room/pldm", include_str!("../../../../../recipes/two-room/pldm.toml")),
+    ("ogb-cube/gcbc", include_str!("../../../recipes/ogb-cube/gcbc.toml")),
+    ("push-t/gcbc", include_str!("../../../recipes/push-t/gcbc.toml")),
+    ("reacher/lewm", include_str!("../../../recipes/reacher/lewm.toml")),
+    ("two-room/lewm", include_str!("../../../recipes/two-room/lewm.toml")),
+    ("two-room/lewm-straight", include_str!("../../../recipes/two-room/lewm-straight.toml")),
+    ("two-room/pldm", include_str!("../../../recipes/two-room/pldm.toml")),
 ];
 
 /// Arguments of `swm recipes`.
@@ -80,7 +80,7 @@ mod tests {
 
     #[test]
     fn every_recipe_of_the_repository_is_shipped_and_valid() {
-        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../recipes");
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("recipes");
         let mut folders: Vec<PathBuf> = vec![root.clone()];
         let mut found = vec![];
         while let Some(folder) = folders.pop() {

@@ -1,6 +1,7 @@
 """Evaluations, studies and trainings on a cluster have the results of one process."""
 
 import json
+import os
 
 import pytest
 import ray
@@ -138,15 +139,54 @@ def test_a_study_has_the_files_of_one_process(cluster, s3, tmp_path):
     one, many = tmp_path / "one", f"{s3}/study"
     printed("study", "run", tmp_path / "colours.toml", "-o", one)
     assert ray.get(swm_ray.study(tmp_path / "colours.toml", many))["cells"] == 3
-    files = {path.relative_to(one).as_posix(): path.read_bytes() for path in one.rglob("*") if path.is_file()}
-    files = {name: content for name, content in files.items() if not name.startswith(".")}
-    assert {name: Folder(many).read(name) for name in Folder(many).list()} == files
+    assert {name: Folder(many).read(name) for name in Folder(many).list()} == files_of(one)
     # On a shared disk, the output is the folder of the study.
     shared = tmp_path / "shared"
     done = swm("study", "run", tmp_path / "colours.toml", "-o", shared, "--on", "ray")
     assert done.returncode == 0, done.stderr
     assert swm_package.studies.read(shared).is_done
     assert swm_package.studies.read(shared).export() == swm_package.studies.read(one).export()
+
+
+def files_of(study):
+    """The files of a study on this machine, without those that begin with a dot."""
+    files = {path.relative_to(study).as_posix(): path.read_bytes() for path in study.rglob("*") if path.is_file()}
+    return {name: content for name, content in files.items() if not name.startswith(".")}
+
+
+@pytest.mark.parametrize("rule", ["ci=20", "decided=25"])
+def test_a_study_that_its_results_end_has_the_files_of_one_process(rule, cluster, s3, tmp_path):
+    (tmp_path / "colours.toml").write_text(STUDY)
+    one, many = tmp_path / "one", Folder(f"{s3}/study-until-{rule}")
+    printed("study", "run", tmp_path / "colours.toml", "episodes=45", "-o", one, "--until", rule)
+    summary = ray.get(swm_ray.study(tmp_path / "colours.toml", many.root, until=rule, episodes=45))
+    assert {name: many.read(name) for name in many.list()} == files_of(one)
+    folder = Folder(summary["folder"])
+    stages = sorted({int(name.split("/")[0]) for name in folder.list("parts/stages")})
+    assert len(stages) > 1 and stages[0] == 10
+    # The cells of a stage are those that the rule left open.
+    still_open = [folder.read_json(f"parts/open/{stage:06d}.json") for stage in stages]
+    played = [len(folder.list(f"parts/stages/{stage:06d}")) for stage in stages]
+    assert played == [2, *map(len, still_open[:-1])] and still_open[-1] == []
+    assert swm_ray.progress(folder.root) == {"done": summary["cells"], "cells": summary["cells"]}
+    # A driver that starts again after a stage, and has to decide again, decides the same.
+    for name in folder.list("cells"):
+        if name == "join.json" or name.startswith(f"stage-{stages[-1]:06d}") or name == f"stage-{stages[0]:06d}.json":
+            remove(folder.at(f"cells/{name}"))
+    again = ray.get(swm_ray.study(tmp_path / "colours.toml", many.root, until=rule, episodes=45))
+    assert again["ran"] == 3 + played[-1] and {name: many.read(name) for name in many.list()} == files_of(one)
+    # A fixed number of episodes does not follow.
+    given = ["study", "run", tmp_path / "colours.toml", "episodes=45", "-o", many.root]
+    fixed = swm(*given, "--on", "ray", "--run-folder", f"{s3}/x")
+    assert fixed.returncode == 2 and f"--until {rule}" in fixed.stderr, fixed.stderr
+
+
+def remove(location):
+    """Removes an object of the store."""
+    import boto3
+
+    bucket, key = location.removeprefix("s3://").split("/", 1)
+    boto3.client("s3", endpoint_url=os.environ["AWS_ENDPOINT_URL"]).delete_object(Bucket=bucket, Key=key)
 
 
 #: A study of each kind whose rows run on a cluster.
@@ -188,10 +228,10 @@ def test_a_table_has_the_rows_of_one_process(kind, cluster, s3, tmp_path):
     assert done.returncode == 2 and "--trust" in done.stderr, done.stderr
 
 
-@pytest.mark.parametrize(("kind", "problem"), [("data", "the speed of one machine"), ("drift", "share one training")])
+@pytest.mark.parametrize(("kind", "problem"), [("data", "those of one machine"), ("drift", "share one training")])
 def test_tables_of_one_machine_are_refused(kind, problem, tmp_path):
     done = swm("study", "run", f"paper/{kind}", "--small", "-o", tmp_path / "out", "--on", "ray")
-    assert done.returncode == 2 and problem in done.stderr, done.stderr
+    assert done.returncode == 2 and problem in done.stderr and "without --on" in done.stderr, done.stderr
     assert not list(tmp_path.iterdir())
 
 

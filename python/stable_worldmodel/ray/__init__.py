@@ -68,17 +68,21 @@ def study(
     *,
     small: bool = False,
     trust: bool = False,
+    until: str | None = None,
     resources: Mapping[str, float] | None = None,
     wait: int | None = None,
     run_folder: str | None = None,
     **settings: Any,
 ) -> ray.ObjectRef:
-    """Evaluates the cells of a study that have no results in the output, as `swm.studies.run`; see `collect`."""
+    """Evaluates the cells of a study that have no results in the output, as `swm.studies.run`; see `collect`.
+
+    With `until`, such as `ci=5`, the results decide how many starts are played, in stages.
+    """
     from ..studies import _toml
 
     arguments = ["study", "run", os.fspath(study), "--output", os.fspath(output)]
     arguments += [f"{name.replace('_', '-')}={_toml(value)}" for name, value in settings.items()]
-    options = {"small": small, "trust": trust, "resources": resources, "wait": wait, "run_folder": run_folder}
+    options = {"small": small, "trust": trust, "until": until, "resources": resources, "wait": wait, "run_folder": run_folder}
     return submit(arguments, options)
 
 
@@ -116,7 +120,7 @@ def submit(arguments: Sequence[str], options: Mapping[str, Any] | None = None) -
 def progress(folder: str | os.PathLike[str]) -> dict[str, int]:
     """How many cells of a run are `done`, of how many `cells`, from its folder.
 
-    While an evaluation with `until` runs, `cells` is the largest number that it may have.
+    While an evaluation or a study with `until` runs, `cells` is the largest number that it may have.
     """
     from .cells import count
 
@@ -125,7 +129,7 @@ def progress(folder: str | os.PathLike[str]) -> dict[str, int]:
     if request is None:
         return {"done": 0, "cells": 0}
     done = run.list("cells")
-    # The rule of an evaluation has ended it.
+    # A rule has ended it.
     ended = "stages" in request["cells"] and "join.json" in done
     return {"done": len(done), "cells": len(done) if ended else count(request)}
 

@@ -40,15 +40,14 @@ def stages(request: dict[str, Any]) -> Iterator[Iterable[Cell]]:
 
 
 def count(request: dict[str, Any]) -> int:
-    """The number of cells; the largest number, if the results of an evaluation end it."""
+    """The number of cells; the largest number, if the results of an evaluation or a study end it."""
     kind, cells = request["kind"], request["cells"]
     if kind == "train":
         return len(cells["runs"])
     if kind in ("collect", "convert"):
         return int(cells["shards"]) + 1 + bool(cells.get("verify"))
-    if "stages" in cells:
-        return len(cells["stages"]) * (len(cells["conditions"]) + 1) + 1
-    return len(cells["conditions"] if kind == "eval" else cells["ids"]) + 1
+    parts = len(cells["conditions"] if kind == "eval" else cells["ids"])
+    return len(cells["stages"]) * (parts + 1) + 1 if "stages" in cells else parts + 1
 
 
 def _ranges(request: dict[str, Any]) -> Iterator[Iterable[Cell]]:
@@ -148,14 +147,16 @@ def _ends(request: dict[str, Any], cell: str) -> bool:
 def _study(request: dict[str, Any]) -> Iterator[Iterable[Cell]]:
     """Cells of a study, each an evaluation or a row of a table, and its file and its image distances."""
     study, ids = request["cells"]["study"], request["cells"]["ids"]
+    if "stages" in request["cells"]:
+        yield from _study_until(request)
+        return
     output, is_table = Folder(request["output"]), "kind" in study
-    alone = study if is_table else study | {"published": []}
     yield (
         {
             "id": identity,
             "name": f"{_described(cell)} ({identity})",
             "arguments": ["study", "resume", f"{SCRATCH}/study", "--trust", *([] if is_table else ["--cell", identity])],
-            "files": {"study/study.json": json.dumps(alone | {"cells": [cell]})},
+            "files": {"study/study.json": _alone(study, cell)},
             # What another run evaluated, perhaps on one machine, is not evaluated again.
             "inputs": {f"study/cells/{identity}.json?": output.at(f"cells/{identity}.json")},
             # A row of a table stays empty on a node that cannot measure it.
@@ -163,18 +164,81 @@ def _study(request: dict[str, Any]) -> Iterator[Iterable[Cell]]:
         }
         for identity, cell in zip(ids, study["cells"], strict=True)
     )
-    yield [
-        {
-            "id": "join",
-            "name": "the study with all its cells",
-            "arguments": ["study", "resume", f"{SCRATCH}/study", "--trust"],
-            "files": {"study/study.json": json.dumps(study)},
-            # No row of a table may have been measured.
-            "inputs": {f"study/cells{'?' * is_table}": output.at("cells")},
-            "outputs": {name: output.at(name.removeprefix("study/").rstrip("?")) for name in _STUDY_FILES},
-            "study": study["title"],
-        }
-    ]
+    # No row of a table may have been measured.
+    yield [_whole(request, {f"study/cells{'?' * is_table}": output.at("cells")}, _STUDY_FILES)]
+
+
+def _study_until(request: dict[str, Any]) -> Iterator[Iterable[Cell]]:
+    """Cells of a study that its results end: stages, after each of which a cell says which cells need more starts.
+
+    Each cell of a stage continues the results of its stage before. They are kept apart, so that a node that comes back with an
+    earlier stage replaces nothing.
+    """
+    study, ids = request["cells"]["study"], request["cells"]["ids"]
+    output, folder = Folder(request["output"]), Folder(request["folder"])
+    of = dict(zip(ids, study["cells"], strict=True))
+    # Where the results of each cell are. What another run evaluated, perhaps on one machine, is not evaluated again.
+    at = {identity: output.at(f"cells/{identity}.json") for identity in ids}
+    still_open, suffix = ids, "?"
+    for stage in map(int, request["cells"]["stages"]):
+        here = f"parts/stages/{stage:06d}"
+        yield (
+            {
+                "id": f"stage-{stage:06d}-{identity}",
+                "name": f"{_described(of[identity])} ({identity}), {stage} episodes",
+                "arguments": [
+                    *("study", "resume", f"{SCRATCH}/study", "--trust", "--cell", identity, "--stage", str(stage)),
+                ],
+                "files": {"study/study.json": _alone(study, of[identity])},
+                "inputs": {f"study/cells/{identity}.json{suffix}": at[identity]},
+                "outputs": {f"study/cells/{identity}.json": folder.at(f"{here}/{identity}.json")},
+            }
+            for identity in still_open
+        )
+        at |= {identity: folder.at(f"{here}/{identity}.json") for identity in still_open}
+        results = {f"study/cells/{identity}.json": location for identity, location in at.items()}
+        decided = _whole(request, results, {}, "--stage", str(stage))
+        decided |= {"id": f"stage-{stage:06d}", "name": f"the rule after {stage} episodes"}
+        yield [decided | {"outputs": {"study/open.json": folder.at(f"parts/open/{stage:06d}.json")}}]
+        still_open, suffix = _open_after(folder, stage, of), ""
+        if not still_open:
+            break
+    yield [_whole(request, results, ("study/cells", *_STUDY_FILES))]
+
+
+def _open_after(folder: Folder, stage: int, cells: dict[str, Any]) -> list[str]:
+    """The ids of the cells that need more starts than those of a stage."""
+    name = f"parts/open/{stage:06d}.json"
+    found = folder.read_json(name)
+    if not isinstance(found, list) or not all(isinstance(identity, str) and identity in cells for identity in found):
+        fix = f"remove it and {folder.at(f'cells/stage-{stage:06d}.json')}, and run the command again"
+        raise RuntimeError(f"{folder.at(name)} is damaged; {fix}")
+    return found
+
+
+def _alone(study: dict[str, Any], cell: dict[str, Any]) -> str:
+    """The file of a study with one cell."""
+    alone = study | {"cells": [cell]}
+    if "kind" not in study:
+        alone["published"] = []
+    if study.get("until"):
+        # A cell alone has no gap that a rule could decide. Its own results follow no rule.
+        alone["until"] = "ci=5"
+    return json.dumps(alone)
+
+
+def _whole(request: dict[str, Any], inputs: dict[str, str], outputs: Iterable[str], *more: str) -> Cell:
+    """The study with the results of all its cells."""
+    study, output = request["cells"]["study"], Folder(request["output"])
+    return {
+        "id": "join",
+        "name": "the study with all its cells",
+        "arguments": ["study", "resume", f"{SCRATCH}/study", "--trust", *more],
+        "files": {"study/study.json": json.dumps(study)},
+        "inputs": inputs,
+        "outputs": {name: output.at(name.removeprefix("study/").rstrip("?")) for name in outputs},
+        "study": study["title"],
+    }
 
 
 def _described(cell: dict[str, Any]) -> str:

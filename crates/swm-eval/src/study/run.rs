@@ -45,14 +45,15 @@ impl Study {
         Ok(missing.len())
     }
 
-    /// Evaluates the cell with this id, unless the folder has its results. Several machines evaluate the cells of a study in
-    /// this way.
+    /// Evaluates the cell with this id: its first `episodes` starts, or all of them, except those whose results the folder has.
+    /// Several machines evaluate the cells of a study in this way.
     ///
     /// # Errors
     /// When there is no such cell, or as [`Study::run`].
     pub fn run_cell(
         &self,
         id: &str,
+        episodes: Option<usize>,
         folder: &StudyFolder,
         resolver: &dyn Resolver,
         options: &RunOptions,
@@ -60,9 +61,12 @@ impl Study {
     ) -> Result<()> {
         for cell in &self.cells {
             if cell.id()? == id {
-                let missing = folder.results(cell)?.is_none();
-                let work = [(cell, None, cell.request.episodes)];
-                return if missing { self.evaluate(&work, folder, resolver, options, control) } else { Ok(()) };
+                let (earlier, most) = (folder.results(cell)?, cell.request.episodes);
+                let wanted = episodes.map_or(most, |episodes| episodes.min(most));
+                if earlier.as_ref().map_or(0, Results::episodes) >= wanted {
+                    return Ok(());
+                }
+                return self.evaluate(&[(cell, earlier, wanted)], folder, resolver, options, control);
             }
         }
         Err(Error::config(format!("--cell {id}"), "the study has no such cell", "give the id of one of its cells"))

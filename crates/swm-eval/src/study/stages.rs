@@ -16,6 +16,13 @@ use swm_core::run::Control;
 use swm_core::{Result, Results};
 
 impl Study {
+    /// The numbers of starts after which a rule is applied; the last one is the largest number of episodes of a cell. A cell with
+    /// fewer episodes plays all of them.
+    pub fn stages(&self) -> Vec<usize> {
+        let most = self.cells.iter().map(|cell| cell.request.episodes).max().unwrap_or_default();
+        stages().take_while(|stage| *stage < most).chain([most]).collect()
+    }
+
     /// Evaluates the first starts of all cells, then more starts of those that the rule leaves open, up to the episodes of
     /// their requests. Returns the number of cells that were evaluated further.
     pub(super) fn run_until(
@@ -29,7 +36,7 @@ impl Study {
         self.check_starts(resolver)?;
         let mut evaluated = BTreeSet::new();
         let mut open: BTreeSet<String> = self.cells.iter().map(Cell::id).collect::<Result<_>>()?;
-        for stage in stages() {
+        for stage in self.stages() {
             let mut work: Vec<Work<'_>> = vec![];
             for cell in &self.cells {
                 let id = cell.id()?;
@@ -53,9 +60,12 @@ impl Study {
         Ok(evaluated.len())
     }
 
-    /// The cells that need more starts than those of a stage. What later stages added does not matter, so a study that
-    /// continues decides as it did before.
-    fn open_after(&self, until: Until, folder: &StudyFolder, stage: usize) -> Result<BTreeSet<String>> {
+    /// The ids of the cells that need more starts than those of a stage. What later stages added does not matter, so a study that
+    /// continues decides as it did before. Cells without results count as not done.
+    ///
+    /// # Errors
+    /// When results are damaged.
+    pub fn open_after(&self, until: Until, folder: &StudyFolder, stage: usize) -> Result<BTreeSet<String>> {
         let mut done = vec![];
         for cell in &self.cells {
             if let Some(results) = folder.results(cell)? {
@@ -67,7 +77,10 @@ impl Study {
     }
 
     /// Checks that datasets have as many starts as the requests have episodes, before the first episode is played.
-    fn check_starts(&self, resolver: &dyn Resolver) -> Result<()> {
+    ///
+    /// # Errors
+    /// When one has fewer, or cannot be read.
+    pub fn check_starts(&self, resolver: &dyn Resolver) -> Result<()> {
         let mut checked: Vec<(&StartsRequest, u64, usize)> = vec![];
         for Cell { request, .. } in &self.cells {
             let starts = (&request.starts, request.seed, request.episodes);

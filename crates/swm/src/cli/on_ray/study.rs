@@ -1,13 +1,12 @@
-//! What is checked before the datasets of a study are collected: its output, which other studies and other files must not be in,
-//! and whether its cells can run on several machines.
+//! What is checked before the datasets of a study are collected: its output, which other studies and other files must not be in.
 
 use super::{OnRayArgs, absolute};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 use std::path::Path;
+use swm_core::results::Until;
 use swm_core::{Error, Result, files};
 use swm_data::{Location, objects};
-use swm_eval::TableStudy;
 
 /// The largest `study.json`, in bytes.
 const MAX_BYTES: u64 = 256 << 20;
@@ -18,14 +17,15 @@ struct Stored {
     title: String,
     #[serde(rename = "cells")]
     _cells: Vec<IgnoredAny>,
-    until: Option<IgnoredAny>,
+    until: Option<Until>,
 }
 
-/// Refuses an output that has another study, or files and no study. On a cluster, an output whose run was begun is accepted.
+/// Refuses an output that has another study, or files and no study, and a fixed number of episodes in that of a study which a rule
+/// ended. On a cluster, an output whose run was begun is accepted.
 ///
 /// # Errors
 /// When it has, or cannot be read.
-pub fn check_output(output: &str, title: &str, on: &OnRayArgs) -> Result<()> {
+pub fn check_output(output: &str, title: &str, until: Option<Until>, on: &OnRayArgs) -> Result<()> {
     const FILE: &str = "study.json";
     if on.is_given() && on.has_begun(output)? {
         return Ok(());
@@ -52,27 +52,14 @@ pub fn check_output(output: &str, title: &str, on: &OnRayArgs) -> Result<()> {
     if found.title != title {
         return Err(other(format!("holds the study '{}', not '{title}'", found.title)));
     }
-    // Elsewhere, the rule of the command is known later.
-    if found.until.is_some() && on.is_given() {
-        return Err(other("holds a study that ran with --until".to_owned()));
-    }
-    Ok(())
-}
-
-/// The kinds of studies whose rows need one machine, and why.
-const ONE_MACHINE: [(&str, &str); 2] = [("data", "measure the speed of one machine"), ("drift", "share one training")];
-
-/// Checks that the rows of a table can be filled on several machines.
-///
-/// # Errors
-/// When they are comparable on one machine only, or share a training.
-pub fn check_rows(study: &TableStudy) -> Result<()> {
-    match ONE_MACHINE.iter().find(|(kind, _)| study.kind == *kind) {
-        Some((kind, why)) => {
-            let problem = format!("the rows of a study of the kind '{kind}' {why}");
-            Err(Error::config("--on", problem, "run the study without it"))
+    match found.until {
+        Some(rule) if until.is_none() => {
+            let problem = format!("holds a study that ran with --until {rule}");
+            let fix = "intervals for a fixed number of episodes do not hold for it: give --until again, or another folder with \
+                       --output";
+            Err(Error::config(&output, problem, fix))
         }
-        None => Ok(()),
+        _ => Ok(()),
     }
 }
 

@@ -15,12 +15,13 @@ mod published;
 mod report;
 mod resume;
 mod shipped;
+mod table_kind;
 mod tables;
 mod variants;
 
 use super::config::count;
 use super::eval::run_options;
-use super::on_ray::study::{check_output, check_rows};
+use super::on_ray::study::check_output;
 use super::on_ray::{OnRayArgs, Request};
 use super::progress::control;
 use super::recipes::Datasets;
@@ -277,16 +278,20 @@ fn run(args: &RunArgs, only_register: bool, context: &Context) -> anyhow::Result
     // Before datasets are collected, which may take long.
     expand::check(&file, &args.settings, &resolver)?;
     if !only_register {
-        check_output(output, &file.title, &args.on)?;
+        check_output(output, &file.title, args.until, &args.on)?;
     }
     file.datasets.make(&origin, context)?;
     let mut study: Study = expand::study(&file, &args.settings, &resolver, &mut control(context))?;
     study.arguments = args.arguments();
     study = with_rule(study, args.until)?;
     if args.on.is_given() {
-        args.on.refuse(&[("--until", args.until.is_some())], "remove it, or run the study without --on")?;
         let ids = study.cells.iter().map(Cell::id).collect::<Result<Vec<_>>>()?;
-        return args.submit(Path::new(output), json!({"study": study, "ids": ids}), context);
+        let mut cells = json!({"study": study, "ids": ids});
+        if study.until.is_some() {
+            study.check_starts(&resolver)?;
+            cells["stages"] = json!(study.stages());
+        }
+        return args.submit(Path::new(output), cells, context);
     }
     let folder = StudyFolder::new(Path::new(output));
     if only_register {
@@ -330,11 +335,11 @@ fn run_table(
     let mut study = file.study(size, &args.settings, origin)?;
     study.arguments = args.arguments();
     if args.on.is_given() {
-        check_rows(&study)?;
+        file.check_several_machines()?;
     }
     let datasets = file.datasets(size)?;
     datasets.check_origin(origin)?;
-    check_output(args.output_text(output)?, &study.title, &args.on)?;
+    check_output(args.output_text(output)?, &study.title, None, &args.on)?;
     datasets.make(origin, context)?;
     if args.on.is_given() {
         let ids = study.cells.iter().map(TableCell::id).collect::<Result<Vec<_>>>()?;

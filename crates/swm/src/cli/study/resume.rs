@@ -2,7 +2,7 @@
 
 use super::{export_table, show, tables};
 use crate::cli::config::count;
-use crate::cli::eval::run_options;
+use crate::cli::eval::{run_options, write_json};
 use crate::cli::progress::control;
 use crate::cli::{Context, emit, emit_json};
 use crate::resolver::HomeResolver;
@@ -12,6 +12,9 @@ use std::path::PathBuf;
 use swm_core::{Error, Origin, limits};
 use swm_eval::{AnyStudy, StudyFolder, TableStudy};
 
+/// The file with the ids of the cells that a stage leaves open.
+const OPEN: &str = "open.json";
+
 /// Arguments of `swm study resume`.
 #[derive(Args)]
 pub struct ResumeArgs {
@@ -20,6 +23,9 @@ pub struct ResumeArgs {
     /// Evaluate only the cell with this id
     #[arg(long, value_name = "ID")]
     cell: Option<String>,
+    /// With a rule that ends the study: play at most so many starts of the cell; without --cell, write which cells need more
+    #[arg(long, hide = true, value_name = "EPISODES")]
+    stage: Option<usize>,
     /// Parallel environments; results do not depend on their number
     #[arg(long, default_value_t = 16, value_parser = count::<1, { limits::ENVS.max }>)]
     envs: usize,
@@ -40,8 +46,17 @@ pub fn run(args: &ResumeArgs, context: &Context) -> anyhow::Result<()> {
     let resolver = HomeResolver::new(Origin::file(args.folder.join("study.json"), args.trust));
     let _lock = folder.create(&study)?;
     let (options, control) = (run_options(args.envs, None, context), &mut control(context));
+    if let (Some(stage), None) = (args.stage, &args.cell) {
+        let open = match study.until {
+            Some(until) => study.open_after(until, &folder, stage)?,
+            None => return Err(Error::config("--stage", "the study has no rule that ends it", "leave it out").into()),
+        };
+        // What a command prints may be too long for a record.
+        write_json(&args.folder.join(OPEN), &open)?;
+        return emit_json(&json!({"open": open.len()}));
+    }
     if let Some(id) = &args.cell {
-        study.run_cell(id, &folder, &resolver, &options, control)?;
+        study.run_cell(id, args.stage, &folder, &resolver, &options, control)?;
         if context.json {
             return emit_json(&json!({"cell": id}));
         }
@@ -55,7 +70,7 @@ pub fn run(args: &ResumeArgs, context: &Context) -> anyhow::Result<()> {
 /// Fills the rows that a study of another kind lacks.
 fn run_table(study: &TableStudy, folder: &StudyFolder, args: &ResumeArgs, context: &Context) -> anyhow::Result<()> {
     let given = args.folder.display().to_string();
-    if args.cell.is_some() {
+    if args.cell.is_some() || args.stage.is_some() {
         let problem = format!("the study is of the kind '{}', whose rows are no evaluations", study.kind);
         return Err(Error::config("--cell", problem, "resume all rows").into());
     }

@@ -9,6 +9,7 @@ use super::any_file::Size;
 use super::chosen::{Chosen, check_cells, known, settings_of};
 use super::drift::{self, DriftSettings, Trained};
 use super::online::{self, OnlineSettings};
+use super::table_kind::TableKind;
 use crate::cli::Context;
 use crate::cli::progress::control;
 use crate::cli::recipes::Datasets;
@@ -53,16 +54,6 @@ pub struct TableFile {
 
 /// The name of the tables of datasets.
 const COLLECT: &str = "collect";
-
-/// What the cells of a study are.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-enum TableKind {
-    Factors,
-    Data,
-    Drift,
-    Online,
-}
 
 /// The settings of the kind `data`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -187,6 +178,14 @@ impl TableFile {
         Ok(study)
     }
 
+    /// Checks that the rows can be filled on several machines.
+    ///
+    /// # Errors
+    /// When they need one machine.
+    pub fn check_several_machines(&self) -> Result<()> {
+        self.kind.check_several_machines()
+    }
+
     /// The datasets that the study collects at a size.
     ///
     /// # Errors
@@ -243,17 +242,6 @@ impl TableFile {
     fn published_of(&self, name: &str, columns: usize) -> Vec<Option<f64>> {
         let values = self.published.get(name);
         (0..columns).map(|i| values.and_then(|values| values.get(i)).copied()).collect()
-    }
-}
-
-impl TableKind {
-    fn name(self) -> &'static str {
-        match self {
-            Self::Factors => "factors",
-            Self::Data => "data",
-            Self::Drift => "drift",
-            Self::Online => "online",
-        }
     }
 }
 

@@ -59,17 +59,24 @@ pub struct Registration {
     pub hash: String,
     /// Whether the study is still the registered one.
     pub is_same: bool,
+    /// The date that the clock of the registering machine showed, in UTC. It proves nothing: a published hash does. `None` for
+    /// registrations of older versions.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub date: Option<String>,
 }
 
 impl fmt::Display for Registration {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { hash, is_same } = self;
+        let Self { hash, is_same, date } = self;
         f.write_str(if *is_same {
             "was registered before its first result as "
         } else {
             "differs from its registration "
         })?;
-        f.write_str(hash)
+        f.write_str(hash)?;
+        date.as_ref().map_or(Ok(()), |date| {
+            write!(f, " (date unproven: the clock of that machine showed {date}; a published hash proves a date)")
+        })
     }
 }
 
@@ -182,6 +189,17 @@ pub struct Published {
 mod tests {
     use super::*;
     use crate::results::{EpisodeResult, Run, Timing};
+
+    #[test]
+    fn registrations_say_that_their_dates_are_unproven() {
+        let date = Some("2026-11-26T17:00:00Z".to_owned());
+        let dated = Registration { hash: "abc".to_owned(), is_same: true, date };
+        assert!(
+            dated.to_string().contains("as abc (date unproven: the clock of that machine showed 2026-11-26T17:00:00Z")
+        );
+        let older: Registration = serde_json::from_str("{\"hash\": \"abc\", \"is_same\": false}").expect("a document");
+        assert_eq!(older.to_string(), "differs from its registration abc");
+    }
 
     #[test]
     fn starts_count_that_count_under_both_conditions() {

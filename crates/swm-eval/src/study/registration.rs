@@ -20,6 +20,9 @@ struct Registered {
     cells: usize,
     /// The hash.
     registered: String,
+    /// What the clock of the machine showed, in UTC. Anybody can set a clock and edit this file: only a published hash proves a date.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    unproven_date: Option<String>,
 }
 
 impl Study {
@@ -34,11 +37,12 @@ impl Study {
 }
 
 impl StudyFolder {
-    /// Registers a study that has no results yet, and returns its hash. Keeps other writers away until the lock is dropped.
+    /// Registers a study that has no results yet, at a date that a clock showed. A study that is registered already keeps its date.
+    /// Keeps other writers away until the lock is dropped.
     ///
     /// # Errors
-    /// When a cell is done, or as [`StudyFolder::create`].
-    pub fn register(&self, study: &Study) -> Result<(Lock, String)> {
+    /// When a cell is done, the folder has a damaged registration, or as [`StudyFolder::create`].
+    pub fn register(&self, study: &Study, date: &str) -> Result<(Lock, Registration)> {
         let lock = self.create(study)?;
         let cells = self.root.join("cells");
         let io = |error| Error::io(&cells, "reading the folder", error);
@@ -46,11 +50,18 @@ impl StudyFolder {
             let fix = "register a study in an empty folder, before its first run";
             return Err(Error::config(self.root.display().to_string(), "has results already", fix));
         }
-        let registered = study.registration_hash()?;
-        let content =
-            Registered { title: study.title.clone(), cells: study.cells.len(), registered: registered.clone() };
+        if let Some(found) = self.registration(study)?.filter(|found| found.is_same && found.date.is_some()) {
+            return Ok((lock, found));
+        }
+        let found = Registration { hash: study.registration_hash()?, is_same: true, date: Some(date.to_owned()) };
+        let content = Registered {
+            title: study.title.clone(),
+            cells: study.cells.len(),
+            registered: found.hash.clone(),
+            unproven_date: found.date.clone(),
+        };
         files::write(&self.root.join(REGISTRATION), &json(&content)?)?;
-        Ok((lock, registered))
+        Ok((lock, found))
     }
 
     /// The registration of the study in this folder; `None` if it was not registered.
@@ -66,6 +77,6 @@ impl StudyFolder {
         let found: Registered = serde_json::from_slice(&files::read(&path, MAX_BYTES)?)
             .map_err(|error| Error::corrupt(&path, format!("is not a registration ({error})"), fix))?;
         let is_same = found.registered == study.registration_hash()?;
-        Ok(Some(Registration { hash: found.registered, is_same }))
+        Ok(Some(Registration { hash: found.registered, is_same, date: found.unproven_date }))
     }
 }

@@ -130,7 +130,7 @@ fn render(page: &StudyPage, sheets: &[Sheet<'_>], figures: &[Placed]) -> Result<
             escape(&shorten(&results.hash, limits::STUDY_NAME_CHARS))
         );
         if let Some(registration) = &results.registration {
-            let words = escape(&shorten(&registration.to_string(), limits::STUDY_NAME_CHARS));
+            let words = escape(&shorten(&registration.to_string(), limits::STUDY_TEXT_CHARS));
             let (open, close) = if registration.is_same { ("", "") } else { ("<b>", "</b>") };
             let _ = writeln!(html, "<p>{open}This study {words}.{close}</p>");
         }

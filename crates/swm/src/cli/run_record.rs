@@ -162,7 +162,7 @@ impl Invocation {
             command: arguments(),
             program: None,
             folder: std::env::current_dir().unwrap_or_default(),
-            started: utc(SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs())),
+            started: now(),
             git: git::commit(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             cpu: format!("{}{cpu}, {threads} threads", cpu_level()),
@@ -184,6 +184,11 @@ fn processor() -> Option<String> {
 fn system() -> String {
     let release = std::fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
     format!("{} {}", std::env::consts::OS, release.trim()).trim().to_owned()
+}
+
+/// What the clock shows, in UTC, as `2026-11-24T01:02:03Z`.
+pub fn now() -> String {
+    utc(SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs()))
 }
 
 /// Formats seconds since 1970 as `2026-11-24T01:02:03Z`.

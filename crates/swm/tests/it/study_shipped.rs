@@ -60,7 +60,13 @@ fn twenty_kills_of_every_study_end_in_the_same_bytes() {
         killed(study, &["episodes=6"], 20);
     }
     killed("paper/factors-per-env", &[], 20);
+}
+
+#[test]
+#[ignore = "twenty kills of each study that trains: minutes"]
+fn twenty_kills_of_studies_that_train_end_in_the_same_bytes() {
     killed("paper/drift", &["episodes=2", "steps=50", "frames=300"], 20);
+    killed("paper/online", &["steps=60", "warmup=40", "episodes=2", "max-steps=20"], 20);
 }
 
 #[test]
@@ -299,16 +305,26 @@ policy = "expert"
 "#;
     std::fs::write(swm.path("study.toml"), study).expect("writing the study");
     let register = ["study", "register", "study.toml", "--output", "out"];
-    let hash = swm.json(&register)["registered"].as_str().expect("a hash").to_owned();
-    assert_eq!(swm.json(&register)["registered"], hash.as_str(), "without results it can be registered again");
+    let first = swm.json(&register);
+    let [hash, date] = ["registered", "unproven_date"].map(|key| first[key].as_str().expect("a text").to_owned());
+    assert!(date.len() == 20 && date.starts_with("20") && date.ends_with('Z'), "{date}");
+    // As if it had been registered a year ago: without results it can be registered again, and keeps its date.
+    let file = swm.path("out/registration.json");
+    let stored = std::fs::read_to_string(&file).expect("the registration");
+    let (this, date) = (date, "2025-11-24T01:02:03Z");
+    std::fs::write(&file, stored.replace(&this, date)).expect("an older date");
+    let again = swm.json(&register);
+    assert_eq!((again["registered"].as_str(), again["unproven_date"].as_str()), (Some(&*hash), Some(date)));
     let run = ["study", "run", "study.toml", "--output", "out"];
     let registration = swm.json(&run)["registration"].clone();
-    assert_eq!(registration, serde_json::json!({"hash": hash, "is_same": true}));
+    assert_eq!(registration, serde_json::json!({"hash": hash, "is_same": true, "date": date}));
+    let status = text(&swm.run(&["study", "status", "out"]).stdout);
+    assert!(status.contains(&hash) && status.contains("date unproven") && status.contains(date), "{status}");
     swm.fails(&register, 2, &["has results already", "empty folder"]);
     // The families are no part of any cell: all cells are done, but it is another study.
     std::fs::write(swm.path("study.toml"), format!("families = []\n{study}")).expect("writing the study");
     let registration = swm.json(&run)["registration"].clone();
-    assert_eq!(registration, serde_json::json!({"hash": hash, "is_same": false}));
+    assert_eq!(registration, serde_json::json!({"hash": hash, "is_same": false, "date": date}));
     swm.json(&["study", "report", "out"]);
     let page = std::fs::read_to_string(swm.path("out/report/index.html")).expect("the page");
     assert!(page.contains("<b>This study differs from its registration"), "the page hides that the study was changed");

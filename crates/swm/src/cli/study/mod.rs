@@ -26,6 +26,7 @@ use super::on_ray::{OnRayArgs, Request};
 use super::progress::control;
 use super::recipes::Datasets;
 use super::results_tables::{compared, percent};
+use super::run_record::now;
 use super::{Context, emit, emit_json, output_folder, table};
 use crate::resolver::HomeResolver;
 use any_file::{AnyFile, Size};
@@ -295,11 +296,15 @@ fn run(args: &RunArgs, only_register: bool, context: &Context) -> anyhow::Result
     }
     let folder = StudyFolder::new(Path::new(output));
     if only_register {
-        let (_lock, hash) = folder.register(&study)?;
+        let (_lock, registration) = folder.register(&study, &now())?;
         if context.json {
-            return emit_json(&json!({"registered": hash, "cells": study.cells.len()}));
+            let cells = study.cells.len();
+            return emit_json(
+                &json!({"registered": registration.hash, "cells": cells, "unproven_date": registration.date}),
+            );
         }
-        emit(&format!("{hash}\n"));
+        let date = registration.date.unwrap_or_default();
+        emit(&format!("{}\ndate of this machine's clock, unproven: {date}\n", registration.hash));
         return Ok(());
     }
     let _lock = folder.create(&study)?;

@@ -14,10 +14,13 @@ pub enum When {
     Terminal,
     /// After every step, the last included.
     Running,
+    /// After the step whose latent is closest to the goal's. A plan may then reach the goal before its end, so a long
+    /// horizon delays nothing.
+    Closest,
 }
 
-/// The squared distance of latents to the goal's latent: `w Σ_t γ^(t-1) Σ_i (z_t,i - g_i)²`, over the last latent or
-/// over all predicted ones. The defaults give the cost of the reference implementation's models.
+/// The squared distance of latents to the goal's latent: `w Σ_t γ^(t-1) Σ_i (z_t,i - g_i)²`, over the last latent, the
+/// closest one or all predicted ones. The defaults give the cost of the reference implementation's models.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Goal {
@@ -42,17 +45,29 @@ impl Goal {
     fn compared(&self, trajectory: Trajectory<'_>) -> impl Iterator<Item = (usize, f32)> {
         let latent = trajectory.goal.len();
         let last = trajectory.latents.len() / latent - 1;
-        let first = if self.when == When::Terminal { last } else { 1 };
+        let steps = match self.when {
+            When::Terminal => last..=last,
+            When::Running => 1..=last,
+            When::Closest => {
+                let distance = |t: &usize| self.distance(trajectory, t * latent);
+                let closest = (1..=last).min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap_or(last);
+                closest..=closest
+            }
+        };
         let (mut weight, discount) = (self.weight, self.discount);
-        (first..=last).map(move |t| {
+        steps.map(move |t| {
             let compared = (t * latent, weight);
             weight *= discount;
             compared
         })
     }
-}
 
-impl Goal {
+    /// The squared distance of the latent that begins at the index `at`.
+    fn distance(&self, trajectory: Trajectory<'_>, at: usize) -> f32 {
+        let Trajectory { latents, goal, .. } = trajectory;
+        picked(&self.latents, goal.len()).map(|i| (latents[at + i] - goal[i]).powi(2)).sum()
+    }
+
     /// Checks weight and discount, without a model.
     ///
     /// # Errors
@@ -66,7 +81,7 @@ impl Goal {
         settings.check(
             self.when == When::Running || undiscounted,
             "discount",
-            format!("{} of a terminal term", self.discount),
+            format!("{} of a term of one step", self.discount),
             "make it running, or leave the discount at 1",
         )
     }
@@ -84,10 +99,7 @@ impl Objective for Goal {
     }
 
     fn cost(&self, trajectory: Trajectory<'_>) -> f32 {
-        let Trajectory { latents, goal, .. } = trajectory;
-        let distance =
-            |at: usize| -> f32 { picked(&self.latents, goal.len()).map(|i| (latents[at + i] - goal[i]).powi(2)).sum() };
-        self.compared(trajectory).map(|(at, weight)| weight * distance(at)).sum()
+        self.compared(trajectory).map(|(at, weight)| weight * self.distance(trajectory, at)).sum()
     }
 
     fn add_gradient(&self, trajectory: Trajectory<'_>, slope: &mut Slope<'_>) {

@@ -146,6 +146,7 @@ fn all_terms() -> Vec<Box<dyn Objective>> {
     vec![
         Box::new(Goal::default()),
         Box::new(running),
+        Box::new(Goal { weight: 0.4, when: When::Closest, ..Goal::default() }),
         Box::new(Control { weight: 0.1 }),
         Box::new(Change { weight: 0.3, block: 2 }),
     ]
@@ -236,6 +237,9 @@ fn values_of_terms_and_constraints_follow_their_formulas() {
     let running = Goal { weight: 2.0, when: When::Running, discount: 0.5, latents: vec![] };
     assert_eq!(running.cost(trajectory), 2.0 * ((1.0 + 4.0) + 0.5 * (9.0 + 9.0)));
     assert_eq!(Goal { latents: vec![Pick::One(1)], ..running }.cost(trajectory), 2.0 * (4.0 + 0.5 * 9.0));
+    let closest = Goal { weight: 3.0, when: When::Closest, ..Goal::default() };
+    assert_eq!(closest.cost(trajectory), 3.0 * (1.0 + 4.0), "the first step is closer");
+    assert_eq!(Goal { latents: vec![Pick::One(0)], ..closest }.cost(trajectory), 3.0);
     assert_eq!(Control { weight: 0.5 }.cost(trajectory), 0.5 * (25.0 + 1.0 + 1.0 + 5.0));
     // Model steps (3 4 0 1), (0 1 2 1); as two actions each, (3 4), (0 1), (0 1), (2 1).
     assert_eq!(Change { weight: 1.0, block: 1 }.cost(trajectory), 9.0 + 9.0 + 4.0 + 0.0);
@@ -463,7 +467,7 @@ fn errors_name_invalid_objectives_and_unsuitable_models() {
     let past = message(&Goal { latents: vec![Pick::Range([2, 4])], ..goal() });
     assert_eq!(past, "goal term latents = 2..4 is outside its space: expected latent dimensions within 0..3");
     assert!(message(&Goal { latents: vec![Pick::One(1), Pick::Range([0, 2])], ..goal() }).contains("1 is named twice"));
-    assert!(message(&Goal { discount: 0.9, ..goal() }).contains("0.9 of a terminal term"));
+    assert!(message(&Goal { discount: 0.9, ..goal() }).contains("0.9 of a term of one step"));
     assert!(message(&Goal { weight: f32::NAN, ..goal() }).contains("goal term weight: NaN"));
     assert!(message(&Control { weight: -1.0 }).contains("control term weight: -1"));
     assert!(message(&Change { weight: 1.0, block: 3 }).contains("3 actions in a model step of dimension 4"));

@@ -135,7 +135,7 @@ impl Hub {
                 }
             }
         }
-        check_hash(&part, &url, file)?;
+        check_hash(&part, &url, file, control)?;
         std::fs::rename(&part, &path).map_err(|error| Error::io(&path, "saving a download", error))?;
         Ok(transferred)
     }
@@ -195,9 +195,9 @@ fn chunk(url: &str, mut answer: Response) -> Result<(Option<bytes::Bytes>, Respo
 }
 
 /// Checks the hash of a complete download, and deletes one that differs.
-fn check_hash(part: &Path, url: &str, file: &HubFile) -> Result<()> {
+fn check_hash(part: &Path, url: &str, file: &HubFile, control: &mut Control<'_>) -> Result<()> {
     let Some(expected) = &file.sha256 else { return Ok(()) };
-    let (found, _) = sha256(part)?;
+    let (found, _) = sha256(part, control)?;
     if found == *expected {
         return Ok(());
     }
@@ -206,11 +206,12 @@ fn check_hash(part: &Path, url: &str, file: &HubFile) -> Result<()> {
     Err(Error::corrupt(url, problem, "run it again; if it happens again, tell the owner of the repository"))
 }
 
-/// The SHA-256 hash of a file in hexadecimal digits, and its size.
-pub(super) fn sha256(path: &Path) -> Result<(String, u64)> {
+/// The SHA-256 hash of a file in hexadecimal digits, and its size. Large files take minutes, so that the caller can stop it.
+pub(super) fn sha256(path: &Path, control: &mut Control<'_>) -> Result<(String, u64)> {
     let io = |error| Error::io(path, "reading the file", error);
     let (mut file, mut hash, mut block, mut size) = (File::open(path).map_err(io)?, Sha256::new(), vec![0; BLOCK], 0);
     loop {
+        control.check()?;
         match file.read(&mut block).map_err(io)? {
             0 => break,
             count => {

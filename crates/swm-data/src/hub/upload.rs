@@ -351,7 +351,7 @@ fn uploads(from: &Path, to: &str, control: &mut Control<'_>) -> Result<Vec<Uploa
     let upload = |(path, local): (String, PathBuf)| {
         control.check()?;
         super::check_no_pointer(&local)?;
-        let (sha256, size) = sha256(&local)?;
+        let (sha256, size) = sha256(&local, control)?;
         let mut sample = vec![];
         let file = File::open(&local).map_err(|error| reading(&local, error))?;
         file.take(SAMPLE as u64).read_to_end(&mut sample).map_err(|error| reading(&local, error))?;
@@ -423,6 +423,19 @@ mod tests {
             std::fs::write(&path, vec![7; size + 1]).expect("a file");
             assert!(line.bytes().is_err(), "the file changed");
         }
+    }
+
+    #[test]
+    fn hashing_a_file_can_be_stopped() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("a");
+        std::fs::write(&path, vec![7; 3 << 20]).expect("a file");
+        let mut checks = 0;
+        let mut control = Control::new().with_poll(|| {
+            checks += 1;
+            if checks > 2 { Err(Error::Interrupted) } else { Ok(()) }
+        });
+        assert!(matches!(sha256(&path, &mut control), Err(Error::Interrupted)));
     }
 
     #[test]

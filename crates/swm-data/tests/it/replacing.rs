@@ -400,6 +400,9 @@ fn linked_parts_of_a_dataset_are_not_replaced() {
         let before = [contents(&path), contents(&outside)];
         let error = overwrite(&path).expect("a refusal").to_string();
         assert!(error.contains(name), "{format} {name}: {error}");
+        if format == "lance" {
+            assert!(create(&path, &schema(), options(WriteMode::Append)).is_err(), "new files would go elsewhere");
+        }
         assert_eq!([contents(&path), contents(&outside)], before, "{format} {name}");
     }
 }

@@ -146,7 +146,7 @@ impl Store {
         Lock::folder(&self.label.join(subfolder)).map(Some)
     }
 
-    /// Checks that no folder of a local table is a symbolic link, because replacing the table would delete files elsewhere.
+    /// Checks that no folder of a local table is a symbolic link, because files elsewhere would be written, or deleted.
     ///
     /// # Errors
     /// If a folder is a link.

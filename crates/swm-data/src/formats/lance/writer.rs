@@ -45,9 +45,7 @@ pub fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Re
     let store = Store::new(location)?;
     store.check_writable()?;
     schema::columns_to_write(schema)?;
-    if options.mode == WriteMode::Overwrite {
-        store.check_no_links()?;
-    }
+    store.check_no_links()?;
     let lock = if options.exclusive { store.lock("")? } else { None };
     for _ in 0..MAX_ATTEMPTS {
         // If another process creates, continues or replaces the table in between, the next attempt starts from the new

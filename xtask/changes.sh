@@ -4,6 +4,7 @@ set -eu
 VERSION=$1
 LAST=$(git describe --tags --abbrev=0 HEAD^ 2>/dev/null || true)
 printf '# stable-worldmodel %s\n' "$VERSION"
-awk '/^## / { sections++; next } sections == 1' CHANGELOG.md
+# Links lead to pages of the repository, which are not beside this file.
+awk '/^## / { sections++; next } sections == 1' CHANGELOG.md | sed 's/\[\([^]]*\)\]([^)]*\.md[^)]*)/\1/g'
 printf '## Commits%s\n\n' "${LAST:+ since $LAST}"
 git log --no-merges --format='- %s (%h)' ${LAST:+"$LAST.."}HEAD

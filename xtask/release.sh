@@ -2,9 +2,6 @@
 # Makes the files of a release in a folder, which is replaced: `make release` calls this.
 set -eu
 OUT=$1
-# Dates inside packages are that of the commit, so that equal sources give equal packages.
-SOURCE_DATE_EPOCH=$(git log -1 --format=%ct)
-export SOURCE_DATE_EPOCH
 VERSION=$(sed -n 's/^version = "\(.*\)"$/\1/p' Cargo.toml | head -1)
 HOST=$(rustc -vV | sed -n 's/^host: //p')
 NAME=stable-worldmodel-$VERSION-$HOST
@@ -15,6 +12,10 @@ mkdir -p "$OUT/$NAME"
 # of dependencies stays.
 CARGO=$PWD/xtask/auditable_cargo.sh cargo-auditable auditable rustc --release --locked -p swm --bin swm -- -C strip=symbols
 cp "$CARGO_TARGET_DIR/release/swm" "$OUT/$NAME/"
+# Dates inside packages are that of the commit, so that equal sources give equal packages. Build scripts of C libraries watch the variable: set
+# before, it would compile everything again.
+SOURCE_DATE_EPOCH=$(git log -1 --format=%ct)
+export SOURCE_DATE_EPOCH
 auditable2cdx "$OUT/$NAME/swm" > "$OUT/$NAME.cdx.json"
 sh xtask/changes.sh "$VERSION" > "$OUT/$NAME/CHANGES.md"
 cp "$OUT/$NAME/CHANGES.md" "$OUT/"

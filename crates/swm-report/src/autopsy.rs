@@ -7,7 +7,7 @@ use crate::text::{escape, percent, points, shorten};
 use base64::Engine as _;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
-use swm_core::results::{Autopsy, Estimate, Repair, letters};
+use swm_core::results::{Autopsy, Estimate, ProbeScores, Repair, letters};
 use swm_core::{Error, Result, files};
 
 /// The style of what only this page has.
@@ -15,6 +15,8 @@ const STYLE: &str = ".strip img { display: block; width: 100%; height: auto; ima
                      .strip { margin: 0.6rem 0 1.4rem; }\n";
 /// The most failures with a row.
 const REPAIRS: usize = 200;
+/// The most elements of a state with a row.
+const ELEMENTS: usize = 200;
 /// The largest size of all frame strips together, in bytes.
 const STRIP_BYTES: usize = 3 << 20;
 
@@ -27,6 +29,8 @@ pub struct AutopsyPage {
     pub env: String,
     /// The outcome.
     pub found: Autopsy,
+    /// What probes read from the latents of the model, if they were fitted.
+    pub probes: Option<ProbeScores>,
     /// Frame strips of repaired starts.
     pub strips: Vec<FrameStrip>,
     /// The command that runs the autopsy again.
@@ -56,7 +60,7 @@ pub fn write_autopsy(page: &AutopsyPage, out_dir: &Path) -> Result<PathBuf> {
 }
 
 fn render(page: &AutopsyPage) -> Result<String> {
-    let AutopsyPage { title, env, found, strips, command } = page;
+    let AutopsyPage { title, env, found, probes: scores, strips, command } = page;
     let title = shorten(title, limits::TEXT_CHARS);
     let lede = format!(
         "{} · {} starts, {} failures · {} planning seeds for each arm",
@@ -81,6 +85,9 @@ fn render(page: &AutopsyPage) -> Result<String> {
         );
         contributions(html, found)?;
         arms(html, found)?;
+        if let Some(scores) = scores {
+            probes(html, scores);
+        }
         repairs(html, found, strips);
         Ok(())
     })
@@ -169,6 +176,37 @@ fn arms(html: &mut String, found: &Autopsy) -> Result<()> {
     Ok(())
 }
 
+/// What probes read from the latents.
+fn probes(html: &mut String, scores: &ProbeScores) {
+    let ProbeScores { dataset, trivial, elements } = scores;
+    let _ = write!(
+        html,
+        "<section>\n<h2>What the latents hold</h2>\n<p>The share of the variance (R²) of each element of the state that probes \
+         read from the latents of single observations: a linear map, and a network with two hidden layers. Both are fitted on \
+         training episodes of {} and scored on validation episodes. C plans by the one with the higher mean.</p>\n\
+         <p class=\"note\">{}</p>\n",
+        escape(&shorten(dataset, limits::TEXT_CHARS)),
+        escape(&scores.note())
+    );
+    let from = trivial.as_ref().map(|column| format!("R², {} alone", escape(&shorten(column, limits::TEXT_CHARS))));
+    let columns: Vec<&str> = ["Element", "R², linear", "R², network"].into_iter().chain(from.as_deref()).collect();
+    open_table(html, &columns);
+    for score in elements.iter().take(ELEMENTS) {
+        let _ = write!(html, "<tr><th scope=\"row\">{}</th>", escape(&shorten(&score.element, limits::TEXT_CHARS)));
+        for (column, value) in columns[1..].iter().zip([score.linear, score.network, score.trivial]) {
+            let value = value.map_or("–".to_owned(), |value| format!("{value:.3}"));
+            let _ = write!(html, "<td class=\"n\" data-label=\"{column}\">{value}</td>");
+        }
+        html.push_str("</tr>\n");
+    }
+    html.push_str("</tbody>\n</table>\n</div>\n");
+    if elements.len() > ELEMENTS {
+        let more = elements.len() - ELEMENTS;
+        let _ = writeln!(html, "<p class=\"note\">{more} more elements are in <code>autopsy.json</code>.</p>");
+    }
+    html.push_str("</section>\n");
+}
+
 /// The smallest repair of every failure, with its frame strip.
 fn repairs(html: &mut String, found: &Autopsy, strips: &[FrameStrip]) {
     if found.repairs.is_empty() {
@@ -218,7 +256,7 @@ fn sentence(sets: impl Iterator<Item = String>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use swm_core::results::{Arm, Contribution, Finding, Ingredient, Proportion};
+    use swm_core::results::{Arm, Contribution, Finding, Ingredient, ProbeScore, Proportion};
 
     #[test]
     fn page_has_the_verdict_all_arms_and_the_strips_of_repaired_starts() {
@@ -245,10 +283,22 @@ mod tests {
             ],
         };
         let strip = |start| FrameStrip { start, set: "D".to_owned(), png: vec![1, 2, 3] };
+        let score = |element: &str, linear| ProbeScore {
+            element: element.to_owned(),
+            linear,
+            network: Some(0.987),
+            trivial: Some(0.25),
+        };
+        let probes = ProbeScores {
+            dataset: "rooms".to_owned(),
+            trivial: Some("pos_agent".to_owned()),
+            elements: vec![score("state[0]", Some(0.912)), score("sin state[4]", None)],
+        };
         let page = AutopsyPage {
             title: "Autopsy of <b>x</b>".to_owned(),
             env: "swm/TwoRoom-v1".to_owned(),
             found,
+            probes: Some(probes),
             strips: vec![strip(4), strip(5)],
             command: "swm autopsy x -o y".to_owned(),
         };
@@ -262,6 +312,10 @@ mod tests {
             "<b>Start 9</b>: no arm solves it.",
             "Autopsy of &lt;b&gt;x",
             "swm autopsy x -o y",
+            "<th scope=\"row\">state[0]</th><td class=\"n\" data-label=\"R², linear\">0.912</td>",
+            "data-label=\"R², network\">0.987</td><td class=\"n\" data-label=\"R², pos_agent alone\">0.250</td>",
+            "<th scope=\"row\">sin state[4]</th><td class=\"n\" data-label=\"R², linear\">–</td>",
+            "an R² that is not above it does not show",
         ] {
             assert!(html.contains(part), "{part}");
         }

@@ -2,6 +2,7 @@
 
 use super::config::count;
 use super::eval::{run_options, write_json};
+use super::probe::element;
 use super::progress::control;
 use super::results_tables::percent;
 use super::{Context, emit, emit_json, eprint, output_folder, study, table};
@@ -11,7 +12,7 @@ use clap::Args;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
-use swm_core::results::{Autopsy, Estimate, Ingredient, Repair, letters};
+use swm_core::results::{Autopsy, Estimate, Ingredient, ProbeScore, ProbeScores, Repair, letters};
 use swm_core::{Error, Key, Origin, Result, VariationRequest, limits};
 use swm_eval::{EvalRequest, PolicyRequest, Resolver as _, StudyFolder, World, WorldConfig};
 use swm_report::{AutopsyPage, FrameStrip};
@@ -41,11 +42,18 @@ pub struct AutopsyArgs {
     #[arg(long, value_name = "LETTERS", default_value = "SRDE")]
     ingredients: String,
     /// The dataset on which the probe of C is fitted (default: that of the starts)
+    ///
+    /// What a linear map and a network read from the latents is shown also without C.
     #[arg(long, value_name = "DATASET")]
     probe_data: Option<String>,
     /// Columns that the probe of C reads
     #[arg(long, value_name = "COLUMN,…", value_delimiter = ',', default_value = "state")]
     probe_columns: Vec<String>,
+    /// Columns that predict without an image (default: pos_agent, else proprio)
+    ///
+    /// What they predict is shown beside what probes read from the latents.
+    #[arg(long, value_name = "COLUMN,…", value_delimiter = ',')]
+    probe_baseline: Vec<String>,
     /// Folder of the autopsy, which is that of a study
     #[arg(short, long, default_value = "autopsy", value_name = "DIR")]
     output: PathBuf,
@@ -95,13 +103,17 @@ pub fn autopsy(args: &AutopsyArgs, context: &Context) -> anyhow::Result<()> {
     plan.study.run(&folder, &resolver, &options, &mut control(context))?;
     let found = plan.autopsy(&folder)?;
     let file = args.output.join("autopsy.json");
-    let document = json!({
+    let probes = args.probe_scores(&plan, &resolver, context)?;
+    let mut document = json!({
         "version": 1,
         "model": args.model,
         "env": plan.request()?.env,
         "study": plan.study.hash()?,
         "autopsy": found,
     });
+    if let Some(probes) = &probes {
+        document["probes"] = json!(probes);
+    }
     write_json(&file, &document)?;
     let strips = plan.strips(&found, &folder, &resolver, &options, &mut control(context))?;
     let strips = strips.into_iter().map(|Strip { start, set, png }| FrameStrip { start, set: letters(&set), png });
@@ -109,6 +121,7 @@ pub fn autopsy(args: &AutopsyArgs, context: &Context) -> anyhow::Result<()> {
         title: title.clone(),
         env: plan.request()?.env.clone(),
         found: found.clone(),
+        probes: probes.clone(),
         strips: strips.collect(),
         command: args.command(),
     };
@@ -118,6 +131,9 @@ pub fn autopsy(args: &AutopsyArgs, context: &Context) -> anyhow::Result<()> {
     }
     emit(&format!("{title} in {}\n", plan.request()?.env));
     emit(&text(&found));
+    if let Some(probes) = &probes {
+        emit(&probe_table(probes));
+    }
     emit(&format!("{}\n{}\n", file.display(), page.display()));
     Ok(())
 }
@@ -131,6 +147,32 @@ impl AutopsyArgs {
         Some(ProbeSource { dataset, columns: self.probe_columns.clone() })
     }
 
+    /// What probes read from the latents of the model; `None` without C and --probe-data.
+    fn probe_scores(&self, plan: &Plan, resolver: &HomeResolver, context: &Context) -> Result<Option<ProbeScores>> {
+        let of_latents = plan.probe.as_ref().map(|probe| probe.dataset.as_str());
+        let Some(dataset) = of_latents.or(self.probe_data.as_deref()) else { return Ok(None) };
+        let request = plan.request()?;
+        let Some(checkpoint) = request.policies.first().and_then(|policy| policy.kind.checkpoint()) else {
+            return Ok(None);
+        };
+        let env = resolver.env(request)?;
+        let probe = (checkpoint, dataset, &self.probe_columns[..]);
+        let (latents, trivial) = resolver.probes(probe, &self.probe_baseline, env.spec(), &mut control(context))?;
+        let [linear, network] = latents.scores();
+        let of_trivial = |i: usize| trivial.as_ref().and_then(|(_, probe)| probe.scores()[1].get(i)?.r2);
+        let elements = linear.iter().zip(network).enumerate().map(|(i, (linear, network))| ProbeScore {
+            element: element(linear),
+            linear: linear.r2,
+            network: network.r2,
+            trivial: of_trivial(i),
+        });
+        Ok(Some(ProbeScores {
+            dataset: dataset.to_owned(),
+            elements: elements.collect(),
+            trivial: trivial.as_ref().map(|(columns, _)| columns.join(",")),
+        }))
+    }
+
     /// The command that runs the autopsy again. It names a folder of its own, so that equal autopsies have equal pages.
     fn command(&self) -> String {
         let mut words = vec!["swm".to_owned(), "autopsy".to_owned(), self.model.clone()];
@@ -141,6 +183,9 @@ impl AutopsyArgs {
         words.extend(self.probe_data.iter().flat_map(|data| ["--probe-data".to_owned(), data.clone()]));
         if self.probe_columns != ["state"] {
             words.extend(["--probe-columns".to_owned(), self.probe_columns.join(",")]);
+        }
+        if !self.probe_baseline.is_empty() {
+            words.extend(["--probe-baseline".to_owned(), self.probe_baseline.join(",")]);
         }
         words.extend(self.settings.iter().cloned().chain(["-o".to_owned(), "autopsy".to_owned()]));
         study::shell(&words)
@@ -292,6 +337,18 @@ fn text(found: &Autopsy) -> String {
     text + "brackets: 95 % bootstrap intervals over starts; recovered: of failures; harmed:\nof solved starts\n"
 }
 
+/// What probes read from the latents, at most 80 columns wide.
+fn probe_table(probes: &ProbeScores) -> String {
+    let r2 = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.3}"));
+    let trivial = probes.trivial.as_ref().map(|column| format!("{column} alone"));
+    let header: Vec<&str> = ["element", "linear R²", "network R²"].into_iter().chain(trivial.as_deref()).collect();
+    let rows = probes.elements.iter().map(|score| {
+        let values = [score.linear, score.network, score.trivial].map(r2);
+        std::iter::once(score.element.clone()).chain(values).take(header.len()).collect()
+    });
+    format!("\nWhat probes read from the latents\n{}{}", table(&header, rows), wrapped(&probes.note()))
+}
+
 /// A sentence in lines of at most 80 columns.
 fn wrapped(sentence: &str) -> String {
     let mut lines = String::new();
@@ -359,6 +416,22 @@ mod tests {
             let widest = text.lines().map(|line| line.trim_end().chars().count()).max();
             assert!(widest.is_some_and(|widest| widest <= COLUMNS), "{widest:?}: {text}");
         }
+    }
+
+    #[test]
+    fn probes_are_shown_beside_the_trivial_predictor() {
+        let score = ProbeScore { element: "cos state[4]".to_owned(), linear: None, network: Some(0.5), trivial: None };
+        let mut probes = ProbeScores { dataset: "rooms".to_owned(), trivial: None, elements: vec![score] };
+        let words = |text: &str| text.split_whitespace().collect::<Vec<_>>().join(" ");
+        let without = words(&probe_table(&probes));
+        assert!(!without.contains("alone") && without.contains("no trivial predictor"), "{without}");
+        probes.trivial = Some("pos_agent".to_owned());
+        probes.elements[0].trivial = Some(0.25);
+        let with = probe_table(&probes);
+        for part in ["pos_agent alone", "0.500", "0.250", "–", "not above it"] {
+            assert!(words(&with).contains(part), "{part}: {with}");
+        }
+        assert!(with.lines().all(|line| line.trim_end().chars().count() <= COLUMNS), "{with}");
     }
 
     #[test]

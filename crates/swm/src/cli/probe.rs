@@ -163,7 +163,7 @@ fn angles(reader: &dyn Reader) -> Vec<(String, usize)> {
 }
 
 /// Returns the name of a predicted element.
-fn element(score: &Score) -> String {
+pub fn element(score: &Score) -> String {
     let element = format!("{}[{}]", score.column, score.index);
     match score.part {
         None => element,

@@ -450,6 +450,25 @@ fn a_probe_is_an_ingredient_with_a_dataset() {
     let arms = found["autopsy"]["arms"].as_array().expect("arms");
     let sets: Vec<&serde_json::Value> = arms.iter().map(|arm| &arm["ingredients"]).collect();
     assert_eq!(serde_json::json!(sets), serde_json::json!([[], ["dynamics"], ["probe"], ["dynamics", "probe"]]));
+    // Both probes, and what the position of the agent alone predicts: all of it, since it is the state of Two-Room.
+    assert_eq!((&found["probes"]["dataset"], &found["probes"]["trivial"]), (&"rooms".into(), &"proprio".into()));
+    let elements = found["probes"]["elements"].as_array().expect("scores");
+    assert!(elements.len() >= 2 && elements[0]["element"] == "state[0]", "{elements:?}");
+    for score in &elements[..2] {
+        let [linear, network, trivial] =
+            ["linear", "network", "trivial"].map(|key| score[key].as_f64().expect("an R²"));
+        assert!(trivial > 0.95 && linear.max(network) > 0.5 && linear.max(network) <= trivial + 0.05, "{score}");
+    }
+    let page = std::fs::read_to_string(swm.path("out/index.html")).expect("the page");
+    assert!(page.contains("What the latents hold") && page.contains("R², proprio alone"));
+    // Without C, the probes say what the latents hold as well, and no arm uses them. Other columns say less of the state.
+    let without = ["autopsy", "zoo:two-room/lewm", "--ingredients=D", "--episodes=2", "--output=d"];
+    let baseline = ["--probe-data=rooms", "--probe-baseline=reward,goal_state"];
+    let without = swm.json(&[&without[..], &baseline, &quick].concat());
+    let [other, same] = [&without, &found].map(|found| &found["probes"]["elements"][0]);
+    assert_eq!((&other["linear"], &other["network"]), (&same["linear"], &same["network"]));
+    assert_eq!(without["probes"]["trivial"], "reward,goal_state");
+    assert!(other["trivial"].as_f64() < same["trivial"].as_f64(), "{other}");
     // With another dataset of this name, arms with a probe are other cells: two arms, three planning seeds.
     let cells = std::fs::read_dir(swm.path("out").join("cells")).expect("the cells of the autopsy");
     let has_probe = |path: std::path::PathBuf| {

@@ -58,6 +58,12 @@ pub trait CostModel: Send {
     /// the other environments. Models without such work ignore it.
     fn plan_together(&mut self) {}
 
+    /// Makes the cost of a candidate the squared distance to the goal's latent of the closest predicted latent, not of the last one, and
+    /// returns whether the model can. Models that cannot are unchanged.
+    fn compare_closest(&mut self) -> bool {
+        false
+    }
+
     /// Returns the gradient interface of this model, if it is differentiable.
     fn differentiable(&mut self) -> Option<&mut dyn DifferentiableCost> {
         None

@@ -1,5 +1,5 @@
-//! [`LewmCost`]: the planning cost of a LeWM, the squared distance between the last predicted latent of a candidate and
-//! the latent of the goal image.
+//! [`LewmCost`]: the planning cost of a LeWM, the squared distance between the last predicted latent of a candidate, or the closest
+//! one, and the latent of the goal image.
 //!
 //! Every call evaluates candidates of one environment on one thread of the current rayon pool, and the shape of a call
 //! does not depend on the other environments. So the bytes of an environment's plan depend neither on the other
@@ -28,6 +28,8 @@ pub struct LewmCost {
     device: Option<DeviceRollout>,
     /// Whether a call to the device computes the candidates of all environments.
     together: bool,
+    /// Whether the closest predicted latent is compared with the goal's, not the last one.
+    pub(super) closest: bool,
     pub(super) config: LewmConfig,
     pub(super) action_dim: usize,
     pub(super) contexts: Vec<PlanContext>,
@@ -66,6 +68,7 @@ impl LewmCost {
             host,
             device,
             together: false,
+            closest: false,
             config: config.clone(),
             action_dim,
             contexts: vec![],
@@ -149,14 +152,19 @@ impl PlanContext {
     ///
     /// # Shapes
     /// `candidates` is `[samples, horizon, action_dim]`, `costs` is `[samples]`.
-    fn cost(&self, rollout: &Rollout, candidates: &[f32], horizon: usize, costs: &mut [f32]) {
+    fn cost(&self, rollout: &Rollout, candidates: &[f32], horizon: usize, closest: bool, costs: &mut [f32]) {
         let (samples, latent) = (costs.len(), self.goal.len());
         let steps = self.start.len() / latent - 1 + horizon;
         let mut actions = Vec::with_capacity(samples * self.past.len() + candidates.len());
         self.extend(&mut actions, candidates, samples);
-        let last = rollout.run(&self.start, &actions, samples, steps).pop().unwrap_or_default();
-        for (cost, end) in costs.iter_mut().zip(last.chunks_exact(latent)) {
-            *cost = end.iter().zip(&self.goal).map(|(a, b)| (a - b).powi(2)).sum();
+        let latents = rollout.run(&self.start, &actions, samples, steps);
+        let compared = if closest { horizon } else { 1 };
+        // The smaller of NaN and a number is the number.
+        costs.fill(f32::NAN);
+        for latents in &latents[latents.len() - compared..] {
+            for (cost, end) in costs.iter_mut().zip(latents.chunks_exact(latent)) {
+                *cost = cost.min(end.iter().zip(&self.goal).map(|(a, b)| (a - b).powi(2)).sum());
+            }
         }
     }
 
@@ -227,6 +235,7 @@ impl CostModel for LewmCost {
     fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
         self.check_sizes(&candidates, costs)?;
         let Candidates { actions, samples, horizon, dim, .. } = candidates;
+        let closest = self.closest;
         let compute = || {
             let Some(host) = &self.host else {
                 if let Some(rollout) = &self.device {
@@ -242,7 +251,7 @@ impl CostModel for LewmCost {
                 .zip(&self.contexts)
                 .for_each(|((costs, actions), context)| {
                     let chunks = costs.par_chunks_mut(chunk_size).zip(actions.par_chunks(chunk_size * horizon * dim));
-                    chunks.for_each(|(costs, actions)| context.cost(&host.rollout, actions, horizon, costs));
+                    chunks.for_each(|(costs, actions)| context.cost(&host.rollout, actions, horizon, closest, costs));
                 });
             Ok(())
         };
@@ -253,6 +262,12 @@ impl CostModel for LewmCost {
     /// On a GPU, a call computes the candidates of all environments. On the CPU, this has no effect.
     fn plan_together(&mut self) {
         self.together = true;
+    }
+
+    /// On a GPU, only the last latent is compared.
+    fn compare_closest(&mut self) -> bool {
+        self.closest = self.host.is_some();
+        self.closest
     }
 
     fn differentiable(&mut self) -> Option<&mut dyn DifferentiableCost> {
@@ -278,10 +293,56 @@ mod tests {
         check_costs("small", &small);
     }
 
-    fn check_costs(preset: &str, settings: &[&str]) {
+    #[test]
+    fn the_closest_latent_is_the_last_one_of_the_cheapest_shorter_plan() {
+        let (samples, horizon, dim) = (5, 4, 4);
+        let (config, model, infos) = model_of("tiny", &["model.predictor.history=2"], dim);
+        let actions: Vec<f32> = (0..samples * horizon * dim).map(|i| (i * 29 % 97) as f32 / 20.0 - 2.0).collect();
+        let costs = |horizon: usize, closest: bool, goal: usize| {
+            let shorter: Vec<f32> =
+                actions.chunks_exact(4 * dim).flat_map(|candidate| candidate[..horizon * dim].to_vec()).collect();
+            let mut cost = LewmCost::of(&model, &config.model, dim);
+            assert!(!closest || cost.compare_closest());
+            cost.observe(&infos, &[0]).expect("observing the environment");
+            for (index, value) in cost.contexts[0].goal.iter_mut().enumerate() {
+                *value = ((goal * 7 + index) as f32).sin();
+            }
+            let candidates = Candidates { actions: &shorter, envs: 1, samples, horizon, dim };
+            let (mut costs, mut again) = (vec![0.0; samples], vec![0.0; samples]);
+            let mut gradient = vec![f32::NAN; shorter.len()];
+            cost.cost(candidates, &mut costs).expect("computing the costs");
+            cost.cost_and_gradient(candidates, &mut again, &mut gradient).expect("computing the gradients");
+            for (cost, again) in costs.iter().zip(&again) {
+                assert!((cost - again).abs() < 1e-4 * cost, "cost {cost}, with its gradient {again}");
+            }
+            (costs, gradient)
+        };
+        let mut steps = std::collections::BTreeSet::new();
+        for goal in 0..8 {
+            let (closest, gradients) = costs(horizon, true, goal);
+            let shorter: Vec<(Vec<f32>, Vec<f32>)> = (1..=horizon).map(|horizon| costs(horizon, false, goal)).collect();
+            for sample in 0..samples {
+                let cheapest = (0..horizon)
+                    .min_by(|&a, &b| shorter[a].0[sample].total_cmp(&shorter[b].0[sample]))
+                    .expect("plans of every length");
+                steps.insert(cheapest);
+                assert_eq!(closest[sample], shorter[cheapest].0[sample]);
+                let width = (cheapest + 1) * dim;
+                let gradient = &gradients[sample * horizon * dim..][..horizon * dim];
+                let expected = &shorter[cheapest].1[sample * width..][..width];
+                for (value, expected) in gradient.iter().zip(expected) {
+                    assert!((value - expected).abs() < 1e-4, "gradient {value}, of the shorter plan {expected}");
+                }
+                assert!(gradient[width..].iter().all(|&value| value == 0.0), "later actions have no effect");
+            }
+        }
+        assert!(steps.len() > 1, "all plans are closest after step {steps:?}");
+    }
+
+    /// A model whose actions have an effect, its configuration, and a batch of one environment.
+    fn model_of(preset: &str, settings: &[&str], dim: usize) -> (TrainConfig<Lewm>, Lewm, Batch) {
         let settings: Vec<String> = settings.iter().map(|setting| (*setting).to_owned()).collect();
         let config = TrainConfig::<Lewm>::load(preset, &settings).expect("loading the preset");
-        let (samples, horizon, dim) = (5, 5, 4);
         let model = Lewm::init(&config.model, dim, &Init::new(Key::new(0), &Device::flex()));
         // Modulations are zero-initialised, and actions have no effect through zero modulations.
         let mut values = parameters::values(&model);
@@ -295,6 +356,12 @@ mod tests {
         let columns = [ColumnSpec::image("pixels", side, side), ColumnSpec::image("goal", side, side)];
         let mut infos = Batch::zeros(&Schema::new(columns).expect("creating the schema"), 1);
         infos.row_mut(0).at::<u8>(1).fill(200);
+        (config, model, infos)
+    }
+
+    fn check_costs(preset: &str, settings: &[&str]) {
+        let (samples, horizon, dim) = (5, 5, 4);
+        let (config, model, infos) = model_of(preset, settings, dim);
         let actions: Vec<f32> = (0..samples * horizon * dim).map(|i| (i * 29 % 97) as f32 / 50.0 - 1.0).collect();
         // Environments with one frame and with two, so that a call for several environments is divided.
         let actions = actions.repeat(4);

@@ -38,6 +38,7 @@ fn differentiable(model: &Lewm) -> Lewm {
 fn cost_and_gradient(
     model: &Lewm,
     context: &PlanContext,
+    closest: bool,
     [samples, horizon, dim]: [usize; 3],
     actions: &[f32],
     costs: &mut [f32],
@@ -55,9 +56,11 @@ fn cost_and_gradient(
         ),
     };
     let last = frames + horizon - 1;
-    let end = model.rollout(start, all_actions).slice([0..samples, last..last + 1, 0..latent]);
+    let compared = if closest { horizon } else { 1 };
+    let ends = model.rollout(start, all_actions).slice([0..samples, last + 1 - compared..last + 1, 0..latent]);
     let goal = tensor(model, context.goal.repeat(samples), [samples, 1, latent]).autodiff();
-    let cost = (end - goal).square().sum_dim(2);
+    let distances = (ends - goal).square().sum_dim(2);
+    let cost = if closest { distances.min_dim(1) } else { distances };
     costs.copy_from_slice(&cost.clone().inner().into_data().into_f32_vec());
     let all = cost.sum().backward();
     copy_gradient(leaf.grad(&all), gradient);
@@ -86,7 +89,8 @@ impl DifferentiableCost for LewmCost {
             |(((costs, gradient), actions), context)| {
                 let chunks = costs.par_chunks_mut(chunk_size).zip(gradient.par_chunks_mut(chunk_size * width));
                 chunks.zip(actions.par_chunks(chunk_size * width)).for_each(|((costs, gradient), actions)| {
-                    cost_and_gradient(&model, context, [costs.len(), horizon, dim], actions, costs, gradient);
+                    let shape = [costs.len(), horizon, dim];
+                    cost_and_gradient(&model, context, self.closest, shape, actions, costs, gradient);
                 });
             },
         );

@@ -4,7 +4,7 @@ use super::constraint::{ActionNorm, LatentBox};
 use super::contracts::{Constraint, Objective, Shape, Slope, Trajectory};
 use super::cost::ObjectiveCost;
 use super::regularised::Regularised;
-use super::term::{Change, Control, Goal};
+use super::term::{Change, Control, Goal, When};
 use crate::search::Settings;
 use serde::{Deserialize, Serialize};
 use swm_core::{CostModel, Result};
@@ -98,6 +98,12 @@ impl ObjectiveConfig {
         self.terms.is_empty() && self.constraints.is_empty()
     }
 
+    /// Whether the objective is the closest distance to the goal alone, which models may compute faster themselves.
+    fn is_closest_goal(&self) -> bool {
+        let closest = Goal { when: When::Closest, ..Goal::default() };
+        self.constraints.is_empty() && self.terms == [Term::Goal(closest)]
+    }
+
     /// Checks the numbers of all terms and constraints, as far as they can be checked without a model.
     ///
     /// # Errors
@@ -124,8 +130,8 @@ impl ObjectiveConfig {
     /// # Errors
     /// When a term or constraint uses latents and the model has none, a constraint uses latents without a goal term, or
     /// the model has constraints of its own.
-    pub fn apply(&self, model: Box<dyn CostModel>) -> Result<Box<dyn CostModel>> {
-        if self.is_empty() {
+    pub fn apply(&self, mut model: Box<dyn CostModel>) -> Result<Box<dyn CostModel>> {
+        if self.is_empty() || (self.is_closest_goal() && model.compare_closest()) {
             return Ok(model);
         }
         let constraints = self.constraints.iter().map(Limit::constraint).collect();

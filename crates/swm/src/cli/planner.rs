@@ -43,7 +43,7 @@ pub struct PlannerArgs {
     /// Term of the objective: goal, control or change; may be repeated
     ///
     /// With settings, such as control,weight=0.01. Without a goal term, the model's own cost is kept and terms are
-    /// added.
+    /// added. goal,when=closest lets a plan reach the goal before its end.
     #[arg(long = "term", value_name = "NAME[,KEY=VALUE…]")]
     pub terms: Vec<String>,
     /// Constraint, such as action_norm,limit=2 or latent_box

@@ -124,7 +124,6 @@ fn check_level(repetitions: u64) {
     let several =
         wrong(repetitions.min(300), &numbers, |n, seed| Starts::choose(&reader, n, OFFSET, seed).expect("starts"));
     assert!(several.iter().all(|share| *share > 2.0 * LEVEL), "several starts per episode: {several:?}");
-    println!("one start per episode: {one:?}; several: {several:?}, of {starts} starts of {long} episodes");
 }
 
 #[test]

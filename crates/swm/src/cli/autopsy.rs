@@ -9,7 +9,7 @@ use super::{Context, emit, emit_json, eprint, output_folder, study, table};
 use crate::autopsy::{Plan, ProbeSource, SEARCH, Strip, plans};
 use crate::resolver::HomeResolver;
 use clap::Args;
-use serde_json::json;
+use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 use swm_core::results::{Autopsy, Estimate, Ingredient, ProbeScore, ProbeScores, Repair, letters};
@@ -104,16 +104,7 @@ pub fn autopsy(args: &AutopsyArgs, context: &Context) -> anyhow::Result<()> {
     let found = plan.autopsy(&folder)?;
     let file = args.output.join("autopsy.json");
     let probes = args.probe_scores(&plan, &resolver, context)?;
-    let mut document = json!({
-        "version": 1,
-        "model": args.model,
-        "env": plan.request()?.env,
-        "study": plan.study.hash()?,
-        "autopsy": found,
-    });
-    if let Some(probes) = &probes {
-        document["probes"] = json!(probes);
-    }
+    let document = args.document(&plan, &found, probes.as_ref())?;
     write_json(&file, &document)?;
     let strips = plan.strips(&found, &folder, &resolver, &options, &mut control(context))?;
     let strips = strips.into_iter().map(|Strip { start, set, png }| FrameStrip { start, set: letters(&set), png });
@@ -145,6 +136,21 @@ impl AutopsyArgs {
         let dataset =
             self.probe_data.clone().or_else(of_starts).filter(|_| ingredients.contains(&Ingredient::Probe))?;
         Some(ProbeSource { dataset, columns: self.probe_columns.clone() })
+    }
+
+    /// The content of `autopsy.json`.
+    fn document(&self, plan: &Plan, found: &Autopsy, probes: Option<&ProbeScores>) -> Result<Value> {
+        let mut document = json!({
+            "version": 1,
+            "model": self.model,
+            "env": plan.request()?.env,
+            "study": plan.study.hash()?,
+            "autopsy": found,
+        });
+        if let Some(probes) = probes {
+            document["probes"] = json!(probes);
+        }
+        Ok(document)
     }
 
     /// What probes read from the latents of the model; `None` without C and --probe-data.

@@ -13,6 +13,9 @@ use swm_plan::SimulatedLatents;
 /// A probe, and the hash of the content of the dataset that it was fitted on.
 pub(super) type FittedProbe = (Arc<StateProbe>, String);
 
+/// Columns that need no image, and the probe that reads states from them.
+pub(crate) type ColumnProbe = (Vec<String>, StateProbe);
+
 impl HomeResolver {
     /// Makes a policy that plans as with a checkpoint, by the states that a probe reads from its latents.
     pub(super) fn probe_policy(
@@ -26,7 +29,7 @@ impl HomeResolver {
         let loaded = self.checkpoint(given)?;
         let info = loaded.info()?;
         check_trained_on(&info, given, world.spec())?;
-        let predictor = || loaded.predictor().ok_or_else(|| no_latents(given, &info.family));
+        let predictor = || loaded.predictor().ok_or_else(|| no_latents(given, info.family));
         let (probe, hash) = self.probe(predictor()?, (given, dataset, columns), world.spec())?;
         let (scale, block, model) = (info.dataset_info.action.clone(), planner.mpc.action_block, predictor()?);
         let cost: Box<dyn CostModel> = if true_dynamics {
@@ -51,10 +54,10 @@ impl HomeResolver {
         baseline: &[String],
         spec: &EnvSpec,
         control: &mut Control<'_>,
-    ) -> Result<(Arc<StateProbe>, Option<(Vec<String>, StateProbe)>)> {
+    ) -> Result<(Arc<StateProbe>, Option<ColumnProbe>)> {
         let loaded = self.checkpoint(given)?;
         let info = loaded.info()?;
-        let predictor = loaded.predictor().ok_or_else(|| no_latents(given, &info.family))?;
+        let predictor = loaded.predictor().ok_or_else(|| no_latents(given, info.family))?;
         let (probe, _) = self.probe(predictor, (given, dataset, columns), spec)?;
         let reader = home::open_dataset(dataset)?;
         let by_default = [POS_AGENT, PROPRIO].into_iter().find(|name| reader.schema().find(name).is_some());

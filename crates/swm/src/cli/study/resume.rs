@@ -23,7 +23,9 @@ pub struct ResumeArgs {
     /// Evaluate only the cell with this id
     #[arg(long, value_name = "ID")]
     cell: Option<String>,
-    /// With a rule that ends the study: play at most so many starts of the cell; without --cell, write which cells need more
+    /// Play at most so many starts of the cell
+    ///
+    /// Without --cell, apply the rule that ends the study to so many starts, and write the ids of the cells that need more.
     #[arg(long, hide = true, value_name = "EPISODES")]
     stage: Option<usize>,
     /// Parallel environments; results do not depend on their number

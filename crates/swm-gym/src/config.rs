@@ -52,7 +52,7 @@ impl Python {
     /// `$SWM_PYTHON` if set, else the interpreter that `swm assets install` made, else as [`Python::of_user`].
     pub fn find() -> Self {
         let program = assets::python();
-        let installed = || program.is_file().then(|| Self { program, origin: "made by `swm assets install`" });
+        let installed = || program.is_file().then_some(Self { program, origin: "made by `swm assets install`" });
         Self::named().or_else(installed).unwrap_or_else(Self::of_user)
     }
 

@@ -258,6 +258,20 @@ mod tests {
     use super::*;
     use swm_core::results::{Arm, Contribution, Finding, Ingredient, ProbeScore, Proportion};
 
+    fn probes() -> ProbeScores {
+        let score = |element: &str, linear| ProbeScore {
+            element: element.to_owned(),
+            linear,
+            network: Some(0.987),
+            trivial: Some(0.25),
+        };
+        ProbeScores {
+            dataset: "rooms".to_owned(),
+            trivial: Some("pos_agent".to_owned()),
+            elements: vec![score("state[0]", Some(0.912)), score("sin state[4]", None)],
+        }
+    }
+
     #[test]
     fn page_has_the_verdict_all_arms_and_the_strips_of_repaired_starts() {
         let some = Estimate { value: 0.5, low: 0.25, high: 0.75 };
@@ -283,22 +297,11 @@ mod tests {
             ],
         };
         let strip = |start| FrameStrip { start, set: "D".to_owned(), png: vec![1, 2, 3] };
-        let score = |element: &str, linear| ProbeScore {
-            element: element.to_owned(),
-            linear,
-            network: Some(0.987),
-            trivial: Some(0.25),
-        };
-        let probes = ProbeScores {
-            dataset: "rooms".to_owned(),
-            trivial: Some("pos_agent".to_owned()),
-            elements: vec![score("state[0]", Some(0.912)), score("sin state[4]", None)],
-        };
         let page = AutopsyPage {
             title: "Autopsy of <b>x</b>".to_owned(),
             env: "swm/TwoRoom-v1".to_owned(),
             found,
-            probes: Some(probes),
+            probes: Some(probes()),
             strips: vec![strip(4), strip(5)],
             command: "swm autopsy x -o y".to_owned(),
         };

@@ -221,7 +221,7 @@ fn verify(given: &[String], trust: bool, context: &Context) -> anyhow::Result<()
     }
     if let Some((name, _)) = found.iter().find(|(_, found)| !found.faults.is_empty()) {
         let problem = format!("{damaged} of {} checkpoints have faults", found.len());
-        let fix = "train them again, or `swm checkpoints remove` them";
+        let fix = "get them again from their source, or train them again";
         anyhow::bail!(Error::corrupt(name, problem, fix));
     }
     Ok(())
@@ -240,7 +240,9 @@ impl Findings {
             lines.push(replayed);
             lines.extend(remarks.iter().cloned());
         }
-        lines.extend(self.faults.iter().cloned());
+        // Some faults begin with the name.
+        let prefix = format!("{name}: ");
+        lines.extend(self.faults.iter().map(|fault| fault.strip_prefix(&prefix).unwrap_or(fault).to_owned()));
         lines.iter().map(|line| format!("{name}: {line}\n")).collect()
     }
 }

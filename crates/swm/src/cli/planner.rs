@@ -56,6 +56,10 @@ pub struct PlannerArgs {
 
 /// The default horizon and receding horizon, in model steps.
 const HORIZON: usize = 5;
+/// The names of `--term`.
+const TERMS: [&str; 3] = ["goal", "control", "change"];
+/// The names of `--limit`.
+const LIMITS: [&str; 2] = ["action_norm", "latent_box"];
 
 impl PlannerArgs {
     /// Returns whether an option of planning in a checkpoint is given.
@@ -135,19 +139,24 @@ impl PlannerArgs {
     }
 
     fn objective(&self) -> Result<ObjectiveConfig> {
-        let read = |flag: &str, tag: &str, texts: &[String]| -> Result<Vec<Value>> {
+        let read = |flag: &str, tag: &'static str, known: &[&str], texts: &[String]| -> Result<Vec<Value>> {
             texts
                 .iter()
                 .map(|text| {
                     let (name, mut settings) = named(flag, text)?;
-                    settings.insert(tag.to_owned(), json!(name.replace('-', "_")));
+                    let name = name.replace('-', "_");
+                    if !known.contains(&name.as_str()) {
+                        let hint = format!("{flag} accepts {}", known.join(", "));
+                        return Err(Error::unknown(tag, &name, known.iter().copied(), hint));
+                    }
+                    settings.insert(tag.to_owned(), json!(name));
                     Ok(Value::Object(settings))
                 })
                 .collect()
         };
         let config = json!({
-            "terms": read("--term", "term", &self.terms)?,
-            "constraints": read("--limit", "constraint", &self.limits)?,
+            "terms": read("--term", "term", &TERMS, &self.terms)?,
+            "constraints": read("--limit", "constraint", &LIMITS, &self.limits)?,
         });
         let objective: ObjectiveConfig = serde_json::from_value(config).map_err(|error| {
             Error::config(

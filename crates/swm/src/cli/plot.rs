@@ -36,7 +36,14 @@ const DOTS: (usize, usize) = (2, 4);
 
 /// Runs `swm plot`.
 pub fn plot(args: &PlotArgs, as_json: bool) -> anyhow::Result<()> {
-    let read = |run: &String| Ok((run.clone(), read_metrics(&log_of(&home::find_checkpoint(run)?))?));
+    let read = |run: &String| {
+        let log = log_of(&home::find_checkpoint(run)?);
+        if !log.exists() {
+            let fix = "give the folder that `swm train --output` wrote";
+            return Err(Error::config(run, "has no log of a training, train.jsonl", fix));
+        }
+        Ok((run.clone(), read_metrics(&log)?))
+    };
     let runs: Vec<(String, Metrics)> = args.runs.iter().map(read).collect::<Result<_>>()?;
     if args.list {
         return list(&runs, as_json);

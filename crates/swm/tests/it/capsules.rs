@@ -86,6 +86,8 @@ fn capsules_are_packed_verified_and_used_like_checkpoints() {
     fs::write(swm.path("notes.safetensors"), "notes").expect("a file of the user");
     swm.fails(&["checkpoints", "pack", "small", "-o", "notes.safetensors"], 2, &["was not written by this program"]);
     swm.fails(&["checkpoints", "verify", "notes.safetensors"], 1, &["1 of 1 checkpoints have faults"]);
+    let faults = swm.run(&["checkpoints", "verify", "notes.safetensors"]).stdout;
+    assert!(text(&faults).starts_with("notes.safetensors: is no capsule"), "{}", text(&faults));
     swm.json(&["eval", "random", "--env", "swm/TwoRoom-v1", "--episodes", "2", "-o", "other"]);
     let other = ["checkpoints", "pack", "small", "-o", "x.safetensors", "--eval", "other"];
     swm.fails(&other, 2, &["0 of its policies have the weights of this checkpoint"]);

@@ -39,6 +39,14 @@ fn messages_of_commands_say_what_to_do() {
             &["study", "run", "paper/data", "-o", "found", "repeats='many'"],
             &["repeats=\"many\"", "expected a whole number from 0", "docs/studies.md describes the settings"],
         ),
+        (
+            &["eval", "simulator", "--env", "swm/TwoRoom-v1", "--limit", "action-box"],
+            &["error: unknown constraint 'action_box'", "--limit accepts action_norm, latent_box"],
+        ),
+        (
+            &["plot", "zoo:two-room/pldm"],
+            &["error: zoo:two-room/pldm: has no log of a training, train.jsonl", "`swm train --output`"],
+        ),
     ];
     for (args, parts) in cases {
         swm.fails(args, 2, parts);

@@ -43,7 +43,7 @@ def _convert(arguments: Sequence[str]) -> int:
 
     try:
         convert(given.name, given.output, given.dest_format, given.source_format)
-    except (OSError, ValueError) as error:
+    except (OSError, RuntimeError, ValueError) as error:
         sys.stderr.write(f"error: {error}\n")
         return 1
     return 0

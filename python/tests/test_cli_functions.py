@@ -71,3 +71,8 @@ def test_the_command_takes_spellings_of_the_reference(tmp_path, monkeypatch, cap
     assert command(monkeypatch, "convert", one, str(tmp_path / "d.h5"), "--format", "hdf5") == 0
     assert command(monkeypatch, "convert", one, "--dest-format=no-such-format") == 1
     assert "no-such-format" in capfd.readouterr().err
+    mine = tmp_path / "mine.h5"
+    mine.write_text("no dataset")
+    assert command(monkeypatch, "convert", one, str(mine), "--dest-format", "hdf5") == 1
+    said = capfd.readouterr().err
+    assert said.startswith("error: ") and "Traceback" not in said and mine.read_text() == "no dataset"

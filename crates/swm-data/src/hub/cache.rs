@@ -52,7 +52,8 @@ impl Folder {
     pub fn known_files(&self, commit: &str) -> Option<Vec<HubFile>> {
         let bytes = files::read(&self.list(commit), MAX_LIST).ok()?;
         let listed: Vec<HubFile> = serde_json::from_slice(&bytes).ok()?;
-        listed.iter().all(|file| super::uri::is_inside(&file.path)).then_some(listed)
+        let no_git = super::uri::git_folder(listed.iter().map(|file| file.path.as_str())).is_none();
+        (no_git && listed.iter().all(|file| super::uri::is_inside(&file.path))).then_some(listed)
     }
 
     pub fn remember_files(&self, commit: &str, listed: &[HubFile]) -> Result<()> {

@@ -178,7 +178,15 @@ impl Client {
                     let problem = format!("its list of files continues at another address: '{}'", next.escape_debug());
                     return Err(Error::corrupt(url, problem, "do not use this hub"));
                 }
-                None => return Ok(files),
+                None => {
+                    let names = files.iter().map(|file: &HubFile| file.path.as_str());
+                    if let Some(folder) = super::uri::git_folder(names) {
+                        let problem =
+                            format!("it lists a repository of Git, whose settings can start programs: '{folder}/HEAD'");
+                        return Err(Error::corrupt(&url, problem, "do not use this repository"));
+                    }
+                    return Ok(files);
+                }
             }
         }
         let problem = format!("its list of files has more than {MAX_PAGES} pages, or {MAX_LISTED} files");

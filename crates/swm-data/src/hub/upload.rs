@@ -32,6 +32,8 @@ const MAX_WHOLE: u64 = 5 << 30;
 const MAX_HELD: u64 = 32 << 20;
 /// The bytes that are read of a file at once.
 const BLOCK: u64 = 1 << 18;
+/// The most headers that are sent with a file because the hub asks for them.
+const MAX_HEADERS: usize = 64;
 /// The media type of Git LFS.
 const LFS_TYPE: &str = "application/vnd.git-lfs+json";
 
@@ -81,6 +83,19 @@ struct Action {
     href: String,
     #[serde(default)]
     header: BTreeMap<String, Value>,
+}
+
+impl Action {
+    /// The headers that the hub asks for.
+    fn headers(&self) -> Result<HeaderMap> {
+        if self.header.len() > MAX_HEADERS {
+            let problem =
+                format!("it asks for {} headers with a file; at most {MAX_HEADERS} are sent", self.header.len());
+            return Err(Error::external("the hub", problem));
+        }
+        let known = self.header.iter().filter_map(|(name, value)| Some((name, value.as_str()?)));
+        known.map(|(name, value)| header(name, value)).collect()
+    }
 }
 
 impl Hub {
@@ -217,9 +232,7 @@ impl Client {
                 return Err(Error::config(upload.local.display().to_string(), problem, "split the dataset"));
             }
             None => {
-                let headers = action.header.iter().filter_map(|(name, value)| Some((name, value.as_str()?)));
-                let headers = headers.map(|(name, value)| header(name, value)).collect::<Result<HeaderMap>>()?;
-                self.put(&action.href, upload, 0, upload.size, headers)?;
+                self.put(&action.href, upload, 0, upload.size, action.headers()?)?;
             }
         }
         if let Some(verify) = found.actions.get("verify") {
@@ -346,6 +359,10 @@ fn uploads(from: &Path, to: &str, control: &mut Control<'_>) -> Result<Vec<Uploa
         let problem = format!("has more than {MAX_FILES} files");
         let fix = "convert the dataset to Lance or HDF5, which have few";
         return Err(Error::config(from.display().to_string(), problem, fix));
+    }
+    if let Some(folder) = super::uri::git_folder(found.iter().map(|(path, _)| path.as_str())) {
+        let problem = format!("is or has a repository of Git ('{folder}/HEAD'), which readers refuse");
+        return Err(Error::config(from.display().to_string(), problem, "give the folder without it"));
     }
     found.sort();
     let upload = |(path, local): (String, PathBuf)| {

@@ -119,9 +119,40 @@ pub(super) fn is_inside(name: &str) -> bool {
         && swm_core::text::printable(name) == name
 }
 
+/// The folder of a list of files that Git takes for a repository of its own, whose settings name programs to start: it holds
+/// `HEAD`, and `objects` or the name of the folder that has them. `None` if there is none.
+pub(super) fn git_folder<'a>(names: impl Iterator<Item = &'a str> + Clone) -> Option<&'a str> {
+    // File systems of other operating systems ignore the case.
+    let starts = |name: &str, start: &str| name.get(..start.len()).is_some_and(|own| own.eq_ignore_ascii_case(start));
+    let folders = names.clone().filter_map(|name| {
+        let (folder, file) = name.rsplit_once('/').unwrap_or(("", name));
+        file.eq_ignore_ascii_case("HEAD").then_some(folder)
+    });
+    folders.into_iter().find(|folder| {
+        names.clone().any(|name| {
+            let inner = if folder.is_empty() {
+                Some(name)
+            } else {
+                name.strip_prefix(folder).and_then(|rest| rest.strip_prefix('/'))
+            };
+            inner.is_some_and(|inner| starts(inner, "objects/") || inner.eq_ignore_ascii_case("commondir"))
+        })
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn repositories_of_git_are_found() {
+        let found = |names: &[&'static str]| git_folder(names.iter().copied());
+        assert_eq!(found(&["HEAD", "config", "objects/x", "refs/heads/x"]), Some(""));
+        assert_eq!(found(&["a/b/config", "a/b/HEAD", "a/b/commondir"]), Some("a/b"));
+        assert_eq!(found(&["a/head", "a/Objects/pack/x"]), Some("a"));
+        assert_eq!(found(&["a/HEAD", "objects/x", "b/objects/x", "ab/objects/x"]), None);
+        assert_eq!(found(&["objects/x", "refs/heads/x", "config", "HEAD.md"]), None);
+    }
 
     #[test]
     fn uris_name_repositories_revisions_and_paths() {

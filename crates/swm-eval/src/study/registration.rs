@@ -76,7 +76,22 @@ impl StudyFolder {
         let fix = "restore the file, or remove it: the study then counts as not registered";
         let found: Registered = serde_json::from_slice(&files::read(&path, MAX_BYTES)?)
             .map_err(|error| Error::corrupt(&path, format!("is not a registration ({error})"), fix))?;
+        if found.unproven_date.as_ref().is_some_and(|date| !is_date(date)) {
+            return Err(Error::corrupt(&path, "unproven_date is no date, such as 2026-11-24T01:02:03Z", fix));
+        }
         let is_same = found.registered == study.registration_hash()?;
         Ok(Some(Registration { hash: found.registered, is_same, date: found.unproven_date }))
     }
+}
+
+/// Whether a text has the form of a date that [`StudyFolder::register`] stores: `2026-11-24T01:02:03Z`.
+fn is_date(text: &str) -> bool {
+    let form = text.bytes().map(|byte| if byte.is_ascii_digit() { b'0' } else { byte });
+    let number = |from: usize| text.get(from..from + 2).and_then(|digits| digits.parse().ok()).unwrap_or(u8::MAX);
+    form.eq(*b"0000-00-00T00:00:00Z")
+        && (1..=12).contains(&number(5))
+        && (1..=31).contains(&number(8))
+        && number(11) < 24
+        && number(14) < 60
+        && number(17) < 60
 }

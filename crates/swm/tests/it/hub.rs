@@ -150,6 +150,13 @@ fn settings_of_git_are_not_downloaded() {
         setup.fails(&["pull", &format!("hf://lab/{name}")], None, &["no repository has", inner]);
         assert!(!setup.swm.path(&format!("hub/models--lab--{name}/snapshots")).exists());
     }
+    // A folder without that name is a repository of Git as well.
+    setup.hub.commit(
+        "models/lab/bare",
+        &[("HEAD", b"ref: x"), ("config", b"[core]"), ("objects/x", b"x"), ("refs/x", b"x")],
+    );
+    setup.fails(&["pull", "hf://lab/bare"], None, &["a repository of Git", "HEAD"]);
+    assert!(!setup.swm.path("hub/models--lab--bare/snapshots").exists());
     setup.hub.commit("models/lab/c", &[(".gitattributes", b"*.bin filter=lfs")]);
     setup.json(&["pull", "hf://lab/c"], None);
 }
@@ -181,6 +188,14 @@ fn uploads_hold_no_file_in_memory() {
     assert!(output.status.success(), "{}", text(&output.stderr));
     let memory = setup.hub.state().memory;
     assert!(memory << 10 < size, "{memory} kB");
+}
+
+#[test]
+fn hubs_that_ask_for_many_headers_are_refused() {
+    let setup = Setup::new();
+    std::fs::write(setup.swm.path("large.bin"), content(2000)).expect("a file");
+    setup.hub.state().upload_headers = 40_000;
+    setup.fails(&["push", "./large.bin", "hf://lab/large"], Some(TOKEN), &["40000 headers", "at most"]);
 }
 
 #[test]

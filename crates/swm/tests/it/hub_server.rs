@@ -42,6 +42,8 @@ pub(crate) struct State {
     pub endless: bool,
     /// The host to which the hub sends readers of its second page.
     pub next_host: Option<String>,
+    /// The number of headers that the hub asks for with a file.
+    pub upload_headers: usize,
     /// Whether files are sent as a whole, whatever their size.
     pub whole: bool,
     /// The process that uploads, and the most memory that it had at the end of an upload, in kB.
@@ -304,7 +306,9 @@ impl State {
                 header.insert("chunk_size".to_owned(), json!(PART.to_string()));
                 json!({"href": format!("{base}/complete"), "header": header})
             } else {
-                json!({"href": format!("{storage}/{oid}")})
+                let header: serde_json::Map<String, Value> =
+                    (0..self.upload_headers).map(|index| (format!("x{index}"), json!("a"))).collect();
+                json!({"href": format!("{storage}/{oid}"), "header": header})
             };
             let verify = json!({"href": format!("{base}/verify")});
             json!({"oid": oid, "size": size, "actions": {"upload": upload, "verify": verify}})

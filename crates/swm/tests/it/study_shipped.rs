@@ -312,6 +312,10 @@ policy = "expert"
     let file = swm.path("out/registration.json");
     let stored = std::fs::read_to_string(&file).expect("the registration");
     let (this, date) = (date, "2025-11-24T01:02:03Z");
+    for wrong in ["2020-99-99T01:02:03Z", "yesterday", "2025-11-24T01:02:03Z\\nverified"] {
+        std::fs::write(&file, stored.replace(&this, wrong)).expect("a wrong date");
+        swm.fails(&register, 1, &["registration.json", "unproven_date is no date"]);
+    }
     std::fs::write(&file, stored.replace(&this, date)).expect("an older date");
     let again = swm.json(&register);
     assert_eq!((again["registered"].as_str(), again["unproven_date"].as_str()), (Some(&*hash), Some(date)));

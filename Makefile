@@ -189,7 +189,7 @@ docs: build wheel
 	  $(CARGO) install --locked --root $(CACHE)/tools mdbook --version $(MDBOOK_VERSION) --no-default-features --features search
 	$(PYTHON_VENV)/bin/python -m pip install --quiet pdoc==$(PDOC_VERSION)
 	$(PYTHON_VENV)/bin/python -m pip install --quiet --force-reinstall --no-deps $(WHEELS)/*.whl
-	$(CARGO) doc --release --no-deps -p swm -p swm-core -p swm-eval -p swm-plan -p swm-models -p swm-data
+	RUSTDOCFLAGS='-D warnings' $(CARGO) doc --release --no-deps -p swm -p swm-core -p swm-eval -p swm-plan -p swm-models -p swm-data
 	SWM=$(SWM) SWM_PDOC=$(PYTHON_VENV)/bin/python SWM_RUSTDOC=$(CARGO_TARGET_DIR)/doc $(CARGO) xtask book $(CACHE)/docs
 
 bench: assets

@@ -2,7 +2,7 @@
 //! deleted, and the way to read a file that a stranger may have written.
 //!
 //! - [`open`] and [`read`] accept regular files only. A pipe or a device could block forever or never end.
-//! - [`write`] replaces a file whole: readers and killed processes see the old content or the new.
+//! - [`write()`] replaces a file whole: readers and killed processes see the old content or the new.
 //! - [`check_free`] and [`check_own`] refuse to replace a file that the program did not write.
 //! - [`delete_named`] removes regular files of a folder by their exact names, [`delete`] by the patterns of names that only
 //!   the program gives, and nothing else.
@@ -255,7 +255,7 @@ pub fn delete_file(path: &Path) -> Result<()> {
     }
 }
 
-/// Deletes the temporary files that a kill during [`write`] leaves, of the files with these names. The caller holds the
+/// Deletes the temporary files that a kill during [`write()`] leaves, of the files with these names. The caller holds the
 /// [`Lock`] of the folder: the temporary file of a writer that still runs looks the same.
 ///
 /// # Errors

@@ -7,7 +7,7 @@
 //! 2. [`space`], [`variation`], [`factors`]: spaces of actions and observations, factors of variation, and the values
 //!    of factors in dataset rows.
 //! 3. [`key`]: keyed random streams, the only source of randomness.
-//! 4. [`env`], [`camera_view`], [`dispatch`], [`dataset_start`]: one environment. [`pool`], [`thread_budget`]: many
+//! 4. [`mod@env`], [`camera_view`], [`dispatch`], [`dataset_start`]: one environment. [`pool`], [`thread_budget`]: many
 //!    environments on a fixed set of threads. [`policy`]: policies and experts.
 //! 5. [`plan`]: costs of candidate action sequences, and the solvers that minimise them. [`predictor`]: models that
 //!    predict latents. [`requirements`]: columns that a model family requires of a dataset.

@@ -4,7 +4,7 @@
 //! - [`collect`]: writes every episode to a dataset. [`policy_mixture`]: policies that share the episodes.
 //! - [`starts`] and [`evaluate`]: initial states and goals, and the success rate of a policy from them.
 //! - [`request`]: all settings of an evaluation as one value. [`runner`] evaluates the policies of a request on the
-//!   same starts, [`reproduce`] repeats an evaluation from its results, and [`replay`] some of its episodes.
+//!   same starts, [`reproduce()`] repeats an evaluation from its results, and [`replay`] some of its episodes.
 //! - [`baselines`]: policies that need no training and show what a success rate means.
 //! - [`until`]: evaluates more and more starts until a rule is met.
 //! - [`study`]: many evaluations with one table.

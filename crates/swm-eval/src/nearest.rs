@@ -273,7 +273,7 @@ fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
 ///
 /// A goal is recorded `goal_offset` rows after its start. After `k` steps, the policy searches for a row whose state is
 /// nearest to the present one while the state `goal_offset - k` rows later is nearest to the goal, and plays its next
-/// [`CHUNK`] actions. After `goal_offset` steps it begins again with the whole offset. The episode that a start comes from is
+/// `CHUNK` actions. After `goal_offset` steps it begins again with the whole offset. The episode that a start comes from is
 /// never searched: it holds the solution.
 pub struct NearestPolicy {
     recordings: Arc<Recordings>,

@@ -1,6 +1,6 @@
 //! [`World`]: a pool of environments of one kind and the loop that plays a policy in them.
 //!
-//! Collections and evaluations implement [`Play`], which selects the episodes and consumes their steps.
+//! Collections and evaluations implement `Play`, which selects the episodes and consumes their steps.
 
 use crate::seeding::{episode_key, reset};
 use std::collections::BTreeMap;

@@ -137,7 +137,7 @@ pub fn location(given: &str) -> Result<Location> {
 /// is downloaded if it is not cached.
 ///
 /// # Errors
-/// As [`home`], if it is a name, and when the [zoo](zoo) or the hub has no such checkpoint.
+/// As [`home`], if it is a name, and when the [zoo] or the hub has no such checkpoint.
 pub fn checkpoint(given: &str) -> Result<PathBuf> {
     if HubUri::is_uri(given) {
         return checkpoint_in(pull(given, RepoKind::Model)?.0);

@@ -69,7 +69,7 @@ pub struct Family {
     pub pairs: usize,
     /// The share of pairs whose outcomes differ, over all comparisons.
     pub discordant: f64,
-    /// The smallest difference of rates that a comparison tells apart with a probability of 80 %, as [`detectable`]
+    /// The smallest difference of rates that a comparison tells apart with a probability of 80 %, as `detectable`
     /// computes it; `None` if it shows no difference so reliably.
     pub detectable: Option<f64>,
     /// Whether the outcomes decided how many pairs there are, so that the intervals are confidence sequences.

@@ -162,7 +162,7 @@ impl Paired {
 
     /// Compares two runs whose numbers of episodes the results decided, on the starts that both have: the first ones. As
     /// [`Paired::of_runs`], but with statistics that hold at every number of pairs: the e-value of a bet on the pairs that
-    /// differ ([`betting`](super::betting)), and the confidence sequence of the difference.
+    /// differ (`betting`), and the confidence sequence of the difference.
     ///
     /// Starts count as independent: no two of them come from one recorded episode, which [`Results::check`](super::Results::check)
     /// makes sure of.

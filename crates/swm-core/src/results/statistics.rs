@@ -78,7 +78,7 @@ impl Proportion {
     }
 
     /// The proportion with the confidence sequence of level 95 %, which holds although the outcomes decide how many trials
-    /// there are ([`betting`](super::betting)).
+    /// there are (`betting`).
     pub fn sequential(successes: usize, n: usize) -> Self {
         let [low, high] = betting::rate(successes, n, 0.05);
         Self { low, high, ..Self::wilson(successes, n) }

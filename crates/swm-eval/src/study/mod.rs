@@ -1,8 +1,8 @@
 //! Studies: many evaluations of one question, with one result.
 //!
-//! A [`Study`] is a list of [`Cell`]s, each an [`EvalRequest`] with the hashes of its inputs. [`Study::run`] evaluates the
-//! cells whose results are not in the [`StudyFolder`] yet. All cells with one source of starts and one seed play the same
-//! starts, so that policies and conditions are compared in pairs.
+//! A [`Study`] is a list of [`Cell`]s, each an [`EvalRequest`](crate::EvalRequest) with the hashes of its inputs. [`Study::run`]
+//! evaluates the cells whose results are not in the [`StudyFolder`] yet. All cells with one source of starts and one seed play
+//! the same starts, so that policies and conditions are compared in pairs.
 //!
 //! With a rule that ends it ([`Study::until`]), a study plays its starts in stages, and the results of a stage decide which
 //! cells play more.

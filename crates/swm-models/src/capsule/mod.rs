@@ -14,7 +14,7 @@
 //! | tensors | content |
 //! | --- | --- |
 //! | names without `/` | the weights, under the names of the checkpoint: half precision for two or more axes, else single |
-//! | `reference/input/…`, `reference/output/…` | the [reference batch](reference), and the outputs of the model |
+//! | `reference/input/…`, `reference/output/…` | the [reference batch](mod@reference), and the outputs of the model |
 //! | `starts/…`, `rows/…` | the columns after the reset of the recorded episodes, and the dataset rows they start from |
 //!
 //! The hash of the weights is that of the `weights.safetensors` that [`export`] writes: single precision, rounded to half

@@ -42,7 +42,7 @@ pub trait TrainableConfig {
     /// Trains on a dataset.
     ///
     /// # Errors
-    /// As [`crate::train`].
+    /// As [`crate::train()`].
     fn train(&self, run: TrainRun<'_>, control: &mut Control<'_>) -> Result<TrainSummary>;
 
     /// Writes the checkpoint from which a training loop outside this program begins, or checks the one from which it

@@ -133,7 +133,7 @@ impl Decoder {
 ///
 /// # Errors
 /// When the images do not have the encoder's image size, the side is not divisible into the decoder's blocks, no
-/// episode is held out, a setting is out of range, or the run is stopped ([`Error::Interrupted`](swm_core::Error::Interrupted)).
+/// episode is held out, a setting is out of range, or the run is stopped ([`Error::Interrupted`]).
 pub fn reconstruct_images(
     encoder: &dyn ImageEncoder,
     reader: &dyn Reader,

@@ -29,7 +29,7 @@ impl Population {
     /// they differ from the draws of other solvers.
     ///
     /// # Errors
-    /// When the candidates have more than [`MAX_VALUES`] values.
+    /// When the candidates have more than `MAX_VALUES` values.
     pub fn new(solver: &str, problem: &PlanProblem<'_>, samples: usize) -> Result<Self> {
         let keys: Vec<Key> = problem.keys.iter().map(|key| key.with(solver)).collect();
         let (envs, horizon, dim) = (keys.len(), problem.horizon, problem.space.dim());

@@ -7,7 +7,7 @@
 //! [`SimulatedLatents`] has the true dynamics as well, but the cost of a world model: the distance of latents.
 //!
 //! Every candidate is played from a snapshot of the environment in a private simulator, with the actions that the
-//! policy would execute ([`Playback`]). A cost depends only on the snapshot and the candidate.
+//! policy would execute (`Playback`). A cost depends only on the snapshot and the candidate.
 
 mod latents;
 mod playback;

@@ -9,7 +9,7 @@
 //! Outer iterations, penalties, standard deviation and noise are those of the reference (`solver/lagrangian.py`). The
 //! number of candidates and Adam's step size (1 in the reference) are those of gradient descent. The reference leaves
 //! the number of steps open; with 50 steps, the cost of the tests' constrained problem is within 0.003 of the lowest.
-//! The penalty term has the gradient 2ρ[g]₊, so an update of the multipliers halves the violation at best. A penalty
+//! The penalty term has the gradient 2ρ\[g\]₊, so an update of the multipliers halves the violation at best. A penalty
 //! that is too large for the step size makes plans worse.
 //!
 //! Intended differences from the paper and the reference:

@@ -1,5 +1,6 @@
 //! [`HubUri`]: what `hf://` and `lerobot://` name.
 
+use std::collections::HashSet;
 use std::fmt;
 use swm_core::{Error, Result};
 
@@ -119,25 +120,25 @@ pub(super) fn is_inside(name: &str) -> bool {
         && swm_core::text::printable(name) == name
 }
 
-/// The folder of a list of files that Git takes for a repository of its own, whose settings name programs to start: it holds
-/// `HEAD`, and `objects` or the name of the folder that has them. `None` if there is none.
-pub(super) fn git_folder<'a>(names: impl Iterator<Item = &'a str> + Clone) -> Option<&'a str> {
-    // File systems of other operating systems ignore the case.
-    let starts = |name: &str, start: &str| name.get(..start.len()).is_some_and(|own| own.eq_ignore_ascii_case(start));
-    let folders = names.clone().filter_map(|name| {
-        let (folder, file) = name.rsplit_once('/').unwrap_or(("", name));
-        file.eq_ignore_ascii_case("HEAD").then_some(folder)
-    });
-    folders.into_iter().find(|folder| {
-        names.clone().any(|name| {
-            let inner = if folder.is_empty() {
-                Some(name)
-            } else {
-                name.strip_prefix(folder).and_then(|rest| rest.strip_prefix('/'))
+/// The folder of a list of files, in lower case, that Git takes for a repository of its own, whose settings name programs to start: it
+/// holds `HEAD`, and `objects` or the name of the folder that has them. `None` if there is none.
+pub(super) fn git_folder<'a>(names: impl Iterator<Item = &'a str>) -> Option<String> {
+    // File systems of other operating systems ignore the case. Sets, because a hub may list many files.
+    let (mut heads, mut stores) = (HashSet::new(), HashSet::new());
+    for name in names.map(str::to_ascii_lowercase) {
+        let mut start = 0;
+        for part in name.split('/') {
+            let folder = name[..start].trim_end_matches('/');
+            let last = start + part.len() == name.len();
+            match (part, last) {
+                ("head", true) => heads.insert(folder.to_owned()),
+                ("commondir", true) | ("objects", false) => stores.insert(folder.to_owned()),
+                _ => false,
             };
-            inner.is_some_and(|inner| starts(inner, "objects/") || inner.eq_ignore_ascii_case("commondir"))
-        })
-    })
+            start += part.len() + 1;
+        }
+    }
+    heads.into_iter().filter(|folder| stores.contains(folder)).min()
 }
 
 #[cfg(test)]
@@ -146,10 +147,10 @@ mod tests {
 
     #[test]
     fn repositories_of_git_are_found() {
-        let found = |names: &[&'static str]| git_folder(names.iter().copied());
-        assert_eq!(found(&["HEAD", "config", "objects/x", "refs/heads/x"]), Some(""));
-        assert_eq!(found(&["a/b/config", "a/b/HEAD", "a/b/commondir"]), Some("a/b"));
-        assert_eq!(found(&["a/head", "a/Objects/pack/x"]), Some("a"));
+        let found = |names: &[&str]| git_folder(names.iter().copied());
+        assert_eq!(found(&["HEAD", "config", "objects/x", "refs/heads/x"]).as_deref(), Some(""));
+        assert_eq!(found(&["a/b/config", "a/b/HEAD", "a/b/commondir"]).as_deref(), Some("a/b"));
+        assert_eq!(found(&["A/head", "a/Objects/pack/x"]).as_deref(), Some("a"));
         assert_eq!(found(&["a/HEAD", "objects/x", "b/objects/x", "ab/objects/x"]), None);
         assert_eq!(found(&["objects/x", "refs/heads/x", "config", "HEAD.md"]), None);
     }

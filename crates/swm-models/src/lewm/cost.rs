@@ -264,7 +264,7 @@ impl CostModel for LewmCost {
         self.together = true;
     }
 
-    /// On a GPU, only the last latent is compared.
+    /// On a GPU, the model cannot; an objective then compares latents of one-step predictions.
     fn compare_closest(&mut self) -> bool {
         self.closest = self.host.is_some();
         self.closest

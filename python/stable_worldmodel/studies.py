@@ -118,6 +118,7 @@ def run(
     *,
     small: bool = False,
     trust: bool = False,
+    until: str | None = None,
     **settings: Any,
 ) -> Study:
     """Runs the cells of a study that have no results in the folder, with `swm study run`.
@@ -127,6 +128,7 @@ def run(
         output: The folder of the study.
         small: Whether to run the small size of the study: minutes on two cores.
         trust: Whether the file may name what loads code or opens connections.
+        until: The rule that ends the study, such as `ci=5` or `decided`; `episodes` is the most then.
         **settings: Options of all evaluations, with `_` for `-`; a list makes a cell for each value.
 
     Returns:
@@ -134,6 +136,7 @@ def run(
     """
     arguments = ["swm", "study", "run", os.fspath(study), "--output", os.fspath(output)]
     arguments += [flag for flag, is_set in (("--small", small), ("--trust", trust)) if is_set]
+    arguments += [] if until is None else ["--until", until]
     arguments += [f"{name.replace('_', '-')}={_toml(value)}" for name, value in settings.items()]
     _command(arguments)
     return read(output)

@@ -49,6 +49,18 @@ def test_a_study_runs_continues_and_is_read(tmp_path):
         study.column("success")
 
 
+def test_a_rule_ends_a_study(tmp_path):
+    (tmp_path / "study.toml").write_text(STUDY)
+    study = swm.studies.run(tmp_path / "study.toml", tmp_path / "out", until="ci=49", episodes=40)
+    assert study.is_done and study.results["until"] == "ci=49"
+    # The first stage has ten starts, which are enough for an interval this wide.
+    assert study.column("success.n").max() <= 10
+    with pytest.raises(ValueError, match=r"--until ci=49"):
+        swm.studies.run(tmp_path / "study.toml", tmp_path / "out", episodes=40)
+    with pytest.raises(ValueError, match=r"'width=5' is no rule"):
+        swm.studies.run(tmp_path / "study.toml", tmp_path / "other", until="width=5")
+
+
 def test_a_study_of_another_kind_has_its_own_columns(tmp_path):
     study = swm.studies.run("paper/factors-per-env", tmp_path / "factors")
     ids = list(study.column("environment"))

@@ -197,7 +197,9 @@ def _command(arguments: list[str]) -> None:
     try:
         for line in child.stdout or ():
             sys.stderr.write(line)
-            last_line = line
+            # Hints may follow an error.
+            if line.strip() and not last_line.startswith("error: "):
+                last_line = line
         child.wait()
     except BaseException:
         child.stdin.close()  # type: ignore[union-attr]

@@ -19,7 +19,7 @@ SWM := $(CARGO_TARGET_DIR)/release/swm
 SUDO := $(shell [ "$$(id -u)" = 0 ] || command -v sudo)
 CARGO := cargo
 
-.PHONY: help demo test test-python test-ray test-lab test-neighbours test-browser chromium lab-assets check build tests wheel wheel-portable wheel-zoo gpu cuda docs assets setup setup-python reference bench deny release nightly clean test-gpu crates
+.PHONY: help demo test test-python test-ray test-lab test-neighbours test-browser chromium lab-assets check build tests wheel wheel-portable wheel-zoo gpu cuda docs assets setup setup-python reference bench bench-plot deny release nightly clean test-gpu crates
 
 help:
 	@echo 'make demo       collect, train, plan, evaluate and report on a laptop CPU'
@@ -42,6 +42,7 @@ help:
 	@echo 'make crates     the crates as packages of the Rust registry: $(CACHE)/crates'
 	@echo 'make deny       licences and sources of the dependencies'
 	@echo 'make bench      our benchmarks, against the reference where `make reference` installed it'
+	@echo 'make bench-plot   the plot of the README, measured on an idle machine and drawn again'
 
 demo: build
 	$(SWM) demo
@@ -195,6 +196,11 @@ docs: build wheel
 bench: assets
 	SWM_REFERENCE_PYTHON=$(CACHE)/reference/bin/python $(SWM) bench envs
 	SWM_REFERENCE_PYTHON=$(CACHE)/reference/bin/python $(SWM) bench data
+
+# The plot of the README, on an idle machine, beside what `make reference` installed.
+bench-plot: wheel assets
+	$(PYTHON_VENV)/bin/python -m pip install --quiet --force-reinstall --no-deps $(WHEELS)/*.whl
+	$(PYTHON_VENV)/bin/python docs/media/benchmarks.py measure --swm $(SWM) --reference $(CACHE)/reference/bin/python
 
 # Downloaded once; every call compares the files with their checksums.
 assets: build

@@ -1,6 +1,8 @@
 //! `swm collect`: runs a policy and stores its episodes.
 
-use super::config::{CodecArgs, VariationArgs, image_size};
+mod recorded;
+
+use super::config::{CodecArgs, VariationArgs, count, image_size};
 use super::wrappers::WrapperArgs;
 use super::{Context, emit, emit_json, eprint, progress};
 use crate::resolver::policy_of_choice;
@@ -9,7 +11,7 @@ use clap::Args;
 use serde_json::json;
 use std::collections::BTreeMap;
 use std::time::Instant;
-use swm_core::{CameraView, EnvChoice, Key, Manifest, Origin, Policy, Result, Schema, limits};
+use swm_core::{CameraView, EnvChoice, Error, Key, Manifest, Origin, Policy, Result, Schema, limits};
 use swm_data::lance::{Shard, create_shard};
 use swm_data::{FORMATS, ImageCodec, Location, WriteMode, WriteOptions, Writer};
 use swm_eval::{CollectConfig, Collected, PolicyChoice, World, WorldConfig};
@@ -18,33 +20,34 @@ use swm_eval::{CollectConfig, Collected, PolicyChoice, World, WorldConfig};
 #[derive(Args)]
 pub struct CollectArgs {
     /// The environment, such as swm/TwoRoom-v1 or swm/OGBCube-v0,env_type=double
-    env: String,
+    #[arg(required_unless_present = "resume")]
+    env: Option<String>,
     /// The dataset to write: a path or a name
     #[arg(short, long, value_name = "DATASET")]
     pub(super) output: String,
-    /// The policy: random, expert, an expert's id, or a checkpoint
+    /// The policy: random, expert (the default), an expert's id, or a checkpoint
     ///
     /// The checkpoint must act without a solver. `swm envs ENV` lists the experts. Repeat the option with weights for a
     /// mixture (--policy expert:0.7 --policy random:0.3): every episode draws its policy.
-    #[arg(long = "policy", value_name = "NAME[:WEIGHT]", default_value = "expert")]
+    #[arg(long = "policy", value_name = "NAME[:WEIGHT]")]
     policies: Vec<String>,
     /// Add Gaussian noise of this standard deviation to every action
     ///
     /// The unit is that of the action space. Actions are clipped to the space, and stored as executed.
-    #[arg(long, value_name = "STD", default_value_t = 0.0)]
-    action_noise: f64,
-    /// Number of episodes of the complete dataset
-    #[arg(long, default_value_t = 100)]
-    pub(super) episodes: usize,
-    /// Seed; an episode depends only on the seed and on the episode's index
-    #[arg(long, default_value_t = 0)]
-    seed: u64,
+    #[arg(long, value_name = "STD")]
+    action_noise: Option<f64>,
+    /// Number of episodes of the complete dataset (default: 100)
+    #[arg(long, value_parser = count::<1, { limits::EPISODES.max }>)]
+    episodes: Option<usize>,
+    /// Seed; an episode depends only on it and on its own index (default: 0)
+    #[arg(long)]
+    seed: Option<u64>,
     /// Parallel environments; the dataset does not depend on their number
     #[arg(long, default_value_t = 8)]
     envs: usize,
-    /// Frame size in pixels: 64 or HEIGHTxWIDTH
-    #[arg(long, default_value = "224", value_parser = image_size)]
-    image: (usize, usize),
+    /// Frame size in pixels: 64 or HEIGHTxWIDTH (default: 224)
+    #[arg(long, value_parser = image_size)]
+    image: Option<(usize, usize)>,
     /// Store no frames
     #[arg(long, conflicts_with = "image")]
     no_pixels: bool,
@@ -74,7 +77,7 @@ pub struct CollectArgs {
     mix_renderers: bool,
     #[command(flatten)]
     codec: CodecArgs,
-    /// Continue an interrupted collection
+    /// Continue an interrupted collection; with --output alone, as it began
     #[arg(long, conflicts_with = "overwrite")]
     pub(super) resume: bool,
     /// Replace an existing dataset
@@ -89,9 +92,19 @@ pub struct CollectArgs {
 impl CollectArgs {
     /// The number of episodes of the complete dataset.
     pub fn episodes(&self) -> usize {
-        self.episodes
+        self.episodes.unwrap_or(DEFAULT_EPISODES)
+    }
+
+    /// The policies and their weights.
+    fn policy(&self) -> Result<PolicyChoice> {
+        if self.policies.is_empty() { Ok(DEFAULT_POLICY.into()) } else { PolicyChoice::parse(&self.policies) }
     }
 }
+
+/// The number of episodes, the policy, and the height and width of frames, unless the command line says otherwise.
+const DEFAULT_EPISODES: usize = 100;
+const DEFAULT_POLICY: &str = "expert";
+const DEFAULT_IMAGE: (usize, usize) = (224, 224);
 
 /// What to do about a dataset that exists.
 const EXISTS: &str = "continue it with --resume, replace it with --overwrite, or choose another name";
@@ -129,8 +142,13 @@ pub struct Collection<'a> {
     pub mix_renderers: bool,
 }
 
-/// Runs `swm collect`.
-pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
+/// Runs `swm collect`. `trust` says whether a dataset that is continued may choose any name.
+pub fn collect(args: &CollectArgs, trust: bool, context: &Context) -> anyhow::Result<()> {
+    if args.env.is_none() {
+        let (args, command) = recorded::complete(args, trust)?;
+        eprint(&format!("continuing: {command}\n"));
+        return collect(&args, trust, context);
+    }
     let (location, collected) = run_args(args, context)?;
     if context.json {
         return emit_json(&json!({"dataset": location.to_string(), "collected": collected}));
@@ -149,25 +167,28 @@ pub fn run_args(args: &CollectArgs, context: &Context) -> anyhow::Result<(Locati
 impl<'a> Collection<'a> {
     /// Returns the collection of a command line.
     fn of(args: &'a CollectArgs, location: &'a Location, threads: usize) -> Result<Self> {
+        let Some(env) = &args.env else {
+            return Err(Error::config("ENV", "no environment is given", "name one; `swm envs` lists them"));
+        };
         args.codec.check_format(location, args.format.as_deref())?;
         Ok(Self {
-            env: crate::env(&args.env, &Origin::User)?,
+            env: crate::env(env, &Origin::User)?,
             location,
             format: args.format.as_deref(),
             shard: args.shard,
             world: WorldConfig {
                 envs: args.envs,
-                image: (!args.no_pixels).then_some(args.image),
+                image: (!args.no_pixels).then_some(args.image.unwrap_or(DEFAULT_IMAGE)),
                 views: args.views.iter().map(|view| CameraView::parse(view)).collect::<Result<_>>()?,
                 max_episode_steps: args.max_steps,
                 threads,
             },
             config: CollectConfig {
-                episodes: args.episodes,
-                seed: args.seed,
+                episodes: args.episodes(),
+                seed: args.seed.unwrap_or(0),
                 variation: args.variation.request()?,
-                policy: PolicyChoice::parse(&args.policies)?,
-                action_noise: args.action_noise,
+                policy: args.policy()?,
+                action_noise: args.action_noise.unwrap_or(0.0),
                 strict_finite: args.strict_finite,
                 ..CollectConfig::default()
             },
@@ -194,7 +215,7 @@ pub fn check(args: &CollectArgs) -> Result<()> {
     collection.world.envs = 1;
     let (mut world, ..) = collection.prepare()?;
     // Environments check camera views when they render.
-    world.reset(args.seed, &collection.config.variation).map(drop)
+    world.reset(args.seed.unwrap_or(0), &collection.config.variation).map(drop)
 }
 
 /// Collects, and shows progress.

@@ -6,11 +6,11 @@ use swm_core::{Error, Result, VariationRequest};
 use swm_data::{FORMATS, ImageCodec, Location};
 
 /// The codec of stored frames, for formats that support several codecs.
-#[derive(Args)]
+#[derive(Args, Clone, Default)]
 pub struct CodecArgs {
-    /// Codec of stored frames, in formats with several codecs
-    #[arg(long, value_enum, default_value_t = Codec::Qoi)]
-    codec: Codec,
+    /// Codec of stored frames, in formats with several codecs (default: qoi)
+    #[arg(long, value_enum)]
+    codec: Option<Codec>,
     /// Quality of JPEG frames, 1 to 100 (default: 95)
     #[arg(long, value_parser = clap::value_parser!(u8).range(1..=100))]
     quality: Option<u8>,
@@ -41,7 +41,7 @@ impl CodecArgs {
             None => FORMATS.rows.iter().find(|entry| (entry.detect)(location)),
         };
         match (entry.filter(|entry| !entry.codecs), self.codec) {
-            (Some(entry), Codec::Jpeg) => {
+            (Some(entry), Some(Codec::Jpeg)) => {
                 let problem = format!("the format {} stores frames without loss", entry.id);
                 Err(Error::config("--codec jpeg", problem, "leave it out, or choose another format"))
             }
@@ -55,12 +55,20 @@ impl CodecArgs {
     /// When a quality is given for a codec without one.
     pub fn codec(&self) -> Result<ImageCodec> {
         match (self.codec, self.quality) {
-            (Codec::Jpeg, quality) => Ok(ImageCodec::Jpeg { quality: quality.unwrap_or(JPEG_QUALITY) }),
+            (Some(Codec::Jpeg), quality) => Ok(ImageCodec::Jpeg { quality: quality.unwrap_or(JPEG_QUALITY) }),
             (_, Some(_)) => {
                 Err(Error::config("--quality", "only JPEG frames have one", "add --codec jpeg, or leave it out"))
             }
-            (Codec::Qoi, None) => Ok(ImageCodec::Qoi),
-            (Codec::Png, None) => Ok(ImageCodec::Png),
+            (Some(Codec::Qoi) | None, None) => Ok(ImageCodec::Qoi),
+            (Some(Codec::Png), None) => Ok(ImageCodec::Png),
+        }
+    }
+
+    /// Returns these arguments, with those of `others` where none are given.
+    pub fn or(&self, others: &Self) -> Self {
+        match self.codec {
+            Some(_) => self.clone(),
+            None => Self { codec: others.codec, quality: self.quality.or(others.quality) },
         }
     }
 }

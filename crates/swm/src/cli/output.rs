@@ -44,6 +44,20 @@ pub fn eprint(text: &str) {
     std::io::stderr().write_all(printable(text).as_bytes()).ok();
 }
 
+/// Prints a text with its own colours to standard error.
+pub fn print_styled(text: &str) {
+    std::io::stderr().write_all(text.as_bytes()).ok();
+}
+
+/// Returns the beginning of a command line that is too long for a terminal.
+pub fn shorten(command: String) -> String {
+    const MOST: usize = 2000;
+    match command.char_indices().nth(MOST) {
+        Some((end, _)) => format!("{} ...", &command[..end]),
+        None => command,
+    }
+}
+
 /// Prints an error, a complete sentence, to standard error.
 pub fn print_error(text: &str) {
     let label = if is_coloured(&std::io::stderr()) { "\x1b[1;31merror:\x1b[0m" } else { "error:" };
@@ -51,7 +65,7 @@ pub fn print_error(text: &str) {
 }
 
 /// Whether texts on a stream have colours: on a terminal, unless `NO_COLOR` is set (no-color.org) or the terminal has none.
-fn is_coloured(stream: &impl IsTerminal) -> bool {
+pub fn is_coloured(stream: &impl IsTerminal) -> bool {
     let is_set = |name: &str| std::env::var_os(name).is_some_and(|value| !value.is_empty());
     stream.is_terminal() && !is_set("NO_COLOR") && std::env::var_os("TERM").is_none_or(|name| name != "dumb")
 }

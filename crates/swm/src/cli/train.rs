@@ -4,7 +4,7 @@ use super::devices::DeviceArgs;
 use super::progress::{control, print_summary};
 use super::recipes::{self, RecipeRun};
 use super::trackers::{Tracker, Trackers};
-use super::{Context, emit, emit_json, eprint, run_record, train_folder};
+use super::{Context, emit, emit_json, eprint, output, run_record, train_folder};
 use crate::home;
 use clap::Args;
 use serde_json::{Value, json};
@@ -242,7 +242,7 @@ impl TrainArgs {
                 }
             }
         }
-        eprint(&format!("continuing: {}\n", shorten(record.commands[0].command.join(" "))));
+        eprint(&format!("continuing: {}\n", output::shorten(record.commands[0].command.join(" "))));
         let output = Some(output.clone());
         // Only the user may ask for a tracker, which is a program, and name another folder that is written to.
         let (log, feature_cache) = (self.log.clone(), self.feature_cache.clone());
@@ -312,13 +312,4 @@ pub fn run(config: &dyn TrainableConfig, setup: TrainRun<'_>, context: &Context)
         return Err(Error::Interrupted);
     }
     Ok(summary)
-}
-
-/// Returns the beginning of a command line that is too long for a terminal.
-fn shorten(command: String) -> String {
-    const MOST: usize = 2000;
-    match command.char_indices().nth(MOST) {
-        Some((end, _)) => format!("{} ...", &command[..end]),
-        None => command,
-    }
 }

@@ -64,6 +64,44 @@ fn killed_collection_keeps_committed_episodes_and_resumes() {
 }
 
 #[test]
+fn dataset_alone_is_continued_as_it_began() {
+    let swm = Swm::new();
+    let mixture = ["--policy", "expert:2", "--policy", "random", "--action-noise", "0.1", "--codec", "jpeg"];
+    let factors = ["--variation", "agent", "--pin", "wall.thickness=7", "--wrapper", "noise,std=3"];
+    let all = [ROOMS, &mixture[..], &factors].concat();
+    swm.json(&with(&all, &["--episodes", "5"]));
+    let whole = content(&swm, "rooms");
+    swm.json(&with(&all, &["--episodes", "2", "--overwrite"]));
+    let resume = ["collect", "--resume", "-o", "rooms"];
+    assert_eq!(swm.json(&resume)["collected"]["added"], 0);
+    let output = swm.run(&with(&resume, &["--episodes", "5", "--envs", "3"]));
+    let log = text(&output.stderr);
+    assert!(output.status.success() && log.contains("continuing: swm collect --policy=expert:2"), "{log}");
+    assert_eq!(content(&swm, "rooms"), whole);
+
+    let fails = |more: &[&str], parts: &[&str]| swm.fails(&with(&resume, more), 2, parts);
+    fails(&["--seed", "4"], &["with seed 4", "with seed 3"]);
+    fails(&["--policy", "random"], &["with policy \"random\"", "\"expert\""]);
+    fails(&["--image", "64"], &["[64,64]", "[32,32]"]);
+    fails(&["--pin", "wall.thickness=8"], &["8.0", "7.0"]);
+    fails(&["--codec", "png"], &["codec \"png\"", "quality"]);
+    swm.fails(&["collect", "--resume", "-o", "room"], 2, &["unknown dataset 'room'", "did you mean rooms"]);
+    swm.fails(&["collect", "-o", "rooms"], 2, &["<ENV>"]);
+    assert_eq!(content(&swm, "rooms"), whole);
+
+    swm.json(&["collect", "swm/TwoRoom-v1", "-o", "parts", "--no-pixels", "--episodes", "4", "--shard", "1/2"]);
+    let shard = swm.json(&["collect", "--resume", "-o", "parts", "--shard", "1/2"]);
+    assert_eq!(shard["collected"]["added"], 0);
+    swm.fails(
+        &["collect", "--resume", "-o", "parts", "--shard", "0/2"],
+        2,
+        &["does not record how", "swm collect ENV"],
+    );
+    std::fs::create_dir(swm.path("empty")).expect("a folder");
+    swm.fails(&["collect", "--resume", "-o", "./empty"], 2, &["does not record how", "swm collect ENV"]);
+}
+
+#[test]
 fn other_wrappers_do_not_continue_a_collection() {
     let swm = Swm::new();
     let resume = with(ROOMS, &["--episodes", "4", "--resume"]);

@@ -88,6 +88,24 @@ fn user_allows_a_module_that_results_name() {
     swm.json(&["reproduce", "results", "--trust"]);
 }
 
+#[test]
+fn dataset_that_is_continued_does_not_choose_a_module() {
+    if !python("gymnasium") {
+        return;
+    }
+    let swm = Swm::new();
+    fs::write(swm.path("evil_mod.py"), MODULE).expect("a module");
+    let options = ["-o", "carts", "--policy", "random", "--no-pixels"];
+    let collect = [&["collect", "evil_mod:Cart-v0", "--episodes", "2"][..], &options].concat();
+    swm.json(&collect);
+    fs::remove_file(swm.path("imported")).expect("the user's own environment was imported");
+    let resume = ["collect", "--resume", "-o", "carts", "--episodes", "3"];
+    swm.fails(&resume, 2, &["carts.lance", "'evil_mod:Cart-v0'", "imports a Python module", "--trust"]);
+    assert!(!swm.path("imported").exists());
+    assert_eq!(swm.json(&[&collect[..], &["--resume"]].concat())["collected"]["added"], 0);
+    assert_eq!(swm.json(&[&resume[..], &["--trust"]].concat())["collected"]["added"], 1);
+}
+
 /// Files of the current folder do not replace modules that the worker imports.
 #[test]
 fn current_folder_hides_no_module() {

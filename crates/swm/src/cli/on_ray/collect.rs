@@ -14,6 +14,12 @@ use swm_data::Location;
 pub struct CollectCommand {
     #[command(flatten)]
     args: CollectArgs,
+    /// With --resume: allow the dataset to choose any name
+    ///
+    /// A dataset records its environment, policies and wrappers. Those that run code, read files or open connections are
+    /// continued only if you name them, or trust the dataset (docs/security.md).
+    #[arg(long, requires = "resume", conflicts_with = "env")]
+    trust: bool,
     #[command(flatten)]
     on: OnRayArgs,
     /// Number of shards with --on (default: one for every 50 episodes)
@@ -26,18 +32,18 @@ pub(super) const SHARD_EPISODES: usize = 50;
 
 /// Runs `swm collect`.
 pub fn run(command: &CollectCommand, context: &Context) -> anyhow::Result<()> {
-    let CollectCommand { args, on, shards } = command;
+    let CollectCommand { args, trust, on, shards } = command;
     if !on.is_given() {
-        return collect::collect(args, context);
+        return collect::collect(args, *trust, context);
     }
     let refused = [("--shard", args.shard.is_some()), ("--resume", args.resume), ("--overwrite", args.overwrite)];
     let fix = "remove it: the same command continues an interrupted run, and --shards says how many shards there are";
     on.refuse(&refused, fix)?;
     collect::check(args)?;
     let target = shared_target(&args.output, args.format.as_deref(), on)?;
-    let shards = shards.unwrap_or_else(|| args.episodes.div_ceil(SHARD_EPISODES)).max(1);
+    let shards = shards.unwrap_or_else(|| args.episodes().div_ceil(SHARD_EPISODES)).max(1);
     limits::SHARDS.check(shards)?;
-    let cells = json!({"shards": shards, "episodes": args.episodes});
+    let cells = json!({"shards": shards, "episodes": args.episodes()});
     let replaced = &["-o", "--output", "--shards", "--format"];
     on.submit(&Request { kind: "collect", output: &target, replaced, cells }, context)
 }

@@ -152,6 +152,12 @@ def test_evaluation_reports_intervals_and_the_random_floor(tmp_path):
     assert [run["policy"] for run in saved["runs"]] == ["random", "expert"]
 
 
+def test_metrics_name_the_episodes_that_count():
+    metrics = swm.world.Metrics(success_rate=50.0, interval=(9.5, 90.5), seeds=np.arange(3))
+    metrics.results = {"runs": [{"success": {"n": 2}}]}  # The third episode was solved at its start.
+    assert str(metrics) == "50.0 % [10, 90] of 2 episodes"
+
+
 def test_evaluation_starts_at_rows_of_a_dataset(tmp_path):
     world = rooms()
     world.set_policy(swm.policy.ExpertPolicy())

@@ -45,8 +45,8 @@ pub fn folders() -> Vec<PathBuf> {
         program.iter().flat_map(|program| program.ancestors().skip(1).take(2)).map(|folder| folder.join(SHARE));
     let given = std::env::var_os("SWM_ZOO").filter(|folder| !folder.is_empty()).map(PathBuf::from);
     let home = home::home().ok().map(|home| home.join("zoo"));
-    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../zoo");
-    let all = given.into_iter().chain(home).chain(package).chain(beside).chain([source]);
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).map(|root| root.join("zoo"));
+    let all = given.into_iter().chain(home).chain(package).chain(beside).chain(source);
     all.filter(|folder| folder.is_dir()).collect()
 }
 

@@ -76,7 +76,8 @@ class Metrics(dict[str, Any]):
 
     def __str__(self) -> str:
         low, high = self["interval"]
-        text = f"{self['success_rate']:.1f} % [{low:.0f}, {high:.0f}] of {len(self['seeds'])} episodes"
+        counted = self.results["runs"][-1]["success"]["n"]
+        text = f"{self['success_rate']:.1f} % [{low:.0f}, {high:.0f}] of {counted} episodes"
         if "random_success_rate" in self:
             low, high = self["random_interval"]
             text += f", at random {self['random_success_rate']:.1f} % [{low:.0f}, {high:.0f}]"

@@ -5,8 +5,9 @@ use super::wrappers::WrapperArgs;
 use super::{emit, emit_json, output_folder};
 use clap::Args;
 use serde_json::json;
+use std::ffi::OsStr;
 use std::path::PathBuf;
-use swm_core::{CameraView, Origin, files};
+use swm_core::{CameraView, Error, Origin, files};
 use swm_data::check_png;
 use swm_lab::rendering::Rendering;
 use swm_lab::still::Still;
@@ -44,6 +45,13 @@ pub fn frame(args: &FrameArgs, as_json: bool) -> anyhow::Result<()> {
     let variation = args.variation.request()?;
     let choice = crate::env(&args.env, &Origin::User)?;
     output_folder::check_file(&args.output)?;
+    let suffix = args.output.extension().unwrap_or(OsStr::new("png"));
+    if !suffix.eq_ignore_ascii_case("png") {
+        let fix = format!("name the file {}", args.output.with_extension("png").display());
+        return Err(
+            Error::config(format!("--output {}", args.output.display()), "frames are written as PNG", fix).into()
+        );
+    }
     check_png(&args.output)?;
     let view = args.view.as_deref().map_or_else(|| Ok(CameraView::default()), CameraView::parse)?;
     let WrapperArgs { wrappers, wrap_goal } = args.wrappers.clone();

@@ -39,10 +39,12 @@ mod shell;
 mod signals;
 mod solvers;
 pub mod study;
+mod tagged;
 mod trackers;
 mod train;
 mod train_folder;
 mod training_curves;
+mod usage;
 mod wrappers;
 mod zoo;
 
@@ -254,15 +256,14 @@ fn parse(arguments: Vec<OsString>) -> clap::error::Result<Cli> {
 /// Prints help, a version, or an error in the arguments.
 fn print_usage(error: &clap::Error) -> u8 {
     use std::io::Write as _;
-    let text = error.render().to_string();
-    if error.use_stderr() && matches!(swm_core::text::printable(&text), std::borrow::Cow::Owned(_)) {
+    if error.use_stderr() {
+        let text = usage::plain(error);
         // Arguments with control characters, such as names of files, are printed without clap's colours.
-        eprint(&text);
+        let is_safe = matches!(swm_core::text::printable(&text), std::borrow::Cow::Borrowed(_));
+        if is_safe { output::print_styled(&usage::coloured(error)) } else { eprint(&text) }
     } else {
         let printed = error.print();
-        if !error.use_stderr() {
-            output::check(printed.and_then(|()| std::io::stdout().flush()));
-        }
+        output::check(printed.and_then(|()| std::io::stdout().flush()));
     }
     u8::try_from(error.exit_code()).unwrap_or(2)
 }

@@ -1,7 +1,8 @@
 //! Arguments for planning: solvers, horizon, objective.
 
-use super::solvers;
+use super::{solvers, tagged};
 use clap::Args;
+use serde::de::DeserializeOwned;
 use serde_json::{Map, Value, json};
 use swm_core::{EnvChoice, Error, Result};
 use swm_eval::{Choice, Model, PolicyKind};
@@ -139,35 +140,27 @@ impl PlannerArgs {
     }
 
     fn objective(&self) -> Result<ObjectiveConfig> {
-        let read = |flag: &str, tag: &'static str, known: &[&str], texts: &[String]| -> Result<Vec<Value>> {
-            texts
-                .iter()
-                .map(|text| {
-                    let (name, mut settings) = named(flag, text)?;
-                    let name = name.replace('-', "_");
-                    if !known.contains(&name.as_str()) {
-                        let hint = format!("{flag} accepts {}", known.join(", "));
-                        return Err(Error::unknown(tag, &name, known.iter().copied(), hint));
-                    }
-                    settings.insert(tag.to_owned(), json!(name));
-                    Ok(Value::Object(settings))
-                })
-                .collect()
+        let objective = ObjectiveConfig {
+            terms: read("--term", "term", &TERMS, &self.terms)?,
+            constraints: read("--limit", "constraint", &LIMITS, &self.limits)?,
         };
-        let config = json!({
-            "terms": read("--term", "term", &TERMS, &self.terms)?,
-            "constraints": read("--limit", "constraint", &LIMITS, &self.limits)?,
-        });
-        let objective: ObjectiveConfig = serde_json::from_value(config).map_err(|error| {
-            Error::config(
-                "--term or --limit",
-                error.to_string(),
-                "terms are goal, control and change; limits are action_norm and latent_box",
-            )
-        })?;
         objective.check()?;
         Ok(objective)
     }
+}
+
+/// Reads the values of an option that may be repeated; `tag` is the kind of what `known` names.
+fn read<T: DeserializeOwned>(flag: &str, tag: &'static str, known: &[&str], texts: &[String]) -> Result<Vec<T>> {
+    let read = |text: &String| {
+        let (given, settings) = named(flag, text)?;
+        let name = given.replace('-', "_");
+        if !known.contains(&name.as_str()) {
+            let hint = format!("{flag} accepts {}", known.join(", "));
+            return Err(Error::unknown(tag, &name, known.iter().copied(), hint));
+        }
+        tagged::read(&format!("{flag} {given}"), tag, &name, &settings)
+    };
+    texts.iter().map(read).collect()
 }
 
 /// Parses `NAME,KEY=VALUE,…`. Values are JSON where they parse as JSON, else strings.

@@ -88,14 +88,27 @@ pub fn parse(text: &str) -> Result<(&'static SolverEntry, Value)> {
             return Err(Error::unknown("solver setting", &key, known.iter().map(String::as_str), hint));
         }
         let setting = key.split('.').fold(&mut settings, |at, part| &mut at[part]);
-        if !setting.is_null() && std::mem::discriminant(setting) != std::mem::discriminant(&value) {
-            let fix = format!("give a value like its default, {}", plain(setting));
-            return Err(Error::config(format!("solver setting {key}"), plain(&value), fix));
+        if let Some(kind) = expected(setting, &value) {
+            let fix = format!("give {kind}; the default is {}", plain(setting));
+            return Err(Error::config(format!("--solver {id}"), format!("{key}={} is not {kind}", plain(&value)), fix));
         }
-        *setting = value;
+        *setting = if setting.is_null() && value == "none" { Value::Null } else { value };
     }
     (entry.make)(&settings)?;
     Ok((entry, settings))
+}
+
+/// Returns the kind of value that a setting has by default, in words, if the given one is of another kind.
+fn expected(default: &Value, given: &Value) -> Option<&'static str> {
+    match default {
+        Value::Number(number) if number.is_u64() => (!given.is_u64()).then_some("a whole number of at least 0"),
+        Value::Number(_) => (!given.is_number()).then_some("a number"),
+        Value::Bool(_) => (!given.is_boolean()).then_some("true or false"),
+        Value::String(_) => (!given.is_string()).then_some("a word"),
+        Value::Array(_) => (!given.is_array()).then_some("a list"),
+        Value::Null => (!given.is_number() && given != "none").then_some("a number or none"),
+        Value::Object(_) => None,
+    }
 }
 
 #[cfg(test)]
@@ -110,11 +123,18 @@ mod tests {
         assert_eq!(settings["iterations"], json!(30), "unset settings have their defaults");
         let (_, settings) = parse("gd,optimizer.step=0.5").expect("parsing the solver");
         assert_eq!((&settings["optimizer"]["step"], &settings["optimizer"]["kind"]), (&json!(0.5), &json!("adam")));
+        assert!(parse("gd,clip=none").expect("parsing the solver").1["clip"].is_null());
         for (text, message) in [
             ("cme", "did you mean cem"),
             ("cem,sample=3", "did you mean samples"),
             ("cem,samples", "KEY=VALUE"),
-            ("cem,samples=many", "samples"),
+            ("cem,samples=many", "--solver cem: samples=many is not a whole number of at least 0; give a whole"),
+            ("icem,block=0.5", "--solver icem: block=0.5 is not a whole number of at least 0"),
+            (
+                "gd,clip=wide",
+                "--solver gd: clip=wide is not a number or none; give a number or none; the default is none",
+            ),
+            ("cem,sigma=wide", "--solver cem: sigma=wide is not a number; give a number; the default is 1"),
             ("gd,optimizer.stepp=1", "did you mean optimizer.step"),
             ("cem,samples=64,samples=65", "is given twice: 'samples=64' and 'samples=65'"),
             ("cem,samples=8,elites=9", "9 of 8 samples"),

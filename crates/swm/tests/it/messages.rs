@@ -1,6 +1,6 @@
 //! Tests of error messages: what was given, what was expected, and what to do.
 
-use crate::Swm;
+use crate::{Swm, text};
 use std::fs;
 
 /// The command with an error, and parts of its message.
@@ -44,6 +44,19 @@ fn messages_of_commands_say_what_to_do() {
             &["error: unknown constraint 'action_box'", "--limit accepts action_norm, latent_box"],
         ),
         (
+            &["eval", "simulator", "--env", "swm/TwoRoom-v1", "--term", "goal,when=closets"],
+            &[
+                "unknown value 'closets' (did you mean closest?)",
+                "when of --term goal is one of terminal, running, closest",
+            ],
+        ),
+        (
+            &["frame", "swm/TwoRoom-v1", "-o", "c.jpg"],
+            &["--output c.jpg: frames are written as PNG; name the file c.png"],
+        ),
+        (&["collect", "swm/TwoRoom-v1", "-o", "none", "--episodes", "0"], &["--episodes", "a whole number from 1"]),
+        (&["collect", "swm/TwoRoom-v1", "-o", "none", "--seed", "x"], &["'--seed <SEED>': expected a whole number"]),
+        (
             &["plot", "zoo:two-room/pldm"],
             &["error: zoo:two-room/pldm: has no log of a training, train.jsonl", "`swm train --output`"],
         ),
@@ -57,7 +70,9 @@ fn messages_of_commands_say_what_to_do() {
             swm.fails(&[command, &[given]].concat(), 2, &[problem, "`swm eval --output`"]);
         }
     }
-    assert!(!swm.path("found").exists() && !swm.path("exported").exists());
+    assert!(["found", "exported", "c.jpg", "datasets"].iter().all(|name| !swm.path(name).exists()));
+    let capsule = text(&swm.run(&["eval", "zoo:nothing"]).stderr);
+    assert!(capsule.contains("unknown capsule 'nothing'") && !capsule.contains(".."), "{capsule}");
 }
 
 #[test]

@@ -5,6 +5,7 @@
 
 use super::lines::Lines;
 use crate::cli::train::TrainArgs;
+use crate::cli::usage;
 use clap::{Args, Parser};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -329,7 +330,7 @@ pub fn parse<T: Args>(kind: Kind, step: &Step, arguments: &[String]) -> Result<T
     }
     let words = std::iter::once(kind.name()).chain(arguments.iter().map(String::as_str));
     Command::<T>::try_parse_from(words).map(|command| command.arguments).map_err(|error| {
-        let text = error.to_string();
+        let text = usage::plain(&error);
         let lines: Vec<&str> = text.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
         let problem =
             lines.iter().take_while(|line| !line.starts_with("Usage")).copied().collect::<Vec<_>>().join("; ");

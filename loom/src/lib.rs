@@ -15,6 +15,8 @@ mod sync {
 
     /// No spinning: loom runs every interleaving of the sleep that follows it.
     pub const SPINS: usize = 0;
+    /// One look, so that a thread also finds work before it sleeps.
+    pub const WATCH: usize = 1;
 
     pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
         mutex.lock().unwrap_or_else(PoisonError::into_inner)

@@ -12,6 +12,10 @@ pub use std::{hint, thread};
 /// wake up.
 pub const SPINS: usize = 200;
 
+/// How often a worker thread looks whether there is more work before it sleeps: 20 to 90 microseconds by the processor, about as
+/// long as a sleeping thread takes to run again.
+pub const WATCH: usize = 2000;
+
 /// Locks a mutex, even if another thread panicked while that thread held the lock.
 ///
 /// The guarded data is valid after every single statement, so a panic cannot leave it half updated.

@@ -3,14 +3,23 @@
 //! The calling thread offers work, does it like every other thread, and waits at the end only for the threads that
 //! have begun. A worker thread that the system starts too late finds no work, and delays nobody. `loom/` checks this
 //! file under all interleavings of its threads.
+//!
+//! Waking a thread takes longer than many steps of environments. A worker thread therefore watches for the next offer for
+//! some microseconds before it sleeps. If offers come later than that, it soon stops watching, and tries again from time to
+//! time.
 
-use crate::sync::{Arc, AtomicUsize, Condvar, Mutex, Ordering, SPINS, hint, lock, thread};
+use crate::sync::{Arc, AtomicUsize, Condvar, Mutex, Ordering, SPINS, WATCH, hint, lock, thread};
 use erased::Erased;
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// A panic, as `catch_unwind` returns it.
 type Panic = Box<dyn Any + Send>;
+
+/// How often a worker thread watches in vain until it sleeps at once.
+const PATIENCE: usize = 3;
+/// Then it watches once in so many times.
+const RETRY: usize = 16;
 
 /// Threads that join in the work of the thread that calls them.
 pub struct WorkerThreads {
@@ -26,6 +35,9 @@ struct Shared {
     finished: Condvar,
     /// The number of worker threads that are working. It grows only while [`Shared::offer`] is locked and holds work.
     working: AtomicUsize,
+    /// The number of offers so far, which worker threads watch without the lock. It changes only while [`Shared::offer`] is
+    /// locked.
+    offers: AtomicUsize,
 }
 
 /// What the worker threads are asked to do.
@@ -34,6 +46,10 @@ struct Offer {
     work: Option<Erased>,
     /// The number of worker threads that may still begin.
     places: usize,
+    /// The number of worker threads that sleep until the next offer.
+    asleep: usize,
+    /// Whether the calling thread sleeps until the last worker thread finishes.
+    awaited: bool,
     panic: Option<Panic>,
     over: bool,
 }
@@ -49,6 +65,7 @@ impl WorkerThreads {
             offered: Condvar::new(),
             finished: Condvar::new(),
             working: AtomicUsize::new(0),
+            offers: AtomicUsize::new(0),
         });
         let mut workers = Self { shared, threads: Vec::with_capacity(count) };
         for i in 0..count {
@@ -66,18 +83,29 @@ impl WorkerThreads {
     /// The panic of a thread, if one panicked; the others finish first.
     pub fn run(&mut self, count: usize, work: &(dyn Fn() + Sync)) -> Result<(), Panic> {
         let places = count.min(self.threads.len());
-        {
+        let asleep = {
             let mut offer = lock(&self.shared.offer);
             offer.work = Some(Erased::new(work));
             offer.places = places;
-        }
-        for _ in 0..places {
+            self.shared.offers.fetch_add(1, Ordering::Relaxed);
+            offer.asleep.min(places)
+        };
+        for _ in 0..asleep {
             self.shared.offered.notify_one();
         }
         let own = catch_unwind(AssertUnwindSafe(work));
         // From here on no thread begins, and after the wait none is inside `work`, whose borrow ends with this call.
         let panic = self.shared.withdraw();
         own.and(panic.map_or(Ok(()), Err))
+    }
+}
+
+#[cfg(test)]
+impl WorkerThreads {
+    /// The number of worker threads that sleep until the next offer.
+    #[allow(dead_code, reason = "`loom/` compiles this file without the tests of the pool")]
+    pub(crate) fn asleep(&self) -> usize {
+        lock(&self.shared.offer).asleep
     }
 }
 
@@ -107,19 +135,47 @@ impl Shared {
             }
             offer = lock(&self.offer);
             while self.working.load(Ordering::Acquire) > 0 {
+                offer.awaited = true;
                 offer = self.finished.wait(offer).unwrap_or_else(std::sync::PoisonError::into_inner);
             }
+            offer.awaited = false;
         }
         offer.panic.take()
     }
 
+    /// Watches for some microseconds whether an offer comes after the last one.
+    fn watch(&self, last: usize) -> bool {
+        for _ in 0..WATCH {
+            if self.offers.load(Ordering::Relaxed) != last {
+                return true;
+            }
+            hint::spin_loop();
+        }
+        false
+    }
+
     /// Joins in every work that is offered, until the end.
     fn serve(&self) {
+        // The offer after which this thread watched last, and how often it slept since one came while it watched.
+        let (mut watched, mut slept) = (None, 0usize);
         let mut offer = lock(&self.offer);
         while !offer.over {
             let begun = offer.work.filter(|_| offer.places > 0);
             let Some(work) = begun else {
+                let last = self.offers.load(Ordering::Relaxed);
+                if watched != Some(last) && (slept < PATIENCE || slept.is_multiple_of(RETRY)) {
+                    watched = Some(last);
+                    drop(offer);
+                    if self.watch(last) {
+                        slept = 0;
+                    }
+                    offer = lock(&self.offer);
+                    continue;
+                }
+                slept = slept.wrapping_add(1);
+                offer.asleep += 1;
                 offer = self.offered.wait(offer).unwrap_or_else(std::sync::PoisonError::into_inner);
+                offer.asleep -= 1;
                 continue;
             };
             offer.places -= 1;
@@ -132,7 +188,7 @@ impl Shared {
             if let Err(panic) = done {
                 offer.panic.get_or_insert(panic);
             }
-            if self.working.fetch_sub(1, Ordering::Release) == 1 {
+            if self.working.fetch_sub(1, Ordering::Release) == 1 && offer.awaited {
                 self.finished.notify_one();
             }
         }

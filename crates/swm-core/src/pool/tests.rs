@@ -225,6 +225,21 @@ fn worker_threads_join_in_and_the_caller_waits_for_them() {
 }
 
 #[test]
+fn worker_threads_join_in_while_they_watch_and_after_they_slept() {
+    let mut workers = WorkerThreads::new(1).expect("starting a thread");
+    let both = Barrier::new(2);
+    for call in 0..60 {
+        // In the middle the thread sleeps before every call, so that it stops watching.
+        if (20..50).contains(&call) {
+            while workers.asleep() == 0 {
+                thread::yield_now();
+            }
+        }
+        workers.run(1, &|| _ = both.wait()).expect("no panic");
+    }
+}
+
+#[test]
 fn a_panic_of_any_thread_is_returned_and_the_threads_go_on() {
     let mut workers = WorkerThreads::new(1).expect("starting a thread");
     let both = Barrier::new(2);

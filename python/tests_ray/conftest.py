@@ -19,6 +19,8 @@ os.environ.update(
     RAY_USAGE_STATS_ENABLED="0",
     RAY_DEDUP_LOGS="0",
     RAY_raylet_start_wait_time_s="120",
+    # A worker process takes a second to start: those of one run serve the next one.
+    RAY_num_workers_soft_limit="4",
     # Jobs run the first `python` of the path.
     PATH=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
 )
@@ -50,6 +52,8 @@ def cluster(s3, tmp_path_factory):
     """A head and two more nodes of one CPU each; this process has joined them."""
     os.environ["STABLEWM_HOME"] = str(tmp_path_factory.mktemp("home"))
     head = {"num_cpus": 1, "object_store_memory": STORE, "include_dashboard": True, "dashboard_port": 0}
+    # Another cluster of this machine may have Ray's own port.
+    head["dashboard_agent_listen_port"] = 0
     nodes = Cluster(initialize_head=True, head_node_args=head)
     for _ in range(2):
         add_node(nodes)
@@ -99,3 +103,17 @@ def rooms(tmp_path_factory, s3):
     flags = [part for name, value in options.items() for part in (f"--{name.replace('_', '-')}", value)]
     printed("collect", "swm/TwoRoom-v1", "--output", path, *flags)
     return path, options, flags
+
+
+def files_of(study):
+    """The files of a study on this machine, without those that begin with a dot."""
+    files = {path.relative_to(study).as_posix(): path.read_bytes() for path in study.rglob("*") if path.is_file()}
+    return {name: content for name, content in files.items() if not name.startswith(".")}
+
+
+def remove(location):
+    """Removes an object of the store."""
+    import boto3
+
+    bucket, key = location.removeprefix("s3://").split("/", 1)
+    boto3.client("s3", endpoint_url=os.environ["AWS_ENDPOINT_URL"]).delete_object(Bucket=bucket, Key=key)

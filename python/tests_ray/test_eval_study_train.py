@@ -1,11 +1,10 @@
 """Evaluations, studies and trainings on a cluster have the results of one process."""
 
 import json
-import os
 
 import pytest
 import ray
-from conftest import content_hash, printed, swm
+from conftest import content_hash, files_of, printed, remove, swm
 
 import stable_worldmodel as swm_package
 import stable_worldmodel.ray as swm_ray
@@ -148,12 +147,6 @@ def test_a_study_has_the_files_of_one_process(cluster, s3, tmp_path):
     assert swm_package.studies.read(shared).export() == swm_package.studies.read(one).export()
 
 
-def files_of(study):
-    """The files of a study on this machine, without those that begin with a dot."""
-    files = {path.relative_to(study).as_posix(): path.read_bytes() for path in study.rglob("*") if path.is_file()}
-    return {name: content for name, content in files.items() if not name.startswith(".")}
-
-
 @pytest.mark.parametrize("rule", ["ci=20", "decided=25"])
 def test_a_study_that_its_results_end_has_the_files_of_one_process(rule, cluster, s3, tmp_path):
     (tmp_path / "colours.toml").write_text(STUDY)
@@ -179,60 +172,6 @@ def test_a_study_that_its_results_end_has_the_files_of_one_process(rule, cluster
     given = ["study", "run", tmp_path / "colours.toml", "episodes=45", "-o", many.root]
     fixed = swm(*given, "--on", "ray", "--run-folder", f"{s3}/x")
     assert fixed.returncode == 2 and f"--until {rule}" in fixed.stderr, fixed.stderr
-
-
-def remove(location):
-    """Removes an object of the store."""
-    import boto3
-
-    bucket, key = location.removeprefix("s3://").split("/", 1)
-    boto3.client("s3", endpoint_url=os.environ["AWS_ENDPOINT_URL"]).delete_object(Bucket=bucket, Key=key)
-
-
-#: A study of each kind whose rows run on a cluster.
-TABLES = {
-    "factors": 'kind = "factors"\ntitle = "T"\nquestion = "q?"\n[published]\n"swm/TwoRoom-v1" = [1, 2]\n"other" = [3, 4]\n',
-    "online": """
-kind = "online"
-title = "Returns"
-question = "Which returns are reached?"
-
-[defaults]
-envs = ["swm/PendulumControl-v1"]
-families = ["sac"]
-preset = "tiny"
-seeds = [0, 1]
-steps = 20
-warmup = 20
-episodes = 1
-max-steps = 20
-""",
-}
-
-
-@pytest.mark.parametrize("kind", TABLES)
-def test_a_table_has_the_rows_of_one_process(kind, cluster, s3, tmp_path):
-    (tmp_path / "table.toml").write_text(TABLES[kind])
-    one, many = Folder(str(tmp_path / "one")), Folder(f"{s3}/table-{kind}")
-    # Another home, so that each trains its models itself.
-    done = swm("study", "run", tmp_path / "table.toml", "-o", one.root, STABLEWM_HOME=str(tmp_path / "home"))
-    assert done.returncode == 0, done.stderr
-    summary = ray.get(swm_ray.study(tmp_path / "table.toml", many.root))
-    cells = one.read_json("study.json")["cells"]
-    assert summary["cells"] == len(cells) + 1 > 2
-    names = [name for name in one.list() if not name.startswith(".")]
-    assert len(names) == len(cells) + 1
-    assert {name: many.read(name) for name in many.list()} == {name: one.read(name) for name in names}
-    # A folder of rows is another's word for what they load.
-    done = swm("study", "resume", one.root)
-    assert done.returncode == 2 and "--trust" in done.stderr, done.stderr
-
-
-@pytest.mark.parametrize(("kind", "problem"), [("data", "those of one machine"), ("drift", "share one training")])
-def test_tables_of_one_machine_are_refused(kind, problem, tmp_path):
-    done = swm("study", "run", f"paper/{kind}", "--small", "-o", tmp_path / "out", "--on", "ray")
-    assert done.returncode == 2 and problem in done.stderr and "without --on" in done.stderr, done.stderr
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_sweep_has_the_weights_of_single_trainings(cluster, s3, rooms, tmp_path):

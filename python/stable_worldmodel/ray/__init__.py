@@ -120,7 +120,7 @@ def submit(arguments: Sequence[str], options: Mapping[str, Any] | None = None) -
 def progress(folder: str | os.PathLike[str]) -> dict[str, int]:
     """How many cells of a run are `done`, of how many `cells`, from its folder.
 
-    While an evaluation or a study with `until` runs, `cells` is the largest number that it may have.
+    While results decide which cells there are (`until`, `swm study break`), `cells` is the largest number that there may be.
     """
     from .cells import count
 
@@ -130,7 +130,7 @@ def progress(folder: str | os.PathLike[str]) -> dict[str, int]:
         return {"done": 0, "cells": 0}
     done = run.list("cells")
     # A rule has ended it.
-    ended = "stages" in request["cells"] and "join.json" in done
+    ended = any(name in request["cells"] for name in ("stages", "inside")) and "join.json" in done
     return {"done": len(done), "cells": len(done) if ended else count(request)}
 
 

@@ -21,8 +21,9 @@ from typing import Any
 
 #: A cell: `id`, `name` and `arguments` of `swm`; `files`, texts to write first, by their paths in the folder of the cell;
 #: `inputs` and `outputs`, locations by these paths, with a question mark after what may be missing; `state`, the folder of
-#: a training's checkpoints; `study`, the title of the study whose files the outputs may replace; `done_if`, a command, and the
-#: values that it prints if the work is done already.
+#: a training's checkpoints; `trains`, the path of that training if its command continues it without being told; `study`, the
+#: title of the study whose files the outputs may replace; `done_if`, a command, and the values that it prints if the work is
+#: done already.
 Cell = dict[str, Any]
 
 #: What the cells of a run share: `folder`, `version`, `level`, `directory` and `threads`.
@@ -108,8 +109,8 @@ def _run_in(scratch: Path, cell: Cell, run: Run) -> Any:
     for name, location in cell.get("inputs", {}).items():
         Folder(location).download(scratch / name.rstrip("?"), missing_ok=name.endswith("?"))
     arguments = [argument.replace(SCRATCH, str(scratch)) for argument in cell["arguments"]]
-    state = TrainingState(cell["state"], scratch / "run") if cell.get("state") else None
-    if state is not None and state.restore():
+    state = TrainingState(cell["state"], scratch / cell.get("trains", "run")) if cell.get("state") else None
+    if state is not None and state.restore() and "trains" not in cell:
         arguments.append("--resume")
     try:
         outcome = _command(arguments, run, state)

@@ -196,3 +196,33 @@ fn cells_of_an_evaluation_join_to_that_of_one_process() {
     let command: Vec<&str> = std::iter::once("swm").chain(eval.iter().copied()).chain(["--output", "joined"]).collect();
     assert_eq!(record["commands"][0]["command"], serde_json::json!(command));
 }
+
+#[test]
+fn the_levels_inside_an_interval_are_those_of_one_process() {
+    let swm = Swm::new();
+    // A slow agent does not arrive in time.
+    let of = ["study", "break", "expert", "env=swm/TwoRoom-v1", "no-pixels=true", "budget=30", "episodes=20"];
+    let of = [&of[..], &["--factor", "agent.speed", "--towards", "1.75", "--output"]].concat();
+    swm.json(&[&of[..], &["one"]].concat());
+    let read = |path: &str| -> Value {
+        serde_json::from_slice(&std::fs::read(swm.path(path)).expect("a file")).expect("JSON")
+    };
+    let whole = read("one/study.json");
+    let request = swm.json(&[&of[..], &["./many", "--on", "ray", "--print-request"]].concat());
+    let grid = &request["cells"];
+    assert_eq!((request["kind"].as_str(), grid["inside"].as_u64()), (Some("study"), Some(3)));
+    std::fs::create_dir_all(swm.path("many/cells")).expect("a folder");
+    std::fs::write(swm.path("many/study.json"), grid["study"].to_string()).expect("the study");
+    let ids = grid["ids"].as_array().expect("ids");
+    assert_eq!((ids.len(), whole["cells"].as_array().map(Vec::len)), (9, Some(12)));
+    for id in ids.iter().filter_map(Value::as_str) {
+        let name = format!("cells/{id}.json");
+        std::fs::copy(swm.path("one").join(&name), swm.path("many").join(&name)).expect("results of the grid");
+    }
+    assert_eq!(swm.json(&[&of[..], &["many", "--inside"]].concat())["cells"], 12);
+    assert_eq!(read("many/levels.json")["study"], whole);
+    // A value of an order has levels inside, a kind of door has none.
+    let doors = ["study", "break", "expert", "env=swm/TwoRoom-v1", "--factor", "door.number", "--output", "./doors"];
+    let request = swm.json(&[&doors[..], &["--on", "ray", "--print-request"]].concat());
+    assert_eq!(request["cells"]["inside"], 0);
+}

@@ -3,17 +3,20 @@
 use super::colour;
 use super::expand;
 use super::file::{OF_THE_COMMAND, POLICY, StudyFile, Table, Values};
-use super::{show, with_rule};
-use crate::cli::Context;
+use super::{cluster_cells, output_text, show, submit, with_rule};
 use crate::cli::config::count;
-use crate::cli::eval::run_options;
+use crate::cli::eval::{run_options, write_json};
+use crate::cli::on_ray::OnRayArgs;
+use crate::cli::on_ray::study::check_output;
 use crate::cli::progress::control;
 use crate::cli::recipes::Datasets;
+use crate::cli::{Context, emit_json};
 use crate::resolver::HomeResolver;
 use clap::Args;
+use serde_json::json;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use swm_core::results::{BreakingPoint, Ray, Until};
+use swm_core::results::{BreakingPoint, Ray, StudyResults, Until};
 use swm_core::{DType, Error, Factor, Origin, Result, Space, VariationSpace, limits};
 use swm_eval::{Common, Resolver as _, Study, StudyFolder};
 
@@ -47,7 +50,15 @@ pub struct BreakArgs {
     /// Parallel environments; results do not depend on their number
     #[arg(long, default_value_t = 16, value_parser = count::<1, { limits::ENVS.max }>)]
     envs: usize,
+    /// Evaluate nothing: choose the levels inside from the results of the grid, a cell
+    #[arg(long, hide = true, conflicts_with = "on")]
+    inside: bool,
+    #[command(flatten)]
+    on: OnRayArgs,
 }
+
+/// The file with the study of all levels, for the run on a cluster.
+const LEVELS: &str = "levels.json";
 
 /// Colours with a name, as pins.
 const COLOURS: [(&str, &str); 9] = [
@@ -69,38 +80,54 @@ type Level = (Option<f64>, Vec<f64>);
 pub fn run(args: &BreakArgs, context: &Context) -> anyhow::Result<()> {
     let own_env = args.settings.iter().find_map(|setting| setting.strip_prefix("env="));
     let resolver = own_env.into_iter().fold(HomeResolver::new(Origin::User), HomeResolver::with_env);
-    let folder = StudyFolder::new(&args.output);
-    let study = |levels: &[Level], ordered: bool| -> Result<Study> {
-        let mut study = expand::study(&args.file(levels), &args.settings, &resolver, &mut control(context))?;
-        study.arguments = args.arguments();
-        let below = f64::from(args.below) / 100.0;
-        study.ray = (!levels.is_empty()).then(|| Ray { factor: args.factor.clone(), below, ordered });
-        if levels.is_empty() { Ok(study) } else { with_rule(study, args.until) }
-    };
-    let plain = study(&[], true)?;
+    let output = output_text(&args.on, &args.output)?;
+    let plain = args.study(&[], true, &resolver, context)?;
     let request = plain.cells.first().map(|cell| &cell.request);
     let env = request.map(|request| resolver.env(request)).transpose()?;
     let space = env.as_ref().map(|env| env.spec().variation_space.clone());
     let Some(space) = space else { return Ok(()) };
-    let factor = &space.factors()[args.factor(&space)?];
-    let ray = args.ray(factor)?;
-    let options = run_options(args.envs, None, context);
-    let mut levels = ray.grid();
-    let first = study(&levels, ray.is_ordered())?;
+    let ray = args.ray(&space.factors()[args.factor(&space)?])?;
+    let study = |levels: &[Level]| args.study(levels, ray.is_ordered(), &resolver, context);
+    let first = study(&ray.grid())?;
+    if args.on.is_given() {
+        check_output(output, &first.title, args.until, &args.on)?;
+        let mut cells = cluster_cells(&first, &resolver)?;
+        cells["inside"] = json!(if ray.is_ordered() { most_inside(&plain) } else { 0 });
+        return submit(&args.on, &args.output, cells, context);
+    }
+    let folder = StudyFolder::new(&args.output);
     let lock = folder.create(&first)?;
-    first.run(&folder, &resolver, &options, &mut control(context))?;
-    let results = first.results(&folder)?;
-    levels.extend(results.breaking.iter().filter_map(BreakingPoint::first).flat_map(|ends| ray.inside(ends)));
-    levels.sort_by(|a, b| a.0.unwrap_or_default().total_cmp(&b.0.unwrap_or_default()));
-    levels.dedup_by(|a, b| a.1 == b.1);
-    let whole = study(&levels, ray.is_ordered())?;
+    let options = run_options(args.envs, None, context);
+    if !args.inside {
+        first.run(&folder, &resolver, &options, &mut control(context))?;
+    }
+    let whole = study(&ray.levels(&first.results(&folder)?))?;
+    if args.inside {
+        write_json(&args.output.join(LEVELS), &cluster_cells(&whole, &resolver)?)?;
+        return emit_json(&json!({"cells": whole.cells.len()}));
+    }
     drop(lock);
     let _lock = folder.create(&whole)?;
     whole.run(&folder, &resolver, &options, &mut control(context))?;
     show(&whole.results(&folder)?, context.json)
 }
 
+/// The most cells that the levels inside an interval add to the grid: each unshifted cell may have an interval of its own, and all of
+/// them are evaluated at its levels.
+fn most_inside(unshifted: &Study) -> usize {
+    Ray::INSIDE * unshifted.cells.len().pow(2)
+}
+
 impl BreakArgs {
+    /// The study of some levels with all names resolved; without levels, the unshifted condition alone.
+    fn study(&self, levels: &[Level], ordered: bool, resolver: &HomeResolver, context: &Context) -> Result<Study> {
+        let mut study = expand::study(&self.file(levels), &self.settings, resolver, &mut control(context))?;
+        study.arguments = self.arguments();
+        let below = f64::from(self.below) / 100.0;
+        study.ray = (!levels.is_empty()).then(|| Ray { factor: self.factor.clone(), below, ordered });
+        if levels.is_empty() { Ok(study) } else { with_rule(study, self.until) }
+    }
+
     /// The index of the factor.
     fn factor(&self, space: &VariationSpace) -> Result<usize> {
         let names = || space.factors().iter().map(|factor| factor.key.as_str());
@@ -225,6 +252,15 @@ impl Line<'_> {
             self.values()
         };
         levels.retain(|(_, value)| *value != self.factor.init_value);
+        levels.dedup_by(|a, b| a.1 == b.1);
+        levels
+    }
+
+    /// The levels of the grid, and those inside the first intervals in which success falls below half.
+    fn levels(&self, grid: &StudyResults) -> Vec<Level> {
+        let mut levels = self.grid();
+        levels.extend(grid.breaking.iter().filter_map(BreakingPoint::first).flat_map(|ends| self.inside(ends)));
+        levels.sort_by(|a, b| a.0.unwrap_or_default().total_cmp(&b.0.unwrap_or_default()));
         levels.dedup_by(|a, b| a.1 == b.1);
         levels
     }

@@ -249,7 +249,7 @@ impl Trained {
 }
 
 /// The name of the model that all rows of a study share.
-fn model_name(request: &Value) -> Result<String> {
+pub(super) fn model_name(request: &Value) -> Result<String> {
     let mut shared = request.clone();
     shared["row"] = Value::Null;
     let id = TableCell { name: String::new(), request: shared, published: vec![] }.id()?;

@@ -41,7 +41,7 @@ use std::path::{Path, PathBuf};
 use swm_core::results::{BreakingPoint, StudyResults, Until};
 use swm_core::run::Control;
 use swm_core::{Error, Origin, Result, limits};
-use swm_eval::{AnyStudy, Cell, Common, Study, StudyFolder, TableCell};
+use swm_eval::{AnyStudy, Cell, Common, Study, StudyFolder};
 
 /// Arguments of `swm study`.
 #[derive(Args)]
@@ -274,7 +274,7 @@ fn run(args: &RunArgs, only_register: bool, context: &Context) -> anyhow::Result
         return Ok(());
     }
     let Some(output) = &args.output else { return Ok(()) };
-    let output = args.output_text(output)?;
+    let output = output_text(&args.on, output)?;
     file.datasets.check_origin(&origin)?;
     // Before datasets are collected, which may take long.
     expand::check(&file, &args.settings, &resolver)?;
@@ -286,13 +286,7 @@ fn run(args: &RunArgs, only_register: bool, context: &Context) -> anyhow::Result
     study.arguments = args.arguments();
     study = with_rule(study, args.until)?;
     if args.on.is_given() {
-        let ids = study.cells.iter().map(Cell::id).collect::<Result<Vec<_>>>()?;
-        let mut cells = json!({"study": study, "ids": ids});
-        if study.until.is_some() {
-            study.check_starts(&resolver)?;
-            cells["stages"] = json!(study.stages());
-        }
-        return args.submit(Path::new(output), cells, context);
+        return submit(&args.on, Path::new(output), cluster_cells(&study, &resolver)?, context);
     }
     let folder = StudyFolder::new(Path::new(output));
     if only_register {
@@ -310,6 +304,17 @@ fn run(args: &RunArgs, only_register: bool, context: &Context) -> anyhow::Result
     let _lock = folder.create(&study)?;
     study.run(&folder, &resolver, &run_options(args.envs, None, context), &mut control(context))?;
     show(&study.results(&folder)?, context.json)
+}
+
+/// What a cluster needs to know of a study: its cells with their ids, and the stages of a rule that ends it.
+fn cluster_cells(study: &Study, resolver: &HomeResolver) -> Result<Value> {
+    let ids = study.cells.iter().map(Cell::id).collect::<Result<Vec<_>>>()?;
+    let mut cells = json!({"study": study, "ids": ids});
+    if study.until.is_some() {
+        study.check_starts(resolver)?;
+        cells["stages"] = json!(study.stages());
+    }
+    Ok(cells)
 }
 
 /// The study with the rule that ends it, if there is one.
@@ -339,38 +344,34 @@ fn run_table(
     }
     let mut study = file.study(size, &args.settings, origin)?;
     study.arguments = args.arguments();
-    if args.on.is_given() {
-        file.check_several_machines()?;
-    }
     let datasets = file.datasets(size)?;
     datasets.check_origin(origin)?;
-    check_output(args.output_text(output)?, &study.title, None, &args.on)?;
+    check_output(output_text(&args.on, output)?, &study.title, None, &args.on)?;
     datasets.make(origin, context)?;
     if args.on.is_given() {
-        let ids = study.cells.iter().map(TableCell::id).collect::<Result<Vec<_>>>()?;
-        return args.submit(output, json!({"study": study, "ids": ids}), context);
+        return submit(&args.on, output, file.cluster_cells(&study)?, context);
     }
     let folder = StudyFolder::new(output);
     tables::run(&study, &folder, context)?;
     export_table::show(&study.results(&folder)?, context.json)
 }
 
+/// Hands the cells of a study over to a cluster.
+fn submit(on: &OnRayArgs, output: &Path, cells: Value, context: &Context) -> anyhow::Result<()> {
+    let output = output_text(on, output)?;
+    on.submit(&Request { kind: "study", output, replaced: &["-o", "--output"], cells }, context)
+}
+
+/// An output as text, which paths of a cluster are. Without one, it is a folder of this machine.
+fn output_text<'a>(on: &OnRayArgs, output: &'a Path) -> Result<&'a str> {
+    if !on.is_given() {
+        output_folder::check_local(output)?;
+    }
+    let fix = "give another folder with --output";
+    output.to_str().ok_or_else(|| Error::config(output.display().to_string(), "is no valid UTF-8", fix))
+}
+
 impl RunArgs {
-    /// Hands the cells of a study over to a cluster.
-    fn submit(&self, output: &Path, cells: Value, context: &Context) -> anyhow::Result<()> {
-        let output = self.output_text(output)?;
-        self.on.submit(&Request { kind: "study", output, replaced: &["-o", "--output"], cells }, context)
-    }
-
-    /// The output as text, which paths of a cluster are. Without one, it is a folder of this machine.
-    fn output_text<'a>(&self, output: &'a Path) -> Result<&'a str> {
-        if !self.on.is_given() {
-            output_folder::check_local(output)?;
-        }
-        let fix = "give another folder with --output";
-        output.to_str().ok_or_else(|| Error::config(output.display().to_string(), "is no valid UTF-8", fix))
-    }
-
     /// The name of the study, its size and its settings, for the command that runs it again.
     fn arguments(&self) -> Vec<String> {
         let small = self.small.then(|| "--small".to_owned());

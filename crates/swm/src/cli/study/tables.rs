@@ -178,12 +178,21 @@ impl TableFile {
         Ok(study)
     }
 
-    /// Checks that the rows can be filled on several machines.
+    /// What a cluster needs to know of the study: its rows with their ids, whether they are one cell (`together`), and the name of
+    /// the model that they share (`model`).
     ///
     /// # Errors
-    /// When they need one machine.
-    pub fn check_several_machines(&self) -> Result<()> {
-        self.kind.check_several_machines()
+    /// Never for a study that was read from JSON.
+    pub fn cluster_cells(&self, study: &TableStudy) -> Result<Value> {
+        let ids = study.cells.iter().map(TableCell::id).collect::<Result<Vec<_>>>()?;
+        let mut cells = json!({"study": study, "ids": ids});
+        if self.kind.is_one_cell() {
+            cells["together"] = json!(true);
+        }
+        if let (TableKind::Drift, Some(first)) = (self.kind, study.cells.first()) {
+            cells["model"] = json!(drift::model_name(&first.request)?);
+        }
+        Ok(cells)
     }
 
     /// The datasets that the study collects at a size.

@@ -80,7 +80,7 @@ pub enum Error {
         fix: String,
     },
     /// A file operation failed.
-    #[error("{}: {action}: {}{}", .path.display(), without_code(.source), disk_hint(.source))]
+    #[error("{}: {action}: {}{}", .path.display(), without_code(.source), hint(.source))]
     Io {
         /// The file or folder.
         path: PathBuf,
@@ -233,8 +233,11 @@ fn without_code(source: &std::io::Error) -> String {
     text.split_once(" (os error ").map_or_else(|| text.clone(), |(message, _)| message.to_owned())
 }
 
-fn disk_hint(source: &std::io::Error) -> &'static str {
+/// What to do about an error of the operating system.
+fn hint(source: &std::io::Error) -> &'static str {
     match source.kind() {
+        std::io::ErrorKind::NotFound => "; check the path",
+        std::io::ErrorKind::PermissionDenied => "; change the permissions, or choose another path",
         std::io::ErrorKind::StorageFull | std::io::ErrorKind::QuotaExceeded => " (free some space, then continue)",
         _ => "",
     }
@@ -259,7 +262,7 @@ mod tests {
     #[test]
     fn missing_files_are_usage_errors_in_words() {
         let error = Error::io("a.json", "opening the file", std::io::Error::from_raw_os_error(2));
-        assert_eq!(error.to_string(), "a.json: opening the file: No such file or directory");
+        assert_eq!(error.to_string(), "a.json: opening the file: No such file or directory; check the path");
         assert!(error.is_usage());
         assert!(!Error::io("a", "writing", std::io::Error::from_raw_os_error(28)).is_usage());
     }

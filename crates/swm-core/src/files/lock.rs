@@ -26,8 +26,8 @@ impl Lock {
             return Err(Error::corrupt(&path, format!("{below}is not a folder"), "choose another path"));
         }
         Self::acquire(&path, || {
-            std::fs::create_dir_all(&path)?;
-            File::open(&path)
+            std::fs::create_dir_all(&path).map_err(|error| Error::io(&path, "creating the folder", error))?;
+            File::open(&path).map_err(|error| locking(&path, error))
         })
     }
 
@@ -43,16 +43,17 @@ impl Lock {
         }
         Self::acquire(path, || {
             if let Some(folder) = path.parent() {
-                std::fs::create_dir_all(folder)?;
+                std::fs::create_dir_all(folder).map_err(|error| Error::io(folder, "creating the folder", error))?;
             }
-            OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path)
+            let file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path);
+            file.map_err(|error| locking(path, error))
         })
     }
 
-    fn acquire(path: &Path, open: impl Fn() -> io::Result<File>) -> Result<Self> {
-        let io = |error| Error::io(path, "taking the lock against other writers", error);
+    fn acquire(path: &Path, open: impl Fn() -> Result<File>) -> Result<Self> {
+        let io = |error| locking(path, error);
         loop {
-            let file = open().map_err(io)?;
+            let file = open()?;
             match file.try_lock() {
                 Err(TryLockError::WouldBlock) => {
                     let problem = "another process writes to it";
@@ -71,6 +72,10 @@ impl Lock {
             }
         }
     }
+}
+
+fn locking(path: &Path, error: io::Error) -> Error {
+    Error::io(path, "taking the lock against other writers", error)
 }
 
 impl Deref for Lock {
@@ -103,6 +108,15 @@ fn is_same(a: &Metadata, b: &Metadata) -> bool {
 mod tests {
     use super::*;
     use std::fs;
+
+    #[test]
+    fn folders_that_cannot_be_created_are_named() {
+        let file = std::env::temp_dir().join(format!("swm-lock-file-{}", std::process::id()));
+        fs::write(&file, "").expect("writing a file");
+        let error = Lock::file(&file.join("sub/data.h5")).expect_err("a folder below a file").to_string();
+        fs::remove_file(&file).expect("removing the file");
+        assert!(error.contains("/sub: creating the folder: "), "{error}");
+    }
 
     #[test]
     fn second_lock_is_refused_until_the_first_is_dropped() {

@@ -38,10 +38,10 @@ pub fn open(location: impl Into<Location>) -> Result<Arc<dyn Reader>> {
     }
     let problem = match location.path().map(|path| path.try_exists()) {
         Some(Ok(false)) => "there is no such dataset",
-        _ => "it is not a dataset of a known format",
+        _ => "it is not a dataset",
     };
     let known: Vec<&str> = FORMATS.rows.iter().map(Named::id).collect();
-    let fix = format!("use a dataset of a format that `swm formats` lists ({})", known.join(", "));
+    let fix = format!("`swm formats` describes the formats: {}", known.join(", "));
     Err(Error::corrupt(location.label(), problem, fix))
 }
 

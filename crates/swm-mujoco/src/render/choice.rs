@@ -107,10 +107,12 @@ pub(super) fn renderer() -> Result<&'static dyn Renderer> {
             tracing::debug!("rendering on the CPU: {problem}");
             Ok(&CPU)
         }
-        Err(problem) => Err(Error::config(
-            "rendering a MuJoCo environment with EGL",
-            problem,
-            "install EGL (Debian: apt install libegl1 libegl-mesa0 libgl1-mesa-dri), or choose the renderer cpu",
-        )),
+        Err(problem) => {
+            let egl =
+                "install EGL (Debian: apt install libegl1 libegl-mesa0 libgl1-mesa-dri), or choose the renderer cpu";
+            // What says itself what to install is not about EGL.
+            let fix = if problem.contains("swm assets") { "or choose the renderer cpu" } else { egl };
+            Err(Error::config("rendering a MuJoCo environment with EGL", problem, fix))
+        }
     }
 }

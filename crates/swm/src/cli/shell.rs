@@ -2,7 +2,7 @@
 //! `swm --help` lists them.
 
 use super::{Cli, emit, emit_json, output_folder};
-use clap::{Args, Command, CommandFactory as _};
+use clap::{Arg, Args, Command, CommandFactory as _};
 use clap_complete::Shell;
 use clap_mangen::Man;
 use serde_json::json;
@@ -41,7 +41,7 @@ pub struct ManArgs {
 
 /// Returns the declarations of all commands, with a help that lists them in groups.
 pub fn command() -> Command {
-    let command = Cli::command();
+    let command = with_negative_numbers(Cli::command());
     let mut groups = String::new();
     for (group, names) in GROUPS {
         let _ = write!(groups, "\n{group}:\n");
@@ -55,6 +55,13 @@ pub fn command() -> Command {
         "{{about}}\n\n{{usage-heading}} {{usage}}\n{groups}\n`swm help COMMAND` explains a command.\n\n\
          Options:\n{{options}}{{after-help}}"
     ))
+}
+
+/// Lets every option take a negative number, so that its own check refuses it, and `-1` is not taken for an option.
+fn with_negative_numbers(command: Command) -> Command {
+    let takes_value = |arg: &Arg| !arg.is_positional() && arg.get_action().takes_values();
+    let command = command.mut_args(|arg| if takes_value(&arg) { arg.allow_negative_numbers(true) } else { arg });
+    command.mut_subcommands(with_negative_numbers)
 }
 
 /// Prints the completions of a shell.

@@ -10,7 +10,7 @@ use clap::Args;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use swm_core::files::Lock;
+use swm_core::files::{self, Lock};
 use swm_core::{EnvPool, Error, Origin, Result};
 use swm_data::Reader;
 use swm_models::{
@@ -209,6 +209,10 @@ impl TrainArgs {
         };
         let folder = home::own_checkpoint(output)?;
         let path = folder.join(run_record::FILE);
+        if !path.exists() {
+            let problem = format!("is no run of `swm train`: it has no {}", run_record::FILE);
+            return Err(Error::config(folder.display().to_string(), problem, fix));
+        }
         let record = run_record::read(&folder)?;
         let started = record.first().and_then(|(cli, from)| Some((cli.into_train()?, from)));
         // A recipe writes to a folder of its own, in which it continues by itself.
@@ -273,6 +277,7 @@ impl TrainArgs {
     /// As [`TrainArgs::config`].
     pub(super) fn config_with(&self, more: &[String]) -> Result<Box<dyn TrainableConfig>> {
         let (family, settings) = (self.family()?, [&self.settings[..], more].concat());
+        self.preset.as_deref().map_or(Ok(()), check_preset_file)?;
         (family.config)(self.preset.as_deref().unwrap_or(family.presets[0].id), &settings)
     }
 
@@ -289,6 +294,22 @@ impl TrainArgs {
         });
         Ok((home::open_dataset(data)?, home::new_checkpoint(&name)?))
     }
+}
+
+/// The largest file of a preset that is read.
+const MAX_PRESET: u64 = 1 << 24;
+
+/// Checks that a preset that is a file is TOML; the error names the file and the line.
+fn check_preset_file(preset: &str) -> Result<()> {
+    if Path::new(preset).extension().is_none_or(|end| end != "toml") {
+        return Ok(());
+    }
+    let text = String::from_utf8_lossy(&files::read(Path::new(preset), MAX_PRESET)?).into_owned();
+    let parsed: std::result::Result<toml::Table, _> = toml::from_str(&text);
+    parsed.map(drop).map_err(|error| {
+        let problem = format!("{}{}", error.message(), recipes::lines::of_error(&text, &error));
+        Error::config(format!("preset {preset}"), problem, "correct the file")
+    })
 }
 
 /// Trains on a dataset, and shows progress.

@@ -61,7 +61,7 @@ mod tests {
     fn refused_values_are_explained_in_words() {
         for (command, message) in [
             ("collect e -o x --seed y", "invalid value 'y' for '--seed <SEED>': expected a whole number of at least 0"),
-            ("collect e -o x --seed=-1", "'--seed <SEED>': expected a whole number of at least 0"),
+            ("collect e -o x --seed -1", "'--seed <SEED>': expected a whole number of at least 0"),
             ("collect e -o x --seed 99999999999999999999", "'--seed <SEED>': the number is too large"),
             ("collect e -o x --action-noise y", "'--action-noise <STD>': expected a number"),
             ("collect e -o x --episodes 0", "'0' is not a whole number from 1 to"),

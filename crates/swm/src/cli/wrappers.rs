@@ -4,6 +4,7 @@ use super::{emit, emit_json, table};
 use crate::resolver::check_wrapper;
 use clap::Args;
 use serde_json::{Map, Value};
+use std::borrow::Cow;
 use swm_core::{Origin, Result};
 use swm_envs::wrappers::{GoalFrame, Stack, WRAPPERS, read};
 use swm_eval::Choice;
@@ -47,6 +48,15 @@ impl WrapperArgs {
     }
 }
 
+/// Returns the value of a setting as the command line writes it; a list is joined by `/`.
+pub fn shown(value: &Value) -> Cow<'_, str> {
+    match value {
+        Value::String(text) => Cow::Borrowed(text),
+        Value::Array(values) => Cow::Owned(values.iter().map(shown).collect::<Vec<_>>().join("/")),
+        other => Cow::Owned(other.to_string()),
+    }
+}
+
 /// Lists the wrappers and their settings.
 pub fn wrappers(as_json: bool) -> anyhow::Result<()> {
     if as_json {
@@ -57,8 +67,7 @@ pub fn wrappers(as_json: bool) -> anyhow::Result<()> {
         let parameters = row.parameters.iter().map(|parameter| {
             let default = match parameter.default_value() {
                 Value::Null => "…".to_owned(),
-                Value::String(text) => text,
-                other => other.to_string(),
+                value => shown(&value).into_owned(),
             };
             format!("{}={default} ({})", parameter.name, parameter.domain)
         });

@@ -15,7 +15,7 @@ fn absurd_counts_are_refused_before_work_starts() {
     for (args, option, value, what) in [
         (ROOMS, "--envs", "1000000", "number of environments"),
         (ROOMS, "--threads", "100000", "number of threads"),
-        (&ROOMS[..4], "--episodes", huge, "number of episodes"),
+        (&ROOMS[..4], "--episodes", huge, "a whole number from 1 to 1000000000"),
         (ROOMS, "--max-steps", huge, "number of steps"),
         (ROOMS, "--shard", "0/1000000000000000", "number of shards"),
         (EVAL, "--budget", huge, "number of steps"),

@@ -51,6 +51,23 @@ fn messages_of_commands_say_what_to_do() {
             ],
         ),
         (
+            &["eval", "simulator", "--env", "swm/TwoRoom-v1", "--score", "reachh"],
+            &["unknown score 'reachh' (did you mean reach?)", "terminal, running, reach, success"],
+        ),
+        (
+            &["train", "lewm", "--data", "none", "--preset", "wrong.toml"],
+            &["preset wrong.toml: ", "(line 2)", "correct the file"],
+        ),
+        (
+            &["train", "lewm", "--data", "none", "--preset", "none.toml"],
+            &["none.toml", "No such file", "check the path"],
+        ),
+        (&["train", "--recipe", "wrong.toml", "-o", "run"], &["recipe wrong.toml: ", " (line 2); docs/zoo.md"]),
+        (
+            &["train", "--resume", "-o", "./folder"],
+            &["./folder: is no run of `swm train`: it has no run.json", "--data"],
+        ),
+        (
             &["frame", "swm/TwoRoom-v1", "-o", "c.jpg"],
             &["--output c.jpg: frames are written as PNG; name the file c.png"],
         ),
@@ -61,6 +78,8 @@ fn messages_of_commands_say_what_to_do() {
             &["error: zoo:two-room/pldm: has no log of a training, train.jsonl", "`swm train --output`"],
         ),
     ];
+    fs::write(swm.path("wrong.toml"), "[model]\nside = [1,\n").expect("a file");
+    fs::create_dir(swm.path("folder")).expect("a folder");
     for (args, parts) in cases {
         swm.fails(args, 2, parts);
     }

@@ -32,7 +32,8 @@ pub fn lance_error(label: &Path, action: &str, error: &lance_core::Error) -> Err
             "this version cannot be read; rewrite the table with a current Lance",
         ),
         (_, lance_core::Error::IO { .. }) if remote => {
-            Error::external(format!("{}: {action}", label.display()), format!("{text}{}", credentials_hint(text)))
+            let problem = if asks_for_credentials(text) { "no credentials were found" } else { text };
+            Error::external(format!("{}: {action}", label.display()), format!("{problem}{}", credentials_hint(text)))
         }
         _ => damaged(label, format!("{action}: {text}")),
     }
@@ -54,11 +55,16 @@ fn without_kind(text: &str) -> &str {
     text.strip_prefix("LanceError(").and_then(|rest| rest.split_once("): ")).map_or(text, |(_, text)| text)
 }
 
-/// Returns the advice for an object store that refused a request, or whose client found no credentials and asked the
-/// metadata server of a cloud machine for them.
+/// Whether an error is that of a client which found no credentials and asked the metadata server of a cloud machine for
+/// them, in vain.
+fn asks_for_credentials(text: &str) -> bool {
+    ["169.254.169.254", "metadata.google.internal"].iter().any(|server| text.contains(server))
+}
+
+/// Returns the advice for an object store that refused a request, or whose client found no credentials.
 fn credentials_hint(text: &str) -> &'static str {
-    let refused = ["169.254.169.254", "metadata.google.internal", "401", "403", "redential"];
-    match refused.iter().any(|part| text.contains(part)) {
+    let refused = ["401", "403", "redential"];
+    match asks_for_credentials(text) || refused.iter().any(|part| text.contains(part)) {
         true => {
             "; the store needs credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, GOOGLE_SERVICE_ACCOUNT, or \
              AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY (docs/data.md)"
@@ -77,6 +83,9 @@ mod tests {
         let text = "LanceError(IO): Generic S3 error: PUT http://169.254.169.254/: 403, crates/x/store.rs:379:30";
         assert_eq!(without_kind(without_position(text)), "Generic S3 error: PUT http://169.254.169.254/: 403");
         assert!(credentials_hint(text).contains("AWS_ACCESS_KEY_ID") && credentials_hint("timeout").is_empty());
+        let error =
+            lance_error(Path::new("s3://b/x.lance"), "listing", &lance_core::Error::io(text.to_owned())).to_string();
+        assert!(error.starts_with("s3://b/x.lance: listing: no credentials were found; the store needs"), "{error}");
         let full = lance_core::Error::io("failed to persist: No space left on device (os error 28)".to_owned());
         let error = lance_error(Path::new("x.lance"), "writing", &full);
         assert!(matches!(&error, Error::Io { source, .. } if source.kind() == ErrorKind::StorageFull));

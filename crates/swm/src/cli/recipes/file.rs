@@ -3,7 +3,7 @@
 //! A step is a table of options of `swm collect`, `swm train` or `swm eval`, without their dashes. `name` names its output;
 //! options of later steps refer to it. `hash` is the expected hash of a dataset or of weights.
 
-use super::lines::Lines;
+use super::lines::{self, Lines};
 use crate::cli::train::TrainArgs;
 use crate::cli::usage;
 use clap::{Args, Parser};
@@ -138,7 +138,10 @@ impl Recipe {
     fn parse_with(what: &str, text: &str, has_lines: bool) -> Result<Self> {
         let invalid =
             |problem: String| Error::config(format!("recipe {what}"), problem, "docs/zoo.md describes recipes");
-        let mut recipe: Self = toml::from_str(text).map_err(|error| invalid(error.to_string()))?;
+        let mut recipe: Self = toml::from_str(text).map_err(|error| {
+            let line = if has_lines { lines::of_error(text, &error) } else { String::new() };
+            invalid(format!("{}{line}", error.message()))
+        })?;
         let parts = [("collect", &mut recipe.collect), ("train", &mut recipe.train), ("eval", &mut recipe.eval)];
         for (kind, steps) in parts.into_iter().filter(|_| has_lines) {
             steps.iter_mut().zip(Lines::of(text, kind)).for_each(|(step, lines)| step.lines = lines);

@@ -42,6 +42,13 @@ impl Lines {
     }
 }
 
+/// Returns ` (line 12)` for an error in a text that is not TOML of the expected form; nothing if its place is unknown.
+pub fn of_error(text: &str, error: &toml::de::Error) -> String {
+    let Some(span) = error.span() else { return String::new() };
+    let line = 1 + text.as_bytes().iter().take(span.start).filter(|byte| **byte == b'\n').count();
+    format!(" (line {line})")
+}
+
 /// Stores the lines of the keys of a table; the keys of nested tables are dotted, without `settings`.
 fn collect(prefix: &str, table: &DeTable<'_>, line: &impl Fn(usize) -> usize, keys: &mut BTreeMap<String, usize>) {
     for (key, value) in table {

@@ -2,7 +2,7 @@
 
 mod datasets;
 mod file;
-mod lines;
+pub(super) mod lines;
 mod run;
 
 pub use datasets::Datasets;

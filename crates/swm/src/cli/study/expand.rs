@@ -3,6 +3,7 @@
 use super::file::{OF_THE_COMMAND, StudyFile, Table, Variant};
 use super::variants::Budget;
 use crate::cli::eval::{CapsuleStarts, EvalArgs};
+use crate::cli::usage;
 use crate::resolver::HomeResolver;
 use clap::{Args as _, Command, FromArgMatches as _};
 use std::collections::{BTreeMap, BTreeSet};
@@ -170,7 +171,7 @@ fn request(all: &Variant, condition: &str, policy: &str, resolver: &HomeResolver
     let matches = EvalArgs::augment_args(Command::new("swm eval")).try_get_matches_from(all.arguments());
     let parsed = matches.and_then(|matches| EvalArgs::from_arg_matches(&matches));
     let args = parsed.map_err(|error| {
-        let text = error.render().to_string();
+        let text = usage::plain(&error);
         let line = text.lines().next().unwrap_or_default().trim_start_matches("error: ").to_owned();
         Error::config("the options of a cell", line, "`swm eval --help` describes the options")
     })?;

@@ -64,11 +64,11 @@ impl CodecArgs {
         }
     }
 
-    /// Returns these arguments, with those of `others` where none are given.
-    pub fn or(&self, others: &Self) -> Self {
+    /// Returns these arguments, with those of `recorded` where none are given.
+    pub fn or(&self, recorded: &Self) -> Self {
         match self.codec {
             Some(_) => self.clone(),
-            None => Self { codec: others.codec, quality: self.quality.or(others.quality) },
+            None => Self { codec: recorded.codec, quality: self.quality.or(recorded.quality) },
         }
     }
 }

@@ -79,10 +79,7 @@ mod tests {
                 json!({"weight": 1, "when": "closets"}),
                 "unknown value 'closets' (did you mean closest?); when of --term goal is one of terminal, running, closest",
             ),
-            (
-                json!({"whn": "closest"}),
-                "unknown setting 'whn' (did you mean when?); the settings of --term goal are weight, when",
-            ),
+            (json!({"weights": 1}), "unknown setting 'weights' (did you mean weight"),
             (json!({"weight": "x"}), "--term goal: weight=x is not a number; give a number"),
             (json!({"latents": "x"}), "--term goal: latents=x is not a list"),
             (json!({"discount": [1]}), "discount=[1] is not a number"),

@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 use swm_core::results::{Autopsy, Estimate, Ingredient, ProbeScore, ProbeScores, Repair, letters};
-use swm_core::{Error, Key, Origin, Result, VariationRequest, limits};
+use swm_core::{Error, Key, Origin, Result, VariationRequest, files, limits};
 use swm_eval::{EvalRequest, PolicyRequest, Resolver as _, StudyFolder, World, WorldConfig};
 use swm_report::{AutopsyPage, FrameStrip};
 
@@ -81,6 +81,10 @@ pub fn autopsy(args: &AutopsyArgs, context: &Context) -> anyhow::Result<()> {
         Path::new(&args.model).file_name().map_or(args.model.clone(), |name| name.to_string_lossy().into_owned());
     let title = format!("Autopsy of {name}");
     let question = format!("Why does {name} fail?");
+    if let Some(setting) = args.settings.iter().find(|setting| setting.starts_with("episodes=")) {
+        let fix = format!("write --{}", setting.replacen('=', " ", 1));
+        return Err(Error::config(setting, "the number of starts is an option of its own", fix).into());
+    }
     let env = args.env.iter().map(|env| format!("env={env}"));
     let settings: Vec<String> =
         env.chain([format!("episodes={}", args.episodes)]).chain(args.settings.iter().cloned()).collect();
@@ -99,6 +103,7 @@ pub fn autopsy(args: &AutopsyArgs, context: &Context) -> anyhow::Result<()> {
     eprint(&cost(arms, args.planning_seeds, starts, seconds));
     let _lock = folder.create(&plan.study)?;
     output_folder::check(&args.output, &["index.html"])?;
+    files::delete_temporary(&args.output, |name| ["autopsy.json", "index.html"].contains(&name))?;
     let options = run_options(args.envs, None, context);
     plan.study.run(&folder, &resolver, &options, &mut control(context))?;
     let found = plan.autopsy(&folder)?;

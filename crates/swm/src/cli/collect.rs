@@ -147,7 +147,7 @@ pub fn collect(args: &CollectArgs, trust: bool, context: &Context) -> anyhow::Re
     if args.env.is_none() {
         let (args, command) = recorded::complete(args, trust)?;
         eprint(&format!("continuing: {command}\n"));
-        return collect(&args, trust, context);
+        return collect(&args, trust, context).map_err(recorded::unknown_policy);
     }
     let (location, collected) = run_args(args, context)?;
     if context.json {

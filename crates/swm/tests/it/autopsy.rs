@@ -93,6 +93,7 @@ fn autopsies_that_explain_nothing_are_refused() {
     fails(&["zoo:two-room/pldm", "solver=cem", "solver=icem"], &["solver"]);
     fails(&["zoo:two-room/pldm", "protocol=compat"], &["use protocol=strict"]);
     fails(&["zoo:two-room/pldm", "policy=random"], &["policy=random", "'zoo:two-room/pldm'"]);
+    fails(&["zoo:two-room/pldm", "episodes=3"], &["episodes=3: the number of starts is an option", "--episodes 3"]);
     fails(&["zoo:two-room/pldm", "--ingredients", "SDs"], &["'s' is given twice"]);
     let estimate = swm.json(&["autopsy", "zoo:two-room/pldm", "--estimate", "--ingredients=SD", "--episodes=2"]);
     assert!(estimate["seconds"].as_f64().is_some_and(|seconds| seconds > 0.0), "{estimate}");

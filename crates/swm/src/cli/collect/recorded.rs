@@ -3,13 +3,11 @@
 use super::CollectArgs;
 use crate::cli::config::VariationArgs;
 use crate::cli::output;
-use crate::cli::wrappers::WrapperArgs;
+use crate::cli::wrappers::{WrapperArgs, shown};
 use crate::home;
 use crate::resolver::check_wrapper;
 use clap::Parser;
 use serde::Deserialize;
-use serde_json::Value;
-use std::borrow::Cow;
 use swm_core::{Error, Manifest, Origin, Result, VariationRequest};
 use swm_data::lance::shard_manifest;
 use swm_data::{ImageCodec, Location};
@@ -131,7 +129,7 @@ impl Recorded {
         }
         for Choice { id, settings } in self.wrappers.into_iter().flatten() {
             let settings = settings.as_object().into_iter().flatten();
-            let settings: String = settings.map(|(name, value)| format!(",{name}={}", setting(value))).collect();
+            let settings: String = settings.map(|(name, value)| format!(",{name}={}", shown(value))).collect();
             all.push(format!("--wrapper={id}{settings}"));
         }
         if self.wrap_goal == Some(true) {
@@ -147,15 +145,6 @@ impl Recorded {
         }
         all.extend(["--".to_owned(), self.env]);
         all
-    }
-}
-
-/// Returns a setting of a wrapper as the command line writes it.
-fn setting(value: &Value) -> Cow<'_, str> {
-    match value {
-        Value::String(text) => Cow::Borrowed(text),
-        Value::Array(values) => Cow::Owned(values.iter().map(setting).collect::<Vec<_>>().join("/")),
-        other => Cow::Owned(other.to_string()),
     }
 }
 
@@ -178,6 +167,19 @@ fn check_origin(given: &CollectArgs, recorded: &CollectArgs, origin: &Origin) ->
         check_wrapper(origin, wrappers::read(wrapper)?.0)?;
     }
     Ok(())
+}
+
+/// Explains the error of a collection that is continued, if its policy is not found: it may be a class in Python.
+pub fn unknown_policy(error: anyhow::Error) -> anyhow::Error {
+    match error.downcast::<Error>() {
+        Ok(Error::UnknownName { kind: "policy", given, .. }) => {
+            let problem = "the dataset was collected with it, and no expert and no checkpoint has this name";
+            let fix = "name the path of its checkpoint with --policy, or continue in Python (World.collect with mode='append')";
+            Error::config(format!("policy '{given}'"), problem, fix).into()
+        }
+        Ok(other) => other.into(),
+        Err(other) => other,
+    }
 }
 
 /// Returns the given arguments, with the recorded ones where none are given.
@@ -220,7 +222,7 @@ fn merged(given: &CollectArgs, recorded: CollectArgs) -> CollectArgs {
 mod tests {
     use super::*;
     use crate::cli::collect::Collection;
-    use serde_json::json;
+    use serde_json::{Value, json};
     use std::path::Path;
 
     #[test]
@@ -287,6 +289,17 @@ mod tests {
         }
         let given = args(&[own[0], own[1], "swm/TwoRoom-v1"]);
         check_origin(&given, &given, &file).expect("names of the user");
+    }
+
+    #[test]
+    fn policies_of_python_are_continued_there() {
+        let unknown = |kind| anyhow::Error::from(Error::unknown(kind, "Mine", [], "hint"));
+        let error = unknown_policy(unknown("policy")).to_string();
+        assert!(
+            error.starts_with("policy 'Mine': the dataset was collected with it") && error.contains("Python"),
+            "{error}"
+        );
+        assert!(unknown_policy(unknown("wrapper")).to_string().starts_with("unknown wrapper 'Mine'"));
     }
 
     #[test]

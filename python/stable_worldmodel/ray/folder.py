@@ -189,8 +189,6 @@ class TrainingState:
         for name in latest["files"]:
             if not _TRAINING_NAMES.fullmatch(inside(name).split("/")[0]):
                 raise RuntimeError(f"{self.folder.at('latest.json')} names {name!r}, which is no file of a training")
-        # Another state may be there, such as that of an output.
-        shutil.rmtree(self.local, ignore_errors=True)
         place = Folder(self.folder.at(str(int(latest["place"]))))
         for name in latest["files"]:
             Folder(place.at(name)).download(self.local / name)

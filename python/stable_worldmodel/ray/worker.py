@@ -106,12 +106,15 @@ def _run_in(scratch: Path, cell: Cell, run: Run) -> Any:
         path = scratch / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-    for name, location in cell.get("inputs", {}).items():
-        Folder(location).download(scratch / name.rstrip("?"), missing_ok=name.endswith("?"))
     arguments = [argument.replace(SCRATCH, str(scratch)) for argument in cell["arguments"]]
     state = TrainingState(cell["state"], scratch / cell.get("trains", "run")) if cell.get("state") else None
-    if state is not None and state.restore() and "trains" not in cell:
+    continued = state is not None and state.restore()
+    if continued and "trains" not in cell:
         arguments.append("--resume")
+    for name, location in cell.get("inputs", {}).items():
+        # The state of this run is newer than what another run left in the output.
+        if not (continued and name.rstrip("?") == cell.get("trains")):
+            Folder(location).download(scratch / name.rstrip("?"), missing_ok=name.endswith("?"))
     try:
         outcome = _command(arguments, run, state)
     except RuntimeError:

@@ -31,6 +31,12 @@ impl Location {
             let fix = "use a path, or a URI that begins with s3://, gs://, az://, http:// or https://";
             return Err(Error::config("dataset", format!("the scheme {scheme}:// is not supported"), fix));
         }
+        // The parser of URIs leaves such characters out, so that another dataset would be meant.
+        if given.contains(|c: char| c.is_control()) || given.trim_end() != given {
+            let problem =
+                format!("the URI {given:?} has a line feed, another control character, or a space at its end");
+            return Err(Error::config("dataset", problem, "leave these characters out"));
+        }
         let url = Url::parse(given).map_err(|error| {
             Error::config("dataset", format!("{given} is not a valid URI: {error}"), "check its spelling")
         })?;
@@ -125,6 +131,16 @@ mod tests {
         assert_eq!(uri.to_string(), "s3://bucket/runs/pusht.LANCE/");
         assert!(!Location::parse("runs/.lance")?.has_suffix("lance"), "`.lance` is a hidden file, not a suffix");
         Ok(())
+    }
+
+    #[test]
+    fn rejects_characters_that_the_parser_leaves_out() {
+        for given in ["s3://b/a\nb.lance", "s3://b/a\tb.lance", "s3://b/a.lance\r", "s3://b/a.lance ", "s3://b/\u{1b}a"]
+        {
+            let error = Location::parse(given).expect_err(given).to_string();
+            assert!(error.contains("control character") && !error.contains(['\n', '\u{1b}']), "{error}");
+        }
+        assert!(Location::parse("runs/a\nb.lance").is_ok(), "the name of a file");
     }
 
     #[test]

@@ -23,5 +23,9 @@ use std::path::Path;
 /// Returns whether an existing path holds no dataset yet: an empty folder, or what a writer leaves that was killed, or has
 /// not finished, while it created a dataset.
 pub fn has_no_dataset(path: &Path) -> bool {
-    column_files::has_no_dataset(path) || hdf5::is_unfinished(path) || lance::is_unfinished(path)
+    column_files::has_no_dataset(path)
+        || hdf5::is_unfinished(path)
+        || lance::is_unfinished(path)
+        || lance_video::is_unfinished(path)
+        || lerobot::is_unfinished(path)
 }

@@ -112,12 +112,22 @@ pub(super) fn is_sha256(text: &str) -> bool {
     text.len() == 64 && text.bytes().all(|byte| matches!(byte, b'0'..=b'9' | b'a'..=b'f'))
 }
 
-/// Whether a name, which may have several parts, stays inside the folder that it is joined to, and is no file of Git's own, whose
-/// settings name programs to start.
+/// Whether a name, which may have several parts, stays inside the folder that it is joined to, and is no file of Git's or Mercurial's
+/// own, whose settings name programs to start.
 pub(super) fn is_inside(name: &str) -> bool {
-    name.split('/').all(|part| !matches!(part, "" | "." | "..") && !part.eq_ignore_ascii_case(".git"))
+    name.split('/').all(|part| !matches!(part, "" | "." | "..") && !is_of_version_control(part))
         && !name.contains(['\\', '\0', '\n', '\t', '?', '#', ':'])
         && swm_core::text::printable(name) == name
+}
+
+/// Whether some file system takes a name for that of the folder in which Git or Mercurial keeps its settings: those of Windows end a
+/// name before dots and spaces and have short names, that of macOS leaves out some characters, and both ignore the case.
+fn is_of_version_control(name: &str) -> bool {
+    let is_left_out =
+        |c: char| matches!(c, '\u{200c}'..='\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{206a}'..='\u{206f}' | '\u{feff}');
+    let plain: String = name.chars().filter(|c| !is_left_out(*c)).collect();
+    let plain = plain.trim_end_matches(['.', ' ']);
+    [".git", ".hg", "git~1", "hg~1"].iter().any(|own| plain.eq_ignore_ascii_case(own))
 }
 
 /// The folder of a list of files, in lower case, that Git takes for a repository of its own, whose settings name programs to start: it
@@ -166,7 +176,14 @@ mod tests {
         assert_eq!((uri.kind, parse("hf://datasets/lab/rooms").kind), (RepoKind::Model, RepoKind::Dataset));
         assert_eq!(parse("lerobot://lerobot/pusht").to_string(), "hf://datasets/lerobot/pusht");
         assert_eq!(parse("hf://a/b/").path, "");
-        for same in ["hf://a/b", "hf://a/b/.gitattributes", "hf://a/b@v2", "hf://datasets/a/b@refs%2Fpr%2F1/c/d.json"] {
+        for same in [
+            "hf://a/b",
+            "hf://a/b/.gitattributes",
+            "hf://a/b/.hgignore",
+            "hf://a/b/git~2/x",
+            "hf://a/b@v2",
+            "hf://datasets/a/b@refs%2Fpr%2F1/c/d.json",
+        ] {
             assert_eq!(parse(same).to_string(), same);
         }
         let commit = "0123456789abcdef0123456789abcdef01234567";
@@ -188,6 +205,12 @@ mod tests {
             "hf://a/b/c\u{202e}d",
             "hf://a/b/.git/config",
             "hf://a/b/data/.GIT",
+            "hf://a/b/.Hg/hgrc",
+            "hf://a/b/x/GIT~1/config",
+            "hf://a/b/hg~1/hgrc",
+            "hf://a/b/.g\u{200c}it/config",
+            "hf://a/b/\u{feff}.git/config",
+            "hf://a/b/.git. /config",
         ] {
             assert!(HubUri::parse(wrong, RepoKind::Model).is_err(), "{wrong}");
         }

@@ -22,6 +22,7 @@ mod hdf5_objects;
 mod hostile;
 mod interruption;
 mod kill;
+mod killed_early;
 mod lance;
 mod lance_shards;
 mod lance_video;

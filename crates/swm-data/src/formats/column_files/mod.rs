@@ -35,6 +35,7 @@ pub(crate) use reader::{ColumnFiles, contains_videos};
 pub(crate) use removal::remove;
 pub(crate) use writer::ColumnFilesWriter;
 
+use npz::Npz;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::io::Read as _;
@@ -74,7 +75,8 @@ pub(crate) fn exists(folder: &Path) -> bool {
     column_path(folder, LENGTHS).is_file()
 }
 
-/// Returns whether a folder is empty, or contains only the first file of a writer that was killed before it was complete.
+/// Returns whether a folder is empty, or contains only the first files of a writer that was killed, or whose disk was full, before its
+/// first commit: a part of an archive, and the first rows of no episodes.
 pub(super) fn has_no_dataset(folder: &Path) -> bool {
     let Ok(mut entries) = folder.read_dir() else { return false };
     let is_left = |path: &Path| {
@@ -84,7 +86,11 @@ pub(super) fn has_no_dataset(folder: &Path) -> bool {
                 file.take(ZIP.len() as u64).read_to_end(&mut start).is_ok() && ZIP.starts_with(&start)
             })
     };
-    entries.all(|entry| entry.is_ok_and(|entry| is_left(&entry.path())))
+    let has_no_rows = |path: &Path| {
+        *path == column_path(folder, OFFSETS)
+            && Npz::open(path).and_then(|mut file| file.header()).is_ok_and(|header| header.rows() == 0)
+    };
+    entries.all(|entry| entry.is_ok_and(|entry| is_left(&entry.path()) || has_no_rows(&entry.path())))
 }
 
 /// Path of the file of a column.

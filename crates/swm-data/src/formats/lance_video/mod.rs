@@ -17,6 +17,9 @@ mod writer;
 
 use crate::dataset::Location;
 use crate::formats::entry::{Backend, FormatEntry};
+use crate::formats::lance;
+use std::fs::DirEntry;
+use std::path::Path;
 
 /// The registry row of this format.
 pub const ENTRY: FormatEntry = FormatEntry {
@@ -31,16 +34,21 @@ pub const ENTRY: FormatEntry = FormatEntry {
 };
 
 #[cfg(feature = "ffmpeg")]
-const BACKEND: Option<Backend> = Some(Backend {
-    open: reader::open,
-    create: writer::create,
-    remove: |path| crate::formats::lance::ENTRY.remove(&path.join(TABLE)),
-});
+const BACKEND: Option<Backend> =
+    Some(Backend { open: reader::open, create: writer::create, remove: |path| lance::ENTRY.remove(&path.join(TABLE)) });
 #[cfg(not(feature = "ffmpeg"))]
 const BACKEND: Option<Backend> = None;
 
 fn detect(location: &Location) -> bool {
     ENTRY.has_suffix(location)
+}
+
+/// Whether a folder holds only what a writer leaves that was killed before the first commit of its table.
+pub(super) fn is_unfinished(folder: &Path) -> bool {
+    let is_table = |entry: std::io::Result<DirEntry>| entry.is_ok_and(|entry| entry.file_name() == TABLE);
+    ENTRY.has_suffix(&Location::from(folder))
+        && folder.read_dir().is_ok_and(|mut entries| entries.all(is_table))
+        && lance::is_unfinished(&folder.join(TABLE))
 }
 
 /// Prefix of the constants that hold videos; the column's name follows.
@@ -51,7 +59,6 @@ const VIDEO: &str = "lance-video/video/";
 const SCHEMA: &str = "lance-video/schema.json";
 
 /// Name of the Lance table within the dataset's folder.
-#[cfg(feature = "ffmpeg")]
 const TABLE: &str = "steps.lance";
 
 /// The location of the Lance table within the dataset's folder.

@@ -45,6 +45,8 @@ mod values;
 #[cfg(feature = "lerobot")]
 mod writer;
 
+pub(super) use removal::is_unfinished;
+
 use crate::dataset::Location;
 use crate::formats::entry::{Backend, FormatEntry};
 

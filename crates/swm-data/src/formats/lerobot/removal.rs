@@ -1,6 +1,7 @@
 //! Deletes a dataset that this project wrote, and nothing else in its folder; and the names of its files.
 
 use super::info::{DATA_PATH, EPISODES_PATH, Info, VIDEO_PATH, fill};
+use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use swm_core::files::{self, Lock};
 use swm_core::{Error, Result};
@@ -52,6 +53,23 @@ pub(super) fn clear(root: &Path) -> Result<()> {
     names.extend([TASKS, STATS].into_iter().flat_map(with_temporary));
     names.extend([temporary(INFO), WRITING.into()]);
     files::delete_named(root, &names)
+}
+
+/// Whether a folder holds only what a writer leaves that was killed before its first `meta/info.json`: the beginning of that file.
+pub fn is_unfinished(root: &Path) -> bool {
+    let names =
+        |folder: &Path| -> Option<Vec<_>> { folder.read_dir().ok()?.map(|entry| Some(entry.ok()?.path())).collect() };
+    let meta = root.join("meta");
+    let is_start = |path: &PathBuf| {
+        *path == root.join(temporary(INFO))
+            && files::open(path).is_ok_and(|file| {
+                let mut start = vec![];
+                file.take(1).read_to_end(&mut start).is_ok() && b"{".starts_with(&start)
+            })
+    };
+    names(root).is_some_and(|found| found == [meta.clone()])
+        && files::check_no_link(&meta).is_ok()
+        && names(&meta).is_some_and(|found| found.iter().all(is_start))
 }
 
 /// The files of one commit, and their temporary files: videos, rows, and the list of episodes.

@@ -71,7 +71,8 @@ impl LerobotWriter {
         options.codec.check()?;
         let columns = stored_columns(schema)?;
         let exists = root.join(INFO).is_file();
-        if !exists && root.read_dir().is_ok_and(|mut entries| entries.next().is_some()) {
+        let is_occupied = root.read_dir().is_ok_and(|mut entries| entries.next().is_some());
+        if !exists && is_occupied && !removal::is_unfinished(root) {
             let problem = format!("{} holds other files", root.display());
             return Err(Error::config("dataset", problem, "choose another path"));
         }

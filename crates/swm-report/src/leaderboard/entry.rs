@@ -22,13 +22,15 @@ pub(super) fn render(entry: &BoardEntry) -> Result<String> {
         fact("author", &entry.author, "");
         fact("licence", &entry.licence, "");
         fact("made on", &entry.processor, "");
+        fact("device", &entry.results.manifest.device, "");
         fact("stable-worldmodel", &entry.results.manifest.swm_version, "");
         fact("weights (BLAKE3)", &entry.weights, " class=\"hash\"");
         fact("entry (BLAKE3)", &entry.hash, " class=\"hash\"");
         let _ = write!(
             html,
-            "</dl>\n<p class=\"note\">Times and the processor below are stated by the submitter: verification does not cover \
-             them.</p>\n<p>The command that plays all episodes again and refuses the entry if one differs; \
+            "</dl>\n<p class=\"note\">Times, the processor and the device below are stated by the submitter: verification does not cover \
+             them. On another processor or device, verification tolerates 5 % of the episodes that end differently, and 1 % of the sum of \
+             rewards of the others; with <code>--exact</code>, nothing.</p>\n<p>The command that plays all episodes again and refuses the entry if one differs; \
              <code>--share 0.1</code> plays a random tenth:</p>\n<pre>{}</pre>\n</section>\n",
             escape(&shorten(&entry.command, 4 * super::NAME_CHARS))
         );

@@ -119,6 +119,9 @@ pub fn write_leaderboard(board: &Leaderboard, out_dir: &Path) -> Result<BoardPag
     let folder = out_dir.join("entries");
     files::check_no_link(&folder)?;
     std::fs::create_dir_all(&folder).map_err(|source| Error::io(&folder, "creating the folder of entries", source))?;
+    // What a kill left of an earlier build, whose pages may have been others.
+    files::delete_temporary(out_dir, |name| name == "index.html" || name == moves::FILE)?;
+    files::delete_temporary(&folder, |name| name.strip_suffix(".html").is_some_and(is_plain))?;
     let last = Built::read(out_dir)?;
     let mut pages = vec![];
     for (entry, page) in board.entries.iter().zip(board.pages().into_iter().skip(1)) {
@@ -201,7 +204,12 @@ mod tests {
     fn every_entry_has_a_page_with_its_results() {
         let folder = tempfile::tempdir().expect("a folder");
         let board = board();
+        std::fs::create_dir(folder.path().join("entries")).expect("a folder");
+        let killed =
+            [".index.html.7.tmp", ".last-build.7.tmp", "entries/.ab-2.html.7.tmp"].map(|name| folder.path().join(name));
+        killed.iter().for_each(|path| std::fs::write(path, "<").expect("what a kill leaves"));
         write_leaderboard(&board, folder.path()).expect("pages");
+        assert!(!killed.iter().any(|path| path.exists()));
         for page in board.pages() {
             assert!(folder.path().join(page).is_file());
         }

@@ -6,7 +6,9 @@ use super::report::results_file;
 use super::results_tables::percent;
 use super::{Context, emit, emit_json, output_folder};
 use crate::home;
-use crate::leaderboard::{Class, Entry, How, Submission, TOLERANCE, Verification, board, entries, verify};
+use crate::leaderboard::{
+    Class, Entry, How, REWARD_TOLERANCE, Submission, TOLERANCE, Verification, board, entries, verify,
+};
 use clap::{Args, Subcommand};
 use serde_json::json;
 use std::collections::hash_map::RandomState;
@@ -70,7 +72,7 @@ struct VerifyArgs {
     /// Nobody can guess which episodes a random seed chooses.
     #[arg(long)]
     seed: Option<u64>,
-    /// Refuse to verify on another kind of processor, with a tolerance
+    /// Refuse another kind of processor or device, which has a tolerance
     #[arg(long)]
     exact: bool,
     /// The checkpoint, if it is not where the entry says
@@ -194,7 +196,8 @@ fn sentences(found: &Verification, seed: u64) -> String {
     let mut lines = String::new();
     for (kind, differences) in [("differs", &found.faults), ("remark", &found.remarks)] {
         for difference in differences.iter().take(SHOWN) {
-            lines += &format!("{kind}: {difference}\n");
+            // A difference has texts of the entry, which could end the line.
+            lines += &format!("{kind}: {}\n", difference.replace('\n', "\\n"));
         }
         if differences.len() > SHOWN {
             lines += &format!("{kind}: {} more\n", differences.len() - SHOWN);
@@ -206,7 +209,11 @@ fn sentences(found: &Verification, seed: u64) -> String {
         Class::Exact => format!("bit for bit, on {made_on}"),
         Class::Outcomes => {
             let most = 100.0 * TOLERANCE;
-            format!("made on {made_on}, verified on {verified_on}: at most {most:.0} % of the outcomes may differ")
+            let rewards = 100.0 * REWARD_TOLERANCE;
+            format!(
+                "made on {made_on}, verified on {verified_on}: at most {most:.0} % of the episodes may end differently, and sums of rewards \
+                 differ by {rewards:.0} %"
+            )
         }
     };
     lines += &format!("played {} of {episodes} episodes of {runs} runs{of_share}; {class}\n", played.len());

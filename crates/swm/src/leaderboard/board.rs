@@ -48,8 +48,13 @@ pub fn entries(folder: &Path) -> Result<Vec<Found>> {
     }
     let mut found: Vec<Found> = vec![];
     for path in files {
-        let entry = Entry::read(&path)?;
         let file = path.strip_prefix(folder).unwrap_or(&path).to_owned();
+        let name = file.to_string_lossy();
+        if name.contains(|c: char| c.is_control()) {
+            let problem = format!("the file name {name:?} has a line feed or another control character");
+            return Err(Error::config("the entries", problem, "rename the file"));
+        }
+        let entry = Entry::read(&path)?;
         if let Some(same) = found.iter().find(|other| other.entry.hash == entry.hash) {
             let problem = format!("{} is the same entry", same.file.display());
             return Err(Error::config(path.display().to_string(), problem, "remove one of them"));
@@ -205,7 +210,31 @@ fn page(file: &Path, entry: &Entry) -> Result<BoardEntry> {
         hash: entry.hash.clone(),
         weights: entry.weights()?.to_owned(),
         page: format!("{}-{hash}", words.chars().take(40).collect::<String>()),
-        command: format!("swm leaderboard verify {}", file.display()),
+        command: format!("swm leaderboard verify {}", quoted(&file.to_string_lossy())),
         results: entry.results.clone(),
     })
+}
+
+/// A file name as one word of a shell.
+fn quoted(name: &str) -> String {
+    let is_plain = |c: char| c.is_alphanumeric() || "._/-".contains(c);
+    let name = if name.starts_with('-') { format!("./{name}") } else { name.to_owned() };
+    if name.chars().all(is_plain) { name } else { format!("'{}'", name.replace('\'', "'\\''")) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn file_names_are_words_of_a_shell() {
+        for (name, word) in [
+            ("sub/two-room.json", "sub/two-room.json"),
+            ("a; rm -r x.json", "'a; rm -r x.json'"),
+            ("it's.json", "'it'\\''s.json'"),
+            ("--trust.json", "./--trust.json"),
+        ] {
+            assert_eq!(quoted(name), word);
+        }
+    }
 }

@@ -185,7 +185,8 @@ impl Entry {
     /// Checks everything that can be checked without playing.
     fn check(&self) -> std::result::Result<(), String> {
         let Self { policy, author, licence, processor, results, .. } = self;
-        for (what, text) in [("author", author), ("licence", licence), ("processor", processor)] {
+        let device = &results.manifest.device;
+        for (what, text) in [("author", author), ("licence", licence), ("processor", processor), ("device", device)] {
             let is_plain = printable(text) == text.as_str() && !text.contains(['\n', '\t']);
             if text.trim().is_empty() || text.chars().count() > MAX_TEXT || !is_plain {
                 return Err(format!(

@@ -9,4 +9,4 @@ mod verify;
 
 pub use board::{Found, board, entries};
 pub use entry::{Entry, Submission};
-pub use verify::{Class, How, TOLERANCE, Verification, verify};
+pub use verify::{Class, How, REWARD_TOLERANCE, TOLERANCE, Verification, verify};

@@ -14,9 +14,14 @@ use swm_eval::reproduce::{Difference, Kind};
 use swm_eval::{
     EvalRequest, PolicyRequest, Predictor, ResolvedPolicy, Resolver, RunOptions, World, reproduce_episodes,
 };
+use swm_models::{Device, device};
 
-/// The share of the played episodes of a run that may have another outcome on another kind of processor, rounded up.
+/// The share of the played episodes of a run that may end differently on another kind of processor or device, rounded up.
 pub const TOLERANCE: f64 = 0.05;
+/// By how much of the larger one two sums of rewards may differ, if an episode does not end differently.
+pub const REWARD_TOLERANCE: f64 = 0.01;
+/// By how much two sums of rewards may differ that are almost zero.
+const SMALLEST_REWARD: f64 = 1e-6;
 
 /// How an entry is verified.
 #[derive(Clone, Debug, Default)]
@@ -25,7 +30,7 @@ pub struct How {
     pub share: f64,
     /// The seed that chooses them.
     pub seed: u64,
-    /// Whether another kind of processor is refused instead of verified with [`TOLERANCE`].
+    /// Whether another kind of processor or another device is refused instead of verified with [`TOLERANCE`].
     pub exact: bool,
     /// Whether the entry may choose any environment, wrapper and dataset.
     pub trust: bool,
@@ -41,10 +46,11 @@ pub struct How {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Class {
-    /// Every bit of every played episode: the processor, or its level of vector instructions, is that of the entry.
+    /// Every bit of every played episode: the device and the processor, or its level of vector instructions, are those of the
+    /// entry.
     Exact,
-    /// The seeds and dataset rows of all episodes, and the outcomes of all but [`TOLERANCE`] of the played ones: the last
-    /// bits of a model differ between processors.
+    /// The seeds and dataset rows of all episodes, all starts and goals, and the end of all but [`TOLERANCE`] of the played episodes:
+    /// success, steps, and the sum of rewards up to [`REWARD_TOLERANCE`]. The last bits of a model differ between processors.
     Outcomes,
 }
 
@@ -92,6 +98,9 @@ pub fn verify(path: &Path, how: &How, options: &RunOptions, control: &mut Contro
     }
     let request = entry.request()?;
     let resolver = resolver(path, &entry, how)?;
+    if how.exact {
+        check_device(path, &entry, &resolver.home)?;
+    }
     let played = numbers(request.episodes, how);
     let again = reproduce_episodes(&entry.results, &played, &resolver, options, control)?;
     let same_device = entry.results.manifest.device == again.results.manifest.device;
@@ -113,6 +122,18 @@ pub fn verify(path: &Path, how: &How, options: &RunOptions, control: &mut Contro
         verification.compare_outcomes(&entry.results, &again.results);
     }
     Ok(verification)
+}
+
+/// Checks, before anything is played, that an entry was made on the device that plays it here.
+fn check_device(path: &Path, entry: &Entry, home: &HomeResolver) -> Result<()> {
+    let trained_on = home.checkpoint(&entry.checkpoint()?)?.info()?.manifest.device;
+    let (theirs, ours) = (&entry.results.manifest.device, device::name_after(&Device::flex(), &trained_on));
+    if *theirs == ours {
+        return Ok(());
+    }
+    let problem = format!("was made on the device '{theirs}', and this is '{ours}'");
+    let fix = "verify it without --exact, which tolerates a few differing episodes, or ask for an entry of this device";
+    Err(Error::config(path.display().to_string(), problem, fix))
 }
 
 /// Returns the resolver of an entry's names, with those that the user replaces.
@@ -150,25 +171,22 @@ impl Verification {
     fn judge(&mut self, differences: &[Difference]) {
         for difference in differences {
             let is_outcome = difference.kind == Kind::Finding;
-            let depends_on_processor =
-                ["hash of starts", "hash of goals", "device"].contains(&difference.what.as_str());
             match self.class {
                 Class::Outcomes if is_outcome => {}
-                Class::Outcomes if depends_on_processor => self.remarks.push(difference.to_string()),
+                Class::Outcomes if difference.what == "device" => self.remarks.push(difference.to_string()),
                 _ => self.faults.push(difference.to_string()),
             }
         }
     }
 
-    /// Compares the outcomes of the played episodes, of which [`TOLERANCE`] may differ.
+    /// Compares the ends of the played episodes, of which [`TOLERANCE`] may differ.
     fn compare_outcomes(&mut self, old: &Results, new: &Results) {
-        let outcome = |episode: &EpisodeResult| (episode.success, episode.solved_at_start);
         for (old, new) in old.runs.iter().zip(&new.runs) {
             let name = |run: &Run| format!("{}, {}", run.policy, run.condition);
             let pairs = self.played.iter().map(|&number| &old.episodes[number]).zip(&new.episodes);
-            let differing = pairs.filter(|(old, new)| outcome(old) != outcome(new)).count();
+            let differing = pairs.filter(|(old, new)| !ends_alike(old, new)).count();
             let allowed = (self.played.len() as f64 * TOLERANCE).ceil() as usize;
-            let words = format!("{}: {differing} of {} episodes have another outcome", name(new), self.played.len());
+            let words = format!("{}: {differing} of {} episodes end differently", name(new), self.played.len());
             if differing > allowed {
                 self.faults.push(format!("{words}, more than {allowed}"));
             } else if differing > 0 {
@@ -176,6 +194,16 @@ impl Verification {
             }
         }
     }
+}
+
+/// Whether an episode ends as another one: success and steps are equal, and the sums of rewards up to [`REWARD_TOLERANCE`].
+fn ends_alike(a: &EpisodeResult, b: &EpisodeResult) -> bool {
+    let end = |episode: &EpisodeResult| (episode.success, episode.solved_at_start, episode.steps, episode.reached);
+    let (a_reward, b_reward) = (a.total_reward, b.total_reward);
+    let allowed = (REWARD_TOLERANCE * a_reward.abs().max(b_reward.abs())).max(SMALLEST_REWARD);
+    // Infinite sums of the same sign are equal, and their difference is no number.
+    let is_close = a_reward == b_reward || (a_reward - b_reward).abs() <= allowed && allowed.is_finite();
+    end(a) == end(b) && (is_close || (a_reward.is_nan() && b_reward.is_nan()))
 }
 
 /// A resolver with a dataset that the user names in place of the entry's.
@@ -255,8 +283,10 @@ mod tests {
         };
         assert_eq!(judged(Class::Exact), (0, all.iter().map(ToString::to_string).collect()));
         let (remarks, faults) = judged(Class::Outcomes);
-        assert_eq!((remarks, faults.len()), (2, 2));
-        assert!(faults[0].starts_with("mujoco") && faults[1].starts_with("hash of weights"), "{faults:?}");
+        assert_eq!((remarks, faults.len()), (1, 3));
+        for (fault, what) in faults.iter().zip(["mujoco", "hash of starts", "hash of weights"]) {
+            assert!(fault.starts_with(what), "{faults:?}");
+        }
 
         // 5 % of 40 episodes are two.
         let results = |solved: usize| {
@@ -268,6 +298,26 @@ mod tests {
             let mut found = verification(Class::Outcomes, 40);
             found.compare_outcomes(&results(20), &results(solved));
             assert_eq!((found.remarks.len(), found.faults.len()), (remarks, faults), "{solved}");
+        }
+    }
+
+    #[test]
+    fn steps_and_rewards_of_an_episode_count_as_its_end() {
+        let episode = EpisodeResult { success: true, steps: 20, total_reward: -80.0, ..EpisodeResult::new(1) };
+        let alike = |change: &dyn Fn(&mut EpisodeResult)| {
+            let mut other = episode.clone();
+            change(&mut other);
+            ends_alike(&episode, &other) && ends_alike(&other, &episode)
+        };
+        assert!(alike(&|_| {}) && alike(&|other| other.total_reward = -80.5));
+        for reward in [-79.0, 80.0, 12345.0, f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+            assert!(!alike(&|other| other.total_reward = reward), "{reward}");
+        }
+        assert!(!alike(&|other| other.steps = 1) && !alike(&|other| other.reached = Some(3)));
+        assert!(!alike(&|other| other.success = false) && !alike(&|other| other.solved_at_start = true));
+        for reward in [0.0, f64::NAN, f64::INFINITY] {
+            let same = EpisodeResult { total_reward: reward, ..episode.clone() };
+            assert!(ends_alike(&same, &same.clone()), "{reward}");
         }
     }
 }

@@ -3,7 +3,7 @@
 use crate::{Swm, text};
 use std::fs;
 use std::path::Path;
-use swm::core::results::{Counting, Run};
+use swm::core::results::{Counting, EpisodeResult, Run};
 use swm::leaderboard::{Entry, entries};
 
 /// A planner that is fast, and whose episodes are short.
@@ -120,10 +120,43 @@ fn another_processor_tolerates_few_outcomes() {
     elsewhere("one.json", &[4]);
     let found = swm.json(&["leaderboard", "verify", "one.json"]);
     assert_eq!((&found["holds"], &found["verification"]["class"]), (&true.into(), &"outcomes".into()));
-    assert!(found["verification"]["remarks"][0].as_str().expect("a remark").contains("1 of 6 episodes"));
+    assert!(
+        found["verification"]["remarks"][0].as_str().expect("a remark").contains("1 of 6 episodes end differently")
+    );
     swm.fails(&["leaderboard", "verify", "one.json", "--exact"], 2, &["abacus"]);
     elsewhere("two.json", &[4, 2]);
     swm.fails(&["leaderboard", "verify", "two.json"], 1, &["does not hold"]);
+}
+
+#[test]
+fn another_device_is_no_way_around_the_comparison() {
+    let swm = Swm::new();
+    let entry = submitted(&swm);
+    let elsewhere = |name: &str, change: &dyn Fn(&mut Entry)| {
+        forged(&swm, &entry, name, |entry| {
+            entry.results.manifest.device = "cuda:0".to_owned();
+            change(entry);
+        });
+    };
+    elsewhere("honest.json", &|_| ());
+    let found = swm.json(&["leaderboard", "verify", "honest.json"]);
+    assert_eq!((&found["holds"], &found["verification"]["class"]), (&true.into(), &"outcomes".into()));
+    swm.fails(&["leaderboard", "verify", "honest.json", "--exact"], 2, &["'cuda:0'", "'cpu (flex)'"]);
+    // Steps, rewards, starts and goals are compared as well.
+    let change_all = |entry: &mut Entry, change: &dyn Fn(&mut EpisodeResult)| {
+        let run = entry.results.runs.iter_mut().find(|run| run.policy == entry.policy).expect("the run of the policy");
+        let mut episodes = run.episodes.clone();
+        episodes.iter_mut().for_each(change);
+        *run = Run::new(&run.condition, &run.policy, Counting::default(), episodes, run.timing.clone());
+        entry.results.comparisons.clear();
+    };
+    elsewhere("steps.json", &|entry| change_all(entry, &|episode| episode.steps = 1));
+    elsewhere("rewards.json", &|entry| change_all(entry, &|episode| episode.total_reward += 12345.0));
+    elsewhere("starts.json", &|entry| change_hash(entry, "starts"));
+    elsewhere("goals.json", &|entry| change_hash(entry, "goals"));
+    for file in ["steps.json", "rewards.json", "starts.json", "goals.json"] {
+        swm.fails(&["leaderboard", "verify", file], 1, &["does not hold"]);
+    }
 }
 
 #[test]
@@ -156,6 +189,9 @@ fn entries_that_contradict_themselves_are_refused_before_anything_is_played() {
     });
     refused("author", &|entry| entry.author = "\u{1b}[31mroot".to_owned());
     refused("author", &|entry| entry.author = "x".repeat(500));
+    refused("device", &|entry| entry.results.manifest.device = "cpu\nthe entry holds".to_owned());
+    refused("device", &|entry| entry.results.manifest.device = "\u{1b}[2Jcpu".to_owned());
+    refused("device", &|entry| entry.results.manifest.device = "x".repeat(500));
     refused("a second policy with weights", &|entry| entry.policy = "no-op".to_owned());
     refused("no weights with a hash", &|entry| drop(entry.results.manifest.hashes.remove("weights of pldm")));
     refused("no hash of the goals", &|entry| drop(entry.results.manifest.hashes.remove("goals")));
@@ -197,6 +233,10 @@ fn edited_files_and_files_that_are_no_entries_are_refused() {
     fs::remove_file(swm.path("bad.json")).expect("removing a file");
     fs::copy(swm.path("entry.json"), swm.path("twin.json")).expect("a copy");
     swm.fails(&["leaderboard", "build", "."], 2, &["is the same entry"]);
+    fs::rename(swm.path("twin.json"), swm.path("a\nmoved: b.json")).expect("renaming a file");
+    let output = swm.run(&["leaderboard", "build", "."]);
+    let errors = text(&output.stderr);
+    assert!(errors.contains("a\\nmoved: b.json") && errors.lines().count() == 1, "{errors}");
 }
 
 #[test]

@@ -6,10 +6,12 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use swm::core::Error;
 use swm::core::run::{Control, Event};
+use swm::core::text::printable;
 
 /// Converts an engine error to a Python exception. Returns an exception that passed through the engine unchanged.
 pub fn to_py_err(error: Error) -> PyErr {
-    let message = error.to_string();
+    // Names in files of strangers could control a terminal.
+    let message = printable(&error.to_string()).into_owned();
     match error {
         Error::Embedder(inner) => match inner.downcast::<PyErr>() {
             Ok(original) => *original,
@@ -50,7 +52,8 @@ pub fn signal_poll() -> impl FnMut() -> swm::core::Result<()> {
 /// # Errors
 /// `ValueError` if the text is not JSON of this type.
 pub fn json<T: serde::de::DeserializeOwned>(what: &str, text: &str) -> PyResult<T> {
-    serde_json::from_str(text).map_err(|error| PyValueError::new_err(format!("{what}: {error}")))
+    serde_json::from_str(text)
+        .map_err(|error| PyValueError::new_err(printable(&format!("{what}: {error}")).into_owned()))
 }
 
 /// Creates a run control that runs Python's signal handlers and calls `progress(done, total, steps)` at most ten times

@@ -65,7 +65,7 @@ mod _engine {
     #[pymodule_export]
     use super::study::{studies, study_export, study_results};
     #[pymodule_export]
-    use super::training::{begin_training, save_checkpoint, training_config};
+    use super::training::{begin_training, record, save_checkpoint, training_config};
     #[pymodule_export]
     use super::world::World;
 

@@ -10,7 +10,7 @@ use pyo3::types::PyDict;
 use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::PathBuf;
-use swm::cli::record_training;
+use swm::cli::{check_training, record_training};
 use swm::core::{Error, Manifest, Result};
 use swm::data::LoaderConfig;
 use swm::models::nn::parameters::{HostTensor, Named};
@@ -34,10 +34,8 @@ fn config(family: &str, preset: Option<&str>, settings: &[String]) -> Result<Box
 
 /// Writes the checkpoint from which a run begins, or with `resume` checks the one from which it continues. Returns the
 /// rest of what the run needs, as JSON: `parameters` (clipping group and factor of the learning rate by name),
-/// and the loaders `training` and `validation`. `run.json` gets `command`, the command line of `swm train` that continues the
-/// run.
+/// and the loaders `training` and `validation`.
 #[pyfunction]
-#[allow(clippy::too_many_arguments, reason = "the settings of a training, as Python passes them")]
 pub fn begin_training(
     py: Python<'_>,
     family: &str,
@@ -46,16 +44,14 @@ pub fn begin_training(
     dataset: &Dataset,
     out: PathBuf,
     resume: bool,
-    command: Vec<String>,
 ) -> PyResult<String> {
     let begun = detached(py, || {
         let options = TrainOptions { resume, cache: swm::home::weights()?, ..TrainOptions::default() };
         let config = config(family, preset, &settings)?;
-        record_training(&out, (command, PROGRAM), resume, || {
-            config.begin(dataset.reader()?, &out, &options).unwrap_or_else(|| {
-                let problem = "it is trained by the engine only";
-                Err(Error::config(family, problem, "train it with swm.wm.train, or `swm train`"))
-            })
+        check_training(&out, resume)?;
+        config.begin(dataset.reader()?, &out, &options).unwrap_or_else(|| {
+            let problem = "it is trained by the engine only";
+            Err(Error::config(family, problem, "train it with swm.wm.train, or `swm train`"))
         })
     });
     let TrainingPlan { parameters, training, validation } = begun.map_err(to_py_err)?;
@@ -75,6 +71,12 @@ pub fn begin_training(
     };
     let plan = json!({ "parameters": groups, "training": loader(training), "validation": validation.map(loader) });
     Ok(plan.to_string())
+}
+
+/// Writes `command`, the command line of `swm train` that continues a run, to its `run.json`. The caller holds the lock of the folder.
+#[pyfunction(name = "record_training")]
+pub fn record(run: PathBuf, command: Vec<String>, resume: bool) -> PyResult<()> {
+    record_training(&run, (command, PROGRAM), resume).map_err(to_py_err)
 }
 
 /// The parts of a checkpoint that are no tensors.

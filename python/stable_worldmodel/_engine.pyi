@@ -38,8 +38,8 @@ def begin_training(
     dataset: Dataset,
     out: str,
     resume: bool,
-    command: Sequence[str],
 ) -> str: ...
+def record_training(run: str, command: Sequence[str], resume: bool) -> None: ...
 def training_config(family: str, preset: str | None, settings: Sequence[str]) -> str: ...
 def save_checkpoint(
     run: str,

@@ -385,6 +385,8 @@ def test_ctrl_c_saves_the_checkpoint(rooms, tmp_path):
     ("arguments", "code", "message"),
     [
         ([], 2, "usage"),
+        (["lewm", "data=nothing", "data=other"], 2, "given twice"),
+        (["lewm", "data="], 2, "is empty"),
         (["lewm"], 2, "data=PATH"),
         (["lewm", "data=nothing"], 1, "nothing"),
         (["lewm", "data"], 2, "KEY=VALUE"),

@@ -14,7 +14,9 @@
 
 use crate::nn::Init;
 use crate::nn::parameters::{self, HostTensor, Named};
-use crate::run_folder::{CHECKPOINT_PATTERNS, CONFIG, FOLDER, MANIFEST, NEW_FOLDER, OPTIMIZER, RAW, STATE, WEIGHTS};
+use crate::run_folder::{
+    CHECKPOINT_PATTERNS, CONFIG, FOLDER, MANIFEST, NEW_FOLDER, OLD_FOLDER, OPTIMIZER, RAW, STATE, WEIGHTS,
+};
 use crate::stored::{self, StoredCheckpoint, broken, read_tensors, read_text, with_weights};
 use crate::tensor_file;
 use crate::train::run_state::RunState;
@@ -228,7 +230,7 @@ fn write_new(
 /// Renames the folder `new` to the name of the checkpoint folder and deletes the old checkpoint. Files of other names in
 /// the old checkpoint's folder move to the new one.
 fn replace(run: &Path, new: &Path) -> Result<()> {
-    let (current, old) = (run.join(FOLDER), run.join(format!("{FOLDER}.old")));
+    let (current, old) = (run.join(FOLDER), run.join(OLD_FOLDER));
     let rename = |from: &Path, to: &Path| {
         std::fs::rename(from, to).map_err(|error| Error::io(to, "replacing a checkpoint", error))
     };
@@ -238,6 +240,16 @@ fn replace(run: &Path, new: &Path) -> Result<()> {
     }
     rename(new, &current)?;
     move_other_files(&old, &current)
+}
+
+/// Gives the old checkpoint its name back if a process was killed between the two renamings of [`replace`].
+pub(crate) fn restore_old(run: &Path) -> Result<()> {
+    let current = run.join(FOLDER);
+    if stored::locate(run) != Some(run.join(OLD_FOLDER)) || current.exists() {
+        return Ok(());
+    }
+    std::fs::rename(run.join(OLD_FOLDER), &current)
+        .map_err(|error| Error::io(&current, "restoring a checkpoint", error))
 }
 
 /// Deletes the checkpoint in the folder `old`, moves the remaining entries to the folder `current`, and removes `old`

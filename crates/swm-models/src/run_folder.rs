@@ -10,6 +10,8 @@ use swm_data::FORMATS;
 pub(crate) const FOLDER: &str = "checkpoint";
 /// The folder in which a checkpoint is written before it replaces [`FOLDER`].
 pub(crate) const NEW_FOLDER: &str = "checkpoint.new";
+/// The folder of the checkpoint that [`FOLDER`] replaces, until it is deleted.
+pub(crate) const OLD_FOLDER: &str = "checkpoint.old";
 /// Family, configuration and statistics of the dataset.
 pub(crate) const CONFIG: &str = "config.json";
 /// Provenance, and the hashes of the other files.
@@ -54,7 +56,7 @@ pub(crate) const REPLAY: &str = "replay.lance";
 /// The state of the episodes in such a folder.
 pub(crate) const COLLECTOR: &str = "place.json";
 /// Logs and reports of failures, as patterns of [`files::delete`].
-const LOG_FILES: &[&str] = &["run.json", "train.jsonl", "events.out.tfevents.*.swm"];
+const LOG_FILES: &[&str] = &["run.json", ".run.json.*.tmp", "train.jsonl", "events.out.tfevents.*.swm"];
 
 /// The folders of a run that may hold a checkpoint; the empty name is the folder of the run.
 const CHECKPOINT_FOLDERS: &[&str] = &[

@@ -195,9 +195,13 @@ pub fn family(run: &Path) -> Option<String> {
 /// Returns whether a run folder has no checkpoint but the beginning of one, which a killed program leaves. The
 /// configuration is written first.
 pub fn is_unfinished(run: &Path) -> bool {
-    let config =
-        || -> Option<Value> { serde_json::from_slice(&read_text(&run.join(NEW_FOLDER).join(CONFIG)).ok()?).ok() };
-    locate(run).is_none() && config().is_some_and(|config| config["family"].is_string())
+    locate(run).is_none() && is_begun(&run.join(NEW_FOLDER))
+}
+
+/// Returns whether a folder has the configuration of a checkpoint, which is written first.
+pub(crate) fn is_begun(folder: &Path) -> bool {
+    let config = || -> Option<Value> { serde_json::from_slice(&read_text(&folder.join(CONFIG)).ok()?).ok() };
+    config().is_some_and(|config| config["family"].is_string())
 }
 
 /// Checks that a folder has no entry with a name of a checkpoint or of a training run, whatever its content, so that a

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 
@@ -34,9 +35,16 @@ example: python -m stable_worldmodel.train lewm data=rooms preset=tiny
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command and returns its exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    if sys.stdout is None:
+        # Files that are opened later would take its place.
+        sys.stderr.write("error: standard output is closed; redirect it to a file or to /dev/null\n")
+        return 1
+    return _run(given)
+
+
+def _run(given: Sequence[str]) -> int:
     if not given or given[0] in ("-h", "--help", "help"):
-        sys.stdout.write(USAGE)
-        return 0 if given else 2
+        return _print(USAGE) or (0 if given else 2)
     family, *rest = given
     try:
         if any(argument.startswith("-") for argument in rest):
@@ -44,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
             run(family, rest, train)
         else:
-            train(parsed(family, rest))
+            return train(parsed(family, rest))
     except KeyboardInterrupt:
         sys.stderr.write("interrupted; resume=true continues\n")
         return 130
@@ -57,8 +65,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def train(options: Options) -> None:
-    """Trains, and prints the folder of the checkpoint."""
+def _print(text: str) -> int:
+    """Prints a text, and returns the exit code: 1 if it is lost, because the disk is full for example."""
+    try:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    except OSError as error:
+        sys.stderr.write(f"error: standard output: {error.strerror}; what was printed is lost\n")
+        # Python would report the rest of the buffer at its end again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    return 0
+
+
+def train(options: Options) -> int:
+    """Trains, prints the folder of the checkpoint, and returns the exit code."""
     from .loop import Trainer
 
     trainer = Trainer(options)
@@ -66,8 +87,7 @@ def train(options: Options) -> None:
         trainer.train()
     finally:
         trainer.ranks.leave()
-    if trainer.ranks.rank == 0:
-        sys.stdout.write(f"{trainer.run}\n")
+    return _print(f"{trainer.run}\n") if trainer.ranks.rank == 0 else 0
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +63,9 @@ class Trainer:
         self.optimizer.restore(state["step"], read_safetensors(self.run / "checkpoint/optimizer.safetensors"))
         self.scaler = torch.amp.GradScaler(self.device.type, enabled=options.amp == "fp16")
         self.step: int = state["step"]
+        self.window = Window.of(state.get("window"), self.losses.names)
+        #: Whether `run.json` has the command of this training.
+        self.recorded = False
         self.best: Any = state["best"]
         self.validations_since_best: int = state["looks"]
         self.loader = self._loader(dataset, plan["training"])
@@ -72,10 +75,28 @@ class Trainer:
     def _begin(self, dataset: Any) -> Any:
         """Writes the first checkpoint of the training, or checks the one that it continues."""
         options = self.options
-        resume = options.resume and (self.run / "checkpoint").is_dir()
+        # A kill while a checkpoint is replaced leaves the old one, which the engine gives its name back.
+        self.resumed = options.resume and any((self.run / f"checkpoint{end}").is_dir() for end in ("", ".old"))
         settings = list(options.settings)
-        dataset, out, command = engine_of(dataset), str(self.run), options.command()
-        return json.loads(_engine.begin_training(options.family, options.preset, settings, dataset, out, resume, command))
+        dataset, out = engine_of(dataset), str(self.run)
+        return json.loads(_engine.begin_training(options.family, options.preset, settings, dataset, out, self.resumed))
+
+    def _record(self) -> None:
+        """Writes the command to `run.json`, under the lock of the folder, so that it has commands of trainings that ran.
+
+        Raises:
+            ValueError: If another process has trained in the folder since this training read the checkpoint.
+        """
+        if self.recorded or self.ranks.rank != 0:
+            return
+        stored = json.loads((self.run / "checkpoint/state.json").read_text())["step"]
+        if stored != self.step:
+            raise ValueError(
+                f"{self.run}: another process has trained here, from step {self.step} to step {stored}; "
+                "continue with resume=true, or choose another folder"
+            )
+        _engine.record_training(str(self.run), self.options.command(), self.resumed)
+        self.recorded = True
 
     def _restored(self) -> Any:
         """The state of the run; the trained weights, if the checkpoint holds their average, replace the average."""
@@ -133,19 +154,19 @@ class Trainer:
             ValueError: If another process trains in the folder.
         """
         steps, log_every, save_every = self.config["schedule"]["steps"], self.config["log_every"], self.config["save_every"]
-        begin, first, window = time.monotonic(), self.step, []
+        begin, first = time.monotonic(), self.step
         batches = self._batches()
         stopped_early = False
         alone = _locked(self.run) if self.ranks.rank == 0 else contextlib.nullcontext()
         with alone, _interruptions() as interrupted:
+            self._record()
             while self.step < (steps if until is None else min(until, steps)) and not stopped_early:
                 metrics, stop = self._update(batches, interrupted.is_set())
-                window.append(metrics)
+                self.window.add(metrics)
                 if self.validation is not None and _due(self.config["validation"]["every"], self.step, steps):
                     stopped_early = self._validate()
-                if _due(log_every, self.step, steps) or stopped_early or stop:
-                    self._log(window, time.monotonic() - begin, self.step - first)
-                    window = []
+                if _due(log_every, self.step, steps) or stopped_early:
+                    self._log(time.monotonic() - begin, self.step - first)
                 if save_every and self.step % save_every == 0 and self.step < steps:
                     self.save()
                 if stop:
@@ -261,7 +282,8 @@ class Trainer:
 
     def save(self) -> str:
         """Writes the checkpoint, from which training can continue, and returns the hash of its weights."""
-        return self._write(self.run, {"step": self.step, "best": self.best, "looks": self.validations_since_best})
+        state = {"step": self.step, "best": self.best, "looks": self.validations_since_best}
+        return self._write(self.run, {**state, **self.window.stored()})
 
     def _write(self, run: Path, state: Mapping[str, Any] | None) -> str:
         weights = self.model.checkpoint_weights()
@@ -274,10 +296,9 @@ class Trainer:
         averaged = weights if self.average is None else self.average
         return self.ranks.first(lambda: write(run, stored, averaged, replace=True, **parts))  # type: ignore[no-any-return]
 
-    def _log(self, window: list[dict[str, float]], elapsed: float, done: int) -> None:
+    def _log(self, elapsed: float, done: int) -> None:
         """Writes the means of the metrics since the last line."""
-        means = {name: sum(row[name] for row in window) / len(window) for name in window[0]}
-        means["lr"] = window[-1]["lr"]
+        means, self.window = self.window.means(), Window()
         clips = done * self.config["optim"].get("accumulate", 1) * self.config["data"]["batch_size"]
         rates = {"clips_per_second": clips / elapsed, "data_wait": self.waited / elapsed, "seconds": elapsed}
         self._write_log({**means, **rates})
@@ -286,6 +307,46 @@ class Trainer:
         if self.ranks.rank == 0:
             with open(self.run / "train.jsonl", "a", encoding="utf-8") as file:
                 file.write(json.dumps({"step": self.step, **values}) + "\n")
+
+
+class Window:
+    """The metrics since the last line of the log; stored in `state.json`, so that a continued training writes equal lines.
+
+    Args:
+        sums: The sum of each metric.
+        count: The number of steps.
+    """
+
+    def __init__(self, sums: Mapping[str, float] | None = None, count: int = 0) -> None:
+        self.sums, self.count = dict(sums or {}), count
+        self.last: Mapping[str, float] = {}
+
+    @classmethod
+    def of(cls, stored: Any, names: Sequence[str]) -> Window:
+        """The window in the state of a run with these losses; an empty one if the state has none, or that of other losses."""
+        names = [*names, "gradient_norm"]
+        if not stored or len(stored["sums"]) != len(names):
+            return cls()
+        # JSON has no values that are not finite.
+        sums = [float("nan") if value is None else value for value in stored["sums"]]
+        return cls(dict(zip(names, sums, strict=True)), stored["count"])
+
+    def stored(self) -> dict[str, Any]:
+        """The part of the state of a run that `of` reads."""
+        if not self.count:
+            return {}
+        return {"window": {"sums": [value if _finite(value) else None for value in self.sums.values()], "count": self.count}}
+
+    def add(self, metrics: Mapping[str, float]) -> None:
+        """Adds the metrics of a step."""
+        self.sums = {name: self.sums.get(name, 0.0) + value for name, value in metrics.items() if name != "lr"}
+        self.count, self.last = self.count + 1, metrics
+
+    def means(self) -> dict[str, float]:
+        """The mean of each metric, and the last learning rate."""
+        means = {name: total / self.count for name, total in self.sums.items()}
+        norm = means.pop("gradient_norm")
+        return {**means, "lr": self.last["lr"], "gradient_norm": norm}
 
 
 @contextlib.contextmanager

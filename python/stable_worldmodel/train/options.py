@@ -42,6 +42,8 @@ class Options:
     settings: Sequence[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
+        if not self.data:
+            raise ValueError("data: the name of the dataset is empty; name one with data=PATH")
         if self.amp not in ("off", "bf16", "fp16"):
             raise ValueError(f"amp: {self.amp!r}; expected off, bf16 or fp16")
 
@@ -67,7 +69,7 @@ def parsed(family: str, arguments: Sequence[str]) -> Options:
     """The options of a command line: `data=PATH`, other options, and settings of the configuration.
 
     Raises:
-        ValueError: If an argument is no `key=value`, or the dataset is missing.
+        ValueError: If an argument is no `key=value`, an option is given twice, or the dataset is missing.
     """
     own = {item.name: item.default for item in fields(Options) if item.name not in ("family", "settings")}
     given: dict[str, Any] = {}
@@ -76,6 +78,8 @@ def parsed(family: str, arguments: Sequence[str]) -> Options:
         key, equals, value = argument.partition("=")
         if not equals:
             raise ValueError(f"{argument!r}: expected KEY=VALUE, such as data=rooms or model.latent=64")
+        if key in given:
+            raise ValueError(f"{key}: given twice, as {given[key]!r} and {value!r}; give it once")
         if key in own:
             given[key] = _value(key, value, own[key])
         else:

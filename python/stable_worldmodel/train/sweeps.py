@@ -17,7 +17,7 @@ __all__ = ["run"]
 _DATASET = "dataset"
 
 
-def run(family: str, arguments: Sequence[str], train: Callable[[Options], None]) -> None:
+def run(family: str, arguments: Sequence[str], train: Callable[[Options], object]) -> None:
     """Runs Hydra's application, which calls `train` for each of its jobs.
 
     Args:

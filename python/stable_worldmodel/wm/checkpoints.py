@@ -80,7 +80,9 @@ def _parts(path: Path) -> tuple[Stored, dict[str, Tensor]] | None:
             return None
         document, weights = read_capsule(path)
         return Stored(document["checkpoint"], document["manifest"]), weights
-    folder = next((f for f in (path, path / "checkpoint") if (f / "weights.safetensors").is_file()), None)
+    folder = next(
+        (f for f in (path, path / "checkpoint", path / "checkpoint.old") if (f / "weights.safetensors").is_file()), None
+    )
     if folder is None:
         return None
     manifest = folder / "manifest.json"

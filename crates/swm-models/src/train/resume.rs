@@ -2,7 +2,7 @@
 //! replaces nothing that no run wrote.
 
 use crate::run_folder::{CHECKPOINT_FILES, CONFIG, FOLDER, NEW_FOLDER};
-use crate::stored::{is_event_file, locate};
+use crate::stored::{is_begun, is_event_file, locate};
 use serde::Deserialize;
 use serde_json::Value;
 use std::path::Path;
@@ -21,7 +21,8 @@ pub(crate) fn refuse_existing(out: &Path) -> Error {
 }
 
 /// Checks that a new run in the folder `out` replaces only what a run left that ended before its first checkpoint: its
-/// log, an unfinished checkpoint, and the best checkpoint. The event file marks the folder of such a run.
+/// log, an unfinished checkpoint, and the best checkpoint. The event file marks the folder of such a run; the configuration marks
+/// an unfinished checkpoint.
 ///
 /// # Errors
 /// When the folder has a log or files of a checkpoint that no run wrote, or cannot be listed.
@@ -39,11 +40,14 @@ pub(crate) fn check_new_run(out: &Path) -> Result<()> {
     let current = out.join(FOLDER);
     let mut foreign = is_occupied(&current) && !current.join(CONFIG).is_file();
     foreign |= locate(out).is_none() && is_occupied(&out.join("checkpoint.old"));
-    let mut places = vec![out.join(NEW_FOLDER)];
+    // A training outside this program writes no event file, and its first checkpoint before any log.
+    let is_foreign = |place: &Path| !has_events && is_occupied(place) && !is_begun(place);
+    foreign |= is_foreign(&out.join(NEW_FOLDER));
     for inner in ["best", "world"] {
-        places.extend(["", ".new", ".old"].map(|end| out.join(inner).join(format!("{FOLDER}{end}"))));
+        let mut places = ["", ".new", ".old"].map(|end| out.join(inner).join(format!("{FOLDER}{end}"))).into_iter();
+        foreign |=
+            places.any(|place| is_foreign(&place) || (is_occupied(&place) && !has_events && locate(out).is_none()));
     }
-    foreign |= !has_events && places.iter().any(|place| is_occupied(place));
     if foreign {
         let problem = "has files with the names of a checkpoint, and there is no checkpoint that can be read";
         return Err(Error::config(out.display().to_string(), problem, "move them away, or choose another folder"));

@@ -14,7 +14,7 @@ use super::run_state::is_due;
 use super::split::episodes;
 use super::step_output::StepOutput;
 use super::trainable::Trainable;
-use crate::checkpoint::Checkpoint;
+use crate::checkpoint::{self, Checkpoint};
 use crate::nn::parameters;
 use std::path::Path;
 use std::sync::Arc;
@@ -58,7 +58,8 @@ pub fn train<M: Trainable>(
 }
 
 /// Writes the checkpoint from which a run on a dataset begins, with the initial weights, for a training loop outside this
-/// program; or, to continue a run, checks its checkpoint. Returns what the loop needs besides the checkpoint.
+/// program; or, to continue a run, checks its checkpoint, and names the old one as the current one if a kill between the two
+/// renamings left only the old one. Returns what the loop needs besides the checkpoint.
 ///
 /// # Errors
 /// As [`train`], before the first step.
@@ -75,6 +76,7 @@ pub fn begin<M: Trainable>(
         resume::check_new_run(out)?;
         learner.save(out)?;
     } else {
+        checkpoint::restore_old(out)?;
         remove_later_steps(out, learner.state().step)?;
     }
     let settings = config.loop_config();

@@ -50,7 +50,7 @@ mod zoo;
 
 use clap::{FromArgMatches as _, Parser, Subcommand};
 use output::{emit, emit_json, eprint, table};
-pub use run_record::record_training;
+pub use run_record::{check_training, record_training};
 use std::backtrace::{Backtrace, BacktraceStatus};
 use std::error::Error as _;
 use std::ffi::OsString;

@@ -13,7 +13,7 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 use std::time::{SystemTime, UNIX_EPOCH};
-use swm_core::files::{self, Lock};
+use swm_core::files;
 use swm_core::{Error, Result};
 
 /// The name of the file.
@@ -94,33 +94,32 @@ pub fn write_command(folder: &Path, command: Vec<String>) -> Result<()> {
     append(folder, Invocation { command, ..Invocation::now() }, false)
 }
 
-/// Writes `run.json` to the folder of a training that another program runs, after `begin` has begun or continued it.
+/// Checks the folder of a training that another program begins, or continues.
+///
+/// # Errors
+/// When the folder has a file `run.json` that is no record of a run, links that the training would replace, or a run that
+/// `swm train` has finished.
+pub fn check_training(folder: &Path, continued: bool) -> Result<()> {
+    check(folder)?;
+    train_folder::check_links(folder)?;
+    if continued { train_folder::check_unfinished(folder, "torch") } else { Ok(()) }
+}
+
+/// Writes `run.json` to the folder of a training that another program runs. The caller holds the lock of the folder, so that the
+/// file has the command lines of trainings that ran.
 ///
 /// `command` is the command line of `swm train` with the same model, dataset and settings: `swm train --output RUN --resume`
 /// repeats it. `program` is what trains.
 ///
 /// # Errors
-/// Before the work, when the folder has a file of this name that is no record of a run, links that the training would replace, or
-/// a run that `swm train` has finished; those of `begin`; when the folder cannot be written to.
-pub fn record_training<T>(
-    folder: &Path,
-    (command, program): (Vec<String>, &str),
-    continued: bool,
-    begin: impl FnOnce() -> Result<T>,
-) -> Result<T> {
-    check(folder)?;
-    train_folder::check_links(folder)?;
-    if continued {
-        train_folder::check_unfinished(folder, "torch")?;
-    }
-    let begun = begin()?;
-    let _lock = Lock::folder(folder)?;
-    append(folder, Invocation { command, program: Some(program.to_owned()), ..Invocation::now() }, continued)?;
-    Ok(begun)
+/// When the folder has a file of this name that is no record of a run, or cannot be written to.
+pub fn record_training(folder: &Path, (command, program): (Vec<String>, &str), continued: bool) -> Result<()> {
+    append(folder, Invocation { command, program: Some(program.to_owned()), ..Invocation::now() }, continued)
 }
 
 fn append(folder: &Path, invocation: Invocation, continued: bool) -> Result<()> {
     check(folder)?;
+    files::delete_temporary(folder, |name| name == FILE)?;
     let path = folder.join(FILE);
     let mut record = if continued && path.exists() { read_file(&path)? } else { RunRecord::default() };
     record.commands.push(invocation);
@@ -228,14 +227,13 @@ mod tests {
         write(folder.path(), false).expect("a new record");
         write(folder.path(), true).expect("a continued record");
         assert_eq!(read(folder.path()).expect("a record").commands.len(), 2);
+        let left = folder.path().join(".run.json.12.tmp");
+        std::fs::write(&left, "{").expect("what a kill leaves");
+        record_training(folder.path(), (vec![], "torch"), true).expect("a continued training");
+        assert!(!left.exists());
         std::fs::write(folder.path().join(FILE), "{\"mine\": 1}").expect("writing a file");
         assert!(write(folder.path(), false).is_err());
-        let mut begun = false;
-        let begin = || {
-            begun = true;
-            Ok(())
-        };
-        assert!(record_training(folder.path(), (vec![], "torch"), false, begin).is_err());
-        assert!(!begun, "refused before the work");
+        assert!(check_training(folder.path(), false).is_err(), "refused before the work");
+        assert!(record_training(folder.path(), (vec![], "torch"), false).is_err());
     }
 }

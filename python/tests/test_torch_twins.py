@@ -19,6 +19,7 @@ CONV = "{conv={channels=[6,8],hidden=12,dim=10}}"
 KEYPOINTS = (
     "{keypoints={filters=[{kernel=5,stride=2,channels=6},{kernel=7,stride=4,channels=4}],sharpness=2.0,hidden=[12],dim=10}}"
 )
+COLOURS = "{keypoints={filters=[],colours=[[2.2,2.2,2.2],[0.5,-1.0,0.3]],sharpness=2.0,hidden=[12],dim=10}}"
 STATE = '[{column="pixels",latent=16},{column="state",latent=8}]'
 
 
@@ -67,6 +68,7 @@ PLANNED = [
     ("lewm", {"model__encoder": KEYPOINTS, "model__decoder": "{hidden=9,weight=2.0}"}),
     ("pldm", {}),
     ("pldm", {"model__encoder": CONV}),
+    ("pldm", {"model__encoder": COLOURS, "model__decoder": "{hidden=9,weight=2.0}"}),
     ("dino_wm", {}),
     ("dino_wm", {"model__encoder": REGISTERS, "model__predictor__history": 2, "model__decoder": 8}),
 ]
@@ -87,6 +89,7 @@ ACTING = [
     ("gcbc", {}),
     ("gcbc", {"model__encoder": CONV}),
     ("gcbc", {"model__encoder": KEYPOINTS}),
+    ("gcbc", {"model__encoder": COLOURS}),
     ("gcbc", {"model__encoder": VIT, "model__history": 2, "data__num_steps": 2}),
     ("gcivl", {"model__head__depth": 4}),
     ("gcivl", {"model__metric": 6, "model__history": 2, "data__num_steps": 3}),

@@ -10,6 +10,7 @@
 mod adamw;
 mod affine;
 mod attention;
+mod colour_moments;
 mod conv;
 pub mod functions;
 mod keypoints;
@@ -23,6 +24,7 @@ mod vit_gradient;
 pub use adamw::{AdamWStep, sum_of_squares};
 pub use affine::Affine;
 pub use attention::causal_attention;
+pub use colour_moments::{ColourMoments, ColourScratch};
 pub use conv::{ChannelStatistics, ConvEncoder, ConvGradient, ConvParameters, ConvSizes, ConvStage};
 pub use keypoints::{FilterBank, KeypointScratch, Keypoints};
 pub use norm::{Modulation, Norm, add_gated};

@@ -243,7 +243,7 @@ class Convolutions(nn.Module):
 
 
 class Keypoints(nn.Module):
-    """Fixed random filters, the expected position of their responses (Finn et al., 2016), and linear layers.
+    """Fixed random filters, their expected positions (Finn et al., 2016), moments of colours, and linear layers.
 
     Args:
         image: Side of the images in pixels.
@@ -252,9 +252,11 @@ class Keypoints(nn.Module):
         hidden: Features of each hidden layer.
         dim: Features of an image.
         seed: The seed of the filters, which the engine draws.
+        colours: Red, green and blue of the colours whose pixels are located, in the units of the normalised images.
     """
 
     takes_frames = True
+    colours: Tensor
 
     def __init__(
         self,
@@ -264,15 +266,18 @@ class Keypoints(nn.Module):
         hidden: Sequence[int],
         dim: int,
         seed: int = 0,
+        colours: Sequence[Sequence[float]] = (),
     ) -> None:
         super().__init__()
         self.seed = seed
+        self.register_buffer("colours", torch.tensor(colours, dtype=torch.float32).reshape(-1, 3), persistent=False)
         self.sharpness, self.filters, self.strides, features = sharpness, nn.ModuleList(), [], 0
         for sizes in filters:
             bank = nn.Conv2d(3, sizes["channels"], sizes["kernel"], bias=False)
             self.filters.append(bank.requires_grad_(False))
             self.strides.append(sizes["stride"])
             features += 3 * sizes["channels"]
+        features += 10 * len(colours)
         self.norm = nn.BatchNorm1d(features)
         inputs = [features, *hidden]
         self.hidden = nn.ModuleList(nn.Linear(size, to) for size, to in zip(inputs, hidden, strict=False))
@@ -281,8 +286,10 @@ class Keypoints(nn.Module):
     def forward(self, frames: Tensor) -> Tensor:
         """Frames `(N, 3, H, W)` to features `(N, dim)`."""
         banks = zip(self.filters, self.strides, strict=True)
-        x = torch.cat([self._keypoints(frames, bank, stride) for bank, stride in banks], 1)
-        x = self.norm(x)
+        features = [self._keypoints(frames, bank, stride) for bank, stride in banks]
+        if len(self.colours):
+            features.append(self._moments(frames))
+        x = self.norm(torch.cat(features, 1))
         for layer in self.hidden:
             x = nn.functional.gelu(layer(x))
         return self.out(x)  # type: ignore[no-any-return]
@@ -302,6 +309,20 @@ class Keypoints(nn.Module):
         places = torch.linspace(-1, 1, side, device=maps.device, dtype=maps.dtype)
         x, y = (weights.sum(axis) @ places for axis in (2, 3))
         return torch.cat([x, y, maps.amax(2) / 4], 1)
+
+    def _moments(self, frames: Tensor) -> Tensor:
+        """The fraction, the mean x and y, and the central moments of the pixels of each colour: `(N, 10 * colours)`."""
+        count, _, side, _ = frames.shape
+        distances = (frames.flatten(2).unsqueeze(1) - self.colours[None, :, :, None]).square().sum(2)
+        weights = (-100 * distances).softmax(1).unflatten(2, (side, side))
+        places = torch.linspace(-1, 1, side, device=frames.device, dtype=frames.dtype)
+        mass = weights.sum((2, 3))
+        total = mass + 0.1  # A colour without pixels has moments of 0.
+        x, y = (weights.sum(axis) @ places / total for axis in (2, 3))
+        dx, dy = places - x.unsqueeze(2), places - y.unsqueeze(2)
+        orders = [(2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3)]
+        central = [torch.einsum("nkyx,nkx,nky->nk", weights, dx**i, dy**j) / total for i, j in orders]
+        return torch.stack([mass / side**2, x, y, *central], 2).reshape(count, -1)
 
 
 def encoder_of(config: Mapping[str, Any], image: int) -> nn.Module:

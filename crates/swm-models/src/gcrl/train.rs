@@ -27,6 +27,8 @@ const TINY: &str = "64 px, a small trained convolutional encoder: minutes on two
 const SMALL: &str = "64 px, overlapping convolutions, for small and rotated objects: for two CPU cores";
 const KEYPOINTS: &str =
     "64 px, keypoints of fixed random filters, encoded once per frame: trains in minutes on two CPU cores";
+const COLOURS: &str =
+    "64 px, moments of given colours, encoded once per frame: scenes of few colours in minutes on two CPU cores";
 const PAPER: &str = "224 px, frozen DINOv2-small, heads of 6 layers, history 3: the published size, for a GPU";
 
 macro_rules! presets {
@@ -42,6 +44,11 @@ macro_rules! presets {
                 id: "keypoints",
                 summary: KEYPOINTS,
                 toml: include_str!(concat!("../../presets/", $family, "/keypoints.toml")),
+            },
+            Preset {
+                id: "colours",
+                summary: COLOURS,
+                toml: include_str!(concat!("../../presets/", $family, "/colours.toml")),
             },
             Preset {
                 id: "paper",

@@ -1,7 +1,7 @@
-//! [`Keypoints`]: an image encoder of filters with fixed random weights, of which a spatial softmax reads the positions, and
-//! trained linear layers.
+//! [`Keypoints`]: an image encoder of filters with fixed random weights, of which a spatial softmax reads the positions, of the
+//! moments of given colours, and of trained linear layers.
 //!
-//! The filters are not trained, so that their features are computed once per frame of a dataset, and a training step
+//! Filters and colours are not trained, so that their features are computed once per frame of a dataset, and a training step
 //! computes the linear layers only.
 
 use super::parameters::host;
@@ -12,10 +12,14 @@ use burn::tensor::{Tensor, TensorData};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use swm_core::{Error, Key, Result};
-use swm_kernels::{FilterBank, KeypointScratch};
+use swm_kernels::{ColourMoments, ColourScratch, FilterBank, KeypointScratch};
 
 /// The most sizes of filters, and the most hidden layers.
 const MOST_LAYERS: usize = 64;
+/// The most colours.
+const MOST_COLOURS: usize = 256;
+/// The most pixels of an image times colours: 256 MiB.
+const MOST_COLOURED: usize = 1 << 26;
 /// The most weights of all filters: 256 MiB.
 const MOST_WEIGHTS: usize = 1 << 26;
 
@@ -27,6 +31,9 @@ pub struct KeypointsConfig {
     pub filters: Vec<FilterConfig>,
     /// The factor of the responses, in standard deviations over an image, before the softmax.
     pub sharpness: f32,
+    /// Colours (red, green, blue) whose pixels are located, in the units of the normalised images.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub colours: Vec<[f32; 3]>,
     /// The number of features of each hidden layer, first to last.
     pub hidden: Vec<usize>,
     /// The number of output features.
@@ -48,7 +55,7 @@ pub struct FilterConfig {
     pub channels: usize,
 }
 
-/// Random filters, the expected position of their responses, and linear layers.
+/// Random filters, the expected position of their responses, the moments of colours, and linear layers.
 #[derive(Module, Debug)]
 pub struct Keypoints {
     /// The filters of each size, which are not trained.
@@ -71,26 +78,35 @@ pub struct Filter {
 }
 
 impl KeypointsConfig {
-    /// The number of features of the filters: the expected x and y, and the largest response of each.
+    /// The number of features that are not trained: the expected x and y and the largest response of each filter, and the
+    /// [moments](ColourMoments) of each colour.
     pub fn features(&self) -> usize {
-        self.filters.iter().map(|filter| 3 * filter.channels).sum()
+        let of_filters: usize = self.filters.iter().map(|filter| 3 * filter.channels).sum();
+        of_filters + ColourMoments::FEATURES * self.colours.len()
     }
 
     /// Checks the sizes. `at` is the dotted path of the settings, for errors.
     ///
     /// # Errors
-    /// When there are no filters, or a size is out of range.
+    /// When there are neither filters nor colours, or a size is out of range.
     pub fn check(&self, at: &str, image: usize) -> Result<()> {
-        if self.filters.is_empty() {
+        if self.filters.is_empty() && self.colours.is_empty() {
             return Err(Error::config(
                 format!("{at}.filters"),
                 "the list is empty",
-                "give at least one size of filters",
+                "give at least one size of filters, or colours",
             ));
         }
-        for (name, count) in [("filters", self.filters.len()), ("hidden", self.hidden.len())] {
-            check_sizes(&[(&format!("the length of {at}.{name}"), count, 0, MOST_LAYERS)])?;
+        let lengths = [
+            ("filters", self.filters.len(), MOST_LAYERS),
+            ("hidden", self.hidden.len(), MOST_LAYERS),
+            ("colours", self.colours.len(), MOST_COLOURS),
+        ];
+        for (name, count, most) in lengths {
+            check_sizes(&[(&format!("the length of {at}.{name}"), count, 0, most)])?;
         }
+        let coloured = image.saturating_mul(image).saturating_mul(self.colours.len());
+        check_sizes(&[(&format!("the pixels times {at}.colours"), coloured, 0, MOST_COLOURED)])?;
         for FilterConfig { kernel, stride, channels } in &self.filters {
             check_sizes(&[
                 (&format!("{at}.filters.kernel"), *kernel, 1, image),
@@ -103,7 +119,7 @@ impl KeypointsConfig {
             }
         }
         let weights = self.filters.iter().map(|filter| 3 * filter.channels * filter.kernel * filter.kernel).sum();
-        check_sizes(&[(&format!("the weights of {at}.filters"), weights, 1, MOST_WEIGHTS)])?;
+        check_sizes(&[(&format!("the weights of {at}.filters"), weights, 0, MOST_WEIGHTS)])?;
         if !(self.sharpness.is_finite() && self.sharpness > 0.0) {
             return Err(Error::config(format!("{at}.sharpness"), self.sharpness.to_string(), "give a number above 0"));
         }
@@ -141,7 +157,7 @@ impl Keypoints {
     /// Computes the features of images, with the running statistics.
     ///
     /// # Shapes
-    /// Maps `[frames, side * side, 3]`, or the features of the filters `[frames, 1, features]`, to `[frames, dim]`.
+    /// Maps `[frames, side * side, 3]`, or the features of filters and colours `[frames, 1, features]`, to `[frames, dim]`.
     pub fn forward(&self, images: Tensor<3>) -> Tensor<2> {
         self.head(self.norm.forward(self.inputs(images)))
     }
@@ -160,7 +176,7 @@ impl Keypoints {
         self.out.forward(hidden)
     }
 
-    /// Returns the features of the filters, which are computed from pixels.
+    /// Returns the features of filters and colours, which are computed from pixels.
     ///
     /// # Shapes
     /// Maps the images of [`Keypoints::forward`] to `[frames, features]`.
@@ -192,8 +208,13 @@ impl Keypoints {
         let mut content =
             serde_json::to_vec(&(&self.config.filters, self.config.sharpness)).expect("a configuration serializes");
         banks.iter().for_each(|bank| content.extend_from_slice(bytemuck::cast_slice(&bank.weight)));
-        let kernels = swm_kernels::Keypoints::new(side, self.config.sharpness, &banks);
-        KeypointKernels { pixels: side * side * 3, kernels, hash: swm_core::manifest::hash(&content) }
+        content.extend_from_slice(bytemuck::cast_slice(self.config.colours.as_flattened()));
+        KeypointKernels {
+            pixels: side * side * 3,
+            filters: swm_kernels::Keypoints::new(side, self.config.sharpness, &banks),
+            colours: ColourMoments::new(side, &self.config.colours),
+            hash: swm_core::manifest::hash(&content),
+        }
     }
 }
 
@@ -208,22 +229,23 @@ fn norm_name(name: &str) -> String {
     format!("{name}.norm")
 }
 
-/// The filters of an encoder, packed for images of one size.
+/// The filters and colours of an encoder, for images of one size.
 pub struct KeypointKernels {
     pixels: usize,
-    kernels: swm_kernels::Keypoints,
+    filters: swm_kernels::Keypoints,
+    colours: ColourMoments,
     hash: String,
 }
 
 impl KeypointKernels {
-    /// The hash of the filters and their settings.
+    /// The hash of the filters, their settings and the colours.
     pub fn hash(&self) -> &str {
         &self.hash
     }
 
     /// The number of features of an image.
     pub fn count(&self) -> usize {
-        self.kernels.features()
+        self.filters.features() + self.colours.features()
     }
 
     /// Computes the features of images.
@@ -233,10 +255,14 @@ impl KeypointKernels {
     pub fn features(&self, pixels: &[f32]) -> Vec<f32> {
         let count = self.count();
         let mut features = vec![0.0; pixels.len() / self.pixels * count];
-        (features.par_chunks_mut(count).zip(pixels.par_chunks(self.pixels)))
-            .for_each_init(KeypointScratch::default, |scratch, (features, image)| {
-                self.kernels.features_of(image, scratch, features)
-            });
+        (features.par_chunks_mut(count).zip(pixels.par_chunks(self.pixels))).for_each_init(
+            <(KeypointScratch, ColourScratch)>::default,
+            |(of_filters, of_colours), (features, image)| {
+                let (filters, colours) = features.split_at_mut(self.filters.features());
+                self.filters.features_of(image, of_filters, filters);
+                self.colours.features_of(image, of_colours, colours);
+            },
+        );
         features
     }
 }

@@ -33,6 +33,11 @@ impl Trainable for Pldm {
             toml: include_str!("../../presets/pldm/keypoints.toml"),
         },
         Preset {
+            id: "colours",
+            summary: "64 px, moments of given colours, encoded once per frame: scenes of few colours in minutes on two CPU cores",
+            toml: include_str!("../../presets/pldm/colours.toml"),
+        },
+        Preset {
             id: "paper",
             summary: "224 px, ViT-tiny/14, predictor of 6 layers: the published size, for a GPU",
             toml: include_str!("../../presets/pldm/paper.toml"),

@@ -131,8 +131,14 @@ fn goal_conditioned_models_learn_on_keypoints_of_frames_that_are_encoded_once() 
         let folder = tempfile::tempdir().expect("creating a temporary folder");
         let mut config = config::<M>(&["schedule.steps=40", "log_every=10"]);
         let filters = vec![FilterConfig { kernel: 5, stride: 2, channels: 8 }];
-        config.model.encoder =
-            BackboneConfig::Keypoints(KeypointsConfig { filters, sharpness: 2.0, hidden: vec![16], dim: 12, seed: 0 });
+        config.model.encoder = BackboneConfig::Keypoints(KeypointsConfig {
+            filters,
+            sharpness: 2.0,
+            colours: vec![],
+            hidden: vec![16],
+            dim: 12,
+            seed: 0,
+        });
         let checkpoint = trained(&config, folder.path());
         let running = &parameters::values(&checkpoint.model)["encoder.norm.running_mean"].values;
         assert!(running.len() == 24 && running.iter().any(|mean| mean.abs() > 0.0), "{running:?}");

@@ -121,13 +121,19 @@ fn conv_config() -> TrainConfig<Lewm> {
     config
 }
 
-/// A model with an encoder of keypoints and a decoder of their features.
+/// A model with an encoder of keypoints and colours, and a decoder of their features.
 pub fn keypoints_config() -> TrainConfig<Lewm> {
     let mut config = config(&["model.predictor.dropout=0"]);
     let filters =
         vec![FilterConfig { kernel: 3, stride: 2, channels: 5 }, FilterConfig { kernel: 5, stride: 4, channels: 3 }];
-    config.model.encoder =
-        EncoderConfig::Keypoints(KeypointsConfig { filters, sharpness: 2.0, hidden: vec![12], dim: 10, seed: 0 });
+    config.model.encoder = EncoderConfig::Keypoints(KeypointsConfig {
+        filters,
+        sharpness: 2.0,
+        colours: vec![[1.0, 0.5, -1.0], [-1.0, 0.0, 0.5]],
+        hidden: vec![12],
+        dim: 10,
+        seed: 0,
+    });
     config.model.decoder = Some(DecoderConfig { hidden: 9, weight: 2.0 });
     config
 }
@@ -175,6 +181,10 @@ fn later_runs_find_the_features_of_fixed_filters_in_a_folder() {
         keypoints.seed = 1;
     }
     assert_eq!(run("other filters", Some(&cache), &config).1, frames);
+    if let EncoderConfig::Keypoints(keypoints) = &mut config.model.encoder {
+        keypoints.colours[0][0] = 0.75;
+    }
+    assert_eq!(run("other colours", Some(&cache), &config).1, frames);
 }
 
 #[test]
@@ -194,6 +204,14 @@ fn decoder_without_fixed_filters_is_refused() {
     }
     let error = config.check().expect_err("checking filters that are too many").to_string();
     assert!(error.contains("the weights of model.encoder.keypoints.filters: 135000000; give at most"), "{error}");
+    let colours = [(vec![[f32::NAN; 3]], "give a finite value"), (vec![], "at least one size of filters, or colours")];
+    for (colours, fix) in colours {
+        if let EncoderConfig::Keypoints(keypoints) = &mut config.model.encoder {
+            (keypoints.filters, keypoints.colours) = (vec![], colours);
+        }
+        let error = config.check().expect_err("checking an encoder without features").to_string();
+        assert!(error.contains(fix), "{error}");
+    }
 }
 
 #[test]

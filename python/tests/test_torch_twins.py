@@ -17,7 +17,8 @@ DINO = "{dinov2={patch=8,dim=24,depth=2,heads=2,mlp=32,grid=8}}"
 REGISTERS = "{dinov2={patch=8,dim=24,depth=1,heads=2,mlp=32,grid=12,registers=2}}"
 CONV = "{conv={channels=[6,8],hidden=12,dim=10}}"
 KEYPOINTS = (
-    "{keypoints={filters=[{kernel=5,stride=2,channels=6},{kernel=7,stride=4,channels=4}],sharpness=2.0,hidden=[12],dim=10}}"
+    "{keypoints={filters=[{kernel=5,stride=2,channels=6},{kernel=7,stride=4,channels=4}],"
+    "colours=[[1.0,0.5,0.0],[-1.0,0.0,0.5]],sharpness=2.0,hidden=[12],dim=10}}"
 )
 COLOURS = "{keypoints={filters=[],colours=[[2.2,2.2,2.2],[0.5,-1.0,0.3]],sharpness=2.0,hidden=[12],dim=10}}"
 STATE = '[{column="pixels",latent=16},{column="state",latent=8}]'

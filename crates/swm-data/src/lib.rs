@@ -22,6 +22,7 @@ pub use formats::{FORMATS, FormatEntry, create, has_no_dataset, lance, open};
 pub use swm_image::{self as image, ImageCodec, RgbImage, check_png, write_png};
 pub use tools::convert::{self, ConvertMode, ConvertOptions, Converted, checksum, convert, convert_shard};
 pub use tools::doctor;
+pub use tools::frequent_colours;
 pub use tools::preview::{
     self, PreviewOptions, check_mp4, contact_sheet, integer_scale, preview, write_mp4, write_mp4_scaled,
 };

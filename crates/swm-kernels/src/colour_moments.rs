@@ -5,7 +5,7 @@ use swm_simd::{Kernel, Level, dispatch};
 
 /// The factor of squared distances of colours: at a distance of 0.1, the weight is 1 / e.
 const SHARPNESS: f32 = 100.0;
-/// Pixels of no colour, at the centre of the image, that are added to every colour: an invisible one has moments of 0.
+/// Weight without a colour, at the centre of the image, that is added to every colour: the moments of an invisible colour are 0.
 const PRIOR: f32 = 0.1;
 
 /// The colours, and the size of the images.
@@ -63,7 +63,6 @@ impl Kernel for Moments<'_> {
         let Self { of: ColourMoments { side, colours }, pixels, scratch, features } = self;
         let (side, count) = (*side, side * side);
         let weights = &mut scratch.weights;
-        weights.clear();
         weights.resize(colours.len() * count, 0.0);
         // Distances, then the softmax over the colours of every pixel, then moments: one plane of pixels for each colour.
         for (colour, plane) in colours.iter().zip(weights.chunks_exact_mut(count)) {

@@ -315,11 +315,11 @@ class Keypoints(nn.Module):
         count, _, side, _ = frames.shape
         distances = (frames.flatten(2).unsqueeze(1) - self.colours[None, :, :, None]).square().sum(2)
         weights = (-100 * distances).softmax(1).unflatten(2, (side, side))
-        places = torch.linspace(-1, 1, side, device=frames.device, dtype=frames.dtype)
+        coordinates = torch.linspace(-1, 1, side, device=frames.device, dtype=frames.dtype)
         mass = weights.sum((2, 3))
         total = mass + 0.1  # A colour without pixels has moments of 0.
-        x, y = (weights.sum(axis) @ places / total for axis in (2, 3))
-        dx, dy = places - x.unsqueeze(2), places - y.unsqueeze(2)
+        x, y = (weights.sum(axis) @ coordinates / total for axis in (2, 3))
+        dx, dy = coordinates - x.unsqueeze(2), coordinates - y.unsqueeze(2)
         orders = [(2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3)]
         central = [torch.einsum("nkyx,nkx,nky->nk", weights, dx**i, dy**j) / total for i, j in orders]
         return torch.stack([mass / side**2, x, y, *central], 2).reshape(count, -1)

@@ -20,11 +20,14 @@ fn no_rows(folder: &Path) -> Vec<u8> {
     std::fs::read(path.join("ep_offset.npz")).expect("the first rows")
 }
 
+/// A format, and files with their contents.
+type Left<'a> = (&'a str, &'a [(&'a str, &'a [u8])]);
+
 #[test]
 fn first_files_of_killed_writers_are_continued_and_replaced() {
     let folder = tempfile::tempdir().expect("creating a folder");
     let no_rows = no_rows(folder.path());
-    let left: [(&str, &[(&str, &[u8])]); 7] = [
+    let left: [Left<'_>; 7] = [
         ("folder", &[("ep_offset.npz", &no_rows)]),
         ("video", &[("ep_offset.npz", &no_rows), ("ep_len.tmp", b"PK")]),
         ("lerobot", &[("meta/info.json.tmp", b"")]),
@@ -51,7 +54,7 @@ fn first_files_of_killed_writers_are_continued_and_replaced() {
 fn files_of_the_user_with_such_names_stay() {
     let folder = tempfile::tempdir().expect("creating a folder");
     let no_rows = no_rows(folder.path());
-    let own: [(&str, &[(&str, &[u8])]); 5] = [
+    let own: [Left<'_>; 5] = [
         ("folder", &[("ep_offset.npz", b"thesis")]),
         ("video", &[("ep_offset.npz", &no_rows), ("thesis.txt", b"thesis")]),
         ("lerobot", &[("meta/info.json.tmp", b"thesis")]),

@@ -28,7 +28,7 @@ const SMALL: &str = "64 px, overlapping convolutions, for small and rotated obje
 const KEYPOINTS: &str =
     "64 px, keypoints of fixed random filters, encoded once per frame: trains in minutes on two CPU cores";
 const COLOURS: &str =
-    "64 px, moments of given colours, encoded once per frame: scenes of few colours in minutes on two CPU cores";
+    "64 px, moments of Push-T's colours (set those of other scenes), encoded once per frame: minutes on two CPU cores";
 const PAPER: &str = "224 px, frozen DINOv2-small, heads of 6 layers, history 3: the published size, for a GPU";
 
 macro_rules! presets {

@@ -28,12 +28,12 @@ pub struct LewmConfig {
     pub encoder: EncoderConfig,
     /// The predictor.
     pub predictor: PredictorConfig,
-    /// A decoder of latents, for an encoder with fixed filters; none if left out.
+    /// A decoder of latents, for an encoder with fixed features; none if left out.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub decoder: Option<DecoderConfig>,
 }
 
-/// A decoder that computes the features of the encoder's fixed filters from a latent. It is part of the loss only.
+/// A decoder that computes the encoder's fixed features from a latent. It is part of the loss only.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DecoderConfig {
@@ -74,8 +74,8 @@ impl LewmConfig {
                 return Err(Error::config("model.decoder.weight", weight.to_string(), "give a number of at least 0"));
             }
             if !matches!(self.encoder, EncoderConfig::Keypoints(_)) {
-                let given = "the encoder has no fixed filters, whose features are decoded";
-                let fix = "leave out model.decoder, or choose an encoder with keypoints: --preset keypoints";
+                let given = "the encoder has no fixed features, which are decoded";
+                let fix = "leave out model.decoder, or choose an encoder with keypoints or colours: --preset keypoints";
                 return Err(Error::config("model.decoder", given, fix));
             }
         }

@@ -34,7 +34,7 @@ impl Trainable for Lewm {
         },
         Preset {
             id: "colours",
-            summary: "64 px, moments of given colours, encoded once per frame: scenes of few colours in minutes on two CPU cores",
+            summary: "64 px, moments of Push-T's colours (set those of other scenes), encoded once per frame: minutes on two CPU cores",
             toml: include_str!("../../presets/lewm/colours.toml"),
         },
         Preset {

@@ -24,7 +24,7 @@ pub enum BackboneConfig {
     PatchCnn(PatchCnnConfig),
     /// Overlapping convolutions with batch normalisation.
     Conv(ConvConfig),
-    /// Positions of the responses of fixed random filters, and trained linear layers.
+    /// Positions of the responses of fixed random filters, moments of given colours, and trained linear layers.
     Keypoints(KeypointsConfig),
 }
 
@@ -43,7 +43,7 @@ pub enum Backbone {
     PatchCnn(PatchCnn),
     /// Overlapping convolutions with batch normalisation.
     Conv(Conv),
-    /// Positions of the responses of fixed random filters, and trained linear layers.
+    /// Positions of the responses of fixed random filters, moments of given colours, and trained linear layers.
     Keypoints(Keypoints),
 }
 

@@ -1,5 +1,5 @@
-//! [`Keypoints`]: an image encoder of filters with fixed random weights, of which a spatial softmax reads the positions, of the
-//! moments of given colours, and of trained linear layers.
+//! [`Keypoints`]: an image encoder: positions that a spatial softmax reads from filters with fixed random weights, moments of given
+//! colours, then trained linear layers.
 //!
 //! Filters and colours are not trained, so that their features are computed once per frame of a dataset, and a training step
 //! computes the linear layers only.
@@ -18,8 +18,10 @@ use swm_kernels::{ColourMoments, ColourScratch, FilterBank, KeypointScratch};
 const MOST_LAYERS: usize = 64;
 /// The most colours.
 const MOST_COLOURS: usize = 256;
-/// The most pixels of an image times colours: 256 MiB.
-const MOST_COLOURED: usize = 1 << 26;
+/// The most pixels of an image times colours: 16 MiB for each thread.
+const MOST_COLOURED: usize = 1 << 22;
+/// The largest value of a colour; normalised images have smaller ones.
+const LARGEST_COLOUR: f32 = 100.0;
 /// The most weights of all filters: 256 MiB.
 const MOST_WEIGHTS: usize = 1 << 26;
 
@@ -31,7 +33,7 @@ pub struct KeypointsConfig {
     pub filters: Vec<FilterConfig>,
     /// The factor of the responses, in standard deviations over an image, before the softmax.
     pub sharpness: f32,
-    /// Colours (red, green, blue) whose pixels are located, in the units of the normalised images.
+    /// Colours (red, green, blue) whose pixels are located: 0 to 1 where `pixel_mean` is 0 and `pixel_std` 1, otherwise normalised by them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub colours: Vec<[f32; 3]>,
     /// The number of features of each hidden layer, first to last.
@@ -60,7 +62,7 @@ pub struct FilterConfig {
 pub struct Keypoints {
     /// The filters of each size, which are not trained.
     pub filters: Vec<Filter>,
-    /// The normalisation of the features of the filters.
+    /// The normalisation of the features of filters and colours.
     pub norm: BatchNorm,
     /// The hidden layers.
     pub hidden: Vec<Linear>,
@@ -88,7 +90,7 @@ impl KeypointsConfig {
     /// Checks the sizes. `at` is the dotted path of the settings, for errors.
     ///
     /// # Errors
-    /// When there are neither filters nor colours, or a size is out of range.
+    /// When there are neither filters nor colours, there is one colour, or a size is out of range.
     pub fn check(&self, at: &str, image: usize) -> Result<()> {
         if self.filters.is_empty() && self.colours.is_empty() {
             return Err(Error::config(
@@ -107,6 +109,16 @@ impl KeypointsConfig {
         }
         let coloured = image.saturating_mul(image).saturating_mul(self.colours.len());
         check_sizes(&[(&format!("the pixels times {at}.colours"), coloured, 0, MOST_COLOURED)])?;
+        if self.colours.len() == 1 {
+            let fix = "give at least two: a pixel belongs to the colours by their distances";
+            return Err(Error::config(format!("{at}.colours"), "one colour", fix));
+        }
+        if let Some(colour) =
+            self.colours.iter().find(|colour| !colour.iter().all(|value| value.abs() <= LARGEST_COLOUR))
+        {
+            let fix = "give normalised values, 0 to 1 with model.pixel_mean 0 and model.pixel_std 1, not bytes";
+            return Err(Error::config(format!("{at}.colours"), format!("{colour:?}"), fix));
+        }
         for FilterConfig { kernel, stride, channels } in &self.filters {
             check_sizes(&[
                 (&format!("{at}.filters.kernel"), *kernel, 1, image),

@@ -134,14 +134,14 @@ fn goal_conditioned_models_learn_on_keypoints_of_frames_that_are_encoded_once() 
         config.model.encoder = BackboneConfig::Keypoints(KeypointsConfig {
             filters,
             sharpness: 2.0,
-            colours: vec![],
+            colours: vec![[1.0; 3], [-1.0; 3]],
             hidden: vec![16],
             dim: 12,
             seed: 0,
         });
         let checkpoint = trained(&config, folder.path());
         let running = &parameters::values(&checkpoint.model)["encoder.norm.running_mean"].values;
-        assert!(running.len() == 24 && running.iter().any(|mean| mean.abs() > 0.0), "{running:?}");
+        assert!(running.len() == 24 + 2 * 10 && running.iter().any(|mean| mean.abs() > 0.0), "{running:?}");
         assert_eq!(M::actor(&checkpoint).latent_dim(), 12);
         let (first, last) = first_and_last(folder.path(), "loss");
         assert!(last < first, "{}: {last} after {first}", M::FAMILY);

@@ -204,7 +204,12 @@ fn decoder_without_fixed_filters_is_refused() {
     }
     let error = config.check().expect_err("checking filters that are too many").to_string();
     assert!(error.contains("the weights of model.encoder.keypoints.filters: 135000000; give at most"), "{error}");
-    let colours = [(vec![[f32::NAN; 3]], "give a finite value"), (vec![], "at least one size of filters, or colours")];
+    let colours = [
+        (vec![[f32::NAN; 3]; 2], "give a finite value"),
+        (vec![[0.0; 3], [255.0, 0.0, 0.0]], "not bytes"),
+        (vec![[1.0; 3]], "give at least two"),
+        (vec![], "at least one size of filters, or colours"),
+    ];
     for (colours, fix) in colours {
         if let EncoderConfig::Keypoints(keypoints) = &mut config.model.encoder {
             (keypoints.filters, keypoints.colours) = (vec![], colours);

@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 use swm_core::columns::{REWARD, SUCCESS, is_stored_as};
 use swm_core::results::Summary;
 use swm_core::{Error, Manifest, Result};
-use swm_data::{Reader, StepRange, checksum, column_stats};
+use swm_data::{Reader, StepRange, checksum, column_stats, frequent_colours};
 use swm_models::capsule::Capsule;
 
 /// Arguments of `swm inspect`.
@@ -24,6 +24,11 @@ pub struct InspectArgs {
     /// The checksum does not depend on format and codec.
     #[arg(long)]
     checksum: bool,
+    /// Find this number of colours in the frames, the most frequent first
+    ///
+    /// They are a setting of `swm train --preset colours`, whose images are not normalised. At most 256 frames are read.
+    #[arg(long, value_name = "COUNT", value_parser = clap::value_parser!(u16).range(2..=256), conflicts_with_all = ["checksum", "croissant", "datasheet"])]
+    colours: Option<u16>,
     /// Print Croissant metadata (JSON-LD), also of a capsule
     ///
     /// Lists all files with their SHA-256 hashes, so all of them are read.
@@ -61,6 +66,9 @@ pub fn inspect(args: &InspectArgs, as_json: bool) -> anyhow::Result<()> {
         return Err(Error::config(option, "it belongs to a description", fix).into());
     }
     let reader = open_dataset(&args.dataset)?;
+    if let Some(count) = args.colours {
+        return colours(&*reader, count.into(), as_json);
+    }
     let contents = contents(&*reader, args.checksum)?;
     if as_json {
         return emit_json(&contents);
@@ -107,6 +115,18 @@ pub fn inspect(args: &InspectArgs, as_json: bool) -> anyhow::Result<()> {
     if let Some(checksum) = contents["checksum"].as_str() {
         emit(&format!("checksum of the decoded content: {checksum}\n"));
     }
+    Ok(())
+}
+
+/// Prints colours of the frames, as the setting of an encoder, in quotes for a shell.
+fn colours(reader: &dyn Reader, count: usize, as_json: bool) -> anyhow::Result<()> {
+    // Three digits are finer than a byte of a frame.
+    let rounded = |value: f32| (f64::from(value) * 1000.0).round() / 1000.0;
+    let colours: Vec<_> = frequent_colours(reader, count)?.iter().map(|colour| colour.map(rounded)).collect();
+    if as_json {
+        return emit_json(&json!({"colours": colours}));
+    }
+    emit(&format!("'model.encoder.keypoints.colours={colours:?}'\n").replace(", ", ","));
     Ok(())
 }
 

@@ -55,6 +55,23 @@ fn converted_dataset_has_the_same_content() {
 }
 
 #[test]
+fn colours_of_frames_are_a_setting_of_a_training() {
+    let swm = Swm::new();
+    collect(&swm, "rooms");
+    let found = swm.json(&["inspect", "rooms", "--colours", "3"]);
+    assert_eq!(found, swm.json(&["inspect", "rooms", "--colours", "3"]));
+    assert_eq!(found["colours"].as_array().map(Vec::len), Some(3), "{found}");
+    let printed = text(&swm.run(&["inspect", "rooms", "--colours", "3"]).stdout);
+    let setting = printed.trim().trim_matches('\'');
+    let config = text(&swm.run(&["train", "pldm", "--preset", "colours", "--print-config", setting]).stdout);
+    let given = found["colours"][0][0].as_f64().expect("a colour");
+    assert!(config.contains(&format!("{given:?}")) && !config.contains("0.957"), "{setting}: {config}");
+    swm.fails(&["inspect", "rooms", "--colours", "1"], 2, &["--colours"]);
+    swm.json(&["collect", "swm/TwoRoom-v1", "--output", "blind", "--episodes", "1", "--max-steps", "3", "--no-pixels"]);
+    swm.fails(&["inspect", "blind", "--colours", "3"], 2, &["pixels"]);
+}
+
+#[test]
 fn doctor_finds_truncated_files() {
     let swm = Swm::new();
     collect(&swm, "rooms");

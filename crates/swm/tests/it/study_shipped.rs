@@ -100,7 +100,7 @@ fn factors_are_counted_beside_published_ones() {
         2,
         &["Factors of variation per environment", "Colour of the agent in Two-Room"],
     );
-    swm.fails(&["study", "run", "paper/factors", "--output", "out"], 2, &["push-t/lewm", "swm zoo"]);
+    swm.fails(&["study", "run", "paper/baselines", "--output", "out"], 2, &["push-t/tdmpc2", "swm zoo"]);
     assert!(!swm.path("datasets").exists(), "nothing is collected for a study whose models are missing");
     swm.fails(&["study", "run", "paper/factors-per-env", "--commands"], 2, &["no cell"]);
 }

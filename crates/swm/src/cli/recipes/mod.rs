@@ -20,6 +20,8 @@ use swm_core::{Error, Origin, Result, files};
 const SHIPPED: &[(&str, &str)] = &[
     ("ogb-cube/gcbc", include_str!("../../../recipes/ogb-cube/gcbc.toml")),
     ("push-t/gcbc", include_str!("../../../recipes/push-t/gcbc.toml")),
+    ("push-t/lewm", include_str!("../../../recipes/push-t/lewm.toml")),
+    ("push-t/pldm", include_str!("../../../recipes/push-t/pldm.toml")),
     ("reacher/lewm", include_str!("../../../recipes/reacher/lewm.toml")),
     ("two-room/lewm", include_str!("../../../recipes/two-room/lewm.toml")),
     ("two-room/lewm-straight", include_str!("../../../recipes/two-room/lewm-straight.toml")),

@@ -94,7 +94,7 @@ fn hostile_numbers_are_refused() {
         swm.fails(&["convert", "a.lance", "b.h5", &given], 2, &["from 0 to 200 dB"]);
     }
     let ray = ["study", "break", "expert", "env=swm/TwoRoom-v1", "--factor=agent.speed", "--below=101", "-o=o"];
-    swm.fails(&ray, 2, &["1..=100"]);
+    swm.fails(&ray, 2, &["a whole number from 1 to 100"]);
     swm.fails(&["bench", "train", "--clips=1152921504606846976"], 2, &["from 1 to 4096"]);
     swm.fails(&["bench", "plan", "--envs=1152921504606846976"], 2, &["from 1 to 16384"]);
 }

@@ -15,7 +15,6 @@ fn absurd_counts_are_refused_before_work_starts() {
     for (args, option, value, what) in [
         (ROOMS, "--envs", "1000000", "number of environments"),
         (ROOMS, "--threads", "100000", "number of threads"),
-        (&ROOMS[..4], "--episodes", huge, "a whole number from 1 to 1000000000"),
         (ROOMS, "--max-steps", huge, "number of steps"),
         (ROOMS, "--shard", "0/1000000000000000", "number of shards"),
         (EVAL, "--budget", huge, "number of steps"),
@@ -25,6 +24,7 @@ fn absurd_counts_are_refused_before_work_starts() {
     }
     swm.fails(&[&ROOMS[..6], &["--image", "100000"]].concat(), 2, &["100000", "4096"]);
     swm.fails(&[&ROOMS[..6], &["--image", "4096", "--envs", "10000"]].concat(), 2, &["bytes of a batch"]);
+    swm.fails(&[&ROOMS[..4], &["--episodes", huge]].concat(), 2, &[huge, "a whole number from 1 to 1000000000"]);
     swm.fails(&[EVAL, &["--episodes", huge]].concat(), 2, &[huge, "from 1 to 1000000"]);
     let wrappers = ["--wrapper", "noise"].repeat(20_000);
     swm.fails(&[&ROOMS[..6], &wrappers].concat(), 2, &["number of wrappers", "20000 is too large"]);

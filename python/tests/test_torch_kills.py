@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-import stable_worldmodel as swm
-
 torch = pytest.importorskip("torch")
 torch.set_num_threads(1)
 
@@ -20,14 +18,6 @@ from stable_worldmodel.wm.utils import load_pretrained  # noqa: E402
 
 #: A training of seconds.
 SHORT = ["data.batch_size=10", "schedule.steps=6", "schedule.warmup=2", "log_every=2", "shards=1"]
-
-
-@pytest.fixture(scope="module")
-def rooms(tmp_path_factory):
-    path = tmp_path_factory.mktemp("data") / "rooms.lance"
-    world = swm.World("swm/TwoRoom-v1", num_envs=3, image_shape=(64, 64), max_episode_steps=25)
-    world.collect(path, episodes=12, seed=0, progress=False, policy=swm.policy.RandomPolicy(seed=0))
-    return str(path)
 
 
 def torch_train(family, rooms, out, settings, **options):

@@ -35,14 +35,6 @@ CONV = "model.encoder={conv={channels=[6,8],hidden=12,dim=10}}"
 
 
 @pytest.fixture(scope="module")
-def rooms(tmp_path_factory):
-    path = tmp_path_factory.mktemp("data") / "rooms.lance"
-    world = swm.World("swm/TwoRoom-v1", num_envs=3, image_shape=(64, 64), max_episode_steps=25)
-    world.collect(path, episodes=12, seed=0, progress=False, policy=swm.policy.RandomPolicy(seed=0))
-    return str(path)
-
-
-@pytest.fixture(scope="module")
 def swings(tmp_path_factory):
     """Episodes with rewards."""
     path = tmp_path_factory.mktemp("data") / "swings.lance"

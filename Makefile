@@ -245,7 +245,7 @@ $(VENV)/ready: | setup
 # The published reference, for parity and speed: heavy (it brings torch), and only wanted by `make bench`.
 reference: setup
 	python3 -m venv $(CACHE)/reference
-	$(CACHE)/reference/bin/python -m pip install --quiet stable-worldmodel opencv-python-headless imageio matplotlib pygame pymunk shapely
+	$(CACHE)/reference/bin/python -m pip install --quiet stable-worldmodel h5py hdf5plugin opencv-python-headless imageio matplotlib pygame pymunk shapely
 
 # Tools of cargo that only `deny` and `nightly` need.
 export PATH := $(CACHE)/tools/bin:$(PATH)

@@ -197,13 +197,14 @@ fn shortened(text: String) -> String {
 /// The names most similar to `given`, best first, at most three.
 pub fn nearest<'a>(given: &str, known: impl IntoIterator<Item = &'a str>) -> Vec<String> {
     let fold = |s: &str| s.to_lowercase().replace(['-', '_', '.', '/'], "");
-    let wanted = fold(given);
     let mut scored: Vec<(f64, &str)> = known
         .into_iter()
         // Something of this very name may be known in another place.
         .filter(|name| *name != given)
         .map(|name| {
-            let folded = fold(name);
+            // A shared beginning, such as `model.` or `swm/`, alone makes no name similar.
+            let shared = shared_parts(given, name);
+            let (wanted, folded) = (fold(&given[shared..]), fold(&name[shared..]));
             let contains = folded.contains(&wanted) || wanted.contains(&folded);
             let (short, long) = (wanted.len().min(folded.len()), wanted.len().max(folded.len()).max(1));
             // The score of a substring grows with the fraction of the name that it covers.
@@ -215,9 +216,18 @@ pub fn nearest<'a>(given: &str, known: impl IntoIterator<Item = &'a str>) -> Vec
         .filter(|(score, _)| *score > 0.75)
         .collect();
     scored.sort_by(|a, b| b.0.total_cmp(&a.0).then_with(|| a.1.cmp(b.1)));
+    // Names far behind the best one distract from it.
+    let best = scored.first().map_or(0.0, |(score, _)| *score);
+    scored.retain(|(score, _)| *score > best - 0.2);
     // Experts of several environments have one name.
     scored.dedup_by(|a, b| a.1 == b.1);
     scored.into_iter().take(3).map(|(_, name)| name.to_owned()).collect()
+}
+
+/// The length of the parts, each with its `.` or `/`, with which both names begin.
+fn shared_parts(a: &str, b: &str) -> usize {
+    let same = a.bytes().zip(b.bytes()).take_while(|(a, b)| a == b).count();
+    a.as_bytes()[..same].iter().rposition(|byte| b"./".contains(byte)).map_or(0, |at| at + 1)
 }
 
 fn nearest_clause(names: &[String]) -> String {
@@ -273,6 +283,8 @@ mod tests {
         assert_eq!(nearest("pusht", known), ["swm/PushT-v1"]);
         assert_eq!(nearest("swm/TowRoom-v1", known)[0], "swm/TwoRoom-v1");
         assert!(nearest("quux", known).is_empty());
+        assert_eq!(nearest("swm/TwoRoom", ["swm/AcrobotDMControl-v0", "swm/TwoRoom-v1"]), ["swm/TwoRoom-v1"]);
+        assert!(nearest("model.foo", ["model.smoothed", "model.projector", "model.encoder.conv.dim"]).is_empty());
         assert_eq!(nearest("rooms", ["rooms", "rooms2"]), ["rooms2"]);
         assert_eq!(nearest("exprt", ["expert", "explore", "expert"])[..2], ["expert", "explore"]);
         let message = Error::unknown("environment", "pusht", known, "`swm envs` lists them").to_string();

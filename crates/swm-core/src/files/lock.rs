@@ -46,7 +46,7 @@ impl Lock {
                 std::fs::create_dir_all(folder).map_err(|error| Error::io(folder, "creating the folder", error))?;
             }
             let file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path);
-            file.map_err(|error| locking(path, error))
+            file.map_err(|error| Error::io(path, "creating the file", error))
         })
     }
 

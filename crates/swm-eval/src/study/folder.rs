@@ -82,7 +82,10 @@ impl StudyFolder {
             kind: Option<String>,
         }
         let path = self.root.join(STUDY);
-        let fix = "give the folder of a study";
+        let fix = "give the folder that `swm study run --output` wrote";
+        if self.root.is_dir() && !path.exists() {
+            return Err(Error::config(self.root.display().to_string(), format!("has no {STUDY}"), fix));
+        }
         let (bytes, no_study) =
             (files::read(&path, MAX_BYTES)?, |error| Error::corrupt(&path, format!("is not a study ({error})"), fix));
         let invalid = |error| Error::corrupt(&path, format!("is not a valid study ({error})"), fix);

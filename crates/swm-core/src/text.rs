@@ -19,6 +19,18 @@ pub fn printable(text: &str) -> Cow<'_, str> {
     Cow::Owned(out)
 }
 
+/// Returns a statement of a stranger, such as an author or a server's message, as one line of at most 200 characters.
+pub fn one_line(text: &str) -> String {
+    const MAX: usize = 200;
+    let words = text.split_whitespace().flat_map(|word| word.chars().chain([' ']));
+    let start: String = words.take(MAX + 1).collect();
+    let line = start.trim_end();
+    match line.char_indices().nth(MAX) {
+        Some((end, _)) => format!("{}…", printable(line[..end].trim_end())),
+        None => printable(line).into_owned(),
+    }
+}
+
 /// Returns whether a character controls a terminal instead of appearing on it: C0 and C1 controls except line feed and
 /// tab, separators of lines and paragraphs, and the marks, embeddings, overrides and isolates of bidirectional text.
 fn is_control(c: char) -> bool {
@@ -39,6 +51,15 @@ mod tests {
         let expected = "a\\u{1b}]0;owned\\u{7}b\\r\\u{9b}31m\\u{7f}\\u{202e}\\u{2066}";
         assert_eq!(printable(title), expected);
         assert!(printable(&printable(title)) == expected, "escaped text stays as it is");
+    }
+
+    #[test]
+    fn statements_of_strangers_are_one_short_line() {
+        assert_eq!(one_line(" Ada\n\nerror: all\tlost \u{1b}[31m"), "Ada error: all lost \\u{1b}[31m");
+        assert_eq!(one_line(""), "");
+        let long = one_line(&"größe ".repeat(1_000_000));
+        assert!(long.chars().count() <= 201 && long.starts_with("größe größe") && long.ends_with('…'), "{long}");
+        assert_eq!(one_line(&"x".repeat(200)), "x".repeat(200));
     }
 
     #[test]

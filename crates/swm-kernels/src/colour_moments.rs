@@ -18,8 +18,15 @@ pub struct ColourMoments {
 /// Memory for the features of an image.
 #[derive(Clone, Debug, Default)]
 pub struct ColourScratch {
-    /// The weight of every pixel for every colour, `[colours, side * side]`.
+    /// The channels of the image, `[3, columns, rows]`.
+    planes: Vec<f32>,
+    /// The weight of every pixel for every colour, `[colours, columns, rows]`.
     weights: Vec<f32>,
+    /// The largest negative squared distance of every pixel, and the sum of its weights before the normalisation, `[columns, rows]`.
+    largest: Vec<f32>,
+    total: Vec<f32>,
+    /// Sums over the pixels of each row, `[4, rows]`.
+    rows: Vec<f32>,
 }
 
 impl ColourMoments {
@@ -62,66 +69,110 @@ impl Kernel for Moments<'_> {
     fn run<L: Level>(self) {
         let Self { of: ColourMoments { side, colours }, pixels, scratch, features } = self;
         let (side, count) = (*side, side * side);
-        let weights = &mut scratch.weights;
-        weights.resize(colours.len() * count, 0.0);
-        // Distances, then the softmax over the colours of every pixel, then moments: one plane of pixels for each colour.
-        for (colour, plane) in colours.iter().zip(weights.chunks_exact_mut(count)) {
-            for (weight, pixel) in plane.iter_mut().zip(pixels.chunks_exact(3)) {
-                let [r, g, b] = [pixel[0] - colour[0], pixel[1] - colour[1], pixel[2] - colour[2]];
-                *weight = -SHARPNESS * L::fma(r, r, L::fma(g, g, b * b));
+        let ColourScratch { planes, weights, largest, total, rows } = scratch;
+        for (memory, values) in [
+            (&mut *planes, 3 * count),
+            (&mut *weights, colours.len() * count),
+            (&mut *largest, count),
+            (&mut *total, count),
+            (&mut *rows, 4 * side),
+        ] {
+            memory.resize(values, 0.0);
+        }
+        // Planes hold the columns of the image one after the other, so that the sums over a row, of which each has the order of its
+        // pixels, are taken for all rows at once.
+        for (row, pixels) in pixels.chunks_exact(3 * side).enumerate() {
+            for (column, pixel) in pixels.chunks_exact(3).enumerate() {
+                for (channel, value) in pixel.iter().enumerate() {
+                    planes[channel * count + column * side + row] = *value;
+                }
             }
         }
-        for pixel in 0..count {
-            let mut largest = f32::NEG_INFINITY;
-            for colour in 0..colours.len() {
-                largest = largest.max(weights[colour * count + pixel]);
-            }
-            let mut total = 0.0;
-            for colour in 0..colours.len() {
-                let weight = exp::<L>(weights[colour * count + pixel] - largest);
-                weights[colour * count + pixel] = weight;
-                total += weight;
-            }
-            for colour in 0..colours.len() {
-                weights[colour * count + pixel] /= total;
-            }
-        }
-        let coordinate = |index: usize| 2.0 * index as f32 / (side - 1).max(1) as f32 - 1.0;
+        softmax::<L>(colours, planes, weights, largest, total);
         for (plane, features) in weights.chunks_exact(count).zip(features.chunks_exact_mut(ColourMoments::FEATURES)) {
-            // Sums over a row first: a power of y is the same for its pixels.
-            let (mut mass, mut x, mut y) = (0.0, 0.0, 0.0);
-            for (row, weights) in plane.chunks_exact(side).enumerate() {
-                let (mut of_row, mut x_of_row) = (0.0, 0.0);
-                for (column, weight) in weights.iter().enumerate() {
-                    of_row += weight;
-                    x_of_row = L::fma(*weight, coordinate(column), x_of_row);
-                }
-                mass += of_row;
-                x += x_of_row;
-                y = L::fma(of_row, coordinate(row), y);
-            }
-            let total = mass + PRIOR;
-            let (x, y) = (x / total, y / total);
-            let mut moments = [0.0_f32; 7];
-            for (row, weights) in plane.chunks_exact(side).enumerate() {
-                let mut powers = [0.0_f32; 4];
-                for (column, weight) in weights.iter().enumerate() {
-                    let dx = coordinate(column) - x;
-                    let (first, second) = (weight * dx, weight * dx * dx);
-                    powers[0] += weight;
-                    powers[1] += first;
-                    powers[2] += second;
-                    powers[3] = L::fma(second, dx, powers[3]);
-                }
-                let dy = coordinate(row) - y;
-                let [zero, one, two, three] = powers;
-                let of_row = [two, one * dy, zero * dy * dy, three, two * dy, one * dy * dy, zero * dy * dy * dy];
-                moments.iter_mut().zip(of_row).for_each(|(moment, value)| *moment += value);
-            }
-            features[..3].copy_from_slice(&[mass / count as f32, x, y]);
-            features[3..].iter_mut().zip(moments).for_each(|(feature, moment)| *feature = moment / total);
+            moments::<L>(side, plane, rows, features);
         }
     }
+}
+
+/// Computes the weights of all pixels for each colour, `[colours, pixels]`: the softmax over the colours of negative squared distances.
+#[inline(always)]
+fn softmax<L: Level>(
+    colours: &[[f32; 3]],
+    planes: &[f32],
+    weights: &mut [f32],
+    largest: &mut [f32],
+    total: &mut [f32],
+) {
+    let count = largest.len();
+    let (red, others) = planes.split_at(count);
+    let (green, blue) = others.split_at(count);
+    largest.fill(f32::NEG_INFINITY);
+    for (colour, plane) in colours.iter().zip(weights.chunks_exact_mut(count)) {
+        for ((((weight, largest), r), g), b) in plane.iter_mut().zip(&mut *largest).zip(red).zip(green).zip(blue) {
+            let [r, g, b] = [r - colour[0], g - colour[1], b - colour[2]];
+            *weight = -SHARPNESS * L::fma(r, r, L::fma(g, g, b * b));
+            *largest = if *weight > *largest { *weight } else { *largest };
+        }
+    }
+    total.fill(0.0);
+    for plane in weights.chunks_exact_mut(count) {
+        for ((weight, largest), total) in plane.iter_mut().zip(&*largest).zip(&mut *total) {
+            *weight = exp::<L>(*weight - largest);
+            *total += *weight;
+        }
+    }
+    for plane in weights.chunks_exact_mut(count) {
+        plane.iter_mut().zip(&*total).for_each(|(weight, total)| *weight /= total);
+    }
+}
+
+/// Computes the features of a colour from its weights, which are stored column by column. `rows` is memory for four values of each row.
+#[inline(always)]
+fn moments<L: Level>(side: usize, plane: &[f32], rows: &mut [f32], features: &mut [f32]) {
+    let coordinate = |index: usize| 2.0 * index as f32 / (side - 1).max(1) as f32 - 1.0;
+    let (zero, others) = rows.split_at_mut(side);
+    let (one, others) = others.split_at_mut(side);
+    let (two, three) = others.split_at_mut(side);
+    zero.fill(0.0);
+    one.fill(0.0);
+    for (column, weights) in plane.chunks_exact(side).enumerate() {
+        let x = coordinate(column);
+        for ((weight, zero), one) in weights.iter().zip(&mut *zero).zip(&mut *one) {
+            *zero += weight;
+            *one = L::fma(*weight, x, *one);
+        }
+    }
+    // A power of y is the same for the pixels of a row.
+    let (mut mass, mut x, mut y) = (0.0, 0.0, 0.0);
+    for (row, (zero, one)) in zero.iter().zip(&*one).enumerate() {
+        mass += zero;
+        x += one;
+        y = L::fma(*zero, coordinate(row), y);
+    }
+    let all = mass + PRIOR;
+    let (x, y) = (x / all, y / all);
+    one.fill(0.0);
+    two.fill(0.0);
+    three.fill(0.0);
+    for (column, weights) in plane.chunks_exact(side).enumerate() {
+        let dx = coordinate(column) - x;
+        for (((weight, one), two), three) in weights.iter().zip(&mut *one).zip(&mut *two).zip(&mut *three) {
+            let second = weight * dx * dx;
+            *one += weight * dx;
+            *two += second;
+            *three = L::fma(second, dx, *three);
+        }
+    }
+    let mut moments = [0.0_f32; 7];
+    for (row, (((zero, one), two), three)) in zero.iter().zip(&*one).zip(&*two).zip(&*three).enumerate() {
+        let dy = coordinate(row) - y;
+        let of_row = [*two, one * dy, zero * dy * dy, *three, two * dy, one * dy * dy, zero * dy * dy * dy];
+        moments.iter_mut().zip(of_row).for_each(|(moment, value)| *moment += value);
+    }
+    let count = side * side;
+    features[..3].copy_from_slice(&[mass / count as f32, x, y]);
+    features[3..].iter_mut().zip(moments).for_each(|(feature, moment)| *feature = moment / all);
 }
 
 #[cfg(test)]

@@ -19,6 +19,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 use swm_core::run::Control;
+use swm_core::text::one_line;
 use swm_core::{Error, Result};
 use url::Url;
 
@@ -269,7 +270,7 @@ impl Client {
             return Ok(());
         }
         let header = |name: &str| answer.headers().get(name).and_then(|value| value.to_str().ok()).unwrap_or_default();
-        let (code, message) = (header(ERROR_CODE), header(ERROR_MESSAGE));
+        let (code, message) = (header(ERROR_CODE), one_line(header(ERROR_MESSAGE)));
         let page = self.page(uri);
         let login = match &self.token {
             None => format!("set {TOKEN} to a token of your account (the hub's settings make them)"),

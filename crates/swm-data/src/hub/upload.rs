@@ -15,6 +15,7 @@ use std::fs::File;
 use std::io::{Read as _, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
 use swm_core::run::{Control, Event, Progress, Stage};
+use swm_core::text::one_line;
 use swm_core::{Error, Result};
 
 /// The name of the stage.
@@ -219,7 +220,7 @@ impl Client {
             return Err(Error::corrupt(url, "its answer names no file", "check the address of the hub"));
         };
         if let Some(error) = found.error {
-            let message = error["message"].as_str().unwrap_or("no reason given").to_owned();
+            let message = one_line(error["message"].as_str().unwrap_or("no reason given"));
             return Err(Error::external(format!("uploading {}", upload.path), message));
         }
         // Without an action, the hub has the file already.
@@ -306,7 +307,7 @@ impl Client {
                 "check on the hub whether the files are there",
             ));
         }
-        Ok((answer.commit_oid, answer.commit_url))
+        Ok((answer.commit_oid, one_line(&answer.commit_url)))
     }
 }
 

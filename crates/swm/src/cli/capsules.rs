@@ -12,6 +12,7 @@ use serde::Serialize;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use swm_core::results::Proportion;
+use swm_core::text::one_line;
 use swm_core::{Error, Result, files};
 use swm_eval::StartsRequest;
 use swm_models::capsule::{Capsule, export};
@@ -175,7 +176,7 @@ impl CapsuleInfo {
 
     /// Describes the capsule in lines for people.
     pub fn lines(&self) -> String {
-        let or_none = |text: &Option<String>| text.as_deref().unwrap_or("not stated").to_owned();
+        let or_none = |text: &Option<String>| text.as_deref().map_or("not stated".to_owned(), one_line);
         let (licence, author) = (or_none(&self.licence), or_none(&self.author));
         let mut lines = format!(
             "capsule {}, {} kB, packed on {}\nlicence {licence}, author {author}\n",

@@ -177,6 +177,20 @@ fn breaking_points_are_found_along_a_ray_and_for_each_value() {
     let whole = contents(&swm.path("speed"));
     assert_eq!(swm.json(&args), results);
     assert!(contents(&swm.path("speed")) == whole, "a study that was done changed");
+    // A killed study keeps the levels inside that it chose, here two of three.
+    let file = std::fs::read_to_string(swm.path("speed/study.json")).expect("the study");
+    let mut study: serde_json::Value = serde_json::from_str(&file).expect("a study");
+    let cells = study["cells"].as_array_mut().expect("cells");
+    let eighths = |change: &serde_json::Value| {
+        change.as_str().and_then(|text| text.parse::<f64>().ok()).map(|change| 8.0 * change)
+    };
+    let is_inside = |cell: &serde_json::Value| {
+        let variables = cell["variables"].as_object().expect("variables");
+        variables.values().filter_map(eighths).any(|change| change.fract() != 0.0)
+    };
+    cells.remove(cells.iter().position(is_inside).expect("a cell inside"));
+    std::fs::write(swm.path("speed/study.json"), study.to_string()).expect("writing the study");
+    assert_eq!(swm.json(&args)["cells"].as_u64(), Some(11));
     swm.json(&["study", "report", "speed"]);
     let page = text(&contents(&swm.path("speed/report"))["index.html"]);
     for words in

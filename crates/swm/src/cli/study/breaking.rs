@@ -14,11 +14,11 @@ use crate::cli::{Context, emit_json};
 use crate::resolver::HomeResolver;
 use clap::Args;
 use serde_json::json;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use swm_core::results::{BreakingPoint, Ray, StudyResults, Until};
 use swm_core::{DType, Error, Factor, Origin, Result, Space, VariationSpace, limits};
-use swm_eval::{Common, Resolver as _, Study, StudyFolder};
+use swm_eval::{Cell, Common, Resolver as _, Study, StudyFolder};
 
 /// Arguments of `swm study break`.
 #[derive(Args)]
@@ -96,8 +96,13 @@ pub fn run(args: &BreakArgs, context: &Context) -> anyhow::Result<()> {
         return submit(&args.on, &args.output, cells, context);
     }
     let folder = StudyFolder::new(&args.output);
-    let lock = folder.create(&first)?;
     let options = run_options(args.envs, None, context);
+    if let Some(whole) = chosen_before(&folder, &first)?.filter(|_| !args.inside) {
+        let _lock = folder.create(&whole)?;
+        whole.run(&folder, &resolver, &options, &mut control(context))?;
+        return show(&whole.results(&folder)?, context.json);
+    }
+    let lock = folder.create(&first)?;
     if !args.inside {
         first.run(&folder, &resolver, &options, &mut control(context))?;
     }
@@ -110,6 +115,17 @@ pub fn run(args: &BreakArgs, context: &Context) -> anyhow::Result<()> {
     let _lock = folder.create(&whole)?;
     whole.run(&folder, &resolver, &options, &mut control(context))?;
     show(&whole.results(&folder)?, context.json)
+}
+
+/// The study of a folder, if it has the grid of `first` and levels inside an interval. They were chosen by the results of that time; under
+/// a rule that ends a study, those of now may choose others, of which nothing is played yet.
+fn chosen_before(folder: &StudyFolder, first: &Study) -> Result<Option<Study>> {
+    let Ok(found) = folder.study() else { return Ok(None) };
+    let ids = |study: &Study| study.cells.iter().map(Cell::id).collect::<Result<BTreeSet<_>>>();
+    let (all, grid) = (ids(&found)?, ids(first)?);
+    let same = (&found.title, &found.ray, found.until, &found.families)
+        == (&first.title, &first.ray, first.until, &first.families);
+    Ok((same && all.len() > grid.len() && all.is_superset(&grid)).then_some(found))
 }
 
 /// The most cells that the levels inside an interval add to the grid: each unshifted cell may have an interval of its own, and all of

@@ -41,11 +41,13 @@ pub struct Shared {
     pub trainings: Trainings,
     pub reports: Arc<reports::Known>,
     pub work: Arc<Semaphore>,
+    /// The folder of files that are made for an answer.
+    pub scratch: Arc<std::path::Path>,
     pub stop: watch::Receiver<bool>,
 }
 
 impl Shared {
-    pub fn new(lab: Lab, stop: watch::Receiver<bool>) -> Self {
+    pub fn new(lab: Lab, scratch: &std::path::Path, stop: watch::Receiver<bool>) -> Self {
         Self {
             datasets: Arc::new(Datasets::new(lab.datasets.clone())),
             lab: Arc::new(lab),
@@ -53,6 +55,7 @@ impl Shared {
             trainings: Trainings::default(),
             reports: Arc::default(),
             work: Arc::new(Semaphore::new(AT_ONCE)),
+            scratch: scratch.into(),
             stop,
         }
     }
@@ -62,9 +65,14 @@ impl Shared {
         &self,
         work: impl FnOnce(&Self) -> Result<T> + Send + 'static,
     ) -> Result<T, Failed> {
-        let _permit = Arc::clone(&self.work).acquire_owned().await.ok();
+        let permit = Arc::clone(&self.work).acquire_owned().await.ok();
         let shared = self.clone();
-        let done = tokio::task::spawn_blocking(move || work(&shared)).await;
+        let done = tokio::task::spawn_blocking(move || {
+            // Work goes on after its client has gone, and counts until it ends.
+            let _permit = permit;
+            work(&shared)
+        });
+        let done = done.await;
         let done = done.unwrap_or_else(|error| Err(Error::external("answering a request of a page", error)));
         done.map_err(Failed)
     }
@@ -300,7 +308,7 @@ async fn values(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -
 async fn video(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
     let video = shared.work(move |shared| {
         let reader = shared.datasets.get(query.folder, &query.name)?;
-        datasets::video(reader, &query.column, query.episode)
+        datasets::video(reader, &query.column, query.episode, &shared.scratch)
     });
     let mut response = answer("video/mp4", video.await?);
     response.headers_mut().insert(header::CONTENT_DISPOSITION, HeaderValue::from_static("attachment"));

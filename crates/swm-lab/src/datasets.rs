@@ -18,6 +18,10 @@ pub const MOST_ELEMENTS: usize = 64;
 const MOST_ROWS: usize = 20_000_000;
 /// The largest number of rows of an episode that is plotted.
 const MOST_STEPS: usize = 100_000;
+/// The largest number of values of a column in an episode that is summarised.
+const MOST_OF_EPISODE: usize = 1 << 26;
+/// The largest number of values of an episode that is plotted, which a small compressed file can exceed.
+const MOST_PLOTTED: usize = 1 << 23;
 /// The largest number of values that are read at the same time.
 const MOST_VALUES: usize = 1 << 20;
 /// The largest number of frames of a video, and of its bytes.
@@ -240,6 +244,12 @@ pub fn values(reader: &dyn Reader, column: &str, element: usize) -> Result<Value
         let problem = format!("the episodes have {rows} rows, more than {MOST_ROWS}");
         return Err(Error::config(format!("column '{column}'"), problem, "read it in a program"));
     }
+    if let Some(values) =
+        all.iter().map(|episode| length(episode).saturating_mul(count)).find(|&values| values > MOST_OF_EPISODE)
+    {
+        let problem = format!("an episode has {values} values, more than {MOST_OF_EPISODE}");
+        return Err(Error::config(format!("column '{column}'"), problem, "read it in a program"));
+    }
     let (mut found, mut ranges, mut waiting) = (Values::default(), vec![], 0);
     for (position, episode) in all.iter().enumerate() {
         ranges.push(StepRange::new(position, 0, length(episode)));
@@ -277,17 +287,19 @@ impl Values {
     }
 }
 
-/// Makes the video of an episode as `swm preview` does: MP4, with the images of a column, or of all if it is empty.
+/// Makes the video of an episode as `swm preview` does: MP4, with the images of a column, or of all if it is empty. Its files are
+/// in a folder inside `scratch` meanwhile.
 ///
 /// # Errors
 /// When there is no such episode, it is too long, it has no images, or this build has no FFmpeg.
-pub fn video(reader: Arc<dyn Reader>, column: &str, episode: usize) -> Result<Vec<u8>> {
+pub fn video(reader: Arc<dyn Reader>, column: &str, episode: usize, scratch: &Path) -> Result<Vec<u8>> {
     let length = episode_length(&*reader, episode)?;
     if length > MOST_FRAMES {
         let problem = format!("it has {length} rows, more than {MOST_FRAMES}");
         return Err(Error::config(format!("the video of episode {episode}"), problem, "use swm preview"));
     }
-    let folder = tempfile::tempdir().map_err(|error| Error::external("making a folder for a video", error))?;
+    let folder =
+        tempfile::tempdir_in(scratch).map_err(|error| Error::external("making a folder for a video", error))?;
     let columns = if column.is_empty() { vec![] } else { vec![column.to_owned()] };
     let options = PreviewOptions { episodes: 1, columns, ..PreviewOptions::default() };
     let written = swm_data::preview(&*subset(reader, vec![episode])?, folder.path(), &options, |_| ())?;
@@ -320,6 +332,12 @@ pub fn rows(reader: &dyn Reader, episode: usize) -> Result<Value> {
         .filter(|column| is_plotted(column))
         .map(|column| column.name.as_str())
         .collect();
+    let elements = |name: &&str| reader.schema().column(name).map(ColumnSpec::len);
+    let values = names.iter().map(elements).sum::<Result<usize>>()?.saturating_mul(length);
+    if values > MOST_PLOTTED {
+        let problem = format!("its columns have {values} values, more than {MOST_PLOTTED}");
+        return Err(Error::config(format!("episode {episode}"), problem, "read it in a program"));
+    }
     let batch = reader.read(&names, &[StepRange::new(episode, 0, length)])?;
     let columns: Result<Vec<Value>> = names
         .iter()

@@ -47,11 +47,11 @@ impl Kind {
         }
     }
 
-    /// What a folder holds; `None` for any other folder.
+    /// What a folder holds; `None` for any other folder, and for one whose file is a link.
     fn of(path: &Path) -> Option<Self> {
         [Self::Autopsy, Self::Study, Self::Results, Self::Leaderboard]
             .into_iter()
-            .find(|kind| path.join(kind.file()).is_file())
+            .find(|kind| path.join(kind.file()).symlink_metadata().is_ok_and(|metadata| metadata.is_file()))
     }
 }
 
@@ -150,9 +150,11 @@ fn is_skipped(path: &Path) -> bool {
     path.file_name().is_some_and(|name| SKIPPED.iter().any(|skipped| name == *skipped))
 }
 
-/// The pages of the entries of a leaderboard, without those that are links.
+/// The pages of the entries of a leaderboard, without those that are links; none if their folder is a link.
 fn entries(leaderboard: &Path) -> Vec<String> {
-    let found = std::fs::read_dir(leaderboard.join(ENTRIES)).into_iter().flatten().flatten().take(MOST);
+    let folder = leaderboard.join(ENTRIES);
+    let found =
+        (!folder.is_symlink()).then(|| std::fs::read_dir(folder)).into_iter().flatten().flatten().flatten().take(MOST);
     let names = found.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_file()));
     let mut names: Vec<String> = names.filter_map(|entry| entry.file_name().into_string().ok()).collect();
     names.retain(|name| name.ends_with(".html"));

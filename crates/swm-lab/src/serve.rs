@@ -92,7 +92,10 @@ impl Server {
     pub fn run(self, stop: &AtomicBool) {
         let Self { runtime, listener, access, lab, .. } = self;
         let (stopping, stopped) = watch::channel(false);
-        let shared = Shared::new(lab, stopped);
+        // Removed at the end, also under work that is not waited for.
+        let scratch = tempfile::tempdir().ok();
+        let folder = scratch.as_ref().map_or_else(std::env::temp_dir, |scratch| scratch.path().to_owned());
+        let shared = Shared::new(lab, &folder, stopped);
         let (running, trainings, lab) = (shared.running.clone(), shared.trainings.clone(), Arc::clone(&shared.lab));
         let router = api::routes(shared);
         runtime.block_on(async {
@@ -118,6 +121,7 @@ impl Server {
             std::thread::sleep(POLL);
         }
         trainings.end(&*lab.training);
+        drop(scratch);
     }
 }
 

@@ -16,11 +16,29 @@ pub(crate) fn dropout_rates(rates: &[(&str, f32)]) -> Result<()> {
     }
 }
 
-/// Checks that the standard deviations of pixels are positive.
+/// Checks that weights of losses are finite and at least 0.
 ///
 /// # Errors
-/// When a standard deviation is not positive.
-pub(crate) fn pixel_std(std: [f32; 3]) -> Result<()> {
+/// When a weight is negative or not finite; the error names the first such weight.
+pub(crate) fn loss_weights(weights: &[(&str, f32)]) -> Result<()> {
+    match weights.iter().find(|(_, weight)| !(weight.is_finite() && *weight >= 0.0)) {
+        Some((name, weight)) => Err(Error::config(*name, weight.to_string(), "give a number of at least 0")),
+        None => Ok(()),
+    }
+}
+
+/// Checks that the means of pixels, which are 0 to 1, are near them, and that the standard deviations are positive.
+///
+/// # Errors
+/// When a mean is beyond 100 or a standard deviation is not positive.
+pub(crate) fn pixel_normalization(mean: [f32; 3], std: [f32; 3]) -> Result<()> {
+    if mean.iter().any(|mean| !(mean.abs() <= 100.0)) {
+        return Err(Error::config(
+            "model.pixel_mean",
+            format!("{mean:?}"),
+            "give three values of pixels, which are 0 to 1",
+        ));
+    }
     if std.iter().any(|std| *std <= 0.0) {
         return Err(Error::config("model.pixel_std", format!("{std:?}"), "give three positive values"));
     }

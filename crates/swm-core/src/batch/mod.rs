@@ -56,6 +56,15 @@ impl Batch {
     /// # Errors
     /// When the rows do not fit into memory.
     pub fn try_resize(&mut self, rows: usize) -> Result<()> {
+        let bytes = rows.saturating_mul(self.schema.row_bytes());
+        // The system promises more memory than there is, and ends a process that uses it. What is read is copied once at least.
+        if bytes > MANY_BYTES && free_memory().is_some_and(|free| 2 * bytes as u64 > free) {
+            return Err(Error::mismatch(
+                "reading rows",
+                format!("{rows} rows of {} bytes, more than half of the free memory", self.schema.row_bytes()),
+                "fewer rows at once; `swm doctor` checks the dataset",
+            ));
+        }
         for (buffer, column) in self.data.iter_mut().zip(self.schema.columns()) {
             let reserved = rows.checked_mul(column.row_bytes()).is_some_and(|bytes| buffer.reserve(bytes));
             if !reserved {
@@ -258,6 +267,16 @@ impl std::fmt::Debug for Batch {
     }
 }
 
+/// The bytes above which the free memory is asked for: a small compressed file can describe more.
+const MANY_BYTES: usize = 1 << 30;
+
+/// The memory that the system could give to a program, in bytes; `None` where it does not say.
+fn free_memory() -> Option<u64> {
+    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
+    Some(1024 * line.trim().trim_end_matches(" kB").parse::<u64>().ok()?)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -265,6 +284,13 @@ mod tests {
     fn schema() -> Schema {
         Schema::new([ColumnSpec::new("state", DType::Float64, [3]), ColumnSpec::image("pixels", 2, 2)])
             .expect("creating the schema")
+    }
+
+    #[test]
+    fn rows_beyond_the_free_memory_are_refused() {
+        let rows = (1 << 40) / schema().row_bytes();
+        let error = Batch::new(schema(), 0).try_resize(rows).expect_err("a TiB").to_string();
+        assert!(error.contains("the free memory") && error.contains("fewer rows at once"), "{error}");
     }
 
     #[test]

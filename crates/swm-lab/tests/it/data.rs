@@ -3,7 +3,7 @@
 use super::TestLab;
 use serde_json::json;
 use std::fs;
-use swm_core::{Action, ResetOptions, columns};
+use swm_core::{Action, Batch, ColumnSpec, DType, ResetOptions, Schema, columns};
 use swm_data::{Location, StepRange, image};
 
 #[test]
@@ -34,6 +34,22 @@ fn columns_are_summarised_in_every_episode_and_an_episode_is_a_video() {
     for query in ["episode=2", "episode=0&column=action", "episode=0&column=../x", "episode=-1"] {
         assert_eq!(lab.get(&format!("api/video?name=two.lance&{query}")).0, 400, "{query}");
     }
+}
+
+#[test]
+fn an_episode_of_more_values_than_are_plotted_is_refused() {
+    let lab = TestLab::start();
+    let folder = lab.home.path().join("datasets");
+    fs::create_dir_all(&folder).expect("creating the folder");
+    let schema = Schema::new(["a", "b"].map(|name| ColumnSpec::new(name, DType::Float32, [64]))).expect("a schema");
+    let location = Location::from(folder.join("wide.lance"));
+    let mut writer = swm_data::create(&location, &schema, swm_data::WriteOptions::default()).expect("a writer");
+    writer.write_episode(&Batch::zeros(&schema, 66_000)).expect("writing the episode");
+    writer.finish().expect("finishing");
+    let (status, message) = lab.get("api/rows?name=wide.lance&episode=0");
+    let message = String::from_utf8_lossy(&message);
+    assert!(status == 400 && message.contains("8448000 values, more than"), "{status} {message}");
+    assert_eq!(lab.get("api/values?name=wide.lance&column=a&x=1").0, 200);
 }
 
 /// Records an episode of some steps of the hand.
@@ -121,8 +137,8 @@ fn check_demonstrations(lab: &TestLab) {
     let mut env = swm_envs::ENVS.choose("swm/TwoRoom-v1").and_then(|choice| choice.env()).expect("an environment");
     let pins = swm_lab::still::request("agent.position=40,40;target.position=180,180", Some("none")).expect("pins");
     env.reset(6, &ResetOptions { variation: pins, ..ResetOptions::default() }).expect("a reset");
-    let schema = swm_core::Schema::new(env.spec().columns.clone()).expect("a schema");
-    let mut seen = swm_core::Batch::zeros(&schema, 1);
+    let schema = Schema::new(env.spec().columns.clone()).expect("a schema");
+    let mut seen = Batch::zeros(&schema, 1);
     for (t, action) in actions.chunks_exact(2).enumerate() {
         env.observe(&mut seen.row_mut(0));
         assert_eq!(seen.to_f32("state").expect("a state"), &states[2 * t..2 * t + 2], "row {t}");

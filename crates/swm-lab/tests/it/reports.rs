@@ -48,6 +48,16 @@ fn pages_of_a_leaderboard_are_shown_and_no_other_file() {
     let page = |entry: &str| lab.get(&format!("api/report?name=boards/site&entry={entry}"));
     assert_eq!(page(""), (200, b"<a data-entry=\"a.html\">tables</a>".to_vec()));
     assert_eq!(page("a.html"), (200, b"entry a".to_vec()));
+    let linked = lab.home.path().join("boards/linked");
+    fs::create_dir(&linked).expect("a folder");
+    fs::write(linked.join("last-build"), "{}").expect("a file");
+    std::os::unix::fs::symlink(board.join("entries"), linked.join("entries")).expect("a link");
+    fs::create_dir(lab.home.path().join("boards/link")).expect("a folder");
+    std::os::unix::fs::symlink(board.join("last-build"), lab.home.path().join("boards/link/last-build"))
+        .expect("a link");
+    let reports = &lab.json("api/reports")["reports"];
+    assert_eq!((&reports[0]["name"], &reports[0]["pages"]), (&json!("boards/linked"), &json!([])));
+    assert_eq!(reports.as_array().map(Vec::len), Some(2), "a folder whose file is a link is no report");
     for entry in ["b.txt", "link.html", "../index.html", "../../../secret.html", "/etc/passwd", "..%2Flast-build"] {
         assert_eq!(page(entry).0, 400, "{entry}");
     }

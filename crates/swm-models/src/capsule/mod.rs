@@ -32,6 +32,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::path::Path;
 use swm_core::files::Lock;
+use swm_core::text::one_line;
 use swm_core::{Batch, Error, Manifest, Result, files, manifest};
 
 /// The largest capsule, in bytes.
@@ -154,6 +155,11 @@ impl Capsule {
         let expected = capsule.manifest.hashes.get("weights");
         if expected != Some(&manifest::hash(&tensor_file::encode(&capsule.weights)?)) {
             return Err(damaged(path, "the hash of its weights differs from its manifest".to_owned()));
+        }
+        let stated = capsule.checkpoint.get("env").and_then(Value::as_str);
+        if stated.is_some() && stated != capsule.env() {
+            let [stated, of_data] = [stated, capsule.env()].map(|env| one_line(env.unwrap_or("none")));
+            return Err(damaged(path, format!("it states the environment {stated}, and was trained on {of_data}")));
         }
         Ok(capsule)
     }

@@ -94,7 +94,7 @@ impl DinoWmConfig {
             ("model.predictor.dropout", predictor.dropout),
             ("model.predictor.emb_dropout", predictor.emb_dropout),
         ])?;
-        checks::pixel_std(self.pixel_std)?;
+        checks::pixel_normalization(self.pixel_mean, self.pixel_std)?;
         let invalid = |problem: String, fix: &str| Err(Error::config("model.columns", problem, fix));
         if !self.columns.iter().any(|column| column.name == ACTION) {
             return invalid("the list lacks the action".to_owned(), "add { name = \"action\", dim = 10 }");

@@ -92,7 +92,7 @@ impl GcrlConfig {
             ));
         }
         checks::dropout_rates(&[("model.head.dropout", dropout), ("model.head.emb_dropout", emb_dropout)])?;
-        checks::pixel_std(self.pixel_std)?;
+        checks::pixel_normalization(self.pixel_mean, self.pixel_std)?;
         if self.frozen && self.weights.is_empty() {
             return Err(Error::config(
                 "model.weights",

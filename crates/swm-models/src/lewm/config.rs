@@ -66,13 +66,10 @@ impl LewmConfig {
             ("model.predictor.dropout", predictor.dropout),
             ("model.predictor.emb_dropout", predictor.emb_dropout),
         ])?;
-        checks::pixel_std(self.pixel_std)?;
+        checks::pixel_normalization(self.pixel_mean, self.pixel_std)?;
         if let Some(decoder) = &self.decoder {
             check_sizes(&[("model.decoder.hidden", decoder.hidden, 1, limits::FEATURES)])?;
-            let weight = decoder.weight;
-            if !(weight.is_finite() && weight >= 0.0) {
-                return Err(Error::config("model.decoder.weight", weight.to_string(), "give a number of at least 0"));
-            }
+            checks::loss_weights(&[("model.decoder.weight", decoder.weight)])?;
             if !matches!(self.encoder, EncoderConfig::Keypoints(_)) {
                 let given = "the encoder has no fixed features, which are decoded";
                 let fix = "leave out model.decoder, or choose an encoder with keypoints or colours: --preset keypoints";

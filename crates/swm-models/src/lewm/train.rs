@@ -49,6 +49,7 @@ impl Trainable for Lewm {
     fn check(config: &TrainConfig<Self>) -> Result<()> {
         check(&config.model, &config.data)?;
         check_straightening(config.loss.temp_straight, &config.data)?;
+        checks::loss_weights(&[("loss.weight", config.loss.weight)])?;
         check_sizes(&[
             ("loss.directions", config.loss.directions, 1, limits::FEATURES),
             ("loss.knots", config.loss.knots, 2, limits::FEATURES),
@@ -99,13 +100,14 @@ pub(crate) fn check(model: &LewmConfig, data: &DataConfig) -> Result<()> {
 
 /// Checks that clips have two differences of latents, if straight paths have a weight.
 pub(crate) fn check_straightening(weight: f32, data: &DataConfig) -> Result<()> {
-    if weight == 0.0 || weight.is_finite() && data.num_steps > 2 {
+    checks::loss_weights(&[("loss.temp_straight", weight)])?;
+    if weight == 0.0 || data.num_steps > 2 {
         return Ok(());
     }
     Err(Error::config(
         "loss.temp_straight",
         format!("weight {weight}, and clips of {} frames; two consecutive latent differences need 3", data.num_steps),
-        "give a finite weight and data.num_steps of at least 3, or the weight 0",
+        "give data.num_steps of at least 3, or the weight 0",
     ))
 }
 

@@ -113,6 +113,13 @@ impl KeypointsConfig {
             let fix = "give at least two: a pixel belongs to the colours by their distances";
             return Err(Error::config(format!("{at}.colours"), "one colour", fix));
         }
+        if let Some((index, colour)) =
+            self.colours.iter().enumerate().find(|(i, colour)| self.colours[..*i].contains(colour))
+        {
+            let problem = format!("{colour:?} twice, the second time at {index}");
+            let fix = "remove one: the pixels of equal colours cannot be told apart";
+            return Err(Error::config(format!("{at}.colours"), problem, fix));
+        }
         if let Some(colour) =
             self.colours.iter().find(|colour| !colour.iter().all(|value| value.abs() <= LARGEST_COLOUR))
         {

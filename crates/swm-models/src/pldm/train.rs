@@ -3,6 +3,7 @@
 use super::loss::PldmLoss;
 use super::model::Pldm;
 use super::step::{PldmStep, step};
+use crate::checks;
 use crate::lewm::{LewmConfig, train as lewm};
 use crate::nn::{Init, Named};
 use crate::train::{
@@ -51,6 +52,15 @@ impl Trainable for Pldm {
         check_sizes(&[
             ("model.latent", config.model.latent, 2, limits::FEATURES),
             ("loss.idm_hidden", config.loss.idm_hidden, 1, limits::FEATURES),
+        ])?;
+        let PldmLoss { std, std_t, cov, cov_t, temp_align, idm, .. } = config.loss;
+        checks::loss_weights(&[
+            ("loss.std", std),
+            ("loss.std_t", std_t),
+            ("loss.cov", cov),
+            ("loss.cov_t", cov_t),
+            ("loss.temp_align", temp_align),
+            ("loss.idm", idm),
         ])?;
         lewm::check_straightening(config.loss.temp_straight, &config.data)
     }

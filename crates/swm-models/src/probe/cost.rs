@@ -96,7 +96,7 @@ impl StateProbe {
     }
 }
 
-/// The latents and the targets of a part of a dataset: every n-th row with finite targets.
+/// The latents and the targets of a part of a dataset: every n-th row, those left out whose latents or targets are not finite.
 fn tables(
     predictor: &mut dyn Predictor,
     reader: &dyn Reader,
@@ -127,14 +127,14 @@ fn tables(
         let table = targets.of(&table, targets.width, 0);
         for (latent, target) in latents.chunks_exact(predictor.latent_dim()).zip(table.chunks_exact(targets.list.len()))
         {
-            if target.iter().all(|value| value.is_finite()) {
+            if latent.iter().chain(target).all(|value| value.is_finite()) {
                 x.extend_from_slice(latent);
                 y.extend_from_slice(target);
             }
         }
     }
     if y.len() < 2 * targets.list.len() {
-        let problem = format!("fewer than two of its rows have finite values in {}", columns.join(", "));
+        let problem = format!("fewer than two of its rows have finite values in {}", names.join(", "));
         return Err(Error::config(format!("the {part} split"), problem, "choose other columns, or a larger dataset"));
     }
     Ok((x, y))

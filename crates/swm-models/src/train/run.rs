@@ -254,17 +254,25 @@ impl<'a> Run<'a> {
     /// Averages the gradients of the step's batches and makes one optimizer step.
     fn step(&mut self) -> Result<Update> {
         let accumulate = self.config.optim.accumulate;
-        let mut sum = StepOutput::default();
+        let (mut sum, mut last) = (StepOutput::default(), None);
         for _ in 0..accumulate {
             let start = Instant::now();
             let index = self.batches.taken;
             let batch = self.batches.next()?;
             self.clock.waited += start.elapsed().as_secs_f64();
             sum.add(self.loss_and_gradients(&batch, index)?);
+            last = Some(batch);
         }
         let mean = if accumulate > 1 { sum.scaled(1.0 / accumulate as f64) } else { sum };
         let key = Key::new(self.config.seed).with("after").at(self.learner.state().step as u64);
-        Ok(self.learner.update(mean, key))
+        let update = self.learner.update(mean, key);
+        match last.filter(|_| !update.gradient_norm.is_finite()) {
+            // Clipping scales such a gradient to 0, so that the training would go on and learn nothing.
+            Some(batch) => {
+                Err(self.not_finite("the norm of the gradient", self.learner.state().step, &batch, &update.metrics))
+            }
+            None => Ok(update),
+        }
     }
 
     /// Computes loss and gradients of the batch with the index `index`, and checks that they are finite.
@@ -278,9 +286,14 @@ impl<'a> Run<'a> {
         } else {
             return Ok(output);
         };
-        let what = format!("{not_finite} at training step {}", self.learner.state().step + 1);
-        let fix = "lower optim.lr or lengthen schedule.warmup; the last checkpoint, if any, is kept";
-        Err(failed_batch::error(self.out, batch, what, &failed_batch::describe(&output.metrics), fix))
+        Err(self.not_finite(not_finite, self.learner.state().step + 1, batch, &output.metrics))
+    }
+
+    /// The error that `what` is not finite at a training step.
+    fn not_finite(&self, what: &str, step: usize, batch: &Batch, metrics: &[(&'static str, f64)]) -> Error {
+        let what = format!("{what} at training step {step}");
+        let fix = "lower optim.lr or the weights of the loss, or lengthen schedule.warmup; the last checkpoint, if any, is kept";
+        failed_batch::error(self.out, batch, what, &failed_batch::describe(metrics), fix)
     }
 
     /// Logs the means of the metrics over the validation batches and returns the loss.

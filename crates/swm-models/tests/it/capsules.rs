@@ -209,6 +209,10 @@ fn contradicting_tensors_are_refused() {
     refused(&|capsule| capsule.weights.values_mut().for_each(|weight| weight.values[0] = f32::NAN), "not finite");
     refused(&|capsule| drop(capsule.manifest.hashes.remove("weights")), "hash of its weights");
     refused(&|capsule| capsule.checkpoint["family"] = json!("dreamer"), "dreamer");
+    refused(
+        &|capsule| capsule.checkpoint["env"] = json!("swm/PushT-v1"),
+        "the environment swm/PushT-v1, and was trained on",
+    );
     refused(&|capsule| capsule.checkpoint = Value::Null, "unknown");
     refused(&|capsule| capsule.manifest.config = json!({ "seed": 7 }), "configuration in its manifest");
     let rows = |rows: usize| Batch::zeros(&Schema::new([ColumnSpec::new("x", DType::U8, [])]).expect("a schema"), rows);

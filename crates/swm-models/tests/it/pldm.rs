@@ -80,6 +80,8 @@ fn invalid_settings_are_refused() {
     let short = message(&["data.num_steps=2", "model.predictor.history=1"]);
     assert!(short.contains("loss.temp_straight") && short.contains("data.num_steps of at least 3"), "{short}");
     assert!(message(&["data.num_steps=2"]).contains("model.predictor.history"));
+    assert!(message(&["loss.cov=-1"]).contains("loss.cov: -1; give a number of at least 0"));
+    assert!(message(&["model.pixel_mean=[1e30,0,0]"]).contains("model.pixel_mean"));
     assert!(message(&["loss.stdd=1"]).contains("did you mean loss.std"));
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let large = config(&["model.image=32"]).expect("loading the configuration");

@@ -208,6 +208,7 @@ fn decoder_without_fixed_filters_is_refused() {
         (vec![[f32::NAN; 3]; 2], "give a finite value"),
         (vec![[0.0; 3], [255.0, 0.0, 0.0]], "not bytes"),
         (vec![[1.0; 3]], "give at least two"),
+        (vec![[1.0; 3], [0.0; 3], [1.0; 3]], "twice, the second time at 2"),
         (vec![], "at least one size of filters, or colours"),
     ];
     for (colours, fix) in colours {
@@ -269,6 +270,27 @@ fn non_finite_loss_stops_the_run() {
     let error = run(&config(&["optim.lr=1e30", "optim.clip=1e30"]), folder.path(), &crate::options(), 0);
     let message = error.expect_err("a loss that is not finite").to_string();
     assert!(message.contains("not finite") && message.contains("optim.lr"), "{message}");
+}
+
+#[test]
+fn gradients_with_an_infinite_norm_stop_the_run() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let mut config = keypoints_config();
+    config.model.decoder.as_mut().expect("a decoder").weight = 1e30;
+    let error = run(&config, folder.path(), &crate::options(), 0).expect_err("a gradient that clipping makes 0");
+    let message = error.to_string();
+    assert!(message.contains("the norm of the gradient at training step 1 is not finite"), "{message}");
+    assert!(message.contains("the weights of the loss") && !folder.path().join("checkpoint").exists(), "{message}");
+}
+
+#[test]
+fn negative_weights_of_losses_are_refused() {
+    for (given, part) in [("loss.weight=-1", "loss.weight: -1"), ("loss.temp_straight=-1", "loss.temp_straight: -1")] {
+        let error = TrainConfig::<Lewm>::load("tiny", &crate::overridden(&[], &[given]))
+            .expect_err("a negative weight")
+            .to_string();
+        assert!(error.contains(part) && error.contains("at least 0"), "{error}");
+    }
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use super::{EvaluationRecord, MODEL, RecordedEpisode, cpu_level};
 use crate::resolver::HomeResolver;
 use serde::Serialize;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::rc::Rc;
 use swm_core::run::Control;
@@ -84,6 +84,7 @@ impl Verification {
         if !["weights", "packed"].iter().any(|name| hashes.get(*name) == Some(&record.weights)) {
             self.faults.push("its evaluation is that of other weights".to_owned());
         }
+        self.faults.extend(contradictions(&record));
         let (numbers, starts) = record.numbers();
         let recorded = EvaluationRecord::recorded(evaluation, &numbers, &starts);
         let replay = record.request.replay(recorded, resolver, options, control)?;
@@ -111,6 +112,28 @@ impl Verification {
             }
         }
     }
+}
+
+/// Returns what the recorded episodes contradict in the success rate of an evaluation. Outcomes under other counting, and those of
+/// weights that were rounded later, may differ.
+fn contradictions(record: &EvaluationRecord) -> Vec<String> {
+    let mut found = vec![];
+    let numbers: BTreeSet<usize> = record.episodes.iter().map(|episode| episode.number).collect();
+    if numbers.len() < record.episodes.len() {
+        found.push("it records an episode twice".to_owned());
+    }
+    let [successes, n] = record.success;
+    let count = |success: bool| {
+        let counted = |episode: &&RecordedEpisode| !episode.solved_at_start && episode.success == success;
+        record.episodes.iter().filter(counted).count()
+    };
+    let (solved, failed) = (count(true), count(false));
+    if solved > successes || failed > n - successes {
+        found.push(format!(
+            "its evaluation states {successes} of {n} episodes solved, and its recorded episodes are {solved} solved and {failed} not"
+        ));
+    }
+    found
 }
 
 /// Returns the names of the columns in which two batches differ.

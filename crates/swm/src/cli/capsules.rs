@@ -165,7 +165,7 @@ impl CapsuleInfo {
             hash: capsule.hash()?,
             weights: capsule.weights_hash().to_owned(),
             family: StoredCheckpoint::of(path, &capsule).family().to_owned(),
-            env: capsule.env().map(str::to_owned),
+            env: capsule.env().map(one_line),
             bytes: std::fs::metadata(path).map_err(|error| Error::io(path, "reading the size", error))?.len(),
             licence: capsule.description.licence,
             author: capsule.description.author,

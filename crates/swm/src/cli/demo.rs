@@ -130,6 +130,7 @@ const MARK_TEXT: &str =
 /// When another process writes to the folder, or it has contents and no mark: its files may be the user's.
 fn claim(folder: &Path) -> Result<Lock> {
     let lock = output_folder::claim(folder, &["index.html"])?;
+    files::delete_temporary(folder, |name| name == MARK)?;
     let mark = folder.join(MARK);
     let io = |error| Error::io(folder, "listing the folder", error);
     let is_marked = files::read(&mark, MARK_TEXT.len() as u64).is_ok_and(|text| text == MARK_TEXT.as_bytes());

@@ -2,7 +2,7 @@
 
 use super::capsules::CapsuleInfo;
 use super::datasets::{bytes, summary};
-use super::{emit, emit_json, table};
+use super::{emit, emit_json, eprint, table};
 use crate::home::{find_checkpoint, open_dataset};
 use crate::metadata::{self, Described, Stated};
 use clap::Args;
@@ -123,6 +123,10 @@ fn colours(reader: &dyn Reader, count: usize, as_json: bool) -> anyhow::Result<(
     // Three digits are finer than a byte of a frame.
     let rounded = |value: f32| (f64::from(value) * 1000.0).round() / 1000.0;
     let colours: Vec<_> = frequent_colours(reader, count)?.iter().map(|colour| colour.map(rounded)).collect();
+    if colours.len() < count {
+        let fix = if colours.len() < 2 { "; an encoder needs at least two" } else { "" };
+        eprint(&format!("the frames have {} of {count} colours{fix}\n", colours.len()));
+    }
     if as_json {
         return emit_json(&json!({"colours": colours}));
     }

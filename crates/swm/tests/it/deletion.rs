@@ -29,6 +29,15 @@ fn demo_refuses_a_folder_that_it_did_not_make() {
 }
 
 #[test]
+fn demo_continues_where_it_was_killed_while_it_marked_its_folder() {
+    let swm = Swm::new();
+    fs::create_dir(swm.path("demo")).expect("creating the folder");
+    fs::write(swm.path("demo/..swm-demo.4242.tmp"), "`swm demo` ma").expect("writing a part of the mark");
+    swm.json(DEMO);
+    assert!(!swm.path("demo/..swm-demo.4242.tmp").exists());
+}
+
+#[test]
 fn second_demo_keeps_files_of_the_user() {
     let swm = Swm::new();
     swm.json(DEMO);

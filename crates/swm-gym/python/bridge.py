@@ -585,12 +585,9 @@ class Bridge:
         if isinstance(reward, (str, bytes)):
             raise ValueError(f'the reward is {reward!r}: return a number')
         success = info.get('success', info.get('is_success'))
-        if success is None:
-            success = terminated
-        elif np.asarray(success).dtype.kind not in 'biuf' or success != success:
-            raise ValueError(f"info['success'] is {success!r}: return True or False")
+        success = terminated if success is None else flag(success, "info['success']")
         distance = info.get('goal_distance', math.inf)
-        HEAD.pack_into(self.buffer, 0, float(reward), float(distance), terminated, truncated, bool(success))
+        HEAD.pack_into(self.buffer, 0, float(reward), float(distance), terminated, truncated, success)
 
     def render(self):
         """Renders into the buffer."""

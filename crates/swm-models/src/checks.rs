@@ -32,7 +32,7 @@ pub(crate) fn loss_weights(weights: &[(&str, f32)]) -> Result<()> {
 /// # Errors
 /// When a mean is beyond 100 or a standard deviation is not positive.
 pub(crate) fn pixel_normalization(mean: [f32; 3], std: [f32; 3]) -> Result<()> {
-    if mean.iter().any(|mean| !(mean.abs() <= 100.0)) {
+    if !mean.iter().all(|mean| mean.abs() <= 100.0) {
         return Err(Error::config(
             "model.pixel_mean",
             format!("{mean:?}"),

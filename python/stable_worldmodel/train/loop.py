@@ -46,6 +46,7 @@ class Trainer:
     def __init__(self, options: Options, kind: type[Pretrained] | None = None) -> None:
         self.options, self.run = options, options.run
         losses = losses_of(options.family)
+        _check_backend(options.compile)
         self.device = _device(options.device)
         self.ranks = Ranks.join(self.device)
         if self.device.type == "cuda" and self.device.index is None and self.ranks.size > 1:
@@ -366,6 +367,20 @@ def _locked(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(file)
+
+
+def _check_backend(compile: bool | str) -> None:
+    """Checks the name of a backend of `torch.compile` before anything is written.
+
+    Raises:
+        ValueError: If there is no such backend.
+    """
+    if isinstance(compile, str):
+        import torch._dynamo
+
+        if compile not in torch._dynamo.list_backends(exclude_tags=()):
+            known = ", ".join(torch._dynamo.list_backends())
+            raise ValueError(f"compile: {compile!r}; expected true, false or a backend, such as {known}")
 
 
 def _device(name: str) -> torch.device:

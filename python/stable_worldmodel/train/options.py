@@ -9,6 +9,8 @@ from typing import Any
 
 __all__ = ["Options", "parsed"]
 
+#: The most threads of the engine.
+_MOST_THREADS = 1024
 #: The values that switch something on or off.
 _FLAGS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 
@@ -44,6 +46,10 @@ class Options:
     def __post_init__(self) -> None:
         if not self.data:
             raise ValueError("data: the name of the dataset is empty; name one with data=PATH")
+        if self.out == "":
+            raise ValueError("out: the name of the checkpoint is empty; leave it out, or name one with out=PATH")
+        if not 0 <= self.threads <= _MOST_THREADS:
+            raise ValueError(f"threads: {self.threads}; expected 0 to {_MOST_THREADS}")
         if self.amp not in ("off", "bf16", "fp16"):
             raise ValueError(f"amp: {self.amp!r}; expected off, bf16 or fp16")
 

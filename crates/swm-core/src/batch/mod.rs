@@ -289,7 +289,7 @@ mod tests {
     #[test]
     fn rows_beyond_the_free_memory_are_refused() {
         let rows = (1 << 40) / schema().row_bytes();
-        let error = Batch::new(schema(), 0).try_resize(rows).expect_err("a TiB").to_string();
+        let error = Batch::zeros(&schema(), 0).try_resize(rows).expect_err("a TiB").to_string();
         assert!(error.contains("the free memory") && error.contains("fewer rows at once"), "{error}");
     }
 

@@ -370,7 +370,8 @@ class Loose(gymnasium.Env):
         observation = self.VALUES.get(self.value, np.zeros(3, np.float32)) if self.t == 2 else np.zeros(3, np.float32)
         if self.t != 2:
             return observation, 0.0, False, False, {'success': False}
-        success = {'success': 'no', 'nan': float('nan')}.get(self.value, False)
+        successes = {'success': 'no', 'nan': float('nan'), 'success-list': (False, False), 'success-nan': [float('nan')]}
+        success = {**successes, 'success-minus': -1, 'success-part': 0.01}.get(self.value, False)
         ends = {'end-nan': float('nan'), 'end-text': 'False', 'end-none': None, 'end-minus': -1}
         reward = '1' if self.value == 'reward' else 0.0
         return observation, reward, ends.get(self.value, False), False, {'success': success}

@@ -81,7 +81,15 @@ fn observations_of_another_shape_or_type_are_errors() {
     let shaped = ["scalar", "one", "column"].map(|value| (value, "shape"));
     for (value, shown) in shaped
         .into_iter()
-        .chain([("complex", "complex"), ("text", "<U1"), ("success", "'no'"), ("nan", "nan")])
+        .chain([("complex", "complex"), ("text", "<U1")])
+        .chain([
+            ("success", "info['success'] is 'no'"),
+            ("nan", "info['success'] is nan"),
+            ("success-list", "info['success'] is (False, False)"),
+            ("success-nan", "info['success'] is [nan]"),
+            ("success-minus", "info['success'] is -1"),
+            ("success-part", "info['success'] is 0.01"),
+        ])
         .chain([
             ("end-nan", "terminated is nan"),
             ("end-text", "terminated is 'False'"),

@@ -94,6 +94,30 @@ fn capsules_are_packed_verified_and_used_like_checkpoints() {
 }
 
 #[test]
+fn records_of_a_capsule_that_contradict_themselves_are_faults() {
+    let swm = Swm::new();
+    train(&swm);
+    eval(&swm, "small", "found", &[]);
+    swm.json(&["checkpoints", "pack", "small", "-o", "a.safetensors", "--eval", "found"]);
+    let refused = |change: &dyn Fn(&mut Capsule), part: &str| {
+        edit(&swm, "a.safetensors", "b.safetensors", change);
+        let printed = swm.run(&["checkpoints", "verify", "b.safetensors"]).stdout;
+        assert!(text(&printed).contains(part), "no '{part}' in {}", text(&printed));
+    };
+    let twice = |capsule: &mut Capsule| {
+        record(capsule)["episodes"][1]["number"] = record(capsule)["episodes"][0]["number"].clone()
+    };
+    refused(&twice, "it records an episode twice");
+    let opposite = |capsule: &mut Capsule| {
+        let episodes = record(capsule)["episodes"].as_array().expect("episodes").clone();
+        let solved = |episode: &Value| episode["success"] == true && episode["solved_at_start"] == false;
+        let n = record(capsule)["success"][1].clone();
+        record(capsule)["success"] = if episodes.iter().any(solved) { json!([0, n]) } else { json!([n, n]) };
+    };
+    refused(&opposite, "episodes solved, and its recorded episodes are");
+}
+
+#[test]
 fn changed_records_of_a_capsule_are_found_and_hostile_ones_refused() {
     let swm = Swm::new();
     train(&swm);
@@ -127,17 +151,6 @@ fn changed_records_of_a_capsule_are_found_and_hostile_ones_refused() {
     refused(&|capsule| record(capsule)["episodes"][0]["number"] = json!(u64::MAX), "choosing starts");
     refused(&|capsule| record(capsule)["success"] = json!([9, 3]), "more successes than episodes");
     refused(&|capsule| record(capsule)["success"] = json!([1u64 << 60, 1u64 << 60]), "counts more than the");
-    let twice = |capsule: &mut Capsule| {
-        record(capsule)["episodes"][1]["number"] = record(capsule)["episodes"][0]["number"].clone()
-    };
-    refused(&twice, "it records an episode twice");
-    let opposite = |capsule: &mut Capsule| {
-        let episodes = record(capsule)["episodes"].as_array().expect("episodes").clone();
-        let solved = |episode: &Value| episode["success"] == true && episode["solved_at_start"] == false;
-        let n = record(capsule)["success"][1].clone();
-        record(capsule)["success"] = if episodes.iter().any(solved) { json!([0, n]) } else { json!([n, n]) };
-    };
-    refused(&opposite, "episodes solved, and its recorded episodes are");
     refused(&|capsule| *record(capsule) = json!([]), "the evaluation in the capsule");
     refused(&|capsule| record(capsule)["weights"] = json!("trust me"), "'trust me' is no hash");
     refused(&|capsule| record(capsule)["hashes"]["starts"] = json!("/etc/passwd"), "'/etc/passwd' is no hash");

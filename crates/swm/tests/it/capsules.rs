@@ -171,7 +171,10 @@ fn changed_records_of_a_capsule_are_found_and_hostile_ones_refused() {
     refused(&with(vec![ColumnSpec::image("pixels", 32, 32), actions(0)]), "actions");
 
     // The environment of the model itself is refused, too, until the user names it.
-    edit(&swm, "a.safetensors", "b.safetensors", |capsule| capsule.checkpoint["facts"]["env"] = json!("evil_mod:X-v0"));
+    edit(&swm, "a.safetensors", "b.safetensors", |capsule| {
+        capsule.checkpoint["facts"]["env"] = json!("evil_mod:X-v0");
+        capsule.checkpoint["env"] = json!("evil_mod:X-v0");
+    });
     swm.fails(&["eval", "b.safetensors", "--episodes", "1"], 2, &["b.safetensors", "imports a Python module"]);
     let capsule = Capsule::read(&swm.path("a.safetensors")).expect("a capsule");
     let record = EvaluationRecord::read(capsule.evaluation.as_ref().expect("an evaluation")).expect("a record");

@@ -584,8 +584,8 @@ class Bridge:
         terminated, truncated = flag(terminated, 'terminated'), flag(truncated, 'truncated')
         if isinstance(reward, (str, bytes)):
             raise ValueError(f'the reward is {reward!r}: return a number')
-        success = info.get('success', info.get('is_success'))
-        success = terminated if success is None else flag(success, "info['success']")
+        key = 'success' if 'success' in info else 'is_success'
+        success = terminated if info.get(key) is None else flag(info[key], f"info['{key}']")
         distance = info.get('goal_distance', math.inf)
         HEAD.pack_into(self.buffer, 0, float(reward), float(distance), terminated, truncated, success)
 

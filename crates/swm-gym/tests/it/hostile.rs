@@ -89,6 +89,8 @@ fn observations_of_another_shape_or_type_are_errors() {
             ("success-nan", "info['success'] is [nan]"),
             ("success-minus", "info['success'] is -1"),
             ("success-part", "info['success'] is 0.01"),
+            ("success-two", "info['success'] is 2"),
+            ("is-success", "info['is_success'] is (True, True)"),
         ])
         .chain([
             ("end-nan", "terminated is nan"),
@@ -109,6 +111,19 @@ fn observations_of_another_shape_or_type_are_errors() {
     env.reset(0, &ResetOptions::default()).expect("a reset");
     for _ in 0..3 {
         env.step(Action::Discrete(&[0])).expect("a leading axis of one element is left out");
+    }
+}
+
+#[test]
+fn success_is_one_truth_value() {
+    let Some(config) = config() else { return };
+    for (value, solved) in [("one-false", false), ("one-true", true), ("numpy", true), ("missing", true)] {
+        let mut env = make(&format!("tests.it.environments:Loose-v0,value={value}"), &config);
+        env.reset(0, &ResetOptions::default()).expect("a reset");
+        for _ in 0..2 {
+            env.step(Action::Discrete(&[0])).expect("a step");
+        }
+        assert_eq!(env.is_success(), solved, "{value}");
     }
 }
 

@@ -66,7 +66,7 @@ class Trainer:
         self.scaler = torch.amp.GradScaler(self.device.type, enabled=options.amp == "fp16")
         self.step: int = state["step"]
         self.window = Window.of(state.get("window"), self.losses.names)
-        #: Whether the folder was found as this training read it, and `run.json` has the command.
+        #: Whether `run.json` has the command of this training.
         self.recorded = False
         self.best: Any = state["best"]
         self.validations_since_best: int = state["looks"]
@@ -75,18 +75,16 @@ class Trainer:
         self.waited = 0.0
 
     def _begin(self, dataset: Any) -> Any:
-        """Writes the command and the first checkpoint of the training, or checks the checkpoint that it continues."""
+        """Writes the first checkpoint of the training, or checks the one that it continues."""
         options = self.options
         # A kill while a checkpoint is replaced leaves the old one, which the engine gives its name back.
         self.resumed = options.resume and any((self.run / f"checkpoint{end}").is_dir() for end in ("", ".old"))
         settings = list(options.settings)
-        family, preset, command = options.family, options.preset, options.command()
         dataset, out = engine_of(dataset), str(self.run)
-        return json.loads(_engine.begin_training(family, preset, settings, dataset, out, self.resumed, command))
+        return json.loads(_engine.begin_training(options.family, options.preset, settings, dataset, out, self.resumed))
 
     def _record(self) -> None:
-        """Adds the command of a training that continues to `run.json`, under the lock of the folder, so that it has commands
-        of trainings that ran.
+        """Writes the command to `run.json`, under the lock of the folder, so that it has commands of trainings that ran.
 
         Raises:
             ValueError: If another process has trained in the folder since this training read the checkpoint.
@@ -99,8 +97,7 @@ class Trainer:
                 f"{self.run}: another process has trained here, from step {self.step} to step {stored}; "
                 "continue with resume=true, or choose another folder"
             )
-        if self.resumed:
-            _engine.record_training(str(self.run), self.options.command())
+        _engine.record_training(str(self.run), self.options.command(), self.resumed)
         self.recorded = True
 
     def _restored(self) -> Any:
@@ -310,11 +307,11 @@ class Trainer:
 
     def _write_log(self, values: Mapping[str, float]) -> None:
         if self.ranks.rank == 0:
-            # JSON has no values that are not finite. In half precision, the gradient of a step that is left out is not.
-            row = {name: value if _finite(value) else None for name, value in values.items()}
             with open(self.run / "train.jsonl", "a", encoding="utf-8") as file:
                 file.write(json.dumps({"step": self.step, **row}) + "\n")
 
+            # JSON has no values that are not finite. In half precision, the gradient of a step that is left out is not.
+            row = {name: value if _finite(value) else None for name, value in values.items()}
 
 class Window:
     """The metrics since the last line of the log; stored in `state.json`, so that a continued training writes equal lines.
@@ -381,14 +378,17 @@ def _check_compile(compile: bool | str, device: torch.device) -> None:
     Raises:
         ValueError: If there is no such backend, or it lacks something, such as a package or a compiler.
     """
-    if compile is False:
-        return
     if isinstance(compile, str):
         import torch._dynamo
 
+    if compile is False:
+        return
         if compile not in torch._dynamo.list_backends(exclude_tags=()):
             known = ", ".join(torch._dynamo.list_backends())
             raise ValueError(f"compile: {compile!r}; expected true, false or a backend, such as {known}")
+
+
+def _device(name: str) -> torch.device:
     try:
         torch.compile(lambda x: x + 1, backend="inductor" if compile is True else compile)(torch.zeros(2, device=device))
     except Exception as error:
@@ -396,9 +396,6 @@ def _check_compile(compile: bool | str, device: torch.device) -> None:
         reason = " ".join(str(error).split("\n\n")[0].split())
         given = "true" if compile is True else repr(compile)
         raise ValueError(f"compile: {given} does not work here ({reason}); install what it needs, or leave it out") from error
-
-
-def _device(name: str) -> torch.device:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:

@@ -21,7 +21,7 @@ from ..data.foreign import engine_of
 from ..data.loader import Goals, Loader
 from ..data.utils import load_dataset
 from ..wm._weights import read_safetensors
-from ..wm.checkpoints import check_kind, module_of
+from ..wm.checkpoints import module_of
 from ..wm.pretrained import Pretrained, stored_names, write
 from .losses import Losses, losses_of
 from .optim import Optimizer, learning_rate
@@ -46,9 +46,8 @@ class Trainer:
     def __init__(self, options: Options, kind: type[Pretrained] | None = None) -> None:
         self.options, self.run = options, options.run
         losses = losses_of(options.family)
-        check_kind(options.family, kind)
+        _check_backend(options.compile)
         self.device = _device(options.device)
-        _check_compile(options.compile, self.device)
         self.ranks = Ranks.join(self.device)
         if self.device.type == "cuda" and self.device.index is None and self.ranks.size > 1:
             self.device = torch.device("cuda", self.ranks.rank % torch.cuda.device_count())
@@ -152,7 +151,7 @@ class Trainer:
 
         Raises:
             KeyboardInterrupt: After Ctrl-C; the checkpoint is saved, and `resume` continues.
-            FloatingPointError: If the loss or the norm of its gradient is not finite; the last checkpoint is kept.
+            FloatingPointError: If the loss is not finite; the last checkpoint is kept.
             ValueError: If another process trains in the folder.
         """
         steps, log_every, save_every = self.config["schedule"]["steps"], self.config["log_every"], self.config["save_every"]
@@ -216,7 +215,7 @@ class Trainer:
             )
         factor = learning_rate(self.config["schedule"], self.step)
         metrics["lr"] = self.config["optim"]["lr"] * factor
-        metrics["gradient_norm"] = self.optimizer.step(self.step, factor, self.scaler)
+        metrics["gradient_norm"] = self.optimizer.step(factor, self.scaler)
         self.ranks.average_buffers(model, share)
         self.losses.after_step()
         self._move_average()
@@ -308,10 +307,8 @@ class Trainer:
     def _write_log(self, values: Mapping[str, float]) -> None:
         if self.ranks.rank == 0:
             with open(self.run / "train.jsonl", "a", encoding="utf-8") as file:
-                file.write(json.dumps({"step": self.step, **row}) + "\n")
+                file.write(json.dumps({"step": self.step, **values}) + "\n")
 
-            # JSON has no values that are not finite. In half precision, the gradient of a step that is left out is not.
-            row = {name: value if _finite(value) else None for name, value in values.items()}
 
 class Window:
     """The metrics since the last line of the log; stored in `state.json`, so that a continued training writes equal lines.
@@ -372,36 +369,26 @@ def _locked(folder: Path) -> Iterator[None]:
         os.close(file)
 
 
-def _check_compile(compile: bool | str, device: torch.device) -> None:
-    """Checks that `torch.compile` works, before anything is written.
+def _check_backend(compile: bool | str) -> None:
+    """Checks the name of a backend of `torch.compile` before anything is written.
 
     Raises:
-        ValueError: If there is no such backend, or it lacks something, such as a package or a compiler.
+        ValueError: If there is no such backend.
     """
     if isinstance(compile, str):
         import torch._dynamo
 
-    if compile is False:
-        return
         if compile not in torch._dynamo.list_backends(exclude_tags=()):
             known = ", ".join(torch._dynamo.list_backends())
             raise ValueError(f"compile: {compile!r}; expected true, false or a backend, such as {known}")
 
 
 def _device(name: str) -> torch.device:
-    try:
-        torch.compile(lambda x: x + 1, backend="inductor" if compile is True else compile)(torch.zeros(2, device=device))
-    except Exception as error:
-        # The rest of the message is about the variables with which torch says more.
-        reason = " ".join(str(error).split("\n\n")[0].split())
-        given = "true" if compile is True else repr(compile)
-        raise ValueError(f"compile: {given} does not work here ({reason}); install what it needs, or leave it out") from error
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.device(name)
-        # A device without data, such as meta, has no values.
-        float(torch.zeros(1, device=device))
+        torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"device: {name!r} is not available ({error}); choose cpu, or another device of torch") from error
     return device

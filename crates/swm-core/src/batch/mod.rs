@@ -58,7 +58,7 @@ impl Batch {
     pub fn try_resize(&mut self, rows: usize) -> Result<()> {
         let bytes = rows.saturating_mul(self.schema.row_bytes());
         // The system promises more memory than there is, and ends a process that uses it. What is read is copied once at least.
-        if bytes > MANY_BYTES && free_memory().is_some_and(|free| 2 * bytes as u64 > free) {
+        if bytes > MANY_BYTES && free_memory().is_some_and(|free| bytes as u64 > free / 2) {
             return Err(Error::mismatch(
                 "reading rows",
                 format!("{rows} rows of {} bytes, more than half of the free memory", self.schema.row_bytes()),

@@ -1,5 +1,9 @@
 """Tests of the replay buffer: the latest episodes, and samples that depend on seed and step."""
 
+import copy
+import sys
+import threading
+
 import numpy as np
 import pytest
 from data_helpers import episode, episodes
@@ -76,3 +80,39 @@ def test_an_action_in_the_last_row_is_kept():
     missing = {**steps, "action": np.array([[0], [np.nan], [2], [3]], np.float32)}
     with pytest.raises(ValueError, match="row 1 of 4"):
         buffer.write_episode(missing)
+
+
+def numbered(length):
+    """An episode whose rows have their number and the length of the episode."""
+    return {"action": np.ones((length, 1), np.float32), "length": np.full(length, length), "row": np.arange(length)}
+
+
+def test_episodes_are_whole_while_another_thread_writes():
+    buffer = data.ReplayBuffer(60, history_len=2)
+    chosen = data.ReplayBuffer(
+        60, history_len=2, sampler=lambda _, it, size, steps: np.full(size, it.num_valid_ends(steps) - 1)
+    )
+    buffers = (buffer, chosen)
+    for one in buffers:
+        one.write_episode(numbered(3))
+
+    def write():
+        for number in range(3000):
+            for one in buffers:
+                one.write_episode(numbered(3 + number * 7 % 11))
+
+    writer = threading.Thread(target=write)
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        writer.start()
+        while writer.is_alive():
+            read = [buffer.load_episode(0), *buffer.episodes(), *copy.deepcopy(buffer).episodes()]
+            assert all(len(content["row"]) == content["length"][0] for content in read)
+            assert np.diff(buffer[0]["row"]).tolist() == [1]
+            batch = chosen.sample(4)
+            assert (batch["row"][:, -1] + 1 == batch["length"][:, -1]).all(), "the sampler chose the last clip"
+    finally:
+        writer.join()
+        sys.setswitchinterval(interval)
+    assert buffer.num_episodes_added == 3001

@@ -1,9 +1,12 @@
 """Tests of writing episodes, native and user-defined formats, conversion and examination."""
 
 import json
+import pickle
 import signal
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +47,27 @@ def test_lists_and_small_types_are_converted(tmp_path):
     assert np.isnan(sample["action"][3]).all() and (sample["action"][:3] == [0, 1]).all()
     assert sample["half"].dtype == np.float32 and sample["small"].dtype == np.int32
     assert dataset.get_col_data("step_idx").tolist() == [0, 1, 2, 3], "the writer computes the indices"
+
+
+@pytest.mark.parametrize("mode", ["append", "overwrite"])
+@pytest.mark.parametrize("name", ["a.lance", "a.h5", "a"])
+def test_threads_share_a_writer(tmp_path, name, mode):
+    format = None if "." in name else "folder"
+    for trial in range(4):
+        path = tmp_path / f"{trial}" / name
+        write(path, (5,), format=format)
+        # A writer that has written nothing can be pickled.
+        writer = pickle.loads(pickle.dumps(data.open_writer(path, format=format, mode=mode)))
+        together = threading.Barrier(6)
+
+        def write_one(number, writer=writer, together=together):
+            together.wait()
+            writer.write_episode(episode(number, 6 + number))
+
+        with writer, ThreadPoolExecutor(6) as threads:
+            list(threads.map(write_one, range(6)))
+        lengths = data.load_dataset(path, format=format).lengths.tolist()
+        assert sorted(lengths) == [5] * (mode == "append") + [6, 7, 8, 9, 10, 11]
 
 
 @pytest.mark.parametrize("name", ["a.h5", "a.lance", "a"])

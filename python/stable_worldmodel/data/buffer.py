@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,106 +23,17 @@ __all__ = ["ReplayBuffer", "classic_filter"]
 Sampler = Callable[[int, "ReplayBuffer", int, int], Any]
 
 
-class ReplayBuffer(Dataset):
-    """The latest episodes, with at most `max_steps` rows: a writer for collection and a dataset for training.
+class _Content(Dataset):
+    """The content of a buffer at one time.
 
-        buffer = ReplayBuffer(max_steps=100_000, history_len=4)
-        world.collect(buffer, episodes=10)
-        batch = buffer.sample(256)  # arrays (256, 4, ...)
-
-    When an episode does not fit, the oldest episodes are removed. Samples depend only on the seed, the step and the content
-    of the buffer.
-
-    Args:
-        max_steps: The maximum number of rows. An episode of `n` steps has `n + 1` rows.
-        history_len: The number of steps of a clip.
-        frameskip: The number of rows from one step to the next.
-        sampler: A function `(step, buffer, batch_size, history_len) -> indices` that chooses clips by indices below
-            `num_valid_ends(history_len)`. With `None`, all clips are equally likely.
-        transform: Called with the dict of every sample of `buffer[i]`, but not with the batches of `sample`.
-        key_filter: A function from the dict of a new episode to a dict of the columns to keep.
-        seed: Determines the samples, together with the step.
+    Another thread may write at any time: every operation of a buffer reads one such object, which nothing changes.
     """
 
-    def __init__(
-        self,
-        max_steps: int,
-        history_len: int = 1,
-        frameskip: int = 1,
-        sampler: Sampler | None = None,
-        transform: Transform | None = None,
-        key_filter: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
-        seed: int = 0,
-    ) -> None:
-        for name, value in (("max_steps", max_steps), ("history_len", history_len), ("frameskip", frameskip)):
-            if value < 1:
-                raise ValueError(f"{name}: expected at least 1, got {value}")
-        super().__init__([], [], frameskip, history_len, transform)
-        self.max_steps = int(max_steps)
-        self.history_len = int(history_len)
-        self.sampler = sampler
-        self.key_filter = key_filter
-        self.seed = int(seed)
-        self._buffer: Any = None
-        self._columns: list[tuple[str, str, list[int]]] = []
-        #: The engine's view of the current content.
-        self._snapshot: Any = None
-        #: The samplers by batch size and history length.
-        self._samplers: dict[tuple[int, int], Any] = {}
-        self._step = 0
-
-    def __getstate__(self) -> dict[str, Any]:
-        """The attributes, with the episodes in place of the engine's memory. A copy counts its own `num_episodes_added`."""
-        gone: dict[str, Any] = {"_buffer": None, "_snapshot": None, "_samplers": {}}
-        return {**self.__dict__, **gone, "_episodes": [] if self._buffer is None else list(self.episodes())}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        episodes = state.pop("_episodes")
-        self.__dict__.update(state)
-        filter, self.key_filter = self.key_filter, None
-        self.write_episodes(episodes)
-        self.key_filter = filter
-
-    def __enter__(self) -> ReplayBuffer:
-        return self
-
-    def __exit__(self, *exc: Any) -> None:
-        return None
-
-    def write_episode(self, ep_data: Mapping[str, Any]) -> None:
-        """Adds an episode: a list of steps or an array `(T, ...)` for each column, as in :class:`EpisodeWriter`."""
-        if self.key_filter is not None:
-            ep_data = self.key_filter(dict(ep_data))
-        arrays, constants = _tensors.rows(ep_data)
-        if not arrays:
-            return
-        if self._buffer is None:
-            self._columns = [(name, array.dtype.name, list(array.shape[1:])) for name, array in arrays.items()]
-            self._buffer = _engine.ReplayBuffer(self._columns, self.max_steps)
-        missing = [name for name, _, _ in self._columns if name not in arrays]
-        extra = [name for name in arrays if name not in {name for name, _, _ in self._columns}]
-        if missing or extra:
-            raise ValueError(f"an episode must have the buffer's columns: missing {missing}, unexpected {extra}")
-        self._buffer.add({name: arrays[name] for name, _, _ in self._columns}, constants)
-        self._refresh()
-
-    def write_episodes(self, episodes: Iterable[Mapping[str, Any]]) -> None:
-        """Adds several episodes."""
-        for episode in episodes:
-            self.write_episode(episode)
-
-    def clear(self) -> None:
-        """Removes all episodes."""
-        if self._buffer is not None:
-            self._buffer = _engine.ReplayBuffer(self._columns, self.max_steps)
-            self._samplers.clear()
-            self._refresh()
-
-    def _refresh(self) -> None:
-        """Updates the snapshot, lengths and offsets to the current content."""
-        self._snapshot = self._buffer.snapshot()
-        lengths = self._snapshot.lengths()
-        super().__init__(lengths, np.cumsum(lengths) - lengths, self.frameskip, self.num_steps, self.transform)
+    def __init__(self, snapshot: Any, columns: list[tuple[str, str, list[int]]], frameskip: int, num_steps: int) -> None:
+        lengths = [] if snapshot is None else snapshot.lengths()
+        super().__init__(lengths, np.cumsum(lengths) - lengths, frameskip, num_steps)
+        self._snapshot = snapshot
+        self._columns = columns
 
     @property
     def column_names(self) -> list[str]:
@@ -129,65 +41,15 @@ class ReplayBuffer(Dataset):
 
     @property
     def engine(self) -> Any:
-        """The engine's dataset of the current content."""
         if self._snapshot is None:
             raise RuntimeError("the replay buffer is empty: write an episode first")
         return self._snapshot
 
-    @property
-    def num_steps_stored(self) -> int:
-        """The number of rows in the buffer."""
-        return 0 if self._buffer is None else int(self._buffer.rows())
+    def num_valid_ends(self, history_len: int) -> int:
+        return int(np.maximum(self.lengths - history_len * self.frameskip + 1, 0).sum())
 
-    @property
-    def num_episodes_added(self) -> int:
-        """The number of episodes added since the last `clear`, including removed episodes."""
-        return 0 if self._buffer is None else int(self._buffer.added())
-
-    def num_valid_ends(self, history_len: int | None = None) -> int:
-        """The number of clips of `history_len` steps in the buffer."""
-        span = (self.history_len if history_len is None else history_len) * self.frameskip
-        return int(np.maximum(self.lengths - span + 1, 0).sum())
-
-    def sample(self, batch_size: int, history_len: int | None = None, step: int | None = None) -> dict[str, Array]:
-        """Samples a batch of clips.
-
-        Args:
-            batch_size: The number of clips.
-            history_len: The number of steps of a clip; `None` uses the value of the buffer.
-            step: The index of the batch, which determines the sampled clips; `None` counts the calls.
-
-        Returns:
-            Arrays `(batch_size, history_len, ...)`; `action` is `(batch_size, history_len, frameskip * dim)`, images
-            `(batch_size, history_len, H, W, C)`.
-        """
-        steps = self.history_len if history_len is None else int(history_len)
-        if batch_size < 1 or steps < 1:
-            raise ValueError(f"expected a batch_size and history_len of at least 1, got {batch_size} and {steps}")
-        if step is None:
-            step = self._step
-            self._step += 1
-        if self.num_valid_ends(steps) == 0:
-            raise RuntimeError(
-                f"the replay buffer has no clip of {steps} steps with frameskip {self.frameskip}: it holds "
-                f"{self.num_episodes} episodes of {self.num_steps_stored} rows"
-            )
-        if self.sampler is not None:
-            return self._chosen(np.asarray(self.sampler(step, self, batch_size, steps)), batch_size, steps)
-        key = (batch_size, steps)
-        if key not in self._samplers:
-            settings = {
-                "num_steps": steps,
-                "frameskip": self.frameskip,
-                "columns": self.column_names,
-                "goals": [],
-                "batch_size": batch_size,
-                "recent": None,
-            }
-            self._samplers[key] = self._buffer.sampler(json.dumps(settings), self.seed)
-        return dict(self._samplers[key].sample(step))
-
-    def _chosen(self, indices: Array, batch_size: int, steps: int) -> dict[str, Array]:
+    def chosen(self, indices: Array, batch_size: int, steps: int) -> dict[str, Array]:
+        """The clips of `steps` steps with these indices, in the form of a batch of `sample`."""
         if indices.shape != (batch_size,):
             raise ValueError(f"the sampler gave indices of shape {indices.shape}, expected ({batch_size},)")
         view = Dataset(self.lengths, self.offsets, self.frameskip, steps)
@@ -229,13 +91,232 @@ class ReplayBuffer(Dataset):
         return {name: array[0] for name, array in found.items()} if np.ndim(row_idx) == 0 else found
 
     def episodes(self) -> Iterator[dict[str, Any]]:
-        """Yields the episodes, oldest first, as dicts of arrays `(T, ...)`."""
-        snapshot, lengths = self._snapshot, self.lengths
-        for episode in range(len(lengths)):
-            run = (np.asarray([n], dtype=np.int64) for n in (episode, 0, lengths[episode]))
-            values = _tensors.episode_values(snapshot.constants(episode).get(_tensors.EPISODE))
-            steps: dict[str, Any] = dict(snapshot.read(self.column_names, *run, 1))
+        for episode in range(self.num_episodes):
+            number, start, length = (np.asarray([n]) for n in (episode, 0, self.lengths[episode]))
+            values = self._episode_values(episode)
+            steps: dict[str, Any] = self._read(number, start, length, 1)
             yield {**steps, _tensors.EPISODE: values} if values else steps
+
+
+class ReplayBuffer(Dataset):
+    """The latest episodes, with at most `max_steps` rows: a writer for collection and a dataset for training.
+
+        buffer = ReplayBuffer(max_steps=100_000, history_len=4)
+        world.collect(buffer, episodes=10)
+        batch = buffer.sample(256)  # arrays (256, 4, ...)
+
+    When an episode does not fit, the oldest episodes are removed. Samples depend only on the seed, the step and the content
+    of the buffer.
+
+    Several threads may write and read at once. Every call reads whole episodes of one moment; after another episode, an
+    index may name another clip or episode.
+
+    Args:
+        max_steps: The maximum number of rows. An episode of `n` steps has `n + 1` rows.
+        history_len: The number of steps of a clip.
+        frameskip: The number of rows from one step to the next.
+        sampler: A function `(step, buffer, batch_size, history_len) -> indices` that chooses clips by indices below
+            `num_valid_ends(history_len)`. With `None`, all clips are equally likely.
+        transform: Called with the dict of every sample of `buffer[i]`, but not with the batches of `sample`.
+        key_filter: A function from the dict of a new episode to a dict of the columns to keep.
+        seed: Determines the samples, together with the step.
+    """
+
+    def __init__(
+        self,
+        max_steps: int,
+        history_len: int = 1,
+        frameskip: int = 1,
+        sampler: Sampler | None = None,
+        transform: Transform | None = None,
+        key_filter: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
+        seed: int = 0,
+    ) -> None:
+        for name, value in (("max_steps", max_steps), ("history_len", history_len), ("frameskip", frameskip)):
+            if value < 1:
+                raise ValueError(f"{name}: expected at least 1, got {value}")
+        super().__init__([], [], frameskip, history_len, transform)
+        self.max_steps = int(max_steps)
+        self.history_len = int(history_len)
+        self.sampler = sampler
+        self.key_filter = key_filter
+        self.seed = int(seed)
+        self._buffer: Any = None
+        self._columns: list[tuple[str, str, list[int]]] = []
+        #: Held while the content changes, and while a sampler of the user, which may call the buffer, chooses from it.
+        self._lock = threading.RLock()
+        #: The samplers of the engine's buffer, by batch size and history length.
+        self._samplers: dict[tuple[int, int], Any] = {}
+        self._step = 0
+        self._refresh()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The attributes, with the episodes in place of the engine's memory. A copy counts its own `num_episodes_added`."""
+        gone: dict[str, Any] = {"_buffer": None, "_content": None, "_samplers": {}, "_lock": None}
+        return {**self.__dict__, **gone, "_episodes": list(self.episodes())}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        episodes = state.pop("_episodes")
+        self.__dict__.update(state)
+        self._lock = threading.RLock()
+        self._refresh()
+        filter, self.key_filter = self.key_filter, None
+        self.write_episodes(episodes)
+        self.key_filter = filter
+
+    def __enter__(self) -> ReplayBuffer:
+        return self
+
+    def __exit__(self, *exc: Any) -> None:
+        return None
+
+    def write_episode(self, ep_data: Mapping[str, Any]) -> None:
+        """Adds an episode: a list of steps or an array `(T, ...)` for each column, as in :class:`EpisodeWriter`."""
+        if self.key_filter is not None:
+            ep_data = self.key_filter(dict(ep_data))
+        arrays, constants = _tensors.rows(ep_data)
+        if not arrays:
+            return
+        with self._lock:
+            if self._buffer is None:
+                self._columns = [(name, array.dtype.name, list(array.shape[1:])) for name, array in arrays.items()]
+                self._buffer = _engine.ReplayBuffer(self._columns, self.max_steps)
+            missing = [name for name, _, _ in self._columns if name not in arrays]
+            extra = [name for name in arrays if name not in {name for name, _, _ in self._columns}]
+            if missing or extra:
+                raise ValueError(f"an episode must have the buffer's columns: missing {missing}, unexpected {extra}")
+            self._buffer.add({name: arrays[name] for name, _, _ in self._columns}, constants)
+            self._refresh()
+
+    def write_episodes(self, episodes: Iterable[Mapping[str, Any]]) -> None:
+        """Adds several episodes."""
+        for episode in episodes:
+            self.write_episode(episode)
+
+    def clear(self) -> None:
+        """Removes all episodes."""
+        with self._lock:
+            if self._buffer is not None:
+                self._buffer = _engine.ReplayBuffer(self._columns, self.max_steps)
+                self._samplers.clear()
+                self._refresh()
+
+    def _refresh(self) -> None:
+        """Takes the current content of the engine's buffer."""
+        snapshot = None if self._buffer is None else self._buffer.snapshot()
+        self._content = content = _Content(snapshot, self._columns, self.frameskip, self.num_steps)
+        self.lengths, self.offsets, self.span = content.lengths, content.offsets, content.span
+        self._clips_before = content._clips_before
+
+    @property
+    def _now(self) -> _Content:
+        """The current content, with the transform of now."""
+        content = self._content
+        content.transform = self.transform
+        return content
+
+    @property
+    def column_names(self) -> list[str]:
+        return [name for name, _, _ in self._columns]
+
+    @property
+    def engine(self) -> Any:
+        """The engine's dataset of the current content."""
+        return self._now.engine
+
+    @property
+    def num_steps_stored(self) -> int:
+        """The number of rows in the buffer."""
+        return 0 if self._buffer is None else int(self._buffer.rows())
+
+    @property
+    def num_episodes_added(self) -> int:
+        """The number of episodes added since the last `clear`, including removed episodes."""
+        return 0 if self._buffer is None else int(self._buffer.added())
+
+    def num_valid_ends(self, history_len: int | None = None) -> int:
+        """The number of clips of `history_len` steps in the buffer."""
+        return self._now.num_valid_ends(self.history_len if history_len is None else history_len)
+
+    def sample(self, batch_size: int, history_len: int | None = None, step: int | None = None) -> dict[str, Array]:
+        """Samples a batch of clips.
+
+        Args:
+            batch_size: The number of clips.
+            history_len: The number of steps of a clip; `None` uses the value of the buffer.
+            step: The index of the batch, which determines the sampled clips; `None` counts the calls.
+
+        Returns:
+            Arrays `(batch_size, history_len, ...)`; `action` is `(batch_size, history_len, frameskip * dim)`, images
+            `(batch_size, history_len, H, W, C)`.
+        """
+        steps = self.history_len if history_len is None else int(history_len)
+        if batch_size < 1 or steps < 1:
+            raise ValueError(f"expected a batch_size and history_len of at least 1, got {batch_size} and {steps}")
+        with self._lock:
+            if step is None:
+                step = self._step
+                self._step += 1
+            content = self._now
+            if content.num_valid_ends(steps) == 0:
+                raise RuntimeError(
+                    f"the replay buffer has no clip of {steps} steps with frameskip {self.frameskip}: it holds "
+                    f"{content.num_episodes} episodes of {int(content.lengths.sum())} rows"
+                )
+            if self.sampler is not None:
+                indices = np.asarray(self.sampler(step, self, batch_size, steps))
+                return self._now.chosen(indices, batch_size, steps)
+            sampler = self._engine_sampler(batch_size, steps)
+        return dict(sampler.sample(step))
+
+    def _engine_sampler(self, batch_size: int, steps: int) -> Any:
+        key = (batch_size, steps)
+        if key not in self._samplers:
+            settings = {
+                "num_steps": steps,
+                "frameskip": self.frameskip,
+                "columns": self.column_names,
+                "goals": [],
+                "batch_size": batch_size,
+                "recent": None,
+            }
+            self._samplers[key] = self._buffer.sampler(json.dumps(settings), self.seed)
+        return self._samplers[key]
+
+    @property
+    def clip_indices(self) -> list[tuple[int, int]]:
+        return self._now.clip_indices
+
+    def __getitem__(self, idx: int) -> dict[str, Any]:
+        return self._now[idx]
+
+    def load_chunk(
+        self, episodes_idx: Sequence[int] | Array, start: Sequence[int] | Array, end: Sequence[int] | Array
+    ) -> list[dict[str, Any]]:
+        return self._now.load_chunk(episodes_idx, start, end)
+
+    def load_episode(self, episode_idx: int) -> dict[str, Any]:
+        return self._now.load_episode(episode_idx)
+
+    def _load_slice(self, ep_idx: int, start: int, end: int) -> dict[str, Any]:
+        return self._now._load_slice(ep_idx, start, end)
+
+    @property
+    def episode_column_names(self) -> list[str]:
+        return self._now.episode_column_names
+
+    def get_episode_data(self, episodes_idx: Sequence[int] | Array | None = None) -> dict[str, Array]:
+        return self._now.get_episode_data(episodes_idx)
+
+    def get_col_data(self, col: str) -> Array:
+        return self._now.get_col_data(col)
+
+    def get_row_data(self, row_idx: Rows) -> dict[str, Array]:
+        return self._now.get_row_data(row_idx)
+
+    def episodes(self) -> Iterator[dict[str, Any]]:
+        """Yields the episodes of now, oldest first, as dicts of arrays `(T, ...)`."""
+        return self._now.episodes()
 
     def dump(self, path: str | os.PathLike[str], format: str | None = None, mode: str = "overwrite", **kwargs: Any) -> None:
         """Writes the content to a dataset of any format."""

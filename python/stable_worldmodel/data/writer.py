@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import threading
 import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -39,7 +40,7 @@ class EpisodeWriter:
     """Writes episodes into a dataset: a :class:`~stable_worldmodel.data.Writer`.
 
     The first episode defines the columns. The writer commits episodes at least every two seconds and when it is closed.
-    Committed episodes remain if the process is killed.
+    Committed episodes remain if the process is killed. Several threads may write episodes at once.
 
     Args:
         path: A path, a URI, or a name under `$STABLEWM_HOME/datasets`.
@@ -71,6 +72,8 @@ class EpisodeWriter:
             self.format = _engine.detect(self.path) or "lance"
         self._codec = codec_json(codec, jpeg_quality)
         self._manifest = None if manifest is None else self._provenance(manifest)
+        #: Held while an episode is written, because the first one opens the dataset.
+        self._lock = threading.RLock()
         self._writer: Any = None
         self._closed = self._warned = False
         #: The columns and their types, once they are known.
@@ -95,6 +98,12 @@ class EpisodeWriter:
         made = {"kind": "write", "swm_version": __version__, "libraries": empty, "seed": 0, "hashes": empty}
         return json.dumps({**made, "config": dict(given), "device": "cpu"})
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_lock": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _lock=threading.RLock())
+
     @property
     def num_episodes(self) -> int:
         """The number of episodes in the dataset, including uncommitted ones; 0 before the first episode is written."""
@@ -107,21 +116,22 @@ class EpisodeWriter:
         integers, or one action fewer. An action in the last row is left out, with a warning, because no observation
         follows it.
         """
-        if self._closed:
-            raise ValueError(f"{self.path}: the writer is closed; open another one with mode='append'")
-        arrays, constants = _tensors.rows(ep_data)
-        if not arrays:
-            raise ValueError("an episode needs at least one numeric column")
-        if _tensors.without_last_action(arrays) and not self._warned:
-            self._warned = True
-            warnings.warn(f"{self.path}: {_tensors.LAST_ACTION}", stacklevel=2)
-        if not self._columns:
-            self._columns = {name: (array.dtype.name, array.shape[1:]) for name, array in arrays.items()}
-        fitted = self._fitted(arrays)
-        if self._writer is None:
-            columns = [(name, dtype, list(shape)) for name, (dtype, shape) in self._columns.items()]
-            self._writer = _engine.Writer(self.path, self.format, self.mode, self._codec, columns, self._manifest)
-        self._writer.write(fitted, constants)
+        with self._lock:
+            if self._closed:
+                raise ValueError(f"{self.path}: the writer is closed; open another one with mode='append'")
+            arrays, constants = _tensors.rows(ep_data)
+            if not arrays:
+                raise ValueError("an episode needs at least one numeric column")
+            if _tensors.without_last_action(arrays) and not self._warned:
+                self._warned = True
+                warnings.warn(f"{self.path}: {_tensors.LAST_ACTION}", stacklevel=2)
+            if not self._columns:
+                self._columns = {name: (array.dtype.name, array.shape[1:]) for name, array in arrays.items()}
+            fitted = self._fitted(arrays)
+            if self._writer is None:
+                columns = [(name, dtype, list(shape)) for name, (dtype, shape) in self._columns.items()]
+                self._writer = _engine.Writer(self.path, self.format, self.mode, self._codec, columns, self._manifest)
+            self._writer.write(fitted, constants)
 
     def _fitted(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
         """The episode with the columns of the dataset, in their order and types."""
@@ -151,9 +161,10 @@ class EpisodeWriter:
 
     def close(self) -> None:
         """Commits the episodes and closes the writer."""
-        self._closed = True
-        if self._writer is not None:
-            self._writer.finish()
+        with self._lock:
+            self._closed = True
+            if self._writer is not None:
+                self._writer.finish()
 
     def __enter__(self) -> EpisodeWriter:
         return self

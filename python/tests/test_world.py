@@ -216,6 +216,16 @@ def test_restored_snapshot_repeats_the_next_step():
     assert np.array_equal(world.infos["state"], after)
 
 
+@pytest.mark.parametrize("index", [-1, 2, 2**70])
+def test_indices_of_no_environment_are_refused(index):
+    world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(16, 16))
+    world.reset(seed=0)
+    state = world.snapshot(1)
+    for call in (world.factors, world.snapshot, lambda index: world.restore(state, index)):
+        with pytest.raises(IndexError, match=f"index: {index}; the world has 2 environments"):
+            call(index)
+
+
 @pytest.mark.parametrize(
     ("make", "error", "words"),
     [

@@ -205,7 +205,7 @@ class World:
 
     def factors(self, index: int = 0) -> dict[str, list[float]]:
         """The factors of the current episode of an environment, by key."""
-        return self._world.factors(index)
+        return self._world.factors(self._checked_index(index))
 
     def close(self) -> None:
         """Closes the environments and ends their worker processes. The world cannot be used afterwards."""
@@ -372,11 +372,21 @@ class World:
 
     def snapshot(self, index: int = 0) -> bytes:
         """The full state of an environment, including its random state."""
-        return self._world.snapshot(index)
+        return self._world.snapshot(self._checked_index(index))
 
     def restore(self, state: bytes, index: int = 0) -> None:
         """Restores a snapshot. Later steps repeat the steps after the snapshot bit for bit."""
-        self._world.restore(index, state)
+        self._world.restore(self._checked_index(index), state)
+
+    def _checked_index(self, index: int) -> int:
+        """The index of an environment.
+
+        Raises:
+            IndexError: When there is no such environment.
+        """
+        if not 0 <= index < self.num_envs:
+            raise IndexError(f"index: {index!r}; the world has {self.num_envs} environments, with indices from 0")
+        return index
 
     def _begin(self, slots: Sequence[int]) -> None:
         self._fresh[list(slots)] = True

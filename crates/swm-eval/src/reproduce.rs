@@ -66,8 +66,8 @@ impl fmt::Display for Difference {
 /// Repeats the evaluation that gave `old` and lists the differences between the old and the new results.
 ///
 /// # Errors
-/// When the results contain no request that this version reads or another number of episodes than it requests, a dataset or a checkpoint has a different hash, and as
-/// [`EvalRequest::run`].
+/// When the results contain no request that this version reads, another number of episodes than it requests, or two runs of a
+/// policy under one condition, a dataset or a checkpoint has a different hash, and as [`EvalRequest::run`].
 pub fn reproduce(
     old: &Results,
     resolver: &dyn Resolver,
@@ -123,6 +123,11 @@ fn requested(old: &Results) -> Result<EvalRequest> {
         let [found, requested] = [run.episodes.len(), request.episodes];
         let problem = format!("its request has {requested} episodes, its run '{}' has {found}", run.policy);
         return Err(Error::config("the results' manifest", problem, "evaluate again (`swm eval`)"));
+    }
+    let mut seen = BTreeSet::new();
+    if let Some(run) = old.runs.iter().find(|run| !seen.insert(key(run))) {
+        let problem = format!("they have two runs of '{}' under '{}'", run.policy, run.condition);
+        return Err(Error::config("the results", problem, "evaluate again (`swm eval`)"));
     }
     Ok(request)
 }
@@ -211,6 +216,10 @@ fn list(old: &Results, new: &Results, number: &dyn Fn(usize) -> usize) -> Vec<Di
     };
     compare(Kind::Version, "stable-worldmodel", &then.swm_version, &now.swm_version);
     compare(Kind::Version, "device", &then.device, &now.device);
+    compare(Kind::Input, "environment", &old.env, &new.env);
+    compare(Kind::Input, "protocol", &old.protocol, &new.protocol);
+    compare(Kind::Input, "counting", &json(&old.counting), &json(&new.counting));
+    compare(Kind::Input, "seed", &then.seed.to_string(), &now.seed.to_string());
     for (what, was, is) in pair_values(&then.libraries, &now.libraries) {
         compare(Kind::Version, what, was, is);
     }
@@ -225,11 +234,11 @@ fn list(old: &Results, new: &Results, number: &dyn Fn(usize) -> usize) -> Vec<Di
     for (what, was, is) in pair_values(&was, &is) {
         compare(Kind::Input, &format!("request, {what}"), was, is);
     }
-    for ((run, episode), was, is) in pair_values(&outcomes(old), &outcomes(new)) {
-        compare(Kind::Finding, &format!("episode {} of {run}", number(*episode)), was, is);
+    for (((policy, condition), episode), was, is) in pair_values(&outcomes(old), &outcomes(new)) {
+        compare(Kind::Finding, &format!("episode {} of {policy}, {condition}", number(*episode)), was, is);
     }
-    for (run, was, is) in pair_values(&summaries(old), &summaries(new)) {
-        compare(Kind::Finding, run, was, is);
+    for ((policy, condition), was, is) in pair_values(&summaries(old), &summaries(new)) {
+        compare(Kind::Finding, &format!("{policy}, {condition}"), was, is);
     }
     found
 }
@@ -244,20 +253,28 @@ fn pair_values<'a, K: Ord>(
     keys.into_iter().map(move |key| (key, side(was, key), side(is, key)))
 }
 
+/// The name of a run for readers. Another run may have the same one, because names of policies and conditions are free.
 fn name(run: &Run) -> String {
     format!("{}, {}", run.policy, run.condition)
 }
 
-/// Every episode as JSON, by the name of its run and its index.
-fn outcomes(results: &Results) -> BTreeMap<(String, usize), String> {
+/// What identifies a run: its policy and its condition.
+type RunKey<'a> = (&'a str, &'a str);
+
+fn key(run: &Run) -> RunKey<'_> {
+    (&run.policy, &run.condition)
+}
+
+/// Every episode as JSON, by its run and its index.
+fn outcomes(results: &Results) -> BTreeMap<(RunKey<'_>, usize), String> {
     let episodes = results.runs.iter().flat_map(|run| run.episodes.iter().enumerate().map(move |(i, e)| (run, i, e)));
-    episodes.map(|(run, i, episode)| ((name(run), i), json(episode))).collect()
+    episodes.map(|(run, i, episode)| ((key(run), i), json(episode))).collect()
 }
 
 /// The success rates and the prediction errors of every run, as JSON. Searches are omitted, because tracing them is
 /// optional.
-fn summaries(results: &Results) -> BTreeMap<String, String> {
-    results.runs.iter().map(|run| (name(run), json(&(run.success, run.strict, &run.prediction)))).collect()
+fn summaries(results: &Results) -> BTreeMap<RunKey<'_>, String> {
+    results.runs.iter().map(|run| (key(run), json(&(run.success, run.strict, &run.prediction)))).collect()
 }
 
 fn json(value: &impl Serialize) -> String {

@@ -52,7 +52,7 @@ pub fn parse_results(path: &Path, bytes: &[u8]) -> Result<Results> {
     })?;
     check_size(path, &results)?;
     results.check().map_err(|problem| {
-        let fix = "its episodes and its statistics contradict each other: evaluate again (`swm eval`)";
+        let fix = "its parts contradict each other: evaluate again (`swm eval`)";
         Error::corrupt(path, format!("is inconsistent: {problem}"), fix)
     })?;
     // Older versions wrote intervals that take starts from one recorded episode as independent.

@@ -1,17 +1,26 @@
 //! Checks that the statistics in [`Results`] are those of the episodes in them.
 //!
 //! A results file may be edited or damaged. Its rates, intervals and comparisons are therefore never shown as they
-//! stand: they must equal the values that are computed again from the episodes.
+//! stand: they must equal the values that are computed again from the episodes. What the results are of must be what the
+//! request in their manifest says.
 
 use super::{Comparison, Counting, Paired, Prediction, Proportion, Results, Run, Summary};
+use serde::Deserialize as _;
+use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
 
 impl Results {
-    /// Checks that every statistic equals the statistic of the episodes.
+    /// Checks that every statistic equals the statistic of the episodes, that a policy has one run under a condition, and that the
+    /// results are of what the manifest says.
     ///
     /// # Errors
     /// When a value differs; the text names the run, the stated value and the value of its episodes.
     pub fn check(&self) -> Result<(), String> {
+        self.check_request()?;
+        let mut seen = BTreeSet::new();
+        if let Some(run) = self.runs.iter().find(|run| !seen.insert((&run.policy, &run.condition))) {
+            return Err(format!("it has two runs of '{}' under '{}'", run.policy, run.condition));
+        }
         self.runs.iter().try_for_each(|run| check_run(run, self.counting, self.stopping.is_some()))?;
         self.check_independence()?;
         self.check_stopping()?;
@@ -38,6 +47,20 @@ impl Results {
         match expected.keys().find(|names| !seen.contains(*names)) {
             Some([condition, a, b]) => Err(format!("the comparison of {a} and {b} is left out ({condition})")),
             None => Ok(()),
+        }
+    }
+
+    /// Checks that the environment, protocol, counting and seed are those of the request in the manifest, as far as it states them.
+    fn check_request(&self) -> Result<(), String> {
+        let requested = |name: &str| self.manifest.config.get(name);
+        let is_other = requested("env").is_some_and(|env| *env != Value::from(self.env.as_str()))
+            || requested("seed").is_some_and(|seed| *seed != Value::from(self.manifest.seed))
+            || requested("starts").is_some_and(|starts| (starts == "episodic") != (self.protocol == "episodic"))
+            || requested("counting")
+                .is_some_and(|counting| Counting::deserialize(counting).ok() != Some(self.counting));
+        match is_other {
+            true => Err("it states another environment, protocol, counting or seed than its request".to_owned()),
+            false => Ok(()),
         }
     }
 

@@ -431,6 +431,26 @@ fn results_without_a_valid_request_are_not_reproduced() {
     assert!(message.contains("it contains no request"), "{message}");
     let message = rejected(&|old| old.manifest.kind = "train".to_owned());
     assert!(message.contains("'train'"), "{message}");
+    let message = rejected(&|old| old.runs.push(old.runs[1].clone()));
+    assert!(message.contains("two runs of"), "{message}");
+}
+
+/// Names of policies and conditions are free: those of two runs can be joined to the same text.
+#[test]
+fn runs_whose_names_join_to_one_text_are_compared_each() {
+    let mut request = EvalRequest { prediction: None, ..request() };
+    let walker = request.policies[0].clone();
+    let other = PolicyRequest { name: format!("{}, in distribution", walker.name), ..walker.clone() };
+    request.policies = vec![walker.clone(), other];
+    request.conditions[0].name = "in distribution, default".to_owned();
+    request.conditions[1].name = "default".to_owned();
+    let results = run(&request, 4, 1);
+    for forged in 0..results.runs.len() {
+        let mut old = results.clone();
+        old.runs[forged].episodes[2].total_reward += 1.0;
+        let differences = differences(&old, &results);
+        assert_eq!(differences.len(), 1, "{} under {}", results.runs[forged].policy, results.runs[forged].condition);
+    }
 }
 
 /// An episode that is played again, alone and without its dataset, has the outcome that it has in the evaluation.

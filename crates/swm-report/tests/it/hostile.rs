@@ -188,6 +188,39 @@ fn statistics_that_contradict_the_episodes_are_refused() {
 }
 
 #[test]
+fn results_of_something_else_than_their_request_are_refused() {
+    let with_request = |change: &dyn Fn(&mut Value)| {
+        refused(|v| {
+            v["manifest"]["config"] = json!({
+                "version": 1, "env": v["env"], "seed": v["manifest"]["seed"], "starts": "episodic", "counting": v["counting"],
+            });
+            change(v);
+        })
+    };
+    assert_eq!(with_request(&|_| {}), "accepted");
+    for (pointer, value) in [
+        ("/env", json!("swm/PushT-v1")),
+        ("/protocol", json!("dataset")),
+        ("/manifest/seed", json!(77)),
+        ("/manifest/config/counting", json!({"strict": {"hold": 25}})),
+        ("/manifest/config/counting", json!("easy")),
+    ] {
+        let error = with_request(&|v| *v.pointer_mut(pointer).expect(pointer) = value.clone());
+        assert!(
+            error.contains("another environment, protocol, counting or seed than its request"),
+            "{pointer}: {error}"
+        );
+    }
+    // A forged run before the true one.
+    let twice = refused(|v| {
+        let runs = v["runs"].as_array_mut().expect("runs");
+        runs.insert(0, runs[2].clone());
+        v["comparisons"] = json!([]);
+    });
+    assert!(twice.contains("it has two runs of 'lewm-tiny' under 'in distribution'"), "{twice}");
+}
+
+#[test]
 fn extreme_values_are_accepted_and_values_outside_the_layout_are_refused() {
     for (pointer, value) in [
         (

@@ -68,8 +68,9 @@ pub struct Submission {
 }
 
 impl Entry {
-    /// Makes an entry from results that this machine computed. Of the policies, the entry keeps one with weights, and those
-    /// without weights: the floor, baselines, experts and the simulator. It leaves out videos, searches and prediction errors.
+    /// Makes an entry from results that this machine computed. Of the policies, the entry keeps one with weights, and the
+    /// baselines: the floor, experts, the simulator and others without weights. It leaves out videos, searches and prediction
+    /// errors.
     ///
     /// # Errors
     /// When no policy, or several policies, with weights may be meant, counting is not strict, or a text is empty or too
@@ -78,7 +79,7 @@ impl Entry {
         let Submission { mut results, policy, author, licence } = submission;
         let all = EvalRequest::of(&results.manifest)?;
         let policy = chosen(&all, policy.as_deref())?;
-        let keeps = |other: &PolicyRequest| other.name == policy || trained(&other.kind).is_none();
+        let keeps = |other: &PolicyRequest| other.name == policy || baseline(&other.kind).is_some();
         let policies: Vec<PolicyRequest> = all.policies.iter().filter(|other| keeps(other)).cloned().collect();
         let request = EvalRequest { policies, prediction: None, ..all.clone() };
         let weights = results.manifest.hashes.get(&all.weights_key(&policy)).cloned();
@@ -199,13 +200,8 @@ impl Entry {
         if results.sequential || results.stopping.is_some() {
             return Err("its results decided the number of episodes, so that the intervals do not hold".to_owned());
         }
-        let same = results.env == request.env
-            && results.protocol == request.protocol()
-            && results.counting == request.counting
-            && results.manifest.seed == request.seed
-            && request.prediction.is_none();
-        if !same {
-            return Err("its results state another environment, protocol, counting or seed than its request".to_owned());
+        if request.prediction.is_some() {
+            return Err("its request has prediction errors, which its results lack".to_owned());
         }
         check_runs(&request, &results.runs)?;
         check_policies(&request, policy)?;
@@ -257,7 +253,8 @@ fn check_request(request: &EvalRequest) -> std::result::Result<(), String> {
     Ok(())
 }
 
-/// Checks that one policy has weights, and that names which pages give a meaning have that meaning.
+/// Checks that one policy has weights, that the others are baselines, and that names which pages give a meaning have that
+/// meaning.
 fn check_policies(request: &EvalRequest, policy: &str) -> std::result::Result<(), String> {
     for PolicyRequest { name, kind } in &request.policies {
         let is_other = match name.as_str() {
@@ -271,6 +268,12 @@ fn check_policies(request: &EvalRequest, policy: &str) -> std::result::Result<()
         match (name == policy, trained(kind)) {
             (true, None) => return Err(format!("its policy '{name}' has no weights with a hash")),
             (false, Some(_)) => return Err(format!("it has a second policy with weights, '{name}'")),
+            (false, None) if baseline(kind).is_none() => {
+                return Err(format!(
+                    "its policy '{name}' is no baseline: it plans in a trained model, with the dynamics of the environment or \
+                     by a probe"
+                ));
+            }
             _ => {}
         }
     }

@@ -1,10 +1,11 @@
 //! Tests of `swm leaderboard`: entries, their verification against forgeries, and the pages.
 
 use crate::{Swm, text};
+use serde_json::json;
 use std::fs;
 use std::path::Path;
 use swm::core::results::{Counting, EpisodeResult, Run};
-use swm::leaderboard::{Entry, entries};
+use swm::leaderboard::{Entry, Submission, entries};
 
 /// A planner that is fast, and whose episodes are short.
 const PLANNER: [&str; 6] = ["--solver", "cem,samples=16,iterations=2,elites=4", "--budget", "12", "--videos", "0"];
@@ -81,6 +82,22 @@ fn an_entry_holds_and_a_share_finds_the_changes_that_it_plays() {
     for file in ["start.json", "starts.json", "seed.json"] {
         assert_eq!(shares(&swm, file), [false; 4], "{file}");
     }
+}
+
+/// Adds the policy `larger`, which has another kind of model than the policy of the entry, and whose run is the floor's.
+fn add_policy(entry: &mut Entry, kind: &str) {
+    let policies = entry.results.manifest.config["policies"].as_array_mut().expect("policies");
+    let mut policy = policies.iter().find(|policy| policy["name"] == entry.policy).expect("the policy").clone();
+    let checkpoint = policy["acts"]["plan"]["model"]["checkpoint"].take();
+    let model = match kind {
+        "true_dynamics" => json!({"checkpoint": checkpoint, "cost": "success"}),
+        _ => json!({"checkpoint": checkpoint, "dataset": "rooms", "columns": ["state"], "true_dynamics": true}),
+    };
+    policy["acts"]["plan"]["model"] = json!({kind: model});
+    policy["name"] = "larger".into();
+    policies.push(policy);
+    entry.results.runs.push(Run { policy: "larger".to_owned(), ..entry.results.runs[0].clone() });
+    entry.results.comparisons.clear();
 }
 
 /// Changes a hash in the manifest.
@@ -202,6 +219,9 @@ fn entries_that_contradict_themselves_are_refused_before_anything_is_played() {
             &mut entry.results.manifest.config["policies"][1]["acts"]["plan"]["solver"]["settings"]["samples"];
         *samples = (1_u64 << 60).into();
     });
+    // Plans in the environment itself or by a probe, as autopsies have them, are neither trained nor baselines.
+    refused("its policy 'larger' is no baseline", &|entry| add_policy(entry, "true_dynamics"));
+    refused("its policy 'larger' is no baseline", &|entry| add_policy(entry, "probe"));
     refused("reserved", &|entry| entry.results.manifest.config["policies"][0]["acts"] = "no_op".into());
     forged(&swm, &entry, "bad.json", |entry| {
         entry.results.env = "evil_mod:X-v0".to_owned();
@@ -256,6 +276,14 @@ fn results_that_are_no_entry_are_not_submitted() {
     let entry = Entry::read(&swm.path("entry.json")).expect("an entry");
     assert_eq!(entry.results.runs.iter().map(|run| run.policy.as_str()).collect::<Vec<_>>(), ["random", "lewm"]);
     assert_eq!(swm.json(&["leaderboard", "verify", "entry.json"])["holds"], true);
+    // A policy that plans in the environment is left out, as another model is.
+    let mut more = entry.clone();
+    add_policy(&mut more, "true_dynamics");
+    more.results.manifest.hashes.insert("weights of lewm".to_owned(), entry.weights().expect("a hash").to_owned());
+    let Entry { results, author, licence, .. } = more;
+    let again = Entry::new(Submission { results, policy: None, author, licence }).expect("an entry");
+    let runs = |entry: &Entry| entry.results.runs.iter().map(|run| run.policy.clone()).collect::<Vec<_>>();
+    assert_eq!((runs(&again), again.weights().ok()), (runs(&entry), entry.weights().ok()));
     fs::write(swm.path("mine.json"), "{}").expect("a file");
     let own = ["leaderboard", "submit", "both", "-o", "mine.json", "--policy", "lewm"];
     swm.fails(&own, 2, &["was not written by this program"]);

@@ -53,8 +53,16 @@ fn checkpoint_does_not_choose_a_module() {
 fn results_do_not_choose_modules_files_and_connections() {
     let swm = Swm::new();
     let file = results(&swm, "swm/TwoRoom-v1");
-    let set =
-        |change: &dyn Fn(&mut Value)| edit(Path::new(&file), |results| change(&mut results["manifest"]["config"]));
+    // What the results state is what their request says.
+    let set = |change: &dyn Fn(&mut Value)| {
+        edit(Path::new(&file), |results| {
+            let request = &mut results["manifest"]["config"];
+            change(request);
+            let (env, is_dataset) = (request["env"].clone(), request["starts"].is_object());
+            results["env"] = env;
+            results["protocol"] = json!(if is_dataset { "dataset" } else { "episodic" });
+        });
+    };
     let refused =
         |parts: &[&str]| swm.fails(&["reproduce", "results"], 2, &[&["results.json", "--trust"], parts].concat());
 

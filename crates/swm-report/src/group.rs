@@ -1,20 +1,54 @@
-//! [`Group`]: the runs of one environment, protocol and counting, by condition, from all files.
+//! [`Group`]: the runs of one environment, protocol, counting and task, by condition, from all files.
 
 use crate::limits;
 use crate::plot::{Ink, inks};
 use crate::text::{escape, shorten};
+use serde_json::Value;
 use std::path::PathBuf;
 use swm_core::Results;
 use swm_core::results::{Comparing, Comparison, Counting, Family, Paired, Proportion, Run, Stopping, Verdict, pairs};
 
-/// All runs in one environment with the same protocol and counting.
+/// All runs in one environment with the same protocol, counting and task.
 pub(crate) struct Group<'a> {
     pub env: &'a str,
     pub protocol: &'a str,
     pub counting: Counting,
+    pub task: Task<'a>,
+    /// Whether another group differs in the task only.
+    pub has_twin: bool,
     /// How the runs of a results file ended whose results decided their number of episodes, and that number.
     pub stopped: Vec<(Stopping, usize)>,
     pub conditions: Vec<Condition<'a>>,
+}
+
+/// What success means beside the counting, as far as the results say so: runs of other tasks are not compared.
+#[derive(Clone, Copy, Default, PartialEq)]
+pub(crate) struct Task<'a> {
+    /// The time limit in steps; null for that of the environment.
+    budget: Option<&'a Value>,
+    /// The origin of starts and goals, and the hash of their dataset.
+    starts: Option<&'a Value>,
+    dataset: Option<&'a String>,
+}
+
+impl<'a> Task<'a> {
+    fn of(results: &'a Results) -> Self {
+        let manifest = &results.manifest;
+        let [budget, starts] = ["budget", "starts"].map(|name| manifest.config.get(name));
+        Self { budget, starts, dataset: manifest.hashes.get("dataset") }
+    }
+
+    /// The task in words.
+    fn words(&self) -> String {
+        let limit = match self.budget.and_then(Value::as_u64) {
+            Some(steps) => format!("at most {steps} steps"),
+            None => "the time limit of the environment".to_owned(),
+        };
+        let Some(starts) = self.starts.and_then(|starts| starts.get("dataset")) else { return limit };
+        let name = starts.get("dataset").and_then(Value::as_str).unwrap_or_default();
+        let offset = starts.get("goal_offset").and_then(Value::as_u64).unwrap_or_default();
+        format!("{limit}, goals {offset} steps after starts of {name}")
+    }
 }
 
 /// All runs under one condition.
@@ -53,10 +87,12 @@ impl<'a> Group<'a> {
         let inks = inks(results.iter().flat_map(|(_, result)| &result.runs).map(|run| run.policy.as_str()));
         for (file, (_, result)) in results.iter().enumerate() {
             let counting = result.counting;
-            let same = |g: &Self| (g.env, g.protocol, g.counting) == (&*result.env, &*result.protocol, counting);
-            let index = groups.iter().position(same).unwrap_or_else(|| {
-                let (env, protocol) = (&*result.env, &*result.protocol);
-                groups.push(Self { env, protocol, counting, stopped: vec![], conditions: vec![] });
+            let (env, protocol, task) = (&*result.env, &*result.protocol, Task::of(result));
+            let is_twin = |g: &Self| (g.env, g.protocol, g.counting) == (env, protocol, counting);
+            let index = groups.iter().position(|group| is_twin(group) && group.task == task).unwrap_or_else(|| {
+                let twins = groups.iter_mut().filter(|group| is_twin(group));
+                let has_twin = twins.map(|group| group.has_twin = true).count() > 0;
+                groups.push(Self { env, protocol, counting, task, has_twin, stopped: vec![], conditions: vec![] });
                 groups.len() - 1
             });
             groups[index].stopped.extend(result.stopping.map(|stopping| (stopping, result.episodes())));
@@ -99,7 +135,9 @@ impl<'a> Group<'a> {
     /// The heading of the group, escaped.
     pub(crate) fn title(&self) -> String {
         let [env, protocol] = [self.env, self.protocol].map(|words| escape(&shorten(words, limits::TEXT_CHARS)));
-        format!("{env} · {protocol}, {}", escape(&self.counting.to_string()))
+        let task = if self.has_twin { format!(", {}", self.task.words()) } else { String::new() };
+        let task = escape(&shorten(&task, limits::TEXT_CHARS));
+        format!("{env} · {protocol}, {}{task}", escape(&self.counting.to_string()))
     }
 }
 

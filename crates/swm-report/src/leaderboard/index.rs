@@ -3,7 +3,7 @@
 use super::moves::{self, Move, range};
 use super::{BoardRow, BoardTable, Leaderboard, STYLE, name};
 use crate::charts;
-use crate::group::{Condition, Group, Row};
+use crate::group::{Condition, Group, Row, Task};
 use crate::limits;
 use crate::page::{Head, document};
 use crate::plot::Ink;
@@ -167,6 +167,8 @@ fn write_chart(html: &mut String, table: &BoardTable, rows: &[Ranked<'_>]) -> Re
         env: &table.env,
         protocol: "",
         counting: Counting::default(),
+        task: Task::default(),
+        has_twin: false,
         stopped: vec![],
         conditions: vec![Condition { name: "", rows: rows_to_draw(rows).map(chart_row).collect() }],
     };

@@ -305,6 +305,32 @@ fn empty_results_are_described() {
 }
 
 #[test]
+fn runs_of_other_tasks_are_not_compared() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let with = |budget: u64, dataset: &str| {
+        let mut results = results();
+        // Another floor, which is not left out as an equal one.
+        results.runs[0].episodes[0].steps += 1;
+        let starts = serde_json::json!({"dataset": {"dataset": dataset, "goal_offset": 25}});
+        results.manifest.config = serde_json::json!({"version": 1, "budget": budget, "starts": starts});
+        results.protocol = "dataset".to_owned();
+        results
+    };
+    let page_of = |first: Results, second: Results| {
+        let files = [first, second].map(|results| (PathBuf::from("results.json"), results));
+        page(&files, folder.path())
+    };
+    let page = page_of(with(50, "rooms"), with(50, "rooms"));
+    assert!(page.contains("lewm-tiny [2] \u{2212} lewm-tiny [1]") && !page.contains("at most 50 steps"));
+    for (second, words) in
+        [(with(15, "rooms"), "at most 15 steps"), (with(50, "halls"), "goals 25 steps after starts of halls")]
+    {
+        let page = page_of(with(50, "rooms"), second);
+        assert!(!page.contains("lewm-tiny [2]") && page.contains(words), "{words}");
+    }
+}
+
+#[test]
 fn files_of_one_environment_share_a_section() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let files = ["a.json", "b.json"].map(|name| (PathBuf::from(name), results()));

@@ -56,15 +56,7 @@ impl Batch {
     /// # Errors
     /// When the rows do not fit into memory.
     pub fn try_resize(&mut self, rows: usize) -> Result<()> {
-        let bytes = rows.saturating_mul(self.schema.row_bytes());
-        // The system promises more memory than there is, and ends a process that uses it. What is read is copied once at least.
-        if bytes > MANY_BYTES && free_memory().is_some_and(|free| bytes as u64 > free / 2) {
-            return Err(Error::mismatch(
-                "reading rows",
-                format!("{rows} rows of {} bytes, more than half of the free memory", self.schema.row_bytes()),
-                "fewer rows at once; `swm doctor` checks the dataset",
-            ));
-        }
+        self.schema.check_memory(rows)?;
         for (buffer, column) in self.data.iter_mut().zip(self.schema.columns()) {
             let reserved = rows.checked_mul(column.row_bytes()).is_some_and(|bytes| buffer.reserve(bytes));
             if !reserved {
@@ -264,6 +256,25 @@ impl Batch {
 impl std::fmt::Debug for Batch {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "Batch({} rows: {})", self.rows, self.schema.describe())
+    }
+}
+
+impl Schema {
+    /// Checks that rows fit into memory, where a file determines their number or their size.
+    ///
+    /// # Errors
+    /// When they take more than half of the free memory.
+    pub fn check_memory(&self, rows: usize) -> Result<()> {
+        let bytes = rows.saturating_mul(self.row_bytes());
+        // The system promises more memory than there is, and ends a process that uses it. What is read is copied once at least.
+        if bytes > MANY_BYTES && free_memory().is_some_and(|free| bytes as u64 > free / 2) {
+            return Err(Error::mismatch(
+                "reading rows",
+                format!("{rows} rows of {} bytes, more than half of the free memory", self.row_bytes()),
+                "fewer rows at once; `swm doctor` checks the dataset",
+            ));
+        }
+        Ok(())
     }
 }
 

@@ -3,10 +3,10 @@
 use crate::sample::{episode, rows, schema, write};
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use swm_core::requirements::{DatasetRequirements, RequiredObservations};
 use swm_core::run::Control;
-use swm_core::{Batch, ColumnSpec, Error, Manifest, Result, Schema};
+use swm_core::{Batch, ColumnSpec, DType, Error, Manifest, Result, Schema};
 use swm_data::doctor::{Diagnosis, Finding, Severity, examine, open_damaged, repair};
 use swm_data::{Constants, ConvertOptions, Episode, Irregularity, Location, Reader, StepRange, WriteMode, open};
 
@@ -104,6 +104,83 @@ fn problem(diagnosis: &Diagnosis) -> (String, Vec<usize>) {
     let problems: Vec<_> = diagnosis.findings.iter().filter(|found| found.severity == Severity::Problem).collect();
     assert_eq!(problems.len(), 1, "{problems:?}");
     (problems[0].what.clone(), problems[0].episodes.clone())
+}
+
+/// An episode of many rows, which no read may hold together.
+struct Long {
+    schema: Schema,
+    episodes: [Episode; 1],
+    /// The most rows of a read, and the rows of all reads.
+    most: AtomicUsize,
+    all: AtomicUsize,
+}
+
+/// The rows of [`Long`].
+const LONG: usize = (3 << 20) + 5;
+
+impl Reader for Long {
+    fn schema(&self) -> &Schema {
+        &self.schema
+    }
+
+    fn episodes(&self) -> &[Episode] {
+        &self.episodes
+    }
+
+    fn read_column(&self, column: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
+        let count = ranges.iter().map(|range| range.length).sum();
+        self.most.fetch_max(count, Ordering::Relaxed);
+        self.all.fetch_add(count, Ordering::Relaxed);
+        let rows = ranges.iter().flat_map(|range| range.start..range.start + range.length);
+        match column {
+            "step_idx" => out.as_chunks_mut::<8>().0.iter_mut().zip(rows).for_each(|(out, row)| {
+                *out = (row as i64).to_ne_bytes();
+            }),
+            "action" => out.as_chunks_mut::<4>().0.iter_mut().zip(rows).for_each(|(out, row)| {
+                let is_missing = [7, LONG - 9, LONG - 1].contains(&row);
+                *out = (if is_missing { f32::NAN } else { 0.5 }).to_ne_bytes();
+            }),
+            _ => {
+                out.iter_mut().zip(rows).for_each(|(out, row)| *out = u8::from([9, LONG - 3, LONG - 1].contains(&row)))
+            }
+        }
+        Ok(())
+    }
+
+    fn manifest(&self) -> Option<Manifest> {
+        None
+    }
+
+    fn footprint(&self) -> Result<Vec<(String, u64)>> {
+        Ok(vec![])
+    }
+
+    fn content_hash(&self) -> Result<String> {
+        Ok("none".to_owned())
+    }
+}
+
+#[test]
+fn a_long_episode_is_examined_in_pieces() {
+    let schema = Schema::new([
+        ColumnSpec::new("step_idx", DType::Int64, []),
+        ColumnSpec::new("action", DType::Float32, []),
+        ColumnSpec::new("terminated", DType::Bool, []),
+    ])
+    .expect("a schema");
+    let reader = Long { schema, episodes: [Episode { index: 0, length: LONG }], most: 0.into(), all: 0.into() };
+    let diagnosis = diagnose(&reader);
+    assert_eq!(reader.most.load(Ordering::Relaxed), 1 << 20, "rows at a time");
+    // Each finding has the episode once, although it is found in two pieces.
+    assert_eq!(problem(&diagnosis), ("there is no action in a row that is not the last".to_owned(), vec![0]));
+    let notes: Vec<_> = diagnosis.findings.iter().filter(|found| !found.episodes.is_empty()).skip(1).collect();
+    assert_eq!(notes.len(), 1, "{notes:?}");
+    assert_eq!((&*notes[0].what, &notes[0].episodes[..]), ("it continues after it terminated", &[0][..]));
+    // A run that is stopped ends before the next piece.
+    reader.all.store(0, Ordering::Relaxed);
+    let stopped = examine(&reader, &MODELS, &mut Control::new().with_interrupt(Arc::new(AtomicBool::new(true))));
+    assert!(matches!(stopped, Err(Error::Interrupted)));
+    assert_eq!(reader.all.load(Ordering::Relaxed), 1 << 20);
 }
 
 #[test]

@@ -99,6 +99,37 @@ fn reads_images_that_are_stored_in_tables() {
     }
 }
 
+/// The error of reading the state of a dataset of LeRobot after changes of files of its metadata.
+fn error_of_state(name: &str, changes: [(&str, &str, &str); 2]) -> String {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lerobot");
+    fuzz::copy_all(&interop().join(name), &path);
+    for (file, from, to) in changes {
+        let file = path.join("meta").join(file);
+        let text = std::fs::read_to_string(&file).expect("the file");
+        assert!(text.contains(from), "{from}");
+        std::fs::write(&file, text.replacen(from, to, 1)).expect("writing the file");
+    }
+    let reader = open(&path).expect("opening the dataset");
+    reader.read(&["proprio"], &[StepRange::new(0, 0, 1)]).expect_err("another size").to_string()
+}
+
+#[test]
+fn values_beyond_the_memory_or_the_declared_shape_are_not_decoded() {
+    let rows = [
+        ("info.json", "\"total_frames\": 34", "\"total_frames\": 1000000000025"),
+        ("episodes.jsonl", "\"length\": 9", "\"length\": 1000000000000"),
+    ];
+    let error = error_of_state("lerobot-v21", rows);
+    assert!(error.contains("1000000000025 rows of 12 bytes, more than half of the free memory"), "{error}");
+    let shape = [
+        ("info.json", "\"dtype\": \"float32\"", "\"dtype\": \"bool\""),
+        ("info.json", "[\n                3\n", "[\n                1\n"),
+    ];
+    let error = error_of_state("lerobot-v30-h264", shape);
+    assert!(error.contains("more values than the dataset declares"), "{error}");
+}
+
 fn damaged(name: &str, cases: u64) {
     let report = fuzz::dataset(name, &interop().join(name), cases, fuzz::read_everything);
     assert!(report.refused > 0, "{report:?}");

@@ -104,7 +104,7 @@ fn episode_files_v3(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
         if files_of_episodes.len() == info.total_episodes {
             break;
         }
-        let batches = table::read(path, &columns, None)?;
+        let batches = table::read(path, &columns)?;
         let column_values = |column: &str| -> Result<Vec<usize>> {
             let valid = |value: i64| usize::try_from(value).ok().filter(|&n| n < 1 << 40);
             let values = table::integers(path, &batches, column)?.into_iter().map(valid);

@@ -145,35 +145,34 @@ impl LerobotReader {
 
     /// All rows of a numeric feature, from all files.
     fn read_values(&self, native: &str, spec: &ColumnSpec) -> Result<Vec<u8>> {
+        Schema::new([spec.clone()])?.check_memory(usize::try_from(self.rows.total()).unwrap_or(usize::MAX))?;
         let parts: Result<Vec<Vec<u8>>> = self
             .files
             .par_iter()
             .with_max_len(1)
             .map(|(path, episodes)| {
-                let batches = table::read(path, &["episode_index", native], None)?;
-                self.check_rows(path, episodes, &table::integers(path, &batches, "episode_index")?)?;
+                let other =
+                    || damaged(path, "its rows do not belong to the episodes that it should contain".to_owned());
                 let mut bytes = vec![];
-                for batch in &batches {
+                // The episode of every row of the file.
+                let mut expected = episodes
+                    .clone()
+                    .flat_map(|e| std::iter::repeat_n(self.rows.episodes()[e].index, self.files_of_episodes[e].length));
+                table::read_batches(path, &["episode_index", native], None, spec.row_bytes(), &mut |batch| {
+                    let found = table::integers(path, std::slice::from_ref(&batch), "episode_index")?;
+                    if !found.into_iter().all(|index| expected.next() == Some(index)) {
+                        return Err(other());
+                    }
                     let array = batch.column_by_name(native);
                     let array = array.ok_or_else(|| damaged(path, format!("it has no column '{native}'")))?;
                     let added = values::append(array, spec, &mut bytes);
-                    added.map_err(|problem| damaged(path, format!("column '{native}': {problem}")))?;
-                }
-                Ok(bytes)
+                    added.map_err(|problem| damaged(path, format!("column '{native}': {problem}")))
+                })?;
+                if expected.next().is_some() { Err(other()) } else { Ok(bytes) }
             })
             .collect();
-        Ok(parts?.concat())
-    }
-
-    /// Checks that a file holds exactly the rows of its episodes.
-    fn check_rows(&self, path: &Path, episodes: &Range<usize>, found: &[i64]) -> Result<()> {
-        let expected = episodes
-            .clone()
-            .flat_map(|e| std::iter::repeat_n(self.rows.episodes()[e].index, self.files_of_episodes[e].length));
-        if expected.eq(found.iter().copied()) {
-            return Ok(());
-        }
-        Err(damaged(path, "its rows do not belong to the episodes that it should contain".to_owned()))
+        let mut parts = parts?;
+        Ok(if parts.len() == 1 { parts.swap_remove(0) } else { parts.concat() })
     }
 
     /// The timestamp of each row, in seconds from the start of the row's episode.
@@ -220,14 +219,14 @@ impl LerobotReader {
     /// Calls `each` with every encoded image of some rows of a file, and with the image's index among these rows.
     fn each_encoded_image(
         &self,
-        native: &str,
+        column: &Column,
         file: usize,
         rows: Vec<Range<usize>>,
         mut each: impl FnMut(usize, &[u8]) -> Result<()>,
     ) -> Result<()> {
-        let path = &self.files[file].0;
+        let (path, native) = (&self.files[file].0, &*column.native);
         let mut at = 0;
-        for batch in table::read(path, &[native], Some(rows))? {
+        table::read_batches(path, &[native], Some(rows), column.spec.row_bytes(), &mut |batch| {
             let stored = batch.column_by_name(native).and_then(|array| array.as_struct_opt());
             let bytes = stored.and_then(|stored| stored.column_by_name("bytes")?.as_binary_opt::<i32>());
             let bytes = bytes.ok_or_else(|| damaged(path, format!("column '{native}' holds no images")))?;
@@ -240,8 +239,8 @@ impl LerobotReader {
                 each(at, bytes.value(row))?;
                 at += 1;
             }
-        }
-        Ok(())
+            Ok(())
+        })
     }
 
     fn read_images(&self, column: &Column, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
@@ -255,7 +254,7 @@ impl LerobotReader {
             let row = |(episode, step): (usize, usize)| (self.rows.first_rows()[episode] - first) as usize + step;
             let mut groups: Vec<_> = group.chunk_by_mut(|a, b| a.0 == b.0).collect();
             let rows = groups.iter().map(|same_row| row(same_row[0].0)..row(same_row[0].0) + 1).collect();
-            self.each_encoded_image(&column.native, file, rows, |at, bytes| {
+            self.each_encoded_image(column, file, rows, |at, bytes| {
                 let Some(((_, first), others)) = groups.get_mut(at).and_then(|same_row| same_row.split_first_mut())
                 else {
                     return Ok(());
@@ -407,7 +406,7 @@ impl Reader for LerobotReader {
                         let file = self.files.partition_point(|(_, episodes)| episodes.end <= position);
                         let first = self.rows.first_rows()[position] - self.rows.first_rows()[self.files[file].1.start];
                         let rows = first as usize..first as usize + episode.length;
-                        self.each_encoded_image(&column.native, file, vec![rows], |_, bytes| {
+                        self.each_encoded_image(column, file, vec![rows], |_, bytes| {
                             add(bytes);
                             Ok(())
                         })?;

@@ -7,7 +7,7 @@ use arrow_schema::Schema as ArrowSchema;
 use parquet::arrow::arrow_reader::{ArrowReaderOptions, ParquetRecordBatchReaderBuilder, RowSelection};
 use parquet::arrow::{ArrowWriter, ProjectionMask};
 use parquet::basic::Compression;
-use parquet::file::metadata::KeyValue;
+use parquet::file::metadata::{ColumnChunkMetaData, KeyValue, RowGroupMetaData};
 use parquet::file::properties::WriterProperties;
 use std::io::Write as _;
 use std::ops::Range;
@@ -19,21 +19,46 @@ use swm_core::{Error, Result, files};
 /// The most rows per byte of a file. A file of equal values, which are stored as runs, has a few thousand.
 const MAX_ROWS_PER_BYTE: u64 = 1 << 14;
 
-/// Rows per decoded batch.
+/// The most rows of a decoded batch.
 const ROWS: usize = 4096;
 
-/// Reads columns of a file: all rows, or ascending ranges of rows. The result lacks the columns that do not exist.
+/// The size of a decoded batch, in bytes of the columns that it is read for.
+const BATCH_BYTES: usize = 16 << 20;
+
+/// Reads columns of a small file: all rows. The result lacks the columns that do not exist.
 ///
 /// # Errors
-/// If the file cannot be read or is damaged, including when the Parquet library panics.
-pub fn read(path: &Path, columns: &[&str], rows: Option<Vec<Range<usize>>>) -> Result<Vec<RecordBatch>> {
+/// As [`read_batches`].
+pub fn read(path: &Path, columns: &[&str]) -> Result<Vec<RecordBatch>> {
+    let mut batches = vec![];
+    read_batches(path, columns, None, 0, &mut |batch| {
+        batches.push(batch);
+        Ok(())
+    })?;
+    Ok(batches)
+}
+
+/// Reads columns of a file, all rows or ascending ranges of rows, and calls `each` with every batch of some rows. A row has about
+/// `row_bytes` bytes: a small file can hold many rows, which do not fit into memory together. The batches lack the columns
+/// that do not exist.
+///
+/// # Errors
+/// If the file cannot be read or is damaged, including when the Parquet library panics, and those of `each`.
+pub fn read_batches(
+    path: &Path,
+    columns: &[&str],
+    rows: Option<Vec<Range<usize>>>,
+    row_bytes: usize,
+    each: &mut dyn FnMut(RecordBatch) -> Result<()>,
+) -> Result<()> {
     if !path.exists() {
         return Err(damaged(path, "the file is missing".to_owned()));
     }
     let file = files::open(path)?;
     let length = file.metadata().map_err(|e| Error::io(path, "opening a table", e))?.len();
     let failed = |e: &dyn std::fmt::Display| damaged(path, format!("the table is damaged: {e}"));
-    let work = || -> Result<Vec<RecordBatch>> {
+    let is_read = |name: &String| columns.contains(&name.as_str());
+    let work = || -> Result<()> {
         // Ignores the Arrow schema that other programs embed, because it is redundant and could be damaged.
         let options = ArrowReaderOptions::new().with_skip_arrow_metadata(true);
         let builder = ParquetRecordBatchReaderBuilder::try_new_with_options(file, options).map_err(|e| failed(&e))?;
@@ -41,11 +66,22 @@ pub fn read(path: &Path, columns: &[&str], rows: Option<Vec<Range<usize>>>) -> R
         if total as u64 > MAX_ROWS_PER_BYTE.saturating_mul(length) {
             return Err(failed(&format!("{total} rows do not fit {length} bytes")));
         }
+        // Rows of the declared shape have fewer values than bytes.
+        let is_larger = |group: &RowGroupMetaData| {
+            let read =
+                group.columns().iter().filter(|c| c.column_path().parts().first().is_some_and(|root| is_read(root)));
+            let most = group.num_rows().saturating_mul(i64::try_from(row_bytes).unwrap_or(i64::MAX));
+            row_bytes > 0 && read.map(ColumnChunkMetaData::num_values).any(|values| values > most)
+        };
+        if builder.metadata().row_groups().iter().any(is_larger) {
+            return Err(failed(&"its rows have more values than the dataset declares"));
+        }
         let fields = builder.parquet_schema().root_schema().get_fields();
         let column_indices: Vec<usize> =
             columns.iter().filter_map(|name| fields.iter().position(|field| field.name() == *name)).collect();
         let mask = ProjectionMask::roots(builder.parquet_schema(), column_indices);
-        let mut builder = builder.with_projection(mask).with_batch_size(ROWS);
+        let mut builder =
+            builder.with_projection(mask).with_batch_size((BATCH_BYTES / row_bytes.max(1)).clamp(1, ROWS));
         if let Some(rows) = rows {
             if rows.last().is_some_and(|range| range.end > total) {
                 return Err(failed(&format!("it has {total} rows")));
@@ -53,7 +89,7 @@ pub fn read(path: &Path, columns: &[&str], rows: Option<Vec<Range<usize>>>) -> R
             builder = builder.with_row_selection(RowSelection::from_consecutive_ranges(rows.into_iter(), total));
         }
         let reader = builder.build().map_err(|e| failed(&e))?;
-        reader.map(|batch| batch.map_err(|e| failed(&e))).collect()
+        reader.into_iter().try_for_each(|batch| each(batch.map_err(|e| failed(&e))?))
     };
     catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|_| Err(failed(&"its content is invalid")))
 }

@@ -130,7 +130,7 @@ impl LerobotWriter {
                 known.ok_or_else(|| damaged(&path, format!("it has no statistics of '{native}'")))?;
             }
             let path = self.root.join(TASKS);
-            for batch in table::read(&path, &[INDEX], None)? {
+            for batch in table::read(&path, &[INDEX])? {
                 use arrow_array::cast::AsArray as _;
                 let texts = batch.column_by_name(INDEX).and_then(|array| array.as_string_opt::<i32>());
                 let texts = texts.ok_or_else(|| damaged(&path, "it holds no strings".to_owned()))?;

@@ -20,6 +20,10 @@ use swm_core::requirements::DatasetRequirements;
 use swm_core::run::{Control, Event, Progress, Stage};
 use swm_core::{Batch, ColumnSpec, DType, Error, Result};
 
+/// The most rows that are examined at a time, and the most bytes of them: a small file can hold an episode of many equal rows.
+const PIECE_ROWS: usize = 1 << 20;
+const PIECE_BYTES: usize = 64 << 20;
+
 /// Severity of a finding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
@@ -124,10 +128,7 @@ pub fn examine(reader: &dyn Reader, models: &[DatasetRequirements], control: &mu
             found.problem(Some(position), format!("its constants cannot be read: {error}"));
         }
         for column in std::iter::once(STEP_IDX).chain(columns.iter().map(|column| &column.name[..])) {
-            match reader.read(&[column], &[StepRange::new(position, 0, episode.length)]) {
-                Ok(batch) => examine_column(&batch, column, position, &mut found)?,
-                Err(error) => found.problem(Some(position), format!("'{column}' cannot be read: {error}")),
-            }
+            examine_column(reader, column, position, &mut found, control)?;
         }
         if !found.bad.contains(&position) {
             intact.push(position);
@@ -179,11 +180,17 @@ struct Findings {
 impl Findings {
     fn problem(&mut self, episode: Option<usize>, what: String) {
         self.bad.extend(episode);
-        self.found.entry((Severity::Problem, what)).or_default().extend(episode);
+        self.add(Severity::Problem, episode, what);
     }
 
     fn note(&mut self, episode: Option<usize>, what: String) {
-        self.found.entry((Severity::Note, what)).or_default().extend(episode);
+        self.add(Severity::Note, episode, what);
+    }
+
+    /// Adds a finding, once for an episode.
+    fn add(&mut self, severity: Severity, episode: Option<usize>, what: String) {
+        let episodes = self.found.entry((severity, what)).or_default();
+        episodes.extend(episode.filter(|episode| episodes.last() != Some(episode)));
     }
 
     fn sorted(self) -> Vec<Finding> {
@@ -192,15 +199,59 @@ impl Findings {
     }
 }
 
-/// Examines one column of one episode.
-fn examine_column(rows: &Batch, column: &str, position: usize, found: &mut Findings) -> Result<()> {
+/// Examines one column of one episode, in pieces.
+///
+/// # Errors
+/// If the run is stopped.
+fn examine_column(
+    reader: &dyn Reader,
+    column: &str,
+    position: usize,
+    found: &mut Findings,
+    control: &mut Control<'_>,
+) -> Result<()> {
+    let length = reader.episodes()[position].length;
+    let row_bytes = reader.schema().column(column).map_or(1, ColumnSpec::row_bytes);
+    let piece = (PIECE_BYTES / row_bytes.max(1)).clamp(1, PIECE_ROWS);
+    let mut first = 0;
+    loop {
+        let count = piece.min(length - first);
+        match reader.read(&[column], &[StepRange::new(position, first, count)]) {
+            Ok(batch) if examine_rows(&batch, column, position, first, length, found)? => {}
+            Ok(_) => return Ok(()),
+            Err(error) => {
+                found.problem(Some(position), format!("'{column}' cannot be read: {error}"));
+                return Ok(());
+            }
+        }
+        first += count;
+        if first >= length {
+            return Ok(());
+        }
+        control.check()?;
+    }
+}
+
+/// Examines rows of one column of one episode of `length` rows, from row `first` on. Returns whether the next rows are to be
+/// examined.
+fn examine_rows(
+    rows: &Batch,
+    column: &str,
+    position: usize,
+    first: usize,
+    length: usize,
+    found: &mut Findings,
+) -> Result<bool> {
     let (count, spec) = (rows.rows(), &rows.schema().columns()[0]);
-    let last = count.saturating_sub(1);
+    let last = length.saturating_sub(1);
     match column {
         STEP_IDX => {
             let steps = rows.to_f32(STEP_IDX)?;
-            if let Some(row) = (0..count.min(1 << 24)).find(|&row| steps[row] != row as f32) {
-                found.problem(Some(position), format!("row {row} holds step {} instead of step {row}", steps[row]));
+            let exact = count.min((1_usize << 24).saturating_sub(first));
+            if let Some(row) = (0..exact).find(|&row| steps[row] != (first + row) as f32) {
+                let (step, row) = (steps[row], first + row);
+                found.problem(Some(position), format!("row {row} holds step {step} instead of step {row}"));
+                return Ok(false);
             }
         }
         ACTION if spec.dtype != DType::U8 && spec.dtype != DType::Bool => {
@@ -209,7 +260,7 @@ fn examine_column(rows: &Batch, column: &str, position: usize, found: &mut Findi
             for row in 0..count {
                 let action = rows.row(row).to_f64(ACTION)?;
                 let none = action.iter().all(|&v| if float { v.is_nan() } else { v == -1.0 });
-                match row == last {
+                match first + row == last {
                     true if !none => {
                         let what = "the last row has an action, but no observation follows it; a repaired or converted \
                                     dataset omits it";
@@ -238,11 +289,11 @@ fn examine_column(rows: &Batch, column: &str, position: usize, found: &mut Findi
         }
         TERMINATED => {
             let flags = rows.bytes(0);
-            if flags.iter().take(last.saturating_sub(1)).any(|&flag| flag != 0) {
+            if flags.iter().take(last.saturating_sub(1 + first)).any(|&flag| flag != 0) {
                 found.note(Some(position), "it continues after it terminated".to_owned());
             }
         }
         _ => {}
     }
-    Ok(())
+    Ok(true)
 }

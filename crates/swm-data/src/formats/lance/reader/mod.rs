@@ -33,6 +33,9 @@ use std::sync::{Arc, Mutex};
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{Error, Manifest, Result, Schema};
 
+/// The most rows that are read at a time: each takes memory beside its bytes, and a small file can hold many equal rows.
+const PIECE_ROWS: usize = 1 << 20;
+
 /// Opens a table.
 pub fn open(location: &Location) -> Result<Arc<dyn Reader>> {
     Ok(Arc::new(LanceReader::open(location)?))
@@ -119,25 +122,27 @@ impl LanceReader {
     fn find_episodes(&mut self) -> Result<()> {
         let mut row = 0;
         let mut episodes: Vec<Episode> = vec![];
-        for rows_read in self.stored_rows(EPISODE_IDX, slice::from_ref(&(0..self.rows())))? {
-            let mut indices = vec![0_i64; rows_read.rows];
-            integers(&rows_read.values, &mut indices)?;
-            for index in indices {
-                match episodes.last_mut() {
-                    Some(episode) if episode.index == index => episode.length += 1,
-                    Some(episode) if episode.index > index => {
-                        return Err(Error::corrupt(
-                            self.folder(),
-                            format!("episode {index} comes after episode {} in row {row}", episode.index),
-                            "rows of an episode must be consecutive, and episodes must be in ascending order; rebuild the dataset",
-                        ));
+        for piece in pieces_of_rows(self.rows()) {
+            for rows_read in self.stored_rows(EPISODE_IDX, slice::from_ref(&piece))? {
+                let mut indices = vec![0_i64; rows_read.rows];
+                integers(&rows_read.values, &mut indices)?;
+                for index in indices {
+                    match episodes.last_mut() {
+                        Some(episode) if episode.index == index => episode.length += 1,
+                        Some(episode) if episode.index > index => {
+                            return Err(Error::corrupt(
+                                self.folder(),
+                                format!("episode {index} comes after episode {} in row {row}", episode.index),
+                                "rows of an episode must be consecutive, and episodes must be in ascending order; rebuild the dataset",
+                            ));
+                        }
+                        _ => {
+                            episodes.push(Episode { index, length: 1 });
+                            self.first_rows.push(row);
+                        }
                     }
-                    _ => {
-                        episodes.push(Episode { index, length: 1 });
-                        self.first_rows.push(row);
-                    }
+                    row += 1;
                 }
-                row += 1;
             }
         }
         self.episodes = episodes;
@@ -216,6 +221,16 @@ impl Reader for LanceReader {
         let column = self.column(name)?;
         let rows: usize = ranges.iter().map(|range| range.length).sum();
         self.check_length(name, rows, out)?;
+        if rows > PIECE_ROWS {
+            let mut rest = out;
+            for piece in pieces(ranges) {
+                let rows: usize = piece.iter().map(|range| range.length).sum();
+                let (now, after) = rest.split_at_mut(rows * column.spec.row_bytes());
+                self.read_column(name, &piece, now)?;
+                rest = after;
+            }
+            return Ok(());
+        }
         // Every requested row with its bytes in `out`, sorted by row.
         let mut requested: Vec<RowSlot> = Vec::with_capacity(rows);
         let mut slots = out.chunks_exact_mut(column.spec.row_bytes());
@@ -237,18 +252,20 @@ impl Reader for LanceReader {
             return Ok(found);
         }
         let (mut episode, mut expected, mut valid) = (0, 0, true);
-        for rows_read in self.stored_rows(STEP_IDX, slice::from_ref(&(0..self.rows())))? {
-            let mut steps = vec![0_i64; rows_read.rows];
-            integers(&rows_read.values, &mut steps)?;
-            for step in steps {
-                if step != expected && valid {
-                    let what = format!("the stored steps do not count up from 0: row {expected} holds {step}");
-                    found.push(Irregularity { episode: Some(episode), what });
-                    valid = false;
-                }
-                expected += 1;
-                if expected == self.episodes[episode].length as i64 {
-                    (episode, expected, valid) = (episode + 1, 0, true);
+        for piece in pieces_of_rows(self.rows()) {
+            for rows_read in self.stored_rows(STEP_IDX, slice::from_ref(&piece))? {
+                let mut steps = vec![0_i64; rows_read.rows];
+                integers(&rows_read.values, &mut steps)?;
+                for step in steps {
+                    if step != expected && valid {
+                        let what = format!("the stored steps do not count up from 0: row {expected} holds {step}");
+                        found.push(Irregularity { episode: Some(episode), what });
+                        valid = false;
+                    }
+                    expected += 1;
+                    if expected == self.episodes[episode].length as i64 {
+                        (episode, expected, valid) = (episode + 1, 0, true);
+                    }
                 }
             }
         }
@@ -354,5 +371,51 @@ impl LanceReader {
             }
         }
         Ok(hash.finish(&self.constants(episode)?))
+    }
+}
+
+/// Splits the rows of a table into pieces.
+fn pieces_of_rows(rows: u64) -> impl Iterator<Item = Range<u64>> {
+    (0..rows).step_by(PIECE_ROWS).map(move |first| first..rows.min(first + PIECE_ROWS as u64))
+}
+
+/// Splits ranges into pieces of at most [`PIECE_ROWS`] rows.
+fn pieces(ranges: &[StepRange]) -> Vec<Vec<StepRange>> {
+    let mut found: Vec<Vec<StepRange>> = vec![vec![]];
+    let mut free = PIECE_ROWS;
+    for &StepRange { episode, mut start, mut length } in ranges {
+        while length > 0 {
+            if free == 0 {
+                found.push(vec![]);
+                free = PIECE_ROWS;
+            }
+            let part = length.min(free);
+            if let Some(piece) = found.last_mut() {
+                piece.push(StepRange::new(episode, start, part));
+            }
+            (start, length, free) = (start + part, length - part, free - part);
+        }
+    }
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pieces_hold_all_rows_in_order() {
+        let ranges = [(0, 3, 5), (1, 0, 2 * PIECE_ROWS), (2, 7, 0), (2, 1, PIECE_ROWS - 5), (3, 4, 1)];
+        let ranges = ranges.map(|(episode, start, length)| StepRange::new(episode, start, length));
+        let pieces = pieces(&ranges);
+        let rows = |ranges: &[StepRange]| ranges.iter().map(|range| range.length).sum::<usize>();
+        assert_eq!(pieces.iter().map(|piece| rows(piece)).collect::<Vec<_>>(), [PIECE_ROWS, PIECE_ROWS, PIECE_ROWS, 1]);
+        let all = pieces.concat();
+        let starts: Vec<_> = all.iter().map(|range| (range.episode, range.start)).collect();
+        assert_eq!(starts, [(0, 3), (1, 0), (1, PIECE_ROWS - 5), (1, 2 * PIECE_ROWS - 5), (2, 1), (3, 4)]);
+        assert_eq!(
+            pieces_of_rows(PIECE_ROWS as u64 + 1).map(|piece| piece.end).collect::<Vec<_>>(),
+            [1 << 20, (1 << 20) + 1]
+        );
     }
 }

@@ -7,6 +7,7 @@ import json
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -258,11 +259,12 @@ class Loader:
         return self._batches(epoch, batch)
 
     def _batches(self, epoch: int, batch: int) -> Iterator[dict[str, Any]]:
-        loading = self._loader.epoch(epoch, batch)
-        while (found := loading.next()) is not None:
+        shaped = map(self._shaped, iter(self._loader.epoch(epoch, batch).next, None))
+        # Page-locked memory is filled while the batch before is used. A transform runs in the thread of its user.
+        for value in _ahead(shaped) if self.pin_memory and self.device is not None and self.transform is None else shaped:
             batch += 1
             self._at = (epoch, batch) if batch < len(self) else (epoch + 1, 0)
-            yield self._shaped(found)
+            yield value
 
     def _shaped(self, found: dict[str, Array]) -> dict[str, Any]:
         batch: dict[str, Any] = {}
@@ -287,3 +289,12 @@ class Loader:
     def __repr__(self) -> str:
         clips = f"{self.num_clips} clips of {self.num_steps} steps, frameskip {self.frameskip}"
         return f"Loader({len(self)} batches of {self.batch_size}: {clips})"
+
+
+def _ahead(batches: Iterator[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """The batches, of which a thread makes the next one while one is used."""
+    with ThreadPoolExecutor(1, "loader") as thread:
+        following = thread.submit(next, batches, None)
+        while (batch := following.result()) is not None:
+            following = thread.submit(next, batches, None)
+            yield batch

@@ -169,7 +169,9 @@ class Adapter:
             costs = [self.model.get_cost(infos, part) for infos, part in self._parts(candidates, "cost")]
             return np.ascontiguousarray(np.concatenate([np.asarray(c) for c in costs]), dtype=np.float32)
         with _torch().inference_mode():
-            return self._numpy([self._checked_cost(infos, part) for infos, part in self._parts(candidates, "cost")])
+            # A recorded cost is overwritten by the next one, so each goes to the CPU before the next.
+            parts = [self._numpy([self._cost(infos, part)]) for infos, part in self._parts(candidates, "cost")]
+            return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def cost_and_gradient(self, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The costs `(B, S)` of candidates `(B, S, H, A)` and their gradients `(B, S, H, A)`."""
@@ -239,6 +241,14 @@ class Adapter:
         return self._numpy(gradients)
 
     # Conversion between numpy and torch.
+
+    def _cost(self, infos: dict[str, Any], candidates: Any) -> Any:
+        """The costs of candidates on their device, recorded as CUDA graphs for models that allow it."""
+        if candidates.device.type != "cuda" or getattr(self.model, "prepare_plan", None) is None:
+            return self._checked_cost(infos, candidates)
+        from .capture import CapturedCosts
+
+        return CapturedCosts.of(self.model)(self.model, infos, candidates, self._checked_cost)
 
     def _checked_cost(self, infos: dict[str, Any], candidates: Any) -> Any:
         cost = self.model.get_cost(infos, candidates)

@@ -41,7 +41,8 @@ class GoalMSE(nn.Module):
         goal = _entry(self, info_dict, self.goal_key).detach()
         if goal.ndim == predicted.ndim - 1:
             goal = goal.unsqueeze(1)
-        squares = (predicted[:, :, -1] - goal[:, :, -1]).square()
+        # The differences of candidates are small: half precision would make their costs equal.
+        squares = (_single(predicted[:, :, -1]) - _single(goal[:, :, -1])).square()
         flat = squares.flatten(2) if squares.ndim > 2 else squares.unsqueeze(2)
         return flat.sum(-1) if self.reduction == "sum" else flat.mean(-1)
 
@@ -82,6 +83,11 @@ class WeightedSum(nn.Module):
         """The costs `(B, S)`."""
         total: torch.Tensor = sum(weight * objective(info_dict) for weight, objective in self.terms)
         return total
+
+
+def _single(value: torch.Tensor) -> torch.Tensor:
+    """A tensor in single precision at least."""
+    return value.to(torch.promote_types(value.dtype, torch.float32))
 
 
 def _entry(objective: nn.Module, info_dict: dict[str, Any], key: str) -> torch.Tensor:

@@ -29,14 +29,26 @@ def train(family: str, data: Any, kind: Any = None, *, settings: Any = (), **opt
         settings: Settings of the configuration, such as `["model.latent=4"]`.
         **options: The other attributes of `Options`; names with `__` are settings, such as `schedule__steps=1000`.
     """
-    from .loop import Trainer
-
     more = {key: options.pop(key) for key in list(options) if "__" in key}
-    trainer = Trainer(Options(family, str(data), settings=[*settings, *settings_of(more)], **options), kind)
-    try:
-        trainer.train()
-    finally:
-        trainer.ranks.leave()
+    given = Options(family, str(data), settings=[*settings, *settings_of(more)], **options)
+    if given.workers:
+        if kind is not None:
+            raise ValueError(
+                f"workers: {given.workers} processes cannot have the class {kind.__name__}; leave out one of the two"
+            )
+        from ..ray.fit import fitted
+
+        return fitted(given)
+    from .loop import Trainer
+    from .memory import explained, sized
+
+    given = sized(given)
+    with explained(given):
+        trainer = Trainer(given, kind)
+        try:
+            trainer.train()
+        finally:
+            trainer.ranks.leave()
     return str(trainer.run)
 
 

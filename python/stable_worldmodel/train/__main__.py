@@ -24,8 +24,10 @@ options:
   compile=false  torch.compile: true, or a backend
   resume=false   Continue an interrupted training
   threads=2      Threads that load batches
+  workers=0      Processes on a Ray cluster, with Ray Train
 
-Keys are those of `swm train`, such as optim.lr=3e-4 seed=1. With Hydra
+Keys are those of `swm train`, such as optim.lr=3e-4 seed=1, and
+data.batch_size=auto for the largest batch that fits on a GPU. With Hydra
 (pip install hydra-core), its flags work, too: --multirun, --cfg job.
 
 example: python -m stable_worldmodel.train lewm data=rooms preset=tiny
@@ -80,13 +82,20 @@ def _print(text: str) -> int:
 
 def train(options: Options) -> int:
     """Trains, prints the folder of the checkpoint, and returns the exit code."""
-    from .loop import Trainer
+    if options.workers:
+        from ..ray.fit import fitted
 
-    trainer = Trainer(options)
-    try:
-        trainer.train()
-    finally:
-        trainer.ranks.leave()
+        return _print(f"{fitted(options)}\n")
+    from .loop import Trainer
+    from .memory import explained, sized
+
+    options = sized(options)
+    with explained(options):
+        trainer = Trainer(options)
+        try:
+            trainer.train()
+        finally:
+            trainer.ranks.leave()
     return _print(f"{trainer.run}\n") if trainer.ranks.rank == 0 else 0
 
 

@@ -36,12 +36,15 @@ class Optimizer:
             self.parameters[name] = parameter
             self.clipped.setdefault(clip, []).append(parameter)
             by_rate.setdefault(rate, []).append(parameter)
+        #: Whether a GPU updates all weights with one kernel, which counts steps on the GPU.
+        self._fused = all(parameter.is_cuda for parameter in self.parameters.values())
         self.adam = torch.optim.AdamW(
             [{"params": parameters, "rate": rate} for rate, parameters in by_rate.items()],
             lr=settings["lr"],
             betas=tuple(settings["betas"]),
             eps=settings["epsilon"],
             weight_decay=settings["weight_decay"],
+            fused=self._fused,
         )
 
     def zero_grad(self) -> None:
@@ -83,7 +86,7 @@ class Optimizer:
             if f"first.{name}" in moments:
                 first, second = (moments[f"{part}.{name}"].view_as(parameter) for part in ("first", "second"))
                 self.adam.state[parameter] = {
-                    "step": torch.tensor(float(steps)),
+                    "step": torch.tensor(float(steps), device=parameter.device if self._fused else "cpu"),
                     "exp_avg": first.to(parameter),
                     "exp_avg_sq": second.to(parameter),
                 }

@@ -11,6 +11,8 @@ __all__ = ["Options", "parsed"]
 
 #: The most threads of the engine.
 _MOST_THREADS = 1024
+#: The most processes of a training.
+_MOST_WORKERS = 4096
 #: The values that switch something on or off.
 _FLAGS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 
@@ -29,6 +31,8 @@ class Options:
         compile: Whether `torch.compile` compiles the networks; or the name of its backend.
         resume: Whether an interrupted training is continued.
         threads: Threads that prefetch batches.
+        workers: Processes on a Ray cluster that train the model together (`stable_worldmodel.ray.fit`); 0 for this process,
+            or those of `torchrun`.
         settings: `key=value` settings of the configuration, as for `swm train`.
     """
 
@@ -41,6 +45,7 @@ class Options:
     compile: bool | str = False
     resume: bool = False
     threads: int = 2
+    workers: int = 0
     settings: Sequence[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -50,6 +55,8 @@ class Options:
             raise ValueError("out: the name of the checkpoint is empty; leave it out, or name one with out=PATH")
         if not 0 <= self.threads <= _MOST_THREADS:
             raise ValueError(f"threads: {self.threads}; expected 0 to {_MOST_THREADS}")
+        if not 0 <= self.workers <= _MOST_WORKERS:
+            raise ValueError(f"workers: {self.workers}; expected 0 to {_MOST_WORKERS}")
         if self.amp not in ("off", "bf16", "fp16"):
             raise ValueError(f"amp: {self.amp!r}; expected off, bf16 or fp16")
 

@@ -10,9 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..planning.evaluator import ShootingCostEvaluator
+from ..planning.evaluator import ShootingCostEvaluator, default_goal_encode
 from ..planning.objective import GoalMSE
 from .frames import Frames
+from .lewm.rollout import roll, rolls
 from .pretrained import Pretrained
 
 __all__ = ["JEPA"]
@@ -47,6 +48,8 @@ class JEPA(Pretrained):
         self.pred_proj = nn.Identity() if pred_proj is None else pred_proj
         #: How frames of `uint8` become inputs of the encoder.
         self.frames = Frames()
+        #: The compiled `roll`, after `compile`.
+        self._roll: Any = None
 
     def encode(self, info: dict[str, Any]) -> dict[str, Any]:
         """Adds `emb` `(B, T, D)`, the latents of `pixels`, and `act_emb` `(B, T, D)` if there is an `action`.
@@ -86,21 +89,53 @@ class JEPA(Pretrained):
         history = int(getattr(self.predictor, "num_frames", 3)) if history_size is None else history_size
         envs, samples = action_sequence.shape[:2]
         if "emb" not in info:
-            first = {key: value[:, 0] for key, value in info.items() if torch.is_tensor(value) and key == "pixels"}
-            # The encoder gets no gradient from a plan.
-            info["emb"] = self.encode(first)["emb"].detach().unsqueeze(1).expand(-1, samples, -1, -1)
-        latents = list(info["emb"].flatten(0, 1).unbind(1))
-        past = info.get("action_history")
-        if len(latents) > 1 and past is not None and past.shape[2]:
-            past = past[:, :, -(len(latents) - 1) :].to(action_sequence)
+            self._encode_start(info, samples)
+        observed = info["emb"].flatten(0, 1)
+        past, frames = info.get("action_history"), observed.shape[1]
+        if frames > 1 and past is not None and past.shape[2]:
+            past = past[:, :, -(frames - 1) :].to(action_sequence)
             action_sequence = torch.cat([past.expand(-1, samples, -1, -1), action_sequence], 2)
-        actions = self.action_encoder(action_sequence.flatten(0, 1))
+        latents = self._predicted(observed, self.action_encoder(action_sequence.flatten(0, 1)), history)
+        info["predicted_emb"] = latents.unflatten(0, (envs, samples))
+        return info
+
+    def _encode_start(self, info: dict[str, Any], samples: int) -> None:
+        """Adds `emb` `(B, S, T, D)`, the latents of the observed frames, which get no gradient from a plan."""
+        first = {key: value[:, 0] for key, value in info.items() if torch.is_tensor(value) and key == "pixels"}
+        info["emb"] = self.encode(first)["emb"].detach().unsqueeze(1).expand(-1, samples, -1, -1)
+
+    def _predicted(self, observed: Tensor, actions: Tensor, history: int) -> Tensor:
+        """The latents of the observed frames, then the predictions, for encoded actions `(N, T, D)`."""
+        predictor: Any = self.predictor
+        if history <= getattr(predictor, "num_frames", 0) and rolls(predictor):
+            rolled: Tensor = (self._roll or roll)(predictor, observed, actions, self.pred_proj, history)
+            return rolled
+        latents = list(observed.unbind(1))
         for now in range(len(latents), actions.shape[1] + 1):
             begin = max(0, now - history)
             window = torch.stack(latents[begin:now], 1)
             latents.append(self.predict(window, actions[:, begin:now])[:, -1])
-        info["predicted_emb"] = torch.stack(latents, 1).unflatten(0, (envs, samples))
-        return info
+        return torch.stack(latents, 1)
+
+    def prepare_plan(self, info: dict[str, Any], samples: int) -> None:
+        """Adds to the infos of a plan what does not depend on the candidates: the latents of the frames and of the goal.
+
+        On an NVIDIA GPU, solvers record `get_cost` for infos that have them as a CUDA graph, and replay it for every
+        iteration. A class whose `get_cost` depends on anything but the infos' tensors, the candidates and the
+        weights sets `prepare_plan = None`.
+        """
+        if "emb" not in info:
+            self._encode_start(info, samples)
+        if "goal_emb" not in info:
+            default_goal_encode(self, info)
+
+    def compile(self, *args: Any, **kwargs: Any) -> None:
+        """Compiles the encoder and the predictions of plans with `torch.compile`, which takes the arguments.
+
+        Training compiles on its own (`compile=true` of `stable_worldmodel.train`).
+        """
+        self.encoder.compile(*args, **kwargs)
+        self._roll = torch.compile(roll, *args, **kwargs)
 
     def criterion(self, info_dict: dict[str, Any], action_candidates: Tensor | None = None) -> Tensor:
         """The costs `(B, S)` of infos that hold a rollout and the goal's latents `goal_emb`. Override it for another cost."""

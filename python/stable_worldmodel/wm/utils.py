@@ -9,14 +9,14 @@ from __future__ import annotations
 import json
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import nn
 
-from .. import _engine
+from .. import _engine, _files
 from ._build import build
 from ._weights import load_into, read_state_dict
 from .checkpoints import module_of
@@ -36,7 +36,7 @@ def save_pretrained(
     filename: str = "weights.pt",
     cache_dir: str | os.PathLike[str] | None = None,
 ) -> None:
-    """Saves a model's weights and configuration, for `load_pretrained`.
+    """Saves a model's weights and configuration, for `load_pretrained`. Older ones of this name are replaced.
 
     Args:
         model: The model.
@@ -46,16 +46,24 @@ def save_pretrained(
         config_key: The key of the model's part of the configuration.
         filename: The file of the weights.
         cache_dir: A folder in place of `$STABLEWM_HOME`.
+
+    Raises:
+        FileExistsError: If the folder has a checkpoint of the engine, or a `config.json` without weights.
     """
     folder = _folder(cache_dir) / run_name
     folder.mkdir(parents=True, exist_ok=True)
-    torch.save(model.state_dict(), folder / filename)
+    settings = folder / "config.json"
+    is_other = (folder / "weights.safetensors").exists() or (settings.exists() and not any(folder.glob("*.pt")))
+    if is_other and config is not None:
+        raise FileExistsError(f"{settings}: save_pretrained did not write this file; choose another run_name")
+    weights = model.state_dict()
+    files: dict[Path, Callable[[Path], object]] = {folder / filename: lambda beside: torch.save(weights, beside)}
     if config is None:
         warnings.warn(f"{folder}: saved without a config, so load_pretrained cannot build the model", stacklevel=2)
-        return
-    if config_key is not None and config_key in config:
-        config = config[config_key]
-    (folder / "config.json").write_text(json.dumps(_plain(config), indent=2))
+    else:
+        text = json.dumps(_plain(config[config_key] if config_key is not None and config_key in config else config), indent=2)
+        files[settings] = lambda beside: beside.write_text(text)
+    _files.replace(files)
 
 
 def _plain(config: Any) -> Any:

@@ -28,10 +28,11 @@ except ImportError as error:
 
 from .._process import module_command
 from .driver import CellsFailed, RunRefused, execute, read_request
+from .fit import fit
 from .folder import Folder
 from .local import connect
 
-__all__ = ["CellsFailed", "RunRefused", "collect", "convert", "evaluate", "progress", "study", "submit", "train"]
+__all__ = ["CellsFailed", "RunRefused", "collect", "convert", "evaluate", "fit", "progress", "study", "submit", "train"]
 
 
 def collect(env: str, output: str | os.PathLike[str], **options: Any) -> ray.ObjectRef:

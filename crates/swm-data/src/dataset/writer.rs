@@ -13,7 +13,7 @@ pub enum WriteMode {
     Create,
     /// Appends to the dataset, or creates it if it does not exist.
     Append,
-    /// Replaces the dataset.
+    /// Replaces the dataset. It stays until the first episode is ready to be written, or the writer is finished.
     Overwrite,
 }
 

@@ -11,6 +11,7 @@ pub mod lance;
 mod lance_video;
 mod lerobot;
 pub mod registry;
+mod replacing;
 #[cfg_attr(not(feature = "hdf5"), allow(dead_code, reason = "npz files use only a part of this module"))]
 mod stored_scalar;
 mod video;

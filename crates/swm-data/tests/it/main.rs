@@ -29,6 +29,7 @@ mod lance_video;
 mod lerobot;
 mod loader;
 mod objects;
+mod overwriting;
 mod preview;
 mod reference;
 mod replacing;

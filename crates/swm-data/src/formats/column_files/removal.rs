@@ -3,6 +3,7 @@
 use super::images::uncommitted;
 use super::reader::stored_metadata;
 use super::{ImageFiles, LENGTHS, OFFSETS, TEMPORARY, check_name, journal};
+use crate::formats::replacing::check_no_links;
 use std::path::{Path, PathBuf};
 use swm_core::files::{self, Lock};
 use swm_core::{ColumnSpec, Error, Result, Schema};
@@ -28,6 +29,24 @@ pub(crate) fn remove(folder: &Path, images: ImageFiles) -> Result<()> {
 /// If the metadata cannot be read or records no columns, the dataset has the other format, or a file is a symbolic link;
 /// then nothing is deleted. Also if a file cannot be deleted.
 pub(super) fn clear(folder: &Path, images: ImageFiles) -> Result<()> {
+    let (schema, names) = stored_files(folder, images)?;
+    files::delete_named(folder, &names)?;
+    // The folders of a dataset without episodes.
+    let mut columns = schema.columns().iter().filter(|column| column.is_image());
+    columns.try_for_each(|column| files::remove_empty_folder(&folder.join(&column.name)))
+}
+
+/// Checks that [`clear`] can delete the dataset in a folder.
+///
+/// # Errors
+/// As [`clear`].
+pub(super) fn check_clear(folder: &Path, images: ImageFiles) -> Result<()> {
+    let (_, names) = stored_files(folder, images)?;
+    check_no_links(folder, &names)
+}
+
+/// The columns, and the files that [`clear`] deletes, in the order of deletion.
+fn stored_files(folder: &Path, images: ImageFiles) -> Result<(Schema, Vec<PathBuf>)> {
     let (schema, rows, killed) = stored_episodes(folder)?;
     let mut names = vec![];
     for column in schema.columns().iter().filter(|column| column.is_image()) {
@@ -39,10 +58,7 @@ pub(super) fn clear(folder: &Path, images: ImageFiles) -> Result<()> {
         names.extend(stored.chain(left).map(|file| file.name.clone()));
     }
     names.extend(own_files(&schema));
-    files::delete_named(folder, &names)?;
-    // The folders of a dataset without episodes.
-    let mut columns = schema.columns().iter().filter(|column| column.is_image());
-    columns.try_for_each(|column| files::remove_empty_folder(&folder.join(&column.name)))
+    Ok((schema, names))
 }
 
 /// Checks that the files of a new dataset, which replaces the one in `folder`, replace no file that is not part of it.

@@ -7,7 +7,8 @@ use super::{
     exists, has_no_dataset, images, removal,
 };
 use crate::dataset::episodes::{self, EpisodeRows};
-use crate::dataset::{CommitPolicy, Constants, StepRange, WriteMode, WriteOptions, is_full, with_stored};
+use crate::dataset::{CommitPolicy, Constants, StepRange, WriteMode, WriteOptions, Writer, is_full, with_stored};
+use crate::formats::replacing::ReplacingWriter;
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -57,18 +58,20 @@ pub(crate) struct ColumnFilesWriter {
 }
 
 impl ColumnFilesWriter {
-    /// Creates, continues or replaces the column files of a folder. `known` is the schema of the dataset to continue.
+    /// Creates, continues or replaces the column files of a folder, and returns the writer that `make` builds on them.
+    /// `known` is the schema of the dataset to continue.
     ///
     /// # Errors
     /// If the dataset exists and `options.mode` forbids it, its columns differ, another process writes to it, or
     /// writing fails.
-    pub fn create(
+    pub fn create<W: Writer + 'static>(
         folder: &Path,
         schema: &Schema,
-        options: &WriteOptions,
+        options: WriteOptions,
         known: Option<&Schema>,
         images: ImageFiles,
-    ) -> Result<Self> {
+        make: impl FnOnce(Self) -> W + Send + 'static,
+    ) -> Result<Box<dyn Writer>> {
         check_columns(schema)?;
         let exists = exists(folder);
         if !exists && folder.is_dir() && !has_no_dataset(folder) {
@@ -81,12 +84,32 @@ impl ColumnFilesWriter {
             return Err(Error::config("dataset", problem, fix));
         }
         let lock = Lock::folder(folder)?;
-        let image_columns = || schema.columns().iter().filter(|column| column.is_image());
-        image_columns().try_for_each(|column| files::check_no_link(&folder.join(&column.name)))?;
+        let mut image_columns = schema.columns().iter().filter(|column| column.is_image());
+        image_columns.try_for_each(|column| files::check_no_link(&folder.join(&column.name)))?;
         if exists && options.mode == WriteMode::Overwrite {
             removal::check_new_files(folder, schema)?;
-            removal::clear(folder, images)?;
+            removal::check_clear(folder, images)?;
+            let (folder, schema, incoming) = (folder.to_owned(), schema.clone(), schema.clone());
+            let replace = move || -> Result<Box<dyn Writer>> {
+                removal::clear(&folder, images)?;
+                Ok(Box::new(make(Self::begin(&folder, &schema, &options, None, images, lock)?)))
+            };
+            let check = move |episode: &Batch, _: &Constants| episodes::check_episode(episode, &incoming);
+            return Ok(ReplacingWriter::boxed(check, replace));
         }
+        Ok(Box::new(make(Self::begin(folder, schema, &options, known, images, lock)?)))
+    }
+
+    /// Begins to write into a folder, which is locked.
+    fn begin(
+        folder: &Path,
+        schema: &Schema,
+        options: &WriteOptions,
+        known: Option<&Schema>,
+        images: ImageFiles,
+        lock: Lock,
+    ) -> Result<Self> {
+        let image_columns = || schema.columns().iter().filter(|column| column.is_image());
         let columns = schema.columns().iter().filter(|c| !c.is_image()).cloned().collect::<Vec<_>>();
         let mut writer = Self {
             folder: folder.to_owned(),
@@ -102,7 +125,7 @@ impl ColumnFilesWriter {
             images,
             group: vec![],
             committed: 0,
-            merged: exists && options.mode == WriteMode::Append,
+            merged: known.is_some(),
             rows_in_files: 0,
             bytes_in_files: 0,
             new_constants: vec![],

@@ -19,8 +19,9 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
     } else {
         None
     };
-    let columns = ColumnFilesWriter::create(folder, schema, &options, known.as_ref(), ImageFiles::Images)?;
-    Ok(Box::new(FolderWriter { columns, schema: schema.clone(), codec: options.codec }))
+    let (incoming, codec) = (schema.clone(), options.codec);
+    let make = move |columns| FolderWriter { columns, schema: incoming, codec };
+    ColumnFilesWriter::create(folder, schema, options, known.as_ref(), ImageFiles::Images, make)
 }
 
 struct FolderWriter {

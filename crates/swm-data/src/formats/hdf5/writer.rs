@@ -8,6 +8,7 @@ use super::table::{Space, TableState, TableWriter};
 use crate::dataset::Location;
 use crate::dataset::episodes::{self, EpisodeRows};
 use crate::dataset::{CommitPolicy, Constants, Reader as _, StepRange, WriteMode, WriteOptions, Writer, with_stored};
+use crate::formats::replacing::ReplacingWriter;
 use std::io;
 use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
@@ -37,9 +38,18 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
         (WriteMode::Overwrite, true) => {
             let old = Lock::file(path)?;
             check_is_dataset(&old, path)?;
-            let temporary = temporary_path(path);
-            let writer = create_file(&temporary, schema, manifest)?;
-            replace_file(writer, &temporary, path)?
+            Layout::new(schema.columns())?;
+            let (path, schema, incoming) = (path.to_owned(), schema.clone(), schema.clone());
+            let replace = move || -> Result<Box<dyn Writer>> {
+                // The old file stays locked until the new one replaces it.
+                let _old = old;
+                let temporary = temporary_path(&path);
+                let mut writer = create_file(&temporary, &schema, options.manifest.as_ref())?;
+                writer.policy = options.commit;
+                Ok(Box::new(replace_file(writer, &temporary, &path)?))
+            };
+            let check = move |episode: &Batch, _: &Constants| episodes::check_episode(episode, &incoming);
+            return Ok(ReplacingWriter::boxed(check, replace));
         }
         (WriteMode::Append, true) => {
             let old = Lock::file(path)?;

@@ -17,6 +17,7 @@ use super::store::{Store, Version};
 use super::table::{MAX_ATTEMPTS, Table};
 use crate::dataset::{CommitPolicy, Constants, WriteMode, WriteOptions, Writer, is_full, with_stored};
 use crate::dataset::{Location, episodes};
+use crate::formats::replacing::ReplacingWriter;
 use arrow_schema::Schema as ArrowSchema;
 use lance_core::datatypes::Schema as LanceSchema;
 use lance_table::transaction::Operation;
@@ -44,17 +45,29 @@ pub fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Re
     }
     let store = Store::new(location)?;
     store.check_writable()?;
-    schema::columns_to_write(schema)?;
+    let columns = schema::columns_to_write(schema)?;
     store.check_no_links()?;
     let lock = if options.exclusive { store.lock("")? } else { None };
-    for _ in 0..MAX_ATTEMPTS {
-        // If another process creates, continues or replaces the table in between, the next attempt starts from the new
-        // state.
-        if let Some(prepared) = prepare(&store, schema, &options)? {
-            return prepared.start(schema, &options, lock);
+    let replaces = options.mode == WriteMode::Overwrite && store.latest()?.is_some();
+    let (schema, incoming, codec) = (schema.clone(), schema.clone(), options.codec);
+    let start = move || {
+        for _ in 0..MAX_ATTEMPTS {
+            // If another process creates, continues or replaces the table in between, the next attempt starts from the
+            // new state.
+            if let Some(prepared) = prepare(&store, &schema, &options)? {
+                return prepared.start(&schema, &options, lock);
+            }
         }
+        Err(too_many_conflicts(&store.label))
+    };
+    if !replaces {
+        return start();
     }
-    Err(too_many_conflicts(&store.label))
+    let check = move |episode: &Batch, constants: &Constants| {
+        episodes::check_episode(episode, &incoming)?;
+        EncodedEpisode::new(&columns, episode, codec, constants).map(drop)
+    };
+    Ok(ReplacingWriter::boxed(check, start))
 }
 
 pub fn too_many_conflicts(label: &Path) -> Error {

@@ -86,4 +86,8 @@ impl Writer for LanceVideoWriter {
     fn finish(self: Box<Self>) -> Result<()> {
         self.writer.finish()
     }
+
+    fn pause(self: Box<Self>) -> Result<()> {
+        self.writer.pause()
+    }
 }

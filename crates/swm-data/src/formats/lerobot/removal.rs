@@ -1,6 +1,7 @@
 //! Deletes a dataset that this project wrote, and nothing else in its folder; and the names of its files.
 
 use super::info::{DATA_PATH, EPISODES_PATH, Info, VIDEO_PATH, fill};
+use crate::formats::replacing::check_no_links;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use swm_core::files::{self, Lock};
@@ -37,6 +38,19 @@ pub(super) fn remove(root: &Path) -> Result<()> {
 /// If the metadata cannot be read, another program wrote the dataset, or a file is a symbolic link; then nothing is
 /// deleted. Also if a file cannot be deleted.
 pub(super) fn clear(root: &Path) -> Result<()> {
+    files::delete_named(root, &stored_files(root)?)
+}
+
+/// Checks that [`clear`] can delete the dataset in a folder.
+///
+/// # Errors
+/// As [`clear`].
+pub(super) fn check_clear(root: &Path) -> Result<()> {
+    check_no_links(root, &stored_files(root)?)
+}
+
+/// The files that [`clear`] deletes, in the order of deletion.
+fn stored_files(root: &Path) -> Result<Vec<PathBuf>> {
     let refused = |problem: String| {
         let problem = format!("the names of its files are unknown: {problem}");
         Error::corrupt(root, problem, "delete the dataset by hand, or choose another path")
@@ -52,7 +66,7 @@ pub(super) fn clear(root: &Path) -> Result<()> {
     let mut names: Vec<PathBuf> = (0..files).rev().flat_map(|index| files_of_index(&info, index)).collect();
     names.extend([TASKS, STATS].into_iter().flat_map(with_temporary));
     names.extend([temporary(INFO), WRITING.into()]);
-    files::delete_named(root, &names)
+    Ok(names)
 }
 
 /// Whether a folder holds only what a writer leaves that was killed before its first `meta/info.json`: the beginning of that file.

@@ -12,6 +12,7 @@ use super::{CONSTANTS, NO_TASK, TASK, values};
 use crate::dataset::Location;
 use crate::dataset::episodes;
 use crate::dataset::{Constants, Reader as _, WriteMode, WriteOptions, Writer, with_stored};
+use crate::formats::replacing::ReplacingWriter;
 use arrow_array::builder::{ListBuilder, StringBuilder};
 use arrow_array::{ArrayRef, Float64Array, Int64Array, RecordBatch, StringArray};
 use arrow_schema::{DataType, Field, Schema as ArrowSchema};
@@ -27,7 +28,7 @@ use swm_video::{Encoder, Encoding};
 
 /// Creates, continues or replaces a dataset.
 pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
-    Ok(Box::new(LerobotWriter::create(location.local("lerobot")?, schema, options)?))
+    LerobotWriter::create(location.local("lerobot")?, schema, options)
 }
 
 struct LerobotWriter {
@@ -67,7 +68,7 @@ struct PendingEpisode {
 }
 
 impl LerobotWriter {
-    fn create(root: &Path, schema: &Schema, options: WriteOptions) -> Result<Self> {
+    fn create(root: &Path, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
         options.codec.check()?;
         let columns = stored_columns(schema)?;
         let exists = root.join(INFO).is_file();
@@ -84,8 +85,22 @@ impl LerobotWriter {
         let lock = Lock::folder(root)?;
         check_folders(root, &columns, schema)?;
         if exists && options.mode == WriteMode::Overwrite {
-            removal::clear(root)?;
+            removal::check_clear(root)?;
+            let (root, schema, incoming) = (root.to_owned(), schema.clone(), schema.clone());
+            let replace = move || -> Result<Box<dyn Writer>> {
+                removal::clear(&root)?;
+                Ok(Box::new(Self::begin(&root, &schema, options, lock)?))
+            };
+            let check = move |episode: &Batch, _: &Constants| episodes::check_episode(episode, &incoming);
+            return Ok(ReplacingWriter::boxed(check, replace));
         }
+        Ok(Box::new(Self::begin(root, schema, options, lock)?))
+    }
+
+    /// Begins to write into a folder, which is locked.
+    fn begin(root: &Path, schema: &Schema, options: WriteOptions, lock: Lock) -> Result<Self> {
+        let columns = stored_columns(schema)?;
+        let continues = options.mode == WriteMode::Append && root.join(INFO).is_file();
         let mut writer = Self {
             root: root.to_owned(),
             _lock: lock,
@@ -100,7 +115,7 @@ impl LerobotWriter {
             failed: false,
             options,
         };
-        if exists && writer.options.mode == WriteMode::Append {
+        if continues {
             writer.continue_from()?;
         }
         writer.clear_group();

@@ -22,8 +22,9 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
     } else {
         None
     };
-    let columns = ColumnFilesWriter::create(folder, schema, &options, known.as_ref(), ImageFiles::Videos)?;
-    Ok(Box::new(VideoWriter { columns, schema: schema.clone(), encoding: Encoding::training(options.codec) }))
+    let (incoming, encoding) = (schema.clone(), Encoding::training(options.codec));
+    let make = move |columns| VideoWriter { columns, schema: incoming, encoding };
+    ColumnFilesWriter::create(folder, schema, options, known.as_ref(), ImageFiles::Videos, make)
 }
 
 /// Suffix of incomplete videos.

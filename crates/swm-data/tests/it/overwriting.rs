@@ -1,0 +1,57 @@
+//! A dataset to replace stays until an episode is ready to be written in its place.
+
+use crate::sample::{check, episode, options, schema, write};
+use swm_core::{Batch, ColumnSpec, DType, Schema};
+use swm_data::{WriteMode, create, open};
+
+#[test]
+fn refused_first_episodes_keep_the_old_dataset() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    for format in ["lance", "lance-video", "folder", "video", "h5", "lerobot"] {
+        let path = folder.path().join(format!("data.{format}"));
+        write(&path, WriteMode::Create, 1, 0..3);
+        let mut without_action = episode(5);
+        without_action.get_mut::<f32>("action").expect("the actions")[0] = f32::NAN;
+        let mut writer = create(&path, &schema(), options(WriteMode::Overwrite)).expect("replacing");
+        writer.write_episode(&without_action).expect_err("a missing action");
+        writer.pause().expect("nothing is written");
+        let reader = open(&path).expect("opening");
+        assert_eq!(reader.episodes().len(), 3, "{format}");
+        check(&*reader, 0);
+
+        // The same writer can store the next episode.
+        let mut writer = create(&path, &schema(), options(WriteMode::Overwrite)).expect("replacing");
+        writer.write_episode(&without_action).expect_err("a missing action");
+        writer.write_episode(&episode(7)).expect("writing an episode");
+        assert_eq!(writer.episodes(), 1, "{format}");
+        writer.finish().expect("finishing");
+        let reader = open(&path).expect("opening");
+        assert_eq!(reader.episodes().len(), 1, "{format}");
+        check(&*reader, 7);
+    }
+}
+
+#[test]
+fn values_that_lance_cannot_store_keep_the_old_table() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let path = folder.path().join("data.lance");
+    write(&path, WriteMode::Create, 1, 0..3);
+    let schema = Schema::new([ColumnSpec::new("count", DType::Int64, [])]).expect("creating the schema");
+    let mut rows = Batch::zeros(&schema, 2);
+    rows.get_mut::<i64>("count").expect("the column")[1] = (1 << 24) + 1;
+    let mut writer = create(&path, &schema, options(WriteMode::Overwrite)).expect("replacing");
+    writer.write_episode(&rows).expect_err("an integer beyond float32");
+    drop(writer);
+    check(&*open(&path).expect("opening"), 0);
+}
+
+#[test]
+fn finished_writer_without_episodes_replaces_the_dataset() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    for format in ["lance", "folder", "h5"] {
+        let path = folder.path().join(format!("data.{format}"));
+        write(&path, WriteMode::Create, 1, 0..3);
+        create(&path, &schema(), options(WriteMode::Overwrite)).and_then(|writer| writer.finish()).expect("replacing");
+        assert!(open(&path).expect("opening").episodes().is_empty(), "{format}");
+    }
+}

@@ -207,6 +207,26 @@ def test_goal_probabilities_choose_current_later_and_random_steps(tmp_path):
         data.GoalDataset(dataset, (1, 1, 0, 0))
 
 
+def test_masks_and_fractions_are_no_indices(tmp_path):
+    write(tmp_path / "a.lance")
+    stored = data.load_dataset(tmp_path / "a.lance", backend="numpy")
+    buffer = data.ReplayBuffer(100, sampler=lambda *_: [True, False, True])
+    buffer.write_episodes(
+        stored.load_episode(n) | {"pixels": np.zeros((length, 2, 2, 3), np.uint8)} for n, length in enumerate((12,))
+    )
+    for dataset in (stored, buffer, data.ConcatDataset([stored, stored])):
+        for wrong in ([True, False, True], [0.9, 1.9]):
+            with pytest.raises(TypeError, match="whole numbers, got (bool|float64); np.flatnonzero"):
+                dataset.get_row_data(wrong)
+            with pytest.raises(TypeError, match="whole numbers"):
+                dataset.load_chunk(wrong, [0] * len(wrong), [1] * len(wrong))
+            with pytest.raises(TypeError, match="whole numbers"):
+                dataset[wrong[0]]
+        assert dataset.get_row_data(np.flatnonzero([True, False, True]))["reward"].ravel().tolist() == [0, 2]
+    with pytest.raises(TypeError, match="sampler: expected whole numbers, got bool"):
+        buffer.sample(3)
+
+
 def test_scalers_normalise_and_invert(tmp_path):
     write(tmp_path / "a.lance")
     dataset = data.load_dataset(tmp_path / "a.lance", num_steps=3, frameskip=2, backend="numpy")

@@ -64,6 +64,16 @@ def test_scalers_take_tensors():
     assert data.PercentileScaler(q_low=[0.0], q_high=[4.0])(torch.tensor([[9.0], [1.0]])).tolist() == [[1.0], [-0.5]]
 
 
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int32, torch.int64, torch.bool])
+@pytest.mark.parametrize("method", ["zscore", "percentile"])
+def test_scalers_take_tensors_of_integers(method, dtype):
+    values = torch.tensor([[0], [1], [1], [0], [1]], dtype=dtype)
+    scaler = data.get_scaler(method).fit(values)
+    expected = data.get_scaler(method).fit_transform(values.double().numpy())
+    np.testing.assert_allclose(scaler(values).numpy(), expected, rtol=1e-6)
+    np.testing.assert_allclose(scaler.inverse_transform(scaler.transform(values)).numpy(), values.double(), atol=1e-6)
+
+
 def test_episodes_of_tensors_are_written(tmp_path):
     with data.open_writer(tmp_path / "a.lance") as writer:
         writer.write_episode(

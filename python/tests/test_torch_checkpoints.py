@@ -1,6 +1,7 @@
 """Tests that checkpoints of the engine and of the published package load as torch modules, as data only."""
 
 import json
+import resource
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +70,30 @@ def test_models_are_saved_and_loaded(home):
         load_pretrained("mine")
     with pytest.raises(FileNotFoundError, match="nothing"):
         load_pretrained("nothing")
+
+
+def test_models_are_replaced_as_a_whole_and_checkpoints_of_the_engine_are_not(home):
+    def config(size):
+        return {"_target_": "torch.nn.Linear", "in_features": size, "out_features": size}
+
+    save_pretrained(torch.nn.Linear(4, 4), "mine", config(4))
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+        with pytest.raises((OSError, RuntimeError)):
+            save_pretrained(torch.nn.Linear(300, 300), "mine", config(300))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert load_pretrained("mine").in_features == 4
+    assert sorted(file.name for file in (home / "checkpoints/mine").iterdir()) == ["config.json", "weights.pt"]
+    save_pretrained(torch.nn.Linear(5, 5), "mine", config(5))
+    assert load_pretrained("mine").in_features == 5
+    run = home / "checkpoints/run/checkpoint"
+    run.mkdir(parents=True)
+    (run / "config.json").write_text("{}")
+    with pytest.raises(FileExistsError, match="choose another run_name"):
+        save_pretrained(torch.nn.Linear(5, 5), "run/checkpoint", config(5))
+    assert [file.name for file in run.iterdir()] == ["config.json"]
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -150,6 +151,42 @@ def test_evaluation_reports_intervals_and_the_random_floor(tmp_path):
     assert np.array_equal(metrics["steps"], again["steps"]) and np.array_equal(metrics["seeds"], again["seeds"])
     saved = json.loads(metrics.save(tmp_path / "results.json").read_text())
     assert [run["policy"] for run in saved["runs"]] == ["random", "expert"]
+
+
+def test_metrics_replace_older_results_as_a_whole_and_nothing_else(tmp_path):
+    world = rooms(num_envs=2)
+    few, many = (world.evaluate(policy=swm.policy.RandomPolicy(), episodes=n, seed=1, progress=False) for n in (2, 40))
+    path = few.save(tmp_path / "results.json")
+    old = path.read_text()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (len(old), limits[1]))
+        with pytest.raises(OSError):
+            many.save(path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.read_text() == old and [file.name for file in tmp_path.iterdir()] == ["results.json"]
+    assert len(json.loads(many.save(path).read_text())["runs"][0]["episodes"]) == 40
+    thesis = tmp_path / "thesis.md"
+    thesis.write_text("thesis")
+    with pytest.raises(FileExistsError, match="holds no results"):
+        few.save(thesis)
+    assert thesis.read_text() == "thesis"
+
+
+@pytest.mark.parametrize(
+    ("actions", "words"),
+    [
+        (np.zeros((2, 3)), r"actions: got actions of shape \(2, 3\), expected \(3, 2\)"),
+        (np.full((3, 2), 0.5 + 9j), "actions: expected real actions"),
+        (np.full((3, 2), np.nan), "actions: expected finite actions"),
+    ],
+)
+def test_steps_refuse_other_actions(actions, words):
+    world = rooms(num_envs=3)
+    world.reset(seed=0)
+    with pytest.raises(ValueError, match=words):
+        world.envs.step(actions)
 
 
 def test_metrics_name_the_episodes_that_count():

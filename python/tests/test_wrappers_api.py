@@ -101,6 +101,47 @@ def test_env_pool_steps_chosen_environments():
         pool.reset(seed=[1])
 
 
+class Changing(gymnasium.Env):
+    """Returns infos of other types and shapes than at its reset, one at a time."""
+
+    observation_space = action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, terminated=False, **infos):
+        self.end, self.later = terminated, infos
+
+    def reset(self, *, seed=None, options=None):
+        infos = {"count": 2, "small": np.uint8(7), "vector": np.zeros(3, np.float32), "name": "a"}
+        return np.zeros(1, np.float32), infos
+
+    def step(self, action):
+        return np.zeros(1, np.float32), 0.0, self.end, False, self.later
+
+
+@pytest.mark.parametrize(
+    ("later", "words"),
+    [
+        ({"count": 1.5}, r"info\['count'\]: got float64 of shape \(\), expected int64"),
+        ({"small": np.int64(300)}, r"info\['small'\]: 300 is stored as uint8"),
+        ({"vector": np.float32(5)}, r"info\['vector'\]: got float32 of shape \(\), expected float32 of shape \(3,\)"),
+        ({"terminated": float("nan")}, "terminated: nan; expected true or false"),
+        ({"terminated": -1}, "terminated: -1; expected true or false"),
+    ],
+)
+def test_pools_refuse_values_that_their_infos_cannot_hold(later, words):
+    pool = EnvPool([lambda: Changing(**later)] * 2)
+    pool.reset(seed=0)
+    with pytest.raises(ValueError, match=words):
+        pool.step(np.zeros((2, 1)))
+
+
+def test_pools_convert_values_that_their_infos_can_hold():
+    pool = EnvPool([lambda: Changing(terminated=np.True_, count=np.int32(5), small=8, vector=[1.0, 2.0, 3.0], name="b")] * 2)
+    pool.reset(seed=0)
+    _, _, terminateds, _, infos = pool.step(np.zeros((2, 1)))
+    assert terminateds.all() and infos["count"].ravel().tolist() == [5, 5] and infos["small"].dtype == np.uint8
+    assert infos["vector"][1, 0].tolist() == [1, 2, 3] and infos["name"] == [["b"], ["b"]]
+
+
 def test_the_environments_of_a_world_are_a_pool():
     world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(16, 16))
     assert isinstance(world.envs, EnvPool)

@@ -140,6 +140,18 @@ def rows(episode: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, str | 
     return arrays, constants
 
 
+def whole(what: str, given: Any) -> Array:
+    """Indices as an array of 64-bit integers.
+
+    Raises:
+        TypeError: When the values are no whole numbers, such as those of a mask.
+    """
+    array = np.asarray(given)
+    if array.size and array.dtype.kind not in "iu":
+        raise TypeError(f"{what}: expected whole numbers, got {array.dtype}; np.flatnonzero gives the indices of a mask")
+    return array.astype(np.int64)
+
+
 def exact(what: str, array: Array, dtype: str) -> Array:
     """The array, contiguous and in another type. Integers keep their values, and finite numbers stay finite.
 

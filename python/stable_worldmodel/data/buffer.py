@@ -53,7 +53,7 @@ class _Content(Dataset):
         if indices.shape != (batch_size,):
             raise ValueError(f"the sampler gave indices of shape {indices.shape}, expected ({batch_size},)")
         view = Dataset(self.lengths, self.offsets, self.frameskip, steps)
-        episodes, starts = view._clips(indices.astype(np.int64))
+        episodes, starts = view._clips(_tensors.whole("sampler", indices))
         found = self._read(episodes, starts, np.full(batch_size, view.span), self.frameskip)
         shapes = {name: () if name == "action" else tuple(shape) for name, _, shape in self._columns}
         return {
@@ -85,7 +85,7 @@ class _Content(Dataset):
         return np.asarray(found[col])
 
     def get_row_data(self, row_idx: Rows) -> dict[str, Array]:
-        rows = np.atleast_1d(np.asarray(row_idx, dtype=np.int64))
+        rows = np.atleast_1d(_tensors.whole("row_idx", row_idx))
         episodes = np.searchsorted(self.offsets, rows, side="right") - 1
         found = self._read(episodes, rows - self.offsets[episodes], np.ones_like(rows), 1)
         return {name: array[0] for name, array in found.items()} if np.ndim(row_idx) == 0 else found

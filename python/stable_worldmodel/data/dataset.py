@@ -101,7 +101,7 @@ class Dataset:
         return int(self._clips_before[-1])
 
     def __getitem__(self, idx: int) -> dict[str, Any]:
-        episodes, starts = self._clips(np.asarray([idx], dtype=np.int64))
+        episodes, starts = self._clips(_tensors.whole("index", [idx]))
         start = int(starts[0])
         return self._grouped(self._load_slice(int(episodes[0]), start, start + self.span), self.num_steps)
 
@@ -116,7 +116,7 @@ class Dataset:
         self, episodes_idx: Sequence[int] | Array, start: Sequence[int] | Array, end: Sequence[int] | Array
     ) -> list[dict[str, Any]]:
         """The rows `start[i] .. end[i]` of each episode `episodes_idx[i]`, as a list of dicts in the form of clips."""
-        runs = zip(*(np.asarray(part).tolist() for part in (episodes_idx, start, end)), strict=True)
+        runs = zip(*(_tensors.whole("load_chunk", part).tolist() for part in (episodes_idx, start, end)), strict=True)
         return [self._grouped(self._load_slice(e, s, t), (t - s) // self.frameskip) for e, s, t in runs]
 
     def load_episode(self, episode_idx: int) -> dict[str, Any]:
@@ -310,18 +310,18 @@ class StoredDataset(Dataset):
     def load_chunk(
         self, episodes_idx: Sequence[int] | Array, start: Sequence[int] | Array, end: Sequence[int] | Array
     ) -> list[dict[str, Any]]:
-        starts, ends = np.asarray(start, dtype=np.int64), np.asarray(end, dtype=np.int64)
+        episodes, starts, ends = (_tensors.whole("load_chunk", part) for part in (episodes_idx, start, end))
         steps, rest = np.divmod(ends - starts, self.frameskip)
         if "action" in self._keys and rest.any():
             raise ValueError(f"load_chunk: {(ends - starts).tolist()} rows are no multiples of frameskip {self.frameskip}")
-        samples = self._slices(np.asarray(episodes_idx), starts, ends)
+        samples = self._slices(episodes, starts, ends)
         return [self._grouped(sample, int(count)) for sample, count in zip(samples, steps, strict=True)]
 
     def __getitems__(self, indices: Sequence[int]) -> list[dict[str, Any]]:
         """The samples of a batch, read in one call."""
         if len(indices) == 0:
             return []
-        episodes, starts = self._clips(np.asarray(indices, dtype=np.int64))
+        episodes, starts = self._clips(_tensors.whole("indices", indices))
         size = len(episodes)
         found = self._read(self._keys, episodes, starts, np.full(size, self.span), self.frameskip)
         columns: dict[str, Any] = {}
@@ -344,7 +344,7 @@ class StoredDataset(Dataset):
         return self._read([col], all_episodes, np.zeros_like(all_episodes), self.lengths, 1)[col]
 
     def get_row_data(self, row_idx: Rows) -> dict[str, Array]:
-        rows = np.atleast_1d(np.asarray(row_idx, dtype=np.int64))
+        rows = np.atleast_1d(_tensors.whole("row_idx", row_idx))
         total = int(self.lengths.sum())
         if ((rows < -total) | (rows >= total)).any():
             raise IndexError(f"some of the rows {rows.tolist()} are outside the dataset, which has {total} rows")
@@ -526,7 +526,7 @@ class ConcatDataset:
     @staticmethod
     def _locate(before: Array, indices: Any, what: str) -> tuple[Array, Array]:
         """The dataset of each index, and the index in that dataset."""
-        indices = np.asarray(indices, dtype=np.int64)
+        indices = _tensors.whole(what, indices)
         total = int(before[-1])
         if ((indices < -total) | (indices >= total)).any():
             raise IndexError(f"some of the {what} {indices.tolist()} are outside the dataset, which has {total} {what}")

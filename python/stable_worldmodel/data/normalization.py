@@ -31,9 +31,15 @@ def _like(value: Any, *bounds: Array | None) -> list[Any]:
     return [torch.as_tensor(bound, dtype=value.dtype, device=value.device) for bound in bounds]
 
 
+def _real(value: Any) -> Any:
+    """The values, with integers and booleans of a tensor in double precision, as numpy computes them."""
+    return value if not _is_tensor(value) or value.is_floating_point() else value.double()
+
+
 def _finite_rows(values: Any) -> Array:
     """The rows `(n, d)` without NaN. The missing action of an episode's last row is NaN."""
     array = _tensors.to_numpy(values)
+    array = array.astype(np.float64) if array.dtype == bool else array
     array = array.reshape(-1, array.shape[-1] if array.ndim > 1 else 1)
     array = array[~np.isnan(array).any(axis=1)]
     if len(array) == 0:
@@ -77,11 +83,13 @@ class _Affine:
 
     def transform(self, X: Any) -> Any:
         """The scaled values, `(..., d)`."""
+        X = _real(X)
         centre, scale = _like(X, *self._bounds())
         return (X - centre) / scale
 
     def inverse_transform(self, X: Any) -> Any:
         """The original values of scaled values, `(..., d)`."""
+        X = _real(X)
         centre, scale = _like(X, *self._bounds())
         return X * scale + centre
 

@@ -12,6 +12,7 @@ from gymnasium.vector.utils import batch_space
 
 from .. import _engine
 from .. import spaces as swm_spaces
+from ..data import _tensors
 
 if TYPE_CHECKING:
     from .world import World
@@ -136,7 +137,8 @@ class EnvPool:
         terminateds, truncateds = np.zeros((2, self.num_envs), bool)
         self._known()
         for env in self._chosen(mask):
-            _, rewards[env], terminateds[env], truncateds[env], info = self.envs[env].step(actions[env])
+            _, rewards[env], terminated, truncated, info = self.envs[env].step(actions[env])
+            terminateds[env], truncateds[env] = _flag("terminated", terminated), _flag("truncated", truncated)
             self._write(env, info)
         return None, rewards, terminateds, truncateds, self._known()
 
@@ -159,12 +161,27 @@ class EnvPool:
             column, value = columns[key], info[key]
             if isinstance(column, list):
                 column[env][0] = value
-            elif hasattr(column, "detach") and not hasattr(value, "detach"):
+                continue
+            array, shape, dtype = _tensors.to_numpy(value), tuple(column.shape[2:]), _tensors.to_numpy(column[:1]).dtype
+            numbers = dtype.kind in "biuf"
+            fits = np.can_cast(array.dtype, dtype, "same_kind" if numbers else "safe")
+            if array.shape != shape or not (fits or (array.dtype.kind in "iu" and dtype.kind in "iu")):
+                given = f"{array.dtype} of shape {array.shape}"
+                raise ValueError(f"info[{key!r}]: got {given}, expected {dtype} of shape {shape} as in the first reset")
+            array = _tensors.exact(f"info[{key!r}]", array.reshape(-1), dtype.name).reshape(shape) if numbers else array
+            if hasattr(column, "detach"):
                 import torch
 
-                column[env, 0] = torch.as_tensor(value, dtype=column.dtype, device=column.device)
+                column[env, 0] = torch.as_tensor(array, dtype=column.dtype, device=column.device)
             else:
-                column[env, 0] = value
+                column[env, 0] = array
+
+
+def _flag(name: str, value: Any) -> bool:
+    """Whether an episode ended."""
+    if np.ndim(value) != 0 or value not in (False, True):
+        raise ValueError(f"{name}: {value!r}; expected true or false")
+    return bool(value)
 
 
 def _column(values: list[Any]) -> Any:

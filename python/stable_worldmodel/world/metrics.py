@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .. import _engine
+from .. import _engine, _files
 
 if TYPE_CHECKING:
     from .world import World
@@ -68,10 +68,17 @@ class Metrics(dict[str, Any]):
         return metrics
 
     def save(self, path: str | Path = "results.json") -> Path:
-        """Writes the results as JSON, the input of `swm report`, and returns the path."""
+        """Writes the results as JSON, the input of `swm report`, and returns the path. Older results there are replaced.
+
+        Raises:
+            FileExistsError: If there is another file.
+        """
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(self.results, indent=2))
+        if path.exists() and path.stat().st_size > 0 and not _is_results(path):
+            raise FileExistsError(f"{path}: this file holds no results; choose another name, or remove it")
+        text = json.dumps(self.results, indent=2)
+        _files.replace({path: lambda beside: beside.write_text(text)})
         return path
 
     def __str__(self) -> str:
@@ -82,6 +89,15 @@ class Metrics(dict[str, Any]):
             low, high = self["random_interval"]
             text += f", at random {self['random_success_rate']:.1f} % [{low:.0f}, {high:.0f}]"
         return text
+
+
+def _is_results(path: Path) -> bool:
+    """Whether a file holds results of an evaluation."""
+    try:
+        found = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return False
+    return isinstance(found, dict) and {"manifest", "runs"} <= found.keys()
 
 
 def _percent(rate: float | None) -> float:

@@ -359,10 +359,7 @@ class World:
         """Steps the environments of `mask` whose episode goes on; returns rewards, terminated and truncated."""
         active = ~(self.terminateds | self.truncateds)
         active &= True if mask is None else np.asarray(mask, bool)
-        given = np.asarray(actions.detach().cpu() if hasattr(actions, "detach") else actions)
-        if given.size != self._actions.size:
-            raise ValueError(f"actions: got shape {given.shape}, expected {self.envs.action_space.shape}")
-        self._actions[active] = given.reshape(self._actions.shape).astype(self._actions.dtype)[active]
+        self._actions[active] = self._engine_form("actions", actions, active)[active]
         self._fresh[active] = False
         self._world.advance(active.tolist())
         self._transform()
@@ -409,16 +406,24 @@ class World:
         name = type(policy).__name__
         if given is None:
             raise TypeError(f"{name}.get_action returned None; expected actions of shape {self.envs.action_space.shape}")
+        return self._engine_form(f"{name}.get_action", given, active)
+
+    def _engine_form(self, what: str, given: Any, active: np.ndarray) -> np.ndarray:
+        """Actions `(num_envs, ..)` in the shape and type of the engine.
+
+        Raises:
+            ValueError: If they have another shape, or those of active environments are not finite real numbers.
+        """
         given = given.detach().cpu().numpy() if hasattr(given, "detach") else np.asarray(given)
         want = self._actions
         if given.size != want.size or given.shape[:1] != want.shape[:1]:
             expected = self.envs.action_space.shape
-            raise ValueError(f"{name}.get_action: got actions of shape {given.shape}, expected {expected}")
+            raise ValueError(f"{what}: got actions of shape {given.shape}, expected {expected}")
         given = given.reshape(want.shape)
         if given.dtype.kind == "c":
-            raise ValueError(f"{name}.get_action: expected real actions, got complex numbers")
+            raise ValueError(f"{what}: expected real actions, got complex numbers")
         if given.dtype.kind == "f" and not np.isfinite(given[active]).all():
-            raise ValueError(f"{name}.get_action: expected finite actions, got {given[active]}")
+            raise ValueError(f"{what}: expected finite actions, got {given[active]}")
         if want.dtype.kind != "f":
             given = np.nan_to_num(given, nan=0)
         return np.ascontiguousarray(given, dtype=want.dtype)

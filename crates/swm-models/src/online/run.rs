@@ -71,6 +71,7 @@ pub fn train_online<M: Agent>(
         return Err(Error::config("online", "the configuration has no table `online`", fix));
     };
     online.check()?;
+    check_effects(&config.loop_config())?;
     if config.data.num_steps > online.segment + 1 {
         let given = format!("segments of {} steps hold no clip of {} frames", online.segment, config.data.num_steps);
         return Err(Error::config("online.part", given, "raise online.part, or lower data.num_steps"));
@@ -81,6 +82,26 @@ pub fn train_online<M: Agent>(
     // A pool of environments cannot be shared between threads, but can be moved to a compute thread.
     let _lock = Lock::folder(out)?;
     threads.install(|| start(config, online, pool, evaluation_pool, out, options)?(control))
+}
+
+/// Refuses settings of trainings on a dataset that have no effect here.
+///
+/// # Errors
+/// The error names the first such setting.
+fn check_effects(config: &LoopConfig) -> Result<()> {
+    let others = [
+        ("optim.accumulate", config.optim.accumulate.to_string(), "1", config.optim.accumulate != 1),
+        ("optim.ema", config.optim.ema.to_string(), "0", config.optim.ema != 0.0),
+        ("data.hold_out", config.data.hold_out.to_string(), "false", config.data.hold_out),
+        ("validation.every", config.validation.every.to_string(), "0", config.validation.every != 0),
+    ];
+    match others.into_iter().find(|(.., given)| *given) {
+        None => Ok(()),
+        Some((name, value, neutral, _)) => {
+            let given = format!("{value} has no effect when a model learns in an environment");
+            Err(Error::config(name, given, format!("leave it at {neutral}, or train on a dataset with --data")))
+        }
+    }
 }
 
 type Loop<'a> = Box<dyn FnOnce(&mut Control<'_>) -> Result<OnlineSummary> + 'a>;

@@ -43,6 +43,10 @@ impl Trainable for Sac {
                 "choose 2 frames and a frameskip of 1, which make one transition",
             ));
         }
+        if config.shards != 1 {
+            let given = format!("{}, but every network computes the whole batch", config.shards);
+            return Err(Error::config("shards", given, "leave it at 1; --threads is the number of threads"));
+        }
         if config.online.as_ref().is_some_and(|online| online.planner.is_some()) {
             let problem = "SAC has no model to plan with";
             return Err(Error::config("online.planner", problem, "leave the table out"));

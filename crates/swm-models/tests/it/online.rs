@@ -180,6 +180,25 @@ fn invalid_settings_and_data_are_refused() {
 }
 
 #[test]
+fn settings_without_effect_are_refused() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    for settings in [
+        &["optim.accumulate=2"][..],
+        &["optim.ema=0.9"],
+        &["data.hold_out=true"],
+        &["data.hold_out=true", "validation.every=4"],
+    ] {
+        let error =
+            run(&config::<Sac>(settings), folder.path(), &TrainOptions::default(), 1).expect_err("it is refused");
+        let text = error.to_string();
+        assert!(text.contains("has no effect when a model learns in an environment"), "{settings:?}: {text}");
+    }
+    let shards = TrainConfig::<Sac>::load("tiny", &["shards=2".to_owned()]).expect_err("SAC has no shards").to_string();
+    assert!(shards.contains("leave it at 1"), "{shards}");
+    assert_eq!(std::fs::read_dir(folder.path()).expect("listing the folder").count(), 0);
+}
+
+#[test]
 fn removed_run_keeps_files_among_its_replay_data() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let out = folder.path().join("run");

@@ -130,6 +130,35 @@ fn values_beyond_the_memory_or_the_declared_shape_are_not_decoded() {
     assert!(error.contains("more values than the dataset declares"), "{error}");
 }
 
+#[test]
+fn features_that_contradict_the_recorded_columns_are_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lerobot");
+    sample::write(&path, WriteMode::Create, 2, 0..3);
+    let info = path.join("meta/info.json");
+    let own: serde_json::Value =
+        serde_json::from_str(&std::fs::read_to_string(&info).expect("the file")).expect("JSON");
+    let error = |change: &dyn Fn(&mut serde_json::Map<String, serde_json::Value>)| {
+        let mut json = own.clone();
+        change(json["features"].as_object_mut().expect("features"));
+        std::fs::write(&info, json.to_string()).expect("writing the file");
+        open(&path).map(|reader| reader.schema().clone()).expect_err("a changed feature").to_string()
+    };
+    for name in ["action", "reward", "observation.images.pixels"] {
+        let other = error(&|features| {
+            let side = &mut features[name]["shape"][0];
+            *side = (side.as_u64().expect("a side") + 1).into();
+        });
+        assert!(other.contains(&format!("the feature '{name}' has the shape")), "{other}");
+    }
+    for dtype in ["string", "float32"] {
+        let other = error(&|features| features["observation.images.pixels"]["dtype"] = dtype.into());
+        assert!(other.contains("pixels"), "{dtype}: {other}");
+    }
+    let missing = error(&|features| drop(features.remove("reward")));
+    assert!(missing.contains("the recorded column 'reward' has no feature"), "{missing}");
+}
+
 fn damaged(name: &str, cases: u64) {
     let report = fuzz::dataset(name, &interop().join(name), cases, fuzz::read_everything);
     assert!(report.refused > 0, "{report:?}");

@@ -6,7 +6,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use swm_core::columns::{PIXELS, PROPRIO, STATE};
+use swm_core::columns::{EPISODE_IDX, PIXELS, PROPRIO, STATE, STEP_IDX};
 use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema, files};
 
 /// The LeRobot version of written datasets.
@@ -202,6 +202,10 @@ impl Info {
             };
             let spec = match recorded {
                 Some(known) if known.len() == spec.len() && known.is_image() == camera => known.clone(),
+                Some(known) => {
+                    let shapes = format!("{:?}, its recorded column {:?}", feature.shape, known.shape);
+                    return Err(damaged(root, format!("the feature '{native}' has the shape {shapes}")));
+                }
                 // The writer of this format adds features that are not in the schema passed to it.
                 _ if self.stable_worldmodel.is_some() => continue,
                 _ => spec,
@@ -220,6 +224,12 @@ impl Info {
             }
         }
         if let Some(recorded) = &self.stable_worldmodel {
+            let is_index = |column: &ColumnSpec| [EPISODE_IDX, STEP_IDX].contains(&column.name.as_str());
+            let is_read = |spec: &ColumnSpec| columns.iter().any(|column| column.spec.name == spec.name);
+            let mut stored = recorded.schema.columns().iter().filter(|spec| !is_index(spec) && !spec.is_empty());
+            if let Some(missing) = stored.find(|spec| !is_read(spec)) {
+                return Err(damaged(root, format!("the recorded column '{}' has no feature", missing.name)));
+            }
             let position = |column: &Column| recorded.schema.find(&column.spec.name);
             columns.sort_by_key(position);
         }

@@ -32,10 +32,12 @@ fn config(family: &str, preset: Option<&str>, settings: &[String]) -> Result<Box
     (family.config)(preset.unwrap_or(family.presets[0].id), settings)
 }
 
-/// Writes the checkpoint from which a run begins, or with `resume` checks the one from which it continues. Returns the
-/// rest of what the run needs, as JSON: `parameters` (clipping group and factor of the learning rate by name),
-/// and the loaders `training` and `validation`.
+/// Writes the checkpoint from which a run begins, and before it `run.json` with `command`, the command line of `swm train`
+/// that continues the run; or with `resume` checks the checkpoint from which it continues. Returns the rest of what the run
+/// needs, as JSON: `parameters` (clipping group and factor of the learning rate by name), and the loaders `training` and
+/// `validation`.
 #[pyfunction]
+#[allow(clippy::too_many_arguments, reason = "one argument for each option in Python")]
 pub fn begin_training(
     py: Python<'_>,
     family: &str,
@@ -44,12 +46,14 @@ pub fn begin_training(
     dataset: &Dataset,
     out: PathBuf,
     resume: bool,
+    command: Vec<String>,
 ) -> PyResult<String> {
     let begun = detached(py, || {
         let options = TrainOptions { resume, cache: swm::home::weights()?, ..TrainOptions::default() };
         let config = config(family, preset, &settings)?;
         check_training(&out, resume)?;
-        config.begin(dataset.reader()?, &out, &options).unwrap_or_else(|| {
+        let record = || record_training(&out, (command.clone(), PROGRAM), false);
+        config.begin(dataset.reader()?, &out, &options, &record).unwrap_or_else(|| {
             let problem = "it is trained by the engine only";
             Err(Error::config(family, problem, "train it with swm.wm.train, or `swm train`"))
         })
@@ -73,10 +77,11 @@ pub fn begin_training(
     Ok(plan.to_string())
 }
 
-/// Writes `command`, the command line of `swm train` that continues a run, to its `run.json`. The caller holds the lock of the folder.
+/// Adds `command`, the command line of `swm train` that continues a run, to its `run.json`, when the run is continued. The
+/// caller holds the lock of the folder.
 #[pyfunction(name = "record_training")]
-pub fn record(run: PathBuf, command: Vec<String>, resume: bool) -> PyResult<()> {
-    record_training(&run, (command, PROGRAM), resume).map_err(to_py_err)
+pub fn record(run: PathBuf, command: Vec<String>) -> PyResult<()> {
+    record_training(&run, (command, PROGRAM), true).map_err(to_py_err)
 }
 
 /// The parts of a checkpoint that are no tensors.

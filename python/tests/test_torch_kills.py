@@ -12,6 +12,7 @@ import pytest
 torch = pytest.importorskip("torch")
 torch.set_num_threads(1)
 
+import stable_worldmodel as swm  # noqa: E402
 from stable_worldmodel.train import Options, Trainer, train  # noqa: E402
 from stable_worldmodel.wm._weights import read_safetensors  # noqa: E402
 from stable_worldmodel.wm.utils import load_pretrained  # noqa: E402
@@ -59,6 +60,27 @@ def test_kills_while_a_checkpoint_is_written_are_continued(rooms, tmp_path):
         found, expected = weights(tmp_path / name), weights(tmp_path / "whole")
         assert all(torch.equal(found[key], value) for key, value in expected.items()) and found.keys() == expected.keys()
         assert {path.name for path in (tmp_path / name).iterdir()} == {"checkpoint", "run.json", "train.jsonl"}
+
+
+def test_a_training_that_is_killed_before_its_first_step_is_continued_by_its_folder(rooms, tmp_path):
+    torch_train("gcbc", rooms, tmp_path / "whole", SHORT)
+    Trainer(Options("gcbc", rooms, out=str(tmp_path / "run"), preset="tiny", device="cpu", settings=SHORT))
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {"checkpoint", "run.json"}
+    record = json.loads((tmp_path / "run/run.json").read_text())
+    assert [run["program"] for run in record["commands"]] == ["stable_worldmodel.train (torch)"]
+    # A kill before the first checkpoint leaves the record only.
+    (tmp_path / "early").mkdir()
+    shutil.copy(tmp_path / "run/run.json", tmp_path / "early/run.json")
+    for name in ("run", "early"):
+        swm.wm.engine._command(["swm", "train", "--output", str(tmp_path / name), "--resume"])
+        assert [row["step"] for row in log_of(tmp_path / name)] == [2, 4, 6]
+    # A training that is refused leaves no record.
+    with pytest.raises(ValueError, match="data.batch_size"):
+        torch_train("gcbc", rooms, tmp_path / "refused", [*SHORT[1:], "data.batch_size=0"])
+    assert not (tmp_path / "refused/run.json").exists()
+    with pytest.raises(ValueError, match="resume=True"):
+        torch_train("gcbc", rooms, tmp_path / "whole", [*SHORT, "seed=1"])
+    assert "seed=1" not in (tmp_path / "whole/run.json").read_text()
 
 
 def test_the_log_of_a_continued_training_is_that_of_a_whole_one(rooms, tmp_path):

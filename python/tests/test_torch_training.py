@@ -390,6 +390,8 @@ def test_ctrl_c_saves_the_checkpoint(rooms, tmp_path):
         (["lewm", "data=nothing", "resume=maybe"], 2, "true or false"),
         (["lewm", "data=nothing", "threads=many"], 2, "whole number"),
         (["lewm", "data=nothing", "device=fast"], 2, "device"),
+        (["lewm", "data=nothing", "device=meta"], 2, "device: 'meta' is not available"),
+        (["lewm", "data=nothing", "device=cpu", "compile=tvm"], 2, "compile: 'tvm' does not work here"),
     ],
 )
 def test_wrong_arguments_are_refused_with_the_reason(arguments, code, message, capsys):
@@ -410,6 +412,22 @@ def test_a_loss_that_is_not_finite_ends_the_training(rooms, tmp_path):
     with pytest.raises(FloatingPointError, match="optim.lr"):
         torch_train("gcbc", rooms, tmp_path / "run", ["optim.lr=1e30", "schedule.warmup=0", "data.batch_size=4"])
     assert np.isfinite(swm.wm.load(str(tmp_path / "run")).card["action_std"]).all()
+
+
+def test_a_class_of_another_family_is_refused_before_anything_is_written(rooms, tmp_path):
+    with pytest.raises(TypeError, match="'gcbc' is a GCRL, not a LeWM; derive the class from GCRL"):
+        torch_train("gcbc", rooms, tmp_path / "run", SHORT, kind=swm.wm.LeWM)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_gradient_of_infinite_norm_ends_the_training(rooms, tmp_path):
+    settings = [*SHORT, "loss.weight=1e30"]
+    with pytest.raises(FloatingPointError, match="norm of the gradient at training step 1 is inf.*optim.lr or the weights"):
+        torch_train("lewm", rooms, tmp_path / "run", settings)
+    # The scaler of half precision leaves such steps out, and lowers the scale.
+    run = torch_train("lewm", rooms, tmp_path / "half", settings, amp="fp16")
+    rows = log_of(run)
+    assert [row["step"] for row in rows] == [2, 4, 6] and rows[0]["gradient_norm"] is None
 
 
 def test_hydra_runs_several_trainings(rooms, tmp_path):

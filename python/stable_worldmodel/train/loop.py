@@ -21,7 +21,7 @@ from ..data.foreign import engine_of
 from ..data.loader import Goals, Loader
 from ..data.utils import load_dataset
 from ..wm._weights import read_safetensors
-from ..wm.checkpoints import module_of
+from ..wm.checkpoints import check_kind, module_of
 from ..wm.pretrained import Pretrained, stored_names, write
 from .losses import Losses, losses_of
 from .optim import Optimizer, learning_rate
@@ -46,8 +46,9 @@ class Trainer:
     def __init__(self, options: Options, kind: type[Pretrained] | None = None) -> None:
         self.options, self.run = options, options.run
         losses = losses_of(options.family)
-        _check_backend(options.compile)
+        check_kind(options.family, kind)
         self.device = _device(options.device)
+        _check_compile(options.compile, self.device)
         self.ranks = Ranks.join(self.device)
         if self.device.type == "cuda" and self.device.index is None and self.ranks.size > 1:
             self.device = torch.device("cuda", self.ranks.rank % torch.cuda.device_count())
@@ -65,7 +66,7 @@ class Trainer:
         self.scaler = torch.amp.GradScaler(self.device.type, enabled=options.amp == "fp16")
         self.step: int = state["step"]
         self.window = Window.of(state.get("window"), self.losses.names)
-        #: Whether `run.json` has the command of this training.
+        #: Whether the folder was found as this training read it, and `run.json` has the command.
         self.recorded = False
         self.best: Any = state["best"]
         self.validations_since_best: int = state["looks"]
@@ -74,16 +75,18 @@ class Trainer:
         self.waited = 0.0
 
     def _begin(self, dataset: Any) -> Any:
-        """Writes the first checkpoint of the training, or checks the one that it continues."""
+        """Writes the command and the first checkpoint of the training, or checks the checkpoint that it continues."""
         options = self.options
         # A kill while a checkpoint is replaced leaves the old one, which the engine gives its name back.
         self.resumed = options.resume and any((self.run / f"checkpoint{end}").is_dir() for end in ("", ".old"))
         settings = list(options.settings)
+        family, preset, command = options.family, options.preset, options.command()
         dataset, out = engine_of(dataset), str(self.run)
-        return json.loads(_engine.begin_training(options.family, options.preset, settings, dataset, out, self.resumed))
+        return json.loads(_engine.begin_training(family, preset, settings, dataset, out, self.resumed, command))
 
     def _record(self) -> None:
-        """Writes the command to `run.json`, under the lock of the folder, so that it has commands of trainings that ran.
+        """Adds the command of a training that continues to `run.json`, under the lock of the folder, so that it has commands
+        of trainings that ran.
 
         Raises:
             ValueError: If another process has trained in the folder since this training read the checkpoint.
@@ -96,7 +99,8 @@ class Trainer:
                 f"{self.run}: another process has trained here, from step {self.step} to step {stored}; "
                 "continue with resume=true, or choose another folder"
             )
-        _engine.record_training(str(self.run), self.options.command(), self.resumed)
+        if self.resumed:
+            _engine.record_training(str(self.run), self.options.command())
         self.recorded = True
 
     def _restored(self) -> Any:
@@ -151,7 +155,7 @@ class Trainer:
 
         Raises:
             KeyboardInterrupt: After Ctrl-C; the checkpoint is saved, and `resume` continues.
-            FloatingPointError: If the loss is not finite; the last checkpoint is kept.
+            FloatingPointError: If the loss or the norm of its gradient is not finite; the last checkpoint is kept.
             ValueError: If another process trains in the folder.
         """
         steps, log_every, save_every = self.config["schedule"]["steps"], self.config["log_every"], self.config["save_every"]
@@ -215,7 +219,7 @@ class Trainer:
             )
         factor = learning_rate(self.config["schedule"], self.step)
         metrics["lr"] = self.config["optim"]["lr"] * factor
-        metrics["gradient_norm"] = self.optimizer.step(factor, self.scaler)
+        metrics["gradient_norm"] = self.optimizer.step(self.step, factor, self.scaler)
         self.ranks.average_buffers(model, share)
         self.losses.after_step()
         self._move_average()
@@ -306,8 +310,10 @@ class Trainer:
 
     def _write_log(self, values: Mapping[str, float]) -> None:
         if self.ranks.rank == 0:
+            # JSON has no values that are not finite. In half precision, the gradient of a step that is left out is not.
+            row = {name: value if _finite(value) else None for name, value in values.items()}
             with open(self.run / "train.jsonl", "a", encoding="utf-8") as file:
-                file.write(json.dumps({"step": self.step, **values}) + "\n")
+                file.write(json.dumps({"step": self.step, **row}) + "\n")
 
 
 class Window:
@@ -369,18 +375,27 @@ def _locked(folder: Path) -> Iterator[None]:
         os.close(file)
 
 
-def _check_backend(compile: bool | str) -> None:
-    """Checks the name of a backend of `torch.compile` before anything is written.
+def _check_compile(compile: bool | str, device: torch.device) -> None:
+    """Checks that `torch.compile` works, before anything is written.
 
     Raises:
-        ValueError: If there is no such backend.
+        ValueError: If there is no such backend, or it lacks something, such as a package or a compiler.
     """
+    if compile is False:
+        return
     if isinstance(compile, str):
         import torch._dynamo
 
         if compile not in torch._dynamo.list_backends(exclude_tags=()):
             known = ", ".join(torch._dynamo.list_backends())
             raise ValueError(f"compile: {compile!r}; expected true, false or a backend, such as {known}")
+    try:
+        torch.compile(lambda x: x + 1, backend="inductor" if compile is True else compile)(torch.zeros(2, device=device))
+    except Exception as error:
+        # The rest of the message is about the variables with which torch says more.
+        reason = " ".join(str(error).split("\n\n")[0].split())
+        given = "true" if compile is True else repr(compile)
+        raise ValueError(f"compile: {given} does not work here ({reason}); install what it needs, or leave it out") from error
 
 
 def _device(name: str) -> torch.device:
@@ -388,7 +403,8 @@ def _device(name: str) -> torch.device:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.device(name)
-        torch.zeros(1, device=device)
+        # A device without data, such as meta, has no values.
+        float(torch.zeros(1, device=device))
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"device: {name!r} is not available ({error}); choose cpu, or another device of torch") from error
     return device

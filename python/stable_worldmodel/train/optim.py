@@ -51,24 +51,31 @@ class Optimizer:
         """Removes gradients."""
         self.adam.zero_grad(set_to_none=True)
 
-    def step(self, factor: float, scaler: Any) -> float:
+    def step(self, done: int, factor: float, scaler: Any) -> float:
         """Makes a step at `factor` times the peak learning rate, and returns the norm of the gradient before clipping.
 
+        Args:
+            done: The number of steps before this one.
+            factor: The factor of the learning rate.
+            scaler: The scaler of the loss in half precision.
+
         Raises:
-            FloatingPointError: If the gradient is not finite. In half precision, the step is left out instead.
+            FloatingPointError: If the norm is not finite. In half precision, the step is left out instead.
         """
         for group in self.adam.param_groups:
             group["lr"] = self.settings["lr"] * factor * group["rate"]
         scaler.unscale_(self.adam)
         norms = [float(nn.utils.clip_grad_norm_(group, self.settings["clip"])) for group in self.clipped.values()]
-        if not scaler.is_enabled() and not all(map(math.isfinite, norms)):
+        norm = math.hypot(*norms)
+        # Clipping scales finite gradients of infinite norm to 0, so that the training would go on and learn nothing.
+        if not scaler.is_enabled() and not math.isfinite(norm):
             raise FloatingPointError(
-                "the gradient of the loss is not finite; lower optim.lr or lengthen schedule.warmup; the last checkpoint "
-                "is kept"
+                f"the norm of the gradient at training step {done + 1} is {norm}; lower optim.lr or the weights of the loss, "
+                "or lengthen schedule.warmup; the last checkpoint is kept"
             )
         scaler.step(self.adam)
         scaler.update()
-        return math.sqrt(sum(norm**2 for norm in norms))
+        return norm
 
     def moments(self) -> dict[str, Tensor]:
         """The state, as a checkpoint holds it: `first.NAME` and `second.NAME`, flattened."""

@@ -28,7 +28,7 @@ from .prejepa.module import Embedder as ColumnEmbedder
 from .pretrained import Pretrained, Stored
 from .tdmpc2 import TDMPC2
 
-__all__ = ["load", "module_of"]
+__all__ = ["check_kind", "load", "module_of"]
 
 Model = TypeVar("Model", bound=Pretrained)
 
@@ -71,6 +71,18 @@ def module_of(path: Path, kind: type[Pretrained] | None = None) -> Any:
     renamed = {model._checkpoint_name(name): name for name in model.state_dict()}
     load_into(model, {renamed.get(name, name): value for name, value in weights.items()}, "the checkpoint")
     return model.eval()
+
+
+def check_kind(family: str, kind: type[Pretrained] | None) -> None:
+    """Checks that a model of a family can have a class, before there is a checkpoint; see `module_of`.
+
+    Raises:
+        TypeError: If the class is neither derived from that of the family nor a base of it.
+    """
+    known = _FAMILIES[family][0]
+    if kind is not None and not issubclass(kind, known) and not issubclass(known, kind):
+        name = known.__name__
+        raise TypeError(f"a model of the family {family!r} is a {name}, not a {kind.__name__}; derive the class from {name}")
 
 
 def _parts(path: Path) -> tuple[Stored, dict[str, Tensor]] | None:

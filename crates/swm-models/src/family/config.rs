@@ -46,11 +46,17 @@ pub trait TrainableConfig {
     fn train(&self, run: TrainRun<'_>, control: &mut Control<'_>) -> Result<TrainSummary>;
 
     /// Writes the checkpoint from which a training loop outside this program begins, or checks the one from which it
-    /// continues; `None` for a family that has no such checkpoint.
+    /// continues; `None` for a family that has no such checkpoint. `record` runs before the first checkpoint is written.
     ///
     /// # Errors
     /// As [`crate::train::begin`].
-    fn begin(&self, reader: Arc<dyn Reader>, out: &Path, options: &TrainOptions) -> Option<Result<TrainingPlan>>;
+    fn begin(
+        &self,
+        reader: Arc<dyn Reader>,
+        out: &Path,
+        options: &TrainOptions,
+        record: &dyn Fn() -> Result<()>,
+    ) -> Option<Result<TrainingPlan>>;
 }
 
 impl<M: ModelFamily> TrainableConfig for TrainConfig<M> {
@@ -82,7 +88,13 @@ impl<M: ModelFamily> TrainableConfig for TrainConfig<M> {
         train(self, run.reader, run.out, &run.options, control)
     }
 
-    fn begin(&self, reader: Arc<dyn Reader>, out: &Path, options: &TrainOptions) -> Option<Result<TrainingPlan>> {
-        Some(begin(self, reader, out, options))
+    fn begin(
+        &self,
+        reader: Arc<dyn Reader>,
+        out: &Path,
+        options: &TrainOptions,
+        record: &dyn Fn() -> Result<()>,
+    ) -> Option<Result<TrainingPlan>> {
+        Some(begin(self, reader, out, options, record))
     }
 }

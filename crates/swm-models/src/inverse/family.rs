@@ -77,7 +77,13 @@ impl TrainableConfig for InverseConfig {
         train(self, &world_model, run.reader, run.out, run.options.threads, control)
     }
 
-    fn begin(&self, _: Arc<dyn Reader>, _: &Path, _: &TrainOptions) -> Option<Result<TrainingPlan>> {
+    fn begin(
+        &self,
+        _: Arc<dyn Reader>,
+        _: &Path,
+        _: &TrainOptions,
+        _: &dyn Fn() -> Result<()>,
+    ) -> Option<Result<TrainingPlan>> {
         None
     }
 }

@@ -61,6 +61,9 @@ pub fn train<M: Trainable>(
 /// program; or, to continue a run, checks its checkpoint, and names the old one as the current one if a kill between the two
 /// renamings left only the old one. Returns what the loop needs besides the checkpoint.
 ///
+/// Before the first checkpoint, after all checks, `record` writes what continues the run: a kill between the two leaves no
+/// checkpoint without it.
+///
 /// # Errors
 /// As [`train`], before the first step.
 pub fn begin<M: Trainable>(
@@ -68,12 +71,14 @@ pub fn begin<M: Trainable>(
     reader: Arc<dyn Reader>,
     out: &Path,
     options: &TrainOptions,
+    record: &dyn Fn() -> Result<()>,
 ) -> Result<TrainingPlan> {
     let inputs = Inputs::of(config, &*reader, options)?;
     let _lock = Lock::folder(out)?;
     let (learner, loader) = inputs.learner(config, out, options)?;
     if !Checkpoint::<M>::exists(out) {
         resume::check_new_run(out)?;
+        record()?;
         learner.save(out)?;
     } else {
         checkpoint::restore_old(out)?;

@@ -9,10 +9,12 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 from data_helpers import episode, episodes, same, write
 
+import stable_worldmodel as swm
 from stable_worldmodel import data
 
 
@@ -28,6 +30,64 @@ def test_write_modes_append_replace_or_fail(tmp_path, name):
     assert data.load_dataset(path).lengths.tolist() == [4]
     with pytest.raises(ValueError, match="mode: expected one of append, overwrite, error, got 'replace'"):
         write(path, (5,), mode="replace")
+
+
+class Broken(gymnasium.Env):
+    """Fails at its first step after a reset of an episode."""
+
+    observation_space = action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    metadata = {"render_modes": ["rgb_array"]}
+    steps = 0
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+
+    def render(self):
+        return np.zeros((16, 16, 3), np.uint8)
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps > 1:  # The first step is the one that determines the columns.
+            raise RuntimeError("the robot fell over")
+        return np.zeros(1, np.float32), 0.0, False, False, {}
+
+
+gymnasium.register("Broken-v0", Broken, max_episode_steps=5)
+
+
+@pytest.mark.parametrize("name", ["a.lance", "a.h5", "folder"])
+def test_a_dataset_to_overwrite_stays_until_an_episode_is_accepted(tmp_path, name):
+    path, format = tmp_path / name, None if "." in name else "folder"
+    write(path, (5, 6), format=format)
+
+    def lengths():
+        return data.load_dataset(path, format=format).lengths.tolist()
+
+    with pytest.raises(ValueError, match="row 0"), data.open_writer(path, format=format, mode="overwrite") as writer:
+        writer.write_episode({**episode(0, 4), "action": np.full((4, 2), np.nan, np.float32)})
+    assert lengths() == [5, 6]
+    world = swm.World("Broken-v0", num_envs=1, image_shape=(16, 16))
+    with pytest.raises(RuntimeError, match="fell over"):
+        world.collect(path, episodes=2, format=format, mode="overwrite", policy=swm.policy.RandomPolicy(), progress=False)
+    assert lengths() == [5, 6]
+    with data.open_writer(path, format=format, mode="overwrite") as writer:
+        with pytest.raises(ValueError, match="row 0"):
+            writer.write_episode({**episode(0, 4), "action": np.full((4, 2), np.nan, np.float32)})
+        writer.write_episode(episode(0, 4))
+    assert lengths() == [4]
+
+
+def test_dump_keeps_the_old_dataset_if_an_episode_is_refused(tmp_path):
+    path = tmp_path / "a.lance"
+    write(path, (5, 6))
+    buffer = data.ReplayBuffer(100)
+    buffer.write_episode({"action": np.zeros((3, 1), np.float32), "x": np.full(4, 2**24 + 1)})
+    with pytest.raises(ValueError, match="x"):
+        buffer.dump(path)
+    assert data.load_dataset(path).lengths.tolist() == [5, 6]
 
 
 def test_lists_and_small_types_are_converted(tmp_path):

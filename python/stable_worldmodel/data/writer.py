@@ -45,7 +45,7 @@ class EpisodeWriter:
     Args:
         path: A path, a URI, or a name under `$STABLEWM_HOME/datasets`.
         format: The format; `None` detects it from the path, or selects Lance.
-        mode: `"append"` continues an existing dataset, `"overwrite"` replaces it, `"error"` raises.
+        mode: `"append"` continues an existing dataset, `"overwrite"` replaces it at the first episode, `"error"` raises.
         codec: The codec of images: `"qoi"` (lossless, the default), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
         jpeg_quality: The quality of the codec `"jpeg"`, as in `codec="jpeg-QUALITY"`.
         manifest: The provenance of the data, stored in the dataset's manifest under the key `config`.
@@ -131,7 +131,13 @@ class EpisodeWriter:
             if self._writer is None:
                 columns = [(name, dtype, list(shape)) for name, (dtype, shape) in self._columns.items()]
                 self._writer = _engine.Writer(self.path, self.format, self.mode, self._codec, columns, self._manifest)
-            self._writer.write(fitted, constants)
+            try:
+                self._writer.write(fitted, constants)
+            except BaseException:
+                if self.mode == "overwrite" and not self._writer.episodes():
+                    # To close a writer without episodes would replace the old dataset by an empty one.
+                    self._writer = None
+                raise
 
     def _fitted(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
         """The episode with the columns of the dataset, in their order and types."""

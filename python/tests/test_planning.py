@@ -274,6 +274,8 @@ class Wrong(Quadratic):
             return None
         if self.defect == "nan":
             return cost * torch.where(torch.arange(cost.shape[1]) == 2, torch.nan, 1.0)
+        if self.defect == "complex":
+            return cost * 1j
         if self.defect == "detached":
             return cost.detach()
         raise MyError("mine")
@@ -284,6 +286,7 @@ WRONG = [
     ("scalar", ValueError, r"Wrong\.get_cost.*float"),
     ("nothing", ValueError, r"Wrong\.get_cost.*NoneType"),
     ("nan", ValueError, "NaN"),
+    ("complex", ValueError, r"Wrong\.get_cost: expected real costs, got torch\.complex64"),
     ("raise", MyError, "^mine$"),
 ]
 

@@ -53,7 +53,7 @@ def prepared(info: Mapping[str, Any], process: Mapping[str, Any], transform: Map
 
 
 class CostError(ValueError, AssertionError):
-    """A model returned costs of another shape."""
+    """A model returned costs of another shape, or complex ones."""
 
 
 class Adapter:
@@ -166,8 +166,10 @@ class Adapter:
     def cost(self, candidates: np.ndarray) -> np.ndarray:
         """The costs `(B, S)` of candidates `(B, S, H, A)`."""
         if not self.torch:
-            costs = [self.model.get_cost(infos, part) for infos, part in self._parts(candidates, "cost")]
-            return np.ascontiguousarray(np.concatenate([np.asarray(c) for c in costs]), dtype=np.float32)
+            parts = [self.model.get_cost(infos, part) for infos, part in self._parts(candidates, "cost")]
+            costs = np.concatenate([np.asarray(part) for part in parts])
+            self._check_real(costs)
+            return np.ascontiguousarray(costs, dtype=np.float32)
         with _torch().inference_mode():
             # A recorded cost is overwritten by the next one, so each goes to the CPU before the next.
             parts = [self._numpy([self._cost(infos, part)]) for infos, part in self._parts(candidates, "cost")]
@@ -257,7 +259,12 @@ class Adapter:
             got = tuple(cost.shape) if hasattr(cost, "shape") else type(cost).__name__
             name = type(self.model).__name__
             raise CostError(f"{name}.get_cost: expected costs of shape {expected} (environments, candidates), got {got}")
+        self._check_real(cost)
         return cost if not isinstance(cost, np.ndarray) else _torch().from_numpy(cost)
+
+    def _check_real(self, cost: Any) -> None:
+        if "complex" in str(cost.dtype):
+            raise CostError(f"{type(self.model).__name__}.get_cost: expected real costs, got {cost.dtype}")
 
     def _parts(self, candidates: np.ndarray, what: str) -> Any:
         """Yields pairs of infos, repeated for every candidate, and candidates, for `batch_size` environments at a time."""

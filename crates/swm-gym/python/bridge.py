@@ -475,6 +475,8 @@ class Bridge:
         self.views = {c['name']: view(c['offset'], c['shape'], np.dtype(c['dtype'])) for c in self.columns}
         # Values of goal columns that stay the same throughout the episode.
         self.held = []
+        # Whether a step said if the goal is reached.
+        self.states_success = False
 
     def call(self, function, *arguments, **keywords):
         """Calls the environment. A child process that the environment forked does not continue: it would write into the
@@ -585,7 +587,11 @@ class Bridge:
         if isinstance(reward, (str, bytes)):
             raise ValueError(f'the reward is {reward!r}: return a number')
         key = 'success' if 'success' in info else 'is_success'
-        success = terminated if info.get(key) is None else flag(info[key], f"info['{key}']")
+        value = info.get(key)
+        if value is None and key in info and self.states_success and (terminated or truncated):
+            raise ValueError(f"info['{key}'] is None at the end of an episode: return True or False, as at earlier steps")
+        success = terminated if value is None else flag(value, f"info['{key}']")
+        self.states_success |= value is not None
         distance = info.get('goal_distance', math.inf)
         HEAD.pack_into(self.buffer, 0, float(reward), float(distance), terminated, truncated, success)
 

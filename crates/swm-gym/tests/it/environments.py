@@ -372,13 +372,15 @@ class Loose(gymnasium.Env):
             return observation, 0.0, False, False, {'success': False}
         successes = {'success': 'no', 'nan': float('nan'), 'success-list': (False, False), 'success-nan': [float('nan')]}
         successes |= {'success-minus': -1, 'success-part': 0.01, 'success-two': 2}
-        successes |= {'one-false': [False], 'one-true': np.array([1]), 'numpy': np.bool_(True), 'missing': None}
+        successes |= {'one-false': [False], 'one-true': np.array([1]), 'numpy': np.bool_(True), 'success-gone': None}
         if self.value == 'is-success':
             return observation, 0.0, False, False, {'is_success': (True, True)}
         success = successes.get(self.value, False)
-        ends = {'end-nan': float('nan'), 'end-text': 'False', 'end-none': None, 'end-minus': -1, 'missing': True}
+        ends = {'end-nan': float('nan'), 'end-text': 'False', 'end-none': None, 'end-minus': -1}
+        ends |= {'missing': True, 'success-gone': True}
         reward = '1' if self.value == 'reward' else 0.0
-        return observation, reward, ends.get(self.value, False), False, {'success': success}
+        info = {} if self.value == 'missing' else {'success': success}
+        return observation, reward, ends.get(self.value, False), False, info
 
 
 gymnasium.register('Loose-v0', Loose, max_episode_steps=1_000_000)

@@ -91,6 +91,7 @@ fn observations_of_another_shape_or_type_are_errors() {
             ("success-part", "info['success'] is 0.01"),
             ("success-two", "info['success'] is 2"),
             ("is-success", "info['is_success'] is (True, True)"),
+            ("success-gone", "info['success'] is None at the end of an episode"),
         ])
         .chain([
             ("end-nan", "terminated is nan"),

@@ -373,6 +373,11 @@ def test_ctrl_c_saves_the_checkpoint(rooms, tmp_path):
     assert trainer.step == step
 
 
+def test_null_stands_for_a_missing_option():
+    options = parsed("lewm", ["data=rooms.lance", "out=null", "preset=null"])
+    assert (options.out, options.preset, options.run.name) == (None, None, "lewm-rooms")
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [

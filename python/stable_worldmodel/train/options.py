@@ -114,7 +114,7 @@ def _value(key: str, value: str, default: Any) -> Any:
         if not value.isdecimal():
             raise ValueError(f"{key}: {value!r}; expected a whole number")
         return int(value)
-    return value
+    return None if default is None and value == "null" else value
 
 
 def settings_of(overrides: Mapping[str, Any]) -> list[str]:

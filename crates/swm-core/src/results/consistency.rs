@@ -6,7 +6,6 @@
 
 use super::{Comparison, Counting, Paired, Prediction, Proportion, Results, Run, Summary};
 use serde::Deserialize as _;
-use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
 
 impl Results {
@@ -53,8 +52,8 @@ impl Results {
     /// Checks that the environment, protocol, counting and seed are those of the request in the manifest, as far as it states them.
     fn check_request(&self) -> Result<(), String> {
         let requested = |name: &str| self.manifest.config.get(name);
-        let is_other = requested("env").is_some_and(|env| *env != Value::from(self.env.as_str()))
-            || requested("seed").is_some_and(|seed| *seed != Value::from(self.manifest.seed))
+        let is_other = requested("env").is_some_and(|env| env != self.env.as_str())
+            || requested("seed").is_some_and(|seed| *seed != self.manifest.seed)
             || requested("starts").is_some_and(|starts| (starts == "episodic") != (self.protocol == "episodic"))
             || requested("counting")
                 .is_some_and(|counting| Counting::deserialize(counting).ok() != Some(self.counting));

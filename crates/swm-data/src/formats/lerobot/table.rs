@@ -68,8 +68,7 @@ pub fn read_batches(
         }
         // Rows of the declared shape have fewer values than bytes.
         let is_larger = |group: &RowGroupMetaData| {
-            let read =
-                group.columns().iter().filter(|c| c.column_path().parts().first().is_some_and(|root| is_read(root)));
+            let read = group.columns().iter().filter(|c| c.column_path().parts().first().is_some_and(is_read));
             let most = group.num_rows().saturating_mul(i64::try_from(row_bytes).unwrap_or(i64::MAX));
             row_bytes > 0 && read.map(ColumnChunkMetaData::num_values).any(|values| values > most)
         };

@@ -276,6 +276,11 @@ fn merge_ranges(ranges: &[Range<u64>]) -> Vec<Range<u64>> {
     joined
 }
 
+/// Whether a store lists objects in the order of their names, as Lance expects of it: directory buckets of S3 do not.
+pub(crate) fn lists_in_order(url: &Url) -> bool {
+    !url.host_str().is_some_and(|bucket| bucket.ends_with("--x-s3"))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -295,5 +300,12 @@ mod tests {
         }
         assert!(file.read(std::slice::from_ref(&(0..3_000_001))).is_err());
         Ok(())
+    }
+
+    #[test]
+    fn directory_buckets_are_not_listed_in_order() {
+        let in_order = |text: &str| lists_in_order(&Url::parse(text).expect("a URL"));
+        assert!(in_order("s3://lab/rooms.lance") && in_order("gs://lab--x-s3-data/rooms.lance"));
+        assert!(!in_order("s3://lab--use1-az4--x-s3/rooms.lance"));
     }
 }

@@ -131,7 +131,8 @@ impl Store {
         // This build does not include Lance's own object stores, so `store` is passed to Lance, with any scheme that
         // Lance supports.
         let scheme = Url::parse("memory:///").map_err(|e| Error::external("opening an object store", e))?;
-        let objects = ObjectStore::new(store, scheme, Some(BLOCK), None, false, lists, REQUESTS, RETRIES, None);
+        let ordered = lists && objects::lists_in_order(url);
+        let objects = ObjectStore::new(store, scheme, Some(BLOCK), None, false, ordered, REQUESTS, RETRIES, None);
         Ok(Self { label: location.label(), remote: true, lists, base, objects: Arc::new(objects) })
     }
 

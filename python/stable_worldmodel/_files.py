@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -10,9 +11,10 @@ from pathlib import Path
 def replace(files: Mapping[Path, Callable[[Path], object]]) -> None:
     """Writes files, each by a function of the path to write to: beside its place, which it takes once all are written.
 
-    What a kill leaves beside a file is replaced when the file is written again.
+    A kill leaves `.NAME.NUMBER.tmp`, which the next `swm eval` into this folder deletes if NAME is its own.
     """
-    beside = {path: path.with_name(f".{path.name}.tmp") for path in files}
+    # Other threads and processes may write the same file.
+    beside = {path: path.with_name(f".{path.name}.{threading.get_native_id()}.tmp") for path in files}
     try:
         for path, write in files.items():
             # A link is not written through.

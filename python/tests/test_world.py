@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
@@ -172,6 +173,14 @@ def test_metrics_replace_older_results_as_a_whole_and_nothing_else(tmp_path):
     with pytest.raises(FileExistsError, match="holds no results"):
         few.save(thesis)
     assert thesis.read_text() == "thesis"
+
+
+def test_threads_save_metrics_to_one_file(tmp_path):
+    metrics = rooms(num_envs=2).evaluate(policy=swm.policy.RandomPolicy(), episodes=2, seed=1, progress=False)
+    with ThreadPoolExecutor(8) as threads:
+        list(threads.map(lambda _: metrics.save(tmp_path / "results.json"), range(200)))
+    assert len(json.loads((tmp_path / "results.json").read_text())["runs"][0]["episodes"]) == 2
+    assert [file.name for file in tmp_path.iterdir()] == ["results.json"]
 
 
 @pytest.mark.parametrize(

@@ -99,9 +99,7 @@ def fitted(options: Options, resources: Mapping[str, float] | None = None, wait:
             f"resume=true continues it"
         ) from error
     if refused.exists():
-        reason = refused.read_text(encoding="utf-8")
-        refused.unlink()
-        raise ValueError(reason)
+        raise ValueError(refused.read_text(encoding="utf-8"))
     return str(run)
 
 

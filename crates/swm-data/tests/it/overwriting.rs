@@ -2,7 +2,8 @@
 
 use crate::sample::{check, episode, options, schema, write};
 use swm_core::{Batch, ColumnSpec, DType, Schema};
-use swm_data::{WriteMode, create, open};
+use swm_data::lance::{Shard, commit_shards, create_shard};
+use swm_data::{Location, WriteMode, create, open};
 
 #[test]
 fn refused_first_episodes_keep_the_old_dataset() {
@@ -42,6 +43,24 @@ fn values_that_lance_cannot_store_keep_the_old_table() {
     let mut writer = create(&path, &schema, options(WriteMode::Overwrite)).expect("replacing");
     writer.write_episode(&rows).expect_err("an integer beyond float32");
     drop(writer);
+    check(&*open(&path).expect("opening"), 0);
+}
+
+#[test]
+fn refused_first_episode_keeps_the_old_shard() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let path = folder.path().join("data.lance");
+    let location = Location::from(&path);
+    let writer = |mode| create_shard(&location, &schema(), options(mode), Shard { index: 0, count: 1 });
+    let mut first = writer(WriteMode::Create).expect("creating the shard");
+    (0..3).for_each(|e| first.write_episode(&episode(e)).expect("writing an episode"));
+    first.finish().expect("finishing the shard");
+    let mut without_action = episode(5);
+    without_action.get_mut::<f32>("action").expect("the actions")[0] = f32::NAN;
+    let mut second = writer(WriteMode::Overwrite).expect("replacing the shard");
+    second.write_episode(&without_action).expect_err("a missing action");
+    second.pause().expect("nothing is written");
+    assert_eq!(commit_shards(&location).expect("committing the shard"), 3);
     check(&*open(&path).expect("opening"), 0);
 }
 

@@ -14,8 +14,10 @@ use super::schema;
 use super::store::{Store, Version};
 use super::table::{MAX_ATTEMPTS, Table};
 use super::writer::{PreparedWriter, Sink, match_table_columns, new_table_schema, too_many_conflicts};
-use crate::dataset::{Location, Reader as _};
+use crate::dataset::episodes::check_episode;
+use crate::dataset::{Constants, Location, Reader as _};
 use crate::dataset::{WriteMode, WriteOptions, Writer};
+use crate::formats::replacing::ReplacingWriter;
 use lance_table::format::Fragment;
 use lance_table::transaction::Operation;
 use object_store::ObjectMeta;
@@ -25,7 +27,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 use std::sync::Arc;
-use swm_core::{Error, Manifest, Result, Schema};
+use swm_core::{Batch, Error, Manifest, Result, Schema};
 use swm_image::ImageCodec;
 
 /// The part of a dataset that one machine writes.
@@ -80,7 +82,8 @@ struct ShardEnd {
 }
 
 /// Writes one shard of a dataset. Readers return the episodes of a shard only after [`commit_shards`]. `options.mode`
-/// refers to the shard: [`WriteMode::Append`] continues a killed shard, [`WriteMode::Overwrite`] replaces the shard.
+/// refers to the shard: [`WriteMode::Append`] continues a killed shard, [`WriteMode::Overwrite`] replaces the shard,
+/// which stays until the first episode is ready to be written.
 /// The dataset may be new or contain episodes.
 ///
 /// # Errors
@@ -112,15 +115,16 @@ pub fn create_shard(
         }
     }
     let begun = ShardStart { columns: schema.clone(), codec: options.codec, manifest: options.manifest.clone() };
-    let logs = Logs::read_shard(&store, shard)?;
+    let mut logs = Logs::read_shard(&store, shard)?;
+    let mut replaced = None;
     let (mut groups, mut episodes) = (0, 0);
-    if let Some(shard_log) = logs.shards.get(&(shard.count, shard.index)) {
+    if let Some(shard_log) = logs.shards.remove(&(shard.count, shard.index)) {
         match options.mode {
             WriteMode::Create => {
                 let problem = format!("shard {} of {} already exists", shard.index, shard.count);
                 return Err(Error::config("shard", problem, "append to the shard, or overwrite it"));
             }
-            WriteMode::Overwrite => shard_log.remove(&store, shard),
+            WriteMode::Overwrite => replaced = Some(shard_log),
             WriteMode::Append => {
                 shard_log.check_columns(&store, &begun)?;
                 groups = shard_log.groups.len();
@@ -128,9 +132,24 @@ pub fn create_shard(
             }
         }
     }
-    let mut log = ShardLog { table: Table::new(store, version, fresh), folder: shard.folder(), groups };
-    log.write_entry("begun.json", &begun)?;
-    PreparedWriter { sink: Sink::Shard(log), columns, episodes }.start(schema, &options, lock)
+    let is_replaced = replaced.is_some();
+    let (checked, schema, incoming, codec) = (columns.clone(), schema.clone(), schema.clone(), options.codec);
+    let start = move || {
+        if let Some(old) = replaced {
+            old.remove(&store, shard);
+        }
+        let mut log = ShardLog { table: Table::new(store, version, fresh), folder: shard.folder(), groups };
+        log.write_entry("begun.json", &begun)?;
+        PreparedWriter { sink: Sink::Shard(log), columns, episodes }.start(&schema, &options, lock)
+    };
+    if !is_replaced {
+        return start();
+    }
+    let check = move |episode: &Batch, constants: &Constants| {
+        check_episode(episode, &incoming)?;
+        EncodedEpisode::new(&checked, episode, codec, constants).map(drop)
+    };
+    Ok(ReplacingWriter::boxed(check, start))
 }
 
 /// The log of the shard that this process writes.

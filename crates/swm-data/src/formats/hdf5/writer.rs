@@ -43,7 +43,7 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
             let replace = move || -> Result<Box<dyn Writer>> {
                 // The old file stays locked until the new one replaces it.
                 let _old = old;
-                let temporary = temporary_path(&path);
+                let temporary = temporary_path(&path)?;
                 let mut writer = create_file(&temporary, &schema, options.manifest.as_ref())?;
                 writer.policy = options.commit;
                 Ok(Box::new(replace_file(writer, &temporary, &path)?))
@@ -115,10 +115,12 @@ fn check_is_dataset(file: &Lock, path: &Path) -> Result<()> {
     })
 }
 
-/// A temporary path in the folder of `path`.
-fn temporary_path(path: &Path) -> PathBuf {
-    let name = format!(".{}.tmp", uuid::Uuid::new_v4().simple());
-    path.with_file_name(name)
+/// The temporary path of a file that replaces the one at `path`, whose lock the caller holds. Deletes what a kill left there.
+fn temporary_path(path: &Path) -> Result<PathBuf> {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let temporary = path.with_file_name(format!(".{name}.copy.tmp"));
+    files::delete_file(&temporary)?;
+    Ok(temporary)
 }
 
 /// Replaces the file at `path` with the complete file at `temporary`.
@@ -135,7 +137,7 @@ fn copy_to_this_layout(path: &Path, reader: &Hdf5Reader) -> Result<Hdf5Writer> {
         return Err(Error::corrupt(path, problem, "convert it to a new dataset, without this column"));
     }
     let schema = Schema::new(reader.stored())?;
-    let temporary = temporary_path(path);
+    let temporary = temporary_path(path)?;
     let copy = || {
         let mut writer = create_file(&temporary, &schema, reader.manifest().as_ref())?;
         let names: Vec<&str> = schema.columns().iter().map(|column| &*column.name).collect();

@@ -149,8 +149,10 @@ fn features_that_contradict_the_recorded_columns_are_refused() {
             let side = &mut features[name]["shape"][0];
             *side = (side.as_u64().expect("a side") + 1).into();
         });
-        assert!(other.contains(&format!("the feature '{name}' has the shape")), "{other}");
+        assert!(other.contains(&format!("the feature '{name}' is")), "{other}");
     }
+    let integers = error(&|features| features["action"]["dtype"] = "int64".into());
+    assert!(integers.contains("the feature 'action' is int64"), "{integers}");
     for dtype in ["string", "float32"] {
         let other = error(&|features| features["observation.images.pixels"]["dtype"] = dtype.into());
         assert!(other.contains("pixels"), "{dtype}: {other}");

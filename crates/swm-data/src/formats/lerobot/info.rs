@@ -201,10 +201,17 @@ impl Info {
                 (ColumnSpec::new(name, dtype, shape), Kind::Values)
             };
             let spec = match recorded {
-                Some(known) if known.len() == spec.len() && known.is_image() == camera => known.clone(),
+                Some(known)
+                    if known.len() == spec.len()
+                        && known.is_image() == camera
+                        && (camera || known.dtype == spec.dtype) =>
+                {
+                    known.clone()
+                }
                 Some(known) => {
-                    let shapes = format!("{:?}, its recorded column {:?}", feature.shape, known.shape);
-                    return Err(damaged(root, format!("the feature '{native}' has the shape {shapes}")));
+                    let recorded = format!("its recorded column {} {:?}", known.dtype.name(), known.shape);
+                    let own = format!("{} {:?}", feature.dtype, feature.shape);
+                    return Err(damaged(root, format!("the feature '{native}' is {own}, {recorded}")));
                 }
                 // The writer of this format adds features that are not in the schema passed to it.
                 _ if self.stable_worldmodel.is_some() => continue,

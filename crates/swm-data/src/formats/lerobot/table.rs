@@ -25,13 +25,23 @@ const ROWS: usize = 4096;
 /// The size of a decoded batch, in bytes of the columns that it is read for.
 const BATCH_BYTES: usize = 16 << 20;
 
+/// The most bytes of a table that is read as a whole.
+const TABLE_BYTES: usize = 1 << 30;
+
+/// A row of a table that is read as a whole has fewer bytes, if it is not made to fill the memory.
+const TABLE_ROW_BYTES: usize = 1 << 16;
+
 /// Reads columns of a small file: all rows. The result lacks the columns that do not exist.
 ///
 /// # Errors
-/// As [`read_batches`].
+/// As [`read_batches`], and if the rows take more than a GiB: a small file can repeat a long text in many rows.
 pub fn read(path: &Path, columns: &[&str]) -> Result<Vec<RecordBatch>> {
-    let mut batches = vec![];
-    read_batches(path, columns, None, 0, &mut |batch| {
+    let (mut batches, mut bytes) = (vec![], 0);
+    read_batches(path, columns, None, TABLE_ROW_BYTES, &mut |batch| {
+        bytes += batch.get_array_memory_size();
+        if bytes > TABLE_BYTES {
+            return Err(damaged(path, format!("its rows take more than {TABLE_BYTES} bytes")));
+        }
         batches.push(batch);
         Ok(())
     })?;

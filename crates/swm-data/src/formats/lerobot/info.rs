@@ -201,18 +201,8 @@ impl Info {
                 (ColumnSpec::new(name, dtype, shape), Kind::Values)
             };
             let spec = match recorded {
-                Some(known)
-                    if known.len() == spec.len()
-                        && known.is_image() == camera
-                        && (camera || known.dtype == spec.dtype) =>
-                {
-                    known.clone()
-                }
-                Some(known) => {
-                    let recorded = format!("its recorded column {} {:?}", known.dtype.name(), known.shape);
-                    let own = format!("{} {:?}", feature.dtype, feature.shape);
-                    return Err(damaged(root, format!("the feature '{native}' is {own}, {recorded}")));
-                }
+                Some(known) if feature.is_stored_as(known, &spec) => known.clone(),
+                Some(known) => return Err(feature.contradicts(known, native, root)),
                 // The writer of this format adds features that are not in the schema passed to it.
                 _ if self.stable_worldmodel.is_some() => continue,
                 _ => spec,
@@ -271,6 +261,18 @@ impl Feature {
             _ => return None,
         };
         (sides.0 > 0 && sides.1 > 0 && sides.0 < 1 << 16 && sides.1 < 1 << 16).then_some(sides)
+    }
+
+    /// Whether the feature, read as `spec`, is that of a recorded column.
+    fn is_stored_as(&self, known: &ColumnSpec, spec: &ColumnSpec) -> bool {
+        let camera = spec.is_image();
+        known.len() == spec.len() && known.is_image() == camera && (camera || known.dtype == spec.dtype)
+    }
+
+    /// The error of a feature that differs from its recorded column.
+    fn contradicts(&self, known: &ColumnSpec, native: &str, root: &Path) -> Error {
+        let recorded = format!("its recorded column {} {:?}", known.dtype.name(), known.shape);
+        damaged(root, format!("the feature '{native}' is {} {:?}, {recorded}", self.dtype, self.shape))
     }
 
     /// The column type for the feature's values, or `None` for text. Only `uint64` values from 2^63 on do not fit.

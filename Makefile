@@ -177,7 +177,7 @@ test-gpu: gpu
 	@ls /usr/share/vulkan/icd.d/*.json /etc/vulkan/icd.d/*.json 2>/dev/null | grep -q . || { $(SUDO) apt-get update -qq && \
 	  DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install -y -qq --no-install-recommends mesa-vulkan-drivers; }
 	$(GPU_TARGET)/release/swm devices
-	CARGO_TARGET_DIR=$(GPU_TARGET) SWM_TEST_DEVICE=$(DEVICE) $(CARGO) test --release -p swm-models --features vulkan --lib --test it
+	CARGO_TARGET_DIR=$(GPU_TARGET) SWM_TEST_DEVICE=$(DEVICE) $(CARGO) test --release -p swm-models --features vulkan --test it -- devices golden
 	rm -rf $(GPU_TARGET)/demo && $(GPU_TARGET)/release/swm demo --device $(DEVICE) --output $(GPU_TARGET)/demo \
 	  --episodes 40 --eval-episodes 6 --envs 6 schedule.steps=40
 

@@ -5,7 +5,7 @@
 //! - [`write()`] replaces a file whole: readers and killed processes see the old content or the new.
 //! - [`check_free`] and [`check_own`] refuse to replace a file that the program did not write.
 //! - [`delete_named`] removes regular files of a folder by their exact names, [`delete`] by the patterns of names that only
-//!   the program gives, and nothing else.
+//!   the program gives, and nothing else. [`move_named`] moves them.
 //! - [`Lock`] keeps a second writer away from a file or folder.
 
 mod lock;
@@ -178,6 +178,52 @@ pub fn delete_named(folder: &Path, names: &[PathBuf]) -> Result<()> {
     folders.iter().rev().try_for_each(|name| remove_empty_folder(&folder.join(name)))
 }
 
+/// Moves regular files of the folder `from`, given by their relative paths, in this order, to the same paths in `to`, on the
+/// same file system. Files that do not exist are skipped. Then removes the folders below `from` that this emptied.
+///
+/// # Errors
+/// When something exists at the new path of a file, or a file cannot be moved. The files before it are moved then.
+pub fn move_named(from: &Path, names: &[PathBuf], to: &Path) -> Result<()> {
+    let mut folders = BTreeSet::new();
+    for name in names {
+        let (old, new) = (from.join(name), to.join(name));
+        if !kind(&old)?.is_some_and(|found| found.is_file()) {
+            continue;
+        }
+        check_free(&new)?;
+        if let Some(folder) = new.parent() {
+            std::fs::create_dir_all(folder).map_err(|error| Error::io(folder, "creating the folder", error))?;
+        }
+        std::fs::rename(&old, &new).map_err(|error| Error::io(&old, "moving the file", error))?;
+        folders.extend(name.ancestors().skip(1).filter(|parent| !parent.as_os_str().is_empty()).map(Path::to_path_buf));
+    }
+    // A folder follows its parent in a sorted set.
+    folders.iter().rev().try_for_each(|name| remove_empty_folder(&from.join(name)))
+}
+
+/// The relative paths of the regular files in a folder and its folders. Links are left out.
+///
+/// # Errors
+/// When a folder cannot be read.
+pub fn list(folder: &Path) -> Result<Vec<PathBuf>> {
+    let (mut names, mut folders) = (vec![], vec![PathBuf::new()]);
+    while let Some(below) = folders.pop() {
+        let path = folder.join(&below);
+        let io = |error| Error::io(&path, "reading the folder", error);
+        for entry in std::fs::read_dir(&path).map_err(io)? {
+            let entry = entry.map_err(io)?;
+            let (kind, name) = (entry.file_type().map_err(io)?, below.join(entry.file_name()));
+            if kind.is_dir() {
+                folders.push(name);
+            } else if kind.is_file() {
+                names.push(name);
+            }
+        }
+    }
+    names.sort();
+    Ok(names)
+}
+
 /// Checks that a path is a folder, or that nothing exists there. Returns whether nothing exists.
 fn check_folder(path: &Path) -> Result<bool> {
     match kind(path)? {
@@ -290,6 +336,21 @@ pub fn remove_empty_folder(folder: &Path) -> Result<()> {
         }
         _ => Ok(()),
     }
+}
+
+/// Removes the empty folders in a folder, then the folder itself if it is empty. Links are not followed.
+///
+/// # Errors
+/// When a folder cannot be read, or an empty folder cannot be removed.
+pub fn remove_empty_folders(folder: &Path) -> Result<()> {
+    let io = |error| Error::io(folder, "reading the folder", error);
+    for entry in std::fs::read_dir(folder).map_err(io)? {
+        let entry = entry.map_err(io)?;
+        if entry.file_type().map_err(io)?.is_dir() {
+            remove_empty_folders(&entry.path())?;
+        }
+    }
+    remove_empty_folder(folder)
 }
 
 fn unlink(path: &Path) -> std::io::Result<()> {

@@ -1,5 +1,6 @@
 //! [`FormatEntry`]: the registry row of a dataset format.
 
+use super::set_aside;
 use crate::dataset::{Location, Reader, WriteMode, WriteOptions, Writer};
 use std::path::Path;
 use std::sync::Arc;
@@ -56,9 +57,15 @@ impl FormatEntry {
     /// Opens a dataset.
     ///
     /// # Errors
-    /// If there is no such dataset, it is damaged, or this build lacks the format's feature.
+    /// If there is no such dataset, it is damaged or being replaced, or this build lacks the format's feature.
     pub fn open(&self, location: &Location) -> Result<Arc<dyn Reader>> {
-        let reader = (self.backend()?.open)(location)?;
+        let opened = (self.backend()?.open)(location);
+        if opened.as_ref().map_or(true, |reader| reader.episodes().is_empty())
+            && let Some(error) = set_aside::interrupted(location)
+        {
+            return Err(error);
+        }
+        let reader = opened?;
         check_sizes(&*reader, location)?;
         Ok(reader)
     }

@@ -12,6 +12,7 @@ mod lance_video;
 mod lerobot;
 pub mod registry;
 mod replacing;
+mod set_aside;
 #[cfg_attr(not(feature = "hdf5"), allow(dead_code, reason = "npz files use only a part of this module"))]
 mod stored_scalar;
 mod video;

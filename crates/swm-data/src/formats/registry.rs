@@ -1,7 +1,7 @@
 //! The list of dataset formats, and [`open`] and [`create`], which choose a format by a dataset's location.
 
 use super::entry::FormatEntry;
-use super::{folder, hdf5, lance, lance_video, lerobot, video};
+use super::{folder, hdf5, lance, lance_video, lerobot, set_aside, video};
 use crate::dataset::{Location, Reader, WriteOptions, Writer};
 use std::sync::Arc;
 use swm_core::{Error, Named, Registry, Result, Schema};
@@ -35,6 +35,9 @@ pub fn open(location: impl Into<Location>) -> Result<Arc<dyn Reader>> {
     let location = location.into();
     if let Some(format) = detect(&location) {
         return format.open(&location);
+    }
+    if let Some(error) = set_aside::interrupted(&location) {
+        return Err(error);
     }
     let problem = match location.path().map(|path| path.try_exists()) {
         Some(Ok(false)) => "there is no such dataset",

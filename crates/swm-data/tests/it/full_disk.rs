@@ -2,7 +2,7 @@
 //!
 //! A child process writes with a limit on the size of files, or on a small file system if the test may mount one.
 
-use crate::sample::{check, episode, options, schema};
+use crate::sample::{check, episode, options, schema, write};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use swm_data::{CommitPolicy, WriteMode, WriteOptions, create, open};
@@ -12,12 +12,16 @@ const TARGET: &str = "SWM_TEST_FULL_DISK";
 /// Environment variable of child processes: the number of episodes to write.
 const EPISODES: &str = "SWM_TEST_FULL_DISK_EPISODES";
 
+/// Environment variable of child processes: whether to replace the dataset.
+const REPLACES: &str = "SWM_TEST_FULL_DISK_REPLACES";
+
 /// A child process. Writes episodes without a commit until writing fails; then prints the error.
 #[test]
 fn child_that_fills_the_disk() {
     let Some(path) = std::env::var_os(TARGET).map(PathBuf::from) else { return };
     let commit = CommitPolicy { interval: std::time::Duration::from_secs(600), ..CommitPolicy::default() };
-    let mut writer = create(&path, &schema(), WriteOptions { commit, ..options(WriteMode::Create) }).expect("creating");
+    let mode = if std::env::var_os(REPLACES).is_some() { WriteMode::Overwrite } else { WriteMode::Create };
+    let mut writer = create(&path, &schema(), WriteOptions { commit, ..options(mode) }).expect("creating");
     let episodes: usize = std::env::var(EPISODES).ok().and_then(|count| count.parse().ok()).expect("a count");
     let finished = (0..episodes).try_for_each(|e| writer.write_episode(&episode(e))).and_then(|()| writer.finish());
     match finished {
@@ -28,9 +32,14 @@ fn child_that_fills_the_disk() {
 
 /// Writes until the disk is full, and returns the number of stored episodes and the error.
 fn fill(path: &Path, limit: &str, episodes: usize) -> (usize, String) {
+    fill_with(path, limit, episodes, &[])
+}
+
+fn fill_with(path: &Path, limit: &str, episodes: usize, variables: &[(&str, &str)]) -> (usize, String) {
     let mut command = Command::new("sh");
     let child = "exec \"$0\" --exact full_disk::child_that_fills_the_disk --nocapture";
     command.args(["-c", &format!("{limit} {child}")]).arg(std::env::current_exe().expect("the test executable"));
+    command.envs(variables.iter().copied());
     let output = command.env(TARGET, path).env(EPISODES, episodes.to_string()).output().expect("running the child");
     let text = String::from_utf8_lossy(&output.stdout);
     let failure = text.lines().find_map(|line| line.split_once("failed: ")).unwrap_or_else(|| {
@@ -45,6 +54,27 @@ fn check_error(stored: usize, error: &str, format: &str) {
     let expected =
         if stored == 1 { "(1 episode is stored)".to_owned() } else { format!("({stored} episodes are stored)") };
     assert!(error.contains(&expected), "{format}: {error}");
+}
+
+#[test]
+fn replacement_that_does_not_fit_keeps_the_old_dataset() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    for format in ["lance", "lance-video", "folder", "video", "h5", "lerobot"] {
+        let path = folder.path().join(format!("data.{format}"));
+        write(&path, WriteMode::Create, 1, 0..3);
+        let before = folder.path().read_dir().expect("listing").count();
+        for blocks in [0, 1, 2, 4] {
+            let limit = format!("trap '' XFSZ; ulimit -f {blocks};");
+            let (stored, error) = fill_with(&path, &limit, 60, &[(REPLACES, "yes")]);
+            if stored == 3 {
+                assert!(!error.contains("did not fill"), "{format}: {error}");
+            }
+            assert!(stored > 0, "{format}, {blocks}: {error}");
+            let aside = ["ep_len.replaced", "meta/replaced"].map(|name| path.join(name).exists());
+            assert_eq!(aside, [false; 2], "{format}, {blocks}: nothing is left aside");
+        }
+        assert_eq!(folder.path().read_dir().expect("listing").count(), before, "{format}: nothing is beside it");
+    }
 }
 
 #[test]

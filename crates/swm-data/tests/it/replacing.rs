@@ -270,7 +270,18 @@ fn killed_replacements_keep_files_of_the_user() {
         write(&path, WriteMode::Create, 1, 0..2);
         let own = names(&path);
         add_user_files(&path);
-        kill::replacements(&path, 4, check_user_files);
+        kill::replacements(&path, 6, |path| {
+            check_user_files(path);
+            if let Err(error) = open(path) {
+                assert!(error.to_string().contains("its old files are in"), "{format}: {error}");
+                // The next writer brings the old dataset back.
+                create(path, &schema(), options(WriteMode::Append)).and_then(|writer| writer.finish()).expect("appending");
+            }
+            let reader = open(path).expect("opening the old or the new dataset");
+            assert!(!reader.episodes().is_empty(), "{format}: {:?}", names(path));
+            check(&*reader, 0);
+            check_user_files(path);
+        });
         write(&path, WriteMode::Overwrite, 1, 0..2);
         check(&*open(&path).expect("opening"), 0);
         check_user_files(&path);

@@ -20,8 +20,8 @@
 //! declares. The journal is merged when it is half as large as the column files, and when the writer finishes, so the
 //! total amount written is a small multiple of the data.
 //!
-//! **Replacing** ([`remove`]) deletes the old dataset's own files in place, its metadata last, before the new dataset is
-//! created. Other files in the folder are neither deleted nor moved nor overwritten.
+//! **Replacing** moves the old dataset's own files to `ep_len.replaced/`, its metadata last, until the new dataset has a
+//! committed episode. Other files in the folder are neither deleted nor moved nor overwritten.
 
 mod images;
 mod journal;

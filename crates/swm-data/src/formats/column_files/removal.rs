@@ -2,50 +2,73 @@
 
 use super::images::uncommitted;
 use super::reader::stored_metadata;
-use super::{ImageFiles, LENGTHS, OFFSETS, TEMPORARY, check_name, journal};
+use super::{ImageFiles, OFFSETS, TEMPORARY, check_name, journal};
 use crate::formats::replacing::check_no_links;
+use crate::formats::set_aside::{self, DatasetFiles};
 use std::path::{Path, PathBuf};
 use swm_core::files::{self, Lock};
 use swm_core::{ColumnSpec, Error, Result, Schema};
 
-/// Deletes the dataset in a folder.
-///
-/// # Errors
-/// As [`clear`], and if another process writes to the dataset.
-pub(crate) fn remove(folder: &Path, images: ImageFiles) -> Result<()> {
-    let _lock = Lock::folder(folder)?;
-    clear(folder, images)?;
-    files::delete_named(folder, &[format!("{LENGTHS}.npz").into()])
-}
+/// The file whose replacement commits a merge, and without which there is no dataset.
+const LENGTHS_FILE: &str = "ep_len.npz";
 
-/// Deletes the dataset in a folder that the caller has locked, except `ep_len.npz`: the files of its own columns and
-/// episodes, as `ep_len.npz` and the journal name them.
+/// Deletes the dataset in a folder: the files of its own columns and episodes, as `ep_len.npz` and the journal name them.
 ///
-/// Images are deleted first, then column files, then the journal; nothing is moved. The `ep_len.npz` of the next dataset
-/// replaces the old one. So after a kill at any time the remaining files still have the metadata that names them: readers
-/// report the missing files, and the next replacement deletes the rest.
+/// Images are deleted first, then column files, then the journal, and `ep_len.npz` last. So after a kill at any time the
+/// remaining files still have the metadata that names them: readers report the missing files, and the next removal deletes
+/// the rest.
 ///
 /// # Errors
 /// If the metadata cannot be read or records no columns, the dataset has the other format, or a file is a symbolic link;
-/// then nothing is deleted. Also if a file cannot be deleted.
-pub(super) fn clear(folder: &Path, images: ImageFiles) -> Result<()> {
-    let (schema, names) = stored_files(folder, images)?;
-    files::delete_named(folder, &names)?;
-    // The folders of a dataset without episodes.
-    let mut columns = schema.columns().iter().filter(|column| column.is_image());
-    columns.try_for_each(|column| files::remove_empty_folder(&folder.join(&column.name)))
+/// then nothing is deleted. Also if a file cannot be deleted, or another process writes to the dataset.
+pub(crate) fn remove(folder: &Path, images: ImageFiles) -> Result<()> {
+    let _lock = Lock::folder(folder)?;
+    set_aside::recover(folder, images)?;
+    let names = images.names(folder)?;
+    images.remove_empty_folders(folder)?;
+    files::delete_named(folder, &names)
 }
 
-/// Checks that [`clear`] can delete the dataset in a folder.
+impl DatasetFiles for ImageFiles {
+    fn set_aside(self) -> &'static str {
+        set_aside::FOLDERS[0]
+    }
+
+    fn metadata(self) -> &'static str {
+        LENGTHS_FILE
+    }
+
+    fn names(self, folder: &Path) -> Result<Vec<PathBuf>> {
+        let (_, mut names) = stored_files(folder, self)?;
+        names.push(LENGTHS_FILE.into());
+        Ok(names)
+    }
+
+    fn committed(self, folder: &Path) -> Result<usize> {
+        Ok(stored_episodes(folder)?.1.len())
+    }
+
+    fn unfinished(self) -> Vec<PathBuf> {
+        vec![format!("{OFFSETS}.npz").into(), TEMPORARY.into()]
+    }
+
+    fn remove_empty_folders(self, folder: &Path) -> Result<()> {
+        let (schema, ..) = stored_episodes(folder)?;
+        let mut columns = schema.columns().iter().filter(|column| column.is_image());
+        columns.try_for_each(|column| files::remove_empty_folder(&folder.join(&column.name)))
+    }
+}
+
+/// Checks that the dataset in a folder can be replaced.
 ///
 /// # Errors
-/// As [`clear`].
-pub(super) fn check_clear(folder: &Path, images: ImageFiles) -> Result<()> {
+/// As [`remove`].
+pub(super) fn check_replaceable(folder: &Path, images: ImageFiles) -> Result<()> {
     let (_, names) = stored_files(folder, images)?;
     check_no_links(folder, &names)
 }
 
-/// The columns, and the files that [`clear`] deletes, in the order of deletion.
+/// The columns, and the files apart from `ep_len.npz`, in the order of deletion.
 fn stored_files(folder: &Path, images: ImageFiles) -> Result<(Schema, Vec<PathBuf>)> {
     let (schema, rows, killed) = stored_episodes(folder)?;
     let mut names = vec![];

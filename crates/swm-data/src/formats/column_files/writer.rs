@@ -9,6 +9,7 @@ use super::{
 use crate::dataset::episodes::{self, EpisodeRows};
 use crate::dataset::{CommitPolicy, Constants, StepRange, WriteMode, WriteOptions, Writer, is_full, with_stored};
 use crate::formats::replacing::ReplacingWriter;
+use crate::formats::set_aside;
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -39,7 +40,7 @@ pub(crate) struct ColumnFilesWriter {
     group: Vec<Vec<u8>>,
     /// Number of committed episodes.
     committed: usize,
-    /// Whether the `ep_len.npz` in the folder is that of this dataset, not of the replaced one.
+    /// Whether the folder has the `ep_len.npz` of this dataset.
     merged: bool,
     /// Number of rows in the column files.
     rows_in_files: usize,
@@ -59,7 +60,8 @@ pub(crate) struct ColumnFilesWriter {
 
 impl ColumnFilesWriter {
     /// Creates, continues or replaces the column files of a folder, and returns the writer that `make` builds on them.
-    /// `known` is the schema of the dataset to continue.
+    /// `known` returns the schema of the dataset to continue, and `committed` the [number of committed
+    /// episodes](Self::committed) of the writer.
     ///
     /// # Errors
     /// If the dataset exists and `options.mode` forbids it, its columns differ, another process writes to it, or
@@ -68,11 +70,13 @@ impl ColumnFilesWriter {
         folder: &Path,
         schema: &Schema,
         options: WriteOptions,
-        known: Option<&Schema>,
+        known: impl FnOnce() -> Result<Schema>,
         images: ImageFiles,
         make: impl FnOnce(Self) -> W + Send + 'static,
+        committed: fn(&W) -> usize,
     ) -> Result<Box<dyn Writer>> {
         check_columns(schema)?;
+        set_aside::recover_unlocked(folder, images)?;
         let exists = exists(folder);
         if !exists && folder.is_dir() && !has_no_dataset(folder) {
             let problem = format!("{} holds other files", folder.display());
@@ -88,16 +92,17 @@ impl ColumnFilesWriter {
         image_columns.try_for_each(|column| files::check_no_link(&folder.join(&column.name)))?;
         if exists && options.mode == WriteMode::Overwrite {
             removal::check_new_files(folder, schema)?;
-            removal::check_clear(folder, images)?;
+            removal::check_replaceable(folder, images)?;
             let (folder, schema, incoming) = (folder.to_owned(), schema.clone(), schema.clone());
-            let replace = move || -> Result<Box<dyn Writer>> {
-                removal::clear(&folder, images)?;
-                Ok(Box::new(make(Self::begin(&folder, &schema, &options, None, images, lock)?)))
+            let replace = move || {
+                let begin = || Self::begin(&folder, &schema, &options, None, images, lock).map(make);
+                set_aside::replace(&folder, images, committed, begin)
             };
             let check = move |episode: &Batch, _: &Constants| episodes::check_episode(episode, &incoming);
             return Ok(ReplacingWriter::boxed(check, replace));
         }
-        Ok(Box::new(make(Self::begin(folder, schema, &options, known, images, lock)?)))
+        let known = (exists && options.mode == WriteMode::Append).then(known).transpose()?;
+        Ok(Box::new(make(Self::begin(folder, schema, &options, known.as_ref(), images, lock)?)))
     }
 
     /// Begins to write into a folder, which is locked.
@@ -197,6 +202,11 @@ impl ColumnFilesWriter {
     /// Number of episodes, including uncommitted episodes.
     pub fn episodes(&self) -> usize {
         self.rows.episodes().len()
+    }
+
+    /// Number of committed episodes.
+    pub fn committed(&self) -> usize {
+        self.committed
     }
 
     /// The folder of the dataset.

@@ -3,8 +3,8 @@
 use super::reader::FolderReader;
 use crate::dataset::Location;
 use crate::dataset::episodes;
-use crate::dataset::{Constants, Reader as _, WriteMode, WriteOptions, Writer};
-use crate::formats::column_files::{ColumnFilesWriter, ImageFiles, SUFFIXES, exists, image_path};
+use crate::dataset::{Constants, Reader as _, WriteOptions, Writer};
+use crate::formats::column_files::{ColumnFilesWriter, ImageFiles, SUFFIXES, image_path};
 use rayon::prelude::*;
 use std::io::Write as _;
 use swm_core::{Batch, Error, Result, Schema, files};
@@ -14,14 +14,10 @@ use swm_image::ImageCodec;
 pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
     let folder = location.local("folder")?;
     options.codec.check()?;
-    let known = if options.mode == WriteMode::Append && exists(folder) {
-        Some(FolderReader::open(folder)?.schema().clone())
-    } else {
-        None
-    };
+    let known = || Ok(FolderReader::open(folder)?.schema().clone());
     let (incoming, codec) = (schema.clone(), options.codec);
     let make = move |columns| FolderWriter { columns, schema: incoming, codec };
-    ColumnFilesWriter::create(folder, schema, options, known.as_ref(), ImageFiles::Images, make)
+    ColumnFilesWriter::create(folder, schema, options, known, ImageFiles::Images, make, |writer| writer.columns.committed())
 }
 
 struct FolderWriter {

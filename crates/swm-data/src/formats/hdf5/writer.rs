@@ -41,12 +41,11 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
             Layout::new(schema.columns())?;
             let (path, schema, incoming) = (path.to_owned(), schema.clone(), schema.clone());
             let replace = move || -> Result<Box<dyn Writer>> {
-                // The old file stays locked until the new one replaces it.
-                let _old = old;
                 let temporary = temporary_path(&path)?;
                 let mut writer = create_file(&temporary, &schema, options.manifest.as_ref())?;
                 writer.policy = options.commit;
-                Ok(Box::new(replace_file(writer, &temporary, &path)?))
+                writer.replaces = Some(Replaced { path, _lock: old });
+                Ok(Box::new(writer))
             };
             let check = move |episode: &Batch, _: &Constants| episodes::check_episode(episode, &incoming);
             return Ok(ReplacingWriter::boxed(check, replace));
@@ -57,8 +56,7 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
             episodes::check_appendable(&location, schema, reader.schema())?;
             let mut writer = match Hdf5Writer::resume(path, &reader, old)? {
                 Ok(writer) => writer,
-                // The old file stays locked until its copy replaces it.
-                Err(_old) => copy_to_this_layout(path, &reader)?,
+                Err(old) => copy_to_this_layout(path, &reader, old)?,
             };
             if let Some(manifest) = manifest
                 && reader.manifest().as_ref() != Some(manifest)
@@ -123,35 +121,33 @@ fn temporary_path(path: &Path) -> Result<PathBuf> {
     Ok(temporary)
 }
 
-/// Replaces the file at `path` with the complete file at `temporary`.
-fn replace_file(mut writer: Hdf5Writer, temporary: &Path, path: &Path) -> Result<Hdf5Writer> {
-    std::fs::rename(temporary, path).map_err(|e| Error::io(path, "replacing the file", e))?;
-    writer.path = path.to_owned();
-    Ok(writer)
+/// The old file, which stays locked until the new one replaces it.
+struct Replaced {
+    path: PathBuf,
+    _lock: Lock,
 }
 
-/// Copies the file at `path` to this module's layout, and replaces the file with the copy.
-fn copy_to_this_layout(path: &Path, reader: &Hdf5Reader) -> Result<Hdf5Writer> {
+/// Copies the locked file at `path` to this module's layout, and replaces the file with the copy.
+fn copy_to_this_layout(path: &Path, reader: &Hdf5Reader, lock: Lock) -> Result<Hdf5Writer> {
     if let [name, ..] = reader.non_numeric() {
         let problem = format!("its dataset '{name}' is not numeric and cannot be appended to");
         return Err(Error::corrupt(path, problem, "convert it to a new dataset, without this column"));
     }
     let schema = Schema::new(reader.stored())?;
     let temporary = temporary_path(path)?;
-    let copy = || {
-        let mut writer = create_file(&temporary, &schema, reader.manifest().as_ref())?;
-        let names: Vec<&str> = schema.columns().iter().map(|column| &*column.name).collect();
-        for (position, episode) in reader.episodes().iter().enumerate() {
-            let batch = reader.read(&names, &[StepRange::new(position, 0, episode.length)])?;
-            writer.append(&batch, &reader.constants(position)?)?;
-        }
-        writer.commit()?;
-        replace_file(writer, &temporary, path)
-    };
-    copy().inspect_err(|_| {
-        // Returns the error of the copy, even if the temporary file cannot be removed.
-        let _ = files::delete_file(&temporary);
-    })
+    let mut writer = create_file(&temporary, &schema, reader.manifest().as_ref())?;
+    writer.replaces = Some(Replaced { path: path.to_owned(), _lock: lock });
+    let names: Vec<&str> = schema.columns().iter().map(|column| &*column.name).collect();
+    let copied = (0..).zip(reader.episodes()).try_for_each(|(position, episode)| {
+        let batch = reader.read(&names, &[StepRange::new(position, 0, episode.length)])?;
+        writer.append(&batch, &reader.constants(position)?)
+    });
+    if let Err(error) = copied.and_then(|()| writer.commit()).and_then(|()| writer.take_place()) {
+        // A part of the copy must not replace the file.
+        writer.failed = true;
+        return Err(error);
+    }
+    Ok(writer)
 }
 
 /// The state of a writer before an episode was added.
@@ -165,6 +161,8 @@ struct Snapshot {
 struct Hdf5Writer {
     path: PathBuf,
     file: Lock,
+    /// The file that this one, at a temporary path, replaces at its first commit of episodes.
+    replaces: Option<Replaced>,
     space: Space,
     /// The record, lengths and first rows of episodes, then the columns.
     tables: Vec<TableWriter>,
@@ -255,6 +253,7 @@ impl Hdf5Writer {
         Self {
             path: path.to_owned(),
             file,
+            replaces: None,
             committed_end: space.end,
             space,
             tables,
@@ -323,6 +322,18 @@ impl Hdf5Writer {
         (self.in_group, self.committed_end, self.last_commit) = (0, self.space.end, Instant::now());
         self.committed = self.rows.episodes().len();
         self.earlier.clear();
+        if self.committed > 0 { self.take_place() } else { Ok(()) }
+    }
+
+    /// Moves the file to the place of the one that it replaces, if there is one.
+    fn take_place(&mut self) -> Result<()> {
+        let Some(old) = self.replaces.take() else { return Ok(()) };
+        if let Err(error) = std::fs::rename(&self.path, &old.path) {
+            let error = Error::io(&old.path, "replacing the file", error);
+            (self.failed, self.replaces) = (true, Some(old));
+            return Err(error);
+        }
+        self.path.clone_from(&old.path);
         Ok(())
     }
 
@@ -425,7 +436,8 @@ impl Writer for Hdf5Writer {
         if self.failed {
             return Err(Self::earlier_failure());
         }
-        self.close()
+        self.close()?;
+        self.take_place()
     }
 }
 
@@ -435,6 +447,11 @@ impl Drop for Hdf5Writer {
             && let Err(error) = self.close()
         {
             tracing::error!(dataset = %self.path.display(), "the last episodes could not be stored: {error}");
+        }
+        if self.replaces.is_some()
+            && let Err(error) = files::delete_file(&self.path)
+        {
+            tracing::debug!("the temporary file stays: {error}");
         }
     }
 }

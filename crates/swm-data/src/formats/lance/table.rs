@@ -42,6 +42,8 @@ pub struct Table {
     pub version: Option<Version>,
     /// The schema of a new or replaced table.
     fresh: LanceSchema,
+    /// Whether the next commit replaces the version, so that data files have the columns of `fresh`.
+    pub replaces: bool,
     file_version: ConcreteFileVersion,
     /// Manifests of versions that this writer committed, oldest first.
     manifests: VecDeque<StorePath>,
@@ -52,12 +54,13 @@ impl Table {
     pub fn new(store: Store, version: Option<Version>, fresh: LanceSchema) -> Self {
         let file_version =
             version.as_ref().map_or(FILE_VERSION, |version| version.manifest.data_storage_format.lance_file_format());
-        Self { store, version, fresh, file_version, manifests: VecDeque::new() }
+        Self { store, version, fresh, replaces: false, file_version, manifests: VecDeque::new() }
     }
 
-    /// The schema, with the field ids of the existing table if the table exists.
+    /// The schema, with the field ids of the existing table if the table exists and is not replaced.
     pub fn fields(&self) -> &LanceSchema {
-        self.version.as_ref().map_or(&self.fresh, |version| &version.manifest.schema)
+        let kept = self.version.as_ref().filter(|_| !self.replaces);
+        kept.map_or(&self.fresh, |version| &version.manifest.schema)
     }
 
     /// The operation that replaces the table's content with `fragments`.

@@ -17,7 +17,6 @@ use super::store::{Store, Version};
 use super::table::{MAX_ATTEMPTS, Table};
 use crate::dataset::{CommitPolicy, Constants, WriteMode, WriteOptions, Writer, is_full, with_stored};
 use crate::dataset::{Location, episodes};
-use crate::formats::replacing::ReplacingWriter;
 use arrow_schema::Schema as ArrowSchema;
 use lance_core::datatypes::Schema as LanceSchema;
 use lance_table::transaction::Operation;
@@ -45,29 +44,16 @@ pub fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Re
     }
     let store = Store::new(location)?;
     store.check_writable()?;
-    let columns = schema::columns_to_write(schema)?;
     store.check_no_links()?;
     let lock = if options.exclusive { store.lock("")? } else { None };
-    let replaces = options.mode == WriteMode::Overwrite && store.latest()?.is_some();
-    let (schema, incoming, codec) = (schema.clone(), schema.clone(), options.codec);
-    let start = move || {
-        for _ in 0..MAX_ATTEMPTS {
-            // If another process creates, continues or replaces the table in between, the next attempt starts from the
-            // new state.
-            if let Some(prepared) = prepare(&store, &schema, &options)? {
-                return prepared.start(&schema, &options, lock);
-            }
+    for _ in 0..MAX_ATTEMPTS {
+        // If another process creates, continues or replaces the table in between, the next attempt starts from the new
+        // state.
+        if let Some(prepared) = prepare(&store, schema, &options)? {
+            return prepared.start(schema, &options, lock);
         }
-        Err(too_many_conflicts(&store.label))
-    };
-    if !replaces {
-        return start();
     }
-    let check = move |episode: &Batch, constants: &Constants| {
-        episodes::check_episode(episode, &incoming)?;
-        EncodedEpisode::new(&columns, episode, codec, constants).map(drop)
-    };
-    Ok(ReplacingWriter::boxed(check, start))
+    Err(too_many_conflicts(&store.label))
 }
 
 pub fn too_many_conflicts(label: &Path) -> Error {
@@ -94,6 +80,8 @@ pub enum Sink {
         next: i64,
         /// See [`WriteOptions::exclusive`].
         exclusive: bool,
+        /// The version whose episodes the first commit replaces.
+        replaced: Option<Version>,
     },
     /// Each commit becomes an entry in the log of a shard.
     Shard(ShardLog),
@@ -107,13 +95,13 @@ pub fn new_table_schema(columns: &[StoredColumn], schema: &Schema, options: &Wri
     Ok(fresh)
 }
 
-/// Creates, continues or replaces the table. Returns `None` if another process changed the table at the same time.
+/// Creates or continues the table, or prepares its replacement. Returns `None` if another process changed the table at the same time.
 fn prepare(store: &Store, schema: &Schema, options: &WriteOptions) -> Result<Option<PreparedWriter>> {
     let mut columns = schema::columns_to_write(schema)?;
     let fresh = new_table_schema(&columns, schema, options)?;
     let found = store.latest()?;
     let mut table = Table::new(store.clone(), found.clone(), fresh);
-    let (mut episodes, mut next) = (0, 0);
+    let (mut episodes, mut next, mut replaced) = (0, 0, None);
     let committed = match (options.mode, found) {
         (_, None) => table.commit(table.overwrite_operation(vec![]))?,
         (WriteMode::Create, Some(_)) => {
@@ -124,11 +112,8 @@ fn prepare(store: &Store, schema: &Schema, options: &WriteOptions) -> Result<Opt
             ));
         }
         (WriteMode::Overwrite, Some(old)) => {
-            let committed = table.commit(table.overwrite_operation(vec![]))?;
-            if committed {
-                table.remove_replaced(&old);
-            }
-            committed
+            (table.replaces, replaced) = (true, Some(old));
+            true
         }
         (WriteMode::Append, Some(old)) => {
             let known = LanceReader::of(store.clone(), Arc::clone(&old.manifest))?;
@@ -143,7 +128,7 @@ fn prepare(store: &Store, schema: &Schema, options: &WriteOptions) -> Result<Opt
         }
     };
     Ok(committed.then_some(PreparedWriter {
-        sink: Sink::Table { table, next, exclusive: options.exclusive },
+        sink: Sink::Table { table, next, exclusive: options.exclusive, replaced },
         columns,
         episodes,
     }))
@@ -391,9 +376,12 @@ impl Committer {
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => {
                     self.commit()?;
+                    if !self.shared.complete.load(Ordering::Acquire) {
+                        return Ok(());
+                    }
                     return match &mut self.sink {
-                        Sink::Shard(log) if self.shared.complete.load(Ordering::Acquire) => log.finish(),
-                        _ => Ok(()),
+                        Sink::Shard(log) => log.finish(),
+                        Sink::Table { table, exclusive, replaced, .. } => replace(table, *exclusive, replaced, &[]),
                     };
                 }
             }
@@ -418,7 +406,12 @@ impl Committer {
             return Ok(());
         }
         let committed = match &mut self.sink {
-            Sink::Table { table, next, exclusive } => append(table, next, *exclusive, episodes),
+            Sink::Table { table, next, exclusive, replaced: replaced @ Some(_) } => {
+                let stored = replace(table, *exclusive, replaced, episodes);
+                *next = episodes.len() as i64;
+                stored
+            }
+            Sink::Table { table, next, exclusive, .. } => append(table, next, *exclusive, episodes),
             Sink::Shard(log) => log.append(episodes),
         };
         match committed {
@@ -435,6 +428,48 @@ impl Committer {
     }
 }
 
+/// Commits episodes as the version that replaces another one, if there is one to replace, and deletes its files.
+fn replace(
+    table: &mut Table,
+    exclusive: bool,
+    replaced: &mut Option<Version>,
+    episodes: &[EncodedEpisode],
+) -> Result<()> {
+    for _ in 0..MAX_ATTEMPTS {
+        let Some(old) = replaced.as_ref() else { return Ok(()) };
+        let fragment = (!episodes.is_empty()).then(|| table.write_episodes(episodes, Some(0))).transpose()?;
+        let discard = |table: &Table| fragment.iter().for_each(|fragment| table.discard(fragment));
+        match table.commit(table.overwrite_operation(fragment.clone().into_iter().collect())) {
+            Ok(true) => {
+                table.remove_replaced(old);
+                (table.replaces, *replaced) = (false, None);
+                return Ok(());
+            }
+            Ok(false) => {
+                discard(table);
+                if exclusive {
+                    return Err(other_writer(table));
+                }
+                let latest = table.store.latest()?;
+                (table.version, *replaced) = (latest.clone(), latest);
+            }
+            Err(error) => {
+                if is_full(&error) {
+                    discard(table);
+                }
+                return Err(error);
+            }
+        }
+    }
+    Err(too_many_conflicts(&table.store.label))
+}
+
+fn other_writer(table: &Table) -> Error {
+    let problem = "another process writes to it, and added or replaced episodes";
+    let fix = "wait until that process has ended, then continue (--resume)";
+    Error::config(table.store.label.display().to_string(), problem, fix)
+}
+
 /// Commits episodes as one version, numbered after all existing episodes.
 fn append(table: &mut Table, next: &mut i64, exclusive: bool, episodes: &[EncodedEpisode]) -> Result<()> {
     for _ in 0..MAX_ATTEMPTS {
@@ -447,9 +482,7 @@ fn append(table: &mut Table, next: &mut i64, exclusive: bool, episodes: &[Encode
             Ok(false) => {
                 table.discard(&fragment);
                 if exclusive {
-                    let problem = "another process writes to it, and added or replaced episodes";
-                    let fix = "wait until that process has ended, then continue (--resume)";
-                    return Err(Error::config(table.store.label.display().to_string(), problem, fix));
+                    return Err(other_writer(table));
                 }
                 *next = table.refresh()?;
             }

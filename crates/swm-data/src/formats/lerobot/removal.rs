@@ -2,6 +2,7 @@
 
 use super::info::{DATA_PATH, EPISODES_PATH, Info, VIDEO_PATH, fill};
 use crate::formats::replacing::check_no_links;
+use crate::formats::set_aside::{self, DatasetFiles};
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use swm_core::files::{self, Lock};
@@ -19,37 +20,61 @@ pub(super) const WRITING: &str = "meta/writing.tmp";
 
 /// Deletes the dataset in a folder.
 ///
-/// # Errors
-/// As [`clear`], and if another process writes to the dataset.
-pub(super) fn remove(root: &Path) -> Result<()> {
-    let _lock = Lock::folder(root)?;
-    clear(root)?;
-    files::delete_named(root, &[INFO.into()])
-}
-
-/// Deletes the dataset in a folder that the caller has locked, except `meta/info.json`.
-///
 /// The names are those of the features in `meta/info.json` and of the files that `meta/episodes` has, whose indices count
-/// up from 0. The last index is deleted first, and of an index the list of episodes last; nothing is moved. The
-/// `meta/info.json` of the next dataset replaces the old one. So after a kill at any time the remaining files still have
-/// the metadata that names them, and the next replacement deletes the rest.
+/// up from 0. The last index is deleted first, and of an index the list of episodes last; `meta/info.json` is deleted
+/// at the end. So after a kill at any time the remaining files still have the metadata that names them, and the next removal
+/// deletes the rest.
 ///
 /// # Errors
 /// If the metadata cannot be read, another program wrote the dataset, or a file is a symbolic link; then nothing is
-/// deleted. Also if a file cannot be deleted.
-pub(super) fn clear(root: &Path) -> Result<()> {
-    files::delete_named(root, &stored_files(root)?)
+/// deleted. Also if a file cannot be deleted, or another process writes to the dataset.
+pub(super) fn remove(root: &Path) -> Result<()> {
+    let _lock = Lock::folder(root)?;
+    set_aside::recover(root, Files)?;
+    files::delete_named(root, &Files.names(root)?)
 }
 
-/// Checks that [`clear`] can delete the dataset in a folder.
+/// What replacing needs to know of the format.
+#[derive(Clone, Copy)]
+pub(super) struct Files;
+
+impl DatasetFiles for Files {
+    fn set_aside(self) -> &'static str {
+        set_aside::FOLDERS[1]
+    }
+
+    fn metadata(self) -> &'static str {
+        INFO
+    }
+
+    fn names(self, root: &Path) -> Result<Vec<PathBuf>> {
+        let mut names = stored_files(root)?;
+        names.push(INFO.into());
+        Ok(names)
+    }
+
+    fn committed(self, root: &Path) -> Result<usize> {
+        Ok(Info::read(root)?.total_episodes)
+    }
+
+    fn unfinished(self) -> Vec<PathBuf> {
+        vec![temporary(INFO)]
+    }
+
+    fn remove_empty_folders(self, _: &Path) -> Result<()> {
+        Ok(())
+    }
+}
+
+/// Checks that the dataset in a folder can be replaced.
 ///
 /// # Errors
-/// As [`clear`].
-pub(super) fn check_clear(root: &Path) -> Result<()> {
+/// As [`remove`].
+pub(super) fn check_replaceable(root: &Path) -> Result<()> {
     check_no_links(root, &stored_files(root)?)
 }
 
-/// The files that [`clear`] deletes, in the order of deletion.
+/// The files apart from `meta/info.json`, in the order of deletion.
 fn stored_files(root: &Path) -> Result<Vec<PathBuf>> {
     let refused = |problem: String| {
         let problem = format!("the names of its files are unknown: {problem}");

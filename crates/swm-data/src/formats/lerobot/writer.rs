@@ -13,6 +13,7 @@ use crate::dataset::Location;
 use crate::dataset::episodes;
 use crate::dataset::{Constants, Reader as _, WriteMode, WriteOptions, Writer, with_stored};
 use crate::formats::replacing::ReplacingWriter;
+use crate::formats::set_aside;
 use arrow_array::builder::{ListBuilder, StringBuilder};
 use arrow_array::{ArrayRef, Float64Array, Int64Array, RecordBatch, StringArray};
 use arrow_schema::{DataType, Field, Schema as ArrowSchema};
@@ -71,6 +72,7 @@ impl LerobotWriter {
     fn create(root: &Path, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
         options.codec.check()?;
         let columns = stored_columns(schema)?;
+        set_aside::recover_unlocked(root, removal::Files)?;
         let exists = root.join(INFO).is_file();
         let is_occupied = root.read_dir().is_ok_and(|mut entries| entries.next().is_some());
         if !exists && is_occupied && !removal::is_unfinished(root) {
@@ -85,11 +87,11 @@ impl LerobotWriter {
         let lock = Lock::folder(root)?;
         check_folders(root, &columns, schema)?;
         if exists && options.mode == WriteMode::Overwrite {
-            removal::check_clear(root)?;
+            removal::check_replaceable(root)?;
             let (root, schema, incoming) = (root.to_owned(), schema.clone(), schema.clone());
-            let replace = move || -> Result<Box<dyn Writer>> {
-                removal::clear(&root)?;
-                Ok(Box::new(Self::begin(&root, &schema, options, lock)?))
+            let replace = move || {
+                let committed = |writer: &Self| writer.info.total_episodes;
+                set_aside::replace(&root, removal::Files, committed, || Self::begin(&root, &schema, options, lock))
             };
             let check = move |episode: &Batch, _: &Constants| episodes::check_episode(episode, &incoming);
             return Ok(ReplacingWriter::boxed(check, replace));

@@ -3,8 +3,8 @@
 use super::reader::VideoReader;
 use crate::dataset::Location;
 use crate::dataset::episodes;
-use crate::dataset::{Constants, Reader as _, WriteMode, WriteOptions, Writer};
-use crate::formats::column_files::{ColumnFilesWriter, ImageFiles, exists, video_path};
+use crate::dataset::{Constants, Reader as _, WriteOptions, Writer};
+use crate::formats::column_files::{ColumnFilesWriter, ImageFiles, video_path};
 use rayon::prelude::*;
 use std::io::Write as _;
 use swm_core::{Batch, Error, Result, Schema, files};
@@ -17,14 +17,10 @@ const FPS: u32 = 25;
 pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
     let folder = location.local("video")?;
     options.codec.check()?;
-    let known = if options.mode == WriteMode::Append && exists(folder) {
-        Some(VideoReader::open(folder)?.schema().clone())
-    } else {
-        None
-    };
+    let known = || Ok(VideoReader::open(folder)?.schema().clone());
     let (incoming, encoding) = (schema.clone(), Encoding::training(options.codec));
     let make = move |columns| VideoWriter { columns, schema: incoming, encoding };
-    ColumnFilesWriter::create(folder, schema, options, known.as_ref(), ImageFiles::Videos, make)
+    ColumnFilesWriter::create(folder, schema, options, known, ImageFiles::Videos, make, |writer| writer.columns.committed())
 }
 
 /// Suffix of incomplete videos.

@@ -173,7 +173,8 @@ impl<F: DatasetFiles, W: Writer> SettingWriter<F, W> {
     fn end(&mut self, result: Result<()>, is_complete: bool) -> Result<()> {
         let Some(aside) = self.aside.take() else { return result };
         let lock = Lock::folder(&aside.root);
-        let settled = lock.and_then(|_lock| if result.is_ok() && is_complete { aside.delete() } else { aside.settle() });
+        let settled =
+            lock.and_then(|_lock| if result.is_ok() && is_complete { aside.delete() } else { aside.settle() });
         result.and(settled)
     }
 }

@@ -275,7 +275,9 @@ fn killed_replacements_keep_files_of_the_user() {
             if let Err(error) = open(path) {
                 assert!(error.to_string().contains("its old files are in"), "{format}: {error}");
                 // The next writer brings the old dataset back.
-                create(path, &schema(), options(WriteMode::Append)).and_then(|writer| writer.finish()).expect("appending");
+                create(path, &schema(), options(WriteMode::Append))
+                    .and_then(|writer| writer.finish())
+                    .expect("appending");
             }
             let reader = open(path).expect("opening the old or the new dataset");
             assert!(!reader.episodes().is_empty(), "{format}: {:?}", names(path));

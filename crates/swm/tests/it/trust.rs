@@ -243,6 +243,19 @@ fn repository_of_a_stranger_starts_no_program() {
     git(&["config", "--unset", "core.fsmonitor"]);
     fs::remove_file(swm.path(".git/hooks/post-index-change")).expect("removing the hook");
     let _ = fs::remove_file(&marker);
+    // A submodule has a configuration of its own.
+    let inner = |arguments: &[&str]| git(&[&["-C", "inner"], arguments].concat());
+    git(&["init", "-q", "inner"]);
+    fs::write(swm.path("inner/.gitattributes"), "* filter=evil\n").expect("attributes");
+    fs::write(swm.path("inner/file"), "content\n").expect("a file");
+    inner(&["add", "."]);
+    inner(&["-c", "user.name=A", "-c", "user.email=a@b.c", "commit", "-qm", "inner"]);
+    git(&["add", "inner"]);
+    inner(&["config", "filter.evil.clean", path]);
+    // Equal content with another time, which git would read again.
+    fs::write(swm.path("inner/file"), "content\n").expect("a file");
+    assert_eq!(recorded(), format!("{commit}-dirty"));
+    assert!(!marker.exists(), "a filter of a submodule was started");
     git(&["config", "filter.evil.clean", path]);
     fs::write(swm.path(".gitattributes"), "* filter=evil\n").expect("attributes");
     assert_eq!(recorded(), commit);

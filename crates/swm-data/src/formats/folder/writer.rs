@@ -17,7 +17,9 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
     let known = || Ok(FolderReader::open(folder)?.schema().clone());
     let (incoming, codec) = (schema.clone(), options.codec);
     let make = move |columns| FolderWriter { columns, schema: incoming, codec };
-    ColumnFilesWriter::create(folder, schema, options, known, ImageFiles::Images, make, |writer| writer.columns.committed())
+    ColumnFilesWriter::create(folder, schema, options, known, ImageFiles::Images, make, |writer| {
+        writer.columns.committed()
+    })
 }
 
 struct FolderWriter {

@@ -20,7 +20,9 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
     let known = || Ok(VideoReader::open(folder)?.schema().clone());
     let (incoming, encoding) = (schema.clone(), Encoding::training(options.codec));
     let make = move |columns| VideoWriter { columns, schema: incoming, encoding };
-    ColumnFilesWriter::create(folder, schema, options, known, ImageFiles::Videos, make, |writer| writer.columns.committed())
+    ColumnFilesWriter::create(folder, schema, options, known, ImageFiles::Videos, make, |writer| {
+        writer.columns.committed()
+    })
 }
 
 /// Suffix of incomplete videos.

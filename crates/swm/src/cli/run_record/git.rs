@@ -8,13 +8,19 @@ use std::process::{Command, Stdio};
 /// Settings that override those of the repository.
 const SETTINGS: [&str; 3] = ["core.fsmonitor=false", "core.hooksPath=/dev/null", "protocol.allow=never"];
 
-/// Returns the commit, with `-dirty` if tracked files differ from it; `None` outside of a repository. In a repository with
+/// Returns the commit, with `-dirty` if tracked files, apart from submodules, differ from it; `None` outside of a repository. In a repository with
 /// filters of its own, which a comparison of files would start, it says nothing of differences.
 pub fn commit() -> Option<String> {
     let describe = ["describe", "--always", "--abbrev=40", "--exclude=*"];
-    let dirty = (!has_filters()).then_some("--dirty");
-    let output = git(&describe).args(dirty).output().ok().filter(|output| output.status.success())?;
-    Some(String::from_utf8_lossy(&output.stdout).trim().to_owned())
+    let output = git(&describe).output().ok().filter(|output| output.status.success())?;
+    let commit = String::from_utf8_lossy(&output.stdout).trim().to_owned();
+    Some(if !has_filters() && differs() { format!("{commit}-dirty") } else { commit })
+}
+
+/// Whether tracked files differ from the commit. Submodules are left out: their own configuration may have filters.
+fn differs() -> bool {
+    let compare = ["diff", "--quiet", "--no-ext-diff", "--no-textconv", "--ignore-submodules=all", "HEAD", "--"];
+    git(&compare).output().is_ok_and(|output| output.status.code() == Some(1))
 }
 
 /// Whether the configuration of the repository itself has filters, or cannot be read. Those of the user are the user's own.

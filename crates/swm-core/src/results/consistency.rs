@@ -57,9 +57,17 @@ impl Results {
             || requested("starts").is_some_and(|starts| (starts == "episodic") != (self.protocol == "episodic"))
             || requested("counting")
                 .is_some_and(|counting| Counting::deserialize(counting).ok() != Some(self.counting));
-        match is_other {
-            true => Err("it states another environment, protocol, counting or seed than its request".to_owned()),
-            false => Ok(()),
+        if is_other {
+            return Err("it states another environment, protocol, counting or seed than its request".to_owned());
+        }
+        // The name of the floor is the name of a policy.
+        let policies = requested("policies").and_then(|policies| policies.as_array());
+        let is_false_floor = |policy: &&serde_json::Value| {
+            policy["name"] == "random" && !policy["acts"].is_null() && policy["acts"] != "random"
+        };
+        match policies.into_iter().flatten().find(is_false_floor) {
+            Some(policy) => Err(format!("its policy 'random' is another one by its request: {}", policy["acts"])),
+            None => Ok(()),
         }
     }
 
@@ -191,4 +199,22 @@ fn same_summary(a: Option<&Summary>, b: Option<&Summary>) -> bool {
 /// Whether values are equal up to the rounding of another order of operations.
 fn close(stated: &[f64], computed: &[f64]) -> bool {
     stated.iter().zip(computed).all(|(a, b)| a == b || (a - b).abs() <= 1e-9 * a.abs().max(b.abs()).max(1.0))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn another_policy_is_not_the_floor() {
+        let of = |acts: serde_json::Value| {
+            let mut results = Results::default();
+            results.manifest.config = json!({ "policies": [{ "name": "random", "acts": acts }] });
+            results.check()
+        };
+        of(json!("random")).expect("the floor");
+        let error = of(json!("no-op")).expect_err("another policy");
+        assert!(error.contains("'random' is another one by its request: \"no-op\""), "{error}");
+    }
 }

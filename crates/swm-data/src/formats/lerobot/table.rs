@@ -36,11 +36,16 @@ const TABLE_ROW_BYTES: usize = 1 << 16;
 /// # Errors
 /// As [`read_batches`], and if the rows take more than a GiB: a small file can repeat a long text in many rows.
 pub fn read(path: &Path, columns: &[&str]) -> Result<Vec<RecordBatch>> {
+    read_within(path, columns, TABLE_BYTES)
+}
+
+/// As [`read`], with another bound in bytes.
+fn read_within(path: &Path, columns: &[&str], most: usize) -> Result<Vec<RecordBatch>> {
     let (mut batches, mut bytes) = (vec![], 0);
     read_batches(path, columns, None, TABLE_ROW_BYTES, &mut |batch| {
         bytes += batch.get_array_memory_size();
-        if bytes > TABLE_BYTES {
-            return Err(damaged(path, format!("its rows take more than {TABLE_BYTES} bytes")));
+        if bytes > most {
+            return Err(damaged(path, format!("its rows take more than {most} bytes")));
         }
         batches.push(batch);
         Ok(())
@@ -149,4 +154,28 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
     temporary.push(".tmp");
     files::open_to_write(temporary.as_ref(), false)?.write_all(bytes).map_err(io)?;
     std::fs::rename(&temporary, path).map_err(io)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use arrow_array::StringArray;
+    use arrow_schema::{DataType, Field};
+
+    #[test]
+    fn texts_that_many_rows_repeat_are_bounded() {
+        let folder = tempfile::tempdir().expect("creating a folder");
+        let path = folder.path().join("episodes.parquet");
+        let schema = Arc::new(ArrowSchema::new(vec![Field::new("tasks", DataType::Utf8, false)]));
+        let text = "a long text ".repeat(1000);
+        let texts = Arc::new(StringArray::from_iter_values(std::iter::repeat_n(&text, 1000)));
+        let batch = RecordBatch::try_new(Arc::clone(&schema), vec![texts]).expect("a table");
+        write(&path, &schema, &batch).expect("writing the table");
+        let length = std::fs::metadata(&path).expect("the file").len();
+        assert!(length < 100_000, "the text is stored once, in {length} bytes");
+        let error = read_within(&path, &["tasks"], 1 << 20).expect_err("12 MB").to_string();
+        assert!(error.contains("its rows take more than 1048576 bytes"), "{error}");
+        let rows = read_within(&path, &["tasks"], 1 << 26).expect("64 MB suffice");
+        assert_eq!(rows.iter().map(RecordBatch::num_rows).sum::<usize>(), 1000);
+    }
 }

@@ -45,8 +45,25 @@ impl ColumnInfo {
         self.std.iter().map(|&std| if std > 1e-6 { std } else { 1.0 }).collect()
     }
 
+    /// Computes the statistics of a column, which must be finite.
     fn of(reader: &dyn Reader, spec: &ColumnSpec) -> Result<Self> {
         let stats = column_stats(reader, &spec.name, None)?;
+        // Models compute with single precision.
+        let is_usable = |value: &f64| (*value as f32).is_finite();
+        if !stats.mean.iter().chain(&stats.std).all(is_usable) {
+            let given = format!("has means {:?} and standard deviations {:?}", stats.mean, stats.std);
+            let fix =
+                "remove or repair the episodes with infinite or huge values, which `swm inspect` shows in the ranges";
+            return Err(Error::config(format!("column '{}' of the training data", spec.name), given, fix));
+        }
+        // The last row of an episode has no action.
+        let expected: usize = reader.episodes().iter().map(|episode| episode.length.saturating_sub(1)).sum();
+        let expected = expected as u64;
+        if spec.name == ACTION && stats.count.iter().any(|&count| count < expected) {
+            let given = format!("has {:?} values at {expected} steps: some have no action", stats.count);
+            let fix = "remove or repair the episodes with NaN before their last row";
+            return Err(Error::config(format!("column '{ACTION}' of the training data"), given, fix));
+        }
         Ok(Self { shape: spec.shape.clone(), mean: stats.mean, std: stats.std, min: stats.min, max: stats.max })
     }
 

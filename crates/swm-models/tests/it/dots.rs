@@ -53,6 +53,14 @@ pub fn draw(at: [f32; 2], rgb: &mut [u8]) {
     }
 }
 
+impl Dots {
+    /// Sets the first action of an episode.
+    pub fn with_action(mut self, episode: usize, action: [f32; 2]) -> Self {
+        self.rows.row_mut(episode * LENGTH).set(1, &action);
+        self
+    }
+}
+
 impl Reader for Dots {
     fn schema(&self) -> &Schema {
         self.rows.schema()

@@ -351,3 +351,14 @@ fn a_pytorch_tensor_cannot_repeat_its_elements_without_limit() {
         assert!(["larger than the file", "limit", "overflow"].iter().any(|word| error.contains(word)), "{error}");
     }
 }
+
+#[test]
+fn infinite_and_missing_actions_are_refused_before_training() {
+    for action in [[f32::INFINITY, 0.0], [0.0, f32::NEG_INFINITY], [0.0, f32::NAN]] {
+        let dots = crate::dots::Dots::new(2, 0).with_action(1, action);
+        for bounded in [false, true] {
+            let error = DatasetInfo::from_reader(&dots, &[], bounded).expect_err("actions that no model learns");
+            assert!(error.to_string().contains("column 'action' of the training data"), "{action:?}: {error}");
+        }
+    }
+}

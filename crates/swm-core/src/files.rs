@@ -182,11 +182,17 @@ pub fn delete_named(folder: &Path, names: &[PathBuf]) -> Result<()> {
 /// same file system. Files that do not exist are skipped. Then removes the folders below `from` that this emptied.
 ///
 /// # Errors
-/// When something exists at the new path of a file, or a file cannot be moved. The files before it are moved then.
+/// When a path leads through a symbolic link, something exists at the new path of a file, or a file cannot be moved. The
+/// files before it are moved then.
 pub fn move_named(from: &Path, names: &[PathBuf], to: &Path) -> Result<()> {
     let mut folders = BTreeSet::new();
     for name in names {
         let (old, new) = (from.join(name), to.join(name));
+        for folder in [from, to] {
+            // The outermost folder first: a link among the folders would lead the next ones elsewhere.
+            let parents: Vec<&Path> = name.ancestors().skip(1).collect();
+            parents.into_iter().rev().try_for_each(|parent| check_folder(&folder.join(parent)).map(drop))?;
+        }
         if !kind(&old)?.is_some_and(|found| found.is_file()) {
             continue;
         }

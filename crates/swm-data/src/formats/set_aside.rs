@@ -118,7 +118,11 @@ impl<F: DatasetFiles> SetAside<F> {
 pub fn recover<F: DatasetFiles>(root: &Path, files: F) -> Result<()> {
     let this = SetAside { root: root.to_owned(), files };
     let folder = this.folder();
-    files::check_no_link(&folder)?;
+    // A stranger may have made the folder: nothing is moved through links.
+    Path::new(files.set_aside()).ancestors().try_for_each(|path| match path.as_os_str().is_empty() {
+        true => Ok(()),
+        false => files::check_no_link(&root.join(path)),
+    })?;
     if folder.is_dir() { this.settle() } else { Ok(()) }
 }
 

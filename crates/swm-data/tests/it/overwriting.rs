@@ -1,9 +1,12 @@
 //! A dataset to replace stays until an episode is ready to be written in its place.
 
+use crate::fuzz::files;
+use crate::replacing::names;
 use crate::sample::{check, episode, options, schema, write};
+use std::os::unix::fs::symlink;
 use swm_core::{Batch, ColumnSpec, DType, Schema};
 use swm_data::lance::{Shard, commit_shards, create_shard};
-use swm_data::{Location, WriteMode, create, open};
+use swm_data::{FORMATS, Location, WriteMode, create, open};
 
 #[test]
 fn refused_first_episodes_keep_the_old_dataset() {
@@ -72,5 +75,55 @@ fn finished_writer_without_episodes_replaces_the_dataset() {
         write(&path, WriteMode::Create, 1, 0..3);
         create(&path, &schema(), options(WriteMode::Overwrite)).and_then(|writer| writer.finish()).expect("replacing");
         assert!(open(&path).expect("opening").episodes().is_empty(), "{format}");
+    }
+}
+
+#[test]
+fn files_set_aside_by_a_stranger_are_not_moved_through_links() {
+    for (format, aside, column) in [
+        ("folder", "ep_len.replaced", "pixels"),
+        ("video", "ep_len.replaced", "pixels"),
+        ("lerobot", "meta/replaced", "data"),
+    ] {
+        let folder = tempfile::tempdir().expect("creating a folder");
+        let (path, outside) = (folder.path().join(format!("d.{format}")), folder.path().join("outside"));
+        write(&path, WriteMode::Create, 1, 0..2);
+        std::fs::create_dir_all(&outside).expect("creating a folder");
+        std::fs::rename(path.join(column), path.join("moved")).expect("moving a folder");
+        symlink(&outside, path.join(column)).expect("making a link");
+        let key = path.join(aside).join(column).join("authorized_keys");
+        std::fs::create_dir_all(key.parent().expect("a folder")).expect("creating a folder");
+        std::fs::write(&key, "a key").expect("writing a file");
+        for mode in [WriteMode::Append, WriteMode::Overwrite, WriteMode::Create] {
+            let error = create(&path, &schema(), options(mode)).err().expect("a link").to_string();
+            assert!(error.contains("symbolic link"), "{format}: {error}");
+            assert!(key.exists() && names(&outside).is_empty(), "{format}");
+        }
+    }
+}
+
+#[test]
+fn removal_of_a_table_takes_what_a_kill_leaves() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let path = folder.path().join("d.lance");
+    let orphan = format!("data/{}.lance", blake3::hash(b"written before a kill").to_hex());
+    let other = format!("data/{}.lance", blake3::hash(b"something else").to_hex());
+    let staged = format!("{other}#1");
+    let temporary = [staged.as_str(), "_versions/18446744073709551614.manifest#12", "_versions/.tmpa1B2c3"];
+    let of_user = ["_versions/.tmp-notes", "_versions/thesis.manifest#1", other.as_str(), "data/thesis.lance#1"];
+    // Without a version, as a kill before the first commit leaves it, and with one.
+    for is_committed in [false, true] {
+        if is_committed {
+            write(&path, WriteMode::Create, 1, 0..2);
+        }
+        for name in ["data", "_versions"] {
+            std::fs::create_dir_all(path.join(name)).expect("creating a folder");
+        }
+        for name in temporary.into_iter().chain(of_user).chain([orphan.as_str()]) {
+            std::fs::write(path.join(name), "written before a kill").expect("writing a file");
+        }
+        FORMATS.get("lance").expect("the format").remove(&path).expect("removing the dataset");
+        let expected = of_user.map(|name| path.join(name));
+        assert_eq!(files(&path), expected, "{is_committed}");
     }
 }

@@ -61,7 +61,7 @@ fn contents(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
 }
 
 /// The relative paths of all files in a folder.
-fn names(folder: &Path) -> Vec<PathBuf> {
+pub fn names(folder: &Path) -> Vec<PathBuf> {
     files(folder).iter().map(|file| file.strip_prefix(folder).expect("a file of the folder").to_owned()).collect()
 }
 
@@ -483,31 +483,5 @@ fn preview_replaces_only_its_own_files() {
         let written = ["contact_sheet.png", "episode_0.mp4", "episode_1.mp4"];
         let left: Vec<&str> = [".episode_9.mp4.77.tmp", ".notes.77.tmp"].into_iter().chain(written).collect();
         assert_eq!(names(&out), left.iter().map(Path::new).collect::<Vec<_>>());
-    }
-}
-
-#[test]
-fn removal_of_a_table_takes_what_a_kill_leaves() {
-    let folder = tempfile::tempdir().expect("creating a temporary folder");
-    let path = folder.path().join("d.lance");
-    let orphan = format!("data/{}.lance", blake3::hash(b"written before a kill").to_hex());
-    let other = format!("data/{}.lance", blake3::hash(b"something else").to_hex());
-    let staged = format!("{other}#1");
-    let temporary = [staged.as_str(), "_versions/18446744073709551614.manifest#12", "_versions/.tmpa1B2c3"];
-    let of_user = ["_versions/.tmp-notes", "_versions/thesis.manifest#1", other.as_str(), "data/thesis.lance#1"];
-    // Without a version, as a kill before the first commit leaves it, and with one.
-    for is_committed in [false, true] {
-        if is_committed {
-            write(&path, WriteMode::Create, 1, 0..2);
-        }
-        for name in ["data", "_versions"] {
-            std::fs::create_dir_all(path.join(name)).expect("creating a folder");
-        }
-        for name in temporary.into_iter().chain(of_user).chain([orphan.as_str()]) {
-            std::fs::write(path.join(name), "written before a kill").expect("writing a file");
-        }
-        FORMATS.get("lance").expect("the format").remove(&path).expect("removing the dataset");
-        let expected = of_user.map(|name| path.join(name));
-        assert_eq!(files(&path), expected, "{is_committed}");
     }
 }

@@ -411,6 +411,7 @@ impl World {
             if location.path().is_some_and(|path| !path.exists()) {
                 return Ok(None);
             }
+            swm::data::recover(&location)?;
             Ok(Some(swm::data::open(location)?.episodes().len()))
         });
         stored.map_err(to_py_err)

@@ -18,7 +18,7 @@ pub use dataset::{
     ReplayLoader, Split, StepRange, WriteMode, WriteOptions, Writer, column_quantiles, column_stats, goals, objects,
     views,
 };
-pub use formats::{FORMATS, FormatEntry, create, has_no_dataset, lance, open};
+pub use formats::{FORMATS, FormatEntry, create, has_no_dataset, lance, open, recover};
 pub use swm_image::{self as image, ImageCodec, RgbImage, check_png, write_png};
 pub use tools::convert::{self, ConvertMode, ConvertOptions, Converted, checksum, convert, convert_shard};
 pub use tools::doctor;

@@ -35,6 +35,8 @@ pub struct Backend {
     pub create: fn(&Location, &Schema, WriteOptions) -> Result<Box<dyn Writer>>,
     /// Deletes a dataset on this machine: the files that its own metadata names, and no other file.
     pub remove: fn(&Path) -> Result<()>,
+    /// Completes or undoes a replacement of a dataset that was interrupted, if replacing takes several steps.
+    pub recover: Option<fn(&Path) -> Result<()>>,
 }
 
 impl Named for FormatEntry {
@@ -106,6 +108,14 @@ impl FormatEntry {
         files::check_no_link(path)?;
         (self.backend()?.remove)(path)?;
         files::remove_empty_folder(path)
+    }
+
+    /// Completes or undoes a replacement of a dataset on this machine that was interrupted.
+    ///
+    /// # Errors
+    /// If another process writes to the dataset, or files cannot be moved or deleted.
+    pub(crate) fn recover(&self, path: &Path) -> Result<()> {
+        self.backend()?.recover.map_or(Ok(()), |recover| recover(path))
     }
 
     fn backend(&self) -> Result<Backend> {

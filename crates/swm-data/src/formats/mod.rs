@@ -18,7 +18,7 @@ mod stored_scalar;
 mod video;
 
 pub use entry::{Backend, FormatEntry};
-pub use registry::{FORMATS, create, detect, open};
+pub use registry::{FORMATS, create, detect, open, recover};
 
 use std::path::Path;
 

@@ -48,6 +48,19 @@ pub fn open(location: impl Into<Location>) -> Result<Arc<dyn Reader>> {
     Err(Error::corrupt(location.label(), problem, fix))
 }
 
+/// Completes or undoes the replacement of a dataset that was interrupted, if there is one: what writes to a dataset that it
+/// reads before calls this first.
+///
+/// # Errors
+/// If another process writes to the dataset, or files cannot be moved or deleted.
+pub fn recover(location: &Location) -> Result<()> {
+    let Some((path, folder)) = location.path().and_then(|path| Some((path, set_aside::folder(path)?))) else {
+        return Ok(());
+    };
+    let named = FORMATS.rows.iter().find(|format| format.has_suffix(location));
+    named.or_else(|| detect(&Location::from(folder))).map_or(Ok(()), |format| format.recover(path))
+}
+
 /// Creates, continues or replaces a dataset whose episodes have the columns of `schema`, in the format that the
 /// location's suffix names. Use [`FormatEntry::create`] for locations without such a suffix.
 ///

@@ -41,10 +41,14 @@ pub trait DatasetFiles: Copy + Send + 'static {
 /// The folders of both formats that have files set aside.
 pub const FOLDERS: [&str; 2] = ["ep_len.replaced", "meta/replaced"];
 
+/// The folder in a dataset's folder in which files are set aside, if there is one.
+pub fn folder(path: &Path) -> Option<PathBuf> {
+    FOLDERS.map(|name| path.join(name)).into_iter().find(|folder| folder.is_dir())
+}
+
 /// The error of a folder whose old dataset is set aside and whose new one has no episode.
 pub fn interrupted(location: &Location) -> Option<Error> {
-    let path = location.path()?;
-    let folder = FOLDERS.map(|name| path.join(name)).into_iter().find(|folder| folder.is_dir())?;
+    let folder = folder(location.path()?)?;
     let problem = format!("it is being replaced, or that was interrupted; its old files are in {}", folder.display());
     let fix = "append to it, or repeat the command that replaces it: the old files return first";
     Some(Error::corrupt(location.label(), problem, fix))

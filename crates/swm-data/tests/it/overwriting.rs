@@ -4,9 +4,10 @@ use crate::fuzz::files;
 use crate::replacing::names;
 use crate::sample::{check, episode, options, schema, write};
 use std::os::unix::fs::symlink;
+use swm_core::run::Control;
 use swm_core::{Batch, ColumnSpec, DType, Schema};
 use swm_data::lance::{Shard, commit_shards, create_shard};
-use swm_data::{FORMATS, Location, WriteMode, create, open};
+use swm_data::{ConvertMode, ConvertOptions, FORMATS, Location, WriteMode, convert, create, open};
 
 #[test]
 fn refused_first_episodes_keep_the_old_dataset() {
@@ -75,6 +76,36 @@ fn finished_writer_without_episodes_replaces_the_dataset() {
         write(&path, WriteMode::Create, 1, 0..3);
         create(&path, &schema(), options(WriteMode::Overwrite)).and_then(|writer| writer.finish()).expect("replacing");
         assert!(open(&path).expect("opening").episodes().is_empty(), "{format}");
+    }
+}
+
+#[test]
+fn interrupted_replacements_are_undone_before_a_target_is_read() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let source = folder.path().join("source.lance");
+    write(&source, WriteMode::Create, 1, 3..4);
+    for (format, aside) in [("folder", "ep_len.replaced"), ("video", "ep_len.replaced"), ("lerobot", "meta/replaced")] {
+        // A name without a suffix, so that the format is recognised by the files.
+        for name in [format!("d.{format}"), format!("d-{format}")] {
+            let (path, kept) = (folder.path().join(&name), folder.path().join("kept"));
+            let entry = FORMATS.get(format).expect("the format");
+            let mut writer =
+                entry.create(&Location::from(&path), &schema(), options(WriteMode::Create)).expect("creating");
+            (0..3).for_each(|e| writer.write_episode(&episode(e)).expect("writing an episode"));
+            writer.finish().expect("finishing");
+            // As a kill leaves it before the first commit of the new dataset.
+            std::fs::rename(&path, &kept).expect("moving the dataset");
+            std::fs::create_dir_all(path.join(aside).parent().expect("a folder")).expect("creating a folder");
+            std::fs::rename(&kept, path.join(aside)).expect("moving the dataset");
+            let error = open(&path).err().expect("nothing to read").to_string();
+            assert!(error.contains("its old files are in"), "{name}: {error}");
+            let options = ConvertOptions { mode: ConvertMode::Append, ..ConvertOptions::default() };
+            convert(&open(&source).expect("the source"), &Location::from(&path), &options, &mut Control::new())
+                .expect("appending");
+            let reader = open(&path).expect("opening");
+            assert_eq!((reader.episodes().len(), path.join(aside).exists()), (4, false), "{name}");
+            check(&*reader, 0);
+        }
     }
 }
 

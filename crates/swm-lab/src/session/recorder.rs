@@ -173,6 +173,7 @@ impl Recorder {
 
 /// Checks that an existing dataset was recorded in the same environment with the same frames.
 fn check_own(location: &Location, new: &Manifest) -> Result<()> {
+    swm_data::recover(location)?;
     let stored = swm_data::open(location.clone())?.manifest();
     if stored.as_ref().is_some_and(|stored| stored.kind == KIND && stored.config == new.config) {
         return Ok(());

@@ -223,6 +223,7 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
     let Collection { location, config, .. } = collection;
     // Invalid options fail before an older dataset is replaced.
     let (mut world, mut policy, weights) = collection.prepare()?;
+    swm_data::recover(location)?;
     let mut manifest = collection.manifest(&world, weights)?;
     manifest.not_finite = match (collection.shard, collection.mode) {
         (None, mode) => collect_target::check(location, mode, &manifest, collection.mix_renderers, EXISTS)?,

@@ -20,6 +20,7 @@ mod writer;
 use crate::dataset::Location;
 use crate::formats::column_files::{self, ImageFiles, contains_videos, exists};
 use crate::formats::entry::{Backend, FormatEntry};
+use crate::formats::set_aside;
 
 /// The registry row of this format.
 pub const ENTRY: FormatEntry = FormatEntry {
@@ -34,6 +35,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
         open: reader::open,
         create: writer::create,
         remove: |path| column_files::remove(path, ImageFiles::Images),
+        recover: Some(|path| set_aside::recover_unlocked(path, ImageFiles::Images)),
     }),
 };
 

@@ -68,7 +68,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
 
 #[cfg(feature = "hdf5")]
 const BACKEND: Option<Backend> =
-    Some(Backend { open: reader::open, create: writer::create, remove: files::delete_file });
+    Some(Backend { open: reader::open, create: writer::create, remove: files::delete_file, recover: None });
 #[cfg(not(feature = "hdf5"))]
 const BACKEND: Option<Backend> = None;
 

@@ -41,5 +41,5 @@ pub const ENTRY: FormatEntry = FormatEntry {
     codecs: true,
     feature: None,
     detect: store::detect,
-    backend: Some(Backend { open: reader::open, create: writer::create, remove: removal::remove }),
+    backend: Some(Backend { open: reader::open, create: writer::create, remove: removal::remove, recover: None }),
 };

@@ -34,8 +34,12 @@ pub const ENTRY: FormatEntry = FormatEntry {
 };
 
 #[cfg(feature = "ffmpeg")]
-const BACKEND: Option<Backend> =
-    Some(Backend { open: reader::open, create: writer::create, remove: |path| lance::ENTRY.remove(&path.join(TABLE)) });
+const BACKEND: Option<Backend> = Some(Backend {
+    open: reader::open,
+    create: writer::create,
+    remove: |path| lance::ENTRY.remove(&path.join(TABLE)),
+    recover: None,
+});
 #[cfg(not(feature = "ffmpeg"))]
 const BACKEND: Option<Backend> = None;
 

@@ -49,6 +49,7 @@ pub(super) use removal::is_unfinished;
 
 use crate::dataset::Location;
 use crate::formats::entry::{Backend, FormatEntry};
+use crate::formats::set_aside;
 
 /// The registry row of this format.
 pub const ENTRY: FormatEntry = FormatEntry {
@@ -63,7 +64,12 @@ pub const ENTRY: FormatEntry = FormatEntry {
 };
 
 #[cfg(feature = "lerobot")]
-const BACKEND: Option<Backend> = Some(Backend { open: reader::open, create: writer::create, remove: removal::remove });
+const BACKEND: Option<Backend> = Some(Backend {
+    open: reader::open,
+    create: writer::create,
+    remove: removal::remove,
+    recover: Some(|path| set_aside::recover_unlocked(path, removal::Files)),
+});
 #[cfg(not(feature = "lerobot"))]
 const BACKEND: Option<Backend> = None;
 

@@ -29,6 +29,7 @@ use crate::dataset::Location;
 use crate::formats::column_files::{self, ImageFiles};
 use crate::formats::column_files::{contains_videos, exists};
 use crate::formats::entry::{Backend, FormatEntry};
+use crate::formats::set_aside;
 
 /// The registry row of this format.
 pub const ENTRY: FormatEntry = FormatEntry {
@@ -47,6 +48,7 @@ const BACKEND: Option<Backend> = Some(Backend {
     open: reader::open,
     create: writer::create,
     remove: |path| column_files::remove(path, ImageFiles::Videos),
+    recover: Some(|path| set_aside::recover_unlocked(path, ImageFiles::Videos)),
 });
 #[cfg(not(feature = "ffmpeg"))]
 const BACKEND: Option<Backend> = None;

@@ -13,7 +13,7 @@ pub use shard::convert_shard;
 
 use crate::dataset::episodes::describe_columns;
 use crate::dataset::{CommitPolicy, Constants, Location, Reader, StepRange, WriteMode, WriteOptions};
-use crate::formats::{FORMATS, FormatEntry, create, detect, has_no_dataset, open};
+use crate::formats::{FORMATS, FormatEntry, create, detect, has_no_dataset, open, recover};
 use comparison::{data_columns, dataset_hash, episode_hash};
 use losses::{check_psnr, check_ratio, has_images, is_lossy};
 use serde::Serialize;
@@ -126,6 +126,7 @@ pub fn convert(
         check_ratio(ratio, &**reader, target, options)?;
     }
     check_distinct(&**reader, target)?;
+    recover(target)?;
     if let Some((entry, trial)) = trial(&**reader, target, options)? {
         // The trial of a conversion that was killed is replaced.
         let options = ConvertOptions { format: Some(entry.id.to_owned()), ..options.clone() };

@@ -54,6 +54,7 @@ pub fn complete(given: &CollectArgs, trust: bool) -> Result<(CollectArgs, String
     if location.path().is_some_and(|path| !path.exists()) {
         home::find_dataset(&given.output)?;
     }
+    swm_data::recover(&location)?;
     let manifest = match given.shard {
         Some(shard) => shard_manifest(&location, shard)?,
         None if location.path().is_some_and(swm_data::has_no_dataset) => None,

@@ -84,6 +84,8 @@ impl<F: DatasetFiles> SetAside<F> {
         let folder = self.folder();
         let mut names = files::list(&folder)?;
         names.sort_by_key(|name| name != Path::new(self.files.metadata()));
+        // All of them or none.
+        names.iter().try_for_each(|name| files::check_free(&self.root.join(name)))?;
         files::move_named(&folder, &names, &self.root)?;
         files::remove_empty_folders(&folder)
     }

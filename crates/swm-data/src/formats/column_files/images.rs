@@ -60,13 +60,20 @@ impl ImageFiles {
 }
 
 /// The files of uncommitted episodes that a killed or failed writer left: those of the consecutive episodes from `from` on.
-pub(super) fn uncommitted(files: &[ImageFile], from: usize) -> impl Iterator<Item = &ImageFile> {
+/// The last is the first, so that a kill while they are deleted in this order leaves consecutive episodes.
+pub(super) fn uncommitted(files: &[ImageFile], from: usize) -> Vec<&ImageFile> {
     let mut last = from;
-    files.iter().filter(move |file| file.episode >= from).take_while(move |file| {
-        let consecutive = file.episode <= last;
-        last = last.max(file.episode + 1);
-        consecutive
-    })
+    let mut found: Vec<&ImageFile> = files
+        .iter()
+        .filter(|file| file.episode >= from)
+        .take_while(|file| {
+            let consecutive = file.episode <= last;
+            last = last.max(file.episode + 1);
+            consecutive
+        })
+        .collect();
+    found.reverse();
+    found
 }
 
 /// Parses an index as writers print it, without a sign and leading zeros.
@@ -106,8 +113,8 @@ mod tests {
     fn uncommitted_files_are_those_of_consecutive_episodes() {
         let file = |(episode, step)| ImageFile { episode, step, name: PathBuf::new() };
         let files: Vec<ImageFile> = [(0, 0), (2, 0), (2, 1), (3, 0), (5, 0)].map(file).into();
-        let of = |from| uncommitted(&files, from).map(|file| (file.episode, file.step)).collect::<Vec<_>>();
-        assert_eq!(of(2), [(2, 0), (2, 1), (3, 0)]);
+        let of = |from| uncommitted(&files, from).iter().map(|file| (file.episode, file.step)).collect::<Vec<_>>();
+        assert_eq!(of(2), [(3, 0), (2, 1), (2, 0)]);
         assert_eq!((of(0), of(1), of(4)), (vec![(0, 0)], vec![], vec![]));
     }
 }

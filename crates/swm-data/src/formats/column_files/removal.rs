@@ -77,8 +77,8 @@ fn stored_files(folder: &Path, images: ImageFiles) -> Result<(Schema, Vec<PathBu
         check_format(folder, &column.name, images, files.is_empty())?;
         let stored = files.iter().filter(|file| rows.get(file.episode).is_some_and(|&rows| file.step < rows));
         // The journal shows that the writer was killed.
-        let left = uncommitted(&files, rows.len()).filter(|_| killed);
-        names.extend(stored.chain(left).map(|file| file.name.clone()));
+        let left = if killed { uncommitted(&files, rows.len()) } else { vec![] };
+        names.extend(left.into_iter().chain(stored).map(|file| file.name.clone()));
     }
     names.extend(own_files(&schema));
     Ok((schema, names))

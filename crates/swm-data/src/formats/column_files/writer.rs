@@ -424,7 +424,7 @@ fn check_columns(schema: &Schema) -> Result<()> {
 fn discard_images(folder: &Path, schema: &Schema, images: ImageFiles, from: usize) -> Result<()> {
     for column in schema.columns().iter().filter(|column| column.is_image()) {
         let files = images.list(folder, &column.name)?;
-        let names: Vec<PathBuf> = images::uncommitted(&files, from).map(|file| file.name.clone()).collect();
+        let names: Vec<PathBuf> = images::uncommitted(&files, from).iter().map(|file| file.name.clone()).collect();
         files::delete_named(folder, &names)?;
     }
     Ok(())

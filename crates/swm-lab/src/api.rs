@@ -1,7 +1,7 @@
 //! The routes of the lab, behind [`crate::access`]. They answer to `GET` and change nothing, but those that save episodes as a
 //! new dataset, and start and stop trainings, by `POST`; all else that changes something goes through the socket of a session.
 
-use crate::datasets::{self, Datasets};
+use crate::datasets::{self, Chosen, Datasets};
 use crate::plans::{self, PlanSession};
 use crate::serve::PATIENCE;
 use crate::session::{self, Player, Running, Session, Setup, messages};
@@ -47,9 +47,9 @@ pub struct Shared {
 }
 
 impl Shared {
-    pub fn new(lab: Lab, scratch: &std::path::Path, stop: watch::Receiver<bool>) -> Self {
+    pub fn new(mut lab: Lab, scratch: &std::path::Path, stop: watch::Receiver<bool>) -> Self {
         Self {
-            datasets: Arc::new(Datasets::new(lab.datasets.clone())),
+            datasets: Arc::new(Datasets::new(lab.datasets.clone(), std::mem::take(&mut lab.sources))),
             lab: Arc::new(lab),
             running: Running::default(),
             trainings: Trainings::default(),
@@ -65,7 +65,24 @@ impl Shared {
         &self,
         work: impl FnOnce(&Self) -> Result<T> + Send + 'static,
     ) -> Result<T, Failed> {
-        let permit = Arc::clone(&self.work).acquire_owned().await.ok();
+        self.within(&self.work, work).await
+    }
+
+    /// As [`Shared::work`], for work that reads a dataset of a folder or a source.
+    async fn read<T: Send + 'static>(
+        &self,
+        folder: usize,
+        work: impl FnOnce(&Self) -> Result<T> + Send + 'static,
+    ) -> Result<T, Failed> {
+        self.within(self.datasets.limit(folder).unwrap_or(&self.work), work).await
+    }
+
+    async fn within<T: Send + 'static>(
+        &self,
+        limit: &Arc<Semaphore>,
+        work: impl FnOnce(&Self) -> Result<T> + Send + 'static,
+    ) -> Result<T, Failed> {
+        let permit = Arc::clone(limit).acquire_owned().await.ok();
         let shared = self.clone();
         let done = tokio::task::spawn_blocking(move || {
             // Work goes on after its client has gone, and counts until it ends.
@@ -116,6 +133,8 @@ pub fn routes(shared: Shared) -> Router {
         .route("/api/planners", get(planners))
         .route("/api/status", get(status))
         .route("/api/datasets", get(list_datasets))
+        .route("/api/names", get(names))
+        .route("/api/summary", get(summary))
         .route("/api/episodes", get(episodes))
         .route("/api/rows", get(rows))
         .route("/api/values", get(values))
@@ -254,6 +273,24 @@ async fn list_datasets(State(shared): State<Shared>) -> Answer {
     as_json(&shared.work(|shared| Ok(shared.datasets.list())).await?)
 }
 
+/// The query of a request about a source.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct SourceQuery {
+    folder: usize,
+}
+
+/// The names of the datasets of a source.
+async fn names(State(shared): State<Shared>, Query(query): Query<SourceQuery>) -> Answer {
+    as_json(&shared.read(query.folder, move |shared| shared.datasets.names(query.folder)).await?)
+}
+
+/// What the list of datasets says of one.
+async fn summary(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
+    let found = shared.read(query.folder, move |shared| shared.datasets.summary(query.folder, &query.name));
+    as_json(&found.await?)
+}
+
 /// The query of a request about an entry of a folder.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -278,18 +315,20 @@ struct EntryQuery {
 }
 
 async fn episodes(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
-    let table = shared.work(move |shared| datasets::episodes(&*shared.datasets.get(query.folder, &query.name)?));
+    let table =
+        shared.read(query.folder, move |shared| datasets::episodes(&*shared.datasets.get(query.folder, &query.name)?));
     as_json(&table.await?)
 }
 
 async fn rows(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
-    let rows =
-        shared.work(move |shared| datasets::rows(&*shared.datasets.get(query.folder, &query.name)?, query.episode));
+    let rows = shared.read(query.folder, move |shared| {
+        datasets::rows(&*shared.datasets.get(query.folder, &query.name)?, query.episode)
+    });
     as_json(&rows.await?)
 }
 
 async fn frame(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
-    let jpeg = shared.work(move |shared| {
+    let jpeg = shared.read(query.folder, move |shared| {
         let reader = shared.datasets.get(query.folder, &query.name)?;
         datasets::frame(&*reader, &query.column, query.episode, query.row)
     });
@@ -298,7 +337,7 @@ async fn frame(State(shared): State<Shared>, Query(query): Query<EntryQuery>) ->
 
 /// The smallest, the largest and the mean value of an element of a column in every episode.
 async fn values(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
-    let values = shared.work(move |shared| {
+    let values = shared.read(query.folder, move |shared| {
         datasets::values(&*shared.datasets.get(query.folder, &query.name)?, &query.column, query.x)
     });
     as_json(&values.await?)
@@ -306,7 +345,7 @@ async fn values(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -
 
 /// The video of an episode, to be stored by the browser.
 async fn video(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
-    let video = shared.work(move |shared| {
+    let video = shared.read(query.folder, move |shared| {
         let reader = shared.datasets.get(query.folder, &query.name)?;
         datasets::video(reader, &query.column, query.episode, &shared.scratch)
     });
@@ -316,7 +355,7 @@ async fn video(State(shared): State<Shared>, Query(query): Query<EntryQuery>) ->
 }
 
 async fn distribution(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
-    let found = shared.work(move |shared| {
+    let found = shared.read(query.folder, move |shared| {
         let reader = shared.datasets.get(query.folder, &query.name)?;
         crate::distribution::distribution(&*reader, &query.column, [query.x, query.y])
     });
@@ -324,8 +363,9 @@ async fn distribution(State(shared): State<Shared>, Query(query): Query<EntryQue
 }
 
 async fn doctor(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -> Answer {
-    let found =
-        shared.work(move |shared| shared.datasets.examine(query.folder, &query.name, &mut until_stopped(&shared.stop)));
+    let found = shared.read(query.folder, move |shared| {
+        shared.datasets.examine(query.folder, &query.name, &mut until_stopped(&shared.stop))
+    });
     as_json(&found.await?)
 }
 
@@ -339,8 +379,9 @@ async fn body<T: DeserializeOwned>(request: Request, fields: &str) -> Result<T, 
 }
 
 async fn save(State(shared): State<Shared>, request: Request) -> Answer {
-    let chosen = body(request, "folder, name, target and episodes").await?;
-    let saved = shared.work(move |shared| shared.datasets.save(chosen, &mut until_stopped(&shared.stop)));
+    let chosen: Chosen = body(request, "folder, name, target and episodes").await?;
+    let saved =
+        shared.read(chosen.folder, move |shared| shared.datasets.save(chosen, &mut until_stopped(&shared.stop)));
     as_json(&json!({"episodes": saved.await?}))
 }
 

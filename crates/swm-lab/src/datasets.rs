@@ -1,6 +1,7 @@
 //! Datasets: their list, the table of episodes, the values of an episode's columns, and its frames.
 
 use crate::folders::{Folders, new_dataset};
+use crate::sources::Source;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -11,6 +12,7 @@ use swm_core::{ColumnSpec, Error, Result, columns, files};
 use swm_data::doctor::{Diagnosis, examine, open_damaged};
 use swm_data::views::subset;
 use swm_data::{ConvertMode, ConvertOptions, FORMATS, ImageCodec, Location, PreviewOptions, Reader, StepRange};
+use tokio::sync::Semaphore;
 
 /// The largest number of elements of a value that is plotted.
 pub const MOST_ELEMENTS: usize = 64;
@@ -31,7 +33,9 @@ const MOST_BYTES: u64 = 256 << 20;
 const QUALITY: u8 = 90;
 /// How long a reader is kept, so that a dataset that grows is read again.
 const KEPT: Duration = Duration::from_secs(5);
-/// The number of readers that are kept.
+/// The same for one at a URI, where opening takes requests.
+const KEPT_AT_URI: Duration = Duration::from_secs(60);
+/// The number of readers that are kept, and of those at URIs.
 const READERS: usize = 4;
 
 /// Returns whether a path is a dataset of a known format.
@@ -69,25 +73,26 @@ pub struct Chosen {
     pub episodes: Vec<usize>,
 }
 
-/// Readers of datasets in some folders.
+/// Readers of datasets in some folders and sources. Sources are numbered after the folders.
 pub struct Datasets {
     folders: Folders,
+    sources: Vec<Source>,
     open: Mutex<Vec<Open>>,
 }
 
-/// The path of a dataset, when it was opened, and its reader.
-type Open = (PathBuf, Instant, Arc<dyn Reader>);
+/// Where a dataset is, when it was opened, and its reader.
+type Open = (Location, Instant, Arc<dyn Reader>);
 
 impl Datasets {
-    /// The datasets in these folders.
-    pub fn new(folders: Folders) -> Self {
-        Self { folders, open: Mutex::new(vec![]) }
+    /// The datasets in these folders and sources.
+    pub fn new(folders: Folders, sources: Vec<Source>) -> Self {
+        Self { folders, sources, open: Mutex::new(vec![]) }
     }
 
-    /// The datasets of all folders. One that does not open has an `error`.
+    /// The datasets of all folders, and the sources, whose datasets are not read. A dataset that does not open has an `error`.
     pub fn list(&self) -> Value {
         let found = self.folders.list(1, is_dataset).into_iter().map(|found| {
-            let mut value = match self.open(&found.path).and_then(|reader| summary(&*reader)) {
+            let mut value = match self.open(&found.path.into()).and_then(|reader| summary(&*reader)) {
                 Ok(value) => value,
                 Err(error) => json!({"error": error.to_string()}),
             };
@@ -96,7 +101,50 @@ impl Datasets {
             value
         });
         let folders: Vec<_> = self.folders.paths().iter().map(|path| path.display().to_string()).collect();
-        json!({"folders": folders, "datasets": found.collect::<Vec<_>>()})
+        let sources = self.sources.iter().enumerate().map(|(i, source)| {
+            let location = source.location().to_string();
+            json!({"folder": folders.len() + i, "location": location, "name": source.name()})
+        });
+        let sources: Vec<_> = sources.collect();
+        json!({"folders": folders, "datasets": found.collect::<Vec<_>>(), "sources": sources})
+    }
+
+    /// The names of the datasets of a source.
+    ///
+    /// # Errors
+    /// When there is no such source, or its store does not list them.
+    pub fn names(&self, folder: usize) -> Result<Vec<String>> {
+        let none = || {
+            let fix = "reload the page, which lists the sources of the lab";
+            Error::config(format!("source {folder}"), "there is no such source", fix)
+        };
+        self.source(folder).ok_or_else(none)?.list()
+    }
+
+    /// The environment, the columns and the counts of a dataset. It is not kept open, because a page asks for those of all.
+    ///
+    /// # Errors
+    /// When there is no such dataset, or it is damaged.
+    pub fn summary(&self, folder: usize, name: &str) -> Result<Value> {
+        let location = self.location(folder, name)?;
+        summary(&*self.known(&location).map_or_else(|| swm_data::open(location), Ok)?)
+    }
+
+    /// The limit of work that reads a source; `None` for a folder.
+    pub fn limit(&self, folder: usize) -> Option<&Arc<Semaphore>> {
+        self.source(folder).map(Source::limit)
+    }
+
+    fn source(&self, folder: usize) -> Option<&Source> {
+        self.sources.get(folder.checked_sub(self.folders.paths().len())?)
+    }
+
+    /// The location of a dataset.
+    fn location(&self, folder: usize, name: &str) -> Result<Location> {
+        match self.source(folder) {
+            Some(source) => source.find(name),
+            None => self.path(folder, name).map(Location::from),
+        }
     }
 
     /// Opens a dataset by name.
@@ -104,10 +152,10 @@ impl Datasets {
     /// # Errors
     /// When there is no such dataset, or it is damaged.
     pub fn get(&self, folder: usize, name: &str) -> Result<Arc<dyn Reader>> {
-        self.open(&self.folders.find(folder, name, 1, is_dataset)?)
+        self.open(&self.location(folder, name)?)
     }
 
-    /// The path of a dataset.
+    /// The path of a dataset in a folder.
     ///
     /// # Errors
     /// When there is no such dataset.
@@ -120,8 +168,7 @@ impl Datasets {
     /// # Errors
     /// When there is no such dataset, no part of it can be opened, or the examination is stopped.
     pub fn examine(&self, folder: usize, name: &str, control: &mut Control<'_>) -> Result<Diagnosis> {
-        let path = self.folders.find(folder, name, 1, is_dataset)?;
-        let (reader, lost) = open_damaged(&Location::from(path))?;
+        let (reader, lost) = open_damaged(&self.location(folder, name)?)?;
         let mut diagnosis = examine(&*reader, &[], control)?;
         diagnosis.add_losses(lost);
         Ok(diagnosis)
@@ -136,26 +183,32 @@ impl Datasets {
         let folder =
             first.ok_or_else(|| Error::config("saving", "the lab has no folder of datasets", "set STABLEWM_HOME"))?;
         let target = Location::from(new_dataset(folder, &chosen.target)?);
-        let source = self.folders.find(chosen.folder, &chosen.name, 1, is_dataset)?;
-        let (reader, _) = open_damaged(&Location::from(source))?;
+        let (reader, _) = open_damaged(&self.location(chosen.folder, &chosen.name)?)?;
         let options = ConvertOptions { mode: ConvertMode::Create, ..ConvertOptions::default() };
         Ok(swm_data::convert(&subset(reader, chosen.episodes)?, &target, &options, control)?.episodes)
     }
 
-    fn open(&self, path: &Path) -> Result<Arc<dyn Reader>> {
-        let lock = || self.open.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut open = lock();
-        open.retain(|(_, since, _)| since.elapsed() < KEPT);
-        if let Some((.., reader)) = open.iter().find(|(known, ..)| known == path) {
-            return Ok(Arc::clone(reader));
+    /// The reader of a dataset that is open.
+    fn known(&self, location: &Location) -> Option<Arc<dyn Reader>> {
+        let mut open = self.open.lock().unwrap_or_else(PoisonError::into_inner);
+        open.retain(|(known, since, _)| since.elapsed() < if known.path().is_some() { KEPT } else { KEPT_AT_URI });
+        open.iter().find(|(known, ..)| known == location).map(|(.., reader)| Arc::clone(reader))
+    }
+
+    fn open(&self, location: &Location) -> Result<Arc<dyn Reader>> {
+        if let Some(reader) = self.known(location) {
+            return Ok(reader);
         }
-        drop(open);
-        let reader = swm_data::open(Location::from(path.to_owned()))?;
-        let mut open = lock();
-        if open.len() >= READERS {
-            open.remove(0);
+        let reader = swm_data::open(location)?;
+        let mut open = self.open.lock().unwrap_or_else(PoisonError::into_inner);
+        // A list opens every dataset of the folders; those at URIs stay.
+        let is_same_kind = |(known, ..): &Open| known.path().is_some() == location.path().is_some();
+        if open.iter().filter(|known| is_same_kind(known)).count() >= READERS
+            && let Some(oldest) = open.iter().position(is_same_kind)
+        {
+            open.remove(oldest);
         }
-        open.push((path.to_owned(), Instant::now(), Arc::clone(&reader)));
+        open.push((location.clone(), Instant::now(), Arc::clone(&reader)));
         Ok(reader)
     }
 }

@@ -7,7 +7,7 @@ use swm_core::{Error, Result};
 /// The longest name of a dataset that the lab writes.
 const LONGEST: usize = 64;
 /// The largest number of entries that are listed in a folder.
-const MOST: usize = 5_000;
+pub const MOST: usize = 5_000;
 
 /// Folders, in the order in which they are shown.
 #[derive(Clone, Debug, Default)]

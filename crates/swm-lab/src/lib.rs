@@ -6,8 +6,8 @@
 //! - [`rendering`]: which camera view of an environment is shown, and the wrappers of its frames.
 //! - [`session`]: a live environment behind a WebSocket, which a policy or a person drives, and whose episodes can be recorded.
 //! - [`plans`]: a live environment that a solver plans in, whose searches are shown, and whose steps are a tree to go back in.
-//! - [`datasets`], [`distribution`] and [`runs`]: what the pages of datasets and of training curves show, from [`folders`] that the lab was
-//!   started with, and no other.
+//! - [`datasets`], [`distribution`] and [`runs`]: what the pages of datasets and of training curves show, from [`folders`] and
+//!   [`sources`] that the lab was started with, and no other.
 //! - [`reports`]: results and studies, and their pages.
 //! - [`trainings`]: trainings that pages start and stop.
 //! - [`assets`]: the pages, built from `web/` and embedded.
@@ -27,6 +27,7 @@ pub mod reports;
 pub mod runs;
 pub mod serve;
 pub mod session;
+pub mod sources;
 pub mod still;
 pub mod trainings;
 
@@ -60,6 +61,8 @@ pub struct Lab {
     pub results: Folders,
     /// Folders of datasets. The first receives recorded demonstrations.
     pub datasets: Folders,
+    /// Datasets at URIs, which are read only.
+    pub sources: Vec<sources::Source>,
     /// Folders of training runs. The first receives those that pages start.
     pub runs: Folders,
     /// Threads of an environment; 0 for one per core.

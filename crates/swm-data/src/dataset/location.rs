@@ -78,6 +78,22 @@ impl Location {
         }
     }
 
+    /// The location of an entry of this folder.
+    #[must_use]
+    pub fn child(&self, name: &str) -> Self {
+        match self {
+            Self::Path(path) => Self::Path(path.join(name)),
+            Self::Uri(url) => {
+                let mut url = url.clone();
+                // A URI without segments names no folder, so that it has no entries.
+                if let Ok(mut segments) = url.path_segments_mut() {
+                    segments.pop_if_empty().push(name);
+                }
+                Self::Uri(url)
+            }
+        }
+    }
+
     /// Whether the name ends in `.suffix`, ignoring case.
     pub fn has_suffix(&self, suffix: &str) -> bool {
         self.name().rsplit_once('.').is_some_and(|(stem, end)| !stem.is_empty() && end.eq_ignore_ascii_case(suffix))
@@ -130,6 +146,16 @@ mod tests {
         assert!(uri.path().is_none() && uri.has_suffix("lance") && uri.name() == "pusht.LANCE");
         assert_eq!(uri.to_string(), "s3://bucket/runs/pusht.LANCE/");
         assert!(!Location::parse("runs/.lance")?.has_suffix("lance"), "`.lance` is a hidden file, not a suffix");
+        Ok(())
+    }
+
+    #[test]
+    fn entries_of_a_folder_keep_their_names() -> Result<()> {
+        let of = |folder: &str, name: &str| Ok::<_, Error>(Location::parse(folder)?.child(name).to_string());
+        assert_eq!(of("s3://bucket/sets", "a.lance")?, "s3://bucket/sets/a.lance");
+        assert_eq!(of("s3://bucket", "a.lance")?, of("s3://bucket/", "a.lance")?);
+        assert_eq!(of("s3://bucket/sets/", "50 %2f?x.lance")?, "s3://bucket/sets/50%20%252f%3Fx.lance");
+        assert_eq!(of("/sets", "a.lance")?, "/sets/a.lance");
         Ok(())
     }
 

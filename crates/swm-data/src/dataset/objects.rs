@@ -14,7 +14,7 @@ mod whole;
 pub(crate) use blocks::{BlockCache, ObjectRanges};
 pub(crate) use patience::answer_or_report;
 pub(crate) use threads::{block_on, start_lance};
-pub use whole::{list_files, list_versions, read_file, write_file, write_new_file};
+pub use whole::{list_files, list_names, list_versions, read_file, write_file, write_new_file};
 
 use crate::dataset::location::Location;
 use object_store::path::Path as StorePath;

@@ -9,7 +9,7 @@ use std::path::Path;
 use std::process::{Command, Output, Stdio};
 use std::sync::Arc;
 use swm_data::lance::{Shard, commit_shards, create_shard};
-use swm_data::objects::ObjectFile;
+use swm_data::objects::{ObjectFile, list_names};
 use swm_data::{CommitPolicy, Constants, Location, StepRange, WriteMode, WriteOptions, create, open};
 
 /// Environment variable of child processes: the location of the dataset.
@@ -117,6 +117,11 @@ fn child_that_writes_and_reads() {
     assert_eq!(commit_shards(&location).expect("committing the shards"), 2);
     let reader = open(&location).expect("opening the dataset");
     check(&*reader, 2);
+    let Location::Uri(mut prefix) = location else { panic!("a URI") };
+    for (path, names) in [("/runs", &["d.lance"][..]), ("/", &["runs"]), ("/none", &[])] {
+        prefix.set_path(path);
+        assert_eq!(list_names(&Location::Uri(prefix.clone())).expect("a list"), names, "{prefix}");
+    }
     println!("hash {}", reader.content_hash().expect("hashing the content"));
 }
 

@@ -8,6 +8,7 @@ mod plans;
 mod refusals;
 mod rendering;
 mod reports;
+mod sources;
 mod trainings;
 
 use serde_json::Value;
@@ -22,6 +23,7 @@ use swm_core::policy::ExpertPolicy;
 use swm_core::{EnvEntry, Policy, Result};
 use swm_eval::World;
 use swm_lab::folders::Folders;
+use swm_lab::sources::Source;
 use swm_lab::{Lab, Options, Token, serve};
 use tokio_tungstenite::tungstenite::WebSocket;
 use tokio_tungstenite::tungstenite::protocol::{Message, Role};
@@ -45,6 +47,11 @@ pub fn expert(entry: &EnvEntry, _: &str, world: &World) -> Result<Box<dyn Policy
 
 impl TestLab {
     pub fn start() -> Self {
+        Self::with(vec![])
+    }
+
+    /// A lab with datasets at URIs.
+    pub fn with(sources: Vec<Source>) -> Self {
         let home = tempfile::tempdir().expect("a folder");
         let lab = Lab {
             envs: &swm_envs::ENVS,
@@ -55,6 +62,7 @@ impl TestLab {
             reports: Box::new(reports::Files),
             results: Folders::new(vec![home.path().to_owned()]),
             datasets: Folders::new(vec![home.path().join("datasets")]),
+            sources,
             runs: Folders::new(vec![home.path().join("checkpoints")]),
             threads: 1,
             measured: None,

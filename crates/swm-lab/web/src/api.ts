@@ -45,6 +45,8 @@ export interface Column {
 export interface Dataset {
   folder: number;
   name: string;
+  // The URI of a dataset in a source.
+  location?: string;
   error?: string;
   env?: string;
   policy?: unknown;
@@ -53,6 +55,13 @@ export interface Dataset {
   steps?: number;
   bytes?: number;
   columns?: Column[];
+}
+
+// Where datasets are beside the folders: one dataset with its name, or a prefix.
+export interface Source {
+  folder: number;
+  location: string;
+  name: string | null;
 }
 
 export interface Episodes {

@@ -1,24 +1,26 @@
 // The page of datasets: the list, the table of episodes, and one episode with its frames and columns.
 
 import { useMemo, useState } from "preact/hooks";
-import { address, type Dataset, type Episodes, get, type Values } from "./api";
+import { address, type Dataset, type Episodes, get, type Source, type Values } from "./api";
 import { Coverage } from "./coverage";
 import { Curation } from "./curation";
 import { EpisodeView } from "./episode";
 import { chosenColumn, Filters, order } from "./filters";
 import { bytes, count } from "./format";
+import { summaryOf, useSources } from "./sources";
 import { type Params, patch, useKeys, useLoaded } from "./state";
 import { type SortKey, Table } from "./table";
 
 interface Listed {
   folders: string[];
   datasets: Dataset[];
+  sources: Source[];
 }
 
 export function DataPage({ params }: { params: Params }) {
   const { value, error, again } = useLoaded(() => get<Listed>("datasets"), "datasets");
   const [filter, setFilter] = useState("");
-  const all = value?.datasets ?? [];
+  const all = [...(value?.datasets ?? []), ...useSources(value?.sources)];
   const shown = all.filter((set) => `${set.name} ${set.env ?? ""}`.toLowerCase().includes(filter.toLowerCase()));
   const folder = Number(params.folder) || 0;
   const chosen = all.find((set) => set.name === params.name && set.folder === folder);
@@ -43,22 +45,18 @@ export function DataPage({ params }: { params: Params }) {
               <button
                 type="button"
                 aria-current={set === chosen}
-                title={set.error ?? set.name}
+                title={set.error ?? set.location ?? set.name}
                 onClick={() =>
                   patch({ name: set.name, folder: set.folder ? String(set.folder) : undefined, episode: undefined, row: undefined, cut: undefined, col: undefined, element: undefined, within: undefined, beside: undefined, sort: undefined })
                 }
               >
                 <span>{set.name}</span>
-                <small>
-                  {set.error
-                    ? "does not open"
-                    : `${set.env ?? "unknown environment"} · ${count(set.episodes ?? 0)} episodes · ${bytes(set.bytes ?? 0)}`}
-                </small>
+                <small>{described(set)}</small>
               </button>
             </li>
           ))}
         </ul>
-        {value && all.length === 0 && (
+        {value && all.length === 0 && value.sources.length === 0 && (
           <p class="muted">
             No datasets in {value.folders.join(", ")}. <code>swm collect</code> writes one, and so do demonstrations that are
             recorded on the first page.
@@ -71,16 +69,45 @@ export function DataPage({ params }: { params: Params }) {
           <p class="error" role="alert">
             {chosen.error}
           </p>
-          <Curation set={chosen} cut={new Set()} count={0} onCut={() => undefined} onSaved={again} />
+          {/* Of a prefix that is not listed, nothing can be examined. */}
+          {chosen.name !== chosen.location && (
+            <Curation set={chosen} cut={new Set()} count={0} onCut={() => undefined} onSaved={again} />
+          )}
         </section>
       )}
-      {chosen && !chosen.error && <DatasetView key={`${chosen.folder}:${chosen.name}`} set={chosen} params={params} onSaved={again} />}
+      {chosen && !chosen.error && <Opened key={`${chosen.folder}:${chosen.name}`} set={chosen} params={params} onSaved={again} />}
       {!chosen && <p class="loading">{value ? "Choose a dataset." : "Reading the folders …"}</p>}
     </div>
   );
 }
 
-function DatasetView({ set, params, onSaved }: { set: Dataset; params: Params; onSaved: () => void }) {
+function described(set: Dataset): string {
+  if (set.error) return "does not open";
+  if (!set.columns) return set.location ?? "";
+  return `${set.env ?? "unknown environment"} · ${count(set.episodes ?? 0)} episodes · ${bytes(set.bytes ?? 0)}`;
+}
+
+interface ViewProps {
+  set: Dataset;
+  params: Params;
+  onSaved: () => void;
+}
+
+// A dataset of a source may be chosen before the list has opened it.
+function Opened({ set, params, onSaved }: ViewProps) {
+  const { value, error } = useLoaded(() => (set.columns ? Promise.resolve(set) : summaryOf(set)), `${set.folder}:${set.name}`);
+  const whole = set.columns ? set : value?.columns && { ...set, ...value };
+  if (whole) return <DatasetView set={whole} params={params} onSaved={onSaved} />;
+  return error ? (
+    <p class="error" role="alert">
+      {error}
+    </p>
+  ) : (
+    <p class="loading">Opening {set.location} …</p>
+  );
+}
+
+function DatasetView({ set, params, onSaved }: ViewProps) {
   const key = `${set.folder}:${set.name}`;
   const { value: table, error } = useLoaded(
     () => get<Episodes>("episodes", { folder: set.folder, name: set.name }),

@@ -5,7 +5,11 @@ use crate::dataset::location::Location;
 use bytes::Bytes;
 use futures::TryStreamExt as _;
 use object_store::{ObjectMeta, ObjectStoreExt as _, PutMode, PutOptions, PutPayload};
+use std::time::Duration;
 use swm_core::{Error, Result};
+
+/// The time for the list of a folder, which a store could continue for ever.
+const LISTING: Duration = Duration::from_secs(60);
 
 /// Reads a file; `None` if it does not exist.
 ///
@@ -50,6 +54,27 @@ pub fn write_new_file(location: &Location, content: Vec<u8>) -> Result<bool> {
 /// If a request to the store fails.
 pub fn list_files(folder: &Location) -> Result<Vec<String>> {
     Ok(listed(folder)?.into_iter().map(|(name, _)| name).collect())
+}
+
+/// Returns the names of the files and folders in a folder, sorted; none if it does not exist.
+///
+/// # Errors
+/// If a request to the store fails, or the list does not end within a minute.
+pub fn list_names(folder: &Location) -> Result<Vec<String>> {
+    let (store, prefix) = store(folder)?;
+    let list = async move {
+        let endless = |_| object_store::Error::Generic { store: "object", source: "its list does not end".into() };
+        tokio::time::timeout(LISTING, store.list_with_delimiter(Some(&prefix))).await.map_err(endless)?
+    };
+    let found = match run(folder, "listing it", list)? {
+        Err(object_store::Error::NotFound { .. }) => return Ok(vec![]),
+        listed => finish(folder, "listing it", listed)?,
+    };
+    let all = found.objects.iter().map(|file| &file.location).chain(&found.common_prefixes);
+    let mut names: Vec<String> = all.filter_map(|path| path.filename().map(str::to_owned)).collect();
+    names.sort();
+    names.dedup();
+    Ok(names)
 }
 
 /// Returns the files below a folder, or the file at this location under the empty name, each with what changes when it does.
@@ -121,6 +146,7 @@ mod tests {
         write_file(&at("c.json"), b"third".to_vec())?;
         assert_eq!(read_file(&at("a/b.json"))?.as_deref(), Some(&b"first"[..]));
         assert_eq!(list_files(&at(""))?, ["a/b.json", "c.json"]);
+        assert_eq!((list_names(&at(""))?, list_names(&at("none"))?), (vec!["a".into(), "c.json".into()], vec![]));
         Ok(())
     }
 }

@@ -61,6 +61,7 @@ pub fn bench(args: &LabBenchArgs, context: &Context) -> anyhow::Result<()> {
         results: Folders::default(),
         training: Box::new(OwnProgram { threads: context.threads }),
         datasets: Folders::default(),
+        sources: vec![],
         runs,
         threads: context.threads,
         measured: Some(sender),

@@ -17,7 +17,10 @@ use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
 use swm_core::{Error, Result};
+use swm_data::hub::HubUri;
+use swm_data::{FORMATS, Location, open};
 use swm_lab::folders::Folders;
+use swm_lab::sources::Source;
 use swm_lab::{Lab, Options, Token, serve};
 use training::OwnProgram;
 use wrapping::OwnWrappers;
@@ -41,9 +44,12 @@ pub struct LabArgs {
     /// It permits to use the lab. SWM_LAB_TOKEN can hold it instead, which keeps it out of the list of processes.
     #[arg(long)]
     token: Option<String>,
-    /// Another folder of datasets; may be repeated
-    #[arg(long, value_name = "DIR")]
-    data: Vec<PathBuf>,
+    /// Another folder of datasets, a dataset, or a URI; may be repeated
+    ///
+    /// A URI names a dataset, as for `swm inspect`, or a prefix of s3://, gs:// or az:// below which datasets lie. Datasets of the hub
+    /// (hf://) are downloaded before the lab starts.
+    #[arg(long, value_name = "DIR|URI")]
+    data: Vec<String>,
     /// Another folder of training runs; may be repeated
     #[arg(long, value_name = "DIR")]
     runs: Vec<PathBuf>,
@@ -62,6 +68,7 @@ pub fn lab(args: &LabArgs, context: &Context) -> anyhow::Result<()> {
         Ok(Folders::new(std::iter::once(first).chain(others.iter().cloned()).collect()))
     };
     let runs = folders(home::checkpoints()?, &args.runs)?;
+    let (datasets, sources) = datasets(&args.data)?;
     let lab = Lab {
         envs: &ENVS,
         wrapping: Box::new(OwnWrappers),
@@ -70,7 +77,8 @@ pub fn lab(args: &LabArgs, context: &Context) -> anyhow::Result<()> {
         reports: Box::new(Pages),
         results: folders(home::home()?, &args.results)?,
         training: Box::new(OwnProgram { threads: context.threads }),
-        datasets: folders(home::datasets()?, &args.data)?,
+        datasets,
+        sources,
         runs,
         threads: context.threads,
         measured: None,
@@ -84,10 +92,34 @@ pub fn lab(args: &LabArgs, context: &Context) -> anyhow::Result<()> {
         eprint("Ctrl-C ends the lab\n");
     }
     if !args.no_open {
-        open(&url);
+        browse(&url);
     }
     server.run(&context.interrupt);
     Ok(())
+}
+
+/// The folders of datasets, and what `--data` names beside.
+fn datasets(given: &[String]) -> Result<(Folders, Vec<Source>)> {
+    let (mut folders, mut sources) = (vec![home::datasets()?], vec![]);
+    for given in given {
+        let location =
+            if given.contains("://") { home::location(given)? } else { Location::from(PathBuf::from(given)) };
+        let is_named = FORMATS.rows.iter().any(|format| format.has_suffix(&location));
+        match location.path() {
+            None => sources.push(Source::at(location)?),
+            // A download has the name of its commit, so that its format is detected.
+            Some(path) if path.exists() && (is_named || HubUri::is_uri(given) && open(&location).is_ok()) => {
+                let name = given.trim_end_matches('/').rsplit('/').next().unwrap_or(given);
+                sources.push(Source::dataset(location.clone(), name));
+            }
+            Some(path) if path.is_dir() => folders.push(path.to_owned()),
+            Some(_) => {
+                let fix = "give an existing folder of datasets, a dataset, or the URI of one";
+                return Err(Error::config(given, "is neither a folder nor a dataset", fix));
+            }
+        }
+    }
+    Ok((Folders::new(folders), sources))
 }
 
 /// The token of the command line, or a random one.
@@ -105,7 +137,7 @@ fn token(args: &LabArgs) -> Result<Token> {
 }
 
 /// Opens a URL in the browser. If that fails, the URL that was printed remains.
-fn open(url: &str) {
+fn browse(url: &str) {
     let program = if cfg!(target_os = "macos") { "open" } else { "xdg-open" };
     let mut command = Command::new(program);
     command.arg(url).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());

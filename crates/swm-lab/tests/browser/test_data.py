@@ -61,6 +61,29 @@ def test_two_episodes_are_scrubbed_together_and_one_is_a_video(lab, open_page):
     expect(frames).to_have_count(1)
 
 
+def test_episodes_of_two_datasets_are_scrubbed_together(open_page):
+    page = open_page("#data?name=rooms.lance&episode=3", width=1400)
+    page.get_by_role("button", name="Keep beside").click()
+    page.get_by_role("button", name=re.compile("pushes.lance")).click()
+    page.locator(".table .all .row").nth(1).click()
+    heading = page.get_by_role("heading", name=re.compile("Episode 1 .* beside episode 3 of rooms.lance"))
+    expect(heading).to_be_visible()
+    frames = page.locator(".episode .frame img")
+    expect(frames).to_have_count(2)
+    # The columns that both datasets have.
+    expect(page.get_by_label("Chart of action")).to_have_count(2)
+    page.get_by_label("Row").fill("4")
+    for frame in frames.all():
+        expect(frame).to_have_attribute("alt", "Row 4 of pixels")
+    columns = page.get_by_role("group", name="Columns")
+    expect(columns.get_by_role("button", name="state")).to_be_visible()
+    expect(columns.get_by_role("button", name="block_pose")).to_have_count(0)
+    page.reload()
+    expect(heading).to_be_visible()
+    page.get_by_role("button", name="Not beside").click()
+    expect(frames).to_have_count(1)
+
+
 def test_a_leaderboard_is_shown(lab, open_page):
     entries = Path(__file__).parents[4] / "leaderboard"
     lab.swm("leaderboard", "build", str(entries), "--output", "board")

@@ -47,7 +47,7 @@ export function DataPage({ params }: { params: Params }) {
                 aria-current={set === chosen}
                 title={set.error ?? set.location ?? set.name}
                 onClick={() =>
-                  patch({ name: set.name, folder: set.folder ? String(set.folder) : undefined, episode: undefined, row: undefined, cut: undefined, col: undefined, element: undefined, within: undefined, beside: undefined, sort: undefined })
+                  patch({ name: set.name, folder: set.folder ? String(set.folder) : undefined, episode: undefined, row: undefined, cut: undefined, col: undefined, element: undefined, within: undefined, beside: params.from ? params.beside : undefined, sort: undefined })
                 }
               >
                 <span>{set.name}</span>

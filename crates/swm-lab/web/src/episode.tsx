@@ -2,9 +2,10 @@
 
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import type uPlot from "uplot";
-import { address, type Dataset, get, type Rows } from "./api";
+import { address, type Column, type Dataset, get, type Rows } from "./api";
 import { Chart } from "./chart";
 import { short } from "./format";
+import { summaryOf } from "./sources";
 import { type Params, patch, useKeys, useLoaded } from "./state";
 
 // Plots that are open unless the URL says otherwise.
@@ -14,16 +15,16 @@ const FPS = 20;
 export function EpisodeView({ set, episode, params }: { set: Dataset; episode: number; params: Params }) {
   const query = { folder: set.folder, name: set.name, episode };
   const { value, error } = useLoaded(() => get<Rows>("rows", query), JSON.stringify(query));
-  const images = (set.columns ?? []).filter((column) => column.image && column.shape.length === 3);
+  const images = imagesOf(set.columns);
   const image = images.find((column) => column.name === params.column) ?? images[0];
-  const other = params.beside === undefined || Number(params.beside) === episode ? undefined : Number(params.beside);
-  const besideQuery = { ...query, episode: other };
-  const beside = useLoaded(
-    () => (other === undefined ? Promise.resolve(undefined) : get<Rows>("rows", besideQuery)),
-    JSON.stringify(besideQuery),
-  );
+  const other = keptBeside(set, episode, params);
+  const beside = useLoaded(async () => other && (await readBeside(other, set)), JSON.stringify(other ?? null));
+  const isForeign = other !== undefined && !isSame(other, set);
+  const besideImages = imagesOf(beside.value?.columns);
+  const besideImage = besideImages.find((column) => column.name === (params.column ?? image?.name)) ?? besideImages[0];
+  const ofName = isForeign ? ` of ${other.name}` : "";
   // The longer of two episodes; the shorter one rests at its end.
-  const last = Math.max(value?.rows ?? 1, beside.value?.rows ?? 1) - 1;
+  const last = Math.max(value?.rows ?? 1, beside.value?.rows.rows ?? 1) - 1;
   const within = (of?: Rows) => Math.min(row, (of?.rows ?? 1) - 1);
   const row = Math.max(0, Math.min(last, Number(params.row) || 0));
   const [isPlaying, setPlaying] = useState(false);
@@ -43,7 +44,10 @@ export function EpisodeView({ set, episode, params }: { set: Dataset; episode: n
     }, 1000 / FPS);
     return () => clearInterval(timer);
   }, [isPlaying, last]);
-  const names = (value?.columns ?? []).map((column) => column.name).filter((name) => !isFactor(name));
+  const plotted = (rows?: Rows) => (rows?.columns ?? []).map((column) => column.name).filter((name) => !isFactor(name));
+  // Columns that both datasets have.
+  const common = isForeign && beside.value ? plotted(beside.value.rows) : undefined;
+  const names = plotted(value).filter((name) => !common || common.includes(name));
   const given = params.plots?.split(",").filter((name) => names.includes(name));
   const shown = given ?? FIRST.filter((name) => names.includes(name));
   const toggle = (name: string) =>
@@ -53,10 +57,11 @@ export function EpisodeView({ set, episode, params }: { set: Dataset; episode: n
       <div class="bar">
         <h2>
           Episode {episode} <small>{value ? `${value.rows} rows` : ""}</small>
-          {other !== undefined && (
+          {other && (
             <>
               {" "}
-              beside episode {other} <small>{beside.value ? `${beside.value.rows} rows` : ""}</small>
+              beside episode {other.episode}
+              {ofName} <small>{beside.value ? `${beside.value.rows.rows} rows` : ""}</small>
             </>
           )}
         </h2>
@@ -74,19 +79,21 @@ export function EpisodeView({ set, episode, params }: { set: Dataset; episode: n
         <button
           type="button"
           aria-pressed={params.beside !== undefined}
-          title="Keep this episode beside the next one that is chosen"
-          onClick={() => patch({ beside: params.beside === undefined ? String(episode) : undefined })}
+          title="Keep this episode beside the next one that is chosen, also of another dataset"
+          onClick={() => patch(params.beside === undefined ? { beside: String(episode), from: keyOf(set) } : { beside: undefined, from: undefined })}
         >
           {params.beside === undefined ? "Keep beside" : "Not beside"}
         </button>
       </div>
       {error && <p class="error">{error}</p>}
       {beside.error && <p class="error">{beside.error}</p>}
-      {image && (
+      {(image || besideImage) && (
         <>
           <div class="pair-of-frames">
-            <Frame set={set} episode={episode} row={within(value)} column={image.name} />
-            {other !== undefined && beside.value && <Frame set={set} episode={other} row={within(beside.value)} column={image.name} />}
+            {image && <Frame set={set} episode={episode} row={within(value)} column={image.name} />}
+            {other && beside.value && besideImage && (
+              <Frame set={other} episode={other.episode} row={within(beside.value.rows)} column={besideImage.name} />
+            )}
           </div>
           {images.length > 1 && (
             <div class="chips" role="group" aria-label="Column of frames">
@@ -138,15 +145,44 @@ export function EpisodeView({ set, episode, params }: { set: Dataset; episode: n
         ))}
       </div>
       {value && <Plots rows={value} names={shown} row={row} onRow={go} />}
-      {other !== undefined && beside.value && (
+      {other && beside.value && (
         <>
-          <h3>Episode {other}</h3>
-          <Plots rows={beside.value} names={shown} row={within(beside.value)} onRow={go} />
+          <h3>
+            Episode {other.episode}
+            {ofName}
+          </h3>
+          <Plots rows={beside.value.rows} names={shown} row={within(beside.value.rows)} onRow={go} />
         </>
       )}
       {value && <Factors rows={value} />}
     </section>
   );
+}
+
+type Key = Pick<Dataset, "folder" | "name">;
+
+const keyOf = (set: Key) => `${set.folder}:${set.name}`;
+const isSame = (a: Key, b: Key) => keyOf(a) === keyOf(b);
+
+function imagesOf(columns: Column[] | undefined): Column[] {
+  return (columns ?? []).filter((column) => column.image && column.shape.length === 3);
+}
+
+// The episode that is kept beside, unless it is the shown one itself. `from` has its dataset, `FOLDER:NAME`; without it, the shown one is meant.
+function keptBeside(set: Dataset, episode: number, params: Params): (Key & { episode: number }) | undefined {
+  if (params.beside === undefined) return undefined;
+  const [, folder, name] = params.from?.match(/^(\d+):(.*)$/) ?? [];
+  const kept = { folder: folder === undefined ? set.folder : Number(folder), name: name ?? set.name, episode: Number(params.beside) };
+  return isSame(kept, set) && kept.episode === episode ? undefined : kept;
+}
+
+// The values of the kept episode, and the columns of its dataset.
+async function readBeside(kept: Key & { episode: number }, set: Dataset) {
+  const [rows, { columns }] = await Promise.all([
+    get<Rows>("rows", { folder: kept.folder, name: kept.name, episode: kept.episode }),
+    isSame(kept, set) ? set : summaryOf(kept),
+  ]);
+  return { rows, columns };
 }
 
 // Factors of variation are constant over an episode, so they are listed, not plotted.
@@ -176,7 +212,7 @@ function Factors({ rows }: { rows: Rows }) {
 
 // Shows the frame of a row. The last frame stays until the next one has arrived, and rows that are passed in the meantime are
 // left out.
-function Frame({ set, episode, row, column }: { set: Dataset; episode: number; row: number; column: string }) {
+function Frame({ set, episode, row, column }: { set: Key; episode: number; row: number; column: string }) {
   const [shown, setShown] = useState<string>();
   const wanted = useRef("");
   const isLoading = useRef(false);

@@ -76,7 +76,7 @@ def test_episodes_of_two_datasets_are_scrubbed_together(open_page):
     for frame in frames.all():
         expect(frame).to_have_attribute("alt", "Row 4 of pixels")
     columns = page.get_by_role("group", name="Columns")
-    expect(columns.get_by_role("button", name="state")).to_be_visible()
+    expect(columns.get_by_role("button", name="state", exact=True)).to_be_visible()
     expect(columns.get_by_role("button", name="block_pose")).to_have_count(0)
     page.reload()
     expect(heading).to_be_visible()

@@ -80,6 +80,32 @@ fn addresses_of_other_machines_need_a_token() {
 }
 
 #[test]
+fn data_is_a_folder_a_dataset_or_a_uri() {
+    let swm = Swm::new();
+    swm.fails(
+        &["lab", "--no-open", "--data", "missing.lance"],
+        2,
+        &["missing.lance", "neither a folder nor a dataset"],
+    );
+    swm.fails(&["lab", "--no-open", "--data", "ftp://host/a.lance"], 2, &["ftp://", "s3://"]);
+    swm.fails(
+        &["lab", "--no-open", "--data", "http://127.0.0.1:9/sets"],
+        2,
+        &["http://127.0.0.1:9/sets", "one dataset"],
+    );
+    swm.json(&["collect", "swm/TwoRoom-v1", "-o", "sets/rooms.lance", "--episodes", "1", "--policy", "random"]);
+    let file = format!("file://{}", swm.path("sets/rooms.lance").display());
+    let lab = Lab::start(&swm, &["--data", "sets", "--data", &file, "--data", "s3://bucket/prefix"]);
+    let json = |path: &str| serde_json::from_slice::<serde_json::Value>(&lab.get(path)).expect("JSON");
+    let listed = json("api/datasets");
+    assert_eq!((&listed["datasets"][0]["folder"], &listed["datasets"][0]["name"]), (&1.into(), &"rooms.lance".into()));
+    let uris: Vec<_> = (0..2).map(|i| listed["sources"][i]["location"].as_str().unwrap_or_default()).collect();
+    assert_eq!(uris, [&file["file://".len()..], "s3://bucket/prefix"]);
+    assert_eq!(json("api/names?folder=2"), serde_json::json!(["rooms.lance"]));
+    assert_eq!(json("api/summary?folder=2&name=rooms.lance")["episodes"], 1);
+}
+
+#[test]
 fn frames_replace_frames_only() {
     let swm = Swm::new();
     let frame = ["frame", "swm/TwoRoom-v1", "--seed", "1", "--image", "32", "--output", "a.png"];

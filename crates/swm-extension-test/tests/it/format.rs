@@ -16,7 +16,7 @@ pub const ENTRY: FormatEntry = FormatEntry {
     codecs: false,
     feature: None,
     detect: |location| location.has_suffix("extjson"),
-    backend: Some(Backend { open, create, remove: swm::core::files::delete_file }),
+    backend: Some(Backend { open, create, remove: swm::core::files::delete_file, recover: None }),
 };
 
 #[derive(Serialize, Deserialize)]

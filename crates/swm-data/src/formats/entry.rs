@@ -62,9 +62,8 @@ impl FormatEntry {
     /// If there is no such dataset, it is damaged or being replaced, or this build lacks the format's feature.
     pub fn open(&self, location: &Location) -> Result<Arc<dyn Reader>> {
         let opened = (self.backend()?.open)(location);
-        if opened.as_ref().map_or(true, |reader| reader.episodes().is_empty())
-            && let Some(error) = set_aside::interrupted(location)
-        {
+        let has_episodes = opened.as_ref().is_ok_and(|reader| !reader.episodes().is_empty());
+        if let Some(error) = set_aside::interrupted(location, has_episodes) {
             return Err(error);
         }
         let reader = opened?;

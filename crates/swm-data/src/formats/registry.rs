@@ -36,7 +36,7 @@ pub fn open(location: impl Into<Location>) -> Result<Arc<dyn Reader>> {
     if let Some(format) = detect(&location) {
         return format.open(&location);
     }
-    if let Some(error) = set_aside::interrupted(&location) {
+    if let Some(error) = set_aside::interrupted(&location, false) {
         return Err(error);
     }
     let problem = match location.path().map(|path| path.try_exists()) {

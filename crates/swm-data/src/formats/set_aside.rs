@@ -46,9 +46,14 @@ pub fn folder(path: &Path) -> Option<PathBuf> {
     FOLDERS.map(|name| path.join(name)).into_iter().find(|folder| folder.is_dir())
 }
 
-/// The error of a folder whose old dataset is set aside and whose new one has no episode.
-pub fn interrupted(location: &Location) -> Option<Error> {
+/// The error of a dataset's folder with files set aside, if the new dataset has no episode or the files were being moved.
+pub fn interrupted(location: &Location, has_episodes: bool) -> Option<Error> {
     let folder = folder(location.path()?)?;
+    // The metadata moves last and returns first.
+    let is_whole = ["ep_len.npz", "meta/info.json"].iter().any(|metadata| folder.join(metadata).is_file());
+    if has_episodes && is_whole {
+        return None;
+    }
     let problem = format!("it is being replaced, or that was interrupted; its old files are in {}", folder.display());
     let fix = "append to it, or repeat the command that replaces it: the old files return first";
     Some(Error::corrupt(location.label(), problem, fix))

@@ -110,6 +110,30 @@ fn interrupted_replacements_are_undone_before_a_target_is_read() {
 }
 
 #[test]
+fn datasets_whose_files_are_being_set_aside_are_not_read() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let cases = [
+        ("folder", "pixels/ep_2_step_0.jpeg", "ep_len.replaced"),
+        ("video", "pixels/ep_2.mp4", "ep_len.replaced"),
+        ("lerobot", "meta/stats.json", "meta/replaced"),
+    ];
+    for (format, name, aside) in cases {
+        let path = folder.path().join(format!("d.{format}"));
+        write(&path, WriteMode::Create, 1, 0..3);
+        // As a kill leaves it before the metadata is moved.
+        let moved = path.join(aside).join(name);
+        std::fs::create_dir_all(moved.parent().expect("a folder")).expect("creating a folder");
+        std::fs::rename(path.join(name), &moved).expect("moving a file");
+        let error = open(&path).err().expect("a part of a dataset").to_string();
+        assert!(error.contains("its old files are in"), "{format}: {error}");
+        write(&path, WriteMode::Append, 1, 3..4);
+        let reader = open(&path).expect("opening");
+        assert_eq!((reader.episodes().len(), path.join(aside).exists()), (4, false), "{format}");
+        check(&*reader, 0);
+    }
+}
+
+#[test]
 fn files_set_aside_by_a_stranger_are_not_moved_through_links() {
     for (format, aside, column) in [
         ("folder", "ep_len.replaced", "pixels"),

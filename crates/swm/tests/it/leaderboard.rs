@@ -220,7 +220,9 @@ fn entries_that_contradict_themselves_are_refused_before_anything_is_played() {
     // Plans in the environment itself or by a probe, as autopsies have them, are neither trained nor baselines.
     refused("its policy 'larger' is no baseline", &|entry| add_policy(entry, "true_dynamics"));
     refused("its policy 'larger' is no baseline", &|entry| add_policy(entry, "probe"));
-    refused("its policy 'random' is another one", &|entry| entry.results.manifest.config["policies"][0]["acts"] = "no_op".into());
+    refused("its policy 'random' is another one", &|entry| {
+        entry.results.manifest.config["policies"][0]["acts"] = "no_op".into()
+    });
     forged(&swm, &entry, "bad.json", |entry| {
         entry.results.env = "evil_mod:X-v0".to_owned();
         entry.results.manifest.config["env"] = "evil_mod:X-v0".into();

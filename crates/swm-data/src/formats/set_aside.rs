@@ -10,11 +10,8 @@ use swm_core::{Batch, Error, Result};
 
 /// What replacing needs to know of a format whose datasets are folders of files.
 pub trait DatasetFiles: Copy + Send + 'static {
-    /// The path in the folder of a dataset for the files of the one that it replaces. Readers of the format ignore it.
-    fn set_aside(self) -> &'static str;
-
-    /// The file that makes a folder a dataset.
-    fn metadata(self) -> &'static str;
+    /// Where the metadata and the files set aside are.
+    const PLACES: Places;
 
     /// The files of the dataset in a folder, its metadata last.
     ///
@@ -38,19 +35,37 @@ pub trait DatasetFiles: Copy + Send + 'static {
     fn remove_empty_folders(self, folder: &Path) -> Result<()>;
 }
 
-/// The folders of both formats that have files set aside.
-pub const FOLDERS: [&str; 2] = ["ep_len.replaced", "meta/replaced"];
+/// Paths in the folder of a dataset.
+pub struct Places {
+    /// The file that makes a folder a dataset.
+    pub metadata: &'static str,
+    /// The folder for the files of the dataset that is replaced. Readers of the format ignore it.
+    pub set_aside: &'static str,
+}
+
+/// The places of `folder` and `video`.
+pub const COLUMN_FILES: Places = Places { metadata: "ep_len.npz", set_aside: "ep_len.replaced" };
+/// The places of `lerobot`.
+pub const LEROBOT: Places = Places { metadata: "meta/info.json", set_aside: "meta/replaced" };
+
+/// The folder in a dataset's folder in which files are set aside, if there is one, and whether they are a whole dataset: the
+/// metadata moves last and returns first.
+fn found(path: &Path) -> Option<(PathBuf, bool)> {
+    [COLUMN_FILES, LEROBOT].into_iter().find_map(|places| {
+        let folder = path.join(places.set_aside);
+        let is_whole = folder.join(places.metadata).is_file();
+        folder.is_dir().then_some((folder, is_whole))
+    })
+}
 
 /// The folder in a dataset's folder in which files are set aside, if there is one.
 pub fn folder(path: &Path) -> Option<PathBuf> {
-    FOLDERS.map(|name| path.join(name)).into_iter().find(|folder| folder.is_dir())
+    found(path).map(|(folder, _)| folder)
 }
 
 /// The error of a dataset's folder with files set aside, if the new dataset has no episode or the files were being moved.
 pub fn interrupted(location: &Location, has_episodes: bool) -> Option<Error> {
-    let folder = folder(location.path()?)?;
-    // The metadata moves last and returns first.
-    let is_whole = ["ep_len.npz", "meta/info.json"].iter().any(|metadata| folder.join(metadata).is_file());
+    let (folder, is_whole) = found(location.path()?)?;
     if has_episodes && is_whole {
         return None;
     }
@@ -68,7 +83,7 @@ struct SetAside<F> {
 impl<F: DatasetFiles> SetAside<F> {
     /// Sets the files of a dataset aside.
     fn begin(root: &Path, files: F) -> Result<Self> {
-        let (aside, names) = (root.join(files.set_aside()), files.names(root)?);
+        let (aside, names) = (root.join(F::PLACES.set_aside), files.names(root)?);
         files::check_free(&aside)?;
         std::fs::create_dir_all(&aside).map_err(|e| Error::io(&aside, "creating the folder", e))?;
         let this = Self { root: root.to_owned(), files };
@@ -81,14 +96,14 @@ impl<F: DatasetFiles> SetAside<F> {
     }
 
     fn folder(&self) -> PathBuf {
-        self.root.join(self.files.set_aside())
+        self.root.join(F::PLACES.set_aside)
     }
 
     /// Moves the files back, the metadata first.
     fn put_back(&self) -> Result<()> {
         let folder = self.folder();
         let mut names = files::list(&folder)?;
-        names.sort_by_key(|name| name != Path::new(self.files.metadata()));
+        names.sort_by_key(|name| name != Path::new(F::PLACES.metadata));
         // All of them or none.
         names.iter().try_for_each(|name| files::check_free(&self.root.join(name)))?;
         files::move_named(&folder, &names, &self.root)?;
@@ -105,7 +120,7 @@ impl<F: DatasetFiles> SetAside<F> {
     /// Deletes what is set aside if the new dataset has an episode. Otherwise deletes the new dataset and moves the files
     /// of the old one back.
     fn settle(&self) -> Result<()> {
-        let is_dataset = |folder: &Path| folder.join(self.files.metadata()).is_file();
+        let is_dataset = |folder: &Path| folder.join(F::PLACES.metadata).is_file();
         let has_new = is_dataset(&self.root);
         // The metadata moves last and returns first: without it, the move was interrupted.
         if is_dataset(&self.folder()) {
@@ -130,7 +145,7 @@ pub fn recover<F: DatasetFiles>(root: &Path, files: F) -> Result<()> {
     let this = SetAside { root: root.to_owned(), files };
     let folder = this.folder();
     // A stranger may have made the folder: nothing is moved through links.
-    Path::new(files.set_aside()).ancestors().try_for_each(|path| match path.as_os_str().is_empty() {
+    Path::new(F::PLACES.set_aside).ancestors().try_for_each(|path| match path.as_os_str().is_empty() {
         true => Ok(()),
         false => files::check_no_link(&root.join(path)),
     })?;
@@ -142,7 +157,7 @@ pub fn recover<F: DatasetFiles>(root: &Path, files: F) -> Result<()> {
 /// # Errors
 /// As [`recover`], and if another process writes to the dataset.
 pub fn recover_unlocked<F: DatasetFiles>(root: &Path, files: F) -> Result<()> {
-    if !root.join(files.set_aside()).is_dir() {
+    if !root.join(F::PLACES.set_aside).is_dir() {
         return Ok(());
     }
     let _lock = Lock::folder(root)?;

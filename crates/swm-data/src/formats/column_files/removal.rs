@@ -4,13 +4,10 @@ use super::images::uncommitted;
 use super::reader::stored_metadata;
 use super::{ImageFiles, OFFSETS, TEMPORARY, check_name, journal};
 use crate::formats::replacing::check_no_links;
-use crate::formats::set_aside::{self, DatasetFiles};
+use crate::formats::set_aside::{self, DatasetFiles, Places};
 use std::path::{Path, PathBuf};
 use swm_core::files::{self, Lock};
 use swm_core::{ColumnSpec, Error, Result, Schema};
-
-/// The file whose replacement commits a merge, and without which there is no dataset.
-const LENGTHS_FILE: &str = "ep_len.npz";
 
 /// Deletes the dataset in a folder: the files of its own columns and episodes, as `ep_len.npz` and the journal name them.
 ///
@@ -30,17 +27,11 @@ pub(crate) fn remove(folder: &Path, images: ImageFiles) -> Result<()> {
 }
 
 impl DatasetFiles for ImageFiles {
-    fn set_aside(self) -> &'static str {
-        set_aside::FOLDERS[0]
-    }
-
-    fn metadata(self) -> &'static str {
-        LENGTHS_FILE
-    }
+    const PLACES: Places = set_aside::COLUMN_FILES;
 
     fn names(self, folder: &Path) -> Result<Vec<PathBuf>> {
         let (_, mut names) = stored_files(folder, self)?;
-        names.push(LENGTHS_FILE.into());
+        names.push(Self::PLACES.metadata.into());
         Ok(names)
     }
 

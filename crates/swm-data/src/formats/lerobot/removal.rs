@@ -2,14 +2,14 @@
 
 use super::info::{DATA_PATH, EPISODES_PATH, Info, VIDEO_PATH, fill};
 use crate::formats::replacing::check_no_links;
-use crate::formats::set_aside::{self, DatasetFiles};
+use crate::formats::set_aside::{self, DatasetFiles, Places};
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use swm_core::files::{self, Lock};
 use swm_core::{Error, Result};
 
 /// The file that declares the features and the number of episodes.
-pub(super) const INFO: &str = "meta/info.json";
+pub(super) const INFO: &str = set_aside::LEROBOT.metadata;
 /// The table of tasks.
 pub(super) const TASKS: &str = "meta/tasks.parquet";
 /// The statistics of the features.
@@ -39,13 +39,7 @@ pub(super) fn remove(root: &Path) -> Result<()> {
 pub(super) struct Files;
 
 impl DatasetFiles for Files {
-    fn set_aside(self) -> &'static str {
-        set_aside::FOLDERS[1]
-    }
-
-    fn metadata(self) -> &'static str {
-        INFO
-    }
+    const PLACES: Places = set_aside::LEROBOT;
 
     fn names(self, root: &Path) -> Result<Vec<PathBuf>> {
         let mut names = stored_files(root)?;

@@ -80,6 +80,23 @@ def test_a_dataset_to_overwrite_stays_until_an_episode_is_accepted(tmp_path, nam
     assert lengths() == [4]
 
 
+@pytest.mark.parametrize("mode", ["append", "overwrite"])
+def test_an_interrupted_overwrite_is_undone_before_a_writer_opens(tmp_path, mode):
+    path = tmp_path / "folder"
+    write(path, (5, 6), format="folder")
+    # A kill before the first commit of an overwrite leaves the old dataset here.
+    old = path / "ep_len.replaced"
+    for file in [file for file in path.rglob("*") if file.is_file()]:
+        moved = old / file.relative_to(path)
+        moved.parent.mkdir(parents=True, exist_ok=True)
+        file.rename(moved)
+    with pytest.raises(RuntimeError, match="being replaced"):
+        data.load_dataset(path, format="folder")
+    write(path, (4,), format="folder", mode=mode)
+    assert data.load_dataset(path, format="folder").lengths.tolist() == ([5, 6, 4] if mode == "append" else [4])
+    assert not old.exists()
+
+
 def test_dump_keeps_the_old_dataset_if_an_episode_is_refused(tmp_path):
     path = tmp_path / "a.lance"
     write(path, (5, 6))

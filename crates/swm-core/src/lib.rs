@@ -48,7 +48,7 @@ pub mod thread_budget;
 pub mod variation;
 mod worker_threads;
 
-pub use batch::{Batch, ColumnSpec, DType, Element, RowMut, RowRef, Schema};
+pub use batch::{Batch, ColumnSpec, DType, Element, LARGEST_SCHEMA, RowMut, RowRef, Schema, check_column_count};
 pub use camera_view::{CameraView, Modality};
 pub use columns::ColumnIndices;
 pub use dataset_start::{Callable, CallableArgument, DatasetStart, DatasetStartEnv};

@@ -100,6 +100,8 @@ impl<M: Trainable> Checkpoint<M> {
             config: json(&self.config)?,
         };
         let mut additional = vec![];
+        // The manifest describes the files of this checkpoint only, not those of one that was loaded or saved before.
+        self.manifest.hashes.retain(|name, _| !matches!(&**name, "optimizer" | "raw"));
         if let Some(state) = state {
             let optimizer = tensor_file::encode(&state.moments)?;
             self.manifest.hashes.insert("optimizer".to_owned(), manifest::hash(&optimizer));

@@ -159,6 +159,12 @@ pub fn find_dataset(path: &str) -> PyResult<String> {
     home::find_dataset(path).map(|location| location.to_string()).map_err(to_py_err)
 }
 
+/// Completes or undoes an interrupted replacement of the dataset at a path or URI.
+#[pyfunction]
+pub fn recover(py: Python<'_>, path: &str) -> PyResult<()> {
+    py.detach(|| swm::data::recover(&Location::parse(path)?)).map_err(to_py_err)
+}
+
 /// The location for a new dataset, given by path, URI or name.
 #[pyfunction]
 pub fn target(path: &str, format: Option<&str>) -> PyResult<String> {

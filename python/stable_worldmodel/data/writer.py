@@ -85,6 +85,7 @@ class EpisodeWriter:
                 f"{self.path}: there is a dataset already; continue it (mode='append') or replace it (mode='overwrite')"
             )
         if exists and mode == "append":
+            _engine.recover(self.path)
             schema = _engine.Dataset(self.path, self.format).schema()
             self._columns = {name: (dtype, tuple(shape)) for name, dtype, shape in schema if name not in NUMBERING}
 

@@ -161,7 +161,8 @@ class Trainer:
         steps, log_every, save_every = self.config["schedule"]["steps"], self.config["log_every"], self.config["save_every"]
         begin, first = time.monotonic(), self.step
         batches = self._batches()
-        stopped_early = False
+        # A training that ended early has nothing left to train when it is resumed.
+        stopped_early = self._out_of_patience()
         alone = _locked(self.run) if self.ranks.rank == 0 else contextlib.nullcontext()
         with alone, _interruptions() as interrupted:
             self._record()
@@ -265,7 +266,11 @@ class Trainer:
             self._write(self.run / "best", state=None)
         else:
             self.validations_since_best += 1
-        return bool(0 < settings["patience"] <= self.validations_since_best)
+        return self._out_of_patience()
+
+    def _out_of_patience(self) -> bool:
+        """Whether as many validations as `validation.patience` have followed the best one."""
+        return bool(0 < self.config["validation"]["patience"] <= self.validations_since_best)
 
     @contextlib.contextmanager
     def _averaged(self) -> Iterator[None]:

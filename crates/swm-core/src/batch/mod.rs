@@ -9,7 +9,7 @@ mod rows;
 mod schema;
 
 pub use rows::{RowMut, RowRef};
-pub use schema::{ColumnSpec, DType, Element, Schema};
+pub use schema::{ColumnSpec, DType, Element, LARGEST_SCHEMA, Schema, check_column_count};
 
 use crate::{Error, Result};
 use buffer::Buffer;
@@ -295,6 +295,19 @@ mod tests {
     fn schema() -> Schema {
         Schema::new([ColumnSpec::new("state", DType::Float64, [3]), ColumnSpec::image("pixels", 2, 2)])
             .expect("creating the schema")
+    }
+
+    #[test]
+    fn schemas_of_too_many_columns_or_equal_names_are_refused() {
+        let columns = |count: usize| -> Vec<ColumnSpec> {
+            (0..count).map(|i| ColumnSpec::new(format!("c{i}"), DType::Float32, [2])).collect()
+        };
+        assert!(Schema::new(columns(LARGEST_SCHEMA)).is_ok());
+        let error = Schema::new(columns(300_000)).expect_err("too many columns").to_string();
+        assert!(error.contains("300000 columns, of at most 4096"), "{error}");
+        let twice = [columns(2), columns(1)].concat();
+        let error = Schema::new(twice).expect_err("a name twice").to_string();
+        assert!(error.contains("two columns are named 'c0'"), "{error}");
     }
 
     #[test]

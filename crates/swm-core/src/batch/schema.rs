@@ -2,6 +2,7 @@
 
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
+use std::collections::HashSet;
 use std::sync::Arc;
 
 /// The type of an element.
@@ -139,14 +140,32 @@ impl TryFrom<Vec<ColumnSpec>> for Schema {
     }
 }
 
+/// The largest number of columns of a schema. Columns are searched by name one after another.
+pub const LARGEST_SCHEMA: usize = 4096;
+
+/// Checks the number of columns that a file or a caller declares.
+///
+/// # Errors
+/// When there are more than [`LARGEST_SCHEMA`].
+pub fn check_column_count(count: usize) -> Result<()> {
+    if count <= LARGEST_SCHEMA {
+        return Ok(());
+    }
+    let problem = format!("{count} columns, of at most {LARGEST_SCHEMA}");
+    Err(Error::config("schema", problem, "store values of one kind in one column, as a vector"))
+}
+
 impl Schema {
     /// A schema of these columns.
     ///
     /// # Errors
-    /// When two columns have the same name, or a row of a column has more than 64 GiB.
+    /// When there are more than [`LARGEST_SCHEMA`] columns, two columns have the same name, or a row of a column has more
+    /// than 64 GiB.
     pub fn new(columns: impl Into<Vec<ColumnSpec>>) -> Result<Self> {
         let columns = columns.into();
-        for (i, column) in columns.iter().enumerate() {
+        check_column_count(columns.len())?;
+        let mut names = HashSet::with_capacity(columns.len());
+        for column in &columns {
             if column.checked_row_bytes().is_none() {
                 return Err(Error::config(
                     format!("column '{}'", column.name),
@@ -154,7 +173,7 @@ impl Schema {
                     "check the file that it comes from",
                 ));
             }
-            if columns[..i].iter().any(|other| other.name == column.name) {
+            if !names.insert(&*column.name) {
                 return Err(Error::config(
                     "schema",
                     format!("two columns are named '{}'", column.name),

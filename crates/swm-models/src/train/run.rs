@@ -211,7 +211,8 @@ impl<'a> Run<'a> {
         control.emit(Event::Started(Stage { name: STAGE, subject: &[family], total: steps, unit: "steps" }));
         self.clock.start = Instant::now();
         let mut last = vec![];
-        let (mut stop, mut stopped_early, mut validation) = (None, false, None);
+        // A run that ended early has nothing left to train when it is resumed.
+        let (mut stop, mut stopped_early, mut validation) = (None, self.is_out_of_patience(), None);
         while self.learner.state().step < steps && !stopped_early {
             if let Err(error) = control.check() {
                 stop = Some(error);
@@ -328,8 +329,13 @@ impl<'a> Run<'a> {
         let is_best = self.learner.save_if_best(loss, self.out)?;
         let since_best = &mut self.learner.state_mut().validations_since_best;
         *since_best = if is_best { 0 } else { *since_best + 1 };
+        Ok(self.is_out_of_patience())
+    }
+
+    /// Whether as many validations as `validation.patience` have followed the best one.
+    fn is_out_of_patience(&self) -> bool {
         let patience = self.config.validation.patience;
-        Ok(patience > 0 && *since_best >= patience)
+        patience > 0 && self.learner.state().validations_since_best >= patience
     }
 
     fn log_line(

@@ -60,6 +60,26 @@ fn files(run: &Path) -> Vec<Vec<u8>> {
 }
 
 #[test]
+fn resuming_a_run_that_ended_early_changes_nothing() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    // At this learning rate no validation improves on the first.
+    let early =
+        ["validation.every=1", "validation.batches=1", "validation.patience=2", "optim.lr=1e-30", "save_every=2"];
+    let config = config(&[&early[..], &["data.hold_out=true"]].concat());
+    let options = crate::options();
+    let train = |options: &TrainOptions| {
+        train(&config, Arc::new(Dots::new(40, 0)), folder.path(), options, &mut stop_after(0))
+            .expect("training the model")
+    };
+    let first = train(&options);
+    assert!(first.stopped_early && first.steps < 10, "{} steps", first.steps);
+    let before = files(folder.path());
+    let again = train(&TrainOptions { resume: true, ..options });
+    assert!((again.steps, again.stopped_early) == (first.steps, true));
+    assert_eq!(files(folder.path()), before);
+}
+
+#[test]
 fn resumed_run_gives_the_files_of_an_uninterrupted_run() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let (complete, resumed) = (folder.path().join("complete"), folder.path().join("resumed"));

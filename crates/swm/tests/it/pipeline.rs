@@ -118,6 +118,8 @@ fn compares_policies_from_the_same_starts_and_reproduces_results() {
     let trained = swm.json(&[&inverse[..], &["batch_size=16", "hidden=32"]].concat());
     assert_eq!(trained["steps"], 4);
     swm.fails(&inverse, 2, &["holds a training run already"]);
+    // Its copy of the encoder has no optimizer, and does not name one.
+    swm.json(&["checkpoints", "verify", "direct"]);
     swm.fails(&["train", "inverse", "--data", "rooms"], 2, &["--encoder"]);
     assert_eq!(swm.json(&["checkpoints"])[0]["family"], "inverse");
 

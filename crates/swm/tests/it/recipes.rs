@@ -52,7 +52,10 @@ fn recipe_runs_what_is_missing_and_compares_hashes() {
     let names = ["small/checkpoint/weights.safetensors", "found/results.json"];
     let before = names.map(changed);
     fs::remove_dir_all(swm.path("first/found")).expect("removing the results");
+    let unfinished = swm.path("first/.recipe.json.4242.tmp");
+    fs::write(&unfinished, "{").expect("writing what a kill leaves");
     assert_eq!(run(&swm, "small.toml", "first", &[])["hashes"], first["hashes"]);
+    assert!(!unfinished.exists());
     assert_eq!(changed(names[0]), before[0]);
     assert!(changed(names[1]) > before[1]);
 

@@ -7,7 +7,7 @@ use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use swm_core::columns::{EPISODE_IDX, PIXELS, PROPRIO, STATE, STEP_IDX};
-use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema, files};
+use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema, check_column_count, files};
 
 /// The LeRobot version of written datasets.
 pub const VERSION: &str = "v3.0";
@@ -174,8 +174,9 @@ impl Info {
     /// The columns of the dataset. Features with text or without elements are skipped.
     ///
     /// # Errors
-    /// If the shape of a feature is invalid.
+    /// If there are too many features, or the shape of one is invalid.
     pub fn columns(&self, root: &Path) -> Result<Vec<Column>> {
+        check_column_count(self.features.0.len())?;
         let (mut columns, mut videos, mut primary) = (vec![], 0, true);
         for (native, feature) in &self.features.0 {
             let recorded = self.stable_worldmodel.as_ref().and_then(|recorded| {

@@ -71,6 +71,7 @@ pub fn run(request: &RecipeRun<'_>, context: &Context) -> anyhow::Result<()> {
     check(&recipe, request.output)?;
     check_weights(&recipe, request, &origin)?;
     let _lock = output_folder::claim(request.output, &["index.html"])?;
+    files::delete_temporary(request.output, |name| name == STATE)?;
     // The folder may come from a stranger, whose links name folders of the user.
     recipe.steps().try_for_each(|(kind, step)| files::check_no_link(&kind.output(request.output, &step.name)))?;
     let mut state = State::open(request, &recipe)?;

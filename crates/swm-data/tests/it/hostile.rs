@@ -137,6 +137,46 @@ fn row_counts_of_parquet_files_allocate_no_memory() {
 }
 
 #[test]
+fn sparse_files_of_a_lance_table_reserve_no_memory() {
+    let read = |suffix: &str| {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("e.lance");
+        crate::format_suite::write(&path, WriteMode::Create, 0..2);
+        let versions = path.join("_versions");
+        let hint = versions.join("latest_version_hint.json");
+        for file in
+            fuzz::files(&versions).into_iter().chain([hint]).filter(|file| file.to_string_lossy().ends_with(suffix))
+        {
+            let file = std::fs::File::create(file).expect("creating a file");
+            file.set_len(1 << 42).expect("a file of 4 TiB without content");
+        }
+        fuzz::read_everything(&path)
+    };
+    let error = read("manifest").expect_err("a manifest of 4 TiB").to_string();
+    assert!(error.contains("has 4398046511104 bytes, of at most"), "{error}");
+    assert!(read("json").is_ok(), "the hint is not read");
+}
+
+#[test]
+fn paths_of_lerobot_episodes_allocate_no_memory() {
+    let (_folder, path) = copied("lerobot-v21");
+    let file = path.join("meta/info.json");
+    let original: Value = serde_json::from_slice(&std::fs::read(&file).expect("a file")).expect("JSON");
+    let mut long = original.clone();
+    long["data_path"] = json!(format!("{}/{{episode_index}}.parquet", "a".repeat(1_000_000)));
+    std::fs::write(&file, long.to_string()).expect("a written file");
+    assert!(error(&path).contains("the path of a file has more than 4096 bytes"), "{}", error(&path));
+    let mut many = original;
+    for camera in 0..3000 {
+        many["features"][format!("v{camera}")] = json!({"dtype": "video", "shape": [8, 8, 3], "names": null});
+    }
+    std::fs::write(&file, many.to_string()).expect("a written file");
+    let lines: String = (0..20_000).map(|i| format!("{{\"episode_index\":{i},\"length\":1}}\n")).collect();
+    std::fs::write(path.join("meta/episodes.jsonl"), lines).expect("a written file");
+    assert!(error(&path).contains("20000 episodes with 300"), "{}", error(&path));
+}
+
+#[test]
 fn pipes_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     let pipe = |path: &Path| {

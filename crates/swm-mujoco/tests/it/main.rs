@@ -6,6 +6,7 @@ mod conformance;
 mod golden;
 mod link;
 mod no_gl;
+mod play;
 mod readout;
 #[path = "../../src/render/similarity.rs"]
 mod similarity;

@@ -1,8 +1,10 @@
 //! The file of a manifest: Lance's bytes, with a checksum that other readers skip.
 
+use bytes::Bytes;
 use lance_io::object_store::ObjectStore;
 use lance_table::format::{IndexMetadata, Manifest};
 use lance_table::io::commit::write_manifest_file_to_path;
+use object_store::ObjectStoreExt as _;
 use object_store::path::Path as StorePath;
 
 /// Start of the checksum in a manifest's file; a BLAKE3 hash of all other bytes of the file follows. The checksum is
@@ -12,6 +14,17 @@ const CHECKSUM_TAG: &[u8; 8] = b"swmSEAL1";
 const CHECKSUM_LEN: usize = CHECKSUM_TAG.len() + 32;
 /// Size of the footer in bytes: offset of the message, format versions, and magic number.
 const FOOTER: usize = 16;
+/// The largest size of a file that is read as a whole, in bytes: the manifest of a million fragments is smaller.
+const LARGEST: u64 = 256 << 20;
+
+/// Reads a manifest or another file of metadata as a whole.
+pub async fn read_whole(objects: &ObjectStore, path: &StorePath) -> lance_core::Result<Bytes> {
+    let object = objects.inner.get(path).await?;
+    match object.meta.size {
+        0..=LARGEST => Ok(object.bytes().await?),
+        size => Err(corrupt(format!("{path} has {size} bytes, of at most {LARGEST}"))),
+    }
+}
 
 /// The file of a manifest as Lance writes it, with a checksum.
 pub async fn encode(

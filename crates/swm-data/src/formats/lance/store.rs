@@ -181,7 +181,7 @@ impl Store {
         let store = self.clone();
         block_on(&self.label, "reading the newest version", async move {
             let location = store.latest_location().await?;
-            let bytes = store.objects.inner.get(&location.path).await?.bytes().await?;
+            let bytes = manifest_file::read_whole(&store.objects, &location.path).await?;
             manifest_file::verify_checksum(&bytes)?;
             // Lance parses the verified bytes, not the object, which may have changed.
             let memory = ObjectStore::memory();
@@ -371,7 +371,7 @@ impl Store {
         let objects = Arc::clone(&self.objects);
         let read = move |path: StorePath| {
             let objects = Arc::clone(&objects);
-            async move { Ok::<_, lance_core::Error>(objects.inner.get(&path).await?.bytes().await?) }
+            async move { manifest_file::read_whole(&objects, &path).await }
         };
         block_on(&self.label, "reading files", futures::stream::iter(paths).map(read).buffered(REQUESTS).try_collect())
     }

@@ -9,6 +9,20 @@ use serde::Deserialize;
 use std::path::{Path, PathBuf};
 use swm_core::{Result, files};
 
+/// The largest number of files of episodes, such as four million episodes with one camera.
+const LARGEST_LIST: usize = 8 << 20;
+
+/// Checks the number of files of episodes before their paths are listed.
+fn check_list(root: &Path, episodes: usize, cameras: usize) -> Result<()> {
+    match episodes.saturating_mul(1 + cameras) {
+        0..=LARGEST_LIST => Ok(()),
+        _ => Err(damaged(
+            root,
+            format!("{episodes} episodes with {cameras} cameras have more than {LARGEST_LIST} files"),
+        )),
+    }
+}
+
 /// The files, length, tasks and constants of an episode.
 pub(super) struct EpisodeFiles {
     pub tasks: Vec<String>,
@@ -47,6 +61,8 @@ fn episode_files_v2(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
     }
     let text = String::from_utf8(files::read(&path, MAX_TEXT_BYTES)?)
         .map_err(|e| damaged(&path, format!("it is no UTF-8 text: {e}")))?;
+    let keys = info.video_keys();
+    check_list(root, text.lines().count(), keys.len())?;
     let mut files_of_episodes = vec![];
     for line in text.lines().filter(|line| !line.trim().is_empty()) {
         let line: Line =
@@ -58,7 +74,7 @@ fn episode_files_v2(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
         let fields =
             [("episode_chunk", files_of_episodes.len() / info.chunks_size), ("episode_index", files_of_episodes.len())];
         let videos: Result<Vec<(PathBuf, f64)>> =
-            info.video_keys().into_iter().map(|key| Ok((video_file(root, info, key, &fields)?, 0.0))).collect();
+            keys.iter().map(|key| Ok((video_file(root, info, key, &fields)?, 0.0))).collect();
         files_of_episodes.push(EpisodeFiles {
             tasks: line.tasks,
             data: info.file(root, &info.data_path, "", &fields)?,
@@ -111,6 +127,7 @@ fn episode_files_v3(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
             values.collect::<Option<_>>().ok_or_else(|| damaged(path, format!("a value of '{column}' is invalid")))
         };
         let (index, length) = (column_values("episode_index")?, column_values("length")?);
+        check_list(root, files_of_episodes.len() + index.len(), keys.len())?;
         let (chunk, file) = (column_values("data/chunk_index")?, column_values("data/file_index")?);
         let mut videos = vec![];
         for key in &keys {

@@ -12,6 +12,9 @@ use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema, check_column_
 /// The LeRobot version of written datasets.
 pub const VERSION: &str = "v3.0";
 
+/// The largest length of the path of a file and of its template, in bytes.
+const LONGEST_PATH: usize = 4096;
+
 /// Path template of data files in version 3.0.
 pub const DATA_PATH: &str = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet";
 /// Path template of videos in version 3.0.
@@ -237,9 +240,12 @@ impl Info {
     /// The path of a file: `template` with the key and the indices filled in.
     ///
     /// # Errors
-    /// If the path leaves the dataset's folder.
+    /// If the path is too long, or leaves the dataset's folder.
     pub fn file(&self, root: &Path, template: &str, key: &str, indices: &[(&str, usize)]) -> Result<PathBuf> {
-        let name = fill(template, key, indices);
+        let name = if template.len() > LONGEST_PATH { String::new() } else { fill(template, key, indices) };
+        if template.len().max(name.len()) > LONGEST_PATH {
+            return Err(damaged(root, format!("the path of a file has more than {LONGEST_PATH} bytes")));
+        }
         let inside = Path::new(&name).components().all(|part| matches!(part, std::path::Component::Normal(_)));
         if inside {
             Ok(root.join(name))

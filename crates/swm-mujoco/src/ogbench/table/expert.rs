@@ -13,11 +13,21 @@ use swm_core::policy::Expert;
 use swm_core::{ExpertEntry, Key, Result, RowRef};
 
 /// The experts of the tables.
-pub const EXPERTS: &[ExpertEntry] = &[ExpertEntry {
-    id: "expert",
-    summary: "places one cube after another, unlocks and slides drawer and window, sets the locks",
-    make: || Box::<TableExpert>::default(),
-}];
+pub const EXPERTS: &[ExpertEntry] = &[
+    ExpertEntry {
+        id: "expert",
+        summary: "places one cube after another, unlocks and slides drawer and window, sets the locks",
+        make: || Box::new(TableExpert::new(1.0)),
+    },
+    ExpertEntry {
+        id: "paper-speed",
+        summary: "the jobs of `expert`, at the speed of OGBench's planned oracle",
+        make: || Box::new(TableExpert::new(PAPER_SPEED)),
+    },
+];
+
+/// The largest motion and rotation of `paper-speed`, as actions.
+const PAPER_SPEED: f64 = 0.7;
 
 /// Displacement for an action of 1, in metres.
 const ACTION_POSITION: f64 = 0.05;
@@ -60,8 +70,9 @@ enum Job {
 }
 
 /// The expert of tables, with its present job.
-#[derive(Default)]
 struct TableExpert {
+    /// The largest absolute value of an action that moves or rotates.
+    speed: f64,
     job: Option<Job>,
     /// Steps since the job started.
     steps: usize,
@@ -297,6 +308,11 @@ struct Move {
 }
 
 impl TableExpert {
+    /// Creates an expert whose actions that move or rotate are at most `speed`, without a job.
+    fn new(speed: f64) -> Self {
+        Self { speed, job: None, steps: 0, locks: [0; 2], retreating: false }
+    }
+
     /// The move for a job; `None` when the job is done.
     fn perform(&mut self, job: Job, inputs: &Inputs) -> Option<Move> {
         match job {
@@ -408,7 +424,7 @@ fn slide(inputs: &Inputs, index: usize, to: f64) -> Option<Move> {
 
 impl Expert for TableExpert {
     fn begin(&mut self, _: Key) {
-        *self = Self::default();
+        *self = Self::new(self.speed);
     }
 
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
@@ -443,13 +459,13 @@ impl Expert for TableExpert {
         }
         let step = scale(sub(motion.to, inputs.gripper), GAIN / ACTION_POSITION);
         for (i, element) in action.iter_mut().enumerate() {
-            let value = match i {
-                0..3 => step[i],
-                3 => motion.rotation / ACTION_YAW,
+            let clamped = |value: f64| value.clamp(-self.speed, self.speed);
+            *element = match i {
+                0..3 => clamped(step[i]),
+                3 => clamped(motion.rotation / ACTION_YAW),
                 _ if motion.close => 1.0,
                 _ => -1.0,
             };
-            *element = value.clamp(-1.0, 1.0);
         }
         Ok(())
     }

@@ -33,8 +33,8 @@ macro_rules! options {
             $($own,)*
             EnvOption {
                 key: "mode",
-                summary: "task: episodes perform a task; data_collection: the factors set the start, one object is the goal",
-                values: &["task", "data_collection"],
+                summary: "task: episodes perform a task; data_collection: the factors set the start, one object is the goal; play: likewise, one goal after another",
+                values: &["task", "data_collection", "play"],
             },
             EnvOption {
                 key: "reward_task_id",
@@ -109,6 +109,7 @@ fn make(config: &'static TableConfig, choice: &EnvChoice) -> Result<Box<dyn Env>
     let model = model(config, arm_rendering)?;
     let mode = match (chosen("mode"), chosen("reward_task_id").parse()) {
         ("data_collection", _) => Mode::DataCollection,
+        ("play", _) => Mode::Play,
         (_, Err(_)) => Mode::RandomTask,
         (_, Ok(0)) => Mode::FixedTask(DEFAULT_TASK - 1),
         (_, Ok(task)) => Mode::FixedTask(task - 1),

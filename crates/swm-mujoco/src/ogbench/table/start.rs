@@ -22,12 +22,16 @@ const STACK_HEIGHT: f64 = 0.04;
 const IN_OPEN_DRAWER: Vec3 = [0.33, -0.24, 0.066];
 /// The position of a cube in a closed drawer, in metres.
 const IN_CLOSED_DRAWER: Vec3 = [0.33, -0.356, 0.065986];
-/// Probability that a goal of `mode=data_collection` stacks the cube.
+/// Probability that a goal of `mode=data_collection` or `mode=play` stacks the cube.
 const P_STACK: f64 = 0.5;
 /// Probability that a goal puts the cube into the drawer.
 const P_DRAWER: f64 = 0.3;
-/// Weight of a locked drawer or window among the subjects of `mode=data_collection`; all other weights are 1.
+/// Weight of a locked drawer or window among the subjects of these modes; all other weights are 1.
 const LOCKED_WEIGHT: f64 = 0.25;
+/// Height of the gripper above every cube at which the next goal of `mode=play` follows, in metres.
+const CLEAR_HEIGHT: f64 = 0.12;
+/// Closure of the fingers (0 to 1) below which the next goal of `mode=play` follows.
+const CLEAR_CLOSURE: f64 = 0.25;
 /// Probability that a sampled goal stacks a cube.
 const P_GOAL_STACK: f64 = 0.3;
 /// The smallest distance of two cubes on the table at a sampled goal, in metres: the gripper fits between them.
@@ -46,7 +50,7 @@ impl Table {
         let rng = &mut key.rng();
         self.arm.set_joints(physics, HOME);
         let task = match self.mode {
-            Mode::DataCollection => None,
+            Mode::DataCollection | Mode::Play => None,
             Mode::RandomTask => Some(rng.random_range(0..self.config.tasks.len())),
             Mode::FixedTask(task) => Some(task),
         };
@@ -137,7 +141,7 @@ impl Table {
         }
     }
 
-    /// Starts an episode of `mode=data_collection`: the factors set the start, and the goal is one object.
+    /// Starts an episode of `mode=data_collection` or `mode=play`: the factors set the start, and the goal is one object.
     fn begin_from_factors(&mut self, physics: &mut Physics, factors: &FactorValues, rng: &mut Rng) {
         self.set_gripper(physics, factors.get("agent.ee_start_position"), rng);
         let (positions, yaws) = (factors.get("cube.start_position"), factors.get("cube.start_yaw"));
@@ -150,9 +154,31 @@ impl Table {
             window: rng.random_range(0.0..=OPEN[1]),
         };
         self.set_fixtures(physics, fixtures);
-        self.draw_subject(physics, factors, rng);
+        let goal = factors.get("cube.goal_position");
+        self.set_subject_goal(physics, ([goal[0], goal[1]], factors.get("cube.goal_yaw")[0]), rng);
+    }
+
+    /// Whether the gripper is open and above all cubes, so that the next goal of `mode=play` may follow.
+    pub(super) fn is_clear(&self, physics: &Physics) -> bool {
+        let (gripper, qpos) = (self.proprioception(physics), physics.data().qpos());
+        let mut heights = self.objects.cubes.iter().map(|cube| gripper.position[2] - cube.position(qpos)[2]);
+        gripper.closed < CLEAR_CLOSURE && heights.all(|height| height > CLEAR_HEIGHT)
+    }
+
+    /// Draws the next goal of `mode=play`. The pose is the key of the draw, so that a restored state has the same next goal.
+    pub(super) fn follow_goal(&mut self, physics: &mut Physics) {
+        let bits = physics.data().qpos().iter().map(|value| value.to_bits());
+        let rng = &mut bits.fold(Key::new(0).with("next goal"), Key::at).rng();
+        let place = (within(self.config.object_bounds, rng), rng.random_range(0.0..TAU));
+        self.set_subject_goal(physics, place, rng);
+        self.update_model(physics);
+    }
+
+    /// Draws the subject of the goal and sets the goal's pose: the present one with the subject at its goal. A cube that
+    /// goes to the table has the position (m) and yaw (rad) `place`.
+    fn set_subject_goal(&mut self, physics: &mut Physics, place: ([f64; 2], f64), rng: &mut Rng) {
+        self.draw_subject(physics, place, rng);
         self.move_marker_bodies(physics);
-        // The goal pose is the start with the subject at its goal.
         let start = physics.data().qpos().to_vec();
         if let Subject::Cube(i) = self.goal.subject {
             let (position, rotation) = self.goal.cubes[i];
@@ -166,7 +192,7 @@ impl Table {
     }
 
     /// Draws the subject of the goal, with the probabilities of the reference's data collection.
-    fn draw_subject(&mut self, physics: &Physics, factors: &FactorValues, rng: &mut Rng) {
+    fn draw_subject(&mut self, physics: &Physics, place: ([f64; 2], f64), rng: &mut Rng) {
         let now = self.fixture_state(physics.data().qpos());
         self.goal.fixtures = now;
         self.goal.cubes.fill((AWAY, IDENTITY));
@@ -187,13 +213,12 @@ impl Table {
             }
             Subject::Drawer => self.goal.fixtures.drawer = if now.drawer >= OPEN[0] / 2.0 { OPEN[0] } else { 0.0 },
             Subject::Window => self.goal.fixtures.window = if now.window <= OPEN[1] / 2.0 { OPEN[1] } else { 0.0 },
-            Subject::Cube(_) | Subject::All => self.draw_cube(physics, now, factors, rng),
+            Subject::Cube(_) | Subject::All => self.draw_cube(physics, now, place, rng),
         }
     }
 
-    /// Draws a cube without another cube on top, and its goal: on another cube, in the open drawer, or at the factors'
-    /// position.
-    fn draw_cube(&mut self, physics: &Physics, now: FixtureState, factors: &FactorValues, rng: &mut Rng) {
+    /// Draws a cube without another cube on top, and its goal: on another cube, in the open drawer, or at `place`.
+    fn draw_cube(&mut self, physics: &Physics, now: FixtureState, place: ([f64; 2], f64), rng: &mut Rng) {
         let qpos = physics.data().qpos();
         let positions: Vec<Vec3> = self.objects.cubes.iter().map(|cube| cube.position(qpos)).collect();
         let above = |a: Vec3, b: Vec3| b[2] > a[2] && (a[0] - b[0]).hypot(a[1] - b[1]) < 0.02;
@@ -212,13 +237,10 @@ impl Table {
                 let [x, y, z] = positions[below];
                 [x, y, z + STACK_HEIGHT]
             }
-            None => {
-                let goal = factors.get("cube.goal_position");
-                [goal[0], goal[1], CUBE_HEIGHT]
-            }
+            None => [place.0[0], place.0[1], CUBE_HEIGHT],
         };
         self.goal.subject = Subject::Cube(cube);
-        self.goal.cubes[cube] = (position, about_z(factors.get("cube.goal_yaw")[0]));
+        self.goal.cubes[cube] = (position, about_z(place.1));
     }
 
     /// Samples a goal that is not reached: cubes on the table, on each other or in the drawer; locks, drawer and window

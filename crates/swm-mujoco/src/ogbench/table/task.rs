@@ -31,6 +31,15 @@ pub enum Mode {
     FixedTask(usize),
     /// The factors set the start, and the goal is one object.
     DataCollection,
+    /// As [`Mode::DataCollection`], but a new goal follows each reached one, and only the limit of steps ends an episode.
+    Play,
+}
+
+impl Mode {
+    /// Whether the factors set the start.
+    pub fn starts_from_factors(self) -> bool {
+        matches!(self, Self::DataCollection | Self::Play)
+    }
 }
 
 /// A table task on a compiled model.
@@ -202,7 +211,7 @@ impl Table {
     /// observation is not computed, as in the reference.
     pub(super) fn observe_goal(&mut self, physics: &mut Physics) {
         self.goal.observed = true;
-        if self.mode == Mode::DataCollection {
+        if self.mode.starts_from_factors() {
             return;
         }
         let (buttons, contact) = (self.buttons, self.contact);
@@ -250,6 +259,12 @@ impl Task for Table {
             }
             _ => f64::from(success),
         };
+        if self.mode == Mode::Play {
+            if success && self.is_clear(physics) {
+                self.follow_goal(physics);
+            }
+            return StepOutcome { reward, terminated: false };
+        }
         StepOutcome { reward, terminated: success && self.terminate }
     }
 

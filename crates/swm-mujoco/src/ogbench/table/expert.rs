@@ -8,26 +8,33 @@
 use super::config::OPEN;
 use super::goal::{GOAL_TOLERANCE, Subject};
 use crate::ogbench::arm::pose::{Vec3, add, distance, scale, sub, wrap};
+use rand::Rng as _;
+use rand_distr::{Distribution as _, StandardNormal};
 use std::f64::consts::{FRAC_PI_2, PI};
 use swm_core::policy::Expert;
-use swm_core::{ExpertEntry, Key, Result, RowRef};
+use swm_core::{ExpertEntry, Key, Result, Rng, RowRef};
 
 /// The experts of the tables.
 pub const EXPERTS: &[ExpertEntry] = &[
     ExpertEntry {
         id: "expert",
         summary: "places one cube after another, unlocks and slides drawer and window, sets the locks",
-        make: || Box::new(TableExpert::new(1.0)),
+        make: || Box::new(TableExpert::new(1.0, 0.0)),
     },
     ExpertEntry {
         id: "paper-speed",
-        summary: "the jobs of `expert`, at the speed of OGBench's planned oracle",
-        make: || Box::new(TableExpert::new(PAPER_SPEED)),
+        summary: "the jobs of `expert`, at the speed and with the noise of OGBench's oracles",
+        make: || Box::new(TableExpert::new(PAPER_SPEED, PAPER_NOISE)),
     },
 ];
 
 /// The largest motion and rotation of `paper-speed`, as actions.
 const PAPER_SPEED: f64 = 0.7;
+/// The largest deviation of the noise of `paper-speed` along x, y and z; each episode draws its own from 0 on. That of the
+/// reference's `ExpertPolicy`.
+const PAPER_NOISE: f64 = 0.1;
+/// The noise of rotation and fingers, as multiples of that along x, y and z; the reference's.
+const NOISE_SCALES: [f64; 5] = [1.0, 1.0, 1.0, 3.0, 10.0];
 
 /// Displacement for an action of 1, in metres.
 const ACTION_POSITION: f64 = 0.05;
@@ -71,8 +78,12 @@ enum Job {
 
 /// The expert of tables, with its present job.
 struct TableExpert {
-    /// The largest absolute value of an action that moves or rotates.
+    /// The largest absolute value of an action that moves or rotates, before noise is added.
     speed: f64,
+    /// The largest deviation of the noise along x, y and z.
+    largest_noise: f64,
+    /// The deviation of the present episode, and the generator of its noise.
+    noise: (f64, Rng),
     job: Option<Job>,
     /// Steps since the job started.
     steps: usize,
@@ -308,9 +319,11 @@ struct Move {
 }
 
 impl TableExpert {
-    /// Creates an expert whose actions that move or rotate are at most `speed`, without a job.
-    fn new(speed: f64) -> Self {
-        Self { speed, job: None, steps: 0, locks: [0; 2], retreating: false }
+    /// Creates an expert whose actions that move or rotate are at most `speed`, with noise of at most this deviation,
+    /// without a job.
+    fn new(speed: f64, largest_noise: f64) -> Self {
+        let noise = (0.0, Key::new(0).rng());
+        Self { speed, largest_noise, noise, job: None, steps: 0, locks: [0; 2], retreating: false }
     }
 
     /// The move for a job; `None` when the job is done.
@@ -423,8 +436,12 @@ fn slide(inputs: &Inputs, index: usize, to: f64) -> Option<Move> {
 }
 
 impl Expert for TableExpert {
-    fn begin(&mut self, _: Key) {
-        *self = Self::new(self.speed);
+    fn begin(&mut self, key: Key) {
+        *self = Self::new(self.speed, self.largest_noise);
+        if self.largest_noise > 0.0 {
+            let mut rng = key.rng();
+            self.noise = (rng.random_range(0.0..self.largest_noise), rng);
+        }
     }
 
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
@@ -466,6 +483,11 @@ impl Expert for TableExpert {
                 _ if motion.close => 1.0,
                 _ => -1.0,
             };
+            let (deviation, rng) = &mut self.noise;
+            if *deviation > 0.0 {
+                let noise: f64 = StandardNormal.sample(rng);
+                *element = (*element + NOISE_SCALES[i] * *deviation * noise).clamp(-1.0, 1.0);
+            }
         }
         Ok(())
     }

@@ -19,6 +19,7 @@ use swm_core::{Error, Origin, Result, files};
 /// The recipes of this program: their names and texts.
 const SHIPPED: &[(&str, &str)] = &[
     ("ogb-cube/gcbc", include_str!("../../../recipes/ogb-cube/gcbc.toml")),
+    ("ogb-cube/lewm", include_str!("../../../recipes/ogb-cube/lewm.toml")),
     ("push-t/gcbc", include_str!("../../../recipes/push-t/gcbc.toml")),
     ("push-t/lewm", include_str!("../../../recipes/push-t/lewm.toml")),
     ("push-t/pldm", include_str!("../../../recipes/push-t/pldm.toml")),

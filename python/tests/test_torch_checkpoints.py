@@ -120,6 +120,64 @@ def test_targets_that_run_code_are_refused(home, target):
         load_pretrained("evil")
 
 
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"name": "hf-hub:evil/model"},
+        {"name": "local-dir:/tmp/evil"},
+        {"name": "resnet18", "checkpoint_path": "/tmp/evil.pth"},
+        {"name": "resnet18", "pretrained_cfg": {"url": "http://127.0.0.1:9/evil.pth"}},
+        {"name": "resnet18", "pretrained_cfg_overlay": {"file": "/tmp/evil.pth"}},
+    ],
+)
+def test_encoders_of_timm_are_not_loaded_from_where_a_file_says(home, given):
+    folder = home / "checkpoints/evil"
+    folder.mkdir(parents=True)
+    torch.save({}, folder / "weights.pt")
+    for path in ("prejepa.module.TimmEncoder", "prejepa.TimmEncoder"):
+        target = {"_target_": f"stable_worldmodel.wm.{path}", **given}
+        (folder / "config.json").write_text(json.dumps({**lewm_config(), "encoder": target}))
+        with pytest.raises(ValueError, match="TimmEncoder"):
+            load_pretrained("evil")
+
+
+def test_an_encoder_of_timm_gets_its_weights_from_the_file_alone(home):
+    pytest.importorskip("timm")
+    from stable_worldmodel.wm.prejepa.module import TimmEncoder
+
+    encoder = TimmEncoder("resnet10t", pretrained=False)
+    target = "stable_worldmodel.wm.prejepa.module.TimmEncoder"
+    save_pretrained(encoder, "mine", {"_target_": target, "name": "resnet10t", "pretrained": True})
+    again = load_pretrained("mine")
+    assert all(torch.equal(value, again.state_dict()[name]) for name, value in encoder.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        {"_target_": "torch.nn.Linear", "in_features": 200_000, "out_features": 200_000},
+        {"_target_": "stable_pretraining.backbone.utils.vit_hf", "num_hidden_layers": 1_000_000},
+        {"_target_": "stable_pretraining.backbone.utils.vit_hf", "hidden_size": 1 << 20},
+        {
+            "_target_": "stable_worldmodel.wm.prejepa.module.Attention",
+            "dim": 4,
+            "num_patches": 1 << 20,
+            "num_frames": 1 << 10,
+        },
+    ],
+)
+def test_models_that_are_larger_than_their_weights_take_no_memory(home, target):
+    folder = home / "checkpoints/evil"
+    folder.mkdir(parents=True)
+    # Elements that share one number take no space in a file.
+    torch.save({"weight": torch.zeros(1).expand(200_000, 200_000)}, folder / "weights.pt")
+    (folder / "config.json").write_text(json.dumps(target))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(ValueError, match="larger model than the file"):
+        load_pretrained("evil")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000, "kilobytes"
+
+
 def test_pickled_code_of_weights_does_not_run(home, tmp_path):
     class Evil:
         def __reduce__(self):

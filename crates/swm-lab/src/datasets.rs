@@ -39,7 +39,7 @@ const KEPT_AT_URI: Duration = Duration::from_secs(60);
 const READERS: usize = 4;
 
 /// Returns whether a path is a dataset of a known format.
-fn is_dataset(path: &Path) -> bool {
+pub(crate) fn is_dataset(path: &Path) -> bool {
     let suffix = path.extension().and_then(|suffix| suffix.to_str()).unwrap_or_default();
     let known = FORMATS.rows.iter().any(|format| format.suffixes.contains(&suffix));
     let location = Location::from(path.to_owned());

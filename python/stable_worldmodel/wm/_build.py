@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import functools
 import importlib
+import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import torch
 from torch import nn
 
 from .encoders import ViT
@@ -83,9 +85,10 @@ def _target(path: str, trust: bool) -> Callable[..., Any]:
             found = getattr(importlib.import_module(package), name, None)
         except ModuleNotFoundError as error:
             raise ValueError(f"_target_: there is no {path!r}") from error
-        # Only models: a function of this package might write files.
-        if isinstance(found, type) and issubclass(found, nn.Module):
-            return found
+        # Only models that are written here: a function of this package might write files, and a class that loads another
+        # library's models would pass the arguments on, which may name files and hosts.
+        if isinstance(found, type) and issubclass(found, nn.Module) and found.__module__.startswith(_OWN):
+            return _timm_encoder if found.__name__ == "TimmEncoder" else found
     raise ValueError(
         f"_target_: {path!r} is neither a model of this package nor a layer of torch, and calling it runs code that the file "
         "names; pass trust=True if you trust the file"
@@ -98,7 +101,22 @@ def _known_backbone(name: str) -> nn.Module:
 
     if name not in BACKBONES:
         raise ValueError(f"create_backbone: {name!r} is none of {', '.join(BACKBONES)}; pass trust=True if you trust the file")
-    return create_backbone(name)
+    with torch.device("cpu"):
+        return create_backbone(name)
+
+
+def _timm_encoder(name: str, **settings: Any) -> nn.Module:
+    """An encoder of `timm` that a file names, without weights: the file of the weights has them."""
+    from .prejepa.module import TimmEncoder
+
+    known = {"pretrained", "num_classes", "img_size", "patch_size"}
+    others = sorted(set(settings) - known)
+    # A name with a prefix, such as `hf-hub:`, is a place to load from.
+    if not re.fullmatch(r"[A-Za-z0-9_.]{1,100}", str(name)) or others:
+        given = f"the name {name!r}" if not others else f"the settings {', '.join(others)}"
+        raise ValueError(f"TimmEncoder: {given} may name a file or a host; pass trust=True if you trust the file")
+    sizes = {key: int(value) for key, value in settings.items() if key != "pretrained"}
+    return TimmEncoder(str(name), **{**sizes, "pretrained": False})
 
 
 #: Sizes of vision transformers: features, layers, heads, hidden features of a layer.

@@ -17,6 +17,7 @@ import torch
 from torch import nn
 
 from .. import _engine, _files
+from ._bounds import bounded
 from ._build import build
 from ._weights import load_into, read_state_dict
 from .checkpoints import module_of
@@ -114,11 +115,21 @@ def load_pretrained(
         for group in groups:
             part = part.setdefault(group, {})
         part[last] = value
-    model = build(config, trust)
+    weights = read_state_dict(file)
+    model = build(config, trust=True) if trust else _built(config, file.stat().st_size, len(weights))
     if not isinstance(model, nn.Module):
         raise ValueError(f"{settings}: it describes no torch module; expected a _target_ and its arguments")
-    load_into(model, read_state_dict(file), str(file))
+    load_into(model, weights, str(file))
     return model
+
+
+def _built(config: Any, stored_bytes: int, stored_tensors: int) -> Any:
+    """The model of a configuration that is not trusted, of the size of its weights."""
+    # Without memory first: a large model is refused before it takes any.
+    with bounded(stored_bytes, stored_tensors), torch.device("meta"):
+        build(config)
+    with bounded(stored_bytes, stored_tensors):
+        return build(config)
 
 
 def _located(name: str, folder: Path) -> Path:

@@ -126,4 +126,13 @@ pub trait Reader: Send + Sync {
     /// # Errors
     /// If the stored data is damaged.
     fn content_hash(&self) -> Result<String>;
+
+    /// A key for caches of decoded rows, which datasets share: equal keys mean equal rows, whoever wrote the files. It is
+    /// [`Reader::content_hash`], except where that is only stated by the files.
+    ///
+    /// # Errors
+    /// If the stored data is damaged.
+    fn cache_key(&self) -> Result<String> {
+        self.content_hash()
+    }
 }

@@ -10,6 +10,7 @@ mod hdf5;
 pub mod lance;
 mod lance_video;
 mod lerobot;
+mod opened;
 pub mod registry;
 mod replacing;
 mod set_aside;

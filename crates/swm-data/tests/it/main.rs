@@ -11,6 +11,7 @@ mod doctor;
 #[cfg(feature = "s3")]
 mod faults;
 mod folder;
+mod forged_hash;
 mod format_suite;
 mod full_disk;
 mod fuzz;
@@ -32,6 +33,7 @@ mod objects;
 mod overwriting;
 mod preview;
 mod reference;
+mod replaced_while_read;
 mod replacing;
 mod replay;
 mod sample;

@@ -1,21 +1,40 @@
 //! [`Imagination`]: what a world model predicts of candidates, beside what happens: latents of predicted steps, and of the
-//! frames of the steps that the environment takes.
+//! frames of the steps that the environment takes; both as frames where a decoder was fitted.
 
+use super::FrameDecoder;
 use super::projection::Pca;
-use super::scratch::{Codec, Scratch};
+use super::scratch::{self, Codec, Scratch};
 use super::watch::Candidate;
 use serde_json::{Value, json};
+use std::rc::Rc;
 use swm_core::columns::PIXELS;
 use swm_core::{Batch, ColumnSpec, Predictor, Result, Schema, Snapshot};
 
 /// The largest number of frames that are encoded for one search.
 const MOST_FRAMES: usize = 256;
+/// The largest number of steps of a candidate that are shown as frames.
+const MOST_SHOWN: usize = 8;
 
 /// A world model whose latents are those of frames.
 pub struct Imagination {
     model: Box<dyn Predictor>,
     side: usize,
     frames: Batch,
+    /// Decodes latents to frames.
+    pub decoder: Option<Rc<FrameDecoder>>,
+    cheapest: Option<Path>,
+}
+
+/// The cheapest candidate of the last search.
+struct Path {
+    /// The frames of the start and of the steps, then that of the goal, `[steps + 2, side, side, 3]`.
+    frames: Vec<u8>,
+    /// The latents of these frames, `[steps + 2, dim]`.
+    latents: Vec<f32>,
+    /// The predicted latents of the steps, `[steps, dim]`.
+    imagined: Vec<f32>,
+    /// Environment steps in a model step.
+    block: usize,
 }
 
 impl Imagination {
@@ -28,10 +47,15 @@ impl Imagination {
             return Ok(None);
         }
         let frames = Batch::zeros(&Schema::new([ColumnSpec::image(PIXELS, side, side)])?, 0);
-        Ok(Some(Self { model, side, frames }))
+        Ok(Some(Self { model, side, frames, decoder: None, cheapest: None }))
     }
 
-    /// Compares what the model predicts of candidates with what they lead to.
+    /// The model, and the side of the frames that it reads.
+    pub fn model(&mut self) -> (&mut dyn Predictor, usize) {
+        (&mut *self.model, self.side)
+    }
+
+    /// Compares what the model predicts of candidates with what they lead to. The cheapest is the first.
     ///
     /// # Errors
     /// When the model or the environment fails.
@@ -43,6 +67,7 @@ impl Imagination {
         let (block, dim) = (self.model.frameskip(), self.model.latent_dim());
         let steps = candidates.first().map_or(0, |one| one.actions.len() / (block * codec.width()).max(1));
         let most = ((MOST_FRAMES - 1) / (steps + 1)).min(candidates.len());
+        self.cheapest = None;
         if steps == 0 || most == 0 {
             return Ok(Value::Null);
         }
@@ -65,7 +90,44 @@ impl Imagination {
         let starts = true_.chunks_exact((steps + 1) * dim).flat_map(|path| path[..dim].iter().copied());
         let mut imagined = vec![0.0; most * steps * dim];
         self.model.rollout(&starts.collect::<Vec<_>>(), &actions, steps, &mut imagined)?;
-        Ok(described(goal, true_, &imagined, (steps, dim, block)))
+        let rgb = self.frames.get::<u8>(PIXELS)?;
+        let bytes = rgb.len() / self.frames.rows();
+        self.cheapest = Some(Path {
+            frames: [&rgb[bytes..(steps + 2) * bytes], &rgb[..bytes]].concat(),
+            latents: [&true_[..(steps + 1) * dim], goal].concat(),
+            imagined: imagined[..steps * dim].to_vec(),
+            block,
+        });
+        let mut shown = described(goal, true_, &imagined, (steps, dim, block));
+        if !shown.is_null() {
+            shown["frames"] = self.decoded()?;
+        }
+        Ok(shown)
+    }
+
+    /// The cheapest candidate of the last search as frames: what happens, the same through the decoder, and what the model
+    /// predicts; `null` without a decoder or a search.
+    ///
+    /// # Errors
+    /// When a frame cannot be encoded.
+    pub fn decoded(&self) -> Result<Value> {
+        let (Some(decoder), Some(path)) = (&self.decoder, &self.cheapest) else { return Ok(Value::Null) };
+        let dim = self.model.latent_dim();
+        let steps = path.imagined.len() / dim;
+        let decoded = (decoder.decode)(&path.latents);
+        let predicted = (decoder.decode)(&[&path.latents[..dim], &path.imagined].concat());
+        let bytes = self.side * self.side * 3;
+        let jpeg = |frames: &[u8], at: usize| scratch::jpeg(&frames[at * bytes..(at + 1) * bytes], self.side);
+        let shown = steps.min(MOST_SHOWN - 1);
+        let shown: Vec<usize> = (0..=shown).map(|i| i * steps / shown).collect();
+        let of = |frames: &[u8]| shown.iter().map(|&at| jpeg(frames, at)).collect::<Result<Vec<_>>>();
+        Ok(json!({
+            "steps": shown.iter().map(|at| at * path.block).collect::<Vec<_>>(),
+            "true": of(&path.frames)?,
+            "decoded": of(&decoded)?,
+            "imagined": of(&predicted)?,
+            "goal": [jpeg(&path.frames, steps + 1)?, jpeg(&decoded, steps + 1)?],
+        }))
     }
 }
 

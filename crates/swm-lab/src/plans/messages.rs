@@ -24,6 +24,11 @@ pub enum Request {
         /// The settings.
         planner: Settings,
     },
+    /// Shows what the model imagines as frames, through a decoder that is fitted to a dataset; `null` shows none.
+    Decode {
+        /// The dataset.
+        dataset: Option<Named>,
+    },
     /// Executes the present plan, then searches the next one and stops.
     Decide,
     /// One step of the environment; searches if a plan is due.
@@ -62,10 +67,20 @@ pub enum Request {
     },
     /// Forgets all steps that do not lead to the present one.
     Forget,
-    /// Ends the search that is under way; the plan is the best so far.
+    /// Ends the search that is under way, whose plan is the best so far, or the fit of a decoder.
     Enough,
     /// The page has shown a frame, and can receive another.
     Shown,
+}
+
+/// A dataset of a folder.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Named {
+    /// The index of its folder.
+    pub folder: usize,
+    /// Its name.
+    pub name: String,
 }
 
 /// A message of the server. The messages `planned`, whose plans are stored as JSON, and `failed` are not in this list.
@@ -107,6 +122,18 @@ pub enum Reply {
         iteration: usize,
         /// The lowest cost of it.
         best: f32,
+    },
+    /// A decoder is being fitted.
+    Fitting {
+        /// Steps that were taken.
+        done: usize,
+        /// All steps.
+        total: usize,
+    },
+    /// What the model imagines is shown as frames from now on, or no longer.
+    Decodes {
+        /// The fraction of the variance of pixels that the decoder explains on held-out episodes; `None` without a decoder.
+        explained: Option<f64>,
     },
     /// The frame of the goal.
     Goal {

@@ -22,7 +22,9 @@ pub use settings::Settings;
 
 use serde::Serialize;
 use serde_json::json;
+use swm_core::run::Control;
 use swm_core::{EnvSpec, Policy, Predictor, Result};
+use swm_data::Reader;
 use swm_eval::World;
 use swm_plan::{ActionKind, ActionScale, PlanObserver, SOLVERS};
 
@@ -67,6 +69,14 @@ pub struct Planner {
     pub predictor: Option<Box<dyn Predictor>>,
 }
 
+/// Decodes the latents of a model to frames.
+pub struct FrameDecoder {
+    /// Maps latents `[n, dim]` to RGB frames of the side that the model reads, `[n, side, side, 3]`.
+    pub decode: Box<dyn Fn(&[f32]) -> Vec<u8>>,
+    /// The fraction of the variance of pixels that it explains on episodes that it was not fitted on.
+    pub explained: f64,
+}
+
 /// The models and the solvers that fit an environment, the solvers with their default settings and what they need.
 pub fn listed(planning: &dyn Planning, spec: &EnvSpec) -> serde_json::Value {
     let actions = ActionKind::of(&spec.action_space);
@@ -102,4 +112,15 @@ pub trait Planners {
         world: &World,
         observer: Box<dyn PlanObserver>,
     ) -> Result<Planner>;
+
+    /// Fits a decoder from the latents of a model, which reads frames of this side and nothing else, to the frames of a dataset.
+    ///
+    /// # Errors
+    /// When the dataset has no frames of this side, or `control` stops the fit.
+    fn decoder(
+        &mut self,
+        model: (&mut dyn Predictor, usize),
+        dataset: &dyn Reader,
+        control: &mut Control<'_>,
+    ) -> Result<FrameDecoder>;
 }

@@ -11,6 +11,16 @@ const QUALITY: u8 = 92;
 /// Elements of a state that a path has.
 const MOST_STATE: usize = 64;
 
+/// Encodes a square frame as JPEG in Base64.
+///
+/// # Errors
+/// When the frame is too large.
+pub fn jpeg(rgb: &[u8], side: usize) -> Result<String> {
+    let mut bytes = vec![];
+    ImageCodec::Jpeg { quality: QUALITY }.encode(rgb, side, side, &mut bytes)?;
+    Ok(STANDARD.encode(bytes))
+}
+
 /// A private environment, in any state.
 pub struct Scratch {
     env: Box<dyn Env>,

@@ -92,6 +92,36 @@ def test_a_world_model_plans_and_a_step_back_shows_its_search(open_page):
     expect(page.get_by_role("alert")).to_have_count(0)
 
 
+def test_what_a_model_imagines_is_decoded_into_frames(open_page):
+    page = open_page("#plans?env=swm/TwoRoom-v1&seed=3&fps=60&model=zoo:two-room/pldm")
+    expect(page.get_by_test_id("command")).to_contain_text("swm eval zoo:two-room/pldm")
+    decide(page)
+    choice = page.get_by_label("decode with")
+    expect(choice.locator("option")).to_have_text(["none", "0/rooms.lance"])
+    # The fit can be stopped.
+    choice.select_option("0/rooms.lance")
+    page.get_by_role("button", name="Stop").click()
+    expect(page.get_by_label("Fit of the decoder")).to_have_count(0)
+    expect(choice).to_have_value("none")
+    choice.select_option("0/rooms.lance")
+    # The plan that is shown gets its frames, and so does the next one.
+    for row in ["environment", "its latents, decoded", "imagined, decoded"]:
+        for step in range(0, 21, 5):
+            expect(page.get_by_alt_text(f"{row}, step {step}", exact=True)).to_be_visible(timeout=240000)
+    expect(page.get_by_alt_text("its latents, decoded, goal")).to_be_visible()
+    expect(page.get_by_text(re.compile(r"\d+ % of the variance of pixels on held-out episodes"))).to_be_visible()
+    start = page.get_by_alt_text("imagined, decoded, step 0", exact=True).get_attribute("src")
+    assert start == page.get_by_alt_text("its latents, decoded, step 0", exact=True).get_attribute("src")
+    decide(page)
+    expect(page.get_by_alt_text("imagined, decoded, step 0", exact=True)).not_to_have_attribute("src", start)
+    page.set_viewport_size({"width": 1400, "height": 1000})
+    screenshot(page, "imagined", full_page=True)
+    # A dataset that is not in the list is refused by the server, see the tests of the crate.
+    choice.select_option("none")
+    expect(page.locator(".decoded")).to_have_count(0)
+    expect(page.get_by_role("alert")).to_have_count(0)
+
+
 def test_states_without_a_place_on_the_frame_are_projected(open_page):
     page = open_page("#plans?env=swm/PendulumControl-v1&seed=1&fps=60")
     decide(page)

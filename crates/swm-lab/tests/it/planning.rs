@@ -1,8 +1,10 @@
 //! A planner of the tests: the simulator, without the program that joins the registries.
 
-use swm_core::{EnvSpec, Result};
+use swm_core::run::Control;
+use swm_core::{EnvSpec, Error, Predictor, Result};
+use swm_data::Reader;
 use swm_eval::World;
-use swm_lab::plans::{Model, Planner, Planners, Planning, Position, SIMULATOR, Settings};
+use swm_lab::plans::{FrameDecoder, Model, Planner, Planners, Planning, Position, SIMULATOR, Settings};
 use swm_plan::{ActionKind, ActionScale, MpcPolicy, PlanObserver, SOLVERS, Score, SimulatorCost, pairing};
 
 /// The simulator alone.
@@ -41,5 +43,9 @@ impl Planners for Simulated {
         let solver = (SOLVERS.get(&settings.solver)?.make)(&serde_json::Value::Object(settings.settings.clone()))?;
         let policy = MpcPolicy::new(solver, Box::new(cost), config, scale.clone(), &spec, 1)?.observed(observer);
         Ok(Planner { policy: Box::new(policy), scale, predictor: None })
+    }
+
+    fn decoder(&mut self, _: (&mut dyn Predictor, usize), _: &dyn Reader, _: &mut Control<'_>) -> Result<FrameDecoder> {
+        Err(Error::config("simulator", "it has no latents", "choose a model"))
     }
 }

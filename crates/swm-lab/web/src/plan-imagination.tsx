@@ -1,10 +1,13 @@
 // What a world model imagines of the cheapest candidates, beside what they lead to.
 
-import { useMemo } from "preact/hooks";
+import { useEffect, useMemo } from "preact/hooks";
 import type uPlot from "uplot";
 import { Chart, COLOURS } from "./chart";
+import { type Dataset, get, type Model } from "./api";
 import { short } from "./format";
-import type { Imagination } from "./plan-session";
+import type { Decoded, Imagination, Plans } from "./plan-session";
+import { patch, useLoaded } from "./state";
+import { Choice } from "./transport";
 
 const SIDE = 1000;
 
@@ -48,5 +51,100 @@ export function ImaginationPanel({ imagination }: { imagination: Imagination }) 
         </figcaption>
       </figure>
     </section>
+  );
+}
+
+// The frames of the cheapest candidate: what happens, the same through the decoder, and what the model predicts.
+export function Frames({ frames, explained }: { frames: Decoded; explained?: number | null }) {
+  const rows = [
+    { name: "environment", images: frames.true, goal: frames.goal[0] },
+    { name: "its latents, decoded", images: frames.decoded, goal: frames.goal[1] },
+    { name: "imagined, decoded", images: frames.imagined, goal: undefined },
+  ];
+  return (
+    <figure class="decoded" aria-label="What the model imagines">
+      <table>
+        <thead>
+          <tr>
+            <td />
+            {frames.steps.map((step) => (
+              <th key={step} scope="col">
+                {step}
+              </th>
+            ))}
+            <th scope="col">goal</th>
+          </tr>
+        </thead>
+        <tbody>
+          {rows.map(({ name, images, goal }) => (
+            <tr key={name}>
+              <th scope="row">{name}</th>
+              {[...images, goal].map((jpeg, i) => (
+                <td key={i}>
+                  {jpeg && <img src={`data:image/jpeg;base64,${jpeg}`} alt={`${name}, ${i < images.length ? `step ${frames.steps[i]}` : "goal"}`} />}
+                </td>
+              ))}
+            </tr>
+          ))}
+        </tbody>
+      </table>
+      <figcaption>
+        The cheapest candidate of the last iteration. Where the rows below differ, the model is wrong; what the middle row lacks, the decoder
+        did not find in the latents
+        {typeof explained === "number" ? ` (${Math.round(100 * explained)} % of the variance of pixels on held-out episodes)` : ""}.
+      </figcaption>
+    </figure>
+  );
+}
+
+const NO_DATASET = "none";
+
+interface DecoderProps {
+  env: string;
+  model: Model;
+  plans: Plans;
+  // The folder and the name of the dataset, as in the address.
+  chosen?: string;
+}
+
+// The choice of the dataset that a decoder is fitted to.
+export function DecoderChoice({ env, model, plans, chosen }: DecoderProps) {
+  const { send, ready, fitting } = plans;
+  const listed = useLoaded(() => get<{ datasets: Dataset[] }>("datasets"), "datasets");
+  const base = env.split(",")[0];
+  const image = (dataset: Dataset) => dataset.columns?.some(({ name, shape }) => name === "pixels" && shape[0] === model.image);
+  const fit = (listed.value?.datasets ?? []).filter((dataset) => dataset.env?.split(",")[0] === base && image(dataset));
+  const names = fit.map(({ folder, name }) => `${folder}/${name}`);
+  const value = chosen && names.includes(chosen) ? chosen : NO_DATASET;
+  const isReady = ready?.model.name === model.name;
+  useEffect(() => {
+    if (!isReady || !listed.value) return;
+    const [folder, name] = [value.slice(0, value.indexOf("/")), value.slice(value.indexOf("/") + 1)];
+    send("decode", { dataset: value === NO_DATASET ? null : { folder: Number(folder), name } });
+  }, [isReady, listed.value, value, plans.isClosed]);
+  return (
+    <>
+      <div class="field is-wide" title="A decoder is fitted to the frames of this dataset; it shows what the model imagines">
+        <Choice
+          label="decode with"
+          value={value}
+          options={[NO_DATASET, ...names]}
+          onChange={(next) => patch({ decode: next === NO_DATASET ? undefined : next })}
+        />
+      </div>
+      {fitting && (
+        <div class="bar">
+          <progress value={fitting.done} max={fitting.total} aria-label="Fit of the decoder" />
+          <button type="button" onClick={() => (send("enough"), patch({ decode: undefined }))}>
+            Stop
+          </button>
+        </div>
+      )}
+      {listed.value && names.length === 0 && (
+        <small>
+          No dataset of {base} has frames of {model.image} px.
+        </small>
+      )}
+    </>
   );
 }

@@ -53,6 +53,17 @@ export interface Imagination {
   moved: number[];
   true_to_goal: number[];
   imagined_to_goal: number[];
+  // The cheapest candidate as JPEGs in Base64, where a decoder was fitted.
+  frames?: Decoded | null;
+}
+
+export interface Decoded {
+  steps: number[];
+  true: string[];
+  decoded: string[];
+  imagined: string[];
+  // The frame of the goal, and the same through the decoder.
+  goal: [string, string];
 }
 
 export interface Search {
@@ -84,6 +95,9 @@ interface State extends Connected {
   searchAt?: number;
   searching?: { iteration: number; best: number };
   ready?: { model: Model; block: number; command: string };
+  // The fit of a decoder: how far it is, or the fraction of the variance of pixels that it explains.
+  fitting?: { done: number; total: number };
+  explained?: number | null;
   goal?: string;
   peeked: Map<number, string>;
 }
@@ -120,6 +134,12 @@ function after(state: State, reply: Reply): State {
       return { ...state, searching: reply as unknown as State["searching"] };
     case "ready":
       return { ...state, ready: reply as unknown as State["ready"], error: undefined };
+    case "fitting":
+      return { ...state, fitting: reply as unknown as State["fitting"] };
+    case "decodes":
+      return { ...state, fitting: undefined, explained: reply.explained as number | null };
+    case "failed":
+      return { ...state, fitting: undefined };
     case "goal":
       return { ...state, goal: image(reply.jpeg) };
     case "peeked":

@@ -2,6 +2,8 @@
 
 import { useEffect, useState } from "preact/hooks";
 import type { EnvInfo, EnvRow, Model, Planners, Solver } from "./api";
+import { DecoderChoice } from "./plan-imagination";
+import type { Plans } from "./plan-session";
 import { type Params, patch } from "./state";
 import { Choice } from "./transport";
 
@@ -74,9 +76,10 @@ interface Props {
   info: EnvInfo;
   planners: Planners;
   params: Params;
+  plans: Plans;
 }
 
-export function PlanSettings({ rows, info, planners, params }: Props) {
+export function PlanSettings({ rows, info, planners, params, plans }: Props) {
   const { chosen: now, model, solver } = chosen(planners, params);
   const env = info.id.split(",")[0];
   const ofEnv = { pin: undefined, variation: undefined, model: undefined, solver: undefined, set: undefined };
@@ -100,6 +103,7 @@ export function PlanSettings({ rows, info, planners, params }: Props) {
         {model.image ? `, ${model.image} px` : ""}
         {model.block ? `, ${model.block} environment steps in a model step` : ""}
       </small>
+      {model.image && <DecoderChoice env={info.id} model={model} plans={plans} chosen={params.decode} />}
       <div class="field">
         <Choice
           label="solver"

@@ -3,6 +3,7 @@
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import { type EnvInfo, type EnvRow, get, type Planners } from "./api";
 import { Problems } from "./live-env";
+import { Frames } from "./plan-imagination";
 import { PlanChanges } from "./plan-changes";
 import { nearest, SearchPanel } from "./plan-search";
 import { branches, type Plans, usePlans } from "./plan-session";
@@ -85,7 +86,7 @@ function PlanPage({ rows, info, planners, params }: Props) {
   });
   return (
     <>
-      <PlanSettings rows={rows} info={info} planners={planners} params={params} />
+      <PlanSettings rows={rows} info={info} planners={planners} params={params} plans={plans} />
       <section class="stage" aria-label={info.id}>
         <h1>
           {info.id} <small>{info.summary}</small>
@@ -102,6 +103,7 @@ function PlanPage({ rows, info, planners, params }: Props) {
         <PlanTransport plans={plans} seed={seed} fps={fps} onReset={reset} onBack={back} />
         <PlanReadout plans={plans} limit={info.max_episode_steps} />
         <Problems live={plans} />
+        {search?.imagination?.frames && <Frames frames={search.imagination.frames} explained={plans.explained} />}
         {all.length > 0 && <Tree plans={plans} all={all} compared={compared} />}
         {chosenBranches.length > 0 && <Comparison plans={plans} chosen={chosenBranches} />}
         <PlanChanges info={info} plans={plans} />

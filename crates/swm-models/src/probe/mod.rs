@@ -21,7 +21,9 @@ mod targets;
 
 pub use cost::{ProbedCost, ProbedLatents, StateProbe};
 pub use fit::FitConfig;
-pub use reconstruction::{ReconstructionConfig, ReconstructionReport, reconstruct_images};
+pub use reconstruction::{
+    ImageDecoder, Reconstruction, ReconstructionConfig, ReconstructionReport, reconstruct_images,
+};
 pub use state::{Baseline, Score, StateConfig, StateReport, read_state};
 pub use supervised::{SupervisedReport, train_encoder};
 pub use targets::AnglePart;

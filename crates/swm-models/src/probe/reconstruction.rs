@@ -1,8 +1,9 @@
 //! Reconstruction of images from latents, which shows the information that an encoder preserves.
 
+use super::ImageEncoder;
 use super::fit::{FitConfig, fit, rows};
+use super::samples::{self, Samples};
 use super::scale::Scale;
-use super::{ImageEncoder, samples};
 use crate::nn::parameters::{self, IntoF32};
 use crate::nn::{Activation, Init, Linear};
 use crate::train::{StepOutput, check_sizes, limits, shards};
@@ -41,6 +42,23 @@ impl Default for ReconstructionConfig {
         let fit = FitConfig { steps: 1500, batch_size: 64, lr: 2e-3 };
         let channels = vec![64, 32, 16];
         Self { seed: 0, frames: 4000, held_out: 500, hidden: 256, channels, shards: 2, shown: 8, fit }
+    }
+}
+
+impl ReconstructionConfig {
+    /// Checks the ranges of all settings.
+    fn check(&self) -> Result<()> {
+        check_sizes(&[
+            ("frames", self.frames, 2, limits::BATCH),
+            ("held_out", self.held_out, 2, limits::BATCH),
+            ("hidden", self.hidden, 1, limits::FEATURES),
+            ("channels", self.channels.len(), 2, limits::FEATURES),
+            ("channels", self.channels.iter().copied().min().unwrap_or(0), 1, limits::FEATURES),
+            ("shards", self.shards, 1, limits::LAYERS),
+            ("shown", self.shown, 1, limits::BATCH),
+            ("fit.steps", self.fit.steps, 1, limits::STEPS),
+            ("fit.batch_size", self.fit.batch_size, 1, limits::BATCH),
+        ])
     }
 }
 
@@ -128,8 +146,53 @@ impl Decoder {
     }
 }
 
-/// Fits a decoder to an encoder's latents; returns the errors and a contact sheet. The sheet shows held-out images in
-/// pairs of rows: the originals, then the reconstructions.
+/// A decoder that was fitted to an encoder's latents.
+pub struct ImageDecoder {
+    decoder: Decoder,
+    scale: Scale,
+    mean: Vec<f32>,
+    latent: usize,
+}
+
+impl ImageDecoder {
+    /// Decodes latents to images with values from 0 to 1.
+    ///
+    /// # Shapes
+    /// Maps `[count, latent]` to `[count, image, image, 3]`.
+    pub fn decode(&self, latents: &[f32]) -> Vec<f32> {
+        let images: Vec<Vec<f32>> = self
+            .scale
+            .apply(latents)
+            .par_chunks(64 * self.latent)
+            .map(|latents| {
+                let x = TensorData::new(latents.to_vec(), [latents.len() / self.latent, self.latent]);
+                let x = Tensor::from_data(x, &Device::flex());
+                let mut decoded = self.decoder.forward(x).into_data().into_f32_vec();
+                let with_mean = decoded.iter_mut().zip(self.mean.iter().cycle());
+                with_mean.for_each(|(value, mean)| *value = (*value + mean).clamp(0.0, 1.0));
+                decoded
+            })
+            .collect();
+        images.concat()
+    }
+}
+
+/// Rounds values from 0 to 1 to bytes.
+pub fn to_bytes(decoded: &[f32]) -> Vec<u8> {
+    decoded.iter().map(|value| (value * 255.0).round() as u8).collect()
+}
+
+/// What [`reconstruct_images`] returns.
+pub struct Reconstruction {
+    /// The decoder.
+    pub decoder: ImageDecoder,
+    /// Its errors.
+    pub report: ReconstructionReport,
+    /// Held-out images in pairs of rows: the originals, then the reconstructions.
+    pub sheet: RgbImage,
+}
+
+/// Fits a decoder to an encoder's latents, and measures its errors.
 ///
 /// # Errors
 /// When the images do not have the encoder's image size, the side is not divisible into the decoder's blocks, no
@@ -139,28 +202,40 @@ pub fn reconstruct_images(
     reader: &dyn Reader,
     config: &ReconstructionConfig,
     control: &mut Control<'_>,
-) -> Result<(ReconstructionReport, RgbImage)> {
-    check_sizes(&[
-        ("frames", config.frames, 2, limits::BATCH),
-        ("held_out", config.held_out, 2, limits::BATCH),
-        ("hidden", config.hidden, 1, limits::FEATURES),
-        ("channels", config.channels.len(), 2, limits::FEATURES),
-        ("channels", config.channels.iter().copied().min().unwrap_or(0), 1, limits::FEATURES),
-        ("shards", config.shards, 1, limits::LAYERS),
-        ("shown", config.shown, 1, limits::BATCH),
-        ("fit.steps", config.fit.steps, 1, limits::STEPS),
-        ("fit.batch_size", config.fit.batch_size, 1, limits::BATCH),
-    ])?;
+) -> Result<Reconstruction> {
+    config.check()?;
     let key = Key::new(config.seed).with("probe");
     let sample = |part, count| samples::sample(encoder, reader, part, &[], true, (count, key.with("frames")));
     let train = sample(Part::Train, config.frames)?;
     let held_out = sample(Part::Validation, config.held_out)?;
-    let (latent, image) = (encoder.latent_dim(), encoder.image_size());
-    let bytes = image * image * 3;
+    let decoder = fit_decoder((encoder.latent_dim(), encoder.image_size()), &train, config, control)?;
+
+    let decoded = decoder.decode(&held_out.latents);
+    let rmse = root_mean_square(decoded.iter().copied(), &held_out.images);
+    let rmse_of_mean = root_mean_square(decoder.mean.iter().copied().cycle(), &held_out.images);
+    let report = ReconstructionReport {
+        latent: encoder.latent_dim(),
+        frames: train.count,
+        held_out: held_out.count,
+        rmse,
+        rmse_of_mean,
+        explained: if rmse_of_mean > 0.0 { 1.0 - (rmse / rmse_of_mean).powi(2) } else { 0.0 },
+    };
+    let sheet = sheet(&held_out.images, &decoded, encoder.image_size(), config.shown)?;
+    Ok(Reconstruction { decoder, report, sheet })
+}
+
+/// Trains a decoder on latents and their images.
+fn fit_decoder(
+    (latent, image): (usize, usize),
+    train: &Samples,
+    config: &ReconstructionConfig,
+    control: &mut Control<'_>,
+) -> Result<ImageDecoder> {
+    let (key, bytes) = (Key::new(config.seed).with("probe"), image * image * 3);
     let mean = mean_image(&train.images, bytes);
     let scale = Scale::of(&train.latents, train.count);
     let latents = scale.apply(&train.latents);
-
     let decoder = Decoder::new(&Init::new(key.with("init"), &Device::flex()), latent, image, config)?;
     let step = |model: &Decoder, indices: &[usize]| {
         shards::mean(indices.len(), config.shards, |range| {
@@ -179,19 +254,7 @@ pub fn reconstruct_images(
         })
     };
     let (decoder, _) = fit(decoder, config.fit, train.count, key.with("batches"), step, |_, _| (), control)?;
-
-    let decoded = decode(&decoder, &scale.apply(&held_out.latents), latent, &mean);
-    let rmse = root_mean_square(decoded.iter().copied(), &held_out.images);
-    let rmse_of_mean = root_mean_square(mean.iter().copied().cycle(), &held_out.images);
-    let report = ReconstructionReport {
-        latent,
-        frames: train.count,
-        held_out: held_out.count,
-        rmse,
-        rmse_of_mean,
-        explained: if rmse_of_mean > 0.0 { 1.0 - (rmse / rmse_of_mean).powi(2) } else { 0.0 },
-    };
-    Ok((report, sheet(&held_out.images, &decoded, image, config.shown)?))
+    Ok(ImageDecoder { decoder, scale, mean, latent })
 }
 
 /// Returns the mean image, with values from 0 to 1.
@@ -205,26 +268,6 @@ fn mean_image(images: &[u8], bytes: usize) -> Vec<f32> {
     }
     let count = (images.len() / bytes) as f32 * 255.0;
     sums.into_iter().map(|sum| sum as f32 / count).collect()
-}
-
-/// Decodes latents to images with values from 0 to 1.
-///
-/// # Shapes
-/// Maps `[count, latent]` to `[count, image, image, 3]`.
-fn decode(decoder: &Decoder, latents: &[f32], latent: usize, mean: &[f32]) -> Vec<f32> {
-    let images: Vec<Vec<f32>> = latents
-        .par_chunks(64 * latent)
-        .map(|latents| {
-            let x = TensorData::new(latents.to_vec(), [latents.len() / latent, latent]);
-            let mut decoded = decoder.forward(Tensor::from_data(x, &Device::flex())).into_data().into_f32_vec();
-            decoded
-                .iter_mut()
-                .zip(mean.iter().cycle())
-                .for_each(|(value, mean)| *value = (*value + mean).clamp(0.0, 1.0));
-            decoded
-        })
-        .collect();
-    images.concat()
 }
 
 /// Returns the root mean squared error of pixel values from 0 to 255; `decoded` has values from 0 to 1.
@@ -243,11 +286,7 @@ fn sheet(images: &[u8], decoded: &[f32], image: usize, shown: usize) -> Result<R
     let mut frames: Vec<Vec<u8>> = vec![];
     for indices in indices.chunks(COLUMNS) {
         frames.extend(indices.iter().map(|i| images[i * bytes..(i + 1) * bytes].to_vec()));
-        frames.extend(
-            indices
-                .iter()
-                .map(|i| decoded[i * bytes..(i + 1) * bytes].iter().map(|v| (v * 255.0).round() as u8).collect()),
-        );
+        frames.extend(indices.iter().map(|i| to_bytes(&decoded[i * bytes..(i + 1) * bytes])));
         // Padding aligns the images of an incomplete last row with the reconstructions.
         if indices.len() < COLUMNS && shown > COLUMNS {
             let blank = vec![u8::MAX; bytes];

@@ -144,9 +144,20 @@ impl Reader for FixedFeatures {
 
     /// The hash of the frames and of what encodes them.
     fn content_hash(&self) -> Result<String> {
+        Ok(self.hash_with(self.inner.content_hash()?))
+    }
+
+    fn cache_key(&self) -> Result<String> {
+        Ok(self.hash_with(self.inner.cache_key()?))
+    }
+}
+
+impl FixedFeatures {
+    /// A hash of a hash of the frames and of what encodes them.
+    fn hash_with(&self, frames: String) -> String {
         let FixedPart { kernels, images } = &self.part;
         let ImageNormalization { side, mean, std } = images;
-        let content = (self.inner.content_hash()?, kernels.hash(), side, mean, std);
-        Ok(swm_core::manifest::hash(&serde_json::to_vec(&content).expect("numbers and text serialize")))
+        let content = (frames, kernels.hash(), side, mean, std);
+        swm_core::manifest::hash(&serde_json::to_vec(&content).expect("numbers and text serialize"))
     }
 }

@@ -13,7 +13,9 @@ use swm_data::{Reader, check_png, write_png};
 use swm_models::TrainConfig;
 use swm_models::lewm::{Lewm, LewmConfig};
 use swm_models::pixels::ImageNormalization;
-use swm_models::probe::{self, AnglePart, FitConfig, ReconstructionConfig, Score, StateConfig, StateReport};
+use swm_models::probe::{
+    self, AnglePart, FitConfig, Reconstruction, ReconstructionConfig, Score, StateConfig, StateReport,
+};
 
 /// Arguments of `swm probe`. Probes are fitted on the training episodes of the dataset, and evaluated on its validation
 /// episodes.
@@ -92,7 +94,7 @@ pub fn probe(args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
             config.frames = args.frames.unwrap_or(config.frames);
             config.fit.steps = args.steps.unwrap_or(config.fit.steps);
             let fitted = || probe::reconstruct_images(&*encoder, &*reader, &config, &mut control(context));
-            let (report, sheet) = threads.install(fitted)?;
+            let Reconstruction { report, sheet, .. } = threads.install(fitted)?;
             write_png(file, sheet.width, sheet.height, &sheet.rgb)?;
             Some((report, file))
         }

@@ -88,7 +88,7 @@ impl CacheConfig {
                 Self::Disk { folder, .. } => {
                     let identity = match &identity {
                         Some(identity) => identity,
-                        None => identity.insert(reader.content_hash()?),
+                        None => identity.insert(reader.cache_key()?),
                     };
                     ColumnCache::ByRow(Box::new(DiskRowCache::open(folder, identity, spec, rows, Arc::clone(&budget))?))
                 }
@@ -255,5 +255,9 @@ impl Reader for CachedReader {
 
     fn content_hash(&self) -> Result<String> {
         self.inner.content_hash()
+    }
+
+    fn cache_key(&self) -> Result<String> {
+        self.inner.cache_key()
     }
 }

@@ -179,4 +179,9 @@ impl Reader for Concat {
         let parts: Result<Vec<String>> = self.parts.iter().map(|part| part.content_hash()).collect();
         Ok(view_hash("concat", parts?))
     }
+
+    fn cache_key(&self) -> Result<String> {
+        let parts: Result<Vec<String>> = self.parts.iter().map(|part| part.cache_key()).collect();
+        Ok(view_hash("concat", parts?))
+    }
 }

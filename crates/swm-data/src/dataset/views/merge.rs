@@ -96,4 +96,9 @@ impl Reader for Merge {
         let hashes = [self.base.content_hash()?, self.other.content_hash()?];
         Ok(view_hash("merge", hashes.into_iter().chain(self.added().map(str::to_owned))))
     }
+
+    fn cache_key(&self) -> Result<String> {
+        let keys = [self.base.cache_key()?, self.other.cache_key()?];
+        Ok(view_hash("merge", keys.into_iter().chain(self.added().map(str::to_owned))))
+    }
 }

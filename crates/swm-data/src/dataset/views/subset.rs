@@ -123,8 +123,19 @@ impl Reader for Subset {
 
     /// A hash of the inner reader's content hash, the column names and the positions.
     fn content_hash(&self) -> Result<String> {
+        Ok(self.hash_with(self.reader.content_hash()?))
+    }
+
+    fn cache_key(&self) -> Result<String> {
+        Ok(self.hash_with(self.reader.cache_key()?))
+    }
+}
+
+impl Subset {
+    /// A hash of a hash of the inner reader, the column names and the positions.
+    fn hash_with(&self, inner: String) -> String {
         let positions = self.positions.iter().flatten().map(usize::to_string);
         let columns = self.schema.columns().iter().map(|column| column.name.clone());
-        Ok(view_hash("subset", std::iter::once(self.reader.content_hash()?).chain(columns).chain(positions)))
+        view_hash("subset", std::iter::once(inner).chain(columns).chain(positions))
     }
 }

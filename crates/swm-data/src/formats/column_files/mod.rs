@@ -63,6 +63,13 @@ struct Metadata {
     /// For each episode, the names of its constants and the indices of the members ([`constant_member`]) that hold
     /// them. Episodes may share members.
     constants: Vec<BTreeMap<String, usize>>,
+    /// How often the dataset was replaced by another one at its path.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    replaced: u64,
+}
+
+fn is_zero(count: &u64) -> bool {
+    *count == 0
 }
 
 /// Name of the member of `ep_len.npz` that holds the constant with an index.

@@ -6,6 +6,8 @@ use super::npz::Npz;
 use super::{LENGTHS, METADATA, Metadata, OFFSETS, column_path, constant_member, journal};
 use crate::dataset::episodes::{EpisodeRows, index_columns};
 use crate::dataset::{Constants, StepRange};
+use crate::formats::opened::Opened;
+use crate::formats::set_aside::COLUMN_FILES;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
@@ -22,6 +24,7 @@ pub(crate) struct ColumnFiles {
     skipped: Vec<String>,
     /// Constants of the episodes that are in the journal but not yet in the column files.
     pending_constants: Vec<Constants>,
+    opened: Opened,
 }
 
 struct Column {
@@ -39,6 +42,7 @@ impl ColumnFiles {
     /// # Errors
     /// If the column files are damaged or inconsistent.
     pub fn open(folder: &Path) -> Result<Self> {
+        let mut opened = Opened::new(folder, &COLUMN_FILES);
         // Reads the journal before the lengths, so that episodes merged between the two reads are skipped.
         let journal_path = journal::path(folder);
         let journal = match files::read(&journal_path, u64::MAX) {
@@ -64,7 +68,24 @@ impl ColumnFiles {
                 .for_each(|(column, unmerged_rows)| column.unmerged_rows.extend(unmerged_rows));
             pending_constants.push(constants);
         }
-        Ok(Self { folder: folder.to_owned(), rows, recorded, columns, skipped, pending_constants })
+        opened.replaced = recorded.replaced;
+        let files = Self { folder: folder.to_owned(), rows, recorded, columns, skipped, pending_constants, opened };
+        // All that was read so far is of one dataset.
+        files.check()?;
+        Ok(files)
+    }
+
+    /// Checks, after something was read from the folder, that the dataset is still the one that was opened.
+    ///
+    /// # Errors
+    /// If it was replaced.
+    pub fn check(&self) -> Result<()> {
+        self.opened.check(|| Ok(stored_metadata(&self.folder)?.1.replaced))
+    }
+
+    /// How often the dataset was replaced by another one at its path.
+    pub(super) const fn replaced(&self) -> u64 {
+        self.recorded.replaced
     }
 
     /// The rows of each episode.
@@ -156,6 +177,7 @@ impl ColumnFiles {
             return Err(Error::corrupt(path, "it changed since the dataset was opened", "open the dataset again"));
         }
         data.truncate(column.in_file * column.spec.row_bytes());
+        self.check()?;
         Ok(data)
     }
 
@@ -185,7 +207,10 @@ impl ColumnFiles {
             return Ok(Constants::new());
         };
         let mut lengths = Npz::open(&column_path(&self.folder, LENGTHS))?;
-        named.iter().map(|(name, &index)| Ok((name.clone(), lengths.member(&constant_member(index))?))).collect()
+        let read = |(name, &index): (&String, &usize)| Ok((name.clone(), lengths.member(&constant_member(index))?));
+        let constants = named.iter().map(read).collect();
+        self.check()?;
+        constants
     }
 
     /// Names of the column files that are not read, because their elements are not numeric.

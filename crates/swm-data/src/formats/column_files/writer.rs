@@ -4,12 +4,12 @@ use super::journal::{self, Journal, PendingEpisode};
 use super::npz::NpzWriter;
 use super::{
     ColumnFiles, ImageFiles, LENGTHS, METADATA, Metadata, OFFSETS, TEMPORARY, check_name, column_path, constant_member,
-    exists, has_no_dataset, images, removal,
+    exists, has_no_dataset, images, reader::stored_metadata, removal,
 };
 use crate::dataset::episodes::{self, EpisodeRows};
 use crate::dataset::{CommitPolicy, Constants, StepRange, WriteMode, WriteOptions, Writer, is_full, with_stored};
 use crate::formats::replacing::ReplacingWriter;
-use crate::formats::set_aside;
+use crate::formats::set_aside::{self, COLUMN_FILES};
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -123,7 +123,14 @@ impl ColumnFilesWriter {
             schema: schema.clone(),
             unmerged: vec![vec![]; columns.len()],
             columns,
-            recorded: Metadata { schema: Some(schema.clone()), manifest: options.manifest.clone(), constants: vec![] },
+            recorded: Metadata {
+                schema: Some(schema.clone()),
+                manifest: options.manifest.clone(),
+                constants: vec![],
+                // The metadata of a dataset that this one replaces is set aside.
+                replaced: stored_metadata(&folder.join(COLUMN_FILES.set_aside))
+                    .map_or(0, |(_, old)| old.replaced.saturating_add(1)),
+            },
             policy: options.commit,
             last_commit: Instant::now(),
             rows: EpisodeRows::default(),
@@ -187,6 +194,7 @@ impl ColumnFilesWriter {
         self.recorded.schema = Some(old.recorded().cloned().map_or_else(|| Schema::new(columns), Ok)?);
         self.recorded.manifest = self.recorded.manifest.take().or_else(|| old.manifest());
         self.recorded.constants = old.constants_in_file().to_vec();
+        self.recorded.replaced = old.replaced();
         // Third-party datasets have no constants.
         self.recorded.constants.resize(in_files, BTreeMap::new());
         let stored = old.stored_constants()?;

@@ -50,7 +50,8 @@ impl FolderReader {
             })?;
             others.iter_mut().for_each(|(_, slot)| slot.copy_from_slice(first));
             Ok(())
-        })
+        })?;
+        self.files.check()
     }
 }
 

@@ -46,8 +46,7 @@ pub fn convert(values: &ArrayRef, n: usize, dtype: DType, out: &mut [u8]) -> Res
         DataType::Float64 => cast_all::<Float64Type, f64>(&elements, dtype, out),
         DataType::Float16 => {
             let values = elements.as_primitive::<Float16Type>();
-            cast(values.iter().map(|v| v.map_or(f64::NAN, f64::from)), dtype, out);
-            Ok(())
+            cast(values.iter().map(|v| v.map_or(f64::NAN, f64::from)), dtype, out)
         }
         DataType::Int8 => cast_all::<Int8Type, i64>(&elements, dtype, out),
         DataType::Int16 => cast_all::<Int16Type, i64>(&elements, dtype, out),
@@ -57,13 +56,15 @@ pub fn convert(values: &ArrayRef, n: usize, dtype: DType, out: &mut [u8]) -> Res
         DataType::UInt16 => cast_all::<UInt16Type, i64>(&elements, dtype, out),
         DataType::UInt32 => cast_all::<UInt32Type, i64>(&elements, dtype, out),
         DataType::UInt64 => {
-            let values = elements.as_primitive::<UInt64Type>().values().iter().map(|&v| v as i64);
-            cast(values, dtype, out);
-            Ok(())
+            let values = elements.as_primitive::<UInt64Type>();
+            check_no_nulls(values.null_count())?;
+            if let Some(large) = values.values().iter().find(|&&value| i64::try_from(value).is_err()) {
+                return Err(format!("it has the value {large}, which is more than an int64 can be"));
+            }
+            cast(values.values().iter().map(|&value| value as i64), dtype, out)
         }
         DataType::Boolean if elements.null_count() == 0 => {
-            cast(elements.as_boolean().values().iter().map(i64::from), dtype, out);
-            Ok(())
+            cast(elements.as_boolean().values().iter().map(i64::from), dtype, out)
         }
         other => Err(format!("{other} is not a supported numeric type")),
     }
@@ -77,6 +78,8 @@ pub trait Scalar: Copy {
     fn f64(self) -> f64;
     /// The value without its fraction.
     fn i64(self) -> i64;
+    /// Whether the value is this integer.
+    fn is(self, integer: i64) -> bool;
 }
 
 impl Scalar for f64 {
@@ -86,6 +89,10 @@ impl Scalar for f64 {
     }
     fn i64(self) -> i64 {
         self as i64
+    }
+    fn is(self, integer: i64) -> bool {
+        // 2^63 becomes the largest integer, which is rounded to 2^63 again.
+        self == integer as f64 && self < i64::MAX as f64
     }
 }
 
@@ -97,6 +104,9 @@ impl Scalar for i64 {
     fn i64(self) -> i64 {
         self
     }
+    fn is(self, integer: i64) -> bool {
+        self == integer
+    }
 }
 
 fn cast_all<T, N>(values: &ArrayRef, dtype: DType, out: &mut [u8]) -> Result<(), String>
@@ -106,28 +116,100 @@ where
 {
     let values = values.as_primitive::<T>();
     if values.null_count() == 0 {
-        cast(values.values().iter().map(|&v| N::from(v)), dtype, out);
-        return Ok(());
+        return cast(values.values().iter().map(|&v| N::from(v)), dtype, out);
     }
-    let Some(missing) = N::MISSING else {
-        return Err(format!("it has {} null values, which its type does not allow", values.null_count()));
-    };
-    cast(values.iter().map(|v| v.map_or(missing, N::from)), dtype, out);
-    Ok(())
+    let Some(missing) = N::MISSING else { return check_no_nulls(values.null_count()) };
+    cast(values.iter().map(|v| v.map_or(missing, N::from)), dtype, out)
 }
 
-/// Writes values as a column with type `dtype`.
-pub fn cast<N: Scalar>(values: impl Iterator<Item = N>, dtype: DType, out: &mut [u8]) {
-    fn write_each<const SIZE: usize>(out: &mut [u8], values: impl Iterator<Item = [u8; SIZE]>) {
-        out.chunks_exact_mut(SIZE).zip(values).for_each(|(slot, value)| slot.copy_from_slice(&value));
+fn check_no_nulls(count: usize) -> Result<(), String> {
+    if count == 0 {
+        return Ok(());
     }
-    match dtype {
-        DType::Bool => write_each(out, values.map(|v| [u8::from(v.f64() != 0.0)])),
-        DType::U8 => write_each(out, values.map(|v| [v.i64() as u8])),
-        DType::Int32 => write_each(out, values.map(|v| (v.i64() as i32).to_ne_bytes())),
-        DType::Int64 => write_each(out, values.map(|v| v.i64().to_ne_bytes())),
-        DType::Float32 => write_each(out, values.map(|v| (v.f64() as f32).to_ne_bytes())),
-        DType::Float64 => write_each(out, values.map(|v| v.f64().to_ne_bytes())),
+    Err(format!("it has {count} null values, which its type does not allow"))
+}
+
+/// Writes values as a column with type `dtype`. Writers store most types as `float32`, so that a value may have another type
+/// than its column.
+///
+/// # Errors
+/// If a value is not one of the type. Rounding of integers and of `float64` is no error for a column of `float32`.
+pub fn cast<N: Scalar>(values: impl Iterator<Item = N>, dtype: DType, out: &mut [u8]) -> Result<(), String> {
+    /// Writes each value, and finds the first for which the second part is not true.
+    fn write_each<const SIZE: usize, N: Scalar>(
+        out: &mut [u8],
+        values: impl Iterator<Item = N>,
+        convert: impl Fn(N) -> ([u8; SIZE], bool),
+    ) -> Option<N> {
+        let mut wrong = None;
+        for (slot, value) in out.chunks_exact_mut(SIZE).zip(values) {
+            let (bytes, is_exact) = convert(value);
+            slot.copy_from_slice(&bytes);
+            if !is_exact {
+                wrong = Some(value);
+            }
+        }
+        wrong
+    }
+    let wrong = match dtype {
+        DType::Bool => write_each(out, values, |v| ([u8::from(v.f64() != 0.0)], v.is(0) || v.is(1))),
+        DType::U8 => write_each(out, values, |v| ([v.i64() as u8], v.is(i64::from(v.i64() as u8)))),
+        DType::Int32 => write_each(out, values, |v| ((v.i64() as i32).to_ne_bytes(), v.is(i64::from(v.i64() as i32)))),
+        DType::Int64 => write_each(out, values, |v| (v.i64().to_ne_bytes(), v.is(v.i64()))),
+        DType::Float32 => write_each(out, values, |v| {
+            let single = v.f64() as f32;
+            (single.to_ne_bytes(), single.is_finite() || !v.f64().is_finite())
+        }),
+        DType::Float64 => write_each(out, values, |v| (v.f64().to_ne_bytes(), true)),
+    };
+    match wrong {
+        None => Ok(()),
+        Some(value) => Err(format!("it has the value {}, which is not one of its type {}", value.f64(), dtype.name())),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use arrow_array::{Float32Array, Float64Array, Int64Array, UInt64Array};
+
+    fn read(values: ArrayRef, dtype: DType) -> Result<Vec<u8>, String> {
+        let mut out = vec![0; values.len() * dtype.size()];
+        convert(&values, 1, dtype, &mut out).map(|()| out)
+    }
+
+    #[test]
+    fn values_that_the_type_does_not_have_are_refused() {
+        let integers = |value: i64| Arc::new(Int64Array::from(vec![1, value])) as ArrayRef;
+        let numbers = |value: f64| Arc::new(Float64Array::from(vec![1.0, value])) as ArrayRef;
+        for (values, dtype) in [
+            (integers(300), DType::U8),
+            (integers(-1), DType::U8),
+            (integers(1 << 40), DType::Int32),
+            (integers(2), DType::Bool),
+            (numbers(1.5), DType::Int32),
+            (numbers(f64::NAN), DType::Int64),
+            (numbers(2f64.powi(63)), DType::Int64),
+            (numbers(0.25), DType::Bool),
+            (numbers(1e300), DType::Float32),
+            (Arc::new(UInt64Array::from(vec![1, u64::MAX])), DType::Int64),
+            (Arc::new(UInt64Array::from(vec![Some(1), None])), DType::Int64),
+        ] {
+            let name = format!("{values:?} as {}", dtype.name());
+            let problem = read(values, dtype).expect_err(&name);
+            assert!(problem.contains("which"), "{name}: {problem}");
+        }
+    }
+
+    #[test]
+    fn values_of_the_type_are_read_whatever_stores_them() {
+        let singles = |values: &[f32]| Arc::new(Float32Array::from(values.to_vec())) as ArrayRef;
+        assert_eq!(read(singles(&[0.0, 1.0, 255.0]), DType::U8), Ok(vec![0, 1, 255]));
+        assert_eq!(read(singles(&[0.0, 1.0]), DType::Bool), Ok(vec![0, 1]));
+        assert_eq!(read(singles(&[-7.0]), DType::Int32), Ok((-7_i32).to_ne_bytes().to_vec()));
+        assert!(read(singles(&[f32::NAN, f32::INFINITY]), DType::Float32).is_ok());
+        let largest = Arc::new(Int64Array::from(vec![i64::MAX, i64::MIN]));
+        assert_eq!(read(largest, DType::Int64), Ok([i64::MAX.to_ne_bytes(), i64::MIN.to_ne_bytes()].concat()));
     }
 }
 

@@ -121,4 +121,8 @@ impl Reader for LanceVideoReader {
     fn content_hash(&self) -> Result<String> {
         self.steps.content_hash()
     }
+
+    fn cache_key(&self) -> Result<String> {
+        self.steps.cache_key()
+    }
 }

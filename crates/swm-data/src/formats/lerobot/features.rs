@@ -83,6 +83,7 @@ pub fn new_info(schema: &Schema, columns: &[(usize, String)], options: &WriteOpt
             schema: schema.clone(),
             manifest: options.manifest.clone(),
             last_action_repeats: true,
+            replaced: 0,
         }),
     }
 }

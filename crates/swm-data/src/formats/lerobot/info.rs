@@ -68,6 +68,13 @@ pub struct WriterMetadata {
     pub manifest: Option<Manifest>,
     /// Whether the last action of an episode is a copy of the previous action and stands for a missing action.
     pub last_action_repeats: bool,
+    /// How often the dataset was replaced by another one at its path.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub replaced: u64,
+}
+
+fn is_zero(count: &u64) -> bool {
+    *count == 0
 }
 
 /// Features by name, in file order. The first camera becomes the column `pixels`.
@@ -138,6 +145,11 @@ pub struct Column {
 }
 
 impl Info {
+    /// How often the dataset was replaced by another one at its path, if this project wrote it.
+    pub fn replaced(&self) -> u64 {
+        self.stable_worldmodel.as_ref().map_or(0, |recorded| recorded.replaced)
+    }
+
     /// Reads `meta/info.json` of a dataset.
     ///
     /// # Errors

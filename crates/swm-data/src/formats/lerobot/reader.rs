@@ -7,6 +7,8 @@ use super::{TASK, table, values};
 use crate::dataset::Location;
 use crate::dataset::episodes::{EpisodeRows, content_hash, index_columns};
 use crate::dataset::{Constants, Episode, Reader, StepRange};
+use crate::formats::opened::Opened;
+use crate::formats::set_aside::LEROBOT;
 use arrow_array::Array as _;
 use arrow_array::cast::AsArray as _;
 use rayon::prelude::*;
@@ -45,11 +47,14 @@ pub(super) struct LerobotReader {
     /// The timestamp of each row in seconds, if stored.
     timestamps: OnceLock<Option<Vec<f32>>>,
     videos: VideoCache<PathBuf>,
+    opened: Opened,
 }
 
 impl LerobotReader {
     pub fn open(root: &Path) -> Result<Self> {
+        let mut opened = Opened::new(root, &LEROBOT);
         let info = Info::read(root)?;
+        opened.replaced = info.replaced();
         let fps = info.fps().unwrap_or(1.0);
         let mut columns = info.columns(root)?;
         let is_computed =
@@ -94,7 +99,7 @@ impl LerobotReader {
                 }
             }
         }
-        Ok(Self {
+        let reader = Self {
             root: root.to_owned(),
             fps,
             schema: Schema::new(specs[..visible].to_vec())?,
@@ -107,7 +112,16 @@ impl LerobotReader {
             timestamps: OnceLock::new(),
             videos,
             info,
-        })
+            opened,
+        };
+        // All that was read so far is of one dataset.
+        reader.check()?;
+        Ok(reader)
+    }
+
+    /// Checks, after something was read, that the dataset is still the one that was opened.
+    fn check(&self) -> Result<()> {
+        self.opened.check(|| Ok(Info::read(&self.root)?.replaced()))
     }
 
     /// The index of a column in `specs`, by its name or its LeRobot name.
@@ -172,6 +186,7 @@ impl LerobotReader {
             })
             .collect();
         let mut parts = parts?;
+        self.check()?;
         Ok(if parts.len() == 1 { parts.swap_remove(0) } else { parts.concat() })
     }
 
@@ -199,7 +214,8 @@ impl LerobotReader {
             frames.push((path.clone(), begin + self.time(times, episode, step), slot));
         }
         let source = |path: &PathBuf| Ok(Source::File(path.clone()));
-        self.videos.read(frames, source, |video, &time| self.frame(video, time))
+        self.videos.read(frames, source, |video, &time| self.frame(video, time))?;
+        self.check()
     }
 
     /// Time from the start of the episode to a row, in seconds.
@@ -264,7 +280,8 @@ impl LerobotReader {
                 others.iter_mut().for_each(|(_, other)| other.copy_from_slice(first));
                 Ok(())
             })
-        })
+        })?;
+        self.check()
     }
 }
 

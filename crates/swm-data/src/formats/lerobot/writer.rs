@@ -13,7 +13,7 @@ use crate::dataset::Location;
 use crate::dataset::episodes;
 use crate::dataset::{Constants, Reader as _, WriteMode, WriteOptions, Writer, with_stored};
 use crate::formats::replacing::ReplacingWriter;
-use crate::formats::set_aside;
+use crate::formats::set_aside::{self, LEROBOT};
 use arrow_array::builder::{ListBuilder, StringBuilder};
 use arrow_array::{ArrayRef, Float64Array, Int64Array, RecordBatch, StringArray};
 use arrow_schema::{DataType, Field, Schema as ArrowSchema};
@@ -119,6 +119,10 @@ impl LerobotWriter {
         };
         if continues {
             writer.continue_from()?;
+        } else if let Some(recorded) = &mut writer.info.stable_worldmodel {
+            // The metadata of a dataset that this one replaces is set aside.
+            let old = Info::read(&root.join(LEROBOT.set_aside));
+            recorded.replaced = old.map_or(0, |old| old.replaced().saturating_add(1));
         }
         writer.clear_group();
         writer.describe()?;

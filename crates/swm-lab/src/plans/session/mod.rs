@@ -1,5 +1,6 @@
 //! The thread of a plan session: it searches, steps, and goes back.
 
+mod decoding;
 mod shown;
 
 use super::imagination::Imagination;
@@ -8,6 +9,7 @@ use super::scratch::{Codec, Scratch};
 use super::tree::{Node, Tree};
 use super::watch::Watch;
 use super::{Model, Planner, Planners, Position, SIMULATOR, Settings, projection, search};
+use crate::folders::Folders;
 use crate::session::{Kind, Out, Session, Setup, check_seed};
 use crate::{Lab, still};
 use std::sync::Arc;
@@ -38,6 +40,7 @@ enum Mode {
 /// A planner with what the session knows of it.
 struct InUse {
     policy: Box<dyn Policy>,
+    model: String,
     imagination: Option<Imagination>,
     codec: Codec,
     /// Environment steps of a plan that are executed.
@@ -52,6 +55,10 @@ pub struct PlanSession<'a> {
     positions: &'static [Position],
     planners: Box<dyn Planners + 'a>,
     in_use: Option<InUse>,
+    datasets: Folders,
+    fitted: Option<decoding::Fitted>,
+    /// The step at which the last search was made.
+    searched_at: Option<usize>,
     watch: Watch,
     world: World,
     scratch: Scratch,
@@ -120,6 +127,9 @@ impl<'a> PlanSession<'a> {
             positions,
             planners: lab.planning.planners(),
             in_use: None,
+            datasets: lab.datasets.clone(),
+            fitted: None,
+            searched_at: None,
             watch: Watch::new(out.clone()),
             scratch: Scratch::new(&setup.env)?,
             tree: Tree::new(root, world.pool().env(0).snapshot(), 0),
@@ -185,6 +195,7 @@ impl<'a> PlanSession<'a> {
                 self.reset()
             }
             Request::Settings { planner } => self.plan_with(&planner),
+            Request::Decode { dataset } => self.decode(dataset),
             Request::Decide => self.go_on(Mode::Deciding),
             Request::Play { on } => self.go_on(if on { Mode::Playing } else { Mode::Paused }),
             Request::Step => {
@@ -264,7 +275,10 @@ impl<'a> PlanSession<'a> {
             _ => None,
         };
         let steps = config.receding_horizon * config.action_block;
-        let had_one = self.in_use.replace(InUse { policy, imagination, codec, steps }).is_some();
+        let in_use = InUse { policy, model: model.name.clone(), imagination, codec, steps };
+        let had_one = self.in_use.replace(in_use).is_some();
+        self.searched_at = None;
+        self.use_decoder();
         if had_one && self.tree.nodes().len() > 1 {
             let model = if settings.model == SIMULATOR { "" } else { settings.model.as_str() };
             let text = format!("{model} {}, horizon {}", settings.solver_text(), settings.horizon);
@@ -342,6 +356,7 @@ impl<'a> PlanSession<'a> {
             plan["imagination"] = imagination.compare(&cheapest, (&mut self.scratch, start, codec))?;
         }
         let plan = plan.to_string();
+        self.searched_at = Some(self.tree.node().id);
         self.tree.set_plan(&plan, cost);
         self.send_plan(&plan);
         Ok(())

@@ -7,11 +7,16 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 use std::time::SystemTime;
-use swm_core::{EnvSpec, Error, Origin, Result};
+use swm_core::columns::PIXELS;
+use swm_core::run::Control;
+use swm_core::{Batch, ColumnSpec, EnvSpec, Error, Origin, Predictor, Result, Schema};
+use swm_data::Reader;
 use swm_eval::{Choice, Model as PlannedIn, World};
 use swm_lab::folders::Folders;
-use swm_lab::plans::{Model, Planner, Planners, Planning, Position, SIMULATOR, Settings};
+use swm_lab::plans::{FrameDecoder, Model, Planner, Planners, Planning, Position, SIMULATOR, Settings};
 use swm_models::Device;
+use swm_models::probe::reconstruction::to_bytes;
+use swm_models::probe::{ImageEncoder, Reconstruction, ReconstructionConfig, reconstruct_images};
 use swm_plan::PlanObserver;
 
 /// How deep checkpoints are looked for in the folders of runs.
@@ -130,5 +135,49 @@ impl Planners for HomePlanners<'_> {
         let WatchedPolicy { policy, scale, predictor } =
             self.resolver.watched_policy(&planned_in, (&solver, &mpc), world, observer)?;
         Ok(Planner { policy, scale, predictor })
+    }
+
+    fn decoder(
+        &mut self,
+        (predictor, side): (&mut dyn Predictor, usize),
+        dataset: &dyn Reader,
+        control: &mut Control<'_>,
+    ) -> Result<FrameDecoder> {
+        let dim = predictor.latent_dim();
+        let schema = Schema::new([ColumnSpec::image(PIXELS, side, side)])?;
+        let encoder = Encoding { predictor: Mutex::new(predictor), schema, side, dim };
+        let config = ReconstructionConfig::default();
+        let Reconstruction { decoder, report, .. } = reconstruct_images(&encoder, dataset, &config, control)?;
+        let decode = move |latents: &[f32]| to_bytes(&decoder.decode(latents));
+        Ok(FrameDecoder { decode: Box::new(decode), explained: report.explained })
+    }
+}
+
+/// The encoder of a model that predicts.
+struct Encoding<'a> {
+    predictor: Mutex<&'a mut dyn Predictor>,
+    schema: Schema,
+    side: usize,
+    dim: usize,
+}
+
+impl ImageEncoder for Encoding<'_> {
+    fn image_size(&self) -> usize {
+        self.side
+    }
+
+    fn latent_dim(&self) -> usize {
+        self.dim
+    }
+
+    fn encode(&self, rgb: &[u8]) -> Result<Vec<f32>> {
+        let bytes = self.side * self.side * 3;
+        let mut rows = Batch::zeros(&self.schema, rgb.len() / bytes);
+        for (i, frame) in rgb.chunks_exact(bytes).enumerate() {
+            rows.row_mut(i).at::<u8>(0).copy_from_slice(frame);
+        }
+        let mut latents = vec![0.0; rows.rows() * self.dim];
+        self.predictor.lock().unwrap_or_else(PoisonError::into_inner).encode(&rows, &mut latents)?;
+        Ok(latents)
     }
 }

@@ -20,7 +20,7 @@ use super::convert::{cast, image_bytes, integers};
 use super::errors::damaged;
 use super::record::{CONSTANTS_KEY, ContentHash};
 use super::schema::{self, Kind, StoredColumn};
-use super::store::Store;
+use super::store::{self, Store};
 use crate::dataset::Location;
 use crate::dataset::objects::BlockCache;
 use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
@@ -188,8 +188,8 @@ impl LanceReader {
         }
         let dtype = self.schema.column(name)?.dtype;
         self.check_length(name, values.len(), out)?;
-        cast(values.into_iter(), dtype, out);
-        Ok(())
+        cast(values.into_iter(), dtype, out)
+            .map_err(|problem| damaged(self.folder(), format!("column '{name}': {problem}")))
     }
 
     fn check_length(&self, name: &str, rows: usize, out: &[u8]) -> Result<()> {
@@ -244,10 +244,10 @@ impl Reader for LanceReader {
         }
     }
 
-    /// Compares the stored `step_idx` with the position in the episode. The two differ if two episodes were
-    /// written with the same index.
+    /// Compares the content hash that is stated of each episode with its values, and the stored `step_idx` with the
+    /// position in the episode. The latter two differ if two episodes were written with the same index.
     fn irregularities(&self) -> Result<Vec<Irregularity>> {
-        let mut found = vec![];
+        let mut found = self.false_hashes()?;
         if self.table.schema.field(STEP_IDX).is_none() {
             return Ok(found);
         }
@@ -324,21 +324,46 @@ impl Reader for LanceReader {
     }
 
     fn content_hash(&self) -> Result<String> {
+        self.hash_of_episodes(&[], |fragment, episodes| self.hashes(fragment, episodes))
+    }
+
+    /// The hashes that data files state of episodes are the word of who wrote them. So local files are known by the hashes in
+    /// their names, which are verified when they are read, other files by their values, and those of a store by its URI too.
+    fn cache_key(&self) -> Result<String> {
+        let label = self.store.label.display().to_string();
+        let place: &[u8] = if self.store.remote { label.as_bytes() } else { &[] };
+        self.hash_of_episodes(place, |fragment, episodes| {
+            let files = &self.table.fragments[fragment].files;
+            if !self.store.remote && files.iter().any(|file| store::hash_in_name(&file.path).is_none()) {
+                return episodes.map(|episode| self.compute_hash(episode)).collect();
+            }
+            let names = files.iter().map(|file| file.path.as_str()).collect::<Vec<_>>().join("/");
+            Ok(episodes.map(|_| names.clone()).collect())
+        })
+    }
+}
+
+impl LanceReader {
+    /// Returns a hash of the columns, and of the index, the length and a hash of each episode; `of_fragment` returns those of
+    /// the episodes in a fragment.
+    fn hash_of_episodes(
+        &self,
+        place: &[u8],
+        of_fragment: impl Fn(usize, Range<usize>) -> Result<Vec<String>>,
+    ) -> Result<String> {
         let mut hasher = blake3::Hasher::new();
         let mut add = |bytes: &[u8]| {
             hasher.update(&(bytes.len() as u64).to_le_bytes());
             hasher.update(bytes);
         };
+        if !place.is_empty() {
+            add(place);
+        }
         for column in &self.columns {
             add(schema::json(&column.spec)?.as_bytes());
         }
-        let mut at = 0;
-        for (fragment, rows) in self.fragment_rows.windows(2).enumerate() {
-            let first = at;
-            while at < self.episodes.len() && self.first_rows[at] < rows[1] {
-                at += 1;
-            }
-            for (episode, hash) in self.episodes[first..at].iter().zip(self.hashes(fragment, first..at)?) {
+        for (fragment, episodes) in self.episodes_of_fragments().enumerate() {
+            for (episode, hash) in self.episodes[episodes.clone()].iter().zip(of_fragment(fragment, episodes)?) {
                 add(&episode.index.to_le_bytes());
                 add(&(episode.length as u64).to_le_bytes());
                 add(hash.as_bytes());
@@ -346,19 +371,43 @@ impl Reader for LanceReader {
         }
         Ok(hasher.finalize().to_hex().to_string())
     }
-}
 
-impl LanceReader {
+    /// The positions of the episodes that begin in each fragment.
+    fn episodes_of_fragments(&self) -> impl Iterator<Item = Range<usize>> {
+        let begin = |row: u64| self.first_rows.partition_point(|&first| first < row);
+        self.fragment_rows.windows(2).map(move |rows| begin(rows[0])..begin(rows[1]))
+    }
+
     /// Returns the hashes of a fragment's episodes, from the fragment's record if it exists, otherwise computed from
     /// the data.
     fn hashes(&self, fragment: usize, episodes: Range<usize>) -> Result<Vec<String>> {
-        if let Some((_, record)) = self.record(fragment)? {
-            let stored = self.episodes[episodes.clone()].iter().map(|episode| episode.length as u64);
-            if stored.eq(record.episodes.iter().map(|episode| episode.rows)) {
-                return Ok(record.episodes.into_iter().map(|episode| episode.hash).collect());
+        match self.stated_hashes(fragment, episodes.clone())? {
+            Some(stated) => Ok(stated),
+            None => episodes.map(|episode| self.compute_hash(episode)).collect(),
+        }
+    }
+
+    /// Returns the hashes in a fragment's record, if it has one of these episodes.
+    fn stated_hashes(&self, fragment: usize, episodes: Range<usize>) -> Result<Option<Vec<String>>> {
+        let Some((_, record)) = self.record(fragment)? else { return Ok(None) };
+        let stored = self.episodes[episodes].iter().map(|episode| episode.length as u64);
+        let is_of_these = stored.eq(record.episodes.iter().map(|episode| episode.rows));
+        Ok(is_of_these.then(|| record.episodes.into_iter().map(|episode| episode.hash).collect()))
+    }
+
+    /// Finds the episodes whose values do not have the hash that is stated of them; those that cannot be read are left out.
+    fn false_hashes(&self) -> Result<Vec<Irregularity>> {
+        let mut found = vec![];
+        for (fragment, episodes) in self.episodes_of_fragments().enumerate() {
+            let Some(stated) = self.stated_hashes(fragment, episodes.clone())? else { continue };
+            for (episode, stated) in episodes.zip(stated) {
+                if self.compute_hash(episode).is_ok_and(|hash| hash != stated) {
+                    let what = "its values do not have the content hash that its data file states".to_owned();
+                    found.push(Irregularity { episode: Some(episode), what });
+                }
             }
         }
-        episodes.map(|episode| self.compute_hash(episode)).collect()
+        Ok(found)
     }
 
     /// Computes the hash of an episode from its stored values.

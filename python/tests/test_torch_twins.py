@@ -1,5 +1,7 @@
 """Tests that torch modules of the engine's checkpoints compute what the engine computes, and are saved as its checkpoints."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -208,3 +210,26 @@ def test_a_subclass_of_a_checkpoint_is_planned_with_and_saved(world, rooms, tmp_
     assert 0 <= found["success_rate"] <= 100
     model.save_pretrained(tmp_path / "careful")
     assert type(load_pretrained(tmp_path / "careful")) is swm.wm.LeWM
+
+
+def test_files_that_the_engine_refuses_are_not_loaded(rooms, tmp_path):
+    trained("lewm", rooms, tmp_path / "run")
+    folder = tmp_path / "run/checkpoint"
+    config, weights = (folder / "config.json").read_bytes(), (folder / "weights.safetensors").read_bytes()
+
+    def refused(**files):
+        for name, content in {"config.json": config, "weights.safetensors": weights, **files}.items():
+            (folder / name).write_bytes(content)
+        for path in (tmp_path / "run", folder):
+            with pytest.raises(RuntimeError):
+                load_pretrained(path)
+
+    assert load_pretrained(folder).stored.config["seed"] == load_pretrained(tmp_path / "run").stored.config["seed"]
+    changed = json.loads(config)
+    changed["facts"]["action"]["std"] = [10 * std for std in changed["facts"]["action"]["std"]]
+    refused(**{"config.json": json.dumps(changed).encode()})
+    changed = json.loads(config)
+    changed["config"]["model"]["predictor"]["mlp"] = 2_000_000
+    refused(**{"config.json": json.dumps(changed).encode()})
+    not_finite = np.full(4, np.nan, "<f4").tobytes()
+    refused(**{"weights.safetensors": weights[: -len(not_finite)] + not_finite})

@@ -28,7 +28,7 @@ from .prejepa.module import Embedder as ColumnEmbedder
 from .pretrained import Pretrained, Stored
 from .tdmpc2 import TDMPC2
 
-__all__ = ["check_kind", "load", "module_of"]
+__all__ = ["check_kind", "is_stored", "load", "module_of"]
 
 Model = TypeVar("Model", bound=Pretrained)
 
@@ -85,6 +85,17 @@ def check_kind(family: str, kind: type[Pretrained] | None) -> None:
         raise TypeError(f"a model of the family {family!r} is a {name}, not a {kind.__name__}; derive the class from {name}")
 
 
+def is_stored(path: Path) -> bool:
+    """Whether a checkpoint of the engine is at a path: a run, the folder `checkpoint` in it, or a capsule."""
+    return path.suffix == ".safetensors" if not path.is_dir() else _folder_of(path) is not None
+
+
+def _folder_of(path: Path) -> Path | None:
+    """The folder of a run that holds the checkpoint."""
+    folders = (path, path / "checkpoint", path / "checkpoint.old")
+    return next((folder for folder in folders if (folder / "weights.safetensors").is_file()), None)
+
+
 def _parts(path: Path) -> tuple[Stored, dict[str, Tensor]] | None:
     """The parts of a checkpoint; `None` if there is none at the path."""
     if path.is_file():
@@ -92,9 +103,7 @@ def _parts(path: Path) -> tuple[Stored, dict[str, Tensor]] | None:
             return None
         document, weights = read_capsule(path)
         return Stored(document["checkpoint"], document["manifest"]), weights
-    folder = next(
-        (f for f in (path, path / "checkpoint", path / "checkpoint.old") if (f / "weights.safetensors").is_file()), None
-    )
+    folder = _folder_of(path)
     if folder is None:
         return None
     manifest = folder / "manifest.json"

@@ -20,7 +20,7 @@ from .. import _engine, _files
 from ._bounds import bounded
 from ._build import build
 from ._weights import load_into, read_state_dict
-from .checkpoints import module_of
+from .checkpoints import is_stored, module_of
 
 __all__ = ["load_pretrained", "save_pretrained"]
 
@@ -99,11 +99,11 @@ def load_pretrained(
         trust: Whether a `_target_` may name any function, which is imported and called.
     """
     path = _located(str(name), _folder(cache_dir))
-    run = module_of(path)
-    if run is not None:
+    if is_stored(path):
         if extra_args:
             raise ValueError("extra_args: the configuration of a checkpoint of the engine cannot be changed")
-        return run
+        # The engine checks the files: the bounds of the configuration, its hash and that of the weights, and their values.
+        return module_of(Path(_engine.Model(os.path.abspath(path), "cpu", "null", False).path))
     file = path if path.is_file() else _only_weights(path)
     settings = file.parent / "config.json"
     if not settings.is_file():

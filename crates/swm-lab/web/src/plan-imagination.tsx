@@ -89,8 +89,8 @@ export function Frames({ frames, explained }: { frames: Decoded; explained?: num
         </tbody>
       </table>
       <figcaption>
-        The cheapest candidate of the last iteration. Where the rows below differ, the model is wrong; what the middle row lacks, the decoder
-        did not find in the latents
+        The cheapest candidate of the last iteration. Where the last row differs from the middle one, the model is wrong; what the middle row
+        lacks, the decoder did not find in the latents
         {typeof explained === "number" ? ` (${Math.round(100 * explained)} % of the variance of pixels on held-out episodes)` : ""}.
       </figcaption>
     </figure>

@@ -305,6 +305,8 @@ impl Store {
         };
         // If the object cannot be read, it may be this one: the caller must not delete what it refers to.
         let stored = match self.objects.inner.get(path).await {
+            // A file of another size, which may be any, is not read.
+            Ok(stored) if stored.meta.size != content.len() as u64 => Some(Bytes::new()),
             Ok(stored) => Some(stored.bytes().await?),
             Err(object_store::Error::NotFound { .. }) => None,
             Err(unreadable) => return Err(unreadable.into()),

@@ -2,6 +2,7 @@
 
 import json
 import resource
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -176,6 +177,24 @@ def test_models_that_are_larger_than_their_weights_take_no_memory(home, target):
     with pytest.raises(ValueError, match="larger model than the file"):
         load_pretrained("evil")
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000, "kilobytes"
+
+
+def test_compressed_weights_and_long_configurations_are_refused(home):
+    folder = home / "checkpoints/evil"
+    folder.mkdir(parents=True)
+    settings = {"_target_": "torch.nn.Linear", "in_features": 4, "out_features": 4}
+    torch.save(torch.nn.Linear(4, 4).state_dict(), folder / "stored.pt")
+    with zipfile.ZipFile(folder / "stored.pt") as stored, zipfile.ZipFile(folder / "weights.pt", "w", zipfile.ZIP_DEFLATED) as packed:
+        for name in stored.namelist():
+            packed.writestr(name, stored.read(name))
+    (folder / "config.json").write_text(json.dumps(settings))
+    assert load_pretrained(folder / "stored.pt").in_features == 4
+    with pytest.raises(RuntimeError, match="is compressed"):
+        load_pretrained(folder / "weights.pt")
+    with (folder / "config.json").open("ab") as file:
+        file.truncate(4 << 30)
+    with pytest.raises(ValueError, match="expected the configuration of a model"):
+        load_pretrained(folder / "stored.pt")
 
 
 def test_pickled_code_of_weights_does_not_run(home, tmp_path):

@@ -15,7 +15,7 @@ pub use lock::Lock;
 use crate::{Error, Result};
 use std::collections::BTreeSet;
 use std::fs::{File, FileType};
-use std::io::{ErrorKind, Read as _, Write as _};
+use std::io::{ErrorKind, Read as _, Seek as _, Write as _};
 use std::path::{Component, Path, PathBuf};
 
 /// Opens a regular file for reading.
@@ -32,10 +32,46 @@ pub fn open(path: &Path) -> Result<File> {
     File::open(path).map_err(io)
 }
 
+/// The length from which a file must take some space on the disk.
+const LONG: u64 = 64 << 20;
+/// The largest length of a longer file, in bytes of the space that it takes. No file of this program is compressed so far by a
+/// file system.
+const SPARSE: u64 = 64;
+
+/// Checks that a long file is no sparse one: it would take memory, and none of the disk of who made it.
+fn check_not_sparse(path: &Path, file: &File) -> Result<()> {
+    let io = |error| Error::io(path, "reading the file", error);
+    let metadata = file.metadata().map_err(io)?;
+    let length = metadata.len();
+    if length <= LONG {
+        return Ok(());
+    }
+    #[cfg(unix)]
+    let taken = std::os::unix::fs::MetadataExt::blocks(&metadata).saturating_mul(512);
+    #[cfg(not(unix))]
+    let taken = length;
+    // Some file systems do not say what a file takes; then it does not begin with nothing.
+    let is_sparse = match taken {
+        0 => {
+            let mut start = vec![];
+            let mut beginning = file;
+            beginning.take(4096).read_to_end(&mut start).map_err(io)?;
+            beginning.rewind().map_err(io)?;
+            start.iter().all(|&byte| byte == 0)
+        }
+        taken => taken < length / SPARSE,
+    };
+    if is_sparse {
+        let problem = format!("is a sparse file: {length} bytes long, of which {taken} are on the disk");
+        return Err(Error::corrupt(path, problem, "get it again from where it comes from"));
+    }
+    Ok(())
+}
+
 /// Reads a regular file of at most `limit` bytes.
 ///
 /// # Errors
-/// As [`open`], and when the file is longer.
+/// As [`open`], and when the file is longer, or is long and sparse.
 pub fn read(path: &Path, limit: u64) -> Result<Vec<u8>> {
     let file = open(path)?;
     let io = |error| Error::io(path, "reading the file", error);
@@ -45,6 +81,7 @@ pub fn read(path: &Path, limit: u64) -> Result<Vec<u8>> {
     if length > limit {
         return Err(too_long());
     }
+    check_not_sparse(path, &file)?;
     let mut bytes = Vec::new();
     bytes.try_reserve_exact(length as usize).map_err(|_| {
         Error::corrupt(path, format!("has {length} bytes, more than the free memory"), "use a machine with more memory")
@@ -373,6 +410,22 @@ mod tests {
         let path = std::env::temp_dir().join(format!("swm-files-{name}-{}", std::process::id()));
         fs::create_dir_all(&path).expect("creating the folder");
         path
+    }
+
+    #[test]
+    fn sparse_files_are_not_read() {
+        let folder = folder("sparse");
+        let path = folder.join("weights");
+        for start in [&b""[..], b"a header"] {
+            fs::write(&path, start).expect("writing the file");
+            File::options().write(true).open(&path).and_then(|file| file.set_len(20 << 30)).expect("a longer file");
+            let error = read(&path, u64::MAX).expect_err("a sparse file").to_string();
+            assert!(error.contains("sparse") && error.contains("21474836480"), "{error}");
+        }
+        let long = vec![7; (LONG + 1) as usize];
+        fs::write(&path, &long).expect("writing the file");
+        assert!(read(&path, u64::MAX).expect("a file") == long);
+        fs::remove_dir_all(&folder).expect("removing the folder");
     }
 
     #[test]

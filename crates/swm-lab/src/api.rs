@@ -1,12 +1,13 @@
 //! The routes of the lab, behind [`crate::access`]. They answer to `GET` and change nothing, but those that save episodes as a
-//! new dataset, and start and stop trainings, by `POST`; all else that changes something goes through the socket of a session.
+//! new dataset, and start and stop trainings, collections and evaluations, by `POST`; all else that changes something goes through the socket of a session.
 
 use crate::datasets::{self, Chosen, Datasets};
 use crate::plans::{self, PlanSession};
+use crate::processes::Processes;
+use crate::requests;
 use crate::serve::PATIENCE;
 use crate::session::{self, Player, Running, Session, Setup, messages};
 use crate::still::StillQuery;
-use crate::trainings::{self, Trainings};
 use crate::{Lab, access, assets, reports, runs};
 use axum::Router;
 use axum::body::Body;
@@ -38,7 +39,7 @@ pub struct Shared {
     pub lab: Arc<Lab>,
     pub datasets: Arc<Datasets>,
     pub running: Running,
-    pub trainings: Trainings,
+    pub processes: Processes,
     pub reports: Arc<reports::Known>,
     pub work: Arc<Semaphore>,
     /// The folder of files that are made for an answer.
@@ -52,7 +53,7 @@ impl Shared {
             datasets: Arc::new(Datasets::new(lab.datasets.clone(), std::mem::take(&mut lab.sources))),
             lab: Arc::new(lab),
             running: Running::default(),
-            trainings: Trainings::default(),
+            processes: Processes::default(),
             reports: Arc::default(),
             work: Arc::new(Semaphore::new(AT_ONCE)),
             scratch: scratch.into(),
@@ -147,8 +148,8 @@ pub fn routes(shared: Shared) -> Router {
         .route("/api/lines", get(lines))
         .route("/api/reports", get(list_reports))
         .route("/api/report", get(report))
-        .route("/api/trainings", get(list_trainings))
-        .route("/api/train", post(train))
+        .route("/api/processes", get(list_processes))
+        .route("/api/start", post(start))
         .route("/api/stop", post(stop))
         .route("/api/bench", post(measured))
         .route("/", get(|headers: HeaderMap| async move { asset("", &headers) }))
@@ -379,7 +380,7 @@ async fn body<T: DeserializeOwned>(request: Request, fields: &str) -> Result<T, 
 }
 
 async fn save(State(shared): State<Shared>, request: Request) -> Answer {
-    let chosen: Chosen = body(request, "folder, name, target and episodes").await?;
+    let chosen: Chosen = body(request, "folder, name, target, episodes and key").await?;
     let saved =
         shared.read(chosen.folder, move |shared| shared.datasets.save(chosen, &mut until_stopped(&shared.stop)));
     as_json(&json!({"episodes": saved.await?}))
@@ -405,35 +406,33 @@ async fn report(State(shared): State<Shared>, Query(query): Query<EntryQuery>) -
     Ok(response)
 }
 
-/// The families that can be trained, and the trainings that were started.
-async fn list_trainings(State(shared): State<Shared>) -> Answer {
+/// The families that can be trained, and the processes that were started.
+async fn list_processes(State(shared): State<Shared>) -> Answer {
     let listed = shared.work(|shared| {
-        let training = &*shared.lab.training;
-        Ok(json!({"families": training.families(), "trainings": shared.trainings.list(training)}))
+        let program = &*shared.lab.program;
+        Ok(json!({"families": program.families(), "processes": shared.processes.list(program)}))
     });
     as_json(&listed.await?)
 }
 
-async fn train(State(shared): State<Shared>, request: Request) -> Answer {
-    let wanted: trainings::Request = body(request, "family, preset, folder, dataset, name, steps and seed").await?;
-    let started = shared.work(move |shared| {
-        let data = shared.datasets.path(wanted.folder, &wanted.dataset)?;
-        shared.trainings.start(&*shared.lab.training, &wanted, &data, &shared.lab.runs)
-    });
+async fn start(State(shared): State<Shared>, request: Request) -> Answer {
+    let wanted: requests::Request = body(request, "the command train, collect or evaluate, and its fields").await?;
+    let started = shared.work(move |shared| shared.processes.start(&*shared.lab.program, wanted.order(&shared.lab)?));
     started.await?;
     as_json(&json!({}))
 }
 
-/// The body of a request to stop a training.
+/// The body of a request to stop a process.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Stopped {
+    kind: requests::Kind,
     name: String,
 }
 
 async fn stop(State(shared): State<Shared>, request: Request) -> Answer {
-    let Stopped { name } = body(request, "name").await?;
-    shared.work(move |shared| shared.trainings.stop(&*shared.lab.training, &name)).await?;
+    let Stopped { kind, name } = body(request, "kind and name").await?;
+    shared.work(move |shared| shared.processes.stop(&*shared.lab.program, kind, &name)).await?;
     as_json(&json!({}))
 }
 

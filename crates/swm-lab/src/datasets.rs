@@ -57,6 +57,8 @@ pub struct Episodes {
     pub returns: Vec<f64>,
     /// Whether the last observation satisfies the goal; empty if the dataset does not say.
     pub success: Vec<bool>,
+    /// A hash of the table.
+    pub key: String,
 }
 
 /// Episodes of a dataset to save as another one.
@@ -71,6 +73,8 @@ pub struct Chosen {
     pub target: String,
     /// Positions of the episodes.
     pub episodes: Vec<usize>,
+    /// The key of the table in which they were chosen; none for a dataset that does not open.
+    pub key: Option<String>,
 }
 
 /// Readers of datasets in some folders and sources. Sources are numbered after the folders.
@@ -183,7 +187,12 @@ impl Datasets {
         let folder =
             first.ok_or_else(|| Error::config("saving", "the lab has no folder of datasets", "set STABLEWM_HOME"))?;
         let target = Location::from(new_dataset(folder, &chosen.target)?);
-        let (reader, _) = open_damaged(&self.location(chosen.folder, &chosen.name)?)?;
+        let (reader, lost) = open_damaged(&self.location(chosen.folder, &chosen.name)?)?;
+        let key = if lost.is_empty() { Some(episodes(&*reader)?.key) } else { None };
+        if key != chosen.key {
+            let problem = "it has other episodes than when the page listed them";
+            return Err(Error::config(chosen.name, problem, "reload the page, and choose the episodes again"));
+        }
         let options = ConvertOptions { mode: ConvertMode::Create, ..ConvertOptions::default() };
         Ok(swm_data::convert(&subset(reader, chosen.episodes)?, &target, &options, control)?.episodes)
     }
@@ -260,6 +269,7 @@ pub fn episodes(reader: &dyn Reader) -> Result<Episodes> {
         let values = reader.read(&[columns::SUCCESS], &ranges)?.to_f32(columns::SUCCESS)?;
         table.success = values.iter().map(|&value| value > 0.0).collect();
     }
+    table.key = swm_core::manifest::hash(&serde_json::to_vec(&table).unwrap_or_default());
     Ok(table)
 }
 

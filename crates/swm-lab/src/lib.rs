@@ -9,7 +9,7 @@
 //! - [`datasets`], [`distribution`] and [`runs`]: what the pages of datasets and of training curves show, from [`folders`] and
 //!   [`sources`] that the lab was started with, and no other.
 //! - [`reports`]: results and studies, and their pages.
-//! - [`trainings`]: trainings that pages start and stop.
+//! - [`requests`]: trainings, collections and evaluations that pages ask for. [`processes`]: those that run.
 //! - [`assets`]: the pages, built from `web/` and embedded.
 //!
 //! This crate knows no environment, no model and no policy: [`Lab`] has the registry, and what makes policies and planners.
@@ -22,14 +22,15 @@ pub mod datasets;
 pub mod distribution;
 pub mod folders;
 pub mod plans;
+pub mod processes;
 pub mod rendering;
 pub mod reports;
+pub mod requests;
 pub mod runs;
 pub mod serve;
 pub mod session;
 pub mod sources;
 pub mod still;
-pub mod trainings;
 
 pub use access::{Access, Token};
 pub use serve::{Options, Server, serve};
@@ -53,8 +54,8 @@ pub struct Lab {
     pub policy: MakePolicy,
     /// The models that plan.
     pub planning: Box<dyn plans::Planning>,
-    /// What trains.
-    pub training: Box<dyn trainings::Training>,
+    /// What trains, collects and evaluates.
+    pub program: Box<dyn processes::Program>,
     /// What makes pages of results and studies.
     pub reports: Box<dyn reports::Reports>,
     /// Folders of results and studies.

@@ -88,7 +88,7 @@ impl Server {
         self.address
     }
 
-    /// Answers requests until `stop` is set; then sockets are closed, environments end and store what was recorded, and trainings stop.
+    /// Answers requests until `stop` is set; then sockets are closed, environments end and store what was recorded, and processes stop.
     pub fn run(self, stop: &AtomicBool) {
         let Self { runtime, listener, access, lab, .. } = self;
         let (stopping, stopped) = watch::channel(false);
@@ -96,7 +96,7 @@ impl Server {
         let scratch = tempfile::tempdir().ok();
         let folder = scratch.as_ref().map_or_else(std::env::temp_dir, |scratch| scratch.path().to_owned());
         let shared = Shared::new(lab, &folder, stopped);
-        let (running, trainings, lab) = (shared.running.clone(), shared.trainings.clone(), Arc::clone(&shared.lab));
+        let (running, processes, lab) = (shared.running.clone(), shared.processes.clone(), Arc::clone(&shared.lab));
         let router = api::routes(shared);
         runtime.block_on(async {
             let connections = Connections::new();
@@ -120,7 +120,7 @@ impl Server {
         while running.count() > 0 && Instant::now() < until {
             std::thread::sleep(POLL);
         }
-        trainings.end(&*lab.training);
+        processes.end(&*lab.program);
         drop(scratch);
     }
 }

@@ -89,6 +89,25 @@ pub fn request(pins: &str, variation: Option<&str>) -> Result<VariationRequest> 
     Ok(VariationRequest { variation, variation_values })
 }
 
+/// The options of a command for sampled and pinned factors, which were checked, each after a space.
+///
+/// # Errors
+/// When a factor is unknown.
+pub fn factor_options(spec: &EnvSpec, request: &VariationRequest) -> Result<String> {
+    let mut options = String::new();
+    match request.variation.as_deref() {
+        None => {}
+        Some([]) => options += " --variation none",
+        Some(keys) => options += &format!(" --variation {}", keys.join(",")),
+    }
+    for (i, (key, values)) in request.variation_values.iter().enumerate() {
+        let space = &spec.variation_space.factors()[spec.variation_space.select(key)?[0]].space;
+        let values = space.format_values(values).replace(' ', "");
+        options += &format!("{} {key}={values}", if i == 0 { " --pin" } else { "" });
+    }
+    Ok(options)
+}
+
 impl Still {
     /// Renders the frame of an environment that [`Rendering::env`] made.
     ///
@@ -155,16 +174,7 @@ impl Still {
             command += " --goal";
         }
         command += &self.rendering.options();
-        match self.variation.variation.as_deref() {
-            None => {}
-            Some([]) => command += " --variation none",
-            Some(keys) => command += &format!(" --variation {}", keys.join(",")),
-        }
-        for (i, (key, values)) in self.variation.variation_values.iter().enumerate() {
-            let space = &spec.variation_space.factors()[spec.variation_space.select(key)?[0]].space;
-            let values = space.format_values(values).replace(' ', "");
-            command += &format!("{} {key}={values}", if i == 0 { " --pin" } else { "" });
-        }
+        command += &factor_options(spec, &self.variation)?;
         Ok(command + " --output frame.png")
     }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import struct
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -75,12 +76,27 @@ def read_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
     """The tensors of a file that `torch.save` wrote, or of a safetensors file. No code of the file runs."""
     if Path(path).suffix == ".safetensors":
         return read_safetensors(path)
+    _check_not_compressed(path)
     found: Any = torch.load(path, map_location="cpu", weights_only=True)
     if isinstance(found, Mapping) and isinstance(found.get("state_dict"), Mapping):
         found = found["state_dict"]
     if not isinstance(found, Mapping) or not all(torch.is_tensor(value) for value in found.values()):
         raise RuntimeError(f"{path}: expected a state dict, a dict of tensors")
     return dict(found)
+
+
+def _check_not_compressed(path: str | os.PathLike[str]) -> None:
+    """Refuses an archive with compressed members, which `torch.save` does not write: they may be of any size.
+
+    Raises:
+        RuntimeError: If a member is compressed.
+    """
+    if not zipfile.is_zipfile(path):
+        return
+    with zipfile.ZipFile(path) as archive:
+        for member in archive.infolist():
+            if member.compress_type != zipfile.ZIP_STORED:
+                raise RuntimeError(f"{path}: {member.filename!r} is compressed; expected a file that torch.save wrote")
 
 
 def load_into(model: nn.Module, weights: Mapping[str, Tensor], source: str) -> None:

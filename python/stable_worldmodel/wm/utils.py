@@ -24,6 +24,9 @@ from .checkpoints import is_stored, module_of
 
 __all__ = ["load_pretrained", "save_pretrained"]
 
+#: The largest size of a configuration, in bytes.
+_MOST_SETTINGS = 16 << 20
+
 
 def _folder(cache_dir: str | os.PathLike[str] | None) -> Path:
     return Path(_engine.home() if cache_dir is None else cache_dir) / "checkpoints"
@@ -107,8 +110,8 @@ def load_pretrained(
     file = path if path.is_file() else _only_weights(path)
     settings = file.parent / "config.json"
     if not settings.is_file():
-        raise FileNotFoundError(f"{settings}: there is no such file, which must describe the model")
-    config = json.loads(settings.read_text())
+        raise FileNotFoundError(f"{settings}: there is no such file, which must describe the model; expected a regular file")
+    config = _read_settings(settings)
     for key, value in (extra_args or {}).items():
         *groups, last = key.split(".")
         part = config
@@ -121,6 +124,15 @@ def load_pretrained(
         raise ValueError(f"{settings}: it describes no torch module; expected a _target_ and its arguments")
     load_into(model, weights, str(file))
     return model
+
+
+def _read_settings(path: Path) -> Any:
+    """The configuration in a file, which is no larger than one that a person or `save_pretrained` writes."""
+    with path.open("rb") as file:
+        text = file.read(_MOST_SETTINGS + 1)
+    if len(text) > _MOST_SETTINGS:
+        raise ValueError(f"{path}: it has more than {_MOST_SETTINGS} bytes; expected the configuration of a model")
+    return json.loads(text)
 
 
 def _built(config: Any, stored_bytes: int, stored_tensors: int) -> Any:

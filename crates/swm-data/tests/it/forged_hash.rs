@@ -1,5 +1,6 @@
 //! A table of a stranger whose data files state the content hashes of other episodes.
 
+use crate::fuzz::copy_all;
 use crate::sample::write;
 use std::path::{Path, PathBuf};
 use swm_data::doctor::examine;
@@ -48,6 +49,24 @@ fn forge(table: &Path, of: &Path, is_named: bool) {
     }
 }
 
+/// Makes the manifests of a table exchange two columns of its data file.
+fn exchange_columns(table: &Path, columns: [usize; 2]) {
+    let name = data_file(table).file_name().and_then(|name| name.to_str()).expect("a name").to_owned();
+    for manifest in table.join("_versions").read_dir().expect("a folder").flatten() {
+        let mut bytes = std::fs::read(manifest.path()).expect("a manifest");
+        let after: Vec<usize> =
+            (name.len()..bytes.len()).filter(|&end| bytes[..end].ends_with(name.as_bytes())).collect();
+        for begin in after {
+            // After the name, the fields of the columns: a list of small numbers with the number 2 in the message, and their
+            // count. The transaction has it, too.
+            assert_eq!(bytes[begin], 0x12);
+            bytes.swap(begin + 2 + columns[0], begin + 2 + columns[1]);
+        }
+        replace(&mut bytes, b"swmSEAL1", b"xxxSEAL1");
+        std::fs::write(manifest.path(), bytes).expect("writing a manifest");
+    }
+}
+
 fn images(reader: &dyn Reader) -> Vec<u8> {
     let rows: Vec<_> = reader.episodes().iter().enumerate().map(|(i, it)| StepRange::new(i, 0, it.length)).collect();
     reader.read(&["pixels"], &rows).expect("reading rows").bytes(0).to_vec()
@@ -77,4 +96,23 @@ fn caches_do_not_trust_it_and_the_doctor_finds_it() {
         let finding = diagnosis.findings.iter().find(|it| it.what.contains("content hash")).expect("a finding");
         assert_eq!((&finding.episodes[..], diagnosis.intact.len()), (&[0, 1, 2, 3, 4, 5][..], 0));
     }
+}
+
+#[test]
+fn caches_know_which_column_of_a_file_is_which() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let (own, strange) = (folder.path().join("own.lance"), folder.path().join("strange.lance"));
+    write(&own, WriteMode::Create, 6, 0..6);
+    copy_all(&own, &strange);
+    let read = |path: &Path| open(path).expect("a dataset");
+    // Of the stored columns, `pixels` is the first after the two indices, and `goal` the last.
+    exchange_columns(&strange, [2, 8]);
+    let goals =
+        |reader: &dyn Reader| reader.read(&["goal"], &[StepRange::new(0, 0, 3)]).expect("rows").bytes(0).to_vec();
+    let (own, strange) = (read(&own), read(&strange));
+    assert!(goals(&*own) != goals(&*strange), "the columns are exchanged");
+    assert_eq!(own.content_hash().expect("a hash"), strange.content_hash().expect("a hash"), "it is only stated");
+    assert_ne!(own.cache_key().expect("a key"), strange.cache_key().expect("a key"));
+    let diagnosis = examine(&*strange, &[], &mut swm_core::run::Control::new()).expect("a diagnosis");
+    assert!(diagnosis.findings.iter().any(|it| it.what.contains("content hash")), "{:?}", diagnosis.findings);
 }

@@ -364,3 +364,23 @@ fn files_round_trip_through_h5py() {
     check_columns(&path, &seen);
     assert_eq!(open(&path).expect("opening the dataset").episodes().len(), 79);
 }
+
+#[test]
+fn rows_that_were_never_written_have_the_value_that_the_file_says() {
+    let reader = open(&interop("hdf5-unwritten.h5")).expect("opening the dataset");
+    let rows: Vec<StepRange> = (0..3).map(|episode| StepRange::new(episode, 0, 4)).collect();
+    let read = |name: &str| reader.read(&[name], &rows).expect("reading rows").to_f32(name).expect("numbers");
+    assert_eq!(read("absent"), [7.5; 24]);
+    assert_eq!(read("half"), [-3.0, -3.0, -3.0, -3.0, 0.0, 1.0, 2.0, 3.0, -3.0, -3.0, -3.0, -3.0]);
+    assert_eq!(read("zero"), [[1.0; 4], [0.0; 4], [0.0; 4]].concat());
+    // Only an enumeration of 0 and 1 is a boolean.
+    assert_eq!(read("choice")[..4], [1.0, 2.0, 1.0, 2.0]);
+    let dtype = |name: &str| reader.schema().column(name).expect("a column").dtype;
+    assert_eq!((dtype("flag"), dtype("choice")), (DType::Bool, DType::Int32));
+}
+
+#[test]
+fn values_in_other_files_are_refused() {
+    let error = open(&interop("hdf5-external.h5")).err().expect("an error").to_string();
+    assert!(error.contains("reward") && error.contains("external"), "{error}");
+}

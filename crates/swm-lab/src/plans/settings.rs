@@ -88,19 +88,25 @@ impl Settings {
 
     /// Returns the command that evaluates this planner.
     pub fn command(&self, spec: &EnvSpec) -> String {
-        let Self { model, horizon, receding, .. } = self;
-        let mut command = format!(
-            "swm eval {model} --env {} --solver {} --horizon {horizon} --receding-horizon {receding}",
-            spec.id,
-            self.solver_text()
-        );
-        if model == SIMULATOR {
-            command += &format!(" --action-block {} --score {}", self.block, self.score);
+        format!("swm eval {}", self.arguments(spec).join(" "))
+    }
+
+    /// Returns the arguments of that command.
+    pub fn arguments(&self, spec: &EnvSpec) -> Vec<String> {
+        let mut arguments = vec![self.model.clone()];
+        let mut add = |option: &str, value: String| arguments.extend([option.to_owned(), value]);
+        add("--env", spec.id.clone());
+        add("--solver", self.solver_text());
+        add("--horizon", self.horizon.to_string());
+        add("--receding-horizon", self.receding.to_string());
+        if self.model == SIMULATOR {
+            add("--action-block", self.block.to_string());
+            add("--score", self.score.clone());
         }
         if !self.warm {
-            command += " --cold-start";
+            arguments.push("--cold-start".to_owned());
         }
-        command
+        arguments
     }
 }
 

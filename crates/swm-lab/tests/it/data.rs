@@ -153,7 +153,10 @@ fn check_page(lab: &TestLab) {
     let found = lab.json("api/datasets");
     assert_eq!((&found["datasets"][0]["name"], &found["datasets"][0]["episodes"]), (&json!("demos.lance"), &json!(2)));
     let table = lab.json("api/episodes?name=demos.lance");
-    assert_eq!(table, json!({"index": [0, 1], "length": [8, 3], "returns": [0.0, 0.0], "success": [false, false]}));
+    let expected = json!({
+        "index": [0, 1], "length": [8, 3], "returns": [0.0, 0.0], "success": [false, false], "key": table["key"],
+    });
+    assert_eq!(table, expected);
     let rows = lab.json("api/rows?name=demos.lance&episode=1");
     let action =
         rows["columns"].as_array().and_then(|columns| columns.iter().find(|column| column["name"] == "action"));
@@ -215,7 +218,8 @@ fn episodes_are_examined_cut_and_saved_as_a_new_dataset() {
     let found = lab.json("api/doctor?name=rooms.lance");
     let problems = found["findings"].as_array().expect("findings").iter().filter(|one| one["severity"] == "problem");
     assert_eq!((&found["episodes"], problems.count()), (&json!(4), 0));
-    let save = |body: &str| lab.post("api/save", body);
+    let key = lab.json("api/episodes?folder=0&name=rooms.lance")["key"].as_str().expect("a key").to_owned();
+    let save = |body: &str| lab.post("api/save", &body.replacen('{', &format!("{{\"key\": \"{key}\", "), 1));
     let (status, body) = save(r#"{"folder": 0, "name": "rooms.lance", "target": "cut", "episodes": [0, 3]}"#);
     assert_eq!((status, body.as_str()), (200, r#"{"episodes":2}"#));
     let of = |name: &str| lab.json(&format!("api/episodes?name={name}"))["length"].clone();
@@ -233,6 +237,13 @@ fn episodes_are_examined_cut_and_saved_as_a_new_dataset() {
     ] {
         assert_eq!(save(body).0, 400, "{}", &body[..body.len().min(100)]);
     }
+    // Positions in the table of another content are no choice.
+    fs::remove_dir_all(lab.home.path().join("datasets/rooms.lance")).expect("removing the dataset");
+    collect(&lab, 6);
+    let (status, message) = save(r#"{"folder": 0, "name": "rooms.lance", "target": "x", "episodes": [1]}"#);
+    assert!(status == 400 && message.contains("other episodes"), "{message}");
+    let keyless = r#"{"folder": 0, "name": "rooms.lance", "target": "x", "episodes": [1]}"#;
+    assert_eq!(lab.post("api/save", keyless).0, 400, "the table is not named");
     // The answer to a body that is too long may be lost, because the connection closes before all of it is sent.
     assert!([400, 0].contains(&save(&"x".repeat(2 << 20)).0));
     assert_eq!(of("cut.lance"), cut, "an existing dataset stays as it is");

@@ -5,11 +5,11 @@ mod data;
 mod live;
 mod planning;
 mod plans;
+mod processes;
 mod refusals;
 mod rendering;
 mod reports;
 mod sources;
-mod trainings;
 
 use serde_json::Value;
 use std::fmt::Write as _;
@@ -58,7 +58,7 @@ impl TestLab {
             wrapping: Box::new(rendering::Registered),
             policy: expert,
             planning: Box::new(planning::Simulated),
-            training: Box::new(trainings::Shell),
+            program: Box::new(processes::Shell),
             reports: Box::new(reports::Files),
             results: Folders::new(vec![home.path().to_owned()]),
             datasets: Folders::new(vec![home.path().join("datasets")]),

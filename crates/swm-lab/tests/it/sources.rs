@@ -42,8 +42,9 @@ fn datasets_below_a_prefix_are_listed_shown_and_saved_as_local_ones() {
         let local = store.json(&format!("api/{route}name=rooms.lance"));
         assert_eq!(lab.json(&format!("api/{route}name=rooms.lance&folder=1")), local, "{route}");
     }
-    let body = r#"{"folder": 1, "name": "rooms.lance", "target": "cut", "episodes": [0, 2]}"#;
-    assert_eq!(lab.post("api/save", body), (200, r#"{"episodes":2}"#.to_owned()));
+    let key = &lab.json("api/episodes?folder=1&name=rooms.lance")["key"];
+    let body = json!({"folder": 1, "name": "rooms.lance", "target": "cut", "episodes": [0, 2], "key": key});
+    assert_eq!(lab.post("api/save", &body.to_string()), (200, r#"{"episodes":2}"#.to_owned()));
     assert_eq!(lab.json("api/datasets")["datasets"][0]["name"], "cut.lance");
     assert_eq!(store.json("api/datasets")["datasets"].as_array().map(Vec::len), Some(1), "the store is only read");
 }

@@ -69,6 +69,7 @@ export interface Episodes {
   length: number[];
   returns: number[];
   success: boolean[];
+  key: string;
 }
 
 // What an element of a column is in every episode.

@@ -13,11 +13,13 @@ interface Props {
   // The number of episodes; 0 for a dataset that does not open.
   count: number;
   onCut: (positions: Set<number>) => void;
+  // The key of the table of episodes.
+  tableKey?: string;
   onSaved: () => void;
   onChoose?: (position: number) => void;
 }
 
-export function Curation({ set, cut, count: all, onCut, onSaved, onChoose }: Props) {
+export function Curation({ set, cut, count: all, tableKey, onCut, onSaved, onChoose }: Props) {
   const [diagnosis, setDiagnosis] = useState<Diagnosis>();
   const [message, setMessage] = useState<string>();
   const [isBusy, setBusy] = useState(false);
@@ -41,7 +43,7 @@ export function Curation({ set, cut, count: all, onCut, onSaved, onChoose }: Pro
   const kept = positions.filter((position) => !cut.has(position));
   const save = () =>
     work(async () => {
-      const body = { folder: set.folder, name: set.name, target, episodes: kept };
+      const body = { folder: set.folder, name: set.name, target, episodes: kept, key: tableKey ?? null };
       const saved = await post<{ episodes: number }>("save", body);
       onSaved();
       return `${count(saved.episodes)} episodes are in ${target}.lance`;

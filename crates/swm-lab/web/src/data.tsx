@@ -192,7 +192,7 @@ function DatasetView({ set, params, onSaved }: ViewProps) {
                 })
               }
             />
-            <Curation set={set} cut={cut} count={table.index.length} onCut={setCut} onSaved={onSaved} onChoose={choose} />
+            <Curation set={set} cut={cut} count={table.index.length} tableKey={table.key} onCut={setCut} onSaved={onSaved} onChoose={choose} />
             <Coverage set={set} params={params} />
           </>
         ) : (

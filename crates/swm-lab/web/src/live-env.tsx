@@ -9,6 +9,7 @@ import { short } from "./format";
 import { isPointed } from "./hand";
 import { Actions, Recorder } from "./panels";
 import { Views, Wrappers } from "./rendering";
+import { CollectForm } from "./start";
 import { type Params, patch } from "./state";
 import { Choice, Readout, Transport } from "./transport";
 import { formatPins, formatSampled } from "./variation";
@@ -57,6 +58,7 @@ export function LiveEnv({ info, params }: { info: EnvInfo; params: Params }) {
         />
         <Recorder recording={live.recording} env={info.id} send={live.send} />
         <Command info={info} control={control} params={params} />
+        <CollectForm info={info} params={params} />
       </section>
       <Factors info={info} control={control} params={params} />
     </>

@@ -11,6 +11,7 @@ import { chosen, PlanSettings } from "./plan-settings";
 import { PlanFrames, PlanReadout, PlanTransport } from "./plan-stage";
 import { Comparison, Tree } from "./plan-tree";
 import { short } from "./format";
+import { EvaluateForm } from "./start";
 import { type Params, patch, useKeys, useLoaded } from "./state";
 
 const FIRST = "swm/PushT-v1";
@@ -113,6 +114,7 @@ function PlanPage({ rows, info, planners, params }: Props) {
             Copy
           </button>
         </div>
+        <EvaluateForm info={info} planner={planner} seed={seed} />
       </section>
       <SearchPanel search={search} iteration={iteration} onIteration={setIteration} />
     </>

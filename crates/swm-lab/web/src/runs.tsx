@@ -6,7 +6,7 @@ import { get, type Lines, type Run } from "./api";
 import { Chart, COLOURS } from "./chart";
 import { ago, short } from "./format";
 import { type Params, patch, useLoaded } from "./state";
-import { TrainingPanel, type Trainings } from "./training";
+import { type Processes, TrainingPanel } from "./training";
 
 interface Listed {
   folders: string[];
@@ -18,7 +18,7 @@ interface Log {
   lines: Record<string, number>[];
 }
 
-// How often logs and trainings are read, and the list of runs, in milliseconds.
+// How often logs and processes are read, and the list of runs, in milliseconds.
 const FOLLOW = 1500;
 const LIST = 3000;
 // A run whose log was written in the last seconds is shown as running.
@@ -29,8 +29,8 @@ const keyOf = (run: Run) => `${run.folder}:${run.name}`;
 export function RunsPage({ params }: { params: Params }) {
   const { value, error, again } = useStaying(useLoaded(() => get<Listed>("runs"), "runs"));
   useInterval(again, LIST);
-  const trainings = useStaying(useLoaded(() => get<Trainings>("trainings"), "trainings"));
-  useInterval(trainings.again, FOLLOW);
+  const processes = useStaying(useLoaded(() => get<Processes>("processes"), "processes"));
+  useInterval(processes.again, FOLLOW);
   const [filter, setFilter] = useState("");
   const runs = value?.runs ?? [];
   const chosen = (params.runs ?? "").split("|").filter(Boolean);
@@ -44,7 +44,7 @@ export function RunsPage({ params }: { params: Params }) {
   const logs = useLogs(selected);
   const started = (name: string) => {
     patch({ runs: [...chosen, `0:${name}`].join("|") });
-    trainings.again();
+    processes.again();
     again();
   };
   return (
@@ -80,7 +80,7 @@ export function RunsPage({ params }: { params: Params }) {
           </p>
         )}
         {error && <p class="error">{error}</p>}
-        <TrainingPanel listed={trainings.value} onStarted={started} onChange={trainings.again} />
+        <TrainingPanel listed={processes.value} onStarted={started} onChange={processes.again} />
       </aside>
       <section class="curves" aria-label="Training curves">
         {selected.length > 0 ? <Curves runs={selected} logs={logs} params={params} /> : <p class="loading">Choose runs.</p>}

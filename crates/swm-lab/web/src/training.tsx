@@ -1,4 +1,4 @@
-// Starting and stopping trainings from the page of runs.
+// Processes that pages started, and the form of a training.
 
 import { useState } from "preact/hooks";
 import { type Dataset, get, post } from "./api";
@@ -10,20 +10,21 @@ interface Family {
   presets: [string, string][];
 }
 
-export interface Training {
+export interface Process {
+  kind: "training" | "collection" | "evaluation";
   name: string;
-  family: string;
+  what: string;
   state: "running" | "stopping" | "stopped" | "finished" | "failed";
   message: string;
 }
 
-export interface Trainings {
+export interface Processes {
   families: Family[];
-  trainings: Training[];
+  processes: Process[];
 }
 
 interface Props {
-  listed?: Trainings;
+  listed?: Processes;
   // Called with the name of a run that was started, and when a list may have changed.
   onStarted: (name: string) => void;
   onChange: () => void;
@@ -32,28 +33,32 @@ interface Props {
 export function TrainingPanel({ listed, onStarted, onChange }: Props) {
   const [error, setError] = useState("");
   if (!listed) return null;
-  const stop = (name: string) => {
+  const stop = ({ kind, name }: Process) => {
     setError("");
-    post("stop", { name }).then(onChange, (failed) => setError(failed.message));
+    post("stop", { kind, name }).then(onChange, (failed) => setError(failed.message));
   };
+  const isEnded = (state: string) => state === "failed" || state === "stopped";
   return (
-    <section class="trainings" aria-label="Trainings">
-      {listed.trainings.length > 0 && (
+    <section class="trainings" aria-label="Processes">
+      {listed.processes.length > 0 && (
         <ul>
-          {listed.trainings.map((training) => (
-            <li key={training.name} class={`is-${training.state}`}>
+          {listed.processes.map((process) => (
+            <li key={`${process.kind} ${process.name}`} class={`is-${process.state}`}>
               <div class="bar">
-                <span>
-                  {training.name} <small>{training.state}</small>
+                <span title={process.what}>
+                  {process.name}{" "}
+                  <small>
+                    {process.kind}, {process.state}
+                  </small>
                 </span>
                 <span class="grow" />
-                {training.state === "running" && (
-                  <button type="button" onClick={() => stop(training.name)} aria-label={`Stop ${training.name}`} title="At the next safe point">
+                {process.state === "running" && (
+                  <button type="button" onClick={() => stop(process)} aria-label={`Stop ${process.name}`} title="At the next safe point">
                     Stop
                   </button>
                 )}
               </div>
-              {training.message && <p class="error">{training.message}</p>}
+              {process.message && (isEnded(process.state) ? <p class="error">{process.message}</p> : <small>{process.message}</small>)}
             </li>
           ))}
         </ul>
@@ -88,8 +93,8 @@ function Form({ families, onStarted }: { families: Family[]; onStarted: (name: s
   const start = (event: Event) => {
     event.preventDefault();
     setSending(true);
-    const wanted = { family: family.id, preset: preset[0], folder: dataset.folder, dataset: dataset.name, name };
-    post("train", { ...wanted, steps: Number(chosen.steps), seed: Number(chosen.seed) })
+    const wanted = { command: "train", family: family.id, preset: preset[0], folder: dataset.folder, dataset: dataset.name, name };
+    post("start", { ...wanted, steps: Number(chosen.steps), seed: Number(chosen.seed) })
       .then(
         () => {
           setError("");
@@ -149,7 +154,7 @@ interface SelectProps {
   onChange: (value: string) => void;
 }
 
-function Select({ label, value, options, onChange }: SelectProps) {
+export function Select({ label, value, options, onChange }: SelectProps) {
   return (
     <label>
       {label}

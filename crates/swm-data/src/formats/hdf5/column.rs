@@ -6,8 +6,8 @@ use super::source::Source;
 use super::structure::{catch_panic, scalar_type};
 use crate::dataset::episodes::RowSlot;
 use crate::dataset::objects::Bytes;
-use crate::formats::stored_scalar::StoredScalar;
-use hdf5_pure::{Dataset, Layout};
+use crate::formats::stored_scalar::{Class, StoredScalar};
+use hdf5_pure::{Dataset, H5Element, Layout};
 use rayon::prelude::*;
 use std::cell::RefCell;
 use std::collections::HashMap;
@@ -50,8 +50,10 @@ pub(super) struct Column {
 }
 
 enum Storage {
-    /// Rows are contiguous from this address on; `None` if no row was written.
-    Contiguous(Option<u64>),
+    /// Rows are contiguous from this address on.
+    Contiguous(u64),
+    /// No row was written. Each reads as this one, in its stored form.
+    Unwritten(Vec<u8>),
     /// Rows are in the dataset's header.
     Compact,
     /// Rows are divided into chunks.
@@ -61,8 +63,37 @@ enum Storage {
         rows: u64,
         /// Side lengths of a chunk along the axes of a row, in elements.
         sides: Vec<usize>,
+        /// An element that was never written, in its stored form.
+        fill: Vec<u8>,
         index: OnceLock<Result<Index, String>>,
     },
+}
+
+/// The value of an element that was never written, in its stored form: 0 unless the file says otherwise.
+fn fill_element(dataset: &Dataset, stored: StoredScalar) -> Vec<u8> {
+    fn of<T: H5Element, const SIZE: usize>(dataset: &Dataset, bytes: fn(T) -> [u8; SIZE]) -> Option<Vec<u8>> {
+        // An enumeration has no such value.
+        let value = catch_panic("reading the value of unwritten elements", || dataset.fill_value::<T>());
+        value.ok().flatten().map(|value| bytes(value).to_vec())
+    }
+    let found = match (stored.class, stored.size) {
+        (Class::Signed, 1) => of(dataset, i8::to_le_bytes),
+        (Class::Signed, 2) => of(dataset, i16::to_le_bytes),
+        (Class::Signed, 4) => of(dataset, i32::to_le_bytes),
+        (Class::Signed, 8) => of(dataset, i64::to_le_bytes),
+        (Class::Unsigned, 1) => of(dataset, u8::to_le_bytes),
+        (Class::Unsigned, 2) => of(dataset, u16::to_le_bytes),
+        (Class::Unsigned, 4) => of(dataset, u32::to_le_bytes),
+        (Class::Unsigned, 8) => of(dataset, u64::to_le_bytes),
+        (Class::Float, 4) => of(dataset, f32::to_le_bytes),
+        (Class::Float, 8) => of(dataset, f64::to_le_bytes),
+        _ => None,
+    };
+    let mut bytes = found.unwrap_or_else(|| vec![0; stored.size]);
+    if stored.big_endian {
+        bytes.reverse();
+    }
+    bytes
 }
 
 impl Column {
@@ -99,7 +130,11 @@ impl Column {
                 if end.is_none_or(|end| end > file_size) {
                     return Err(format!("{rows} rows of {bytes} bytes do not fit the file"));
                 }
-                Storage::Contiguous(address)
+                match address {
+                    Some(address) => Storage::Contiguous(address),
+                    // The library refuses values in other files, which have no address either.
+                    None => Storage::Unwritten(catch_panic("reading its data", || dataset.read_raw_rows(0, 1))?),
+                }
             }
             Layout::Compact { .. } => {
                 if row_bytes.and_then(|bytes| bytes.checked_mul(rows)).is_none_or(|bytes| bytes > MAX_COMPACT_BYTES) {
@@ -129,6 +164,7 @@ impl Column {
                     pipeline,
                     rows: chunk_shape[0],
                     sides: chunk_shape[1..].iter().map(|&side| side as usize).collect(),
+                    fill: fill_element(&dataset, stored),
                     index: OnceLock::new(),
                 }
             }
@@ -157,6 +193,7 @@ impl Column {
     /// Size in the file, in bytes.
     pub fn footprint(&self, source: &Source) -> Result<u64, String> {
         match &self.storage {
+            Storage::Unwritten(_) => Ok(0),
             Storage::Contiguous(_) | Storage::Compact => Ok(self.rows * self.stored_row() as u64),
             Storage::Chunked { .. } => Ok(self.index(source)?.chunks.iter().map(|chunk| u64::from(chunk.size)).sum()),
         }
@@ -194,14 +231,11 @@ impl Column {
                 let all = catch_panic("reading its data", || self.dataset.read_raw())?;
                 self.copy_rows(&all, 0, slots, &row_of)
             }
-            Storage::Contiguous(None) => {
-                slots.iter_mut().for_each(|(_, slot)| slot.fill(0));
-                Ok(())
-            }
-            Storage::Contiguous(Some(address)) => self.read_contiguous(source, *address, slots, &row_of),
-            Storage::Chunked { pipeline, rows, sides, .. } => {
+            Storage::Unwritten(row) => slots.iter_mut().try_for_each(|(_, slot)| self.stored.convert(row, slot)),
+            Storage::Contiguous(address) => self.read_contiguous(source, *address, slots, &row_of),
+            Storage::Chunked { pipeline, rows, sides, fill, .. } => {
                 let grid = Grid::new(*rows, sides, &self.spec.shape, self.stored.size);
-                self.read_chunks(source, pipeline, &grid, slots, &row_of)
+                self.read_chunks(source, (pipeline, fill), &grid, slots, &row_of)
             }
         }
     }
@@ -280,7 +314,7 @@ impl Column {
     fn read_chunks(
         &self,
         source: &Source,
-        pipeline: &Pipeline,
+        (pipeline, fill): (&Pipeline, &[u8]),
         grid: &Grid,
         slots: &mut [RowSlot<'_>],
         row_of: &(impl Fn((usize, usize)) -> u64 + Sync),
@@ -313,8 +347,8 @@ impl Column {
                 }
                 rows_buffer.resize(grid.rows as usize * self.stored_row(), 0);
                 if chunks.len() != grid.per_row() {
-                    // Chunks that were never written read as 0.
-                    rows_buffer.fill(0);
+                    // Chunks that were never written.
+                    rows_buffer.chunks_exact_mut(fill.len()).for_each(|element| element.copy_from_slice(fill));
                 }
                 for found in chunks {
                     if grid.covers_rows() {
@@ -332,7 +366,7 @@ impl Column {
 
     /// The index of chunks, read at the first access.
     fn index(&self, source: &Source) -> Result<&Index, String> {
-        let Storage::Chunked { pipeline, rows, sides, index } = &self.storage else {
+        let Storage::Chunked { pipeline, rows, sides, index, .. } = &self.storage else {
             return Err("it has no chunks".to_owned());
         };
         let grid = Grid::new(*rows, sides, &self.spec.shape, self.stored.size);

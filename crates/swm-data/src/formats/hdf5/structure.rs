@@ -41,8 +41,10 @@ pub(super) fn scalar_type(datatype: &Datatype) -> Option<StoredScalar> {
             }
             (Class::Float, *size, *byte_order)
         }
-        // h5py stores booleans as an enumeration with two members.
-        Datatype::Enumeration { size: 1, members, .. } if members.len() == 2 => {
+        // h5py stores booleans as an enumeration with two members, 0 and 1; others are numbers.
+        Datatype::Enumeration { size: 1, members, .. }
+            if members.len() == 2 && [0, 1].iter().all(|value| members.iter().any(|it| it.value == [*value])) =>
+        {
             (Class::Bool, 1, DatatypeByteOrder::LittleEndian)
         }
         Datatype::Enumeration { base_type, .. } => return scalar_type(base_type),

@@ -1,8 +1,8 @@
 //! `swm bench lab`: frames and latency of the lab, measured by its page in a browser.
 
 use super::planning::HomePlanning;
+use super::program::OwnProgram;
 use super::reports::Pages;
-use super::training::OwnProgram;
 use super::wrapping::OwnWrappers;
 use crate::ENVS;
 use crate::cli::config::{count, seconds};
@@ -59,7 +59,7 @@ pub fn bench(args: &LabBenchArgs, context: &Context) -> anyhow::Result<()> {
         planning: Box::new(HomePlanning::new(runs.clone())),
         reports: Box::new(Pages),
         results: Folders::default(),
-        training: Box::new(OwnProgram { threads: context.threads }),
+        program: Box::new(OwnProgram),
         datasets: Folders::default(),
         sources: vec![],
         runs,

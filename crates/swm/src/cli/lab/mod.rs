@@ -2,8 +2,8 @@
 
 mod bench;
 mod planning;
+mod program;
 mod reports;
-mod training;
 mod wrapping;
 
 use super::{Context, emit, emit_json, eprint};
@@ -11,6 +11,7 @@ use crate::resolver::scripted;
 use crate::{ENVS, home};
 use clap::Args;
 use planning::HomePlanning;
+use program::OwnProgram;
 use reports::Pages;
 use serde_json::json;
 use std::net::{IpAddr, Ipv4Addr};
@@ -22,7 +23,6 @@ use swm_data::{FORMATS, Location, open};
 use swm_lab::folders::Folders;
 use swm_lab::sources::Source;
 use swm_lab::{Lab, Options, Token, serve};
-use training::OwnProgram;
 use wrapping::OwnWrappers;
 
 pub use bench::{LabBenchArgs, bench};
@@ -76,7 +76,7 @@ pub fn lab(args: &LabArgs, context: &Context) -> anyhow::Result<()> {
         planning: Box::new(HomePlanning::new(runs.clone())),
         reports: Box::new(Pages),
         results: folders(home::home()?, &args.results)?,
-        training: Box::new(OwnProgram { threads: context.threads }),
+        program: Box::new(OwnProgram),
         datasets,
         sources,
         runs,

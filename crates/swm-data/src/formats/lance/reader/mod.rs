@@ -24,7 +24,7 @@ use super::store::{self, Store};
 use crate::dataset::Location;
 use crate::dataset::objects::BlockCache;
 use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
-use lance_table::format::Manifest as Table;
+use lance_table::format::{DataFile, Manifest as Table};
 use std::collections::BTreeMap;
 use std::ops::Range;
 use std::path::PathBuf;
@@ -324,31 +324,33 @@ impl Reader for LanceReader {
     }
 
     fn content_hash(&self) -> Result<String> {
-        self.hash_of_episodes(&[], |fragment, episodes| self.hashes(fragment, episodes))
+        self.hash_of_episodes("", |fragment, episodes| self.hashes(fragment, episodes))
     }
 
     /// The hashes that data files state of episodes are the word of who wrote them. So local files are known by the hashes in
-    /// their names, which are verified when they are read, other files by their values, and those of a store by its URI too.
+    /// their names, which are verified when they are read, and by what the manifest says of them, such as which of their
+    /// columns is which; other files by their values, and those of a store by its URI too.
     fn cache_key(&self) -> Result<String> {
-        let label = self.store.label.display().to_string();
-        let place: &[u8] = if self.store.remote { label.as_bytes() } else { &[] };
-        self.hash_of_episodes(place, |fragment, episodes| {
-            let files = &self.table.fragments[fragment].files;
-            if !self.store.remote && files.iter().any(|file| store::hash_in_name(&file.path).is_none()) {
+        let store = if self.store.remote { self.store.label.display().to_string() } else { String::new() };
+        let ids: Vec<_> = self.table.schema.fields_pre_order().map(|field| (&field.name, field.id)).collect();
+        self.hash_of_episodes(&format!("{store} {ids:?}"), |fragment, episodes| {
+            let fragment = &self.table.fragments[fragment];
+            let is_named = |file: &DataFile| store::hash_in_name(&file.path).is_some();
+            if !self.store.remote && !fragment.files.iter().all(is_named) {
                 return episodes.map(|episode| self.compute_hash(episode)).collect();
             }
-            let names = files.iter().map(|file| file.path.as_str()).collect::<Vec<_>>().join("/");
-            Ok(episodes.map(|_| names.clone()).collect())
+            let described = format!("{fragment:?}");
+            Ok(episodes.map(|_| described.clone()).collect())
         })
     }
 }
 
 impl LanceReader {
-    /// Returns a hash of the columns, and of the index, the length and a hash of each episode; `of_fragment` returns those of
+    /// Returns a hash of `more`, of the columns, and of the index, the length and a hash of each episode; `of_fragment` returns those of
     /// the episodes in a fragment.
     fn hash_of_episodes(
         &self,
-        place: &[u8],
+        more: &str,
         of_fragment: impl Fn(usize, Range<usize>) -> Result<Vec<String>>,
     ) -> Result<String> {
         let mut hasher = blake3::Hasher::new();
@@ -356,8 +358,8 @@ impl LanceReader {
             hasher.update(&(bytes.len() as u64).to_le_bytes());
             hasher.update(bytes);
         };
-        if !place.is_empty() {
-            add(place);
+        if !more.is_empty() {
+            add(more.as_bytes());
         }
         for column in &self.columns {
             add(schema::json(&column.spec)?.as_bytes());

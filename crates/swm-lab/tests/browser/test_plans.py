@@ -162,6 +162,37 @@ def test_a_training_is_stopped_and_can_be_continued(lab, open_page):
     expect(page.get_by_role("button", name="Stop stopped")).to_have_count(0, timeout=120000)
 
 
+def test_episodes_are_collected_and_a_planner_is_evaluated(lab, open_page):
+    page = open_page("#envs?env=swm/TwoRoom-v1&seed=5&pin=agent.speed%3D9")
+    page.get_by_text("Collect episodes").click()
+    page.get_by_label("policy", exact=True).select_option("random")
+    page.get_by_label("episodes", exact=True).fill("7")
+    page.get_by_label("Name of what is written").fill("fast")
+    page.get_by_role("button", name="Start", exact=True).click()
+    page.get_by_role("link", name="Runs", exact=True).last.click()
+    row = page.locator(".trainings li", has_text="fast")
+    expect(row).to_contain_text("collection, finished", timeout=120000)
+    found = json.loads(lab.swm("inspect", "fast", "--json"))
+    assert found["episodes"] == 7
+    assert "9" in str(found["manifest"]["config"])
+    # The planner of the page plays from the states of that dataset.
+    page = open_page("#plans?env=swm/TwoRoom-v1&seed=3&model=zoo:two-room/pldm&set=samples%3D64,iterations%3D4")
+    expect(page.get_by_test_id("command")).to_contain_text("swm eval zoo:two-room/pldm")
+    page.get_by_text("Evaluate this planner").click()
+    page.get_by_label("starts").select_option("0/fast.lance")
+    page.get_by_label("episodes", exact=True).fill("3")
+    page.get_by_label("Name of what is written").fill("from-plans")
+    page.get_by_role("button", name="Start", exact=True).click()
+    page.get_by_role("link", name="Runs", exact=True).last.click()
+    row = page.locator(".trainings li", has_text="from-plans")
+    expect(row).to_contain_text("evaluation, finished", timeout=120000)
+    screenshot(page, "processes")
+    results = json.loads((lab.home / "results" / "from-plans" / "results.json").read_text())
+    assert len(results["runs"][0]["episodes"]) == 3
+    page.goto(lab.url + "#results")
+    expect(page.get_by_role("button", name=re.compile("from-plans"))).to_be_visible(timeout=30000)
+
+
 def test_results_are_shown_in_a_frame_of_their_own(lab, open_page):
     lab.swm(
         "eval",

@@ -162,7 +162,7 @@ impl Request {
 }
 
 /// The first of some folders.
-fn first<'a>(folders: &'a Folders, kind: Kind) -> Result<&'a PathBuf> {
+fn first(folders: &Folders, kind: Kind) -> Result<&PathBuf> {
     let none = || Error::config(format!("a {kind}"), "the lab has no folder for it", "set STABLEWM_HOME");
     folders.paths().first().ok_or_else(none)
 }

@@ -127,7 +127,7 @@ pub trait Reader: Send + Sync {
     /// If the stored data is damaged.
     fn content_hash(&self) -> Result<String>;
 
-    /// A key for caches of decoded rows, which datasets share: equal keys mean equal rows, whoever wrote the files. It is
+    /// A key for caches of decoded rows, which datasets share: equal keys mean equal rows, whatever program wrote the files. It is
     /// [`Reader::content_hash`], except where that is only stated by the files.
     ///
     /// # Errors

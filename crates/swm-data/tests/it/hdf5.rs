@@ -367,7 +367,7 @@ fn files_round_trip_through_h5py() {
 
 #[test]
 fn rows_that_were_never_written_have_the_value_that_the_file_says() {
-    let reader = open(&interop("hdf5-unwritten.h5")).expect("opening the dataset");
+    let reader = open(interop("hdf5-unwritten.h5")).expect("opening the dataset");
     let rows: Vec<StepRange> = (0..3).map(|episode| StepRange::new(episode, 0, 4)).collect();
     let read = |name: &str| reader.read(&[name], &rows).expect("reading rows").to_f32(name).expect("numbers");
     assert_eq!(read("absent"), [7.5; 24]);
@@ -381,6 +381,6 @@ fn rows_that_were_never_written_have_the_value_that_the_file_says() {
 
 #[test]
 fn values_in_other_files_are_refused() {
-    let error = open(&interop("hdf5-external.h5")).err().expect("an error").to_string();
+    let error = open(interop("hdf5-external.h5")).err().expect("an error").to_string();
     assert!(error.contains("reward") && error.contains("external"), "{error}");
 }

@@ -69,10 +69,13 @@ pub struct Planner {
     pub predictor: Option<Box<dyn Predictor>>,
 }
 
+/// Maps latents `[n, dim]` to RGB frames of the side that a model reads, `[n, side, side, 3]`.
+pub type Decode = dyn Fn(&[f32]) -> Vec<u8>;
+
 /// Decodes the latents of a model to frames.
 pub struct FrameDecoder {
-    /// Maps latents `[n, dim]` to RGB frames of the side that the model reads, `[n, side, side, 3]`.
-    pub decode: Box<dyn Fn(&[f32]) -> Vec<u8>>,
+    /// The decoder.
+    pub decode: Box<Decode>,
     /// The fraction of the variance of pixels that it explains on episodes that it was not fitted on.
     pub explained: f64,
 }

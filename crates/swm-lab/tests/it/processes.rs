@@ -192,32 +192,36 @@ fn given(lab: &TestLab, name: &str, folder: &str) -> String {
     given.lines().collect::<Vec<_>>().join(" ")
 }
 
+/// Asks for a collection, with some fields changed.
+fn collect(lab: &TestLab, change: Value) -> (u16, String) {
+    let mut body = json!({
+        "command": "collect", "env": "swm/TwoRoom-v1", "policy": "expert", "episodes": 20, "image": 64, "seed": 7,
+        "pin": "agent.speed=5;target.color=1,2,3", "variation": "none", "name": "walks",
+    });
+    change.as_object().expect("fields").iter().for_each(|(key, value)| body[key] = value.clone());
+    lab.post("api/start", &body.to_string())
+}
+
+/// Asks for an evaluation, with some fields changed.
+fn evaluate(lab: &TestLab, change: Value) -> (u16, String) {
+    let mut body = json!({
+        "command": "evaluate", "env": "swm/TwoRoom-v1", "episodes": 10, "seed": 3, "name": "planned",
+        "planner": {
+            "model": "simulator", "solver": "cem", "settings": {"samples": 16}, "horizon": 5, "receding": 1, "block": 5,
+            "score": "terminal", "warm": true,
+        },
+        "dataset": {"folder": 0, "name": "rooms.lance"},
+    });
+    change.as_object().expect("fields").iter().for_each(|(key, value)| body[key] = value.clone());
+    lab.post("api/start", &body.to_string())
+}
+
 #[test]
-fn collections_and_evaluations_are_commands_of_checked_arguments() {
+fn collections_and_evaluations_are_commands() {
     let lab = TestLab::start();
     super::data::collect(&lab, 1);
     let home = lab.home.path().display().to_string();
-    let collect = |change: Value| {
-        let mut body = json!({
-            "command": "collect", "env": "swm/TwoRoom-v1", "policy": "expert", "episodes": 20, "image": 64, "seed": 7,
-            "pin": "agent.speed=5;target.color=1,2,3", "variation": "none", "name": "walks",
-        });
-        change.as_object().expect("fields").iter().for_each(|(key, value)| body[key] = value.clone());
-        lab.post("api/start", &body.to_string())
-    };
-    let evaluate = |change: Value| {
-        let mut body = json!({
-            "command": "evaluate", "env": "swm/TwoRoom-v1", "episodes": 10, "seed": 3, "name": "planned",
-            "planner": {
-                "model": "simulator", "solver": "cem", "settings": {"samples": 16}, "horizon": 5, "receding": 1, "block": 5,
-                "score": "terminal", "warm": true,
-            },
-            "dataset": {"folder": 0, "name": "rooms.lance"},
-        });
-        change.as_object().expect("fields").iter().for_each(|(key, value)| body[key] = value.clone());
-        lab.post("api/start", &body.to_string())
-    };
-    assert_eq!(collect(json!({})), (200, "{}".to_owned()));
+    assert_eq!(collect(&lab, json!({})), (200, "{}".to_owned()));
     assert_eq!(
         given(&lab, "walks", "datasets/walks.lance"),
         format!(
@@ -225,18 +229,31 @@ fn collections_and_evaluations_are_commands_of_checked_arguments() {
              target.color=1,2,3 --output {home}/datasets/walks.lance --threads 1"
         )
     );
-    assert_eq!(evaluate(json!({})), (200, "{}".to_owned()));
+    assert_eq!(evaluate(&lab, json!({})), (200, "{}".to_owned()));
     assert_eq!(
         given(&lab, "planned", "results/planned"),
         format!(
             "eval simulator --env swm/TwoRoom-v1 --solver cem,samples=16 --horizon 5 --receding-horizon 1 --action-block 5 \
-             --score terminal --dataset {home}/datasets/rooms.lance --episodes 10 --seed 3 --output {home}/results/planned --threads 1"
+             --score terminal --dataset {home}/datasets/rooms.lance --episodes 10 --seed 3 --output {home}/results/planned \
+             --threads 1"
         )
     );
     // What exists is not written again.
-    for (status, message) in [collect(json!({})), collect(json!({"name": "rooms"})), evaluate(json!({}))] {
+    for (status, message) in
+        [collect(&lab, json!({})), collect(&lab, json!({"name": "rooms"})), evaluate(&lab, json!({}))]
+    {
         assert!(status == 400 && message.contains("choose another name"), "{message}");
     }
+}
+
+#[test]
+fn requests_to_collect_and_to_evaluate_are_checked() {
+    let lab = TestLab::start();
+    super::data::collect(&lab, 1);
+    let planner = |model: &str, solver: &str| {
+        json!({"planner": {"model": model, "solver": solver, "horizon": 5, "receding": 1, "block": 5, "score": "terminal",
+            "warm": true}})
+    };
     for change in [
         json!({"name": "../escape"}),
         json!({"name": "/tmp/escape"}),
@@ -253,7 +270,7 @@ fn collections_and_evaluations_are_commands_of_checked_arguments() {
         json!({"variation": "--trust"}),
         json!({"output": "/tmp/x"}),
     ] {
-        assert_eq!(collect(change.clone()).0, 400, "{change}");
+        assert_eq!(collect(&lab, change.clone()).0, 400, "{change}");
     }
     for change in [
         json!({"name": ""}),
@@ -261,14 +278,13 @@ fn collections_and_evaluations_are_commands_of_checked_arguments() {
         json!({"episodes": 0}),
         json!({"dataset": {"folder": 0, "name": "../rooms.lance"}}),
         json!({"dataset": "s3://bucket/rooms.lance"}),
-        json!({"planner": {"model": "/tmp/checkpoint", "solver": "cem", "horizon": 5, "receding": 1, "block": 5,
-            "score": "terminal", "warm": true}}),
-        json!({"planner": {"model": "simulator", "solver": "module:Solver", "horizon": 5, "receding": 1, "block": 5,
-            "score": "terminal", "warm": true}}),
+        planner("/tmp/checkpoint", "cem"),
+        planner("simulator", "module:Solver"),
         json!({"command": "demo"}),
     ] {
-        assert_eq!(evaluate(change.clone()).0, 400, "{change}");
+        assert_eq!(evaluate(&lab, change.clone()).0, 400, "{change}");
     }
+    assert_eq!(lab.json("api/processes")["processes"], json!([]));
 }
 
 #[test]

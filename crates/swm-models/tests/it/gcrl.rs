@@ -371,7 +371,7 @@ fn probes_read_the_position_and_reconstruct_the_image() {
 
     let mut settings = ReconstructionConfig { channels: vec![16, 8], shown: 6, ..ReconstructionConfig::default() };
     (settings.fit.steps, settings.fit.lr) = (1000, 5e-3);
-    let (report, sheet) =
+    let probe::Reconstruction { report, sheet, .. } =
         probe::reconstruct_images(&Profiles, &data, &settings, &mut Control::new()).expect("fitting the decoder");
     assert!(report.explained > 0.2 && report.rmse < report.rmse_of_mean, "{report:?}");
     let cell = SIDE * 8 + 2;

@@ -168,6 +168,13 @@ pub fn cast<N: Scalar>(values: impl Iterator<Item = N>, dtype: DType, out: &mut 
     }
 }
 
+/// Converts integers of any width to 64 bits.
+pub fn integers(values: &ArrayRef, out: &mut [i64]) -> Result<()> {
+    convert(values, 1, DType::Int64, bytemuck::cast_slice_mut(out)).map_err(|problem| {
+        Error::mismatch("reading an index column", format!("invalid values ({problem})"), "integers")
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -211,11 +218,4 @@ mod tests {
         let largest = Arc::new(Int64Array::from(vec![i64::MAX, i64::MIN]));
         assert_eq!(read(largest, DType::Int64), Ok([i64::MAX.to_ne_bytes(), i64::MIN.to_ne_bytes()].concat()));
     }
-}
-
-/// Converts integers of any width to 64 bits.
-pub fn integers(values: &ArrayRef, out: &mut [i64]) -> Result<()> {
-    convert(values, 1, DType::Int64, bytemuck::cast_slice_mut(out)).map_err(|problem| {
-        Error::mismatch("reading an index column", format!("invalid values ({problem})"), "integers")
-    })
 }

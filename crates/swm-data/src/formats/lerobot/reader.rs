@@ -74,13 +74,7 @@ impl LerobotReader {
             );
             return Err(damaged(root, problem));
         }
-        let mut files: Vec<(PathBuf, Range<usize>)> = vec![];
-        for (position, episode) in files_of_episodes.iter().enumerate() {
-            match files.last_mut() {
-                Some((path, episodes)) if *path == episode.data => episodes.end = position + 1,
-                _ => files.push((episode.data.clone(), position..position + 1)),
-            }
-        }
+        let files = data_files(&files_of_episodes);
         let recorded = info.stable_worldmodel.as_ref().map(|recorded| recorded.schema.columns()).unwrap_or_default();
         let specs: Vec<ColumnSpec> =
             index_columns(recorded).into_iter().chain(columns.iter().map(|column| column.spec.clone())).collect();
@@ -283,6 +277,18 @@ impl LerobotReader {
         })?;
         self.check()
     }
+}
+
+/// Each data file, with the positions of the episodes in it.
+fn data_files(files_of_episodes: &[EpisodeFiles]) -> Vec<(PathBuf, Range<usize>)> {
+    let mut files: Vec<(PathBuf, Range<usize>)> = vec![];
+    for (position, episode) in files_of_episodes.iter().enumerate() {
+        match files.last_mut() {
+            Some((path, episodes)) if *path == episode.data => episodes.end = position + 1,
+            _ => files.push((episode.data.clone(), position..position + 1)),
+        }
+    }
+    files
 }
 
 /// Overwrites an action with the values of a missing action: NaN, or -1 for integers.

@@ -164,7 +164,12 @@ pub fn cast<N: Scalar>(values: impl Iterator<Item = N>, dtype: DType, out: &mut 
     };
     match wrong {
         None => Ok(()),
-        Some(value) => Err(format!("it has the value {}, which is not one of its type {}", value.f64(), dtype.name())),
+        Some(value) => {
+            let value = value.f64();
+            // In full, a large number is hundreds of digits.
+            let text = if value.abs() < 1e15 { value.to_string() } else { format!("{value:e}") };
+            Err(format!("it has the value {text}, which is not one of its type {}", dtype.name()))
+        }
     }
 }
 

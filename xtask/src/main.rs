@@ -23,7 +23,7 @@ mod words;
 
 use anyhow::{Context as _, Result, bail};
 use graph::Graph;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 
 /// A check: the name, the checked property, and the function that runs the check.
@@ -58,7 +58,7 @@ fn main() -> ExitCode {
     let words: Vec<String> = std::env::args().skip(1).collect();
     let outcome = match words.iter().map(String::as_str).collect::<Vec<_>>()[..] {
         ["check"] => CHECKS.iter().try_for_each(|(_, _, run)| run()),
-        ["book", folder] => book::book(&root(), std::path::Path::new(folder)),
+        ["book", folder] => book::book(&root(), Path::new(folder)),
         ["nightly"] => nightly::nightly(None),
         ["nightly", part] => nightly::nightly(Some(part)),
         ["help" | "--help" | "-h"] => {
@@ -191,7 +191,8 @@ fn forget_own_package(command: &mut Command) {
 /// The folder of the workspace in which cargo runs this program. If two checkouts share a target folder, the program
 /// may have been compiled in another folder.
 fn root() -> PathBuf {
-    let here = std::env::var_os("CARGO_MANIFEST_DIR").unwrap_or_else(|| env!("CARGO_MANIFEST_DIR").into());
-    let here = PathBuf::from(here);
-    here.parent().map(PathBuf::from).unwrap_or(here)
+    // Checkouts may share a target folder, and with it this program: the folder that it was compiled in may be another one.
+    let here = std::env::current_dir().unwrap_or_default();
+    let found = here.ancestors().find(|folder| folder.join("xtask/Cargo.toml").is_file());
+    found.or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).parent()).map(PathBuf::from).unwrap_or_default()
 }

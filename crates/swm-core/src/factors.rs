@@ -24,8 +24,13 @@ pub fn from_row(space: &VariationSpace, current: &FactorValues, row: RowRef<'_>)
     for factor in space.factors() {
         let name = columns::flat_factor(&factor.key);
         if row.schema().find(&name).is_some() {
-            let value: Vec<f64> =
-                row.to_f64(&name)?.iter().enumerate().map(|(i, &v)| clamp_rounded(v, factor.space.bounds(i))).collect();
+            let value = row.to_f64(&name)?;
+            if value.len() != factor.space.len() {
+                // The error of a value of another length.
+                factor.space.check(&factor.key, &value)?;
+            }
+            let rounded = value.iter().enumerate().map(|(i, &v)| clamp_rounded(v, factor.space.bounds(i)));
+            let value: Vec<f64> = rounded.collect();
             if value == factor.init_value {
                 request.variation_values.remove(&factor.key);
             } else {

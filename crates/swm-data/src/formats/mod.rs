@@ -3,6 +3,7 @@
 //! Each format implements [`Reader`](crate::Reader) and [`Writer`](crate::Writer). Its module declares `ENTRY`, its row
 //! of the registry.
 
+mod cast;
 mod column_files;
 pub mod entry;
 mod folder;

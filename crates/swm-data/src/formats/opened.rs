@@ -13,34 +13,32 @@ pub struct Opened {
     metadata: PathBuf,
     born: Option<(u64, SystemTime)>,
     state: Mutex<Option<State>>,
-    /// How often the dataset had been replaced when it was opened.
-    pub replaced: u64,
 }
 
 /// What changes whenever a file is written anew: its number, its time and its size.
-type State = (u64, SystemTime, u64);
+pub type State = (u64, SystemTime, u64);
 
 impl Opened {
-    /// The dataset in a folder, before its metadata is read, which says how often it was replaced.
+    /// The dataset in a folder, before its metadata is read.
     pub fn new(folder: &Path, places: &Places) -> Self {
         let metadata = folder.join(places.metadata);
         let state = Mutex::new(state(&metadata));
-        Self { born: born(folder), folder: folder.to_owned(), metadata, state, replaced: 0 }
+        Self { born: born(folder), folder: folder.to_owned(), metadata, state }
     }
 
-    /// Checks, after something was read, that it belongs to the dataset that was opened. `replaced` reads how often the
-    /// dataset has been replaced; it is called only if the metadata was written again, as a writer that appends does.
+    /// Checks, after something was read, that it belongs to the dataset that was opened. `is_same` compares the dataset that is
+    /// there now; it is called only if the metadata was written again, as a writer that appends does.
     ///
     /// # Errors
     /// If the dataset was replaced or is gone.
-    pub fn check(&self, replaced: impl FnOnce() -> Result<u64>) -> Result<()> {
+    pub fn check(&self, is_same: impl FnOnce() -> Result<bool>) -> Result<()> {
         let now = state(&self.metadata);
         let is_same_folder = born(&self.folder) == self.born;
         let mut known = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         if is_same_folder && now.is_some() && now == *known {
             return Ok(());
         }
-        if is_same_folder && now.is_some() && replaced()? == self.replaced {
+        if is_same_folder && now.is_some() && is_same()? {
             *known = now;
             return Ok(());
         }
@@ -58,7 +56,8 @@ fn number(_: &std::fs::Metadata) -> u64 {
     0
 }
 
-fn state(path: &Path) -> Option<State> {
+/// The state of a file; `None` if it is gone.
+pub fn state(path: &Path) -> Option<State> {
     let metadata = path.metadata().ok()?;
     Some((number(&metadata), metadata.modified().ok()?, metadata.len()))
 }

@@ -22,6 +22,8 @@ with h5py.File("hdf5-unwritten.h5", "w", libver=("earliest", "v110")) as file:
     half[4:8] = np.arange(4)
     file.create_dataset("zero", (ROWS,), "f8", chunks=(4,))[:4] = 1.0
     file.create_dataset("choice", data=np.arange(ROWS) % 2 + 1, dtype=h5py.enum_dtype({"ONE": 1, "TWO": 2}, basetype="i1"))
+    file.create_dataset("halves", (ROWS,), "f2", chunks=(4,), fillvalue=3.0)[:4] = 0.5
+    file.create_dataset("true", (ROWS,), "?", chunks=(4,), fillvalue=True)[4:8] = False
     file.create_dataset("flag", data=np.arange(ROWS) % 2 == 1)
 
 with h5py.File("hdf5-external.h5", "w", libver=("earliest", "v110")) as file:

@@ -372,6 +372,8 @@ fn rows_that_were_never_written_have_the_value_that_the_file_says() {
     let read = |name: &str| reader.read(&[name], &rows).expect("reading rows").to_f32(name).expect("numbers");
     assert_eq!(read("absent"), [7.5; 24]);
     assert_eq!(read("half"), [-3.0, -3.0, -3.0, -3.0, 0.0, 1.0, 2.0, 3.0, -3.0, -3.0, -3.0, -3.0]);
+    assert_eq!(read("halves"), [[0.5; 4], [3.0; 4], [3.0; 4]].concat());
+    assert_eq!(read("true"), [[1.0; 4], [0.0; 4], [1.0; 4]].concat());
     assert_eq!(read("zero"), [[1.0; 4], [0.0; 4], [0.0; 4]].concat());
     // Only an enumeration of 0 and 1 is a boolean.
     assert_eq!(read("choice")[..4], [1.0, 2.0, 1.0, 2.0]);

@@ -1,5 +1,6 @@
 //! A reader of a dataset that another process replaces never returns rows of both.
 
+use crate::fuzz::copy_all;
 use crate::sample::{check, episode, write};
 use swm_data::{Reader, StepRange, WriteMode, open};
 
@@ -29,6 +30,21 @@ fn columns_and_images_of_another_dataset_are_refused() {
             }
             check(&*open(&path).expect("opening the new dataset"), first);
         }
+    }
+}
+
+#[test]
+fn files_that_are_copied_over_the_dataset_are_another_one() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    for format in FORMATS {
+        let (path, other) = (folder.path().join(format!("a.{format}")), folder.path().join(format!("b.{format}")));
+        write(&path, WriteMode::Create, 3, 0..6);
+        write(&other, WriteMode::Create, 3, 7..13);
+        let reader = open(&path).expect("opening the dataset");
+        first_rows(&*reader, "state").expect("a column");
+        copy_all(&other, &path);
+        let error = first_rows(&*reader, "action").expect_err(format).to_string();
+        assert!(error.contains("replaced"), "{format}: {error}");
     }
 }
 

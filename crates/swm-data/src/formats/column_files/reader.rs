@@ -42,7 +42,7 @@ impl ColumnFiles {
     /// # Errors
     /// If the column files are damaged or inconsistent.
     pub fn open(folder: &Path) -> Result<Self> {
-        let mut opened = Opened::new(folder, &COLUMN_FILES);
+        let opened = Opened::new(folder, &COLUMN_FILES);
         // Reads the journal before the lengths, so that episodes merged between the two reads are skipped.
         let journal_path = journal::path(folder);
         let journal = match files::read(&journal_path, u64::MAX) {
@@ -68,7 +68,6 @@ impl ColumnFiles {
                 .for_each(|(column, unmerged_rows)| column.unmerged_rows.extend(unmerged_rows));
             pending_constants.push(constants);
         }
-        opened.replaced = recorded.replaced;
         let files = Self { folder: folder.to_owned(), rows, recorded, columns, skipped, pending_constants, opened };
         // All that was read so far is of one dataset.
         files.check()?;
@@ -80,7 +79,30 @@ impl ColumnFiles {
     /// # Errors
     /// If it was replaced.
     pub fn check(&self) -> Result<()> {
-        self.opened.check(|| Ok(stored_metadata(&self.folder)?.1.replaced))
+        self.opened.check(|| self.is_same())
+    }
+
+    /// Whether the dataset in the folder is this one, or has grown from it. A program that replaces files by itself counts no
+    /// replacement: the columns that were read so far are compared, or the manifests if none was.
+    fn is_same(&self) -> Result<bool> {
+        let (lengths, now) = stored_metadata(&self.folder)?;
+        let own = self.rows.episodes()[..self.episodes_in_files()].iter().map(|episode| episode.length as i64);
+        if now.replaced != self.recorded.replaced || !lengths.iter().copied().take(own.len()).eq(own) {
+            return Ok(false);
+        }
+        let mut read = self.columns.iter().filter_map(|column| Some((column, column.data.get()?))).peekable();
+        if read.peek().is_none() {
+            return Ok(now.manifest.is_some() && now.manifest == self.recorded.manifest);
+        }
+        for (column, data) in read {
+            let in_file = column.in_file * column.spec.row_bytes();
+            let (header, found) = Npz::open(&column_path(&self.folder, &column.spec.name))?.array()?;
+            let is_equal = found.get(..in_file) == data.get(..in_file);
+            if header.spec(&column.spec.name).as_ref() != Some(&column.spec) || !is_equal {
+                return Ok(false);
+            }
+        }
+        Ok(true)
     }
 
     /// How often the dataset was replaced by another one at its path.

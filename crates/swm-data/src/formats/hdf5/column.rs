@@ -63,20 +63,20 @@ enum Storage {
         rows: u64,
         /// Side lengths of a chunk along the axes of a row, in elements.
         sides: Vec<usize>,
-        /// An element that was never written, in its stored form.
-        fill: Vec<u8>,
+        /// An element that was never written, in its stored form; `None` if only the library knows it.
+        fill: Option<Vec<u8>>,
         index: OnceLock<Result<Index, String>>,
     },
 }
 
-/// The value of an element that was never written, in its stored form: 0 unless the file says otherwise.
-fn fill_element(dataset: &Dataset, stored: StoredScalar) -> Vec<u8> {
+/// The value of an element that was never written, in its stored form: 0 unless the file says otherwise. `None` for types whose
+/// value the library does not tell, such as enumerations.
+fn fill_element(dataset: &Dataset, stored: StoredScalar) -> Option<Vec<u8>> {
     fn of<T: H5Element, const SIZE: usize>(dataset: &Dataset, bytes: fn(T) -> [u8; SIZE]) -> Option<Vec<u8>> {
-        // An enumeration has no such value.
-        let value = catch_panic("reading the value of unwritten elements", || dataset.fill_value::<T>());
-        value.ok().flatten().map(|value| bytes(value).to_vec())
+        let value = catch_panic("reading the value of unwritten elements", || dataset.fill_value::<T>()).ok()?;
+        Some(value.map_or_else(|| vec![0; SIZE], |value| bytes(value).to_vec()))
     }
-    let found = match (stored.class, stored.size) {
+    let mut bytes = match (stored.class, stored.size) {
         (Class::Signed, 1) => of(dataset, i8::to_le_bytes),
         (Class::Signed, 2) => of(dataset, i16::to_le_bytes),
         (Class::Signed, 4) => of(dataset, i32::to_le_bytes),
@@ -88,12 +88,11 @@ fn fill_element(dataset: &Dataset, stored: StoredScalar) -> Vec<u8> {
         (Class::Float, 4) => of(dataset, f32::to_le_bytes),
         (Class::Float, 8) => of(dataset, f64::to_le_bytes),
         _ => None,
-    };
-    let mut bytes = found.unwrap_or_else(|| vec![0; stored.size]);
+    }?;
     if stored.big_endian {
         bytes.reverse();
     }
-    bytes
+    Some(bytes)
 }
 
 impl Column {
@@ -235,7 +234,7 @@ impl Column {
             Storage::Contiguous(address) => self.read_contiguous(source, *address, slots, &row_of),
             Storage::Chunked { pipeline, rows, sides, fill, .. } => {
                 let grid = Grid::new(*rows, sides, &self.spec.shape, self.stored.size);
-                self.read_chunks(source, (pipeline, fill), &grid, slots, &row_of)
+                self.read_chunks(source, (pipeline, fill.as_deref()), &grid, slots, &row_of)
             }
         }
     }
@@ -314,7 +313,7 @@ impl Column {
     fn read_chunks(
         &self,
         source: &Source,
-        (pipeline, fill): (&Pipeline, &[u8]),
+        (pipeline, fill): (&Pipeline, Option<&[u8]>),
         grid: &Grid,
         slots: &mut [RowSlot<'_>],
         row_of: &(impl Fn((usize, usize)) -> u64 + Sync),
@@ -348,6 +347,11 @@ impl Column {
                 rows_buffer.resize(grid.rows as usize * self.stored_row(), 0);
                 if chunks.len() != grid.per_row() {
                     // Chunks that were never written.
+                    let Some(fill) = fill else {
+                        let first = row * grid.rows;
+                        let all = catch_panic("reading its data", || self.dataset.read_raw_rows(first, grid.rows))?;
+                        return self.copy_rows(&all, first, group, row_of);
+                    };
                     rows_buffer.chunks_exact_mut(fill.len()).for_each(|element| element.copy_from_slice(fill));
                 }
                 for found in chunks {

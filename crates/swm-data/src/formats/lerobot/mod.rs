@@ -27,6 +27,7 @@
 //! datasets that browsers must play.
 
 #[cfg(feature = "lerobot")]
+mod checks;
 mod episode_files;
 #[cfg(feature = "lerobot")]
 mod features;

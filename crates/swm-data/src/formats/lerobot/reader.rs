@@ -1,13 +1,14 @@
 //! Reads numeric columns from Parquet files, and frames from videos by time. Numeric columns are cached in memory after
 //! the first access.
 
+use super::checks::other_rows;
 use super::episode_files::EpisodeFiles;
 use super::info::{Column, Info, Kind, damaged};
 use super::{TASK, table, values};
 use crate::dataset::Location;
 use crate::dataset::episodes::{EpisodeRows, content_hash, index_columns};
-use crate::dataset::{Constants, Episode, Reader, StepRange};
-use crate::formats::opened::Opened;
+use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
+use crate::formats::opened::{self, Opened};
 use crate::formats::set_aside::LEROBOT;
 use arrow_array::Array as _;
 use arrow_array::cast::AsArray as _;
@@ -30,31 +31,34 @@ pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
 }
 
 pub(super) struct LerobotReader {
-    root: PathBuf,
+    pub(super) root: PathBuf,
     pub info: Info,
     fps: f64,
     schema: Schema,
     /// The columns of the schema after the index columns, then the computed features, which are only read by name.
-    columns: Vec<Column>,
+    pub(super) columns: Vec<Column>,
     /// Specs of the index columns and of `columns`.
     specs: Vec<ColumnSpec>,
-    rows: EpisodeRows,
+    pub(super) rows: EpisodeRows,
     pub files_of_episodes: Vec<EpisodeFiles>,
     /// Each data file, with the positions of the episodes in it.
-    files: Vec<(PathBuf, Range<usize>)>,
+    pub(super) files: Vec<(PathBuf, Range<usize>)>,
     /// The values of each numeric column.
     data: Vec<OnceLock<Vec<u8>>>,
     /// The timestamp of each row in seconds, if stored.
     timestamps: OnceLock<Option<Vec<f32>>>,
     videos: VideoCache<PathBuf>,
-    opened: Opened,
+    pub(super) opened: Opened,
+    /// Whether each data file was found to have the rows of its episodes.
+    pub(super) checked: Vec<OnceLock<()>>,
+    /// The states of the data files.
+    pub(super) states: Vec<Option<opened::State>>,
 }
 
 impl LerobotReader {
     pub fn open(root: &Path) -> Result<Self> {
-        let mut opened = Opened::new(root, &LEROBOT);
+        let opened = Opened::new(root, &LEROBOT);
         let info = Info::read(root)?;
-        opened.replaced = info.replaced();
         let fps = info.fps().unwrap_or(1.0);
         let mut columns = info.columns(root)?;
         let is_computed =
@@ -75,6 +79,7 @@ impl LerobotReader {
             return Err(damaged(root, problem));
         }
         let files = data_files(&files_of_episodes);
+        let states: Vec<_> = files.iter().map(|(path, _)| opened::state(path)).collect();
         let recorded = info.stable_worldmodel.as_ref().map(|recorded| recorded.schema.columns()).unwrap_or_default();
         let specs: Vec<ColumnSpec> =
             index_columns(recorded).into_iter().chain(columns.iter().map(|column| column.spec.clone())).collect();
@@ -107,15 +112,12 @@ impl LerobotReader {
             videos,
             info,
             opened,
+            checked: states.iter().map(|_| OnceLock::new()).collect(),
+            states,
         };
         // All that was read so far is of one dataset.
         reader.check()?;
         Ok(reader)
-    }
-
-    /// Checks, after something was read, that the dataset is still the one that was opened.
-    fn check(&self) -> Result<()> {
-        self.opened.check(|| Ok(Info::read(&self.root)?.replaced()))
     }
 
     /// The index of a column in `specs`, by its name or its LeRobot name.
@@ -152,31 +154,26 @@ impl LerobotReader {
     }
 
     /// All rows of a numeric feature, from all files.
-    fn read_values(&self, native: &str, spec: &ColumnSpec) -> Result<Vec<u8>> {
+    pub(super) fn read_values(&self, native: &str, spec: &ColumnSpec) -> Result<Vec<u8>> {
         Schema::new([spec.clone()])?.check_memory(usize::try_from(self.rows.total()).unwrap_or(usize::MAX))?;
         let parts: Result<Vec<Vec<u8>>> = self
             .files
             .par_iter()
             .with_max_len(1)
             .map(|(path, episodes)| {
-                let other =
-                    || damaged(path, "its rows do not belong to the episodes that it should contain".to_owned());
                 let mut bytes = vec![];
-                // The episode of every row of the file.
-                let mut expected = episodes
-                    .clone()
-                    .flat_map(|e| std::iter::repeat_n(self.rows.episodes()[e].index, self.files_of_episodes[e].length));
+                let mut expected = self.rows_of(episodes);
                 table::read_batches(path, &["episode_index", native], None, spec.row_bytes(), &mut |batch| {
                     let found = table::integers(path, std::slice::from_ref(&batch), "episode_index")?;
                     if !found.into_iter().all(|index| expected.next() == Some(index)) {
-                        return Err(other());
+                        return Err(other_rows(path));
                     }
                     let array = batch.column_by_name(native);
                     let array = array.ok_or_else(|| damaged(path, format!("it has no column '{native}'")))?;
                     let added = values::append(array, spec, &mut bytes);
                     added.map_err(|problem| damaged(path, format!("column '{native}': {problem}")))
                 })?;
-                if expected.next().is_some() { Err(other()) } else { Ok(bytes) }
+                if expected.next().is_some() { Err(other_rows(path)) } else { Ok(bytes) }
             })
             .collect();
         let mut parts = parts?;
@@ -234,6 +231,7 @@ impl LerobotReader {
         rows: Vec<Range<usize>>,
         mut each: impl FnMut(usize, &[u8]) -> Result<()>,
     ) -> Result<()> {
+        self.check_rows(file)?;
         let (path, native) = (&self.files[file].0, &*column.native);
         let mut at = 0;
         table::read_batches(path, &[native], Some(rows), column.spec.row_bytes(), &mut |batch| {
@@ -372,6 +370,10 @@ impl Reader for LerobotReader {
             constants.insert(TASK.to_owned(), files.tasks.join("\n").into_bytes());
         }
         Ok(constants)
+    }
+
+    fn irregularities(&self) -> Result<Vec<Irregularity>> {
+        self.misplaced_rows()
     }
 
     fn sources(&self) -> Vec<PathBuf> {

@@ -1,5 +1,6 @@
 //! Conversions between Arrow arrays and the bytes of columns.
 
+use crate::formats::cast::{Scalar, cast};
 use arrow_array::cast::AsArray as _;
 use arrow_array::types::{
     ArrowPrimitiveType, Float16Type, Float32Type, Float64Type, Int8Type, Int16Type, Int32Type, Int64Type, UInt8Type,
@@ -18,6 +19,8 @@ use swm_core::{ColumnSpec, DType, Error, Result};
 pub fn append(array: &dyn Array, column: &ColumnSpec, out: &mut Vec<u8>) -> Result<(), String> {
     let expected = array.len() * column.len();
     let mut leaf: ArrayRef = arrow_array::make_array(array.to_data());
+    // The lengths of nested lists, outermost first.
+    let mut lengths = vec![];
     loop {
         if leaf.null_count() > 0 {
             return Err("some values are missing".to_owned());
@@ -26,39 +29,45 @@ pub fn append(array: &dyn Array, column: &ColumnSpec, out: &mut Vec<u8>) -> Resu
             DataType::List(_) => {
                 let list = leaf.as_list::<i32>();
                 check_offsets(list.value_offsets())?;
+                lengths.push(list.value_length(0) as usize);
                 let (first, last) = (list.value_offsets()[0] as usize, list.value_offsets()[list.len()] as usize);
                 list.values().slice(first, last - first)
             }
-            DataType::FixedSizeList(..) => Arc::clone(leaf.as_fixed_size_list().values()),
+            DataType::FixedSizeList(_, length) => {
+                lengths.push(usize::try_from(*length).unwrap_or(0));
+                Arc::clone(leaf.as_fixed_size_list().values())
+            }
             _ => break,
         };
     }
     if leaf.len() != expected {
         return Err(format!("it has {} values instead of {expected}", leaf.len()));
     }
+    // One list may hold the values of any shape, row by row.
+    if lengths.len() > 1 && lengths != column.shape && expected > 0 {
+        return Err(format!("its rows are lists of the shape {lengths:?}, not {:?}", column.shape));
+    }
     match leaf.data_type() {
-        DataType::Boolean => {
-            let values = leaf.as_boolean().values().iter().map(i64::from);
-            append_values(values, column.dtype, out, |v| v, |v| v as f64);
-        }
-        DataType::Int8 => append_integers::<Int8Type>(&leaf, column, out)?,
-        DataType::Int16 => append_integers::<Int16Type>(&leaf, column, out)?,
-        DataType::Int32 => append_integers::<Int32Type>(&leaf, column, out)?,
-        DataType::Int64 => append_integers::<Int64Type>(&leaf, column, out)?,
-        DataType::UInt8 => append_integers::<UInt8Type>(&leaf, column, out)?,
-        DataType::UInt16 => append_integers::<UInt16Type>(&leaf, column, out)?,
-        DataType::UInt32 => append_integers::<UInt32Type>(&leaf, column, out)?,
-        DataType::UInt64 => append_integers::<UInt64Type>(&leaf, column, out)?,
+        DataType::Boolean => append_values(leaf.as_boolean().values().iter().map(i64::from), column.dtype, out),
+        DataType::Int8 => append_integers::<Int8Type>(&leaf, column, out),
+        DataType::Int16 => append_integers::<Int16Type>(&leaf, column, out),
+        DataType::Int32 => append_integers::<Int32Type>(&leaf, column, out),
+        DataType::Int64 => append_integers::<Int64Type>(&leaf, column, out),
+        DataType::UInt8 => append_integers::<UInt8Type>(&leaf, column, out),
+        DataType::UInt16 => append_integers::<UInt16Type>(&leaf, column, out),
+        DataType::UInt32 => append_integers::<UInt32Type>(&leaf, column, out),
+        DataType::UInt64 => append_integers::<UInt64Type>(&leaf, column, out),
         DataType::Float16 => {
-            append_floats(leaf.as_primitive::<Float16Type>().values().iter().map(|v| f64::from(*v)), column, out)
+            append_values(leaf.as_primitive::<Float16Type>().values().iter().map(|v| f64::from(*v)), column.dtype, out)
         }
         DataType::Float32 => {
-            append_floats(leaf.as_primitive::<Float32Type>().values().iter().map(|v| f64::from(*v)), column, out)
+            append_values(leaf.as_primitive::<Float32Type>().values().iter().map(|v| f64::from(*v)), column.dtype, out)
         }
-        DataType::Float64 => append_floats(leaf.as_primitive::<Float64Type>().values().iter().copied(), column, out),
-        other => return Err(format!("it holds {other}, which is not numeric")),
+        DataType::Float64 => {
+            append_values(leaf.as_primitive::<Float64Type>().values().iter().copied(), column.dtype, out)
+        }
+        other => Err(format!("it holds {other}, which is not numeric")),
     }
-    Ok(())
 }
 
 /// Checks that all lists have the same length. Damaged files may declare invalid offsets.
@@ -75,41 +84,21 @@ fn append_integers<T: ArrowPrimitiveType>(leaf: &ArrayRef, column: &ColumnSpec, 
 where
     T::Native: ArrowNativeType + TryInto<i64>,
 {
-    let range = match column.dtype {
-        DType::U8 => 0..=u8::MAX.into(),
-        DType::Int32 => i32::MIN.into()..=i32::MAX.into(),
-        _ => i64::MIN..=i64::MAX,
+    let integer = |&value: &T::Native| {
+        value.try_into().map_err(|_| format!("it has the value {value:?}, which is more than an int64 can be"))
     };
-    let fitting = |value: T::Native| value.try_into().ok().filter(|value| range.contains(value));
-    let values: Result<Vec<i64>, String> = leaf
-        .as_primitive::<T>()
-        .values()
-        .iter()
-        .map(|&value| fitting(value).ok_or_else(|| format!("its value {value:?} does not fit {}", column.dtype.name())))
-        .collect();
-    append_values(values?.into_iter(), column.dtype, out, |v| v, |v| v as f64);
-    Ok(())
+    let values: Result<Vec<i64>, String> = leaf.as_primitive::<T>().values().iter().map(integer).collect();
+    append_values(values?.into_iter(), column.dtype, out)
 }
 
-fn append_floats(values: impl Iterator<Item = f64>, column: &ColumnSpec, out: &mut Vec<u8>) {
-    append_values(values, column.dtype, out, |v| v as i64, |v| v);
-}
-
-fn append_values<V: Copy>(
-    values: impl Iterator<Item = V>,
+fn append_values<V: Scalar>(
+    values: impl ExactSizeIterator<Item = V>,
     dtype: DType,
     out: &mut Vec<u8>,
-    to_integer: impl Fn(V) -> i64,
-    to_float: impl Fn(V) -> f64,
-) {
-    match dtype {
-        DType::Bool => out.extend(values.map(|v| u8::from(to_float(v) != 0.0))),
-        DType::U8 => out.extend(values.map(|v| to_integer(v) as u8)),
-        DType::Int32 => values.for_each(|v| out.extend((to_integer(v) as i32).to_ne_bytes())),
-        DType::Int64 => values.for_each(|v| out.extend(to_integer(v).to_ne_bytes())),
-        DType::Float32 => values.for_each(|v| out.extend((to_float(v) as f32).to_ne_bytes())),
-        DType::Float64 => values.for_each(|v| out.extend(to_float(v).to_ne_bytes())),
-    }
+) -> Result<(), String> {
+    let first = out.len();
+    out.resize(first + values.len() * dtype.size(), 0);
+    cast(values, dtype, &mut out[first..])
 }
 
 /// Converts the bytes of a column to an Arrow array, and returns it with its field.
@@ -147,20 +136,52 @@ fn primitive<T: ArrowPrimitiveType, const N: usize>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use arrow_array::UInt64Array;
+    use arrow_array::{Float64Array, UInt64Array};
+
+    fn read(array: &dyn Array, column: &ColumnSpec) -> Result<Vec<u8>, String> {
+        let mut out = vec![];
+        append(array, column, &mut out).map(|()| out)
+    }
 
     #[test]
-    fn integers_that_do_not_fit_the_column_are_errors() {
-        let append = |value: u64, dtype| {
-            let mut out = vec![];
-            append(&UInt64Array::from(vec![1, value]), &ColumnSpec::new("count", dtype, []), &mut out).map(|()| out)
-        };
-        assert_eq!(append(1 << 62, DType::Int64), Ok([1_i64, 1 << 62].map(i64::to_ne_bytes).concat()));
-        for (value, dtype) in
-            [(1 << 63, DType::Int64), (1 << 63, DType::Float64), (1 << 31, DType::Int32), (256, DType::U8)]
-        {
-            let error = append(value, dtype).expect_err("a value that does not fit");
-            assert_eq!(error, format!("its value {value} does not fit {}", dtype.name()));
+    fn values_that_the_column_does_not_have_are_errors() {
+        let integers = |value: u64, dtype| read(&UInt64Array::from(vec![1, value]), &ColumnSpec::new("x", dtype, []));
+        assert_eq!(integers(1 << 62, DType::Int64), Ok([1_i64, 1 << 62].map(i64::to_ne_bytes).concat()));
+        for (value, dtype) in [
+            (1 << 63, DType::Int64),
+            (1 << 63, DType::Float64),
+            (1 << 31, DType::Int32),
+            (256, DType::U8),
+            (2, DType::Bool),
+            ((1 << 53) + 1, DType::Float32),
+        ] {
+            let error = integers(value, dtype).expect_err("a value that does not fit");
+            assert!(error.contains("it has the value"), "{value}: {error}");
         }
+        let floats = |value: f64, dtype| read(&Float64Array::from(vec![1.0, value]), &ColumnSpec::new("x", dtype, []));
+        assert_eq!(floats(0.1, DType::Float32), Ok([1.0_f32, 0.1].map(f32::to_ne_bytes).concat()));
+        for (value, dtype) in [
+            (1.5, DType::Int64),
+            (f64::NAN, DType::U8),
+            (300.0, DType::U8),
+            (1e300, DType::Float32),
+            (0.5, DType::Bool),
+        ] {
+            assert!(floats(value, dtype).is_err(), "{value}");
+        }
+    }
+
+    #[test]
+    fn nested_lists_have_the_shape_of_the_column() {
+        let list = |length, values: ArrayRef| {
+            let item = Arc::new(Field::new("item", values.data_type().clone(), false));
+            Arc::new(FixedSizeListArray::new(item, length, values, None)) as ArrayRef
+        };
+        let nested = list(2, list(3, Arc::new(Float64Array::from(vec![0.0; 12]))));
+        let column = |shape: &[usize]| ColumnSpec::new("x", DType::Float64, shape.to_vec());
+        assert!(read(&nested, &column(&[2, 3])).is_ok());
+        assert!(read(&nested, &column(&[3, 2])).expect_err("another shape").contains("[2, 3], not [3, 2]"));
+        let flat = list(6, Arc::new(Float64Array::from(vec![0.0; 12])));
+        assert!(read(&flat, &column(&[3, 2])).is_ok());
     }
 }

@@ -16,7 +16,7 @@ mod values;
 pub use self::lance_reader::LanceReader;
 
 use self::lance_reader::{RecentFiles, RowSlot};
-use super::convert::{cast, image_bytes, integers};
+use super::convert::{image_bytes, integers};
 use super::errors::damaged;
 use super::record::{CONSTANTS_KEY, ContentHash};
 use super::schema::{self, Kind, StoredColumn};
@@ -24,6 +24,7 @@ use super::store::{self, Store};
 use crate::dataset::Location;
 use crate::dataset::objects::BlockCache;
 use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
+use crate::formats::cast::cast;
 use lance_table::format::{DataFile, Manifest as Table};
 use std::collections::BTreeMap;
 use std::ops::Range;

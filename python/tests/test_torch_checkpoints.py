@@ -184,7 +184,10 @@ def test_compressed_weights_and_long_configurations_are_refused(home):
     folder.mkdir(parents=True)
     settings = {"_target_": "torch.nn.Linear", "in_features": 4, "out_features": 4}
     torch.save(torch.nn.Linear(4, 4).state_dict(), folder / "stored.pt")
-    with zipfile.ZipFile(folder / "stored.pt") as stored, zipfile.ZipFile(folder / "weights.pt", "w", zipfile.ZIP_DEFLATED) as packed:
+    with (
+        zipfile.ZipFile(folder / "stored.pt") as stored,
+        zipfile.ZipFile(folder / "weights.pt", "w", zipfile.ZIP_DEFLATED) as packed,
+    ):
         for name in stored.namelist():
             packed.writestr(name, stored.read(name))
     (folder / "config.json").write_text(json.dumps(settings))

@@ -3,6 +3,7 @@
 use super::info::{Info, MAX_TEXT_BYTES, damaged};
 use super::{CONSTANTS, table};
 use arrow_array::Array as _;
+use arrow_array::PrimitiveArray;
 use arrow_array::cast::AsArray as _;
 use arrow_array::types::Float64Type;
 use serde::Deserialize;
@@ -135,7 +136,11 @@ fn episode_files_v3(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
             for batch in &batches {
                 let column = batch.column_by_name(&video_column(key, "from_timestamp"));
                 let column = column.and_then(|array| array.as_primitive_opt::<Float64Type>());
-                let column = column.ok_or_else(|| damaged(path, format!("it has no start times of '{key}'")))?;
+                let all_known = |column: &&PrimitiveArray<Float64Type>| {
+                    column.null_count() == 0 && column.values().iter().all(|time| time.is_finite())
+                };
+                let column = column.filter(all_known);
+                let column = column.ok_or_else(|| damaged(path, format!("it lacks start times of '{key}'")))?;
                 start_times.extend_from_slice(column.values());
             }
             videos.push((

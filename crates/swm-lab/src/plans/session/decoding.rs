@@ -10,6 +10,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 use swm_core::run::{Control, Event};
 use swm_core::{Error, Result};
+use swm_data::Reader;
 
 /// The time between two reports of a fit.
 const REPORT: Duration = Duration::from_millis(100);
@@ -18,6 +19,8 @@ const REPORT: Duration = Duration::from_millis(100);
 pub(super) struct Fitted {
     pub model: String,
     dataset: Named,
+    /// A hash of what the dataset says of itself.
+    content: String,
     pub decoder: Rc<FrameDecoder>,
 }
 
@@ -28,11 +31,18 @@ impl PlanSession<'_> {
         match dataset {
             None => self.fitted = None,
             Some(dataset) => {
-                let known = self.fitted.as_ref().is_some_and(|it| it.model == model && it.dataset == dataset);
-                if !known {
+                let path = self.datasets.find(dataset.folder, &dataset.name, 1, is_dataset)?;
+                let reader = swm_data::open(path)?;
+                let lengths: Vec<usize> = reader.episodes().iter().map(|episode| episode.length).collect();
+                let content = serde_json::to_vec(&(reader.manifest(), lengths)).unwrap_or_default();
+                let content = swm_core::manifest::hash(&content);
+                let is_it = |it: &Fitted| it.model == model && it.dataset == dataset && it.content == content;
+                if !self.fitted.as_ref().is_some_and(is_it) {
                     self.fitted = None;
-                    match self.fit(&dataset) {
-                        Ok(decoder) => self.fitted = Some(Fitted { model, dataset, decoder: Rc::new(decoder) }),
+                    match self.fit(&*reader) {
+                        Ok(decoder) => {
+                            self.fitted = Some(Fitted { model, dataset, content, decoder: Rc::new(decoder) });
+                        }
                         // The page has ended the fit.
                         Err(Error::Interrupted) => {}
                         Err(error) => return Err(error),
@@ -57,9 +67,7 @@ impl PlanSession<'_> {
         }
     }
 
-    fn fit(&mut self, dataset: &Named) -> Result<FrameDecoder> {
-        let path = self.datasets.find(dataset.folder, &dataset.name, 1, is_dataset)?;
-        let reader = swm_data::open(path)?;
+    fn fit(&mut self, reader: &dyn Reader) -> Result<FrameDecoder> {
         let out = self.out.clone();
         out.enough.store(false, Ordering::Relaxed);
         let Some(in_use) = &mut self.in_use else { return Err(Error::Interrupted) };
@@ -79,7 +87,7 @@ impl PlanSession<'_> {
                     out.reply(&Reply::Fitting { done: progress.done, total: progress.total });
                 }
             });
-        self.planners.decoder(imagination.model(), &*reader, &mut control)
+        self.planners.decoder(imagination.model(), reader, &mut control)
     }
 
     /// Adds the frames to the plan that is shown, if it is the one of the last search.

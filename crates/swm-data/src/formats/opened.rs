@@ -46,6 +46,11 @@ impl Opened {
     }
 }
 
+/// Whether a dataset was never replaced; then its metadata do not count it.
+pub fn is_zero(replaced: &u64) -> bool {
+    *replaced == 0
+}
+
 #[cfg(unix)]
 fn number(metadata: &std::fs::Metadata) -> u64 {
     std::os::unix::fs::MetadataExt::ino(metadata)

@@ -35,6 +35,7 @@ pub(crate) use reader::{ColumnFiles, contains_videos};
 pub(crate) use removal::remove;
 pub(crate) use writer::ColumnFilesWriter;
 
+use crate::formats::opened;
 use npz::Npz;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -64,12 +65,8 @@ struct Metadata {
     /// them. Episodes may share members.
     constants: Vec<BTreeMap<String, usize>>,
     /// How often the dataset was replaced by another one at its path.
-    #[serde(default, skip_serializing_if = "is_zero")]
+    #[serde(default, skip_serializing_if = "opened::is_zero")]
     replaced: u64,
-}
-
-fn is_zero(count: &u64) -> bool {
-    *count == 0
 }
 
 /// Name of the member of `ep_len.npz` that holds the constant with an index.

@@ -1,5 +1,6 @@
 //! `meta/info.json`: the features of a dataset and the templates of its file names.
 
+use crate::formats::opened;
 use serde::de::{MapAccess, Visitor};
 use serde::ser::SerializeMap as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
@@ -69,12 +70,8 @@ pub struct WriterMetadata {
     /// Whether the last action of an episode is a copy of the previous action and stands for a missing action.
     pub last_action_repeats: bool,
     /// How often the dataset was replaced by another one at its path.
-    #[serde(default, skip_serializing_if = "is_zero")]
+    #[serde(default, skip_serializing_if = "opened::is_zero")]
     pub replaced: u64,
-}
-
-fn is_zero(count: &u64) -> bool {
-    *count == 0
 }
 
 /// Features by name, in file order. The first camera becomes the column `pixels`.

@@ -20,7 +20,7 @@ use crate::run_folder::{
 use crate::stored::{self, StoredCheckpoint, broken, read_tensors, read_text, with_weights};
 use crate::tensor_file;
 use crate::train::run_state::RunState;
-use crate::train::{DatasetInfo, TrainConfig, Trainable};
+use crate::train::{DatasetInfo, TrainConfig, Trainable, colours};
 use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -134,6 +134,9 @@ impl<M: Trainable> Checkpoint<M> {
         let invalid = |error: Error| stored.broken(error.to_string());
         let ConfigFile { dataset_info, image, action_block, .. } = stored.parsed()?;
         config.check().and_then(|()| dataset_info.check()).map_err(invalid)?;
+        if colours::are_missing(&config) {
+            return Err(stored.broken("its encoder has no colours, which a training finds".to_owned()));
+        }
         let expected = (M::image_size(&config.model), config.data.frameskip);
         if (image, action_block) != expected {
             let describe = |(image, block): (Option<usize>, usize)| {

@@ -253,6 +253,7 @@ class Keypoints(nn.Module):
         dim: Features of an image.
         seed: The seed of the filters, which the engine draws.
         colours: Red, green and blue of the colours whose pixels are located, in the units of the normalised images.
+        find_colours: How many colours the engine finds in the training data before it makes a checkpoint.
     """
 
     takes_frames = True
@@ -267,8 +268,11 @@ class Keypoints(nn.Module):
         dim: int,
         seed: int = 0,
         colours: Sequence[Sequence[float]] = (),
+        find_colours: int = 0,
     ) -> None:
         super().__init__()
+        if find_colours and not colours:
+            raise ValueError("encoder: its colours are not found yet; train with the engine or give `colours`")
         self.seed = seed
         self.register_buffer("colours", torch.tensor(colours, dtype=torch.float32).reshape(-1, 3), persistent=False)
         self.sharpness, self.filters, self.strides, features = sharpness, nn.ModuleList(), [], 0

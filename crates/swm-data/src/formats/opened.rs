@@ -1,6 +1,7 @@
 //! [`Opened`]: tells whether the dataset at a path is still the one that a reader has opened.
 
 use super::set_aside::Places;
+use std::fs::Metadata;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 use std::time::SystemTime;
@@ -52,19 +53,23 @@ pub fn is_zero(replaced: &u64) -> bool {
 }
 
 #[cfg(unix)]
-fn number(metadata: &std::fs::Metadata) -> u64 {
+fn number(metadata: &Metadata) -> u64 {
     std::os::unix::fs::MetadataExt::ino(metadata)
 }
 
 #[cfg(not(unix))]
-fn number(_: &std::fs::Metadata) -> u64 {
+fn number(_: &Metadata) -> u64 {
     0
 }
 
 /// The state of a file; `None` if it is gone.
 pub fn state(path: &Path) -> Option<State> {
-    let metadata = path.metadata().ok()?;
-    Some((number(&metadata), metadata.modified().ok()?, metadata.len()))
+    state_of(&path.metadata().ok()?)
+}
+
+/// The state of a file with this metadata.
+pub fn state_of(metadata: &Metadata) -> Option<State> {
+    Some((number(metadata), metadata.modified().ok()?, metadata.len()))
 }
 
 /// The number of a folder and the time when it was made, which not every file system knows.

@@ -16,13 +16,16 @@ const ITERATIONS: usize = 30;
 
 /// Returns `count` colours (red, green, blue, each 0 to 1) of the frames of a dataset, the most frequent first: the centres of k-means,
 /// whose first centres are those of k-means++ (Arthur and Vassilvitskii 2007), so that rare colours are found that differ from the
-/// frequent ones. Returns fewer if the frames have fewer colours. Reads at most 256 frames, and is deterministic.
+/// frequent ones. Returns fewer if the frames have fewer colours. Reads at most 256 frames of the given episodes, or of all, and is
+/// deterministic.
 ///
 /// # Errors
 /// When the dataset has no RGB frames in the column `pixels`, or no frame at all, or reading fails.
-pub fn frequent_colours(reader: &dyn Reader, count: usize) -> Result<Vec<[f32; 3]>> {
+pub fn frequent_colours(reader: &dyn Reader, count: usize, episodes: Option<&[usize]>) -> Result<Vec<[f32; 3]>> {
     let column = reader.schema().column(PIXELS)?;
-    let lengths: Vec<usize> = reader.episodes().iter().map(|episode| episode.length).collect();
+    let all: Vec<usize> = (0..reader.episodes().len()).collect();
+    let episodes = episodes.unwrap_or(&all);
+    let lengths: Vec<usize> = episodes.iter().map(|&episode| reader.episodes()[episode].length).collect();
     let rows: usize = lengths.iter().sum();
     if !column.is_image() || column.is_empty() || rows == 0 {
         let given = format!("{rows} frames of {:?} {}", column.shape, column.dtype.name());
@@ -36,7 +39,7 @@ pub fn frequent_colours(reader: &dyn Reader, count: usize) -> Result<Vec<[f32; 3
             before += lengths[episode];
             episode += 1;
         }
-        ranges.push(StepRange::new(episode, row - before, 1));
+        ranges.push(StepRange::new(episodes[episode], row - before, 1));
     }
     let (mut pixels, key) = (vec![], Key::new(0).with("frequent colours"));
     for (block, ranges) in ranges.chunks(BLOCK).enumerate() {

@@ -82,3 +82,59 @@ fn a_reader_of_a_dataset_that_grows_reads_on() {
         assert!(first_rows(&*grown, "action").is_err(), "{format}");
     }
 }
+
+/// Makes a file look as if it was written a minute later: the clock of a file system may be coarser than a test is fast.
+fn touch_later(path: &std::path::Path) {
+    let file = std::fs::File::options().write(true).open(path).expect("opening the file");
+    let time = std::time::SystemTime::now() + std::time::Duration::from_secs(60);
+    file.set_modified(time).expect("setting the time of the file");
+}
+
+#[test]
+fn an_hdf5_file_that_is_written_over_in_place_is_another_dataset() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let (path, other) = (folder.path().join("a.h5"), folder.path().join("b.h5"));
+    write(&path, WriteMode::Create, 3, 0..6);
+    write(&other, WriteMode::Create, 3, 7..13);
+    let reader = open(&path).expect("opening the dataset");
+    first_rows(&*reader, "state").expect("a column");
+    // Keeps the file and changes its content, as `cp` does.
+    std::fs::copy(&other, &path).expect("copying the file");
+    touch_later(&path);
+    for column in ["action", "state"] {
+        let error = first_rows(&*reader, column).expect_err("rows of another dataset").to_string();
+        assert!(error.contains("written over") && error.contains("open the dataset again"), "{column}: {error}");
+    }
+    check(&*open(&path).expect("opening the new dataset"), 7);
+}
+
+#[test]
+fn a_reader_of_an_hdf5_file_that_grows_reads_on() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let path = folder.path().join("a.h5");
+    write(&path, WriteMode::Create, 3, 0..6);
+    let reader = open(&path).expect("opening the dataset");
+    first_rows(&*reader, "state").expect("a column");
+    write(&path, WriteMode::Append, 3, 6..9);
+    touch_later(&path);
+    check(&*reader, 0);
+    assert_eq!(reader.episodes().len(), 6);
+    // A replaced file stays open as it was.
+    write(&path, WriteMode::Overwrite, 3, 7..13);
+    check(&*reader, 0);
+}
+
+#[test]
+fn an_hdf5_file_of_another_program_that_is_written_to_is_read_no_more() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let path = folder.path().join("a.h5");
+    let third_party = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop/hdf5-unwritten.h5");
+    std::fs::copy(third_party, &path).expect("copying the file");
+    let reader = open(&path).expect("opening the dataset");
+    let column = reader.schema().columns()[2].name.clone();
+    let row = [StepRange::new(0, 0, 1)];
+    reader.read(&[&column], &row).expect("a row");
+    touch_later(&path);
+    let error = reader.read(&[&column], &row).expect_err("rows that may be others").to_string();
+    assert!(error.contains("written over"), "{error}");
+}

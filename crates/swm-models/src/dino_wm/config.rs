@@ -56,6 +56,11 @@ impl DinoWmConfig {
         self.encoder.patches(self.image)
     }
 
+    /// The normalisation of input images.
+    pub(super) const fn pixels(&self) -> ImageNormalization {
+        ImageNormalization { side: self.image, mean: self.pixel_mean, std: self.pixel_std }
+    }
+
     /// Converts images to normalised patches.
     ///
     /// # Shapes
@@ -64,8 +69,7 @@ impl DinoWmConfig {
     /// # Errors
     /// When the bytes are not a whole number of images.
     pub(super) fn image_patches(&self, rgb: &[u8], device: &Device) -> Result<Tensor<3>> {
-        let normalization = ImageNormalization { side: self.image, mean: self.pixel_mean, std: self.pixel_std };
-        pixels::patches(&normalization, self.encoder.patch(), rgb, device)
+        pixels::patches(&self.pixels(), self.encoder.patch(), rgb, device)
     }
 
     /// Checks the configuration.

@@ -4,8 +4,8 @@ use super::config::{ACTION, DinoWmConfig};
 use super::model::DinoWm;
 use super::step::{DinoWmStep, TrainBatch, step};
 use crate::checks;
-use crate::nn::{Init, Named};
-use crate::pixels;
+use crate::nn::{BackboneConfig, Init, Named};
+use crate::pixels::{self, ImageNormalization};
 use crate::train::{DatasetInfo, Preset, StepContext, StepOutput, TrainConfig, Trainable, shards};
 use crate::weights;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -45,6 +45,11 @@ impl Trainable for DinoWm {
 
     fn image_size(config: &DinoWmConfig) -> Option<usize> {
         Some(config.image)
+    }
+
+    fn encoder_config(config: &mut DinoWmConfig) -> Option<(&mut BackboneConfig, ImageNormalization)> {
+        let images = config.pixels();
+        Some((&mut config.encoder, images))
     }
 
     fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {

@@ -6,8 +6,8 @@ use super::model::{Gcbc, Gciql, Gcivl};
 use super::policy::Actor;
 use super::step::{Clips, ENCODER, Relabelled};
 use crate::checkpoint::Checkpoint;
-use crate::nn::{Backbone, DropoutRng, Init, Named, parameters};
-use crate::pixels::Frames;
+use crate::nn::{Backbone, BackboneConfig, DropoutRng, Init, Named, parameters};
+use crate::pixels::{Frames, ImageNormalization};
 use crate::train::{
     DatasetInfo, FixedPart, ParameterGroup, Preset, StepContext, StepOutput, TrainConfig, Trainable, shards,
 };
@@ -27,8 +27,7 @@ const TINY: &str = "64 px, a small trained convolutional encoder: minutes on two
 const SMALL: &str = "64 px, overlapping convolutions, for small and rotated objects: for two CPU cores";
 const KEYPOINTS: &str =
     "64 px, keypoints of fixed random filters, encoded once per frame: trains in minutes on two CPU cores";
-const COLOURS: &str =
-    "64 px, moments of Push-T's colours (set those of other scenes), encoded once per frame: minutes on two CPU cores";
+const COLOURS: &str = "64 px, moments of six colours of the frames, for scenes of flat colours, encoded once per frame: minutes on two CPU cores";
 const PAPER: &str = "224 px, frozen DINOv2-small, heads of 6 layers, history 3: the published size, for a GPU";
 
 macro_rules! presets {
@@ -101,6 +100,11 @@ impl Trainable for Gcbc {
         Some(config.image)
     }
 
+    fn encoder_config(config: &mut GcrlConfig) -> Option<(&mut BackboneConfig, ImageNormalization)> {
+        let images = config.pixels();
+        Some((&mut config.encoder, images))
+    }
+
     fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
         pixels::check(config.model.image, schema, PIXELS)?;
         Ok(LoaderConfig {
@@ -171,6 +175,11 @@ macro_rules! value_learner {
 
             fn image_size(config: &GcrlConfig) -> Option<usize> {
                 Some(config.image)
+            }
+
+            fn encoder_config(config: &mut GcrlConfig) -> Option<(&mut BackboneConfig, ImageNormalization)> {
+                let images = config.pixels();
+                Some((&mut config.encoder, images))
             }
 
             fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {

@@ -3,8 +3,8 @@
 use super::step::{self, LewmStep, SigregConfig, TrainBatch};
 use super::{Lewm, LewmConfig, loss, pixels};
 use crate::checks;
-use crate::nn::{Init, Named};
-use crate::pixels::Frames;
+use crate::nn::{BackboneConfig, Init, Named};
+use crate::pixels::{Frames, ImageNormalization};
 use crate::train::{
     DataConfig, DatasetInfo, FixedPart, Preset, StepContext, StepOutput, TrainConfig, Trainable, check_sizes, limits,
 };
@@ -34,7 +34,7 @@ impl Trainable for Lewm {
         },
         Preset {
             id: "colours",
-            summary: "64 px, moments of Push-T's colours (set those of other scenes), encoded once per frame: minutes on two CPU cores",
+            summary: "64 px, moments of six colours of the frames, for scenes of flat colours, encoded once per frame: minutes on two CPU cores",
             toml: include_str!("../../presets/lewm/colours.toml"),
         },
         Preset {
@@ -58,6 +58,11 @@ impl Trainable for Lewm {
 
     fn image_size(config: &LewmConfig) -> Option<usize> {
         Some(config.image)
+    }
+
+    fn encoder_config(config: &mut LewmConfig) -> Option<(&mut BackboneConfig, ImageNormalization)> {
+        let images = pixels::normalization(config);
+        Some((&mut config.encoder, images))
     }
 
     fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {

@@ -24,7 +24,7 @@ pub enum BackboneConfig {
     PatchCnn(PatchCnnConfig),
     /// Overlapping convolutions with batch normalisation.
     Conv(ConvConfig),
-    /// Positions of the responses of fixed random filters, moments of given colours, and trained linear layers.
+    /// Positions of the responses of fixed random filters, moments of colours, and trained linear layers.
     Keypoints(KeypointsConfig),
 }
 
@@ -43,7 +43,7 @@ pub enum Backbone {
     PatchCnn(PatchCnn),
     /// Overlapping convolutions with batch normalisation.
     Conv(Conv),
-    /// Positions of the responses of fixed random filters, moments of given colours, and trained linear layers.
+    /// Positions of the responses of fixed random filters, moments of colours, and trained linear layers.
     Keypoints(Keypoints),
 }
 
@@ -74,6 +74,16 @@ impl BackboneConfig {
         match self {
             Self::Keypoints(keypoints) => keypoints.features(),
             _ => 0,
+        }
+    }
+
+    /// The colours of an encoder that are to be found in the training data before a model is made; `None` if there are none to find.
+    pub fn colours_to_find(&mut self) -> Option<(usize, &mut Vec<[f32; 3]>)> {
+        match self {
+            Self::Keypoints(keypoints) if keypoints.colours.is_empty() && keypoints.find_colours > 0 => {
+                Some((keypoints.find_colours, &mut keypoints.colours))
+            }
+            _ => None,
         }
     }
 

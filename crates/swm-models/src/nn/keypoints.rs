@@ -1,4 +1,4 @@
-//! [`Keypoints`]: an image encoder: positions that a spatial softmax reads from filters with fixed random weights, moments of given
+//! [`Keypoints`]: an image encoder: positions that a spatial softmax reads from filters with fixed random weights, moments of
 //! colours, then trained linear layers.
 //!
 //! Filters and colours are not trained, so that their features are computed once per frame of a dataset, and a training step
@@ -34,8 +34,11 @@ pub struct KeypointsConfig {
     /// The factor of the responses, in standard deviations over an image, before the softmax.
     pub sharpness: f32,
     /// Colours (red, green, blue) whose pixels are located: 0 to 1 where `pixel_mean` is 0 and `pixel_std` 1, otherwise normalised by them.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[serde(default)]
     pub colours: Vec<[f32; 3]>,
+    /// How many colours to find in the frames of the training data (k-means), if `colours` is empty; 0 for none.
+    #[serde(default, skip_serializing_if = "is_none")]
+    pub find_colours: usize,
     /// The number of features of each hidden layer, first to last.
     pub hidden: Vec<usize>,
     /// The number of output features.
@@ -43,6 +46,11 @@ pub struct KeypointsConfig {
     /// The seed of the filters. It is not that of the training, so that runs with several seeds share the features.
     #[serde(default)]
     pub seed: u64,
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "the signature that serde calls")]
+const fn is_none(count: &usize) -> bool {
+    *count == 0
 }
 
 /// Filters of one size.
@@ -87,16 +95,21 @@ impl KeypointsConfig {
         of_filters + ColourMoments::FEATURES * self.colours.len()
     }
 
+    /// The number of colours, found or to be found.
+    const fn count_of_colours(&self) -> usize {
+        if self.colours.is_empty() { self.find_colours } else { self.colours.len() }
+    }
+
     /// Checks the sizes. `at` is the dotted path of the settings, for errors.
     ///
     /// # Errors
     /// When there are neither filters nor colours, there is one colour, or a size is out of range.
     pub fn check(&self, at: &str, image: usize) -> Result<()> {
-        if self.filters.is_empty() && self.colours.is_empty() {
+        if self.filters.is_empty() && self.count_of_colours() == 0 {
             return Err(Error::config(
                 format!("{at}.filters"),
                 "the list is empty",
-                "give at least one size of filters, or colours",
+                "give at least one size of filters, or colours, or a number of colours to find",
             ));
         }
         let lengths = [
@@ -104,12 +117,13 @@ impl KeypointsConfig {
             ("hidden", self.hidden.len(), MOST_LAYERS),
             ("colours", self.colours.len(), MOST_COLOURS),
         ];
+        check_sizes(&[(&format!("{at}.find_colours"), self.find_colours, 0, MOST_COLOURS)])?;
         for (name, count, most) in lengths {
             check_sizes(&[(&format!("the length of {at}.{name}"), count, 0, most)])?;
         }
-        let coloured = image.saturating_mul(image).saturating_mul(self.colours.len());
+        let coloured = image.saturating_mul(image).saturating_mul(self.count_of_colours());
         check_sizes(&[(&format!("the pixels times {at}.colours"), coloured, 0, MOST_COLOURED)])?;
-        if self.colours.len() == 1 {
+        if self.count_of_colours() == 1 {
             let fix = "give at least two: a pixel belongs to the colours by their distances";
             return Err(Error::config(format!("{at}.colours"), "one colour", fix));
         }

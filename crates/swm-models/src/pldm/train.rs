@@ -4,8 +4,9 @@ use super::loss::PldmLoss;
 use super::model::Pldm;
 use super::step::{PldmStep, step};
 use crate::checks;
-use crate::lewm::{LewmConfig, train as lewm};
-use crate::nn::{Init, Named};
+use crate::lewm::{LewmConfig, pixels, train as lewm};
+use crate::nn::{BackboneConfig, Init, Named};
+use crate::pixels::ImageNormalization;
 use crate::train::{
     DatasetInfo, FixedPart, Preset, StepContext, StepOutput, TrainConfig, Trainable, check_sizes, limits,
 };
@@ -35,7 +36,7 @@ impl Trainable for Pldm {
         },
         Preset {
             id: "colours",
-            summary: "64 px, moments of Push-T's colours (set those of other scenes), encoded once per frame: minutes on two CPU cores",
+            summary: "64 px, moments of six colours of the frames, for scenes of flat colours, encoded once per frame: minutes on two CPU cores",
             toml: include_str!("../../presets/pldm/colours.toml"),
         },
         Preset {
@@ -67,6 +68,11 @@ impl Trainable for Pldm {
 
     fn image_size(config: &LewmConfig) -> Option<usize> {
         Some(config.image)
+    }
+
+    fn encoder_config(config: &mut LewmConfig) -> Option<(&mut BackboneConfig, ImageNormalization)> {
+        let images = pixels::normalization(config);
+        Some((&mut config.encoder, images))
     }
 
     fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {

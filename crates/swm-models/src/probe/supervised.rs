@@ -10,7 +10,7 @@ use crate::lewm::shard::{Differentiation, Shard};
 use crate::nn::parameters::{self, IntoF32};
 use crate::nn::{Backbone, BackboneConfig, Init, Mlp, Named};
 use crate::pixels::{self, ImageNormalization};
-use crate::train::StepOutput;
+use crate::train::{StepOutput, colours};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use rayon::prelude::*;
@@ -61,6 +61,8 @@ pub fn train_encoder(
     control: &mut Control<'_>,
 ) -> Result<SupervisedReport> {
     encoder.check("model.encoder", images.side)?;
+    let mut encoder = encoder.clone();
+    colours::find(&mut encoder, images, reader, true)?;
     // Batch normalisation needs two frames.
     config.check(2)?;
     let targets = Targets::new(reader, &config.columns, &config.angles)?;

@@ -7,6 +7,7 @@
 //! learner.
 
 pub mod checks;
+pub(crate) mod colours;
 pub mod config;
 mod dataset_info;
 pub(crate) mod described;

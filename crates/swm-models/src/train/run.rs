@@ -1,5 +1,6 @@
 //! [`train`]: the training loop on a dataset.
 
+use super::colours::with_colours;
 use super::config::{LoopConfig, TrainConfig};
 use super::dataset_info::DatasetInfo;
 use super::failed_batch;
@@ -47,6 +48,8 @@ pub fn train<M: Trainable>(
 ) -> Result<TrainSummary> {
     let threads = swm_core::pool::threads(options.threads)?;
     threads.install(|| {
+        config.check()?;
+        let config = &with_colours(config, &*reader)?;
         let inputs = Inputs::of(config, &*reader, options)?;
         let _lock = Lock::folder(out)?;
         let (mut learner, loader) = inputs.learner(config, out, options)?;
@@ -73,6 +76,8 @@ pub fn begin<M: Trainable>(
     options: &TrainOptions,
     record: &dyn Fn() -> Result<()>,
 ) -> Result<TrainingPlan> {
+    config.check()?;
+    let config = &with_colours(config, &*reader)?;
     let inputs = Inputs::of(config, &*reader, options)?;
     let _lock = Lock::folder(out)?;
     let (learner, loader) = inputs.learner(config, out, options)?;

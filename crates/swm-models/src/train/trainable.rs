@@ -6,8 +6,9 @@ use super::fixed_features::FixedPart;
 use super::optim::ParameterGroup;
 use super::presets::Preset;
 use super::step_output::StepOutput;
-use crate::nn::Init;
 use crate::nn::parameters::Named;
+use crate::nn::{BackboneConfig, Init};
+use crate::pixels::ImageNormalization;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use serde::{Serialize, de::DeserializeOwned};
@@ -43,6 +44,12 @@ pub trait Trainable: Module + Sync + 'static {
 
     /// The side of the square images that the model takes, in pixels; `None` for a state-only model.
     fn image_size(config: &Self::Config) -> Option<usize>;
+
+    /// The image encoder and the normalisation of its images, whose colours may have to be found in the data; `None` for a model
+    /// without images.
+    fn encoder_config(_config: &mut Self::Config) -> Option<(&mut BackboneConfig, ImageNormalization)> {
+        None
+    }
 
     /// Returns the clips, columns and goals of a batch. The training loop sets batch size, order, threads and episodes.
     ///

@@ -12,6 +12,7 @@
 pub mod hub;
 pub(crate) mod keys;
 pub mod names;
+mod negative;
 pub(crate) mod reference;
 pub mod torch;
 
@@ -86,6 +87,10 @@ fn pickled(path: &Path) -> Result<Named<HostTensor>> {
         }
         other => damaged(path, other.to_string()),
     })?;
+    if negative::any(path)? {
+        let problem = "it has a tensor with the negative bit, whose values have the opposite sign";
+        return Err(Error::corrupt(path, problem, "call `resolve_neg()` on its tensors and save them again"));
+    }
     // A tensor can repeat the elements of its storage, so its shape alone does not limit its size.
     let mut left = length.saturating_mul(LARGEST_EXPANSION).saturating_add(1 << 20);
     reader

@@ -137,6 +137,7 @@ fn goal_conditioned_models_learn_on_keypoints_of_frames_that_are_encoded_once() 
             colours: vec![[1.0; 3], [-1.0; 3]],
             hidden: vec![16],
             dim: 12,
+            find_colours: 0,
             seed: 0,
         });
         let checkpoint = trained(&config, folder.path());

@@ -330,9 +330,14 @@ fn repeated(path: &Path, count: u64) {
         b"\x89ccollections\nOrderedDict\n)RtRs.".to_vec(),
     ]
     .concat();
+    archive(path, &pickle, &[0; 4]);
+}
+
+/// A PyTorch file with a pickle and the elements of one tensor.
+fn archive(path: &Path, pickle: &[u8], elements: &[u8]) {
     let mut zip = zip::ZipWriter::new(std::fs::File::create(path).expect("a file"));
     let options = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
-    for (name, bytes) in [("data.pkl", &pickle[..]), ("byteorder", b"little"), ("data/0", &[0; 4]), ("version", b"3")] {
+    for (name, bytes) in [("data.pkl", pickle), ("byteorder", b"little"), ("data/0", elements), ("version", b"3")] {
         zip.start_file(format!("weights/{name}"), options).expect("an entry");
         std::io::Write::write_all(&mut zip, bytes).expect("bytes");
     }
@@ -361,4 +366,30 @@ fn infinite_and_missing_actions_are_refused_before_training() {
             assert!(error.to_string().contains("column 'action' of the training data"), "{action:?}: {error}");
         }
     }
+}
+
+/// A PyTorch file with one negative tensor of the values [1.0, 2.0], in the pickle that `torch.save` writes.
+fn negative(path: &Path) {
+    let text = |text: &str| [b"X".as_slice(), &(text.len() as u32).to_le_bytes(), text.as_bytes()].concat();
+    let pickle = [
+        b"\x80\x02}q\x00".to_vec(),
+        [text("w"), b"q\x01ctorch._utils\n_rebuild_tensor_v2\nq\x02((".to_vec()].concat(),
+        [text("storage"), b"q\x03ctorch\nFloatStorage\nq\x04".to_vec()].concat(),
+        [text("0"), b"q\x05".to_vec(), text("cpu"), b"q\x06K\x02tq\x07QK\x00K\x02\x85q\x08K\x01\x85q\x09".to_vec()]
+            .concat(),
+        b"\x89ccollections\nOrderedDict\nq\x0a)Rq\x0b}q\x0c".to_vec(),
+        [text("neg"), b"q\x0d\x88stq\x0eRq\x0fs.".to_vec()].concat(),
+    ]
+    .concat();
+    let values = [1.0_f32.to_le_bytes(), 2.0_f32.to_le_bytes()].concat();
+    archive(path, &pickle, &values);
+}
+
+#[test]
+fn tensors_with_the_negative_bit_are_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("negative.pt");
+    negative(&path);
+    let error = weights::read(&path).expect_err("the values have the opposite sign").to_string();
+    assert!(error.contains("negative bit") && error.contains("resolve_neg"), "{error}");
 }

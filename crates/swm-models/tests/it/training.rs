@@ -150,6 +150,7 @@ pub fn keypoints_config() -> TrainConfig<Lewm> {
         filters,
         sharpness: 2.0,
         colours: vec![[1.0, 0.5, -1.0], [-1.0, 0.0, 0.5]],
+        find_colours: 0,
         hidden: vec![12],
         dim: 10,
         seed: 0,
@@ -205,6 +206,47 @@ fn later_runs_find_the_features_of_fixed_filters_in_a_folder() {
         keypoints.colours[0][0] = 0.75;
     }
     assert_eq!(run("other colours", Some(&cache), &config).1, frames);
+}
+
+#[test]
+fn colours_are_found_in_the_training_data() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let mut config = keypoints_config();
+    let EncoderConfig::Keypoints(keypoints) = &mut config.model.encoder else {
+        unreachable!("an encoder of keypoints")
+    };
+    (keypoints.filters, keypoints.colours, keypoints.find_colours) = (vec![], vec![], 4);
+    config.check().expect("colours that are to be found");
+    let train_with = |name: &str, config: &TrainConfig<Lewm>, stop_at| {
+        let out = folder.path().join(name);
+        let options = TrainOptions { resume: out.exists(), ..crate::options() };
+        run(config, &out, &options, stop_at).expect("training the model");
+        (Checkpoint::<Lewm>::load(&out, &crate::device()).expect("loading the checkpoint").config, files(&out))
+    };
+    let (stored, whole) = train_with("whole", &config, 0);
+    let EncoderConfig::Keypoints(found) = &stored.model.encoder else { unreachable!("an encoder of keypoints") };
+    assert_eq!((found.find_colours, found.colours.len()), (4, 4));
+    // The frames are grey, from black to white, in the units of normalised images.
+    let (mean, std) = (config.model.pixel_mean, config.model.pixel_std);
+    for colour in &found.colours {
+        let grey = [0, 1, 2].map(|i| colour[i] * std[i] + mean[i]);
+        assert!((grey[0] - grey[1]).abs() < 1e-5 && (grey[1] - grey[2]).abs() < 1e-5, "{grey:?}");
+        assert!((-1e-6..=1.0).contains(&grey[0]), "{grey:?}");
+    }
+    train_with("parts", &config, 4);
+    let (_, resumed) = train_with("parts", &config, 0);
+    assert!(whole == resumed, "a resumed run finds other colours");
+    // The stored configuration gives the same weights.
+    assert!(train_with("again", &stored, 0).1[1] == whole[1], "the colours that were found give other weights");
+    config.seed = 1;
+    assert_eq!(train_with("seed", &config, 0).0.model.encoder, stored.model.encoder);
+
+    let path = folder.path().join("whole/checkpoint/config.json");
+    let mut changed: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).expect("a file")).expect("JSON");
+    changed["config"]["model"]["encoder"]["keypoints"].as_object_mut().expect("an encoder").remove("colours");
+    std::fs::write(&path, changed.to_string()).expect("a written file");
+    let error = Checkpoint::<Lewm>::load(&folder.path().join("whole"), &crate::device()).expect_err("no colours");
+    assert!(error.to_string().contains("no colours"), "{error}");
 }
 
 #[test]

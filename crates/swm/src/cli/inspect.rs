@@ -122,7 +122,7 @@ pub fn inspect(args: &InspectArgs, as_json: bool) -> anyhow::Result<()> {
 fn colours(reader: &dyn Reader, count: usize, as_json: bool) -> anyhow::Result<()> {
     // Three digits are finer than a byte of a frame.
     let rounded = |value: f32| (f64::from(value) * 1000.0).round() / 1000.0;
-    let colours: Vec<_> = frequent_colours(reader, count)?.iter().map(|colour| colour.map(rounded)).collect();
+    let colours: Vec<_> = frequent_colours(reader, count, None)?.iter().map(|colour| colour.map(rounded)).collect();
     if colours.len() < count {
         let fix = if colours.len() < 2 { "; an encoder needs at least two" } else { "" };
         eprint(&format!("the frames have {} of {count} colours{fix}\n", colours.len()));

@@ -386,7 +386,7 @@ impl Column {
             let (Ok(size), false) = (u32::try_from(chunk.storage_size), wrong_size) else {
                 return Err(format!("a chunk of {} bytes is stored in {} bytes", grid.chunk_bytes, chunk.storage_size));
             };
-            let inside = chunk.address.checked_add(size.into()).is_some_and(|end| end <= source.size());
+            let inside = chunk.address.checked_add(size.into()).is_some_and(|end| source.reaches(end));
             if !inside {
                 return Err(format!("a chunk lies at byte {}, beyond the end of the file", chunk.address));
             }

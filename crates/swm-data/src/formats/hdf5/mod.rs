@@ -46,6 +46,8 @@ mod table;
 #[cfg(feature = "hdf5")]
 mod tree;
 #[cfg(feature = "hdf5")]
+mod unchanged;
+#[cfg(feature = "hdf5")]
 mod writer;
 
 use crate::dataset::Location;

@@ -6,9 +6,11 @@ use super::record::Record;
 use super::source::Source;
 use super::structure::catch_panic;
 use super::table;
+use super::unchanged::Unchanged;
 use crate::dataset::Location;
 use crate::dataset::episodes::{EpisodeRows, content_hash, index_columns};
 use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
@@ -24,6 +26,7 @@ pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
 
 pub(super) struct Hdf5Reader {
     source: Source,
+    unchanged: Unchanged,
     rows: EpisodeRows,
     schema: Schema,
     columns: Vec<Column>,
@@ -42,6 +45,7 @@ impl Hdf5Reader {
 
     /// Reads the structure of a file.
     pub fn of(source: Source) -> Result<Self> {
+        let unchanged = Unchanged::new(&source);
         let damaged = |problem: String| damaged(&source, problem);
         let file = catch_panic("opening the file as HDF5", || hdf5_pure::File::from_source(source.clone()))
             .map_err(damaged)?;
@@ -99,7 +103,7 @@ impl Hdf5Reader {
             Some(_) => vec![],
             None => catch_panic("listing its groups", || file.root().groups()).map_err(damaged)?,
         };
-        Ok(Self { source, rows, schema, columns, record, non_numeric, groups })
+        Ok(Self { source, unchanged, rows, schema, columns, record, non_numeric, groups })
     }
 
     /// First row and length of every episode.
@@ -120,6 +124,32 @@ impl Hdf5Reader {
     /// Names of datasets that are not numeric.
     pub fn non_numeric(&self) -> &[String] {
         &self.non_numeric
+    }
+
+    /// Reads stored rows of a column.
+    fn read_rows(&self, name: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
+        let spec = self.schema.column(name)?;
+        let Some(column) = self.columns.iter().find(|column| column.spec.name == name) else {
+            return Err(self.fail(name, "it does not exist"));
+        };
+        let mut slots = self.rows.row_slots(spec, ranges, out)?;
+        let first = self.rows.first_rows();
+        if !self.rows.is_contiguous() {
+            slots.sort_by_key(|&((episode, step), _)| first[episode] + step as u64);
+        }
+        let row_of = |(episode, step): (usize, usize)| first[episode] + step as u64;
+        column.read(&self.source, &mut slots, row_of).map_err(|problem| self.fail(name, &problem))
+    }
+
+    /// Whether the file, which was written to, holds this dataset and what a writer of this format appended. `seen` has rows that
+    /// were read before.
+    fn grew(&self, seen: &BTreeMap<String, (StepRange, Vec<u8>)>) -> bool {
+        let Ok(now) = self.source.with_present_size().and_then(Self::of) else { return false };
+        let same_row = |(column, (range, row)): (&String, &(StepRange, Vec<u8>))| {
+            let mut found = vec![0; row.len()];
+            now.read_rows(column, &[*range], &mut found).is_ok() && found == *row
+        };
+        now.record.continues(&self.record) && now.episodes().starts_with(self.episodes()) && seen.iter().all(same_row)
     }
 
     fn fail(&self, column: &str, problem: &str) -> Error {
@@ -155,16 +185,8 @@ impl Reader for Hdf5Reader {
         if name == EPISODE_IDX || name == STEP_IDX {
             return self.rows.fill_index_column(spec, ranges, out);
         }
-        let Some(column) = self.columns.iter().find(|column| column.spec.name == name) else {
-            return Err(self.fail(name, "it does not exist"));
-        };
-        let mut slots = self.rows.row_slots(spec, ranges, out)?;
-        let first = self.rows.first_rows();
-        if !self.rows.is_contiguous() {
-            slots.sort_by_key(|&((episode, step), _)| first[episode] + step as u64);
-        }
-        let row_of = |(episode, step): (usize, usize)| first[episode] + step as u64;
-        column.read(&self.source, &mut slots, row_of).map_err(|problem| self.fail(name, &problem))
+        self.read_rows(name, ranges, out)?;
+        self.unchanged.check(&self.source, (name, ranges, out), |seen| self.grew(seen))
     }
 
     fn constants(&self, episode: usize) -> Result<Constants> {

@@ -82,6 +82,11 @@ impl Record {
         Ok(record)
     }
 
+    /// Whether writers have appended to `old`, a record of this format's writer, or left it as it is.
+    pub fn continues(&self, old: &Self) -> bool {
+        old.schema.is_some() && self.bytes.starts_with(&old.bytes[..old.committed])
+    }
+
     /// The constants of an episode.
     pub fn constants(&self, episode: usize) -> Constants {
         let named = self.episodes.get(&episode).into_iter().flatten();

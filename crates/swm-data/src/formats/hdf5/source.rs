@@ -2,12 +2,14 @@
 
 use crate::dataset::Location;
 use crate::dataset::objects::{Bytes, ObjectFile};
+use crate::formats::opened::{self, State};
 use hdf5_pure::FormatError;
 use std::collections::{HashMap, VecDeque};
 use std::fs::File;
 use std::ops::Range;
 use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::{Error, Result, files};
 
@@ -21,7 +23,7 @@ const CACHED_BLOCKS: usize = 256;
 pub(super) struct Source(Arc<Kind>);
 
 enum Kind {
-    Local { file: File, path: PathBuf, len: u64 },
+    Local { file: File, path: PathBuf, len: AtomicU64 },
     Remote { file: ObjectFile, label: PathBuf, blocks: Mutex<Blocks> },
 }
 
@@ -53,7 +55,7 @@ impl Source {
     /// Wraps an open local file, with the present size of the file.
     pub fn of(file: File, path: &Path) -> Result<Self> {
         let len = file.metadata().map_err(|e| Error::io(path, "reading the size of the file", e))?.len();
-        Ok(Self(Arc::new(Kind::Local { file, path: path.to_owned(), len })))
+        Ok(Self(Arc::new(Kind::Local { file, path: path.to_owned(), len: AtomicU64::new(len) })))
     }
 
     /// The path or address of the file, for error messages.
@@ -64,11 +66,43 @@ impl Source {
         }
     }
 
-    /// Size in bytes.
+    /// Size in bytes, as far as it is known: a writer may append to a local file.
     pub fn size(&self) -> u64 {
         match &*self.0 {
-            Kind::Local { len, .. } => *len,
+            Kind::Local { len, .. } => len.load(Ordering::Relaxed),
             Kind::Remote { file, .. } => file.len(),
+        }
+    }
+
+    /// Whether the file has the bytes before `end`. Asks a local file for its size again if it was shorter.
+    pub fn reaches(&self, end: u64) -> bool {
+        if let Kind::Local { file, len, .. } = &*self.0
+            && end > len.load(Ordering::Relaxed)
+            && let Ok(metadata) = file.metadata()
+        {
+            len.store(metadata.len(), Ordering::Relaxed);
+        }
+        end <= self.size()
+    }
+
+    /// What changes whenever an open local file is written to; `None` for an object in a store.
+    pub fn state(&self) -> Option<State> {
+        match &*self.0 {
+            Kind::Local { file, .. } => opened::state_of(&file.metadata().ok()?),
+            Kind::Remote { .. } => None,
+        }
+    }
+
+    /// The same local file with its present size; an object in a store as it is.
+    ///
+    /// # Errors
+    /// If the file cannot be accessed.
+    pub fn with_present_size(&self) -> Result<Self> {
+        match &*self.0 {
+            Kind::Local { file, path, .. } => {
+                Self::of(file.try_clone().map_err(|e| Error::io(path, "opening it again", e))?, path)
+            }
+            Kind::Remote { .. } => Ok(self.clone()),
         }
     }
 
@@ -82,7 +116,7 @@ impl Source {
     /// # Errors
     /// If the file is shorter, or reading fails.
     pub fn read(&self, offset: u64, out: &mut [u8]) -> Result<()> {
-        if offset.checked_add(out.len() as u64).is_none_or(|end| end > self.size()) {
+        if !offset.checked_add(out.len() as u64).is_some_and(|end| self.reaches(end)) {
             let given = format!("{} bytes from byte {offset}", out.len());
             return Err(Error::mismatch(
                 format!("reading {}", self.label().display()),

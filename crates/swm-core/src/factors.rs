@@ -128,3 +128,28 @@ fn read<'a>(space: &VariationSpace, bytes: &'a [u8]) -> Result<(FactorValues, &'
     }
     Ok((space.resolve(&request, Key::new(0))?, rest))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Batch, ColumnSpec, DType, Factor, Schema, Space};
+
+    #[test]
+    fn recorded_columns_of_another_length_than_the_factor_are_errors() {
+        let size = Space::uniform_box([2], DType::Float32, 0.0, 1.0);
+        let space = VariationSpace::new(vec![Factor::new("agent.size", size, [0.25, 0.75])], &[]);
+        let request = VariationRequest { variation: Some(vec![]), ..VariationRequest::default() };
+        let current = space.resolve(&request, Key::new(0)).expect("the defaults");
+        let restored = |length: usize| {
+            let column = ColumnSpec::new(columns::flat_factor("agent.size"), DType::Float32, [length]);
+            let mut batch = Batch::zeros(&Schema::new([column]).expect("a schema"), 1);
+            batch.row_mut(0).at::<f32>(0).fill(0.5);
+            from_row(&space, &current, batch.row(0))
+        };
+        assert_eq!(restored(2).expect("a value of the factor").get("agent.size"), [0.5, 0.5]);
+        for length in [1, 3] {
+            let error = restored(length).expect_err("another length").to_string();
+            assert!(error.contains("agent.size") && error.contains(&format!("{:?}", vec![0.5; length])), "{error}");
+        }
+    }
+}

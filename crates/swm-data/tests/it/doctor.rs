@@ -1,6 +1,10 @@
 //! An examination reports deliberate defects, and a repair omits defective episodes from the repaired dataset.
 
+use crate::hostile::copied;
+use crate::lerobot::{DATA, change_values};
 use crate::sample::{episode, rows, schema, write};
+use crate::video::THIRD_PARTY_LENGTHS;
+use arrow_array::types::Int64Type;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -221,6 +225,30 @@ fn finds_restarting_steps_and_shared_rows_in_an_hdf5_file() {
     assert_eq!(problems_of(1), ["the stored steps do not count up from 0: row 2 holds 0"]);
     assert!(problems_of(3).contains(&"some of its rows also belong to episode 2".to_owned()), "{:?}", problems_of(3));
     assert_eq!(diagnosis.intact, [0, 2]);
+}
+
+#[test]
+fn finds_misplaced_rows_in_a_lerobot_dataset() {
+    let (_folder, path) = copied("lerobot-v30-h264");
+    let examined = |change: &dyn Fn(&mut [Option<i64>])| {
+        change_values::<Int64Type>(&path.join(DATA), "frame_index", change);
+        diagnose(&*open(&path).expect("opening the dataset"))
+    };
+    let diagnosis = examined(&|_| {});
+    assert_eq!((diagnosis.problems(), &diagnosis.intact[..]), (0, &[0, 1, 2][..]), "{diagnosis:?}");
+    // The rows of the episodes follow each other in one file.
+    let first = THIRD_PARTY_LENGTHS[0];
+    let diagnosis = examined(&|steps| steps.swap(first + 2, first + 3));
+    assert_eq!(problem(&diagnosis), ("the stored steps do not count up from 0: row 2 holds 3".to_owned(), vec![1]));
+    assert_eq!(diagnosis.intact, [0, 2]);
+    // Steps that count up from 1.
+    let shifted = |steps: &mut [Option<i64>]| {
+        steps.swap(first + 2, first + 3);
+        steps[..first].iter_mut().for_each(|step| *step = step.map(|step| step + 1));
+    };
+    let diagnosis = examined(&shifted);
+    assert_eq!(problem(&diagnosis), ("the stored steps do not count up from 0: row 0 holds 1".to_owned(), vec![0]));
+    assert_eq!(diagnosis.intact, [1, 2]);
 }
 
 #[test]

@@ -11,7 +11,7 @@ fn interop(name: &str) -> PathBuf {
 }
 
 /// A copy of a dataset of `tests/interop` in a new folder.
-fn copied(name: &str) -> (tempfile::TempDir, PathBuf) {
+pub fn copied(name: &str) -> (tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join(name);
     fuzz::copy_all(&interop(name), &path);

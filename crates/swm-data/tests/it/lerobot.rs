@@ -5,9 +5,18 @@
 //! cargo test --release --workspace --test it -- --ignored lerobot::
 //! ```
 
+use crate::hostile::copied;
 use crate::video::{THIRD_PARTY_LENGTHS, check_frames, interop};
 use crate::{format_suite, fuzz, sample};
+use arrow_array::cast::AsArray as _;
+use arrow_array::types::{Float64Type, Int64Type};
+use arrow_array::{ArrowPrimitiveType, PrimitiveArray, RecordBatch};
+use parquet::arrow::ArrowWriter;
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+use std::fs::File;
+use std::path::Path;
 use std::process::Command;
+use std::sync::Arc;
 use std::time::Duration;
 use swm_core::{ColumnSpec, DType};
 use swm_data::{CommitPolicy, Constants, ImageCodec, StepRange, WriteMode, WriteOptions, create, open};
@@ -96,6 +105,82 @@ fn reads_images_that_are_stored_in_tables() {
                 assert_eq!(found, expected.map(|v| v.min(255) as u8), "({x}, {y}) of row {row}");
             }
         }
+    }
+}
+
+/// The data file of all episodes of a small dataset of LeRobot 3.0.
+pub const DATA: &str = "data/chunk-000/file-000.parquet";
+/// The list of episodes of such a dataset.
+const EPISODES: &str = "meta/episodes/chunk-000/file-000.parquet";
+
+/// Writes a Parquet file again, with other rows.
+fn rewrite(path: &Path, change: impl FnOnce(RecordBatch) -> RecordBatch) {
+    let file = File::open(path).expect("opening the file");
+    let reader = ParquetRecordBatchReaderBuilder::try_new(file).expect("a Parquet file").build().expect("a reader");
+    let mut batches: Vec<RecordBatch> = reader.collect::<Result<_, _>>().expect("reading the rows");
+    assert_eq!(batches.len(), 1, "the file has so few rows that they are one batch");
+    let batch = change(batches.remove(0));
+    let file = File::create(path).expect("creating the file");
+    let mut writer = ArrowWriter::try_new(file, batch.schema(), None).expect("a writer");
+    writer.write(&batch).expect("writing the rows");
+    writer.close().expect("closing the file");
+}
+
+/// Changes the values of a column of a Parquet file, one value or null per row.
+pub fn change_values<T: ArrowPrimitiveType>(path: &Path, column: &str, change: impl FnOnce(&mut [Option<T::Native>])) {
+    rewrite(path, |batch| {
+        let at = batch.schema().index_of(column).expect("the column");
+        let mut columns = batch.columns().to_vec();
+        let mut values: Vec<Option<T::Native>> = columns[at].as_primitive::<T>().iter().collect();
+        change(&mut values);
+        columns[at] = Arc::new(values.into_iter().collect::<PrimitiveArray<T>>());
+        RecordBatch::try_new(batch.schema(), columns).expect("the changed rows")
+    });
+}
+
+#[test]
+fn images_in_tables_are_refused_if_the_rows_are_not_those_of_the_episodes() {
+    let read = |change: &dyn Fn(&Path)| {
+        let (_folder, path) = copied("lerobot-v30-h264");
+        change(&path.join(DATA));
+        // The image of the first row, which no change moves.
+        let reader = open(&path).expect("opening the dataset");
+        reader.read(&["observation.images.still"], &[StepRange::new(0, 0, 1)]).map(|read| read.bytes(0).to_vec())
+    };
+    let original = read(&|_| {}).expect("the original");
+    assert_eq!(read(&|file| rewrite(file, |rows| rows)).expect("the same rows in another file"), original);
+    let refused = |what: &str, change: &dyn Fn(&Path)| {
+        let error = read(change).map(|image| image.len()).expect_err(what).to_string();
+        assert!(error.contains("its rows do not belong to the episodes that it should contain"), "{what}: {error}");
+    };
+    let last = THIRD_PARTY_LENGTHS.iter().sum::<usize>() - 1;
+    let end = THIRD_PARTY_LENGTHS[0];
+    let change = |file: &Path, change: &dyn Fn(&mut [Option<i64>])| {
+        change_values::<Int64Type>(file, "episode_index", change);
+    };
+    refused("rows of two episodes in another order", &|file| change(file, &|indices| indices.swap(end - 1, end)));
+    refused("a last row of an unknown episode", &|file| change(file, &|indices| indices[last] = Some(7)));
+    refused("an episode with one row more", &|file| change(file, &|indices| indices[end] = Some(0)));
+    refused("a file without its last row", &|file| rewrite(file, |rows| rows.slice(0, last)));
+}
+
+#[test]
+fn start_times_that_are_null_or_not_finite_are_refused() {
+    let (_folder, path) = copied("lerobot-v30-h264");
+    let list = path.join(EPISODES);
+    for key in ["observation.images.top", "observation.images.wrist"] {
+        let column = format!("videos/{key}/from_timestamp");
+        let change = |time| change_values::<Float64Type>(&list, &column, |times| times[1] = time);
+        let mut start = None;
+        change_values::<Float64Type>(&list, &column, |times| start = times[1]);
+        for time in [None, Some(f64::NAN), Some(f64::INFINITY), Some(f64::NEG_INFINITY)] {
+            change(time);
+            let error = open(&path).map(|reader| reader.episodes().len()).expect_err("no start time").to_string();
+            assert!(error.contains(&format!("it lacks start times of '{key}'")), "{time:?}: {error}");
+        }
+        change(start);
+        let expected = fuzz::read_everything(&interop().join("lerobot-v30-h264")).expect("the original");
+        assert_eq!(fuzz::read_everything(&path).expect("the start time of before"), expected);
     }
 }
 

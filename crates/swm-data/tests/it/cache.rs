@@ -144,6 +144,74 @@ fn links_in_a_cache_are_not_written_through() {
     assert_eq!(std::fs::read(&mine).expect("reading the file"), b"mine");
 }
 
+/// The files of a cache of one dataset.
+fn files_of(cache: &Path) -> Vec<PathBuf> {
+    let mut found = vec![];
+    for dataset in std::fs::read_dir(cache).expect("listing the cache").flatten() {
+        found.extend(
+            std::fs::read_dir(dataset.path()).expect("listing a cache folder").flatten().map(|entry| entry.path()),
+        );
+    }
+    found.sort();
+    found
+}
+
+/// The file with the rows of a cache of one column of one dataset.
+fn rows_file(cache: &Path) -> PathBuf {
+    let is_rows = |file: &PathBuf| file.extension().is_some_and(|end| end == "rows");
+    files_of(cache).into_iter().find(is_rows).expect("finding the rows file")
+}
+
+#[test]
+fn a_cache_that_is_shortened_or_written_over_while_it_is_open_is_checked_again() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let (path, rows) = dataset(folder.path());
+    let cache = CacheConfig::Disk { folder: folder.path().join("cache"), bytes: 1 << 30 };
+    let reader = Counting::open(&path);
+    let cached = with_cache(&reader, &cache);
+    let expected = read_all(&*cached);
+    reader.decoded();
+    let file = rows_file(&folder.path().join("cache"));
+    let original = std::fs::read(&file).expect("reading the file");
+    let write_later = |bytes: &[u8]| {
+        std::fs::write(&file, bytes).expect("writing the file");
+        let opened = std::fs::File::options().write(true).open(&file).expect("opening the file");
+        let later = std::time::SystemTime::now() + std::time::Duration::from_secs(60);
+        opened.set_modified(later).expect("setting the time of the file");
+    };
+    // The same content: nothing is decoded again.
+    write_later(&original);
+    assert!(read_all(&*cached) == expected && reader.decoded() == 0);
+    write_later(&original.iter().map(|byte| !byte).collect::<Vec<u8>>());
+    assert!(read_all(&*cached) == expected);
+    assert_eq!(reader.decoded(), rows + 3);
+    write_later(b"");
+    assert!(read_all(&*cached) == expected);
+    assert_eq!(reader.decoded(), rows + 3);
+}
+
+#[test]
+fn rows_of_the_cache_of_another_dataset_are_decoded_again() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let (path, rows) = dataset(folder.path());
+    let other = folder.path().join("other.lance");
+    write(&other, WriteMode::Create, 3, 1..7);
+    let at = |name: &str| folder.path().join(name);
+    for (from, name) in [(&path, "first"), (&other, "second")] {
+        read_all(&*with_cache(&Counting::open(from), &CacheConfig::Disk { folder: at(name), bytes: 1 << 30 }));
+    }
+    let (first, second) = (files_of(&at("first")), files_of(&at("second")));
+    for (to, from) in first.iter().zip(&second) {
+        std::fs::copy(from, to).expect("copying a file");
+    }
+    let reader = Counting::open(&path);
+    let expected = read_all(&*reader);
+    reader.decoded();
+    let cached = with_cache(&reader, &CacheConfig::Disk { folder: at("first"), bytes: 1 << 30 });
+    assert!(read_all(&*cached) == expected);
+    assert_eq!(reader.decoded(), rows + 3);
+}
+
 #[test]
 fn damaged_cache_rows_are_decoded_again() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
@@ -152,19 +220,8 @@ fn damaged_cache_rows_are_decoded_again() {
     let reader = Counting::open(&path);
     let expected = read_all(&*with_cache(&reader, &cache));
     reader.decoded();
-    let files = || -> Vec<PathBuf> {
-        let mut found = vec![];
-        for dataset in std::fs::read_dir(folder.path().join("cache")).expect("listing the cache").flatten() {
-            found.extend(
-                std::fs::read_dir(dataset.path()).expect("listing a cache folder").flatten().map(|entry| entry.path()),
-            );
-        }
-        found
-    };
-    let rows_file = files()
-        .into_iter()
-        .find(|file| file.extension().is_some_and(|end| end == "rows"))
-        .expect("finding the rows file");
+    let files = || files_of(&folder.path().join("cache"));
+    let rows_file = rows_file(&folder.path().join("cache"));
     // Flips a bit of the third row.
     let mut bytes = std::fs::read(&rows_file).expect("reading a file");
     bytes[2 * IMAGE + 7] ^= 1;

@@ -33,7 +33,7 @@ use swm_core::{Error, Result, files};
 /// For a training checkpoint with weights under `state_dict`, returns those weights only.
 ///
 /// # Errors
-/// When the file cannot be read, has another format, is damaged, or holds an object that is not a tensor of real
+/// When the file cannot be read, has another format, is damaged, or holds an object that is not a tensor of finite real
 /// values.
 pub fn read(path: &Path) -> Result<Named<HostTensor>> {
     let tensors = match path.extension().and_then(|end| end.to_str()) {
@@ -48,7 +48,15 @@ pub fn read(path: &Path) -> Result<Named<HostTensor>> {
         .iter()
         .filter_map(|(name, tensor)| Some((name.strip_prefix("state_dict.")?.to_owned(), tensor.clone())))
         .collect();
-    Ok(if nested.is_empty() { tensors } else { nested })
+    let tensors = if nested.is_empty() { tensors } else { nested };
+    match tensors.iter().find(|(_, tensor)| !tensor.values.iter().all(|value| value.is_finite())) {
+        Some((name, _)) => Err(Error::corrupt(
+            path,
+            format!("'{name}' has values that are not finite"),
+            "give weights of a training that did not diverge",
+        )),
+        None => Ok(tensors),
+    }
 }
 
 /// The tensors of a safetensors file.

@@ -316,7 +316,7 @@ fn only_regular_files_are_weights() {
 }
 
 /// A PyTorch file with one element that a tensor repeats `count` times, by a stride of 0.
-fn repeated(path: &Path, count: u64) {
+fn repeated(path: &Path, count: u64, element: f32) {
     let text = |text: &str| [b"X".as_slice(), &(text.len() as u32).to_le_bytes(), text.as_bytes()].concat();
     let long = |value: u64| [[0x8a, 8].as_slice(), &value.to_le_bytes()].concat();
     let pickle = [
@@ -330,7 +330,7 @@ fn repeated(path: &Path, count: u64) {
         b"\x89ccollections\nOrderedDict\n)RtRs.".to_vec(),
     ]
     .concat();
-    archive(path, &pickle, &[0; 4]);
+    archive(path, &pickle, &element.to_le_bytes());
 }
 
 /// A PyTorch file with a pickle and the elements of one tensor.
@@ -348,10 +348,10 @@ fn archive(path: &Path, pickle: &[u8], elements: &[u8]) {
 fn a_pytorch_tensor_cannot_repeat_its_elements_without_limit() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("repeated.pt");
-    repeated(&path, 1000);
+    repeated(&path, 1000, 0.0);
     assert_eq!(weights::read(&path).expect("weights")["w"].values.len(), 1000);
     for count in [1 << 31, 1 << 40, 1 << 60] {
-        repeated(&path, count);
+        repeated(&path, count, 0.0);
         let error = weights::read(&path).expect_err("too large").to_string();
         assert!(["larger than the file", "limit", "overflow"].iter().any(|word| error.contains(word)), "{error}");
     }
@@ -392,4 +392,15 @@ fn tensors_with_the_negative_bit_are_refused() {
     negative(&path);
     let error = weights::read(&path).expect_err("the values have the opposite sign").to_string();
     assert!(error.contains("negative bit") && error.contains("resolve_neg"), "{error}");
+}
+
+#[test]
+fn weights_that_are_not_finite_are_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("diverged.pt");
+    for value in [f32::NAN, f32::NEG_INFINITY] {
+        repeated(&path, 3, value);
+        let error = weights::read(&path).expect_err("no weights of a model").to_string();
+        assert!(error.contains("'w' has values that are not finite"), "{error}");
+    }
 }

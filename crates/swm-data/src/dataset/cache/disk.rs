@@ -1,43 +1,46 @@
-//! A cache of decoded rows in memory-mapped files.
+//! A cache of decoded rows in files.
 //!
 //! The cache of a column consists of two files, in a folder named after the dataset's content hash. `COLUMN.rows`
 //! stores row `r` at `r * row_bytes`; rows that are not cached are file holes, which take no disk space. `COLUMN.marks`
-//! stores eight bytes per row, its mark: zero, or the first bytes of the BLAKE3 hash of the row, with the lowest bit
-//! set.
+//! stores eight bytes per row, its mark: zero, or the first bytes of a BLAKE3 hash of the dataset, the number of the row and its
+//! content, with the lowest bit set.
 //!
-//! A row is written before its mark, and each process verifies the mark when it first reads the row. A row that was
-//! only half written at a power failure, or that was changed later, is therefore decoded again. A dataset with changed
-//! content has another folder name and starts with an empty cache.
+//! A row is written before its mark, and each process verifies the mark when it first reads the row, and again after another
+//! program wrote to the file. A row that was only half written at a power failure, was changed later, or was copied from the
+//! cache of another dataset is therefore decoded again. A dataset with changed content has another folder name and starts with an
+//! empty cache. Rows are read, not mapped into memory, because a mapped file that another program shortens ends the process.
 //!
 //! The process that holds the lock on the marks file fills the cache; other processes only read it.
 
 use super::{Budget, RowCache};
-use memmap2::Mmap;
 use std::fs::{File, OpenOptions};
-use std::os::unix::fs::FileExt as _;
+use std::os::unix::fs::{FileExt as _, MetadataExt as _};
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU8, Ordering};
+use std::sync::atomic::{AtomicI64, AtomicU32, Ordering};
 use swm_core::{ColumnSpec, Error, Result, files};
 
 /// Size of a mark in bytes.
 const MARK_BYTES: usize = 8;
 
 /// State of a row whose mark this process has not checked.
-const UNKNOWN: u8 = 0;
-/// State of a row that matches its mark.
-const VALID: u8 = 1;
+const UNKNOWN: u32 = 0;
 /// State of a row that has no mark, or does not match its mark.
-const ABSENT: u8 = 2;
+const ABSENT: u32 = u32::MAX;
 
-/// Cached rows of a column in a memory-mapped file.
+/// Cached rows of a column in a file.
 pub struct DiskRowCache {
-    map: Mmap,
     file: File,
     marks: File,
+    /// The key of the hashes: the dataset and the column.
+    key: [u8; blake3::KEY_LEN],
     row_bytes: usize,
-    /// State of each row in this process: [`UNKNOWN`], [`VALID`] or [`ABSENT`].
-    states: Vec<AtomicU8>,
+    /// State of each row in this process: [`UNKNOWN`], [`ABSENT`], or the version of the file in which the row matched its mark.
+    states: Vec<AtomicU32>,
+    /// The time of the last change of the file that this process knows, in nanoseconds.
+    changed: AtomicI64,
+    /// Counts the changes of the file by other programs, from 1 on.
+    version: AtomicU32,
     /// Whether this process fills the cache.
     fills: bool,
     budget: Arc<Budget>,
@@ -64,13 +67,14 @@ impl DiskRowCache {
         let row_bytes = column.row_bytes();
         let (file, marks) = (open("rows", rows * row_bytes)?, open("marks", rows * MARK_BYTES)?);
         let fills = marks.try_lock().is_ok();
-        let map = map(&file).map_err(|e| Error::io(&folder, "mapping the cache", e))?;
         let cache = Self {
-            map,
+            changed: AtomicI64::new(changed(&file)),
+            version: AtomicU32::new(1),
             file,
             marks,
+            key: *blake3::hash(format!("{identity}/{}", column.name).as_bytes()).as_bytes(),
             row_bytes,
-            states: (0..rows).map(|_| AtomicU8::new(UNKNOWN)).collect(),
+            states: (0..rows).map(|_| AtomicU32::new(UNKNOWN)).collect(),
             fills,
             budget,
         };
@@ -95,57 +99,60 @@ impl DiskRowCache {
         (mark != [0; MARK_BYTES]).then_some(mark)
     }
 
-    fn row(&self, row: usize) -> &[u8] {
-        &self.map[row * self.row_bytes..(row + 1) * self.row_bytes]
+    /// The mark of a row with this content; never zero.
+    fn hash(&self, row: usize, bytes: &[u8]) -> [u8; MARK_BYTES] {
+        let hash = blake3::Hasher::new_keyed(&self.key).update(&(row as u64).to_le_bytes()).update(bytes).finalize();
+        let mut mark = [0; MARK_BYTES];
+        mark.copy_from_slice(&hash.as_bytes()[..MARK_BYTES]);
+        mark[0] |= 1;
+        mark
     }
+
+    /// The present version of the file.
+    fn version(&self) -> u32 {
+        let now = changed(&self.file);
+        if self.changed.swap(now, Ordering::AcqRel) == now {
+            return self.version.load(Ordering::Acquire);
+        }
+        // After 2^32 changes, a row could count as checked that was checked long ago.
+        self.version.fetch_add(1, Ordering::AcqRel) + 1
+    }
+}
+
+/// The time of the last change of a file, in nanoseconds.
+fn changed(file: &File) -> i64 {
+    file.metadata()
+        .map_or(0, |metadata| metadata.mtime().wrapping_mul(1_000_000_000).wrapping_add(metadata.mtime_nsec()))
 }
 
 impl RowCache for DiskRowCache {
     fn get(&self, row: usize, out: &mut [u8]) -> bool {
-        match self.states[row].load(Ordering::Acquire) {
-            VALID => {
-                out.copy_from_slice(self.row(row));
-                return true;
-            }
-            // A process that does not fill the cache checks again, because the filling process may have added the row.
-            ABSENT if self.fills => return false,
-            _ => {}
-        }
-        let Some(mark) = self.mark(row) else {
-            self.states[row].store(ABSENT, Ordering::Release);
+        let (version, state) = (self.version(), self.states[row].load(Ordering::Acquire));
+        // A process that does not fill the cache checks again, because the filling process may have added the row.
+        if state == ABSENT && self.fills {
             return false;
+        }
+        let read = |out: &mut [u8]| self.file.read_exact_at(out, (row * self.row_bytes) as u64).is_ok();
+        let intact = if state == version {
+            read(out)
+        } else {
+            self.mark(row).is_some_and(|mark| read(out) && self.hash(row, out) == mark)
         };
-        out.copy_from_slice(self.row(row));
-        let intact = hash(out) == mark;
-        self.states[row].store(if intact { VALID } else { ABSENT }, Ordering::Release);
+        self.states[row].store(if intact { version } else { ABSENT }, Ordering::Release);
         intact
     }
 
     fn put(&self, row: usize, bytes: &[u8]) {
-        if !self.fills || self.states[row].load(Ordering::Acquire) == VALID || !self.budget.take(bytes.len()) {
+        let version = self.version();
+        if !self.fills || self.states[row].load(Ordering::Acquire) == version || !self.budget.take(bytes.len()) {
             return;
         }
         // If writing fails, for example because the disk is full, the row is not cached.
         let written = self.file.write_all_at(bytes, (row * self.row_bytes) as u64).is_ok()
-            && self.marks.write_all_at(&hash(bytes), (row * MARK_BYTES) as u64).is_ok();
+            && self.marks.write_all_at(&self.hash(row, bytes), (row * MARK_BYTES) as u64).is_ok();
         if written {
-            self.states[row].store(VALID, Ordering::Release);
+            self.changed.store(changed(&self.file), Ordering::Release);
+            self.states[row].store(version, Ordering::Release);
         }
     }
-}
-
-/// The mark of a row; never zero.
-fn hash(bytes: &[u8]) -> [u8; MARK_BYTES] {
-    let mut mark = [0; MARK_BYTES];
-    mark.copy_from_slice(&blake3::hash(bytes).as_bytes()[..MARK_BYTES]);
-    mark[0] |= 1;
-    mark
-}
-
-#[allow(unsafe_code, reason = "mapping a file")]
-fn map(file: &File) -> std::io::Result<Mmap> {
-    // SAFETY: the cache owns the file. Its size follows from the dataset's content and is set before any process maps
-    // it, so the file never shrinks while it is mapped. A row is written once, before its mark, and only marked rows
-    // are read. A row that does not match its mark is copied and compared, but not used.
-    unsafe { Mmap::map(file) }
 }

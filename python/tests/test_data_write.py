@@ -195,6 +195,7 @@ def test_invalid_episodes_are_rejected_and_valid_ones_stored(tmp_path):
         ({**valid, "terminated": np.zeros(5)}, TypeError, "'terminated' is float64, expected bool as in the dataset"),
         ({**valid, "state": np.zeros((5, 4), complex)}, TypeError, "complex128 cannot be stored"),
         ({**valid, "state": [np.zeros(4), np.zeros(3)]}, ValueError, "'state': its steps differ in shape"),
+        ({**valid, "state": np.ma.masked_less(np.ones((5, 4)), 2)}, ValueError, "'state': it has masked values"),
         ({}, ValueError, "at least one numeric column"),
     ]
     with data.open_writer(path) as writer:

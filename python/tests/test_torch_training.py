@@ -453,6 +453,14 @@ def test_hydra_runs_several_trainings(rooms, tmp_path):
         assert module.stored.config["model"]["encoder"]["pyramid"]["dim"] == 32
 
 
+def test_a_setting_that_is_given_twice_is_refused(rooms, tmp_path):
+    pytest.importorskip("hydra")
+    twice = ["--multirun", "seed=1", "model.latent=3", "seed=2"]
+    child = command("lewm", f"data={rooms}", "preset=tiny", "device=cpu", *twice, cwd=tmp_path)
+    _, errors = child.communicate(timeout=300)
+    assert child.returncode == 2 and "seed: given twice" in errors, errors
+
+
 def test_without_hydra_its_flags_are_refused(rooms):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     program = "import sys; sys.modules['hydra'] = None; from stable_worldmodel.train.__main__ import main; "

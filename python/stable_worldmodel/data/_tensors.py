@@ -121,6 +121,8 @@ def rows(episode: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, str | 
         if text is not None:
             constants[name] = text
             continue
+        if np.ma.is_masked(value):
+            raise ValueError(f"column {name!r}: it has masked values, which datasets cannot leave out; fill them with `filled`")
         try:
             array = to_numpy(value)
         except ValueError as error:

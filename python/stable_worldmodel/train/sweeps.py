@@ -26,7 +26,7 @@ def run(family: str, arguments: Sequence[str], train: Callable[[Options], object
         train: Trains a model.
 
     Raises:
-        ValueError: If Hydra is not installed, or the family or the preset is unknown.
+        ValueError: If Hydra is not installed, a setting is given twice, or the family or the preset is unknown.
     """
     try:
         import hydra
@@ -38,6 +38,11 @@ def run(family: str, arguments: Sequence[str], train: Callable[[Options], object
         raise ValueError(f"{flags}: flags are those of Hydra, which is not installed: pip install hydra-core") from error
 
     named = [_DATASET + argument[4:] if argument.startswith("data=") else argument for argument in arguments]
+    given_keys = [argument.lstrip("+~").partition("=")[0] for argument in named if not argument.startswith("-")]
+    for key in given_keys:
+        # Hydra would take the last value.
+        if given_keys.count(key) > 1:
+            raise ValueError(f"{key}: given twice; give it once, for a sweep with several values: {key}=A,B")
     # Hydra takes flags before overrides only.
     named.sort(key=lambda argument: "=" in argument and not argument.startswith("-"))
     preset = next((argument.partition("=")[2] for argument in named if argument.startswith("preset=")), None)

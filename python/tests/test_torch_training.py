@@ -31,6 +31,8 @@ SHORT = [
     "shards=1",
 ]
 PIXELS = 'model.encoding=[{column="pixels",latent=16},{column="state",latent=8}]'
+#: The colours are found in the data.
+COLOURS = "model.encoder={keypoints={filters=[],find_colours=3,sharpness=2.0,hidden=[12],dim=10}}"
 CONV = "model.encoder={conv={channels=[6,8],hidden=12,dim=10}}"
 
 
@@ -70,6 +72,7 @@ RUNS = [
     ("lewm", ["loss.weight=0.0", "loss.temp_straight=0.5", "data.num_steps=4"]),
     ("pldm", [CONV, "model.predictor.history=2", "optim.ema=0.5"]),
     ("pldm", ["loss.std_t=1.0", "loss.cov_t=1.0", "loss.temp_straight=0.5"]),
+    ("pldm", [COLOURS]),
     ("gcbc", ["validation.every=3", "validation.batches=2"]),
     ("gcbc", [CONV, "optim.accumulate=2"]),
     ("gcivl", []),

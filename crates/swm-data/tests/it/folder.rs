@@ -27,6 +27,39 @@ fn writer_killed_50_times_keeps_committed_episodes() {
     format_suite::killed("d.folder", 50);
 }
 
+/// Writes a column file with an array of zeros.
+fn write_zeros(path: &Path, descr: &str, shape: &str, bytes: usize) {
+    let text = format!("{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}\n");
+    let length = (text.len() as u16).to_le_bytes();
+    let array = [b"\x93NUMPY\x01\x00", &length[..], text.as_bytes(), &vec![0; bytes]].concat();
+    let mut file = zip::ZipWriter::new(std::fs::File::create(path).expect("creating the file"));
+    file.start_file("arr_0.npy", zip::write::SimpleFileOptions::default()).expect("starting a member");
+    std::io::Write::write_all(&mut file, &array).expect("writing a member");
+    file.finish().expect("finishing the file");
+}
+
+#[test]
+fn recorded_columns_without_numbers_are_refused() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    for format in ["folder", "video"] {
+        let path = folder.path().join(format!("d.{format}"));
+        sample::write(&path, WriteMode::Create, 3, 0..6);
+        let rows = (5..11).sum::<usize>();
+        let column = path.join("state.npz");
+        let given = [("'<c8'", format!("({rows}, 3)"), rows * 24), ("'<f4'", format!("({rows}, 0)"), 0)];
+        for (descr, shape, bytes) in given {
+            write_zeros(&column, descr, &shape, bytes);
+            let error = open(&path).err().expect("a column that the dataset records").to_string();
+            assert!(error.contains("state.npz") && error.contains("contradicts the recorded schema"), "{error}");
+        }
+        // A file that the dataset does not record is left out, and named.
+        std::fs::rename(&column, path.join("other.npz")).expect("renaming a file");
+        sample::write(&folder.path().join(format!("again.{format}")), WriteMode::Create, 3, 0..6);
+        std::fs::copy(folder.path().join(format!("again.{format}/state.npz")), &column).expect("copying a file");
+        sample::check(&*open(&path).expect("opening the dataset"), 0);
+    }
+}
+
 fn damaged(cases: u64) {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let path = folder.path().join("d.folder");

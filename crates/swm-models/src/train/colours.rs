@@ -12,7 +12,7 @@ use swm_data::{Part, Reader, frequent_colours};
 /// gives the same colours, whatever the seed.
 ///
 /// # Errors
-/// When the frames have fewer than two colours, or cannot be read.
+/// When the frames have fewer colours, or cannot be read.
 pub fn with_colours<M: Trainable>(config: &TrainConfig<M>, reader: &dyn Reader) -> Result<TrainConfig<M>> {
     let mut config = config.clone();
     if let Some((encoder, images)) = M::encoder_config(&mut config.model) {
@@ -40,9 +40,13 @@ pub(crate) fn find(
     let Some((count, colours)) = encoder.colours_to_find() else { return Ok(()) };
     let episodes = episodes(hold_out, Part::Train, reader)?;
     let found = frequent_colours(reader, count, episodes.as_deref())?;
-    if found.len() < 2 {
+    if found.len() < count {
         let problem = format!("the frames of the training data have {} of {count} colours", found.len());
-        return Err(Error::config("model.encoder.keypoints.find_colours", problem, "choose another encoder or preset"));
+        let fix = match found.len() {
+            0 | 1 => "choose another encoder or preset".to_owned(),
+            fewer => format!("find {fewer} or fewer"),
+        };
+        return Err(Error::config("model.encoder.keypoints.find_colours", problem, fix));
     }
     let normalised = |colour: [f32; 3]| [0, 1, 2].map(|i: usize| (colour[i] - images.mean[i]) / images.std[i]);
     *colours = found.into_iter().map(normalised).collect();

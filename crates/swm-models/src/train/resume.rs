@@ -83,11 +83,12 @@ fn is_log(path: &Path, has_events: bool) -> bool {
 /// # Errors
 /// When the configuration differs, with the settings that differ and their values, or else when the data differ.
 pub(crate) fn check_same_run(path: &Path, stored: &Manifest, requested: &Manifest) -> Result<()> {
-    let problem = if stored.config != requested.config {
+    // Other data may also change the configuration, by the colours that were found in it.
+    let problem = if stored.hashes.get("dataset") != requested.hashes.get("dataset") {
+        "the stored run was trained on other data".to_owned()
+    } else if stored.config != requested.config {
         let differing = differences("", &stored.config, &requested.config);
         format!("the stored run has another configuration ({})", differing.join(", "))
-    } else if stored.hashes.get("dataset") != requested.hashes.get("dataset") {
-        "the stored run was trained on other data".to_owned()
     } else {
         return Ok(());
     };

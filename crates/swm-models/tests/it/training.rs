@@ -240,6 +240,12 @@ fn colours_are_found_in_the_training_data() {
     assert!(train_with("again", &stored, 0).1[1] == whole[1], "the colours that were found give other weights");
     config.seed = 1;
     assert_eq!(train_with("seed", &config, 0).0.model.encoder, stored.model.encoder);
+    let EncoderConfig::Keypoints(keypoints) = &mut config.model.encoder else {
+        unreachable!("an encoder of keypoints")
+    };
+    keypoints.find_colours = 256;
+    let error = run(&config, &folder.path().join("many"), &crate::options(), 0).expect_err("more colours than greys");
+    assert!(error.is_usage() && error.to_string().contains("of 256 colours"), "{error}");
 
     let path = folder.path().join("whole/checkpoint/config.json");
     let mut changed: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).expect("a file")).expect("JSON");

@@ -102,7 +102,7 @@ pub fn autopsy(args: &AutopsyArgs, context: &Context) -> anyhow::Result<()> {
     }
     eprint(&cost(arms, args.planning_seeds, starts, seconds));
     let _lock = folder.create(&plan.study)?;
-    output_folder::check(&args.output, &["index.html"])?;
+    output_folder::check(&args.output, &["index.html", "autopsy.json"])?;
     files::delete_temporary(&args.output, |name| ["autopsy.json", "index.html"].contains(&name))?;
     let options = run_options(args.envs, None, context);
     plan.study.run(&folder, &resolver, &options, &mut control(context))?;

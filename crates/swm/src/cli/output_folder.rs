@@ -70,16 +70,28 @@ pub fn check(folder: &Path, names: &[&str]) -> Result<()> {
 }
 
 /// Returns whether an existing output file was written by this program: a page names it, tables of a study lie beside its
-/// page, results have the manifest of an evaluation, and traces are a list of plans.
+/// page, results have the manifest of an evaluation, autopsies have the hash of their study, and traces are a list of plans.
 fn is_own(path: &Path) -> bool {
     let read = |path: &Path| files::read(path, MAX_OUTPUT_BYTES).unwrap_or_default();
     let is_page = |path: &Path| read(path).windows(PAGE_MARK.len()).any(|part| part == PAGE_MARK.as_bytes());
     match path.file_name().and_then(|name| name.to_str()) {
         Some(name) if name.ends_with(".html") => is_page(path),
         Some("table.csv" | "table.tex" | "table.md") => is_page(&path.with_file_name("index.html")),
+        Some("autopsy.json") => serde_json::from_slice::<StoredAutopsy>(&read(path)).is_ok(),
         Some("traces.json") => serde_json::from_slice::<Vec<StoredPlan>>(&read(path)).is_ok(),
         _ => serde_json::from_slice::<StoredResults>(&read(path)).is_ok_and(|found| found.manifest.kind == "evaluate"),
     }
+}
+
+/// The fields by which an `autopsy.json` is recognised.
+#[derive(Deserialize)]
+struct StoredAutopsy {
+    #[serde(rename = "version")]
+    _version: u64,
+    #[serde(rename = "study")]
+    _study: String,
+    #[serde(rename = "autopsy")]
+    _autopsy: IgnoredAny,
 }
 
 /// The fields by which a `results.json` of any version is recognised.

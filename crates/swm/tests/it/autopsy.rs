@@ -72,6 +72,9 @@ fn autopsy_runs_its_arms_and_continues_after_a_kill() {
     assert!(out.contains("search x 10") && out.contains("smallest repair"), "{out}");
     assert!(err.contains("6 arms x 3 planning seeds x 4 starts: at most 0 s"), "all arms are known: {err}");
     assert!(out.lines().all(|line| line.chars().count() <= 80), "a line is wider than 80 columns: {out}");
+    // Another file of that name is the user's.
+    std::fs::write(swm.path("whole/autopsy.json"), r#"{"mine": "notes"}"#).expect("writing a file");
+    swm.fails(&args("whole"), 2, &["autopsy.json", "was not written by this program"]);
     let status = swm.run(&["study", "status", "whole"]);
     assert!(text(&status.stdout).contains("19 of 19 cells"), "{}", text(&status.stdout));
 }

@@ -176,7 +176,8 @@ fn parse(bytes: &[u8]) -> Result<(Header, usize), String> {
         let (_, rest) = text.split_once(&format!("'{name}':"))?;
         Some(rest.trim_start())
     };
-    let invalid = || format!("the array's header is invalid: {}", text.trim_end());
+    let start: String = text.trim_end().chars().take(200).collect();
+    let invalid = || format!("the array's header is invalid: {start}");
     let column_major = match field("fortran_order").ok_or_else(invalid)? {
         order if order.starts_with("False") => false,
         order if order.starts_with("True") => true,

@@ -346,6 +346,10 @@ fn columns(folder: &Path, recorded: &Metadata, rows: usize) -> Result<(Vec<Colum
         if rows > 0 || known.is_none() {
             let header = Npz::open(&path)?.header()?;
             let Some(found) = header.spec(&name).filter(|spec| !spec.is_empty()) else {
+                if known.is_some() {
+                    let problem = "it holds no numbers that can be read, which contradicts the recorded schema";
+                    return Err(Error::corrupt(path, problem, "restore it from a copy, or rebuild the dataset"));
+                }
                 skipped.push(name);
                 continue;
             };

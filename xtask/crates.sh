@@ -11,5 +11,5 @@ sed -i 's/^swm = { /&package = "stable-worldmodel", /' Cargo.toml
 sed -i 's/^name = "swm"$/name = "stable-worldmodel"/; t renamed; b; :renamed; n; :rest; n; b rest' crates/swm/Cargo.toml
 printf '\n[lib]\nname = "swm"\n' >> crates/swm/Cargo.toml
 # In the order in which they are published: a crate after those that it needs. Nothing is compiled; nothing is sent.
-CARGO_TARGET_DIR=$OUT cargo package --quiet --workspace --no-verify --allow-dirty --exclude swm-extension-test --exclude swm-fuzz \
+CARGO_TARGET_DIR=$OUT cargo package --quiet --workspace --no-verify --allow-dirty --exclude swm-extension-test --exclude swm-fuzz --exclude gemm \
   --exclude swm-python --exclude workspace-hack --exclude xtask

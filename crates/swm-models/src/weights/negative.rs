@@ -43,11 +43,10 @@ pub fn any(path: &Path) -> Result<bool> {
 /// value follows.
 fn marks(pickle: &[u8]) -> bool {
     const TRUE: u8 = 0x88;
-    let value = |after: &[u8]| match after {
-        [TRUE, ..] | [0x94, TRUE, ..] | [b'q', _, TRUE, ..] | [b'r', _, _, _, _, TRUE, ..] => true,
-        _ => false,
+    let is_true = |after: &[u8]| {
+        matches!(after, [TRUE, ..] | [0x94, TRUE, ..] | [b'q', _, TRUE, ..] | [b'r', _, _, _, _, TRUE, ..])
     };
     [&b"X\x03\0\0\0neg"[..], &b"\x8c\x03neg"[..]].iter().any(|key| {
-        pickle.windows(key.len()).enumerate().any(|(at, window)| window == *key && value(&pickle[at + key.len()..]))
+        pickle.windows(key.len()).enumerate().any(|(at, window)| window == *key && is_true(&pickle[at + key.len()..]))
     })
 }

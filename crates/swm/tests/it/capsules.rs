@@ -76,7 +76,7 @@ fn capsules_are_packed_verified_and_used_like_checkpoints() {
     // A capsule is packed in place; the capsule of another training is not replaced.
     // What a killed command left is deleted, and nothing of other files.
     let left = [".again.safetensors.77.tmp", ".other.safetensors.77.tmp"].map(|name| swm.path(name));
-    left.iter().for_each(|path| std::fs::write(path, "cut off").expect("writing a file"));
+    left.iter().for_each(|path| fs::write(path, "cut off").expect("writing a file"));
     swm.json(&["checkpoints", "pack", "again.safetensors", "-o", "again.safetensors", "--author", "they"]);
     assert_eq!(left.each_ref().map(|path| path.exists()), [false, true]);
     let other = ["train", "lewm", "--data", "rooms", "-o", "second", "schedule.steps=4", "schedule.warmup=0", "seed=1"];

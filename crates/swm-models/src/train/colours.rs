@@ -12,8 +12,9 @@ use swm_data::{Part, Reader, frequent_colours};
 /// gives the same colours, whatever the seed.
 ///
 /// # Errors
-/// When the frames have fewer colours, or cannot be read.
+/// When the configuration contradicts itself, or the frames have fewer colours, or cannot be read.
 pub fn with_colours<M: Trainable>(config: &TrainConfig<M>, reader: &dyn Reader) -> Result<TrainConfig<M>> {
+    config.check()?;
     let mut config = config.clone();
     if let Some((encoder, images)) = M::encoder_config(&mut config.model) {
         find(encoder, &images, reader, config.data.hold_out)?;

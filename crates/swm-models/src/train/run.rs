@@ -48,7 +48,6 @@ pub fn train<M: Trainable>(
 ) -> Result<TrainSummary> {
     let threads = swm_core::pool::threads(options.threads)?;
     threads.install(|| {
-        config.check()?;
         let config = &with_colours(config, &*reader)?;
         let inputs = Inputs::of(config, &*reader, options)?;
         let _lock = Lock::folder(out)?;
@@ -76,7 +75,6 @@ pub fn begin<M: Trainable>(
     options: &TrainOptions,
     record: &dyn Fn() -> Result<()>,
 ) -> Result<TrainingPlan> {
-    config.check()?;
     let config = &with_colours(config, &*reader)?;
     let inputs = Inputs::of(config, &*reader, options)?;
     let _lock = Lock::folder(out)?;

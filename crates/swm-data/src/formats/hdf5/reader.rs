@@ -6,11 +6,10 @@ use super::record::Record;
 use super::source::Source;
 use super::structure::catch_panic;
 use super::table;
-use super::unchanged::Unchanged;
+use super::unchanged::{Seen, Unchanged};
 use crate::dataset::Location;
 use crate::dataset::episodes::{EpisodeRows, content_hash, index_columns};
 use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
-use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
@@ -143,7 +142,7 @@ impl Hdf5Reader {
 
     /// Whether the file, which was written to, holds this dataset and what a writer of this format appended. `seen` has rows that
     /// were read before.
-    fn grew(&self, seen: &BTreeMap<String, (StepRange, Vec<u8>)>) -> bool {
+    fn grew(&self, seen: &Seen) -> bool {
         let Ok(now) = self.source.with_present_size().and_then(Self::of) else { return false };
         let same_row = |(column, (range, row)): (&String, &(StepRange, Vec<u8>))| {
             let mut found = vec![0; row.len()];

@@ -7,12 +7,15 @@ use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 use swm_core::{Error, Result};
 
+/// The first row that was read of each column.
+pub(super) type Seen = BTreeMap<String, (StepRange, Vec<u8>)>;
+
 /// What is known of an open file. A replaced file stays open as it was, but a program can also write another dataset over it in
 /// place, whose rows would then be read in the layout of the first.
 pub(super) struct Unchanged {
     state: Mutex<Option<State>>,
-    /// The first row that was read of each column, to compare it if the file changes.
-    seen: Mutex<BTreeMap<String, (StepRange, Vec<u8>)>>,
+    /// Compared with what the file holds if it changes.
+    seen: Mutex<Seen>,
 }
 
 impl Unchanged {
@@ -31,7 +34,7 @@ impl Unchanged {
         &self,
         source: &Source,
         (column, ranges, rows): (&str, &[StepRange], &[u8]),
-        grew: impl Fn(&BTreeMap<String, (StepRange, Vec<u8>)>) -> bool,
+        grew: impl Fn(&Seen) -> bool,
     ) -> Result<()> {
         let mut seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
         let now = source.state();

@@ -49,7 +49,8 @@ pub struct WriteOptions {
     pub commit: CommitPolicy,
     /// Whether this must be the only writer. An exclusive writer fails when another writer adds to the dataset at the
     /// same time, instead of adding its episodes after those of the other. Collections are exclusive, because two that
-    /// continue the same dataset would store the same episodes twice. Formats other than Lance have one writer anyway.
+    /// continue the same dataset would store the same episodes twice. Formats other than Lance, and writers that replace
+    /// a dataset, have one writer anyway.
     pub exclusive: bool,
 }
 

@@ -31,6 +31,25 @@ fn second_collection_into_a_dataset_is_refused() {
 }
 
 #[test]
+fn writers_that_replace_a_table_do_not_mix_their_episodes() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    for existing in [false, true] {
+        let path = folder.path().join(format!("data-{existing}.lance"));
+        if existing {
+            write(&path, WriteMode::Create, 1, 0..2);
+        }
+        let mut first = create(&path, &schema(), options(WriteMode::Overwrite)).expect("replacing");
+        let error = create(&path, &schema(), options(WriteMode::Overwrite)).err().expect("a second writer");
+        assert!(error.is_usage() && error.to_string().contains("another process writes"), "{error}");
+        first.write_episode(&episode(0)).expect("writing");
+        first.finish().expect("finishing");
+        let reader = open(&path).expect("opening");
+        assert_eq!(reader.episodes().len(), 1);
+        check(&*reader, 0);
+    }
+}
+
+#[test]
 fn exclusive_writer_fails_when_another_writer_commits() {
     let folder = tempfile::tempdir().expect("creating a folder");
     let path = folder.path().join("data.lance");

@@ -37,8 +37,8 @@ pub(crate) const STAGE: &str = "train";
 ///
 /// # Errors
 /// When the configuration contradicts itself or the data, `out` holds a run that cannot be continued, another process
-/// trains in `out`, the loss or its
-/// gradient is not finite (the batch is saved), the caller's poll fails (after saving), or writing fails.
+/// trains in `out`, the loss or its gradient is not finite (the batch is saved), the caller's poll fails or a batch cannot be
+/// read (both after saving), or writing fails.
 pub fn train<M: Trainable>(
     config: &TrainConfig<M>,
     reader: Arc<dyn Reader>,
@@ -221,12 +221,17 @@ impl<'a> Run<'a> {
                 stop = Some(error);
                 break;
             }
-            let Update { metrics, lr, gradient_norm } = self.step()?;
+            let (Update { metrics, lr, gradient_norm }, loss) = match self.advance() {
+                Ok(advanced) => advanced,
+                Err(error) if self.is_worth_saving(&error) => {
+                    stop = Some(error);
+                    break;
+                }
+                Err(error) => return Err(error),
+            };
             let done = self.learner.state().step;
             let elapsed = self.clock.tick(done, &self.config);
-            self.learner.state_mut().window.add(&metrics, gradient_norm);
-            if is_due(self.config.validation.every, done, steps) {
-                let loss = self.validate()?;
+            if let Some(loss) = loss {
                 validation = Some(loss);
                 stopped_early = self.record_validation(loss)?;
             }
@@ -258,6 +263,21 @@ impl<'a> Run<'a> {
             control.emit(Event::Finished { stage: STAGE, metrics: &last });
         }
         Ok(self.summary(weights, interrupted, stopped_early, last))
+    }
+
+    /// Whether a run is saved that `error` ends: not if values are not finite, nor before the first step.
+    fn is_worth_saving(&self, error: &Error) -> bool {
+        self.learner.state().step > self.clock.first_step && !matches!(error, Error::NotFinite { .. })
+    }
+
+    /// Makes one step, and validates after it if that is due. Returns the loss of the validation.
+    fn advance(&mut self) -> Result<(Update, Option<f64>)> {
+        let update = self.step()?;
+        let LoopConfig { validation, schedule, .. } = &self.config;
+        let is_due = is_due(validation.every, self.learner.state().step, schedule.steps);
+        self.learner.state_mut().window.add(&update.metrics, update.gradient_norm);
+        let loss = is_due.then(|| self.validate()).transpose()?;
+        Ok((update, loss))
     }
 
     /// Averages the gradients of the step's batches and makes one optimizer step.

@@ -14,6 +14,8 @@ pub struct Dots {
     seed: u64,
     /// The frames that were read so far.
     pub frames_read: AtomicUsize,
+    /// See [`Dots::breaking_after`].
+    readable: usize,
 }
 
 impl Dots {
@@ -40,7 +42,7 @@ impl Dots {
             }
         }
         let episodes = (0..episodes).map(|i| Episode { index: i as i64, length: LENGTH }).collect();
-        Self { rows, episodes, seed, frames_read: AtomicUsize::new(0) }
+        Self { rows, episodes, seed, frames_read: AtomicUsize::new(0), readable: usize::MAX }
     }
 }
 
@@ -54,6 +56,11 @@ pub fn draw(at: [f32; 2], rgb: &mut [u8]) {
 }
 
 impl Dots {
+    /// The dataset, of which no more frames can be read after about `frames`.
+    pub fn breaking_after(self, frames: usize) -> Self {
+        Self { readable: frames, ..self }
+    }
+
     /// Sets the first action of an episode.
     pub fn with_action(mut self, episode: usize, action: [f32; 2]) -> Self {
         self.rows.row_mut(episode * LENGTH).set(1, &action);
@@ -78,7 +85,10 @@ impl Reader for Dots {
             let (first, bytes) = (range.episode * LENGTH + range.start, range.length * n);
             out[at..at + bytes].copy_from_slice(&self.rows.bytes(index)[first * n..][..bytes]);
             at += bytes;
-            self.frames_read.fetch_add(if index == 0 { range.length } else { 0 }, Ordering::Relaxed);
+            let read = self.frames_read.fetch_add(if index == 0 { range.length } else { 0 }, Ordering::Relaxed);
+            if index == 0 && read > self.readable {
+                return Err(Error::corrupt("dots", "the disk is gone", "restore it"));
+            }
         }
         Ok(())
     }

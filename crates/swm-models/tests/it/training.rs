@@ -105,6 +105,25 @@ fn resumed_run_gives_the_files_of_an_uninterrupted_run() {
 }
 
 #[test]
+fn run_whose_data_break_keeps_the_steps_before() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    let (complete, broken) = (folder.path().join("complete"), folder.path().join("broken"));
+    let (config, options) = (config(&[]), crate::options());
+    run(&config, &complete, &options, 0).expect("training the model");
+    let reader = Arc::new(Dots::new(6, 0).breaking_after(400));
+    let error = train(&config, reader, &broken, &options, &mut Control::new()).expect_err("broken data");
+    assert!(error.to_string().contains("the disk is gone"), "{error}");
+    let resume = TrainOptions { resume: true, ..options };
+    let again = run(&config, &broken, &resume, 0).expect("resuming");
+    assert!((again.steps, again.interrupted) == (10, false));
+    assert_eq!(files(&complete), files(&broken));
+    // Before the first step there is nothing to keep.
+    let (empty, reader) = (folder.path().join("empty"), Arc::new(Dots::new(6, 0).breaking_after(0)));
+    train(&config, reader, &empty, &crate::options(), &mut Control::new()).expect_err("broken data");
+    assert!(!Checkpoint::<Lewm>::exists(&empty));
+}
+
+#[test]
 fn running_statistics_of_the_encoder_are_stored_and_resumed() {
     let folder = tempfile::tempdir().expect("creating a temporary folder");
     let (complete, resumed) = (folder.path().join("complete"), folder.path().join("resumed"));

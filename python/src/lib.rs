@@ -43,7 +43,7 @@ mod _engine {
     #[pymodule_export]
     use super::data::replay::{ReplayBuffer, ReplaySampler};
     #[pymodule_export]
-    use super::data::tools::{convert, detect, doctor, find_dataset, inspect, recover, target};
+    use super::data::tools::{check_replacement, convert, detect, doctor, find_dataset, inspect, recover, target};
     #[pymodule_export]
     use super::data::writer::Writer;
     #[pymodule_export]

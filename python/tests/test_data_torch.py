@@ -1,8 +1,10 @@
 """Tests of datasets in torch's DataLoader: without workers, and with spawned and forked workers."""
 
+import pickle
+
 import numpy as np
 import pytest
-from data_helpers import clips, same, write
+from data_helpers import LENGTHS, clips, episode, same, write
 
 from stable_worldmodel import data
 
@@ -87,3 +89,23 @@ def test_episodes_of_tensors_are_written(tmp_path):
     assert sample["pixels"].flatten()[:5].tolist() == [0, 1, 2, 3, 4]
     assert sample["action"][:3].tolist() == [[0.5], [1.0], [2.0]] and sample["action"][3].isnan().all()
     assert sample["latent"].dtype == torch.float32
+
+
+@pytest.mark.parametrize("format", ["lance", "h5", "folder", "video", "lerobot"])
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+def test_workers_that_start_after_the_dataset_was_replaced_refuse_it(tmp_path, format, context):
+    path = tmp_path / f"d.{format}"
+    write(path)
+    dataset = data.load_dataset(str(path), num_steps=4)
+    loader = torch.utils.data.DataLoader(dataset, batch_size=8, num_workers=1, multiprocessing_context=context)
+    assert len(list(loader)) > 0
+    with data.open_writer(path) as writer:
+        writer.write_episode(episode(7, 15))
+    before = sum(len(batch["reward"]) for batch in loader)
+    assert before == len(dataset)
+    with data.open_writer(path, mode="overwrite") as writer:
+        writer.write_episodes([episode(number + 10, length) for number, length in enumerate(LENGTHS)])
+    with pytest.raises(Exception, match="replaced since the dataset was opened"):
+        list(loader)
+    with pytest.raises(Exception, match="replaced since the dataset was opened"):
+        pickle.loads(pickle.dumps(dataset))[0]

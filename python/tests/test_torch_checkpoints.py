@@ -1,7 +1,9 @@
 """Tests that checkpoints of the engine and of the published package load as torch modules, as data only."""
 
 import json
+import os
 import resource
+import threading
 import zipfile
 from pathlib import Path
 
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 
 import stable_worldmodel as swm
+from stable_worldmodel import _files
 
 torch = pytest.importorskip("torch")
 torch.set_num_threads(1)
@@ -249,3 +252,28 @@ def test_a_subclass_is_planned_with():
     world.reset(seed=0)
     world.step()
     assert np.abs(world.infos["action"]).max() < 0.1
+
+
+def test_load_waits_for_a_save_and_skips_what_is_no_file(home):
+    config = {"_target_": "torch.nn.Linear", "in_features": 3, "out_features": 3}
+    save_pretrained(torch.nn.Linear(3, 3), "mine", config)
+    folder = home / "checkpoints/mine"
+    os.mkfifo(folder / "zz.pt")
+    loaded = []
+    with _files.locked(folder, exclusive=True):
+        other = threading.Thread(target=lambda: loaded.append(load_pretrained("mine")))
+        other.start()
+        other.join(0.3)
+        assert not loaded
+    other.join()
+    assert loaded[0].in_features == 3
+
+
+@pytest.mark.parametrize("name", ["weights.pt", "weights.safetensors"])
+def test_sparse_weights_take_no_memory(tmp_path, name):
+    file = tmp_path / name
+    with file.open("wb") as opened:
+        opened.write(b"PK")
+        opened.truncate(1 << 33)
+    with pytest.raises(RuntimeError, match="sparse"):
+        _weights.read_state_dict(file)

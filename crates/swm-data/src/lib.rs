@@ -14,7 +14,7 @@ pub mod tools;
 
 pub use dataset::{
     BatchSlice, CacheConfig, ClipSpec, Clips, ColumnStats, CommitPolicy, Constants, Episode, Epoch, GoalMixture,
-    GoalSpec, Irregularity, LoadedBatch, Loader, LoaderConfig, Location, Part, Reader, ReplayBuffer, ReplayConfig,
+    GoalSpec, Irregularity, LoadedBatch, Loader, LoaderConfig, Location, Mark, Part, Reader, ReplayBuffer, ReplayConfig,
     ReplayLoader, Split, StepRange, WriteMode, WriteOptions, Writer, column_quantiles, column_stats, goals, objects,
     views,
 };

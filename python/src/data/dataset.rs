@@ -11,7 +11,7 @@ use pyo3::types::{PyBytes, PyDict};
 use std::sync::{Arc, Mutex, PoisonError};
 use swm::core::columns::ACTION;
 use swm::core::{Batch, ColumnSpec, Error, Result, Schema};
-use swm::data::{CacheConfig, FORMATS, Reader, StepRange, views};
+use swm::data::{CacheConfig, FORMATS, Mark, Reader, StepRange, views};
 use swm::home;
 
 /// A function that opens a reader. A forked process calls the function again.
@@ -22,6 +22,8 @@ type Open = Arc<dyn Fn() -> Result<Arc<dyn Reader>> + Send + Sync>;
 pub struct Dataset {
     open: Open,
     opened: Mutex<Opened>,
+    /// What is compared when another process opens the dataset again; `None` for views, whose parts have their own.
+    mark: Option<Mark>,
 }
 
 struct Opened {
@@ -37,18 +39,23 @@ impl Dataset {
     /// The error of `open`.
     pub fn of(py: Python<'_>, open: Open) -> PyResult<Self> {
         let reader = detached(py, || open()).map_err(to_py_err)?;
-        Ok(Self { open, opened: Mutex::new(Opened { process: std::process::id(), reader }) })
+        Ok(Self::with(reader, open, None))
+    }
+
+    fn with(reader: Arc<dyn Reader>, open: Open, mark: Option<Mark>) -> Self {
+        Self { open, opened: Mutex::new(Opened { process: std::process::id(), reader }), mark }
     }
 
     /// Returns the reader of this process. A forked process opens a new reader.
     ///
     /// # Errors
-    /// If a forked process cannot open its reader.
+    /// If a forked process cannot open its reader, or the dataset was replaced before that.
     pub fn reader(&self) -> Result<Arc<dyn Reader>> {
         let mut opened = self.opened.lock().unwrap_or_else(PoisonError::into_inner);
         let process = std::process::id();
         if opened.process != process {
             let reader = (self.open)()?;
+            self.mark.as_ref().map_or(Ok(()), |mark| mark.check(&*reader))?;
             // Dropping the parent's reader could wait for threads that the forked process does not have.
             std::mem::forget(std::mem::replace(&mut opened.reader, reader));
             opened.process = process;
@@ -72,17 +79,30 @@ impl Drop for Dataset {
 
 #[pymethods]
 impl Dataset {
-    /// Opens a dataset by path, URI or name.
+    /// Opens a dataset by path, URI or name. With the [`Dataset::mark`] of a dataset that was opened before, it must be that one.
     #[new]
-    fn new(py: Python<'_>, path: String, format: Option<String>) -> PyResult<Self> {
-        let open = move || {
+    fn new(py: Python<'_>, path: String, format: Option<String>, mark: Option<&str>) -> PyResult<Self> {
+        let open: Open = Arc::new(move || {
             let location = home::find_dataset(&path)?;
             match &format {
                 Some(format) => FORMATS.get(format)?.open(&location),
                 None => swm::data::open(location),
             }
-        };
-        Self::of(py, Arc::new(open))
+        });
+        let known: Option<Mark> = mark.map(serde_json::from_str).transpose().map_err(invalid_mark)?;
+        let opened = detached(py, || {
+            let reader = open()?;
+            // Without a row that can be read there is nothing to compare.
+            let mark = known.map_or_else(|| Ok(Mark::of(&*reader).ok()), |mark| mark.check(&*reader).map(|()| Some(mark)))?;
+            Ok((reader, mark))
+        });
+        let (reader, mark) = opened.map_err(to_py_err)?;
+        Ok(Self::with(reader, open, mark))
+    }
+
+    /// The mark by which another process recognises the dataset, as JSON.
+    fn mark(&self) -> PyResult<Option<String>> {
+        self.mark.as_ref().map(serde_json::to_string).transpose().map_err(invalid_mark)
     }
 
     /// A dataset read by a Python object: see [`ForeignReader`].
@@ -192,6 +212,10 @@ impl Dataset {
         }
         Ok(dict)
     }
+}
+
+fn invalid_mark(error: serde_json::Error) -> PyErr {
+    PyValueError::new_err(format!("the mark of a dataset: {error}"))
 }
 
 /// Reads each column as one batch: all rows of `action`, every `frameskip`-th row of other columns.

@@ -153,6 +153,13 @@ pub fn detect(path: &str) -> PyResult<Option<&'static str>> {
     Ok(formats::detect(&location).map(|format| format.id()))
 }
 
+/// Raises an error if the dataset at a path is being replaced, or that was interrupted.
+#[pyfunction]
+pub fn check_replacement(path: &str) -> PyResult<()> {
+    let location = Location::parse(path).map_err(to_py_err)?;
+    formats::interrupted(&location).map_or(Ok(()), |error| Err(to_py_err(error)))
+}
+
 /// The location of an existing dataset, given by path, URI or name.
 #[pyfunction]
 pub fn find_dataset(path: &str) -> PyResult<String> {

@@ -162,7 +162,8 @@ class StoredDataset(Dataset):
     """A dataset in one of the engine's formats.
 
     A batch is read in one call, which decodes each row once, on all cores, without the GIL. The dataset can be pickled
-    (the process that unpickles it opens the files again) and used after a fork.
+    (the process that unpickles it opens the files again) and used after a fork; an error says if the dataset was replaced
+    in between.
 
     Args:
         path: A path, a URI (`s3://`, `gs://`, `az://`, `http(s)://`), or a name under `$STABLEWM_HOME/datasets`.
@@ -200,7 +201,9 @@ class StoredDataset(Dataset):
         self.path = resolve(path)
         self.format = format or self.format or _engine.detect(self.path)
         self.backend = _tensors.backend(backend)
-        self._handle: Any = _engine.Dataset(self.path, self.format)
+        self._handle: Any = _engine.Dataset(self.path, self.format, None)
+        #: What a process that unpickles the dataset compares: it must not read another one in the layout of this.
+        self._mark: str | None = self._handle.mark()
         lengths = self._handle.lengths()
         super().__init__(lengths, np.cumsum(lengths) - lengths, frameskip, num_steps, transform)
         scalar = (1,) if self.format in self._LISTS else ()
@@ -221,7 +224,7 @@ class StoredDataset(Dataset):
             self._handle = self._open()
 
     def _open(self) -> Any:
-        handle = _engine.Dataset(self.path, self.format)
+        handle = _engine.Dataset(self.path, self.format, self._mark)
         return handle.cached(self._cached, 1 << 62) if self._cached else handle
 
     @property

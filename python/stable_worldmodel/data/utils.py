@@ -105,6 +105,7 @@ def load_dataset(
         "transform": transform,
     }
     if kind is None:
+        _engine.check_replacement(path)
         known = ", ".join(FORMATS)
         raise ValueError(f"{path} is of no known format ({known}); name the format with format=")
     if not kind.native:

@@ -86,7 +86,7 @@ class EpisodeWriter:
             )
         if exists and mode == "append":
             _engine.recover(self.path)
-            schema = _engine.Dataset(self.path, self.format).schema()
+            schema = _engine.Dataset(self.path, self.format, None).schema()
             self._columns = {name: (dtype, tuple(shape)) for name, dtype, shape in schema if name not in NUMBERING}
 
     @staticmethod

@@ -53,6 +53,7 @@ def read_capsule(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str
 
 def _read(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, str]]:
     """The tensors and the metadata of a safetensors file."""
+    _check_not_sparse(path)
     with open(path, "rb") as file:
         size = os.fstat(file.fileno()).st_size
         (length,) = struct.unpack("<Q", file.read(8).ljust(8, b"\0"))
@@ -76,6 +77,7 @@ def read_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
     """The tensors of a file that `torch.save` wrote, or of a safetensors file. No code of the file runs."""
     if Path(path).suffix == ".safetensors":
         return read_safetensors(path)
+    _check_not_sparse(path)
     _check_not_compressed(path)
     found: Any = torch.load(path, map_location="cpu", weights_only=True)
     if isinstance(found, Mapping) and isinstance(found.get("state_dict"), Mapping):
@@ -83,6 +85,25 @@ def read_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
     if not isinstance(found, Mapping) or not all(torch.is_tensor(value) for value in found.values()):
         raise RuntimeError(f"{path}: expected a state dict, a dict of tensors")
     return dict(found)
+
+
+def _check_not_sparse(path: str | os.PathLike[str]) -> None:
+    """Refuses what the engine's readers refuse: a long file that takes memory, and hardly any of the disk of who made it.
+
+    Raises:
+        RuntimeError: If a file of more than 64 MiB takes less than a 64th of its length on the disk.
+    """
+    found = os.stat(path)
+    taken = found.st_blocks * 512
+    if found.st_size <= 64 << 20 or taken >= found.st_size // 64:
+        return
+    with open(path, "rb") as file:
+        # Some file systems do not say what a file takes; then it does not begin with nothing.
+        if taken == 0 and any(file.read(4096)):
+            return
+    raise RuntimeError(
+        f"{path}: it is a sparse file, {found.st_size} bytes long, of which {taken} are on the disk; get it again from where it comes from"
+    )
 
 
 def _check_not_compressed(path: str | os.PathLike[str]) -> None:

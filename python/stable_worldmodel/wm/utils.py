@@ -67,7 +67,8 @@ def save_pretrained(
     else:
         text = json.dumps(_plain(config[config_key] if config_key is not None and config_key in config else config), indent=2)
         files[settings] = lambda beside: beside.write_text(text)
-    _files.replace(files)
+    with _files.locked(folder, exclusive=True):
+        _files.replace(files)
 
 
 def _plain(config: Any) -> Any:
@@ -111,14 +112,15 @@ def load_pretrained(
     settings = file.parent / "config.json"
     if not settings.is_file():
         raise FileNotFoundError(f"{settings}: there is no such file, which must describe the model; expected a regular file")
-    config = _read_settings(settings)
+    # Another process may replace both files.
+    with _files.locked(file.parent, exclusive=False):
+        config, weights = _read_settings(settings), read_state_dict(file)
     for key, value in (extra_args or {}).items():
         *groups, last = key.split(".")
         part = config
         for group in groups:
             part = part.setdefault(group, {})
         part[last] = value
-    weights = read_state_dict(file)
     model = build(config, trust=True) if trust else _built(config, file.stat().st_size, len(weights))
     if not isinstance(model, nn.Module):
         raise ValueError(f"{settings}: it describes no torch module; expected a _target_ and its arguments")
@@ -158,7 +160,7 @@ def _located(name: str, folder: Path) -> Path:
 
 
 def _only_weights(folder: Path) -> Path:
-    files = sorted(folder.glob("*.pt"))
+    files = sorted(file for file in folder.glob("*.pt") if file.is_file())
     if not files:
         raise FileNotFoundError(f"{folder}: it has no .pt file")
     if len(files) > 1:

@@ -20,7 +20,7 @@ mod stored_scalar;
 mod video;
 
 pub use entry::{Backend, FormatEntry};
-pub use registry::{FORMATS, create, detect, open, recover};
+pub use registry::{FORMATS, create, detect, interrupted, open, recover};
 
 use std::path::Path;
 

@@ -43,8 +43,13 @@ impl Opened {
             *known = now;
             return Ok(());
         }
-        Err(Error::corrupt(&self.folder, "it was replaced since the dataset was opened", "open the dataset again"))
+        Err(replaced(&self.folder))
     }
+}
+
+/// The error of a dataset that was replaced.
+pub fn replaced(path: &Path) -> Error {
+    Error::corrupt(path, "it was replaced since the dataset was opened", "open the dataset again")
 }
 
 /// Whether a dataset was never replaced; then its metadata do not count it.

@@ -36,7 +36,7 @@ pub fn open(location: impl Into<Location>) -> Result<Arc<dyn Reader>> {
     if let Some(format) = detect(&location) {
         return format.open(&location);
     }
-    if let Some(error) = set_aside::interrupted(&location, false) {
+    if let Some(error) = interrupted(&location) {
         return Err(error);
     }
     let problem = match location.path().map(|path| path.try_exists()) {
@@ -46,6 +46,11 @@ pub fn open(location: impl Into<Location>) -> Result<Arc<dyn Reader>> {
     let known: Vec<&str> = FORMATS.rows.iter().map(Named::id).collect();
     let fix = format!("`swm formats` describes the formats: {}", known.join(", "));
     Err(Error::corrupt(location.label(), problem, fix))
+}
+
+/// The error of a location whose dataset is being replaced and has no episode yet, or of which that was interrupted.
+pub fn interrupted(location: &Location) -> Option<Error> {
+    set_aside::interrupted(location, false)
 }
 
 /// Completes or undoes the replacement of a dataset that was interrupted, if there is one: what writes to a dataset that it

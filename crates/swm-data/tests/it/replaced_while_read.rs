@@ -2,7 +2,7 @@
 
 use crate::fuzz::copy_all;
 use crate::sample::{check, episode, write};
-use swm_data::{Reader, StepRange, WriteMode, open};
+use swm_data::{Mark, Reader, StepRange, WriteMode, open};
 
 /// The formats whose readers open files by name when they are needed.
 const FORMATS: [&str; 3] = ["folder", "video", "lerobot"];
@@ -137,4 +137,45 @@ fn an_hdf5_file_of_another_program_that_is_written_to_is_read_no_more() {
     touch_later(&path);
     let error = reader.read(&[&column], &row).expect_err("rows that may be others").to_string();
     assert!(error.contains("written over"), "{error}");
+}
+
+#[test]
+fn a_dataset_that_is_opened_again_must_be_the_one_of_its_mark() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    for format in ["lance", "lance-video", "h5", "folder", "video", "lerobot"] {
+        let path = folder.path().join(format!("d.{format}"));
+        write(&path, WriteMode::Create, 3, 0..6);
+        let mark = Mark::of(&*open(&path).expect("opening the dataset")).expect("a mark");
+        let text = serde_json::to_string(&mark).expect("a mark as JSON");
+        let mark: Mark = serde_json::from_str(&text).expect("a mark from JSON");
+        let check = || mark.check(&*open(&path).expect("opening the dataset"));
+        check().expect("the same dataset");
+        write(&path, WriteMode::Append, 3, 6..9);
+        check().expect("a dataset that has grown");
+        write(&path, WriteMode::Overwrite, 3, 0..6);
+        check().expect("the same rows");
+        // Episodes 7 to 12 have the lengths of episodes 0 to 5; in episodes 0 to 4 one is missing.
+        for others in [7..13, 0..5, 7..20] {
+            write(&path, WriteMode::Overwrite, 3, others);
+            let error = check().expect_err(format).to_string();
+            assert!(error.contains("replaced") && error.contains("open the dataset again"), "{format}: {error}");
+        }
+    }
+}
+
+#[test]
+fn rows_of_a_table_that_was_replaced_are_not_called_damaged() {
+    let folder = tempfile::tempdir().expect("creating a folder");
+    let path = folder.path().join("d.lance");
+    write(&path, WriteMode::Create, 3, 0..6);
+    let reader = open(&path).expect("opening the dataset");
+    write(&path, WriteMode::Overwrite, 3, 7..13);
+    let error = first_rows(&*reader, "action").expect_err("deleted files").to_string();
+    assert!(error.contains("replaced") && error.contains("open the dataset again"), "{error}");
+    // A file that is missing otherwise is damage.
+    let reader = open(&path).expect("opening the dataset");
+    let data = std::fs::read_dir(path.join("data")).expect("listing the files");
+    data.for_each(|file| std::fs::remove_file(file.expect("a file").path()).expect("deleting a file"));
+    let error = first_rows(&*reader, "action").expect_err("deleted files").to_string();
+    assert!(error.contains("missing"), "{error}");
 }

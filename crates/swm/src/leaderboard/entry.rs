@@ -87,9 +87,7 @@ impl Entry {
         results.manifest.hashes.extend(weights.map(|hash| (request.weights_key(&policy), hash)));
         results.manifest.config = to_json(&request)?;
         results.runs.retain(|run| request.policies.iter().any(|policy| policy.name == run.policy));
-        for run in &mut results.runs {
-            *run = Run { searches: None, prediction: None, played: None, videos: vec![], ..run.clone() };
-        }
+        results.runs = results.runs.iter().map(kept).collect();
         results.comparisons = Comparison::all(&results.runs, results.counting);
         let entry =
             Self { version: VERSION, policy, author, licence, processor: cpu_level(), results, hash: String::new() };
@@ -283,13 +281,25 @@ fn check_policies(request: &EvalRequest, policy: &str) -> std::result::Result<()
     }
 }
 
-/// Checks that there is one run for each condition and policy of a request, in order, with all episodes.
+/// What an entry keeps of a run: not what verification does not compute again, and no videos, which are other files.
+fn kept(run: &Run) -> Run {
+    Run { strict: None, searches: None, prediction: None, played: None, videos: vec![], ..run.clone() }
+}
+
+/// Checks that there is one run for each condition and policy of a request, in order, with all episodes and nothing that entries
+/// leave out.
 fn check_runs(request: &EvalRequest, runs: &[Run]) -> std::result::Result<(), String> {
     let expected = request.conditions.iter().flat_map(|condition| {
         request.policies.iter().map(move |policy| (condition.name.as_str(), policy.name.as_str()))
     });
     if !runs.iter().map(|run| (run.condition.as_str(), run.policy.as_str())).eq(expected) {
         return Err("its runs are not those of its request".to_owned());
+    }
+    if let Some(run) = runs.iter().find(|run| kept(run) != **run) {
+        return Err(format!(
+            "its run '{}' has videos, searches, prediction errors or a second rate, which entries leave out",
+            run.policy
+        ));
     }
     match runs.iter().find(|run| run.episodes.len() != request.episodes) {
         Some(run) => Err(format!(

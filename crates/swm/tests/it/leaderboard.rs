@@ -4,7 +4,7 @@ use crate::{Swm, text};
 use serde_json::json;
 use std::fs;
 use std::path::Path;
-use swm::core::results::{Counting, EpisodeResult, Run};
+use swm::core::results::{Counting, EpisodeResult, Run, Searches};
 use swm::leaderboard::{Entry, Submission, entries};
 
 /// A planner that is fast, and whose episodes are short.
@@ -192,6 +192,10 @@ fn entries_that_contradict_themselves_are_refused_before_anything_is_played() {
     });
     refused("another environment, protocol, counting or seed", &|entry| entry.results.manifest.seed += 1);
     refused("another environment, protocol, counting or seed", &|entry| entry.results.env = "swm/PushT-v1".to_owned());
+    refused("has videos", &|entry| entry.results.runs[0].videos.push("entry.mp4".to_owned()));
+    refused("searches", &|entry| {
+        entry.results.runs[1].searches = Some(Searches { plans: 9, best: vec![], mean: vec![], spread: vec![] });
+    });
     refused("its runs are not those of its request", &|entry| {
         entry.results.runs.pop();
         entry.results.comparisons.clear();

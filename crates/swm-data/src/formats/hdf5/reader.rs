@@ -184,8 +184,10 @@ impl Reader for Hdf5Reader {
         if name == EPISODE_IDX || name == STEP_IDX {
             return self.rows.fill_index_column(spec, ranges, out);
         }
-        self.read_rows(name, ranges, out)?;
-        self.unchanged.check(&self.source, (name, ranges, out), |seen| self.grew(seen))
+        let read = self.read_rows(name, ranges, out);
+        // Rows that could not be read are no rows that were seen.
+        let ranges = if read.is_ok() { ranges } else { &[] };
+        self.unchanged.check(&self.source, (name, ranges, out), |seen| self.grew(seen)).and(read)
     }
 
     fn constants(&self, episode: usize) -> Result<Constants> {

@@ -4,9 +4,9 @@
 //! file) and one new version of the table, committed atomically. Readers therefore never see a part of an episode, and
 //! a killed process loses only uncommitted episodes.
 //!
-//! Several writers may append concurrently. If another writer commits first, this writer renumbers its episodes after
-//! the new ones and retries. An exclusive writer fails instead: on this machine it locks the folder, in an object store
-//! it notices another writer at its next commit. A writer that replaces a table is exclusive.
+//! Several writers may append concurrently. If another writer commits first, this writer renumbers its episodes after the new ones
+//! and retries. An exclusive writer (any that replaces a table) fails instead: on this machine it locks the folder, in an object
+//! store it notices another writer at its next commit.
 
 use super::ENTRY;
 use super::encode::EncodedEpisode;
@@ -38,7 +38,6 @@ const MAX_QUEUED: usize = 2;
 /// Creates, continues or replaces a table.
 pub fn create(location: &Location, schema: &Schema, mut options: WriteOptions) -> Result<Box<dyn Writer>> {
     options.codec.check()?;
-    // Two writers that replace a table at the same time would mix their episodes, or lose those of one of them.
     options.exclusive |= options.mode == WriteMode::Overwrite;
     // A new table is recognised by its versions, whatever its name; a folder that is none must not become one.
     if location.path().is_none_or(Path::exists) {

@@ -176,8 +176,8 @@ impl LerobotReader {
                 if expected.next().is_some() { Err(other_rows(path)) } else { Ok(bytes) }
             })
             .collect();
-        let mut parts = parts?;
         self.check()?;
+        let mut parts = parts?;
         Ok(if parts.len() == 1 { parts.swap_remove(0) } else { parts.concat() })
     }
 
@@ -205,8 +205,8 @@ impl LerobotReader {
             frames.push((path.clone(), begin + self.time(times, episode, step), slot));
         }
         let source = |path: &PathBuf| Ok(Source::File(path.clone()));
-        self.videos.read(frames, source, |video, &time| self.frame(video, time))?;
-        self.check()
+        let read = self.videos.read(frames, source, |video, &time| self.frame(video, time));
+        self.check().and(read)
     }
 
     /// Time from the start of the episode to a row, in seconds.
@@ -256,7 +256,7 @@ impl LerobotReader {
         let mut slots = self.rows.row_slots(&column.spec, ranges, out)?;
         let file_of = |episode: usize| self.files.partition_point(|(_, episodes)| episodes.end <= episode);
         let jobs: Vec<_> = slots.chunk_by_mut(|a, b| file_of(a.0.0) == file_of(b.0.0)).collect();
-        jobs.into_par_iter().with_max_len(1).try_for_each(|group| {
+        let read = jobs.into_par_iter().with_max_len(1).try_for_each(|group| {
             let Some(file) = group.first().map(|((episode, _), _)| file_of(*episode)) else { return Ok(()) };
             let first = self.rows.first_rows()[self.files[file].1.start];
             let row = |(episode, step): (usize, usize)| (self.rows.first_rows()[episode] - first) as usize + step;
@@ -272,8 +272,8 @@ impl LerobotReader {
                 others.iter_mut().for_each(|(_, other)| other.copy_from_slice(first));
                 Ok(())
             })
-        })?;
-        self.check()
+        });
+        self.check().and(read)
     }
 }
 

@@ -58,8 +58,8 @@ impl Reader for VideoReader {
         }
         let slots = self.files.rows().row_slots(column, ranges, out)?;
         let requests = slots.into_iter().map(|((episode, step), slot)| ((index, episode), step, slot)).collect();
-        self.videos.read(requests, |key| self.source(key), |_, &step| Ok(step))?;
-        self.files.check()
+        let read = self.videos.read(requests, |key| self.source(key), |_, &step| Ok(step));
+        self.files.check().and(read)
     }
 
     fn constants(&self, episode: usize) -> Result<Constants> {

@@ -50,6 +50,15 @@ impl LanceReader {
         &self.store.label
     }
 
+    /// Whether the newest version of the table lacks a data file of this one, because another dataset took its place.
+    pub(super) fn is_replaced(&self) -> bool {
+        let Ok(Some(newest)) = self.store.latest() else { return false };
+        let files = |table: &Table| -> HashSet<String> {
+            table.fragments.iter().flat_map(|fragment| &fragment.files).map(|file| file.path.clone()).collect()
+        };
+        !files(&self.table).is_subset(&files(&newest.manifest))
+    }
+
     /// The number of rows of the table.
     pub(super) fn rows(&self) -> u64 {
         self.fragment_rows[self.fragment_rows.len() - 1]

@@ -25,6 +25,7 @@ use crate::dataset::Location;
 use crate::dataset::objects::BlockCache;
 use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
 use crate::formats::cast::cast;
+use crate::formats::opened::replaced;
 use lance_table::format::{DataFile, Manifest as Table};
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -206,19 +207,9 @@ impl LanceReader {
     }
 }
 
-impl Reader for LanceReader {
-    fn schema(&self) -> &Schema {
-        &self.schema
-    }
-
-    fn episodes(&self) -> &[Episode] {
-        &self.episodes
-    }
-
-    fn read_column(&self, name: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
-        if name == EPISODE_IDX || name == STEP_IDX {
-            return self.read_index_column(name, ranges, out);
-        }
+impl LanceReader {
+    /// Reads rows of a column that is no index column, as [`Reader::read_column`] does.
+    fn read_rows(&self, name: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
         let column = self.column(name)?;
         let rows: usize = ranges.iter().map(|range| range.length).sum();
         self.check_length(name, rows, out)?;
@@ -227,7 +218,7 @@ impl Reader for LanceReader {
             for piece in pieces(ranges) {
                 let rows: usize = piece.iter().map(|range| range.length).sum();
                 let (now, after) = rest.split_at_mut(rows * column.spec.row_bytes());
-                self.read_column(name, &piece, now)?;
+                self.read_rows(name, &piece, now)?;
                 rest = after;
             }
             return Ok(());
@@ -243,6 +234,23 @@ impl Reader for LanceReader {
             Kind::Values(_) => self.read_values(column, &mut requested),
             Kind::Image => self.read_images(column, &mut requested),
         }
+    }
+}
+
+impl Reader for LanceReader {
+    fn schema(&self) -> &Schema {
+        &self.schema
+    }
+
+    fn episodes(&self) -> &[Episode] {
+        &self.episodes
+    }
+
+    fn read_column(&self, name: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
+        if name == EPISODE_IDX || name == STEP_IDX {
+            return self.read_index_column(name, ranges, out);
+        }
+        self.read_rows(name, ranges, out).map_err(|error| if self.is_replaced() { replaced(self.folder()) } else { error })
     }
 
     /// Compares the content hash that is stated of each episode with its values, and the stored `step_idx` with the

@@ -17,33 +17,42 @@ _MOST_WAIT = 30.0
 
 @contextlib.contextmanager
 def locked(folder: Path, *, exclusive: bool) -> Iterator[None]:
-    """Keeps writers of a folder's files away, and with `exclusive` readers, too, so that several files are read as they were written.
+    """Waits for writers of a folder's files, and with `exclusive` for readers, too, so that several files are read as written.
 
-    The lock is advisory, and that of the engine's writers. File systems without locks keep no one away.
-
-    Raises:
-        TimeoutError: If another process holds the lock for half a minute.
+    The lock is advisory, and that of the engine's writers. After half a minute, in a folder that cannot be read, and on file
+    systems without locks, the work goes on without it.
     """
-    opened = os.open(folder, os.O_RDONLY)
     try:
-        end = time.monotonic() + _MOST_WAIT
-        while True:
-            try:
-                fcntl.flock(opened, (fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH) | fcntl.LOCK_NB)
-                break
-            except OSError as error:
-                if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
-                    break
-                if time.monotonic() > end:
-                    raise TimeoutError(f"{folder}: another process writes to it; wait until it has ended") from None
-                time.sleep(0.01)
+        opened = os.open(folder, os.O_RDONLY)
+    except PermissionError:
+        yield
+        return
+    try:
+        _wait_for(opened, fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH)
         yield
     finally:
+        # A process that was forked meanwhile keeps the lock of a file that is only closed.
+        with contextlib.suppress(OSError):
+            fcntl.flock(opened, fcntl.LOCK_UN)
         os.close(opened)
+
+
+def _wait_for(opened: int, lock: int) -> None:
+    end = time.monotonic() + _MOST_WAIT
+    while time.monotonic() < end:
+        try:
+            fcntl.flock(opened, lock | fcntl.LOCK_NB)
+            return
+        except OSError as error:
+            if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
+                return
+        time.sleep(0.01)
 
 
 def replace(files: Mapping[Path, Callable[[Path], object]]) -> None:
     """Writes files, each by a function of the path to write to: beside its place, which it takes once all are written.
+
+    Who reads several of them under :func:`locked` reads them as they were written.
 
     A kill leaves `.NAME.NUMBER.tmp`, which the next `swm eval` into this folder deletes if NAME is its own.
     """
@@ -54,8 +63,11 @@ def replace(files: Mapping[Path, Callable[[Path], object]]) -> None:
             # A link is not written through.
             beside[path].unlink(missing_ok=True)
             write(beside[path])
-        for path, written in beside.items():
-            os.replace(written, path)
+        with contextlib.ExitStack() as locks:
+            for folder in sorted({path.parent for path in files} if len(files) > 1 else ()):
+                locks.enter_context(locked(folder, exclusive=True))
+            for path, written in beside.items():
+                os.replace(written, path)
     except BaseException:
         for written in beside.values():
             written.unlink(missing_ok=True)

@@ -173,7 +173,9 @@ def test_concatenated_and_merged_datasets_have_all_clips_and_columns(tmp_path):
         np.testing.assert_array_equal(sample["feature"], 10.0 + sample["state"])
     with pytest.raises(ValueError, match="same episodes"):
         data.MergeDataset([parts[0], parts[1]])
-    for dataset in (both, merged):
+    # The first dataset has `state`, too, which `keys_from_dataset` takes from the second.
+    chosen = data.MergeDataset([parts[0], features], [["action"], ["feature", "state"]])
+    for dataset in (both, merged, chosen):
         batches = list(data.Loader(dataset, 4, shuffle=False, columns=["state", "action"], backend="numpy"))
         found = np.concatenate([batch["state"] for batch in batches])
         np.testing.assert_array_equal(found, [dataset[i]["state"] for i in range(len(dataset))])

@@ -176,8 +176,9 @@ fn kind(path: &Path) -> Result<Option<FileType>> {
     }
 }
 
-/// Deletes regular files of `folder`, given by their relative paths, in this order. Files that do not exist are skipped.
-/// Then removes the folders below `folder` that this emptied.
+/// Deletes regular files of `folder`, given by their relative paths, in this order, and removes the folders below `folder` that
+/// this empties. Files that do not exist are skipped. The last file that exists is deleted after those folders: it may be the
+/// metadata that names the others, so that after a kill the deletion can be repeated.
 ///
 /// # Errors
 /// When one of the paths leads out of the folder or through a symbolic link, or names something other than a regular file:
@@ -208,11 +209,15 @@ pub fn delete_named(folder: &Path, names: &[PathBuf]) -> Result<()> {
             Some(_) => return Err(Error::corrupt(path, "is not a regular file", "remove it by hand")),
         }
     }
-    for path in found {
-        unlink(&path).map_err(|error| Error::io(&path, "deleting the file", error))?;
+    let (others, last) = found.split_at(found.len().saturating_sub(1));
+    for files in [others, last] {
+        for path in files {
+            unlink(path).map_err(|error| Error::io(path, "deleting the file", error))?;
+        }
+        // A folder follows its parent in a sorted set.
+        folders.iter().rev().try_for_each(|name| remove_empty_folder(&folder.join(name)))?;
     }
-    // A folder follows its parent in a sorted set.
-    folders.iter().rev().try_for_each(|name| remove_empty_folder(&folder.join(name)))
+    Ok(())
 }
 
 /// Moves regular files of the folder `from`, given by their relative paths, in this order, to the same paths in `to`, on the

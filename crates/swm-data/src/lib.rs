@@ -14,9 +14,9 @@ pub mod tools;
 
 pub use dataset::{
     BatchSlice, CacheConfig, ClipSpec, Clips, ColumnStats, CommitPolicy, Constants, Episode, Epoch, GoalMixture,
-    GoalSpec, Irregularity, LoadedBatch, Loader, LoaderConfig, Location, Mark, Part, Reader, ReplayBuffer, ReplayConfig,
-    ReplayLoader, Split, StepRange, WriteMode, WriteOptions, Writer, column_quantiles, column_stats, goals, objects,
-    views,
+    GoalSpec, Irregularity, LoadedBatch, Loader, LoaderConfig, Location, Mark, Part, Reader, ReplayBuffer,
+    ReplayConfig, ReplayLoader, Split, StepRange, WriteMode, WriteOptions, Writer, column_quantiles, column_stats,
+    goals, objects, views,
 };
 pub use formats::{FORMATS, FormatEntry, create, has_no_dataset, lance, open, recover};
 pub use swm_image::{self as image, ImageCodec, RgbImage, check_png, write_png};

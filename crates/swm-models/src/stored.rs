@@ -244,6 +244,20 @@ pub fn faults(run: &Path) -> Result<Vec<String>> {
     if run.is_file() {
         return Ok(vec![]);
     }
+    let present = || locate(run).map(|folder| (read_text(&folder.join(MANIFEST)).ok(), folder));
+    let mut known = present();
+    loop {
+        let found = faults_of_folder(run);
+        let now = present();
+        // A training that saves meanwhile replaces the whole folder.
+        if now == known || found.as_ref().is_ok_and(Vec::is_empty) {
+            return found;
+        }
+        known = now;
+    }
+}
+
+fn faults_of_folder(run: &Path) -> Result<Vec<String>> {
     let folder = locate(run).ok_or_else(|| missing(run))?;
     let manifest = read_manifest(&folder)?;
     let mut faults = vec![];
@@ -259,7 +273,7 @@ pub fn faults(run: &Path) -> Result<Vec<String>> {
     }
     let world_model = run.join(WORLD_MODEL);
     if locate(&world_model).is_some() {
-        faults.extend(self::faults(&world_model)?.into_iter().map(|fault| format!("{WORLD_MODEL}: {fault}")));
+        faults.extend(faults_of_folder(&world_model)?.into_iter().map(|fault| format!("{WORLD_MODEL}: {fault}")));
     }
     Ok(faults)
 }

@@ -22,7 +22,8 @@ type Open = Arc<dyn Fn() -> Result<Arc<dyn Reader>> + Send + Sync>;
 pub struct Dataset {
     open: Open,
     opened: Mutex<Opened>,
-    /// What is compared when another process opens the dataset again; `None` for views, whose parts have their own.
+    /// What is compared when another process opens the dataset again. `None` for views, whose parts have their own, for readers in
+    /// Python, and if it could not be read.
     mark: Option<Mark>,
 }
 
@@ -92,8 +93,9 @@ impl Dataset {
         let known: Option<Mark> = mark.map(serde_json::from_str).transpose().map_err(invalid_mark)?;
         let opened = detached(py, || {
             let reader = open()?;
-            // Without a row that can be read there is nothing to compare.
-            let mark = known.map_or_else(|| Ok(Mark::of(&*reader).ok()), |mark| mark.check(&*reader).map(|()| Some(mark)))?;
+            // Other columns of a dataset with damaged rows can be read.
+            let mark =
+                known.map_or_else(|| Ok(Mark::of(&*reader).ok()), |mark| mark.check(&*reader).map(|()| Some(mark)))?;
             Ok((reader, mark))
         });
         let (reader, mark) = opened.map_err(to_py_err)?;
@@ -125,6 +127,15 @@ impl Dataset {
         let open = move || {
             let names: Vec<&str> = names.iter().map(String::as_str).collect();
             views::merge(base.get().reader()?, other.get().reader()?, &names)
+        };
+        Self::of(py, Arc::new(open))
+    }
+
+    /// A view of some columns of the dataset, preceded by the index columns.
+    fn select(slf: Py<Self>, py: Python<'_>, names: Vec<String>) -> PyResult<Self> {
+        let open = move || {
+            let names: Vec<&str> = names.iter().map(String::as_str).collect();
+            views::select(slf.get().reader()?, &names)
         };
         Self::of(py, Arc::new(open))
     }

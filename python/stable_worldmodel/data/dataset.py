@@ -415,6 +415,10 @@ class MergeDataset:
         from .foreign import engine_of
 
         merged = engine_of(self.datasets[0])
+        others = {name for keys in self.keys_map[1:] for name in keys} - set(self.keys_map[0])
+        known = [name for name, _, _ in merged.schema()]
+        if not others.isdisjoint(known):
+            merged = merged.select([name for name in known if name not in others])
         for dataset, keys in zip(self.datasets[1:], self.keys_map[1:], strict=True):
             merged = _engine.Dataset.merge(merged, engine_of(dataset), keys)
         return merged

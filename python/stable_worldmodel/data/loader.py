@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import json
 import math
+import operator
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -249,7 +250,10 @@ class Loader:
             raise ValueError(
                 f"the state belongs to a loader with other settings ({changes}); create it with the saved settings"
             )
-        self._next = self._at = (int(state["epoch"]), int(state["batch"]))
+        epoch, batch = operator.index(state["epoch"]), operator.index(state["batch"])
+        if epoch < 0 or not 0 <= batch <= len(self):
+            raise ValueError(f"the state has epoch {epoch} and batch {batch}; expected a batch from 0 to {len(self)}")
+        self._next = self._at = (epoch, batch)
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         """Yields the batches of an epoch. The next iteration yields the next epoch, also if this iteration ends early."""

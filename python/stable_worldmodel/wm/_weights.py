@@ -88,7 +88,7 @@ def read_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
 
 
 def _check_not_sparse(path: str | os.PathLike[str]) -> None:
-    """Refuses what the engine's readers refuse: a long file that takes memory, and hardly any of the disk of who made it.
+    """Refuses a long sparse file, as the engine does: reading it would take memory for its full length.
 
     Raises:
         RuntimeError: If a file of more than 64 MiB takes less than a 64th of its length on the disk.
@@ -101,9 +101,8 @@ def _check_not_sparse(path: str | os.PathLike[str]) -> None:
         # Some file systems do not say what a file takes; then it does not begin with nothing.
         if taken == 0 and any(file.read(4096)):
             return
-    raise RuntimeError(
-        f"{path}: it is a sparse file, {found.st_size} bytes long, of which {taken} are on the disk; get it again from where it comes from"
-    )
+    size = f"{found.st_size} bytes long, of which {taken} are on the disk"
+    raise RuntimeError(f"{path}: it is a sparse file, {size}; get it again from where it comes from")
 
 
 def _check_not_compressed(path: str | os.PathLike[str]) -> None:

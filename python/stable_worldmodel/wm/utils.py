@@ -67,8 +67,7 @@ def save_pretrained(
     else:
         text = json.dumps(_plain(config[config_key] if config_key is not None and config_key in config else config), indent=2)
         files[settings] = lambda beside: beside.write_text(text)
-    with _files.locked(folder, exclusive=True):
-        _files.replace(files)
+    _files.replace(files)
 
 
 def _plain(config: Any) -> Any:

@@ -20,6 +20,7 @@ mod stored_scalar;
 mod video;
 
 pub use entry::{Backend, FormatEntry};
+pub(crate) use opened::replaced;
 pub use registry::{FORMATS, create, detect, interrupted, open, recover};
 
 use std::path::Path;

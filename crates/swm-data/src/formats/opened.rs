@@ -49,7 +49,7 @@ impl Opened {
 
 /// The error of a dataset that was replaced.
 pub fn replaced(path: &Path) -> Error {
-    Error::corrupt(path, "it was replaced since the dataset was opened", "open the dataset again")
+    Error::corrupt(path, "its files were replaced since the dataset was opened", "open the dataset again")
 }
 
 /// Whether a dataset was never replaced; then its metadata do not count it.

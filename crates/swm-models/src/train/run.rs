@@ -221,17 +221,19 @@ impl<'a> Run<'a> {
                 stop = Some(error);
                 break;
             }
-            let (Update { metrics, lr, gradient_norm }, loss) = match self.advance() {
-                Ok(advanced) => advanced,
-                Err(error) if self.is_worth_saving(&error) => {
+            let Update { metrics, lr, gradient_norm } = match self.step()? {
+                Step::Made(update) => update,
+                Step::NoBatch(error) if self.learner.state().step > self.clock.first_step => {
                     stop = Some(error);
                     break;
                 }
-                Err(error) => return Err(error),
+                Step::NoBatch(error) => return Err(error),
             };
             let done = self.learner.state().step;
             let elapsed = self.clock.tick(done, &self.config);
-            if let Some(loss) = loss {
+            self.learner.state_mut().window.add(&metrics, gradient_norm);
+            if is_due(self.config.validation.every, done, steps) {
+                let loss = self.validate()?;
                 validation = Some(loss);
                 stopped_early = self.record_validation(loss)?;
             }
@@ -252,42 +254,33 @@ impl<'a> Run<'a> {
                 control.emit(Event::Saved(self.out));
             }
         }
-        let weights = self.learner.save(self.out)?;
-        control.emit(Event::Saved(self.out));
+        let saved = self.learner.save(self.out);
+        if saved.is_ok() {
+            control.emit(Event::Saved(self.out));
+        }
         let interrupted = match stop {
             None => false,
             Some(Error::Interrupted) => true,
             Some(error) => return Err(error),
         };
+        let weights = saved?;
         if !interrupted {
             control.emit(Event::Finished { stage: STAGE, metrics: &last });
         }
         Ok(self.summary(weights, interrupted, stopped_early, last))
     }
 
-    /// Whether a run is saved that `error` ends: not if values are not finite, nor before the first step.
-    fn is_worth_saving(&self, error: &Error) -> bool {
-        self.learner.state().step > self.clock.first_step && !matches!(error, Error::NotFinite { .. })
-    }
-
-    /// Makes one step, and validates after it if that is due. Returns the loss of the validation.
-    fn advance(&mut self) -> Result<(Update, Option<f64>)> {
-        let update = self.step()?;
-        let LoopConfig { validation, schedule, .. } = &self.config;
-        let is_due = is_due(validation.every, self.learner.state().step, schedule.steps);
-        self.learner.state_mut().window.add(&update.metrics, update.gradient_norm);
-        let loss = is_due.then(|| self.validate()).transpose()?;
-        Ok((update, loss))
-    }
-
     /// Averages the gradients of the step's batches and makes one optimizer step.
-    fn step(&mut self) -> Result<Update> {
+    fn step(&mut self) -> Result<Step> {
         let accumulate = self.config.optim.accumulate;
         let (mut sum, mut last) = (StepOutput::default(), None);
         for _ in 0..accumulate {
             let start = Instant::now();
             let index = self.batches.taken;
-            let batch = self.batches.next()?;
+            let batch = match self.batches.next() {
+                Ok(batch) => batch,
+                Err(error) => return Ok(Step::NoBatch(error)),
+            };
             self.clock.waited += start.elapsed().as_secs_f64();
             sum.add(self.loss_and_gradients(&batch, index)?);
             last = Some(batch);
@@ -300,7 +293,7 @@ impl<'a> Run<'a> {
             Some(batch) => {
                 Err(self.not_finite("the norm of the gradient", self.learner.state().step, &batch, &update.metrics))
             }
-            None => Ok(update),
+            None => Ok(Step::Made(update)),
         }
     }
 
@@ -393,6 +386,14 @@ impl<'a> Run<'a> {
             seconds,
         }
     }
+}
+
+/// What came of a step.
+enum Step {
+    /// An update.
+    Made(Update),
+    /// A batch could not be read; the model is as before.
+    NoBatch(Error),
 }
 
 impl Batches {

@@ -113,6 +113,9 @@ fn run_whose_data_break_keeps_the_steps_before() {
     let reader = Arc::new(Dots::new(6, 0).breaking_after(400));
     let error = train(&config, reader, &broken, &options, &mut Control::new()).expect_err("broken data");
     assert!(error.to_string().contains("the disk is gone"), "{error}");
+    let state = std::fs::read_to_string(broken.join("checkpoint/state.json")).expect("a checkpoint");
+    let step = serde_json::from_str::<serde_json::Value>(&state).expect("JSON")["step"].as_u64();
+    assert!(step.is_some_and(|step| (1..10).contains(&step)), "{state}");
     let resume = TrainOptions { resume: true, ..options };
     let again = run(&config, &broken, &resume, 0).expect("resuming");
     assert!((again.steps, again.interrupted) == (10, false));

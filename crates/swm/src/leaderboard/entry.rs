@@ -297,7 +297,7 @@ fn check_runs(request: &EvalRequest, runs: &[Run]) -> std::result::Result<(), St
     }
     if let Some(run) = runs.iter().find(|run| kept(run) != **run) {
         return Err(format!(
-            "its run '{}' has videos, searches, prediction errors or a second rate, which entries leave out",
+            "its run '{}' has videos, searches, prediction errors or a rate of strict counting, which entries leave out",
             run.policy
         ));
     }

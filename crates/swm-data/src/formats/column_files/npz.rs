@@ -120,6 +120,20 @@ impl Npz {
         Ok(self.parsed()?.0)
     }
 
+    /// Reads the first `most` bytes of the elements, as the file stores them, or all if there are fewer.
+    ///
+    /// # Errors
+    /// As [`Npz::header`].
+    pub fn first_bytes(&mut self, most: usize) -> Result<Vec<u8>> {
+        let (_, begin) = self.parsed()?;
+        let path = self.path.clone();
+        let file = self.archive.by_name(ARRAY).map_err(|e| damaged(&path, format!("{ARRAY}: {e}")))?;
+        let mut start = vec![];
+        let end = begin.saturating_add(most) as u64;
+        file.take(end).read_to_end(&mut start).map_err(|e| damaged(&path, format!("{ARRAY}: {e}")))?;
+        Ok(start.split_off(begin.min(start.len())))
+    }
+
     /// Reads the header of the array, and the offset of the elements.
     fn parsed(&mut self) -> Result<(Header, usize)> {
         let path = self.path.clone();

@@ -105,6 +105,25 @@ impl ColumnFiles {
         Ok(true)
     }
 
+    /// See [`crate::Reader::identity`]: how often the dataset was replaced, and the first row of each column.
+    ///
+    /// # Errors
+    /// If the file of a column is damaged.
+    pub fn identity(&self) -> Result<String> {
+        let mut hasher = blake3::Hasher::new();
+        hasher.update(&self.recorded.replaced.to_le_bytes());
+        for Column { spec, in_file, unmerged_rows, .. } in &self.columns {
+            let size = spec.row_bytes();
+            let row = match in_file {
+                0 => unmerged_rows.iter().take(size).copied().collect(),
+                _ => Npz::open(&column_path(&self.folder, &spec.name))?.first_bytes(size)?,
+            };
+            hasher.update(spec.name.as_bytes());
+            hasher.update(&row);
+        }
+        Ok(hasher.finalize().to_hex().to_string())
+    }
+
     /// How often the dataset was replaced by another one at its path.
     pub(super) const fn replaced(&self) -> u64 {
         self.recorded.replaced

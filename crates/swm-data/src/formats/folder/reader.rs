@@ -66,9 +66,16 @@ impl Reader for FolderReader {
 
     fn read_column(&self, name: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
         let column = self.schema.column(name)?;
-        let read =
-            if self.files.has(name) { self.files.read(column, ranges, out) } else { self.read_images(column, ranges, out) };
+        let read = if self.files.has(name) {
+            self.files.read(column, ranges, out)
+        } else {
+            self.read_images(column, ranges, out)
+        };
         read.or_else(|error| self.files.check().and(Err(error)))
+    }
+
+    fn identity(&self, _: usize) -> Result<String> {
+        self.files.identity()
     }
 
     fn constants(&self, episode: usize) -> Result<Constants> {

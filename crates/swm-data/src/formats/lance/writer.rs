@@ -382,7 +382,7 @@ impl Committer {
                     }
                     return match &mut self.sink {
                         Sink::Shard(log) => log.finish(),
-                        Sink::Table { table, exclusive, replaced, .. } => replace(table, *exclusive, replaced, &[]),
+                        Sink::Table { table, replaced, .. } => replace(table, replaced, &[]),
                     };
                 }
             }
@@ -407,8 +407,8 @@ impl Committer {
             return Ok(());
         }
         let committed = match &mut self.sink {
-            Sink::Table { table, next, exclusive, replaced: replaced @ Some(_) } => {
-                let stored = replace(table, *exclusive, replaced, episodes);
+            Sink::Table { table, next, replaced: replaced @ Some(_), .. } => {
+                let stored = replace(table, replaced, episodes);
                 *next = episodes.len() as i64;
                 stored
             }
@@ -430,39 +430,27 @@ impl Committer {
 }
 
 /// Commits episodes as the version that replaces another one, if there is one to replace, and deletes its files.
-fn replace(
-    table: &mut Table,
-    exclusive: bool,
-    replaced: &mut Option<Version>,
-    episodes: &[EncodedEpisode],
-) -> Result<()> {
-    for _ in 0..MAX_ATTEMPTS {
-        let Some(old) = replaced.as_ref() else { return Ok(()) };
-        let fragment = (!episodes.is_empty()).then(|| table.write_episodes(episodes, Some(0))).transpose()?;
-        let discard = |table: &Table| fragment.iter().for_each(|fragment| table.discard(fragment));
-        match table.commit(table.overwrite_operation(fragment.clone().into_iter().collect())) {
-            Ok(true) => {
-                table.remove_replaced(old);
-                (table.replaces, *replaced) = (false, None);
-                return Ok(());
-            }
-            Ok(false) => {
+fn replace(table: &mut Table, replaced: &mut Option<Version>, episodes: &[EncodedEpisode]) -> Result<()> {
+    let Some(old) = replaced.as_ref() else { return Ok(()) };
+    let fragment = (!episodes.is_empty()).then(|| table.write_episodes(episodes, Some(0))).transpose()?;
+    let discard = |table: &Table| fragment.iter().for_each(|fragment| table.discard(fragment));
+    match table.commit(table.overwrite_operation(fragment.clone().into_iter().collect())) {
+        Ok(true) => {
+            table.remove_replaced(old);
+            (table.replaces, *replaced) = (false, None);
+            Ok(())
+        }
+        Ok(false) => {
+            discard(table);
+            Err(other_writer(table))
+        }
+        Err(error) => {
+            if is_full(&error) {
                 discard(table);
-                if exclusive {
-                    return Err(other_writer(table));
-                }
-                let latest = table.store.latest()?;
-                (table.version, *replaced) = (latest.clone(), latest);
             }
-            Err(error) => {
-                if is_full(&error) {
-                    discard(table);
-                }
-                return Err(error);
-            }
+            Err(error)
         }
     }
-    Err(too_many_conflicts(&table.store.label))
 }
 
 fn other_writer(table: &Table) -> Error {

@@ -122,6 +122,10 @@ impl Reader for LanceVideoReader {
         self.steps.content_hash()
     }
 
+    fn identity(&self, episodes: usize) -> Result<String> {
+        self.steps.identity(episodes)
+    }
+
     fn cache_key(&self) -> Result<String> {
         self.steps.cache_key()
     }

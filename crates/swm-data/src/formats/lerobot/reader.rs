@@ -352,6 +352,13 @@ impl Reader for LerobotReader {
         Ok(batch)
     }
 
+    /// How often the dataset was replaced, and the sizes of its data files, which writers do not change.
+    fn identity(&self, episodes: usize) -> Result<String> {
+        let files = self.files.iter().zip(&self.states).take_while(|((_, range), _)| range.start < episodes);
+        let sizes: Vec<String> = files.map(|(_, state)| format!("{:?}", state.map(|(_, _, size)| size))).collect();
+        Ok(format!("{:?} {}", self.info.replaced(), sizes.join(" ")))
+    }
+
     fn constants(&self, episode: usize) -> Result<Constants> {
         let Some(files) = self.files_of_episodes.get(episode) else {
             let given = format!("episode position {episode}");

@@ -81,6 +81,9 @@ pub fn read_batches(
         if total as u64 > MAX_ROWS_PER_BYTE.saturating_mul(length) {
             return Err(failed(&format!("{total} rows do not fit {length} bytes")));
         }
+        if builder.metadata().row_groups().iter().flat_map(RowGroupMetaData::columns).any(is_outside) {
+            return Err(failed(&"a column begins before the file, or has a negative size"));
+        }
         // Rows of the declared shape have fewer values than bytes.
         let is_larger = |group: &RowGroupMetaData| {
             let read = group.columns().iter().filter(|c| c.column_path().parts().first().is_some_and(is_read));
@@ -106,6 +109,14 @@ pub fn read_batches(
         reader.into_iter().try_for_each(|batch| each(batch.map_err(|e| failed(&e))?))
     };
     catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|_| Err(failed(&"its content is invalid")))
+}
+
+/// Whether a column begins before the file or has a negative size, at which the library panics.
+fn is_outside(column: &ColumnChunkMetaData) -> bool {
+    let is_negative = |number: i64| number < 0;
+    is_negative(column.data_page_offset())
+        || is_negative(column.compressed_size())
+        || column.dictionary_page_offset().is_some_and(is_negative)
 }
 
 /// The values of an integer column.
@@ -177,5 +188,27 @@ mod tests {
         assert!(error.contains("its rows take more than 1048576 bytes"), "{error}");
         let rows = read_within(&path, &["tasks"], 1 << 26).expect("64 MB suffice");
         assert_eq!(rows.iter().map(RecordBatch::num_rows).sum::<usize>(), 1000);
+    }
+
+    #[test]
+    fn a_changed_bit_of_the_footer_is_an_error_without_a_panic() {
+        let folder = tempfile::tempdir().expect("creating a folder");
+        let path = folder.path().join("data.parquet");
+        let schema = Arc::new(ArrowSchema::new(vec![Field::new("tasks", DataType::Utf8, false)]));
+        let texts = Arc::new(StringArray::from_iter_values(["a", "b"]));
+        let batch = RecordBatch::try_new(Arc::clone(&schema), vec![texts]).expect("a table");
+        write(&path, &schema, &batch).expect("writing the table");
+        let bytes = std::fs::read(&path).expect("the file");
+        // The length of the footer and a mark end the file.
+        let (rest, end) = bytes.split_at(bytes.len() - 8);
+        let footer = u32::from_le_bytes([end[0], end[1], end[2], end[3]]) as usize;
+        for bit in 8 * (rest.len() - footer)..8 * rest.len() {
+            let mut changed = bytes.clone();
+            changed[bit / 8] ^= 1 << (bit % 8);
+            std::fs::write(&path, changed).expect("writing the file");
+            if let Err(error) = read(&path, &["tasks"]) {
+                assert!(!error.to_string().contains("its content is invalid"), "a panic for bit {bit}");
+            }
+        }
     }
 }

@@ -48,6 +48,10 @@ pub fn append(array: &dyn Array, column: &ColumnSpec, out: &mut Vec<u8>) -> Resu
         return Err(format!("its rows are lists of the shape {lengths:?}, not {:?}", column.shape));
     }
     match leaf.data_type() {
+        // A damaged description of the file, in which floats are read as bits.
+        DataType::Boolean if matches!(column.dtype, DType::Float32 | DType::Float64) => {
+            return Err(format!("it is stored as booleans, and declared as {}", column.dtype.name()));
+        }
         DataType::Boolean => append_values(leaf.as_boolean().values().iter().map(i64::from), column.dtype, out),
         DataType::Int8 => append_integers::<Int8Type>(&leaf, column, out),
         DataType::Int16 => append_integers::<Int16Type>(&leaf, column, out),
@@ -169,6 +173,9 @@ mod tests {
         ] {
             assert!(floats(value, dtype).is_err(), "{value}");
         }
+        let booleans = |dtype| read(&BooleanArray::from(vec![true, false]), &ColumnSpec::new("x", dtype, []));
+        assert_eq!(booleans(DType::Bool), Ok(vec![1, 0]));
+        assert!(booleans(DType::Float32).is_err());
     }
 
     #[test]

@@ -62,6 +62,10 @@ impl Reader for VideoReader {
         self.files.check().and(read)
     }
 
+    fn identity(&self, _: usize) -> Result<String> {
+        self.files.identity()
+    }
+
     fn constants(&self, episode: usize) -> Result<Constants> {
         self.files.constants(episode)
     }

@@ -5,6 +5,7 @@ use crate::dataset::objects::BlockCache;
 use crate::formats::lance::image_locations::ImageLocations;
 use crate::formats::lance::schema::StoredColumn;
 use crate::formats::lance::store::Store;
+use crate::formats::opened::replaced;
 use lance_file::reader::FileReader;
 use lance_table::format::Manifest as Table;
 use std::collections::{HashMap, HashSet, VecDeque};
@@ -12,7 +13,7 @@ use std::fs::File;
 use std::ops::Range;
 use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use swm_core::Schema;
+use swm_core::{Error, Schema};
 
 /// Maximum number of open local data files. Each file takes up to two file descriptors; a process may usually open
 /// 1024.
@@ -50,13 +51,15 @@ impl LanceReader {
         &self.store.label
     }
 
-    /// Whether the newest version of the table lacks a data file of this one, because another dataset took its place.
-    pub(super) fn is_replaced(&self) -> bool {
-        let Ok(Some(newest)) = self.store.latest() else { return false };
+    /// The error of a read, or that the files were replaced: then the newest version of the table lacks a data file of this one.
+    pub(super) fn explained(&self, error: Error) -> Error {
         let files = |table: &Table| -> HashSet<String> {
             table.fragments.iter().flat_map(|fragment| &fragment.files).map(|file| file.path.clone()).collect()
         };
-        !files(&self.table).is_subset(&files(&newest.manifest))
+        match self.store.latest() {
+            Ok(Some(newest)) if !files(&self.table).is_subset(&files(&newest.manifest)) => replaced(self.folder()),
+            _ => error,
+        }
     }
 
     /// The number of rows of the table.

@@ -25,7 +25,6 @@ use crate::dataset::Location;
 use crate::dataset::objects::BlockCache;
 use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
 use crate::formats::cast::cast;
-use crate::formats::opened::replaced;
 use lance_table::format::{DataFile, Manifest as Table};
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -205,9 +204,15 @@ impl LanceReader {
             format!("{expected} for {rows} rows"),
         ))
     }
-}
 
-impl LanceReader {
+    /// The constants of an episode, which is in this fragment.
+    fn stored_constants(&self, episode: usize, fragment: usize) -> Result<Constants> {
+        let Some((reader, record)) = self.record(fragment)? else { return Ok(Constants::new()) };
+        let Some(values) = self.buffer(&reader, CONSTANTS_KEY)? else { return Ok(Constants::new()) };
+        let position = episode - self.first_rows.partition_point(|&first| first < self.fragment_rows[fragment]);
+        record.constants(position, &values).map_err(|problem| damaged(self.folder(), problem))
+    }
+
     /// Reads rows of a column that is no index column, as [`Reader::read_column`] does.
     fn read_rows(&self, name: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
         let column = self.column(name)?;
@@ -250,7 +255,7 @@ impl Reader for LanceReader {
         if name == EPISODE_IDX || name == STEP_IDX {
             return self.read_index_column(name, ranges, out);
         }
-        self.read_rows(name, ranges, out).map_err(|error| if self.is_replaced() { replaced(self.folder()) } else { error })
+        self.read_rows(name, ranges, out).map_err(|error| self.explained(error))
     }
 
     /// Compares the content hash that is stated of each episode with its values, and the stored `step_idx` with the
@@ -325,15 +330,19 @@ impl Reader for LanceReader {
                 format!("positions below {}", self.episodes.len()),
             ));
         };
-        let fragment = self.fragment_of(row);
-        let Some((reader, record)) = self.record(fragment)? else { return Ok(Constants::new()) };
-        let Some(values) = self.buffer(&reader, CONSTANTS_KEY)? else { return Ok(Constants::new()) };
-        let position = episode - self.first_rows.partition_point(|&first| first < self.fragment_rows[fragment]);
-        record.constants(position, &values).map_err(|problem| damaged(self.folder(), problem))
+        self.stored_constants(episode, self.fragment_of(row)).map_err(|error| self.explained(error))
     }
 
     fn content_hash(&self) -> Result<String> {
         self.hash_of_episodes("", |fragment, episodes| self.hashes(fragment, episodes))
+    }
+
+    /// The names of the data files, which are hashes of the content or random.
+    fn identity(&self, episodes: usize) -> Result<String> {
+        let end = self.first_rows.get(episodes).copied().unwrap_or_else(|| self.rows());
+        let fragments = self.table.fragments.iter().zip(&self.fragment_rows).take_while(|(_, first)| **first < end);
+        let files = fragments.flat_map(|(fragment, _)| &fragment.files).map(|file| file.path.as_str());
+        Ok(files.collect::<Vec<_>>().join("\n"))
     }
 
     /// The hashes that data files state of episodes are the word of who wrote them. So local files are known by the hashes in

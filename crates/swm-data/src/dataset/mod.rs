@@ -7,6 +7,7 @@ pub mod cache;
 pub mod clips;
 pub(crate) mod episodes;
 pub mod goals;
+mod identity;
 pub mod loader;
 mod location;
 mod mark;

@@ -4,7 +4,7 @@
 //! the action that follows this observation. The last row of an episode is its final observation; its action is NaN
 //! (float) or -1 (integer).
 
-use super::mark::first_and_last_row;
+use super::identity::first_and_last_row;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use swm_core::{Batch, ColumnSpec, Manifest, Result, Schema};

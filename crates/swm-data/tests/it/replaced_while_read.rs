@@ -170,7 +170,8 @@ fn rows_of_a_table_that_was_replaced_are_not_called_damaged() {
         write(&path, WriteMode::Create, 1, 0..40);
         let reader = open(&path).expect("opening the dataset");
         write(&path, WriteMode::Overwrite, 3, 7..13);
-        let error = first_rows(&*reader, column).expect_err("deleted files").to_string();
+        // The files of the first episode may be open.
+        let error = reader.read(&[column], &[StepRange::new(3, 0, 1)]).expect_err(format).to_string();
         assert!(error.contains("replaced") && error.contains("open the dataset again"), "{format}: {error}");
     }
     // A file that is missing otherwise is damage.

@@ -56,7 +56,7 @@ pub fn draw(at: [f32; 2], rgb: &mut [u8]) {
 }
 
 impl Dots {
-    /// The dataset, of which no more frames can be read after about `frames`.
+    /// The dataset, of which no more frames can be read after about `frames`. A loader reads each of the 24 frames of an episode once.
     pub fn breaking_after(self, frames: usize) -> Self {
         Self { readable: frames, ..self }
     }

@@ -110,7 +110,7 @@ fn run_whose_data_break_keeps_the_steps_before() {
     let (complete, broken) = (folder.path().join("complete"), folder.path().join("broken"));
     let (config, options) = (config(&[]), crate::options());
     run(&config, &complete, &options, 0).expect("training the model");
-    let reader = Arc::new(Dots::new(6, 0).breaking_after(400));
+    let reader = Arc::new(Dots::new(6, 0).breaking_after(90));
     let error = train(&config, reader, &broken, &options, &mut Control::new()).expect_err("broken data");
     assert!(error.to_string().contains("the disk is gone"), "{error}");
     let state = std::fs::read_to_string(broken.join("checkpoint/state.json")).expect("a checkpoint");

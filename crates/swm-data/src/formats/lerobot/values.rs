@@ -50,7 +50,7 @@ pub fn append(array: &dyn Array, column: &ColumnSpec, out: &mut Vec<u8>) -> Resu
     match leaf.data_type() {
         // A damaged description of the file, in which floats are read as bits.
         DataType::Boolean if matches!(column.dtype, DType::Float32 | DType::Float64) => {
-            return Err(format!("it is stored as booleans, and declared as {}", column.dtype.name()));
+            Err(format!("it is stored as booleans, and declared as {}", column.dtype.name()))
         }
         DataType::Boolean => append_values(leaf.as_boolean().values().iter().map(i64::from), column.dtype, out),
         DataType::Int8 => append_integers::<Int8Type>(&leaf, column, out),

@@ -4,7 +4,7 @@
 //! the action that follows this observation. The last row of an episode is its final observation; its action is NaN
 //! (float) or -1 (integer).
 
-use super::identity::first_and_last_row;
+use super::identity::sampled_rows;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use swm_core::{Batch, ColumnSpec, Manifest, Result, Schema};
@@ -129,13 +129,13 @@ pub trait Reader: Send + Sync {
     fn content_hash(&self) -> Result<String>;
 
     /// What tells the first `episodes` episodes from those of another dataset with the same lengths: equal for a copy of the files,
-    /// and after this program added episodes. Cheaper than [`Reader::content_hash`], and no proof: by default, the values of the
-    /// first and the last row; the formats say what else. Other after another program wrote the same rows into other files.
+    /// and after this program added episodes. Cheaper than [`Reader::content_hash`], and no proof: by default, the values of
+    /// some rows; the formats say what else. Other after another program wrote the same rows into other files.
     ///
     /// # Errors
     /// If the stored data is damaged.
     fn identity(&self, episodes: usize) -> Result<String> {
-        first_and_last_row(self, episodes)
+        sampled_rows(self, episodes)
     }
 
     /// A key for caches of decoded rows, which datasets share: equal keys mean equal rows, whatever program wrote the files. It is

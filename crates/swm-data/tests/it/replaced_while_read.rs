@@ -152,6 +152,12 @@ fn a_dataset_that_is_opened_again_must_be_the_one_of_its_mark() {
         check().expect("the same dataset");
         write(&path, WriteMode::Append, 3, 6..9);
         check().expect("a dataset that has grown");
+        // An episode between the first and the last is another one of the same length.
+        write(&path, WriteMode::Overwrite, 1, 0..3);
+        write(&path, WriteMode::Append, 1, 10..11);
+        write(&path, WriteMode::Append, 1, 4..6);
+        let error = check().expect_err(format).to_string();
+        assert!(error.contains("replaced"), "{format}: {error}");
         // Episodes 7 to 12 have the lengths of episodes 0 to 5; in episodes 0 to 4 one is missing.
         for others in [7..13, 0..5, 7..20] {
             write(&path, WriteMode::Overwrite, 3, others);

@@ -1,9 +1,10 @@
 //! Storage of a Lance table: its location, its newest version, and commits of new versions.
 
+mod latest;
+
 use super::errors::{damaged, lance_error};
 use super::{ENTRY, manifest_file};
 use crate::dataset::{Location, objects};
-use arrow_schema::Schema as ArrowSchema;
 use bytes::Bytes;
 use futures::{StreamExt as _, TryStreamExt as _};
 use lance_core::cache::LanceCache;
@@ -11,12 +12,12 @@ use lance_encoding::decoder::DecoderPlugins;
 use lance_file::reader::{FileReader, FileReaderOptions};
 use lance_io::object_store::ObjectStore;
 use lance_io::scheduler::{ScanScheduler, SchedulerConfig};
-use lance_table::feature_flags::{ensure_can_read_manifest, ensure_can_write_manifest};
+use lance_table::feature_flags::ensure_can_write_manifest;
 use lance_table::format::{DataFile, Fragment, IndexMetadata, Manifest, ManifestBuildConfig};
 use lance_table::io::commit::{
     CommitHandler as _, ConditionalPutCommitHandler, ManifestLocation, ManifestNamingScheme, write_version_hint,
 };
-use lance_table::io::manifest::{read_manifest, read_manifest_indexes};
+use lance_table::io::manifest::read_manifest;
 use lance_table::transaction::{Operation, Transaction, validate_operation};
 use object_store::path::Path as StorePath;
 use object_store::{ObjectMeta, ObjectStoreExt as _, PutMode, PutOptions};
@@ -168,37 +169,6 @@ impl Store {
         }
         let problem = format!("{} cannot be written: it is read over HTTP", self.label.display());
         Err(Error::config("dataset", problem, "write to a path or to s3://, gs:// or az://"))
-    }
-
-    /// The newest version; `None` if there is no table yet.
-    ///
-    /// # Errors
-    /// If the folder holds other files, or the newest version cannot be read.
-    pub fn latest(&self) -> Result<Option<Version>> {
-        if self.lists && !self.has_versions()? {
-            return self.check_free().map(|()| None);
-        }
-        let store = self.clone();
-        block_on(&self.label, "reading the newest version", async move {
-            let location = store.latest_location().await?;
-            let bytes = manifest_file::read_whole(&store.objects, &location.path).await?;
-            manifest_file::verify_checksum(&bytes)?;
-            // Lance parses the verified bytes, not the object, which may have changed.
-            let memory = ObjectStore::memory();
-            memory.put(&location.path, &bytes).await?;
-            let manifest = read_manifest(&memory, &location.path, Some(bytes.len() as u64)).await?;
-            if manifest.version != location.version {
-                return Err(manifest_file::corrupt(format!(
-                    "version {} is stored as version {}",
-                    manifest.version, location.version
-                )));
-            }
-            ensure_can_read_manifest(&manifest)?;
-            let indices = read_manifest_indexes(&memory, &location, &manifest).await?;
-            // Converting the schema here turns Lance's panic on unknown types into an error.
-            let _ = ArrowSchema::from(&manifest.schema);
-            Ok(Some(Version { manifest: Arc::new(manifest), indices }))
-        })
     }
 
     fn has_versions(&self) -> Result<bool> {

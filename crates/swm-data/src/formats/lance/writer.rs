@@ -50,7 +50,7 @@ pub fn create(location: &Location, schema: &Schema, mut options: WriteOptions) -
     for _ in 0..MAX_ATTEMPTS {
         // If another process creates, continues or replaces the table in between, the next attempt starts from the new
         // state.
-        if let Some(prepared) = prepare(&store, schema, &options)? {
+        if let Some(prepared) = store.with_latest(|found| prepare(&store, found, schema, &options))? {
             return prepared.start(schema, &options, lock);
         }
     }
@@ -97,10 +97,14 @@ pub fn new_table_schema(columns: &[StoredColumn], schema: &Schema, options: &Wri
 }
 
 /// Creates or continues the table, or prepares its replacement. Returns `None` if another process changed the table at the same time.
-fn prepare(store: &Store, schema: &Schema, options: &WriteOptions) -> Result<Option<PreparedWriter>> {
+fn prepare(
+    store: &Store,
+    found: Option<Version>,
+    schema: &Schema,
+    options: &WriteOptions,
+) -> Result<Option<PreparedWriter>> {
     let mut columns = schema::columns_to_write(schema)?;
     let fresh = new_table_schema(&columns, schema, options)?;
-    let found = store.latest()?;
     let mut table = Table::new(store.clone(), found.clone(), fresh);
     let (mut episodes, mut next, mut replaced) = (0, 0, None);
     let committed = match (options.mode, found) {

@@ -49,16 +49,15 @@ impl LanceReader {
     /// If there is no table, or the table is damaged.
     pub fn open(location: &Location) -> Result<Self> {
         let store = Store::new(location)?;
-        let Some(version) = store.latest()? else {
-            let exists = store.remote || store.label.is_dir();
-            let problem = if exists { "it holds no Lance table" } else { "there is no such dataset" };
-            return Err(Error::corrupt(
-                &store.label,
-                problem,
-                "check the path; `swm datasets` lists the stored datasets",
-            ));
-        };
-        Self::of(store, version.manifest)
+        store.with_latest(|found| match found {
+            Some(version) => Self::of(store.clone(), version.manifest),
+            None => {
+                let exists = store.remote || store.label.is_dir();
+                let problem = if exists { "it holds no Lance table" } else { "there is no such dataset" };
+                let fix = "check the path; `swm datasets` lists the stored datasets";
+                Err(Error::corrupt(&store.label, problem, fix))
+            }
+        })
     }
 
     /// Opens a version of a table.

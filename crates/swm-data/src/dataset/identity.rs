@@ -16,7 +16,8 @@ pub(super) fn sampled_rows(reader: &(impl Reader + ?Sized), episodes: usize) -> 
     let names: Vec<&str> = compared.iter().map(|column| column.name.as_str()).collect();
     let lengths = reader.episodes()[..episodes].iter().map(|episode| episode.length).enumerate();
     let filled: Vec<(usize, usize)> = lengths.filter(|&(_, length)| length > 0).collect();
-    let middles = (0..SAMPLED.min(filled.len())).map(|i| filled[i * filled.len() / SAMPLED.min(filled.len())]);
+    let sampled = SAMPLED.min(filled.len());
+    let middles = (0..sampled).map(|i| filled[i * filled.len() / sampled]);
     let mut rows: Vec<StepRange> = middles.map(|(index, length)| StepRange::new(index, length / 2, 1)).collect();
     rows.extend(filled.first().map(|&(index, _)| StepRange::new(index, 0, 1)));
     rows.extend(filled.last().map(|&(index, length)| StepRange::new(index, length - 1, 1)));

@@ -106,7 +106,7 @@ pub trait Reader: Send + Sync {
     }
 
     /// The parts of a third-party dataset that are not read, because they are neither numbers nor images: text, complex
-    /// numbers, groups of HDF5.
+    /// numbers, groups and soft links of HDF5.
     fn unread(&self) -> Vec<String> {
         vec![]
     }

@@ -7,6 +7,8 @@ mod cast;
 mod column_files;
 pub mod entry;
 mod folder;
+#[cfg(any(feature = "hdf5", feature = "lerobot"))]
+mod guarded;
 mod hdf5;
 pub mod lance;
 mod lance_video;

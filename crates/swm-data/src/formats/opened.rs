@@ -1,6 +1,7 @@
 //! [`Opened`]: tells whether the dataset at a path is still the one that a reader has opened.
 
 use super::set_aside::Places;
+use std::borrow::Cow;
 use std::fs::Metadata;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
@@ -50,6 +51,14 @@ impl Opened {
 /// The error of a dataset that was replaced.
 pub fn replaced(path: &Path) -> Error {
     Error::corrupt(path, "its files were replaced since the dataset was opened", "open the dataset again")
+}
+
+/// The error of reading videos, which are opened again for every read: that of a video that is missing, if one is.
+pub fn or_missing<'a>(error: Error, mut videos: impl Iterator<Item = Cow<'a, Path>>) -> Error {
+    match videos.find(|path| !path.exists()) {
+        Some(path) => Error::corrupt(path, "the video is missing", "move it back, or restore it from a copy"),
+        None => error,
+    }
 }
 
 /// Whether a dataset was never replaced; then its metadata do not count it.

@@ -111,10 +111,10 @@ fn reads_images_that_are_stored_in_tables() {
 /// The data file of all episodes of a small dataset of LeRobot 3.0.
 pub const DATA: &str = "data/chunk-000/file-000.parquet";
 /// The list of episodes of such a dataset.
-const EPISODES: &str = "meta/episodes/chunk-000/file-000.parquet";
+pub const EPISODES: &str = "meta/episodes/chunk-000/file-000.parquet";
 
 /// Writes a Parquet file again, with other rows.
-fn rewrite(path: &Path, change: impl FnOnce(RecordBatch) -> RecordBatch) {
+pub fn rewrite(path: &Path, change: impl FnOnce(RecordBatch) -> RecordBatch) {
     let file = File::open(path).expect("opening the file");
     let reader = ParquetRecordBatchReaderBuilder::try_new(file).expect("a Parquet file").build().expect("a reader");
     let mut batches: Vec<RecordBatch> = reader.collect::<Result<_, _>>().expect("reading the rows");

@@ -18,6 +18,8 @@ mod fuzz;
 mod goals;
 #[cfg(feature = "hdf5")]
 mod hdf5;
+#[cfg(feature = "hdf5")]
+mod hdf5_links;
 #[cfg(all(feature = "hdf5", feature = "s3", feature = "http"))]
 mod hdf5_objects;
 mod hostile;
@@ -28,9 +30,11 @@ mod lance;
 mod lance_shards;
 mod lance_video;
 mod lerobot;
+mod lerobot_ranges;
 mod loader;
 mod objects;
 mod overwriting;
+mod parquet_codecs;
 mod preview;
 mod reference;
 mod replaced_while_read;

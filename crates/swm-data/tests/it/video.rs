@@ -85,6 +85,27 @@ fn reports_videos_with_wrong_frame_counts() {
     assert!(message.contains("ep_2.mp4"), "{message}");
 }
 
+#[test]
+fn videos_that_are_moved_away_are_missing_until_they_are_back() {
+    let folder = tempfile::tempdir().expect("creating a temporary folder");
+    for (format, video) in
+        [("video", "pixels/ep_1.mp4"), ("lerobot", "videos/observation.images.pixels/chunk-000/file-000.mp4")]
+    {
+        let path = folder.path().join(format!("d.{format}"));
+        format_suite::write(&path, WriteMode::Create, 0..3);
+        let reader = open(&path).expect("opening the dataset");
+        let read = || reader.read(&["pixels"], &[StepRange::new(1, 0, 2)]).map(|read| read.bytes(0).to_vec());
+        let expected = read().expect("the frames");
+        let (video, away) = (path.join(video), folder.path().join("away.mp4"));
+        std::fs::rename(&video, &away).expect("moving the video away");
+        let error = read().expect_err("no video").to_string();
+        let name = video.file_name().and_then(|name| name.to_str()).expect("a name");
+        assert!(error.contains(&format!("{name}: the video is missing; move it back")), "{format}: {error}");
+        std::fs::rename(&away, &video).expect("moving the video back");
+        assert_eq!(read().expect("the video is back"), expected, "{format}");
+    }
+}
+
 pub fn interop() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop")
 }

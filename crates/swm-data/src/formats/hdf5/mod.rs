@@ -5,7 +5,7 @@
 //!
 //! **Reading.** The crate `hdf5-pure` reads the structure of a file; this module reads the chunks. The chunks of a
 //! batch are planned together, read once each, and decoded on all threads, usually straight into the batch. All chunk
-//! layouts and the usual filters of h5py and hdf5plugin are supported (`filters/`). From `s3://` and `http://`
+//! layouts and the usual filters of h5py and hdf5plugin are supported (`filters/`). Links are not followed (`links`). From `s3://` and `http://`
 //! locations, all byte ranges of a batch are read concurrently.
 //!
 //! **Writing.** Images are chunks of one row with LZF compression, which h5py reads without plugins; rendered frames
@@ -33,6 +33,8 @@ mod column;
 mod filters;
 #[cfg(feature = "hdf5")]
 mod layout;
+#[cfg(feature = "hdf5")]
+mod links;
 #[cfg(feature = "hdf5")]
 mod reader;
 #[cfg(feature = "hdf5")]

@@ -2,6 +2,7 @@
 
 use super::column::Column;
 use super::layout::{self, LENGTHS, OFFSETS};
+use super::links::Contents;
 use super::record::Record;
 use super::source::Source;
 use super::structure::catch_panic;
@@ -34,6 +35,8 @@ pub(super) struct Hdf5Reader {
     non_numeric: Vec<String>,
     /// Names of groups, whose datasets are not read; none in files of this module.
     groups: Vec<String>,
+    /// Names of soft links.
+    links: Vec<String>,
 }
 
 impl Hdf5Reader {
@@ -48,7 +51,8 @@ impl Hdf5Reader {
         let damaged = |problem: String| damaged(&source, problem);
         let file = catch_panic("opening the file as HDF5", || hdf5_pure::File::from_source(source.clone()))
             .map_err(damaged)?;
-        let names = catch_panic("listing its datasets", || file.root().datasets()).map_err(damaged)?;
+        let contents = Contents::read(&file, &source).map_err(damaged)?;
+        let names = &contents.datasets;
         let record = layout::record(&source).map_err(damaged)?;
         let record = record.map(|found| table::read_all(&found, &source)).transpose();
         let record = record.map_err(|e| damaged(format!("the record of the dataset is unreadable: {e}")))?;
@@ -60,7 +64,7 @@ impl Hdf5Reader {
             Ok(column)
         };
         let counts = |name: &str| -> Result<Vec<i64>> {
-            let missing = || damaged(format!("it has no list of integers '{name}', which locates the episodes"));
+            let missing = || damaged(contents.lacks(name));
             if !names.iter().any(|known| known == name) {
                 return Err(missing());
             }
@@ -93,16 +97,16 @@ impl Hdf5Reader {
         for written in record.schema.iter().flat_map(Schema::columns) {
             let same = |column: &&Column| column.spec == *written && column.is_plain();
             if !columns.iter().any(|column| same(&column)) {
-                let problem = format!("column '{}' differs from the record, or is missing", written.name);
-                return Err(damaged(problem));
+                let differs = format!("column '{}' differs from the record, or is missing", written.name);
+                return Err(damaged(contents.link(&written.name).unwrap_or(differs)));
             }
         }
         let schema = sorted(&mut columns, &record)?;
         let groups = match record.schema {
             Some(_) => vec![],
-            None => catch_panic("listing its groups", || file.root().groups()).map_err(damaged)?,
+            None => contents.groups(&file).map_err(damaged)?,
         };
-        Ok(Self { source, unchanged, rows, schema, columns, record, non_numeric, groups })
+        Ok(Self { source, unchanged, rows, schema, columns, record, non_numeric, groups, links: contents.links })
     }
 
     /// First row and length of every episode.
@@ -118,11 +122,6 @@ impl Hdf5Reader {
     /// The columns of the file, in the order of the schema.
     pub fn stored(&self) -> Vec<ColumnSpec> {
         self.columns.iter().map(|column| column.spec.clone()).collect()
-    }
-
-    /// Names of datasets that are not numeric.
-    pub fn non_numeric(&self) -> &[String] {
-        &self.non_numeric
     }
 
     /// Reads stored rows of a column.
@@ -234,7 +233,8 @@ impl Reader for Hdf5Reader {
 
     fn unread(&self) -> Vec<String> {
         let groups = self.groups.iter().map(|group| format!("{group}/"));
-        self.non_numeric.iter().cloned().chain(groups).collect()
+        let links = self.links.iter().map(|link| format!("{link} (a soft link)"));
+        self.non_numeric.iter().cloned().chain(links).chain(groups).collect()
     }
 
     fn manifest(&self) -> Option<Manifest> {

@@ -1,18 +1,15 @@
 //! Calls of the crate `hdf5-pure`, which reads the structure of a file. Panics of the crate become errors.
 
+use crate::formats::guarded::guarded;
 use crate::formats::stored_scalar::{Class, StoredScalar};
 use hdf5_pure::{Datatype, DatatypeByteOrder, FloatingPointLayout};
-use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// Calls `hdf5-pure`, which may panic on damaged files.
 pub(super) fn catch_panic<T, E: std::fmt::Display>(
     action: &str,
     code: impl FnOnce() -> Result<T, E>,
 ) -> Result<T, String> {
-    match catch_unwind(AssertUnwindSafe(code)) {
-        Ok(result) => result.map_err(|e| format!("{action}: {e}")),
-        Err(_) => Err(format!("{action}: the HDF5 library panicked")),
-    }
+    guarded(code).and_then(|result| result.map_err(|e| e.to_string())).map_err(|problem| format!("{action}: {problem}"))
 }
 
 /// The numeric type of a dataset; `None` for text and compound types.

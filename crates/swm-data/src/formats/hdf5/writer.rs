@@ -129,9 +129,9 @@ struct Replaced {
 
 /// Copies the locked file at `path` to this module's layout, and replaces the file with the copy.
 fn copy_to_this_layout(path: &Path, reader: &Hdf5Reader, lock: Lock) -> Result<Hdf5Writer> {
-    if let [name, ..] = reader.non_numeric() {
-        let problem = format!("its dataset '{name}' is not numeric and cannot be appended to");
-        return Err(Error::corrupt(path, problem, "convert it to a new dataset, without this column"));
+    if let [name, ..] = &reader.unread()[..] {
+        let problem = format!("'{name}' is no numeric dataset, and appending would lose it");
+        return Err(Error::corrupt(path, problem, "convert the file to a new dataset, which leaves it out"));
     }
     let schema = Schema::new(reader.stored())?;
     let temporary = temporary_path(path)?;

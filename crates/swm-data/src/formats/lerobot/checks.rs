@@ -57,6 +57,19 @@ impl LerobotReader {
         episodes.clone().flat_map(|e| std::iter::repeat_n(all[e].index, self.files_of_episodes[e].length))
     }
 
+    /// Finds the episodes whose parts of videos are longer than their rows.
+    pub fn excess_of_videos(&self) -> Vec<Irregularity> {
+        let cameras = self.info.video_keys();
+        let episodes = self.files_of_episodes.iter().enumerate();
+        let found = episodes.flat_map(|(episode, files)| {
+            cameras.iter().zip(&files.videos).filter_map(move |(camera, part)| {
+                let what = part.excess(camera, files.length, self.fps)?;
+                Some(Irregularity { episode: Some(episode), what })
+            })
+        });
+        found.collect()
+    }
+
     /// Finds the episodes whose rows do not count up from 0 in their file. Readers take rows in the order of the file.
     pub fn misplaced_rows(&self) -> Result<Vec<Irregularity>> {
         if !self.info.features.0.iter().any(|(name, _)| name == FRAME_INDEX) {

@@ -1,11 +1,11 @@
 //! The list of episodes in `meta/`: the files, length, tasks and constants of each episode.
 
 use super::info::{Info, MAX_TEXT_BYTES, damaged};
+use super::ranges::{self, Ranges, VideoPart};
 use super::{CONSTANTS, table};
-use arrow_array::Array as _;
-use arrow_array::PrimitiveArray;
 use arrow_array::cast::AsArray as _;
-use arrow_array::types::Float64Type;
+use arrow_array::types::{Float64Type, Int64Type};
+use arrow_array::{Array as _, PrimitiveArray, RecordBatch};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
 use swm_core::{Result, files};
@@ -28,8 +28,8 @@ fn check_list(root: &Path, episodes: usize, cameras: usize) -> Result<()> {
 pub(super) struct EpisodeFiles {
     pub tasks: Vec<String>,
     pub data: PathBuf,
-    /// For every video feature, the path of a video and the start time of the episode in this video, in seconds.
-    pub videos: Vec<(PathBuf, f64)>,
+    /// For every video feature, the part of a video that has the episode's frames.
+    pub videos: Vec<VideoPart>,
     pub length: usize,
     /// The constants as JSON.
     pub constants: Option<String>,
@@ -74,8 +74,8 @@ fn episode_files_v2(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
         }
         let fields =
             [("episode_chunk", files_of_episodes.len() / info.chunks_size), ("episode_index", files_of_episodes.len())];
-        let videos: Result<Vec<(PathBuf, f64)>> =
-            keys.iter().map(|key| Ok((video_file(root, info, key, &fields)?, 0.0))).collect();
+        let part = |key: &&str| Ok(VideoPart { path: video_file(root, info, key, &fields)?, begin: 0.0, end: None });
+        let videos: Result<Vec<VideoPart>> = keys.iter().map(part).collect();
         files_of_episodes.push(EpisodeFiles {
             tasks: line.tasks,
             data: info.file(root, &info.data_path, "", &fields)?,
@@ -106,49 +106,35 @@ fn episode_files_v3(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
     }
     files.sort();
     let keys = info.video_keys();
-    let video_column = |key: &str, field: &str| format!("videos/{key}/{field}");
     let mut columns: Vec<String> =
         ["episode_index", "tasks", "length", "data/chunk_index", "data/file_index", CONSTANTS]
+            .into_iter()
+            .chain(ranges::ROWS)
             .map(str::to_owned)
-            .to_vec();
+            .collect();
     for key in &keys {
-        columns.extend(["chunk_index", "file_index", "from_timestamp"].map(|field| video_column(key, field)));
+        let fields = ["chunk_index", "file_index", "from_timestamp", "to_timestamp"];
+        columns.extend(fields.map(|field| video_column(key, field)));
     }
     let columns: Vec<&str> = columns.iter().map(String::as_str).collect();
     let mut files_of_episodes = vec![];
+    let mut stated = Ranges::new(info.fps().unwrap_or(1.0));
     for path in &files {
         // Ignores files that are not part of the dataset.
         if files_of_episodes.len() == info.total_episodes {
             break;
         }
         let batches = table::read(path, &columns)?;
-        let column_values = |column: &str| -> Result<Vec<usize>> {
-            let valid = |value: i64| usize::try_from(value).ok().filter(|&n| n < 1 << 40);
-            let values = table::integers(path, &batches, column)?.into_iter().map(valid);
-            values.collect::<Option<_>>().ok_or_else(|| damaged(path, format!("a value of '{column}' is invalid")))
-        };
-        let (index, length) = (column_values("episode_index")?, column_values("length")?);
+        let (index, length) = (counts(path, &batches, "episode_index")?, counts(path, &batches, "length")?);
         check_list(root, files_of_episodes.len() + index.len(), keys.len())?;
-        let (chunk, file) = (column_values("data/chunk_index")?, column_values("data/file_index")?);
-        let mut videos = vec![];
-        for key in &keys {
-            let mut start_times = vec![];
-            for batch in &batches {
-                let column = batch.column_by_name(&video_column(key, "from_timestamp"));
-                let column = column.and_then(|array| array.as_primitive_opt::<Float64Type>());
-                let all_known = |column: &&PrimitiveArray<Float64Type>| {
-                    column.null_count() == 0 && column.values().iter().all(|time| time.is_finite())
-                };
-                let column = column.filter(all_known);
-                let column = column.ok_or_else(|| damaged(path, format!("it lacks start times of '{key}'")))?;
-                start_times.extend_from_slice(column.values());
-            }
-            videos.push((
-                column_values(&video_column(key, "chunk_index"))?,
-                column_values(&video_column(key, "file_index"))?,
-                start_times,
-            ));
-        }
+        let chunk = counts(path, &batches, "data/chunk_index")?;
+        let file = counts(path, &batches, "data/file_index")?;
+        let [from, to] = ranges::ROWS
+            .map(|name| ranges::stated::<Int64Type>(path, &batches, name, &format!("values of '{name}'"), |_| true));
+        let (from, to) = (from?, to?);
+        let videos: Result<Vec<VideoColumns>> =
+            keys.iter().map(|key| VideoColumns::read(path, &batches, key)).collect();
+        let videos = videos?;
         let (mut tasks, mut constants) = (vec![], vec![]);
         for batch in &batches {
             tasks.extend(texts(batch, "tasks").unwrap_or_else(|| vec![vec![]; batch.num_rows()]));
@@ -165,28 +151,72 @@ fn episode_files_v3(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
                 return Err(damaged(path, problem));
             }
             let indices = |chunk: usize, file: usize| [("chunk_index", chunk), ("file_index", file)];
-            let files: Result<Vec<(PathBuf, f64)>> = keys
-                .iter()
-                .zip(&videos)
-                .map(|(key, (chunk, file, begin))| {
-                    Ok((video_file(root, info, key, &indices(chunk[row], file[row]))?, begin[row]))
-                })
-                .collect();
-            files_of_episodes.push(EpisodeFiles {
+            let part = |(key, columns): (&&str, &VideoColumns)| {
+                let indices = indices(columns.chunk[row], columns.file[row]);
+                let path = video_file(root, info, key, &indices)?;
+                Ok(VideoPart { path, begin: columns.begin[row], end: columns.end[row] })
+            };
+            let videos: Result<Vec<VideoPart>> = keys.iter().zip(&videos).map(part).collect();
+            let files = EpisodeFiles {
                 tasks: std::mem::take(&mut tasks[row]),
                 data: info.file(root, &info.data_path, "", &indices(chunk[row], file[row]))?,
-                videos: files?,
+                videos: videos?,
                 length: length[row],
                 constants: constants[row].take(),
                 file: chunk[row].saturating_mul(info.chunks_size).saturating_add(file[row]),
-            });
+            };
+            stated.check(path, &files, [from[row], to[row]], &keys)?;
+            files_of_episodes.push(files);
         }
     }
     Ok(files_of_episodes)
 }
 
+/// The name of a column that describes the videos of a feature.
+fn video_column(key: &str, field: &str) -> String {
+    format!("videos/{key}/{field}")
+}
+
+/// The values of a column of counts or indices.
+fn counts(path: &Path, batches: &[RecordBatch], column: &str) -> Result<Vec<usize>> {
+    let valid = |value: i64| usize::try_from(value).ok().filter(|&n| n < 1 << 40);
+    let values = table::integers(path, batches, column)?.into_iter().map(valid);
+    values.collect::<Option<_>>().ok_or_else(|| damaged(path, format!("a value of '{column}' is invalid")))
+}
+
+/// The columns that describe the videos of a feature: the indices of the file, and the start and end time of each episode.
+struct VideoColumns {
+    chunk: Vec<usize>,
+    file: Vec<usize>,
+    begin: Vec<f64>,
+    end: Vec<Option<f64>>,
+}
+
+impl VideoColumns {
+    fn read(path: &Path, batches: &[RecordBatch], key: &str) -> Result<Self> {
+        let mut begin = vec![];
+        for batch in batches {
+            let column = batch.column_by_name(&video_column(key, "from_timestamp"));
+            let column = column.and_then(|array| array.as_primitive_opt::<Float64Type>());
+            let all_known = |column: &&PrimitiveArray<Float64Type>| {
+                column.null_count() == 0 && column.values().iter().all(|time| time.is_finite())
+            };
+            let column = column.filter(all_known);
+            let column = column.ok_or_else(|| damaged(path, format!("it lacks start times of '{key}'")))?;
+            begin.extend_from_slice(column.values());
+        }
+        let (name, what) = (video_column(key, "to_timestamp"), format!("end times of '{key}'"));
+        Ok(Self {
+            chunk: counts(path, batches, &video_column(key, "chunk_index"))?,
+            file: counts(path, batches, &video_column(key, "file_index"))?,
+            begin,
+            end: ranges::stated::<Float64Type>(path, batches, &name, &what, f64::is_finite)?,
+        })
+    }
+}
+
 /// The values of a column of lists of strings, or `None` if there is no such column.
-fn texts(batch: &arrow_array::RecordBatch, column: &str) -> Option<Vec<Vec<String>>> {
+fn texts(batch: &RecordBatch, column: &str) -> Option<Vec<Vec<String>>> {
     let lists = batch.column_by_name(column)?.as_list_opt::<i32>()?;
     let text = |list: arrow_array::ArrayRef| -> Option<Vec<String>> {
         let text = list.as_string_opt::<i32>()?;

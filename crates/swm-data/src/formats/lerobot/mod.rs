@@ -21,18 +21,22 @@
 //! the last row, so that other programs get no NaN; the reader restores NaN (or -1).
 //!
 //! **Frames** are located by time: the start time of the episode in the file plus the timestamp of the row. Reading
-//! fails if the time of the nearest frame differs by more than a quarter of a frame interval.
+//! fails if the time of the nearest frame differs by more than a quarter of a frame interval. Opening fails if the ranges of rows
+//! or of times that version 3.0 states for each episode contradict its length or each other (`ranges`).
 //!
 //! [`ImageCodec`](swm_image::ImageCodec) determines the encoding of frames as in the format `video`; use JPEG for
 //! datasets that browsers must play.
 
 #[cfg(feature = "lerobot")]
 mod checks;
+#[cfg(feature = "lerobot")]
 mod episode_files;
 #[cfg(feature = "lerobot")]
 mod features;
 #[cfg(feature = "lerobot")]
 mod info;
+#[cfg(feature = "lerobot")]
+mod ranges;
 #[cfg(feature = "lerobot")]
 mod reader;
 #[cfg(feature = "lerobot")]

@@ -4,6 +4,7 @@
 use super::checks::other_rows;
 use super::episode_files::EpisodeFiles;
 use super::info::{Column, Info, Kind, damaged};
+use super::ranges::VideoPart;
 use super::{TASK, table, values};
 use crate::dataset::Location;
 use crate::dataset::episodes::{EpisodeRows, content_hash, index_columns};
@@ -14,6 +15,7 @@ use arrow_array::Array as _;
 use arrow_array::cast::AsArray as _;
 use rayon::prelude::*;
 use serde::Deserialize;
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -33,7 +35,7 @@ pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
 pub(super) struct LerobotReader {
     pub(super) root: PathBuf,
     pub info: Info,
-    fps: f64,
+    pub(super) fps: f64,
     schema: Schema,
     /// The columns of the schema after the index columns, then the computed features, which are only read by name.
     pub(super) columns: Vec<Column>,
@@ -89,7 +91,7 @@ impl LerobotReader {
             if let (Kind::Video(feature), Some(episode)) =
                 (column.kind, files_of_episodes.iter().find(|episode| episode.length > 0))
             {
-                let path = &episode.videos[feature].0;
+                let path = &episode.videos[feature].path;
                 let size = videos.frame_size(path, || Ok(Source::File(path.clone())))?;
                 let declared = &column.spec.shape[..2];
                 if [size.0, size.1] != *declared {
@@ -201,12 +203,15 @@ impl LerobotReader {
         let slots = self.rows.row_slots(column, ranges, out)?;
         let mut frames = Vec::with_capacity(slots.len());
         for ((episode, step), slot) in slots {
-            let (path, begin) = &self.files_of_episodes[episode].videos[feature];
+            let VideoPart { path, begin, .. } = &self.files_of_episodes[episode].videos[feature];
             frames.push((path.clone(), begin + self.time(times, episode, step), slot));
         }
         let source = |path: &PathBuf| Ok(Source::File(path.clone()));
         let read = self.videos.read(frames, source, |video, &time| self.frame(video, time));
-        self.check().and(read)
+        self.check()?;
+        let part = |range: &StepRange| &self.files_of_episodes[range.episode].videos[feature];
+        let videos = ranges.iter().map(|range| Cow::Borrowed(&*part(range).path));
+        read.map_err(|error| opened::or_missing(error, videos))
     }
 
     /// Time from the start of the episode to a row, in seconds.
@@ -380,7 +385,9 @@ impl Reader for LerobotReader {
     }
 
     fn irregularities(&self) -> Result<Vec<Irregularity>> {
-        self.misplaced_rows()
+        let mut found = self.excess_of_videos();
+        found.extend(self.misplaced_rows()?);
+        Ok(found)
     }
 
     fn sources(&self) -> Vec<PathBuf> {
@@ -444,7 +451,7 @@ impl Reader for LerobotReader {
                         })?;
                     }
                     Kind::Video(feature) => {
-                        let (path, begin) = &self.files_of_episodes[position].videos[feature];
+                        let VideoPart { path, begin, .. } = &self.files_of_episodes[position].videos[feature];
                         let video = self.videos.get(path, || Ok(Source::File(path.clone())))?;
                         let frames: Result<Vec<usize>> = (0..episode.length)
                             .map(|step| self.frame(&video, begin + self.time(times, position, step)))

@@ -1,6 +1,7 @@
 //! Reads and writes Parquet files.
 
 use super::info::damaged;
+use crate::formats::guarded::guarded;
 use arrow_array::cast::AsArray as _;
 use arrow_array::{Array, RecordBatch};
 use arrow_schema::Schema as ArrowSchema;
@@ -9,9 +10,9 @@ use parquet::arrow::{ArrowWriter, ProjectionMask};
 use parquet::basic::Compression;
 use parquet::file::metadata::{ColumnChunkMetaData, KeyValue, RowGroupMetaData};
 use parquet::file::properties::WriterProperties;
+use parquet::schema::types::SchemaDescriptor;
 use std::io::Write as _;
 use std::ops::Range;
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::sync::Arc;
 use swm_core::{Error, Result, files};
@@ -84,6 +85,7 @@ pub fn read_batches(
         if builder.metadata().row_groups().iter().flat_map(RowGroupMetaData::columns).any(is_outside) {
             return Err(failed(&"a column begins before the file, or has a negative size"));
         }
+        check_compression(path, builder.metadata().row_groups(), is_read)?;
         // Rows of the declared shape have fewer values than bytes.
         let is_larger = |group: &RowGroupMetaData| {
             let read = group.columns().iter().filter(|c| c.column_path().parts().first().is_some_and(is_read));
@@ -93,9 +95,7 @@ pub fn read_batches(
         if builder.metadata().row_groups().iter().any(is_larger) {
             return Err(failed(&"its rows have more values than the dataset declares"));
         }
-        let fields = builder.parquet_schema().root_schema().get_fields();
-        let column_indices: Vec<usize> =
-            columns.iter().filter_map(|name| fields.iter().position(|field| field.name() == *name)).collect();
+        let column_indices = positions(builder.parquet_schema(), columns).map_err(|problem| failed(&problem))?;
         let mask = ProjectionMask::roots(builder.parquet_schema(), column_indices);
         let mut builder =
             builder.with_projection(mask).with_batch_size((BATCH_BYTES / row_bytes.max(1)).clamp(1, ROWS));
@@ -108,7 +108,42 @@ pub fn read_batches(
         let reader = builder.build().map_err(|e| failed(&e))?;
         reader.into_iter().try_for_each(|batch| each(batch.map_err(|e| failed(&e))?))
     };
-    catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|_| Err(failed(&"its content is invalid")))
+    guarded(work).unwrap_or_else(|panic| Err(failed(&panic)))
+}
+
+/// The positions of columns in a table.
+///
+/// # Errors
+/// If two columns of the table have one of the names.
+fn positions(table: &SchemaDescriptor, columns: &[&str]) -> Result<Vec<usize>, String> {
+    let fields = table.root_schema().get_fields();
+    let mut found: Vec<usize> = vec![];
+    for (position, field) in fields.iter().enumerate().filter(|(_, field)| columns.contains(&field.name())) {
+        if found.iter().any(|&earlier| fields[earlier].name() == field.name()) {
+            return Err(format!("it has two columns '{}'", field.name()));
+        }
+        found.push(position);
+    }
+    Ok(found)
+}
+
+/// Checks that the columns that are read have a compression that this build reads.
+fn check_compression(path: &Path, groups: &[RowGroupMetaData], is_read: impl Fn(&String) -> bool) -> Result<()> {
+    for column in groups.iter().flat_map(RowGroupMetaData::columns) {
+        let Some(name) = column.column_path().parts().first().filter(|name| is_read(name)) else { continue };
+        let compression = match column.compression() {
+            Compression::UNCOMPRESSED | Compression::SNAPPY | Compression::ZSTD(_) => continue,
+            Compression::GZIP(_) => "gzip",
+            Compression::BROTLI(_) => "brotli",
+            Compression::LZ4 | Compression::LZ4_RAW => "lz4",
+            Compression::LZO => "lzo",
+        };
+        let problem =
+            format!("column '{name}' is compressed with {compression}, which is not read (snappy, zstd and none are)");
+        let fix = "write the file again with pyarrow.parquet.write_table(pyarrow.parquet.read_table(FILE), FILE)";
+        return Err(Error::corrupt(path, problem, fix));
+    }
+    Ok(())
 }
 
 /// Whether a column begins before the file or has a negative size, at which the library panics.
@@ -191,6 +226,21 @@ mod tests {
     }
 
     #[test]
+    fn two_columns_of_one_name_are_refused() {
+        let folder = tempfile::tempdir().expect("creating a folder");
+        let path = folder.path().join("data.parquet");
+        let field = |name: &str| Field::new(name, DataType::Utf8, false);
+        let schema = Arc::new(ArrowSchema::new(vec![field("reward"), field("other"), field("other")]));
+        let texts = |text: &str| -> arrow_array::ArrayRef { Arc::new(StringArray::from_iter_values([text])) };
+        let columns = vec![texts("a"), texts("b"), texts("c")];
+        let batch = RecordBatch::try_new(Arc::clone(&schema), columns).expect("a table");
+        write(&path, &schema, &batch).expect("writing the table");
+        assert_eq!(read(&path, &["reward"]).expect("one of these").len(), 1);
+        let error = read(&path, &["reward", "other"]).expect_err("two of these").to_string();
+        assert!(error.contains("two columns 'other'"), "{error}");
+    }
+
+    #[test]
     fn a_changed_bit_of_the_footer_is_an_error_without_a_panic() {
         let folder = tempfile::tempdir().expect("creating a folder");
         let path = folder.path().join("data.parquet");
@@ -207,7 +257,7 @@ mod tests {
             changed[bit / 8] ^= 1 << (bit % 8);
             std::fs::write(&path, changed).expect("writing the file");
             if let Err(error) = read(&path, &["tasks"]) {
-                assert!(!error.to_string().contains("its content is invalid"), "a panic for bit {bit}");
+                assert!(!error.to_string().contains("panicked"), "a panic for bit {bit}: {error}");
             }
         }
     }

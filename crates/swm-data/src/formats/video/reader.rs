@@ -4,6 +4,8 @@ use crate::dataset::Location;
 use crate::dataset::episodes::content_hash;
 use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
 use crate::formats::column_files::{ColumnFiles, exists, video_path};
+use crate::formats::opened;
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use swm_core::{ColumnSpec, Error, Manifest, Result, Schema};
@@ -59,7 +61,9 @@ impl Reader for VideoReader {
         let slots = self.files.rows().row_slots(column, ranges, out)?;
         let requests = slots.into_iter().map(|((episode, step), slot)| ((index, episode), step, slot)).collect();
         let read = self.videos.read(requests, |key| self.source(key), |_, &step| Ok(step));
-        self.files.check().and(read)
+        self.files.check()?;
+        let videos = ranges.iter().map(|range| Cow::Owned(video_path(self.files.folder(), name, range.episode)));
+        read.map_err(|error| opened::or_missing(error, videos))
     }
 
     fn identity(&self, _: usize) -> Result<String> {

@@ -11,7 +11,7 @@ use clap::{Args, ValueEnum};
 use serde::Serialize;
 use serde_json::json;
 use std::path::{Path, PathBuf};
-use swm_core::files::{self, Lock};
+use swm_core::files;
 use swm_core::results::Proportion;
 use swm_core::text::one_line;
 use swm_core::{Error, Result};
@@ -69,12 +69,7 @@ pub fn pack(args: &PackArgs, context: &Context) -> anyhow::Result<()> {
     };
     let packed = capsule::pack(&request, &run_options(ENVS, None, context), &mut control(context))?;
     check_same_model(&args.output, &packed)?;
-    // Deletes what a killed command left, unless another one writes there now.
-    let folder = args.output.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let lock = Lock::folder(folder).ok();
-    if lock.is_some() {
-        files::delete_temporary(folder, |name| args.output.file_name().is_some_and(|own| own == name))?;
-    }
+    let _lock = output_folder::claim_file(&args.output)?;
     let hash = packed.write(&args.output)?;
     if context.json {
         return emit_json(&json!({"path": args.output, "hash": hash, "weights": packed.weights_hash()}));

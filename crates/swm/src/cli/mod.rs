@@ -268,6 +268,23 @@ fn print_usage(error: &clap::Error) -> u8 {
     u8::try_from(error.exit_code()).unwrap_or(2)
 }
 
+/// The least stack of a thread in bytes: that of threads which Rust starts without the variable.
+const LEAST_STACK: usize = 2 << 20;
+
+/// Checks the variable that sets the stack of threads: one that overflows its stack aborts the program.
+///
+/// # Errors
+/// When it is less than [`LEAST_STACK`].
+fn check_stack(given: Option<&str>) -> Result<()> {
+    match given.and_then(|text| text.parse::<usize>().ok()) {
+        Some(bytes) if bytes < LEAST_STACK => {
+            let problem = format!("threads need a stack of at least {LEAST_STACK} bytes");
+            Err(Error::config(format!("RUST_MIN_STACK={bytes}"), problem, "remove the variable, or set it higher"))
+        }
+        _ => Ok(()),
+    }
+}
+
 impl Cli {
     /// Runs the command and returns its exit code.
     fn run(self) -> u8 {
@@ -305,6 +322,7 @@ impl Cli {
         // Rayon starts as many threads as this variable says; hashing files uses them, whatever `--threads` is.
         let of_rayon = std::env::var("RAYON_NUM_THREADS").ok().and_then(|text| text.parse().ok());
         limits::RAYON_THREADS.check(of_rayon.unwrap_or(0))?;
+        check_stack(std::env::var("RUST_MIN_STACK").ok().as_deref())?;
         swm_mujoco::render::choose(self.renderer);
         match self.command {
             Command::Envs(args) => envs::envs(&args, json),

@@ -110,6 +110,8 @@ fn escaped_json(json: &str) -> Cow<'_, str> {
 const LONGEST_WORD: usize = 24;
 /// The width that every column gets before words of other columns are kept whole.
 const NARROW: usize = 10;
+/// The most characters of a cell.
+const MAX_CELL: usize = 400;
 
 /// Returns the width of the longest word of each column.
 fn longest_words(header: &[&str], rows: &[Vec<String>]) -> Vec<usize> {
@@ -137,7 +139,7 @@ fn keep_words(table: &mut comfy_table::Table, words: &[usize]) {
 
 /// Formats rows as a table with a header.
 pub fn table(header: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> String {
-    let rows: Vec<Vec<String>> = rows.into_iter().collect();
+    let rows: Vec<Vec<String>> = rows.into_iter().map(|row| row.into_iter().map(shortened).collect()).collect();
     let mut table = comfy_table::Table::new();
     table.load_preset(comfy_table::presets::NOTHING);
     table.set_style(comfy_table::TableComponent::HeaderLines, '─');
@@ -160,6 +162,15 @@ pub fn table(header: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> St
     keep_words(&mut table, &longest_words(header, &rows));
     // All cells are escaped, so that every escape character is one of the table.
     format!("{table}\n").replace('\x1b', escape())
+}
+
+/// Returns a cell of at most [`MAX_CELL`] characters: every line of a table is as wide as its longest cell in a pipe.
+fn shortened(mut cell: String) -> String {
+    if let Some((end, _)) = cell.char_indices().nth(MAX_CELL) {
+        cell.truncate(end);
+        cell.push('…');
+    }
+    cell
 }
 
 /// How a cell stands out.
@@ -197,6 +208,13 @@ mod tests {
         table.set_width(20);
         keep_words(&mut table, &longest_words(&header, &[row.to_vec()]));
         assert!(table.to_string().lines().all(|line| line.len() <= 32), "{table}");
+    }
+
+    #[test]
+    fn long_cells_of_tables_are_cut() {
+        let shown = table(&["column", "values"], [vec!["é".repeat(100_000), "1".to_owned()]]);
+        assert!(shown.contains('…') && shown.chars().count() < 10 * MAX_CELL, "{} characters", shown.chars().count());
+        assert_eq!(shortened("é".repeat(MAX_CELL)), "é".repeat(MAX_CELL));
     }
 
     #[test]

@@ -29,6 +29,20 @@ pub fn claim(folder: &Path, names: &[&str]) -> Result<Lock> {
     Ok(lock)
 }
 
+/// Deletes what a killed command left of writing a file, unless another one writes in its folder now. Returns the lock of the folder,
+/// which the writer of the file holds.
+///
+/// # Errors
+/// When a file cannot be deleted.
+pub fn claim_file(file: &Path) -> Result<Option<Lock>> {
+    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let lock = Lock::folder(folder).ok();
+    if lock.is_some() {
+        files::delete_temporary(folder, |name| file.file_name().is_some_and(|own| own == name))?;
+    }
+    Ok(lock)
+}
+
 /// Deletes what a killed evaluation left of writing its record, its videos and their posters.
 fn delete_temporary_of_evaluation(folder: &Path) -> Result<()> {
     files::delete_temporary(folder, |name| name == run_record::FILE)?;

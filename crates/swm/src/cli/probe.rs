@@ -95,6 +95,7 @@ pub fn probe(args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
             config.fit.steps = args.steps.unwrap_or(config.fit.steps);
             let fitted = || probe::reconstruct_images(&*encoder, &*reader, &config, &mut control(context));
             let Reconstruction { report, sheet, .. } = threads.install(fitted)?;
+            let _lock = output_folder::claim_file(file)?;
             write_png(file, sheet.width, sheet.height, &sheet.rgb)?;
             Some((report, file))
         }

@@ -171,6 +171,11 @@ fn previews_videos_and_images_do_not_replace_files_of_the_user() {
     swm.fails(&with(&probe, "thesis.png"), 2, &["thesis.png", refused]);
     files.iter().for_each(|path| assert_untouched(path));
     assert!(!swm.path("shown/contact_sheet.png").exists());
+    // What a kill left of an image is deleted by the next of this name.
+    [".rooms.png.77.tmp", ".other.png.77.tmp"].iter().for_each(|name| user_file(&swm.path(name)));
+    swm.json(&with(&probe, "rooms.png"));
+    assert!(swm.path("rooms.png").exists() && !swm.path(".rooms.png.77.tmp").exists());
+    assert_untouched(&swm.path(".other.png.77.tmp"));
     // The program replaces its own files.
     for _ in 0..2 {
         swm.json(&with(&preview, "preview"));

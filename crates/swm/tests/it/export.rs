@@ -56,6 +56,29 @@ fn export_says_how_to_install_the_package() {
     assert!(!left.into_iter().any(|file| file.file_name().to_string_lossy().contains(".rrd")));
 }
 
+/// A package that fails when the recording starts.
+#[test]
+fn error_of_the_package_is_one_line() {
+    let python = std::env::var("SWM_PYTHON").unwrap_or_else(|_| "python3".to_owned());
+    if !std::process::Command::new(&python).arg("--version").output().is_ok_and(|output| output.status.success()) {
+        println!("SKIPPED: there is no Python");
+        return;
+    }
+    let swm = rooms();
+    let package = swm.path("packages/rerun");
+    std::fs::create_dir_all(&package).expect("a folder");
+    let fails = "class EncodedImage: columns = None\nclass Scalars: columns = None\n\
+                 def RecordingStream(*args, **kwargs): raise OSError('no space left')\n";
+    std::fs::write(package.join("__init__.py"), fails).expect("a package");
+    std::fs::write(package.join("blueprint.py"), "").expect("a package");
+    std::fs::write(swm.path("packages/numpy.py"), "").expect("a package");
+    let mut command = swm.command(&["export", "rooms"]);
+    let output = command.env("PYTHONPATH", swm.path("packages")).output().expect("swm starts");
+    let error = text(&output.stderr);
+    assert!(error.contains("OSError: no space left\n") && !error.contains("Traceback"), "{error}");
+    assert_eq!(output.status.code(), Some(1), "{error}");
+}
+
 #[test]
 fn recordings_are_those_that_the_viewer_verifies() {
     if !crate::gym::python("rerun") {

@@ -42,6 +42,7 @@ fn variables_of_libraries_are_checked() {
         ("LANCE_CPU_THREADS", "0"),
         ("LANCE_MAX_IOP_SIZE", "0"),
         ("RAYON_NUM_THREADS", "20000"),
+        ("RUST_MIN_STACK", "1"),
     ] {
         let output = swm.command(ROOMS).env(name, value).output().expect("swm runs");
         let error = text(&output.stderr);

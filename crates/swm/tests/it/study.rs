@@ -318,6 +318,7 @@ fn errors_in_a_study_name_the_line_and_the_nearest_word() {
         ("planner = 0.9", "planner = 90", vec!["study.toml:30", "not a success rate", "0 to 1"]),
         ("source = \"a table\"", "sources = \"a table\"", vec!["study.toml:29", "sources", "source"]),
         ("source = \"a table\"", "", vec!["study.toml:28", "no source"]),
+        ("name = \"chance\"", "name = \"chance\\nswm: done\"", vec!["study.toml:", "several lines"]),
     ] {
         assert!(STUDY.contains(from), "{from}");
         std::fs::write(swm.path("study.toml"), STUDY.replace(from, to)).expect("writing the study");

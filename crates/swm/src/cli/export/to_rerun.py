@@ -7,10 +7,16 @@ import sys
 answers = os.fdopen(os.dup(1), "w", buffering=1)
 os.dup2(2, 1)
 given = sys.stdin.buffer
+# `swm export` prints what an error of the package means.
+sys.excepthook = lambda kind, error, trace: print(f"{kind.__name__}: {error}", file=sys.stderr)
 
 
 def message():
-    fields = json.loads(given.readline())
+    line = given.readline()
+    if not line:
+        # The program that sends the episodes was killed.
+        sys.exit(1)
+    fields = json.loads(line)
     return fields, given.read(fields.get("bytes", 0))
 
 

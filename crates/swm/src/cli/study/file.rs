@@ -279,6 +279,9 @@ impl Source<'_> {
         if named && table.name.is_empty() {
             return Err(Error::config(table.at, "the table has no name", "add name = \"…\""));
         }
+        if table.name.contains(['\n', '\r']) {
+            return Err(Error::config(table.at, "the name has several lines", "write it in one line"));
+        }
         Ok(table)
     }
 

@@ -17,6 +17,9 @@ const CAMERAS: [&str; 2] = ["observation.images.top", "observation.images.wrist"
 const BEGIN: [f64; 3] = [0.0, 1.1, 2.5];
 const END: [f64; 3] = [1.1, 2.5, 3.4];
 
+/// A column, the episode, and the value that it states.
+type Change<T> = (&'static str, usize, T);
+
 fn set_rows(list: &Path, column: &str, row: usize, value: Option<i64>) {
     change_values::<Int64Type>(list, column, |rows| rows[row] = value);
 }
@@ -35,7 +38,7 @@ fn refused(path: &Path) -> String {
 #[test]
 fn ranges_of_rows_that_contradict_the_lengths_are_refused() {
     // The lengths are 11, 14 and 9.
-    let cases: [(&[(&str, usize, i64)], &str); 9] = [
+    let cases: [(&[Change<i64>], &str); 9] = [
         (&[("dataset_to_index", 1, 24)], "episode 1 has the rows 11..24"),
         (&[("dataset_from_index", 1, 10)], "episode 1 has the rows 10..25"),
         (&[("dataset_from_index", 2, 0), ("dataset_to_index", 2, 9)], "episode 2 has the rows 0..9"),
@@ -60,7 +63,7 @@ fn ranges_of_rows_that_contradict_the_lengths_are_refused() {
 
 #[test]
 fn ranges_of_times_that_contradict_the_lengths_or_each_other_are_refused() {
-    let cases: [(&[(&str, usize, f64)], &str); 6] = [
+    let cases: [(&[Change<f64>], &str); 6] = [
         // A frame shorter than the rows.
         (&[("to_timestamp", 1, 2.4)], "episode 1"),
         (&[("to_timestamp", 2, 2.5)], "episode 2"),

@@ -171,16 +171,23 @@ fn previews_videos_and_images_do_not_replace_files_of_the_user() {
     swm.fails(&with(&probe, "thesis.png"), 2, &["thesis.png", refused]);
     files.iter().for_each(|path| assert_untouched(path));
     assert!(!swm.path("shown/contact_sheet.png").exists());
-    // What a kill left of an image is deleted by the next of this name.
-    [".rooms.png.77.tmp", ".other.png.77.tmp"].iter().for_each(|name| user_file(&swm.path(name)));
-    swm.json(&with(&probe, "rooms.png"));
-    assert!(swm.path("rooms.png").exists() && !swm.path(".rooms.png.77.tmp").exists());
-    assert_untouched(&swm.path(".other.png.77.tmp"));
     // The program replaces its own files.
     for _ in 0..2 {
         swm.json(&with(&preview, "preview"));
         swm.json(&with(&eval, "results"));
     }
+}
+
+#[test]
+fn what_a_kill_leaves_of_an_image_is_deleted_by_the_next_of_its_name() {
+    let swm = Swm::new();
+    let demo = ["demo", "-o", "demo", "--episodes", "40", "--eval-episodes", "2", "schedule.steps=2"];
+    swm.json(&[&demo[..], &["schedule.warmup=1"]].concat());
+    [".rooms.png.77.tmp", ".other.png.77.tmp"].iter().for_each(|name| user_file(&swm.path(name)));
+    let probe = ["probe", "demo/pldm-rooms", "--data", "demo/rooms.lance", "--steps", "1", "--frames", "8"];
+    swm.json(&[&probe[..], &["--images", "rooms.png"]].concat());
+    assert!(swm.path("rooms.png").exists() && !swm.path(".rooms.png.77.tmp").exists());
+    assert_untouched(&swm.path(".other.png.77.tmp"));
 }
 
 #[test]

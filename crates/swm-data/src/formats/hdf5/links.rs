@@ -43,12 +43,12 @@ impl Contents {
             Ok(datasets) => return Ok(Self { datasets, links: vec![], groups: vec![] }),
             Err(problem) => problem,
         };
-        let (hard, links) = match symbol_table(source) {
-            Ok(Some((hard, links))) if !links.is_empty() => (hard, links),
+        let names = match symbol_table(source) {
+            Ok(Some(names)) if !names.links.is_empty() => names,
             _ => return Err(problem),
         };
-        let mut contents = Self { datasets: vec![], links, groups: vec![] };
-        for name in hard {
+        let mut contents = Self { datasets: vec![], links: names.links, groups: vec![] };
+        for name in names.objects {
             match catch_panic("reading a header", || Ok::<_, String>(file.dataset(&name)))? {
                 Ok(_) => contents.datasets.push(name),
                 // A group, or a type that has a name.
@@ -90,8 +90,15 @@ impl Contents {
     }
 }
 
-/// The names of the objects and of the soft links in a root group of the oldest kind; `None` if it is of another kind.
-fn symbol_table(source: &Source) -> Result<Option<(Vec<String>, Vec<String>)>, String> {
+/// The names in a root group: of objects, and of soft links.
+#[derive(Default)]
+struct Names {
+    objects: Vec<String>,
+    links: Vec<String>,
+}
+
+/// The names in a root group of the oldest kind; `None` if it is of another kind.
+fn symbol_table(source: &Source) -> Result<Option<Names>, String> {
     let mut head = [0; 28];
     read(source, 0, &mut head)?;
     // Superblocks of version 1 have one integer more. The addresses and lengths in the file have 8 bytes.
@@ -107,18 +114,18 @@ fn symbol_table(source: &Source) -> Result<Option<(Vec<String>, Vec<String>)>, S
         return Ok(None);
     }
     let heap = heap(source, read_u64(source, cache + 8)?)?;
-    let (mut hard, mut soft) = (vec![], vec![]);
+    let mut names = Names::default();
     for node in leaves(source, read_u64(source, cache)?)? {
         for (name, kind) in entries(source, node)? {
             let name = usize::try_from(name).ok().and_then(|at| heap.get(at..)).unwrap_or_default();
             let end = name.iter().take(LONGEST_NAME + 1).position(|&byte| byte == 0);
             let end = end.ok_or_else(|| format!("a name of its root group has more than {LONGEST_NAME} bytes"))?;
             let name = String::from_utf8_lossy(&name[..end]).into_owned();
-            if kind == SOFT_LINK { soft.push(name) } else { hard.push(name) }
+            if kind == SOFT_LINK { names.links.push(name) } else { names.objects.push(name) }
         }
-        check_column_count(hard.len().max(soft.len())).map_err(|error| error.to_string())?;
+        check_column_count(names.objects.len().max(names.links.len())).map_err(|error| error.to_string())?;
     }
-    Ok(Some((hard, soft)))
+    Ok(Some(names))
 }
 
 /// The names in the heap of a group.

@@ -333,8 +333,9 @@ class World:
             )
             for slot, episode in begun:
                 self._episodes[slot] = episode
-            self._show_factors([slot for slot, _ in begun])
-            self._fresh[:] = False
+            if begun:
+                self._show_factors([slot for slot, _ in begun])
+            self._fresh.fill(False)
             self._transform()
             return
         for _ in range(steps):

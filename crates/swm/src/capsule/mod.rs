@@ -19,3 +19,25 @@ pub fn cpu_level() -> String {
     let level = format!("{:?}", swm_simd::cpu_level()).to_lowercase();
     format!("{} {level}", std::env::consts::ARCH)
 }
+
+/// Returns whether processors of two levels, as [`cpu_level`] states them, compute the same bits. AVX-512 and AVX2 do: both round
+/// a multiplication and an addition once, and sums are cut alike.
+pub fn computes_alike(a: &str, b: &str) -> bool {
+    const FUSED: [&str; 2] = ["x86_64 avx2", "x86_64 avx512"];
+    a == b || (FUSED.contains(&a) && FUSED.contains(&b))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::computes_alike;
+
+    #[test]
+    fn levels_with_fused_products_compute_alike() {
+        assert!(
+            computes_alike("x86_64 avx2", "x86_64 avx512") && computes_alike("aarch64 baseline", "aarch64 baseline")
+        );
+        for other in ["x86_64 baseline", "aarch64 baseline", ""] {
+            assert!(!computes_alike("x86_64 avx512", other) && !computes_alike(other, "x86_64 avx2"));
+        }
+    }
+}

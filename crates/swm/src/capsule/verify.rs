@@ -1,6 +1,6 @@
 //! [`verify`]: compares the behaviour of a capsule's model with the behaviour that the capsule records.
 
-use super::{EvaluationRecord, MODEL, RecordedEpisode, cpu_level};
+use super::{EvaluationRecord, MODEL, RecordedEpisode, computes_alike, cpu_level};
 use crate::resolver::HomeResolver;
 use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
@@ -103,9 +103,9 @@ impl Verification {
         Ok(())
     }
 
-    /// Adds a difference: a fault on an equal processor, a remark on another one, whose last bits differ.
+    /// Adds a difference: a fault on a processor that computes the same bits, a remark on another one.
     fn report(&mut self, difference: String) {
-        match self.packed_on == self.verified_on {
+        match computes_alike(&self.packed_on, &self.verified_on) {
             true => self.faults.push(difference),
             false => {
                 self.remarks.push(format!("{difference} (packed on {}, this is {})", self.packed_on, self.verified_on))

@@ -1,7 +1,7 @@
 //! [`verify`]: plays the episodes of an entry, or a random share of them, and lists what differs.
 
 use super::Entry;
-use crate::capsule::cpu_level;
+use crate::capsule::{computes_alike, cpu_level};
 use crate::resolver::HomeResolver;
 use serde::Serialize;
 use std::path::Path;
@@ -92,7 +92,7 @@ pub fn verify(path: &Path, how: &How, options: &RunOptions, control: &mut Contro
         let problem = format!("was made with stable-worldmodel {theirs}, and this is {ours}");
         return Err(Error::config(path.display().to_string(), problem, "verify it with the version that made it"));
     }
-    let same_processor = entry.processor == cpu_level();
+    let same_processor = computes_alike(&entry.processor, &cpu_level());
     if how.exact && !same_processor {
         let problem = format!("was made on {}, and this is {}", entry.processor, cpu_level());
         return Err(Error::config(path.display().to_string(), problem, "verify it on such a processor"));

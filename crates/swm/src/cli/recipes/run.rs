@@ -89,8 +89,9 @@ pub fn run(request: &RecipeRun<'_>, context: &Context) -> anyhow::Result<()> {
     }
     let page = report(&recipe, request, context)?;
     let compared = state.compare(&recipe);
-    let other = recipe.recorded_on.as_deref().filter(|processor| *processor != state.processor);
-    let same_processor = recipe.recorded_on.as_ref() == Some(&state.processor);
+    let alike = |recorded: &&str| capsule::computes_alike(recorded, &state.processor);
+    let other = recipe.recorded_on.as_deref().filter(|recorded| !alike(recorded));
+    let same_processor = recipe.recorded_on.as_deref().is_some_and(|recorded| alike(&recorded));
     let differs = |compared: &&Compared<'_>| compared.expected.is_some_and(|expected| expected != compared.hash);
     if let Some(Compared { name, .. }) = compared.iter().find(differs).filter(|_| same_processor) {
         eprint(&format!("warning: '{name}' differs from what the recipe recorded on such a processor\n"));

@@ -2,7 +2,7 @@
 
 #![no_main]
 
-#[path = "../../crates/swm-video/src/mp4.rs"]
+#[path = "../../crates/swm-video/src/mp4/mod.rs"]
 #[allow(dead_code, reason = "a part of a crate")]
 mod mp4;
 

@@ -1,6 +1,7 @@
 //! A cache of the opened videos of a dataset, with a pool of decoders.
 
-use crate::decode::{DecoderPool, FrameRequest, Source, Video};
+use crate::decode::{DecoderPool, FrameRequest};
+use crate::video::{Source, Video};
 use rayon::prelude::*;
 use std::collections::{HashMap, VecDeque};
 use std::hash::Hash;

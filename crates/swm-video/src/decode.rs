@@ -3,151 +3,22 @@
 
 use crate::colour;
 use crate::header;
-use crate::mp4::{self, Codec, Index};
+use crate::mp4::{Codec, Index};
+use crate::parameters::brings_parameters;
 use crate::reducer::Reducer;
+use crate::video::{Video, damaged};
 use ffmpeg_next::codec::{self, Compliance, Flags, threading};
 use ffmpeg_next::decoder::{self, Check};
 use ffmpeg_next::{Dictionary, Discard, Packet, ffi, frame};
 use rayon::prelude::*;
-use std::fs::File;
-use std::io::{Read as _, Seek as _, SeekFrom};
-use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
-use swm_core::{Error, Result, files};
+use swm_core::{Error, Result};
 
 /// The maximum number of idle decoders in the pool. Each holds the memory of a few decoded frames.
 const IDLE_DECODERS: usize = 32;
 
-/// The source of a video's bytes.
-#[derive(Clone, Debug)]
-pub enum Source {
-    /// A file.
-    File(PathBuf),
-    /// Bytes in memory, with the path that error messages contain.
-    Memory(PathBuf, Arc<[u8]>),
-}
-
-/// An opened source.
-enum Open<'a> {
-    File(File),
-    Memory(&'a [u8]),
-}
-
-impl Source {
-    fn label(&self) -> &Path {
-        let (Self::File(path) | Self::Memory(path, _)) = self;
-        path
-    }
-
-    fn open(&self) -> Result<(Open<'_>, u64)> {
-        Ok(match self {
-            Self::File(path) => {
-                let io = |e| Error::io(path, "opening a video", e);
-                let file = files::open(path)?;
-                let length = file.metadata().map_err(io)?.len();
-                (Open::File(file), length)
-            }
-            Self::Memory(_, bytes) => (Open::Memory(bytes), bytes.len() as u64),
-        })
-    }
-}
-
-impl Open<'_> {
-    /// Fills `bytes` from `offset` on.
-    fn read(&mut self, offset: u64, bytes: &mut [u8]) -> std::result::Result<(), String> {
-        match self {
-            Self::File(file) => {
-                let read = file.seek(SeekFrom::Start(offset)).and_then(|_| file.read_exact(bytes));
-                read.map_err(|e| format!("cannot be read: {e}"))
-            }
-            Self::Memory(all) => {
-                let from = usize::try_from(offset).ok().and_then(|at| all.get(at..)?.get(..bytes.len()));
-                bytes.copy_from_slice(from.ok_or("ends too early")?);
-                Ok(())
-            }
-        }
-    }
-}
-
-/// An MP4 file whose tables were read. The file is not kept open.
-#[derive(Debug)]
-pub struct Video {
-    source: Source,
-    pub(crate) index: Index,
-}
-
-impl Video {
-    /// Reads the tables of a video.
-    ///
-    /// # Errors
-    /// When the file cannot be read, is not a plain MP4 file, or has an unsupported codec.
-    pub fn open(source: Source) -> Result<Self> {
-        let (mut open, length) = source.open()?;
-        let index = Index::read(length, |offset, bytes| open.read(offset, bytes));
-        let index = index.map_err(|problem| damaged(source.label(), &problem))?;
-        Ok(Self { source, index })
-    }
-
-    /// Returns the number of frames.
-    pub fn frames(&self) -> usize {
-        self.index.frames.len()
-    }
-
-    /// Returns the height and width.
-    pub fn size(&self) -> (usize, usize) {
-        (self.index.height, self.index.width)
-    }
-
-    /// Returns the bytes of memory that the opened video takes.
-    pub fn memory(&self) -> usize {
-        let index = &self.index;
-        let tables = index.samples.len() * size_of::<mp4::Sample>() + index.frames.len() * 12;
-        let sums = index.sums.as_ref().map_or(0, |sums| 4 * sums.len());
-        let bytes = if let Source::Memory(_, bytes) = &self.source { bytes.len() } else { 0 };
-        size_of::<Self>() + tables + sums + bytes
-    }
-
-    /// Calls `each` with the encoded bytes of every frame of `frames`.
-    ///
-    /// # Errors
-    /// When the file is damaged.
-    pub fn coded(&self, frames: impl IntoIterator<Item = usize>, mut each: impl FnMut(&[u8])) -> Result<()> {
-        let (mut open, _) = self.source.open()?;
-        let mut bytes = vec![];
-        for frame in frames {
-            let sample = self.index.frames.get(frame).map(|&i| i as usize);
-            let sample = sample.ok_or_else(|| self.lacks(frame))?;
-            let entry = self.index.samples[sample];
-            bytes.resize(entry.size as usize, 0);
-            let read = open.read(entry.offset, &mut bytes).and_then(|()| self.index.check(sample, &bytes));
-            read.map_err(|problem| damaged(self.source.label(), &problem))?;
-            each(&bytes);
-        }
-        Ok(())
-    }
-
-    /// Returns the error for a defect of this video.
-    pub fn damaged(&self, problem: &str) -> Error {
-        damaged(self.source.label(), problem)
-    }
-
-    fn lacks(&self, frame: usize) -> Error {
-        self.damaged(&format!("has {} frames, but frame {frame} was requested", self.frames()))
-    }
-
-    /// Returns the index of the frame closest to a time in seconds, and the frame's distance from the time in seconds.
-    /// Returns `None` if the video has no frames.
-    pub fn frame_at(&self, seconds: f64) -> Option<(usize, f64)> {
-        let frame = self.index.frame_at(seconds)?;
-        Some((frame, (self.index.seconds(frame) - seconds).abs()))
-    }
-}
-
-/// Returns the error for a damaged video.
-fn damaged(path: &Path, problem: &str) -> Error {
-    let fix = "restore it from a copy, or encode it again with `ffmpeg -i IN -c:v libx264 OUT.mp4`";
-    Error::corrupt(path, format!("the video {problem}"), fix)
-}
+/// How many key frames earlier decoding begins where it fails from the nearest one, attempt by attempt.
+const EARLIER: [usize; 3] = [1, 4, 16];
 
 /// A request to decode a frame into memory.
 pub struct FrameRequest<'a> {
@@ -205,11 +76,18 @@ impl DecoderPool {
         let runs: Vec<&mut [Job<'_>]> =
             jobs.chunk_by_mut(|a, b| (order(a).0, order(a).1) == (order(b).0, order(b).1)).collect();
         runs.into_par_iter().with_max_len(1).try_for_each(|run| {
-            let Some(Job { video, .. }) = run.first() else { return Ok(()) };
-            let video = *video;
+            let Some(Job { video, key, .. }) = run.first() else { return Ok(()) };
+            let (video, key) = (*video, *key);
             let mut decoder = self.take(video)?;
-            // After a failure the state of the decoder is unknown, so the decoder is dropped.
-            decoder.run(video, run).map_err(|problem| damaged(video.source.label(), &problem))?;
+            let mut outcome = decoder.run(video, key, run);
+            // Not every frame that a file calls a key frame is one: others complete the pictures of a whole period. After a failure
+            // the state of the decoder is unknown, so the decoder is dropped.
+            for earlier in EARLIER {
+                let (Err(_), Some(from)) = (&outcome, video.index.earlier_key(key, earlier)) else { break };
+                decoder = Decoder::new(video)?;
+                outcome = decoder.run(video, from, run);
+            }
+            outcome.map_err(|problem| damaged(video.source.label(), &problem))?;
             self.give_back(decoder);
             Ok(())
         })
@@ -243,7 +121,11 @@ impl DecoderPool {
         }
     }
 
+    /// Keeps a decoder for later, unless the stream gave it parameters that count for this stream only.
     fn give_back(&self, decoder: Decoder) {
+        if decoder.has_own_parameters {
+            return;
+        }
         let mut idle = self.idle.lock().unwrap_or_else(PoisonError::into_inner);
         if idle.len() == IDLE_DECODERS {
             idle.remove(0);
@@ -260,6 +142,19 @@ struct Decoder {
     inner: decoder::Video,
     frame: frame::Video,
     coded: Vec<u8>,
+    /// Whether frames brought parameters that the header of their file does not have.
+    has_own_parameters: bool,
+}
+
+/// The requested frames of a run that is being decoded.
+struct Run<'a, 'b> {
+    video: &'a Video,
+    jobs: &'a mut [Job<'b>],
+    /// The number of requested frames that were not decoded yet.
+    missing: usize,
+    /// The time of the last frame that the decoder gave.
+    time: i64,
+    reducer: Reducer,
 }
 
 impl Decoder {
@@ -305,6 +200,7 @@ impl Decoder {
             inner,
             frame: frame::Video::empty(),
             coded: vec![],
+            has_own_parameters: false,
         })
     }
 
@@ -314,15 +210,13 @@ impl Decoder {
             && (Arc::ptr_eq(&self.extradata, &index.extradata) || self.extradata == index.extradata)
     }
 
-    /// Decodes the requested frames of one run, which are in decoding order.
-    fn run(&mut self, video: &Video, jobs: &mut [Job<'_>]) -> Result<(), String> {
-        let (Some(first), Some(last)) = (jobs.first().map(|job| job.key), jobs.last().map(|job| job.sample)) else {
-            return Ok(());
-        };
+    /// Decodes the requested frames of one run, which are in decoding order, from the encoded frame `first` on.
+    fn run(&mut self, video: &Video, first: usize, jobs: &mut [Job<'_>]) -> Result<(), String> {
+        let Some(last) = jobs.last().map(|job| job.sample) else { return Ok(()) };
         let (mut open, _) = video.source.open().map_err(|e| e.to_string())?;
         let samples = &video.index.samples[first..=last];
-        let mut missing = jobs.len();
-        let mut reducer = Reducer::default();
+        let missing = jobs.len();
+        let mut run = Run { video, jobs, missing, time: i64::MIN, reducer: Reducer::default() };
         // Samples that are adjacent in the file are read together.
         let mut at = first;
         for group in samples.chunk_by(|a, b| a.offset + u64::from(a.size) == b.offset) {
@@ -335,24 +229,26 @@ impl Decoder {
                 rest = following;
                 video.index.check(at, bytes)?;
                 // A frame that is not requested and that no other frame refers to is not decoded.
-                let wanted = jobs.binary_search_by_key(&at, |job| job.sample).is_ok();
+                let wanted = run.jobs.binary_search_by_key(&at, |job| job.sample).is_ok();
                 self.inner.skip_frame(if wanted { Discard::Default } else { Discard::NonReference });
+                self.has_own_parameters |= brings_parameters(&video.index, bytes);
                 let mut packet = Packet::copy(bytes);
                 packet.set_pts(Some(at as i64));
                 self.inner.send_packet(&packet).map_err(|e| format!("cannot be decoded in encoded frame {at}: {e}"))?;
-                self.receive(video, jobs, &mut missing, &mut reducer)?;
+                self.receive(&mut run)?;
                 at += 1;
             }
             self.coded = coded;
         }
-        if missing > 0 {
+        if run.missing > 0 {
             self.inner.send_eof().map_err(|e| format!("cannot be decoded to its end: {e}"))?;
-            self.receive(video, jobs, &mut missing, &mut reducer)?;
+            self.receive(&mut run)?;
         }
         self.inner.flush();
-        if missing > 0 {
+        if run.missing > 0 {
             return Err(format!(
-                "is damaged: of the frames from encoded frame {first} to {last}, {missing} are missing"
+                "is damaged: of the frames from encoded frame {first} to {last}, {} are missing",
+                run.missing
             ));
         }
         Ok(())
@@ -365,6 +261,7 @@ impl Decoder {
         self.coded.resize(sample.size as usize, 0);
         open.read(sample.offset, &mut self.coded)?;
         video.index.check(0, &self.coded)?;
+        self.has_own_parameters |= brings_parameters(&video.index, &self.coded);
         self.inner.skip_frame(Discard::Default);
         let sent = self.inner.send_packet(&Packet::copy(&self.coded)).and_then(|()| self.inner.send_eof());
         sent.and_then(|()| self.inner.receive_frame(&mut self.frame)).map_err(|e| format!("cannot be decoded: {e}"))?;
@@ -373,13 +270,7 @@ impl Decoder {
     }
 
     /// Receives the finished frames of the decoder and converts the requested frames.
-    fn receive(
-        &mut self,
-        video: &Video,
-        jobs: &mut [Job<'_>],
-        missing: &mut usize,
-        reducer: &mut Reducer,
-    ) -> Result<(), String> {
+    fn receive(&mut self, run: &mut Run<'_, '_>) -> Result<(), String> {
         loop {
             match self.inner.receive_frame(&mut self.frame) {
                 Ok(()) => {}
@@ -387,6 +278,15 @@ impl Decoder {
                 Err(error) => return Err(format!("cannot be decoded: {error}")),
             }
             let Some(sample) = self.frame.pts().and_then(|pts| usize::try_from(pts).ok()) else { continue };
+            let Run { video, jobs, missing, time, reducer } = &mut *run;
+            // Decoders give frames in the order of their presentation, which the stream itself states.
+            let shown = video.index.samples.get(sample).map_or(i64::MAX, |sample| sample.time);
+            if shown < *time {
+                return Err(format!(
+                    "states a time for its encoded frame {sample} at which its stream shows another frame"
+                ));
+            }
+            *time = shown;
             let begin = jobs.partition_point(|job| job.sample < sample);
             let end = jobs.partition_point(|job| job.sample <= sample);
             let Some((Job { out, .. }, duplicates)) = jobs[begin..end].split_first_mut() else { continue };
@@ -409,6 +309,8 @@ impl Decoder {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::video::Source;
+    use std::path::Path;
 
     /// Returns the frames of `tests/interop/odd-NAME.mp4`, as PyAV decoded them, and the video.
     fn odd(name: &str) -> (Vec<u8>, Video) {

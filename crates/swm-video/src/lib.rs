@@ -13,11 +13,16 @@ mod decode;
 mod encode;
 mod header;
 mod mp4;
+mod parameters;
+#[cfg(test)]
+mod rare_tests;
 mod reducer;
+mod video;
 
 pub use cache::VideoCache;
-pub use decode::{DecoderPool, FrameRequest, Source, Video};
+pub use decode::{DecoderPool, FrameRequest};
 pub use encode::{Encoder, Encoding, Quality, encode};
+pub use video::{Source, Video};
 
 use std::path::Path;
 

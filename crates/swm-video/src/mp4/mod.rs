@@ -3,8 +3,13 @@
 //! Access to single frames needs the position, size, presentation time and key flag of every encoded frame. Reading
 //! the tables takes microseconds, whereas demultiplexing reads the whole file, and safe code handles damaged tables.
 
+mod boxes;
+mod tables;
+
+use boxes::{Boxes, find, versioned};
 use std::ops::Range;
 use std::sync::Arc;
+use tables::{description, samples};
 
 /// Limit of the size of a file's tables in bytes. The tables of an hour of video take less than a megabyte.
 const LARGEST_TABLES: u64 = 256 << 20;
@@ -143,7 +148,7 @@ impl Index {
         let stbl = find(minf, b"stbl")?.ok_or("has a track without tables")?;
         let (codec, extradata, width, height) =
             description(find(stbl, b"stsd")?.ok_or("has a track without a codec")?)?;
-        let samples = samples(stbl, length)?;
+        let samples = samples(stbl, width * height, length)?;
         let edit = edit(trak, movie_scale, timescale)?;
         let mut frames: Vec<u32> = (0..u32::try_from(samples.len()).map_err(|e| e.to_string())?).collect();
         frames.retain(|&i| edit.shown.contains(&samples[i as usize].time));
@@ -158,6 +163,12 @@ impl Index {
         let shown = self.samples[sample].time;
         let begins = |i: &usize| self.samples[*i].key && self.samples[*i].time <= shown;
         (0..=sample).rev().find(begins).unwrap_or(0)
+    }
+
+    /// Returns the key sample that is `count` key samples before `sample`, or the first sample; `None` before the first one.
+    pub fn earlier_key(&self, sample: usize, count: usize) -> Option<usize> {
+        let keys = (0..sample).rev().filter(|&i| self.samples[i].key);
+        (sample > 0).then(|| keys.take(count).last().unwrap_or(0))
     }
 
     /// Checks the bytes of a sample against the checksum, if the file has checksums.
@@ -227,94 +238,6 @@ pub fn sum(bytes: &[u8]) -> u32 {
     (sum >> 32) as u32 ^ sum as u32
 }
 
-/// Iterates over the boxes within a box.
-struct Boxes<'a>(&'a [u8]);
-
-impl<'a> Iterator for Boxes<'a> {
-    type Item = Result<([u8; 4], &'a [u8])>;
-
-    fn next(&mut self) -> Option<Self::Item> {
-        let (&[a, b, c, d, k, i, n, e], rest) = self.0.split_first_chunk::<8>()?;
-        let kind = [k, i, n, e];
-        let (size, body) = match u32::from_be_bytes([a, b, c, d]) {
-            0 => (rest.len(), rest),
-            1 => {
-                let Some((large, body)) = rest.split_first_chunk::<8>() else { return self.cut(kind) };
-                (usize::try_from(u64::from_be_bytes(*large).saturating_sub(16)).unwrap_or(usize::MAX), body)
-            }
-            size => ((size as usize).saturating_sub(8), rest),
-        };
-        match body.split_at_checked(size) {
-            Some((body, rest)) => {
-                self.0 = rest;
-                Some(Ok((kind, body)))
-            }
-            None => self.cut(kind),
-        }
-    }
-}
-
-impl<'a> Boxes<'a> {
-    fn cut(&mut self, kind: [u8; 4]) -> Option<Result<([u8; 4], &'a [u8])>> {
-        self.0 = &[];
-        Some(Err(format!("has a box '{}' that is cut short", kind.escape_ascii())))
-    }
-}
-
-/// Returns the first box of a kind.
-fn find<'a>(parent: &'a [u8], kind: &[u8; 4]) -> Result<Option<&'a [u8]>> {
-    for child in Boxes(parent) {
-        let (found, body) = child?;
-        if found == *kind {
-            return Ok(Some(body));
-        }
-    }
-    Ok(None)
-}
-
-/// Reads big-endian integers in sequence.
-struct Integers<'a>(&'a [u8]);
-
-impl Integers<'_> {
-    fn bytes<const N: usize>(&mut self) -> Result<[u8; N]> {
-        let (first, rest) = self.0.split_first_chunk::<N>().ok_or("has a table that is cut short")?;
-        self.0 = rest;
-        Ok(*first)
-    }
-
-    fn u32(&mut self) -> Result<u32> {
-        Ok(u32::from_be_bytes(self.bytes()?))
-    }
-
-    fn u64(&mut self) -> Result<u64> {
-        Ok(u64::from_be_bytes(self.bytes()?))
-    }
-
-    fn i32(&mut self) -> Result<i32> {
-        Ok(i32::from_be_bytes(self.bytes()?))
-    }
-
-    fn i64(&mut self) -> Result<i64> {
-        Ok(i64::from_be_bytes(self.bytes()?))
-    }
-
-    /// Returns the number of entries that follow, each of `size` bytes.
-    fn count(&mut self, size: usize) -> Result<usize> {
-        let count = self.u32()? as usize;
-        if count.checked_mul(size).is_none_or(|bytes| bytes > self.0.len()) {
-            return Err("has a table that is cut short".to_owned());
-        }
-        Ok(count)
-    }
-}
-
-/// Reads the version and the flags at the start of a box. Returns the version, and the integers after the flags.
-fn versioned(body: &[u8]) -> Result<(u8, Integers<'_>)> {
-    let mut integers = Integers(body);
-    let [version, ..] = integers.bytes::<4>()?;
-    Ok((version, integers))
-}
-
 /// Returns the units per second in the header of a movie or a track.
 fn timescale(header: &[u8]) -> Result<u32> {
     let (version, mut integers) = versioned(header)?;
@@ -324,44 +247,6 @@ fn timescale(header: &[u8]) -> Result<u32> {
         0 => Err("has a time unit of 0".to_owned()),
         timescale => Ok(timescale),
     }
-}
-
-/// Returns the codec, its decoder record, width and height.
-fn description(stsd: &[u8]) -> Result<(Codec, Arc<[u8]>, usize, usize)> {
-    /// Size in bytes of a visual sample entry before its boxes.
-    const ENTRY: usize = 78;
-    /// Offset of the frame size in a visual sample entry.
-    const SIZE: usize = 24;
-    let (_, integers) = versioned(stsd)?;
-    let entries = integers.0.get(4..).unwrap_or_default();
-    let (kind, entry) = Boxes(entries).next().ok_or("has a track without a codec")??;
-    let (codec, record) = match &kind {
-        b"avc1" | b"avc3" => (Codec::H264, b"avcC"),
-        b"hvc1" | b"hev1" => (Codec::Hevc, b"hvcC"),
-        b"vp09" => (Codec::Vp9, b"vpcC"),
-        b"av01" => (Codec::Av1, b"av1C"),
-        b"FFV1" => (Codec::Ffv1, b"glbl"),
-        other => {
-            return Err(format!(
-                "has the codec '{}', which is none of H.264, H.265, VP9, AV1, FFV1",
-                other.escape_ascii()
-            ));
-        }
-    };
-    let (fixed, boxes) = entry.split_at_checked(ENTRY).ok_or("has a codec description that is cut short")?;
-    let size = |at: usize| usize::from(u16::from_be_bytes([fixed[at], fixed[at + 1]]));
-    // Ignores malformed boxes, because vendors add boxes in unknown forms.
-    let record = Boxes(boxes).flatten().find(|(kind, _)| kind == record).map_or(&[][..], |(_, body)| body);
-    // A decoder needs no record for VP9.
-    let extradata = if codec == Codec::Vp9 { &[] } else { record };
-    let (width, height) = (size(SIZE), size(SIZE + 2));
-    if width == 0 || height == 0 {
-        return Err("has frames without a size".to_owned());
-    }
-    if width * height > swm_image::MAX_PIXELS {
-        return Err(format!("has frames of {width} x {height} pixels, more than {}", swm_image::MAX_PIXELS));
-    }
-    Ok((codec, extradata.into(), width, height))
 }
 
 /// The part of a track that is presented.
@@ -397,98 +282,4 @@ fn edit(trak: &[u8], movie_scale: u32, timescale: u32) -> Result<Edit> {
         start = start.saturating_add(units);
     }
     if pieces > 1 { Err("is edited from several pieces".to_owned()) } else { Ok(edit) }
-}
-
-/// Reads all samples, in decoding order.
-#[allow(clippy::too_many_lines, reason = "reads the six tables of samples in sequence")]
-fn samples(stbl: &[u8], length: u64) -> Result<Vec<Sample>> {
-    let table = |kind: &[u8; 4]| find(stbl, kind)?.ok_or(format!("lacks its table '{}'", kind.escape_ascii()));
-    // Reads the sizes.
-    let (_, mut sizes) = versioned(table(b"stsz")?)?;
-    let common_size = sizes.u32()?;
-    let count = if common_size == 0 { sizes.count(4)? } else { sizes.u32()? as usize };
-    if common_size != 0 && u64::from(common_size) * count as u64 > length {
-        return Err("is shorter than its frames".to_owned());
-    }
-    let mut samples = vec![Sample { offset: 0, size: common_size, time: 0, key: false }; count];
-    if common_size == 0 {
-        for sample in &mut samples {
-            sample.size = sizes.u32()?;
-        }
-    }
-    // Reads the decoding times, and the offsets from decoding times to presentation times.
-    let (_, mut durations) = versioned(table(b"stts")?)?;
-    let (mut at, mut time) = (0, 0_i64);
-    for _ in 0..durations.count(8)? {
-        let (n, duration) = (durations.u32()? as usize, durations.u32()?);
-        for sample in samples.iter_mut().skip(at).take(n) {
-            sample.time = time;
-            time = time.saturating_add(duration.into());
-        }
-        at = at.saturating_add(n);
-    }
-    if at < count {
-        return Err("has frames without a time".to_owned());
-    }
-    if let Some(ctts) = find(stbl, b"ctts")? {
-        let (_, mut shifts) = versioned(ctts)?;
-        let mut at = 0_usize;
-        for _ in 0..shifts.count(8)? {
-            // Version 0 is unsigned by the standard, but writers of negative offsets exist.
-            let (n, shift) = (shifts.u32()? as usize, shifts.i32()?);
-            samples
-                .iter_mut()
-                .skip(at)
-                .take(n)
-                .for_each(|sample| sample.time = sample.time.saturating_add(shift.into()));
-            at = at.saturating_add(n);
-        }
-    }
-    // Marks the key frames that a table lists. Without this table, every sample is a key frame.
-    match find(stbl, b"stss")? {
-        None => samples.iter_mut().for_each(|sample| sample.key = true),
-        Some(stss) => {
-            let (_, mut keys) = versioned(stss)?;
-            for _ in 0..keys.count(4)? {
-                let number = keys.u32()? as usize;
-                let sample = number.checked_sub(1).and_then(|i| samples.get_mut(i));
-                sample.ok_or("names a key frame that does not exist")?.key = true;
-            }
-        }
-    }
-    // Reads the positions. Samples follow each other within a chunk; a table holds the offsets of the chunks.
-    let (wide, chunks) = match find(stbl, b"stco")? {
-        Some(stco) => (false, stco),
-        None => (true, table(b"co64")?),
-    };
-    let (_, mut chunks) = versioned(chunks)?;
-    let n = chunks.count(if wide { 8 } else { 4 })?;
-    let (_, mut table) = versioned(table(b"stsc")?)?;
-    // Runs of chunks: the first chunk (from 1), the number of samples per chunk, and the index of the description,
-    // which is ignored.
-    let mut runs = vec![];
-    for _ in 0..table.count(12)? {
-        runs.push((table.u32()? as usize, table.u32()? as usize));
-        table.u32()?;
-    }
-    let (mut run, mut at) = (0, 0);
-    for chunk in 1..=n {
-        while runs.get(run + 1).is_some_and(|&(first, _)| first <= chunk) {
-            run += 1;
-        }
-        let per_chunk = runs.get(run).map_or(0, |&(_, samples)| samples);
-        let mut offset = if wide { chunks.u64()? } else { chunks.u32()?.into() };
-        for sample in samples.iter_mut().skip(at).take(per_chunk) {
-            sample.offset = offset;
-            offset = offset.checked_add(sample.size.into()).ok_or("has a frame beyond its end")?;
-            if offset > length {
-                return Err("ends before its last frame".to_owned());
-            }
-        }
-        at = at.saturating_add(per_chunk);
-    }
-    if at < count {
-        return Err("has frames without a position".to_owned());
-    }
-    Ok(samples)
 }
